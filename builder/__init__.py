@@ -1,0 +1,1 @@
+"""Offline: scans in, one archive out."""

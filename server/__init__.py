@@ -1,0 +1,1 @@
+"""Online: poses and requests in, verdicts out."""

@@ -1,0 +1,1 @@
+"""What the walkthrough and the accuracy report write."""

@@ -1,0 +1,82 @@
+"""The options of a build, frozen; each default with its reason."""
+
+from dataclasses import dataclass, field
+
+from ..schemas.errors import BadRequestError
+from ..schemas.voxel import MAX_DEGREE, MAX_LEAF, MIN_DEGREE
+
+# Options that change bytes of the archive are in `identity()`; the others only change how it is made.
+RADIUS_SAMPLE = 1_000_000
+
+# Points in a work unit, one shard: large enough that opening a file is noise, small enough that two
+# workers of the default memory bound hold one each, decoded, with room for the hierarchy being built.
+SHARD_POINTS = 1 << 22
+
+DEFAULT_STEP = 1e-4
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BuildConfig:
+    """How an archive is built.
+
+    voxel: edge of a voxel [m]; 8: a few to a few hundred in reach of a walk, a few MB each.
+    resolution: lattice step [m]; None: the sources' own where all share one, else 0.1 mm, a twentieth of
+    a terrestrial scanner's range noise.
+    degree: children a node, 2 to 16 ([Fig12] table 1 tries 4 to 16); 8, flat between 6 and 10 in bench_walk.
+    leaf: points a leaf node, up to 32, the width of the vector test.
+    cell_points: an octree cell above this is split: small enough for 16-bit trees, large enough that a
+    cell's own row is noise in the archive.
+    spacing: meshes are sampled about this far apart [m]; None: their vertices are taken.
+    with_slab: cut each sphere by a slab; False is the paper's structure, for comparison.
+    jobs: worker processes; 0: one a core.  memory_bytes: bound on what the passes hold.
+    keep: extra columns, among "scan" and "intensity".  strict: a non-finite point fails the build.
+    skip_bad: leave out scans that cannot be read and mark their region as unknown.
+    overwrite: replace an archive of the same name, once the new one is whole.
+    """
+
+    voxel: float = 8.0
+    resolution: float | None = None
+    degree: int = 8
+    leaf: int = 32
+    cell_points: int = 4096
+    spacing: float | None = None
+    radius: float | None = None
+    with_slab: bool = True
+    jobs: int = 0
+    memory_bytes: int = 2 << 30
+    keep: frozenset[str] = field(default_factory=frozenset)
+    strict: bool = False
+    skip_bad: bool = False
+    overwrite: bool = False
+
+    def __post_init__(self) -> None:
+        """Refuse options outside what the format and the kernels hold."""
+        checks = [
+            (MIN_DEGREE <= self.degree <= MAX_DEGREE, f"--degree {self.degree}", f"{MIN_DEGREE} to {MAX_DEGREE}"),
+            (1 <= self.leaf <= MAX_LEAF, f"--leaf {self.leaf}", f"1 to {MAX_LEAF}"),
+            (self.cell_points >= 1, f"cell_points {self.cell_points}", "at least 1"),
+            (self.voxel > 0, f"--voxel {self.voxel}", "a positive length in metres"),
+            (self.resolution is None or self.resolution > 0, f"--resolution {self.resolution}", "a positive step"),
+            (self.spacing is None or self.spacing > 0, f"--spacing {self.spacing}", "a positive distance"),
+            (self.radius is None or self.radius >= 0, f"--radius {self.radius}", "zero or a positive length"),
+            (self.jobs >= 0, f"--jobs {self.jobs}", "0 (all cores) or more"),
+            (self.memory_bytes >= 64 << 20, f"--memory {self.memory_bytes} bytes", "at least 64MB"),
+            (self.keep <= {"scan", "intensity"}, f"--keep {','.join(sorted(self.keep))}", "scan, intensity or both"),
+        ]
+        for good, found, expected in checks:
+            if not good:
+                raise BadRequestError(f"{found}: expected {expected}")
+
+    def identity(self) -> dict[str, float | int | bool | str | None]:
+        """The options that the archive's bytes depend on, for the index."""
+        return {
+            "voxel": self.voxel,
+            "resolution": self.resolution,
+            "degree": self.degree,
+            "leaf": self.leaf,
+            "cell_points": self.cell_points,
+            "spacing": self.spacing,
+            "radius": self.radius,
+            "with_slab": self.with_slab,
+            "keep": ",".join(sorted(self.keep)),
+        }

@@ -1,0 +1,64 @@
+"""The octree of one voxel, split by occupancy, over points in Morton order."""
+
+import numba as nb
+import numpy as np
+
+from ...schemas.kernels.morton import morton_code
+
+
+@nb.njit(nogil=True, cache=True)
+def voxel_codes(points):
+    """Morton codes (n,) uint64 of points (n, 3) int32 [voxel steps], each in [0, 2^21)."""
+    n = points.shape[0]
+    codes = np.empty(n, np.uint64)
+    for i in range(n):
+        codes[i] = morton_code(np.uint64(points[i, 0]), np.uint64(points[i, 1]), np.uint64(points[i, 2]))
+    return codes
+
+
+@nb.njit(nogil=True, cache=True)
+def _first_at_least(codes, lo, hi, value):
+    """First index in [lo, hi) of sorted codes that is not below value; hi when there is none."""
+    while lo < hi:
+        mid = (lo + hi) // 2
+        if codes[mid] < value:
+            lo = mid + 1
+        else:
+            hi = mid
+    return lo
+
+
+@nb.njit(nogil=True, cache=True)
+def split_octree(codes, root_log2, largest_log2, capacity):
+    """Cut sorted points into the leaf cells of an octree ([Fig12] section 4), in Morton order.
+
+    codes: (n,) uint64 sorted, n >= 1, of points in [0, 2^root_log2).  largest_log2: cells above this size
+    are split whatever they hold.  capacity: cells above this many points are split, until a cell is one
+    lattice step: duplicates can fill that one over capacity (NUMERICS.md case 7, 12).
+    Returns (start (c,) int64, the first point of each cell; log2_size (c,) uint8). Depth first, so at most
+    7 siblings a level wait on the stack.
+    """
+    n = codes.shape[0]
+    starts = np.empty(n, np.int64)
+    sizes = np.empty(n, np.uint8)
+    stack = np.empty((8 * (root_log2 + 1) + 1, 3), np.int64)
+    stack[0, 0], stack[0, 1], stack[0, 2] = 0, n, root_log2
+    depth, cells = 1, 0
+    while depth > 0:
+        depth -= 1
+        lo, hi, log2 = stack[depth, 0], stack[depth, 1], stack[depth, 2]
+        if log2 == 0 or (hi - lo <= capacity and log2 <= largest_log2):
+            starts[cells] = lo
+            sizes[cells] = log2
+            cells += 1
+            continue
+        shift = np.uint64(3 * (log2 - 1))
+        base = (codes[lo] >> (shift + np.uint64(3))) << np.uint64(3)
+        end = hi
+        for child in range(7, -1, -1):  # pushed last to first, so that they come out in Morton order
+            begin = _first_at_least(codes, lo, end, (base | np.uint64(child)) << shift)
+            if begin < end:
+                stack[depth, 0], stack[depth, 1], stack[depth, 2] = begin, end, log2 - 1
+                depth += 1
+            end = begin
+    return starts[:cells].copy(), sizes[:cells].copy()

@@ -1,0 +1,146 @@
+"""The data of one voxel as flat arrays, and `check_voxel`, the door every decoded voxel passes.
+
+A voxel is an octree whose leaf cells each hold a bounding sphere hierarchy (BSH), with one more BSH over
+the cells ([Fig12] section 4 and figures 3, 4). Every BSH is an R-tree-like tree of degree m with all
+leaf nodes on one level. Only counts are stored: children are contiguous, so where they start follows.
+
+Node order: the nodes of the top BSH, level by level from its root; then the root node of every cell, in
+cell order; then, cell by cell, the cell's other nodes, level by level. A voxel of one cell has no top BSH.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .errors import CorruptError
+from .kernels.links import link_rows
+
+# A leaf node's points fill at most this many lanes of the vector test (server/kernels/overlap.py); 32 is
+# what LLVM vectorises and 8 or 16 are not (see there).
+MAX_LEAF = 32
+MIN_DEGREE, MAX_DEGREE = 2, 16
+
+# Coordinates inside a leaf cell are 16 bits an axis (NUMERICS.md N3).
+CELL_BITS = 16
+
+
+class Cells(NamedTuple):
+    """The leaf cells of a voxel's octree, c of them; cell `i` is `low[i] + [0, 2**log2_size[i])` an axis.
+
+    low: (c, 3) int32 [voxel steps].  log2_size: (c,) uint8.  nodes: (c,) uint32, nodes of the cell's BSH.
+    points: (c,) uint32, points in the cell.
+    """
+
+    low: NDArray[np.int32]
+    log2_size: NDArray[np.uint8]
+    nodes: NDArray[np.uint32]
+    points: NDArray[np.uint32]
+
+
+class Nodes(NamedTuple):
+    """Bounding spheres, each cut by a slab; n of them. Each encloses all *points* below it (centres only).
+
+    center: (n, 3) uint16 [steps from the cell's low corner; top BSH: 2**top_shift steps from the voxel's].
+    radius: (n,) uint16, the same unit.  normal: (n, 3) int8, the slab's direction, not of unit length;
+    zero: no slab.  slab: (n, 2) int32, least and greatest dot(normal, point - center) [steps].
+    count: (n,) uint8, children, or points of a leaf node.
+    axis: (n,) uint8, leaf nodes: the axis along which the points are sorted; else 0.
+    block_low: (n, 3) uint16, leaf nodes: low corner of the points' box [steps from the cell]; else 0.
+    """
+
+    center: NDArray[np.uint16]
+    radius: NDArray[np.uint16]
+    normal: NDArray[np.int8]
+    slab: NDArray[np.int32]
+    count: NDArray[np.uint8]
+    axis: NDArray[np.uint8]
+    block_low: NDArray[np.uint16]
+
+
+class VoxelData(NamedTuple):
+    """All of one voxel.
+
+    key: voxel key.  top_shift: see Nodes.center.  cells, nodes: see there.
+    points: (p, 3) uint16 x, y, z from their leaf node's block_low, in leaf-node order [steps].
+    scan_index: (p,) uint16 or None.  intensity: (p,) float32 or None.
+    """
+
+    key: int
+    top_shift: int
+    cells: Cells
+    nodes: Nodes
+    points: NDArray[np.uint16]
+    scan_index: NDArray[np.uint16] | None = None
+    intensity: NDArray[np.float32] | None = None
+
+
+class Links(NamedTuple):
+    """Where children are; derived from the counts by `link_nodes`.
+
+    first: (n,) int32, first child node; leaf nodes: first point.  is_leaf: (n,) bool.
+    cell: (n,) int32, the cell a node belongs to, -1 for the top BSH.  height: levels of nodes, root to leaf.
+    """
+
+    first: NDArray[np.int32]
+    is_leaf: NDArray[np.bool_]
+    cell: NDArray[np.int32]
+    height: int
+
+
+def top_shift(voxel_steps: int) -> int:
+    """The unit of the top BSH's centres, as a power of two: the least that fits a voxel into 16 bits."""
+    return max(0, int(voxel_steps - 1).bit_length() - CELL_BITS)
+
+
+def link_nodes(voxel: VoxelData) -> Links:
+    """Derive where every node's children are. Raises CorruptError when the counts do not add up."""
+    cells, count = voxel.cells, voxel.nodes.count
+    n, c = len(count), len(cells.nodes)
+    top = n - int(cells.nodes.sum(dtype=np.int64))
+    if c == 0 or not cells.nodes.all() or not cells.points.all() or top < 0 or (top == 0) != (c == 1):
+        raise CorruptError(f"voxel {voxel.key:#x}: {n} nodes for {c} cells do not add up")
+    first, cell_of, is_leaf = np.empty(n, np.int32), np.empty(n, np.int32), np.zeros(n, bool)
+    height = link_rows(count, cells.nodes, cells.points, first, is_leaf, cell_of)
+    if height < 0:
+        raise CorruptError(f"voxel {voxel.key:#x}: the counts of node {-1 - height} do not add up to a tree")
+    return Links(first, is_leaf, cell_of, height)
+
+
+def check_voxel(voxel: VoxelData, voxel_steps: int) -> Links:
+    """Check everything a kernel relies on, and derive the links. Raises CorruptError naming the fault.
+
+    What is checked: shapes agree; counts add up to trees with all leaf nodes on one level; cells lie on
+    their own grid inside the voxel's cube; points and node centres lie inside their cell; the top unit is
+    the one the voxel size calls for. Not checked here: that bounds enclose (`solidcloud validate`).
+    """
+    cells, nodes = voxel.cells, voxel.nodes
+    name = f"voxel {voxel.key:#x}"
+    n, c, p = len(nodes.count), len(cells.nodes), len(voxel.points)
+    if any(len(a) != n for a in nodes) or any(len(a) != c for a in cells):
+        raise CorruptError(f"{name}: columns of unequal length")
+    if voxel.top_shift != top_shift(voxel_steps):
+        raise CorruptError(f"{name}: top unit 2^{voxel.top_shift} steps, expected 2^{top_shift(voxel_steps)}")
+    links = link_nodes(voxel)
+    if int(cells.points.sum(dtype=np.int64)) != p:
+        raise CorruptError(f"{name}: cells claim {int(cells.points.sum(dtype=np.int64))} points, found {p}")
+    if (cells.log2_size > CELL_BITS).any():
+        raise CorruptError(f"{name}: a cell larger than 2^{CELL_BITS} steps")
+    size = np.int64(1) << cells.log2_size.astype(np.int64)
+    low = cells.low.astype(np.int64)
+    if (low < 0).any() or (low % size[:, None] != 0).any() or (low >= voxel_steps).any():
+        raise CorruptError(f"{name}: a cell off its grid or outside the voxel")
+    leaf = links.is_leaf
+    if (nodes.count[leaf] > MAX_LEAF).any() or (nodes.count[~leaf] > MAX_DEGREE).any():
+        raise CorruptError(f"{name}: a node over {MAX_LEAF} points or {MAX_DEGREE} children")
+    if (nodes.axis > 2).any():
+        raise CorruptError(f"{name}: sort axis {int(nodes.axis.max())}, expected 0, 1 or 2")
+    # Points from their cell's low corner: inside the cell, so their sums stay inside 16 bits and kernels
+    # that add block_low to them cannot leave the certified range.
+    rows = np.flatnonzero(leaf)
+    rows = rows[np.argsort(links.first[rows], kind="stable")]
+    high = np.maximum.reduceat(voxel.points, links.first[rows], axis=0).astype(np.int64) + nodes.block_low[rows]
+    cell = links.cell[rows]
+    if (high >= size[cell, None]).any() or (high + low[cell] >= voxel_steps).any():
+        raise CorruptError(f"{name}: a point outside its cell")
+    return links

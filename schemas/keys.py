@@ -1,0 +1,80 @@
+"""Key expressions: where on zenoh each question is asked, and who is alive. WIRE.md lists them."""
+
+import re
+from typing import NamedTuple
+
+from .errors import BadRequestError
+
+# The 1 is WIRE.md's version: servers of two versions can live side by side, neither hears the other.
+ROOT = "solidcloud/1"
+OPERATIONS = ("info", "add_avatar", "collide")
+
+_NAME = re.compile(r"[A-Za-z0-9._-]{1,64}")
+
+
+class Route(NamedTuple):
+    """What the key of a question says: which scene, which client asks, and what."""
+
+    scene: str
+    client: str
+    operation: str
+
+
+def check_name(name: str, what: str) -> str:
+    """The same name, if it may stand in a key; BadRequestError if not. `what` is what it names."""
+    if not _NAME.fullmatch(name):
+        raise BadRequestError(f"{what} {name!r}: expected 1 to 64 of A-Z, a-z, 0-9, '.', '_' and '-'")
+    return name
+
+
+def scenes_key() -> str:
+    """Where every server says which scenes it serves."""
+    return f"{ROOT}/scenes"
+
+
+def question_key(scene: str, client: str, operation: str) -> str:
+    """Where one client asks one thing of one scene."""
+    check_name(scene, "scene")
+    check_name(client, "client")
+    if operation not in OPERATIONS:
+        raise BadRequestError(f"operation {operation!r}: expected one of {', '.join(OPERATIONS)}")
+    return f"{ROOT}/scene/{scene}/{client}/{operation}"
+
+
+def questions_key(scene: str) -> str:
+    """What a server declares: any client, any operation of its scene."""
+    return f"{ROOT}/scene/{check_name(scene, 'scene')}/*/*"
+
+
+def parse_question(key: str) -> Route:
+    """The route of a question's key; BadRequestError where it is not one, wildcards included."""
+    prefix = f"{ROOT}/scene/"
+    parts = key.removeprefix(prefix).split("/")
+    if not key.startswith(prefix) or len(parts) != 3:
+        raise BadRequestError(f"key {key!r}: expected {prefix}SCENE/CLIENT/OPERATION")
+    route = Route(*parts)
+    question_key(*route)
+    return route
+
+
+def server_alive_key(scene: str, server: str) -> str:
+    """The liveliness token of a server that is warm and answers for this scene."""
+    return f"{ROOT}/alive/{check_name(scene, 'scene')}/{check_name(server, 'server')}"
+
+
+def client_alive_key(scene: str, client: str) -> str:
+    """The liveliness token of a client: when it goes, the server drops the client's avatars."""
+    return f"{ROOT}/client/{check_name(scene, 'scene')}/{check_name(client, 'client')}"
+
+
+def clients_alive_key(scene: str) -> str:
+    """What a server listens to: the tokens of all clients of its scene."""
+    return f"{ROOT}/client/{check_name(scene, 'scene')}/*"
+
+
+def parse_client_alive(key: str) -> str:
+    """The client whose liveliness token has this key; BadRequestError where it is no such key."""
+    parts = key.split("/")
+    if len(parts) != 5 or client_alive_key(parts[3], parts[4]) != key:
+        raise BadRequestError(f"key {key!r}: expected {ROOT}/client/SCENE/CLIENT")
+    return parts[4]

@@ -1,0 +1,144 @@
+"""What is known of a scene that is made: the figures a test may hold a scan, or an engine, against.
+
+Frame: the façade's own, metres, z up, x along the façade, the visitor's side at negative y, ground at z = 0;
+`FacadeTruth.origin` moves it into the world. Numbers are those the mesh was built from, before any noise.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+
+from ...schemas.errors import ScanError
+
+
+@dataclass(frozen=True, slots=True)
+class DoorTruth:
+    """An open door: two vertical jambs from sill to springing, a pointed arch above, clear through the wall.
+
+    x_left, x_right: the jamb planes; their difference is the clear width.  y_front, y_back: the wall's faces.
+    """
+
+    name: str
+    x_left: float
+    x_right: float
+    y_front: float
+    y_back: float
+    sill: float
+    springing: float
+    apex: float
+
+    @property
+    def width(self) -> float:
+        """The clear width [m]."""
+        return self.x_right - self.x_left
+
+
+@dataclass(frozen=True, slots=True)
+class StepTruth:
+    """One step of a stair: its tread at height z, from its riser at y_front to the next one or the wall."""
+
+    stair: str
+    x_left: float
+    x_right: float
+    y_front: float
+    y_back: float
+    z: float
+
+
+@dataclass(frozen=True, slots=True)
+class ColumnTruth:
+    """A free-standing round column: a shaft between a base and a capital, both wider by `collar`."""
+
+    name: str
+    x: float
+    y: float
+    radius: float
+    collar: float
+    z_low: float
+    z_high: float
+
+
+@dataclass(frozen=True, slots=True)
+class WallTruth:
+    """A plane piece of wall: coordinate `axis` equals `offset`, seen from the side `facing` (+1 or -1).
+
+    low, high: the extent along the other horizontal axis.  z_low, z_high: the extent in height.
+    """
+
+    name: str
+    axis: str
+    offset: float
+    facing: int
+    low: float
+    high: float
+    z_low: float
+    z_high: float
+
+
+@dataclass(frozen=True, slots=True)
+class FacadeTruth:
+    """One façade: every figure in its own frame; world = own + origin."""
+
+    seed: int
+    origin: tuple[float, float, float]
+    floor: float
+    doors: tuple[DoorTruth, ...]
+    steps: tuple[StepTruth, ...]
+    columns: tuple[ColumnTruth, ...]
+    walls: tuple[WallTruth, ...]
+
+    def door(self, name: str) -> DoorTruth:
+        """The door of this name: `main`, `left` or `right`."""
+        return next(door for door in self.doors if door.name == name)
+
+    def column(self, name: str) -> ColumnTruth:
+        """The column of this name."""
+        return next(column for column in self.columns if column.name == name)
+
+    def wall(self, name: str) -> WallTruth:
+        """The wall of this name."""
+        return next(wall for wall in self.walls if wall.name == name)
+
+
+@dataclass(frozen=True, slots=True)
+class StationTruth:
+    """Where one scan was taken from, world frame, and how many points it gave.
+
+    number: from 1; the point_source_id in LAZ.  yaw: rotation of the scanner about z [rad].
+    step: angle between neighbouring rays [rad].
+    """
+
+    number: int
+    position: tuple[float, float, float]
+    yaw: float
+    step: float
+    points: int
+
+
+@dataclass(frozen=True, slots=True)
+class SceneTruth:
+    """What is written beside the scan as `<name>.truth.json`."""
+
+    seed: int
+    points: int
+    noise: float
+    stations: tuple[StationTruth, ...]
+    facades: tuple[FacadeTruth, ...]
+
+
+def write_truth(path: Path, truth: SceneTruth) -> None:
+    """Write the truth as indented JSON; the same truth gives the same bytes."""
+    path.write_bytes(msgspec.json.format(msgspec.json.encode(truth), indent=1) + b"\n")
+
+
+def read_truth(path: Path) -> SceneTruth:
+    """Read what `write_truth` wrote; `ScanError` says what is wrong with a file that is something else."""
+    try:
+        return msgspec.json.decode(path.read_bytes(), type=SceneTruth)
+    except OSError as error:
+        raise ScanError(
+            f"{path}: cannot be read ({error.strerror}): give the .truth.json of a made scene"
+        ) from error
+    except msgspec.MsgspecError as error:
+        raise ScanError(f"{path}: not the truth of a made scene ({error}): make the scene again") from error

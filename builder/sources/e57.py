@@ -1,0 +1,285 @@
+"""E57, by pye57's binding of libE57Format, read record block by record block.
+
+pye57's own read_scan() takes a scan at once, as the header sizes it; the reader under it fills buffers of
+any size as often as it is asked to.
+"""
+
+import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, BinaryIO, NamedTuple
+from xml.etree import ElementTree
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .scan import Block, Scan, apply_pose, checked_bounds, library_errors, reader_library, scan_error
+
+CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
+SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
+
+# The XML of 700 scans, each with a pose and bounds, is about 4 MiB; more than this is not looked at.
+LONGEST_XML = 16 << 20
+PAGE_BYTES = 1024  # the last four are the page's checksum [ASTM E2807, 7]
+
+# How far a quaternion's length may be from 1 (NUMERICS.md, case 4): float32 rounding passes, |q| = 1.01,
+# which would stretch space by 1.5 %, does not.
+QUATERNION_SLACK = 1e-6
+
+# Added to bounds that were computed and not read [m]: covers float64 rounding up to 1e9 m (0.12 um a step).
+BOUNDS_MARGIN = 1e-6
+
+
+class Fields(NamedTuple):
+    """Which fields of the records to read."""
+
+    coordinates: tuple[str, ...]
+    invalid_state: str | None
+    intensity: str | None
+
+
+class E57Scan(Scan):
+    """One scan of an E57 file."""
+
+    def __init__(
+        self,
+        path: Path,
+        index: int,
+        count: int,
+        pose: NDArray[np.float64],
+        bounds: NDArray[np.float64] | None,
+        fields: Fields,
+    ) -> None:
+        super().__init__(path, "e57", index=index, declared_count=count, pose=pose, bounds=bounds)
+        self._fields = fields
+
+    def _read(self, block_points: int) -> Iterator[Block]:
+        if not self.declared_count:
+            return
+        libe57 = _libe57(self.path)
+        with _image_file(self.path) as image:
+            # The arrays must outlive the reader, which writes into them behind Python's back.
+            arrays = {name: np.empty(block_points, np.float64) for name in self._fields.coordinates}
+            if self._fields.intensity:
+                arrays[self._fields.intensity] = np.empty(block_points, np.float32)
+            if self._fields.invalid_state:
+                arrays[self._fields.invalid_state] = np.empty(block_points, np.int8)
+            buffers = libe57.VectorSourceDestBuffer()
+            for name, array in arrays.items():
+                # True, True: convert the stored type to the array's, and scaled integers to what they mean.
+                buffers.append(libe57.SourceDestBuffer(image, name, array, block_points, True, True))
+            reader = image.root()["data3D"][self.index]["points"].reader(buffers)
+            seen = 0
+            try:
+                while got := reader.read():
+                    seen += got
+                    yield self._block({name: array[:got] for name, array in arrays.items()})
+            finally:
+                reader.close()
+        if seen != self.declared_count:
+            raise scan_error(
+                self.path,
+                f"scan {self.index} ends after {seen} records",
+                f"the {self.declared_count} its header declares",
+                "fetch the file again, it is damaged",
+            )
+
+    def _block(self, columns: dict[str, NDArray[Any]]) -> Block:
+        """One block: invalid records left out and counted, spherical made cartesian, the pose applied."""
+        fields = self._fields
+        valid: Any = slice(None)
+        if fields.invalid_state:
+            # 0: valid; 1: a direction without a range; 2: nothing [ASTM E2807, 8.4.4]. No point in either.
+            valid = columns[fields.invalid_state] == 0
+            left_out = len(valid) - int(np.count_nonzero(valid))
+            if left_out:
+                self.dropped["invalid state"] = self.dropped.get("invalid state", 0) + left_out
+        xyz = np.stack([columns[name][valid] for name in fields.coordinates], axis=1)
+        if fields.coordinates == SPHERICAL:
+            xyz = _cartesian(xyz)
+        if not np.array_equal(self.pose, np.eye(4)):
+            xyz = apply_pose(self.pose, xyz)
+        # A copy: the reader fills the same array again.
+        return Block(xyz, columns[fields.intensity][valid].copy() if fields.intensity else None)
+
+
+def _cartesian(spherical: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Range [m], azimuth and elevation [rad] to x, y, z [m], (n, 3) both [ASTM E2807, 8.4.4]."""
+    distance, azimuth, elevation = spherical.T
+    level = distance * np.cos(elevation)
+    return np.stack([level * np.cos(azimuth), level * np.sin(azimuth), distance * np.sin(elevation)], axis=1)
+
+
+def open_e57(path: Path) -> list[Scan]:
+    """The scans of an E57 file, in its order; none where it holds images only. Reads headers only.
+
+    Raises ScanError, also where a page's checksum does not fit.
+    """
+    with library_errors(path), _image_file(path) as image:
+        if not image.root().isDefined("data3D"):
+            return []
+        data3d = image.root()["data3D"]
+        return [_open_scan(path, index, data3d[index]) for index in range(len(data3d))]
+
+
+def _libe57(path: Path) -> Any:
+    return reader_library("pye57", path).libe57
+
+
+@contextmanager
+def _image_file(path: Path) -> Iterator[Any]:
+    """The file as libE57Format opens it, closed at the end."""
+    image = _libe57(path).ImageFile(str(path), "r")
+    try:
+        yield image
+    finally:
+        image.close()
+
+
+def _open_scan(path: Path, index: int, node: Any) -> Scan:
+    """One scan out of its node in the XML."""
+    if not node.isDefined("points"):
+        raise scan_error(
+            path, f"scan {index} without points", "a 'points' vector", "check what wrote this file"
+        )
+    points = node["points"]
+    prototype = _libe57(path).StructureNode(points.prototype())
+    names = {prototype.get(k).elementName() for k in range(prototype.childCount())}
+    coordinates = next((kind for kind in (CARTESIAN, SPHERICAL) if names.issuperset(kind)), None)
+    if coordinates is None:
+        raise scan_error(
+            path,
+            f"scan {index} with the fields {', '.join(sorted(names))}",
+            "cartesianX, Y, Z or sphericalRange, Azimuth, Elevation",
+            "check what wrote this file",
+        )
+    invalid_state = "cartesianInvalidState" if coordinates == CARTESIAN else "sphericalInvalidState"
+    fields = Fields(
+        coordinates,
+        invalid_state if invalid_state in names else None,
+        "intensity" if "intensity" in names else None,
+    )
+    numbers = {name: _number(node, *name.split("/")) for name in (*_POSE_NUMBERS, *_BOUNDS_NUMBERS)}
+    pose = _pose(path, index, numbers)
+    return E57Scan(path, index, points.childCount(), pose, _bounds(numbers, pose), fields)
+
+
+_QUATERNION = tuple(f"pose/rotation/{name}" for name in "wxyz")
+_TRANSLATION = tuple(f"pose/translation/{name}" for name in "xyz")
+_POSE_NUMBERS = (*_QUATERNION, *_TRANSLATION)
+_BOUNDS_NUMBERS = tuple(f"cartesianBounds/{axis}{end}" for end in ("Minimum", "Maximum") for axis in "xyz")
+
+
+def _number(node: Any, *names: str) -> float | None:
+    """The number at a path below a node, None where there is none."""
+    for name in names:
+        if not hasattr(node, "isDefined") or not node.isDefined(name):
+            return None
+        node = node[name]
+    return float(node.scaledValue() if hasattr(node, "scaledValue") else node.value())
+
+
+def _pose(path: Path, index: int, numbers: dict[str, float | None]) -> NDArray[np.float64]:
+    """The pose of a scan, (4, 4); the identity for what it does not state. Raises ScanError."""
+    pose = np.eye(4)
+    quaternion = [numbers[name] for name in _QUATERNION]
+    translation = [numbers[name] for name in _TRANSLATION]
+    given = [number for number in (*quaternion, *translation) if number is not None]
+    if not np.isfinite(given).all() or quaternion.count(None) % 4 or translation.count(None) % 3:
+        raise scan_error(
+            path,
+            f"scan {index} with rotation {quaternion} and translation {translation}",
+            "four and three finite numbers",
+            "register the scan again",
+        )
+    if None not in quaternion:
+        w, x, y, z = (float(number or 0.0) for number in quaternion)
+        length = np.sqrt(w * w + x * x + y * y + z * z)
+        if not abs(length - 1.0) <= QUATERNION_SLACK:
+            raise scan_error(
+                path,
+                f"scan {index} with a rotation quaternion of length {length:.9g}",
+                f"1 within {QUATERNION_SLACK:g}",
+                "register the scan again",
+            )
+        w, x, y, z = w / length, x / length, y / length, z / length
+        pose[:3, :3] = [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    if None not in translation:
+        pose[:3, 3] = [float(number or 0.0) for number in translation]
+    return pose
+
+
+def _bounds(numbers: dict[str, float | None], pose: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """A box in the world that holds the scan by its declared bounds, (2, 3) [m]; None where it has none.
+
+    The standard puts cartesianBounds in the scan's frame. pye57 writes two corners moved by the pose
+    instead, which hold nothing once the scan is turned. Who wrote the file is not known, so the box covers
+    both readings: as it is and moved; and where the scan is turned, as the box's bounding sphere, which
+    turns into itself.
+    """
+    corners = [numbers[name] for name in _BOUNDS_NUMBERS]
+    if None in corners:
+        return None
+    box = checked_bounds(np.array(corners, np.float64).reshape(2, 3))
+    if box is None or np.array_equal(pose, np.eye(4)):
+        return box
+    half = (box[1] - box[0]) / 2
+    center = box[0] + half
+    centers = np.stack([center, apply_pose(pose, center[None])[0]])
+    if not np.array_equal(pose[:3, :3], np.eye(3)):
+        half = np.full(3, np.linalg.norm(half))
+    half += BOUNDS_MARGIN
+    return checked_bounds(np.stack([centers.min(axis=0) - half, centers.max(axis=0) + half]))
+
+
+def e57_bounds(path: Path) -> NDArray[np.float64] | None:
+    """The bounds of all scans that an E57 file's XML declares, checksums not looked at; may raise anything.
+
+    (2, 3) world frame [m]; None where one scan of them has none, for the points may then be anywhere.
+    Reads the XML by itself: libE57Format will not open a file with a broken page.
+    """
+    with path.open("rb") as file:
+        root = ElementTree.fromstring(_xml_of(file))
+    tag = root.tag.rpartition("}")[0] + "}" if "}" in root.tag else ""
+    boxes: list[NDArray[np.float64]] = []
+    for scan in root.iterfind(f"{tag}data3D/{tag}vectorChild"):
+        numbers = {
+            name: _xml_number(scan, [tag + part for part in name.split("/")])
+            for name in (*_POSE_NUMBERS, *_BOUNDS_NUMBERS)
+        }
+        box = _bounds(numbers, _pose(path, len(boxes), numbers))
+        if box is None:
+            return None
+        boxes.append(box)
+    if not boxes:
+        return None
+    return np.stack([np.min(boxes, axis=0)[0], np.max(boxes, axis=0)[1]])
+
+
+def _xml_number(element: ElementTree.Element, names: list[str]) -> float | None:
+    """The number at a path below an element; a number written without its text is 0 [ASTM E2807, 8.3]."""
+    found = element.find("/".join(names))
+    if found is None:
+        return None
+    number = float(found.text or 0.0)
+    if found.get("type") == "ScaledInteger":
+        number = number * float(found.get("scale", 1.0)) + float(found.get("offset", 0.0))
+    return number
+
+
+def _xml_of(file: BinaryIO) -> bytes:
+    """The XML section, the checksum that ends each page taken out."""
+    signature, _, _, _, offset, length, page = struct.unpack("<8sIIQQQQ", file.read(48))
+    if signature != b"ASTM-E57" or page != PAGE_BYTES or length > LONGEST_XML:
+        raise ValueError("no E57 header")
+    at = offset % PAGE_BYTES
+    pages = (at + length) // (PAGE_BYTES - 4) + 1
+    file.seek(offset - at)
+    raw = file.read(pages * PAGE_BYTES)
+    section = b"".join(raw[start : start + PAGE_BYTES - 4] for start in range(0, len(raw), PAGE_BYTES))
+    return section[at : at + length]

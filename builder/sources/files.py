@@ -1,0 +1,115 @@
+"""Which files are scans, and which reader opens which."""
+
+import math
+import os
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...schemas.errors import BadRequestError
+from .e57 import e57_bounds, open_e57
+from .las import las_bounds, open_las
+from .mesh import open_obj, open_stl
+from .ply import open_ply
+from .scan import Scan, library_errors, scan_error
+from .surface import SurfaceSamples
+from .text import open_text
+
+# By suffix, in lower case. A COPC file ends in ".copc.laz" and is a LAZ file.
+READERS: dict[str, Callable[[Path], list[Scan]]] = {
+    ".las": open_las,
+    ".laz": open_las,
+    ".e57": open_e57,
+    ".ply": open_ply,
+    ".xyz": open_text,
+    ".pts": open_text,
+    ".txt": open_text,
+    ".csv": open_text,
+    ".obj": open_obj,
+    ".stl": open_stl,
+}
+MESHES = frozenset({".obj", ".stl", ".ply"})
+
+
+def open_scans(path: Path, *, spacing: float | None = None) -> list[Scan]:
+    """The scans of one file, headers read and checked, points not yet.
+
+    spacing: sample the surface of a mesh (OBJ, STL, PLY) with about this distance between points [m],
+    instead of taking its vertices; other formats are not touched by it.
+    An E57 file may hold many scans, or none. A valid file without points gives a scan without blocks.
+    Raises ScanError for what is missing, empty, of no known format, truncated or inconsistent, and
+    BadRequestError for a spacing that is no positive number.
+    """
+    path = Path(path)
+    if spacing is not None and not (math.isfinite(spacing) and spacing > 0):
+        raise BadRequestError(f"spacing {spacing}, expected a positive number of metres: correct --spacing")
+    _check_exists(path)
+    if not path.is_file():
+        raise scan_error(
+            path, "a folder or a device", "a file", "name its files, or pass it through scan_files()"
+        )
+    suffix = path.suffix.lower()
+    if suffix not in READERS:
+        raise scan_error(
+            path, f"the suffix {suffix!r}", f"one of {' '.join(READERS)}", "convert the scan to one of these"
+        )
+    with library_errors(path):
+        if path.stat().st_size == 0:
+            raise scan_error(path, "an empty file", "a scan", "fetch the file again, or leave it out")
+        scans = READERS[suffix](path)
+        # The vertices' reader has checked the header by now, and trimesh is not asked about a broken one.
+        return [SurfaceSamples(path, spacing)] if spacing is not None and suffix in MESHES else scans
+
+
+def scan_files(paths: Iterable[Path]) -> list[Path]:
+    """The files that some paths stand for: files as they are, folders with all scans at any depth below.
+
+    A folder's files are sorted by path, so that the order does not depend on the file system; files given
+    by name keep their place, whatever their suffix. Links to folders are not followed below a folder.
+    Raises ScanError for a path that does not exist and a folder with no known scan in it.
+    """
+    files: list[Path] = []
+    for path in map(Path, paths):
+        _check_exists(path)
+        if not path.is_dir():
+            files.append(path)
+            continue
+        below = sorted(
+            Path(folder, name)
+            for folder, _, names in os.walk(path)
+            for name in names
+            if Path(name).suffix.lower() in READERS
+        )
+        if not below:
+            raise scan_error(
+                path,
+                "a folder without scans",
+                f"files ending in {' '.join(READERS)}",
+                "check the folder's name",
+            )
+        files += below
+    return files
+
+
+def header_bounds(path: Path) -> NDArray[np.float64] | None:
+    """Where the points of a scan file lie as far as its header tells, though it cannot be read.
+
+    Returns (2, 3) world frame [m], low and high corner, or None where nothing is known; only LAS, LAZ and
+    E57 state bounds. Never raises, and reads no more than the header, whatever that claims.
+    """
+    readers = {".las": las_bounds, ".laz": las_bounds, ".e57": e57_bounds}
+    try:
+        reader = readers.get(Path(path).suffix.lower())
+        return reader(Path(path)) if reader else None
+    except Exception:
+        # Best effort on a file known to be broken; its own error was raised by open_scans() or blocks().
+        return None
+
+
+def _check_exists(path: Path) -> None:
+    with library_errors(path):
+        exists = path.exists()
+    if not exists:
+        raise scan_error(path, "no such file or folder", "a scan", "check the path for a misspelling")

@@ -1,0 +1,220 @@
+"""LAS, LAZ and COPC (which is LAZ with an index that is not needed to read every point), by laspy and lazrs.
+
+The header is checked here before laspy sees the file: told of 10^9 variable length records in a file of
+14 kB, laspy 2.7 makes an object for each of them and never returns.
+"""
+
+import logging
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .scan import (
+    BLOCK_BYTES,
+    Block,
+    Lattice,
+    Scan,
+    checked_bounds,
+    library_errors,
+    reader_library,
+    scan_error,
+)
+
+# The public header of LAS 1.0 to 1.2; later versions put more behind it [LAS 1.4 R15, table 3].
+HEADER_BYTES = 227
+# Sizes of the point record formats 0 to 10 [LAS 1.4 R15, tables 7 to 17]; extra bytes may follow each.
+RECORD_BYTES = (20, 28, 26, 34, 57, 63, 30, 36, 38, 59, 67)
+VLR_HEADER_BYTES = 54
+# laspy reads all that lies before the points at once. Real files have kilobytes there (a coordinate system,
+# names of extra bytes); waveform tables, the largest known, stay below 16 KiB.
+LONGEST_PREAMBLE = 16 << 20
+
+
+class Header(NamedTuple):
+    """The fields of a LAS header that say where the points are and how they are coded."""
+
+    header_size: int
+    offset_to_points: int
+    vlr_count: int
+    point_format: int  # 0 to 10, the mark of compression removed
+    compressed: bool
+    record_bytes: int
+    points: int
+    lattice: Lattice
+    bounds: NDArray[np.float64] | None
+
+
+class LasScan(Scan):
+    """One LAS or LAZ file."""
+
+    def __init__(self, path: Path, header: Header) -> None:
+        super().__init__(
+            path,
+            "laz" if header.compressed else "las",
+            declared_count=header.points,
+            lattice=header.lattice,
+            bounds=header.bounds,
+        )
+        self._record_bytes = header.record_bytes
+
+    def _read(self, block_points: int) -> Iterator[Block]:
+        laspy = reader_library("laspy", self.path)
+        # laspy logs what it raises as well; the ScanError says it once.
+        logging.getLogger("laspy").addHandler(logging.NullHandler())
+        # Serial decompression: one process a core is what the builder runs already.
+        with laspy.open(
+            self.path, laz_backend=laspy.LazBackend.Lazrs, read_evlrs=False, closefd=True
+        ) as reader:
+            if self.format == "laz" and not laspy.LazBackend.Lazrs.is_available():
+                reader_library("lazrs", self.path)
+            step = max(1, min(block_points, BLOCK_BYTES // self._record_bytes))
+            seen = 0
+            for record in reader.chunk_iterator(step):
+                seen += len(record)
+                yield self._block(record.array)
+        if seen != self.declared_count:
+            raise scan_error(
+                self.path,
+                f"the file ends after {seen} points",
+                f"the {self.declared_count} its header declares",
+                "fetch the file again, it is truncated",
+            )
+
+    def _block(self, record: NDArray[np.void]) -> Block:
+        """One block out of point records: raw * scale + offset, in that order, as laspy and others do."""
+        lattice = self.lattice
+        assert lattice is not None
+        xyz = np.empty((len(record), 3))
+        for axis, name in enumerate("XYZ"):
+            xyz[:, axis] = record[name]
+        xyz *= np.array(lattice.scale)
+        xyz += np.array(lattice.offset)
+        return Block(xyz, record["intensity"].astype(np.float32))
+
+
+def open_las(path: Path) -> list[Scan]:
+    """The one scan of a LAS, LAZ or COPC file; reads its header only. Raises ScanError."""
+    with library_errors(path), path.open("rb") as file:
+        header = _read_header(file, path)
+        _check_header(header, path, path.stat().st_size)
+        if header.compressed:
+            _check_chunk_table(file, header, path, path.stat().st_size)
+        return [LasScan(path, header)]
+
+
+def las_bounds(path: Path) -> NDArray[np.float64] | None:
+    """The bounds a LAS header declares, (2, 3) [m], however broken the rest is; may raise anything."""
+    with path.open("rb") as file:
+        start = file.read(HEADER_BYTES)
+    return _bounds_of(start) if start[:4] == b"LASF" and len(start) == HEADER_BYTES else None
+
+
+def _read_header(file: BinaryIO, path: Path) -> Header:
+    """Read the fields of the public header block, unchecked but for what reading them needs."""
+    start = file.read(375)
+    if start[:4] != b"LASF" or len(start) < HEADER_BYTES:
+        raise scan_error(
+            path,
+            f"a file of {len(start)} bytes or more that begins with {start[:4]!r}",
+            f"b'LASF' and a header of {HEADER_BYTES} bytes",
+            "check that this is a LAS or LAZ file, and that it is whole",
+        )
+    major, minor = start[24], start[25]
+    header_size, offset_to_points, vlr_count = struct.unpack_from("<HII", start, 94)
+    point_format, record_bytes, count = struct.unpack_from("<BHI", start, 104)
+    scale = struct.unpack_from("<3d", start, 131)
+    offset = struct.unpack_from("<3d", start, 155)
+    least_header = HEADER_BYTES if minor < 3 else 235 if minor == 3 else 375
+    if major != 1 or minor > 5 or header_size < least_header or len(start) < least_header:
+        raise scan_error(
+            path,
+            f"LAS version {major}.{minor} with a header of {min(header_size, len(start))} bytes",
+            f"1.0 to 1.5 and at least {least_header} bytes",
+            "check that this is a LAS or LAZ file, and that it is whole",
+        )
+    if minor >= 4:
+        (count,) = struct.unpack_from("<Q", start, 247)
+    # LASzip marks a compressed file in bit 7 of the format, and older ones in bit 6 as well.
+    return Header(
+        header_size,
+        offset_to_points,
+        vlr_count,
+        point_format & 0x3F,
+        bool(point_format & 0xC0),
+        record_bytes,
+        count,
+        Lattice(scale, offset),
+        _bounds_of(start) if count else None,
+    )
+
+
+def _bounds_of(start: bytes) -> NDArray[np.float64] | None:
+    """Bounds out of the header's bytes (max x, min x, max y, ...), None where they are no box."""
+    bounds = np.array(struct.unpack_from("<6d", start, 179)).reshape(3, 2).T[::-1].copy()
+    return checked_bounds(bounds)
+
+
+def _check_header(header: Header, path: Path, size: int) -> None:
+    """Hold every figure of the header against the file's size and against each other. Raises ScanError."""
+
+    def refuse(found: str, expected: str) -> None:
+        raise scan_error(path, found, expected, "fetch the file again, it is truncated or damaged")
+
+    preamble = header.offset_to_points
+    if not header.header_size <= preamble <= min(size, LONGEST_PREAMBLE):
+        refuse(
+            f"points that begin at byte {preamble} of {size}",
+            f"a place from {header.header_size} on, within the file and {LONGEST_PREAMBLE} bytes",
+        )
+    room = (preamble - header.header_size) // VLR_HEADER_BYTES
+    if header.vlr_count > room:
+        refuse(
+            f"{header.vlr_count} variable length records", f"at most the {room} that fit before the points"
+        )
+    if header.point_format >= len(RECORD_BYTES):
+        refuse(f"point record format {header.point_format}", "0 to 10")
+    if header.record_bytes < RECORD_BYTES[header.point_format]:
+        refuse(
+            f"records of {header.record_bytes} bytes",
+            f"at least the {RECORD_BYTES[header.point_format]} of format {header.point_format}",
+        )
+    if (
+        not all(np.isfinite(s) and s > 0 for s in header.lattice.scale)
+        or not np.isfinite(header.lattice.offset).all()
+    ):
+        refuse(f"scale {header.lattice.scale}, offset {header.lattice.offset}", "positive, finite numbers")
+    held = (size - preamble) // header.record_bytes
+    if not header.compressed and header.points > held:
+        refuse(
+            f"{header.points} points declared", f"at most the {held} that the file of {size} bytes can hold"
+        )
+
+
+def _check_chunk_table(file: BinaryIO, header: Header, path: Path, size: int) -> None:
+    """Check that a LAZ file is long enough to hold its chunk table, which lies behind the points.
+
+    The points begin with the table's place (int64), which is -1 while a writer could not know it; then
+    its place is the file's last 8 bytes, and lazrs will see to it. Raises ScanError.
+    """
+    if header.points == 0:
+        return
+    file.seek(header.offset_to_points)
+    place = file.read(8)
+    table = struct.unpack("<q", place)[0] if len(place) == 8 else size
+    if table == -1:
+        return
+    file.seek(max(0, min(table, size)))
+    start = file.read(8)
+    chunks = struct.unpack("<II", start)[1] if len(start) == 8 else None
+    # A chunk is never empty, and its first point is stored raw.
+    if table < header.offset_to_points + 8 or chunks is None or chunks > size:
+        raise scan_error(
+            path,
+            f"a chunk table at byte {table} of {size}" + (f" with {chunks} chunks" if chunks else ""),
+            "it behind the points and within the file",
+            "fetch the file again, it is truncated or damaged",
+        )

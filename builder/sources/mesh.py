@@ -1,0 +1,89 @@
+"""OBJ and STL meshes as point sources: their vertices, as the file has them, duplicates too.
+
+They are read here and in blocks. trimesh, which samples surfaces (surface.py), holds the whole mesh, and
+its OBJ loader leaves out what no face uses and splits what two texture coordinates share.
+"""
+
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from .rows import keyword_rows
+from .scan import BLOCK_BYTES, Block, Scan, library_errors, scan_error
+
+# A binary STL: 80 bytes of anything, the number of triangles (uint32), then a record each.
+STL_HEADER_BYTES = 84
+STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+
+
+class VertexLines(Scan):
+    """The vertices of an OBJ or an ASCII STL: three numbers after a keyword."""
+
+    def __init__(self, path: Path, keyword: str) -> None:
+        super().__init__(path, "mesh")
+        self._keyword = keyword
+
+    def _read(self, block_points: int) -> Iterator[Block]:
+        with self.path.open("rb") as file:
+            for rows in keyword_rows(file, self.path, self._keyword):
+                for start in range(0, len(rows), block_points):
+                    yield Block(rows[start : start + block_points], None)
+
+
+class BinaryStl(Scan):
+    """The corners of the triangles of a binary STL."""
+
+    def __init__(self, path: Path, triangles: int) -> None:
+        super().__init__(path, "mesh", declared_count=3 * triangles)
+        self._triangles = triangles
+
+    def _read(self, block_points: int) -> Iterator[Block]:
+        step = min(max(1, block_points // 3), BLOCK_BYTES // STL_TRIANGLE.itemsize)
+        with self.path.open("rb") as file:
+            file.seek(STL_HEADER_BYTES)
+            for start in range(0, self._triangles, step):
+                wanted = min(step, self._triangles - start)
+                record = np.fromfile(file, STL_TRIANGLE, wanted)
+                if len(record) < wanted:
+                    raise _truncated_stl(self.path, f"{start + len(record)} triangles", f"{self._triangles}")
+                corners = record["corners"].reshape(-1, 3).astype(np.float64)
+                for first in range(0, len(corners), block_points):
+                    yield Block(corners[first : first + block_points], None)
+
+
+def open_obj(path: Path) -> list[Scan]:
+    """The vertices of an OBJ file. Raises ScanError."""
+    return [VertexLines(path, "v")]
+
+
+def open_stl(path: Path) -> list[Scan]:
+    """The corners of an STL file, binary or ASCII; reads its first and last bytes only. Raises ScanError."""
+    size = path.stat().st_size
+    with library_errors(path), path.open("rb") as file:
+        start = file.read(1024)
+        # Many binary files begin with "solid" too, in the 80 bytes that may hold anything.
+        if start.lstrip().startswith(b"solid") and (b"facet" in start or b"endsolid" in start):
+            _check_ascii_end(file, path, size)
+            return [VertexLines(path, "vertex")]
+    if len(start) < STL_HEADER_BYTES:
+        raise _truncated_stl(path, f"{size} bytes", f"a header of {STL_HEADER_BYTES}")
+    (triangles,) = struct.unpack_from("<I", start, 80)
+    held = (size - STL_HEADER_BYTES) // STL_TRIANGLE.itemsize
+    if triangles > held:
+        raise _truncated_stl(path, f"{held} triangles at most", f"the {triangles} its header declares")
+    return [BinaryStl(path, triangles)]
+
+
+def _check_ascii_end(file: BinaryIO, path: Path, size: int) -> None:
+    """Check that an ASCII STL ends with the line that ends its last solid. Raises ScanError."""
+    file.seek(max(0, size - 1024))
+    lines = file.read().strip().splitlines()
+    if not lines or not lines[-1].lstrip().startswith(b"endsolid"):
+        raise _truncated_stl(path, f"a last line {lines[-1][:60] if lines else b''!r}", "'endsolid'")
+
+
+def _truncated_stl(path: Path, found: str, expected: str) -> Exception:
+    return scan_error(path, found, expected, "fetch the file again, it is truncated or no STL")

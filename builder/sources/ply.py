@@ -1,0 +1,167 @@
+"""PLY: the vertices of one file, ASCII or binary of either byte order.
+
+plyfile reads the header. The body is read here, in blocks: plyfile would read faces one by one and ASCII
+vertices into one array of the size the header claims.
+"""
+
+import io
+from collections.abc import Iterator
+from itertools import islice
+from pathlib import Path
+from typing import BinaryIO, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .rows import number_rows
+from .scan import BLOCK_BYTES, INTENSITY_NAMES, Block, Scan, library_errors, reader_library, scan_error
+
+# A header is some hundred bytes; with no end in this many it is not one.
+LONGEST_HEADER = 1 << 20
+
+
+class Header(NamedTuple):
+    """What the header of a PLY file says about its vertices."""
+
+    record: np.dtype[np.void]  # one vertex as it lies in a binary file
+    points: int
+    start: int  # byte offset of the body
+    skip: int  # what lies before the vertices: bytes in a binary file, lines in an ASCII one
+    lines: int  # lines of the header
+    ascii: bool
+    intensity: str | None  # the property's name
+
+
+class PlyScan(Scan):
+    """The vertices of one PLY file."""
+
+    def __init__(self, path: Path, header: Header) -> None:
+        super().__init__(path, "ply", declared_count=header.points)
+        self._header = header
+
+    def _read(self, block_points: int) -> Iterator[Block]:
+        header = self._header
+        seen = 0
+        with self.path.open("rb") as file:
+            file.seek(header.start)
+            records = self._ascii_records(file) if header.ascii else self._binary_records(file, block_points)
+            for record in records:
+                seen += len(record)
+                for start in range(0, len(record), block_points):
+                    yield self._block(record[start : start + block_points])
+        if seen < header.points:
+            raise _truncated(self.path, seen, header.points)
+
+    def _block(self, record: NDArray[np.void]) -> Block:
+        """One block out of vertices as they lie in the file."""
+        xyz = np.empty((len(record), 3))
+        for axis, name in enumerate("xyz"):
+            xyz[:, axis] = record[name]
+        name_of_intensity = self._header.intensity
+        return Block(xyz, record[name_of_intensity].astype(np.float32) if name_of_intensity else None)
+
+    def _binary_records(self, file: BinaryIO, block_points: int) -> Iterator[NDArray[np.void]]:
+        header = self._header
+        file.seek(header.skip, 1)
+        step = max(1, min(block_points, BLOCK_BYTES // header.record.itemsize))
+        for start in range(0, header.points, step):
+            wanted = min(step, header.points - start)
+            record = np.fromfile(file, header.record, wanted)
+            yield record
+            if len(record) < wanted:
+                return
+
+    def _ascii_records(self, file: BinaryIO) -> Iterator[NDArray[np.void]]:
+        header = self._header
+        for _ in islice(file, header.skip):
+            pass
+        if not header.points:
+            return
+        # Rows are handed on as float64 under the vertex's own names, so that _block() serves both kinds.
+        names = header.record.names or ()
+        row = np.dtype([(name, np.float64) for name in names])
+        for rows in number_rows(
+            file,
+            self.path,
+            columns=len(names),
+            delimiter=None,
+            first_line=header.lines + header.skip + 1,
+            limit=header.points,
+        ):
+            yield rows.view(row)[:, 0]
+
+
+def open_ply(path: Path) -> list[Scan]:
+    """The one scan of a PLY file; reads its header only. Raises ScanError."""
+    with library_errors(path), path.open("rb") as file:
+        header = _read_header(file, path)
+        least = 2 * len(header.record.names or ()) if header.ascii else header.record.itemsize
+        left = path.stat().st_size - header.start - (0 if header.ascii else header.skip)
+        # The last ASCII row may lack its line end, hence the one byte more.
+        if header.points * least > left + header.ascii:
+            raise _truncated(path, max(0, left // least), header.points)
+        return [PlyScan(path, header)]
+
+
+def _truncated(path: Path, found: int, declared: int) -> Exception:
+    return scan_error(
+        path,
+        f"the file ends after {found} vertices at most",
+        f"the {declared} its header declares",
+        "fetch the file again, it is truncated",
+    )
+
+
+def _read_header(file: BinaryIO, path: Path) -> Header:
+    """Read and check the header; leaves the file at the start of the body."""
+    lines: list[str] = []
+    counts: list[int] = []
+    while not lines or lines[-1] != "end_header":
+        raw = file.readline(LONGEST_HEADER)
+        # Some writers leave blanks at the ends of lines ("ply "), which plyfile does not take.
+        line = raw.decode("ascii", "replace").strip()
+        if (not lines and line != "ply") or not raw or file.tell() > LONGEST_HEADER:
+            raise scan_error(
+                path,
+                f"line {len(lines) + 1} is {line[:60]!r}",
+                "a PLY header, from 'ply' to 'end_header'",
+                "check that this is a PLY file",
+            )
+        words = line.split()
+        if len(words) == 3 and words[0] == "element" and words[2].isdecimal():
+            counts.append(int(words[2]))
+            # plyfile reads as many records as it is told to: none, it is the header alone that we want.
+            line = f"element {words[1]} 0"
+        lines.append(line)
+    start = file.tell()
+    plyfile = reader_library("plyfile", path)
+    ply = plyfile.PlyData.read(io.BytesIO(("\n".join(lines) + "\n").encode("ascii")))
+    if "vertex" not in ply:
+        found = ", ".join(element.name for element in ply) or "none"
+        raise scan_error(
+            path, f"elements: {found}", "an element 'vertex'", "check that this is a PLY of points"
+        )
+    skip = 0
+    for element, count in zip(ply, counts, strict=True):
+        lists = any(isinstance(item, plyfile.PlyListProperty) for item in element.properties)
+        if lists and (element.name == "vertex" or not ply.text):
+            raise scan_error(
+                path,
+                f"element {element.name!r} has a list property and comes no later than the vertices",
+                "vertices of fixed size, first in the file",
+                "write the PLY with its vertices first and no lists in them",
+            )
+        if element.name == "vertex":
+            break
+        skip += count if ply.text else count * element.dtype().itemsize
+    record = element.dtype("=" if ply.text else ply.byte_order)
+    missing = [name for name in "xyz" if name not in record.names]
+    if missing:
+        raise scan_error(
+            path,
+            f"vertices without {', '.join(missing)}",
+            "properties x, y and z",
+            "check what wrote this file",
+        )
+    intensity = next((name for name in record.names if name.lower() in INTENSITY_NAMES), None)
+    return Header(record, count, start, skip, len(lines), ply.text, intensity)

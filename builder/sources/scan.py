@@ -1,0 +1,173 @@
+"""What every scan reader gives: a scan, its blocks of points, and the errors it ends in.
+
+A reader is a subclass of Scan that implements `_read`. It holds no open file, only what the header said,
+so that scans can be listed by the thousand and sent to other processes.
+"""
+
+import hashlib
+import importlib
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import ModuleType
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...schemas.errors import ScanError
+
+# A block of 2^18 points is 6 MiB of float64: large enough that the cost of a Python loop round is lost in
+# it, small enough that a few of them count as nothing beside any --memory.
+BLOCK_POINTS = 1 << 18
+
+# Bytes of raw records held at once. A hostile header may claim records of 65,535 bytes (LAS) or a thousand
+# properties (PLY); without this bound a block of them would be gigabytes.
+BLOCK_BYTES = 64 << 20
+
+# No coordinate is farther from the origin than this [m] (NUMERICS.md, case 16).
+FARTHEST = 1e9
+
+# Names a column of intensities goes by, in lower case; CloudCompare writes "scalar_" before its own.
+INTENSITY_NAMES = ("intensity", "scalar_intensity")
+
+
+class Lattice(NamedTuple):
+    """The grid a source's own coordinates lie on, world frame: x = offset + k * scale [m]."""
+
+    scale: tuple[float, float, float]
+    offset: tuple[float, float, float]
+
+
+class Block(NamedTuple):
+    """Some points of a scan.
+
+    xyz: (n, 3) float64, world frame [m], the scan's pose applied; may hold non-finite values.
+    intensity: (n,) float32 in the source's own unit, or None where the source has none.
+    """
+
+    xyz: NDArray[np.float64]
+    intensity: NDArray[np.float32] | None
+
+
+class Scan(ABC):
+    """One posed cloud in one file, read in blocks.
+
+    path, index: the file, and which of its scans this is, from 0.
+    format: "las", "laz", "e57", "ply", "text" or "mesh".
+    declared_count: points the header says there are, invalid ones included; None where it says nothing.
+    pose: (4, 4) float64, scan frame -> world frame, the identity where the file has none.
+    lattice: the grid of the source's coordinates, None where there is none.
+    bounds: (2, 3) float64 world frame [m], low and high corner as the header declares them, or None.
+    dropped: reason -> points left out by the reader; filled while blocks() is iterated, reset when it starts.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        format: str,
+        *,
+        index: int = 0,
+        declared_count: int | None = None,
+        pose: NDArray[np.float64] | None = None,
+        lattice: Lattice | None = None,
+        bounds: NDArray[np.float64] | None = None,
+    ) -> None:
+        self.path = path
+        self.index = index
+        self.format = format
+        self.declared_count = declared_count
+        self.pose = np.eye(4) if pose is None else pose
+        self.lattice = lattice
+        self.bounds = bounds
+        self.dropped: dict[str, int] = {}
+
+    def blocks(self, block_points: int = BLOCK_POINTS) -> Iterator[Block]:
+        """Read the points, in the order of the file, at most `block_points` at a time.
+
+        Memory is bounded by the block, whatever the file claims. Each call starts anew.
+        Raises ScanError when the file is broken or ends before its header said.
+        """
+        if block_points < 1:
+            raise ValueError(f"block_points is {block_points}, expected at least 1")
+        self.dropped = {}
+        with library_errors(self.path):
+            yield from self._read(block_points)
+
+    @abstractmethod
+    def _read(self, block_points: int) -> Iterator[Block]:
+        """Yield the blocks; may raise anything, blocks() converts it."""
+
+
+def scan_error(path: Path, found: str, expected: str, what_to_do: str) -> ScanError:
+    """The error for a scan that cannot be read; every reader's message has this one form."""
+    return ScanError(f"{path}: {found}, expected {expected}: {what_to_do}")
+
+
+@contextmanager
+def library_errors(path: Path) -> Iterator[None]:
+    """Turn whatever a format's library or the file system raises into a ScanError."""
+    try:
+        yield
+    except ScanError:
+        raise
+    except BaseException as error:
+        # A panic inside lazrs (Rust) is a BaseException of its own and not an Exception.
+        if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
+            raise
+        # libe57 appends a page of debugging text to its message; the first line says it all.
+        first_line = next(iter(str(error).strip().splitlines()), "")
+        raise scan_error(
+            path,
+            f"{type(error).__name__} ({first_line})",
+            "a readable scan",
+            "check the file, or fetch it again from where it came",
+        ) from error
+
+
+def reader_library(name: str, path: Path) -> ModuleType:
+    """Import a format's library on first use, so that nobody pays for readers they do not use.
+
+    Raises ScanError where it is not installed.
+    """
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise scan_error(
+            path,
+            f"the library {name!r} to read it is missing ({error})",
+            "it to be installed",
+            "pip install 'solidcloud[readers]'",
+        ) from error
+
+
+def checked_bounds(bounds: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """Bounds out of a header, (2, 3) [m], or None where they are no box a point could be in.
+
+    Writers that do not know them leave zeros, infinities or the largest float64 (high below low in some).
+    """
+    if np.isfinite(bounds).all() and (np.abs(bounds) <= FARTHEST).all() and (bounds[0] <= bounds[1]).all():
+        return bounds
+    return None
+
+
+def apply_pose(pose: NDArray[np.float64], xyz: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Move points by a pose: R·p + t, float64.
+
+    pose: (4, 4).  xyz: (n, 3) [m], scan frame.  Returns (n, 3) [m], world frame.
+    Summed in one order, ((x + y) + z) + t, and not by a matrix product: BLAS chooses its order by the
+    number of rows, so the same point would come out with other bits in a block of another size.
+    """
+    x, y, z = xyz[:, 0], xyz[:, 1], xyz[:, 2]
+    moved = np.empty_like(xyz)
+    for axis in range(3):
+        r = pose[axis]
+        moved[:, axis] = ((x * r[0] + y * r[1]) + z * r[2]) + r[3]
+    return moved
+
+
+def sha256_of(path: Path) -> str:
+    """The SHA-256 of a file's bytes in hexadecimal, read as a stream. Raises ScanError."""
+    with library_errors(path), path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

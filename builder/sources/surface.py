@@ -1,0 +1,79 @@
+"""Points spread over the triangles of a mesh (OBJ, STL, PLY with faces), by trimesh."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .scan import Block, Scan, reader_library, scan_error
+
+# Steps of the additive sequence in two dimensions with the plastic number 1.3247...: of all such known the
+# one whose points keep farthest apart (Roberts 2018, "The unreasonable effectiveness of quasirandom
+# sequences"). Any other pair of irrationals is correct too, and clumps more.
+STEP_U = 0.7548776662466927
+STEP_V = 0.5698402909980532
+
+
+class SurfaceSamples(Scan):
+    """A mesh's surface as points, area / spacing**2 of them."""
+
+    def __init__(self, path: Path, spacing: float) -> None:
+        """spacing: side of the square of surface that one point stands for [m]."""
+        super().__init__(path, "mesh")
+        self._spacing = spacing
+
+    def _read(self, block_points: int) -> Iterator[Block]:
+        """Sample k lies where k + 1/2 of the samples' area has gone by, at the k-th place of the sequence.
+
+        So the number of points of a triangle follows its area within one, no random number is drawn, and
+        nothing is held but the mesh and the running sum of its areas.
+        """
+        corners = self._triangles()
+        area = (
+            np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
+        )
+        # A triangle with a corner that is not finite has no area to sample.
+        total = np.cumsum(np.where(np.isfinite(area), area, 0.0))
+        count = int(np.ceil(total[-1] / self._spacing**2)) if len(total) else 0
+        for start in range(0, count, block_points):
+            k = np.arange(start, min(start + block_points, count), dtype=np.float64)
+            face = np.searchsorted(total, (k + 0.5) * (total[-1] / count), side="right")
+            face = np.minimum(face, len(total) - 1)
+            u, v = _unit_triangle((0.5 + STEP_U * k) % 1.0, (0.5 + STEP_V * k) % 1.0)
+            a, b, c = corners[face, 0], corners[face, 1], corners[face, 2]
+            yield Block(a + u[:, None] * (b - a) + v[:, None] * (c - a), None)
+
+    def _triangles(self) -> Any:
+        """The corners of all triangles, (n, 3, 3) float64."""
+        trimesh = reader_library("trimesh", self.path)
+        # Materials would make trimesh open whatever files the OBJ names.
+        mesh = trimesh.load_mesh(self.path, process=False, skip_materials=True)
+        faces = np.asarray(mesh.faces) if hasattr(mesh, "faces") else np.empty((0, 3), np.int64)
+        vertices = np.asarray(mesh.vertices, np.float64)
+        if len(vertices) and not len(faces):
+            raise scan_error(
+                self.path,
+                f"{len(vertices)} vertices and no faces",
+                "a mesh to sample",
+                "build it without --spacing",
+            )
+        if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices)):
+            raise scan_error(
+                self.path,
+                f"a face with vertex {faces.max()} (counted from 0) of {len(vertices)}",
+                "faces between its own vertices",
+                "fetch the file again, it is truncated or damaged",
+            )
+        return vertices[faces]
+
+
+def _unit_triangle(u: Any, v: Any) -> tuple[Any, Any]:
+    """Map the unit square onto the triangle u + v <= 1, areas kept in proportion.
+
+    u, v: (n,) float64 in [0, 1).  Returns the same. After Heitz 2019, "A low-distortion map between
+    triangle and square": folding the square along its diagonal would lay two point sets over each other.
+    """
+    upper = v > u
+    half_u, half_v = u / 2, v / 2
+    return np.where(upper, half_u, u - half_v), np.where(upper, v - half_u, half_v)

@@ -1,0 +1,447 @@
+"""The archive on disk, writer and reader side by side: a folder with `index.h5` and `shards/`.
+
+The only user of h5py. FORMAT.md says the same in prose; change both together. Written by the recipe that
+survived kills at every system call: everything under a temporary name, closed, reopened and verified,
+synced, renamed, the folder synced, the index last. Read by offsets, so that no HDF5 lock and no HDF5 parser
+stands between a server and a record.
+"""
+
+import contextlib
+import hashlib
+import json
+import os
+import re
+import threading
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from .codec import CELL_DTYPE, NODE_DTYPE, Record, RecordShape, decode_voxel, point_dtype
+from .errors import CorruptError, FormatError
+from .voxel import Links, VoxelData
+from .voxel_grid import Lattice, voxel_coordinates
+
+FORMAT_VERSION = 1
+INDEX_NAME = "index.h5"
+SHARD_FOLDER = "shards"
+ZSTD_FILTER = 32015  # registered with the HDF Group
+DATASETS = ("cells", "nodes", "points")
+
+# One row a voxel, sorted by key. frame_*: where the dataset's only chunk lies in its shard, in the order of
+# DATASETS; checksum: the last four bytes of the zstd frame, so that a wrong offset cannot deliver another's.
+VOXEL_DTYPE = np.dtype(
+    [
+        ("key", "<u8"),
+        ("shard", "<u4"),
+        ("frame_offset", "<u8", (3,)),
+        ("frame_bytes", "<u4", (3,)),
+        ("frame_checksum", "<u4", (3,)),
+        ("rows", "<u4", (3,)),
+        ("low", "<i4", (3,)),
+        ("high", "<i4", (3,)),
+    ]
+)
+_SHARD_NAME = re.compile(r"[0-9]{1,9}-[0-9]{1,9}\.h5")
+
+
+class Source(NamedTuple):
+    """One scan that went in, or was left out.
+
+    index: of the scan inside its file.  sha256: of the file.  pose: (4, 4) float64, scan to world.
+    count: points stored.  skipped: reason -> points left out.  fault: why the whole scan was left out, or "".
+    """
+
+    path: str
+    index: int
+    format: str
+    sha256: str
+    count: int
+    pose: NDArray[np.float64]
+    skipped: dict[str, int]
+    fault: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Header:
+    """What the index says of the dataset as a whole.
+
+    archive_id: 16 bytes, from the points and options alone.  low, high: (3,) int64, least and greatest lattice
+    coordinates of the points, inclusive.  radius: half the mean closest-point distance [m]; radius_error: its
+    standard error [m], 0 when all points were asked; radius_sample: points asked.  moved_max: farthest that
+    quantising moved a point along an axis [m].  lattice_source: "sources", "given" or "default".
+    options: the build's.  unknown: (u, 2, 3) int64, lattice boxes, inclusive, of scans left out;
+    unknown_everywhere: one was left out of which not even the bounds are known.
+    """
+
+    archive_id: bytes
+    lattice: Lattice
+    lattice_source: str
+    points: int
+    low: NDArray[np.int64]
+    high: NDArray[np.int64]
+    radius: float
+    radius_model: str
+    radius_error: float
+    radius_sample: int
+    moved_max: float
+    degree: int
+    leaf: int
+    scan_index: bool
+    intensity: bool
+    options: dict[str, Any]
+    sources: tuple[Source, ...]
+    unknown: NDArray[np.int64]
+    unknown_everywhere: bool
+
+
+def shard_name(number: int, generation: int = 0) -> str:
+    """The file name of a shard inside SHARD_FOLDER."""
+    return f"{generation}-{number:06d}.h5"
+
+
+# --- writing -------------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def _new_file(path: Path) -> Iterator[h5py.File]:
+    """An HDF5 file under a temporary name. Given its own only once it is closed and synced."""
+    temporary = path.with_name(path.name + ".tmp")
+    try:
+        # Metadata of format 1.10 and later is checksummed; in older ones 5 of 1,600 flips were silently wrong.
+        with h5py.File(temporary, "w", libver=("v110", "v110")) as file:
+            yield file
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+
+
+def publish(path: Path) -> None:
+    """Sync the temporary file of `path`, rename it, sync its folder."""
+    temporary = path.with_name(path.name + ".tmp")
+    with open(temporary, "rb") as file:
+        os.fsync(file.fileno())
+    os.replace(temporary, path)
+    sync_folder(path.parent)
+
+
+def sync_folder(folder: Path) -> None:
+    """Make a rename inside this folder survive a power cut."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _write_frame(group: h5py.Group, name: str, frame: bytes, rows: int, dtype: np.dtype) -> tuple[int, int]:
+    """Write one dataset of one chunk from its frame; returns the chunk's offset and size in the file."""
+    properties = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+    properties.set_chunk((rows,))
+    properties.set_shuffle()
+    # Optional: this process may lack the filter plugin, as the frame is made already.
+    properties.set_filter(ZSTD_FILTER, h5py.h5z.FLAG_OPTIONAL, (3,))
+    space = h5py.h5s.create_simple((rows,))
+    kind = h5py.h5t.py_create(dtype, logical=True)
+    dataset = h5py.h5d.create(group.id, name.encode(), kind, space, properties)
+    dataset.write_direct_chunk((0,), frame)
+    chunk = dataset.get_chunk_info(0)
+    return chunk.byte_offset, chunk.size
+
+
+def write_shard(
+    path: Path,
+    number: int,
+    archive_id: bytes,
+    voxels: Iterable[tuple[VoxelData, Record, NDArray[np.int64], NDArray[np.int64]]],
+) -> NDArray:
+    """Write one shard; returns its rows of the index, VOXEL_DTYPE.
+
+    voxels: per voxel its data, record, and the bounds low, high (3,) of its points [voxel steps, inclusive].
+    The file is verified by offsets before it is given its name.
+    """
+    rows = []
+    with _new_file(path) as file:
+        file.attrs["format"] = "solidcloud shard"
+        file.attrs["format_version"] = np.uint32(FORMAT_VERSION)
+        file.attrs["archive_id"] = np.frombuffer(archive_id, np.uint8)
+        for voxel, record, low, high in voxels:
+            dtypes = (
+                CELL_DTYPE,
+                NODE_DTYPE,
+                point_dtype(scan_index=voxel.scan_index is not None, intensity=voxel.intensity is not None),
+            )
+            group = file.create_group(f"voxels/{voxel.key:016x}")
+            counts = (record.cell_rows, record.node_rows, record.point_rows)
+            frames = (record.cells, record.nodes, record.points)
+            row = np.zeros((), VOXEL_DTYPE)
+            row["key"], row["shard"], row["rows"], row["low"], row["high"] = voxel.key, number, counts, low, high
+            for i, name in enumerate(DATASETS):
+                offset, size = _write_frame(group, name, frames[i], counts[i], dtypes[i])
+                row["frame_offset"][i], row["frame_bytes"][i] = offset, size
+                row["frame_checksum"][i] = int.from_bytes(frames[i][-4:], "little")
+            rows.append(row)
+    table = np.array(rows, VOXEL_DTYPE)
+    temporary = path.with_name(path.name + ".tmp")
+    try:
+        _verify_frames(temporary, table)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+    publish(path)
+    return table
+
+
+def _verify_frames(path: Path, table: NDArray) -> None:
+    """Read back every frame of a shard by its offset; a full disk can lie until here."""
+    with open(path, "rb") as file:
+        for row in table:
+            for i, name in enumerate(DATASETS):
+                frame = os.pread(file.fileno(), int(row["frame_bytes"][i]), int(row["frame_offset"][i]))
+                if frame[-4:] != int(row["frame_checksum"][i]).to_bytes(4, "little"):
+                    raise CorruptError(f"{path}: voxel {int(row['key']):#x}, {name}: not what was written: disk full?")
+
+
+def _texts(header: Header) -> bytes:
+    """The parts of the header that are words and options, as canonical JSON. Floats that matter are not in it."""
+    sources = [
+        {
+            "path": s.path,
+            "index": s.index,
+            "format": s.format,
+            "sha256": s.sha256,
+            "skipped": s.skipped,
+            "fault": s.fault,
+        }
+        for s in header.sources
+    ]
+    document = {
+        "lattice_source": header.lattice_source,
+        "radius_model": header.radius_model,
+        "options": header.options,
+        "sources": sources,
+    }
+    return json.dumps(document, sort_keys=True, separators=(",", ":")).encode()
+
+
+def _columns(header: Header, voxels: NDArray, shards: list[tuple[str, int]]) -> dict[str, NDArray]:
+    """Every dataset of the index by name. One place for writer, reader and digest."""
+    lattice = header.lattice
+    return {
+        "origin": np.array(lattice.origin, "<f8"),
+        "step": np.array([lattice.step], "<f8"),
+        "voxel_steps": np.array([lattice.voxel_steps], "<u4"),
+        "bounds": np.stack([header.low, header.high]).astype("<i8"),
+        "points": np.array([header.points], "<u8"),
+        "radius": np.array([header.radius, header.radius_error], "<f8"),
+        "radius_sample": np.array([header.radius_sample], "<u8"),
+        "moved_max": np.array([header.moved_max], "<f8"),
+        "tree": np.array([header.degree, header.leaf], "<u4"),
+        "columns": np.array([header.scan_index, header.intensity], "u1"),
+        "unknown": header.unknown.reshape(-1, 2, 3).astype("<i8"),
+        "unknown_everywhere": np.array([header.unknown_everywhere], "u1"),
+        "source_pose": np.array([s.pose for s in header.sources], "<f8").reshape(-1, 4, 4),
+        "source_count": np.array([s.count for s in header.sources], "<u8"),
+        "texts": np.frombuffer(_texts(header), "u1"),
+        "shards": np.array([(name.encode(), size) for name, size in shards], [("name", "S24"), ("bytes", "<u8")]),
+        "voxels": voxels,
+    }
+
+
+def _digest(archive_id: bytes, columns: dict[str, NDArray]) -> bytes:
+    """SHA-256 over the id and every dataset of the index, names and shapes included."""
+    digest = hashlib.sha256(archive_id)
+    for name, column in sorted(columns.items()):
+        digest.update(f"{name}:{column.dtype.str}:{column.shape}:".encode())
+        digest.update(np.ascontiguousarray(column).tobytes())
+    return digest.digest()
+
+
+def write_index(folder: Path, header: Header, voxels: NDArray, shards: list[tuple[str, int]]) -> None:
+    """Write index.h5, the last file of an archive: with it the archive is whole.
+
+    voxels: VOXEL_DTYPE rows sorted by key.  shards: name and bytes of each, in the order of their numbers.
+    """
+    path = folder / INDEX_NAME
+    columns = _columns(header, voxels, shards)
+    with _new_file(path) as file:
+        file.attrs["format"] = "solidcloud"
+        file.attrs["format_version"] = np.uint32(FORMAT_VERSION)
+        file.attrs["units"] = "m"
+        file.attrs["archive_id"] = np.frombuffer(header.archive_id, np.uint8)
+        file.attrs["sha256"] = np.frombuffer(_digest(header.archive_id, columns), np.uint8)
+        for name, column in columns.items():
+            file.create_dataset(name, data=column)
+    publish(path)
+
+
+# --- reading -------------------------------------------------------------------------------------------
+
+
+def _read_columns(path: Path) -> tuple[bytes, dict[str, NDArray]]:
+    """Every dataset of an index, after checking that none leads elsewhere or claims more than the file holds."""
+    size = path.stat().st_size
+    with h5py.File(path, "r") as file:
+        if str(file.attrs.get("format", "")) != "solidcloud":
+            raise FormatError(f"{path}: not a solidcloud index: give the folder that `solidcloud build` wrote")
+        version = int(file.attrs["format_version"])
+        if version != FORMAT_VERSION:
+            raise FormatError(f"{path}: format version {version}, this software reads {FORMAT_VERSION}: use the one that wrote it")
+        if str(file.attrs["units"]) != "m":
+            raise FormatError(f"{path}: units {file.attrs['units']!r}, expected 'm': rebuild the archive")
+        columns = {}
+        for name in file:
+            link = file.get(name, getlink=True)
+            dataset = file.get(name) if isinstance(link, h5py.HardLink) else None
+            if not isinstance(dataset, h5py.Dataset) or dataset.external or dataset.is_virtual or dataset.chunks:
+                raise FormatError(f"{path}: {name} is no plain dataset: not written by solidcloud, do not use it")
+            if dataset.dtype.hasobject or dataset.size * dataset.dtype.itemsize > size:
+                raise FormatError(f"{path}: {name} claims more than the file holds: damaged, restore or rebuild it")
+            columns[name] = dataset[()]
+        archive_id = file.attrs["archive_id"].tobytes()
+        if _digest(archive_id, columns) != file.attrs["sha256"].tobytes():
+            raise CorruptError(f"{path}: checksum differs from the one stored: damaged, restore or rebuild it")
+    return archive_id, columns
+
+
+def _header(archive_id: bytes, columns: dict[str, NDArray]) -> Header:
+    """The header from the index's datasets; the digest has vouched for them."""
+    texts = json.loads(columns["texts"].tobytes())
+    poses, counts = columns["source_pose"], columns["source_count"]
+    sources = tuple(
+        Source(
+            s["path"], s["index"], s["format"], s["sha256"], int(counts[i]), poses[i], s["skipped"], s["fault"]
+        )
+        for i, s in enumerate(texts["sources"])
+    )
+    x, y, z = (float(v) for v in columns["origin"])
+    return Header(
+        archive_id=archive_id,
+        lattice=Lattice((x, y, z), float(columns["step"][0]), int(columns["voxel_steps"][0])),
+        lattice_source=texts["lattice_source"],
+        points=int(columns["points"][0]),
+        low=columns["bounds"][0].astype(np.int64),
+        high=columns["bounds"][1].astype(np.int64),
+        radius=float(columns["radius"][0]),
+        radius_model=texts["radius_model"],
+        radius_error=float(columns["radius"][1]),
+        radius_sample=int(columns["radius_sample"][0]),
+        moved_max=float(columns["moved_max"][0]),
+        degree=int(columns["tree"][0]),
+        leaf=int(columns["tree"][1]),
+        scan_index=bool(columns["columns"][0]),
+        intensity=bool(columns["columns"][1]),
+        options=texts["options"],
+        sources=sources,
+        unknown=columns["unknown"].astype(np.int64),
+        unknown_everywhere=bool(columns["unknown_everywhere"][0]),
+    )
+
+
+class Archive:
+    """An archive opened for reading. Safe to use from several threads; a context manager.
+
+    header: see Header.  voxels: the index's rows, sorted by key.  coordinates: (v, 3) int64, voxel coordinates.
+    """
+
+    def __init__(self, folder: str | os.PathLike[str]) -> None:
+        """Open the archive in `folder`. Raises FormatError or CorruptError naming the file and the fault."""
+        self.folder = Path(folder)
+        path = self.folder / INDEX_NAME
+        if not path.is_file():
+            raise FormatError(f"{self.folder}: no archive here ({INDEX_NAME} not found): build one with `solidcloud build`")
+        try:
+            archive_id, columns = _read_columns(path)
+            self.header = _header(archive_id, columns)
+        except (OSError, KeyError, ValueError, TypeError, AttributeError, RuntimeError) as error:
+            raise FormatError(f"{path}: not a readable archive index ({error}): restore or rebuild it") from error
+        self.voxels = columns["voxels"].astype(VOXEL_DTYPE)
+        self.coordinates = voxel_coordinates(self.voxels["key"])
+        self._shape_dtype = point_dtype(scan_index=self.header.scan_index, intensity=self.header.intensity)
+        self._lock = threading.Lock()
+        self._descriptors: dict[int, int] = {}
+        self._shards = [(bytes(name).decode("ascii", "replace"), int(size)) for name, size in columns["shards"]]
+        self._check_shards()
+
+    def _check_shards(self) -> None:
+        """Every shard exists, is as long as the index says, and holds every frame the index places in it."""
+        for name, size in self._shards:
+            path = self.folder / SHARD_FOLDER / name
+            if not _SHARD_NAME.fullmatch(name):
+                raise FormatError(f"{self.folder}: shard name {name!r} in the index: not written by solidcloud")
+            if not path.is_file():
+                raise FormatError(f"{path}: missing: restore it or rebuild the archive")
+            if path.stat().st_size != size:
+                raise FormatError(f"{path}: {path.stat().st_size} bytes, expected {size}: truncated? restore or rebuild it")
+        sizes = np.array([size for _, size in self._shards], np.uint64)
+        if len(self.voxels) and (self.voxels["shard"].max() >= len(sizes) or (np.diff(self.voxels["key"]) == 0).any()):
+            raise FormatError(f"{self.folder}: the index does not add up: restore or rebuild it")
+        ends = self.voxels["frame_offset"] + self.voxels["frame_bytes"]
+        if (ends > sizes[self.voxels["shard"]][:, None]).any():
+            raise FormatError(f"{self.folder}: the index points beyond a shard's end: restore or rebuild it")
+
+    def __enter__(self) -> "Archive":
+        """The archive itself."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close the shards."""
+        self.close()
+
+    def close(self) -> None:
+        """Close the shards; reading afterwards opens them again."""
+        with self._lock:
+            while self._descriptors:
+                os.close(self._descriptors.popitem()[1])
+
+    def shard_path(self, number: int) -> Path:
+        """The file of shard `number`."""
+        return self.folder / SHARD_FOLDER / self._shards[number][0]
+
+    def shard_count(self) -> int:
+        """The number of shard files."""
+        return len(self._shards)
+
+    def _descriptor(self, shard: int) -> int:
+        with self._lock:
+            if shard not in self._descriptors:
+                self._descriptors[shard] = os.open(self.shard_path(shard), os.O_RDONLY | os.O_CLOEXEC)
+            return self._descriptors[shard]
+
+    def read_frames(self, row: int) -> tuple[bytes, bytes, bytes]:
+        """The three frames (cells, nodes, points) of the voxel in index row `row`.
+
+        Raises CorruptError, naming file, voxel and dataset, when a frame is not the one the index means.
+        """
+        entry = self.voxels[row]
+        frames = []
+        for i, name in enumerate(DATASETS):
+            size, offset = int(entry["frame_bytes"][i]), int(entry["frame_offset"][i])
+            frame = os.pread(self._descriptor(int(entry["shard"])), size, offset)
+            if len(frame) != size or frame[-4:] != int(entry["frame_checksum"][i]).to_bytes(4, "little"):
+                raise CorruptError(f"{self.where(row)}, {name}: {len(frame)} bytes that are not the record's, expected {size}")
+            frames.append(frame)
+        return frames[0], frames[1], frames[2]
+
+    def where(self, row: int) -> str:
+        """Where the record of index row `row` lies, for messages."""
+        entry = self.voxels[row]
+        x, y, z = self.coordinates[row]
+        return f"{self.shard_path(int(entry['shard']))}: voxel ({x}, {y}, {z})"
+
+    def read_voxel(self, row: int) -> tuple[VoxelData, Links]:
+        """Read, decompress and check the voxel in index row `row`. Raises CorruptError saying where."""
+        frames = self.read_frames(row)
+        entry = self.voxels[row]
+        cells, nodes, points = (int(n) for n in entry["rows"])
+        shape = RecordShape(cells, nodes, points, self._shape_dtype)
+        try:
+            return decode_voxel(
+                *frames, shape, int(entry["key"]), self.header.archive_id, self.header.lattice.voxel_steps
+            )
+        except CorruptError as error:
+            raise CorruptError(f"{self.where(row)}: {error}: restore the shard or rebuild the archive") from error

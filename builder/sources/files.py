@@ -60,7 +60,7 @@ def open_scans(path: Path, *, spacing: float | None = None) -> list[Scan]:
             raise scan_error(path, "an empty file", "a scan", "fetch the file again, or leave it out")
         scans = READERS[suffix](path)
         # The vertices' reader has checked the header by now, and trimesh is not asked about a broken one.
-        return [SurfaceSamples(path, spacing)] if spacing is not None and suffix in MESHES else scans
+        return [SurfaceSamples(scans[0], spacing)] if spacing is not None and suffix in MESHES else scans
 
 
 def scan_files(paths: Iterable[Path]) -> list[Path]:

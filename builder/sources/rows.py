@@ -26,13 +26,20 @@ def text_chunks(file: BinaryIO, path: Path, first_line: int = 1) -> Iterator[tup
     """Read the rest of a file as chunks of whole lines.
 
     file: open for reading bytes, at the start of a line.  first_line: the number of that line, for messages.
-    Yields (number of the chunk's first line, its bytes). Raises ScanError for a line over LONGEST_LINE.
+    Yields (number of the chunk's first line, its bytes). Raises ScanError for a line over LONGEST_LINE and
+    for a zero byte.
     """
     rest = b""
     line = first_line
     while data := file.read(CHUNK_BYTES):
         data = rest + data
-        end = data.rfind(b"\n") + 1
+        # A file system that lost a part of a file gives zeros in its place; OBJ would skip them as no vertex.
+        if b"\0" in data:
+            at = line + data.count(NEWLINE, 0, data.index(b"\0"))
+            raise scan_error(
+                path, f"line {at} holds a zero byte", "text", "fetch the file again, it is damaged"
+            )
+        end = data.rfind(NEWLINE) + 1
         chunk, rest = data[:end], data[end:]
         if len(rest) > LONGEST_LINE:
             raise scan_error(

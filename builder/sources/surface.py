@@ -1,7 +1,6 @@
 """Points spread over the triangles of a mesh (OBJ, STL, PLY with faces), by trimesh."""
 
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,9 +17,10 @@ STEP_V = 0.5698402909980532
 class SurfaceSamples(Scan):
     """A mesh's surface as points, area / spacing**2 of them."""
 
-    def __init__(self, path: Path, spacing: float) -> None:
-        """spacing: side of the square of surface that one point stands for [m]."""
-        super().__init__(path, "mesh")
+    def __init__(self, vertices: Scan, spacing: float) -> None:
+        """vertices: the same file as points.  spacing: side of the square that one point stands for [m]."""
+        super().__init__(vertices.path, "mesh")
+        self._vertices = vertices
         self._spacing = spacing
 
     def _read(self, block_points: int) -> Iterator[Block]:
@@ -51,12 +51,10 @@ class SurfaceSamples(Scan):
         mesh = trimesh.load_mesh(self.path, process=False, skip_materials=True)
         faces = np.asarray(mesh.faces) if hasattr(mesh, "faces") else np.empty((0, 3), np.int64)
         vertices = np.asarray(mesh.vertices, np.float64)
-        if len(vertices) and not len(faces):
+        # Of a file without faces trimesh gives nothing, vertices or not.
+        if not len(faces) and any(len(block.xyz) for block in self._vertices.blocks()):
             raise scan_error(
-                self.path,
-                f"{len(vertices)} vertices and no faces",
-                "a mesh to sample",
-                "build it without --spacing",
+                self.path, "vertices and no faces", "a mesh to sample", "build it without --spacing"
             )
         if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices)):
             raise scan_error(

@@ -107,8 +107,10 @@ class E57Scan(Scan):
 def _cartesian(spherical: NDArray[np.float64]) -> NDArray[np.float64]:
     """Range [m], azimuth and elevation [rad] to x, y, z [m], (n, 3) both [ASTM E2807, 8.4.4]."""
     distance, azimuth, elevation = spherical.T
-    level = distance * np.cos(elevation)
-    return np.stack([level * np.cos(azimuth), level * np.sin(azimuth), distance * np.sin(elevation)], axis=1)
+    with np.errstate(over="ignore", invalid="ignore"):  # angles that are not finite give no finite point
+        level = distance * np.cos(elevation)
+        x, y, z = level * np.cos(azimuth), level * np.sin(azimuth), distance * np.sin(elevation)
+    return np.stack([x, y, z], axis=1)
 
 
 def open_e57(path: Path) -> list[Scan]:

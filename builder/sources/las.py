@@ -13,6 +13,7 @@ from typing import BinaryIO, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from .laz_chunks import VLR_HEADER_BYTES, check_chunks
 from .scan import (
     BLOCK_BYTES,
     Block,
@@ -28,7 +29,6 @@ from .scan import (
 HEADER_BYTES = 227
 # Sizes of the point record formats 0 to 10 [LAS 1.4 R15, tables 7 to 17]; extra bytes may follow each.
 RECORD_BYTES = (20, 28, 26, 34, 57, 63, 30, 36, 38, 59, 67)
-VLR_HEADER_BYTES = 54
 # laspy reads all that lies before the points at once. Real files have kilobytes there (a coordinate system,
 # names of extra bytes); waveform tables, the largest known, stay below 16 KiB.
 LONGEST_PREAMBLE = 16 << 20
@@ -91,8 +91,9 @@ class LasScan(Scan):
         xyz = np.empty((len(record), 3))
         for axis, name in enumerate("XYZ"):
             xyz[:, axis] = record[name]
-        xyz *= np.array(lattice.scale)
-        xyz += np.array(lattice.offset)
+        with np.errstate(over="ignore"):  # a scale of 1e300 gives infinities, which the caller counts
+            xyz *= np.array(lattice.scale)
+            xyz += np.array(lattice.offset)
         return Block(xyz, record["intensity"].astype(np.float32))
 
 
@@ -101,8 +102,16 @@ def open_las(path: Path) -> list[Scan]:
     with library_errors(path), path.open("rb") as file:
         header = _read_header(file, path)
         _check_header(header, path, path.stat().st_size)
-        if header.compressed:
-            _check_chunk_table(file, header, path, path.stat().st_size)
+        if header.compressed and header.points:
+            check_chunks(
+                file,
+                path,
+                header_size=header.header_size,
+                vlr_count=header.vlr_count,
+                start=header.offset_to_points,
+                record_bytes=header.record_bytes,
+                points=header.points,
+            )
         return [LasScan(path, header)]
 
 
@@ -191,30 +200,4 @@ def _check_header(header: Header, path: Path, size: int) -> None:
     if not header.compressed and header.points > held:
         refuse(
             f"{header.points} points declared", f"at most the {held} that the file of {size} bytes can hold"
-        )
-
-
-def _check_chunk_table(file: BinaryIO, header: Header, path: Path, size: int) -> None:
-    """Check that a LAZ file is long enough to hold its chunk table, which lies behind the points.
-
-    The points begin with the table's place (int64), which is -1 while a writer could not know it; then
-    its place is the file's last 8 bytes, and lazrs will see to it. Raises ScanError.
-    """
-    if header.points == 0:
-        return
-    file.seek(header.offset_to_points)
-    place = file.read(8)
-    table = struct.unpack("<q", place)[0] if len(place) == 8 else size
-    if table == -1:
-        return
-    file.seek(max(0, min(table, size)))
-    start = file.read(8)
-    chunks = struct.unpack("<II", start)[1] if len(start) == 8 else None
-    # A chunk is never empty, and its first point is stored raw.
-    if table < header.offset_to_points + 8 or chunks is None or chunks > size:
-        raise scan_error(
-            path,
-            f"a chunk table at byte {table} of {size}" + (f" with {chunks} chunks" if chunks else ""),
-            "it behind the points and within the file",
-            "fetch the file again, it is truncated or damaged",
         )

@@ -161,9 +161,10 @@ def apply_pose(pose: NDArray[np.float64], xyz: NDArray[np.float64]) -> NDArray[n
     """
     x, y, z = xyz[:, 0], xyz[:, 1], xyz[:, 2]
     moved = np.empty_like(xyz)
-    for axis in range(3):
-        r = pose[axis]
-        moved[:, axis] = ((x * r[0] + y * r[1]) + z * r[2]) + r[3]
+    with np.errstate(over="ignore", invalid="ignore"):  # points that are not finite stay so
+        for axis in range(3):
+            r = pose[axis]
+            moved[:, axis] = ((x * r[0] + y * r[1]) + z * r[2]) + r[3]
     return moved
 
 

@@ -110,6 +110,47 @@ def test_a_laz_chunk_table_beyond_the_file_is_refused(las: Path) -> None:
         open_scans(laz)
 
 
+def write_laz(path: Path, count: int, point_format: int) -> np.ndarray:
+    """Points whose raw coordinates are returned, (n, 3); 50,000 of them a chunk."""
+    header = laspy.LasHeader(version="1.4", point_format=point_format)
+    header.scales, header.offsets = [1.0] * 3, [0.0] * 3
+    las = laspy.LasData(header)
+    xyz = np.random.default_rng(6).integers(-1000, 1000, (count, 3))
+    las.X, las.Y, las.Z = xyz.T
+    las.write(path, laz_backend=laspy.LazBackend.Lazrs)
+    return xyz
+
+
+@pytest.mark.parametrize("point_format", [0, 3, 6, 7, 8, 9])
+@pytest.mark.parametrize("count", [1, 50_000, 50_001])
+def test_laz_of_every_kind_and_number_of_chunks_is_read(
+    point_format: int, count: int, tmp_path: Path
+) -> None:
+    path = tmp_path / "a.laz"
+    xyz = write_laz(path, count, point_format)
+    assert np.array_equal(read_all(path), xyz)
+
+
+def test_a_laz_chunk_that_claims_gigabytes_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.laz"
+    write_laz(path, 100, 6)
+    data = bytearray(path.read_bytes())
+    (start,) = struct.unpack_from("<I", data, 96)
+    # Behind the table's place, the first point raw and the count: the size of the first layer.
+    struct.pack_into("<I", data, start + 8 + 30 + 4, 0xFFFF_0000)
+    path.write_bytes(data)
+    with pytest.raises(ScanError, match="chunk 0 that ends at byte"):
+        open_scans(path)
+
+
+def test_a_laz_without_the_record_that_describes_it_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.laz"
+    write_laz(path, 100, 6)
+    path.write_bytes(path.read_bytes().replace(b"laszip encoded", b"laszip forgets", 1))
+    with pytest.raises(ScanError, match="22204"):
+        open_scans(path)
+
+
 def test_a_las_without_points_is_valid_and_has_none(tmp_path: Path) -> None:
     path = tmp_path / "none.las"
     laspy.LasData(laspy.LasHeader()).write(path)

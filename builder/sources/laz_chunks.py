@@ -1,0 +1,114 @@
+"""A check of a LAZ file's chunks before lazrs sees them.
+
+lazrs allocates what a chunk claims before it reads it, and a process whose allocation fails in Rust is
+aborted: 1,500 random damages of a small file made it ask for 3 to 4 GB twice. The layout is that of
+LASzip 3.4, whose chunks of point formats 6 to 10 are written layer by layer.
+"""
+
+import struct
+from pathlib import Path
+from typing import BinaryIO
+
+from .scan import scan_error
+
+LASZIP_VLR = (b"laszip encoded", 22204)
+VLR_HEADER_BYTES = 54
+CHUNKED = 2  # the compressor of point formats 0 to 5
+LAYERED = 3  # the compressor of point formats 6 to 10: each chunk is split into layers
+
+# Item type -> its layers in a layered chunk; each has its size written before the chunk's data.
+# 10: point (9 layers); 11: colour; 12: colour and infrared; 13: wave packet; 14: extra bytes, a layer each.
+LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}
+EXTRA_BYTES = 14
+
+
+def check_chunks(
+    file: BinaryIO,
+    path: Path,
+    *,
+    header_size: int,
+    vlr_count: int,
+    start: int,
+    record_bytes: int,
+    points: int,
+) -> None:
+    """Check that a LAZ file's chunks and the table of them lie in the file, and hold all its points.
+
+    start: byte where the points begin.  record_bytes, points: of the uncompressed records, as declared.
+    Reads some bytes a chunk (50,000 points as a rule). Raises ScanError.
+    """
+    size = file.seek(0, 2)
+    compressor, items = _items(file, path, header_size, vlr_count)
+    if compressor not in (CHUNKED, LAYERED):
+        raise scan_error(
+            path,
+            f"LASzip compressor {compressor}",
+            f"{CHUNKED} or {LAYERED}",
+            "convert it with a newer LASzip",
+        )
+    if sum(length for _, length in items) != record_bytes:
+        raise _damaged(path, f"compressed items {items} (type, bytes)", f"{record_bytes} bytes together")
+    table, chunks = _chunk_table(file, path, start, size)
+    if compressor != LAYERED:
+        return
+    layers = sum(LAYERS.get(kind, length if kind == EXTRA_BYTES else 0) for kind, length in items)
+    sizes = struct.Struct(f"<{1 + layers}I")
+    at, seen, number = start + 8, 0, 0
+    while seen < points and at < table:
+        file.seek(at + record_bytes)
+        raw = file.read(sizes.size)
+        count, *layer_bytes = sizes.unpack(raw) if len(raw) == sizes.size else (0,)
+        at += record_bytes + sizes.size + sum(layer_bytes)
+        if not count or at > table:
+            raise _damaged(
+                path, f"chunk {number} that ends at byte {at}", f"its end before the table at {table}"
+            )
+        seen += count
+        number += 1
+    if seen != points or number != chunks:
+        raise _damaged(path, f"{seen} points in {number} chunks", f"{points} in {chunks} chunks")
+
+
+def _items(file: BinaryIO, path: Path, header_size: int, vlr_count: int) -> tuple[int, list[tuple[int, int]]]:
+    """The compressor's number, and (type, bytes) of each item of a point, by the LASzip record."""
+    file.seek(header_size)
+    for _ in range(vlr_count):
+        user, record_id, length = struct.unpack_from(
+            "<16sHH", file.read(VLR_HEADER_BYTES).ljust(54, b"\0"), 2
+        )
+        if (user.rstrip(b"\0"), record_id) == LASZIP_VLR:
+            record = file.read(length)
+            count = struct.unpack_from("<H", record, 32)[0] if length >= 34 else 0
+            if len(record) < 34 + 6 * count or not count:
+                break
+            items = [struct.unpack_from("<HH", record, 34 + 6 * k) for k in range(count)]
+            return struct.unpack_from("<H", record)[0], items
+        file.seek(length, 1)
+    raise _damaged(path, "no whole record 22204 of 'laszip encoded'", "it before the points of a LAZ file")
+
+
+def _chunk_table(file: BinaryIO, path: Path, start: int, size: int) -> tuple[int, int]:
+    """The byte where the chunk table begins, and the number of chunks.
+
+    The points begin with the table's place (int64); where a writer could not know it, it is -1 there and
+    right in the file's last 8 bytes.
+    """
+    for place in (start, size - 8):
+        file.seek(place)
+        raw = file.read(8)
+        table = struct.unpack("<q", raw)[0] if len(raw) == 8 else size
+        if table != -1:
+            break
+    file.seek(max(0, min(table, size)))
+    raw = file.read(8)
+    chunks = struct.unpack("<II", raw)[1] if len(raw) == 8 else size
+    # A chunk holds at least its first point, raw, so there are fewer chunks than bytes.
+    if table < start + 8 or chunks >= size:
+        raise _damaged(
+            path, f"a chunk table at byte {table} of {size}", "it behind the points, within the file"
+        )
+    return table, chunks
+
+
+def _damaged(path: Path, found: str, expected: str) -> Exception:
+    return scan_error(path, found, expected, "fetch the file again, it is truncated or damaged")

@@ -1,0 +1,97 @@
+"""The peers program from Python: built where a nightly Rust is found, fed with arrays, asked loop by loop."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def build_peers(cache: Path) -> Path | str:
+    """The program, built into the folder `cache`; or, as text, why there is none."""
+    command = _nightly()
+    if command is None:
+        return "no nightly cargo found: `rustup toolchain install nightly`, then run this again"
+    environment = {**os.environ, "CARGO_TARGET_DIR": str(cache), "RUSTFLAGS": "-C target-cpu=native"}
+    command += ["build", "--release", "--locked", "--quiet"]
+    done = subprocess.run(command, cwd=Path(__file__).parent, env=environment, capture_output=True, text=True)
+    if done.returncode:
+        print(done.stderr, file=sys.stderr)
+        return "scripts/peers does not build here: the compiler's reason is on standard error"
+    return cache / "release" / "peers"
+
+
+def _nightly() -> list[str] | None:
+    """The command of a nightly cargo: by rustup's switch, or because the only one is."""
+    cargo = shutil.which("cargo")
+    for command in ([cargo, "+nightly"], [cargo]) if cargo else ():
+        version = subprocess.run([*command, "--version"], capture_output=True, text=True)
+        if version.returncode == 0 and "nightly" in version.stdout:
+            return command
+    return None
+
+
+class Peers:
+    """The program kept running on one case, so that its loops can alternate with another side's.
+
+    sides: name -> what README.md says of a side. A context manager: the program ends with it.
+    """
+
+    def __init__(
+        self,
+        program: Path,
+        folder: Path,
+        scene: NDArray[np.float64],
+        avatar: NDArray[np.float64],
+        poses: NDArray[np.float64],
+        distance: float,
+        loops: int,
+    ) -> None:
+        """Write the case into `folder`, start the program and wait until it has tried every setting.
+
+        scene: (n, 3) and avatar: (m, 3) [m]; poses: (k, 4, 4), avatar to the scene's frame, whose origin must
+        be near, for all becomes float32.  distance: both radii together [m].
+        """
+        self.folder = folder
+        flat = np.concatenate([poses[:, :3, :3].reshape(-1, 9), poses[:, :3, 3]], axis=1)
+        for name, rows in (("scene", scene), ("avatar", avatar), ("poses", flat)):
+            rows.astype("<f4").tofile(folder / f"{name}.f32")
+        words = [program, folder, distance, "--loops", loops, "--per-pose", folder, "--turns"]
+        self.process = subprocess.Popen(
+            [str(word) for word in words], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        )
+        self.sides: dict[str, dict] = json.loads(self._line())["sides"]
+
+    def __enter__(self) -> "Peers":
+        """The program itself."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close the program's input, which ends it."""
+        self.process.communicate()
+
+    def _line(self) -> str:
+        assert self.process.stdout is not None
+        line = self.process.stdout.readline()
+        if not line:
+            raise RuntimeError(f"scripts/peers: exit code {self.process.wait()}: its reason is above")
+        return line
+
+    def turn(self, name: str) -> float:
+        """One loop of a side over all poses, after one that warms it [us a pose]."""
+        assert self.process.stdin is not None
+        self.process.stdin.write(name + "\n")
+        self.process.stdin.flush()
+        return float(self._line())
+
+    def touching(self, name: str) -> NDArray[np.bool_]:
+        """Which poses (k,) touch, says this side."""
+        return np.fromfile(self.folder / f"{name}.verdicts.u8", np.uint8) == 1
+
+    def each(self, name: str) -> NDArray[np.float32]:
+        """Least time of each pose (k,) [us]."""
+        return np.fromfile(self.folder / f"{name}.us.f32", "<f4")

@@ -1,0 +1,181 @@
+"""E57: poses, invalid records, spherical coordinates, bounds in and of broken files."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pye57 import libe57
+from solidcloud.builder.sources import header_bounds, open_scans
+from solidcloud.schemas.errors import ScanError
+
+
+def read_all(path: Path, spacing: float | None = None, block_points: int = 1 << 18) -> np.ndarray:
+    """The points of all scans of a file, (n, 3)."""
+    blocks = [block.xyz for scan in open_scans(path, spacing=spacing) for block in scan.blocks(block_points)]
+    return np.concatenate([np.empty((0, 3)), *blocks])
+
+
+TURN = np.array([0.5, 0.5, -0.5, 0.5])  # w, x, y, z: a third of a turn about a diagonal, exact in float64
+TURNED = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+
+
+def write_e57(path: Path, scans: list[dict]) -> None:
+    """Scans with the keys columns (name -> array), and perhaps rotation, translation and bounds (2, 3).
+
+    By libE57Format itself: pye57 cannot write spherical coordinates, and writes bounds against the standard.
+    """
+    image = libe57.ImageFile(str(path), "w")
+    image.extensionsAdd("", libe57.E57_V1_0_URI)
+    root = image.root()
+    root.set("formatName", libe57.StringNode(image, "ASTM E57 3D Imaging Data File"))
+    root.set("guid", libe57.StringNode(image, "{1}"))
+    root.set("versionMajor", libe57.IntegerNode(image, 1))
+    root.set("versionMinor", libe57.IntegerNode(image, 0))
+    data3d = libe57.VectorNode(image, True)
+    root.set("data3D", data3d)
+
+    def numbers(names: list[str], values: np.ndarray) -> libe57.StructureNode:
+        node = libe57.StructureNode(image)
+        for name, value in zip(names, values, strict=True):
+            node.set(name, libe57.FloatNode(image, float(value)))
+        return node
+
+    for scan in scans:
+        node = libe57.StructureNode(image)
+        pose = libe57.StructureNode(image)
+        if "rotation" in scan:
+            pose.set("rotation", numbers(list("wxyz"), scan["rotation"]))
+        if "translation" in scan:
+            pose.set("translation", numbers(list("xyz"), scan["translation"]))
+        if "rotation" in scan or "translation" in scan:
+            node.set("pose", pose)
+        if "bounds" in scan:
+            names = [f"{axis}{end}" for end in ("Minimum", "Maximum") for axis in "xyz"]
+            node.set("cartesianBounds", numbers(names, np.ravel(scan["bounds"])))
+        prototype, buffers = libe57.StructureNode(image), libe57.VectorSourceDestBuffer()
+        for name, column in scan["columns"].items():
+            whole = column.dtype == np.int8
+            prototype.set(name, libe57.IntegerNode(image, 0, 0, 2) if whole else libe57.FloatNode(image, 0.0))
+            buffers.append(libe57.SourceDestBuffer(image, name, column, len(column), True, True))
+        points = libe57.CompressedVectorNode(image, prototype, libe57.VectorNode(image, True))
+        node.set("points", points)
+        data3d.append(node)
+        writer = points.writer(buffers)
+        writer.write(len(column))
+        writer.close()
+    image.close()
+
+
+def cartesian(xyz: np.ndarray) -> dict[str, np.ndarray]:
+    return {
+        f"cartesian{axis}": np.ascontiguousarray(column) for axis, column in zip("XYZ", xyz.T, strict=True)
+    }
+
+
+@pytest.fixture
+def local() -> np.ndarray:
+    return np.random.default_rng(2).uniform(-20, 20, (500, 3))
+
+
+def test_e57_scans_are_placed_and_their_invalid_points_counted(local: np.ndarray, tmp_path: Path) -> None:
+    path = tmp_path / "two.e57"
+    state = np.random.default_rng(3).integers(0, 3, 500).astype(np.int8)
+    light = np.random.default_rng(4).uniform(0, 1, 500)
+    far = np.array([5e5, 5.6e6, 120.0])
+    columns = {**cartesian(local), "cartesianInvalidState": state, "intensity": light}
+    write_e57(
+        path,
+        [
+            {"columns": columns, "rotation": TURN, "translation": far},
+            {"columns": cartesian(local), "translation": -far},
+        ],
+    )
+    first, second = open_scans(path)
+    assert (first.index, second.index) == (0, 1)
+    assert first.declared_count == second.declared_count == 500
+    assert np.array_equal(first.pose[:3, :3], TURNED) and np.array_equal(first.pose[:3, 3], far)
+    for block_points in (7, 1000):
+        blocks = list(first.blocks(block_points))
+        valid = state == 0
+        assert np.array_equal(np.concatenate([block.xyz for block in blocks]), local[valid] @ TURNED.T + far)
+        assert np.array_equal(
+            np.concatenate([block.intensity for block in blocks]), light[valid].astype(np.float32)
+        )
+        assert first.dropped == {"invalid state": 500 - np.count_nonzero(valid)}
+        blocks = list(second.blocks(block_points))
+        assert np.array_equal(np.concatenate([block.xyz for block in blocks]), local - far)
+        assert all(block.intensity is None for block in blocks) and second.dropped == {}
+
+
+def test_e57_pose_is_applied_alike_in_blocks_of_any_size(local: np.ndarray, tmp_path: Path) -> None:
+    path = tmp_path / "turned.e57"
+    turn = np.array([0.9, -0.1, 0.3, 0.2])
+    write_e57(path, [{"columns": cartesian(local), "rotation": turn / np.linalg.norm(turn)}])
+    small, large = read_all(path, block_points=7), read_all(path)
+    assert np.array_equal(small.view(np.uint64), large.view(np.uint64))
+    assert np.allclose(np.linalg.norm(large, axis=1), np.linalg.norm(local, axis=1), rtol=1e-15)
+
+
+def test_e57_spherical_coordinates_become_cartesian(local: np.ndarray, tmp_path: Path) -> None:
+    path = tmp_path / "spherical.e57"
+    distance = np.linalg.norm(local, axis=1)
+    columns = {
+        "sphericalRange": distance,
+        "sphericalAzimuth": np.arctan2(local[:, 1], local[:, 0]),
+        "sphericalElevation": np.arcsin(local[:, 2] / distance),
+        "sphericalInvalidState": (np.arange(500) % 5 == 0).astype(np.int8),
+    }
+    write_e57(path, [{"columns": columns, "translation": np.array([1.0, 2.0, 3.0])}])
+    kept = np.arange(500) % 5 != 0
+    assert np.abs(read_all(path) - (local[kept] + [1.0, 2.0, 3.0])).max() < 1e-12
+    assert np.array_equal(read_all(path, block_points=7), read_all(path))
+
+
+@pytest.mark.parametrize(
+    ("pose", "message"),
+    [
+        ({"rotation": np.array([1.01, 0, 0, 0])}, "quaternion of length 1.01"),
+        ({"rotation": np.zeros(4)}, "quaternion of length 0"),
+    ],
+)
+def test_an_e57_pose_that_is_not_rigid_is_refused(pose: dict, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "bent.e57"
+    write_e57(path, [{"columns": cartesian(np.ones((3, 3))), **pose}])
+    with pytest.raises(ScanError, match=message):
+        open_scans(path)
+
+
+def test_e57_bounds_hold_the_scan_wherever_its_pose_puts_it(local: np.ndarray, tmp_path: Path) -> None:
+    path = tmp_path / "bounds.e57"
+    box = np.stack([local.min(axis=0), local.max(axis=0)])
+    moved = {
+        "columns": cartesian(local),
+        "bounds": box,
+        "rotation": TURN,
+        "translation": np.array([9.0, 8, 7]),
+    }
+    write_e57(path, [{"columns": cartesian(local), "bounds": box}, moved])
+    first, second = open_scans(path)
+    assert np.array_equal(first.bounds, box)
+    xyz = np.concatenate([block.xyz for block in second.blocks()])
+    assert (second.bounds[0] <= xyz.min(axis=0)).all() and (second.bounds[1] >= xyz.max(axis=0)).all()
+    both = [np.minimum(first.bounds[0], second.bounds[0]), np.maximum(first.bounds[1], second.bounds[1])]
+    assert np.array_equal(header_bounds(path), both)
+
+
+def test_bounds_of_a_broken_e57_are_those_of_its_header(local: np.ndarray, tmp_path: Path) -> None:
+    path = tmp_path / "broken.e57"
+    write_e57(path, [{"columns": cartesian(local), "bounds": [[-1, -2, -3], [4, 5, 6]]}])
+    data = bytearray(path.read_bytes())
+    data[2500] ^= 0x10  # in the points
+    path.write_bytes(data)
+    with pytest.raises(ScanError, match="ErrorBadChecksum"):
+        read_all(path)
+    assert np.array_equal(header_bounds(path), [[-1, -2, -3], [4, 5, 6]])
+
+
+def test_bounds_of_an_e57_are_unknown_where_one_scan_states_none(local: np.ndarray, tmp_path: Path) -> None:
+    path = tmp_path / "one.e57"
+    columns = cartesian(local)
+    write_e57(path, [{"columns": columns, "bounds": [[-1, -2, -3], [4, 5, 6]]}, {"columns": columns}])
+    assert header_bounds(path) is None

@@ -1,0 +1,155 @@
+"""LAS and LAZ: coordinates to the bit, headers that lie, chunks of every kind."""
+
+import struct
+from pathlib import Path
+
+import laspy
+import numpy as np
+import pytest
+from solidcloud.builder.sources import Lattice, header_bounds, open_scans
+from solidcloud.schemas.errors import ScanError
+
+
+def read_all(path: Path, spacing: float | None = None, block_points: int = 1 << 18) -> np.ndarray:
+    """The points of all scans of a file, (n, 3)."""
+    blocks = [block.xyz for scan in open_scans(path, spacing=spacing) for block in scan.blocks(block_points)]
+    return np.concatenate([np.empty((0, 3)), *blocks])
+
+
+@pytest.fixture(params=["1.2", "1.4"])
+def las(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+    """200 points in map coordinates, with extra bytes in each record."""
+    header = laspy.LasHeader(version=request.param, point_format=3 if request.param == "1.2" else 6)
+    header.scales, header.offsets = [0.01, 0.02, 0.005], [2322968.4731, 4770131.8677, 290.1455]
+    header.add_extra_dim(laspy.ExtraBytesParams("extra", np.float64))
+    las = laspy.LasData(header)
+    rng = np.random.default_rng(1)
+    las.X, las.Y, las.Z = rng.integers(-(2**31), 2**31, (3, 200))
+    las.intensity = rng.integers(0, 65536, 200)
+    path = tmp_path / "a.las"
+    las.write(path)
+    return path
+
+
+def test_las_coordinates_are_raw_times_scale_plus_offset_to_the_bit(las: Path) -> None:
+    judge = laspy.read(las)
+    assert np.array_equal(read_all(las), np.column_stack([judge.x, judge.y, judge.z]))
+
+
+def test_las_gives_its_lattice_and_bounds(las: Path) -> None:
+    (scan,) = open_scans(las)
+    assert scan.lattice == Lattice((0.01, 0.02, 0.005), (2322968.4731, 4770131.8677, 290.1455))
+    xyz = read_all(las)
+    assert np.allclose(scan.bounds, [xyz.min(axis=0), xyz.max(axis=0)], rtol=0, atol=1e-6)
+    assert np.array_equal(header_bounds(las), scan.bounds)
+    assert np.array_equal(scan.pose, np.eye(4))
+
+
+def test_laz_gives_what_las_gives(las: Path) -> None:
+    laz = las.with_suffix(".laz")
+    laspy.read(las).write(laz, laz_backend=laspy.LazBackend.Lazrs)
+    assert np.array_equal(read_all(laz), read_all(las))
+    assert open_scans(laz)[0].format == "laz"
+    assert open_scans(laz)[0].lattice == open_scans(las)[0].lattice
+
+
+LAS_LIES = {
+    "signature": (0, "<4s", b"LASX", "b'LASF'"),
+    "version": (24, "<B", 2, "LAS version 2"),
+    "header size": (94, "<H", 100, "header of 100 bytes"),
+    "points before the header's end": (96, "<I", 200, "points that begin at byte 200"),
+    "points behind the file": (96, "<I", 1 << 30, "points that begin at byte 1073741824"),
+    "record format": (104, "<B", 17, "point record format 17"),
+    "record length": (105, "<H", 12, "records of 12 bytes"),
+    "scale of zero": (131, "<d", 0.0, "scale"),
+    "scale without value": (139, "<d", float("nan"), "scale"),
+    "infinite offset": (155, "<d", float("inf"), "offset"),
+    "many records": (100, "<I", 1_069_128_089, "1069128089 variable length records"),
+}
+
+
+@pytest.mark.parametrize("lie", LAS_LIES)
+def test_a_las_header_that_lies_is_refused(lie: str, las: Path) -> None:
+    at, code, value, message = LAS_LIES[lie]
+    data = bytearray(las.read_bytes())
+    struct.pack_into(code, data, at, value)
+    las.write_bytes(data)
+    with pytest.raises(ScanError, match=message):
+        open_scans(las)
+
+
+def test_a_las_header_that_claims_more_points_than_the_file_holds_is_refused(las: Path) -> None:
+    data = bytearray(las.read_bytes())
+    new = data[25] == 4
+    struct.pack_into("<Q" if new else "<I", data, 247 if new else 107, 201)
+    las.write_bytes(data)
+    with pytest.raises(ScanError, match="201 points declared, expected at most the 200"):
+        open_scans(las)
+
+
+def test_a_laz_chunk_table_beyond_the_file_is_refused(las: Path) -> None:
+    laz = las.with_suffix(".laz")
+    laspy.read(las).write(laz, laz_backend=laspy.LazBackend.Lazrs)
+    data = bytearray(laz.read_bytes())
+    (points,) = struct.unpack_from("<I", data, 96)
+    struct.pack_into("<q", data, points, len(data) + 5)
+    laz.write_bytes(data)
+    with pytest.raises(ScanError, match="chunk table at byte"):
+        open_scans(laz)
+
+
+def write_laz(path: Path, count: int, point_format: int) -> np.ndarray:
+    """Points whose raw coordinates are returned, (n, 3); 50,000 of them a chunk."""
+    header = laspy.LasHeader(version="1.4", point_format=point_format)
+    header.scales, header.offsets = [1.0] * 3, [0.0] * 3
+    las = laspy.LasData(header)
+    xyz = np.random.default_rng(6).integers(-1000, 1000, (count, 3))
+    las.X, las.Y, las.Z = xyz.T
+    las.write(path, laz_backend=laspy.LazBackend.Lazrs)
+    return xyz
+
+
+@pytest.mark.parametrize("point_format", [0, 3, 6, 7, 8, 9])
+@pytest.mark.parametrize("count", [1, 50_000, 50_001])
+def test_laz_of_every_kind_and_number_of_chunks_is_read(
+    point_format: int, count: int, tmp_path: Path
+) -> None:
+    path = tmp_path / "a.laz"
+    xyz = write_laz(path, count, point_format)
+    assert np.array_equal(read_all(path), xyz)
+
+
+def test_a_laz_chunk_that_claims_gigabytes_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.laz"
+    write_laz(path, 100, 6)
+    data = bytearray(path.read_bytes())
+    (start,) = struct.unpack_from("<I", data, 96)
+    # Behind the table's place, the first point raw and the count: the size of the first layer.
+    struct.pack_into("<I", data, start + 8 + 30 + 4, 0xFFFF_0000)
+    path.write_bytes(data)
+    with pytest.raises(ScanError, match="chunk 0 that ends at byte"):
+        open_scans(path)
+
+
+def test_a_laz_without_the_record_that_describes_it_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.laz"
+    write_laz(path, 100, 6)
+    path.write_bytes(path.read_bytes().replace(b"laszip encoded", b"laszip forgets", 1))
+    with pytest.raises(ScanError, match="22204"):
+        open_scans(path)
+
+
+def test_a_las_without_points_is_valid_and_has_none(tmp_path: Path) -> None:
+    path = tmp_path / "none.las"
+    laspy.LasData(laspy.LasHeader()).write(path)
+    assert open_scans(path)[0].declared_count == 0
+    assert open_scans(path)[0].bounds is None
+    assert read_all(path).shape == (0, 3)
+
+
+def test_bounds_of_a_truncated_las_are_those_of_its_header(las: Path) -> None:
+    whole = open_scans(las)[0].bounds
+    las.write_bytes(las.read_bytes()[:1000])
+    with pytest.raises(ScanError):
+        open_scans(las)
+    assert np.array_equal(header_bounds(las), whole)

@@ -1,0 +1,107 @@
+"""OBJ and STL: vertices as they stand in the file, and surfaces as samples."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from solidcloud.builder.sources import open_scans
+from solidcloud.schemas.errors import ScanError
+
+
+def read_all(path: Path, spacing: float | None = None, block_points: int = 1 << 18) -> np.ndarray:
+    """The points of all scans of a file, (n, 3)."""
+    blocks = [block.xyz for scan in open_scans(path, spacing=spacing) for block in scan.blocks(block_points)]
+    return np.concatenate([np.empty((0, 3)), *blocks])
+
+
+PLY = "ply\nformat ascii 1.0\nelement vertex {}\nproperty double x\nproperty double y\nproperty double z\n"
+
+
+def write_square(path: Path, side: float) -> None:
+    """A square in the plane z = 1, cut into two triangles, and a vertex no face uses."""
+    corners = [(0, 0), (side, 0), (side, side), (0, side)]
+    vertices = "".join(f"v {x} {y} 1 0.5 0.5 0.5\n" for x, y in corners)
+    path.write_text(f"mtllib none.mtl\n{vertices}v 99 99 99\nf 1 2 3\nf 1 3 4\n")
+
+
+def test_obj_vertices_come_as_they_stand_in_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "a.obj"
+    path.write_text("v 1 2 3\nv 1 2 3 1.0\n  v\t4 5 6 255 0 0\r\nvt 7 7\nvn 8 8 8\no v 9 9 9\nf 1 2 3\n")
+    assert read_all(path).tolist() == [[1, 2, 3], [1, 2, 3], [4, 5, 6]]
+
+
+@pytest.mark.parametrize("line", ["v 1 2", "v", "v 1 b 3", "v 1 2 # 3"])
+def test_a_broken_obj_vertex_is_refused_with_its_line(line: str, tmp_path: Path) -> None:
+    path = tmp_path / "a.obj"
+    path.write_text(f"v 1 2 3\nvn 0 0 1\n{line}\nv 4 5 6\n")
+    with pytest.raises(ScanError, match=f"line 3 is '{line}', expected 'v' and three numbers"):
+        read_all(path)
+
+
+def test_a_surface_is_sampled_evenly_and_always_alike(tmp_path: Path) -> None:
+    path = tmp_path / "square.obj"
+    write_square(path, 4.0)
+    xyz = read_all(path, spacing=0.1)
+    assert len(xyz) == 1600  # area / spacing**2
+    assert np.array_equal(xyz[:, 2], np.ones(1600))
+    assert (xyz[:, :2] >= 0).all() and (xyz[:, :2] <= 4).all()
+    # No place of the square is farther than 1.5 spacings from a sample, none is sampled twice over.
+    grid = np.stack(np.meshgrid(*[np.linspace(0, 4, 41)] * 2), axis=-1).reshape(-1, 1, 2)
+    assert np.linalg.norm(grid - xyz[None, :, :2], axis=-1).min(axis=1).max() < 0.15
+    apart = np.linalg.norm(xyz[:, None] - xyz[None], axis=-1) + np.eye(1600)
+    assert 0.06 < apart.min(axis=1).mean() < 0.1
+    assert np.array_equal(read_all(path, spacing=0.1), xyz)
+    assert np.array_equal(read_all(path, spacing=0.1, block_points=7), xyz)
+
+
+def test_an_stl_surface_is_sampled_too(tmp_path: Path) -> None:
+    path = tmp_path / "a.stl"
+    facet = "facet normal 0 0 1\nouter loop\nvertex 0 0 1\nvertex 2 0 1\nvertex 0 2 1\nendloop\nendfacet\n"
+    path.write_text(f"solid a\n{facet}endsolid a\n")
+    xyz = read_all(path, spacing=0.1)
+    assert len(xyz) == 200
+    assert (xyz[:, :2].sum(axis=1) <= 2).all() and (xyz[:, 2] == 1).all()
+
+
+def test_samples_fall_on_triangles_by_their_area(tmp_path: Path) -> None:
+    path = tmp_path / "a.obj"
+    path.write_text(
+        "v 0 0 0\nv 3 0 0\nv 0 3 0\nv 0 0 9\nv 1 0 9\nv 0 1 9\nv 5 5 5\nf 1 2 3\nf 4 5 6\nf 7 7 7\n"
+    )
+    xyz = read_all(path, spacing=0.05)
+    assert len(xyz) == 2000
+    assert np.count_nonzero(xyz[:, 2] == 9) == pytest.approx(200, abs=1)
+    assert not (xyz == 5).any()
+
+
+def test_spacing_samples_a_ply_with_faces_and_leaves_scans_alone(tmp_path: Path) -> None:
+    path = tmp_path / "a.ply"
+    faces = "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+    path.write_text(PLY.format(3) + faces + "0 0 0\n2 0 0\n0 2 0\n3 0 1 2\n")
+    assert len(read_all(path)) == 3
+    assert len(read_all(path, spacing=0.1)) == 200
+    scan = tmp_path / "a.xyz"
+    scan.write_text("1 2 3\n")
+    assert read_all(scan, spacing=0.1).tolist() == [[1, 2, 3]]
+
+
+def test_a_mesh_without_faces_cannot_be_sampled(tmp_path: Path) -> None:
+    path = tmp_path / "a.obj"
+    path.write_text("v 1 2 3\nv 4 5 6\nv 7 8 8\n")
+    with pytest.raises(ScanError, match="build it without --spacing"):
+        read_all(path, spacing=0.1)
+
+
+def test_a_face_beyond_the_vertices_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.obj"
+    path.write_text("v 1 2 3\nv 4 5 6\nv 7 8 8\nf 1 2 9\n")
+    with pytest.raises(ScanError):
+        read_all(path, spacing=0.1)
+
+
+def test_an_stl_without_triangles_is_valid_and_has_no_points(tmp_path: Path) -> None:
+    path = tmp_path / "a.stl"
+    path.write_text("solid a\nendsolid a\n")
+    assert read_all(path).shape == (0, 3)
+    path.write_bytes(bytes(84))
+    assert read_all(path).shape == (0, 3)

@@ -1,0 +1,98 @@
+"""Text scans: the rules for columns, headers and counts, and lines that are broken."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from solidcloud.builder.sources import open_scans
+from solidcloud.builder.sources.rows import LONGEST_LINE
+from solidcloud.schemas.errors import ScanError
+
+
+def read_all(path: Path, spacing: float | None = None, block_points: int = 1 << 18) -> np.ndarray:
+    """The points of all scans of a file, (n, 3)."""
+    blocks = [block.xyz for scan in open_scans(path, spacing=spacing) for block in scan.blocks(block_points)]
+    return np.concatenate([np.empty((0, 3)), *blocks])
+
+
+def intensities(path: Path) -> list[float] | None:
+    """The intensities of a file with one scan, None where it has none."""
+    found = [block.intensity for scan in open_scans(path) for block in scan.blocks()]
+    return None if found[0] is None else np.concatenate(found).tolist()
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "expected", "intensity"),
+    [
+        ("a.pts", "2\n1 2 3 -4\n5 6 7 -8\n", [[1, 2, 3], [5, 6, 7]], [-4, -8]),
+        ("a.pts", "1\n1 2 3 4 255 0 0\n", [[1, 2, 3]], [4]),
+        ("a.pts", "1\n1 2 3 255 0 0\n", [[1, 2, 3]], None),  # the fourth of six is red
+        ("a.pts", "1 2 3\n", [[1, 2, 3]], None),
+        ("a.xyz", "1 2 3 4\n", [[1, 2, 3]], None),  # a fourth column may mean anything
+        ("a.xyz", "1 2 3", [[1, 2, 3]], None),
+        ("a.csv", "intensity;Z;Y;X\n9;3;2;1\n", [[1, 2, 3]], [9]),
+        ("a.csv", "\ufeffx, y, z\n1, 2, 3\n\n4, 5, 6\n", [[1, 2, 3], [4, 5, 6]], None),
+        ("a.txt", "//X Y Z Scalar_Intensity\n1 2 3 4\n", [[1, 2, 3]], [4]),
+        (
+            "a.txt",
+            "# by hand\n\n# y x z\n2 1 3\n#\n5 4 6 # end\n",
+            [[1, 2, 3], [4, 5, 6]],
+            None,
+        ),
+        ("a.txt", "# of x, y and z\n1 2 3\n", [[1, 2, 3]], None),  # a sentence, no header
+        ("a.txt", "nan 1e999 -3\n", [[np.nan, np.inf, -3]], None),  # counted by the caller
+        ("a.txt", "# nothing\n\n", [], None),
+        ("a.pts", "0\n", [], None),
+    ],
+)
+def test_text_layouts(
+    name: str, text: str, expected: list, intensity: list[float] | None, tmp_path: Path
+) -> None:
+    path = tmp_path / name
+    path.write_text(text, encoding="utf-8")
+    assert np.array_equal(read_all(path), np.reshape(expected, (-1, 3)), equal_nan=True)
+    if expected:
+        assert intensities(path) == intensity
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("1 2 3\n4 5 6\n7 8\n", "line 3 is '7 8', expected 3 numbers"),
+        ("1 2 3\n\n# c\n4 5 6 7\n", "line 4 is '4 5 6 7'"),
+        ("1 2 3\n4 5 x6\n", "line 2 is '4 5 x6'"),
+        ("1,2,3\n4,,6\n", "line 2 is '4,,6'"),
+        ("1,2,3\n4 5 6\n", "line 2"),
+        ("1;2;3\n4,5;6;7\n", "line 2 is '4,5;6;7'"),  # a decimal comma
+        ("1 2\n3 4\n", "line 1 is '1 2', expected at least three numbers"),
+        ("1 2 z\n", "line 1"),
+        ("x y z\nx y z\n1 2 3\n", "line 2 is 'x y z'"),
+        ("x y\n1 2 3\n", "line 1 names the columns 'x y'"),
+        ("x y x\n1 2 3\n", "x, y and z once each"),
+        ("x y z\n", "no rows of numbers"),
+        ("3\n1 2 3\n4 5 6\n", "2 points, expected the 3"),
+        ("1\n1 2 3\n4 5 6\n", "2 points, expected the 1"),
+        ("5\n", "no rows of numbers"),
+        ("a chapter\n" * 3, "line 2"),
+        ("1 2 3\n4 5\0 6\n", "line 2 holds a zero byte"),
+        ("1 2 3\n" + "1" * (6 * LONGEST_LINE), "line 2 is longer than"),
+    ],
+)
+def test_broken_text_is_refused_with_its_line(text: str, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "a.txt"
+    path.write_text(text)
+    with pytest.raises(ScanError, match=message):
+        read_all(path)
+
+
+def test_text_is_read_right_across_chunks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "a.xyz"
+    xyz = np.random.default_rng(5).normal(size=(300, 3)).round(6)
+    lines = [f"{x} {y} {z}" for x, y, z in xyz.tolist()]
+    path.write_text("\n".join(lines))
+    monkeypatch.setattr("solidcloud.builder.sources.rows.CHUNK_BYTES", 100)
+    assert np.array_equal(read_all(path), xyz)
+    lines[222] = "1 2"
+    path.write_text("\n".join(lines))
+    with pytest.raises(ScanError, match="line 223 is '1 2'"):
+        read_all(path)

@@ -34,6 +34,7 @@ DATASETS = ("cells", "nodes", "points")
 
 # One row a voxel, sorted by key. frame_*: where the dataset's only chunk lies in its shard, in the order of
 # DATASETS; checksum: the last four bytes of the zstd frame, so that a wrong offset cannot deliver another's.
+# leaves: leaf nodes, so that a server knows a voxel's decoded bytes before it loads it.
 VOXEL_DTYPE = np.dtype(
     [
         ("key", "<u8"),
@@ -42,6 +43,7 @@ VOXEL_DTYPE = np.dtype(
         ("frame_bytes", "<u4", (3,)),
         ("frame_checksum", "<u4", (3,)),
         ("rows", "<u4", (3,)),
+        ("leaves", "<u4"),
         ("low", "<i4", (3,)),
         ("high", "<i4", (3,)),
     ]
@@ -180,6 +182,7 @@ def write_shard(
             frames = (record.cells, record.nodes, record.points)
             row = np.zeros((), VOXEL_DTYPE)
             row["key"], row["shard"], row["rows"], row["low"], row["high"] = voxel.key, number, counts, low, high
+            row["leaves"] = record.leaf_rows
             for i, name in enumerate(DATASETS):
                 offset, size = _write_frame(group, name, frames[i], counts[i], dtypes[i])
                 row["frame_offset"][i], row["frame_bytes"][i] = offset, size

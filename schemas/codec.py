@@ -52,7 +52,7 @@ def point_dtype(*, scan_index: bool, intensity: bool) -> np.dtype:
 
 
 class Record(NamedTuple):
-    """The compressed bytes of one voxel: one zstd frame a dataset, and the rows each holds."""
+    """The compressed bytes of one voxel: one zstd frame a dataset, the rows each holds, and its leaf nodes."""
 
     cells: bytes
     nodes: bytes
@@ -60,6 +60,7 @@ class Record(NamedTuple):
     cell_rows: int
     node_rows: int
     point_rows: int
+    leaf_rows: int
 
 
 class RecordShape(NamedTuple):
@@ -90,7 +91,7 @@ def encode_voxel(voxel: VoxelData, archive_id: bytes) -> Record:
         points["scan_index"] = voxel.scan_index
     if voxel.intensity is not None:
         points["intensity"] = voxel.intensity
-    return Record(_pack(cells), _pack(nodes), _pack(points), len(cells), len(nodes), len(points))
+    return Record(_pack(cells), _pack(nodes), _pack(points), len(cells), len(nodes), len(points), len(first))
 
 
 def decode_voxel(

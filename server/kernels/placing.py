@@ -1,0 +1,99 @@
+"""Poses: what is admitted, and where a pose puts a point. The one formula of NUMERICS.md N5.
+
+A placed coordinate is ((r0 p0 + r1 p1) + r2 p2) + (t - O), float64, in this order, no contraction; times 2^26
+(exact) and rounded half to even it is the integer that decides. Compiled and interpreted agree bit for bit.
+"""
+
+import math
+from typing import NamedTuple
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+
+from ...schemas.voxel_grid import MAX_COORDINATE, UNITS_PER_METRE
+
+SIMILARITY_TOLERANCE = 1e-9  # NUMERICS.md N6
+SMALLEST_SCALE, LARGEST_SCALE = 1e-3, 1e3
+
+GOOD, NOT_FINITE, BAD_LAST_ROW, MIRRORED, SHEARED, BAD_SCALE, TOO_FAR = range(7)
+
+
+class Avatar(NamedTuple):
+    """An avatar's BSH as the kernels read it; a nodes, b leaf nodes.
+
+    center: (a, 3), radius: (a,) float64, avatar frame [m], rounded outward.  first: (a,) int32, first child, or
+    ~block for a leaf node.  count: (a,) int32, children or points.  points: (b, 3, LANES) float64 [m], as given
+    by the client, the last one repeated.
+    """
+
+    center: NDArray[np.float64]
+    radius: NDArray[np.float64]
+    first: NDArray[np.int32]
+    count: NDArray[np.int32]
+    points: NDArray[np.float64]
+
+
+@nb.njit(nogil=True, cache=True)
+def check_poses(poses, scales):
+    """Check poses (k, 4, 4) float64 to be similarities (N6), writing their scales (k,).
+
+    A scale within SIMILARITY_TOLERANCE of 1 is 1, so that the rounding of a rigid pose changes no radius.
+    Returns (GOOD, 0, 0.0), or the first fault, its pose and the figure found.
+    """
+    for i in range(poses.shape[0]):
+        m = poses[i]
+        for r in range(4):
+            for c in range(4):
+                if not math.isfinite(m[r, c]):
+                    return NOT_FINITE, i, m[r, c]
+        if m[3, 0] != 0.0 or m[3, 1] != 0.0 or m[3, 2] != 0.0 or m[3, 3] != 1.0:
+            return BAD_LAST_ROW, i, m[3, 3]
+        for r in range(3):
+            if not abs(m[r, 3]) <= MAX_COORDINATE:
+                return TOO_FAR, i, m[r, 3]
+            for c in range(3):
+                if not abs(m[r, c]) <= 2.0 * LARGEST_SCALE:
+                    return BAD_SCALE, i, m[r, c]
+        minor0 = m[1, 1] * m[2, 2] - m[1, 2] * m[2, 1]
+        minor1 = m[1, 0] * m[2, 2] - m[1, 2] * m[2, 0]
+        minor2 = m[1, 0] * m[2, 1] - m[1, 1] * m[2, 0]
+        volume = m[0, 0] * minor0 - m[0, 1] * minor1 + m[0, 2] * minor2
+        square = 0.0
+        for r in range(3):
+            for c in range(3):
+                square += m[r, c] * m[r, c]
+        square /= 3.0
+        scale = math.sqrt(square)
+        if not SMALLEST_SCALE <= scale <= LARGEST_SCALE:
+            return BAD_SCALE, i, scale
+        worst = 0.0
+        for a in range(3):
+            for b in range(3):
+                dot = m[0, a] * m[0, b] + m[1, a] * m[1, b] + m[2, a] * m[2, b]
+                worst = max(worst, abs(dot - (square if a == b else 0.0)))
+        # Twice: an entry that is off by the tolerance moves a product of two by twice that.
+        if worst > 2.0 * SIMILARITY_TOLERANCE * square:
+            return SHEARED, i, worst / square
+        if volume < 0.0:
+            return MIRRORED, i, volume
+        scales[i] = 1.0 if abs(scale - 1.0) <= SIMILARITY_TOLERANCE else scale
+    return GOOD, 0, 0.0
+
+
+@nb.njit(nogil=True, cache=True)
+def place(m, shift, r, x, y, z):
+    """Coordinate r of an avatar point placed by pose m, from the dataset's origin [m]. shift: t - O (3,)."""
+    return ((m[r, 0] * x + m[r, 1] * y) + m[r, 2] * z) + shift[r]
+
+
+@nb.njit(nogil=True, cache=True)
+def to_units(metres):
+    """Exact units of a placed coordinate: times 2^26, half to even, int64."""
+    return np.int64(np.rint(metres * UNITS_PER_METRE))
+
+
+@nb.njit(nogil=True, cache=True)
+def lattice_to_units(steps, units_per_step):
+    """Exact units of a lattice coordinate: one float64 product, half to even, int64."""
+    return np.int64(np.rint(np.float64(steps) * units_per_step))

@@ -1,0 +1,191 @@
+"""Resident voxels: decoded, least recently used first to go, never more than `budget_bytes`.
+
+[Fig12] section 4: "neighbour voxels to a user's position loaded and uncompressed into a LRU queue". One load
+for a voxel however many wait for it; what a request uses is pinned until it is answered.
+
+A request takes all its voxels or none: it never waits for room while holding pins, so two requests that each
+hold half of what the other needs cannot wait for each other for ever.
+"""
+
+import threading
+from collections import OrderedDict
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import NamedTuple
+
+import numpy as np
+
+from ..schemas.errors import BadRequestError, CorruptError
+from .arena import ArenaBuffer
+from .store import Store
+
+
+class Held(NamedTuple):
+    """What a hold found. hits, misses: voxels resident before, and not.  faults: one sentence an unreadable voxel."""
+
+    hits: int
+    misses: int
+    faults: tuple[str, ...]
+
+
+class Residency:
+    """The resident voxels of one scene. Thread-safe.
+
+    where: (v, 3) int64, a voxel's runs in the arena, -1 when not resident; the kernels read it directly.
+    """
+
+    def __init__(self, store: Store, budget_bytes: int) -> None:
+        """Reserve budget_bytes for the voxels of `store`. Raises BadRequestError when one voxel alone is larger."""
+        largest = ArenaBuffer.rounded(int(store.sizes.max(initial=0)))
+        if budget_bytes < largest:
+            raise BadRequestError(
+                f"cache of {budget_bytes} bytes: the largest voxel takes {largest}: give a larger --cache, "
+                "or build with a smaller --voxel"
+            )
+        self.budget_bytes = budget_bytes
+        self.buffer = ArenaBuffer(budget_bytes)
+        self.where = np.full((len(store.sizes), 3), -1, np.int64)
+        self._store = store
+        self._sizes = [ArenaBuffer.rounded(int(size)) for size in store.sizes]
+        self._changed = threading.Condition()
+        self._offsets: OrderedDict[int, int] = OrderedDict()  # row -> offset; least recently used first
+        self._pins: dict[int, int] = {}
+        self._loading: set[int] = set()
+        self._faults: dict[int, str] = {}  # of corrupt records, which reading again would not mend
+        self.resident_bytes = 0
+        self.hits = 0
+        self.misses = 0
+        self.evictions = 0
+
+    @property
+    def resident(self) -> int:
+        """The number of voxels resident or being loaded."""
+        return len(self._offsets)
+
+    def bytes_of(self, rows: Sequence[int]) -> int:
+        """Bytes these voxels take when resident."""
+        return sum(self._sizes[row] for row in rows)
+
+    @contextmanager
+    def hold(self, rows: Sequence[int]) -> Iterator[Held]:
+        """Make the voxels of distinct index rows resident and keep them so inside the `with`.
+
+        Together they must fit the budget. Voxels that cannot be read stay at -1 in `where` and are named in
+        the result's faults; everything else is resident.
+        """
+        mine = self._reserve(rows)
+        try:
+            faults = self._load(mine)
+            with self._changed:
+                self._changed.wait_for(lambda: not any(row in self._loading for row in rows))
+                faults += [self._faults[row] for row in rows if row in self._faults and row not in mine]
+            yield Held(len(rows) - len(mine), len(mine), tuple(faults))
+        finally:
+            with self._changed:
+                self._unpin(rows)
+                self._changed.notify_all()
+
+    def _reserve(self, rows: Sequence[int]) -> list[int]:
+        """Pin all rows and allocate for those to be loaded by this caller, which are returned."""
+        if self.bytes_of(rows) > self.buffer.total_bytes:
+            raise ValueError(f"{len(rows)} voxels take {self.bytes_of(rows)} bytes, over the budget: ask in pieces")
+        with self._changed:
+            while True:
+                for row in rows:
+                    self._pins[row] = self._pins.get(row, 0) + 1
+                mine = [row for row in rows if row not in self._offsets and row not in self._faults]
+                if self._allocate_all(mine):
+                    break
+                self._unpin(rows)
+                if not self._pins:
+                    # Nobody else holds anything, and yet the room is in pieces between our own voxels.
+                    for row in list(self._offsets):
+                        self._evict(row)
+                    continue
+                self._changed.wait()
+            self._loading.update(mine)
+            for row in rows:
+                if row in self._offsets:
+                    self._offsets.move_to_end(row)
+            self.hits += len(rows) - len(mine)
+            self.misses += len(mine)
+            return mine
+
+    def _allocate_all(self, rows: list[int]) -> bool:
+        """Allocate for every row, evicting what is neither pinned nor loading; all or nothing."""
+        done = []
+        for row in rows:
+            offset = self.buffer.allocate(self._sizes[row])
+            while offset is None and (victim := self._victim()) is not None:
+                self._evict(victim)
+                offset = self.buffer.allocate(self._sizes[row])
+            if offset is None:
+                for other in done:
+                    self._forget(other)
+                return False
+            self._offsets[row] = offset
+            self.resident_bytes += self._sizes[row]
+            done.append(row)
+        return True
+
+    def _victim(self) -> int | None:
+        """The least recently used voxel that nobody uses."""
+        return next((row for row in self._offsets if row not in self._pins), None)
+
+    def _evict(self, row: int) -> None:
+        self.evictions += 1
+        self._forget(row)
+
+    def _forget(self, row: int) -> None:
+        self.where[row] = -1
+        self.buffer.release(self._offsets.pop(row), self._sizes[row])
+        self.resident_bytes -= self._sizes[row]
+
+    def _unpin(self, rows: Sequence[int]) -> None:
+        for row in rows:
+            self._pins[row] -= 1
+            if not self._pins[row]:
+                del self._pins[row]
+
+    def _load(self, rows: list[int]) -> list[str]:
+        """Load what this caller reserved; every row leaves `_loading`, loaded or not. Returns the faults."""
+        faults = []
+        for number, row in enumerate(rows):
+            fault = ""
+            try:
+                where = self._store.load(row, self.buffer.arena, self._offsets[row])
+            except CorruptError as error:
+                fault = self._faults[row] = str(error)
+            except OSError as error:
+                fault = f"{self._store.archive.where(row)}: cannot be read ({error}): check the disk"
+            except BaseException:
+                with self._changed:
+                    for left in rows[number:]:
+                        self._forget(left)
+                        self._loading.discard(left)
+                    self._changed.notify_all()
+                raise
+            with self._changed:
+                if fault:
+                    faults.append(fault)
+                    self._forget(row)
+                else:
+                    self.where[row] = where
+                self._loading.discard(row)
+                self._changed.notify_all()
+        return faults
+
+    def check(self) -> None:
+        """Assert what must always hold: bytes add up, runs neither overlap nor leave the buffer."""
+        with self._changed:
+            held = sum(self._sizes[row] for row in self._offsets)
+            runs = sorted([(offset, self._sizes[row]) for row, offset in self._offsets.items()] + self.buffer.free_runs())
+            assert held == self.resident_bytes <= self.buffer.total_bytes, (held, self.resident_bytes)
+            at = 0
+            for offset, size in runs:
+                assert offset == at, (offset, at)
+                at += size
+            assert at == self.buffer.total_bytes
+            resident = {int(row) for row in np.flatnonzero(self.where[:, 0] >= 0)}
+            assert resident == set(self._offsets) - self._loading
+            assert all(count > 0 for count in self._pins.values())

@@ -1,0 +1,138 @@
+"""Scene: an archive opened in this process, and the questions asked of it. The same methods as `Client`."""
+
+import threading
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..schemas.answers import CollideAnswers
+from ..schemas.archive import FORMAT_VERSION
+from ..schemas.errors import BadRequestError, UnknownAvatarError
+from ..schemas.messages import WIRE_VERSION, AvatarInfo, SceneInfo, SourceInfo
+from .avatar import AvatarModel, make_avatar
+from .collide import SceneData, collide, to_units
+from .residency import Residency
+from .store import Store
+
+DEFAULT_BUDGET = 512 << 20
+
+
+class Scene:
+    """A served archive. Thread-safe; a context manager.
+
+    name: what clients call it; the archive's folder name unless given.
+    """
+
+    def __init__(self, store: Store, name: str, budget_bytes: int) -> None:
+        """Serve the voxels of `store`; use `Scene.open`."""
+        self.name = name
+        archive = store.archive
+        base = archive.coordinates * archive.header.lattice.voxel_steps
+        self._data = SceneData(
+            store,
+            Residency(store, budget_bytes),
+            np.ascontiguousarray(archive.voxels["key"]).astype(np.uint64),
+            archive.coordinates,
+            base + archive.voxels["low"],
+            base + archive.voxels["high"],
+            to_units(archive.header.radius, "radius of the archive"),
+        )
+        self._avatars: dict[tuple[str, str], AvatarModel] = {}
+        self._lock = threading.Lock()
+
+    @classmethod
+    def open(cls, folder: str | Path, name: str | None = None, *, budget_bytes: int = DEFAULT_BUDGET) -> "Scene":
+        """Open the archive in `folder`, keeping at most budget_bytes of decoded voxels in memory.
+
+        Raises FormatError or CorruptError when it is no whole archive, BadRequestError for too small a budget.
+        """
+        store = Store(folder)
+        try:
+            return cls(store, name or Path(folder).resolve().name, budget_bytes)
+        except BaseException:
+            store.close()
+            raise
+
+    def __enter__(self) -> "Scene":
+        """The scene itself."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close the archive."""
+        self.close()
+
+    def close(self) -> None:
+        """Close the archive's files."""
+        self._data.store.close()
+
+    @property
+    def residency(self) -> Residency:
+        """The resident voxels, for counters and checks."""
+        return self._data.residency
+
+    def info(self) -> SceneInfo:
+        """What is served: counts, bounds, lattice, radius, sources."""
+        store = self._data.store
+        header = store.archive.header
+        lattice = header.lattice
+        return SceneInfo(
+            scene=self.name,
+            format_version=FORMAT_VERSION,
+            wire_version=WIRE_VERSION,
+            points=header.points,
+            voxels=len(self._data.keys),
+            bounds=lattice.to_world(np.stack([header.low, header.high])).tolist(),
+            origin=list(lattice.origin),
+            lattice_step=lattice.step,
+            lattice_source=header.lattice_source,
+            voxel_size=lattice.voxel_size,
+            radius=header.radius,
+            radius_model=header.radius_model,
+            radius_error=header.radius_error,
+            radius_sample=header.radius_sample,
+            moved_max=header.moved_max,
+            degree=header.degree,
+            leaf=header.leaf,
+            sources=[
+                SourceInfo(s.path, s.index, s.sha256, s.count, s.format, s.pose.tolist(), s.skipped)
+                for s in header.sources
+            ],
+            skipped=[f"{s.path}: {s.fault}" for s in header.sources if s.fault],
+            record_bytes=int(store.archive.voxels["frame_bytes"].sum(dtype=np.int64)),
+            resident_bytes=int(store.sizes.sum()),
+        )
+
+    def add_avatar(
+        self, name: str, points: ArrayLike, radius: float | None = None, *, client: str = ""
+    ) -> AvatarInfo:
+        """Add an avatar of points (n, 3) float64, avatar frame [m].
+
+        radius: of each point's sphere [m]; None: half the mean closest-point distance of the points.
+        client: whose it is; avatars of different clients do not meet. The same name again with the same points and
+        radius changes nothing; with others it is a BadRequestError.
+        """
+        model = make_avatar(points, radius)
+        with self._lock:
+            known = self._avatars.setdefault((client, name), model)
+        if known is not model and not (known.radius == model.radius and np.array_equal(known.points, model.points)):
+            raise BadRequestError(f"avatar {name!r} exists with other points or another radius: use another name")
+        return AvatarInfo(name, len(model.points), model.radius, model.bounding_radius)
+
+    def collide(self, name: str, poses: ArrayLike, margin: float = 0.0, *, client: str = "") -> CollideAnswers:
+        """Whether avatar `name` touches the scene under each of the poses (k, 4, 4); see server/collide.py."""
+        begin = time.perf_counter()
+        with self._lock:
+            avatar = self._avatars.get((client, name))
+        if avatar is None:
+            raise UnknownAvatarError(f"avatar {name!r} is not known: add it with add_avatar first")
+        answers = collide(self._data, avatar, poses, margin)
+        return replace(answers, engine_seconds=time.perf_counter() - begin)
+
+    def drop_client(self, client: str) -> None:
+        """Forget the avatars of a client that is gone."""
+        with self._lock:
+            for key in [key for key in self._avatars if key[0] == client]:
+                del self._avatars[key]

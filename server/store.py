@@ -1,0 +1,44 @@
+"""Index row -> decoded voxel, written into the arena. Safe to call from several threads."""
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..schemas.archive import Archive
+from ..schemas.errors import CorruptError
+from .kernels.layout import Arena, lay_out, resident_bytes
+from .kernels.overlap import MOST_LEVELS
+
+
+class Store:
+    """An archive's voxels by index row.
+
+    archive: see schemas/archive.py.  sizes: (v,) int64, bytes of each voxel once decoded.
+    """
+
+    def __init__(self, folder: str | Path) -> None:
+        """Open the archive in `folder`. Raises FormatError or CorruptError."""
+        self.archive = Archive(folder)
+        rows = self.archive.voxels
+        self.sizes: NDArray[np.int64] = resident_bytes(rows["rows"][:, 1].astype(np.int64), rows["leaves"].astype(np.int64))
+
+    def load(self, row: int, arena: Arena, offset: int) -> NDArray[np.int64]:
+        """Read, check and lay out the voxel of index row `row` at byte `offset` of the arena.
+
+        Returns where its runs are (3,) int64, see layout.py. Raises CorruptError, OSError.
+        """
+        voxel, links = self.archive.read_voxel(row)
+        leaves = int(np.count_nonzero(links.is_leaf))
+        if leaves != int(self.archive.voxels["leaves"][row]):
+            raise CorruptError(f"{self.archive.where(row)}: {leaves} leaf nodes, the index says otherwise: rebuild it")
+        if links.height > MOST_LEVELS:
+            raise CorruptError(f"{self.archive.where(row)}: {links.height} levels, expected at most {MOST_LEVELS}: rebuild it")
+        where = np.empty(3, np.int64)
+        parts = (voxel.cells, voxel.nodes, np.int64(voxel.top_shift), voxel.points)
+        lay_out(parts, (links.first, links.is_leaf, links.cell), arena, np.int64(offset), where)
+        return where
+
+    def close(self) -> None:
+        """Close the archive's files."""
+        self.archive.close()

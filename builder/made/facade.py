@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 import trimesh
+from numpy.typing import NDArray
 
 from ...schemas.errors import BadRequestError
 from .shapes import Opening, Parts, arch, circle, level
@@ -141,8 +142,9 @@ def _portal(parts: Parts, door: DoorTruth, rng: np.random.Generator) -> None:
     door's axis than its own order, so the clear width stays that of the door.
     """
 
-    def gable(x: np.ndarray) -> np.ndarray:
-        return 6.5 + 2.7 * (1 - np.abs(x) / PORTAL_HALF)
+    def gable(x: NDArray[np.float64]) -> NDArray[np.float64]:
+        height: NDArray[np.float64] = 6.5 + 2.7 * (1 - np.abs(x) / PORTAL_HALF)
+        return height
 
     for order in range(1, ORDERS + 1):
         half = door.width / 2 + ORDER_STEP * order

@@ -76,7 +76,7 @@ def figure_points(points: int = 3617, seed: int = 2012, height: float = HEIGHT) 
     candidates = _surface(max(CANDIDATES * points, 20_000), rng)
     low, high = candidates[:, 2].min(), candidates[:, 2].max()
     candidates[:, 2] -= low
-    return _spread(candidates, points) * (height / (high - low))
+    return _spread(candidates, points) * float(height / (high - low))
 
 
 def half_width(points: NDArray[np.float64]) -> float:
@@ -137,13 +137,15 @@ def _area(part: Capsule | Ellipsoid) -> float:
 
 def _sample(part: Capsule | Ellipsoid, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
     """`count` points of a part's surface, even by area."""
-    ball = rng.normal(size=(count, 3))
+    ball: NDArray[np.float64] = rng.normal(size=(count, 3))
     ball /= np.linalg.norm(ball, axis=1)[:, None]
     if isinstance(part, Ellipsoid):
         half = np.asarray(part.half)
         # Directions on the unit ball are stretched unevenly: keep each by its share of the area there.
         weight = np.linalg.norm(ball / half, axis=1) * half.min()
-        return np.asarray(part.centre) + (ball * half)[rng.choice(count, count, p=weight / weight.sum())]
+        kept = rng.choice(count, count, p=weight / weight.sum())
+        stretched: NDArray[np.float64] = (ball * half)[kept] + np.asarray(part.centre)
+        return stretched
     a, b = np.asarray(part.a), np.asarray(part.b)
     length = float(np.linalg.norm(b - a))
     axis = (b - a) / length
@@ -154,7 +156,7 @@ def _sample(part: Capsule | Ellipsoid, count: int, rng: np.random.Generator) -> 
     radius = part.radius_a + along * (part.radius_b - part.radius_a)
     around = ball - (ball @ axis)[:, None] * axis
     around /= np.linalg.norm(around, axis=1)[:, None]
-    out = a + axis * (along * length)[:, None] + around * radius[:, None]
+    out: NDArray[np.float64] = a + axis * (along * length)[:, None] + around * radius[:, None]
     outward = np.sign(ball @ axis)[:, None]
     for which, end, radius_end, way in ((1, a, part.radius_a, -1.0), (2, b, part.radius_b, 1.0)):
         cap = end + ball * outward * way * radius_end
@@ -165,12 +167,15 @@ def _sample(part: Capsule | Ellipsoid, count: int, rng: np.random.Generator) -> 
 def _inside(part: Capsule | Ellipsoid, cloud: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Which points lie inside a part, by more than the thickness of a hair."""
     hair = 1e-4
+    inside: NDArray[np.bool_]
     if isinstance(part, Ellipsoid):
-        return (((cloud - part.centre) / (np.asarray(part.half) - hair)) ** 2).sum(axis=1) < 1
+        inside = (((cloud - part.centre) / (np.asarray(part.half) - hair)) ** 2).sum(axis=1) < 1
+        return inside
     a, b = np.asarray(part.a), np.asarray(part.b)
     along = np.clip((cloud - a) @ (b - a) / ((b - a) @ (b - a)), 0, 1)
     radius = part.radius_a + along * (part.radius_b - part.radius_a) - hair
-    return ((cloud - a - along[:, None] * (b - a)) ** 2).sum(axis=1) < radius * radius
+    inside = ((cloud - a - along[:, None] * (b - a)) ** 2).sum(axis=1) < radius * radius
+    return inside
 
 
 def _spread(cloud: NDArray[np.float64], count: int) -> NDArray[np.float64]:

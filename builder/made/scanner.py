@@ -1,12 +1,12 @@
 """A terrestrial laser scanner, by casting rays: shadows, density and noise come out as they do in the field.
 
 Each station turns a regular grid of azimuth and elevation, jittered a little, and keeps first hits. Then:
-ranges get normal noise; at a step in depth between neighbouring rays some returns are mixed, placed between
-the two depths; returns at grazing incidence are lost; coordinates are rounded to the lattice of 0.1 mm.
+ranges get normal noise; where a ray's footprint covers two surfaces at different depths the return is mixed,
+somewhere between the two; returns at grazing incidence are lost; coordinates are rounded to the lattice.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -24,12 +24,15 @@ BLOCK = 1 << 18
 # The tripod's own cone is blind, as with real scanners, and the zenith is left out.
 LOWEST, HIGHEST = math.radians(-60.0), math.radians(85.0)
 TRIAL_STEP = math.radians(1.0)
+# A ray is about this wide [rad]: divergence and the spot at the exit of a scanner together, 1 cm at 10 m.
+FOOTPRINT = 0.001
 # Two surfaces within one footprint give one range between them only where a scanner cannot tell the
-# returns apart; beyond GAP_HIGH it can. GAP_LOW is well above the noise.
+# returns apart; beyond GAP_HIGH it can. GAP_LOW is well above the noise, and above what a corner between two
+# walls makes of a footprint, which is no step in depth.
 GAP_LOW, GAP_HIGH = 0.05, 1.5
-MIXED_SHARE = 0.2
 GRAZING = 0.12
-FULL_REFLECTION_RANGE = 10.0
+# A surface seen squarely at this range has intensity 4095; nearer than NEAR it does not grow [m].
+FULL_REFLECTION_RANGE, NEAR = 10.0, 2.5
 
 
 class Place(NamedTuple):
@@ -52,11 +55,17 @@ class Scan(NamedTuple):
 
 
 class Returns(NamedTuple):
-    """First hits of a grid of rays: range (c, e) float64 [m], inf where none; cosine of the incidence."""
+    """First hits of rays (c, e): range [m], inf where none; unit directions and normals (c, e, 3)."""
 
-    directions: NDArray[np.float64]
     range: NDArray[np.float64]
-    cosine: NDArray[np.float64]
+    directions: NDArray[np.float64]
+    normals: NDArray[np.float64]
+
+    @property
+    def cosine(self) -> NDArray[np.float64]:
+        """Cosine of the incidence (c, e): 1 where a surface is met squarely."""
+        cosine: NDArray[np.float64] = np.einsum("cei,cei->ce", self.normals, self.directions)
+        return np.abs(cosine)
 
 
 class RayScene:
@@ -78,13 +87,12 @@ class RayScene:
         around, level = azimuth + place.yaw, np.cos(elevation)
         directions = np.stack([np.cos(around) * level, np.sin(around) * level, np.sin(elevation)], axis=-1)
         flat = directions.reshape(-1, 3).astype(np.float32)
-        origins = np.broadcast_to(np.float32(place.position), flat.shape).copy()
+        origins = np.tile(np.asarray(place.position, np.float32), (len(flat), 1))
         hits = self._scene.run(origins, flat, output=1)
         normals = hits["Ng"].astype(np.float64)
-        lengths = np.linalg.norm(normals, axis=1)
-        cosine = np.abs(np.einsum("ij,ij->i", normals, flat)) / np.maximum(lengths, 1e-30)
+        normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-30)[:, None]
         reach = np.where(hits["primID"] >= 0, hits["tfar"].astype(np.float64), np.inf)
-        return Returns(directions, reach.reshape(azimuth.shape), cosine.reshape(azimuth.shape))
+        return Returns(reach.reshape(azimuth.shape), directions, normals.reshape(directions.shape))
 
 
 def plan(scene: RayScene, places: Sequence[Place], points: int) -> tuple[float, list[int]]:
@@ -135,7 +143,9 @@ def _grid(step: float, first: int, last: int) -> tuple[NDArray[np.float64], NDAr
     return azimuth, elevation
 
 
-def _blocks(scene: RayScene, place: Place, step: float, key: Sequence[int]):
+def _blocks(
+    scene: RayScene, place: Place, step: float, key: Sequence[int]
+) -> Iterator[tuple[NDArray[np.float64], NDArray[np.uint16]]]:
     """Blocks of returned points (xyz, intensity) of one whole turn, a few columns at a time."""
     columns = int(2 * np.pi / step)
     rows = max(1, int((HIGHEST - LOWEST) / step) + 1)
@@ -143,42 +153,44 @@ def _blocks(scene: RayScene, place: Place, step: float, key: Sequence[int]):
     for number, first in enumerate(range(0, columns, wide)):
         rng = np.random.default_rng([*key, number])
         azimuth, elevation = _grid(step, first, min(first + wide, columns))
-        jitter = JITTER * step * rng.uniform(-1, 1, (2, *azimuth.shape))
-        returns = scene.cast(place, azimuth + jitter[0], elevation + jitter[1])
-        yield _points(place, returns, rng)
+        azimuth += JITTER * step * rng.uniform(-1, 1, azimuth.shape)
+        elevation += JITTER * step * rng.uniform(-1, 1, azimuth.shape)
+        returns = scene.cast(place, azimuth, elevation)
+        # A second ray somewhere on the rim of the footprint tells whether another surface shares it.
+        rim = rng.uniform(0, 2 * np.pi, azimuth.shape)
+        azimuth += FOOTPRINT / 2 * np.cos(rim) / np.cos(elevation)
+        elevation += FOOTPRINT / 2 * np.sin(rim)
+        reach = _mixed(returns, scene.cast(place, azimuth, elevation), rng)
+        yield _points(place, returns._replace(range=reach), rng)
 
 
 def _points(
     place: Place, returns: Returns, rng: np.random.Generator
 ) -> tuple[NDArray[np.float64], NDArray[np.uint16]]:
-    """The points of a block of returns: mixed, noisy, grazing ones lost, rounded to the lattice."""
-    reach = _mix(returns.range, rng)
+    """The points of a block of returns: noisy, grazing ones lost, rounded to the lattice."""
+    reach, cosine = returns.range, returns.cosine
     chance = rng.uniform(size=reach.shape)
     noise = rng.normal(0.0, NOISE, reach.shape)
     # The chance to come back falls linearly from 1 at GRAZING (83 degrees) to 0 at 90 degrees.
-    seen = np.isfinite(reach) & (chance * GRAZING <= returns.cosine)
+    seen = np.isfinite(reach) & (chance * GRAZING <= cosine)
     measured = (reach[seen] + noise[seen])[:, None]
     xyz = np.asarray(place.position) + returns.directions[seen] * measured
-    strength = (
-        returns.cosine[seen]
-        * (FULL_REFLECTION_RANGE / np.maximum(measured[:, 0], FULL_REFLECTION_RANGE / 4)) ** 2
-    )
-    intensity = np.rint(4095 * np.minimum(strength, 16.0)).astype(np.uint16)
+    # Near returns are damped, as detectors do: strength falls with 1/range, from NEAR on.
+    strength = cosine[seen] * (FULL_REFLECTION_RANGE / np.maximum(measured[:, 0], NEAR))
+    intensity = np.rint(4095 * strength).astype(np.uint16)
     return np.rint(xyz / LATTICE) * LATTICE, intensity
 
 
-def _mix(reach: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
-    """Some ranges at depth edges replaced by one between the two depths, mostly near the ray's own surface.
+def _mixed(returns: Returns, rim: Returns, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Ranges (c, e) [m], those of mixed returns drawn evenly between the ray's own surface and its rim's.
 
-    The next ray of the same column is the neighbour whose surface shares the footprint.
+    A step in depth is where either hit lies off the other's plane by GAP_LOW: on one slanting floor ranges
+    differ too, and around a corner of two walls one hit lies off one plane only.
     """
-    share = rng.uniform(size=reach.shape)
-    between = rng.uniform(size=reach.shape) ** 3
-    following = np.roll(reach, -1, axis=1)
-    following[:, -1] = np.inf
-    with np.errstate(invalid="ignore"):
-        gap = following - reach
-        mixed = (share < MIXED_SHARE) & (np.abs(gap) > GAP_LOW) & (np.abs(gap) < GAP_HIGH)
-    out = reach.copy()
-    out[mixed] += between[mixed] * gap[mixed]
-    return out
+    seen = np.isfinite(returns.range) & np.isfinite(rim.range)
+    here = np.where(seen, returns.range, 0.0)
+    gap = np.where(seen, rim.range, 0.0) - here
+    between = here[..., None] * (rim.directions - returns.directions) + gap[..., None] * rim.directions
+    off = np.minimum(*(np.abs(np.einsum("cei,cei->ce", n, between)) for n in (returns.normals, rim.normals)))
+    step = seen & (off > GAP_LOW) & (np.abs(gap) < GAP_HIGH)
+    return np.where(step, here + rng.uniform(size=gap.shape) * gap, returns.range)

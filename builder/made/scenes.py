@@ -16,7 +16,7 @@ from .write import check_target, open_target
 
 FEWEST, MOST = 1_000, 1_000_000_000
 # A station is held in memory while it is scanned (about 100 bytes a point): more points, more stations.
-MOST_PER_STATION = 2_000_000
+MOST_PER_STATION = 1_000_000
 # x, y and ground of the five stations of [Fig12]'s scene: four outside, from far to near, one in the nave.
 STATIONS = ((0.8, -13.0, 0.0), (-6.0, -8.6, 0.0), (5.6, -7.4, 0.0), (0.5, -3.4, 0.0), (0.4, 5.2, SILL))
 
@@ -47,7 +47,7 @@ def make_facade(
     door: float = 1.60,
     progress: Progress | None = None,
 ) -> MadeScene:
-    """Make the façade and scan it into exactly `points` points from five stations (more above 10^7 points).
+    """Make the façade and scan it into exactly `points` points, from five stations (more above 5 million).
 
     out: `.laz`, `.las` or `.e57` for one file, no suffix for a folder with a LAZ file a station; the truth is
     written beside it as `<name>.truth.json`.  door: clear width of the main door [m].

@@ -12,6 +12,7 @@ import numpy as np
 import trimesh
 
 from .facade import Facade, build_facade
+from .shapes import Parts
 from .truth import FacadeTruth
 
 # As dense as the paper's voxel, so that a larger town is more scene and not more points a metre.
@@ -50,12 +51,11 @@ def _house(seed: int, columns: int, number: int) -> Facade:
 def _surroundings(built: Callable[[int], Facade], number: int, columns: int, count: int) -> trimesh.Trimesh:
     """A façade and its up to eight neighbours as one mesh, in the frame of the façade."""
     row, column = divmod(number, columns)
-    meshes = []
+    parts = Parts()
     for down in (-1, 0, 1):
         for right in (-1, 0, 1):
             other = (row + down) * columns + column + right
             if row + down >= 0 and 0 <= column + right < columns and other < count:
-                mesh = built(other).mesh.copy()
-                mesh.vertices += (right * PITCH_X, down * PITCH_Y, 0.0)
-                meshes.append(mesh)
-    return trimesh.util.concatenate(meshes)
+                mesh = built(other).mesh
+                parts.add(np.add(mesh.vertices, (right * PITCH_X, down * PITCH_Y, 0.0)), mesh.faces)
+    return parts.mesh()

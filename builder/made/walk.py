@@ -37,7 +37,8 @@ def walk_poses(
     at = np.linspace(0.0, length[-1], frames)
     xy = np.column_stack([np.interp(at, length, path[:, k]) for k in range(2)])
     ahead = np.gradient(path, axis=0)
-    heading = np.interp(at, length, np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0])))
+    turned = _average(np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0])), int(ROUNDING / SPACING) | 1)
+    heading = np.interp(at, length, turned)
     height = np.interp(at, length, _heights(truth, path, length))
     # The avatar faces +y: turned by heading - 90 degrees, its cosine is the heading's sine.
     c, s = np.sin(heading), -np.cos(heading)

@@ -73,7 +73,10 @@ class LasFolder:
 
 
 class E57File:
-    """One E57 file with a posed scan a station: coordinates in the scanner's own frame, float64."""
+    """One E57 file with a posed scan a station: coordinates in the scanner's own frame.
+
+    pye57 stores them as float32, which moves a point by at most 1 um at 16 m, 1/100 of the lattice.
+    """
 
     def __init__(self, path: Path) -> None:
         self._file = pye57.E57(str(path), mode="w")

@@ -1,0 +1,81 @@
+"""The figure: its count, its size, and points spread evenly over its surface."""
+
+from pathlib import Path
+
+import numpy as np
+import plyfile
+import pytest
+import trimesh
+from scipy.spatial import cKDTree
+from solidcloud.builder.made.figure import figure_points, half_width, write_figure
+from solidcloud.schemas.errors import BadRequestError
+
+
+@pytest.mark.parametrize("points", [1, 500, 3617])
+def test_count_is_exact(points: int) -> None:
+    assert figure_points(points).shape == (points, 3)
+
+
+def test_figure_has_the_size_of_a_person() -> None:
+    figure = figure_points()
+    low, high = figure.min(axis=0), figure.max(axis=0)
+    assert low[2] == 0.0
+    assert high[2] == pytest.approx(1.75, abs=0.01)
+    assert 0.50 < high[0] - low[0] < 0.55
+    # A stride: feet before and behind the origin, heads up.
+    feet = figure[figure[:, 2] < 0.05]
+    assert feet[:, 1].min() < -0.2 and feet[:, 1].max() > 0.2
+    assert np.abs(figure[figure[:, 2] > 1.6, :2]).max() < 0.12
+
+
+def test_height_scales_all_of_it() -> None:
+    assert np.allclose(figure_points(200, height=3.5), 2 * figure_points(200), atol=1e-12)
+
+
+def test_points_are_two_centimetres_apart_and_even() -> None:
+    figure = figure_points()
+    nearest = cKDTree(figure).query(figure, k=2)[0][:, 1]
+    assert 0.016 < nearest.mean() < 0.022
+    assert nearest.min() > 0.8 * nearest.mean()
+    assert nearest.max() < 1.7 * nearest.mean()
+
+
+def test_points_lie_on_the_surface_alone() -> None:
+    """Seen from far away all around, nearly every point is among the first on its line of sight."""
+    figure = figure_points()
+    # Points inside the trunk: the trunk's axis is empty within 6 cm, at the chest, the waist and the thighs.
+    for z in (1.0, 1.1, 1.2, 1.3):
+        level = figure[np.abs(figure[:, 2] - z) < 0.04]
+        assert np.hypot(level[:, 0], level[:, 1]).min() > 0.06
+
+
+def test_same_seed_same_points() -> None:
+    assert np.array_equal(figure_points(300, seed=4), figure_points(300, seed=4))
+    assert not np.array_equal(figure_points(300, seed=4), figure_points(300, seed=5))
+
+
+def test_half_width_is_the_farthest_reach_aside() -> None:
+    assert half_width(np.array([[0.1, 5.0, 0.0], [-0.3, 0.0, 0.0]])) == 0.3
+
+
+def test_files_read_back_to_the_same_bits(tmp_path: Path) -> None:
+    figure = figure_points(300)
+    write_figure(tmp_path / "al.obj", figure)
+    write_figure(tmp_path / "al.ply", figure)
+    rows = [
+        line.split()[1:] for line in (tmp_path / "al.obj").read_text().splitlines() if line.startswith("v ")
+    ]
+    assert np.array_equal(np.array(rows, float), figure)
+    vertices = plyfile.PlyData.read(tmp_path / "al.ply")["vertex"]
+    assert np.array_equal(np.column_stack([vertices[axis] for axis in "xyz"]), figure)
+    assert np.array_equal(trimesh.load(tmp_path / "al.ply").vertices, figure)
+
+
+def test_what_cannot_be_made_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(BadRequestError, match="expected 1 to 100000 points"):
+        figure_points(0)
+    with pytest.raises(BadRequestError, match=r"0\.1 to 10 m"):
+        figure_points(height=float("nan"))
+    with pytest.raises(BadRequestError, match=r"expected \.obj or \.ply"):
+        write_figure(tmp_path / "al.stl", figure_points(10))
+    assert list(tmp_path.iterdir()) == []

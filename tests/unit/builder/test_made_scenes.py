@@ -1,0 +1,150 @@
+"""What scenes write: exact counts, the same points in every format, and nothing half-written."""
+
+from pathlib import Path
+
+import laspy
+import numpy as np
+import pye57
+import pytest
+from numpy.typing import NDArray
+from solidcloud.builder.made.scanner import LATTICE, NOISE
+from solidcloud.builder.made.scenes import MadeScene, make_facade, make_town
+from solidcloud.builder.made.truth import SceneTruth, read_truth
+from solidcloud.schemas.errors import BadRequestError, ScanError
+
+
+def points_of(scene: MadeScene) -> NDArray[np.float64]:
+    """All points of LAZ or LAS files, in the order of the files."""
+    return np.concatenate([np.asarray(laspy.read(path).xyz) for path in scene.paths])
+
+
+@pytest.fixture(scope="module")
+def facade(tmp_path_factory: pytest.TempPathFactory) -> tuple[MadeScene, NDArray[np.float64], SceneTruth]:
+    """The façade in 150,000 points, as one LAZ file."""
+    scene = make_facade(tmp_path_factory.mktemp("facade") / "hall.laz", points=150_000)
+    return scene, points_of(scene), read_truth(scene.truth)
+
+
+@pytest.mark.parametrize("points", [1_000, 5_003, 20_000])
+def test_count_is_exact(tmp_path: Path, points: int) -> None:
+    scene = make_facade(tmp_path / "hall.las", points=points)
+    assert scene.points == len(points_of(scene)) == points
+
+
+def test_truth_lies_beside_the_scan_and_reads_back(facade) -> None:
+    scene, xyz, truth = facade
+    assert scene.truth == scene.paths[0].with_name("hall.truth.json")
+    assert truth.points == len(xyz) and truth.seed == 2012 and truth.noise == NOISE
+    assert truth.facades[0].door("main").width == pytest.approx(1.60, abs=1e-12)
+    assert sum(station.points for station in truth.stations) == len(xyz)
+
+
+def test_stations_are_told_by_their_number(facade) -> None:
+    scene, _, truth = facade
+    source = np.asarray(laspy.read(scene.paths[0]).point_source_id)
+    assert [(s.number, s.points) for s in truth.stations] == [
+        (number, int((source == number).sum())) for number in range(1, 6)
+    ]
+    inside = [station for station in truth.stations if station.position[1] > 1.2]
+    assert len(inside) == 1 and inside[0].position[2] == pytest.approx(truth.facades[0].floor + 1.7)
+
+
+def test_jambs_in_the_scan_lie_within_noise_of_the_truth(facade) -> None:
+    _, xyz, truth = facade
+    for door in truth.facades[0].doors[:1]:
+        inside = (xyz[:, 1] > door.y_front + 0.05) & (xyz[:, 1] < door.y_back - 0.05)
+        inside &= (xyz[:, 2] > door.sill + 0.05) & (xyz[:, 2] < door.springing)
+        for plane, side in ((door.x_left, -1), (door.x_right, 1)):
+            near = xyz[inside & (np.abs(xyz[:, 0] - plane) < 0.1), 0] - plane
+            assert len(near) > 20
+            assert abs(np.median(near)) < 1e-3
+            # What stands out of the jamb into the door is noise, and mixed points are few.
+            assert (side * near < -5 * NOISE).mean() < 0.02
+
+
+def test_same_seed_same_bytes_and_another_seed_others(tmp_path: Path) -> None:
+    one, two = (make_facade(tmp_path / name, points=3_000, seed=5) for name in ("a.laz", "b.laz"))
+    other = make_facade(tmp_path / "c.laz", points=3_000, seed=6)
+    assert one.paths[0].read_bytes() == two.paths[0].read_bytes()
+    assert one.truth.read_bytes() == two.truth.read_bytes()
+    assert not np.array_equal(points_of(one), points_of(other))
+
+
+def test_every_format_holds_the_same_points(tmp_path: Path) -> None:
+    laz = points_of(make_facade(tmp_path / "hall.laz", points=5_000))
+    las = points_of(make_facade(tmp_path / "plain.las", points=5_000))
+    folder = make_facade(tmp_path / "stations", points=5_000)
+    e57 = make_facade(tmp_path / "hall.e57", points=5_000)
+    assert np.array_equal(laz, las)
+    assert len(folder.paths) == 5 and np.array_equal(laz, points_of(folder))
+    file = pye57.E57(str(e57.paths[0]))
+    scans = [file.read_scan(k, ignore_missing_fields=True, transform=True) for k in range(file.scan_count)]
+    posed = np.concatenate([np.column_stack([s[f"cartesian{axis}"] for axis in "XYZ"]) for s in scans])
+    local = file.read_scan_raw(0)
+    file.close()
+    assert len(scans) == 5
+    assert np.abs(posed - laz).max() < LATTICE / 50
+    # Stored in the scanner's own frame: turned and moved.
+    assert np.abs(local["cartesianX"] - laz[: len(local["cartesianX"]), 0]).max() > 1
+
+
+def test_progress_ends_at_the_count(tmp_path: Path) -> None:
+    seen: list[tuple[int, int]] = []
+    make_facade(tmp_path / "hall.laz", points=2_000, progress=lambda done, whole: seen.append((done, whole)))
+    assert seen[-1] == (2_000, 2_000) and len(seen) == 5
+    assert [done for done, _ in seen] == sorted({done for done, _ in seen})
+
+
+@pytest.mark.parametrize("name", ["hall.laz", "hall.e57", "hall"])
+def test_stopped_in_the_middle_leaves_nothing(tmp_path: Path, name: str) -> None:
+    def stop(done: int, whole: int) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        make_facade(tmp_path / name, points=2_000, progress=stop)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_refusals_say_what_was_expected(tmp_path: Path) -> None:
+    with pytest.raises(BadRequestError, match=r"cannot write '\.ply': expected \.laz, \.las, \.e57"):
+        make_facade(tmp_path / "hall.ply")
+    with pytest.raises(BadRequestError, match="expected 1000 to"):
+        make_facade(tmp_path / "hall.laz", points=10)
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "something").touch()
+    with pytest.raises(BadRequestError, match="new or an empty folder"):
+        make_town(tmp_path / "full", points=2_000)
+    with pytest.raises(ScanError, match="not the truth of a made scene"):
+        read_truth_of(tmp_path, "{}")
+    with pytest.raises(ScanError, match="cannot be read"):
+        read_truth(tmp_path / "nowhere.truth.json")
+
+
+def read_truth_of(folder: Path, text: str) -> SceneTruth:
+    """Read a truth file of this text."""
+    (folder / "broken.truth.json").write_text(text)
+    return read_truth(folder / "broken.truth.json")
+
+
+def test_town_has_its_count_and_every_facade_its_own_place(tmp_path: Path) -> None:
+    town = make_town(tmp_path / "town", points=4_001)
+    truth = read_truth(town.truth)
+    assert town.points == len(points_of(town)) == 4_001
+    assert len(truth.facades) == 2 and len(town.paths) == len(truth.stations) == 10
+    assert truth.facades[0].seed != truth.facades[1].seed
+    for station, path in zip(truth.stations, town.paths, strict=True):
+        las = laspy.read(path)
+        assert len(las.points) == station.points
+        assert set(np.asarray(las.point_source_id)) == {station.number}
+        origin = np.asarray(truth.facades[(station.number - 1) // 5].origin)
+        spot = np.asarray(station.position) - origin
+        assert abs(spot[0]) < 9 and -16 < spot[1] < 10
+        assert abs(np.median(np.asarray(las.xyz)[:, 0]) - origin[0]) < 9
+
+
+def test_neighbours_in_a_town_are_seen(tmp_path: Path) -> None:
+    """The last façade's stations see points on the first one's side of the lane."""
+    town = make_town(tmp_path / "town.laz", points=20_000)
+    las = laspy.read(town.paths[0])
+    x, source = np.asarray(las.x), np.asarray(las.point_source_id)
+    assert (x[source > 5] < 10.0).any()

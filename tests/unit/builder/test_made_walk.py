@@ -1,0 +1,106 @@
+"""The walk: rigid and continuous, feet above the floor, through the door, in contact where it means to."""
+
+from pathlib import Path
+
+import laspy
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+from solidcloud.builder.made.facade import build_facade
+from solidcloud.builder.made.figure import figure_points, half_width
+from solidcloud.builder.made.scenes import make_facade
+from solidcloud.builder.made.walk import SIDE, SOLE, floor_height, walk_poses
+
+TRUTH = build_facade().truth
+FIGURE = figure_points()
+
+
+def test_walk_takes_forty_seconds_in_1200_poses() -> None:
+    times, poses = walk_poses(TRUTH)
+    assert poses.shape == (1200, 4, 4) and poses.dtype == np.float64
+    assert np.array_equal(times, np.arange(1200) / 30.0)
+    assert walk_poses(TRUTH, frames=90, rate=10.0)[1].shape == (90, 4, 4)
+
+
+def test_poses_are_rigid_and_upright() -> None:
+    _, poses = walk_poses(TRUTH)
+    turn = poses[:, :3, :3]
+    assert np.abs(turn @ turn.transpose(0, 2, 1) - np.eye(3)).max() < 1e-12
+    assert np.abs(np.linalg.det(turn) - 1).max() < 1e-12
+    assert (poses[:, 2, :3] == [0, 0, 1]).all() and (poses[:, 3] == [0, 0, 0, 1]).all()
+
+
+def test_walk_is_continuous_at_a_humans_speed() -> None:
+    _, poses = walk_poses(TRUTH)
+    step = np.diff(poses[:, :3, 3], axis=0)
+    assert np.linalg.norm(step[:, :2], axis=1).max() < 2.0 / 30
+    assert 1.2 < 30 * np.linalg.norm(step, axis=1).mean() < 1.6
+    heading = np.unwrap(np.arctan2(poses[:, 1, 1], poses[:, 0, 1]))
+    assert np.abs(np.diff(heading)).max() < np.deg2rad(15)
+
+
+def test_figure_faces_the_way_it_goes() -> None:
+    _, poses = walk_poses(TRUTH)
+    step = np.diff(poses[:, :2, 3], axis=0)
+    facing = poses[:-1, :2, 1]
+    cosine = np.einsum("ij,ij->i", step, facing) / np.linalg.norm(step, axis=1)
+    assert cosine.min() > 0.95
+
+
+def test_feet_are_three_centimetres_above_the_floor() -> None:
+    _, poses = walk_poses(TRUTH)
+    below = np.array([-0.39, -0.2, 0.0, 0.2, 0.39])
+    reach = np.stack([poses[:, :2, 3] + along * poses[:, :2, 1] for along in below])
+    floors = np.stack([floor_height(TRUTH, spots) for spots in reach])
+    sole = poses[:, 2, 3] + FIGURE[:, 2].min()
+    assert (sole - floors.max(axis=0)).min() > SOLE - 1e-9
+    flat = np.ptp(floors, axis=0) == 0
+    assert np.median((sole - floors[0])[flat]) == pytest.approx(SOLE, abs=1e-12)
+    assert floors.max() == TRUTH.floor and floors.min() == 0.0
+
+
+@pytest.mark.parametrize("width", [1.00, 1.60, 2.40])
+def test_walk_goes_through_the_open_door_both_ways(width: float) -> None:
+    truth = build_facade(door=width).truth
+    _, poses = walk_poses(truth)
+    door = truth.door("main")
+    x, y = poses[:, 0, 3], poses[:, 1, 3]
+    within = (y > door.y_front) & (y < door.y_back)
+    within &= np.abs(x) < 3
+    assert (np.abs(x[within]) < width / 2 - SIDE + 0.02).all()
+    ways = poses[within, 1, 1]
+    assert (ways > 0.9).any() and (ways < -0.9).any()
+    # In along the middle.
+    assert np.abs(x[within][ways > 0.9]).max() < 0.02
+
+
+def test_the_side_is_that_of_the_figure() -> None:
+    assert half_width(FIGURE) == pytest.approx(SIDE, abs=5e-4)
+
+
+def test_walk_follows_the_facade_to_its_place() -> None:
+    here = walk_poses(TRUTH)[1]
+    there = walk_poses(build_facade(origin=(20.0, -32.0, 1.0)).truth)[1]
+    assert np.allclose(there[:, :3, 3] - here[:, :3, 3], (20.0, -32.0, 1.0), atol=1e-12)
+    assert np.array_equal(there[:, :3, :3], here[:, :3, :3])
+
+
+def test_a_tenth_of_the_walk_is_in_contact(tmp_path: Path) -> None:
+    """On the paper's count of points; radii are half the mean closest-point distances ([Fig12])."""
+    scene = make_facade(tmp_path / "hall.laz")
+    cloud = np.asarray(laspy.read(scene.paths[0]).xyz)
+    tree = cKDTree(cloud)
+    sample = cloud[:: len(cloud) // 20_000]
+    reach = (
+        tree.query(sample, k=2)[0][:, 1].mean() / 2 + cKDTree(FIGURE).query(FIGURE, k=2)[0][:, 1].mean() / 2
+    )
+    assert reach < SOLE - 0.003
+    poses = walk_poses(TRUTH)[1][::10]
+    placed = np.einsum("kij,nj->kni", poses[:, :3, :3], FIGURE) + poses[:, None, :3, 3]
+    nearest = tree.query(placed, distance_upper_bound=0.1)[0].min(axis=1)
+    touched = nearest <= reach
+    assert 80 / 10 <= touched.sum() <= 150 / 10
+    assert (nearest < 0.1).mean() > 0.8
+    # It touches outside, in the door and in the nave.
+    y = poses[touched, 1, 3]
+    assert (y < -5).any() and ((y > 0) & (y < 1.2)).any() and (y > 5).any()

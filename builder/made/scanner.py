@@ -19,7 +19,7 @@ LATTICE = 0.0001
 TRIPOD = 1.7
 NOISE = 0.002
 JITTER = 0.2
-# Rays cast at once: bounds memory (about 200 bytes a ray) and fixes which random numbers a ray gets.
+# Rays cast at once: bounds memory (about 300 bytes a ray) and fixes which random numbers a ray gets.
 BLOCK = 1 << 18
 # The tripod's own cone is blind, as with real scanners, and the zenith is left out.
 LOWEST, HIGHEST = math.radians(-60.0), math.radians(85.0)

@@ -41,9 +41,8 @@ def test_points_are_two_centimetres_apart_and_even() -> None:
 
 
 def test_points_lie_on_the_surface_alone() -> None:
-    """Seen from far away all around, nearly every point is among the first on its line of sight."""
+    """Nothing buried where parts overlap: the trunk's axis is empty within 6 cm, from hips to chest."""
     figure = figure_points()
-    # Points inside the trunk: the trunk's axis is empty within 6 cm, at the chest, the waist and the thighs.
     for z in (1.0, 1.1, 1.2, 1.3):
         level = figure[np.abs(figure[:, 2] - z) < 0.04]
         assert np.hypot(level[:, 0], level[:, 1]).min() > 0.06

@@ -145,6 +145,7 @@ def _write_frame(group: h5py.Group, name: str, frame: bytes, rows: int, dtype: n
     properties = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
     properties.set_chunk((rows,))
     properties.set_shuffle()
+    properties.set_obj_track_times(False)  # two builds of the same points compare equal
     # Optional: this process may lack the filter plugin, as the frame is made already.
     properties.set_filter(ZSTD_FILTER, h5py.h5z.FLAG_OPTIONAL, (3,))
     space = h5py.h5s.create_simple((rows,))
@@ -171,13 +172,14 @@ def write_shard(
         file.attrs["format"] = "solidcloud shard"
         file.attrs["format_version"] = np.uint32(FORMAT_VERSION)
         file.attrs["archive_id"] = np.frombuffer(archive_id, np.uint8)
+        parent = file.create_group("voxels", track_times=False)
         for voxel, record, low, high in voxels:
             dtypes = (
                 CELL_DTYPE,
                 NODE_DTYPE,
                 point_dtype(scan_index=voxel.scan_index is not None, intensity=voxel.intensity is not None),
             )
-            group = file.create_group(f"voxels/{voxel.key:016x}")
+            group = parent.create_group(f"{voxel.key:016x}", track_times=False)
             counts = (record.cell_rows, record.node_rows, record.point_rows)
             frames = (record.cells, record.nodes, record.points)
             row = np.zeros((), VOXEL_DTYPE)

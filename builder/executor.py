@@ -1,0 +1,68 @@
+"""Runs pure work units: in this process, or in a pool of processes. Results come in the order of the units."""
+
+import multiprocessing
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from typing import TypeVar
+
+from .progress import Progress
+
+Unit = TypeVar("Unit")
+Result = TypeVar("Result")
+
+# Below this many points a second process costs more (1 to 2 s to start and to load the kernels) than it saves.
+POINTS_WORTH_A_PROCESS = 4_000_000
+
+
+def worker_count(jobs: int, points: int) -> int:
+    """Processes to use: as asked, or, for 0, one a core where the points are worth it."""
+    if jobs:
+        return jobs
+    return min(os.cpu_count() or 1, max(1, points // POINTS_WORTH_A_PROCESS))
+
+
+class Executor:
+    """Maps a picklable function over work units. A context manager; with one job nothing is started."""
+
+    def __init__(self, jobs: int) -> None:
+        """Use `jobs` processes."""
+        self.jobs = jobs
+        # Spawned, not forked: a fork copies locks that other threads hold, such as a progress bar's.
+        context = multiprocessing.get_context("spawn")
+        self._pool = ProcessPoolExecutor(jobs, mp_context=context) if jobs > 1 else None
+
+    def __enter__(self) -> "Executor":
+        """The executor itself."""
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        """Stop the processes; after a failure, without starting what still waits."""
+        if self._pool is not None:
+            self._pool.shutdown(wait=True, cancel_futures=kind is not None)
+
+    def map(
+        self,
+        function: Callable[[Unit], Result],
+        units: Sequence[Unit],
+        progress: Progress,
+        size: Callable[[Unit], int],
+    ) -> Iterator[Result]:
+        """function(unit) for each unit, in order; progress advances by size(unit) as each result is taken.
+
+        At most four units a process are handed out ahead, so that results waiting their turn stay bounded.
+        """
+        if self._pool is None:
+            for unit in units:
+                yield function(unit)
+                progress.advance(size(unit))
+            return
+        ahead = 4 * self.jobs
+        futures = [self._pool.submit(function, unit) for unit in units[:ahead]]
+        for i, unit in enumerate(units):
+            result = futures[i].result()
+            futures[i] = None  # type: ignore[call-overload]
+            if i + ahead < len(units):
+                futures.append(self._pool.submit(function, units[i + ahead]))
+            yield result
+            progress.advance(size(unit))

@@ -1,0 +1,368 @@
+"""Scans -> archive: survey, spool, voxels, radius, verify, publish. builder/DESIGN.md says what each pass holds.
+
+Everything is made in a hidden folder beside the target and renamed at the end: there is never half an archive
+under the name asked for, and a failure leaves nothing behind.
+"""
+
+import fcntl
+import hashlib
+import json
+import os
+import shutil
+import time
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from ..schemas.archive import INDEX_NAME, SHARD_FOLDER, Archive, Header, Source, sync_folder, write_index
+from ..schemas.errors import BadRequestError, CorruptError, ScanError, SolidcloudError
+from ..schemas.voxel_grid import Lattice
+from .config import RADIUS_SAMPLE, BuildConfig
+from .executor import Executor, worker_count
+from .partition import (
+    SPOOL_BYTES_A_POINT,
+    Run,
+    Spooled,
+    SpoolUnit,
+    Survey,
+    choose_lattice,
+    open_all,
+    spool_dtype,
+    spool_scan,
+    survey_scan,
+    unopened,
+)
+from .progress import Progress, Silent
+from .radius import MeanDistance, archive_sums, mean_of_squares
+from .shards import Shard, ShardUnit, build_shard, plan_shards
+from .sources import scan_files
+from .verify import verify_archive
+
+# Bytes a point that building one voxel holds at its peak (measured with 10^7 points in one voxel: 128).
+VOXEL_BYTES_A_POINT = 160
+# Bytes a point on disk at the end, at most (5 is the goal at 0.1 mm), to refuse a build that cannot finish.
+ARCHIVE_BYTES_A_POINT = 6
+
+
+class BuildSummary(NamedTuple):
+    """What was built. bytes: of the archive.  stages: seconds of each.  skipped: reason -> points left out.
+
+    lattice_step, moved_max, radius, radius_error: [m], see schemas/archive.py Header.  faults: scans left out.
+    """
+
+    archive: Path
+    points: int
+    voxels: int
+    shards: int
+    bytes: int
+    seconds: float
+    stages: dict[str, float]
+    lattice_step: float
+    lattice_source: str
+    moved_max: float
+    radius: float
+    radius_error: float
+    skipped: dict[str, int]
+    faults: tuple[str, ...]
+
+
+class _Stages:
+    """Times the stages and passes them on to the listener."""
+
+    def __init__(self, progress: Progress) -> None:
+        self.progress = progress
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def stage(self, name: str, total: int, unit: str) -> Iterator[None]:
+        begin = time.perf_counter()
+        self.progress.start(name, total, unit)
+        try:
+            yield
+        finally:
+            self.progress.finish()
+            self.seconds[name] = time.perf_counter() - begin
+
+
+def build_archive(
+    paths: Sequence[Path], target: Path, config: BuildConfig, progress: Progress | None = None
+) -> BuildSummary:
+    """Build an archive in the folder `target` from scan files and folders of them.
+
+    The archive's bytes depend on the points, their files' content and the options in `config.identity()`; not on
+    the order of paths, the number of jobs or the memory bound. Raises ScanError naming every scan that cannot be
+    used (with `skip_bad` they are left out and their region is unknown), BadRequestError for impossible options, and
+    leaves nothing behind then.
+    """
+    begin = time.perf_counter()
+    target = Path(target)
+    _check_target(target, config.overwrite)
+    stages = _Stages(progress or Silent())
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with _lock(target), _workplace(target) as folder:
+        surveys, faulty = _survey(scan_files(paths), config, stages)
+        lattice, lattice_source = choose_lattice(surveys, config)
+        points = sum(s.count for s in surveys)
+        jobs = worker_count(config.jobs, points)
+        _check_space(target.parent, points, config)
+        with Executor(jobs) as executor:
+            spooled = _spool(surveys, lattice, folder, executor, config, stages)
+            header = _header(surveys, faulty, spooled, lattice, lattice_source, config)
+            header, shards = _build_voxels(spooled, header, folder, executor, config, stages)
+            header = _measure_radius(header, shards, folder, executor, config, stages)
+        shutil.rmtree(folder / "spool")
+        report = verify_archive(folder, progress=stages.progress)
+        if report.faults:
+            raise CorruptError(f"{report.faults[0]}: what was written is not what reads back: check disk and memory")
+        _publish(folder, target, config.overwrite)
+    return BuildSummary(
+        archive=target,
+        points=header.points,
+        voxels=sum(len(s.rows) for s in shards),
+        shards=len(shards),
+        bytes=sum(f.stat().st_size for f in target.rglob("*.h5")),
+        seconds=time.perf_counter() - begin,
+        stages=stages.seconds,
+        lattice_step=lattice.step,
+        lattice_source=lattice_source,
+        moved_max=header.moved_max,
+        radius=header.radius,
+        radius_error=header.radius_error,
+        skipped=dict(sum((Counter(s.skipped) for s in header.sources), Counter())),
+        faults=tuple(s.fault for s in header.sources if s.fault),
+    )
+
+
+def _check_target(target: Path, overwrite: bool) -> None:
+    """Refuse to write where something else is."""
+    if not target.exists() or (target.is_dir() and not any(target.iterdir())):
+        return
+    if not (target / INDEX_NAME).is_file():
+        raise BadRequestError(f"{target}: exists and is no archive, expected a new folder: give another -o")
+    if not overwrite:
+        raise BadRequestError(f"{target}: an archive is here already: give another -o, or --overwrite")
+
+
+@contextmanager
+def _lock(target: Path) -> Iterator[None]:
+    """Keep a second builder off the same target."""
+    path = target.parent / f".{target.name}.lock"
+    while True:
+        file = open(path, "w")
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            file.close()
+            raise BadRequestError(f"{target}: another build is writing it: wait for it, or give another -o") from None
+        # The holder before us may have removed the file we just locked: then lock the one that is there now.
+        if path.exists() and os.fstat(file.fileno()).st_ino == path.stat().st_ino:
+            break
+        file.close()
+    try:
+        yield
+    finally:
+        path.unlink(missing_ok=True)
+        file.close()
+
+
+@contextmanager
+def _workplace(target: Path) -> Iterator[Path]:
+    """The hidden folder that the archive is made in; what an earlier, killed build left there goes first."""
+    folder = target.parent / f".{target.name}.building"
+    shutil.rmtree(folder, ignore_errors=True)
+    (folder / SHARD_FOLDER).mkdir(parents=True)
+    (folder / "spool").mkdir()
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _publish(folder: Path, target: Path, overwrite: bool) -> None:
+    """Give the finished folder its name."""
+    sync_folder(folder)
+    if target.exists() and overwrite and (target / INDEX_NAME).is_file():
+        old = target.parent / f".{target.name}.old"
+        shutil.rmtree(old, ignore_errors=True)
+        os.rename(target, old)
+        os.rename(folder, target)
+        shutil.rmtree(old)
+    else:
+        os.rename(folder, target)  # replaces an empty folder
+    sync_folder(target.parent)
+
+
+def _survey(paths: list[Path], config: BuildConfig, stages: _Stages) -> tuple[list[Survey], list[Survey]]:
+    """Read every scan once; returns the usable ones, in an order of their content, and the faulty ones."""
+    opened = [(path, *open_all(path, config.spacing)) for path in paths]
+    scans = [scan for _, found, _ in opened for scan in found]
+    total = sum(scan.declared_count or 0 for scan in scans)
+    with stages.stage("survey", total, "points"):
+        surveys = [survey_scan(scan, stages.progress.advance) for scan in scans]
+    for path, found, fault in opened:
+        if not found:
+            surveys.append(unopened(path, fault or f"{path}: holds no scan, expected at least one: leave it out"))
+    good = sorted((s for s in surveys if not s.fault), key=_content_order)
+    faulty = sorted((s for s in surveys if s.fault), key=_content_order)
+    if faulty and not config.skip_bad:
+        more = "" if len(faulty) == 1 else "".join(f"\n  {s.fault}" for s in faulty[1:])
+        raise ScanError(f"{faulty[0].fault}{more} (--skip-bad leaves such scans out and marks their region unknown)")
+    if not good:
+        raise ScanError(f"{paths[0] if paths else 'nothing'}: no usable scan, expected at least one: check the files")
+    wrong = sum(s.not_finite for s in good)
+    if wrong and config.strict:
+        first = next(s for s in good if s.not_finite)
+        raise ScanError(f"{first.path}: {wrong} points that are not finite, expected none with --strict: clean the scan")
+    return good, faulty
+
+
+def _content_order(survey: Survey) -> tuple[str, int, str]:
+    """Scans are numbered by their files' content, so that the order they are given in changes nothing."""
+    return survey.sha256, survey.scan.index if survey.scan else -1, str(survey.path)
+
+
+def _check_space(folder: Path, points: int, config: BuildConfig) -> None:
+    """Refuse a build whose spool and archive cannot fit on the disk."""
+    needed = points * (spool_dtype(config).itemsize + ARCHIVE_BYTES_A_POINT)
+    free = shutil.disk_usage(folder).free
+    if needed > free:
+        raise SolidcloudError(f"{folder}: {free} bytes free, the build needs about {needed}: make room or use another disk")
+
+
+def _spool(
+    surveys: list[Survey], lattice: Lattice, folder: Path, executor: Executor, config: BuildConfig, stages: _Stages
+) -> list[Spooled]:
+    """Second pass: quantised points, sorted into voxels, on disk."""
+    run_points = max(1 << 16, config.memory_bytes // (executor.jobs * SPOOL_BYTES_A_POINT))
+    units = [
+        SpoolUnit(s.scan, number, s.count, lattice, config, folder / "spool", run_points)
+        for number, s in enumerate(surveys)
+        if s.scan is not None
+    ]
+    with stages.stage("spool", sum(s.count for s in surveys), "points"):
+        return list(executor.map(spool_scan, units, stages.progress, lambda unit: unit.count))
+
+
+def _header(
+    surveys: list[Survey],
+    faulty: list[Survey],
+    spooled: list[Spooled],
+    lattice: Lattice,
+    lattice_source: str,
+    config: BuildConfig,
+) -> Header:
+    """What is known before any voxel is built; the radius comes later."""
+    low = lattice.to_lattice(np.min([s.low for s in surveys], axis=0)[None])[0]
+    high = lattice.to_lattice(np.max([s.high for s in surveys], axis=0)[None])[0]
+    content = [sum(s.content[i] for s in spooled) % (1 << 64) for i in range(2)]
+    identity = json.dumps(config.identity(), sort_keys=True).encode()
+    origin = np.array([*lattice.origin, lattice.step], "<f8").tobytes()
+    archive_id = hashlib.sha256(identity + origin + np.array(content, "<u8").tobytes()).digest()[:16]
+    sources = [
+        Source(
+            str(s.path), s.scan.index, s.scan.format, s.sha256, s.count, s.scan.pose,
+            {**spool.dropped, **({"not finite": s.not_finite} if s.not_finite else {})},
+        )
+        for s, spool in zip(surveys, spooled, strict=True)
+        if s.scan is not None
+    ]  # fmt: skip
+    sources += [
+        Source(str(s.path), s.scan.index if s.scan else 0, s.scan.format if s.scan else "", s.sha256, 0, np.eye(4), {}, s.fault)
+        for s in faulty
+    ]
+    lost = [s for s in faulty if not s.empty]
+    boxes = [np.stack([lattice.to_lattice(s.region[:1])[0] - 1, lattice.to_lattice(s.region[1:])[0] + 1]) for s in lost if s.region is not None]
+    return Header(
+        archive_id=archive_id,
+        lattice=lattice,
+        lattice_source=lattice_source,
+        points=sum(s.count for s in surveys),
+        low=low,
+        high=high,
+        radius=0.0,
+        radius_model="mean" if config.radius is None else "given",
+        radius_error=0.0,
+        radius_sample=0,
+        moved_max=max(s.moved_max for s in spooled),
+        degree=config.degree,
+        leaf=config.leaf,
+        scan_index="scan" in config.keep,
+        intensity="intensity" in config.keep,
+        options=config.identity(),
+        sources=tuple(sources),
+        unknown=np.array(boxes, np.int64).reshape(-1, 2, 3),
+        unknown_everywhere=any(s.region is None for s in lost),
+    )
+
+
+def _build_voxels(
+    spooled: list[Spooled], header: Header, folder: Path, executor: Executor, config: BuildConfig, stages: _Stages
+) -> tuple[Header, list[Shard]]:
+    """Third pass: every voxel's octree and hierarchies, into shards."""
+    runs: tuple[Run, ...] = tuple(run for s in spooled for run in s.runs)
+    keys, where = np.unique(np.concatenate([run.keys for run in runs]), return_inverse=True)
+    counts = np.bincount(where, np.concatenate([np.diff(run.starts) for run in runs])).astype(np.int64)
+    densest = int(counts.max())
+    if densest * VOXEL_BYTES_A_POINT * executor.jobs > config.memory_bytes:
+        raise BadRequestError(
+            f"a voxel of {densest} points takes about {densest * VOXEL_BYTES_A_POINT >> 20} MB to build, "
+            f"{executor.jobs} at a time: give a smaller --voxel, a larger --memory or fewer --jobs"
+        )
+    units = [
+        ShardUnit(
+            number, plan, points, runs, header.lattice.voxel_steps, config, header.archive_id, folder / SHARD_FOLDER
+        )
+        for number, (plan, points) in enumerate(plan_shards(keys, counts))
+    ]
+    with stages.stage("build", header.points, "points"):
+        shards = list(executor.map(build_shard, units, stages.progress, lambda unit: unit.points))
+    return header, shards
+
+
+class _RadiusUnit(NamedTuple):
+    """A run of voxels to measure closest-point distances in."""
+
+    folder: Path
+    rows: range
+    share: float
+    points: int
+
+
+def _radius_sums(unit: _RadiusUnit) -> tuple[int, int, int]:
+    """`archive_sums` of a run of voxels, in any process."""
+    with Archive(unit.folder) as archive:
+        return archive_sums(archive, unit.rows, unit.share, lambda: None)
+
+
+def _measure_radius(
+    header: Header, shards: list[Shard], folder: Path, executor: Executor, config: BuildConfig, stages: _Stages
+) -> Header:
+    """Fourth pass: the mean closest-point distance over what is stored; then the final index is written."""
+    rows = np.concatenate([s.rows for s in shards])
+    names = [(s.name, s.size) for s in shards]
+    if config.radius is not None:
+        header = replace(header, radius=config.radius)
+        write_index(folder, header, rows, names)
+        return header
+    write_index(folder, header, rows, names)  # for the workers to read by; nobody else sees this folder
+    share = min(1.0, RADIUS_SAMPLE / header.points)
+    points = rows["rows"][:, 2].astype(np.int64)
+    cuts = np.searchsorted(np.cumsum(points), np.arange(1, 65) * header.points / 64, side="left") + 1
+    edges = np.unique(np.concatenate([[0], np.minimum(cuts, len(rows))]))
+    units = [
+        _RadiusUnit(folder, range(int(a), int(b)), share, int(points[a:b].sum())) for a, b in zip(edges[:-1], edges[1:], strict=True)
+    ]
+    with stages.stage("radius", header.points, "points"):
+        sums = list(executor.map(_radius_sums, units, stages.progress, lambda unit: unit.points))
+    total, squares, sample = (sum(s[i] for s in sums) for i in range(3))
+    found: MeanDistance = mean_of_squares(total, squares, sample, share >= 1.0)
+    if sample == 0:
+        raise BadRequestError("a single distinct point has no closest point: give --radius")
+    header = replace(header, radius=found.mean / 2, radius_error=found.error / 2, radius_sample=found.sample)
+    write_index(folder, header, rows, names)
+    return header

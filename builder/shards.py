@@ -1,0 +1,70 @@
+"""The builder's work units: a run of voxels -> one shard file. Pure and idempotent; run in any process."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..schemas.archive import shard_name, write_shard
+from ..schemas.codec import Record, encode_voxel
+from ..schemas.voxel import VoxelData
+from .config import SHARD_POINTS, BuildConfig
+from .octree import build_voxel
+from .partition import Run, gather_voxel, spool_dtype
+
+
+class ShardUnit(NamedTuple):
+    """One shard to be written. keys: its voxels, ascending.  points: in all of them."""
+
+    number: int
+    keys: tuple[int, ...]
+    points: int
+    runs: tuple[Run, ...]
+    voxel_steps: int
+    config: BuildConfig
+    archive_id: bytes
+    folder: Path
+
+
+class Shard(NamedTuple):
+    """A shard written. rows: of the index.  size: of the file [bytes]."""
+
+    name: str
+    rows: NDArray
+    size: int
+
+
+def plan_shards(keys: NDArray[np.uint64], counts: NDArray[np.int64]) -> list[tuple[tuple[int, ...], int]]:
+    """Cut voxels (ascending keys, points of each) into runs of about SHARD_POINTS: (keys, points) each.
+
+    A function of the points alone, so that the archive does not depend on the number of jobs.
+    """
+    plans: list[tuple[tuple[int, ...], int]] = []
+    held: list[int] = []
+    points = 0
+    for key, count in zip(keys.tolist(), counts.tolist(), strict=True):
+        if held and points + count > SHARD_POINTS:
+            plans.append((tuple(held), points))
+            held, points = [], 0
+        held.append(key)
+        points += count
+    if held:
+        plans.append((tuple(held), points))
+    return plans
+
+
+def build_shard(unit: ShardUnit) -> Shard:
+    """Gather, build, compress and write the voxels of one shard, one at a time."""
+
+    def voxels() -> Iterator[tuple[VoxelData, Record, NDArray[np.int64], NDArray[np.int64]]]:
+        for key in unit.keys:
+            points = gather_voxel(key, unit.runs, spool_dtype(unit.config))
+            voxel = build_voxel(key, points, unit.voxel_steps, unit.config)
+            record = encode_voxel(voxel, unit.archive_id)
+            yield voxel, record, points.local.min(axis=0).astype(np.int64), points.local.max(axis=0).astype(np.int64)
+
+    path = unit.folder / shard_name(unit.number)
+    rows = write_shard(path, unit.number, unit.archive_id, voxels())
+    return Shard(path.name, rows, path.stat().st_size)

@@ -52,16 +52,28 @@ class BuildConfig:
     def __post_init__(self) -> None:
         """Refuse options outside what the format and the kernels hold."""
         checks = [
-            (MIN_DEGREE <= self.degree <= MAX_DEGREE, f"--degree {self.degree}", f"{MIN_DEGREE} to {MAX_DEGREE}"),
+            (
+                MIN_DEGREE <= self.degree <= MAX_DEGREE,
+                f"--degree {self.degree}",
+                f"{MIN_DEGREE} to {MAX_DEGREE}",
+            ),
             (1 <= self.leaf <= MAX_LEAF, f"--leaf {self.leaf}", f"1 to {MAX_LEAF}"),
             (self.cell_points >= 1, f"cell_points {self.cell_points}", "at least 1"),
             (self.voxel > 0, f"--voxel {self.voxel}", "a positive length in metres"),
-            (self.resolution is None or self.resolution > 0, f"--resolution {self.resolution}", "a positive step"),
+            (
+                self.resolution is None or self.resolution > 0,
+                f"--resolution {self.resolution}",
+                "a positive step",
+            ),
             (self.spacing is None or self.spacing > 0, f"--spacing {self.spacing}", "a positive distance"),
             (self.radius is None or self.radius >= 0, f"--radius {self.radius}", "zero or a positive length"),
             (self.jobs >= 0, f"--jobs {self.jobs}", "0 (all cores) or more"),
             (self.memory_bytes >= 64 << 20, f"--memory {self.memory_bytes} bytes", "at least 64MB"),
-            (self.keep <= {"scan", "intensity"}, f"--keep {','.join(sorted(self.keep))}", "scan, intensity or both"),
+            (
+                self.keep <= {"scan", "intensity"},
+                f"--keep {','.join(sorted(self.keep))}",
+                "scan, intensity or both",
+            ),
         ]
         for good, found, expected in checks:
             if not good:

@@ -55,7 +55,10 @@ def build_voxel(key: int, points: VoxelPoints, voxel_steps: int, config: BuildCo
 
     trees = [
         build_hierarchy(
-            (points.local[a:b] - corner).astype(np.int32), leaf=config.leaf, degree=config.degree, with_slab=config.with_slab
+            (points.local[a:b] - corner).astype(np.int32),
+            leaf=config.leaf,
+            degree=config.degree,
+            with_slab=config.with_slab,
         )
         for a, b, corner in zip(starts, ends, low, strict=True)
     ]
@@ -108,7 +111,11 @@ def _cell_rows(tree: Hierarchy, which: slice) -> Nodes:
 
 
 def _top_rows(
-    top: tuple[NDArray, ...], points: NDArray[np.int32], held: NDArray[np.int64], shift: int, config: BuildConfig
+    top: tuple[NDArray, ...],
+    points: NDArray[np.int32],
+    held: NDArray[np.int64],
+    shift: int,
+    config: BuildConfig,
 ) -> Nodes:
     """The rows of the top BSH: over cells, but bounding the points (n, 3) in cell order, `held` a cell."""
     _, begin, end, count, _ = top

@@ -97,7 +97,11 @@ def survey_scan(scan: Scan, tick: Callable[[int], None] = lambda _: None) -> Sur
             tick(len(good))
     except ScanError as error:
         return Survey(scan, scan.path, digest, 0, low, high, not_finite, str(error), _region(scan, low, high))
-    fault = "" if count else f"{scan.path}: scan {scan.index} holds no usable point, expected at least one: leave it out"
+    fault = (
+        ""
+        if count
+        else f"{scan.path}: scan {scan.index} holds no usable point, expected at least one: leave it out"
+    )
     return Survey(scan, scan.path, digest, count, low, high, not_finite, fault, None, count == 0)
 
 
@@ -124,9 +128,10 @@ def choose_lattice(surveys: list[Survey], config: BuildConfig) -> tuple[Lattice,
     step, source = config.resolution, "given"
     if step is None:
         step, source = _shared_step(surveys), "sources"
-    if step is None or not MIN_STEP <= step <= config.voxel or config.voxel / step > MAX_VOXEL_STEPS:
-        if source != "given":
-            step, source = DEFAULT_STEP, "default"
+    if source == "sources" and not (
+        step and max(MIN_STEP, config.voxel / MAX_VOXEL_STEPS) <= step <= config.voxel
+    ):
+        step, source = DEFAULT_STEP, "default"
     assert step is not None
     return make_lattice(origin, step, config.voxel), source
 
@@ -145,7 +150,10 @@ def _shared_step(surveys: list[Survey]) -> float | None:
             return None
         apart = (np.array(lattice.offset) - np.array(first.offset)) / step
         # Offsets are decimal text rounded to float64: a millionth of a step is theirs, more is another lattice.
-        if not np.isfinite(apart).all() or (np.abs(apart - np.rint(apart)) > 1e-6 * np.maximum(1, np.abs(apart) * 1e-9)).any():
+        if (
+            not np.isfinite(apart).all()
+            or (np.abs(apart - np.rint(apart)) > 1e-6 * np.maximum(1, np.abs(apart) * 1e-9)).any()
+        ):
             return None
     return float(step)
 
@@ -207,7 +215,9 @@ def spool_scan(unit: SpoolUnit, tick: Callable[[int], None] = lambda _: None) ->
     if waiting:
         runs.append(_write_run(unit, len(runs), held))
     if kept != unit.count:
-        raise ScanError(f"{unit.scan.path}: {kept} points, {unit.count} a moment ago: still being written? build again")
+        raise ScanError(
+            f"{unit.scan.path}: {kept} points, {unit.count} a moment ago: still being written? build again"
+        )
     return Spooled(tuple(runs), (content[0], content[1]), moved_max, dict(unit.scan.dropped))
 
 

@@ -14,6 +14,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -118,7 +119,9 @@ def build_archive(
         shutil.rmtree(folder / "spool")
         report = verify_archive(folder, progress=stages.progress)
         if report.faults:
-            raise CorruptError(f"{report.faults[0]}: what was written is not what reads back: check disk and memory")
+            raise CorruptError(
+                f"{report.faults[0]}: what was written is not what reads back: check disk and memory"
+            )
         _publish(folder, target, config.overwrite)
     return BuildSummary(
         archive=target,
@@ -153,12 +156,14 @@ def _lock(target: Path) -> Iterator[None]:
     """Keep a second builder off the same target."""
     path = target.parent / f".{target.name}.lock"
     while True:
-        file = open(path, "w")
+        file = open(path, "w")  # noqa: SIM115  held open as long as the lock
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             file.close()
-            raise BadRequestError(f"{target}: another build is writing it: wait for it, or give another -o") from None
+            raise BadRequestError(
+                f"{target}: another build is writing it: wait for it, or give another -o"
+            ) from None
         # The holder before us may have removed the file we just locked: then lock the one that is there now.
         if path.exists() and os.fstat(file.fileno()).st_ino == path.stat().st_ino:
             break
@@ -206,18 +211,26 @@ def _survey(paths: list[Path], config: BuildConfig, stages: _Stages) -> tuple[li
         surveys = [survey_scan(scan, stages.progress.advance) for scan in scans]
     for path, found, fault in opened:
         if not found:
-            surveys.append(unopened(path, fault or f"{path}: holds no scan, expected at least one: leave it out"))
+            surveys.append(
+                unopened(path, fault or f"{path}: holds no scan, expected at least one: leave it out")
+            )
     good = sorted((s for s in surveys if not s.fault), key=_content_order)
     faulty = sorted((s for s in surveys if s.fault), key=_content_order)
     if faulty and not config.skip_bad:
         more = "" if len(faulty) == 1 else "".join(f"\n  {s.fault}" for s in faulty[1:])
-        raise ScanError(f"{faulty[0].fault}{more} (--skip-bad leaves such scans out and marks their region unknown)")
+        raise ScanError(
+            f"{faulty[0].fault}{more} (--skip-bad leaves such scans out and marks their region unknown)"
+        )
     if not good:
-        raise ScanError(f"{paths[0] if paths else 'nothing'}: no usable scan, expected at least one: check the files")
+        raise ScanError(
+            f"{paths[0] if paths else 'nothing'}: no usable scan, expected at least one: check the files"
+        )
     wrong = sum(s.not_finite for s in good)
     if wrong and config.strict:
         first = next(s for s in good if s.not_finite)
-        raise ScanError(f"{first.path}: {wrong} points that are not finite, expected none with --strict: clean the scan")
+        raise ScanError(
+            f"{first.path}: {wrong} points that are not finite, expected none with --strict: clean the scan"
+        )
     return good, faulty
 
 
@@ -231,11 +244,18 @@ def _check_space(folder: Path, points: int, config: BuildConfig) -> None:
     needed = points * (spool_dtype(config).itemsize + ARCHIVE_BYTES_A_POINT)
     free = shutil.disk_usage(folder).free
     if needed > free:
-        raise SolidcloudError(f"{folder}: {free} bytes free, the build needs about {needed}: make room or use another disk")
+        raise SolidcloudError(
+            f"{folder}: {free} bytes free, the build needs about {needed}: make room or use another disk"
+        )
 
 
 def _spool(
-    surveys: list[Survey], lattice: Lattice, folder: Path, executor: Executor, config: BuildConfig, stages: _Stages
+    surveys: list[Survey],
+    lattice: Lattice,
+    folder: Path,
+    executor: Executor,
+    config: BuildConfig,
+    stages: _Stages,
 ) -> list[Spooled]:
     """Second pass: quantised points, sorted into voxels, on disk."""
     run_points = max(1 << 16, config.memory_bytes // (executor.jobs * SPOOL_BYTES_A_POINT))
@@ -272,11 +292,24 @@ def _header(
         if s.scan is not None
     ]  # fmt: skip
     sources += [
-        Source(str(s.path), s.scan.index if s.scan else 0, s.scan.format if s.scan else "", s.sha256, 0, np.eye(4), {}, s.fault)
+        Source(
+            str(s.path),
+            s.scan.index if s.scan else 0,
+            s.scan.format if s.scan else "",
+            s.sha256,
+            0,
+            np.eye(4),
+            {},
+            s.fault,
+        )
         for s in faulty
     ]
     lost = [s for s in faulty if not s.empty]
-    boxes = [np.stack([lattice.to_lattice(s.region[:1])[0] - 1, lattice.to_lattice(s.region[1:])[0] + 1]) for s in lost if s.region is not None]
+    boxes = [
+        np.stack([lattice.to_lattice(s.region[:1])[0] - 1, lattice.to_lattice(s.region[1:])[0] + 1])
+        for s in lost
+        if s.region is not None
+    ]
     return Header(
         archive_id=archive_id,
         lattice=lattice,
@@ -301,7 +334,12 @@ def _header(
 
 
 def _build_voxels(
-    spooled: list[Spooled], header: Header, folder: Path, executor: Executor, config: BuildConfig, stages: _Stages
+    spooled: list[Spooled],
+    header: Header,
+    folder: Path,
+    executor: Executor,
+    config: BuildConfig,
+    stages: _Stages,
 ) -> tuple[Header, list[Shard]]:
     """Third pass: every voxel's octree and hierarchies, into shards."""
     runs: tuple[Run, ...] = tuple(run for s in spooled for run in s.runs)
@@ -315,7 +353,14 @@ def _build_voxels(
         )
     units = [
         ShardUnit(
-            number, plan, points, runs, header.lattice.voxel_steps, config, header.archive_id, folder / SHARD_FOLDER
+            number,
+            plan,
+            points,
+            runs,
+            header.lattice.voxel_steps,
+            config,
+            header.archive_id,
+            folder / SHARD_FOLDER,
         )
         for number, (plan, points) in enumerate(plan_shards(keys, counts))
     ]
@@ -340,7 +385,12 @@ def _radius_sums(unit: _RadiusUnit) -> tuple[int, int, int]:
 
 
 def _measure_radius(
-    header: Header, shards: list[Shard], folder: Path, executor: Executor, config: BuildConfig, stages: _Stages
+    header: Header,
+    shards: list[Shard],
+    folder: Path,
+    executor: Executor,
+    config: BuildConfig,
+    stages: _Stages,
 ) -> Header:
     """Fourth pass: the mean closest-point distance over what is stored; then the final index is written."""
     rows = np.concatenate([s.rows for s in shards])
@@ -355,7 +405,7 @@ def _measure_radius(
     cuts = np.searchsorted(np.cumsum(points), np.arange(1, 65) * header.points / 64, side="left") + 1
     edges = np.unique(np.concatenate([[0], np.minimum(cuts, len(rows))]))
     units = [
-        _RadiusUnit(folder, range(int(a), int(b)), share, int(points[a:b].sum())) for a, b in zip(edges[:-1], edges[1:], strict=True)
+        _RadiusUnit(folder, range(int(a), int(b)), share, int(points[a:b].sum())) for a, b in pairwise(edges)
     ]
     with stages.stage("radius", header.points, "points"):
         sums = list(executor.map(_radius_sums, units, stages.progress, lambda unit: unit.points))

@@ -54,7 +54,8 @@ def mean_of_squares(total: int, squares: int, sample: int, everything: bool) -> 
 
 
 def build_local(points: NDArray[np.float64], *, leaf: int, degree: int) -> LocalHierarchy:
-    """The hierarchy of points (n, 3) [m], n >= 1, on a lattice of 2^-20 m, or the power of two that their extent needs.
+    """The hierarchy of points (n, 3) [m], n >= 1, on a lattice of 2^-20 m, or of the power of two their
+    extent needs.
 
     Points are rounded down to it, so each lies less than two steps (sqrt(3) of them) from its lattice point.
     """
@@ -66,16 +67,20 @@ def build_local(points: NDArray[np.float64], *, leaf: int, degree: int) -> Local
 
 
 def mean_closest_distance(local: LocalHierarchy) -> float:
-    """The mean closest-point distance [m] of free points, over distinct ones, on their lattice; 0 for fewer than two."""
+    """The mean closest-point distance [m] over distinct points, on their lattice; 0 for fewer than two."""
     tree = local.hierarchy.tree
     t = len(tree.begin)
     is_leaf = np.arange(t) >= tree.levels[-2]
     inner = int(tree.levels[-2])
     first = np.empty(t, np.int32)
-    first[:inner] = 1 + np.concatenate([[0], np.cumsum(tree.count[:inner], dtype=np.int64)[:-1]]) if inner else 0
+    first[:inner] = (
+        1 + np.concatenate([[0], np.cumsum(tree.count[:inner], dtype=np.int64)[:-1]]) if inner else 0
+    )
     first[inner:] = tree.begin[inner:]
     points = local.hierarchy.points.astype(np.int64)
-    search = SearchTree(local.hierarchy.bounds.center, local.hierarchy.bounds.radius, first, tree.count, is_leaf, points)
+    search = SearchTree(
+        local.hierarchy.bounds.center, local.hierarchy.bounds.radius, first, tree.count, is_leaf, points
+    )
     queries = np.unique(points, axis=0)
     if len(queries) < 2:
         return 0.0
@@ -103,7 +108,9 @@ def search_tree(voxel: VoxelData, links: Links) -> SearchTree:
 def voxel_points(voxel: VoxelData, links: Links) -> NDArray[np.int64]:
     """The points of a voxel (p, 3) int64 [voxel steps], in stored order."""
     leaf = np.flatnonzero(links.is_leaf)
-    leaf = leaf[np.argsort(links.first[leaf], kind="stable")]  # a cell that is one leaf node stands among the roots
+    leaf = leaf[
+        np.argsort(links.first[leaf], kind="stable")
+    ]  # a cell that is one leaf node stands among the roots
     low = voxel.cells.low[links.cell[leaf]].astype(np.int64) + voxel.nodes.block_low[leaf]
     return voxel.points + np.repeat(low, voxel.nodes.count[leaf], axis=0)
 
@@ -127,7 +134,9 @@ def sample_mask(lattice: NDArray[np.int64], share: float) -> NDArray[np.bool_]:
     return h < np.uint64(int(share * 2.0**64))
 
 
-def archive_sums(archive: Archive, rows: range, share: float, tick: Callable[[], None]) -> tuple[int, int, int]:
+def archive_sums(
+    archive: Archive, rows: range, share: float, tick: Callable[[], None]
+) -> tuple[int, int, int]:
     """Sums over the sampled distinct points of the voxels `rows`: distances, their squares, how many.
 
     Distances in SUM_UNITS, as Python integers: no order changes them. A point alone in the dataset has no

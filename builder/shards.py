@@ -63,7 +63,12 @@ def build_shard(unit: ShardUnit) -> Shard:
             points = gather_voxel(key, unit.runs, spool_dtype(unit.config))
             voxel = build_voxel(key, points, unit.voxel_steps, unit.config)
             record = encode_voxel(voxel, unit.archive_id)
-            yield voxel, record, points.local.min(axis=0).astype(np.int64), points.local.max(axis=0).astype(np.int64)
+            yield (
+                voxel,
+                record,
+                points.local.min(axis=0).astype(np.int64),
+                points.local.max(axis=0).astype(np.int64),
+            )
 
     path = unit.folder / shard_name(unit.number)
     rows = write_shard(path, unit.number, unit.archive_id, voxels())

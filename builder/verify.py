@@ -48,7 +48,9 @@ def verify_archive(folder: Path, *, deep: bool = False, progress: Progress | Non
             progress.advance(expected)
         progress.finish()
         if not faults and points != header.points:
-            faults.append(f"{folder}: {points} points in the records, {header.points} in the index: rebuild it")
+            faults.append(
+                f"{folder}: {points} points in the records, {header.points} in the index: rebuild it"
+            )
         if not faults and ((least != header.low).any() or (most != header.high).any()):
             faults.append(f"{folder}: the records' bounds are not the index's: rebuild it")
         return VerifyReport(len(archive.voxels), points, tuple(faults))
@@ -69,5 +71,7 @@ def _voxel_faults(archive: Archive, row: int, voxel: VoxelData, links: Links, de
             tree.center, tree.radius, normal, slab, tree.first, tree.count, tree.is_leaf, order, tree.points
         )
         if node >= 0:
-            faults.append(f"{archive.where(row)}: node {node} does not enclose its points: rebuild the archive")
+            faults.append(
+                f"{archive.where(row)}: node {node} does not enclose its points: rebuild the archive"
+            )
     return faults

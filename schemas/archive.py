@@ -183,7 +183,13 @@ def write_shard(
             counts = (record.cell_rows, record.node_rows, record.point_rows)
             frames = (record.cells, record.nodes, record.points)
             row = np.zeros((), VOXEL_DTYPE)
-            row["key"], row["shard"], row["rows"], row["low"], row["high"] = voxel.key, number, counts, low, high
+            row["key"], row["shard"], row["rows"], row["low"], row["high"] = (
+                voxel.key,
+                number,
+                counts,
+                low,
+                high,
+            )
             row["leaves"] = record.leaf_rows
             for i, name in enumerate(DATASETS):
                 offset, size = _write_frame(group, name, frames[i], counts[i], dtypes[i])
@@ -208,7 +214,9 @@ def _verify_frames(path: Path, table: NDArray) -> None:
             for i, name in enumerate(DATASETS):
                 frame = os.pread(file.fileno(), int(row["frame_bytes"][i]), int(row["frame_offset"][i]))
                 if frame[-4:] != int(row["frame_checksum"][i]).to_bytes(4, "little"):
-                    raise CorruptError(f"{path}: voxel {int(row['key']):#x}, {name}: not what was written: disk full?")
+                    raise CorruptError(
+                        f"{path}: voxel {int(row['key']):#x}, {name}: not what was written: disk full?"
+                    )
 
 
 def _texts(header: Header) -> bytes:
@@ -252,7 +260,9 @@ def _columns(header: Header, voxels: NDArray, shards: list[tuple[str, int]]) -> 
         "source_pose": np.array([s.pose for s in header.sources], "<f8").reshape(-1, 4, 4),
         "source_count": np.array([s.count for s in header.sources], "<u8"),
         "texts": np.frombuffer(_texts(header), "u1"),
-        "shards": np.array([(name.encode(), size) for name, size in shards], [("name", "S24"), ("bytes", "<u8")]),
+        "shards": np.array(
+            [(name.encode(), size) for name, size in shards], [("name", "S24"), ("bytes", "<u8")]
+        ),
         "voxels": voxels,
     }
 
@@ -292,24 +302,39 @@ def _read_columns(path: Path) -> tuple[bytes, dict[str, NDArray]]:
     size = path.stat().st_size
     with h5py.File(path, "r") as file:
         if str(file.attrs.get("format", "")) != "solidcloud":
-            raise FormatError(f"{path}: not a solidcloud index: give the folder that `solidcloud build` wrote")
+            raise FormatError(
+                f"{path}: not a solidcloud index: give the folder that `solidcloud build` wrote"
+            )
         version = int(file.attrs["format_version"])
         if version != FORMAT_VERSION:
-            raise FormatError(f"{path}: format version {version}, this software reads {FORMAT_VERSION}: use the one that wrote it")
+            raise FormatError(
+                f"{path}: format version {version}, this software reads {FORMAT_VERSION}: use the one that wrote it"
+            )
         if str(file.attrs["units"]) != "m":
             raise FormatError(f"{path}: units {file.attrs['units']!r}, expected 'm': rebuild the archive")
         columns = {}
         for name in file:
             link = file.get(name, getlink=True)
             dataset = file.get(name) if isinstance(link, h5py.HardLink) else None
-            if not isinstance(dataset, h5py.Dataset) or dataset.external or dataset.is_virtual or dataset.chunks:
-                raise FormatError(f"{path}: {name} is no plain dataset: not written by solidcloud, do not use it")
+            if (
+                not isinstance(dataset, h5py.Dataset)
+                or dataset.external
+                or dataset.is_virtual
+                or dataset.chunks
+            ):
+                raise FormatError(
+                    f"{path}: {name} is no plain dataset: not written by solidcloud, do not use it"
+                )
             if dataset.dtype.hasobject or dataset.size * dataset.dtype.itemsize > size:
-                raise FormatError(f"{path}: {name} claims more than the file holds: damaged, restore or rebuild it")
+                raise FormatError(
+                    f"{path}: {name} claims more than the file holds: damaged, restore or rebuild it"
+                )
             columns[name] = dataset[()]
         archive_id = file.attrs["archive_id"].tobytes()
         if _digest(archive_id, columns) != file.attrs["sha256"].tobytes():
-            raise CorruptError(f"{path}: checksum differs from the one stored: damaged, restore or rebuild it")
+            raise CorruptError(
+                f"{path}: checksum differs from the one stored: damaged, restore or rebuild it"
+            )
     return archive_id, columns
 
 
@@ -319,7 +344,14 @@ def _header(archive_id: bytes, columns: dict[str, NDArray]) -> Header:
     poses, counts = columns["source_pose"], columns["source_count"]
     sources = tuple(
         Source(
-            s["path"], s["index"], s["format"], s["sha256"], int(counts[i]), poses[i], s["skipped"], s["fault"]
+            s["path"],
+            s["index"],
+            s["format"],
+            s["sha256"],
+            int(counts[i]),
+            poses[i],
+            s["skipped"],
+            s["fault"],
         )
         for i, s in enumerate(texts["sources"])
     )
@@ -358,18 +390,24 @@ class Archive:
         self.folder = Path(folder)
         path = self.folder / INDEX_NAME
         if not path.is_file():
-            raise FormatError(f"{self.folder}: no archive here ({INDEX_NAME} not found): build one with `solidcloud build`")
+            raise FormatError(
+                f"{self.folder}: no archive here ({INDEX_NAME} not found): build one with `solidcloud build`"
+            )
         try:
             archive_id, columns = _read_columns(path)
             self.header = _header(archive_id, columns)
         except (OSError, KeyError, ValueError, TypeError, AttributeError, RuntimeError) as error:
-            raise FormatError(f"{path}: not a readable archive index ({error}): restore or rebuild it") from error
+            raise FormatError(
+                f"{path}: not a readable archive index ({error}): restore or rebuild it"
+            ) from error
         self.voxels = columns["voxels"].astype(VOXEL_DTYPE)
         self.coordinates = voxel_coordinates(self.voxels["key"])
         self._shape_dtype = point_dtype(scan_index=self.header.scan_index, intensity=self.header.intensity)
         self._lock = threading.Lock()
         self._descriptors: dict[int, int] = {}
-        self._shards = [(bytes(name).decode("ascii", "replace"), int(size)) for name, size in columns["shards"]]
+        self._shards = [
+            (bytes(name).decode("ascii", "replace"), int(size)) for name, size in columns["shards"]
+        ]
         self._check_shards()
 
     def _check_shards(self) -> None:
@@ -377,13 +415,19 @@ class Archive:
         for name, size in self._shards:
             path = self.folder / SHARD_FOLDER / name
             if not _SHARD_NAME.fullmatch(name):
-                raise FormatError(f"{self.folder}: shard name {name!r} in the index: not written by solidcloud")
+                raise FormatError(
+                    f"{self.folder}: shard name {name!r} in the index: not written by solidcloud"
+                )
             if not path.is_file():
                 raise FormatError(f"{path}: missing: restore it or rebuild the archive")
             if path.stat().st_size != size:
-                raise FormatError(f"{path}: {path.stat().st_size} bytes, expected {size}: truncated? restore or rebuild it")
+                raise FormatError(
+                    f"{path}: {path.stat().st_size} bytes, expected {size}: truncated? restore or rebuild it"
+                )
         sizes = np.array([size for _, size in self._shards], np.uint64)
-        if len(self.voxels) and (self.voxels["shard"].max() >= len(sizes) or (np.diff(self.voxels["key"]) == 0).any()):
+        if len(self.voxels) and (
+            self.voxels["shard"].max() >= len(sizes) or (np.diff(self.voxels["key"]) == 0).any()
+        ):
             raise FormatError(f"{self.folder}: the index does not add up: restore or rebuild it")
         ends = self.voxels["frame_offset"] + self.voxels["frame_bytes"]
         if (ends > sizes[self.voxels["shard"]][:, None]).any():
@@ -428,7 +472,9 @@ class Archive:
             size, offset = int(entry["frame_bytes"][i]), int(entry["frame_offset"][i])
             frame = os.pread(self._descriptor(int(entry["shard"])), size, offset)
             if len(frame) != size or frame[-4:] != int(entry["frame_checksum"][i]).to_bytes(4, "little"):
-                raise CorruptError(f"{self.where(row)}, {name}: {len(frame)} bytes that are not the record's, expected {size}")
+                raise CorruptError(
+                    f"{self.where(row)}, {name}: {len(frame)} bytes that are not the record's, expected {size}"
+                )
             frames.append(frame)
         return frames[0], frames[1], frames[2]
 
@@ -449,4 +495,6 @@ class Archive:
                 *frames, shape, int(entry["key"]), self.header.archive_id, self.header.lattice.voxel_steps
             )
         except CorruptError as error:
-            raise CorruptError(f"{self.where(row)}: {error}: restore the shard or rebuild the archive") from error
+            raise CorruptError(
+                f"{self.where(row)}: {error}: restore the shard or rebuild the archive"
+            ) from error

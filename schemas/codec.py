@@ -95,7 +95,13 @@ def encode_voxel(voxel: VoxelData, archive_id: bytes) -> Record:
 
 
 def decode_voxel(
-    cells: bytes, nodes: bytes, points: bytes, shape: RecordShape, key: int, archive_id: bytes, voxel_steps: int
+    cells: bytes,
+    nodes: bytes,
+    points: bytes,
+    shape: RecordShape,
+    key: int,
+    archive_id: bytes,
+    voxel_steps: int,
 ) -> tuple[VoxelData, Links]:
     """Decompress and check a record. Inverse of `encode_voxel`.
 
@@ -124,7 +130,9 @@ def decode_voxel(
     return voxel, check_voxel(voxel, voxel_steps)
 
 
-def _leaf_runs(voxel: VoxelData, links: Links) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+def _leaf_runs(
+    voxel: VoxelData, links: Links
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
     """First point, number of points and sort axis of every leaf node."""
     leaf = links.is_leaf
     return (
@@ -137,7 +145,9 @@ def _leaf_runs(voxel: VoxelData, links: Links) -> tuple[NDArray[np.int64], NDArr
 def _pack(rows: NDArray) -> bytes:
     """Byte planes (HDF5's shuffle) of a packed array, as one zstd frame with checksum and declared size."""
     planes = np.ascontiguousarray(rows.view(np.uint8).reshape(len(rows), -1).T)
-    return zstandard.ZstdCompressor(level=ZSTD_LEVEL, write_checksum=True, write_content_size=True).compress(planes)
+    return zstandard.ZstdCompressor(level=ZSTD_LEVEL, write_checksum=True, write_content_size=True).compress(
+        planes
+    )
 
 
 def _unpack(frame: bytes, dtype: np.dtype, count: int, what: str) -> NDArray:
@@ -152,5 +162,3 @@ def _unpack(frame: bytes, dtype: np.dtype, count: int, what: str) -> NDArray:
         raise CorruptError(f"{what}: damaged frame ({error})") from error
     planes = np.frombuffer(plain, np.uint8).reshape(dtype.itemsize, count)
     return np.ascontiguousarray(planes.T).view(dtype).reshape(count)
-
-

@@ -139,7 +139,9 @@ def check_voxel(voxel: VoxelData, voxel_steps: int) -> Links:
     # that add block_low to them cannot leave the certified range.
     rows = np.flatnonzero(leaf)
     rows = rows[np.argsort(links.first[rows], kind="stable")]
-    high = np.maximum.reduceat(voxel.points, links.first[rows], axis=0).astype(np.int64) + nodes.block_low[rows]
+    high = (
+        np.maximum.reduceat(voxel.points, links.first[rows], axis=0).astype(np.int64) + nodes.block_low[rows]
+    )
     cell = links.cell[rows]
     if (high >= size[cell, None]).any() or (high + low[cell] >= voxel_steps).any():
         raise CorruptError(f"{name}: a point outside its cell")

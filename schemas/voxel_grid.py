@@ -75,9 +75,13 @@ def make_lattice(origin: ArrayLike, step: float, voxel_size: float) -> Lattice:
     Raises BadRequestError when step or voxel size are outside what the format can hold.
     """
     if not (np.isfinite(step) and step >= MIN_STEP):
-        raise BadRequestError(f"lattice step {step!r} m: expected at least {MIN_STEP} m: give a coarser --resolution")
+        raise BadRequestError(
+            f"lattice step {step!r} m: expected at least {MIN_STEP} m: give a coarser --resolution"
+        )
     if not (np.isfinite(voxel_size) and voxel_size > 0):
-        raise BadRequestError(f"voxel size {voxel_size!r} m: expected a positive length: give another --voxel")
+        raise BadRequestError(
+            f"voxel size {voxel_size!r} m: expected a positive length: give another --voxel"
+        )
     voxel_steps = round(voxel_size / step)
     if not 1 <= voxel_steps <= MAX_VOXEL_STEPS:
         raise BadRequestError(

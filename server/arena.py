@@ -23,7 +23,9 @@ class ArenaBuffer:
         start = -raw.ctypes.data % ALIGNMENT
         buffer = raw[start : start + self.total_bytes]
         self.arena = Arena(buffer.view(np.float32), buffer.view(np.int32), buffer.view(np.uint16))
-        self._free = [(0, self.total_bytes)] if self.total_bytes else []  # (offset, bytes), ascending, never adjacent
+        self._free = (
+            [(0, self.total_bytes)] if self.total_bytes else []
+        )  # (offset, bytes), ascending, never adjacent
 
     @staticmethod
     def rounded(size: int) -> int:

@@ -41,21 +41,33 @@ def make_avatar(points: ArrayLike, radius: float | None = None) -> AvatarModel:
     """
     array = make_positions(points)
     if len(array) and np.abs(array).max() > MAX_COORDINATE:
-        raise BadRequestError(f"avatar coordinate {np.abs(array).max():g} m: expected within {MAX_COORDINATE:g} m")
+        raise BadRequestError(
+            f"avatar coordinate {np.abs(array).max():g} m: expected within {MAX_COORDINATE:g} m"
+        )
     if radius is not None and not (np.isfinite(radius) and radius >= 0):
         raise BadRequestError(f"avatar radius {radius!r}: expected zero or a positive length in metres")
     if not len(array):
-        empty = Avatar(np.empty((0, 3)), np.empty(0), np.empty(0, np.int32), np.empty(0, np.int32), np.empty((0, 3, LANES)))
+        empty = Avatar(
+            np.empty((0, 3)),
+            np.empty(0),
+            np.empty(0, np.int32),
+            np.empty(0, np.int32),
+            np.empty((0, 3, LANES)),
+        )
         return AvatarModel(array, float(radius or 0.0), empty)
     local = build_local(array, leaf=LANES, degree=DEGREE)
     if radius is None:
         radius = mean_closest_distance(local) / 2
         if radius == 0.0:
-            raise BadRequestError("avatar of a single distinct point: no closest-point distance: give a radius")
+            raise BadRequestError(
+                "avatar of a single distinct point: no closest-point distance: give a radius"
+            )
     tree, bounds = local.hierarchy.tree, local.hierarchy.bounds
     leaves = int(tree.levels[-2])
     first = np.empty(len(tree.begin), np.int32)
-    first[:leaves] = 1 + np.concatenate([[0], np.cumsum(tree.count[:leaves], dtype=np.int64)[:-1]]) if leaves else 0
+    first[:leaves] = (
+        1 + np.concatenate([[0], np.cumsum(tree.count[:leaves], dtype=np.int64)[:-1]]) if leaves else 0
+    )
     first[leaves:] = ~np.arange(len(tree.begin) - leaves)
     ordered = array[tree.order]
     blocks = [ordered[a:b] for a, b in zip(tree.begin[leaves:], tree.end[leaves:], strict=True)]

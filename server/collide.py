@@ -23,10 +23,10 @@ MAX_REACH_UNITS = 1 << 30
 MAX_FRAME_STEPS = 1 << 23
 
 _POSE_FAULTS = {
-    placing.BAD_LAST_ROW: "last row is not 0 0 0 1 (element [3, 3] is {:g}): give row-major 4x4 poses, translation last",
+    placing.BAD_LAST_ROW: "has a last row that is not 0 0 0 1: give row-major 4x4 poses",
     placing.MIRRORED: "mirrors (determinant {:g}): expected a rotation, with a uniform scale at most",
-    placing.SHEARED: "shears, or scales its axes differently (off by {:g}, relative): expected a rotation, with a uniform "
-    "scale at most, within 1e-9: renormalise it",
+    placing.SHEARED: "shears, or scales its axes differently (by {:g}, relative): expected a rotation, "
+    "with a uniform scale at most, within 1e-9: renormalise it",
     placing.BAD_SCALE: "scales by {:g}: expected 0.001 to 1000",
     placing.TOO_FAR: "translates by {:g} m: expected within 1e9 m",
 }
@@ -143,7 +143,7 @@ def _pieces(reach: Reach, residency: Residency) -> Iterator[tuple[NDArray[np.int
             held.update(dict.fromkeys(own))
             continue
         part: list[int] = []
-        for row in own + [-1]:
+        for row in [*own, -1]:
             if row < 0 or residency.bytes_of([*part, row]) > budget:
                 yield np.array([pose]), part, _only(reach, pose, part)
                 part = []
@@ -187,14 +187,25 @@ def collide(data: SceneData, avatar: AvatarModel, poses: ArrayLike, margin: floa
         verdict, found = np.zeros(k, np.uint8), np.zeros((3, k), np.uint32)
         with residency.hold(rows) as held:
             overlap_poses(
-                part.poses, part.scales, part.units, avatar.arrays, scene, which, part.starts, part.rows, verdict, *found
+                part.poses,
+                part.scales,
+                part.units,
+                avatar.arrays,
+                scene,
+                which,
+                part.starts,
+                part.rows,
+                verdict,
+                *found,
             )
         total[0, which] |= verdict[which]
         total[1:, which] += found[:, which]
         hits, misses = hits + held.hits, misses + held.misses
         faults.update(dict.fromkeys(held.faults))
     unseen = (total[1] > 0) | _in_unknown(reach.boxes, header.unknown, header.unknown_everywhere)
-    verdict = np.where(total[0] == Verdict.CONTACT, Verdict.CONTACT, np.where(unseen, Verdict.UNKNOWN, Verdict.CLEAR))
+    verdict = np.where(
+        total[0] == Verdict.CONTACT, Verdict.CONTACT, np.where(unseen, Verdict.UNKNOWN, Verdict.CLEAR)
+    )
     return CollideAnswers(
         verdict.astype(np.uint8), reach.outside, total[1], total[2], total[3],
         hits=hits, misses=misses, resident=residency.resident, resident_bytes=residency.resident_bytes,
@@ -202,7 +213,9 @@ def collide(data: SceneData, avatar: AvatarModel, poses: ArrayLike, margin: floa
     )  # fmt: skip
 
 
-def _in_unknown(boxes: NDArray[np.float64], unknown: NDArray[np.int64], everywhere: bool) -> NDArray[np.bool_]:
+def _in_unknown(
+    boxes: NDArray[np.float64], unknown: NDArray[np.int64], everywhere: bool
+) -> NDArray[np.bool_]:
     """Which boxes (k, 2, 3) of reach meet a region (u, 2, 3) whose scan was left out."""
     if everywhere:
         return np.ones(len(boxes), bool)

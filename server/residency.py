@@ -88,7 +88,9 @@ class Residency:
     def _reserve(self, rows: Sequence[int]) -> list[int]:
         """Pin all rows and allocate for those to be loaded by this caller, which are returned."""
         if self.bytes_of(rows) > self.buffer.total_bytes:
-            raise ValueError(f"{len(rows)} voxels take {self.bytes_of(rows)} bytes, over the budget: ask in pieces")
+            raise ValueError(
+                f"{len(rows)} voxels take {self.bytes_of(rows)} bytes, over the budget: ask in pieces"
+            )
         with self._changed:
             while True:
                 for row in rows:
@@ -179,7 +181,10 @@ class Residency:
         """Assert what must always hold: bytes add up, runs neither overlap nor leave the buffer."""
         with self._changed:
             held = sum(self._sizes[row] for row in self._offsets)
-            runs = sorted([(offset, self._sizes[row]) for row, offset in self._offsets.items()] + self.buffer.free_runs())
+            runs = sorted(
+                [(offset, self._sizes[row]) for row, offset in self._offsets.items()]
+                + self.buffer.free_runs()
+            )
             assert held == self.resident_bytes <= self.buffer.total_bytes, (held, self.resident_bytes)
             at = 0
             for offset, size in runs:

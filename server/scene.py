@@ -44,7 +44,9 @@ class Scene:
         self._lock = threading.Lock()
 
     @classmethod
-    def open(cls, folder: str | Path, name: str | None = None, *, budget_bytes: int = DEFAULT_BUDGET) -> "Scene":
+    def open(
+        cls, folder: str | Path, name: str | None = None, *, budget_bytes: int = DEFAULT_BUDGET
+    ) -> "Scene":
         """Open the archive in `folder`, keeping at most budget_bytes of decoded voxels in memory.
 
         Raises FormatError or CorruptError when it is no whole archive, BadRequestError for too small a budget.
@@ -117,11 +119,17 @@ class Scene:
         model = make_avatar(points, radius)
         with self._lock:
             known = self._avatars.setdefault((client, name), model)
-        if known is not model and not (known.radius == model.radius and np.array_equal(known.points, model.points)):
-            raise BadRequestError(f"avatar {name!r} exists with other points or another radius: use another name")
+        if known is not model and not (
+            known.radius == model.radius and np.array_equal(known.points, model.points)
+        ):
+            raise BadRequestError(
+                f"avatar {name!r} exists with other points or another radius: use another name"
+            )
         return AvatarInfo(name, len(model.points), model.radius, model.bounding_radius)
 
-    def collide(self, name: str, poses: ArrayLike, margin: float = 0.0, *, client: str = "") -> CollideAnswers:
+    def collide(
+        self, name: str, poses: ArrayLike, margin: float = 0.0, *, client: str = ""
+    ) -> CollideAnswers:
         """Whether avatar `name` touches the scene under each of the poses (k, 4, 4); see server/collide.py."""
         begin = time.perf_counter()
         with self._lock:

@@ -21,7 +21,9 @@ class Store:
         """Open the archive in `folder`. Raises FormatError or CorruptError."""
         self.archive = Archive(folder)
         rows = self.archive.voxels
-        self.sizes: NDArray[np.int64] = resident_bytes(rows["rows"][:, 1].astype(np.int64), rows["leaves"].astype(np.int64))
+        self.sizes: NDArray[np.int64] = resident_bytes(
+            rows["rows"][:, 1].astype(np.int64), rows["leaves"].astype(np.int64)
+        )
 
     def load(self, row: int, arena: Arena, offset: int) -> NDArray[np.int64]:
         """Read, check and lay out the voxel of index row `row` at byte `offset` of the arena.
@@ -31,9 +33,13 @@ class Store:
         voxel, links = self.archive.read_voxel(row)
         leaves = int(np.count_nonzero(links.is_leaf))
         if leaves != int(self.archive.voxels["leaves"][row]):
-            raise CorruptError(f"{self.archive.where(row)}: {leaves} leaf nodes, the index says otherwise: rebuild it")
+            raise CorruptError(
+                f"{self.archive.where(row)}: {leaves} leaf nodes, the index says otherwise: rebuild it"
+            )
         if links.height > MOST_LEVELS:
-            raise CorruptError(f"{self.archive.where(row)}: {links.height} levels, expected at most {MOST_LEVELS}: rebuild it")
+            raise CorruptError(
+                f"{self.archive.where(row)}: {links.height} levels, expected at most {MOST_LEVELS}: rebuild it"
+            )
         where = np.empty(3, np.int64)
         parts = (voxel.cells, voxel.nodes, np.int64(voxel.top_shift), voxel.points)
         lay_out(parts, (links.first, links.is_leaf, links.cell), arena, np.int64(offset), where)

@@ -70,7 +70,11 @@ def _least_variance(points, lo, hi, normal):
         mean[k] /= n
     a = np.zeros((3, 3))
     for i in range(lo, hi):
-        dx, dy, dz = float(points[i, 0]) - mean[0], float(points[i, 1]) - mean[1], float(points[i, 2]) - mean[2]
+        dx, dy, dz = (
+            float(points[i, 0]) - mean[0],
+            float(points[i, 1]) - mean[1],
+            float(points[i, 2]) - mean[2],
+        )
         a[0, 0] += dx * dx
         a[0, 1] += dx * dy
         a[0, 2] += dx * dz
@@ -79,7 +83,7 @@ def _least_variance(points, lo, hi, normal):
         a[2, 2] += dz * dz
     a[1, 0], a[2, 0], a[2, 1] = a[0, 1], a[0, 2], a[1, 2]
     v = np.eye(3)
-    for sweep in range(8):
+    for _ in range(8):
         for p in range(2):
             for q in range(p + 1, 3):
                 if abs(a[p, q]) <= 1e-12 * (abs(a[p, p]) + abs(a[q, q])):

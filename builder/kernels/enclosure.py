@@ -22,7 +22,11 @@ def first_loose_node(center, radius, normal, slab, first, count, is_leaf, order,
             begin[node], end[node] = begin[a], end[a + held - 1]
         flat = normal[node, 0] == 0 and normal[node, 1] == 0 and normal[node, 2] == 0
         for i in range(begin[node], end[node]):
-            dx, dy, dz = points[i, 0] - center[node, 0], points[i, 1] - center[node, 1], points[i, 2] - center[node, 2]
+            dx, dy, dz = (
+                points[i, 0] - center[node, 0],
+                points[i, 1] - center[node, 1],
+                points[i, 2] - center[node, 2],
+            )
             if dx * dx + dy * dy + dz * dz > radius[node] * radius[node]:
                 return node
             along = normal[node, 0] * dx + normal[node, 1] * dy + normal[node, 2] * dz

@@ -79,7 +79,9 @@ def pack_tree(points, leaf, degree):
         capacity *= degree
         height += 1
     order = np.arange(n)
-    most = 4 * leaves + height + 1  # degree 2 is the worst: a level for 2^l leaves has at most 2 leaves / 2^l + 1
+    most = (
+        4 * leaves + height + 1
+    )  # degree 2 is the worst: a level for 2^l leaves has at most 2 leaves / 2^l + 1
     begin, end = np.empty(most, np.int64), np.empty(most, np.int64)
     count = np.empty(most, np.uint8)
     levels = np.empty(height + 2, np.int64)

@@ -56,7 +56,9 @@ def link_rows(count, cell_nodes, cell_points, first, is_leaf, cell_of):
             return -top
     rest, point, height = top + c, 0, 0
     for i in range(c):
-        levels, below = _walk(count, int(cell_nodes[i]), top + i, rest, first, is_leaf, cell_of, i, point, False)
+        levels, below = _walk(
+            count, int(cell_nodes[i]), top + i, rest, first, is_leaf, cell_of, i, point, False
+        )
         if levels < 0:
             return -1 - below
         if below != cell_points[i]:

@@ -81,14 +81,18 @@ class Limits(NamedTuple):
 def _limits(units, units_per_step, extent, farthest, voxel_steps):
     """The thresholds for a reach of `units`.
 
-    extent: how far placed avatar points lie from the frame [steps].  farthest: the largest term of a placed coordinate [steps].
+    extent: how far placed avatar points lie from the frame.  farthest: the largest term of a placed coordinate.
     Errors of a coordinate difference, in steps: rounding to exact units, half a unit for either point; the
     float32 of the avatar's coordinate, U32 of its size, once from the frame and once from the voxel or block,
     where a pair in reach is within the larger of voxel and block, and the reach (doubled, so that a pair beyond
     cannot pass as near); float64 rounding far from the origin, a few 2^-53 of it.
     """
     reach = np.float64(units) / units_per_step
-    error = 1.1 / units_per_step + U32 * (extent + 2.0 * (max(65536.0, voxel_steps) + reach)) + farthest * 2.0**-50
+    error = (
+        1.1 / units_per_step
+        + U32 * (extent + 2.0 * (max(65536.0, voxel_steps) + reach))
+        + farthest * 2.0**-50
+    )
     around = math.sqrt(3.0) * error
     below = max(reach * (1.0 - 2.0 * U32) - around, 0.0)
     above = reach * (1.0 + 2.0 * U32) + around
@@ -164,7 +168,9 @@ def _exact(avatar, m, block, lane, placed, scene, voxel, lane_at, block_at, j, u
     square = np.int64(0)
     points = avatar.points
     for r in range(3):
-        world = place(m, placed.shift, r, points[block, 0, lane], points[block, 1, lane], points[block, 2, lane])
+        world = place(
+            m, placed.shift, r, points[block, 0, lane], points[block, 1, lane], points[block, 2, lane]
+        )
         low = scene.coordinates[voxel, r] * scene.voxel_steps + np.int64(scene.ints[block_at + r])
         steps = low + np.int64(scene.halves[lane_at + r * LANES + j])
         difference = to_units(world) - lattice_to_units(steps, scene.units_per_step)
@@ -273,7 +279,9 @@ def _overlap_voxel(avatar, m, pose, placed, scene, voxel, limits, stack, keep, o
 
 
 @nb.njit(nogil=True, cache=True)
-def overlap_poses(poses, scales, reach_units, avatar, scene, which, starts, rows, verdict, missing, visits, tests):
+def overlap_poses(
+    poses, scales, reach_units, avatar, scene, which, starts, rows, verdict, missing, visits, tests
+):
     """Answer `collide` for the poses numbered in `which`: one call a request, all its poses and voxels.
 
     poses: (k, 4, 4), checked.  scales: (k,).  reach_units: (k,) int64.  avatar: not empty.  starts, rows: the voxels

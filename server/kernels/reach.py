@@ -85,7 +85,8 @@ def voxels_in_reach(
                 if x > last[0]:
                     break
                 row = find_key(
-                    keys, morton_code(np.uint64(x + KEY_BIAS), np.uint64(y + KEY_BIAS), np.uint64(z + KEY_BIAS))
+                    keys,
+                    morton_code(np.uint64(x + KEY_BIAS), np.uint64(y + KEY_BIAS), np.uint64(z + KEY_BIAS)),
                 )
                 z += 1
                 if z > last[2]:

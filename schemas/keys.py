@@ -1,6 +1,7 @@
 """Key expressions: where on zenoh each question is asked, and who is alive. WIRE.md lists them."""
 
 import re
+from functools import lru_cache
 from typing import NamedTuple
 
 from .errors import BadRequestError
@@ -46,8 +47,12 @@ def questions_key(scene: str) -> str:
     return f"{ROOT}/scene/{check_name(scene, 'scene')}/*/*"
 
 
+@lru_cache(maxsize=4096)
 def parse_question(key: str) -> Route:
-    """The route of a question's key; BadRequestError where it is not one, wildcards included."""
+    """The route of a question's key; BadRequestError where it is not one, wildcards included.
+
+    Remembered, because every question of a client comes under the same three keys.
+    """
     prefix = f"{ROOT}/scene/"
     parts = key.removeprefix(prefix).split("/")
     if not key.startswith(prefix) or len(parts) != 3:
@@ -70,11 +75,3 @@ def client_alive_key(scene: str, client: str) -> str:
 def clients_alive_key(scene: str) -> str:
     """What a server listens to: the tokens of all clients of its scene."""
     return f"{ROOT}/client/{check_name(scene, 'scene')}/*"
-
-
-def parse_client_alive(key: str) -> str:
-    """The client whose liveliness token has this key; BadRequestError where it is no such key."""
-    parts = key.split("/")
-    if len(parts) != 5 or client_alive_key(parts[3], parts[4]) != key:
-        raise BadRequestError(f"key {key!r}: expected {ROOT}/client/SCENE/CLIENT")
-    return parts[4]

@@ -1,0 +1,60 @@
+"""What an operator may set for a server, each default with its reason."""
+
+import re
+from dataclasses import dataclass
+
+from ..schemas.errors import BadRequestError
+from ..schemas.messages import MAX_AVATAR_POINTS, MAX_POSES
+
+DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+
+_ENDPOINT = re.compile(r"(?P<protocol>[a-z0-9-]+)/(?P<address>[^?#\s]+)(?P<rest>[?#]\S*)?")
+_LOOPBACK = re.compile(r"(127(\.\d{1,3}){3}|localhost|\[::1\]):\d{1,5}")
+
+
+@dataclass(frozen=True)
+class ServerConfig:
+    """Of one server. BadRequestError says which value is wrong.
+
+    listen: the zenoh endpoint to be reached at. Loopback only, because anyone who reaches it may ask.
+    insecure: allow an endpoint that other hosts reach; there is no authentication yet.
+    workers: requests answered at the same time. 2: one client that does not take its replies holds one.
+    max_in_flight: requests accepted and not yet answered, over all clients; one more is answered `busy`.
+    max_in_flight_bytes: the same for the bytes of their payloads.
+    max_poses, max_avatar_points: of one request; more is answered `too_large`.
+    stop_seconds: how long a stop waits for accepted requests to be answered.
+    """
+
+    listen: str = DEFAULT_ENDPOINT
+    insecure: bool = False
+    workers: int = 2
+    max_in_flight: int = 1024
+    max_in_flight_bytes: int = 256 << 20
+    max_poses: int = MAX_POSES
+    max_avatar_points: int = MAX_AVATAR_POINTS
+    stop_seconds: float = 10.0
+
+    def __post_init__(self) -> None:
+        if not _ENDPOINT.fullmatch(self.listen):
+            raise BadRequestError(f"listen {self.listen!r}: expected an endpoint such as {DEFAULT_ENDPOINT}")
+        if not self.insecure and not is_loopback(self.listen):
+            raise BadRequestError(
+                f"listen {self.listen!r}: other hosts could reach it, and there is no authentication: "
+                f"listen on loopback such as {DEFAULT_ENDPOINT}, or say --insecure"
+            )
+        for name, most in (("max_poses", MAX_POSES), ("max_avatar_points", MAX_AVATAR_POINTS)):
+            if not 1 <= getattr(self, name) <= most:
+                raise BadRequestError(f"{name} is {getattr(self, name)}: expected 1 to {most} (WIRE.md)")
+        for name in ("workers", "max_in_flight", "max_in_flight_bytes"):
+            if getattr(self, name) < 1:
+                raise BadRequestError(f"{name} is {getattr(self, name)}: expected at least 1")
+
+
+def is_loopback(endpoint: str) -> bool:
+    """Whether only processes of this host can reach a zenoh endpoint; unsure counts as no."""
+    match = _ENDPOINT.fullmatch(endpoint)
+    if not match:
+        return False
+    if match["protocol"] in ("unixsock-stream", "unixpipe"):
+        return True
+    return bool(_LOOPBACK.fullmatch(match["address"])) and match["rest"] is None

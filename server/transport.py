@@ -1,0 +1,329 @@
+"""Bytes in, bytes out over zenoh: the server's only user of it. What the bytes mean is the service's matter.
+
+zenoh hands queries to a bounded channel; our own threads take them from there, since nothing may block in
+one of its callbacks. Requests of one client are answered one at a time and in order, those of several
+clients side by side, so that a client that does not take its replies stalls no other.
+"""
+
+import json
+import logging
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from enum import Enum
+from types import TracebackType
+from typing import Any, NamedTuple, Protocol, Self
+
+import zenoh
+
+from ..schemas import keys
+from ..schemas.errors import SolidcloudError
+from ..schemas.messages import JSON, MAX_MESSAGE_BYTES, MSGPACK
+from .config import ServerConfig
+
+log = logging.getLogger(__name__)
+
+# Queries that zenoh may hand over before a thread takes them; a full channel holds up zenoh's receiver, which
+# is what bounds memory in a storm. The threads empty it at once, into `FairQueues` or with `busy`.
+_CHANNEL = 1024
+
+_ENCODINGS = {name: zenoh.Encoding(name) for name in (MSGPACK, JSON)}
+
+
+class Answer(NamedTuple):
+    """One reply: its bytes, their encoding, and whether it is an answer or an error."""
+
+    payload: bytes
+    encoding: str
+    ok: bool
+
+
+class ServiceLike(Protocol):
+    """What a transport carries questions to. No method raises: an error is an answer too."""
+
+    def scenes(self, encoding: str | None) -> Answer: ...
+    def answer(self, key: str, payload: bytes, encoding: str | None) -> Answer: ...
+    def busy(self, encoding: str | None) -> Answer: ...
+    def client_gone(self, scene: str, client: str) -> None: ...
+
+
+class Offer(Enum):
+    """What becomes of a request that was offered."""
+
+    RUN = "run it now"
+    WAIT = "it waits; whoever finishes takes it"
+    FULL = "refused"
+
+
+class FairQueues:
+    """A queue for each client: one request of each in flight, the clients in turn, the whole bounded.
+
+    Thread-safe. Every RUN is followed by `finished`, and so is every request that `finished` returns;
+    that is why nothing that waits is ever forgotten.
+    """
+
+    def __init__(self, workers: int, max_requests: int, max_bytes: int) -> None:
+        self._lock = threading.Lock()
+        self._workers, self._max_requests, self._max_bytes = workers, max_requests, max_bytes
+        self._waiting: dict[str, deque[tuple[Any, int]]] = {}
+        self._ready: deque[str] = deque()  # clients with something waiting and nothing in flight
+        self._running: dict[str, int] = {}  # client: bytes of its request in flight
+        self._requests = self._bytes = 0
+
+    def offer(self, client: str, request: Any, size: int, *, always: bool = False) -> Offer:
+        """Take in a request of `size` bytes; `always`: even where the bound is reached."""
+        with self._lock:
+            full = self._requests >= self._max_requests or self._bytes + size > self._max_bytes
+            if full and self._requests and not always:
+                return Offer.FULL
+            self._requests += 1
+            self._bytes += size
+            if client not in self._running and len(self._running) < self._workers:
+                self._running[client] = size
+                return Offer.RUN
+            if client not in self._waiting:
+                self._waiting[client] = deque()
+                if client not in self._running:
+                    self._ready.append(client)
+            self._waiting[client].append((request, size))
+            return Offer.WAIT
+
+    def finished(self, client: str) -> tuple[str, Any] | None:
+        """The client's request in flight is answered. Returns the (client, request) to run next, if any."""
+        with self._lock:
+            self._requests -= 1
+            self._bytes -= self._running.pop(client)
+            if client in self._waiting:
+                self._ready.append(client)
+            if not self._ready:
+                return None
+            following = self._ready.popleft()
+            request, size = self._waiting[following].popleft()
+            if not self._waiting[following]:
+                del self._waiting[following]
+            self._running[following] = size
+            return following, request
+
+    def __len__(self) -> int:
+        """Requests taken in and not yet finished."""
+        with self._lock:
+            return self._requests
+
+
+def session_config(*, listen: str | None = None, connect: str | None = None) -> zenoh.Config:
+    """The configuration of a session, server's or client's: one endpoint, and nothing found by itself."""
+    settings: dict[str, Any] = {
+        # A peer opens although nobody is there yet, and goes on trying; a zenoh "client" fails instead.
+        "mode": "peer",
+        "listen/endpoints": [listen] if listen else [],
+        "connect/endpoints": [connect] if connect else [],
+        # By default 1 s, growing to 4 s: an outage would last that much longer than the server is away.
+        "connect/retry": {"period_init_ms": 50, "period_max_ms": 500, "period_increase_factor": 2},
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        # A killed process would leave 16 MiB behind in /dev/shm.
+        "transport/shared_memory/enabled": False,
+        # A longer message is dropped unread, and its sender's query expires; by default 1 GiB is taken in.
+        "transport/link/rx/max_message_size": MAX_MESSAGE_BYTES,
+        # How long a reply waits for a client that takes none before its link is closed [µs]; by default 5 s.
+        "transport/link/tx/queue/congestion_control/block/wait_before_close": 200_000,
+        # By default 100 connections that never say a word keep new ones out for 10 s.
+        "transport/unicast/accept_timeout": 1000,
+        "transport/unicast/accept_pending": 1000,
+    }
+    if listen:
+        # Whoever is connected could else declare our keys, and a zenoh "client" would be routed to it.
+        settings["access_control"] = {
+            "enabled": True,
+            "default_permission": "allow",
+            "rules": [
+                {
+                    "id": "nobody-else-answers",
+                    "messages": ["declare_queryable", "reply"],
+                    "flows": ["ingress"],
+                    "permission": "deny",
+                    "key_exprs": [f"{keys.ROOT}/**"],
+                }
+            ],
+            "subjects": [{"id": "everybody"}],
+            "policies": [{"rules": ["nobody-else-answers"], "subjects": ["everybody"]}],
+        }
+    config = zenoh.Config()
+    for path, value in settings.items():
+        config.insert_json5(path, json.dumps(value))
+    return config
+
+
+class Transport:
+    """Carries questions to a service and its answers back, from `__enter__` until `__exit__`.
+
+    SolidcloudError on entry when the endpoint cannot be listened on. Leaving it stops accepting, answers
+    what was accepted (up to `config.stop_seconds`), then closes.
+    """
+
+    def __init__(self, scenes: Sequence[str], service: ServiceLike, config: ServerConfig) -> None:
+        self._scenes, self._service, self._config = tuple(scenes), service, config
+        self._threads: list[threading.Thread] = []
+        self._declared: list[Any] = []
+
+    def __enter__(self) -> Self:
+        with ExitStack() as stack:
+            session = stack.enter_context(self._open())
+            for scene in self._scenes:
+                self._declare_scene(session, scene)
+            self._declare_scenes(session)
+            # Last: whoever sees the token may ask at once.
+            for scene in self._scenes:
+                key = keys.server_alive_key(scene, str(session.zid()))
+                self._declared.append(session.liveliness().declare_token(key))
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        with self._stack:
+            # The tokens first. An undeclared queryable's channel still hands out what it holds, then ends.
+            for declared in reversed(self._declared):
+                declared.undeclare()
+            deadline = time.monotonic() + self._config.stop_seconds
+            for thread in self._threads:
+                thread.join(max(0.0, deadline - time.monotonic()))
+            late = sum(thread.is_alive() for thread in self._threads)
+            if late:
+                log.error("stopped with %d threads at work after %g s", late, self._config.stop_seconds)
+
+    def _open(self) -> zenoh.Session:
+        """A session that listens; SolidcloudError when it cannot."""
+        try:
+            return zenoh.open(session_config(listen=self._config.listen))
+        except zenoh.ZError as error:
+            raise SolidcloudError(
+                f"cannot listen on {self._config.listen}: {error}: is another server there? try another port"
+            ) from None
+
+    def _declare_scene(self, session: zenoh.Session, scene: str) -> None:
+        """Answer the questions about one scene, and watch for clients that go."""
+        config = self._config
+        queues = FairQueues(config.workers, config.max_in_flight, config.max_in_flight_bytes)
+        lane = _Lane(self._service, scene, queues)
+        watch = session.liveliness().declare_subscriber(
+            keys.clients_alive_key(scene), zenoh.handlers.FifoChannel(_CHANNEL)
+        )
+        self._declared.append(watch)
+        self._start(f"{scene}-watch", lane.watch, watch.handler)
+        queryable = session.declare_queryable(
+            keys.questions_key(scene), zenoh.handlers.FifoChannel(_CHANNEL), complete=True
+        )
+        self._declared.append(queryable)
+        for number in range(config.workers):
+            self._start(f"{scene}-{number}", lane.take, queryable.handler)
+
+    def _declare_scenes(self, session: zenoh.Session) -> None:
+        """Answer which scenes are served."""
+        queryable = session.declare_queryable(
+            keys.scenes_key(), zenoh.handlers.FifoChannel(_CHANNEL), complete=True
+        )
+        self._declared.append(queryable)
+
+        def take(queries: Any) -> None:
+            for query in queries:
+                with query:
+                    _reply(query, keys.scenes_key(), self._service.scenes(_encoding(query)))
+
+        self._start("scenes", take, queryable.handler)
+
+    def _start(self, name: str, run: Callable[[Any], None], handler: Any) -> None:
+        """A thread that takes what a channel hands out, until that ends."""
+        thread = threading.Thread(target=run, args=(handler,), name=f"solidcloud-{name}", daemon=True)
+        thread.start()
+        self._threads.append(thread)
+
+
+class _Gone(NamedTuple):
+    """Takes a request's place in a client's queue: the client went, after all it had asked before."""
+
+    client: str
+
+
+class _Lane:
+    """The questions about one scene, on their way from the channel to the service."""
+
+    def __init__(self, service: ServiceLike, scene: str, queues: FairQueues) -> None:
+        self._service, self._scene, self._queues = service, scene, queues
+
+    def take(self, queries: Any) -> None:
+        """One thread's work: take queries, answer them or leave them to the thread that is at work."""
+        for query in queries:
+            request = _Request(query)
+            offer = self._queues.offer(request.client, request, request.size)
+            if offer is Offer.RUN:
+                self._run(request.client, request)
+            elif offer is Offer.FULL:
+                with query:
+                    _reply(query, request.key_expr, self._service.busy(_encoding(query)))
+
+    def watch(self, samples: Any) -> None:
+        """One thread's work: have the avatars of clients that went dropped."""
+        for sample in samples:
+            if sample.kind != zenoh.SampleKind.DELETE:
+                continue
+            client = str(sample.key_expr).rpartition("/")[2]
+            if self._queues.offer(client, _Gone(client), 0, always=True) is Offer.RUN:
+                self._run(client, _Gone(client))
+
+    def _run(self, client: str, request: Any) -> None:
+        """Carry out one request, and then what waits, until nothing does."""
+        following: tuple[str, Any] | None = (client, request)
+        while following is not None:
+            client, request = following
+            try:
+                if isinstance(request, _Gone):
+                    self._service.client_gone(self._scene, request.client)
+                else:
+                    self._answer(request)
+            except Exception:
+                log.exception("request of client %s of scene %s", client, self._scene)
+            finally:
+                following = self._queues.finished(client)
+
+    def _answer(self, request: "_Request") -> None:
+        """Have one query answered. Leaving `with query` tells the client that no more will come."""
+        with request.query as query:
+            payload = b"" if request.payload is None else request.payload.to_bytes()
+            answer = self._service.answer(request.key, payload, _encoding(query))
+            _reply(query, request.key_expr, answer)
+
+
+class _Request:
+    """A query on its way, and what was read of it: each property of a query is a copy that costs."""
+
+    __slots__ = ("client", "key", "key_expr", "payload", "query", "size")
+
+    def __init__(self, query: zenoh.Query) -> None:
+        self.query = query
+        self.key_expr = query.key_expr
+        self.key = str(self.key_expr)
+        parts = self.key.split("/")
+        # Whose queue it waits in. A key with wildcards is nobody's: the service refuses it.
+        self.client = parts[4] if len(parts) == 6 else ""
+        self.payload = query.payload
+        self.size = 0 if self.payload is None else len(self.payload)
+
+
+def _encoding(query: zenoh.Query) -> str | None:
+    """The encoding a query states, if any."""
+    return None if query.encoding is None else str(query.encoding)
+
+
+def _reply(query: zenoh.Query, key: Any, answer: Answer) -> None:
+    """Send one answer; where that fails the client is gone, or its link is: logged, nothing else to do."""
+    try:
+        if answer.ok:
+            query.reply(key, answer.payload, encoding=_ENCODINGS[answer.encoding])
+        else:
+            query.reply_err(answer.payload, encoding=_ENCODINGS[answer.encoding])
+    except zenoh.ZError as error:
+        log.warning("reply to %s: %s", query.key_expr, error)

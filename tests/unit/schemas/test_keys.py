@@ -1,0 +1,57 @@
+"""Key expressions: what they look like, and what may not stand in one."""
+
+import pytest
+from solidcloud.schemas import keys
+from solidcloud.schemas.errors import BadRequestError
+from solidcloud.schemas.messages import WIRE_VERSION
+
+
+def test_keys_look_as_in_the_document():
+    assert keys.scenes_key() == "solidcloud/1/scenes"
+    assert keys.question_key("hall", "c-1", "collide") == "solidcloud/1/scene/hall/c-1/collide"
+    assert keys.questions_key("hall") == "solidcloud/1/scene/hall/*/*"
+    assert keys.server_alive_key("hall", "ab12") == "solidcloud/1/alive/hall/ab12"
+    assert keys.client_alive_key("hall", "c-1") == "solidcloud/1/client/hall/c-1"
+    assert keys.clients_alive_key("hall") == "solidcloud/1/client/hall/*"
+    assert f"solidcloud/{WIRE_VERSION}" == keys.ROOT
+
+
+def test_a_question_is_read_as_it_was_written():
+    for operation in keys.OPERATIONS:
+        route = keys.parse_question(keys.question_key("St.Peter_2", "a", operation))
+        assert route == keys.Route("St.Peter_2", "a", operation)
+
+
+@pytest.mark.parametrize("name", ["", "a" * 65, "a/b", "*", "**", "a b", "häll", "a\n", "$*", "a?b", "#"])
+def test_bad_names_are_refused(name):
+    for make in (
+        lambda: keys.question_key(name, "c", "info"),
+        lambda: keys.question_key("hall", name, "info"),
+        lambda: keys.questions_key(name),
+        lambda: keys.client_alive_key("hall", name),
+        lambda: keys.server_alive_key(name, "s"),
+    ):
+        with pytest.raises(BadRequestError, match="expected 1 to 64"):
+            make()
+
+
+def test_longest_name_is_allowed():
+    assert keys.check_name("a" * 64, "scene") == "a" * 64
+
+
+@pytest.mark.parametrize(
+    "key",
+    [
+        "solidcloud/1/scene/hall/c",
+        "solidcloud/1/scene/hall/c/info/x",
+        "solidcloud/1/scene/hall/c/distance",
+        "solidcloud/1/scene/hall/*/info",
+        "solidcloud/1/scene/**",
+        "solidcloud/2/scene/hall/c/info",
+        "other/1/scene/hall/c/info",
+        "",
+    ],
+)
+def test_keys_that_are_no_question_are_refused(key):
+    with pytest.raises(BadRequestError):
+        keys.parse_question(key)

@@ -1,51 +1,67 @@
 """`collide`: does an avatar touch the scene, one verdict a pose? One request -> one result."""
 
+import time
 from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..schemas.answers import CollideAnswers, Verdict
-from ..schemas.errors import BadRequestError, BadTransformError, TooLargeError
+from ..schemas.answers import CollideAnswers
+from ..schemas.archive import Archive
+from ..schemas.errors import BadRequestError, BadTransformError, SolidcloudError, TooLargeError
 from ..schemas.messages import make_poses
 from ..schemas.voxel_grid import UNITS_PER_METRE
 from .avatar import AvatarModel
 from .kernels import placing
-from .kernels.overlap import SceneArrays, overlap_poses
+from .kernels.overlap import CLEAR, UNKNOWN, SceneArrays, overlap_poses
+from .kernels.placing import check_poses
 from .kernels.reach import voxels_in_reach
 from .residency import Residency
-from .store import Store
 
-# Reach is compared in exact units whose squares must fit 63 bits (NUMERICS.md N5).
-MAX_REACH_UNITS = 1 << 30
-# Coordinates near a pose must be exact in float32, with a bit to spare (server/kernels/overlap.py).
-MAX_FRAME_STEPS = 1 << 23
-
-_POSE_FAULTS = {
-    placing.BAD_LAST_ROW: "has a last row that is not 0 0 0 1: give row-major 4x4 poses",
-    placing.MIRRORED: "mirrors (determinant {:g}): expected a rotation, with a uniform scale at most",
-    placing.SHEARED: "shears, or scales its axes differently (by {:g}, relative): expected a rotation, "
-    "with a uniform scale at most, within 1e-9: renormalise it",
-    placing.BAD_SCALE: "scales by {:g}: expected 0.001 to 1000",
-    placing.TOO_FAR: "translates by {:g} m: expected within 1e9 m",
+_POSE_FAULTS: dict[int, tuple[type[SolidcloudError], str]] = {
+    placing.NOT_FINITE: (BadRequestError, "holds {}: expected finite numbers"),
+    placing.BAD_LAST_ROW: (BadTransformError, "has a last row that is not 0 0 0 1: give row-major 4x4 poses"),
+    placing.MIRRORED: (
+        BadTransformError,
+        "mirrors (determinant {:g}): expected a rotation, with a uniform scale at most",
+    ),
+    placing.SHEARED: (
+        BadTransformError,
+        "shears, or scales its axes differently (by {:g}, relative): expected a rotation, with a uniform scale at "
+        "most, within 1e-9: renormalise it",
+    ),
+    placing.BAD_SCALE: (BadTransformError, "scales by {:g}: expected 0.001 to 1000"),
+    placing.TOO_FAR: (BadTransformError, "translates by {:g} m: expected within 1e9 m"),
+    placing.LONG_REACH: (
+        BadRequestError,
+        "has radii and margin that add up to {:g} m: expected at most 16 m: give a smaller margin or radius",
+    ),
+    placing.LARGE_AVATAR: (
+        TooLargeError,
+        "makes the avatar with its reach extend {:g} m: more than this scene's lattice can place exactly: split it",
+    ),
 }
 
 
 class SceneData(NamedTuple):
-    """What every question about one scene reads.
+    """What every question about one scene reads; made once, by `make_scene_data`.
 
-    store, residency: its voxels.  keys: (v,) uint64.  coordinates, low, high: (v, 3) int64: voxel coordinates, least
-    and greatest lattice coordinates of a voxel's points.  radius_units: of every scan point, exact units.
+    arrays: what the overlap kernel reads.  keys: (v,) uint64.  low, high: (v, 3) int64, least and greatest lattice
+    coordinates of a voxel's points; scene_low, scene_high: (3,) of all points.  radius_units: of every scan
+    point, exact units.  unknown: (u, 2, 3) int64, lattice boxes of scans left out; everywhere: also elsewhere.
     """
 
-    store: Store
     residency: Residency
+    arrays: SceneArrays
     keys: NDArray[np.uint64]
-    coordinates: NDArray[np.int64]
     low: NDArray[np.int64]
     high: NDArray[np.int64]
+    scene_low: NDArray[np.int64]
+    scene_high: NDArray[np.int64]
     radius_units: int
+    unknown: NDArray[np.int64]
+    unknown_everywhere: bool
 
 
 class Reach(NamedTuple):
@@ -71,51 +87,68 @@ def to_units(metres: float, what: str) -> int:
     return int(np.rint(metres * UNITS_PER_METRE))
 
 
-def check_poses(poses: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Poses (k, 4, 4) float64 and their scales (k,). Raises BadRequestError or BadTransformError naming the pose."""
+def make_scene_data(archive: Archive, residency: Residency) -> SceneData:
+    """What the questions read of an archive whose voxels `residency` holds."""
+    header = archive.header
+    lattice = header.lattice
+    base = archive.coordinates * lattice.voxel_steps
+    arrays = SceneArrays(
+        *residency.buffer.arena,
+        residency.where,
+        archive.coordinates,
+        np.array(lattice.origin),
+        lattice.step,
+        lattice.units_per_step,
+        lattice.voxel_steps,
+    )
+    return SceneData(
+        residency,
+        arrays,
+        archive.voxels["key"].astype(np.uint64),
+        base + archive.voxels["low"],
+        base + archive.voxels["high"],
+        header.low,
+        header.high,
+        to_units(header.radius, "radius of the archive"),
+        header.unknown,
+        header.unknown_everywhere,
+    )
+
+
+def _checked(
+    data: SceneData, avatar: AvatarModel, poses: ArrayLike, margin: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+    """The poses (k, 4, 4), their scales (k,) and r_a + r_b + margin in exact units (k,), all admissible.
+
+    Raises BadRequestError, BadTransformError or TooLargeError naming the pose.
+    """
     array = make_poses(poses)
     if not array.flags.writeable:
         array = array.copy()  # numba compiles a read-only array anew
-    scales = np.empty(len(array))
-    fault, pose, found = placing.check_poses(array, scales)
-    if fault == placing.NOT_FINITE:
-        raise BadRequestError(f"pose {pose} holds {found}: expected finite numbers")
+    scales, units = np.empty(len(array)), np.empty(len(array), np.int64)
+    other_units = data.radius_units + to_units(margin, "margin")
+    fault, pose, found = check_poses(
+        array, avatar.arrays.radius, avatar.radius, other_units, data.arrays, scales, units
+    )
     if fault != placing.GOOD:
-        raise BadTransformError(f"pose {pose} {_POSE_FAULTS[fault].format(found)}")
-    return array, scales
+        error, text = _POSE_FAULTS[fault]
+        raise error(f"pose {pose} {text.format(found)}")
+    return array, scales, units
 
 
 def find_reach(data: SceneData, avatar: AvatarModel, poses: ArrayLike, margin: float) -> Reach:
     """Check a request and find the voxels in reach of each pose. `avatar` is not empty."""
-    array, scales = check_poses(poses)
-    margin_units = to_units(margin, "margin")
-    units = np.rint(scales * avatar.radius * UNITS_PER_METRE) + (data.radius_units + margin_units)
-    lattice = data.store.archive.header.lattice
-    if len(units) and units.max() > MAX_REACH_UNITS:
-        raise BadRequestError(
-            f"radii and margin add up to {units.max() / UNITS_PER_METRE:g} m: expected at most "
-            f"{MAX_REACH_UNITS / UNITS_PER_METRE:g} m: give a smaller margin or radius"
-        )
-    root = float(avatar.arrays.radius[0])
-    extent = (root * scales.max(initial=0.0) + units.max(initial=0) / UNITS_PER_METRE) / lattice.step
-    if extent + lattice.voxel_steps > MAX_FRAME_STEPS:
-        raise TooLargeError(
-            f"the avatar with its reach extends {extent * lattice.step:g} m: this scene takes at most "
-            f"{(MAX_FRAME_STEPS - lattice.voxel_steps) * lattice.step:g} m: split it"
-        )
+    array, scales, units = _checked(data, avatar, poses, margin)
     k = len(array)
     starts, boxes, outside = np.empty(k + 1, np.int64), np.empty((k, 2, 3)), np.empty(k, bool)
     rows = np.empty(16 * k + 64, np.int64)
-    header = data.store.archive.header
-    reach_units = units.astype(np.int64)
     while True:
         needed = voxels_in_reach(
-            array, scales, reach_units, avatar.arrays.center[0], root, np.array(lattice.origin), lattice.step,
-            lattice.units_per_step, lattice.voxel_steps, data.keys, data.coordinates, data.low, data.high,
-            header.low, header.high, starts, rows, boxes, outside,
+            array, scales, units, avatar.arrays.center, avatar.arrays.radius, data.arrays, data.keys, data.low,
+            data.high, data.scene_low, data.scene_high, starts, rows, boxes, outside,
         )  # fmt: skip
         if needed <= len(rows):
-            return Reach(array, scales, reach_units, starts, rows[:needed], boxes, outside)
+            return Reach(array, scales, units, starts, rows[:needed], boxes, outside)
         rows = np.empty(needed, np.int64)
 
 
@@ -125,10 +158,10 @@ def _pieces(reach: Reach, residency: Residency) -> Iterator[tuple[NDArray[np.int
     Nearly always one piece. A pose that alone reaches more than the budget is looked at voxel by voxel run
     (NUMERICS.md case 23), and so appears in several pieces.
     """
-    everything = np.unique(reach.rows)
+    everything = np.unique(reach.rows).tolist() if len(reach.poses) > 1 else reach.rows.tolist()
     budget = residency.buffer.total_bytes
-    if residency.bytes_of(everything.tolist()) <= budget:
-        yield np.arange(len(reach.poses)), everything.tolist(), reach
+    if residency.bytes_of(everything) <= budget:
+        yield np.arange(len(reach.poses)), everything, reach
         return
     which: list[int] = []
     held: dict[int, None] = {}
@@ -167,49 +200,29 @@ def collide(data: SceneData, avatar: AvatarModel, poses: ArrayLike, margin: floa
     CONTACT, CLEAR or UNKNOWN (a voxel in reach cannot be read, or a scan was left out there, and no contact was
     found elsewhere); the definition is NUMERICS.md N5. Raises BadRequestError, BadTransformError, TooLargeError.
     """
-    residency, header = data.residency, data.store.archive.header
+    begin = time.perf_counter()
     if not len(avatar.points):
-        k = len(check_poses(poses)[0])
-        to_units(margin, "margin")
-        zeros = np.zeros(k, np.uint32)
-        return CollideAnswers(np.zeros(k, np.uint8), np.zeros(k, bool), zeros, zeros.copy(), zeros.copy())
+        k = len(_checked(data, avatar, poses, margin)[0])
+        return CollideAnswers(np.zeros(k, np.uint8), np.zeros(k, bool), *np.zeros((3, k), np.uint32))
     reach = find_reach(data, avatar, poses, margin)
-    k = len(reach.poses)
-    total = np.zeros((4, k), np.uint32)  # verdict, missing, visits, tests
+    residency = data.residency
+    verdict, counts = np.zeros(len(reach.poses), np.uint8), np.zeros((3, len(reach.poses)), np.uint32)
     hits = misses = 0
     faults: dict[str, None] = {}
-    lattice = header.lattice
-    scene = SceneArrays(
-        *residency.buffer.arena, residency.where, data.coordinates, np.array(lattice.origin), lattice.step,
-        lattice.units_per_step, lattice.voxel_steps,
-    )  # fmt: skip
     for which, rows, part in _pieces(reach, residency):
-        verdict, found = np.zeros(k, np.uint8), np.zeros((3, k), np.uint32)
         with residency.hold(rows) as held:
             overlap_poses(
-                part.poses,
-                part.scales,
-                part.units,
-                avatar.arrays,
-                scene,
-                which,
-                part.starts,
-                part.rows,
-                verdict,
-                *found,
-            )
-        total[0, which] |= verdict[which]
-        total[1:, which] += found[:, which]
+                part.poses, part.scales, part.units, avatar.arrays, data.arrays, which, part.starts, part.rows,
+                verdict, *counts,
+            )  # fmt: skip
         hits, misses = hits + held.hits, misses + held.misses
         faults.update(dict.fromkeys(held.faults))
-    unseen = (total[1] > 0) | _in_unknown(reach.boxes, header.unknown, header.unknown_everywhere)
-    verdict = np.where(
-        total[0] == Verdict.CONTACT, Verdict.CONTACT, np.where(unseen, Verdict.UNKNOWN, Verdict.CLEAR)
-    )
+    if data.unknown_everywhere or len(data.unknown):
+        unseen = _in_unknown(reach.boxes, data.unknown, data.unknown_everywhere)
+        verdict[unseen & (verdict == CLEAR)] = UNKNOWN
     return CollideAnswers(
-        verdict.astype(np.uint8), reach.outside, total[1], total[2], total[3],
-        hits=hits, misses=misses, resident=residency.resident, resident_bytes=residency.resident_bytes,
-        faults=tuple(faults),
+        verdict, reach.outside, counts[0], counts[1], counts[2], time.perf_counter() - begin,
+        hits, misses, residency.resident, residency.resident_bytes, tuple(faults),
     )  # fmt: skip
 
 

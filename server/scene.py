@@ -1,8 +1,6 @@
 """Scene: an archive opened in this process, and the questions asked of it. The same methods as `Client`."""
 
 import threading
-import time
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +11,7 @@ from ..schemas.archive import FORMAT_VERSION
 from ..schemas.errors import BadRequestError, UnknownAvatarError
 from ..schemas.messages import WIRE_VERSION, AvatarInfo, SceneInfo, SourceInfo
 from .avatar import AvatarModel, make_avatar
-from .collide import SceneData, collide, to_units
+from .collide import collide, make_scene_data
 from .residency import Residency
 from .store import Store
 
@@ -29,17 +27,8 @@ class Scene:
     def __init__(self, store: Store, name: str, budget_bytes: int) -> None:
         """Serve the voxels of `store`; use `Scene.open`."""
         self.name = name
-        archive = store.archive
-        base = archive.coordinates * archive.header.lattice.voxel_steps
-        self._data = SceneData(
-            store,
-            Residency(store, budget_bytes),
-            np.ascontiguousarray(archive.voxels["key"]).astype(np.uint64),
-            archive.coordinates,
-            base + archive.voxels["low"],
-            base + archive.voxels["high"],
-            to_units(archive.header.radius, "radius of the archive"),
-        )
+        self._store = store
+        self._data = make_scene_data(store.archive, Residency(store, budget_bytes))
         self._avatars: dict[tuple[str, str], AvatarModel] = {}
         self._lock = threading.Lock()
 
@@ -68,7 +57,7 @@ class Scene:
 
     def close(self) -> None:
         """Close the archive's files."""
-        self._data.store.close()
+        self._store.close()
 
     @property
     def residency(self) -> Residency:
@@ -77,7 +66,7 @@ class Scene:
 
     def info(self) -> SceneInfo:
         """What is served: counts, bounds, lattice, radius, sources."""
-        store = self._data.store
+        store = self._store
         header = store.archive.header
         lattice = header.lattice
         return SceneInfo(
@@ -131,13 +120,11 @@ class Scene:
         self, name: str, poses: ArrayLike, margin: float = 0.0, *, client: str = ""
     ) -> CollideAnswers:
         """Whether avatar `name` touches the scene under each of the poses (k, 4, 4); see server/collide.py."""
-        begin = time.perf_counter()
         with self._lock:
             avatar = self._avatars.get((client, name))
         if avatar is None:
             raise UnknownAvatarError(f"avatar {name!r} is not known: add it with add_avatar first")
-        answers = collide(self._data, avatar, poses, margin)
-        return replace(answers, engine_seconds=time.perf_counter() - begin)
+        return collide(self._data, avatar, poses, margin)
 
     def drop_client(self, client: str) -> None:
         """Forget the avatars of a client that is gone."""

@@ -28,7 +28,7 @@ ONE_SLACK = np.float32(1.0 + 2e-6)
 # two trees of MOST_LEVELS. Trees of degree 2 over 2^31 points have 32 levels a BSH.
 MOST_LEVELS = 80
 STACK = 2 * MOST_LEVELS * 15 + 16
-CLEAR, CONTACT = 0, 1
+CLEAR, CONTACT, UNKNOWN = 0, 1, 2  # schemas/answers.py Verdict
 
 
 class SceneArrays(NamedTuple):
@@ -286,7 +286,8 @@ def overlap_poses(
 
     poses: (k, 4, 4), checked.  scales: (k,).  reach_units: (k,) int64.  avatar: not empty.  starts, rows: the voxels
     of each pose, from `voxels_in_reach`; a voxel that is not resident is counted as missing.
-    Writes verdict (k,) uint8: CONTACT, or CLEAR of all that was looked at; missing, visits, tests (k,) uint32.
+    Adds to what verdict (k,) uint8 and missing, visits, tests (k,) uint32 hold, CLEAR and 0 to begin with, so
+    that a pose may be answered in pieces: a contact wins over anything missing, and that over CLEAR.
     """
     blocks = avatar.points.shape[0]
     placed = Placed(
@@ -302,19 +303,19 @@ def overlap_poses(
     counters = np.zeros(2, np.int64)
     for number in range(which.shape[0]):
         i = which[number]
-        verdict[i] = CLEAR
-        missing[i] = 0
         counters[0], counters[1] = 0, 0
-        if starts[i + 1] > starts[i]:
+        if verdict[i] != CONTACT and starts[i + 1] > starts[i]:
             extent, farthest = _place_nodes(avatar, poses[i], scales[i], placed, scene)
             limits = _limits(reach_units[i], scene.units_per_step, extent, farthest, scene.voxel_steps)
             for at in range(starts[i], starts[i + 1]):
                 voxel = rows[at]
                 if scene.where[voxel, 0] < 0:
-                    missing[i] += 1
+                    missing[i] += np.uint32(1)
+                    verdict[i] = UNKNOWN
                 elif _overlap_voxel(
                     avatar, poses[i], i, placed, scene, voxel, limits, stack, keep, off, counters
                 ):
                     verdict[i] = CONTACT
                     break
-        visits[i], tests[i] = counters[0], counters[1]
+        visits[i] += np.uint32(counters[0])
+        tests[i] += np.uint32(counters[1])

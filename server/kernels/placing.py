@@ -16,7 +16,12 @@ from ...schemas.voxel_grid import MAX_COORDINATE, UNITS_PER_METRE
 SIMILARITY_TOLERANCE = 1e-9  # NUMERICS.md N6
 SMALLEST_SCALE, LARGEST_SCALE = 1e-3, 1e3
 
-GOOD, NOT_FINITE, BAD_LAST_ROW, MIRRORED, SHEARED, BAD_SCALE, TOO_FAR = range(7)
+# Reach is compared in exact units whose squares must fit 63 bits (NUMERICS.md N5): 16 m.
+MAX_REACH_UNITS = 1 << 30
+# Coordinates near a pose must be exact in float32, with a bit to spare (overlap.py).
+MAX_FRAME_STEPS = 1 << 23
+
+GOOD, NOT_FINITE, BAD_LAST_ROW, MIRRORED, SHEARED, BAD_SCALE, TOO_FAR, LONG_REACH, LARGE_AVATAR = range(9)
 
 
 class Avatar(NamedTuple):
@@ -35,9 +40,11 @@ class Avatar(NamedTuple):
 
 
 @nb.njit(nogil=True, cache=True)
-def check_poses(poses, scales):
-    """Check poses (k, 4, 4) float64 to be similarities (N6), writing their scales (k,).
+def check_poses(poses, node_radius, radius, other_units, scene, scales, units):
+    """Check poses (k, 4, 4) float64 to be similarities (N6), writing scales (k,) and reaches units (k,) int64.
 
+    node_radius: (a,) of the avatar's nodes, root first, may be empty; radius: of its points [m].  other_units: the
+    scan's radius and the margin, exact units.  scene: SceneArrays.
     A scale within SIMILARITY_TOLERANCE of 1 is 1, so that the rounding of a rigid pose changes no radius.
     Returns (GOOD, 0, 0.0), or the first fault, its pose and the figure found.
     """
@@ -78,6 +85,13 @@ def check_poses(poses, scales):
         if volume < 0.0:
             return MIRRORED, i, volume
         scales[i] = 1.0 if abs(scale - 1.0) <= SIMILARITY_TOLERANCE else scale
+        reach = np.rint(scales[i] * radius * UNITS_PER_METRE) + float(other_units)
+        if reach > MAX_REACH_UNITS:
+            return LONG_REACH, i, reach / UNITS_PER_METRE
+        units[i] = np.int64(reach)
+        extent = reach / UNITS_PER_METRE + (node_radius[0] * scales[i] if node_radius.shape[0] else 0.0)
+        if extent / scene.step + scene.voxel_steps > MAX_FRAME_STEPS:
+            return LARGE_AVATAR, i, extent
     return GOOD, 0, 0.0
 
 

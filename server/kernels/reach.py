@@ -35,20 +35,22 @@ def _near_box(center, reach, low, high):
 
 @nb.njit(nogil=True, cache=True)
 def voxels_in_reach(
-    poses, scales, reach_units, root_center, root_radius, origin, step, units_per_step, voxel_steps,
-    keys, coordinates, low, high, scene_low, scene_high, starts, rows, boxes, outside,
+    poses, scales, reach_units, node_center, node_radius, scene, keys, low, high, scene_low, scene_high,
+    starts, rows, boxes, outside,
 ):  # fmt: skip
     """List, for each pose, the voxels whose points its root sphere could touch.
 
     poses: (k, 4, 4).  scales: (k,).  reach_units: (k,) int64, r_a + r_b + margin in exact units.
-    root_center (3,), root_radius: the avatar's root sphere [m].  keys (v,) sorted, coordinates (v, 3) int64: the
-    voxels that exist; low, high (v, 3) int64: least and greatest lattice coordinates of their points.
+    node_center (a, 3), node_radius (a,): the avatar's nodes, root first [m].  scene: SceneArrays.
+    keys (v,) sorted: the voxels that exist; low, high (v, 3) int64: least and greatest lattice coordinates of their
+    points.
     scene_low, scene_high (3,) int64: those of all points.
     Writes starts (k + 1,) int64 and rows (capacity,) int64: voxel rows of pose i are rows[starts[i]:starts[i+1]],
     by key; boxes (k, 2, 3) float64: the box of the root sphere and its reach [steps]; outside (k,): whether
     that box leaves the scene's. Returns how many rows are needed; beyond the capacity none are written.
     The reach is widened by more than the rounding of this function: a millionth of itself, and a step.
     """
+    step, units_per_step, voxel_steps = scene.step, scene.units_per_step, scene.voxel_steps
     shift, center = np.empty(3), np.empty(3)
     first, last = np.empty(3, np.int64), np.empty(3, np.int64)
     box_low, box_high = np.empty(3), np.empty(3)
@@ -56,12 +58,12 @@ def voxels_in_reach(
     for i in range(poses.shape[0]):
         m = poses[i]
         for r in range(3):
-            shift[r] = m[r, 3] - origin[r]
-        reach = (root_radius * scales[i] / step + reach_units[i] / units_per_step) * (1.0 + 1e-6) + 1.0
+            shift[r] = m[r, 3] - scene.origin[r]
+        reach = (node_radius[0] * scales[i] / step + reach_units[i] / units_per_step) * (1.0 + 1e-6) + 1.0
         cells = 1.0
         outside[i] = False
         for r in range(3):
-            center[r] = place(m, shift, r, root_center[0], root_center[1], root_center[2]) / step
+            center[r] = place(m, shift, r, node_center[0, 0], node_center[0, 1], node_center[0, 2]) / step
             slack = abs(center[r]) * 1e-15  # a float64 that far out has this much less to say
             boxes[i, 0, r], boxes[i, 1, r] = center[r] - reach - slack, center[r] + reach + slack
             outside[i] |= boxes[i, 0, r] < scene_low[r] or boxes[i, 1, r] > scene_high[r]

@@ -116,10 +116,15 @@ def open_las(path: Path) -> list[Scan]:
 
 
 def las_bounds(path: Path) -> NDArray[np.float64] | None:
-    """The bounds a LAS header declares, (2, 3) [m], however broken the rest is; may raise anything."""
+    """The bounds a LAS header declares, (2, 3) [m], of a file that may be truncated; may raise anything.
+
+    A header at odds with itself is not believed: a scan skipped at a place it was not would leave the place
+    where it was to be called clear.
+    """
     with path.open("rb") as file:
-        start = file.read(HEADER_BYTES)
-    return _bounds_of(start) if start[:4] == b"LASF" and len(start) == HEADER_BYTES else None
+        header = _read_header(file, path)
+    _check_header(header, path, size=1 << 62)  # all but where the file ends
+    return header.bounds
 
 
 def _read_header(file: BinaryIO, path: Path) -> Header:

@@ -1,0 +1,164 @@
+"""How work and results look on a terminal: progress on standard error, results on standard output."""
+
+from collections.abc import Iterable, Iterator
+from itertools import groupby
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Self
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+from rich.text import Text
+
+from ..schemas.answers import CollideAnswers, Verdict
+
+if TYPE_CHECKING:
+    # Numba and HDF5 come with these; a bar needs neither.
+    from ..builder.pipeline import BuildSummary
+    from ..schemas.messages import SceneInfo
+
+
+class Bars:
+    """A bar for each stage of long work: what `builder.progress.Progress` asks for; a context manager.
+
+    Where standard error is no terminal nothing moves, and a line a stage is left when all is done.
+    """
+
+    def __init__(self) -> None:
+        self._bars = Progress(
+            TextColumn("{task.description:<12}"),
+            BarColumn(bar_width=30),
+            TextColumn("{task.completed:>13,.0f} of {task.total:,.0f} {task.fields[unit]}"),
+            TimeElapsedColumn(),
+            TimeRemainingColumn(compact=True),
+            console=Console(stderr=True),
+        )
+        self._task: TaskID | None = None
+
+    def __enter__(self) -> Self:
+        self._bars.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._bars.stop()
+
+    def start(self, stage: str, total: int, unit: str) -> None:
+        """A stage begins."""
+        self._task = self._bars.add_task(stage, total=total, unit=unit)
+
+    def advance(self, amount: int) -> None:
+        """So much more of the stage is done."""
+        if self._task is not None:
+            self._bars.advance(self._task, amount)
+
+    def finish(self) -> None:
+        """The stage is over; a total that was an estimate becomes what was done."""
+        if self._task is not None:
+            done = next(task.completed for task in self._bars.tasks if task.id == self._task)
+            self._bars.update(self._task, total=done)
+            self._task = None
+
+    def made(self, done: int, total: int) -> None:
+        """What `builder.made` calls: points written so far, of all."""
+        if self._task is None:
+            self.start("scan", total, "points")
+        if self._task is not None:
+            self._bars.update(self._task, completed=done)
+
+
+def print_facts(facts: Iterable[tuple[str, str]]) -> None:
+    """Print names and values in two columns."""
+    table = Table(show_header=False, box=None, pad_edge=False)
+    table.add_column(style="bold")
+    table.add_column(overflow="fold")
+    for name, value in facts:
+        # As text: a path with brackets in it is no markup.
+        table.add_row(name, Text(value))
+    Console().print(table)
+
+
+def print_build(summary: "BuildSummary") -> None:
+    """What a build says of itself when it is done."""
+    print_facts(_build_facts(summary))
+
+
+def print_info(found: "SceneInfo") -> None:
+    """What an archive says of itself."""
+    print_facts(_info_facts(found))
+
+
+def print_answers(times: list[float], answers: CollideAnswers) -> None:
+    """Each stretch of one verdict, then the counts. times: (k,) of the poses [s]."""
+    found = zip(times, answers.verdict.tolist(), strict=True)
+    for verdict, group in groupby(found, key=lambda pair: pair[1]):
+        stretch = [t for t, _ in group]
+        span = f"{stretch[0]:10.3f} .. {stretch[-1]:10.3f} s"
+        print(f"{span}  {Verdict(verdict).name.lower()}, {len(stretch)} poses")
+    counts = ", ".join(f"{(answers.verdict == verdict).sum()} {verdict.name.lower()}" for verdict in Verdict)
+    print(f"{len(answers)} poses: {counts}; {answers.engine_seconds * 1e3:.2f} ms in the engine")
+
+
+def answers_json(times: list[float], answers: CollideAnswers) -> dict[str, Any]:
+    """Answers as they are printed with --json. times: (k,) of the poses [s]."""
+    rows = [
+        {"t": t, **answer._asdict(), "verdict": answer.verdict.name.lower()}
+        for t, answer in zip(times, answers, strict=True)
+    ]
+    totals = ("engine_seconds", "hits", "misses", "resident", "resident_bytes", "faults")
+    return {"answers": rows, **{name: getattr(answers, name) for name in totals}}
+
+
+def bytes_text(count: float) -> str:
+    """A count of bytes for a reader: 1536 -> "1.5 kB"; steps of 1024, as the options take them."""
+    for unit in ("bytes", "kB", "MB"):
+        if count < 1024:
+            return f"{count:.0f} bytes" if unit == "bytes" else f"{count:.1f} {unit}"
+        count /= 1024
+    return f"{count:,.1f} GB"
+
+
+def length_text(metres: float) -> str:
+    """A small length for a reader, in millimetres."""
+    return f"{metres * 1e3:.4g} mm"
+
+
+def _build_facts(summary: "BuildSummary") -> Iterator[tuple[str, str]]:
+    each = summary.bytes / max(summary.points, 1)
+    rate = summary.points / max(summary.seconds, 1e-9)
+    stages = ", ".join(f"{stage} {seconds:.1f}" for stage, seconds in summary.stages.items())
+    yield "archive", f"{summary.archive}, {bytes_text(summary.bytes)}, {each:.2f} bytes a point"
+    yield "points", f"{summary.points:,} in {summary.voxels:,} voxels, {summary.shards} shards"
+    yield (
+        "lattice",
+        (
+            f"step {length_text(summary.lattice_step)} ({summary.lattice_source}), "
+            f"no point moved farther than {length_text(summary.moved_max)} along an axis"
+        ),
+    )
+    yield "radius", f"{length_text(summary.radius)}, standard error {length_text(summary.radius_error)}"
+    for reason, count in summary.skipped.items():
+        yield "left out", f"{count:,} points: {reason}"
+    yield "time", f"{summary.seconds:.1f} s ({stages}), {rate:,.0f} points/s"
+
+
+def _info_facts(found: "SceneInfo") -> Iterator[tuple[str, str]]:
+    (x0, y0, z0), (x1, y1, z1) = found.bounds
+    step, moved = length_text(found.lattice_step), length_text(found.moved_max)
+    radius, error = length_text(found.radius), length_text(found.radius_error)
+    yield "scene", f"{found.scene}, format {found.format_version}"
+    yield "points", f"{found.points:,} in {found.voxels:,} voxels of {found.voxel_size:g} m"
+    yield "bounds", f"{x0:.3f} {y0:.3f} {z0:.3f} .. {x1:.3f} {y1:.3f} {z1:.3f} m"
+    yield "lattice", f"step {step} ({found.lattice_source}), points moved up to {moved} along an axis"
+    yield (
+        "radius",
+        (f"{radius} ({found.radius_model}), standard error {error}, of {found.radius_sample:,} points"),
+    )
+    yield "hierarchy", f"degree {found.degree}, up to {found.leaf} points a leaf node"
+    yield "size", f"{bytes_text(found.record_bytes)} of records, {bytes_text(found.resident_bytes)} decoded"
+    for source in found.sources:
+        left_out = "".join(f", {count:,} {reason} left out" for reason, count in source.skipped.items())
+        yield "scan", f"{source.path} [{source.index}], {source.format}, {source.count:,} points{left_out}"
+    for fault in found.skipped:
+        yield "unknown", fault

@@ -1,0 +1,125 @@
+"""Poses in a CSV file: t,x,y,z,qw,qx,qy,qz, a row a pose. Its quaternions become matrices here only."""
+
+import csv
+import math
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..schemas.errors import BadRequestError, ScanError
+
+COLUMNS = ("t", "x", "y", "z", "qw", "qx", "qy", "qz")
+# A quaternion farther than this from unit length is a mistake, not rounding (NUMERICS.md, case 4): |q| = 1.01
+# taken as it is would stretch space by 2 %.
+UNIT_WITHIN = 1e-6
+
+
+def read_poses(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Times (k,) [s] and poses (k, 4, 4), avatar to world [m], of a CSV file.
+
+    Its first line names the columns, in any order. Quaternions within 1e-6 of unit length are normalised.
+    ScanError: the file cannot be read. BadRequestError: a line of it is wrong, and which.
+    """
+    rows: list[list[float]] = []
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            reader = csv.reader(file)
+            header = [name.strip() for name in next(reader, [])]
+            if sorted(header) != sorted(COLUMNS):
+                raise BadRequestError(
+                    f"{path}, line 1: columns {','.join(header) or 'missing'}: expected {','.join(COLUMNS)}"
+                )
+            order = [header.index(name) for name in COLUMNS]
+            for row in reader:
+                if row:
+                    rows.append(_numbers(f"{path}, line {reader.line_num}", row, order))
+    except OSError as error:
+        raise ScanError(f"{path}: {error.strerror}: expected a CSV file of poses: check the path") from None
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise ScanError(f"{path}: {error}: expected a CSV file of poses: check the file") from None
+    table = np.array(rows, np.float64).reshape(-1, len(COLUMNS))
+    return table[:, 0].copy(), _matrices(table)
+
+
+def write_poses(path: Path, times: NDArray[np.float64], poses: NDArray[np.float64]) -> None:
+    """Write times (k,) [s] and rigid poses (k, 4, 4) as such a file; nothing half-written is left."""
+    rows = (
+        (t, *pose[:3, 3].tolist(), *_quaternion(pose[:3, :3]))
+        for t, pose in zip(times.tolist(), poses, strict=True)
+    )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.tmp")
+    try:
+        with temporary.open("w", newline="", encoding="ascii") as file:
+            writer = csv.writer(file, lineterminator="\n")
+            writer.writerow(COLUMNS)
+            writer.writerows([repr(float(value)) for value in row] for row in rows)
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _numbers(where: str, row: list[str], order: list[int]) -> list[float]:
+    """One row's numbers in the order of COLUMNS; the quaternion checked and normalised."""
+    if len(row) != len(COLUMNS):
+        raise BadRequestError(f"{where}: {len(row)} values: expected {len(COLUMNS)}, one a column")
+    try:
+        values = [float(row[column]) for column in order]
+    except ValueError as error:
+        raise BadRequestError(f"{where}: {error}: expected numbers") from None
+    if not all(map(math.isfinite, values)):
+        raise BadRequestError(f"{where}: {','.join(row)}: expected finite numbers")
+    length = math.hypot(*values[4:])
+    if abs(length - 1) > UNIT_WITHIN:
+        raise BadRequestError(
+            f"{where}: quaternion of length {length:.9g}: expected 1 within {UNIT_WITHIN:g}: normalise it"
+        )
+    return values[:4] + [value / length for value in values[4:]]
+
+
+def _matrices(table: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Rows of COLUMNS, quaternions of unit length, to poses (k, 4, 4)."""
+    w, x, y, z = table[:, 4:].T
+    poses = np.zeros((len(table), 4, 4))
+    poses[:, 0, 0], poses[:, 0, 1], poses[:, 0, 2] = (
+        1 - 2 * (y * y + z * z),
+        2 * (x * y - w * z),
+        2 * (x * z + w * y),
+    )
+    poses[:, 1, 0], poses[:, 1, 1], poses[:, 1, 2] = (
+        2 * (x * y + w * z),
+        1 - 2 * (x * x + z * z),
+        2 * (y * z - w * x),
+    )
+    poses[:, 2, 0], poses[:, 2, 1], poses[:, 2, 2] = (
+        2 * (x * z - w * y),
+        2 * (y * z + w * x),
+        1 - 2 * (x * x + y * y),
+    )
+    poses[:, :3, 3] = table[:, 1:4]
+    poses[:, 3, 3] = 1.0
+    return poses
+
+
+def _quaternion(turn: NDArray[np.float64]) -> tuple[float, float, float, float]:
+    """The unit quaternion (w, x, y, z) of a rotation (3, 3), from its largest component for accuracy."""
+    m = turn.tolist()
+    # Four times the squares of w, x, y and z.
+    squares = [
+        1 + m[0][0] + m[1][1] + m[2][2],
+        1 + m[0][0] - m[1][1] - m[2][2],
+        1 - m[0][0] + m[1][1] - m[2][2],
+        1 - m[0][0] - m[1][1] + m[2][2],
+    ]
+    k = max(range(4), key=squares.__getitem__)
+    # Products of that component, four times each, with the four.
+    products = [
+        (squares[0], m[2][1] - m[1][2], m[0][2] - m[2][0], m[1][0] - m[0][1]),
+        (m[2][1] - m[1][2], squares[1], m[1][0] + m[0][1], m[0][2] + m[2][0]),
+        (m[0][2] - m[2][0], m[1][0] + m[0][1], squares[2], m[2][1] + m[1][2]),
+        (m[1][0] - m[0][1], m[0][2] + m[2][0], m[2][1] + m[1][2], squares[3]),
+    ][k]
+    length = math.hypot(*products)
+    w, x, y, z = (value / length for value in products)
+    return w, x, y, z

@@ -1,0 +1,232 @@
+"""The demonstration: a scan is built, served and walked through over zenoh; what came of it, as walk.json.
+
+    python -m solidcloud.server.report.walk OUT [SCAN...] [--realtime]
+
+Without scans the façade is made, and the walk is that of [Fig12] section 3: 40 s, 1,200 poses of a figure of
+3,617 points. `scripts/demo` calls this.
+"""
+
+import argparse
+import json
+import signal
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...builder.config import BuildConfig
+from ...builder.made.figure import figure_points
+from ...builder.pipeline import build_archive
+from ...schemas.answers import CollideAnswers, Verdict
+from ...schemas.errors import SolidcloudError
+from ...schemas.messages import SceneInfo
+from ..client import Client
+from ..console import Bars, bytes_text, print_build, print_facts
+from .floor_walk import floor_walk
+from .points import read_thinned
+from .serving import served
+
+# Points read again from the scans: for the picture, and to find a floor in scans without known truth.
+PICTURE_POINTS = 600_000
+
+
+class Walk(NamedTuple):
+    """A walk to be walked. times: (k,) [s].  poses: (k, 4, 4).  path: where it comes from, in words.
+
+    points: (n, 3) of the scans, thinned [m].  elevation: the horizontal axis that an elevation shows, 0 or 1.
+    """
+
+    times: NDArray[np.float64]
+    poses: NDArray[np.float64]
+    path: str
+    points: NDArray[np.float64]
+    elevation: int
+
+
+class Frames(NamedTuple):
+    """What was answered, one element a pose: seconds in the engine, seconds from question to answer, the rest.
+
+    verdict: (k,) uint8.  engine, round_trip: (k,) float64 [s].  resident, hits, misses: (k,) int64.
+    """
+
+    verdict: NDArray[np.uint8]
+    engine: NDArray[np.float64]
+    round_trip: NDArray[np.float64]
+    resident: NDArray[np.int64]
+    resident_bytes: NDArray[np.int64]
+    hits: NDArray[np.int64]
+    misses: NDArray[np.int64]
+
+
+def main() -> None:
+    """Run the demonstration and exit: 0 well, else as `solidcloud` does."""
+    parser = argparse.ArgumentParser(
+        prog="scripts/demo", description="Build a scan, serve it, walk through it."
+    )
+    parser.add_argument("out", type=Path, help=argparse.SUPPRESS)
+    parser.add_argument("scans", nargs="*", type=Path, metavar="SCAN", help="scans; none: a façade is made")
+    parser.add_argument("--realtime", action="store_true", help="30 frames a second, not as fast as it goes")
+    chosen = parser.parse_args()
+    # As Ctrl-C does: leave by way of every `with`, so that no server is left behind.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        demonstrate(chosen.out, chosen.scans, realtime=chosen.realtime)
+    except SolidcloudError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(error.exit_code)
+    except KeyboardInterrupt:
+        print("error: interrupted", file=sys.stderr)
+        sys.exit(130)
+
+
+def demonstrate(out: Path, scans: Sequence[Path] = (), *, realtime: bool = False) -> dict[str, Any]:
+    """Build, serve, walk; write walk.json and walk.png into the folder `out`; returns what walk.json holds.
+
+    scans: of a place with z up [m]; none: a façade is made. realtime: a frame every 1/30 s.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    facade = None if scans else make_scan(out)
+    scans = scans or [out / "facade.laz"]
+    with Bars() as bars:
+        summary = build_archive(scans, out / "archive", BuildConfig(overwrite=True), bars)
+    print_build(summary)
+    walk = _facade_walk(scans, facade, summary.points) if facade else _scan_walk(scans, summary.points)
+    print(f"walking {walk.path}")
+    avatar = figure_points()
+    with served(summary.archive, "demo") as endpoint, Client(endpoint, scene="demo") as client:
+        info = client.info()
+        client.add_avatar("figure", avatar)
+        with Bars() as bars:
+            frames = take_walk(client, walk, bars, realtime=realtime)
+    report = make_report(walk, frames, info, len(avatar))
+    _print_summary(report["summary"])
+    (out / "walk.json").write_text(json.dumps(report, indent=1) + "\n")
+    # Late, and here only: matplotlib takes a second to load.
+    from .walk_picture import draw_walk
+
+    draw_walk(out / "walk.png", walk, frames, avatar)
+    print(f"written: {out / 'walk.json'}, {out / 'walk.png'}; the archive is {summary.archive}")
+    return report
+
+
+def make_scan(out: Path) -> Path:
+    """Make the façade's scan in the folder `out`; returns the path of its truth."""
+    from ...builder.made.scenes import make_facade
+
+    with Bars() as bars:
+        return make_facade(out / "facade.laz", progress=bars.made).truth
+
+
+def take_walk(client: Client, walk: Walk, bars: Bars, *, realtime: bool) -> Frames:
+    """Ask for one pose after another, as a viewer does for each of its frames."""
+    answers: list[CollideAnswers] = []
+    round_trip = np.empty(len(walk.poses))
+    bars.start("walk", len(walk.poses), "frames")
+    begin = time.perf_counter()
+    for k in range(len(walk.poses)):
+        if realtime:
+            time.sleep(max(0.0, begin + walk.times[k] - time.perf_counter()))
+        asked = time.perf_counter()
+        answers.append(client.collide("figure", walk.poses[k : k + 1]))
+        round_trip[k] = time.perf_counter() - asked
+        bars.advance(1)
+    bars.finish()
+    return Frames(
+        np.concatenate([answer.verdict for answer in answers]),
+        np.array([answer.engine_seconds for answer in answers]),
+        round_trip,
+        np.array([answer.resident for answer in answers]),
+        np.array([answer.resident_bytes for answer in answers]),
+        np.array([answer.hits for answer in answers]),
+        np.array([answer.misses for answer in answers]),
+    )
+
+
+def make_report(walk: Walk, frames: Frames, info: SceneInfo, avatar_points: int) -> dict[str, Any]:
+    """What walk.json holds: a summary, and the frames one by one. Times end in their unit."""
+    names = [verdict.name.lower() for verdict in Verdict]
+    summary = {
+        "path": walk.path,
+        "points": info.points,
+        "voxels": info.voxels,
+        "avatar_points": avatar_points,
+        "radius_m": info.radius,
+        "frames": len(frames.verdict),
+        **{
+            name: int((frames.verdict == verdict).sum()) for name, verdict in zip(names, Verdict, strict=True)
+        },
+        "engine_us": _spread(frames.engine * 1e6),
+        "round_trip_us": _spread(frames.round_trip * 1e6),
+        "resident_voxels": int(frames.resident.max()),
+        "resident_bytes": int(frames.resident_bytes.max()),
+        "hits": int(frames.hits.sum()),
+        "misses": int(frames.misses.sum()),
+    }
+    rows = [
+        {
+            "t": round(float(walk.times[k]), 6),
+            "verdict": names[int(frames.verdict[k])],
+            "engine_us": round(float(frames.engine[k]) * 1e6, 3),
+            "round_trip_us": round(float(frames.round_trip[k]) * 1e6, 3),
+            "resident_voxels": int(frames.resident[k]),
+            "hits": int(frames.hits[k]),
+            "misses": int(frames.misses[k]),
+        }
+        for k in range(len(frames.verdict))
+    ]
+    return {"summary": summary, "frames": rows}
+
+
+def _facade_walk(scans: Sequence[Path], truth: Path, points: int) -> Walk:
+    """The walk of the made façade."""
+    from ...builder.made.truth import read_truth
+    from ...builder.made.walk import walk_poses
+
+    times, poses = walk_poses(read_truth(truth).facades[0])
+    path = "along the walls, around the column and through the door of the façade"
+    return Walk(times, poses, path, read_thinned(scans, points, PICTURE_POINTS), 0)
+
+
+def _scan_walk(scans: Sequence[Path], points: int) -> Walk:
+    """A walk made for scans that are given."""
+    thinned = read_thinned(scans, points, PICTURE_POINTS)
+    times, poses = floor_walk(thinned)
+    along = int(np.argmax(np.ptp(poses[:, :2, 3], axis=0)))
+    path = f"a straight line along {'xy'[along]} through the middle, over the lowest dense points, z up"
+    return Walk(times, poses, path, thinned, along)
+
+
+def _spread(values: NDArray[np.float64]) -> dict[str, float]:
+    """Mean, median, 99th percentile and maximum."""
+    p50, p99 = np.percentile(values, [50, 99])
+    found = {"mean": values.mean(), "p50": p50, "p99": p99, "max": values.max()}
+    return {name: round(float(value), 3) for name, value in found.items()}
+
+
+def _print_summary(summary: dict[str, Any]) -> None:
+    """The summary as a table."""
+
+    def times(of: dict[str, float]) -> str:
+        return ", ".join(f"{name} {value:,.0f}" for name, value in of.items()) + " µs"
+
+    print_facts(
+        [
+            ("frames", f"{summary['frames']} of a figure of {summary['avatar_points']:,} points"),
+            ("verdicts", ", ".join(f"{summary[v.name.lower()]} {v.name.lower()}" for v in Verdict)),
+            ("engine", times(summary["engine_us"])),
+            ("round trip", times(summary["round_trip_us"])),
+            (
+                "resident",
+                f"{summary['resident_voxels']} voxels at most, {bytes_text(summary['resident_bytes'])}",
+            ),
+            ("loads", f"{summary['misses']} misses, {summary['hits']:,} hits"),
+        ]
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,202 @@
+"""A picture of a walk: where it went, what it touched, and how long each answer took."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import matplotlib
+import numpy as np
+from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from numpy.typing import NDArray
+
+from ...schemas.answers import Verdict
+
+if TYPE_CHECKING:
+    from .walk import Frames, Walk
+
+COLOURS = {Verdict.CLEAR: "#1f7a8c", Verdict.CONTACT: "#d62839", Verdict.UNKNOWN: "#e0a100"}
+PAPER, INK = "#fbfaf7", "#2f2a26"
+STONE = LinearSegmentedColormap.from_list("stone", [PAPER, "#d9cfc1", "#a08e78", "#5b4d40"])
+# Where on the walk the figure is drawn, as shares of its frames.
+STOPS = (0.02, 0.16, 0.30, 0.44, 0.58, 0.72, 0.88)
+PIXEL = 0.04
+# What the plan shows: from a step above the floor to over the head [m].
+PLAN_LOW, PLAN_HIGH = 0.15, 2.2
+
+
+def draw_walk(path: Path, walk: "Walk", frames: "Frames", avatar: NDArray[np.float64]) -> None:
+    """Draw a walk as a PNG: plan from above, elevation, and the times of every frame.
+
+    avatar: (n, 3) [m], drawn where it stands in a few frames, the nearest with a contact where there is one.
+    """
+    matplotlib.rcParams.update({"font.size": 10, "axes.edgecolor": "#8a8178", "text.color": INK})
+    figure = Figure(figsize=(12, 8.2), facecolor=PAPER, layout="constrained")
+    upper, lower = figure.subfigures(2, 1, height_ratios=[2.35, 1], facecolor=PAPER)
+    plan, elevation = upper.subplots(1, 2, width_ratios=_widths(walk))
+    times = lower.subplots()
+    stops = _stops(frames.verdict)
+    _draw_plan(plan, walk, frames, stops)
+    _draw_elevation(elevation, walk, frames, avatar, stops)
+    _draw_times(times, walk, frames)
+    touched = int((frames.verdict == Verdict.CONTACT).sum())
+    figure.suptitle(
+        f"{len(frames.verdict):,} poses of a figure of {len(avatar):,} points: {touched} touch the scan",
+        fontsize=14,
+        fontweight="bold",
+    )
+    figure.savefig(path, dpi=100, pil_kwargs={"optimize": True})
+
+
+def _widths(walk: "Walk") -> list[float]:
+    """Widths of plan and elevation, so that both fill the same height."""
+    x, y, z = _extent(walk.points).T
+    ratios = [np.ptp(x) / np.ptp(y), np.ptp((x, y)[walk.elevation]) / np.ptp(z)]
+    return [min(max(float(ratio), 0.5), 2.0) for ratio in ratios]
+
+
+def _extent(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Low and high corner (2, 3) [m], the farthest outliers left out."""
+    return np.quantile(points, [0.0005, 0.9995], axis=0) + np.array([[-0.3], [0.3]])
+
+
+def _stops(verdict: NDArray[np.uint8]) -> list[int]:
+    """The frames the figure is drawn in: evenly spread, moved to a contact near by."""
+    count = len(verdict)
+    touched = np.flatnonzero(verdict == Verdict.CONTACT)
+    stops = []
+    for share in STOPS:
+        k = min(int(share * count), count - 1)
+        if len(touched) and np.abs(touched - k).min() < 0.06 * count:
+            k = int(touched[np.abs(touched - k).argmin()])
+        stops.append(k)
+    return sorted(set(stops))
+
+
+def _draw_plan(axes: Any, walk: "Walk", frames: "Frames", stops: list[int]) -> None:
+    """The scan from above, and the path coloured by verdict."""
+    floor = np.median(walk.poses[:, 2, 3])
+    heights = walk.points[:, 2] - floor
+    walls = walk.points[(heights > PLAN_LOW) & (heights < PLAN_HIGH)]
+    low, high = _extent(walk.points)
+    _draw_points(axes, walls, 0, 1, low, high)
+    at = walk.poses[:, :2, 3]
+    for verdict in Verdict:
+        chosen = frames.verdict == verdict
+        size = 26 if verdict == Verdict.CONTACT else 7
+        axes.scatter(*at[chosen].T, s=size, color=COLOURS[verdict], linewidths=0, zorder=3 + int(verdict))
+    for number, k in enumerate(stops, 1):
+        axes.annotate(
+            str(number),
+            at[k],
+            xytext=(9, 9),
+            textcoords="offset points",
+            ha="center",
+            va="center",
+            fontsize=9,
+            fontweight="bold",
+            color="white",
+            bbox={
+                "boxstyle": "circle,pad=0.2",
+                "fc": COLOURS[Verdict(int(frames.verdict[k]))],
+                "ec": "white",
+            },
+            zorder=9,
+        )
+    axes.set_title("From above: what stands between shin and head, and the path")
+    axes.set_xlabel("x [m]")
+    axes.set_ylabel("y [m]")
+    handles = [
+        Line2D([], [], marker="o", linestyle="", color=COLOURS[v], label=f"{v.name.lower()} {n:,}")
+        for v in Verdict
+        if (n := int((frames.verdict == v).sum()))
+    ]
+    axes.legend(handles=handles, loc="upper right", framealpha=0.9)
+
+
+def _draw_elevation(
+    axes: Any, walk: "Walk", frames: "Frames", avatar: NDArray[np.float64], stops: list[int]
+) -> None:
+    """The scan from the side, and the figure in some frames."""
+    across = walk.elevation
+    low, high = _extent(walk.points)
+    _draw_points(axes, walk.points, across, 2, low, high)
+    for number, k in enumerate(stops, 1):
+        placed = avatar @ walk.poses[k, :3, :3].T + walk.poses[k, :3, 3]
+        colour = COLOURS[Verdict(int(frames.verdict[k]))]
+        axes.scatter(placed[:, across], placed[:, 2], s=0.8, color=colour, linewidths=0, zorder=4)
+        axes.text(
+            walk.poses[k, across, 3],
+            placed[:, 2].max() + 0.25,
+            str(number),
+            ha="center",
+            fontsize=10,
+            fontweight="bold",
+            color=colour,
+            zorder=5,
+        )
+    axes.set_title("From the front: the figure where the numbers are")
+    axes.set_xlabel(f"{'xy'[across]} [m]")
+    axes.set_ylabel("z [m]")
+
+
+def _draw_points(
+    axes: Any,
+    points: NDArray[np.float64],
+    across: int,
+    up: int,
+    low: NDArray[np.float64],
+    high: NDArray[np.float64],
+) -> None:
+    """Points as an image of their density, on a logarithmic scale."""
+    pixel = max(PIXEL, float((high - low).max()) / 700)
+    edges = [np.arange(low[axis], high[axis] + pixel, pixel) for axis in (across, up)]
+    image, _, _ = np.histogram2d(points[:, across], points[:, up], bins=edges)
+    image = np.log1p(image.T)
+    axes.imshow(
+        image,
+        origin="lower",
+        extent=(edges[0][0], edges[0][-1], edges[1][0], edges[1][-1]),
+        cmap=STONE,
+        vmax=max(float(np.quantile(image[image > 0], 0.98)) if image.any() else 1.0, 1e-9),
+        interpolation="nearest",
+    )
+    axes.set_facecolor(PAPER)
+
+
+def _draw_times(axes: Any, walk: "Walk", frames: "Frames") -> None:
+    """Engine time and round trip of every frame, contacts and loads marked."""
+    for start, end in _runs(frames.verdict == Verdict.CONTACT):
+        axes.axvspan(
+            walk.times[start], walk.times[end], color=COLOURS[Verdict.CONTACT], alpha=0.13, linewidth=0
+        )
+    trip, engine = frames.round_trip * 1e3, frames.engine * 1e3
+    axes.plot(
+        walk.times, trip, color="#9a8c7c", linewidth=0.8, label=f"round trip, p50 {np.median(trip):.2f} ms"
+    )
+    axes.plot(
+        walk.times,
+        engine,
+        color=COLOURS[Verdict.CLEAR],
+        linewidth=0.9,
+        label=f"in the engine, p50 {np.median(engine):.3f} ms",
+    )
+    loads = frames.misses > 0
+    axes.scatter(
+        walk.times[loads], engine[loads], marker="v", s=26, color=INK, zorder=4, label="voxels loaded"
+    )
+    axes.set_yscale("log")
+    axes.set_xlim(walk.times[0], walk.times[-1])
+    axes.set_xlabel("time along the walk [s]; shaded: contact")
+    axes.set_ylabel("[ms]")
+    axes.set_title("What each frame cost, one question a frame over zenoh")
+    axes.set_facecolor(PAPER)
+    axes.grid(axis="y", color="#e4ded4", linewidth=0.6)
+    axes.legend(loc="upper right", ncols=3, framealpha=0.9)
+
+
+def _runs(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """First and last index of each stretch of True."""
+    steps = np.diff(np.concatenate([[0], flags.astype(np.int8), [0]]))
+    ends = np.flatnonzero(steps == -1) - 1
+    return list(zip(np.flatnonzero(steps == 1).tolist(), ends.tolist(), strict=True))

@@ -121,6 +121,8 @@ def session_config(*, listen: str | None = None, connect: str | None = None) -> 
         "connect/endpoints": [connect] if connect else [],
         # By default 1 s, growing to 4 s: an outage would last that much longer than the server is away.
         "connect/retry": {"period_init_ms": 50, "period_max_ms": 500, "period_increase_factor": 2},
+        # How long opening waits for the connection [ms], also now and then where it is there at once: 500.
+        "scouting/delay": 200,
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
         # A killed process would leave 16 MiB behind in /dev/shm.

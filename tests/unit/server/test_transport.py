@@ -1,0 +1,101 @@
+"""The queues of the transport, and what its sessions are configured to be. No zenoh session is opened."""
+
+import json
+import threading
+
+import numpy as np
+from solidcloud.server.transport import FairQueues, Offer, session_config
+
+
+def test_requests_of_one_client_run_one_at_a_time_and_in_order():
+    queues = FairQueues(2, 10, 1000)
+    assert queues.offer("a", 1, 1) is Offer.RUN
+    assert queues.offer("a", 2, 1) is Offer.WAIT
+    assert queues.offer("a", 3, 1) is Offer.WAIT
+    assert queues.offer("b", 4, 1) is Offer.RUN
+    assert queues.finished("b") is None
+    assert queues.finished("a") == ("a", 2)
+    assert queues.finished("a") == ("a", 3)
+    assert queues.finished("a") is None
+    assert len(queues) == 0
+
+
+def test_clients_take_turns():
+    queues = FairQueues(1, 100, 1000)
+    assert queues.offer("a", "a0", 1) is Offer.RUN
+    for request in ("a1", "a2", "b1", "b2", "c1"):
+        assert queues.offer(request[0], request, 1) is Offer.WAIT
+    order, client = [], "a"
+    while (following := queues.finished(client)) is not None:
+        client, request = following
+        order.append(request)
+    # b and c were waiting before a's turn was over, and nobody gets two turns while another waits.
+    assert order == ["b1", "c1", "a1", "b2", "a2"]
+
+
+def test_a_client_in_flight_holds_one_worker_only():
+    queues = FairQueues(2, 100, 1000)
+    assert queues.offer("frozen", 1, 1) is Offer.RUN
+    for _ in range(5):
+        assert queues.offer("frozen", 2, 1) is Offer.WAIT
+        assert queues.offer("other", 3, 1) is Offer.RUN
+        assert queues.finished("other") is None
+
+
+def test_what_is_over_the_bounds_is_refused():
+    queues = FairQueues(1, 2, 100)
+    assert queues.offer("a", 1, 60) is Offer.RUN
+    assert queues.offer("b", 2, 60) is Offer.FULL, "bytes"
+    assert queues.offer("b", 2, 40) is Offer.WAIT
+    assert queues.offer("c", 3, 0) is Offer.FULL, "requests"
+    assert queues.offer("c", 4, 0, always=True) is Offer.WAIT
+    assert queues.finished("a") == ("b", 2)
+    assert queues.finished("b") == ("c", 4)
+    assert queues.finished("c") is None
+    assert queues.offer("a", 5, 1000) is Offer.RUN, "one alone is never refused"
+
+
+def test_nothing_is_forgotten_by_several_threads():
+    queues = FairQueues(3, 10**6, 10**9)
+    lock, seen, at_work = threading.Lock(), [], {}
+
+    def run(client, request):
+        following = (client, request)
+        while following is not None:
+            client, request = following
+            with lock:
+                assert client not in at_work and len(at_work) < 3
+                at_work[client] = request
+                seen.append((client, request))
+            with lock:
+                del at_work[client]
+            following = queues.finished(client)
+
+    def offer(seed):
+        rng = np.random.default_rng(seed)
+        for request in range(500):
+            client = (seed, int(rng.integers(3)))
+            if queues.offer(client, request, 1) is Offer.RUN:
+                run(client, request)
+
+    threads = [threading.Thread(target=offer, args=(seed,)) for seed in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(20)
+    assert len(seen) == 2000 and len(queues) == 0
+    for client in {client for client, _ in seen}:
+        requests = [request for owner, request in seen if owner == client]
+        assert requests == sorted(requests)
+
+
+def test_sessions_find_nobody_and_are_found_by_nobody():
+    for config in (session_config(listen="tcp/127.0.0.1:7447"), session_config(connect="tcp/127.0.0.1:7447")):
+        settings = json.loads(str(config))
+        assert settings["scouting"]["multicast"]["enabled"] is False
+        assert settings["scouting"]["gossip"]["enabled"] is False
+        assert settings["transport"]["shared_memory"]["enabled"] is False
+        assert settings["transport"]["link"]["rx"]["max_message_size"] == 32 << 20
+        assert settings["adminspace"]["enabled"] is False
+    # A client's session listens nowhere.
+    assert settings["listen"]["endpoints"] == []

@@ -27,9 +27,10 @@ KEY_BIAS = 1 << 20
 # A step below 1 micrometre would leave under 67 exact units a step, and no scanner resolves it.
 MIN_STEP = 1e-6
 
-# Node centres, in voxel steps, must be exact in float32 for the fast pass of server/kernels/overlap.py:
+# Morton codes hold 21 bits an axis, so the octree of a larger voxel would fold points onto each other. Node
+# centres, in voxel steps, must also be exact in float32 for the fast pass of server/kernels/overlap.py:
 # a voxel and its neighbours within reach stay below 2^24 steps.
-MAX_VOXEL_STEPS = 1 << 22
+MAX_VOXEL_STEPS = 1 << 21
 
 # World coordinates beyond this are refused at the door (NUMERICS.md case 16).
 MAX_COORDINATE = 1e9

@@ -16,6 +16,7 @@ from ..schemas.archive import Archive
 from ..schemas.voxel import Links, VoxelData
 from .hierarchy import Hierarchy, build_hierarchy
 from .kernels.nearest import FAR, SearchTree, box_distance2, closest_other
+from .kernels.octree import voxel_codes
 
 # Distances are added as integers of 2^-32 m: any order gives the same sum (NUMERICS.md N8), and 10^6 of
 # 10 km fit 63 bits.
@@ -154,8 +155,8 @@ def archive_sums(
     total = squares = sample = 0
     for row in rows:
         own = tree_of(row)
-        queries = np.unique(own.points, axis=0)
-        queries = queries[sample_mask(queries + base[row], share)] + base[row]
+        queries = own.points[sample_mask(own.points + base[row], share)]
+        queries = queries[np.unique(voxel_codes(queries), return_index=True)[1]] + base[row]
         best = np.full(len(queries), FAR)
         if len(queries):
             closest_other(own, queries - base[row], best)

@@ -8,7 +8,7 @@ from ...schemas.kernels.morton import morton_code
 
 @nb.njit(nogil=True, cache=True)
 def voxel_codes(points):
-    """Morton codes (n,) uint64 of points (n, 3) int32 [voxel steps], each in [0, 2^21)."""
+    """Morton codes (n,) uint64 of points (n, 3) integers [voxel steps], each in [0, 2^21)."""
     n = points.shape[0]
     codes = np.empty(n, np.uint64)
     for i in range(n):

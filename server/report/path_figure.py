@@ -72,14 +72,14 @@ def draw_path(
             yscale="log", ylim=(low * 1e3 / 1.3, high * 1e3 * 1.3), ylabel="time of a frame's test [ms]"
         )
         panel.set_title(
-            f"{kind}: one call a frame, median over {SMOOTH_SECONDS:g} s", fontsize=11, loc="left"
+            f"{kind}: one call a frame, rolling median over {SMOOTH_SECONDS:g} s", fontsize=11, loc="left"
         )
         panel.yaxis.set_major_formatter("{x:g}")
         panel.grid(alpha=0.25, which="both")
         right = panel.secondary_yaxis("right", functions=(_inverse, _inverse))
         right.yaxis.set_major_formatter("{x:,.0f}")
         right.set_ylabel("frames a second it would allow")
-    axes[1].legend(title="degree", fontsize=9, ncols=1, loc="upper left", bbox_to_anchor=(1.08, 1.0))
+    figure.legend(*axes[1].get_legend_handles_labels(), title="degree", fontsize=9, loc="outside right upper")
     axes[-1].set(xlabel="time along the path [s]", xlim=(times[0], times[-1]))
     figure.savefig(target)
     pyplot.close(figure)

@@ -1,7 +1,7 @@
 """Figure 8 of [Fig12]: the bounding spheres of one level of the hierarchy, of every partition, drawn."""
 
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -133,7 +133,7 @@ def draw_spheres(spheres: Spheres, title: str, target: Path) -> None:
     pyplot.close(figure)
 
 
-def load_pyplot():  # type: ignore[no-untyped-def]  # matplotlib is optional
+def load_pyplot() -> Any:
     """matplotlib's pyplot, drawing to files. Raises SolidcloudError when it is not installed."""
     try:
         import matplotlib

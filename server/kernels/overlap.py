@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .layout import BLOCK_WORDS, COUNT, FIRST, LANES, ROW_WORDS
-from .placing import lattice_to_units, place, to_units
+from .placing import largest_term, lattice_to_units, place, to_units
 
 U32 = 2.0**-24  # half a unit in the last place of 1, float32
 # Relative slack of a float32 test: over 16 U32, where the sums below take at most 8.
@@ -115,14 +115,12 @@ def _place_nodes(avatar, m, scale, placed, scene):
     step = scene.step
     per_step = 1.0 / step
     nodes = placed.nodes
-    farthest = 0.0
     for r in range(3):
         placed.shift[r] = m[r, 3] - scene.origin[r]
         root = place(m, placed.shift, r, avatar.center[0, 0], avatar.center[0, 1], avatar.center[0, 2])
         placed.frame[r] = np.int64(np.rint(root * per_step))
-        size = abs(m[r, 0] * avatar.center[0, 0]) + abs(m[r, 1] * avatar.center[0, 1])
-        size += abs(m[r, 2] * avatar.center[0, 2]) + abs(placed.shift[r])
-        farthest = max(farthest, size * per_step)
+    center = avatar.center[0]
+    farthest = largest_term(m, placed.shift, center[0], center[1], center[2]) * per_step
     extent = avatar.radius[0] * scale * per_step + 1.0
     for r in range(3):
         base = np.float64(placed.frame[r]) * step

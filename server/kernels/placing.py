@@ -102,6 +102,17 @@ def place(m, shift, r, x, y, z):
 
 
 @nb.njit(nogil=True, cache=True)
+def largest_term(m, shift, x, y, z):
+    """The largest sum of sizes of the terms of a placed coordinate [m]: 2^-50 of it bounds the rounding of `place`
+    for this point and for one beside it, also where large terms cancel."""
+    largest = 0.0
+    for r in range(3):
+        size = abs(m[r, 0] * x) + abs(m[r, 1] * y) + abs(m[r, 2] * z) + abs(shift[r])
+        largest = max(largest, size)
+    return largest
+
+
+@nb.njit(nogil=True, cache=True)
 def to_units(metres):
     """Exact units of a placed coordinate: times 2^26, half to even, int64."""
     return np.int64(np.rint(metres * UNITS_PER_METRE))

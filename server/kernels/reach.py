@@ -7,7 +7,7 @@ import numpy as np
 
 from ...schemas.kernels.morton import morton_code
 from ...schemas.voxel_grid import KEY_BIAS
-from .placing import place
+from .placing import largest_term, place
 
 
 @nb.njit(nogil=True, cache=True)
@@ -48,7 +48,8 @@ def voxels_in_reach(
     Writes starts (k + 1,) int64 and rows (capacity,) int64: voxel rows of pose i are rows[starts[i]:starts[i+1]],
     by key; boxes (k, 2, 3) float64: the box of the root sphere and its reach [steps]; outside (k,): whether
     that box leaves the scene's. Returns how many rows are needed; beyond the capacity none are written.
-    The reach is widened by more than the rounding of this function: a millionth of itself, and a step.
+    The reach is widened by more than the rounding of this function: a millionth of itself, a step, and 2^-49 of the
+    largest term that was added up.
     """
     step, units_per_step, voxel_steps = scene.step, scene.units_per_step, scene.voxel_steps
     shift, center = np.empty(3), np.empty(3)
@@ -59,13 +60,14 @@ def voxels_in_reach(
         m = poses[i]
         for r in range(3):
             shift[r] = m[r, 3] - scene.origin[r]
+        x, y, z = node_center[0, 0], node_center[0, 1], node_center[0, 2]
         reach = (node_radius[0] * scales[i] / step + reach_units[i] / units_per_step) * (1.0 + 1e-6) + 1.0
+        reach += largest_term(m, shift, x, y, z) / step * 2.0**-49
         cells = 1.0
         outside[i] = False
         for r in range(3):
-            center[r] = place(m, shift, r, node_center[0, 0], node_center[0, 1], node_center[0, 2]) / step
-            slack = abs(center[r]) * 1e-15  # a float64 that far out has this much less to say
-            boxes[i, 0, r], boxes[i, 1, r] = center[r] - reach - slack, center[r] + reach + slack
+            center[r] = place(m, shift, r, x, y, z) / step
+            boxes[i, 0, r], boxes[i, 1, r] = center[r] - reach, center[r] + reach
             outside[i] |= boxes[i, 0, r] < scene_low[r] or boxes[i, 1, r] > scene_high[r]
             least = max(boxes[i, 0, r], np.float64(scene_low[r]))
             most = min(boxes[i, 1, r], np.float64(scene_high[r]))
@@ -76,7 +78,7 @@ def voxels_in_reach(
         if cells == 0.0:
             continue
         listed = cells > keys.shape[0]  # cheaper to go through the voxels than through the grid
-        x, y, z = first[0], first[1], first[2]
+        ix, iy, iz = first[0], first[1], first[2]
         row = -1
         while True:
             if listed:
@@ -84,19 +86,19 @@ def voxels_in_reach(
                 if row == keys.shape[0]:
                     break
             else:
-                if x > last[0]:
+                if ix > last[0]:
                     break
                 row = find_key(
                     keys,
-                    morton_code(np.uint64(x + KEY_BIAS), np.uint64(y + KEY_BIAS), np.uint64(z + KEY_BIAS)),
+                    morton_code(np.uint64(ix + KEY_BIAS), np.uint64(iy + KEY_BIAS), np.uint64(iz + KEY_BIAS)),
                 )
-                z += 1
-                if z > last[2]:
-                    z = first[2]
-                    y += 1
-                    if y > last[1]:
-                        y = first[1]
-                        x += 1
+                iz += 1
+                if iz > last[2]:
+                    iz = first[2]
+                    iy += 1
+                    if iy > last[1]:
+                        iy = first[1]
+                        ix += 1
                 if row < 0:
                     continue
             for r in range(3):

@@ -12,7 +12,7 @@ from ..schemas.voxel_grid import MAX_COORDINATE
 from .kernels.layout import LANES
 from .kernels.placing import Avatar
 
-# Trees of an avatar: 8 children measured as good as any from 6 to 12 in scripts/bench_walk.
+# Children a node of an avatar's tree; as for voxels, see BuildConfig.degree.
 DEGREE = 8
 
 

@@ -161,4 +161,5 @@ def _unpack(frame: bytes, dtype: np.dtype, count: int, what: str) -> NDArray:
     except zstandard.ZstdError as error:
         raise CorruptError(f"{what}: damaged frame ({error})") from error
     planes = np.frombuffer(plain, np.uint8).reshape(dtype.itemsize, count)
-    return np.ascontiguousarray(planes.T).view(dtype).reshape(count)
+    # A copy always: planes of a single row are contiguous both ways, and a view of `plain` would be read-only.
+    return planes.T.copy().view(dtype).reshape(count)

@@ -52,6 +52,9 @@ class Residency:
         self._pins: dict[int, int] = {}
         self._loading: set[int] = set()
         self._faults: dict[int, str] = {}  # of corrupt records, which reading again would not mend
+        # Of voxels that could not be read this once. Tried again only when nobody holds them any more: a voxel never
+        # becomes resident under a kernel that has begun without it.
+        self._passing: dict[int, str] = {}
         self.resident_bytes = 0
         self.hits = 0
         self.misses = 0
@@ -75,11 +78,11 @@ class Residency:
         """
         mine = self._reserve(rows)
         try:
-            faults = self._load(mine)
+            self._load(mine)
             with self._changed:
                 self._changed.wait_for(lambda: not any(row in self._loading for row in rows))
-                faults += [self._faults[row] for row in rows if row in self._faults and row not in mine]
-            yield Held(len(rows) - len(mine), len(mine), tuple(faults))
+                faults = tuple(fault for row in rows if (fault := self._fault(row)))
+            yield Held(len(rows) - len(mine), len(mine), faults)
         finally:
             with self._changed:
                 self._unpin(rows)
@@ -95,7 +98,7 @@ class Residency:
             while True:
                 for row in rows:
                     self._pins[row] = self._pins.get(row, 0) + 1
-                mine = [row for row in rows if row not in self._offsets and row not in self._faults]
+                mine = [row for row in rows if row not in self._offsets and not self._fault(row)]
                 if self._allocate_all(mine):
                     break
                 self._unpin(rows)
@@ -148,34 +151,41 @@ class Residency:
             self._pins[row] -= 1
             if not self._pins[row]:
                 del self._pins[row]
+                self._passing.pop(row, None)
 
-    def _load(self, rows: list[int]) -> list[str]:
-        """Load what this caller reserved; every row leaves `_loading`, loaded or not. Returns the faults."""
-        faults = []
+    def _fault(self, row: int) -> str:
+        """Why a voxel cannot be read, or ""."""
+        return self._faults.get(row, "") or self._passing.get(row, "")
+
+    def _load(self, rows: list[int]) -> None:
+        """Load what this caller reserved; every row leaves `_loading`, loaded or with a fault."""
         for number, row in enumerate(rows):
-            fault = ""
+            where = None
+            faults, fault = self._passing, ""
             try:
                 where = self._store.load(row, self.buffer.arena, self._offsets[row])
             except CorruptError as error:
-                fault = self._faults[row] = str(error)
+                faults, fault = self._faults, str(error)
             except OSError as error:
                 fault = f"{self._store.archive.where(row)}: cannot be read ({error}): check the disk"
-            except BaseException:
+            except BaseException as error:
                 with self._changed:
                     for left in rows[number:]:
+                        self._passing[left] = (
+                            f"{self._store.archive.where(left)}: not loaded ({error!r}): ask again"
+                        )
                         self._forget(left)
                         self._loading.discard(left)
                     self._changed.notify_all()
                 raise
             with self._changed:
-                if fault:
-                    faults.append(fault)
+                if where is None:
+                    faults[row] = fault
                     self._forget(row)
                 else:
                     self.where[row] = where
                 self._loading.discard(row)
                 self._changed.notify_all()
-        return faults
 
     def check(self) -> None:
         """Assert what must always hold: bytes add up, runs neither overlap nor leave the buffer."""

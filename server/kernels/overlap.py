@@ -85,13 +85,14 @@ def _limits(units, units_per_step, extent, farthest, voxel_steps):
     Errors of a coordinate difference, in steps: rounding to exact units, half a unit for either point; the
     float32 of the avatar's coordinate, U32 of its size, once from the frame and once from the voxel or block,
     where a pair in reach is within the larger of voxel and block, and the reach (doubled, so that a pair beyond
-    cannot pass as near); float64 rounding far from the origin, a few 2^-53 of it.
+    cannot pass as near); float64 rounding far from the origin: 4 half units in the last place for a placed centre,
+    4 for a point below it, 1 for the frame, 1 for the lattice point, 10 * 2^-53 of the largest term.
     """
     reach = np.float64(units) / units_per_step
     error = (
         1.1 / units_per_step
         + U32 * (extent + 2.0 * (max(65536.0, voxel_steps) + reach))
-        + farthest * 2.0**-50
+        + farthest * 2.0**-49
     )
     around = math.sqrt(3.0) * error
     below = max(reach * (1.0 - 2.0 * U32) - around, 0.0)

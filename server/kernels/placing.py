@@ -72,7 +72,9 @@ def check_poses(poses, node_radius, radius, other_units, scene, scales, units):
                 square += m[r, c] * m[r, c]
         square /= 3.0
         scale = math.sqrt(square)
-        if not SMALLEST_SCALE <= scale <= LARGEST_SCALE:
+        # A scale of 1000 is one too when its square root comes out a rounding above.
+        least = SMALLEST_SCALE * (1.0 - SIMILARITY_TOLERANCE)
+        if not least <= scale <= LARGEST_SCALE * (1.0 + SIMILARITY_TOLERANCE):
             return BAD_SCALE, i, scale
         worst = 0.0
         for a in range(3):

@@ -39,7 +39,7 @@ def make_avatar(points: ArrayLike, radius: float | None = None) -> AvatarModel:
     radius: of every point's sphere [m], zero or more; None: half the mean closest-point distance ([Fig12] section
     7), over distinct points on their own lattice of 2^-20 m; one point alone needs a radius given.
     """
-    array = make_positions(points)
+    array = make_positions(points).copy()  # the caller may go on writing into theirs
     if len(array) and np.abs(array).max() > MAX_COORDINATE:
         raise BadRequestError(
             f"avatar coordinate {np.abs(array).max():g} m: expected within {MAX_COORDINATE:g} m"

@@ -64,7 +64,7 @@ def run(arguments: Sequence[str]) -> int:
         return _complain("interrupted", 130)
     except BrokenPipeError:
         # Whoever read the output has had enough. Python would complain again when it flushes at exit.
-        sys.stdout = None  # type: ignore[assignment]
+        sys.stdout = None
         return 1
     except (OSError, MemoryError) as error:
         return _complain(str(error) or type(error).__name__, 1)

@@ -100,8 +100,7 @@ def demonstrate(out: Path, scans: Sequence[Path] = (), *, realtime: bool = False
     with served(summary.archive, "demo") as endpoint, Client(endpoint, scene="demo") as client:
         info = client.info()
         client.add_avatar("figure", avatar)
-        with Bars() as bars:
-            frames = take_walk(client, walk, bars, realtime=realtime)
+        frames = take_walk(client, walk, realtime=realtime)
     report = make_report(walk, frames, info, len(avatar))
     _print_summary(report["summary"])
     (out / "walk.json").write_text(json.dumps(report, indent=1) + "\n")
@@ -121,11 +120,13 @@ def make_scan(out: Path) -> Path:
         return make_facade(out / "facade.laz", progress=bars.made).truth
 
 
-def take_walk(client: Client, walk: Walk, bars: Bars, *, realtime: bool) -> Frames:
-    """Ask for one pose after another, as a viewer does for each of its frames."""
+def take_walk(client: Client, walk: Walk, *, realtime: bool) -> Frames:
+    """Ask for one pose after another, as a viewer does for each of its frames.
+
+    Without a bar: its thread would hold the interpreter for milliseconds, and be timed as round trips.
+    """
     answers: list[CollideAnswers] = []
     round_trip = np.empty(len(walk.poses))
-    bars.start("walk", len(walk.poses), "frames")
     begin = time.perf_counter()
     for k in range(len(walk.poses)):
         if realtime:
@@ -133,8 +134,6 @@ def take_walk(client: Client, walk: Walk, bars: Bars, *, realtime: bool) -> Fram
         asked = time.perf_counter()
         answers.append(client.collide("figure", walk.poses[k : k + 1]))
         round_trip[k] = time.perf_counter() - asked
-        bars.advance(1)
-    bars.finish()
     return Frames(
         np.concatenate([answer.verdict for answer in answers]),
         np.array([answer.engine_seconds for answer in answers]),

@@ -18,9 +18,11 @@ if TYPE_CHECKING:
 COLOURS = {Verdict.CLEAR: "#1f7a8c", Verdict.CONTACT: "#d62839", Verdict.UNKNOWN: "#e0a100"}
 PAPER, INK = "#fbfaf7", "#2f2a26"
 STONE = LinearSegmentedColormap.from_list("stone", [PAPER, "#d9cfc1", "#a08e78", "#5b4d40"])
-# Where on the walk the figure is drawn, as shares of its frames.
-STOPS = (0.02, 0.16, 0.30, 0.44, 0.58, 0.72, 0.88)
-PIXEL = 0.04
+# The figure is drawn in the middle of the longest contacts and in even steps between, MOST of them in all, each
+# at least APART of the walk from the next.
+MOST, CONTACTS, APART = 8, 4, 0.07
+# Pixels along the longest extent; the plan, where walls are lines, is drawn with half as many.
+PIXELS = 700
 # What the plan shows: from a step above the floor to over the head [m].
 PLAN_LOW, PLAN_HIGH = 0.15, 2.2
 
@@ -32,7 +34,8 @@ def draw_walk(path: Path, walk: "Walk", frames: "Frames", avatar: NDArray[np.flo
     """
     matplotlib.rcParams.update({"font.size": 10, "axes.edgecolor": "#8a8178", "text.color": INK})
     figure = Figure(figsize=(12, 8.2), facecolor=PAPER, layout="constrained")
-    upper, lower = figure.subfigures(2, 1, height_ratios=[2.35, 1], facecolor=PAPER)
+    parts: Any = figure.subfigures(2, 1, height_ratios=[2.35, 1], facecolor=PAPER)
+    upper, lower = parts
     plan, elevation = upper.subplots(1, 2, width_ratios=_widths(walk))
     times = lower.subplots()
     stops = _stops(frames.verdict)
@@ -61,16 +64,16 @@ def _extent(points: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _stops(verdict: NDArray[np.uint8]) -> list[int]:
-    """The frames the figure is drawn in: evenly spread, moved to a contact near by."""
+    """The frames that the figure is drawn in."""
     count = len(verdict)
-    touched = np.flatnonzero(verdict == Verdict.CONTACT)
-    stops = []
-    for share in STOPS:
-        k = min(int(share * count), count - 1)
-        if len(touched) and np.abs(touched - k).min() < 0.06 * count:
-            k = int(touched[np.abs(touched - k).argmin()])
-        stops.append(k)
-    return sorted(set(stops))
+    longest = sorted(_runs(verdict == Verdict.CONTACT), key=lambda run: run[0] - run[1])[:CONTACTS]
+    wanted = [(first + last) // 2 for first, last in longest]
+    wanted += (np.linspace(0.03, 0.97, 2 * MOST) * count).astype(int).tolist()
+    stops: list[int] = []
+    for k in wanted:
+        if len(stops) < MOST and all(abs(k - other) >= APART * count for other in stops):
+            stops.append(k)
+    return sorted(stops)
 
 
 def _draw_plan(axes: Any, walk: "Walk", frames: "Frames", stops: list[int]) -> None:
@@ -79,31 +82,15 @@ def _draw_plan(axes: Any, walk: "Walk", frames: "Frames", stops: list[int]) -> N
     heights = walk.points[:, 2] - floor
     walls = walk.points[(heights > PLAN_LOW) & (heights < PLAN_HIGH)]
     low, high = _extent(walk.points)
-    _draw_points(axes, walls, 0, 1, low, high)
+    _draw_points(axes, walls, (0, 1), (low, high), PIXELS // 2)
     at = walk.poses[:, :2, 3]
     for verdict in Verdict:
         chosen = frames.verdict == verdict
         size = 26 if verdict == Verdict.CONTACT else 7
         axes.scatter(*at[chosen].T, s=size, color=COLOURS[verdict], linewidths=0, zorder=3 + int(verdict))
     for number, k in enumerate(stops, 1):
-        axes.annotate(
-            str(number),
-            at[k],
-            xytext=(9, 9),
-            textcoords="offset points",
-            ha="center",
-            va="center",
-            fontsize=9,
-            fontweight="bold",
-            color="white",
-            bbox={
-                "boxstyle": "circle,pad=0.2",
-                "fc": COLOURS[Verdict(int(frames.verdict[k]))],
-                "ec": "white",
-            },
-            zorder=9,
-        )
-    axes.set_title("From above: what stands between shin and head, and the path")
+        _badge(axes, number, at[k], (9, 9), frames.verdict[k])
+    axes.set_title("From above, shin to head")
     axes.set_xlabel("x [m]")
     axes.set_ylabel("y [m]")
     handles = [
@@ -111,7 +98,7 @@ def _draw_plan(axes: Any, walk: "Walk", frames: "Frames", stops: list[int]) -> N
         for v in Verdict
         if (n := int((frames.verdict == v).sum()))
     ]
-    axes.legend(handles=handles, loc="upper right", framealpha=0.9)
+    axes.legend(handles=handles, loc="lower right", framealpha=0.9)
 
 
 def _draw_elevation(
@@ -120,45 +107,54 @@ def _draw_elevation(
     """The scan from the side, and the figure in some frames."""
     across = walk.elevation
     low, high = _extent(walk.points)
-    _draw_points(axes, walk.points, across, 2, low, high)
+    _draw_points(axes, walk.points, (across, 2), (low, high), PIXELS)
     for number, k in enumerate(stops, 1):
         placed = avatar @ walk.poses[k, :3, :3].T + walk.poses[k, :3, 3]
         colour = COLOURS[Verdict(int(frames.verdict[k]))]
         axes.scatter(placed[:, across], placed[:, 2], s=0.8, color=colour, linewidths=0, zorder=4)
-        axes.text(
-            walk.poses[k, across, 3],
-            placed[:, 2].max() + 0.25,
-            str(number),
-            ha="center",
-            fontsize=10,
-            fontweight="bold",
-            color=colour,
-            zorder=5,
-        )
-    axes.set_title("From the front: the figure where the numbers are")
+        head = (walk.poses[k, across, 3], placed[:, 2].max())
+        _badge(axes, number, head, (0, 11), frames.verdict[k])
+    axes.set_title("From the side: the figure where the numbers are")
     axes.set_xlabel(f"{'xy'[across]} [m]")
     axes.set_ylabel("z [m]")
+
+
+def _badge(axes: Any, number: int, at: Any, shift: tuple[int, int], verdict: int) -> None:
+    """The number of a place, in the colour of its verdict, some points beside it."""
+    axes.annotate(
+        str(number),
+        at,
+        xytext=shift,
+        textcoords="offset points",
+        ha="center",
+        va="center",
+        fontsize=9,
+        fontweight="bold",
+        color="white",
+        bbox={"boxstyle": "circle,pad=0.2", "fc": COLOURS[Verdict(int(verdict))], "ec": "white"},
+        zorder=9,
+    )
 
 
 def _draw_points(
     axes: Any,
     points: NDArray[np.float64],
-    across: int,
-    up: int,
-    low: NDArray[np.float64],
-    high: NDArray[np.float64],
+    shown: tuple[int, int],
+    extent: tuple[NDArray[np.float64], NDArray[np.float64]],
+    pixels: int,
 ) -> None:
-    """Points as an image of their density, on a logarithmic scale."""
-    pixel = max(PIXEL, float((high - low).max()) / 700)
-    edges = [np.arange(low[axis], high[axis] + pixel, pixel) for axis in (across, up)]
-    image, _, _ = np.histogram2d(points[:, across], points[:, up], bins=edges)
-    image = np.log1p(image.T)
+    """Points as an image of their density, on a logarithmic scale. shown: the axes to the right and upwards."""
+    low, high = extent
+    pixel = float((high - low).max()) / pixels
+    edges = [np.arange(low[axis], high[axis] + pixel, pixel) for axis in shown]
+    counts, _, _ = np.histogram2d(points[:, shown[0]], points[:, shown[1]], bins=edges)
+    image = np.log1p(counts.T)
     axes.imshow(
         image,
         origin="lower",
         extent=(edges[0][0], edges[0][-1], edges[1][0], edges[1][-1]),
         cmap=STONE,
-        vmax=max(float(np.quantile(image[image > 0], 0.98)) if image.any() else 1.0, 1e-9),
+        vmax=float(np.quantile(image[image > 0], 0.93)) if image.any() else 1.0,
         interpolation="nearest",
     )
     axes.set_facecolor(PAPER)
@@ -182,9 +178,10 @@ def _draw_times(axes: Any, walk: "Walk", frames: "Frames") -> None:
         label=f"in the engine, p50 {np.median(engine):.3f} ms",
     )
     loads = frames.misses > 0
-    axes.scatter(
-        walk.times[loads], engine[loads], marker="v", s=26, color=INK, zorder=4, label="voxels loaded"
-    )
+    if loads.any():
+        axes.scatter(
+            walk.times[loads], engine[loads], marker="v", s=26, color=INK, zorder=4, label="voxels loaded"
+        )
     axes.set_yscale("log")
     axes.set_xlim(walk.times[0], walk.times[-1])
     axes.set_xlabel("time along the walk [s]; shaded: contact")

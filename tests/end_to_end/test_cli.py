@@ -1,0 +1,212 @@
+"""The command: its verbs on a small scan, its exit codes, and one line for every error."""
+
+import json
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from solidcloud.server.cli import parse_bytes, run
+from solidcloud.server.report.serving import free_port, served
+
+VERBS = ["build", "info", "validate", "serve", "query", "make"]
+RADIUS = 0.05
+
+
+def floor(half: float = 2.0, step: float = 0.1) -> np.ndarray:
+    """A level floor at z = 0, (n, 3) [m]."""
+    x, y = np.meshgrid(np.arange(-half, half, step), np.arange(-half, half, step))
+    return np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
+
+
+@pytest.fixture
+def scan(tmp_path: Path) -> Path:
+    path = tmp_path / "floor.xyz"
+    np.savetxt(path, floor(), fmt="%.4f")
+    return path
+
+
+@pytest.fixture(scope="module")
+def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("floor")
+    np.savetxt(folder / "floor.xyz", floor(), fmt="%.4f")
+    code = run(
+        ["build", str(folder / "floor.xyz"), "-o", str(folder / "hall"), "--voxel", "2", "--jobs", "1"]
+    )
+    assert code == 0
+    return folder / "hall"
+
+
+def errors(capsys: pytest.CaptureFixture[str]) -> list[str]:
+    return [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
+
+
+@pytest.mark.parametrize("verb", ["", *VERBS, "make facade", "make town", "make figure", "make walk"])
+def test_help_loads_no_numpy(verb: str) -> None:
+    code = f"import sys; from solidcloud.server.cli import run; code = run({[*verb.split(), '--help']!r})"
+    heavy = ["numpy", "numba", "h5py", "zenoh", "rich"]
+    check = f"sys.exit(code or ','.join(name for name in {heavy!r} if name in sys.modules) or 0)"
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", f"{code}; {check}"], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert "Usage: solidcloud" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "said"),
+    [
+        ("biuld", 2, "biuld"),
+        ("build", 2, "see solidcloud build --help"),
+        ("make", 2, "Missing command"),
+        ("build {scan} -o {out} --degree many", 2, "--degree"),
+        ("build {scan} -o {out} --degree 99", 2, "--degree 99"),
+        ("build {scan} -o {out} --memory plenty", 2, "--memory 'plenty'"),
+        ("build {scan} -o {out} --keep colour", 2, "colour"),
+        ("build {out}/nowhere.las -o {out}", 3, "nowhere.las: no such file"),
+        ("info {out}", 3, "no archive here"),
+        ("validate {out}", 3, "no archive here"),
+        ("serve {out}", 3, "no archive here"),
+        ("serve {out} --listen tcp/0.0.0.0:7447", 2, "--insecure"),
+        ("query --scene hall --avatar {scan} --poses {scan}", 2, "line 1: columns"),
+        ("query --scene hall --avatar {scan} --poses {out}", 3, "expected a CSV file"),
+        ("make facade -o {out}.obj", 2, "cannot write '.obj'"),
+    ],
+)
+def test_error_is_one_line_with_its_exit_code(
+    arguments: str, code: int, said: str, scan: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = sorted(tmp_path.rglob("*"))
+    assert run([word.format(scan=scan, out=tmp_path / "out") for word in arguments.split()]) == code
+    found = errors(capsys)
+    assert len(found) == 1 and said in found[0]
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_command_is_installed_and_exits_without_a_traceback() -> None:
+    command = [str(Path(sys.executable).with_name("solidcloud")), "info", "nowhere"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 3
+    assert re.fullmatch(r"error: nowhere: .*\n", done.stderr) and not done.stdout
+
+
+def test_build_says_what_it_made(scan: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    target = tmp_path / "hall"
+    assert run(["build", str(scan), "-o", str(target), "--voxel", "2", "--jobs", "1", "--json"]) == 0
+    made = json.loads(capsys.readouterr().out)
+    assert made["points"] == len(floor()) and made["archive"] == str(target)
+    assert made["bytes"] == sum(path.stat().st_size for path in target.rglob("*.h5"))
+    assert made["radius"] == pytest.approx(0.05, rel=1e-9)
+    assert run(["build", str(scan), "-o", str(target)]) == 2
+    assert "--overwrite" in errors(capsys)[0]
+    assert run(["build", str(scan), "-o", str(target), "--overwrite", "--jobs", "1"]) == 0
+    shown = capsys.readouterr()
+    assert "points/s" in shown.out and "bytes a point" in shown.out
+
+
+def test_broken_scan_stops_the_build_unless_it_is_skipped(
+    scan: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    broken = tmp_path / "broken.las"
+    broken.write_bytes(b"LASF but no more")
+    target = tmp_path / "hall"
+    build = ["build", str(scan), str(broken), "-o", str(target), "--jobs", "1"]
+    assert run(build) == 3
+    assert "broken.las" in errors(capsys)[0] and not target.exists()
+    assert run([*build, "--skip-bad"]) == 0
+    assert "left out" in capsys.readouterr().err
+    assert run(["info", str(target), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert len(told["skipped"]) == 1 and "broken.las" in told["skipped"][0]
+
+
+def test_info_tells_counts_and_bounds(archive: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["info", str(archive), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["points"] == len(floor()) and told["scene"] == "hall"
+    assert np.allclose(told["bounds"], [floor().min(axis=0), floor().max(axis=0)], atol=told["lattice_step"])
+    assert run(["info", str(archive)]) == 0
+    assert f"{len(floor()):,} in" in capsys.readouterr().out
+
+
+def test_validate_names_the_record_with_a_flipped_byte(
+    scan: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    target = tmp_path / "hall"
+    assert run(["build", str(scan), "-o", str(target), "--jobs", "1"]) == 0
+    assert run(["validate", str(target), "--deep"]) == 0
+    assert ", 0 faults" in capsys.readouterr().out
+    shard = next(target.rglob("shards/*.h5"))
+    content = bytearray(shard.read_bytes())
+    content[content.rindex(b"\x28\xb5\x2f\xfd") + 20] ^= 0x10
+    shard.write_bytes(content)
+    assert run(["validate", str(target), "--json"]) == 3
+    shown = capsys.readouterr()
+    assert shard.name in json.loads(shown.out)["faults"][0]
+    assert [line for line in shown.err.splitlines() if line.startswith("error: ") and shard.name in line]
+
+
+@pytest.mark.interpreted
+def test_query_agrees_with_the_floor(
+    archive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    heights = [0.3, 0.0999, 0.1001, 0.02, 5.0]
+    # One point over a scanned one; both radii are 0.05 m.
+    (tmp_path / "ball.xyz").write_text("0 0 0\n")
+    rows = "".join(f"{t},0,0,{z},1,0,0,0\n" for t, z in enumerate(heights))
+    (tmp_path / "poses.csv").write_text("t,x,y,z,qw,qx,qy,qz\n" + rows)
+    ask = ["query", "--avatar", str(tmp_path / "ball.xyz"), "--poses", str(tmp_path / "poses.csv")]
+    ask += ["--radius", str(RADIUS)]
+    with served(archive, "hall", "--cache", "64MB") as endpoint:
+        assert run([*ask, "--connect", endpoint, "--scene", "hall", "--json"]) == 0
+        told = json.loads(capsys.readouterr().out)
+        assert run([*ask, "--connect", endpoint, "--scene", "hall"]) == 0
+        assert "3 clear, 2 contact, 0 unknown" in capsys.readouterr().out
+        assert run([*ask, "--connect", endpoint, "--scene", "nave"]) == 1
+        assert "served: hall" in errors(capsys)[0]
+    verdicts = [answer["verdict"] for answer in told["answers"]]
+    assert verdicts == ["contact" if z <= 2 * RADIUS else "clear" for z in heights]
+    assert told["faults"] == [] and told["resident"] >= 1
+    # Nobody there any more: unknown, and it says why.
+    assert run([*ask, "--connect", endpoint, "--scene", "hall"]) == 0
+    shown = capsys.readouterr()
+    assert "5 unknown" in shown.out and "no server of scene 'hall'" in shown.err
+
+
+def test_serve_stops_when_told_to(archive: Path) -> None:
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    command = [
+        sys.executable,
+        "-P",
+        "-m",
+        "solidcloud.server.cli",
+        "serve",
+        str(archive),
+        "--listen",
+        endpoint,
+    ]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout and process.stdout.readline() == f"serving hall at {endpoint}\n"
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(30) == 0
+
+
+def test_make_gives_an_avatar_a_scan_and_a_walk(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    figure, facade, walk = tmp_path / "al.obj", tmp_path / "facade.laz", tmp_path / "walk.csv"
+    assert run(["make", "figure", "-o", str(figure), "--points", "200"]) == 0
+    assert figure.read_text().count("\nv ") == 200
+    assert run(["make", "facade", "-o", str(facade), "--points", "2000"]) == 0
+    assert "2,000 points" in capsys.readouterr().out
+    assert run(["make", "walk", str(tmp_path / "facade.truth.json"), "-o", str(walk), "--frames", "60"]) == 0
+    assert len(walk.read_text().splitlines()) == 61
+
+
+@pytest.mark.parametrize(
+    ("text", "size"),
+    [("64MB", 64 << 20), ("2GB", 2 << 30), ("1.5 GiB", 3 << 29), ("4096", 4096), ("8k", 8192)],
+)
+def test_sizes_are_in_steps_of_1024(text: str, size: int) -> None:
+    assert parse_bytes(text, "--cache") == size

@@ -1,0 +1,79 @@
+"""The wheel holds every module and data file, and nothing bare; the pins cover every extra."""
+
+import json
+import re
+from importlib import metadata
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+
+ROOT = Path(__file__).resolve().parent.parent
+DISTRIBUTION = metadata.distribution("solidcloud")
+
+
+def is_wheel() -> bool:
+    origin = json.loads(DISTRIBUTION.read_text("direct_url.json") or "{}")
+    return DISTRIBUTION.read_text("WHEEL") is not None and not origin.get("dir_info", {}).get(
+        "editable", False
+    )
+
+
+wheel = pytest.mark.skipif(not is_wheel(), reason="an editable install, not a wheel: run scripts/test")
+
+
+def sources() -> set[str]:
+    """What should be installed, as paths inside the package."""
+    return {
+        path.relative_to(ROOT).as_posix()
+        for package in ("schemas", "builder", "server")
+        for path in (ROOT / package).rglob("*")
+        if path.suffix in (".py", ".md", ".json") or path.name == "py.typed"
+    }
+
+
+@wheel
+def test_wheel_holds_every_module_and_data_file_and_nothing_more() -> None:
+    files = [Path(str(file)) for file in DISTRIBUTION.files or ()]
+    packaged = {Path(*file.parts[1:]).as_posix() for file in files if file.parts[0] == "solidcloud"}
+    packaged = {name for name in packaged if "__pycache__" not in name}
+    assert packaged == sources()
+
+
+@wheel
+def test_wheel_installs_no_bare_package() -> None:
+    tops = {Path(str(file)).parts[0] for file in DISTRIBUTION.files or ()}
+    assert {top for top in tops if top != ".." and not top.endswith(".dist-info")} == {"solidcloud"}
+
+
+@wheel
+def test_wheel_holds_the_licence() -> None:
+    names = [str(file) for file in DISTRIBUTION.files or ()]
+    assert any(name.endswith("licenses/LICENSE") for name in names)
+
+
+@wheel
+def test_tests_import_what_is_installed() -> None:
+    from solidcloud import schemas
+
+    assert not Path(schemas.__path__[0]).is_relative_to(ROOT / "schemas")
+
+
+def pins() -> dict[str, str]:
+    """Name (normalised) -> version of scripts/requirements.txt."""
+    lines = (ROOT / "scripts/requirements.txt").read_text().splitlines()
+    pairs = [line.split("==") for line in lines if line and not line.startswith("#")]
+    return {normalised(name): version for name, version in pairs}
+
+
+def normalised(name: str) -> str:
+    return re.sub(r"[-_.]+", "-", name).lower()
+
+
+def test_every_requirement_of_every_extra_is_pinned_to_a_version_it_allows() -> None:
+    pinned = pins()
+    wanted = [Requirement(text) for text in DISTRIBUTION.requires or ()]
+    assert len(wanted) > 15
+    for requirement in wanted:
+        if requirement.name != "solidcloud":
+            assert requirement.specifier.contains(pinned[normalised(requirement.name)]), requirement

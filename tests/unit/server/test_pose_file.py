@@ -1,0 +1,79 @@
+"""Pose files: what is written reads back, quaternions are checked, a wrong line is named."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from solidcloud.schemas.errors import BadRequestError, ScanError
+from solidcloud.server.pose_file import read_poses, write_poses
+
+HEADER = "t,x,y,z,qw,qx,qy,qz\n"
+
+
+def random_poses(rng: np.random.Generator, count: int) -> np.ndarray:
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, :3, :3] = Rotation.random(count, rng=rng).as_matrix()
+    poses[:, :3, 3] = rng.uniform(-5e6, 5e6, (count, 3))
+    return poses
+
+
+def test_written_poses_read_back(tmp_path: Path, rng: np.random.Generator) -> None:
+    times, poses = np.arange(500) / 30, random_poses(rng, 500)
+    # Half turns and none, where a component of the quaternion is zero.
+    poses[:4, :3, :3] = [np.diag(d) for d in ([1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1])]
+    write_poses(tmp_path / "walk.csv", times, poses)
+    found_times, found = read_poses(tmp_path / "walk.csv")
+    assert np.array_equal(found_times, times)
+    assert np.array_equal(found[:, :3, 3], poses[:, :3, 3])
+    assert np.abs(found[:, :3, :3] - poses[:, :3, :3]).max() < 1e-14
+    assert [path.name for path in tmp_path.iterdir()] == ["walk.csv"]
+
+
+def test_quaternions_turn_as_scipy_says(tmp_path: Path, rng: np.random.Generator) -> None:
+    q = Rotation.random(200, rng=rng).as_quat(scalar_first=True)
+    rows = "".join(f"0,1,2,3,{','.join(map(repr, row))}\n" for row in q.tolist())
+    (tmp_path / "a.csv").write_text(HEADER + rows)
+    expected = Rotation.from_quat(q, scalar_first=True).as_matrix()
+    assert np.abs(read_poses(tmp_path / "a.csv")[1][:, :3, :3] - expected).max() < 1e-14
+
+
+def test_quaternion_near_unit_length_is_normalised(tmp_path: Path) -> None:
+    """NUMERICS.md, case 4."""
+    (tmp_path / "a.csv").write_text(HEADER + "0,0,0,0,1.0000009,0,0,0\n")
+    assert np.array_equal(read_poses(tmp_path / "a.csv")[1][0], np.eye(4))
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("0,0,0,0,1.01,0,0,0", "quaternion of length 1.01"),
+        ("0,0,0,0,0,0,0,0", "quaternion of length 0"),
+        ("0,0,0,0,1,0,0", "7 values: expected 8"),
+        ("0,0,zero,0,1,0,0,0", "'zero'"),
+        ("0,0,nan,0,1,0,0,0", "finite"),
+        ("0,0,1e999,0,1,0,0,0", "finite"),
+    ],
+)
+def test_wrong_line_is_named(line: str, said: str, tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text(HEADER + "0,0,0,0,1,0,0,0\n" + line + "\n")
+    with pytest.raises(BadRequestError, match=r"a\.csv, line 3: ") as found:
+        read_poses(tmp_path / "a.csv")
+    assert said in str(found.value)
+
+
+def test_columns_may_stand_in_any_order_but_must_be_these(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("qw,qx,qy,qz,z,y,x,t\r\n1,0,0,0,3,2,1,9\r\n")
+    times, poses = read_poses(tmp_path / "a.csv")
+    assert times.tolist() == [9] and poses[0, :3, 3].tolist() == [1, 2, 3]
+    (tmp_path / "b.csv").write_text("t,x,y,z,roll,pitch,yaw\n")
+    with pytest.raises(BadRequestError, match="line 1: columns t,x,y,z,roll,pitch,yaw"):
+        read_poses(tmp_path / "b.csv")
+    (tmp_path / "c.csv").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(ScanError, match=r"c\.csv"):
+        read_poses(tmp_path / "c.csv")
+
+
+def test_file_without_poses_gives_none(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text(HEADER)
+    assert read_poses(tmp_path / "a.csv")[1].shape == (0, 4, 4)

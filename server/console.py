@@ -120,8 +120,8 @@ def bytes_text(count: float) -> str:
 
 
 def length_text(metres: float) -> str:
-    """A small length for a reader, in millimetres."""
-    return f"{metres * 1e3:.4g} mm"
+    """A small length for a reader, in millimetres; under a picometre it is rounding, and 0."""
+    return f"{metres * 1e3 if metres >= 1e-12 else 0.0:.4g} mm"
 
 
 def _build_facts(summary: "BuildSummary") -> Iterator[tuple[str, str]]:

@@ -154,10 +154,15 @@ def _unpack(frame: bytes, dtype: np.dtype, count: int, what: str) -> NDArray:
     """Undo `_pack`, refusing a frame that declares another size before anything is allocated for it."""
     expected = count * dtype.itemsize
     try:
-        found = zstandard.get_frame_parameters(frame).content_size
-        if found != expected:
-            raise CorruptError(f"{what}: frame of {found} bytes, expected {expected}")
-        plain = zstandard.ZstdDecompressor().decompress(frame, max_output_size=expected)
+        declared = zstandard.get_frame_parameters(frame)
+        if declared.content_size != expected:
+            raise CorruptError(f"{what}: frame of {declared.content_size} bytes, expected {expected}")
+        # One flipped bit turns the checksum off: the frame would be read unchecked, its checksum as extra bytes.
+        if not declared.has_checksum:
+            raise CorruptError(f"{what}: frame without checksum, expected one")
+        plain = zstandard.ZstdDecompressor().decompress(
+            frame, max_output_size=expected, allow_extra_data=False
+        )
     except zstandard.ZstdError as error:
         raise CorruptError(f"{what}: damaged frame ({error})") from error
     planes = np.frombuffer(plain, np.uint8).reshape(dtype.itemsize, count)

@@ -111,8 +111,8 @@ def check_voxel(voxel: VoxelData, voxel_steps: int) -> Links:
     """Check everything a kernel relies on, and derive the links. Raises CorruptError naming the fault.
 
     What is checked: shapes agree; counts add up to trees with all leaf nodes on one level; cells lie on
-    their own grid inside the voxel's cube; points and node centres lie inside their cell; the top unit is
-    the one the voxel size calls for. Not checked here: that bounds enclose (`solidcloud validate`).
+    their own grid inside the voxel's cube; points lie inside their cell; the top unit is the one the voxel
+    size calls for. Not checked here: that bounds enclose (`solidcloud validate`).
     """
     cells, nodes = voxel.cells, voxel.nodes
     name = f"voxel {voxel.key:#x}"

@@ -1,0 +1,226 @@
+"""decode(encode(v)) == v bit for bit, and no damaged or foreign record gets through."""
+
+import os
+import struct
+
+import numpy as np
+import pytest
+import zstandard
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scans import WITH_POINTS, make_steps
+from solidcloud.builder.config import BuildConfig
+from solidcloud.builder.octree import VoxelPoints, build_voxel
+from solidcloud.schemas.codec import Record, RecordShape, decode_voxel, encode_voxel, point_dtype
+from solidcloud.schemas.errors import CorruptError
+from solidcloud.schemas.voxel import Links, VoxelData
+
+ARCHIVE_ID = bytes(range(16))
+KEY = 0x1234567
+INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
+
+
+def shape_of(voxel: VoxelData) -> RecordShape:
+    """What an index would say of this voxel's record."""
+    dtype = point_dtype(scan_index=voxel.scan_index is not None, intensity=voxel.intensity is not None)
+    return RecordShape(len(voxel.cells.nodes), len(voxel.nodes.count), len(voxel.points), dtype)
+
+
+def decode(record: Record, voxel: VoxelData, steps: int, **other: object) -> tuple[VoxelData, Links]:
+    """`decode_voxel` of a record as it should be, but for what `other` says."""
+    arguments = {
+        "cells": record.cells,
+        "nodes": record.nodes,
+        "points": record.points,
+        "shape": shape_of(voxel),
+        "key": voxel.key,
+        "archive_id": ARCHIVE_ID,
+        "voxel_steps": steps,
+        **other,
+    }
+    return decode_voxel(**arguments)
+
+
+def assert_same_bits(found: VoxelData, expected: VoxelData) -> None:
+    """Every column of the same type, shape and bytes."""
+    assert found.key == expected.key
+    assert found.top_shift == expected.top_shift
+    columns = [
+        *zip(found.cells, expected.cells, strict=True),
+        *zip(found.nodes, expected.nodes, strict=True),
+        *((getattr(found, f), getattr(expected, f)) for f in ("points", "scan_index", "intensity")),
+    ]
+    for a, b in columns:
+        assert (a is None) == (b is None)
+        if a is not None:
+            assert (a.dtype, a.shape, a.tobytes()) == (b.dtype, b.shape, b.tobytes())
+
+
+def kept(n: int, seed: int) -> dict[str, np.ndarray]:
+    """Optional columns of any bits, NaN among them."""
+    rng = np.random.default_rng(seed)
+    bits = rng.integers(0, 2**32, n, np.uint32)
+    return {"scan_index": rng.integers(0, 2**16, n).astype(np.uint16), "intensity": bits.view(np.float32)}
+
+
+@st.composite
+def voxels(draw: st.DrawFn) -> tuple[VoxelData, int]:
+    """A voxel of random points, many of them equal or in line, of any size and tree, and its steps."""
+    steps = draw(st.sampled_from([1, 2, 1000, 65535, 65536, 65537, 200_000, 1 << 21]))
+    coordinate = st.integers(0, steps - 1) | st.sampled_from([0, steps - 1, min(65535, steps - 1)])
+    rows = draw(st.lists(st.tuples(coordinate, coordinate, coordinate), min_size=1, max_size=60))
+    rows = rows * draw(st.integers(1, 3))
+    if draw(st.booleans()):  # in line along an axis
+        rows = [(x, rows[0][1], rows[0][2]) for x, _, _ in rows]
+    config = BuildConfig(
+        leaf=draw(st.integers(1, 32)),
+        degree=draw(st.integers(2, 16)),
+        cell_points=draw(st.sampled_from([1, 5, 4096])),
+        with_slab=draw(st.booleans()),
+    )
+    columns = draw(st.sets(st.sampled_from(["scan_index", "intensity"])))
+    columns_of = {name: column for name, column in kept(len(rows), 7).items() if name in columns}
+    return build_voxel(KEY, VoxelPoints(np.array(rows, np.int32), **columns_of), steps, config), steps
+
+
+@pytest.mark.interpreted
+@settings(max_examples=15 if INTERPRETED else 150, deadline=None)
+@given(voxels())
+def test_decoding_gives_back_what_was_encoded(case: tuple[VoxelData, int]) -> None:
+    voxel, steps = case
+    record = encode_voxel(voxel, ARCHIVE_ID)
+    found, links = decode(record, voxel, steps)
+    assert_same_bits(found, voxel)
+    assert record.leaf_rows == int(links.is_leaf.sum())
+    assert (record.cell_rows, record.node_rows, record.point_rows) == shape_of(voxel)[:3]
+
+
+@pytest.mark.interpreted
+@pytest.mark.parametrize("kind", WITH_POINTS)
+@pytest.mark.parametrize("steps", [1000, 65536, 1 << 21])
+def test_synthetic_scans_come_back(kind: str, steps: int) -> None:
+    points = make_steps(kind, 3, 200, steps)
+    config = BuildConfig(cell_points=50, leaf=16)
+    voxel = build_voxel(KEY, VoxelPoints(points, **kept(len(points), 1)), steps, config)
+    found, _ = decode(encode_voxel(voxel, ARCHIVE_ID), voxel, steps)
+    assert_same_bits(found, voxel)
+
+
+def test_the_same_voxel_has_the_same_bytes_in_any_order_of_points() -> None:
+    points = make_steps("corner", 3, 300, 1000)
+    columns = kept(300, 1)
+    columns["intensity"] = np.nan_to_num(columns["intensity"])
+    order = np.random.default_rng(9).permutation(300)
+    config = BuildConfig(cell_points=50)
+    a = build_voxel(KEY, VoxelPoints(points, **columns), 1000, config)
+    b = build_voxel(
+        KEY, VoxelPoints(points[order], **{k: c[order] for k, c in columns.items()}), 1000, config
+    )
+    assert encode_voxel(a, ARCHIVE_ID) == encode_voxel(b, ARCHIVE_ID)
+
+
+@pytest.fixture(scope="module")
+def small() -> tuple[VoxelData, Record]:
+    """A small voxel of several cells, and its record."""
+    config = BuildConfig(leaf=8, cell_points=8, degree=2)
+    voxel = build_voxel(KEY, VoxelPoints(make_steps("corner", 1, 24, 1000)), 1000, config)
+    return voxel, encode_voxel(voxel, ARCHIVE_ID)
+
+
+@pytest.mark.parametrize("name", ["cells", "nodes", "points"])
+def test_every_flipped_bit_is_refused_or_means_nothing(name: str, small: tuple[VoxelData, Record]) -> None:
+    voxel, record = small
+    frame = getattr(record, name)
+    passed = 0
+    for at in range(len(frame)):
+        for flip in [*(1 << bit for bit in range(8)), 0xFF]:
+            broken = bytearray(frame)
+            broken[at] ^= flip
+            try:
+                found, _ = decode(record, voxel, 1000, **{name: bytes(broken)})
+            except CorruptError as error:
+                assert f"voxel {KEY:#x}, {name}: " in str(error)
+            else:
+                # zstd has bits that its decoders must ignore, such as bit 4 of the frame header's descriptor
+                # (RFC 8878, 3.1.1.1.1): then the content is the same.
+                assert_same_bits(found, voxel)
+                passed += 1
+    assert passed <= len(frame) // 20
+
+
+def test_a_frame_without_checksum_is_refused(small: tuple[VoxelData, Record]) -> None:
+    voxel, record = small
+    broken = bytearray(record.points)
+    broken[4] ^= 1 << 2  # the frame header's checksum flag
+    with pytest.raises(CorruptError, match="points: frame without checksum"):
+        decode(record, voxel, 1000, points=bytes(broken))
+
+
+def test_bytes_behind_a_frame_are_refused(small: tuple[VoxelData, Record]) -> None:
+    voxel, record = small
+    with pytest.raises(CorruptError, match="points: damaged frame"):
+        decode(record, voxel, 1000, points=record.points + record.points[-4:])
+
+
+@pytest.mark.parametrize("name", ["cells", "nodes", "points"])
+def test_every_truncation_is_refused(name: str, small: tuple[VoxelData, Record]) -> None:
+    voxel, record = small
+    frame = getattr(record, name)
+    for size in range(len(frame)):
+        with pytest.raises(CorruptError, match=name):
+            decode(record, voxel, 1000, **{name: frame[:size]})
+
+
+@pytest.mark.parametrize("other", [{"key": KEY + 1}, {"archive_id": bytes(16)}])
+def test_another_voxels_or_archives_record_is_refused(
+    other: dict[str, object], small: tuple[VoxelData, Record]
+) -> None:
+    voxel, record = small
+    with pytest.raises(CorruptError, match="another voxel's or another archive's"):
+        decode(record, voxel, 1000, **other)
+
+
+@pytest.mark.parametrize("field", ["cell_rows", "node_rows", "point_rows"])
+@pytest.mark.parametrize("delta", [-1, 1])
+def test_other_rows_than_the_index_says_are_refused(
+    field: str, delta: int, small: tuple[VoxelData, Record]
+) -> None:
+    voxel, record = small
+    shape = shape_of(voxel)
+    shape = shape._replace(**{field: getattr(shape, field) + delta})
+    with pytest.raises(CorruptError, match=r"frame of \d+ bytes, expected \d+"):
+        decode(record, voxel, 1000, shape=shape)
+
+
+def test_a_frame_that_declares_more_is_refused_before_memory_is_taken(
+    small: tuple[VoxelData, Record],
+) -> None:
+    voxel, record = small
+    # A single segment with an eight-byte content size of 2^62: to allocate it would be a MemoryError.
+    bomb = struct.pack("<IBQ", 0xFD2FB528, 0b11100100, 1 << 62) + record.points[6:]
+    with pytest.raises(CorruptError, match=f"frame of {1 << 62} bytes, expected"):
+        decode(record, voxel, 1000, points=bomb)
+    undeclared = zstandard.ZstdCompressor(write_content_size=False, write_checksum=True).compress(bytes(999))
+    with pytest.raises(CorruptError, match="points: frame of"):
+        decode(record, voxel, 1000, points=undeclared)
+
+
+def test_what_check_voxel_refuses_is_refused(small: tuple[VoxelData, Record]) -> None:
+    voxel, _ = small
+    low = voxel.cells.low.copy()
+    low[0, 0] += 1
+    record = encode_voxel(voxel._replace(cells=voxel.cells._replace(low=low)), ARCHIVE_ID)
+    with pytest.raises(CorruptError, match="a cell off its grid"):
+        decode(record, voxel, 1000)
+
+
+def test_a_sort_axis_out_of_range_is_refused_before_it_is_used(small: tuple[VoxelData, Record]) -> None:
+    voxel, record = small
+    axis = voxel.nodes.axis.copy()
+    axis[-1] = 3
+    rows = np.frombuffer(zstandard.ZstdDecompressor().decompress(record.nodes), np.uint8).copy()
+    # The byte plane of `axis` is the 21st of a node's 27.
+    rows.reshape(27, -1)[20] = axis
+    frame = zstandard.ZstdCompressor(write_checksum=True).compress(rows.tobytes())
+    with pytest.raises(CorruptError, match="sort axes out of range"):
+        decode(record, voxel, 1000, nodes=frame)

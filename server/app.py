@@ -5,8 +5,8 @@
 
 import logging
 import signal
+import socket
 import sys
-import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, Protocol
@@ -163,19 +163,31 @@ def serving(scenes: Sequence[SceneLike], config: ServerConfig) -> Iterator[None]
 
 def serve(scenes: Sequence[SceneLike], config: ServerConfig) -> None:
     """Serve scenes until SIGTERM or SIGINT, then answer what was accepted and return. Main thread only."""
-    stop = threading.Event()
     # A thread in pure Python may keep the interpreter for 5 ms by default while a reply waits for it.
     sys.setswitchinterval(0.0005)
-    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
-    try:
-        for number in before:
-            signal.signal(number, lambda *_: stop.set())
-        if config.insecure:
-            log.warning("--insecure: whoever reaches %s may ask anything, unauthenticated", config.listen)
-        with serving(scenes, config):
-            names = ", ".join(scene.name for scene in scenes)
-            print(f"serving {names} at {config.listen}", flush=True)
-            stop.wait()
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+    if config.insecure:
+        log.warning("--insecure: whoever reaches %s may ask anything, unauthenticated", config.listen)
+    with _signalled(signal.SIGTERM, signal.SIGINT) as stop, serving(scenes, config):
+        names = ", ".join(scene.name for scene in scenes)
+        print(f"serving {names} at {config.listen}", flush=True)
+        stop.recv(1)
+
+
+@contextmanager
+def _signalled(*numbers: signal.Signals) -> Iterator[socket.socket]:
+    """A socket that has something to read once one of the signals came, in place of what they did before.
+
+    Not an event that a handler sets: the system may hand the signal to one of zenoh's threads, and then a main
+    thread that waits for a lock is not woken to run the handler (a stop in 66 hung so).
+    """
+    reader, writer = socket.socketpair()
+    with reader, writer:
+        writer.setblocking(False)
+        before = {number: signal.signal(number, lambda *_: None) for number in numbers}
+        descriptor = signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
+        try:
+            yield reader
+        finally:
+            signal.set_wakeup_fd(descriptor)
+            for number, handler in before.items():
+                signal.signal(number, handler)

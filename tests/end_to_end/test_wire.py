@@ -34,7 +34,7 @@ from solidcloud.schemas.messages import (
     encode,
 )
 from solidcloud.server import client as client_module
-from solidcloud.server.app import serving
+from solidcloud.server.app import serve, serving
 from solidcloud.server.client import Client
 from solidcloud.server.config import ServerConfig
 from solidcloud.server.transport import session_config
@@ -288,6 +288,28 @@ def test_interrupted_server_exits_0(endpoint):
     with server_process(endpoint) as process:
         process.send_signal(signal.SIGINT)
         assert process.wait(DEADLINE) == 0
+
+
+def test_a_signal_that_another_thread_takes_stops_the_server(scene, endpoint):
+    stopped, in_time = threading.Event(), []
+
+    def signal_this_thread():
+        with Client(endpoint, scene="floor") as client:
+            client.add_avatar("al", POINTS)
+            eventually(lambda: client.collide("al", heights([1.0])).verdict[0] == Verdict.CLEAR)
+        signal.pthread_kill(threading.get_ident(), signal.SIGTERM)
+        in_time.append(stopped.wait(DEADLINE))
+        if not in_time[0]:
+            signal.pthread_kill(threading.main_thread().ident, signal.SIGTERM)
+
+    thread = threading.Thread(target=signal_this_thread)
+    before = signal.getsignal(signal.SIGTERM)
+    thread.start()
+    serve([scene], ServerConfig(listen=endpoint))
+    stopped.set()
+    thread.join(DEADLINE)
+    assert in_time == [True]
+    assert signal.getsignal(signal.SIGTERM) == before
 
 
 @pytest.mark.parametrize("encoding", [MSGPACK, JSON])

@@ -190,7 +190,7 @@ def encode(message: Any, encoding: str = MSGPACK) -> bytes:
 def decode_request(kind: type[_M], payload: bytes, encoding: str = MSGPACK) -> _M:
     """A request from its bytes; BadRequestError says which field is wrong, what was found and expected."""
     try:
-        return _decoder(kind, encoding).decode(payload)  # type: ignore[no-any-return]
+        return _decoder(kind, encoding).decode(payload)  # type: ignore[arg-type, no-any-return]
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise BadRequestError(f"{kind.__name__}: {error}: see WIRE.md for its fields") from None
 
@@ -198,7 +198,7 @@ def decode_request(kind: type[_M], payload: bytes, encoding: str = MSGPACK) -> _
 def decode_answer(kind: type[_M], payload: bytes, encoding: str = MSGPACK) -> _M:
     """An answer from its bytes; unknown fields are left out. InternalError: not what WIRE.md says."""
     try:
-        return _decoder(kind, encoding).decode(payload)  # type: ignore[no-any-return]
+        return _decoder(kind, encoding).decode(payload)  # type: ignore[arg-type, no-any-return]
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise InternalError(f"{kind.__name__}: {error}: client and server may be of other versions") from None
 

@@ -1,0 +1,135 @@
+"""Bounds enclose, proved in Python integers; leaf spheres are close to the minimal ball."""
+
+import itertools
+
+import numpy as np
+import pytest
+from scans import WITH_POINTS, make_steps
+from solidcloud.builder.hierarchy import Bounds, bound_runs, build_hierarchy
+from solidcloud.builder.kernels.bounding_sphere import ceil_sqrt
+
+
+def assert_encloses(bounds: Bounds, i: int, points: np.ndarray, unit: int) -> None:
+    """Sphere and slab i hold every point (n, 3), in integers without bound."""
+    xyz = points.astype(object)  # Python integers
+    apart = xyz - bounds.center[i].astype(object) * unit
+    assert max((apart * apart).sum(axis=1)) <= (int(bounds.radius[i]) * unit) ** 2
+    normal = bounds.normal[i].astype(object)
+    if any(normal):
+        along = (apart * normal).sum(axis=1)
+        assert int(bounds.slab[i, 0]) <= min(along)
+        assert max(along) <= int(bounds.slab[i, 1])
+
+
+def bound(points: np.ndarray, unit_log2: int = 0, with_slab: bool = True, highest: int = 65535) -> Bounds:
+    """The bound of all points as one run."""
+    run = np.array([0]), np.array([len(points)])
+    return bound_runs(
+        points.astype(np.int32), *run, unit_log2=unit_log2, highest=highest, with_slab=with_slab
+    )
+
+
+@pytest.mark.interpreted
+@pytest.mark.parametrize("value", [0, 1, 2, 3, 4, 2**52 + 1, 2**53 + 1, (2**31 - 1) ** 2, 2**62 - 1, 2**62])
+def test_ceil_sqrt_is_exact(value: int) -> None:
+    root = int(ceil_sqrt(np.int64(value)))
+    assert root * root >= value
+    assert root == 0 or (root - 1) ** 2 < value
+
+
+DEGENERATE = {
+    "one": [[7, 8, 9]],
+    "two": [[0, 0, 0], [65535, 65535, 65535]],
+    "equal": [[5, 5, 5]] * 40,
+    "collinear": [[i, 2 * i, 3 * i] for i in range(30)],
+    "coplanar": [[i % 6, i // 6, 4] for i in range(36)],
+    "cospherical": [[50 + sx * x, 50 + sy * y, 50 + sz * z] for x, y, z in [(15, 20, 0), (0, 7, 24), (25, 0, 0)]
+                    for sx, sy, sz in itertools.product((-1, 1), repeat=3)],
+    "corners": list(itertools.product((0, 65535), repeat=3)),
+    "many corners": list(itertools.product((0, 65535), repeat=3)) * 50,
+}  # fmt: skip
+
+
+@pytest.mark.interpreted
+@pytest.mark.parametrize("name", DEGENERATE)
+@pytest.mark.parametrize("with_slab", [True, False])
+def test_degenerate_sets_are_bounded(name: str, with_slab: bool) -> None:
+    points = np.array(DEGENERATE[name])
+    bounds = bound(points, with_slab=with_slab)
+    assert_encloses(bounds, 0, points, 1)
+    assert bounds.normal.any() == (with_slab and len(points) >= 3)
+    if name in ("one", "equal"):
+        assert bounds.radius[0] == 0
+
+
+@pytest.mark.interpreted
+@pytest.mark.parametrize("name", ["collinear", "coplanar"])
+def test_a_flat_set_has_a_thin_slab(name: str) -> None:
+    bounds = bound(np.array(DEGENERATE[name]))
+    # A plane through lattice points whose normal is stored rounded: thinner than two steps.
+    assert (bounds.slab[0, 1] - bounds.slab[0, 0]) / np.linalg.norm(bounds.normal[0]) < 2
+
+
+@pytest.mark.parametrize("unit_log2", [0, 1, 5])
+@pytest.mark.parametrize("kind", WITH_POINTS)
+def test_bounds_enclose_in_every_unit(kind: str, unit_log2: int) -> None:
+    points = make_steps(kind, 2, 300, 65536 << unit_log2)
+    assert_encloses(bound(points, unit_log2), 0, points, 1 << unit_log2)
+
+
+def test_a_radius_fits_sixteen_bits_for_any_points_of_a_cell() -> None:
+    # sqrt(3) / 2 * 65535 = 56,755 for the least ball; a guess 15 % worse would wrap around in uint16.
+    rng = np.random.default_rng(0)
+    corners = np.array(list(itertools.product((0, 65535), repeat=3)))
+    for _ in range(300):
+        chosen = corners[rng.choice(8, rng.integers(2, 9), replace=False)]
+        chosen = np.clip(chosen + rng.integers(-9000, 9000, chosen.shape), 0, 65535)
+        points = np.repeat(chosen, rng.choice([1, 200]), axis=0)
+        assert bound(points).radius[0] < 1 << 16
+
+
+def minimal_radius_bound(blocks: np.ndarray) -> np.ndarray:
+    """Lower bounds (b,) on the radius of the minimal ball of each block (b, n, 3), sharp to about 0.1 %.
+
+    Any convex weights w give one: sum(w |p|^2) - |sum(w p)|^2 <= radius^2 (the dual of the minimal ball). So
+    the judge is sure whatever the iteration (Frank and Wolfe, exact line search) does on degenerate points.
+    """
+    p = blocks - blocks.mean(axis=1, keepdims=True)
+    squares = (p * p).sum(axis=2)
+    weights = np.full(p.shape[:2], 1.0 / p.shape[1])
+    rows = np.arange(len(p))
+    for step in range(2000):
+        centers = np.einsum("bn,bnk->bk", weights, p)
+        far = ((p - centers[:, None]) ** 2).sum(axis=2).argmax(axis=1)
+        rate = 2.0 / (step + 3.0)
+        weights *= 1 - rate
+        weights[rows, far] += rate
+    centers = np.einsum("bn,bnk->bk", weights, p)
+    return np.sqrt(np.maximum((weights * squares).sum(axis=1) - (centers**2).sum(axis=1), 0))
+
+
+def test_the_judge_of_minimal_balls_knows_the_known_ones() -> None:
+    cube = np.array([list(itertools.product((0.0, 2.0), repeat=3))])
+    assert minimal_radius_bound(cube)[0] == pytest.approx(np.sqrt(3), rel=2e-3)
+    triangle = np.array([[[0.0, 0, 0], [1, 0, 0], [0.5, np.sqrt(0.75), 0], [0.5, 0.3, 0]]])
+    assert minimal_radius_bound(triangle)[0] == pytest.approx(1 / np.sqrt(3), rel=2e-3)
+    pair = np.array([[[0.0, 0, 0], [0, 6, 0], [0, 3, 0]]])
+    assert minimal_radius_bound(pair)[0] == pytest.approx(3, rel=2e-3)
+
+
+def tightness(kind: str) -> np.ndarray:
+    """Stored radius over the minimal ball's, of every full leaf node of a scan."""
+    hierarchy = build_hierarchy(make_steps(kind, 5, 3000, 20_000), leaf=32, degree=8)
+    leaves = slice(hierarchy.tree.levels[-2], None)
+    begin, end = hierarchy.tree.begin[leaves], hierarchy.tree.end[leaves]
+    full = end - begin == 32
+    blocks = hierarchy.points[begin[full][:, None] + np.arange(32)].astype(float)
+    # Half a step an axis for the stored centre, one for the radius rounded up.
+    stored = hierarchy.bounds.radius[leaves][full] - (1 + np.sqrt(0.75))
+    return stored / np.maximum(minimal_radius_bound(blocks), 1.0)
+
+
+@pytest.mark.parametrize("kind", ["plane", "corner", "pillar", "noise", "duplicates"])
+def test_leaf_spheres_are_at_most_a_quarter_larger_than_the_minimal_ball(kind: str) -> None:
+    # Found: at most 1.031 on each of these, 1.01 on average; the bound is the one NUMERICS.md case 20 asks for.
+    assert tightness(kind).max() <= 1.25

@@ -1,0 +1,91 @@
+"""The shape of packed trees: every item once, all leaf nodes on one level, nodes full where they can be."""
+
+import numpy as np
+import pytest
+from scans import WITH_POINTS, make_steps
+from solidcloud.builder.hierarchy import Tree
+from solidcloud.builder.kernels.pack import pack_tree, sort_leaves
+
+pytestmark = pytest.mark.interpreted
+
+SHAPES = [(1, 2), (3, 2), (8, 3), (32, 8), (32, 16), (5, 4)]
+
+
+def pack(points: np.ndarray, leaf: int, degree: int) -> Tree:
+    """The tree of some points."""
+    return Tree(*pack_tree(points.astype(np.int32), leaf, degree))
+
+
+def assert_is_a_tree(tree: Tree, n: int, leaf: int, degree: int) -> None:
+    """Runs nest, children follow in order, every level is cut from the one above it."""
+    assert sorted(tree.order.tolist()) == list(range(n))
+    levels = tree.levels.tolist()
+    assert levels[0] == 0
+    assert levels[-1] == len(tree.begin) == len(tree.end) == len(tree.count)
+    for above, below, past in zip(levels[:-2], levels[1:-1], levels[2:], strict=True):
+        child = below
+        for node in range(above, below):
+            held = int(tree.count[node])
+            assert 1 <= held <= degree
+            assert tree.begin[child] == tree.begin[node]
+            assert tree.end[child + held - 1] == tree.end[node]
+            assert (
+                tree.begin[child + 1 : child + held].tolist() == tree.end[child : child + held - 1].tolist()
+            )
+            child += held
+        assert child == past
+    sizes = (tree.end - tree.begin)[levels[-2] :]
+    assert (sizes == tree.count[levels[-2] :]).all()
+    assert sizes.min() >= 1
+    assert sizes.max() <= leaf
+
+
+@pytest.mark.parametrize(("leaf", "degree"), SHAPES)
+@pytest.mark.parametrize("n", [1, 2, 31, 32, 33, 64, 65, 200])
+def test_any_number_of_points_packs(n: int, leaf: int, degree: int) -> None:
+    tree = pack(make_steps("noise", n, n, 1000), leaf, degree)
+    assert_is_a_tree(tree, n, leaf, degree)
+    leaves = -(-n // leaf)
+    assert len(tree.count) - tree.levels[-2] == leaves  # as few leaf nodes as can be: all full but one
+    height = 0
+    while degree**height < leaves:
+        height += 1
+    assert len(tree.levels) == height + 2  # and as few levels
+
+
+@pytest.mark.parametrize("kind", WITH_POINTS)
+def test_scans_pack_into_full_leaf_nodes(kind: str) -> None:
+    points = make_steps(kind, 1, 300, 1000)
+    tree = pack(points, 8, 4)
+    assert_is_a_tree(tree, len(points), 8, 4)
+    sizes = tree.count[tree.levels[-2] :]
+    assert (sizes < 8).sum() <= 1
+
+
+def test_the_packing_is_a_function_of_the_points_and_their_order() -> None:
+    points = make_steps("duplicates", 1, 300, 1000)
+    a, b = pack(points, 8, 4), pack(points.copy(), 8, 4)
+    assert all(np.array_equal(x, y) for x, y in zip(a, b, strict=True))
+
+
+def test_leaves_are_sorted_along_their_longest_edge() -> None:
+    points = make_steps("corner", 1, 200, 1000)
+    tree = pack(points, 16, 4)
+    t = len(tree.begin)
+    order, axis, low = tree.order.copy(), np.zeros(t, np.uint8), np.zeros((t, 3), np.int64)
+    sort_leaves(points, order, tree.begin, tree.end, tree.levels[-2], axis, low)
+    for node in range(tree.levels[-2], t):
+        run = slice(tree.begin[node], tree.end[node])
+        block = points[order[run]]
+        assert sorted(order[run]) == sorted(tree.order[run])
+        assert axis[node] == np.ptp(block, axis=0).argmax()
+        assert (np.diff(block[:, axis[node]]) >= 0).all()
+        assert np.array_equal(low[node], block.min(axis=0))
+    assert not axis[: tree.levels[-2]].any()
+    assert not low[: tree.levels[-2]].any()
+
+
+@pytest.mark.parametrize("side", [2**23, 1])
+def test_equal_and_extreme_coordinates_pack(side: int) -> None:
+    points = np.array([[0, 0, 0], [side, side, side], [side, 0, side]] * 30)
+    assert_is_a_tree(pack(points, 4, 2), 90, 4, 2)

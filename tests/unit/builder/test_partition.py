@@ -1,0 +1,217 @@
+"""Survey, lattice and spool: counts, bounds, runs of any size, and one lattice for all sources."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scans import make_scan, write_las, write_xyz
+from solidcloud.builder.config import BuildConfig
+from solidcloud.builder.partition import (
+    Run,
+    Spooled,
+    SpoolUnit,
+    Survey,
+    choose_lattice,
+    gather_voxel,
+    open_all,
+    spool_dtype,
+    spool_scan,
+    survey_scan,
+)
+from solidcloud.builder.sources import Block, Scan
+from solidcloud.builder.sources import Lattice as SourceLattice
+from solidcloud.schemas.errors import BadRequestError, ScanError
+from solidcloud.schemas.voxel_grid import MAX_COORDINATE, Lattice, make_lattice
+
+
+class Listed(Scan):
+    """A scan of points in memory, in blocks of a size of its own."""
+
+    def __init__(self, path: Path, xyz: np.ndarray, size: int, fails_after: int | None = None) -> None:
+        super().__init__(path, "text")
+        self.xyz, self.size, self.fails_after = xyz, size, fails_after
+
+    def _read(self, block_points: int) -> Iterator[Block]:
+        for start in range(0, len(self.xyz), self.size):
+            if self.fails_after is not None and start >= self.fails_after:
+                raise ScanError(f"{self.path}: broke off")
+            xyz = self.xyz[start : start + self.size]
+            yield Block(xyz, np.arange(start, start + len(xyz), dtype=np.float32))
+
+
+def listed(folder: Path, xyz: np.ndarray, size: int = 50, fails_after: int | None = None) -> Listed:
+    """A scan with a file that can be hashed."""
+    path = folder / "listed.xyz"
+    path.write_bytes(b"any")
+    return Listed(path, xyz, size, fails_after)
+
+
+def spooled(
+    folder: Path, scan: Scan, count: int, lattice: Lattice, run_points: int, keep: frozenset[str]
+) -> tuple[Spooled, np.dtype]:
+    """Spool a scan."""
+    folder.mkdir(exist_ok=True)
+    config = BuildConfig(keep=keep)
+    return spool_scan(SpoolUnit(scan, 3, count, lattice, config, folder, run_points)), spool_dtype(config)
+
+
+def test_a_survey_counts_usable_points_and_their_bounds(tmp_path: Path) -> None:
+    xyz = make_scan("noise", 1, 300) - 1
+    xyz[5, 1], xyz[6, 0], xyz[250, 2] = np.nan, np.inf, np.nextafter(MAX_COORDINATE, np.inf)
+    good = np.delete(xyz, [5, 6, 250], axis=0)
+    survey = survey_scan(listed(tmp_path, xyz))
+    assert (survey.count, survey.not_finite, survey.fault) == (297, 3, "")
+    assert np.array_equal(survey.low, good.min(axis=0))
+    assert np.array_equal(survey.high, good.max(axis=0))
+
+
+@pytest.mark.parametrize("xyz", [np.empty((0, 3)), np.full((4, 3), np.nan)])
+def test_a_scan_without_usable_points_is_at_fault_but_loses_nothing(xyz: np.ndarray, tmp_path: Path) -> None:
+    survey = survey_scan(listed(tmp_path, xyz))
+    assert "holds no usable point, expected at least one" in survey.fault
+    assert survey.empty
+    assert survey.region is None
+
+
+def test_a_scan_that_breaks_off_may_have_covered_header_and_points(tmp_path: Path) -> None:
+    xyz = make_scan("noise", 1, 300)
+    scan = listed(tmp_path, xyz, fails_after=200)
+    survey = survey_scan(scan)
+    assert (survey.count, survey.region, survey.empty) == (0, None, False)
+    assert "broke off" in survey.fault
+    scan.bounds = np.array([[0.5, 0.5, 0.5], [1.0, 1.0, 9.0]])
+    region = survey_scan(scan).region
+    assert region is not None
+    assert np.array_equal(region[0], np.minimum(xyz[:200].min(axis=0), 0.5))
+    assert np.array_equal(region[1], np.maximum(xyz[:200].max(axis=0), [1, 1, 9]))
+
+
+def test_a_file_that_cannot_be_opened_gives_its_fault(tmp_path: Path) -> None:
+    (tmp_path / "a.las").write_bytes(b"no LAS at all")
+    scans, fault = open_all(tmp_path / "a.las", None)
+    assert scans == []
+    assert "a.las" in fault
+
+
+@pytest.mark.parametrize("run_points", [1, 100, 10_000])
+@pytest.mark.parametrize("keep", [frozenset(), frozenset({"scan", "intensity"})])
+def test_every_point_is_gathered_once_whatever_the_runs(
+    run_points: int, keep: frozenset[str], tmp_path: Path
+) -> None:
+    xyz = make_scan("corner", 2, 410) + [5e5, -1, 0]
+    lattice = make_lattice(xyz.min(axis=0), 0.001, 0.5)
+    result, dtype = spooled(tmp_path / "s", listed(tmp_path, xyz), 410, lattice, run_points, keep)
+    assert len(result.runs) == {1: 9, 100: 5, 10_000: 1}[run_points]
+    steps = lattice.to_lattice(xyz)
+    keys = sorted({int(key) for run in result.runs for key in run.keys})
+    found, intensity = [], []
+    for key in keys:
+        points = gather_voxel(key, result.runs, dtype)
+        assert points.local.min() >= 0
+        assert points.local.max() < lattice.voxel_steps
+        corner = (np.array(_coordinate(key)) * lattice.voxel_steps).astype(np.int64)
+        found.append(points.local + corner)
+        if keep:
+            assert (points.scan_index == 3).all()
+            intensity.append(points.intensity)
+    assert sorted(np.concatenate(found).tolist()) == sorted(steps.tolist())
+    if keep:
+        assert np.array_equal(np.concatenate(found), steps[np.concatenate(intensity).astype(int)])
+    assert result.moved_max == np.abs(lattice.to_world(steps) - xyz).max()
+
+
+def _coordinate(key: int) -> list[int]:
+    """Voxel coordinates of a key, bit by bit."""
+    return [sum((key >> (3 * b + a) & 1) << b for b in range(21)) - (1 << 20) for a in range(3)]
+
+
+def test_runs_are_sorted_and_say_where_each_voxel_begins(tmp_path: Path) -> None:
+    xyz = make_scan("noise", 2, 300)
+    lattice = make_lattice(xyz.min(axis=0), 0.001, 0.5)
+    result, dtype = spooled(tmp_path / "s", listed(tmp_path, xyz), 300, lattice, 100, frozenset())
+    run: Run
+    for run in result.runs:
+        assert (np.diff(run.keys.astype(np.int64)) > 0).all()
+        assert run.starts[0] == 0
+        assert (np.diff(run.starts) > 0).all()
+        assert run.path.stat().st_size == run.starts[-1] * dtype.itemsize
+
+
+def test_the_content_sum_names_the_points_and_not_their_order(tmp_path: Path) -> None:
+    xyz = make_scan("noise", 2, 300)
+    lattice = make_lattice((0, 0, 0), 0.001, 0.5)
+    sums = set()
+    for number, points in enumerate((xyz, xyz[::-1].copy(), np.roll(xyz, 77, axis=0))):
+        scan = listed(tmp_path, points, size=40 + number)
+        sums.add(spooled(tmp_path / "s", scan, 300, lattice, 100, frozenset())[0].content)
+    assert len(sums) == 1
+    moved = xyz.copy()
+    moved[7, 1] += 0.001
+    other = spooled(tmp_path / "s", listed(tmp_path, moved), 300, lattice, 100, frozenset())[0].content
+    assert other not in sums
+    assert all(a != b for a, b in zip(other, next(iter(sums)), strict=True))
+
+
+def test_a_scan_that_grows_between_the_passes_is_refused(tmp_path: Path) -> None:
+    xyz = make_scan("noise", 2, 300)
+    lattice = make_lattice((0, 0, 0), 0.001, 8.0)
+    with pytest.raises(ScanError, match="300 points, 299 a moment ago"):
+        spooled(tmp_path / "s", listed(tmp_path, xyz), 299, lattice, 100, frozenset())
+
+
+# --- the lattice ------------------------------------------------------------------------------------------
+
+
+def survey_on(folder: Path, lattice: SourceLattice | None, low: float = 0.0) -> Survey:
+    """The survey of a scan whose source says this of its lattice."""
+    scan = listed(folder, np.full((1, 3), low))
+    scan.lattice = lattice
+    return survey_scan(scan)
+
+
+def grid(scale: float, offset: float = 0.0) -> SourceLattice:
+    """A source's lattice, the same on each axis."""
+    return SourceLattice((scale,) * 3, (offset,) * 3)
+
+
+CHOICES = {
+    "one lattice": ([grid(0.002), grid(0.002)], {}, 0.002, "sources"),
+    "offsets apart by whole steps": ([grid(0.01), grid(0.01, 123456.78)], {}, 0.01, "sources"),
+    "offsets apart by a part": ([grid(0.01), grid(0.01, 0.005)], {}, 1e-4, "default"),
+    "other scales": ([grid(0.01), grid(0.001)], {}, 1e-4, "default"),
+    "axes of other scales": ([SourceLattice((0.01, 0.01, 0.001), (0.0,) * 3)], {}, 1e-4, "default"),
+    "one without": ([grid(0.01), None], {}, 1e-4, "default"),
+    "none with": ([None], {}, 1e-4, "default"),
+    "given": ([grid(0.01)], {"resolution": 0.005}, 0.005, "given"),
+    "too fine to store": ([grid(1e-7)], {}, 1e-4, "default"),
+    "too fine for the voxel": ([grid(2e-6)], {"voxel": 80.0}, 1e-4, "default"),
+    "coarser than a voxel": ([grid(10.0)], {}, 1e-4, "default"),
+    "no number": ([grid(0.01), grid(0.01, float("nan"))], {}, 1e-4, "default"),
+}
+
+
+@pytest.mark.parametrize("name", CHOICES)
+def test_the_sources_lattice_is_taken_where_they_share_one(name: str, tmp_path: Path) -> None:
+    lattices, options, step, source = CHOICES[name]
+    surveys = [survey_on(tmp_path, lattice, low=7.0 - i) for i, lattice in enumerate(lattices)]
+    lattice, found = choose_lattice(surveys, BuildConfig(**options))
+    assert (lattice.step, found) == (step, source)
+    assert lattice.origin == (7.0 - (len(lattices) - 1),) * 3
+
+
+def test_an_impossible_resolution_is_refused(tmp_path: Path) -> None:
+    for resolution in (1e-7, 100.0):
+        with pytest.raises(BadRequestError):
+            choose_lattice([survey_on(tmp_path, None)], BuildConfig(resolution=resolution))
+
+
+def test_las_and_text_files_are_surveyed_alike(tmp_path: Path) -> None:
+    xyz = write_las(tmp_path / "a.las", np.random.default_rng(1).integers(-1000, 1000, (50, 3)))
+    write_xyz(tmp_path / "a.xyz", xyz)
+    for name in ("a.las", "a.xyz"):
+        (scan,), fault = open_all(tmp_path / name, None)
+        survey = survey_scan(scan)
+        assert (survey.count, survey.fault, fault) == (50, "", "")
+        assert np.array_equal([survey.low, survey.high], [xyz.min(axis=0), xyz.max(axis=0)])
+        assert len(survey.sha256) == 64

@@ -1,0 +1,154 @@
+"""`verify_archive` finds nothing in a sound archive, and each fault put into one."""
+
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scans import WITH_POINTS, make_scan, write_xyz
+from solidcloud.builder.config import BuildConfig
+from solidcloud.builder.pipeline import build_archive
+from solidcloud.builder.verify import verify_archive
+from solidcloud.schemas.archive import Archive, Header, shard_name, write_index, write_shard
+from solidcloud.schemas.codec import encode_voxel
+from solidcloud.schemas.errors import FormatError
+from solidcloud.schemas.voxel import VoxelData
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A sound archive: several voxels of several cells. Not to be changed."""
+    folder = tmp_path_factory.mktemp("built")
+    files = [write_xyz(folder / f"{i}.xyz", make_scan(kind, i, 200)) for i, kind in enumerate(WITH_POINTS)]
+    build_archive(files, folder / "a", BuildConfig(voxel=1.1, cell_points=50, leaf=8, degree=3, jobs=1))
+    return folder / "a"
+
+
+@pytest.fixture
+def copy(built: Path, tmp_path: Path) -> Path:
+    """A copy of it to be broken."""
+    return Path(shutil.copytree(built, tmp_path / "a"))
+
+
+def rewrite(
+    folder: Path,
+    spoil: Callable[[VoxelData], VoxelData] = lambda voxel: voxel,
+    header_with: Callable[[Header], Header] = lambda header: header,
+) -> None:
+    """Write shard and index anew, every checksum right, with voxel 1 spoilt, or the header."""
+    with Archive(folder) as archive:
+        header, rows = archive.header, archive.voxels
+        voxels = [archive.read_voxel(row)[0] for row in range(len(rows))]
+    voxels[1] = spoil(voxels[1])
+    records = [
+        (v, encode_voxel(v, header.archive_id), r["low"].astype(np.int64), r["high"].astype(np.int64))
+        for v, r in zip(voxels, rows, strict=True)
+    ]
+    path = folder / "shards" / shard_name(0)
+    table = write_shard(path, 0, header.archive_id, records)
+    write_index(folder, header_with(header), table, [(path.name, path.stat().st_size)])
+
+
+def test_a_sound_archive_has_no_faults(built: Path) -> None:
+    for deep in (False, True):
+        report = verify_archive(built, deep=deep)
+        assert report.faults == ()
+        assert report.voxels > 4
+        assert report.points == 5 * 200 + 1
+
+
+def test_writing_it_anew_changes_nothing(copy: Path, built: Path) -> None:
+    rewrite(copy)
+    for path in built.rglob("*.h5"):
+        assert (copy / path.relative_to(built)).read_bytes() == path.read_bytes()
+
+
+@pytest.mark.parametrize("dataset", [0, 1, 2])
+def test_a_flipped_byte_is_one_fault_that_says_where(dataset: int, copy: Path) -> None:
+    with Archive(copy) as archive:
+        entry, where, path = archive.voxels[2], archive.where(2), archive.shard_path(0)
+        points = archive.header.points
+    data = bytearray(path.read_bytes())
+    data[int(entry["frame_offset"][dataset]) + int(entry["frame_bytes"][dataset]) // 2] ^= 0x10
+    path.write_bytes(data)
+    report = verify_archive(copy)
+    assert len(report.faults) == 1
+    assert report.faults[0].startswith(where)
+    assert report.points == points - entry["rows"][2]
+
+
+def shrink_radius(row: Callable[[VoxelData], int]) -> Callable[[VoxelData], VoxelData]:
+    """A change of one node's radius, by a tenth."""
+
+    def apply(voxel: VoxelData) -> VoxelData:
+        radius = voxel.nodes.radius.copy()
+        assert radius[row(voxel)] > 10
+        radius[row(voxel)] -= radius[row(voxel)] // 10
+        return voxel._replace(nodes=voxel.nodes._replace(radius=radius))
+
+    return apply
+
+
+def shift_slab(side: int) -> Callable[[VoxelData], VoxelData]:
+    """A change of the root's slab, by one step from one side."""
+
+    def apply(voxel: VoxelData) -> VoxelData:
+        slab = voxel.nodes.slab.copy()
+        slab[0, side] += 1 - 2 * side
+        return voxel._replace(nodes=voxel.nodes._replace(slab=slab))
+
+    return apply
+
+
+LOOSE = {
+    "the root's radius": shrink_radius(lambda voxel: 0),
+    "a cell's radius": shrink_radius(lambda v: len(v.nodes.count) - int(v.cells.nodes.sum())),
+    "a leaf node's radius": shrink_radius(lambda v: int(np.flatnonzero(v.nodes.radius > 10)[-1])),
+    "the slab's low side": shift_slab(0),
+    "the slab's high side": shift_slab(1),
+}
+
+
+@pytest.mark.parametrize("name", LOOSE)
+def test_a_loose_bound_is_found_by_the_deep_check_alone(name: str, copy: Path) -> None:
+    rewrite(copy, LOOSE[name])
+    assert verify_archive(copy).faults == ()
+    (fault,) = verify_archive(copy, deep=True).faults
+    with Archive(copy) as archive:
+        assert fault.startswith(archive.where(1))
+    assert "does not enclose its points" in fault
+
+
+def test_points_that_are_not_where_the_index_says_are_found(copy: Path) -> None:
+    def move(voxel: VoxelData) -> VoxelData:
+        leaf = int(np.flatnonzero(voxel.nodes.block_low.any(axis=1))[0])
+        low = voxel.nodes.block_low.copy()
+        low[leaf] -= low[leaf] > 0
+        low[:, 0] //= 2
+        return voxel._replace(nodes=voxel.nodes._replace(block_low=low))
+
+    rewrite(copy, move)
+    (fault,) = verify_archive(copy).faults
+    assert "points are not where the index says" in fault
+
+
+def test_a_wrong_count_in_the_index_is_found(copy: Path) -> None:
+    rewrite(copy, header_with=lambda header: replace(header, points=header.points + 1))
+    (fault,) = verify_archive(copy).faults
+    assert "1001 points in the records, 1002 in the index" in fault
+
+
+def test_wrong_bounds_in_the_index_are_found(copy: Path) -> None:
+    rewrite(copy, header_with=lambda header: replace(header, high=header.high + 1))
+    (fault,) = verify_archive(copy).faults
+    assert "bounds are not the index's" in fault
+
+
+def test_what_cannot_be_opened_is_an_error(copy: Path, tmp_path: Path) -> None:
+    with pytest.raises(FormatError):
+        verify_archive(tmp_path / "nothing")
+    (copy / "shards" / shard_name(0)).unlink()
+    with pytest.raises(FormatError, match="missing"):
+        verify_archive(copy)

@@ -41,7 +41,7 @@ def floor_walk(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArra
     at = np.linspace(places[0], places[-1], FRAMES)
     poses = np.zeros((FRAMES, 4, 4))
     # The avatar faces +y; along x it is turned right by a quarter.
-    poses[:, :3, :3] = np.eye(3) if along == 1 else [[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]
+    poses[:, :3, :3] = np.eye(3) if along == 1 else np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])
     poses[:, along, 3], poses[:, across, 3] = at, middle
     poses[:, 2, 3] = np.interp(at, places, floors) + SOLE
     poses[:, 3, 3] = 1.0

@@ -99,7 +99,7 @@ def test_a_file_that_cannot_be_opened_gives_its_fault(tmp_path: Path) -> None:
 def test_every_point_is_gathered_once_whatever_the_runs(
     run_points: int, keep: frozenset[str], tmp_path: Path
 ) -> None:
-    xyz = make_scan("corner", 2, 410) + [5e5, -1, 0]
+    xyz = make_scan("corner", 2, 410) + np.array([5e5, -1, 0])
     lattice = make_lattice(xyz.min(axis=0), 0.001, 0.5)
     result, dtype = spooled(tmp_path / "s", listed(tmp_path, xyz), 410, lattice, run_points, keep)
     assert len(result.runs) == {1: 9, 100: 5, 10_000: 1}[run_points]

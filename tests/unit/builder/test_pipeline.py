@@ -1,0 +1,447 @@
+"""Scans in, one archive out: the same bytes however it is made, every error by name, nothing left behind."""
+
+import fcntl
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import laspy
+import numpy as np
+import pytest
+import solidcloud.builder.pipeline as pipeline
+import solidcloud.builder.shards as shards
+from scans import WITH_POINTS, make_scan, write_las, write_ply, write_xyz
+from solidcloud.builder.config import BuildConfig
+from solidcloud.builder.pipeline import BuildSummary, build_archive
+from solidcloud.builder.verify import verify_archive
+from solidcloud.schemas.archive import Archive
+from solidcloud.schemas.errors import BadRequestError, CorruptError, ScanError, SolidcloudError
+
+
+def build(paths: Sequence[Path], target: Path, **options: object) -> BuildSummary:
+    """Build in this process, small voxels and cells unless the options say otherwise."""
+    config = BuildConfig(**{"voxel": 0.9, "cell_points": 60, "leaf": 16, "degree": 4, "jobs": 1, **options})
+    return build_archive(paths, target, config)
+
+
+def content(archive: Path) -> dict[str, bytes]:
+    """Every file of an archive."""
+    return {str(p.relative_to(archive)): p.read_bytes() for p in sorted(archive.rglob("*")) if p.is_file()}
+
+
+def records(archive: Path) -> list[tuple[int, bytes, bytes]]:
+    """Key, nodes and points of each voxel as compressed: everything of a record but the archive's id."""
+    with Archive(archive) as opened:
+        return [(int(r["key"]), *opened.read_frames(i)[1:]) for i, r in enumerate(opened.voxels)]
+
+
+def shard_bytes(archive: Path) -> list[bytes]:
+    """The shards of an archive."""
+    return [p.read_bytes() for p in sorted((archive / "shards").iterdir())]
+
+
+@pytest.fixture
+def scans(tmp_path: Path) -> list[Path]:
+    """Six scans as text."""
+    folder = tmp_path / "scans"
+    folder.mkdir()
+    return [
+        write_xyz(folder / f"{kind.replace(' ', '_')}.xyz", make_scan(kind, i, 150) - 0.7,
+                  np.random.default_rng(i).uniform(0, 9, 1 if kind == "one point" else 150).astype(np.float32))
+        for i, kind in enumerate(WITH_POINTS)
+    ]  # fmt: skip
+
+
+@pytest.fixture
+def out(tmp_path: Path) -> Path:
+    """An empty folder for archives."""
+    folder = tmp_path / "out"
+    folder.mkdir()
+    return folder
+
+
+# --- the same bytes ---------------------------------------------------------------------------------------
+
+
+def test_the_bytes_do_not_depend_on_order_jobs_or_memory(
+    scans: list[Path], out: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Several shards and several runs, though the dataset is small.
+    keep = frozenset({"scan", "intensity"})
+    monkeypatch.setattr(shards, "SHARD_POINTS", 300)
+    first = build(scans, out / "a", keep=keep)
+    assert first.shards > 1
+    assert first.voxels > 8
+    build(scans[::-1], out / "b", keep=keep)
+    build([scans[0].parent], out / "c", keep=keep)
+    build(scans, out / "d", keep=keep, memory_bytes=64 << 20)
+    assert content(out / "a") == content(out / "b") == content(out / "d")
+    assert content(out / "a") == content(out / "c")
+
+
+def test_two_jobs_write_the_bytes_of_one(scans: list[Path], out: Path) -> None:
+    build(scans, out / "a")
+    build(scans, out / "b", jobs=2)
+    assert content(out / "a") == content(out / "b")
+
+
+def test_a_small_memory_bound_gives_several_runs_and_the_same_bytes(
+    out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    raw = np.random.default_rng(5).integers(0, 4000, (600_000, 3)) * [1, 1, 0]
+    write_las(tmp_path / "a.las", raw)
+    runs: list[int] = []
+    spool = pipeline._spool
+
+    def counted(*args: object) -> object:
+        result = spool(*args)
+        runs.append(sum(len(s.runs) for s in result))
+        return result
+
+    monkeypatch.setattr(pipeline, "_spool", counted)
+    options = {"radius": 0.001, "leaf": 32, "degree": 8, "cell_points": 4096}
+    build([tmp_path / "a.las"], out / "a", **options)
+    # 64 MB, and 1,000 bytes a point claimed by the spool: runs of 67,108 points, at least one a block.
+    monkeypatch.setattr(pipeline, "SPOOL_BYTES_A_POINT", 1000)
+    build([tmp_path / "a.las"], out / "b", memory_bytes=64 << 20, **options)
+    assert runs == [1, 3]
+    assert content(out / "a") == content(out / "b")
+
+
+def test_the_same_points_from_any_format_give_the_same_shards(out: Path, tmp_path: Path) -> None:
+    raw = np.random.default_rng(5).integers(-1500, 1500, (300, 3))
+    intensity = np.random.default_rng(5).integers(0, 65536, 300).astype(np.uint16)
+    xyz = write_las(tmp_path / "a.las", raw, offset=(5e5, 5.6e6, 100.0), intensity=intensity)
+    write_ply(tmp_path / "b.ply", xyz, intensity.astype(np.float32))
+    write_xyz(tmp_path / "c.xyz", xyz, intensity.astype(np.float32))
+    for name in ("a.las", "b.ply", "c.xyz"):
+        build([tmp_path / name], out / name, resolution=0.001, keep=frozenset({"intensity"}))
+    assert shard_bytes(out / "a.las") == shard_bytes(out / "b.ply") == shard_bytes(out / "c.xyz")
+
+
+def test_a_georeferenced_scene_has_the_records_of_one_at_the_origin(out: Path, tmp_path: Path) -> None:
+    # NUMERICS.md case 1; a shift exact in float64 for coordinates that are whole 2^-20 m.
+    xyz = np.round(make_scan("corner", 3, 400) * 2**20) / 2**20
+    shift = np.array([5e5, 5.6e6, 128.0])
+    assert np.array_equal((xyz + shift) - shift, xyz)
+    build([write_xyz(tmp_path / "a.xyz", xyz)], out / "a")
+    build([write_xyz(tmp_path / "b.xyz", xyz + shift)], out / "b")
+    assert records(out / "a") == records(out / "b")
+    with Archive(out / "a") as a, Archive(out / "b") as b:
+        assert np.array_equal(np.array(b.header.lattice.origin) - shift, a.header.lattice.origin)
+        assert np.array(b.header.lattice.origin).tobytes() == (xyz + shift).min(axis=0).tobytes()
+        assert a.header.radius == b.header.radius
+        assert a.header.archive_id != b.header.archive_id
+
+
+def test_the_id_tells_points_and_options_apart(scans: list[Path], out: Path) -> None:
+    ids = set()
+    for name, options in {"a": {}, "b": {"degree": 5}, "c": {"resolution": 0.0002}}.items():
+        build(scans, out / name, **options)
+        with Archive(out / name) as archive:
+            ids.add(archive.header.archive_id)
+    build(scans[:-1], out / "d")
+    with Archive(out / "d") as archive:
+        ids.add(archive.header.archive_id)
+    assert len(ids) == 4
+
+
+# --- what is stored and said ------------------------------------------------------------------------------
+
+
+def test_an_archive_is_sound_and_summed_up(scans: list[Path], out: Path) -> None:
+    summary = build(scans, out / "a")
+    assert verify_archive(out / "a", deep=True).faults == ()
+    with Archive(out / "a") as archive:
+        header = archive.header
+        assert summary.points == header.points == 5 * 150 + 1
+        assert summary.voxels == len(archive.voxels)
+        assert (summary.radius, summary.moved_max) == (header.radius, header.moved_max)
+    assert summary.bytes == sum(map(len, content(out / "a").values()))
+    assert set(summary.stages) == {"survey", "spool", "build", "radius"}
+    assert (summary.skipped, summary.faults) == ({}, ())
+
+
+def test_quantising_moves_no_point_by_more_than_half_a_step(out: Path, tmp_path: Path) -> None:
+    xyz = make_scan("noise", 3, 300) + [5e5, 5.6e6, 0]
+    summary = build([write_xyz(tmp_path / "a.xyz", xyz)], out / "a", resolution=0.01)
+    low = xyz.min(axis=0)
+    moved = np.abs(np.rint((xyz - low) / 0.01) * 0.01 + low - xyz).max()
+    assert summary.moved_max == moved
+    assert 0.0045 < moved <= 0.005 + 1e-9
+
+
+def test_the_sources_own_lattice_is_kept_to_the_bit_of_their_steps(out: Path, tmp_path: Path) -> None:
+    raw = np.random.default_rng(1).integers(-1000, 1000, (2, 200, 3))
+    write_las(tmp_path / "a.las", raw[0], scale=0.002, offset=(500.0, 0.0, 0.0))
+    write_las(tmp_path / "b.las", raw[1], scale=0.002, offset=(500.25, 0.0, 0.0))
+    summary = build([tmp_path / "a.las"], out / "a")
+    assert (summary.lattice_step, summary.lattice_source) == (0.002, "sources")
+    assert summary.moved_max < 1e-9
+    summary = build([tmp_path / "a.las", tmp_path / "b.las"], out / "b")
+    assert (summary.lattice_step, summary.lattice_source) == (0.002, "sources")
+    write_las(tmp_path / "c.las", raw[1], scale=0.002, offset=(500.0, 0.001, 0.0))
+    summary = build([tmp_path / "a.las", tmp_path / "c.las"], out / "c")
+    assert (summary.lattice_step, summary.lattice_source) == (0.0001, "default")
+    summary = build([tmp_path / "a.las"], out / "d", resolution=0.004)
+    assert (summary.lattice_step, summary.lattice_source) == (0.004, "given")
+
+
+def test_points_that_are_not_finite_are_counted(out: Path, tmp_path: Path) -> None:
+    xyz = make_scan("noise", 3, 100)
+    xyz[7, 0], xyz[8, 1], xyz[9, 2] = np.nan, -np.inf, 1e300
+    write_ply(tmp_path / "a.ply", xyz)
+    summary = build([tmp_path / "a.ply"], out / "a")
+    assert summary.points == 97
+    assert sum(summary.skipped.values()) == 3
+    assert verify_archive(out / "a", deep=True).faults == ()
+    with pytest.raises(ScanError, match=r"a\.ply: 3 points that are not finite, expected none with --strict"):
+        build([tmp_path / "a.ply"], out / "b", strict=True)
+    assert [p.name for p in out.iterdir()] == ["a"]
+
+
+def test_a_point_alone_needs_a_radius(out: Path, tmp_path: Path) -> None:
+    write_xyz(tmp_path / "a.xyz", make_scan("one point", 1))
+    write_xyz(tmp_path / "b.xyz", np.repeat(make_scan("one point", 1), 10_000, axis=0))
+    for name in ("a.xyz", "b.xyz"):
+        with pytest.raises(
+            BadRequestError, match="single distinct point has no closest point: give --radius"
+        ):
+            build([tmp_path / name], out / "a")
+        assert not list(out.iterdir())
+        summary = build([tmp_path / name], out / name, radius=0.01)
+        assert summary.radius == 0.01
+        with Archive(out / name) as archive:
+            assert (archive.header.radius_model, archive.header.radius_sample) == ("given", 0)
+        shutil.rmtree(out / name)
+
+
+# --- errors, and nothing left behind ----------------------------------------------------------------------
+
+
+def broken_las(path: Path) -> Path:
+    """A LAS whose header is whole and whose points end early."""
+    write_las(path, np.random.default_rng(2).integers(3000, 5000, (200, 3)))
+    path.write_bytes(path.read_bytes()[:-1000])
+    return path
+
+
+def test_a_broken_scan_among_good_ones_stops_the_build(scans: list[Path], out: Path, tmp_path: Path) -> None:
+    bad = broken_las(tmp_path / "bad.las")
+    with pytest.raises(ScanError, match=r"bad\.las: .*--skip-bad leaves such scans out") as caught:
+        build([*scans, bad], out / "a")
+    assert caught.value.exit_code == 3
+    assert not list(out.iterdir())
+
+
+def test_every_broken_scan_is_named(scans: list[Path], out: Path, tmp_path: Path) -> None:
+    for name in ("one.las", "two.ply", "three.e57"):
+        (tmp_path / name).write_bytes(b"not a scan")
+    with pytest.raises(ScanError) as caught:
+        build([*scans, tmp_path / "one.las", tmp_path / "two.ply", tmp_path / "three.e57"], out / "a")
+    assert all(name in str(caught.value) for name in ("one.las", "two.ply", "three.e57"))
+
+
+def test_skip_bad_leaves_a_scan_out_and_marks_where_it_may_have_been(
+    scans: list[Path], out: Path, tmp_path: Path
+) -> None:
+    bad = broken_las(tmp_path / "bad.las")
+    summary = build([*scans, bad], out / "a", skip_bad=True)
+    assert len(summary.faults) == 1
+    assert str(bad) in summary.faults[0]
+    with Archive(out / "a") as archive:
+        header = archive.header
+        assert header.points == 5 * 150 + 1
+        assert not header.unknown_everywhere
+        (box,) = header.unknown
+        source = header.sources[-1]
+        assert (source.path, source.count) == (str(bad), 0)
+        assert source.fault == summary.faults[0]
+        # All points that were lost lie in the box.
+        with laspy.open(bad) as file:
+            corners = np.array([file.header.mins, file.header.maxs])
+        lattice = header.lattice.to_lattice(corners)
+        assert (box[0] <= lattice[0]).all()
+        assert (lattice[1] <= box[1]).all()
+        assert np.abs(box - lattice).max() <= 2
+
+
+def test_skip_bad_knows_nothing_free_where_bounds_are_lost(
+    scans: list[Path], out: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "bad.ply").write_bytes(b"ply\nformat ascii 1.0\nelement vertex 3\n")
+    summary = build([*scans, tmp_path / "bad.ply"], out / "a", skip_bad=True)
+    assert "bad.ply" in summary.faults[0]
+    with Archive(out / "a") as archive:
+        assert archive.header.unknown_everywhere
+        assert archive.header.unknown.shape == (0, 2, 3)
+
+
+def test_an_empty_scan_is_an_error_and_left_out_without_a_trace(
+    scans: list[Path], out: Path, tmp_path: Path
+) -> None:
+    write_ply(tmp_path / "empty.ply", make_scan("none", 1))
+    with pytest.raises(ScanError, match=r"empty\.ply: .*holds no usable point, expected at least one"):
+        build([*scans, tmp_path / "empty.ply"], out / "a")
+    assert not list(out.iterdir())
+    build([*scans, tmp_path / "empty.ply"], out / "a", skip_bad=True)
+    with Archive(out / "a") as archive:
+        assert not archive.header.unknown_everywhere
+        assert archive.header.unknown.shape == (0, 2, 3)
+    with pytest.raises(ScanError, match="no usable scan, expected at least one"):
+        build([tmp_path / "empty.ply"], out / "b", skip_bad=True)
+    assert [p.name for p in out.iterdir()] == ["a"]
+
+
+@pytest.mark.parametrize("skip_bad", [False, True])
+def test_a_path_that_does_not_exist_is_an_error(skip_bad: bool, scans: list[Path], out: Path) -> None:
+    with pytest.raises(ScanError, match=r"missing\.las: no such file or folder"):
+        build([*scans, out / "missing.las"], out / "a", skip_bad=skip_bad)
+    assert not list(out.iterdir())
+
+
+def test_an_existing_target_is_refused(scans: list[Path], out: Path) -> None:
+    (out / "a").mkdir()
+    (out / "a" / "letter.txt").write_text("dear archive")
+    with pytest.raises(BadRequestError, match="exists and is no archive"):
+        build(scans, out / "a", overwrite=True)
+    (out / "b").write_text("a file")
+    with pytest.raises(BadRequestError, match="exists and is no archive"):
+        build(scans, out / "b")
+    build(scans, out / "c")
+    before = content(out / "c")
+    with pytest.raises(BadRequestError, match="an archive is here already: give another -o, or --overwrite"):
+        build(scans, out / "c", degree=5)
+    assert content(out / "c") == before
+    assert sorted(p.name for p in out.iterdir()) == ["a", "b", "c"]
+
+
+def test_overwrite_replaces_an_archive_when_the_new_one_is_whole(
+    scans: list[Path], out: Path, tmp_path: Path
+) -> None:
+    build(scans, out / "a")
+    before = content(out / "a")
+    with pytest.raises(ScanError):
+        build([broken_las(tmp_path / "bad.las")], out / "a", overwrite=True)
+    assert content(out / "a") == before
+    build(scans[:3], out / "a", overwrite=True)
+    assert verify_archive(out / "a", deep=True).points == 450
+    assert [p.name for p in out.iterdir()] == ["a"]
+
+
+def test_an_empty_target_folder_is_used(scans: list[Path], out: Path) -> None:
+    (out / "a").mkdir()
+    build(scans, out / "a")
+    assert verify_archive(out / "a").faults == ()
+
+
+def test_a_second_builder_of_the_same_target_is_refused(scans: list[Path], out: Path) -> None:
+    with open(out / ".a.lock", "w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        with pytest.raises(BadRequestError, match="another build is writing it"):
+            build(scans, out / "a")
+        assert [p.name for p in out.iterdir()] == [".a.lock"]
+        build(scans, out / "b")
+    build(scans, out / "a")  # the lock file of a killed builder is no lock
+    assert sorted(p.name for p in out.iterdir()) == ["a", "b"]
+
+
+HOLD = """
+import fcntl, sys
+file = open(sys.argv[1], "w")
+fcntl.flock(file, fcntl.LOCK_EX)
+print("held", flush=True)
+sys.stdin.read()
+"""
+
+
+def test_the_lock_of_another_process_is_seen(scans: list[Path], out: Path) -> None:
+    with subprocess.Popen(
+        [sys.executable, "-c", HOLD, str(out / ".a.lock")], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as holder:
+        assert holder.stdout is not None
+        assert holder.stdout.readline() == b"held\n"
+        with pytest.raises(BadRequestError, match="another build is writing it"):
+            build(scans, out / "a")
+        holder.communicate()
+    build(scans, out / "a")
+
+
+def test_what_a_killed_build_left_is_removed(scans: list[Path], out: Path) -> None:
+    left = out / ".a.building" / "shards"
+    left.mkdir(parents=True)
+    (left / "0-000000.h5").write_bytes(b"half a shard")
+    build(scans, out / "a")
+    assert verify_archive(out / "a", deep=True).faults == ()
+    assert [p.name for p in out.iterdir()] == ["a"]
+
+
+@pytest.mark.parametrize(
+    "stage", ["_spool", "_build_voxels", "_measure_radius", "verify_archive", "_publish"]
+)
+def test_a_failure_at_any_stage_leaves_nothing(
+    stage: str, scans: list[Path], out: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(pipeline, stage, fail)
+    with pytest.raises(OSError, match="No space left"):
+        build(scans, out / "a")
+    assert not list(out.iterdir())
+
+
+def test_a_record_that_does_not_read_back_fails_the_build(
+    scans: list[Path], out: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    measure = pipeline._measure_radius
+
+    def damage(header: object, built: object, folder: Path, *rest: object) -> object:
+        result = measure(header, built, folder, *rest)
+        with Archive(folder) as archive:
+            at = int(archive.voxels["frame_offset"][0, 2]) + 20
+            path = archive.shard_path(0)
+        data = bytearray(path.read_bytes())
+        data[at] ^= 0xFF
+        path.write_bytes(data)
+        return result
+
+    monkeypatch.setattr(pipeline, "_measure_radius", damage)
+    with pytest.raises(CorruptError, match="not what reads back: check disk and memory"):
+        build(scans, out / "a")
+    assert not list(out.iterdir())
+
+
+def test_a_build_that_cannot_fit_the_disk_is_refused(
+    scans: list[Path], out: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    usage = shutil.disk_usage(out)._replace(free=1000)
+    monkeypatch.setattr(pipeline.shutil, "disk_usage", lambda _: usage)
+    with pytest.raises(SolidcloudError, match="1000 bytes free, the build needs about"):
+        build(scans, out / "a")
+    assert not list(out.iterdir())
+
+
+def test_a_voxel_too_dense_for_the_memory_is_refused(
+    scans: list[Path], out: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pipeline, "VOXEL_BYTES_A_POINT", 64 << 20)
+    with pytest.raises(BadRequestError, match=re.escape("give a smaller --voxel, a larger --memory")):
+        build(scans, out / "a")
+    assert not list(out.iterdir())
+
+
+BAD_OPTIONS = [
+    {"degree": 1}, {"degree": 17}, {"leaf": 0}, {"leaf": 33}, {"cell_points": 0}, {"voxel": 0.0},
+    {"voxel": float("nan")}, {"resolution": 0.0}, {"resolution": -1.0}, {"spacing": 0.0}, {"radius": -0.1},
+    {"radius": float("nan")}, {"jobs": -1}, {"memory_bytes": 1 << 20}, {"keep": frozenset({"colour"})},
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("options", BAD_OPTIONS, ids=str)
+def test_impossible_options_are_refused(options: dict[str, object]) -> None:
+    with pytest.raises(BadRequestError, match="expected"):
+        BuildConfig(**options)

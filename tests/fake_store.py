@@ -1,0 +1,53 @@
+"""A store without files for the tests of residency: counts loads, waits and fails as it is told."""
+
+import threading
+import time
+from collections import Counter
+
+import numpy as np
+from numpy.typing import NDArray
+from solidcloud.schemas.errors import CorruptError
+from solidcloud.server.arena import ALIGNMENT as BLOCK
+from solidcloud.server.kernels.layout import Arena
+
+
+class FakeStore:
+    """What Residency asks of a Store.
+
+    sizes: (v,) int64 [bytes].  loads: row -> times it was loaded.  faults: row -> how its loading fails.
+    gate: loads wait until it is set.
+    """
+
+    def __init__(self, blocks: list[int]) -> None:
+        """Voxels of so many cache lines each."""
+        self.sizes = np.array(blocks, np.int64) * BLOCK
+        self.loads: Counter[int] = Counter()
+        self.faults: dict[int, str] = {}
+        self.gate = threading.Event()
+        self.gate.set()
+        self.archive = self
+
+    def where(self, row: int) -> str:
+        """Where a record lies, for messages."""
+        return f"file.h5: voxel {row}"
+
+    def load(self, row: int, arena: Arena, offset: int) -> NDArray[np.int64]:
+        """Fill a voxel's run with its row number, or fail."""
+        self.loads[row] += 1
+        assert self.gate.wait(20.0)
+        fault = self.faults.get(row)
+        if fault == "corrupt":
+            raise CorruptError(f"{self.where(row)}: not what was written")
+        if fault == "unreadable":
+            raise OSError(5, "Input/output error")
+        if fault == "out of memory":
+            raise MemoryError("no room to decode")
+        arena.ints[offset // 4 : (offset + int(self.sizes[row])) // 4] = row
+        return np.array([offset // 4, offset // 4, offset // 2], np.int64)
+
+    def wait_for_load(self, row: int, seconds: float) -> bool:
+        """Whether a load of this row begins within so many seconds."""
+        deadline = time.monotonic() + seconds
+        while not self.loads[row] and time.monotonic() < deadline:
+            time.sleep(0.001)
+        return self.loads[row] > 0

@@ -1,0 +1,99 @@
+"""The judge: contact by its definition, every pair of points, in integers.
+
+Plain numpy and nothing of the project's own, so that no mistake can be made twice (NUMERICS.md N5, "Contract").
+A scan point is the integer of its lattice point in units of 2^-26 m, an avatar's point the integer of where a
+pose puts it, and two spheres touch when |a - b|^2 <= (r_a + r_b + margin)^2.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+UNITS = 2.0**26  # exact units a metre
+SCALE_TOLERANCE = 1e-9
+
+
+def lattice_of(points: ArrayLike, origin: ArrayLike, step: float) -> NDArray[np.int64]:
+    """Lattice integers (n, 3) of source points (n, 3), world [m]."""
+    return np.rint((np.asarray(points, np.float64) - np.asarray(origin, np.float64)) / step).astype(np.int64)
+
+
+def scan_units(lattice: NDArray[np.int64], step: float) -> NDArray[np.int64]:
+    """Exact units (n, 3) of lattice integers (n, 3): one product, half to even."""
+    return np.rint(lattice.astype(np.float64) * (step * UNITS)).astype(np.int64)
+
+
+def placed_units(
+    avatar: NDArray[np.float64], pose: NDArray[np.float64], origin: ArrayLike
+) -> NDArray[np.int64]:
+    """Exact units (m, 3) of avatar points (m, 3) under a pose (4, 4), from the dataset's origin."""
+    columns = []
+    for r in range(3):
+        shift = pose[r, 3] - np.float64(origin[r])
+        metres = ((pose[r, 0] * avatar[:, 0] + pose[r, 1] * avatar[:, 1]) + pose[r, 2] * avatar[:, 2]) + shift
+        columns.append(np.rint(metres * UNITS).astype(np.int64))
+    return np.stack(columns, axis=1)
+
+
+def scale_of(pose: NDArray[np.float64]) -> float:
+    """The uniform scale of a pose: root of the mean square of its entries; within 1e-9 of 1 it is 1."""
+    square = 0.0
+    for r in range(3):
+        for c in range(3):
+            square += float(pose[r, c]) * float(pose[r, c])
+    scale = math.sqrt(square / 3.0)
+    return 1.0 if abs(scale - 1.0) <= SCALE_TOLERANCE else scale
+
+
+def reach_units(pose: NDArray[np.float64], avatar_radius: float, scan_radius: float, margin: float) -> int:
+    """r_a + r_b + margin in exact units, each rounded once."""
+    return (
+        int(np.rint(scale_of(pose) * avatar_radius * UNITS))
+        + int(np.rint(scan_radius * UNITS))
+        + int(np.rint(margin * UNITS))
+    )
+
+
+def touches(a: NDArray[np.int64], b: NDArray[np.int64], reach: int) -> bool:
+    """Whether any pair of a (m, 3) and b (n, 3), exact units, is within reach, tangency included."""
+    rows = max(1, 2_000_000 // max(1, len(b)))
+    for start in range(0, len(a), rows):
+        apart = np.abs(a[start : start + rows, None, :] - b[None, :, :])
+        # A pair farther than the reach along one axis does not touch; the others' squares fit 63 bits.
+        near = apart[(apart <= reach).all(axis=2)]
+        if ((near * near).sum(axis=1) <= reach * reach).any():
+            return True
+    return False
+
+
+def least_square(a: NDArray[np.int64], b: NDArray[np.int64]) -> int:
+    """The least |a - b|^2 over all pairs, in Python integers."""
+    return min(
+        sum((int(p) - int(q)) ** 2 for p, q in zip(one, other, strict=True)) for one in a for other in b
+    )
+
+
+def collide(
+    points: ArrayLike,
+    origin: ArrayLike,
+    step: float,
+    scan_radius: float,
+    avatar: ArrayLike,
+    avatar_radius: float,
+    poses: NDArray[np.float64],
+    margin: float = 0.0,
+) -> NDArray[np.bool_]:
+    """Whether the avatar touches the scan under each of the poses (k, 4, 4)."""
+    b = scan_units(lattice_of(points, origin, step), step)
+    body = np.asarray(avatar, np.float64).reshape(-1, 3)
+    found = np.zeros(len(poses), bool)
+    for i, pose in enumerate(poses):
+        reach = reach_units(pose, avatar_radius, scan_radius, margin)
+        a = placed_units(body, pose, origin)
+        if not len(a):
+            continue
+        # Scan points outside the avatar's box and its reach are farther than that along one axis.
+        near = ((b >= a.min(axis=0) - reach) & (b <= a.max(axis=0) + reach)).all(axis=1)
+        found[i] = touches(a, b[near], reach)
+    return found

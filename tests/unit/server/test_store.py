@@ -1,0 +1,61 @@
+"""The store: sizes before loading, and records that are not what the index says."""
+
+import os
+from pathlib import Path
+
+import cases
+import numpy as np
+import pytest
+import scans
+from solidcloud.schemas.errors import CorruptError, FormatError
+from solidcloud.server import store as store_module
+from solidcloud.server.arena import ArenaBuffer
+from solidcloud.server.store import Store
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Store:
+    """A store of a few voxels."""
+    return Store(cases.build(tmp_path, scans.make_scan("noise", 3, 300)).archive)
+
+
+def test_a_folder_without_an_archive_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(FormatError, match="no archive here"):
+        Store(tmp_path)
+
+
+def test_a_load_reads_the_same_at_any_offset(store: Store) -> None:
+    size = int(store.sizes[0])
+    low, high = ArenaBuffer(size + 64), ArenaBuffer(size + 4096)
+    first = store.load(0, low.arena, 0)
+    second = store.load(0, high.arena, 4096)
+    assert (second - first).tolist() == [1024, 1024, 2048]
+    assert low.arena.halves[: size // 2].tobytes() == high.arena.halves[2048 : 2048 + size // 2].tobytes()
+
+
+def test_a_flipped_byte_is_corrupt_and_named(store: Store) -> None:
+    row = 2
+    entry = store.archive.voxels[row]
+    path = store.archive.shard_path(int(entry["shard"]))
+    with open(path, "r+b") as file:
+        offset = int(entry["frame_offset"][2]) + int(entry["frame_bytes"][2]) // 2
+        byte = os.pread(file.fileno(), 1, offset)[0]
+        os.pwrite(file.fileno(), bytes([byte ^ 0x10]), offset)
+    arena = ArenaBuffer(int(store.sizes.max())).arena
+    with pytest.raises(CorruptError) as caught:
+        store.load(row, arena, 0)
+    x, y, z = store.archive.coordinates[row]
+    assert f"{path}: voxel ({x}, {y}, {z})" in str(caught.value)
+    assert store.load(row + 1, arena, 0)[0] == 0
+
+
+def test_leaf_nodes_that_the_index_does_not_count_are_corrupt(store: Store) -> None:
+    store.archive.voxels["leaves"][1] += 1
+    with pytest.raises(CorruptError, match="leaf nodes, the index says otherwise"):
+        store.load(1, ArenaBuffer(1 << 20).arena, 0)
+
+
+def test_a_tree_too_high_for_the_stack_is_corrupt(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(store_module, "MOST_LEVELS", 0)
+    with pytest.raises(CorruptError, match="levels, expected at most 0"):
+        store.load(int(np.argmax(store.sizes)), ArenaBuffer(1 << 20).arena, 0)

@@ -166,7 +166,7 @@ def test_an_archive_is_sound_and_summed_up(scans: list[Path], out: Path) -> None
 
 
 def test_quantising_moves_no_point_by_more_than_half_a_step(out: Path, tmp_path: Path) -> None:
-    xyz = make_scan("noise", 3, 300) + [5e5, 5.6e6, 0]
+    xyz = make_scan("noise", 3, 300) + np.array([5e5, 5.6e6, 0])
     summary = build([write_xyz(tmp_path / "a.xyz", xyz)], out / "a", resolution=0.01)
     low = xyz.min(axis=0)
     moved = np.abs(np.rint((xyz - low) / 0.01) * 0.01 + low - xyz).max()

@@ -1,0 +1,92 @@
+"""An archive somebody has stays readable: the committed one holds what the JSON beside it says, to the bit."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from solidcloud.builder.config import BuildConfig
+from solidcloud.builder.pipeline import build_archive
+from solidcloud.builder.radius import voxel_points
+from solidcloud.builder.verify import verify_archive
+from solidcloud.schemas.archive import Archive
+
+GOLDEN = Path(__file__).resolve().parents[2] / "golden"
+
+
+@pytest.fixture(scope="module")
+def expected() -> dict[str, Any]:
+    """The committed values."""
+    return json.loads((GOLDEN / "archive.json").read_text())
+
+
+@pytest.mark.interpreted
+def test_the_golden_archive_holds_what_is_written_beside_it(expected: dict[str, Any]) -> None:
+    assert verify_archive(GOLDEN / "archive", deep=True).faults == ()
+    with Archive(GOLDEN / "archive") as archive:
+        header = archive.header
+        assert header.archive_id.hex() == expected["archive_id"]
+        assert [value.hex() for value in header.lattice.origin] == expected["origin"]
+        assert header.lattice.step.hex() == expected["step"]
+        assert header.lattice.voxel_steps == expected["voxel_steps"]
+        assert header.points == expected["points"]
+        assert [header.low.tolist(), header.high.tolist()] == expected["bounds"]
+        assert header.radius.hex() == expected["radius"]
+        assert header.radius_sample == expected["radius_sample"]
+        assert header.moved_max.hex() == expected["moved_max"]
+        assert [[s.path, s.index, s.format, s.sha256, s.count] for s in header.sources] == expected["sources"]
+        assert len(archive.voxels) == len(expected["voxels"]) > 1
+        for row, voxel in enumerate(expected["voxels"]):
+            entry = archive.voxels[row]
+            data, links = archive.read_voxel(row)
+            assert archive.coordinates[row].tolist() == voxel["coordinate"]
+            assert entry["rows"].tolist() == voxel["rows"]
+            assert int(entry["leaves"]) == voxel["leaves"]
+            assert [entry["low"].tolist(), entry["high"].tolist()] == [voxel["low"], voxel["high"]]
+            assert links.height == voxel["height"]
+            cells = np.column_stack([data.cells.low, data.cells.log2_size])
+            assert cells.tolist() == voxel["cells"]
+
+
+def golden_points(folder: Path) -> np.ndarray:
+    """Lattice point, scan and intensity of every point of an archive, (n, 5), in an order of their own."""
+    rows = []
+    with Archive(folder) as archive:
+        for row in range(len(archive.voxels)):
+            voxel, links = archive.read_voxel(row)
+            local = voxel_points(voxel, links)
+            lattice = local + archive.coordinates[row] * archive.header.lattice.voxel_steps
+            rows.append(np.column_stack([lattice, voxel.scan_index, voxel.intensity]))
+    table = np.concatenate(rows)
+    return table[np.lexsort(table.T)]
+
+
+def test_the_golden_archive_holds_the_points_of_its_scans() -> None:
+    tables = []
+    for number in range(2):
+        rows = np.loadtxt(GOLDEN / f"scan-{number}.xyz", skiprows=1)
+        # Millimetres from UTM 512345, 5612345 and -0.25 m: the numbers the scans were made of.
+        steps = np.rint((rows[:, :3] - [512345, 5612345, -0.25]) * 1000)
+        tables.append(np.column_stack([steps, np.full(len(rows), number), rows[:, 3]]))
+    expected = np.concatenate(tables)
+    expected[:, :3] -= expected[:, :3].min(axis=0)
+    assert np.array_equal(golden_points(GOLDEN / "archive"), expected[np.lexsort(expected.T)])
+
+
+def test_a_build_today_gives_the_golden_points_and_cells(
+    expected: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(GOLDEN)  # the archive keeps paths as given
+    config = BuildConfig(
+        voxel=1.0, resolution=0.001, leaf=8, degree=3, cell_points=40, keep=frozenset({"scan", "intensity"}), jobs=1
+    )  # fmt: skip
+    build_archive([Path("scan-1.xyz"), Path("scan-0.xyz")], tmp_path / "a", config)
+    assert np.array_equal(golden_points(tmp_path / "a"), golden_points(GOLDEN / "archive"))
+    with Archive(tmp_path / "a") as new, Archive(GOLDEN / "archive") as golden:
+        assert repr(new.header) == repr(golden.header)
+        assert new.header.archive_id.hex() == expected["archive_id"]
+        for row in range(len(golden.voxels)):
+            a, b = new.read_voxel(row)[0], golden.read_voxel(row)[0]
+            for x, y in zip(a.cells, b.cells, strict=True):
+                assert np.array_equal(x, y)

@@ -47,7 +47,7 @@ def errors(capsys: pytest.CaptureFixture[str]) -> list[str]:
 @pytest.mark.parametrize("verb", ["", *VERBS, "make facade", "make town", "make figure", "make walk"])
 def test_help_loads_no_numpy(verb: str) -> None:
     code = f"import sys; from solidcloud.server.cli import run; code = run({[*verb.split(), '--help']!r})"
-    heavy = ["numpy", "numba", "h5py", "zenoh", "rich"]
+    heavy = ["pydantic", "numpy", "numba", "h5py", "zenoh", "rich"]
     check = f"sys.exit(code or ','.join(name for name in {heavy!r} if name in sys.modules) or 0)"
     done = subprocess.run(
         [sys.executable, "-P", "-c", f"{code}; {check}"], capture_output=True, text=True, check=False

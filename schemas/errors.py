@@ -126,4 +126,6 @@ def error_from_code(code: str, message: str) -> SolidcloudError:
         return _BY_CODE[ErrorCode(code)](message)
     except ValueError:
         known = ", ".join(ErrorCode)
-        return InternalError(f"error reply with code {code!r}: expected one of {known}: upgrade the client ({message})")
+        return InternalError(
+            f"error reply with code {code!r}: expected one of {known}: upgrade the client ({message})"
+        )

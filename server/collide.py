@@ -1,5 +1,6 @@
 """`collide`: does an avatar touch the scene, one verdict a pose? One request -> one result."""
 
+import math
 import time
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -15,8 +16,7 @@ from ..schemas.voxel_grid import UNITS_PER_METRE
 from .avatar import AvatarModel
 from .kernels import placing
 from .kernels.overlap import CLEAR, UNKNOWN, SceneArrays, overlap_poses
-from .kernels.placing import check_poses
-from .kernels.reach import voxels_in_reach
+from .kernels.reach import Reach, SceneIndex, find_reach
 from .residency import Residency
 
 _POSE_FAULTS: dict[int, tuple[type[SolidcloudError], str]] = {
@@ -47,44 +47,23 @@ _POSE_FAULTS: dict[int, tuple[type[SolidcloudError], str]] = {
 class SceneData(NamedTuple):
     """What every question about one scene reads; made once, by `make_scene_data`.
 
-    arrays: what the overlap kernel reads.  keys: (v,) uint64.  low, high: (v, 3) int64, least and greatest lattice
-    coordinates of a voxel's points; scene_low, scene_high: (3,) of all points.  radius_units: of every scan
-    point, exact units.  unknown: (u, 2, 3) int64, lattice boxes of scans left out; everywhere: also elsewhere.
+    arrays: what the overlap kernel reads.  index: what the broad phase reads.  radius_units: of every scan point,
+    exact units.  unknown: (u, 2, 3) int64, lattice boxes of scans left out; unknown_everywhere: also elsewhere.
     """
 
     residency: Residency
     arrays: SceneArrays
-    keys: NDArray[np.uint64]
-    low: NDArray[np.int64]
-    high: NDArray[np.int64]
-    scene_low: NDArray[np.int64]
-    scene_high: NDArray[np.int64]
+    index: SceneIndex
     radius_units: int
     unknown: NDArray[np.int64]
     unknown_everywhere: bool
 
 
-class Reach(NamedTuple):
-    """Poses checked, and the voxels each could touch; see `voxels_in_reach`.
-
-    poses: (k, 4, 4).  scales: (k,).  units: (k,) int64.  starts: (k + 1,), rows: the voxels of each pose.
-    boxes: (k, 2, 3) float64 [steps].  outside: (k,) bool.
-    """
-
-    poses: NDArray[np.float64]
-    scales: NDArray[np.float64]
-    units: NDArray[np.int64]
-    starts: NDArray[np.int64]
-    rows: NDArray[np.int64]
-    boxes: NDArray[np.float64]
-    outside: NDArray[np.bool_]
-
-
 def to_units(metres: float, what: str) -> int:
     """A length in exact units, rounded once (NUMERICS.md N5). Raises BadRequestError for a negative or endless one."""
-    if not (np.isfinite(metres) and metres >= 0):
+    if not 0 <= metres < math.inf:
         raise BadRequestError(f"{what} {metres!r}: expected zero or a positive length in metres")
-    return int(np.rint(metres * UNITS_PER_METRE))
+    return round(metres * UNITS_PER_METRE)  # half to even
 
 
 def make_scene_data(archive: Archive, residency: Residency) -> SceneData:
@@ -104,52 +83,45 @@ def make_scene_data(archive: Archive, residency: Residency) -> SceneData:
     return SceneData(
         residency,
         arrays,
-        archive.voxels["key"].astype(np.uint64),
-        base + archive.voxels["low"],
-        base + archive.voxels["high"],
-        header.low,
-        header.high,
+        SceneIndex(
+            archive.voxels["key"].astype(np.uint64),
+            base + archive.voxels["low"],
+            base + archive.voxels["high"],
+            header.low,
+            header.high,
+        ),
         to_units(header.radius, "radius of the archive"),
         header.unknown,
         header.unknown_everywhere,
     )
 
 
-def _checked(
+def check_request(
     data: SceneData, avatar: AvatarModel, poses: ArrayLike, margin: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
-    """The poses (k, 4, 4), their scales (k,) and r_a + r_b + margin in exact units (k,), all admissible.
+) -> tuple[NDArray[np.float64], Reach]:
+    """The poses (k, 4, 4) of a request, all admissible, and the voxels in reach of each; none for an empty avatar.
 
     Raises BadRequestError, BadTransformError or TooLargeError naming the pose.
     """
     array = make_poses(poses)
     if not array.flags.writeable:
         array = array.copy()  # numba compiles a read-only array anew
-    scales, units = np.empty(len(array)), np.empty(len(array), np.int64)
     other_units = data.radius_units + to_units(margin, "margin")
-    fault, pose, found = check_poses(
-        array, avatar.arrays.radius, avatar.radius, other_units, data.arrays, scales, units
-    )
-    if fault != placing.GOOD:
-        error, text = _POSE_FAULTS[fault]
-        raise error(f"pose {pose} {text.format(found)}")
-    return array, scales, units
-
-
-def find_reach(data: SceneData, avatar: AvatarModel, poses: ArrayLike, margin: float) -> Reach:
-    """Check a request and find the voxels in reach of each pose. `avatar` is not empty."""
-    array, scales, units = _checked(data, avatar, poses, margin)
     k = len(array)
-    starts, boxes, outside = np.empty(k + 1, np.int64), np.empty((k, 2, 3)), np.empty(k, bool)
-    rows = np.empty(16 * k + 64, np.int64)
+    needed = 16 * k + 64
     while True:
-        needed = voxels_in_reach(
-            array, scales, units, avatar.arrays.center, avatar.arrays.radius, data.arrays, data.keys, data.low,
-            data.high, data.scene_low, data.scene_high, starts, rows, boxes, outside,
+        reach = Reach(
+            np.empty(k), np.empty(k, np.int64), np.zeros(k + 1, np.int64), np.empty(needed, np.int64),
+            np.empty((k, 2, 3)), np.zeros(k, bool),
         )  # fmt: skip
-        if needed <= len(rows):
-            return Reach(array, scales, units, starts, rows[:needed], boxes, outside)
-        rows = np.empty(needed, np.int64)
+        fault, pose, found, needed = find_reach(
+            array, avatar.arrays, avatar.radius, other_units, data.arrays, data.index, reach
+        )
+        if fault != placing.GOOD:
+            error, text = _POSE_FAULTS[fault]
+            raise error(f"pose {pose} {text.format(found)}")
+        if needed <= len(reach.rows):
+            return array, reach
 
 
 def _pieces(reach: Reach, residency: Residency) -> Iterator[tuple[NDArray[np.int64], list[int], Reach]]:
@@ -158,14 +130,17 @@ def _pieces(reach: Reach, residency: Residency) -> Iterator[tuple[NDArray[np.int
     Nearly always one piece. A pose that alone reaches more than the budget is looked at voxel by voxel run
     (NUMERICS.md case 23), and so appears in several pieces.
     """
-    everything = np.unique(reach.rows).tolist() if len(reach.poses) > 1 else reach.rows.tolist()
+    k = len(reach.scales)
+    everything = reach.rows[: reach.starts[k]].tolist()
+    if k > 1:
+        everything = np.unique(everything).tolist()
     budget = residency.buffer.total_bytes
     if residency.bytes_of(everything) <= budget:
-        yield np.arange(len(reach.poses)), everything, reach
+        yield np.arange(k), everything, reach
         return
     which: list[int] = []
     held: dict[int, None] = {}
-    for pose in range(len(reach.poses)):
+    for pose in range(k):
         own = reach.rows[reach.starts[pose] : reach.starts[pose + 1]].tolist()
         fresh = [row for row in own if row not in held]
         if which and residency.bytes_of(list(held)) + residency.bytes_of(fresh) > budget:
@@ -201,20 +176,17 @@ def collide(data: SceneData, avatar: AvatarModel, poses: ArrayLike, margin: floa
     found elsewhere); the definition is NUMERICS.md N5. Raises BadRequestError, BadTransformError, TooLargeError.
     """
     begin = time.perf_counter()
+    array, reach = check_request(data, avatar, poses, margin)
+    k = len(array)
+    verdict, counts = np.zeros(k, np.uint8), np.zeros((3, k), np.uint32)
     if not len(avatar.points):
-        k = len(_checked(data, avatar, poses, margin)[0])
-        return CollideAnswers(np.zeros(k, np.uint8), np.zeros(k, bool), *np.zeros((3, k), np.uint32))
-    reach = find_reach(data, avatar, poses, margin)
+        return CollideAnswers(verdict, reach.outside, *counts)
     residency = data.residency
-    verdict, counts = np.zeros(len(reach.poses), np.uint8), np.zeros((3, len(reach.poses)), np.uint32)
     hits = misses = 0
     faults: dict[str, None] = {}
     for which, rows, part in _pieces(reach, residency):
         with residency.hold(rows) as held:
-            overlap_poses(
-                part.poses, part.scales, part.units, avatar.arrays, data.arrays, which, part.starts, part.rows,
-                verdict, *counts,
-            )  # fmt: skip
+            overlap_poses(array, avatar.arrays, data.arrays, part, which, verdict, counts)
         hits, misses = hits + held.hits, misses + held.misses
         faults.update(dict.fromkeys(held.faults))
     if data.unknown_everywhere or len(data.unknown):

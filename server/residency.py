@@ -9,8 +9,7 @@ hold half of what the other needs cannot wait for each other for ever.
 
 import threading
 from collections import OrderedDict
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -26,6 +25,24 @@ class Held(NamedTuple):
     hits: int
     misses: int
     faults: tuple[str, ...]
+
+
+class Hold:
+    """A hold on voxels, for a `with`; a class and not a generator, which would cost 3 of 12 µs a request."""
+
+    __slots__ = ("_residency", "_rows")
+
+    def __init__(self, residency: "Residency", rows: Sequence[int]) -> None:
+        """Use `Residency.hold`."""
+        self._residency, self._rows = residency, rows
+
+    def __enter__(self) -> Held:
+        """Wait until all that can be read is resident."""
+        return self._residency.acquire(self._rows)
+
+    def __exit__(self, *_: object) -> None:
+        """Let the voxels go."""
+        self._residency.release(self._rows)
 
 
 class Residency:
@@ -69,24 +86,34 @@ class Residency:
         """Bytes these voxels take when resident."""
         return sum(self._sizes[row] for row in rows)
 
-    @contextmanager
-    def hold(self, rows: Sequence[int]) -> Iterator[Held]:
-        """Make the voxels of distinct index rows resident and keep them so inside the `with`.
+    def hold(self, rows: Sequence[int]) -> "Hold":
+        """Make the voxels of distinct index rows resident and keep them so inside a `with`, which gives a `Held`.
 
         Together they must fit the budget. Voxels that cannot be read stay at -1 in `where` and are named in
         the result's faults; everything else is resident.
         """
+        return Hold(self, rows)
+
+    def acquire(self, rows: Sequence[int]) -> Held:
+        """Begin a hold; `release` must follow, unless this raises."""
         mine = self._reserve(rows)
+        if not mine and not self._loading and not self._faults and not self._passing:
+            return Held(len(rows), 0, ())  # all resident and pinned: nothing can change that
         try:
             self._load(mine)
             with self._changed:
                 self._changed.wait_for(lambda: not any(row in self._loading for row in rows))
                 faults = tuple(fault for row in rows if (fault := self._fault(row)))
-            yield Held(len(rows) - len(mine), len(mine), faults)
-        finally:
-            with self._changed:
-                self._unpin(rows)
-                self._changed.notify_all()
+        except BaseException:
+            self.release(rows)
+            raise
+        return Held(len(rows) - len(mine), len(mine), faults)
+
+    def release(self, rows: Sequence[int]) -> None:
+        """End a hold."""
+        with self._changed:
+            self._unpin(rows)
+            self._changed.notify_all()
 
     def _reserve(self, rows: Sequence[int]) -> list[int]:
         """Pin all rows and allocate for those to be loaded by this caller, which are returned."""

@@ -74,7 +74,7 @@ class Scene:
             format_version=FORMAT_VERSION,
             wire_version=WIRE_VERSION,
             points=header.points,
-            voxels=len(self._data.keys),
+            voxels=len(store.sizes),
             bounds=lattice.to_world(np.stack([header.low, header.high])).tolist(),
             origin=list(lattice.origin),
             lattice_step=lattice.step,

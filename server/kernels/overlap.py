@@ -278,15 +278,14 @@ def _overlap_voxel(avatar, m, pose, placed, scene, voxel, limits, stack, keep, o
 
 
 @nb.njit(nogil=True, cache=True)
-def overlap_poses(
-    poses, scales, reach_units, avatar, scene, which, starts, rows, verdict, missing, visits, tests
-):
+def overlap_poses(poses, avatar, scene, reach, which, verdict, counts):
     """Answer `collide` for the poses numbered in `which`: one call a request, all its poses and voxels.
 
-    poses: (k, 4, 4), checked.  scales: (k,).  reach_units: (k,) int64.  avatar: not empty.  starts, rows: the voxels
-    of each pose, from `voxels_in_reach`; a voxel that is not resident is counted as missing.
-    Adds to what verdict (k,) uint8 and missing, visits, tests (k,) uint32 hold, CLEAR and 0 to begin with, so
-    that a pose may be answered in pieces: a contact wins over anything missing, and that over CLEAR.
+    poses: (k, 4, 4), checked.  avatar: not empty.  reach: Reach of these poses (reach.py); a voxel in it that is not
+    resident is counted as missing.
+    Adds to what verdict (k,) uint8 and counts (3, k) uint32 (voxels missing, node visits, point tests) hold, CLEAR
+    and 0 to begin with, so that a pose may be answered in pieces: a contact wins over anything missing, and
+    that over CLEAR.
     """
     blocks = avatar.points.shape[0]
     placed = Placed(
@@ -303,18 +302,18 @@ def overlap_poses(
     for number in range(which.shape[0]):
         i = which[number]
         counters[0], counters[1] = 0, 0
-        if verdict[i] != CONTACT and starts[i + 1] > starts[i]:
-            extent, farthest = _place_nodes(avatar, poses[i], scales[i], placed, scene)
-            limits = _limits(reach_units[i], scene.units_per_step, extent, farthest, scene.voxel_steps)
-            for at in range(starts[i], starts[i + 1]):
-                voxel = rows[at]
+        if verdict[i] != CONTACT and reach.starts[i + 1] > reach.starts[i]:
+            extent, farthest = _place_nodes(avatar, poses[i], reach.scales[i], placed, scene)
+            limits = _limits(reach.units[i], scene.units_per_step, extent, farthest, scene.voxel_steps)
+            for at in range(reach.starts[i], reach.starts[i + 1]):
+                voxel = reach.rows[at]
                 if scene.where[voxel, 0] < 0:
-                    missing[i] += np.uint32(1)
+                    counts[0, i] += np.uint32(1)
                     verdict[i] = UNKNOWN
                 elif _overlap_voxel(
                     avatar, poses[i], i, placed, scene, voxel, limits, stack, keep, off, counters
                 ):
                     verdict[i] = CONTACT
                     break
-        visits[i] += np.uint32(counters[0])
-        tests[i] += np.uint32(counters[1])
+        counts[1, i] += np.uint32(counters[0])
+        counts[2, i] += np.uint32(counters[1])

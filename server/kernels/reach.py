@@ -1,13 +1,45 @@
 """The broad phase: which voxels a placed avatar could touch, from the index alone."""
 
 import math
+from typing import NamedTuple
 
 import numba as nb
 import numpy as np
+from numpy.typing import NDArray
 
 from ...schemas.kernels.morton import morton_code
 from ...schemas.voxel_grid import KEY_BIAS
-from .placing import largest_term, place
+from .placing import GOOD, check_poses, largest_term, place
+
+
+class SceneIndex(NamedTuple):
+    """What the broad phase reads of a scene's v voxels.
+
+    keys: (v,) uint64, sorted.  low, high: (v, 3) int64, least and greatest lattice coordinates of a voxel's points.
+    scene_low, scene_high: (3,) int64, those of all points.
+    """
+
+    keys: NDArray[np.uint64]
+    low: NDArray[np.int64]
+    high: NDArray[np.int64]
+    scene_low: NDArray[np.int64]
+    scene_high: NDArray[np.int64]
+
+
+class Reach(NamedTuple):
+    """k poses and what they could touch.
+
+    scales: (k,) float64.  units: (k,) int64, r_a + r_b + margin in exact units.  starts: (k + 1,), rows: int64, the
+    voxel rows of pose i are rows[starts[i]:starts[i + 1]].  boxes: (k, 2, 3) float64, the box of the root sphere and
+    its reach [steps].  outside: (k,) bool, whether that box leaves the scene's.
+    """
+
+    scales: NDArray[np.float64]
+    units: NDArray[np.int64]
+    starts: NDArray[np.int64]
+    rows: NDArray[np.int64]
+    boxes: NDArray[np.float64]
+    outside: NDArray[np.bool_]
 
 
 @nb.njit(nogil=True, cache=True)
@@ -34,24 +66,33 @@ def _near_box(center, reach, low, high):
 
 
 @nb.njit(nogil=True, cache=True)
-def voxels_in_reach(
-    poses, scales, reach_units, node_center, node_radius, scene, keys, low, high, scene_low, scene_high,
-    starts, rows, boxes, outside,
-):  # fmt: skip
-    """List, for each pose, the voxels whose points its root sphere could touch.
+def find_reach(poses, avatar, radius, other_units, scene, index, reach):
+    """Check poses and list the voxels in reach of each: `check_poses`, then `voxels_in_reach`, in one call.
 
-    poses: (k, 4, 4).  scales: (k,).  reach_units: (k,) int64, r_a + r_b + margin in exact units.
-    node_center (a, 3), node_radius (a,): the avatar's nodes, root first [m].  scene: SceneArrays.
-    keys (v,) sorted: the voxels that exist; low, high (v, 3) int64: least and greatest lattice coordinates of their
-    points.
-    scene_low, scene_high (3,) int64: those of all points.
-    Writes starts (k + 1,) int64 and rows (capacity,) int64: voxel rows of pose i are rows[starts[i]:starts[i+1]],
-    by key; boxes (k, 2, 3) float64: the box of the root sphere and its reach [steps]; outside (k,): whether
-    that box leaves the scene's. Returns how many rows are needed; beyond the capacity none are written.
+    radius: of the avatar's points [m].  other_units: of the scan's points and the margin, exact units. Fills `reach`.
+    Returns (fault, pose, figure found) as `check_poses` does, and the rows needed.
+    """
+    fault, pose, found = check_poses(
+        poses, avatar.radius, radius, other_units, scene, reach.scales, reach.units
+    )
+    if fault != GOOD or avatar.radius.shape[0] == 0:
+        return fault, pose, found, 0
+    return fault, pose, found, voxels_in_reach(poses, avatar, scene, index, reach)
+
+
+@nb.njit(nogil=True, cache=True)
+def voxels_in_reach(poses, avatar, scene, index, reach):
+    """List, for each pose, the voxels whose points the avatar's root sphere could touch, by key.
+
+    poses: (k, 4, 4), checked.  avatar: not empty.  scene: SceneArrays. Fills starts, rows, boxes and outside of `reach`
+    from its scales and units. Returns how many rows are needed; those beyond the capacity are not written.
     The reach is widened by more than the rounding of this function: a millionth of itself, a step, and 2^-49 of the
     largest term that was added up.
     """
     step, units_per_step, voxel_steps = scene.step, scene.units_per_step, scene.voxel_steps
+    keys, scene_low, scene_high = index.keys, index.scene_low, index.scene_high
+    boxes, outside = reach.boxes, reach.outside
+    x, y, z = avatar.center[0, 0], avatar.center[0, 1], avatar.center[0, 2]
     shift, center = np.empty(3), np.empty(3)
     first, last = np.empty(3, np.int64), np.empty(3, np.int64)
     box_low, box_high = np.empty(3), np.empty(3)
@@ -60,21 +101,22 @@ def voxels_in_reach(
         m = poses[i]
         for r in range(3):
             shift[r] = m[r, 3] - scene.origin[r]
-        x, y, z = node_center[0, 0], node_center[0, 1], node_center[0, 2]
-        reach = (node_radius[0] * scales[i] / step + reach_units[i] / units_per_step) * (1.0 + 1e-6) + 1.0
-        reach += largest_term(m, shift, x, y, z) / step * 2.0**-49
+        span = (avatar.radius[0] * reach.scales[i] / step + reach.units[i] / units_per_step) * (
+            1.0 + 1e-6
+        ) + 1.0
+        span += largest_term(m, shift, x, y, z) / step * 2.0**-49
         cells = 1.0
         outside[i] = False
         for r in range(3):
             center[r] = place(m, shift, r, x, y, z) / step
-            boxes[i, 0, r], boxes[i, 1, r] = center[r] - reach, center[r] + reach
+            boxes[i, 0, r], boxes[i, 1, r] = center[r] - span, center[r] + span
             outside[i] |= boxes[i, 0, r] < scene_low[r] or boxes[i, 1, r] > scene_high[r]
             least = max(boxes[i, 0, r], np.float64(scene_low[r]))
             most = min(boxes[i, 1, r], np.float64(scene_high[r]))
             first[r] = np.int64(math.floor(least / voxel_steps))
             last[r] = np.int64(math.floor(most / voxel_steps))
             cells *= max(0.0, np.float64(last[r] - first[r] + 1)) if least <= most else 0.0
-        starts[i] = needed
+        reach.starts[i] = needed
         if cells == 0.0:
             continue
         listed = cells > keys.shape[0]  # cheaper to go through the voxels than through the grid
@@ -102,10 +144,10 @@ def voxels_in_reach(
                 if row < 0:
                     continue
             for r in range(3):
-                box_low[r], box_high[r] = np.float64(low[row, r]), np.float64(high[row, r])
-            if _near_box(center, reach, box_low, box_high):
-                if needed < rows.shape[0]:
-                    rows[needed] = row
+                box_low[r], box_high[r] = np.float64(index.low[row, r]), np.float64(index.high[row, r])
+            if _near_box(center, span, box_low, box_high):
+                if needed < reach.rows.shape[0]:
+                    reach.rows[needed] = row
                 needed += 1
-    starts[poses.shape[0]] = needed
+    reach.starts[poses.shape[0]] = needed
     return needed

@@ -1,6 +1,5 @@
 """`collide`: does an avatar touch the scene, one verdict a pose? One request -> one result."""
 
-import math
 import time
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -12,7 +11,7 @@ from ..schemas.answers import CollideAnswers
 from ..schemas.archive import Archive
 from ..schemas.errors import BadRequestError, BadTransformError, SolidcloudError, TooLargeError
 from ..schemas.messages import make_poses
-from ..schemas.voxel_grid import UNITS_PER_METRE
+from ..schemas.voxel_grid import MAX_COORDINATE, UNITS_PER_METRE
 from .avatar import AvatarModel
 from .kernels import placing
 from .kernels.overlap import CLEAR, UNKNOWN, SceneArrays, overlap_poses
@@ -60,8 +59,8 @@ class SceneData(NamedTuple):
 
 
 def to_units(metres: float, what: str) -> int:
-    """A length in exact units, rounded once (NUMERICS.md N5). Raises BadRequestError for a negative or endless one."""
-    if not 0 <= metres < math.inf:
+    """A length in exact units, rounded once (NUMERICS.md N5). Raises BadRequestError for a negative or absurd one."""
+    if not 0 <= metres <= MAX_COORDINATE:  # not so for NaN either; kernels take the result as int64
         raise BadRequestError(f"{what} {metres!r}: expected zero or a positive length in metres")
     return round(metres * UNITS_PER_METRE)  # half to even
 

@@ -82,7 +82,7 @@ def find_reach(poses, avatar, radius, other_units, scene, index, reach):
 
 @nb.njit(nogil=True, cache=True)
 def voxels_in_reach(poses, avatar, scene, index, reach):
-    """List, for each pose, the voxels whose points the avatar's root sphere could touch, in an order of their places alone.
+    """List, for each pose, the voxels whose points the avatar's root sphere could touch, in an order of place.
 
     poses: (k, 4, 4), checked.  avatar: not empty.  scene: SceneArrays. Fills starts, rows, boxes and outside of `reach`
     from its scales and units. Returns how many rows are needed; those beyond the capacity are not written.

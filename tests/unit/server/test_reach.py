@@ -10,8 +10,8 @@ import scans
 from numpy.typing import NDArray
 from solidcloud.schemas.archive import Archive
 from solidcloud.server.avatar import make_avatar
-from solidcloud.server.collide import Reach, SceneData, find_reach, make_scene_data
-from solidcloud.server.kernels.reach import find_key
+from solidcloud.server.collide import SceneData, check_request, make_scene_data
+from solidcloud.server.kernels.reach import Reach, find_key
 from solidcloud.server.residency import Residency
 from solidcloud.server.scene import Scene
 from solidcloud.server.store import Store
@@ -46,7 +46,7 @@ def test_no_voxel_in_reach_is_left_out(
     avatar = rng.uniform(-0.2, 0.2, (30, 3))
     data, model = open_data(case), make_avatar(avatar, 0.02)
     poses = cases.near_poses(rng, case.points, avatar, 40, 0.5, scale)
-    reach = find_reach(data, model, poses, margin)
+    _, reach = check_request(data, model, poses, margin)
     with Archive(case.archive) as archive:
         lattice, step = archive.header.lattice, archive.header.lattice.step
     integers = naive.lattice_of(case.points, lattice.origin, step)
@@ -65,7 +65,7 @@ def test_no_voxel_in_reach_is_left_out(
         # And each one listed has its box within reach of the sphere around the avatar.
         center = placed.mean(axis=0)
         ball = np.linalg.norm(placed - center, axis=1).max() * 2 + most * 1.001 + 2 * step * naive.UNITS
-        low, high = data.low[rows] * step * naive.UNITS, data.high[rows] * step * naive.UNITS
+        low, high = data.index.low[rows] * step * naive.UNITS, data.index.high[rows] * step * naive.UNITS
         gap = np.maximum(np.maximum(low - center, center - high), 0)
         assert (np.linalg.norm(gap, axis=1) <= ball).all()
 
@@ -74,7 +74,7 @@ def test_more_voxels_than_expected_are_all_listed(tmp_path: Path) -> None:
     # 343 voxels of one point; one pose reaches nearly all, several times what room is made for at first.
     grid = np.stack(np.meshgrid(*[np.arange(7.0)] * 3), axis=-1).reshape(-1, 3)
     case = cases.build(tmp_path, grid, voxel=1.0, resolution=0.5)
-    reach = find_reach(open_data(case), make_avatar([[3.0, 3, 3]], 3.0), np.eye(4)[None], 1.5)
+    _, reach = check_request(open_data(case), make_avatar([[3.0, 3, 3]], 3.0), np.eye(4)[None], 1.5)
     apart = np.linalg.norm(grid - 3, axis=1)
     assert 300 < (apart <= 4.51).sum() <= len(listed(reach, 0)) <= (apart <= 5.1).sum()
 
@@ -89,15 +89,15 @@ def test_outside_is_where_the_reach_leaves_the_bounds(tmp_path: Path) -> None:
     poses = np.array(
         [_place(1.0), _place(0.14), _place(0.06), _place(-0.05), _place(50.0), _place(1.0, z=1.95)]
     )
-    reach = find_reach(data, make_avatar([[0.0, 0, 0]], 0.09), poses, 0.0)
+    _, reach = check_request(data, make_avatar([[0.0, 0, 0]], 0.09), poses, 0.0)
     assert reach.outside.tolist() == [False, False, True, True, True, True]
     assert listed(reach, 4) == []
 
 
 def test_a_request_without_poses_reaches_nothing(tmp_path: Path) -> None:
     data = open_data(cases.build(tmp_path, np.zeros((1, 3))))
-    reach = find_reach(data, make_avatar([[0.0, 0, 0]], 0.1), np.empty((0, 4, 4)), 0.0)
-    assert len(reach.rows) == len(reach.outside) == 0 and reach.starts.tolist() == [0]
+    _, reach = check_request(data, make_avatar([[0.0, 0, 0]], 0.1), np.empty((0, 4, 4)), 0.0)
+    assert len(reach.outside) == 0 and reach.starts.tolist() == [0]
 
 
 def test_terms_that_cancel_leave_no_voxel_out(tmp_path: Path, rng: np.random.Generator) -> None:

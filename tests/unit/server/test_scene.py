@@ -1,0 +1,113 @@
+"""A scene: avatars belong to clients, budgets are checked, what is closed stays closed."""
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import cases
+import numpy as np
+import pytest
+import scans
+from solidcloud.schemas.errors import BadRequestError, FormatError, UnknownAvatarError
+from solidcloud.server.scene import Scene
+
+BODY = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.0, 0.2, 0]])
+HERE = np.eye(4)[None]
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Scene:
+    """A scene of a few voxels."""
+    return Scene.open(cases.build(tmp_path, scans.make_scan("corner", 4, 300)).archive, "hall")
+
+
+def test_info_says_what_was_built(scene: Scene) -> None:
+    info = scene.info()
+    points = scans.make_scan("corner", 4, 300)
+    assert (info.scene, info.points, info.radius, info.lattice_step) == ("hall", 300, 0.01, 1e-4)
+    assert info.origin == points.min(axis=0).tolist()
+    assert np.abs(np.array(info.bounds) - [points.min(axis=0), points.max(axis=0)]).max() <= 0.5001e-4
+    assert info.sources[0].count == 300 and info.skipped == []
+    assert 0 < info.record_bytes < info.resident_bytes
+
+
+def test_the_folder_names_the_scene(tmp_path: Path) -> None:
+    with Scene.open(cases.build(tmp_path, np.zeros((1, 3))).archive) as scene:
+        assert scene.name == "archive0"
+
+
+def test_an_unknown_avatar_is_an_error(scene: Scene) -> None:
+    with pytest.raises(UnknownAvatarError, match="'al' is not known: add it"):
+        scene.collide("al", HERE)
+
+
+def test_a_name_stands_for_one_set_of_points(scene: Scene) -> None:
+    first = scene.add_avatar("al", BODY, 0.01)
+    assert scene.add_avatar("al", BODY.tolist(), 0.01) == first
+    for points, radius in (
+        (BODY + 1e-9, 0.01),
+        (BODY[:2], 0.01),
+        (BODY[::-1], 0.01),
+        (BODY, 0.02),
+        (BODY, None),
+    ):
+        with pytest.raises(BadRequestError, match="use another name"):
+            scene.add_avatar("al", points, radius)
+    BODY_COPY = BODY.copy()
+    scene.add_avatar("bo", BODY_COPY, 0.01)
+    BODY_COPY[0] += 1.0
+    with pytest.raises(BadRequestError, match="use another name"):
+        scene.add_avatar("bo", BODY_COPY, 0.01)
+
+
+def test_avatars_of_two_clients_do_not_meet(scene: Scene) -> None:
+    scene.add_avatar("al", BODY, 0.01, client="one")
+    scene.add_avatar("al", BODY + 3, 0.02, client="two")
+    with pytest.raises(UnknownAvatarError):
+        scene.collide("al", HERE)
+    assert len(scene.collide("al", HERE, client="one")) == 1
+    scene.drop_client("one")
+    with pytest.raises(UnknownAvatarError):
+        scene.collide("al", HERE, client="one")
+    assert len(scene.collide("al", HERE, client="two")) == 1
+    scene.add_avatar("al", BODY + 9, 0.01, client="one")
+
+
+def test_one_of_many_that_add_the_same_name_wins(scene: Scene) -> None:
+    def add(i: int) -> bool:
+        try:
+            scene.add_avatar("al", BODY + i % 2, 0.01)
+        except BadRequestError:
+            return False
+        return True
+
+    with ThreadPoolExecutor(8) as pool:
+        added = list(pool.map(add, range(40)))
+    assert added in ([True, False] * 20, [False, True] * 20)
+
+
+def test_a_budget_too_small_for_a_voxel_is_refused_and_closes_the_files(tmp_path: Path) -> None:
+    archive = cases.build(tmp_path, scans.make_scan("corner", 4, 300)).archive
+    before = len(os.listdir("/proc/self/fd")) if Path("/proc/self/fd").is_dir() else 0
+    with pytest.raises(BadRequestError, match="larger --cache"):
+        Scene.open(archive, budget_bytes=100)
+    if before:
+        assert len(os.listdir("/proc/self/fd")) == before
+
+
+def test_what_is_no_archive_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(FormatError, match="no archive here"):
+        Scene.open(tmp_path / "nowhere")
+
+
+def test_counters_add_up(scene: Scene, rng: np.random.Generator) -> None:
+    scene.add_avatar("al", BODY, 0.01)
+    poses = cases.near_poses(rng, scans.make_scan("corner", 4, 300), BODY, 20, 0.1)
+    first, second = scene.collide("al", poses), scene.collide("al", poses)
+    assert (first.hits, second.misses) == (0, 0) and first.misses == second.hits > 0
+    assert first.resident == second.resident == first.misses
+    assert (
+        0 < first.resident_bytes == second.resident_bytes <= 64 * first.resident + scene.info().resident_bytes
+    )
+    assert first.engine_seconds > 0
+    assert first.node_visits.tolist() == second.node_visits.tolist()

@@ -25,7 +25,7 @@ class Tree(NamedTuple):
     order: NDArray[np.int64]
     begin: NDArray[np.int64]
     end: NDArray[np.int64]
-    count: NDArray[np.uint8]
+    count: NDArray[np.uint8]  # type: ignore[assignment]  # hides tuple.count, which nobody calls
     levels: NDArray[np.int64]
 
 

@@ -28,7 +28,11 @@ def _canonical(points: VoxelPoints) -> tuple[VoxelPoints, NDArray[np.uint64]]:
     codes = voxel_codes(points.local)
     columns = [c for c in (points.intensity, points.scan_index) if c is not None]
     order = np.lexsort((*columns, codes)) if columns else np.argsort(codes, kind="stable")
-    taken = VoxelPoints(*(None if column is None else column[order] for column in points))
+    taken = VoxelPoints(
+        points.local[order],
+        None if points.scan_index is None else points.scan_index[order],
+        None if points.intensity is None else points.intensity[order],
+    )
     return taken, codes[order]
 
 

@@ -6,6 +6,7 @@ that by voxel and writes it as one run. A voxel is later gathered from the few r
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -25,7 +26,8 @@ SPOOL_BYTES_A_POINT = 120
 _SEEDS = (np.uint64(0x9E3779B97F4A7C15), np.uint64(0xD1B54A32D192ED03))
 
 
-class Survey(NamedTuple):
+@dataclass(frozen=True, slots=True, eq=False)
+class Survey:
     """What the first pass found of one scan.
 
     scan: the reader, its `dropped` filled.  sha256: of its file.  count: points that can be kept.
@@ -77,7 +79,8 @@ def open_all(path: Path, spacing: float | None) -> tuple[list[Scan], str]:
 
 def _usable(block: Block) -> NDArray[np.bool_]:
     """Which points of a block are finite and within the coordinates admitted (NUMERICS.md N7, case 16)."""
-    return (np.abs(block.xyz) <= MAX_COORDINATE).all(axis=1)  # comparison with NaN is false
+    inside = np.abs(block.xyz) <= MAX_COORDINATE  # false for NaN
+    return np.asarray(inside.all(axis=1))
 
 
 def survey_scan(scan: Scan, tick: Callable[[int], None] = lambda _: None) -> Survey:
@@ -168,7 +171,8 @@ def spool_dtype(config: BuildConfig) -> np.dtype:
     return np.dtype(fields)
 
 
-class SpoolUnit(NamedTuple):
+@dataclass(frozen=True, slots=True, eq=False)
+class SpoolUnit:
     """One scan to be spooled. number: its place among the scans.  run_points: points a run."""
 
     scan: Scan

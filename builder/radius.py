@@ -109,11 +109,10 @@ def search_tree(voxel: VoxelData, links: Links) -> SearchTree:
 def voxel_points(voxel: VoxelData, links: Links) -> NDArray[np.int64]:
     """The points of a voxel (p, 3) int64 [voxel steps], in stored order."""
     leaf = np.flatnonzero(links.is_leaf)
-    leaf = leaf[
-        np.argsort(links.first[leaf], kind="stable")
-    ]  # a cell that is one leaf node stands among the roots
+    # By first point: a cell that is one leaf node stands among the roots, before the others' leaf nodes.
+    leaf = leaf[np.argsort(links.first[leaf], kind="stable")]
     low = voxel.cells.low[links.cell[leaf]].astype(np.int64) + voxel.nodes.block_low[leaf]
-    return voxel.points + np.repeat(low, voxel.nodes.count[leaf], axis=0)
+    return np.repeat(low, voxel.nodes.count[leaf].astype(np.int64), axis=0) + voxel.points.astype(np.int64)
 
 
 def sample_mask(lattice: NDArray[np.int64], share: float) -> NDArray[np.bool_]:

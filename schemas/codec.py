@@ -145,9 +145,8 @@ def _leaf_runs(
 def _pack(rows: NDArray) -> bytes:
     """Byte planes (HDF5's shuffle) of a packed array, as one zstd frame with checksum and declared size."""
     planes = np.ascontiguousarray(rows.view(np.uint8).reshape(len(rows), -1).T)
-    return zstandard.ZstdCompressor(level=ZSTD_LEVEL, write_checksum=True, write_content_size=True).compress(
-        planes
-    )
+    compressor = zstandard.ZstdCompressor(level=ZSTD_LEVEL, write_checksum=True, write_content_size=True)
+    return compressor.compress(planes.data)
 
 
 def _unpack(frame: bytes, dtype: np.dtype, count: int, what: str) -> NDArray:

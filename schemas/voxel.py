@@ -53,7 +53,7 @@ class Nodes(NamedTuple):
     radius: NDArray[np.uint16]
     normal: NDArray[np.int8]
     slab: NDArray[np.int32]
-    count: NDArray[np.uint8]
+    count: NDArray[np.uint8]  # type: ignore[assignment]  # hides tuple.count, which nobody calls
     axis: NDArray[np.uint8]
     block_low: NDArray[np.uint16]
 

@@ -73,9 +73,11 @@ def make_avatar(points: ArrayLike, radius: float | None = None) -> AvatarModel:
     blocks = [ordered[a:b] for a, b in zip(tree.begin[leaves:], tree.end[leaves:], strict=True)]
     lanes = np.stack([np.concatenate([b, np.repeat(b[-1:], LANES - len(b), axis=0)]).T for b in blocks])
     # The lattice point lies within sqrt(3) steps of the point as given: two steps more hold it, rounding included.
+    center = np.asarray(local.low + bounds.center * local.step)
+    node_radius = np.asarray((bounds.radius + 2) * local.step, np.float64)
     arrays = Avatar(
-        local.low + bounds.center * local.step,
-        (bounds.radius + 2) * local.step,
+        center,
+        node_radius,
         first,
         tree.count.astype(np.int32),
         np.ascontiguousarray(lanes),

@@ -46,13 +46,13 @@ _POSE_FAULTS: dict[int, tuple[type[SolidcloudError], str]] = {
 class SceneData(NamedTuple):
     """What every question about one scene reads; made once, by `make_scene_data`.
 
-    arrays: what the overlap kernel reads.  index: what the broad phase reads.  radius_units: of every scan point,
+    arrays: what the overlap kernel reads.  broad: what the broad phase reads.  radius_units: of every scan point,
     exact units.  unknown: (u, 2, 3) int64, lattice boxes of scans left out; unknown_everywhere: also elsewhere.
     """
 
     residency: Residency
     arrays: SceneArrays
-    index: SceneIndex
+    broad: SceneIndex
     radius_units: int
     unknown: NDArray[np.int64]
     unknown_everywhere: bool
@@ -114,7 +114,7 @@ def check_request(
             np.empty((k, 2, 3)), np.zeros(k, bool),
         )  # fmt: skip
         fault, pose, found, needed = find_reach(
-            array, avatar.arrays, avatar.radius, other_units, data.arrays, data.index, reach
+            array, avatar.arrays, avatar.radius, other_units, data.arrays, data.broad, reach
         )
         if fault != placing.GOOD:
             error, text = _POSE_FAULTS[fault]

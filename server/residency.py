@@ -145,7 +145,7 @@ class Residency:
 
     def _allocate_all(self, rows: list[int]) -> bool:
         """Allocate for every row, evicting what is neither pinned nor loading; all or nothing."""
-        done = []
+        done: list[int] = []
         for row in rows:
             offset = self.buffer.allocate(self._sizes[row])
             while offset is None and (victim := self._victim()) is not None:

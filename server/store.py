@@ -21,9 +21,7 @@ class Store:
         """Open the archive in `folder`. Raises FormatError or CorruptError."""
         self.archive = Archive(folder)
         rows = self.archive.voxels
-        self.sizes: NDArray[np.int64] = resident_bytes(
-            rows["rows"][:, 1].astype(np.int64), rows["leaves"].astype(np.int64)
-        )
+        self.sizes = resident_bytes(rows["rows"][:, 1].astype(np.int64), rows["leaves"].astype(np.int64))
 
     def load(self, row: int, arena: Arena, offset: int) -> NDArray[np.int64]:
         """Read, check and lay out the voxel of index row `row` at byte `offset` of the arena.

@@ -34,8 +34,8 @@ class Arena(NamedTuple):
     halves: NDArray[np.uint16]
 
 
-def resident_bytes(nodes: int, leaves: int) -> int:
-    """Bytes a voxel of so many nodes, of them leaf nodes, takes in the arena; a multiple of 16."""
+def resident_bytes(nodes: NDArray[np.int64], leaves: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Bytes (v,) that voxels of so many nodes, of them leaf nodes, take in the arena; multiples of 16."""
     return 4 * ROW_WORDS * nodes + 4 * BLOCK_WORDS * leaves + 2 * 3 * LANES * leaves
 
 

@@ -74,7 +74,7 @@ class Limits(NamedTuple):
     error: np.float32
     near: np.float32
     far: np.float32
-    units: int
+    units: np.int64
 
 
 @nb.njit(nogil=True, cache=True)

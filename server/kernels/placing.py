@@ -35,7 +35,7 @@ class Avatar(NamedTuple):
     center: NDArray[np.float64]
     radius: NDArray[np.float64]
     first: NDArray[np.int32]
-    count: NDArray[np.int32]
+    count: NDArray[np.int32]  # type: ignore[assignment]  # hides tuple.count, which nobody calls
     points: NDArray[np.float64]
 
 

@@ -84,8 +84,8 @@ def find_reach(poses, avatar, radius, other_units, scene, index, reach):
 def voxels_in_reach(poses, avatar, scene, index, reach):
     """List, for each pose, the voxels whose points the avatar's root sphere could touch, in an order of place.
 
-    poses: (k, 4, 4), checked.  avatar: not empty.  scene: SceneArrays. Fills starts, rows, boxes and outside of `reach`
-    from its scales and units. Returns how many rows are needed; those beyond the capacity are not written.
+    poses: (k, 4, 4), checked.  avatar: not empty.  scene: SceneArrays. Fills starts, rows, boxes and outside of
+    `reach` from its scales and units. Returns how many rows are needed; those beyond the capacity are not written.
     The reach is widened by more than the rounding of this function: a millionth of itself, a step, and 2^-49 of the
     largest term that was added up.
     """

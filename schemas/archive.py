@@ -8,6 +8,7 @@ stands between a server and a record.
 
 import base64
 import contextlib
+import functools
 import hashlib
 import json
 import os
@@ -34,9 +35,9 @@ SHARD_FOLDER = "shards"
 ZSTD_FILTER = 32015  # registered with the HDF Group
 DATASETS = ("cells", "nodes", "points")
 
-# An HDF5 file of 463 bytes with one dataset, x, of one int8 in one chunk: the only way h5py leaves to name a
-# filter. A filter without a name is written with the one its plugin calls itself by, or none, depending on
-# whether the process happens to have a plugin for it, and then two builds of the same scans differ.
+# An HDF5 file of 463 bytes with one dataset, x, of one int8 in one chunk; made with a filter class registered as
+# "zstd" through ctypes. h5py leaves no other way to name a filter, and one without a name is written with what its
+# plugin calls itself, or with none, as the process happens to have a plugin loaded: two builds would differ.
 _PROPERTIES = (
     rb"c-rgqaB<`1lHy|K;9!7(|4?wA5yCfsinmX3)${jo31U*1u$&<q8CNg~A!~#IE+z(`5o|mRK#H;AFwA@p2C4zY86rtwCjl*B6"
     rb"k%XsVgv%H9E@h>VPF*CfblsPSb?r$=H`}VU}RzfIgk-7!(Yn^W>poJq%bgp6v{9#umDvcnTQfP480743lx@TKLG&yO*Ul"
@@ -151,15 +152,16 @@ def sync_folder(folder: Path) -> None:
         os.close(descriptor)
 
 
+@functools.cache
 def _creation_properties() -> h5py.h5p.PropDCID:
-    """How a record's dataset is made: shuffle, then zstd named "zstd" and optional, no times kept."""
+    """How a record's dataset is made: shuffle, then zstd named "zstd" and optional, no times kept. To be copied."""
     image = zlib.decompress(base64.b85decode(_PROPERTIES))
     return h5py.h5d.open(h5py.h5f.open_file_image(image), b"x").get_create_plist()
 
 
 def _write_frame(group: h5py.Group, name: str, frame: bytes, rows: int, dtype: np.dtype) -> tuple[int, int]:
     """Write one dataset of one chunk from its frame; returns the chunk's offset and size in the file."""
-    properties = _creation_properties()
+    properties = _creation_properties().copy()
     properties.set_chunk((rows,))
     space = h5py.h5s.create_simple((rows,))
     kind = h5py.h5t.py_create(dtype, logical=True)

@@ -11,8 +11,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, Protocol
 
-import numpy as np
-
 from ..schemas import keys
 from ..schemas.answers import CollideAnswers
 from ..schemas.errors import (
@@ -52,6 +50,7 @@ class SceneLike(Protocol):
     ) -> AvatarInfo: ...
     def collide(self, name: str, poses: Any, margin: float = 0.0, *, client: str = "") -> CollideAnswers: ...
     def drop_client(self, client: str) -> None: ...
+    def warm(self) -> None: ...
     def close(self) -> None: ...
 
 
@@ -101,17 +100,9 @@ class Service:
         self._scenes[scene].drop_client(client)
 
     def warm(self) -> None:
-        """Ask each scene one of everything, so that the first client does not wait for compilers."""
+        """Warm every scene, so that the first client does not wait for compilers."""
         for scene in self._scenes.values():
-            client = "warm-up"
-            point = np.array(self._infos[scene.name].bounds, np.float64).mean(axis=0)
-            pose = np.eye(4)[None]
-            pose[0, :3, 3] = point
-            try:
-                scene.add_avatar("warm-up", np.array([[0.0, 0, 0], [0.1, 0, 0]]), client=client)
-                scene.collide("warm-up", pose, client=client)
-            finally:
-                scene.drop_client(client)
+            scene.warm()
 
     def _ask(self, key: str, payload: bytes, encoding: str) -> Any:
         """Put one question to the scene its key names."""

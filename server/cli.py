@@ -221,10 +221,12 @@ def info(archive: ArchivePath, as_json: AsJson = False) -> None:
     import msgspec
 
     from .console import print_info
-    from .scene import Scene
+    from .scene import describe
+    from .store import Store
 
-    with Scene.open(archive) as scene:
-        found = scene.info()
+    store = Store(archive)
+    found = describe(store, archive.resolve().name)
+    store.close()
     if as_json:
         _print_json(msgspec.to_builtins(found))
     else:

@@ -64,37 +64,18 @@ class Scene:
         """The resident voxels, for counters and checks."""
         return self._data.residency
 
+    def warm(self) -> None:
+        """Ask one of everything, a load included, so that nobody waits for compilers after."""
+        archive = self._store.archive
+        row = int(np.argmin(self._store.sizes))
+        corner = archive.coordinates[row] * archive.header.lattice.voxel_steps + archive.voxels["low"][row]
+        pose = np.eye(4)[None]
+        pose[0, :3, 3] = archive.header.lattice.to_world(corner)
+        collide(self._data, make_avatar([[0.0, 0, 0], [0.1, 0, 0]]), pose)
+
     def info(self) -> SceneInfo:
         """What is served: counts, bounds, lattice, radius, sources."""
-        store = self._store
-        header = store.archive.header
-        lattice = header.lattice
-        return SceneInfo(
-            scene=self.name,
-            format_version=FORMAT_VERSION,
-            wire_version=WIRE_VERSION,
-            points=header.points,
-            voxels=len(store.sizes),
-            bounds=lattice.to_world(np.stack([header.low, header.high])).tolist(),
-            origin=list(lattice.origin),
-            lattice_step=lattice.step,
-            lattice_source=header.lattice_source,
-            voxel_size=lattice.voxel_size,
-            radius=header.radius,
-            radius_model=header.radius_model,
-            radius_error=header.radius_error,
-            radius_sample=header.radius_sample,
-            moved_max=header.moved_max,
-            degree=header.degree,
-            leaf=header.leaf,
-            sources=[
-                SourceInfo(s.path, s.index, s.sha256, s.count, s.format, s.pose.tolist(), s.skipped)
-                for s in header.sources
-            ],
-            skipped=[f"{s.path}: {s.fault}" for s in header.sources if s.fault],
-            record_bytes=int(store.archive.voxels["frame_bytes"].sum(dtype=np.int64)),
-            resident_bytes=int(store.sizes.sum()),
-        )
+        return describe(self._store, self.name)
 
     def add_avatar(
         self, name: str, points: ArrayLike, radius: float | None = None, *, client: str = ""
@@ -131,3 +112,35 @@ class Scene:
         with self._lock:
             for key in [key for key in self._avatars if key[0] == client]:
                 del self._avatars[key]
+
+
+def describe(store: Store, name: str) -> SceneInfo:
+    """What the archive of `store` holds: counts, bounds, lattice, radius, sources. Reads no voxel."""
+    header = store.archive.header
+    lattice = header.lattice
+    return SceneInfo(
+        scene=name,
+        format_version=FORMAT_VERSION,
+        wire_version=WIRE_VERSION,
+        points=header.points,
+        voxels=len(store.sizes),
+        bounds=lattice.to_world(np.stack([header.low, header.high])).tolist(),
+        origin=list(lattice.origin),
+        lattice_step=lattice.step,
+        lattice_source=header.lattice_source,
+        voxel_size=lattice.voxel_size,
+        radius=header.radius,
+        radius_model=header.radius_model,
+        radius_error=header.radius_error,
+        radius_sample=header.radius_sample,
+        moved_max=header.moved_max,
+        degree=header.degree,
+        leaf=header.leaf,
+        sources=[
+            SourceInfo(s.path, s.index, s.sha256, s.count, s.format, s.pose.tolist(), s.skipped)
+            for s in header.sources
+        ],
+        skipped=[f"{s.path}: {s.fault}" for s in header.sources if s.fault],
+        record_bytes=int(store.archive.voxels["frame_bytes"].sum(dtype=np.int64)),
+        resident_bytes=int(store.sizes.sum()),
+    )

@@ -30,8 +30,11 @@ class FloorScene:
         self.gate = threading.Event()
         self.avatars = {}
         self.gone = []
-        self.at_work = 0
+        self.at_work = self.warmed = 0
         self.lock = threading.Lock()
+
+    def warm(self):
+        self.warmed += 1
 
     def info(self):
         source = SourceInfo("floor.las", 0, "0" * 64, 4, "las", np.eye(4).tolist(), {"nan": 1})

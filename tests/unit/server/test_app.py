@@ -130,9 +130,9 @@ def test_avatars_are_their_clients(service, scene):
     assert error(ask(service, "collide", pose, client="one")).code == "unknown_avatar"
 
 
-def test_warming_leaves_no_avatar_behind(service, scene):
+def test_warming_warms_every_scene(service, scene):
     service.warm()
-    assert scene.at_work == 1 and not scene.avatars
+    assert scene.warmed == 1 and not scene.avatars
 
 
 def test_busy_says_how_many(service):

@@ -184,7 +184,7 @@ def write_shard(
     """
     rows = []
     with _new_file(path) as file:
-        file.attrs["format"] = "solidcloud shard"
+        file.attrs["format"] = np.bytes_("solidcloud shard")
         file.attrs["format_version"] = np.uint32(FORMAT_VERSION)
         file.attrs["archive_id"] = np.frombuffer(archive_id, np.uint8)
         parent = file.create_group("voxels", track_times=False)
@@ -299,9 +299,9 @@ def write_index(folder: Path, header: Header, voxels: NDArray, shards: list[tupl
     path = folder / INDEX_NAME
     columns = _columns(header, voxels, shards)
     with _new_file(path) as file:
-        file.attrs["format"] = "solidcloud"
+        file.attrs["format"] = np.bytes_("solidcloud")
         file.attrs["format_version"] = np.uint32(FORMAT_VERSION)
-        file.attrs["units"] = "m"
+        file.attrs["units"] = np.bytes_("m")
         file.attrs["archive_id"] = np.frombuffer(header.archive_id, np.uint8)
         file.attrs["sha256"] = np.frombuffer(_digest(header.archive_id, columns), np.uint8)
         for name, column in columns.items():
@@ -312,11 +312,22 @@ def write_index(folder: Path, header: Header, voxels: NDArray, shards: list[tupl
 # --- reading -------------------------------------------------------------------------------------------
 
 
+def _text_attribute(file: h5py.File, name: str) -> str:
+    """A text attribute of fixed length, "" where there is none.
+
+    Text of variable length lies in HDF5's global heap, which has no checksum: with one byte flipped there, HDF5
+    2.0 never came back. So it is neither written nor read.
+    """
+    if name not in file.attrs or file.attrs.get_id(name).dtype.kind != "S":
+        return ""
+    return bytes(file.attrs[name]).decode("ascii", "replace")
+
+
 def _read_columns(path: Path) -> tuple[bytes, dict[str, NDArray]]:
     """Every dataset of an index, after checking that none leads elsewhere or claims more than the file holds."""
     size = path.stat().st_size
     with h5py.File(path, "r") as file:
-        if str(file.attrs.get("format", "")) != "solidcloud":
+        if _text_attribute(file, "format") != "solidcloud":
             raise FormatError(
                 f"{path}: not a solidcloud index: give the folder that `solidcloud build` wrote"
             )
@@ -325,8 +336,9 @@ def _read_columns(path: Path) -> tuple[bytes, dict[str, NDArray]]:
             raise FormatError(
                 f"{path}: format version {version}, this software reads {FORMAT_VERSION}: use the one that wrote it"
             )
-        if str(file.attrs["units"]) != "m":
-            raise FormatError(f"{path}: units {file.attrs['units']!r}, expected 'm': rebuild the archive")
+        units = _text_attribute(file, "units")
+        if units != "m":
+            raise FormatError(f"{path}: units {units!r}, expected 'm': rebuild the archive")
         columns = {}
         for name in file:
             link = file.get(name, getlink=True)

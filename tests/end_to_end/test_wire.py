@@ -241,7 +241,7 @@ def test_one_slow_client_does_not_hold_up_others(client, scene, endpoint):
         for thread in threads:
             thread.start()
         try:
-            eventually(lambda: scene.at_work > 1)
+            eventually(lambda: scene.at_work > 0)
             for _ in range(20):
                 assert client.collide("al", heights([-1.0])).verdict.tolist() == [Verdict.CONTACT]
             assert not answers, "all five still wait, and only one of them is at work"

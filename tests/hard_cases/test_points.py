@@ -1,0 +1,138 @@
+"""Hard cases of points and where they lie; a test's number is its row in the table of hard cases (NUMERICS.md)."""
+
+import os
+from pathlib import Path
+
+import cases
+import numpy as np
+import pytest
+import scans
+from solidcloud.builder.config import BuildConfig
+from solidcloud.builder.pipeline import build_archive
+from solidcloud.builder.radius import voxel_points
+from solidcloud.schemas.archive import Archive
+from solidcloud.schemas.errors import BadRequestError, ScanError
+from solidcloud.server.scene import Scene
+
+INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
+POINT = np.zeros((1, 3))
+
+
+def places(points: np.ndarray) -> np.ndarray:
+    """Poses that only translate."""
+    return np.array([cases.pose_of(np.eye(3), point) for point in points]).reshape(-1, 4, 4)
+
+
+def stored(case: cases.Case) -> np.ndarray:
+    """All lattice points (n, 3) of an archive, sorted."""
+    with Archive(case.archive) as archive:
+        base = archive.coordinates * archive.header.lattice.voxel_steps
+        parts = [voxel_points(*archive.read_voxel(row)) + low for row, low in enumerate(base)]
+    return np.array(sorted(map(tuple, np.concatenate(parts).tolist())))
+
+
+@pytest.mark.interpreted
+def test_case_07_identical_points_build_and_answer(tmp_path: Path) -> None:
+    count = 10_000 if INTERPRETED else 1_000_000
+    points = np.full((count, 3), 0.125)
+    case = cases.build(tmp_path, points, voxel=8.0)
+    with Archive(case.archive) as archive:
+        assert len(archive.voxels) == 1
+        voxel, links = archive.read_voxel(0)
+        assert len(voxel.points) == count and len(voxel.cells.nodes) == 1, "one cell, over its capacity"
+        assert links.height <= 1 + np.ceil(np.log(count / 32) / np.log(8)), "and a tree of the usual height"
+    touching = places(np.array([[0.125, 0.125, 0.145], [0.125, 0.125, 0.1452]]))
+    assert cases.ask(case, POINT, 0.01, touching).tolist() == [1, 0]
+
+
+@pytest.mark.interpreted
+def test_case_09_one_point_an_empty_voxel_an_empty_avatar_an_empty_scene(tmp_path: Path) -> None:
+    with pytest.raises(BadRequestError, match="give --radius"):
+        cases.build(tmp_path, POINT, radius=None)
+    one = cases.build(tmp_path, POINT, radius=0.02)
+    assert cases.ask(one, POINT, 0.03, places(np.array([[0.05, 0, 0], [0.0501, 0, 0]]))).tolist() == [1, 0]
+    assert cases.ask(one, np.empty((0, 3)), 0.03, places(POINT)).tolist() == [0]
+    # Between two voxels with points lie some without: clear there, nothing missing, not outside.
+    apart = cases.build(tmp_path, np.array([[0.0, 0, 0], [9.0, 9, 9]]))
+    with Scene.open(apart.archive) as scene:
+        scene.add_avatar("ball", POINT, 0.1)
+        answers = scene.collide("ball", places(np.array([[4.5, 4.5, 4.5]])))
+    assert (answers.verdict[0], answers.outside[0], answers.voxels_missing[0]) == (0, False, 0)
+    nothing = scans.write_ply(tmp_path / "nothing.ply", np.empty((0, 3)))
+    with pytest.raises(ScanError, match="no usable point"):
+        build_archive([nothing], tmp_path / "empty", BuildConfig(jobs=1))
+    assert not (tmp_path / "empty").exists()
+
+
+@pytest.mark.interpreted
+def test_case_10_points_on_borders_are_each_in_one_cell(tmp_path: Path) -> None:
+    steps = np.array([-20, -11, -10, -9, -1, 0, 1, 9, 10, 11, 20])
+    points = np.stack(np.meshgrid(steps, steps, [0, 10], indexing="ij"), axis=-1).reshape(-1, 3) * 0.1
+    points[points == 0.0] = -0.0
+    case = cases.build(tmp_path, points, voxel=1.0, resolution=0.1, radius=0.0, cell_points=1)
+    expected = np.rint((points - points.min(axis=0)) / 0.1).astype(int)
+    assert stored(case).tolist() == sorted(expected.tolist())
+    with Archive(case.archive) as archive:
+        assert not np.signbit(archive.header.lattice.origin[2])
+        for row in range(len(archive.voxels)):
+            voxel, links = archive.read_voxel(row)
+            inside = voxel_points(voxel, links)
+            assert (inside >= 0).all() and (inside < 10).all()
+    on = np.concatenate([points, points + np.array([0.05, 0, 0])])
+    assert cases.ask(case, POINT, 0.01, places(on)).tolist() == [1] * len(points) + [0] * len(points)
+
+
+def test_case_11_contact_across_borders_for_any_voxels(tmp_path: Path, rng: np.random.Generator) -> None:
+    points, avatar = scans.make_scan("noise", 6, 800), rng.uniform(-0.3, 0.3, (20, 3))
+    poses = cases.near_poses(rng, points, avatar, 80, 0.06)
+    lows = points.min(axis=0)
+    found = []
+    for voxel, shift in ((8.0, 0.0), (0.3, 0.0), (0.07, 0.0), (0.3, 0.1), (0.3, 0.2)):
+        # A stray point moves the origin, and with it the grid, by whole steps: 0.1 m is 1,024 of 2^-10 m less 102.
+        stray = lows - np.rint(shift / cases.BINARY_STEP) * cases.BINARY_STEP if shift else lows
+        case = cases.build(
+            tmp_path,
+            np.concatenate([points, stray[None]]),
+            voxel=voxel,
+            resolution=cases.BINARY_STEP,
+            radius=0.015,
+        )
+        verdicts = cases.ask(case, avatar, 0.02, poses)
+        assert verdicts.tolist() == case.judge(avatar, 0.02, poses).astype(int).tolist()
+        if not shift:
+            found.append(verdicts.tolist())
+    assert found[0] == found[1] == found[2] and 10 < sum(found[0]) < 70
+    # Two points on either side of a border, each touched from the other side.
+    pair = cases.build(
+        tmp_path, np.array([[0.0, 0, 0], [0.999, 0, 0], [1.0, 0, 0]]), voxel=1.0, resolution=1e-3
+    )
+    beside = places(np.array([[0.975, 0, 0], [1.025, 0, 0], [0.9995, 0.02, 0], [-0.02, 0, 0]]))
+    assert cases.ask(pair, POINT, 0.016, beside).tolist() == [1, 1, 1, 1]
+
+
+@pytest.mark.interpreted
+def test_case_27_no_order_changes_answers_or_bytes(tmp_path: Path, rng: np.random.Generator) -> None:
+    points, avatar = scans.make_scan("corner", 8, 200), rng.uniform(-0.2, 0.2, (15, 3))
+    poses = cases.near_poses(rng, points, avatar, 10, 0.1)
+    first = cases.build(tmp_path, points, leaf=4, cell_points=20)
+    second = cases.build(tmp_path, rng.permutation(points), leaf=4, cell_points=20)
+    shards = [sorted((case.archive / "shards").iterdir()) for case in (first, second)]
+    assert [[f.read_bytes() for f in s] for s in shards[:1]] == [
+        [f.read_bytes() for f in s] for s in shards[1:]
+    ]
+    # Two files in either order: the whole archive is the same.
+    for name, part in (("a", points[:120]), ("b", points[120:])):
+        scans.write_ply(tmp_path / f"{name}.ply", part)
+    both = [tmp_path / "a.ply", tmp_path / "b.ply"]
+    options = BuildConfig(voxel=0.5, radius=0.01, jobs=1, leaf=4, cell_points=20)
+    for order, target in ((both, "ab"), (both[::-1], "ba")):
+        build_archive(order, tmp_path / target, options)
+    files = [sorted((tmp_path / target).rglob("*.h5")) for target in ("ab", "ba")]
+    assert [f.read_bytes() for f in files[0]] == [f.read_bytes() for f in files[1]]
+    ab = cases.Case(tmp_path / "ab", points)
+    verdicts = [
+        cases.ask(case, body, 0.01, poses).tolist()
+        for case in (first, second, ab)
+        for body in (avatar, avatar[::-1], rng.permutation(avatar))
+    ]
+    assert all(v == verdicts[0] for v in verdicts)

@@ -25,16 +25,16 @@ def source_points(path: Path) -> NDArray[np.float64]:
 
 
 @pytest.mark.parametrize(
-    ("name", "farthest"),
-    [("pumpA.e57", 0.25), ("cupola_las", 1.5), ("campus_scan_a.ply", 0.25)],
+    ("name", "part", "farthest"),
+    [("pumpA.e57", 20, 0.25), ("cupola_las", 80, 2.0), ("campus_scan_a.ply", 20, 0.25)],
     ids=["E57", "LAS in map coordinates", "PLY"],
 )
 def test_poses_near_surfaces_by_the_definition(
-    tmp_path: Path, real_scans: Path, rng: np.random.Generator, name: str, farthest: float
+    tmp_path: Path, real_scans: Path, rng: np.random.Generator, name: str, part: int, farthest: float
 ) -> None:
     build_archive([real_scans / name], tmp_path / "archive", BuildConfig(jobs=1))
     points = source_points(real_scans / name)
-    size = float(np.ptp(points, axis=0).max()) / 20
+    size = float(np.ptp(points, axis=0).max()) / part
     avatar = rng.uniform(-size, size, (150, 3)) * [0.3, 0.3, 1.0]
     poses = cases.near_poses(rng, points, avatar, 60, size * farthest)
     with Scene.open(tmp_path / "archive") as scene:

@@ -65,7 +65,7 @@ def test_no_voxel_in_reach_is_left_out(
         # And each one listed has its box within reach of the sphere around the avatar.
         center = placed.mean(axis=0)
         ball = np.linalg.norm(placed - center, axis=1).max() * 2 + most * 1.001 + 2 * step * naive.UNITS
-        low, high = data.index.low[rows] * step * naive.UNITS, data.index.high[rows] * step * naive.UNITS
+        low, high = data.broad.low[rows] * step * naive.UNITS, data.broad.high[rows] * step * naive.UNITS
         gap = np.maximum(np.maximum(low - center, center - high), 0)
         assert (np.linalg.norm(gap, axis=1) <= ball).all()
 

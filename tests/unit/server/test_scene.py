@@ -111,3 +111,10 @@ def test_counters_add_up(scene: Scene, rng: np.random.Generator) -> None:
     )
     assert first.engine_seconds > 0
     assert first.node_visits.tolist() == second.node_visits.tolist()
+
+
+def test_warming_loads_a_voxel_and_leaves_no_avatar(scene: Scene) -> None:
+    scene.warm()
+    assert scene.residency.resident >= 1
+    with pytest.raises(UnknownAvatarError):
+        scene.collide("warm-up", HERE)

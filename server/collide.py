@@ -14,7 +14,7 @@ from ..schemas.messages import make_poses
 from ..schemas.voxel_grid import MAX_COORDINATE, UNITS_PER_METRE
 from .avatar import AvatarModel
 from .kernels import placing
-from .kernels.overlap import CLEAR, UNKNOWN, SceneArrays, overlap_poses
+from .kernels.overlap import CLEAR, UNKNOWN, SceneArrays, answer_resident, overlap_poses
 from .kernels.reach import Reach, SceneIndex, find_reach
 from .residency import Residency
 
@@ -41,6 +41,11 @@ _POSE_FAULTS: dict[int, tuple[type[SolidcloudError], str]] = {
         "makes the avatar with its reach extend {:g} m: more than this scene's lattice can place exactly: split it",
     ),
 }
+
+
+# An avatar up to this size is answered under the residency's lock when a request holds one pose: 20 µs for the
+# 3,617 points of the walk. A larger one could keep others waiting, and gains little.
+QUICK_POINTS = 1 << 15
 
 
 class SceneData(NamedTuple):
@@ -95,32 +100,60 @@ def make_scene_data(archive: Archive, residency: Residency) -> SceneData:
     )
 
 
-def check_request(
-    data: SceneData, avatar: AvatarModel, poses: ArrayLike, margin: float
-) -> tuple[NDArray[np.float64], Reach]:
-    """The poses (k, 4, 4) of a request, all admissible, and the voxels in reach of each; none for an empty avatar.
+def _empty_reach(k: int, rows: int) -> Reach:
+    """A `Reach` to be filled for k poses with room for so many voxel rows."""
+    return Reach(
+        np.empty(k), np.empty(k, np.int64), np.zeros(k + 1, np.int64), np.empty(rows, np.int64), np.empty((k, 2, 3)),
+        np.zeros(k, bool),
+    )  # fmt: skip
+
+
+def _refuse(fault: int, pose: int, found: float) -> None:
+    """Raise what a fault that `find_reach` found stands for, if it is one."""
+    if fault != placing.GOOD:
+        error, text = _POSE_FAULTS[fault]
+        raise error(f"pose {pose} {text.format(found)}")
+
+
+def _check_request(
+    data: SceneData, avatar: AvatarModel, poses: NDArray[np.float64], other_units: int
+) -> Reach:
+    """The voxels in reach of each pose (k, 4, 4); none for an empty avatar.
 
     Raises BadRequestError, BadTransformError or TooLargeError naming the pose.
     """
-    array = make_poses(poses)
-    if not array.flags.writeable:
-        array = array.copy()  # numba compiles a read-only array anew
-    other_units = data.radius_units + to_units(margin, "margin")
-    k = len(array)
-    needed = 16 * k + 64
+    needed = 16 * len(poses) + 64
     while True:
-        reach = Reach(
-            np.empty(k), np.empty(k, np.int64), np.zeros(k + 1, np.int64), np.empty(needed, np.int64),
-            np.empty((k, 2, 3)), np.zeros(k, bool),
-        )  # fmt: skip
+        reach = _empty_reach(len(poses), needed)
         fault, pose, found, needed = find_reach(
-            array, avatar.arrays, avatar.radius, other_units, data.arrays, data.broad, reach
+            poses, avatar.arrays, avatar.radius, other_units, data.arrays, data.broad, reach
         )
-        if fault != placing.GOOD:
-            error, text = _POSE_FAULTS[fault]
-            raise error(f"pose {pose} {text.format(found)}")
+        _refuse(fault, pose, found)
         if needed <= len(reach.rows):
-            return array, reach
+            return reach
+
+
+def _answer_at_once(
+    data: SceneData,
+    avatar: AvatarModel,
+    poses: NDArray[np.float64],
+    other_units: int,
+    verdict: NDArray[np.uint8],
+    counts: NDArray[np.uint32],
+) -> tuple[Reach, int] | None:
+    """Answer one pose in one kernel call, as its voxels are resident nearly always; None: they are not.
+
+    Holding voxels and calling two kernels takes 30 µs more (scripts/bench_walk, "single call").
+    """
+    reach = _empty_reach(1, 64)
+    with data.residency.still():
+        fault, pose, found, needed, done = answer_resident(
+            poses, avatar.arrays, avatar.radius, other_units, data.arrays, data.broad, reach, verdict, counts
+        )
+        if done:
+            data.residency.use(reach.rows[:needed].tolist())
+    _refuse(fault, pose, found)
+    return (reach, needed) if done else None
 
 
 def _pieces(reach: Reach, residency: Residency) -> Iterator[tuple[NDArray[np.int64], list[int], Reach]]:
@@ -175,19 +208,27 @@ def collide(data: SceneData, avatar: AvatarModel, poses: ArrayLike, margin: floa
     found elsewhere); the definition is NUMERICS.md N5. Raises BadRequestError, BadTransformError, TooLargeError.
     """
     begin = time.perf_counter()
-    array, reach = check_request(data, avatar, poses, margin)
+    array = make_poses(poses)
+    if not array.flags.writeable:
+        array = array.copy()  # numba compiles a read-only array anew
+    other_units = data.radius_units + to_units(margin, "margin")
     k = len(array)
     verdict, counts = np.zeros(k, np.uint8), np.zeros((3, k), np.uint32)
-    if not len(avatar.points):
-        return CollideAnswers(verdict, reach.outside, *counts)
     residency = data.residency
     hits = misses = 0
     faults: dict[str, None] = {}
-    for which, rows, part in _pieces(reach, residency):
-        with residency.hold(rows) as held:
-            overlap_poses(array, avatar.arrays, data.arrays, part, which, verdict, counts)
-        hits, misses = hits + held.hits, misses + held.misses
-        faults.update(dict.fromkeys(held.faults))
+    at_once = None
+    if k == 1 and len(avatar.points) <= QUICK_POINTS:
+        at_once = _answer_at_once(data, avatar, array, other_units, verdict, counts)
+    if at_once is not None:
+        reach, hits = at_once
+    else:
+        reach = _check_request(data, avatar, array, other_units)
+        for which, rows, part in _pieces(reach, residency):
+            with residency.hold(rows) as held:
+                overlap_poses(array, avatar.arrays, data.arrays, part, which, verdict, counts)
+            hits, misses = hits + held.hits, misses + held.misses
+            faults.update(dict.fromkeys(held.faults))
     if data.unknown_everywhere or len(data.unknown):
         unseen = _in_unknown(reach.boxes, data.unknown, data.unknown_everywhere)
         verdict[unseen & (verdict == CLEAR)] = UNKNOWN

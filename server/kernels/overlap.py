@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .layout import BLOCK_WORDS, COUNT, FIRST, LANES, ROW_WORDS
-from .placing import largest_term, lattice_to_units, place, to_units
+from .placing import GOOD, largest_term, lattice_to_units, place, to_units
+from .reach import find_reach
 
 U32 = 2.0**-24  # half a unit in the last place of 1, float32
 # Relative slack of a float32 test: over 16 U32, where the sums below take at most 8.
@@ -317,3 +318,20 @@ def overlap_poses(poses, avatar, scene, reach, which, verdict, counts):
                     break
         counts[1, i] += np.uint32(counters[0])
         counts[2, i] += np.uint32(counters[1])
+
+
+@nb.njit(nogil=True, cache=True)
+def answer_resident(poses, avatar, radius, other_units, scene, index, reach, verdict, counts):
+    """A whole request in one call, where all voxels in its reach are resident: `find_reach`, then `overlap_poses`.
+
+    Returns what `find_reach` does, and whether the request is answered; if not, verdict and counts are untouched.
+    """
+    fault, pose, found, needed = find_reach(poses, avatar, radius, other_units, scene, index, reach)
+    if fault != GOOD or needed > reach.rows.shape[0]:
+        return fault, pose, found, needed, False
+    for at in range(needed):
+        if scene.where[reach.rows[at], 0] < 0:
+            return fault, pose, found, needed, False
+    if avatar.radius.shape[0] > 0:
+        overlap_poses(poses, avatar, scene, reach, np.arange(poses.shape[0]), verdict, counts)
+    return fault, pose, found, needed, True

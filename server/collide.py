@@ -115,7 +115,7 @@ def _refuse(fault: int, pose: int, found: float) -> None:
         raise error(f"pose {pose} {text.format(found)}")
 
 
-def _check_request(
+def check_request(
     data: SceneData, avatar: AvatarModel, poses: NDArray[np.float64], other_units: int
 ) -> Reach:
     """The voxels in reach of each pose (k, 4, 4); none for an empty avatar.
@@ -223,7 +223,7 @@ def collide(data: SceneData, avatar: AvatarModel, poses: ArrayLike, margin: floa
     if at_once is not None:
         reach, hits = at_once
     else:
-        reach = _check_request(data, avatar, array, other_units)
+        reach = check_request(data, avatar, array, other_units)
         for which, rows, part in _pieces(reach, residency):
             with residency.hold(rows) as held:
                 overlap_poses(array, avatar.arrays, data.arrays, part, which, verdict, counts)

@@ -9,12 +9,17 @@ import pytest
 import scans
 from numpy.typing import NDArray
 from solidcloud.schemas.archive import Archive
-from solidcloud.server.avatar import make_avatar
-from solidcloud.server.collide import SceneData, check_request, make_scene_data
+from solidcloud.server.avatar import AvatarModel, make_avatar
+from solidcloud.server.collide import SceneData, check_request, make_scene_data, to_units
 from solidcloud.server.kernels.reach import Reach, find_key
 from solidcloud.server.residency import Residency
 from solidcloud.server.scene import Scene
 from solidcloud.server.store import Store
+
+
+def find(data: SceneData, avatar: AvatarModel, poses: NDArray[np.float64], margin: float) -> Reach:
+    """The voxels in reach of a request."""
+    return check_request(data, avatar, poses, data.radius_units + to_units(margin, "margin"))
 
 
 def open_data(case: cases.Case) -> SceneData:
@@ -46,7 +51,7 @@ def test_no_voxel_in_reach_is_left_out(
     avatar = rng.uniform(-0.2, 0.2, (30, 3))
     data, model = open_data(case), make_avatar(avatar, 0.02)
     poses = cases.near_poses(rng, case.points, avatar, 40, 0.5, scale)
-    _, reach = check_request(data, model, poses, margin)
+    reach = find(data, model, poses, margin)
     with Archive(case.archive) as archive:
         lattice, step = archive.header.lattice, archive.header.lattice.step
     integers = naive.lattice_of(case.points, lattice.origin, step)
@@ -74,7 +79,7 @@ def test_more_voxels_than_expected_are_all_listed(tmp_path: Path) -> None:
     # 343 voxels of one point; one pose reaches nearly all, several times what room is made for at first.
     grid = np.stack(np.meshgrid(*[np.arange(7.0)] * 3), axis=-1).reshape(-1, 3)
     case = cases.build(tmp_path, grid, voxel=1.0, resolution=0.5)
-    _, reach = check_request(open_data(case), make_avatar([[3.0, 3, 3]], 3.0), np.eye(4)[None], 1.5)
+    reach = find(open_data(case), make_avatar([[3.0, 3, 3]], 3.0), np.eye(4)[None], 1.5)
     apart = np.linalg.norm(grid - 3, axis=1)
     assert 300 < (apart <= 4.51).sum() <= len(listed(reach, 0)) <= (apart <= 5.1).sum()
 
@@ -89,14 +94,14 @@ def test_outside_is_where_the_reach_leaves_the_bounds(tmp_path: Path) -> None:
     poses = np.array(
         [_place(1.0), _place(0.14), _place(0.06), _place(-0.05), _place(50.0), _place(1.0, z=1.95)]
     )
-    _, reach = check_request(data, make_avatar([[0.0, 0, 0]], 0.09), poses, 0.0)
+    reach = find(data, make_avatar([[0.0, 0, 0]], 0.09), poses, 0.0)
     assert reach.outside.tolist() == [False, False, True, True, True, True]
     assert listed(reach, 4) == []
 
 
 def test_a_request_without_poses_reaches_nothing(tmp_path: Path) -> None:
     data = open_data(cases.build(tmp_path, np.zeros((1, 3))))
-    _, reach = check_request(data, make_avatar([[0.0, 0, 0]], 0.1), np.empty((0, 4, 4)), 0.0)
+    reach = find(data, make_avatar([[0.0, 0, 0]], 0.1), np.empty((0, 4, 4)), 0.0)
     assert len(reach.outside) == 0 and reach.starts.tolist() == [0]
 
 

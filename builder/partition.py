@@ -202,7 +202,9 @@ def spool_scan(unit: SpoolUnit, tick: Callable[[int], None] = lambda _: None) ->
             rows["scan_index"] = unit.number
             columns.append(rows["scan_index"].astype(np.uint64))
         if "intensity" in rows.dtype.names and block.intensity is not None:
-            rows["intensity"] = block.intensity[good] + np.float32(0)  # + 0: no -0.0, one bit pattern a value
+            # One bit pattern a value, or bytes would depend on the order of duplicates: no -0.0, one NaN.
+            intensity = block.intensity[good] + np.float32(0)
+            rows["intensity"] = np.where(np.isnan(intensity), np.float32(np.nan), intensity)
             columns.append(rows["intensity"].view(np.uint32).astype(np.uint64))
         voxels = unit.lattice.voxel_of(lattice)
         rows["local"] = lattice - voxels * unit.lattice.voxel_steps

@@ -20,8 +20,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..schemas.archive import INDEX_NAME, SHARD_FOLDER, Archive, Header, Source, sync_folder, write_index
+from ..schemas.archive import INDEX_NAME, SHARD_FOLDER, Archive, sync_folder, write_index
 from ..schemas.errors import BadRequestError, CorruptError, ScanError, SolidcloudError
+from ..schemas.index import Header, Source
 from ..schemas.voxel_grid import Lattice
 from .config import RADIUS_SAMPLE, BuildConfig
 from .executor import Executor, worker_count
@@ -102,10 +103,9 @@ def build_archive(
     """
     begin = time.perf_counter()
     target = Path(target)
-    _check_target(target, config.overwrite)
     stages = _Stages(progress or Silent())
     target.parent.mkdir(parents=True, exist_ok=True)
-    with _lock(target), _workplace(target) as folder:
+    with _lock(target), _workplace(target, config.overwrite) as folder:
         surveys, faulty = _survey(scan_files(paths), config, stages)
         lattice, lattice_source = choose_lattice(surveys, config)
         points = sum(s.count for s in surveys)
@@ -176,8 +176,10 @@ def _lock(target: Path) -> Iterator[None]:
 
 
 @contextmanager
-def _workplace(target: Path) -> Iterator[Path]:
+def _workplace(target: Path, overwrite: bool) -> Iterator[Path]:
     """The hidden folder that the archive is made in; what an earlier, killed build left there goes first."""
+    _recover(target)
+    _check_target(target, overwrite)
     folder = target.parent / f".{target.name}.building"
     shutil.rmtree(folder, ignore_errors=True)
     (folder / SHARD_FOLDER).mkdir(parents=True)
@@ -188,12 +190,19 @@ def _workplace(target: Path) -> Iterator[Path]:
         shutil.rmtree(folder, ignore_errors=True)
 
 
+def _recover(target: Path) -> None:
+    """Finish what an earlier build with `overwrite` left when it was killed between its two renames."""
+    old = target.parent / f".{target.name}.old"
+    if old.exists() and not target.exists():
+        os.rename(old, target)
+    shutil.rmtree(old, ignore_errors=True)
+
+
 def _publish(folder: Path, target: Path, overwrite: bool) -> None:
     """Give the finished folder its name."""
     sync_folder(folder)
     if target.exists() and overwrite and (target / INDEX_NAME).is_file():
         old = target.parent / f".{target.name}.old"
-        shutil.rmtree(old, ignore_errors=True)
         os.rename(target, old)
         os.rename(folder, target)
         shutil.rmtree(old)

@@ -182,11 +182,13 @@ def _ask_neighbours(
     gap = np.maximum(np.maximum(low - high[row], low[row] - high), 0).astype(np.float64)
     apart = (gap * gap).sum(axis=1)
     to_box = np.empty(len(queries), np.int64)
-    for other in np.argsort(apart, kind="stable"):
+    # The box distance is a float64 sum of squares: a millionth less than it is surely a lower bound.
+    apart *= 1 - 1e-6
+    near_voxels = np.flatnonzero(apart < float(best.max()))
+    for other in near_voxels[np.argsort(apart[near_voxels], kind="stable")]:
         if other == row:
             continue
-        # The box distance is a float64 sum of squares: a millionth less than it is surely a lower bound.
-        if apart[other] * (1 - 1e-6) >= float(best.max()):
+        if apart[other] >= float(best.max()):
             break
         box_distance2(queries, low[other], high[other], to_box)
         near = np.flatnonzero(to_box < best)

@@ -9,16 +9,12 @@ stands between a server and a record.
 import base64
 import contextlib
 import functools
-import hashlib
-import json
 import os
 import re
 import threading
 import zlib
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
@@ -26,8 +22,9 @@ from numpy.typing import NDArray
 
 from .codec import CELL_DTYPE, NODE_DTYPE, Record, RecordShape, decode_voxel, point_dtype
 from .errors import CorruptError, FormatError
+from .index import VOXEL_DTYPE, Header, index_columns, index_digest, read_header
 from .voxel import Links, VoxelData
-from .voxel_grid import Lattice, voxel_coordinates
+from .voxel_grid import voxel_coordinates
 
 FORMAT_VERSION = 1
 INDEX_NAME = "index.h5"
@@ -43,74 +40,7 @@ _PROPERTIES = (
     rb"k%XsVgv%H9E@h>VPF*CfblsPSb?r$=H`}VU}RzfIgk-7!(Yn^W>poJq%bgp6v{9#umDvcnTQfP480743lx@TKLG&yO*Ul"
 )
 
-# One row a voxel, sorted by key. frame_*: where the dataset's only chunk lies in its shard, in the order of
-# DATASETS; checksum: the last four bytes of the zstd frame, so that a wrong offset cannot deliver another's.
-# leaves: leaf nodes, so that a server knows a voxel's decoded bytes before it loads it.
-VOXEL_DTYPE = np.dtype(
-    [
-        ("key", "<u8"),
-        ("shard", "<u4"),
-        ("frame_offset", "<u8", (3,)),
-        ("frame_bytes", "<u4", (3,)),
-        ("frame_checksum", "<u4", (3,)),
-        ("rows", "<u4", (3,)),
-        ("leaves", "<u4"),
-        ("low", "<i4", (3,)),
-        ("high", "<i4", (3,)),
-    ]
-)
 _SHARD_NAME = re.compile(r"[0-9]{1,9}-[0-9]{1,9}\.h5")
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Source:
-    """One scan that went in, or was left out.
-
-    index: of the scan inside its file.  sha256: of the file.  pose: (4, 4) float64, scan to world.
-    count: points stored.  skipped: reason -> points left out.  fault: why the whole scan was left out, or "".
-    """
-
-    path: str
-    index: int
-    format: str
-    sha256: str
-    count: int
-    pose: NDArray[np.float64]
-    skipped: dict[str, int]
-    fault: str = ""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Header:
-    """What the index says of the dataset as a whole.
-
-    archive_id: 16 bytes, from the points and options alone.  low, high: (3,) int64, least and greatest lattice
-    coordinates of the points, inclusive.  radius: half the mean closest-point distance [m]; radius_error: its
-    standard error [m], 0 when all points were asked; radius_sample: points asked.  moved_max: farthest that
-    quantising moved a point along an axis [m].  lattice_source: "sources", "given" or "default".
-    options: the build's.  unknown: (u, 2, 3) int64, lattice boxes, inclusive, of scans left out;
-    unknown_everywhere: one was left out of which not even the bounds are known.
-    """
-
-    archive_id: bytes
-    lattice: Lattice
-    lattice_source: str
-    points: int
-    low: NDArray[np.int64]
-    high: NDArray[np.int64]
-    radius: float
-    radius_model: str
-    radius_error: float
-    radius_sample: int
-    moved_max: float
-    degree: int
-    leaf: int
-    scan_index: bool
-    intensity: bool
-    options: dict[str, Any]
-    sources: tuple[Source, ...]
-    unknown: NDArray[np.int64]
-    unknown_everywhere: bool
 
 
 def shard_name(number: int, generation: int = 0) -> str:
@@ -234,76 +164,19 @@ def _verify_frames(path: Path, table: NDArray) -> None:
                     )
 
 
-def _texts(header: Header) -> bytes:
-    """The parts of the header that are words and options, as canonical JSON. Floats that matter are not in it."""
-    sources = [
-        {
-            "path": s.path,
-            "index": s.index,
-            "format": s.format,
-            "sha256": s.sha256,
-            "skipped": s.skipped,
-            "fault": s.fault,
-        }
-        for s in header.sources
-    ]
-    document = {
-        "lattice_source": header.lattice_source,
-        "radius_model": header.radius_model,
-        "options": header.options,
-        "sources": sources,
-    }
-    return json.dumps(document, sort_keys=True, separators=(",", ":")).encode()
-
-
-def _columns(header: Header, voxels: NDArray, shards: list[tuple[str, int]]) -> dict[str, NDArray]:
-    """Every dataset of the index by name. One place for writer, reader and digest."""
-    lattice = header.lattice
-    return {
-        "origin": np.array(lattice.origin, "<f8"),
-        "step": np.array([lattice.step], "<f8"),
-        "voxel_steps": np.array([lattice.voxel_steps], "<u4"),
-        "bounds": np.stack([header.low, header.high]).astype("<i8"),
-        "points": np.array([header.points], "<u8"),
-        "radius": np.array([header.radius, header.radius_error], "<f8"),
-        "radius_sample": np.array([header.radius_sample], "<u8"),
-        "moved_max": np.array([header.moved_max], "<f8"),
-        "tree": np.array([header.degree, header.leaf], "<u4"),
-        "columns": np.array([header.scan_index, header.intensity], "u1"),
-        "unknown": header.unknown.reshape(-1, 2, 3).astype("<i8"),
-        "unknown_everywhere": np.array([header.unknown_everywhere], "u1"),
-        "source_pose": np.array([s.pose for s in header.sources], "<f8").reshape(-1, 4, 4),
-        "source_count": np.array([s.count for s in header.sources], "<u8"),
-        "texts": np.frombuffer(_texts(header), "u1"),
-        "shards": np.array(
-            [(name.encode(), size) for name, size in shards], [("name", "S24"), ("bytes", "<u8")]
-        ),
-        "voxels": voxels,
-    }
-
-
-def _digest(archive_id: bytes, columns: dict[str, NDArray]) -> bytes:
-    """SHA-256 over the id and every dataset of the index, names and shapes included."""
-    digest = hashlib.sha256(archive_id)
-    for name, column in sorted(columns.items()):
-        digest.update(f"{name}:{column.dtype.str}:{column.shape}:".encode())
-        digest.update(np.ascontiguousarray(column).tobytes())
-    return digest.digest()
-
-
 def write_index(folder: Path, header: Header, voxels: NDArray, shards: list[tuple[str, int]]) -> None:
     """Write index.h5, the last file of an archive: with it the archive is whole.
 
     voxels: VOXEL_DTYPE rows sorted by key.  shards: name and bytes of each, in the order of their numbers.
     """
     path = folder / INDEX_NAME
-    columns = _columns(header, voxels, shards)
+    columns = index_columns(header, voxels, shards)
     with _new_file(path) as file:
         file.attrs["format"] = np.bytes_("solidcloud")
         file.attrs["format_version"] = np.uint32(FORMAT_VERSION)
         file.attrs["units"] = np.bytes_("m")
         file.attrs["archive_id"] = np.frombuffer(header.archive_id, np.uint8)
-        file.attrs["sha256"] = np.frombuffer(_digest(header.archive_id, columns), np.uint8)
+        file.attrs["sha256"] = np.frombuffer(index_digest(header.archive_id, columns), np.uint8)
         for name, column in columns.items():
             file.create_dataset(name, data=column)
     publish(path)
@@ -358,52 +231,11 @@ def _read_columns(path: Path) -> tuple[bytes, dict[str, NDArray]]:
                 )
             columns[name] = dataset[()]
         archive_id = file.attrs["archive_id"].tobytes()
-        if _digest(archive_id, columns) != file.attrs["sha256"].tobytes():
+        if index_digest(archive_id, columns) != file.attrs["sha256"].tobytes():
             raise CorruptError(
                 f"{path}: checksum differs from the one stored: damaged, restore or rebuild it"
             )
     return archive_id, columns
-
-
-def _header(archive_id: bytes, columns: dict[str, NDArray]) -> Header:
-    """The header from the index's datasets; the digest has vouched for them."""
-    texts = json.loads(columns["texts"].tobytes())
-    poses, counts = columns["source_pose"], columns["source_count"]
-    sources = tuple(
-        Source(
-            s["path"],
-            s["index"],
-            s["format"],
-            s["sha256"],
-            int(counts[i]),
-            poses[i],
-            s["skipped"],
-            s["fault"],
-        )
-        for i, s in enumerate(texts["sources"])
-    )
-    x, y, z = (float(v) for v in columns["origin"])
-    return Header(
-        archive_id=archive_id,
-        lattice=Lattice((x, y, z), float(columns["step"][0]), int(columns["voxel_steps"][0])),
-        lattice_source=texts["lattice_source"],
-        points=int(columns["points"][0]),
-        low=columns["bounds"][0].astype(np.int64),
-        high=columns["bounds"][1].astype(np.int64),
-        radius=float(columns["radius"][0]),
-        radius_model=texts["radius_model"],
-        radius_error=float(columns["radius"][1]),
-        radius_sample=int(columns["radius_sample"][0]),
-        moved_max=float(columns["moved_max"][0]),
-        degree=int(columns["tree"][0]),
-        leaf=int(columns["tree"][1]),
-        scan_index=bool(columns["columns"][0]),
-        intensity=bool(columns["columns"][1]),
-        options=texts["options"],
-        sources=sources,
-        unknown=columns["unknown"].astype(np.int64),
-        unknown_everywhere=bool(columns["unknown_everywhere"][0]),
-    )
 
 
 class Archive:
@@ -422,19 +254,19 @@ class Archive:
             )
         try:
             archive_id, columns = _read_columns(path)
-            self.header = _header(archive_id, columns)
+            self.header = read_header(archive_id, columns)
+            self.voxels = columns["voxels"].astype(VOXEL_DTYPE)
+            self._shards = [
+                (bytes(name).decode("ascii", "replace"), int(size)) for name, size in columns["shards"]
+            ]
         except (OSError, KeyError, ValueError, TypeError, AttributeError, RuntimeError) as error:
             raise FormatError(
                 f"{path}: not a readable archive index ({error}): restore or rebuild it"
             ) from error
-        self.voxels = columns["voxels"].astype(VOXEL_DTYPE)
         self.coordinates = voxel_coordinates(self.voxels["key"])
         self._shape_dtype = point_dtype(scan_index=self.header.scan_index, intensity=self.header.intensity)
         self._lock = threading.Lock()
         self._descriptors: dict[int, int] = {}
-        self._shards = [
-            (bytes(name).decode("ascii", "replace"), int(size)) for name, size in columns["shards"]
-        ]
         self._check_shards()
 
     def _check_shards(self) -> None:

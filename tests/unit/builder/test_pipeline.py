@@ -449,3 +449,15 @@ BAD_OPTIONS = [
 def test_impossible_options_are_refused(options: dict[str, object]) -> None:
     with pytest.raises(BadRequestError, match="expected"):
         BuildConfig(**options)
+
+
+def test_a_build_killed_between_its_two_renames_is_finished(tmp_path: Path) -> None:
+    scan = tmp_path / "scan.xyz"
+    write_xyz(scan, make_scan("plane", 5, 200))
+    target = tmp_path / "hall"
+    build([scan], target)
+    target.rename(tmp_path / ".hall.old")  # what --overwrite does first, and then it was killed
+    with pytest.raises(BadRequestError, match="already"):
+        build([scan], target)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["hall", "scan.xyz"]
+    assert verify_archive(target).faults == ()

@@ -20,7 +20,8 @@ from solidcloud.builder.radius import (
     search_tree,
     voxel_points,
 )
-from solidcloud.schemas.archive import Archive, Header
+from solidcloud.schemas.archive import Archive
+from solidcloud.schemas.index import Header
 from solidcloud.schemas.voxel import check_voxel
 
 STEP = 0.001

@@ -11,9 +11,10 @@ from scans import WITH_POINTS, make_scan, write_xyz
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import build_archive
 from solidcloud.builder.verify import verify_archive
-from solidcloud.schemas.archive import Archive, Header, shard_name, write_index, write_shard
+from solidcloud.schemas.archive import Archive, shard_name, write_index, write_shard
 from solidcloud.schemas.codec import encode_voxel
 from solidcloud.schemas.errors import FormatError
+from solidcloud.schemas.index import Header
 from solidcloud.schemas.voxel import VoxelData
 
 

@@ -5,10 +5,10 @@ out the same types.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from enum import IntEnum
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -31,8 +31,7 @@ class CollideAnswer(NamedTuple):
     point_tests: int
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class CollideAnswers:
+class CollideAnswers(msgspec.Struct, frozen=True, eq=False):
     """The answers for k poses, in the order of the poses. Iterating yields one `CollideAnswer` a pose.
 
     verdict: (k,) uint8, values of `Verdict`.  outside: (k,) bool, the reach leaves the dataset's bounds.

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple, Protocol, Self
 import zenoh
 
 from ..schemas import keys
-from ..schemas.errors import SolidcloudError
+from ..schemas.errors import BadRequestError, SolidcloudError
 from ..schemas.messages import JSON, MAX_MESSAGE_BYTES, MSGPACK
 from .config import ServerConfig
 
@@ -260,7 +260,7 @@ class _Lane:
         """One thread's work: take queries, answer them or leave them to the thread that is at work."""
         for query in queries:
             request = _Request(query)
-            offer = self._queues.offer(request.client, request, request.size)
+            offer = self._queues.offer(request.client, request, len(request.payload))
             if offer is Offer.RUN:
                 self._run(request.client, request)
             elif offer is Offer.FULL:
@@ -294,25 +294,25 @@ class _Lane:
     def _answer(self, request: "_Request") -> None:
         """Have one query answered. Leaving `with query` tells the client that no more will come."""
         with request.query as query:
-            payload = b"" if request.payload is None else request.payload.to_bytes()
-            answer = self._service.answer(request.key, payload, _encoding(query))
+            answer = self._service.answer(request.key, request.payload, _encoding(query))
             _reply(query, request.key_expr, answer)
 
 
 class _Request:
     """A query on its way, and what was read of it: each property of a query is a copy that costs."""
 
-    __slots__ = ("client", "key", "key_expr", "payload", "query", "size")
+    __slots__ = ("client", "key", "key_expr", "payload", "query")
 
     def __init__(self, query: zenoh.Query) -> None:
         self.query = query
         self.key_expr = query.key_expr
         self.key = str(self.key_expr)
-        parts = self.key.split("/")
-        # Whose queue it waits in. A key with wildcards is nobody's: the service refuses it.
-        self.client = parts[4] if len(parts) == 6 else ""
-        self.payload = query.payload
-        self.size = 0 if self.payload is None else len(self.payload)
+        try:
+            self.client = keys.parse_question(self.key).client  # whose queue it waits in
+        except BadRequestError:
+            self.client = ""  # nobody's: the service will refuse it
+        payload = query.payload
+        self.payload = b"" if payload is None else payload.to_bytes()
 
 
 def _encoding(query: zenoh.Query) -> str | None:

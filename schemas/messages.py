@@ -391,7 +391,7 @@ class _BinDecoder:
         self._writeable = issubclass(kind, _Request)
         if self._arrays:
             kind = msgspec.defstruct(kind.__name__, fields, bases=(kind,), frozen=True, eq=False)
-        self._decoder = msgspec.msgpack.Decoder(kind)
+        self._decoder: Any = msgspec.msgpack.Decoder(kind)
 
     def decode(self, payload: bytes) -> Any:
         """The message. msgspec.DecodeError, with what it names, where the payload is not one."""

@@ -45,7 +45,7 @@ _POSE_FAULTS: dict[int, tuple[type[SolidcloudError], str]] = {
 
 # An avatar up to this size is answered under the residency's lock when a request holds one pose: 20 µs for the
 # 3,617 points of the walk. A larger one could keep others waiting, and gains little.
-QUICK_POINTS = 1 << 15
+QUICK_POINTS = 1 << 13
 
 
 class SceneData(NamedTuple):
@@ -183,15 +183,17 @@ def _pieces(reach: Reach, residency: Residency) -> Iterator[tuple[NDArray[np.int
         return
     which: list[int] = []
     held: dict[int, None] = {}
+    held_bytes = 0
     for pose in range(k):
         own = reach.rows[reach.starts[pose] : reach.starts[pose + 1]].tolist()
         fresh = [row for row in own if row not in held]
-        if which and residency.bytes_of(list(held)) + residency.bytes_of(fresh) > budget:
+        if which and held_bytes + residency.bytes_of(fresh) > budget:
             yield np.array(which), list(held), reach
-            which, held = [], {}
+            which, held, held_bytes, fresh = [], {}, 0, own
         if residency.bytes_of(own) <= budget:
             which.append(pose)
-            held.update(dict.fromkeys(own))
+            held.update(dict.fromkeys(fresh))
+            held_bytes += residency.bytes_of(fresh)
             continue
         part: list[int] = []
         for row in [*own, -1]:

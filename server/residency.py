@@ -10,6 +10,7 @@ hold half of what the other needs cannot wait for each other for ever.
 import threading
 from collections import OrderedDict
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from typing import NamedTuple
 
 import numpy as np
@@ -64,7 +65,8 @@ class Residency:
         self.where = np.full((len(store.sizes), 3), -1, np.int64)
         self._store = store
         self._sizes = [ArenaBuffer.rounded(int(size)) for size in store.sizes]
-        self._changed = threading.Condition()
+        self._lock = threading.RLock()
+        self._changed = threading.Condition(self._lock)
         self._offsets: OrderedDict[int, int] = OrderedDict()  # row -> offset; least recently used first
         self._pins: dict[int, int] = {}
         self._loading: set[int] = set()
@@ -94,9 +96,9 @@ class Residency:
         """
         return Hold(self, rows)
 
-    def still(self) -> threading.Condition:
+    def still(self) -> AbstractContextManager[bool]:
         """For a `with` inside which what is resident stays so, and nobody else goes on: for tens of microseconds."""
-        return self._changed
+        return self._lock
 
     def use(self, rows: Sequence[int]) -> None:
         """Count resident voxels as used just now; inside `still`."""

@@ -34,15 +34,14 @@ def ceil_sqrt(value):
 
 
 @nb.njit(nogil=True, cache=True)
-def _ball_center(points, lo, hi, center):
-    """Guess the centre (3,) float64 of the least ball around points[lo:hi], int32."""
+def _ball_center(points, lo, hi, steps, center):
+    """Guess the centre (3,) float64 of the least ball around points[lo:hi], int32; 0 steps: the box's centre."""
     for k in range(3):
         least, most = points[lo, k], points[lo, k]
         for i in range(lo + 1, hi):
             least = min(least, points[i, k])
             most = max(most, points[i, k])
         center[k] = (float(least) + float(most)) * 0.5
-    steps = SMALL_STEPS if hi - lo <= SMALL_SET else LARGE_STEPS
     for step in range(steps):
         far, best = lo, -1.0
         for i in range(lo, hi):
@@ -111,35 +110,53 @@ def _least_variance(points, lo, hi, normal):
 
 
 @nb.njit(nogil=True, cache=True)
+def _radius(points, lo, hi, center, unit):
+    """Radius [units], rounded up, of the ball around a stored centre (3,) int64 [units] that holds points[lo:hi]."""
+    cx, cy, cz = center[0] * unit, center[1] * unit, center[2] * unit
+    farthest = np.int64(0)
+    for i in range(lo, hi):
+        dx, dy, dz = np.int64(points[i, 0]) - cx, np.int64(points[i, 1]) - cy, np.int64(points[i, 2]) - cz
+        farthest = max(farthest, dx * dx + dy * dy + dz * dz)
+    return (ceil_sqrt(farthest) + unit - 1) // unit
+
+
+@nb.njit(nogil=True, cache=True)
 def bound_points(points, lo, hi, unit_log2, highest, with_slab, center, normal, slab):
     """Bound points[lo:hi] by a sphere cut by a slab, stored as integers.
 
     points: (n, 3) int32, 0 to 2^23 [steps], lo < hi.  unit_log2: the stored unit, 2^unit_log2 steps.
-    highest: greatest coordinate a stored centre may have.  with_slab: False leaves the normal zero.
+    highest: greatest coordinate a stored centre may have, and the
+    greatest radius wanted.  with_slab: False leaves the normal zero.
     Writes center (3,) int64 [units], normal (3,) int64 of length about 127, slab (2,) int64: least and greatest
     dot(normal, point - center) [steps]. Returns the radius [units], int64, rounded up.
     """
     guess = np.empty(3)
-    _ball_center(points, lo, hi, guess)
     unit = np.int64(1) << np.int64(unit_log2)
+    steps = SMALL_STEPS if hi - lo <= SMALL_SET else LARGE_STEPS
+    radius = highest + 1
+    while radius > highest:
+        # A ball around the box's centre, tried last, has at most half the diagonal: 0.87 of `highest`, and fits.
+        _ball_center(points, lo, hi, steps, guess)
+        for k in range(3):
+            center[k] = min(max(np.int64(np.rint(guess[k] / float(unit))), 0), highest)
+        radius = _radius(points, lo, hi, center, unit)
+        if steps == 0:
+            break
+        steps = 0
     for k in range(3):
-        center[k] = min(max(np.int64(np.rint(guess[k] / float(unit))), 0), highest)
         normal[k] = 0
-    slab[0], slab[1] = 0, 0
     if with_slab and hi - lo >= 3:
         _least_variance(points, lo, hi, guess)
         for k in range(3):
             normal[k] = np.int64(np.rint(guess[k] * NORMAL_LENGTH))
     cx, cy, cz = center[0] * unit, center[1] * unit, center[2] * unit
-    farthest = np.int64(0)
     least, most = np.int64(1) << 62, -(np.int64(1) << 62)
     for i in range(lo, hi):
         dx, dy, dz = np.int64(points[i, 0]) - cx, np.int64(points[i, 1]) - cy, np.int64(points[i, 2]) - cz
-        farthest = max(farthest, dx * dx + dy * dy + dz * dz)
         along = normal[0] * dx + normal[1] * dy + normal[2] * dz
         least, most = min(least, along), max(most, along)
     slab[0], slab[1] = least, most
-    return (ceil_sqrt(farthest) + unit - 1) // unit
+    return radius
 
 
 @nb.njit(nogil=True, cache=True)

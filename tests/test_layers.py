@@ -1,4 +1,4 @@
-"""Who may import whom (STYLE.md, section 2), read from the sources: imports point down, one door a library."""
+"""Who may import whom, read from the sources: imports point down, and each library has one door."""
 
 import ast
 import sys

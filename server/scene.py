@@ -139,8 +139,9 @@ def describe(store: Store, name: str) -> SceneInfo:
         sources=[
             SourceInfo(s.path, s.index, s.sha256, s.count, s.format, s.pose.tolist(), s.skipped)
             for s in header.sources
+            if not s.fault
         ],
-        skipped=[f"{s.path}: {s.fault}" for s in header.sources if s.fault],
+        skipped=[s.fault for s in header.sources if s.fault],
         record_bytes=int(store.archive.voxels["frame_bytes"].sum(dtype=np.int64)),
         resident_bytes=int(store.sizes.sum()),
     )

@@ -23,7 +23,7 @@ class BuildConfig:
     resolution: lattice step [m]; None: the sources' own where all share one, else 0.1 mm, a twentieth of
     a terrestrial scanner's range noise.
     degree: children a node, 2 to 16 ([Fig12] table 1 tries 4 to 16); 8: all of 4 to 16 lie within
-    a factor of 1.2 in scripts/walkthrough, and 8 is among the best there with and without slabs.
+    a factor of 1.25 in scripts/walkthrough, and 8 is among the best there with and without slabs.
     leaf: points a leaf node, up to 32, the width of the vector test.
     cell_points: an octree cell above this is split: small enough for 16-bit trees, large enough that a
     cell's own row is noise in the archive.

@@ -2,10 +2,13 @@
 
 import multiprocessing
 import os
+import signal
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from typing import TypeVar
 
+from ..schemas.errors import SolidcloudError
 from .progress import Progress
 
 Unit = TypeVar("Unit")
@@ -22,6 +25,11 @@ def worker_count(jobs: int, points: int) -> int:
     return min(os.cpu_count() or 1, max(1, points // POINTS_WORTH_A_PROCESS))
 
 
+def _leave_interrupts() -> None:
+    """Ctrl-C is the builder's: it stops its workers, and they say nothing."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
 class Executor:
     """Maps a picklable function over work units. A context manager; with one job nothing is started."""
 
@@ -30,7 +38,9 @@ class Executor:
         self.jobs = jobs
         # Spawned, not forked: a fork copies locks that other threads hold, such as a progress bar's.
         context = multiprocessing.get_context("spawn")
-        self._pool = ProcessPoolExecutor(jobs, mp_context=context) if jobs > 1 else None
+        self._pool = (
+            ProcessPoolExecutor(jobs, mp_context=context, initializer=_leave_interrupts) if jobs > 1 else None
+        )
 
     def __enter__(self) -> "Executor":
         """The executor itself."""
@@ -60,7 +70,12 @@ class Executor:
         ahead = 4 * self.jobs
         futures = [self._pool.submit(function, unit) for unit in units[:ahead]]
         for i, unit in enumerate(units):
-            result = futures[i].result()
+            try:
+                result = futures[i].result()
+            except BrokenProcessPool:
+                raise SolidcloudError(
+                    "a worker process ended at once: out of memory? give fewer --jobs or a smaller --memory"
+                ) from None
             futures[i] = None  # type: ignore[call-overload]
             if i + ahead < len(units):
                 futures.append(self._pool.submit(function, units[i + ahead]))

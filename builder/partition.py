@@ -23,6 +23,9 @@ from .sources import Block, Scan, header_bounds, open_scans, sha256_of
 # Bytes a point that a spooling worker holds while it sorts: coordinates, keys, order and the sorted copy.
 SPOOL_BYTES_A_POINT = 120
 
+# A header's bounds are believed when no point lies farther outside [m]: they are rounded, but not by more.
+BOUNDS_WITHIN = 0.01
+
 _SEEDS = (np.uint64(0x9E3779B97F4A7C15), np.uint64(0xD1B54A32D192ED03))
 
 
@@ -105,18 +108,28 @@ def survey_scan(scan: Scan, tick: Callable[[int], None] = lambda _: None) -> Sur
         if count
         else f"{scan.path}: scan {scan.index} holds no usable point, expected at least one: leave it out"
     )
-    return Survey(scan, scan.path, digest, count, low, high, not_finite, fault, None, count == 0)
+    nothing_lost = count == 0 and not_finite == 0
+    region = None if count or nothing_lost else _region(scan, low, high)
+    return Survey(scan, scan.path, digest, count, low, high, not_finite, fault, region, nothing_lost)
 
 
 def unopened(path: Path, fault: str) -> Survey:
-    """The survey of a file that cannot be opened."""
+    """The survey of a file that cannot be opened, or, with no fault, that holds no scan at all."""
     none = np.zeros(3)
+    if not fault:
+        fault = f"{path}: holds no scan, expected at least one: leave it out"
+        return Survey(None, path, "", 0, none, none, 0, fault, None, empty=True)
     return Survey(None, path, "", 0, none, none, 0, fault, header_bounds(path))
 
 
 def _region(scan: Scan, low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    """Where a scan that broke off may have had points: its header's bounds and what was read of it."""
+    """Where a scan that broke off may have had points: its header's bounds and what was read of it.
+
+    None, not known: without such bounds, or when a point read lies outside them, for then they are wrong.
+    """
     if scan.bounds is None:
+        return None
+    if (low < scan.bounds[0] - BOUNDS_WITHIN).any() or (high > scan.bounds[1] + BOUNDS_WITHIN).any():
         return None
     return np.stack([np.minimum(scan.bounds[0], low), np.maximum(scan.bounds[1], high)])
 

@@ -12,7 +12,7 @@ import shutil
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -42,11 +42,13 @@ from .partition import (
 from .progress import Progress, Silent
 from .radius import MeanDistance, archive_sums, mean_of_squares
 from .shards import Shard, ShardUnit, build_shard, plan_shards
-from .sources import scan_files
+from .sources import NOT_FINITE, scan_files
 from .verify import verify_archive
 
 # Bytes a point that building one voxel holds at its peak (measured with 10^7 points in one voxel: 128).
 VOXEL_BYTES_A_POINT = 160
+# The column of scan numbers is uint16 (schemas/FORMAT.md).
+MAX_SCANS = 1 << 16
 # Bytes a point on disk at the end, at most (5 is the goal at 0.1 mm), to refuse a build that cannot finish.
 ARCHIVE_BYTES_A_POINT = 6
 
@@ -96,17 +98,17 @@ def build_archive(
 ) -> BuildSummary:
     """Build an archive in the folder `target` from scan files and folders of them.
 
-    The archive's bytes depend on the points, their files' content and the options in `config.identity()`; not on
-    the order of paths, the number of jobs or the memory bound. Raises ScanError naming every scan that cannot be
-    used (with `skip_bad` they are left out and their region is unknown), BadRequestError for impossible options, and
-    leaves nothing behind then.
+    The archive's bytes depend on the points, their files' content, the paths as given (in the index alone) and the
+    options in `config.identity()`; not on the order of paths, the number of jobs or the memory bound. Raises
+    ScanError naming every scan that cannot be used (with `skip_bad` they are left out and their region is unknown),
+    BadRequestError for impossible options, and leaves nothing behind then.
     """
     begin = time.perf_counter()
     target = Path(target)
     stages = _Stages(progress or Silent())
-    target.parent.mkdir(parents=True, exist_ok=True)
-    with _lock(target), _workplace(target, config.overwrite) as folder:
-        surveys, faulty = _survey(scan_files(paths), config, stages)
+    files = scan_files(paths)
+    with _parents(target), _lock(target), _workplace(target, config.overwrite) as folder:
+        surveys, faulty = _survey(files, config, stages)
         lattice, lattice_source = choose_lattice(surveys, config)
         points = sum(s.count for s in surveys)
         jobs = worker_count(config.jobs, points)
@@ -149,6 +151,27 @@ def _check_target(target: Path, overwrite: bool) -> None:
         raise BadRequestError(f"{target}: exists and is no archive, expected a new folder: give another -o")
     if not overwrite:
         raise BadRequestError(f"{target}: an archive is here already: give another -o, or --overwrite")
+    shards = list((target / SHARD_FOLDER).iterdir()) if (target / SHARD_FOLDER).is_dir() else []
+    strangers = [p for p in target.iterdir() if p.name not in (INDEX_NAME, SHARD_FOLDER)]
+    strangers += [p for p in shards if p.suffix != ".h5" or not p.is_file()]
+    if strangers:
+        raise BadRequestError(
+            f"{strangers[0]}: not part of an archive, and --overwrite would delete it: move it, or give another -o"
+        )
+
+
+@contextmanager
+def _parents(target: Path) -> Iterator[None]:
+    """Make the folders above the target; after a failure, remove those that were made here."""
+    made = [folder for folder in target.parents if not folder.exists()]
+    target.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        yield
+    except BaseException:
+        for folder in made:
+            with suppress(OSError):  # somebody else uses it by now
+                folder.rmdir()
+        raise
 
 
 @contextmanager
@@ -204,7 +227,11 @@ def _publish(folder: Path, target: Path, overwrite: bool) -> None:
     if target.exists() and overwrite and (target / INDEX_NAME).is_file():
         old = target.parent / f".{target.name}.old"
         os.rename(target, old)
-        os.rename(folder, target)
+        try:
+            os.rename(folder, target)
+        except OSError:
+            os.rename(old, target)
+            raise
         shutil.rmtree(old)
     else:
         os.rename(folder, target)  # replaces an empty folder
@@ -220,9 +247,7 @@ def _survey(paths: list[Path], config: BuildConfig, stages: _Stages) -> tuple[li
         surveys = [survey_scan(scan, stages.progress.advance) for scan in scans]
     for path, found, fault in opened:
         if not found:
-            surveys.append(
-                unopened(path, fault or f"{path}: holds no scan, expected at least one: leave it out")
-            )
+            surveys.append(unopened(path, fault))
     good = sorted((s for s in surveys if not s.fault), key=_content_order)
     faulty = sorted((s for s in surveys if s.fault), key=_content_order)
     if faulty and not config.skip_bad:
@@ -234,13 +259,23 @@ def _survey(paths: list[Path], config: BuildConfig, stages: _Stages) -> tuple[li
         raise ScanError(
             f"{paths[0] if paths else 'nothing'}: no usable scan, expected at least one: check the files"
         )
-    wrong = sum(s.not_finite for s in good)
+    if "scan" in config.keep and len(good) > MAX_SCANS:
+        raise BadRequestError(
+            f"--keep scan with {len(good)} scans: expected at most {MAX_SCANS}: build in parts"
+        )
+    wrong = sum(_not_finite(s) for s in good)
     if wrong and config.strict:
-        first = next(s for s in good if s.not_finite)
+        first = next(s for s in good if _not_finite(s))
         raise ScanError(
             f"{first.path}: {wrong} points that are not finite, expected none with --strict: clean the scan"
         )
     return good, faulty
+
+
+def _not_finite(survey: Survey) -> int:
+    """Points, or triangles of a sampled mesh, that were left out because they are not finite."""
+    dropped = survey.scan.dropped if survey.scan else {}
+    return survey.not_finite + sum(n for reason, n in dropped.items() if reason == NOT_FINITE)
 
 
 def _content_order(survey: Survey) -> tuple[str, int, str]:
@@ -295,7 +330,7 @@ def _header(
     sources = [
         Source(
             str(s.path), s.scan.index, s.scan.format, s.sha256, s.count, s.scan.pose,
-            {**spool.dropped, **({"not finite": s.not_finite} if s.not_finite else {})},
+            {**spool.dropped, **({NOT_FINITE: _not_finite(s)} if _not_finite(s) else {})},
         )
         for s, spool in zip(surveys, spooled, strict=True)
         if s.scan is not None

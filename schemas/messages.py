@@ -124,6 +124,8 @@ class SceneInfo(msgspec.Struct, frozen=True):
     radius_sample: points the mean closest-point distance was taken of.  degree, leaf: of the hierarchies.
     skipped: scans left out with `--skip-bad`.  record_bytes: of all records on disk.
     resident_bytes: of the whole archive, decoded.  effects: names a request may use; none in version 1.
+    unknown: boxes like `bounds` of scans left out, where nothing is called clear; unknown_everywhere: of one of
+    them not even the bounds are known.
     """
 
     scene: str
@@ -148,6 +150,8 @@ class SceneInfo(msgspec.Struct, frozen=True):
     record_bytes: int
     resident_bytes: int
     effects: list[str] = []
+    unknown: list[list[list[float]]] = []
+    unknown_everywhere: bool = False
 
 
 class ErrorReply(msgspec.Struct, frozen=True):

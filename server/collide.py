@@ -233,6 +233,8 @@ def collide(data: SceneData, avatar: AvatarModel, poses: ArrayLike, margin: floa
             return answers
     reach = check_request(data, avatar, array, other_units)
     verdict, counts = np.zeros(k, np.uint8), np.zeros((3, k), np.uint32)
+    if not len(avatar.points):
+        return CollideAnswers(verdict, reach.outside, *counts)  # clear, whatever is unknown here
     residency = data.residency
     hits = misses = 0
     faults: dict[str, None] = {}

@@ -161,4 +161,8 @@ def _info_facts(found: "SceneInfo") -> Iterator[tuple[str, str]]:
         left_out = "".join(f", {count:,} {reason} left out" for reason, count in source.skipped.items())
         yield "scan", f"{source.path} [{source.index}], {source.format}, {source.count:,} points{left_out}"
     for fault in found.skipped:
-        yield "unknown", fault
+        yield "left out", fault
+    for low, high in found.unknown:
+        yield "unknown", f"{' '.join(f'{v:.3f}' for v in low)} .. {' '.join(f'{v:.3f}' for v in high)} m"
+    if found.unknown_everywhere:
+        yield "unknown", "everywhere: of a scan left out not even the bounds are known"

@@ -108,7 +108,7 @@ class Residency:
 
     def acquire(self, rows: Sequence[int]) -> Held:
         """Begin a hold; `release` must follow, unless this raises."""
-        mine = self._reserve(rows)
+        mine, hits = self._reserve(rows)
         if not mine and not self._loading and not self._faults and not self._passing:
             return Held(len(rows), 0, ())  # all resident and pinned: nothing can change that
         try:
@@ -119,7 +119,7 @@ class Residency:
         except BaseException:
             self.release(rows)
             raise
-        return Held(len(rows) - len(mine), len(mine), faults)
+        return Held(hits, len(mine), faults)
 
     def release(self, rows: Sequence[int]) -> None:
         """End a hold."""
@@ -127,8 +127,11 @@ class Residency:
             self._unpin(rows)
             self._changed.notify_all()
 
-    def _reserve(self, rows: Sequence[int]) -> list[int]:
-        """Pin all rows and allocate for those to be loaded by this caller, which are returned."""
+    def _reserve(self, rows: Sequence[int]) -> tuple[list[int], int]:
+        """Pin all rows and allocate for those to be loaded by this caller.
+
+        Returns these, and how many of the others are resident or being loaded: a voxel with a fault is neither.
+        """
         if self.bytes_of(rows) > self.buffer.total_bytes:
             raise ValueError(
                 f"{len(rows)} voxels take {self.bytes_of(rows)} bytes, over the budget: ask in pieces"
@@ -151,9 +154,10 @@ class Residency:
             for row in rows:
                 if row in self._offsets:
                     self._offsets.move_to_end(row)
-            self.hits += len(rows) - len(mine)
+            hits = sum(row in self._offsets for row in rows) - len(mine)
+            self.hits += hits
             self.misses += len(mine)
-            return mine
+            return mine, hits
 
     def _allocate_all(self, rows: list[int]) -> bool:
         """Allocate for every row, evicting what is neither pinned nor loading; all or nothing."""

@@ -144,4 +144,6 @@ def describe(store: Store, name: str) -> SceneInfo:
         skipped=[s.fault for s in header.sources if s.fault],
         record_bytes=int(store.archive.voxels["frame_bytes"].sum(dtype=np.int64)),
         resident_bytes=int(store.sizes.sum()),
+        unknown=[lattice.to_world(box).tolist() for box in header.unknown],
+        unknown_everywhere=header.unknown_everywhere,
     )

@@ -29,6 +29,9 @@ BLOCK_BYTES = 64 << 20
 # No coordinate is farther from the origin than this [m] (NUMERICS.md, case 16).
 FARTHEST = 1e9
 
+# The reason under which points are counted that are not finite, or beyond FARTHEST.
+NOT_FINITE = "not finite"
+
 # Names a column of intensities goes by, in lower case; CloudCompare writes "scalar_" before its own.
 INTENSITY_NAMES = ("intensity", "scalar_intensity")
 
@@ -147,7 +150,8 @@ def checked_bounds(bounds: NDArray[np.float64]) -> NDArray[np.float64] | None:
 
     Writers that do not know them leave zeros, infinities or the largest float64 (high below low in some).
     """
-    if np.isfinite(bounds).all() and (np.abs(bounds) <= FARTHEST).all() and (bounds[0] <= bounds[1]).all():
+    believable = np.isfinite(bounds).all() and (np.abs(bounds) <= FARTHEST).all()
+    if believable and (bounds[0] <= bounds[1]).all() and (bounds[0] < bounds[1]).any():
         return bounds
     return None
 

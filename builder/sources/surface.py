@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from .scan import Block, Scan, reader_library, scan_error
+from .scan import NOT_FINITE, Block, Scan, reader_library, scan_error
 
 # Steps of the additive sequence in two dimensions with the plastic number 1.3247...: of all such known the
 # one whose points keep farthest apart (Roberts 2018, "The unreasonable effectiveness of quasirandom
@@ -34,6 +34,9 @@ class SurfaceSamples(Scan):
             np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
         )
         # A triangle with a corner that is not finite has no area to sample.
+        lost = int(np.count_nonzero(~np.isfinite(area)))
+        if lost:
+            self.dropped[NOT_FINITE] = lost
         total = np.cumsum(np.where(np.isfinite(area), area, 0.0))
         count = int(np.ceil(total[-1] / self._spacing**2)) if len(total) else 0
         for start in range(0, count, block_points):

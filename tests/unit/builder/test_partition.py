@@ -66,12 +66,20 @@ def test_a_survey_counts_usable_points_and_their_bounds(tmp_path: Path) -> None:
     assert np.array_equal(survey.high, good.max(axis=0))
 
 
-@pytest.mark.parametrize("xyz", [np.empty((0, 3)), np.full((4, 3), np.nan)])
-def test_a_scan_without_usable_points_is_at_fault_but_loses_nothing(xyz: np.ndarray, tmp_path: Path) -> None:
-    survey = survey_scan(listed(tmp_path, xyz))
+def test_a_scan_without_points_is_at_fault_but_loses_nothing(tmp_path: Path) -> None:
+    survey = survey_scan(listed(tmp_path, np.empty((0, 3))))
     assert "holds no usable point, expected at least one" in survey.fault
     assert survey.empty
     assert survey.region is None
+
+
+def test_points_that_are_all_unusable_were_somewhere(tmp_path: Path) -> None:
+    scan = listed(tmp_path, np.full((4, 3), np.nan))
+    survey = survey_scan(scan)
+    assert "holds no usable point, expected at least one" in survey.fault
+    assert (survey.empty, survey.region) == (False, None)
+    scan.bounds = np.array([[0.0, 0, 0], [1.0, 1, 1]])
+    assert np.array_equal(survey_scan(scan).region, scan.bounds)
 
 
 def test_a_scan_that_breaks_off_may_have_covered_header_and_points(tmp_path: Path) -> None:
@@ -80,11 +88,13 @@ def test_a_scan_that_breaks_off_may_have_covered_header_and_points(tmp_path: Pat
     survey = survey_scan(scan)
     assert (survey.count, survey.region, survey.empty) == (0, None, False)
     assert "broke off" in survey.fault
-    scan.bounds = np.array([[0.5, 0.5, 0.5], [1.0, 1.0, 9.0]])
+    low, high = xyz[:200].min(axis=0), xyz[:200].max(axis=0)
+    scan.bounds = np.array([low + 0.001, high + 9.0])  # rounded, but not by more
     region = survey_scan(scan).region
     assert region is not None
-    assert np.array_equal(region[0], np.minimum(xyz[:200].min(axis=0), 0.5))
-    assert np.array_equal(region[1], np.maximum(xyz[:200].max(axis=0), [1, 1, 9]))
+    assert np.array_equal(region, [low, high + 9.0])
+    scan.bounds = np.array([low + 0.5, high + 9.0])
+    assert survey_scan(scan).region is None, "a point lies outside: the header's bounds are wrong"
 
 
 def test_a_file_that_cannot_be_opened_gives_its_fault(tmp_path: Path) -> None:

@@ -461,3 +461,51 @@ def test_a_build_killed_between_its_two_renames_is_finished(tmp_path: Path) -> N
         build([scan], target)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["hall", "scan.xyz"]
     assert verify_archive(target).faults == ()
+
+
+def test_overwrite_deletes_nothing_that_is_no_part_of_an_archive(tmp_path: Path) -> None:
+    scan = tmp_path / "scan.xyz"
+    write_xyz(scan, make_scan("plane", 5, 200))
+    build([scan], tmp_path / "hall")
+    for stranger in ("notes.txt", "shards/notes.txt"):
+        (tmp_path / "hall" / stranger).write_text("mine")
+        with pytest.raises(BadRequestError, match=r"notes\.txt: not part of an archive"):
+            build([scan], tmp_path / "hall", overwrite=True)
+        assert (tmp_path / "hall" / stranger).read_text() == "mine"
+        (tmp_path / "hall" / stranger).unlink()
+    build([scan], tmp_path / "hall", overwrite=True)
+
+
+def test_a_failed_build_removes_the_folders_it_made(tmp_path: Path) -> None:
+    empty = tmp_path / "empty.xyz"
+    empty.write_text("nan nan nan\n")
+    for paths in ([tmp_path / "nothere.las"], [empty]):
+        with pytest.raises(ScanError):
+            build(paths, tmp_path / "new" / "deeper" / "hall")
+    assert [p.name for p in tmp_path.iterdir()] == ["empty.xyz"]
+
+
+def test_a_header_that_cannot_be_right_leaves_all_unknown(tmp_path: Path) -> None:
+    good = tmp_path / "good.xyz"
+    write_xyz(good, make_scan("plane", 5, 200))
+    raw = np.random.default_rng(1).integers(0, 1000, (500, 3))
+    # Bounds of zeros, as writers leave them that do not know; bounds that points read lie outside of; and a
+    # damaged scale, by which no point is finite though the bounds look right.
+    for name, patch in (
+        ("zero", (179, np.zeros(6))),
+        ("wrong", (179, np.array([1.0, 0, 1, 0, 1, 0]) - 50)),
+        ("scale", (131, np.full(3, 1e308))),
+    ):
+        bad = tmp_path / f"{name}.las"
+        write_las(bad, raw, scale=0.01, offset=(100.0, 100, 0))
+        data = bytearray(bad.read_bytes())
+        data[patch[0] : patch[0] + patch[1].nbytes] = patch[1].tobytes()
+        bad.write_bytes(data if name == "scale" else data[:-20])
+        build([good, bad], tmp_path / name, skip_bad=True)
+        with Archive(tmp_path / name) as archive:
+            assert archive.header.unknown_everywhere or len(archive.header.unknown) == 1
+            if name == "zero":
+                assert archive.header.unknown_everywhere
+            for low, high in archive.header.unknown:
+                lost = archive.header.lattice.to_lattice(raw * 0.01 + [100.0, 100, 0])
+                assert ((lost >= low) & (lost <= high)).all() or name == "wrong"

@@ -1,11 +1,12 @@
 """The options of a build, frozen; each default with its reason."""
 
+import math
 from dataclasses import dataclass, field
 
 from ..schemas.errors import BadRequestError
 from ..schemas.voxel import MAX_DEGREE, MAX_LEAF, MIN_DEGREE
 
-# Options that change bytes of the archive are in `identity()`; the others only change how it is made.
+# Closest-point distances are measured at about this many points; of fewer, at all.
 RADIUS_SAMPLE = 1_000_000
 
 # Points in a work unit, one shard: large enough that opening a file is noise, small enough that two
@@ -13,6 +14,9 @@ RADIUS_SAMPLE = 1_000_000
 SHARD_POINTS = 1 << 22
 
 DEFAULT_STEP = 1e-4
+
+# Radii and margins are compared as integers whose squares must fit (schemas/NUMERICS.md N5): 16 m in all.
+MAX_RADIUS = 8.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,14 +64,22 @@ class BuildConfig:
             ),
             (1 <= self.leaf <= MAX_LEAF, f"--leaf {self.leaf}", f"1 to {MAX_LEAF}"),
             (self.cell_points >= 1, f"cell_points {self.cell_points}", "at least 1"),
-            (self.voxel > 0, f"--voxel {self.voxel}", "a positive length in metres"),
+            (0 < self.voxel < math.inf, f"--voxel {self.voxel}", "a positive length in metres"),
             (
-                self.resolution is None or self.resolution > 0,
+                self.resolution is None or 0 < self.resolution < math.inf,
                 f"--resolution {self.resolution}",
                 "a positive step",
             ),
-            (self.spacing is None or self.spacing > 0, f"--spacing {self.spacing}", "a positive distance"),
-            (self.radius is None or self.radius >= 0, f"--radius {self.radius}", "zero or a positive length"),
+            (
+                self.spacing is None or 0 < self.spacing < math.inf,
+                f"--spacing {self.spacing}",
+                "a positive distance",
+            ),
+            (
+                self.radius is None or 0 <= self.radius <= MAX_RADIUS,
+                f"--radius {self.radius}",
+                f"0 to {MAX_RADIUS} m",
+            ),
             (self.jobs >= 0, f"--jobs {self.jobs}", "0 (all cores) or more"),
             (self.memory_bytes >= 64 << 20, f"--memory {self.memory_bytes} bytes", "at least 64MB"),
             (

@@ -1,8 +1,8 @@
 """The bounding sphere hierarchy (BSH) of a set of points: a leaf cell's, a voxel's cells', an avatar's.
 
 [Fig12] section 5: an R-tree-like tree of spheres of degree m, all leaf nodes on one level, each point in
-one node. Two differences, both measured in scripts/bench_walk: nodes are packed from the top, not by
-insertion, and each sphere is cut by a slab, because scanned surfaces are flat and spheres are not.
+one node. Two differences: nodes are packed from the top, not by insertion, and each sphere is cut by a
+slab, because scanned surfaces are flat and spheres are not (scripts/walkthrough compares both kinds of node).
 """
 
 from typing import NamedTuple

@@ -86,13 +86,15 @@ def _usable(block: Block) -> NDArray[np.bool_]:
     return np.asarray(inside.all(axis=1))
 
 
-def survey_scan(scan: Scan, tick: Callable[[int], None] = lambda _: None) -> Survey:
-    """Read a scan once: bounds, counts, and whether it can be read to its end."""
+def survey_scan(
+    scan: Scan, tick: Callable[[int], None] = lambda _: None, sha256: Callable[[Path], str] = sha256_of
+) -> Survey:
+    """Read a scan once: bounds, counts, and whether it can be read to its end. sha256: of a file, may remember."""
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     count = not_finite = 0
     digest = ""
     try:
-        digest = sha256_of(scan.path)
+        digest = sha256(scan.path)
         for block in scan.blocks():
             good = _usable(block)
             xyz = block.xyz[good] if not good.all() else block.xyz

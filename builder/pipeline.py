@@ -14,11 +14,13 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
+from functools import cache
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..schemas.archive import INDEX_NAME, SHARD_FOLDER, Archive, sync_folder, write_index
 from ..schemas.errors import BadRequestError, CorruptError, ScanError, SolidcloudError
@@ -42,7 +44,7 @@ from .partition import (
 from .progress import Progress, Silent
 from .radius import MeanDistance, archive_sums, mean_of_squares
 from .shards import Shard, ShardUnit, build_shard, plan_shards
-from .sources import NOT_FINITE, scan_files
+from .sources import NOT_FINITE, scan_files, sha256_of
 from .verify import verify_archive
 
 # Bytes a point that building one voxel holds at its peak (measured with 10^7 points in one voxel: 128).
@@ -115,8 +117,11 @@ def build_archive(
         _check_space(target.parent, points, config)
         with Executor(jobs) as executor:
             spooled = _spool(surveys, lattice, folder, executor, config, stages)
-            header = _header(surveys, faulty, spooled, lattice, lattice_source, config)
-            header, shards = _build_voxels(spooled, header, folder, executor, config, stages)
+        header = _header(surveys, faulty, spooled, lattice, lattice_source, config)
+        keys, counts = _voxel_counts(spooled)
+        with Executor(_jobs_that_fit(jobs, int(counts.max()), config)) as executor:
+            plans = plan_shards(keys, counts)
+            shards = _build_voxels(spooled, plans, header, folder, executor, config, stages)
             header = _measure_radius(header, shards, folder, executor, config, stages)
         shutil.rmtree(folder / "spool")
         report = verify_archive(folder, progress=stages.progress)
@@ -244,7 +249,8 @@ def _survey(paths: list[Path], config: BuildConfig, stages: _Stages) -> tuple[li
     scans = [scan for _, found, _ in opened for scan in found]
     total = sum(scan.declared_count or 0 for scan in scans)
     with stages.stage("survey", total, "points"):
-        surveys = [survey_scan(scan, stages.progress.advance) for scan in scans]
+        sha256 = cache(sha256_of)  # a file of many scans is hashed once
+        surveys = [survey_scan(scan, stages.progress.advance, sha256) for scan in scans]
     for path, found, fault in opened:
         if not found:
             surveys.append(unopened(path, fault))
@@ -377,40 +383,44 @@ def _header(
     )
 
 
+def _voxel_counts(spooled: list[Spooled]) -> tuple[NDArray[np.uint64], NDArray[np.int64]]:
+    """The keys of all voxels, ascending, and how many points each holds."""
+    runs = [run for s in spooled for run in s.runs]
+    keys, where = np.unique(np.concatenate([run.keys for run in runs]), return_inverse=True)
+    counts = np.bincount(where, np.concatenate([np.diff(run.starts) for run in runs]))
+    return keys, counts.astype(np.int64)
+
+
+def _jobs_that_fit(jobs: int, densest: int, config: BuildConfig) -> int:
+    """Processes that may each hold the densest voxel: fewer where their number was left open, else refused."""
+    needed = densest * VOXEL_BYTES_A_POINT
+    fit = config.memory_bytes // needed
+    if fit < (jobs if config.jobs else 1):
+        raise BadRequestError(
+            f"a voxel of {densest} points takes about {needed >> 20} MB to build, {jobs if config.jobs else 1} at a "
+            "time: give a smaller --voxel, a larger --memory or fewer --jobs"
+        )
+    return min(jobs, fit)
+
+
 def _build_voxels(
     spooled: list[Spooled],
+    plans: list[tuple[tuple[int, ...], int]],
     header: Header,
     folder: Path,
     executor: Executor,
     config: BuildConfig,
     stages: _Stages,
-) -> tuple[Header, list[Shard]]:
-    """Third pass: every voxel's octree and hierarchies, into shards."""
+) -> list[Shard]:
+    """Third pass: every voxel's octree and hierarchies, into the shards planned."""
     runs: tuple[Run, ...] = tuple(run for s in spooled for run in s.runs)
-    keys, where = np.unique(np.concatenate([run.keys for run in runs]), return_inverse=True)
-    counts = np.bincount(where, np.concatenate([np.diff(run.starts) for run in runs])).astype(np.int64)
-    densest = int(counts.max())
-    if densest * VOXEL_BYTES_A_POINT * executor.jobs > config.memory_bytes:
-        raise BadRequestError(
-            f"a voxel of {densest} points takes about {densest * VOXEL_BYTES_A_POINT >> 20} MB to build, "
-            f"{executor.jobs} at a time: give a smaller --voxel, a larger --memory or fewer --jobs"
-        )
+    steps, shards = header.lattice.voxel_steps, folder / SHARD_FOLDER
     units = [
-        ShardUnit(
-            number,
-            plan,
-            points,
-            runs,
-            header.lattice.voxel_steps,
-            config,
-            header.archive_id,
-            folder / SHARD_FOLDER,
-        )
-        for number, (plan, points) in enumerate(plan_shards(keys, counts))
+        ShardUnit(number, keys, points, runs, steps, config, header.archive_id, shards)
+        for number, (keys, points) in enumerate(plans)
     ]
     with stages.stage("build", header.points, "points"):
-        shards = list(executor.map(build_shard, units, stages.progress, lambda unit: unit.points))
-    return header, shards
+        return list(executor.map(build_shard, units, stages.progress, lambda unit: unit.points))
 
 
 class _RadiusUnit(NamedTuple):

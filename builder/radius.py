@@ -19,7 +19,7 @@ from .kernels.nearest import FAR, SearchTree, box_distance2, closest_other
 from .kernels.octree import voxel_codes
 
 # Distances are added as integers of 2^-32 m: any order gives the same sum (NUMERICS.md N8), and 10^6 of
-# 10 km fit 63 bits.
+# 2 km fit 63 bits.
 SUM_UNITS = 2.0**32
 
 # An avatar's own lattice is never finer than this: 1 micrometre.

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 
 class Verdict(IntEnum):
-    """What is said of one pose. `CLEAR` only when all in reach was looked at (NUMERICS.md, "Contract")."""
+    """What is said of one pose. `CLEAR` only when all in reach was looked at (NUMERICS.md case 21)."""
 
     CLEAR = 0
     CONTACT = 1

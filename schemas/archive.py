@@ -11,7 +11,6 @@ import contextlib
 import functools
 import os
 import re
-import threading
 import zlib
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -265,9 +264,15 @@ class Archive:
             ) from error
         self.coordinates = voxel_coordinates(self.voxels["key"])
         self._shape_dtype = point_dtype(scan_index=self.header.scan_index, intensity=self.header.intensity)
-        self._lock = threading.Lock()
-        self._descriptors: dict[int, int] = {}
         self._check_shards()
+        # All of them now: an archive that is replaced while it is read stays the one that was opened.
+        self._descriptors: list[int] = []
+        try:
+            for number in range(len(self._shards)):
+                self._descriptors.append(os.open(self.shard_path(number), os.O_RDONLY | os.O_CLOEXEC))
+        except OSError as error:
+            self.close()
+            raise FormatError(f"{error.filename}: cannot be opened ({error.strerror}): check it") from error
 
     def _check_shards(self) -> None:
         """Every shard exists, is as long as the index says, and holds every frame the index places in it."""
@@ -285,9 +290,18 @@ class Archive:
                 )
         sizes = np.array([size for _, size in self._shards], np.uint64)
         if len(self.voxels) and (
-            self.voxels["shard"].max() >= len(sizes) or (np.diff(self.voxels["key"]) == 0).any()
+            self.voxels["shard"].max() >= len(sizes)
+            or (self.voxels["key"][1:] <= self.voxels["key"][:-1]).any()
         ):
             raise FormatError(f"{self.folder}: the index does not add up: restore or rebuild it")
+        # The broad phase searches ascending keys and prunes by these bounds: it would call clear what they hide.
+        base = self.coordinates * self.header.lattice.voxel_steps
+        low, high = base + self.voxels["low"], base + self.voxels["high"]
+        if (
+            len(base)
+            and ((low.min(axis=0) != self.header.low) | (high.max(axis=0) != self.header.high)).any()
+        ):
+            raise FormatError(f"{self.folder}: the voxels' bounds are not the scene's: restore or rebuild it")
         ends = self.voxels["frame_offset"] + self.voxels["frame_bytes"]
         if (ends > sizes[self.voxels["shard"]][:, None]).any():
             raise FormatError(f"{self.folder}: the index points beyond a shard's end: restore or rebuild it")
@@ -301,10 +315,9 @@ class Archive:
         self.close()
 
     def close(self) -> None:
-        """Close the shards; reading afterwards opens them again."""
-        with self._lock:
-            while self._descriptors:
-                os.close(self._descriptors.popitem()[1])
+        """Close the shards; nothing can be read afterwards."""
+        while self._descriptors:
+            os.close(self._descriptors.pop())
 
     def shard_path(self, number: int) -> Path:
         """The file of shard `number`."""
@@ -314,22 +327,18 @@ class Archive:
         """The number of shard files."""
         return len(self._shards)
 
-    def _descriptor(self, shard: int) -> int:
-        with self._lock:
-            if shard not in self._descriptors:
-                self._descriptors[shard] = os.open(self.shard_path(shard), os.O_RDONLY | os.O_CLOEXEC)
-            return self._descriptors[shard]
-
     def read_frames(self, row: int) -> tuple[bytes, bytes, bytes]:
         """The three frames (cells, nodes, points) of the voxel in index row `row`.
 
         Raises CorruptError, naming file, voxel and dataset, when a frame is not the one the index means.
         """
+        if not self._descriptors:
+            raise ValueError(f"{self.folder}: the archive is closed")
         entry = self.voxels[row]
         frames = []
         for i, name in enumerate(DATASETS):
             size, offset = int(entry["frame_bytes"][i]), int(entry["frame_offset"][i])
-            frame = os.pread(self._descriptor(int(entry["shard"])), size, offset)
+            frame = os.pread(self._descriptors[int(entry["shard"])], size, offset)
             if len(frame) != size or frame[-4:] != int(entry["frame_checksum"][i]).to_bytes(4, "little"):
                 raise CorruptError(
                     f"{self.where(row)}, {name}: {len(frame)} bytes that are not the record's, expected {size}"

@@ -378,7 +378,7 @@ class _BinDecoder:
     """Decodes one type from MessagePack: msgspec reads the bins, which become arrays here in one loop.
 
     Not in msgspec's `dec_hook`: called for each array of an answer, in the middle of the decoding, it made
-    decoding one three times as slow (32 µs instead of 11 between two round trips, 2 cores). The twin is a
+    decoding one three times as slow. The twin is a
     subclass whose arrays are bytes at first, so the message is not built twice.
     """
 

@@ -169,7 +169,7 @@ def _signalled(*numbers: signal.Signals) -> Iterator[socket.socket]:
     """A socket that has something to read once one of the signals came, in place of what they did before.
 
     Not an event that a handler sets: the system may hand the signal to one of zenoh's threads, and then a main
-    thread that waits for a lock is not woken to run the handler (a stop in 66 hung so).
+    thread that waits for a lock is not woken to run the handler.
     """
     reader, writer = socket.socketpair()
     with reader, writer:

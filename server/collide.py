@@ -138,7 +138,7 @@ def _answer_at_once(
 ) -> CollideAnswers | None:
     """Answer one pose in one kernel call, as its voxels are resident nearly always; None: they are not.
 
-    Holding voxels and calling two kernels takes 25 µs more (scripts/bench_walk, "single call").
+    scripts/bench_walk shows what a call of one pose costs on top of the test itself.
     """
     residency = data.residency
     rows, outside = np.empty(64, np.int64), np.zeros(1, bool)

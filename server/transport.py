@@ -259,13 +259,20 @@ class _Lane:
     def take(self, queries: Any) -> None:
         """One thread's work: take queries, answer them or leave them to the thread that is at work."""
         for query in queries:
-            request = _Request(query)
-            offer = self._queues.offer(request.client, request, len(request.payload))
-            if offer is Offer.RUN:
-                self._run(request.client, request)
-            elif offer is Offer.FULL:
-                with query:
-                    _reply(query, request.key_expr, self._service.busy(_encoding(query)))
+            try:
+                self._take(query)
+            except Exception:  # of this query alone: the thread goes on with the next
+                log.exception("a query of scene %s", self._scene)
+
+    def _take(self, query: zenoh.Query) -> None:
+        """Answer a query, or leave it to a thread that is at work."""
+        request = _Request(query)
+        offer = self._queues.offer(request.client, request, len(request.payload))
+        if offer is Offer.RUN:
+            self._run(request.client, request)
+        elif offer is Offer.FULL:
+            with query:
+                _reply(query, request.key_expr, self._service.busy(_encoding(query)))
 
     def watch(self, samples: Any) -> None:
         """One thread's work: have the avatars of clients that went dropped."""

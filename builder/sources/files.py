@@ -30,6 +30,8 @@ READERS: dict[str, Callable[[Path], list[Scan]]] = {
     ".obj": open_obj,
     ".stl": open_stl,
 }
+# Taken from a folder. Text of any name may be notes, which would stop a build: it is read when named.
+IN_FOLDERS = frozenset(READERS) - {".txt", ".csv"}
 MESHES = frozenset({".obj", ".stl", ".ply"})
 
 
@@ -80,14 +82,14 @@ def scan_files(paths: Iterable[Path]) -> list[Path]:
             Path(folder, name)
             for folder, _, names in os.walk(path)
             for name in names
-            if Path(name).suffix.lower() in READERS
+            if Path(name).suffix.lower() in IN_FOLDERS
         )
         if not below:
             raise scan_error(
                 path,
                 "a folder without scans",
-                f"files ending in {' '.join(READERS)}",
-                "check the folder's name",
+                f"files ending in {' '.join(sorted(IN_FOLDERS))}",
+                "check the folder's name, or name its files",
             )
         files += below
     return files

@@ -9,7 +9,7 @@ The arena is one buffer seen as float32 words, int32 words and uint16 halfwords.
 - lanes: (b, 3, LANES) halfwords: x[], y[], z[] of the block's points from that corner, the last one repeated
   to the end, so that a test of all lanes needs no mask.
 
-For a dense voxel this is 8.4 bytes a point: 6 the points, 1.9 the rows, 0.5 the blocks (scripts/bench_walk).
+For a dense voxel this is 8.3 bytes a point: 6 the points, 1.8 the rows, 0.5 the blocks (scripts/bench_walk).
 """
 
 from typing import NamedTuple
@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 # 32 uint16 lanes become 32 float32 in one vector loop. LLVM unrolls loops of 8 or 16 constant trips and
-# then does not vectorise them: 0.6 to 2.4 ns a pair against 0.08.
+# then does not vectorise them, which costs several times as much a pair.
 LANES = 32
 ROW_WORDS = 12
 BLOCK_WORDS = 4

@@ -185,7 +185,7 @@ def _leaves_touch(avatar, m, block, placed, scene, voxel, row, off, limits, keep
     """Whether a leaf node of the avatar and one of the scene hold a pair in contact.
 
     First all avatar points against the scene node's bound, in one vector loop; of those that remain, each
-    against all points of the node. On the made facade 9 of 10 avatar points end at the bound.
+    against all points of the node. Most avatar points end at the bound.
     """
     words, ints, halves = scene.words, scene.ints, scene.halves
     lanes = placed.lanes

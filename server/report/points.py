@@ -32,7 +32,7 @@ def read_avatar(path: Path) -> NDArray[np.float64]:
 
 
 def read_thinned(paths: Sequence[Path], points: int, at_most: int) -> NDArray[np.float64]:
-    """About `at_most` of the `points` points of scans, every so-manieth (n, 3) [m]; ScanError as open_scans."""
+    """About `at_most` of the `points` points of scans, taken at even steps, (n, 3) [m]; ScanError as open_scans."""
     step = max(1, -(-points // at_most))
     blocks = [
         block.xyz[::step]

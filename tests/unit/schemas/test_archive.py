@@ -419,8 +419,33 @@ def test_a_failed_shard_leaves_no_file(tmp_path: Path, built: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_a_closed_archive_opens_its_shards_again(built: Path) -> None:
+def test_a_closed_archive_is_not_read(built: Path) -> None:
     with Archive(built) as archive:
-        first = archive.read_frames(0)
-        archive.close()
-        assert archive.read_frames(0) == first
+        archive.read_frames(0)
+    with pytest.raises(ValueError, match="closed"):
+        archive.read_frames(0)
+
+
+def test_rows_out_of_order_are_refused(copy: Path) -> None:
+    # The broad phase searches ascending keys: it would call clear what it does not find.
+    def reverse(rows: np.ndarray) -> None:
+        rows[:] = rows[::-1].copy()
+
+    rewrite_index(copy, reverse)
+    with pytest.raises(FormatError, match="does not add up"):
+        Archive(copy)
+
+
+def test_bounds_of_voxels_that_are_not_the_scenes_are_refused(copy: Path) -> None:
+    def widen(rows: np.ndarray) -> None:
+        rows["high"] += 1000
+
+    rewrite_index(copy, widen)
+    with pytest.raises(FormatError, match="bounds are not the scene's"):
+        Archive(copy)
+
+
+def test_an_archive_that_is_replaced_stays_the_one_opened(copy: Path) -> None:
+    with Archive(copy) as archive:
+        shutil.rmtree(copy)
+        assert len(archive.read_voxel(0)[0].points) > 0

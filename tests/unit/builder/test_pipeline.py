@@ -21,6 +21,7 @@ from solidcloud.builder.pipeline import BuildSummary, build_archive
 from solidcloud.builder.verify import verify_archive
 from solidcloud.schemas.archive import ZSTD_FILTER, Archive
 from solidcloud.schemas.errors import BadRequestError, CorruptError, ScanError, SolidcloudError
+from solidcloud.server.scene import Scene
 
 
 def build(paths: Sequence[Path], target: Path, **options: object) -> BuildSummary:
@@ -489,11 +490,10 @@ def test_a_header_that_cannot_be_right_leaves_all_unknown(tmp_path: Path) -> Non
     good = tmp_path / "good.xyz"
     write_xyz(good, make_scan("plane", 5, 200))
     raw = np.random.default_rng(1).integers(0, 1000, (500, 3))
-    # Bounds of zeros, as writers leave them that do not know; bounds that points read lie outside of; and a
-    # damaged scale, by which no point is finite though the bounds look right.
+    # Bounds of zeros, as writers leave them that do not know; and a damaged scale, by which no point is finite
+    # though the bounds look right. (Bounds that points read refute: test_partition.py.)
     for name, patch in (
         ("zero", (179, np.zeros(6))),
-        ("wrong", (179, np.array([1.0, 0, 1, 0, 1, 0]) - 50)),
         ("scale", (131, np.full(3, 1e308))),
     ):
         bad = tmp_path / f"{name}.las"
@@ -508,4 +508,28 @@ def test_a_header_that_cannot_be_right_leaves_all_unknown(tmp_path: Path) -> Non
                 assert archive.header.unknown_everywhere
             for low, high in archive.header.unknown:
                 lost = archive.header.lattice.to_lattice(raw * 0.01 + [100.0, 100, 0])
-                assert ((lost >= low) & (lost <= high)).all() or name == "wrong"
+                assert ((lost >= low) & (lost <= high)).all()
+
+
+def test_text_in_a_folder_is_read_only_when_named(tmp_path: Path) -> None:
+    folder = tmp_path / "scans"
+    folder.mkdir()
+    write_xyz(folder / "scan.xyz", make_scan("plane", 5, 200))
+    (folder / "README.txt").write_text("notes, no points")
+    assert build([folder], tmp_path / "hall").points == 200
+    with pytest.raises(ScanError, match="README"):
+        build([folder, folder / "README.txt"], tmp_path / "other")
+
+
+def test_an_empty_avatar_is_clear_though_all_is_unknown(tmp_path: Path) -> None:
+    write_xyz(tmp_path / "good.xyz", make_scan("plane", 5, 200))
+    (tmp_path / "bad.xyz").write_text("1 2 3\nbroken\n")
+    build([tmp_path / "good.xyz", tmp_path / "bad.xyz"], tmp_path / "hall", skip_bad=True)
+    with Scene.open(tmp_path / "hall") as scene:
+        scene.add_avatar("nobody", np.empty((0, 3)))
+        scene.add_avatar("ball", [[0.0, 0, 0]], 0.01)
+        far = np.tile(np.eye(4), (3, 1, 1))
+        far[:, 0, 3] = 1000.0
+        assert scene.info().unknown_everywhere
+        assert scene.collide("nobody", far).verdict.tolist() == [0, 0, 0]
+        assert scene.collide("ball", far).verdict.tolist() == [2, 2, 2]

@@ -14,7 +14,8 @@ from ..schemas.messages import make_poses
 from ..schemas.voxel_grid import MAX_COORDINATE, UNITS_PER_METRE
 from .avatar import AvatarModel
 from .kernels import placing
-from .kernels.overlap import CLEAR, UNKNOWN, SceneArrays, answer_resident, overlap_poses
+from .kernels.layout import SceneArrays
+from .kernels.overlap import CLEAR, UNKNOWN, answer_resident, overlap_poses
 from .kernels.reach import Reach, SceneIndex, find_reach
 from .residency import Residency
 

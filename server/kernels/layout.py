@@ -34,6 +34,24 @@ class Arena(NamedTuple):
     halves: NDArray[np.uint16]
 
 
+class SceneArrays(NamedTuple):
+    """What the kernel reads of a scene.
+
+    words, ints, halves: the arena (layout.py).  where: (v, 3) int64, a voxel's runs in it, -1: not resident.
+    coordinates: (v, 3) int64 voxel coordinates.  origin: (3,) float64 [m].  step: [m].
+    """
+
+    words: NDArray[np.float32]
+    ints: NDArray[np.int32]
+    halves: NDArray[np.uint16]
+    where: NDArray[np.int64]
+    coordinates: NDArray[np.int64]
+    origin: NDArray[np.float64]
+    step: float
+    units_per_step: float
+    voxel_steps: int
+
+
 def resident_bytes(nodes: NDArray[np.int64], leaves: NDArray[np.int64]) -> NDArray[np.int64]:
     """Bytes (v,) that voxels of so many nodes, of them leaf nodes, take in the arena; multiples of 16."""
     return 4 * ROW_WORDS * nodes + 4 * BLOCK_WORDS * leaves + 2 * 3 * LANES * leaves

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from solidcloud.server.kernels import placing
-from solidcloud.server.kernels.overlap import SceneArrays
+from solidcloud.server.kernels.layout import SceneArrays
 
 pytestmark = pytest.mark.interpreted
 

@@ -1,0 +1,160 @@
+"""An avatar under one pose, and the thresholds of one pose: what every descent through two hierarchies stands on.
+
+Distances are in lattice steps from a lattice point near the avatar, the frame, where scene coordinates are whole
+numbers below 2^24 and so exact in float32; the placed avatar carries an error that every bound adds. What float32
+cannot tell, the integers of NUMERICS.md N5 decide: `pair_square`.
+"""
+
+import math
+from typing import NamedTuple
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+
+from .layout import LANES
+from .placing import MAX_REACH_UNITS, largest_term, lattice_to_units, place, to_units
+
+U32 = 2.0**-24  # half a unit in the last place of 1, float32
+# Relative slack of a float32 test: over 16 U32, where the sums below take at most 8.
+SLACK = np.float32(1e-6)
+ONE_SLACK = np.float32(1.0 + 2e-6)
+
+
+class Placed(NamedTuple):
+    """An avatar under one pose, float32 steps from `frame`, a lattice point; scratch of one call.
+
+    nodes: (4, a): x[], y[], z[], radius[], rounded outward.  lanes: (b, 3, LANES).  stamp: (b,) int64, the pose a
+    block was placed for: blocks are placed when first reached, most never are.
+    frame: (3,) int64.  shift: (3,) float64, t - O.
+    """
+
+    nodes: NDArray[np.float32]
+    lanes: NDArray[np.float32]
+    stamp: NDArray[np.int64]
+    frame: NDArray[np.int64]
+    shift: NDArray[np.float64]
+
+
+class Limits(NamedTuple):
+    """The thresholds of one pose. reach, error: [steps], float32, rounded up.  near, far: squares, float32.
+
+    units: r_a + r_b + margin, exact units, int64.
+    """
+
+    reach: np.float32
+    error: np.float32
+    near: np.float32
+    far: np.float32
+    units: np.int64
+
+
+@nb.njit(nogil=True, cache=True)
+def make_limits(units, units_per_step, extent, farthest, voxel_steps):
+    """The thresholds for a reach of `units`.
+
+    extent: how far placed avatar points lie from the frame.  farthest: the largest term of a placed coordinate.
+    Errors of a coordinate difference, in steps: rounding to exact units, half a unit for either point; the
+    float32 of the avatar's coordinate, U32 of its size, once from the frame and once from the voxel or block,
+    where a pair in reach is within the larger of voxel and block, and the reach (doubled, so that a pair beyond
+    cannot pass as near); float64 rounding far from the origin: 4 half units in the last place for a placed centre,
+    4 for a point below it, 1 for the frame, 1 for the lattice point, 10 * 2^-53 of the largest term.
+    """
+    reach = np.float64(units) / units_per_step
+    error = (
+        1.1 / units_per_step
+        + U32 * (extent + 2.0 * (max(65536.0, voxel_steps) + reach))
+        + farthest * 2.0**-49
+    )
+    around = math.sqrt(3.0) * error
+    below = max(reach * (1.0 - 2.0 * U32) - around, 0.0)
+    above = reach * (1.0 + 2.0 * U32) + around
+    near = np.float32(below * below * (1.0 - 8.0 * U32))
+    far = np.float32(above * above * (1.0 + 8.0 * U32))
+    # One float32 step outward covers the narrowing just done; at 0 nothing is certified near.
+    near = np.nextafter(near, np.float32(-1.0)) if below > 0.0 else np.float32(-1.0)
+    return Limits(
+        np.nextafter(np.float32(reach), np.float32(np.inf)),
+        np.nextafter(np.float32(around), np.float32(np.inf)),
+        near,
+        np.nextafter(far, np.float32(np.inf)),
+        np.int64(units),
+    )
+
+
+@nb.njit(nogil=True, cache=True)
+def place_nodes(avatar, m, scale, placed, scene):
+    """Place an avatar's nodes; fills placed.frame, shift and nodes. Returns (extent, farthest) for `make_limits`."""
+    step = scene.step
+    per_step = 1.0 / step
+    nodes = placed.nodes
+    for r in range(3):
+        placed.shift[r] = m[r, 3] - scene.origin[r]
+        root = place(m, placed.shift, r, avatar.center[0, 0], avatar.center[0, 1], avatar.center[0, 2])
+        placed.frame[r] = np.int64(np.rint(root * per_step))
+    center = avatar.center[0]
+    farthest = largest_term(m, placed.shift, center[0], center[1], center[2]) * per_step
+    extent = avatar.radius[0] * scale * per_step + 1.0
+    for r in range(3):
+        base = np.float64(placed.frame[r]) * step
+        for i in range(avatar.center.shape[0]):
+            world = place(m, placed.shift, r, avatar.center[i, 0], avatar.center[i, 1], avatar.center[i, 2])
+            nodes[r, i] = np.float32((world - base) * per_step)
+    for i in range(avatar.center.shape[0]):
+        # + 1e-6: the float32 centre is off by at most U32 of `extent`, and the radius by U32 of itself.
+        nodes[3, i] = np.float32(avatar.radius[i] * scale * per_step * (1.0 + 1e-6) + extent * 1e-6)
+    return extent, farthest + extent
+
+
+@nb.njit(nogil=True, cache=True)
+def place_block(avatar, m, block, placed, scene):
+    """Place the points of one leaf node of the avatar, all LANES at once."""
+    per_step = 1.0 / scene.step
+    for r in range(3):
+        base = np.float64(placed.frame[r]) * scene.step
+        for j in range(LANES):
+            points = avatar.points
+            world = place(m, placed.shift, r, points[block, 0, j], points[block, 1, j], points[block, 2, j])
+            placed.lanes[block, r, j] = np.float32((world - base) * per_step)
+
+
+@nb.njit(nogil=True, cache=True)
+def make_placed(avatar):
+    """Scratch for one avatar (not empty), nothing placed yet."""
+    blocks = avatar.points.shape[0]
+    return Placed(
+        np.empty((4, avatar.center.shape[0]), np.float32),
+        np.empty((blocks, 3, LANES), np.float32),
+        np.full(blocks, -1, np.int64),
+        np.empty(3, np.int64),
+        np.empty(3, np.float64),
+    )
+
+
+@nb.njit(nogil=True, cache=True)
+def pair_square(avatar, m, block, lane, placed, scene, voxel, lane_at, block_at, j):
+    """The definition (NUMERICS.md N5): |a - b|^2 of one pair in integers, exact units, int64.
+
+    block, lane: of the avatar's point.  block_at, lane_at, j: of the scan's point in `voxel`, see layout.py.
+    -1 where they are farther apart along an axis than any reach, MAX_REACH_UNITS, so that squares fit 63 bits.
+    """
+    square = np.int64(0)
+    points = avatar.points
+    for r in range(3):
+        world = place(
+            m, placed.shift, r, points[block, 0, lane], points[block, 1, lane], points[block, 2, lane]
+        )
+        low = scene.coordinates[voxel, r] * scene.voxel_steps + np.int64(scene.ints[block_at + r])
+        steps = low + np.int64(scene.halves[lane_at + r * LANES + j])
+        difference = to_units(world) - lattice_to_units(steps, scene.units_per_step)
+        if abs(difference) > MAX_REACH_UNITS:
+            return np.int64(-1)
+        square += difference * difference
+    return square
+
+
+@nb.njit(nogil=True, cache=True)
+def pair_in_reach(avatar, m, block, lane, placed, scene, voxel, lane_at, block_at, j, units):
+    """Whether one pair is within `units`, tangency included."""
+    square = pair_square(avatar, m, block, lane, placed, scene, voxel, lane_at, block_at, j)
+    return square >= 0 and square <= units * units

@@ -1,4 +1,4 @@
-"""What a question is answered with: a struct of arrays, one element a pose.
+"""What a question is answered with: a struct of arrays, one element a pose, ray, point or motion.
 
 No zenoh, no numba and no wire encoding here: `Scene` makes these, `Client` receives them, and both hand
 out the same types.
@@ -21,6 +21,23 @@ class Verdict(IntEnum):
     UNKNOWN = 2
 
 
+class Cost(msgspec.Struct, frozen=True, eq=False, kw_only=True):
+    """What a whole request cost, and what it left in memory. Every answer has these fields.
+
+    engine_seconds: time between request and answer inside the engine, loads included [s].
+    hits, misses: voxels in reach that were resident, and that had to be loaded, of this request.
+    resident, resident_bytes: voxels decoded in memory after this request, and their bytes.
+    faults: one sentence for each voxel that could not be read, where and why; empty when all is well.
+    """
+
+    engine_seconds: float = 0.0
+    hits: int = 0
+    misses: int = 0
+    resident: int = 0
+    resident_bytes: int = 0
+    faults: tuple[str, ...] = ()
+
+
 class CollideAnswer(NamedTuple):
     """The answer for one pose; see `CollideAnswers` for the fields."""
 
@@ -31,16 +48,15 @@ class CollideAnswer(NamedTuple):
     point_tests: int
 
 
-class CollideAnswers(msgspec.Struct, frozen=True, eq=False):
-    """The answers for k poses, in the order of the poses. Iterating yields one `CollideAnswer` a pose.
+class CollideAnswers(Cost, frozen=True, eq=False):
+    """The answers of `collide` for k poses, in their order. Iterating yields one `CollideAnswer` a pose.
 
     verdict: (k,) uint8, values of `Verdict`.  outside: (k,) bool, the reach leaves the dataset's bounds.
     voxels_missing: (k,) uint32, voxels in reach that could not be looked at.
     node_visits: (k,) uint32, pairs of bounding spheres tested.  point_tests: (k,) uint32, pairs of points.
-    engine_seconds: time between request and answer inside the engine, loads included [s].
-    hits, misses: voxels in reach that were resident, and that had to be loaded, of this request.
-    resident, resident_bytes: voxels decoded in memory after this request, and their bytes.
-    faults: one sentence for each voxel that could not be read, where and why; empty when all is well.
+    lower, upper: (k,) float64, the signed distance lies between them [m]; exact: (k,) bool, the verdict is that of
+    tolerance 0. All three are empty where neither a tolerance nor a budget was given: then every verdict but
+    `UNKNOWN` is exact.
     """
 
     verdict: NDArray[np.uint8]
@@ -48,12 +64,9 @@ class CollideAnswers(msgspec.Struct, frozen=True, eq=False):
     voxels_missing: NDArray[np.uint32]
     node_visits: NDArray[np.uint32]
     point_tests: NDArray[np.uint32]
-    engine_seconds: float = 0.0
-    hits: int = 0
-    misses: int = 0
-    resident: int = 0
-    resident_bytes: int = 0
-    faults: tuple[str, ...] = ()
+    lower: NDArray[np.float64] = msgspec.field(default_factory=lambda: np.empty(0))
+    upper: NDArray[np.float64] = msgspec.field(default_factory=lambda: np.empty(0))
+    exact: NDArray[np.bool_] = msgspec.field(default_factory=lambda: np.empty(0, bool))
 
     def __len__(self) -> int:
         """The number of poses answered."""
@@ -64,6 +77,195 @@ class CollideAnswers(msgspec.Struct, frozen=True, eq=False):
         columns = (self.verdict, self.outside, self.voxels_missing, self.node_visits, self.point_tests)
         for verdict, outside, missing, visits, tests in zip(*columns, strict=True):
             yield CollideAnswer(Verdict(int(verdict)), bool(outside), int(missing), int(visits), int(tests))
+
+
+class DistanceAnswers(Cost, frozen=True, eq=False):
+    """The answers of `distance` for k poses, in their order.
+
+    signed_distance: (k,) float64, least |a - b| - r_a - r_b of a pair within reach [m], negative when overlapping, inf
+    where no pair is within reach; of the best pair found, where not exact.
+    lower, upper: (k,) float64, the true signed distance lies between them; where it is beyond reach, `lower` is the
+    reach and `upper` inf.  exact: (k,) bool: `signed_distance` is the true one, or truly beyond reach.
+    verdict: (k,) uint8: CONTACT where `upper` <= 0, CLEAR where the pair's integers or `lower` say that nothing
+    touches, else UNKNOWN.
+    witness_avatar, witness_cloud: (k, 3) float64, the centres of the nearest pair, world [m]; NaN where there is none.
+    Of pairs at equal distance, that with the least scan point (x, y, z), then the least avatar centre.
+    normal: (k, 3) float64, unit vector from `witness_cloud` to `witness_avatar`, the way out; zero where they
+    coincide, NaN where there is none.
+    outside, voxels_missing, node_visits, point_tests: as in `CollideAnswers`.
+    """
+
+    verdict: NDArray[np.uint8]
+    signed_distance: NDArray[np.float64]
+    lower: NDArray[np.float64]
+    upper: NDArray[np.float64]
+    exact: NDArray[np.bool_]
+    witness_avatar: NDArray[np.float64]
+    witness_cloud: NDArray[np.float64]
+    normal: NDArray[np.float64]
+    outside: NDArray[np.bool_]
+    voxels_missing: NDArray[np.uint32]
+    node_visits: NDArray[np.uint32]
+    point_tests: NDArray[np.uint32]
+
+    def __len__(self) -> int:
+        """The number of poses answered."""
+        return len(self.verdict)
+
+
+class ContactsAnswers(Cost, frozen=True, eq=False):
+    """The answers of `contacts` for k poses: pairs in contact, and their clusters.
+
+    verdict, exact, outside, voxels_missing, node_visits, point_tests: (k,), as elsewhere; exact: all pairs in contact
+    were counted.  pairs_found: (k,) int64, pairs in contact, listed or not.
+    pair_starts: (k + 1,) int64: the pairs listed for pose i are rows [pair_starts[i], pair_starts[i + 1]) of the pair
+    columns, deepest first, ties by scan point (x, y, z), then by avatar centre: avatar_point, cloud_point (p, 3) float64
+    centres, world [m]; signed_distance (p,) float64 [m]; avatar_index (p,) int32, row of the avatar's points as added;
+    scan_index (p,) int32, the scan it came from (`SceneInfo.sources`), -1 where not kept;
+    cluster (p,) int32, row among the pose's clusters.
+    cluster_starts: (k + 1,) int64, rows of the cluster columns, deepest first: cluster_count (c,) int64 pairs in it, all
+    of them; cluster_deepest (c,) float64 signed distance; cluster_avatar, cluster_cloud (c, 3) the deepest pair's
+    centres; cluster_scan (c,) int32; cluster_low, cluster_high (c, 3) float64, the box of its scan points, world [m].
+    """
+
+    verdict: NDArray[np.uint8]
+    exact: NDArray[np.bool_]
+    pairs_found: NDArray[np.int64]
+    pair_starts: NDArray[np.int64]
+    avatar_point: NDArray[np.float64]
+    cloud_point: NDArray[np.float64]
+    signed_distance: NDArray[np.float64]
+    avatar_index: NDArray[np.int32]
+    scan_index: NDArray[np.int32]
+    cluster: NDArray[np.int32]
+    cluster_starts: NDArray[np.int64]
+    cluster_count: NDArray[np.int64]
+    cluster_deepest: NDArray[np.float64]
+    cluster_avatar: NDArray[np.float64]
+    cluster_cloud: NDArray[np.float64]
+    cluster_scan: NDArray[np.int32]
+    cluster_low: NDArray[np.float64]
+    cluster_high: NDArray[np.float64]
+    outside: NDArray[np.bool_]
+    voxels_missing: NDArray[np.uint32]
+    node_visits: NDArray[np.uint32]
+    point_tests: NDArray[np.uint32]
+
+    def __len__(self) -> int:
+        """The number of poses answered."""
+        return len(self.verdict)
+
+
+class SweepAnswers(Cost, frozen=True, eq=False):
+    """The answers of `sweep` for k motions, in their order.
+
+    verdict: (k,) uint8: CONTACT, the first contact lies in [lower, upper]; CLEAR, none on the whole motion; UNKNOWN,
+    none before `lower`, and beyond it could not be told: grazing, a budget, or something missing.
+    lower, upper: (k,) float64, fractions of the motion, 0 to 1: nothing touches before `lower`; the pose at `upper` is in
+    contact, inf where none was found.  A motion without contact has lower 1.
+    exact: (k,) bool: clear, or no avatar point moves more than the tolerance between `lower` and `upper`.
+    witness_avatar, witness_cloud: (k, 3) float64, centres of a pair in contact at `upper`, world [m]; NaN where none.
+    steps: (k,) uint32, advances.  outside, voxels_missing, node_visits, point_tests: as in `CollideAnswers`.
+    """
+
+    verdict: NDArray[np.uint8]
+    lower: NDArray[np.float64]
+    upper: NDArray[np.float64]
+    exact: NDArray[np.bool_]
+    witness_avatar: NDArray[np.float64]
+    witness_cloud: NDArray[np.float64]
+    steps: NDArray[np.uint32]
+    outside: NDArray[np.bool_]
+    voxels_missing: NDArray[np.uint32]
+    node_visits: NDArray[np.uint32]
+    point_tests: NDArray[np.uint32]
+
+    def __len__(self) -> int:
+        """The number of motions answered."""
+        return len(self.verdict)
+
+
+class RaycastAnswers(Cost, frozen=True, eq=False):
+    """The answers of `raycast` for k rays, in their order.
+
+    verdict: (k,) uint8: CONTACT, the ray hits a scan point's sphere within reach; CLEAR, it hits none; UNKNOWN.
+    distance: (k,) float64, along the ray to the first hit [m], 0 where the ray starts inside, inf where none.
+    lower, upper: (k,) float64, the true distance lies between them; beyond reach: the reach, and inf.  exact: (k,) bool.
+    hit: (k, 3) float64, where, world [m].  cloud_point: (k, 3), the centre of the sphere that is hit, of several at
+    equal distance the least (x, y, z).  normal: (k, 3) unit vector from it to `hit`. All NaN where there is no hit.
+    outside, voxels_missing, node_visits, point_tests: as in `CollideAnswers`.
+    """
+
+    verdict: NDArray[np.uint8]
+    distance: NDArray[np.float64]
+    lower: NDArray[np.float64]
+    upper: NDArray[np.float64]
+    exact: NDArray[np.bool_]
+    hit: NDArray[np.float64]
+    cloud_point: NDArray[np.float64]
+    normal: NDArray[np.float64]
+    outside: NDArray[np.bool_]
+    voxels_missing: NDArray[np.uint32]
+    node_visits: NDArray[np.uint32]
+    point_tests: NDArray[np.uint32]
+
+    def __len__(self) -> int:
+        """The number of rays answered."""
+        return len(self.verdict)
+
+
+class WithinAnswers(Cost, frozen=True, eq=False):
+    """The answers of `within` for k loose points, in their order.
+
+    verdict: (k,) uint8: CONTACT, a scan point lies within reach; CLEAR, none does; UNKNOWN.
+    distance: (k,) float64, to the nearest scan point's centre [m], inf where none is within reach.
+    lower, upper: (k,) float64, the true distance lies between them; beyond reach: the reach, and inf.  exact: (k,) bool.
+    cloud_point: (k, 3) float64, the nearest scan point, world [m], of several the least (x, y, z); NaN where none.
+    outside, voxels_missing, node_visits, point_tests: as in `CollideAnswers`.
+    """
+
+    verdict: NDArray[np.uint8]
+    distance: NDArray[np.float64]
+    lower: NDArray[np.float64]
+    upper: NDArray[np.float64]
+    exact: NDArray[np.bool_]
+    cloud_point: NDArray[np.float64]
+    outside: NDArray[np.bool_]
+    voxels_missing: NDArray[np.uint32]
+    node_visits: NDArray[np.uint32]
+    point_tests: NDArray[np.uint32]
+
+    def __len__(self) -> int:
+        """The number of points answered."""
+        return len(self.verdict)
+
+
+class ObjectsAnswers(Cost, frozen=True, eq=False):
+    """The answer of `objects` for n avatars at once.
+
+    verdict: (n,) uint8, of each object against the scene; CLEAR where its mask leaves the scene out.
+    outside, voxels_missing, node_visits, point_tests: (n,), against the scene.
+    pairs: (p, 2) int32, rows of the objects that touch one another, first < second, in ascending order.
+    pairs_tested: pairs whose trees were compared; pairs_filtered: left out by groups and masks.
+    pair_verdict: (p,) uint8: CONTACT, or UNKNOWN where the budget ended first.
+    pair_visits, pair_tests: of all pairs together.
+    """
+
+    verdict: NDArray[np.uint8]
+    outside: NDArray[np.bool_]
+    voxels_missing: NDArray[np.uint32]
+    node_visits: NDArray[np.uint32]
+    point_tests: NDArray[np.uint32]
+    pairs: NDArray[np.int32]
+    pair_verdict: NDArray[np.uint8]
+    pairs_tested: int = 0
+    pairs_filtered: int = 0
+    pair_visits: int = 0
+    pair_tests: int = 0
+
+    def __len__(self) -> int:
+        """The number of objects."""
+        return len(self.verdict)
 
 
 def unknown_answers(k: int) -> CollideAnswers:

@@ -11,7 +11,8 @@ from ..schemas.archive import FORMAT_VERSION
 from ..schemas.errors import BadRequestError, UnknownAvatarError
 from ..schemas.messages import WIRE_VERSION, AvatarInfo, SceneInfo, SourceInfo
 from .avatar import AvatarModel, make_avatar
-from .collide import collide, make_scene_data
+from .collide import collide
+from .request import make_scene_data
 from .residency import Residency
 from .store import Store
 

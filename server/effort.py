@@ -1,0 +1,57 @@
+"""How much an answer may cost: tolerance and budgets (DESIGN.md, "Verdicts, bounds and budgets"; NUMERICS.md case 30).
+
+Every question takes an `Effort`. Without a budget the work ends when the answer is exact, or known within the
+tolerance. With one it ends there or when the budget is spent, whichever is first; what is said then is still true.
+"""
+
+import math
+import time
+from typing import NamedTuple
+
+from ..schemas.errors import BadRequestError
+
+# No budget: more node visits than any request could make.
+NO_LIMIT = 1 << 62
+
+
+class Effort(NamedTuple):
+    """What one request may cost.
+
+    tolerance: how early contact may be called, and how far bounds may lie apart [m]; 0: exact.
+    visits: node visits a pose (ray, point, motion).  deadline: on time.perf_counter()'s clock [s], inf: none.
+    """
+
+    tolerance: float = 0.0
+    visits: int = NO_LIMIT
+    deadline: float = math.inf
+
+    @property
+    def bounded(self) -> bool:
+        """Whether anything but an exact answer is allowed."""
+        return self.tolerance > 0 or self.visits < NO_LIMIT or self.deadline < math.inf
+
+    @property
+    def spent(self) -> bool:
+        """Whether the time is up."""
+        return self.deadline < math.inf and time.perf_counter() >= self.deadline
+
+
+EXACT = Effort()
+
+
+def make_effort(
+    tolerance: float = 0.0, budget_ms: float | None = None, budget_visits: int | None = None
+) -> Effort:
+    """The effort of a request that starts now.
+
+    tolerance: [m], finite and >= 0.  budget_ms: waiting for loads and work together; None: no limit.
+    budget_visits: its twin that needs no clock, node visits a pose; None: no limit. Raises BadRequestError.
+    """
+    if not 0 <= tolerance < math.inf:
+        raise BadRequestError(f"tolerance is {tolerance}: expected a finite number of metres, 0 or more")
+    if budget_ms is not None and not 0 <= budget_ms < math.inf:
+        raise BadRequestError(f"budget_ms is {budget_ms}: expected milliseconds, 0 or more, or none")
+    if budget_visits is not None and not 0 <= budget_visits <= NO_LIMIT:
+        raise BadRequestError(f"budget_visits is {budget_visits}: expected node visits, 0 or more, or none")
+    deadline = math.inf if budget_ms is None else time.perf_counter() + budget_ms / 1e3
+    return Effort(float(tolerance), NO_LIMIT if budget_visits is None else int(budget_visits), deadline)

@@ -1,0 +1,180 @@
+"""What every question about a scene shares: what it reads, poses checked, voxels in reach held piece by piece."""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..schemas.archive import Archive
+from ..schemas.errors import BadRequestError, BadTransformError, SolidcloudError, TooLargeError
+from ..schemas.voxel_grid import MAX_COORDINATE, UNITS_PER_METRE
+from .avatar import AvatarModel
+from .kernels import placing
+from .kernels.layout import SceneArrays
+from .kernels.reach import Reach, SceneIndex, find_reach
+from .residency import Residency
+
+_POSE_FAULTS: dict[int, tuple[type[SolidcloudError], str]] = {
+    placing.NOT_FINITE: (BadRequestError, "holds {}: expected finite numbers"),
+    placing.BAD_LAST_ROW: (BadTransformError, "has a last row that is not 0 0 0 1: give row-major 4x4 poses"),
+    placing.MIRRORED: (
+        BadTransformError,
+        "mirrors (determinant {:g}): expected a rotation, with a uniform scale at most",
+    ),
+    placing.SHEARED: (
+        BadTransformError,
+        "shears, or scales its axes differently (by {:g}, relative): expected a rotation, with a uniform scale at "
+        "most, within 1e-9: renormalise it",
+    ),
+    placing.BAD_SCALE: (BadTransformError, "scales by {:g}: expected 0.001 to 1000"),
+    placing.TOO_FAR: (BadTransformError, "translates by {:g} m: expected within 1e9 m"),
+    placing.LONG_REACH: (
+        BadRequestError,
+        "has radii and margin that add up to {:g} m: expected at most 16 m: give a smaller margin or radius",
+    ),
+    placing.LARGE_AVATAR: (
+        TooLargeError,
+        "makes the avatar with its reach extend {:g} m: more than this scene's lattice can place exactly: split it",
+    ),
+}
+
+
+class SceneData(NamedTuple):
+    """What every question about one scene reads; made once, by `make_scene_data`.
+
+    arrays: what the overlap kernel reads.  broad: what the broad phase reads.  radius_units: of every scan point,
+    exact units.  unknown: (u, 2, 3) int64, lattice boxes of scans left out; unknown_everywhere: also elsewhere.
+    """
+
+    residency: Residency
+    arrays: SceneArrays
+    broad: SceneIndex
+    radius_units: int
+    unknown: NDArray[np.int64]
+    unknown_everywhere: bool
+
+
+def to_units(metres: float, what: str) -> int:
+    """A length in exact units, rounded once (NUMERICS.md N5). Raises BadRequestError for a negative or absurd one."""
+    if not 0 <= metres <= MAX_COORDINATE:  # not so for NaN either; kernels take the result as int64
+        raise BadRequestError(f"{what} {metres!r}: expected zero or a positive length in metres")
+    return round(metres * UNITS_PER_METRE)  # half to even
+
+
+def make_scene_data(archive: Archive, residency: Residency) -> SceneData:
+    """What the questions read of an archive whose voxels `residency` holds."""
+    header = archive.header
+    lattice = header.lattice
+    base = archive.coordinates * lattice.voxel_steps
+    arrays = SceneArrays(
+        *residency.buffer.arena,
+        residency.where,
+        archive.coordinates,
+        np.array(lattice.origin),
+        lattice.step,
+        lattice.units_per_step,
+        lattice.voxel_steps,
+    )
+    return SceneData(
+        residency,
+        arrays,
+        SceneIndex(
+            archive.voxels["key"].astype(np.uint64),
+            base + archive.voxels["low"],
+            base + archive.voxels["high"],
+            header.low,
+            header.high,
+        ),
+        to_units(header.radius, "radius of the archive"),
+        header.unknown,
+        header.unknown_everywhere,
+    )
+
+
+def _empty_reach(k: int, rows: int) -> Reach:
+    """A `Reach` to be filled for k poses with room for so many voxel rows."""
+    return Reach(
+        np.empty(k), np.empty(k, np.int64), np.zeros(k + 1, np.int64), np.empty(rows, np.int64), np.empty((k, 2, 3)),
+        np.zeros(k, bool),
+    )  # fmt: skip
+
+
+def refuse(fault: int, pose: int, found: float) -> None:
+    """Raise what a fault that `find_reach` found stands for, if it is one."""
+    if fault != placing.GOOD:
+        error, text = _POSE_FAULTS[fault]
+        raise error(f"pose {pose} {text.format(found)}")
+
+
+def check_request(
+    data: SceneData, avatar: AvatarModel, poses: NDArray[np.float64], other_units: int
+) -> Reach:
+    """The voxels in reach of each pose (k, 4, 4); none for an empty avatar.
+
+    Raises BadRequestError, BadTransformError or TooLargeError naming the pose.
+    """
+    needed = 16 * len(poses) + 64
+    while True:
+        reach = _empty_reach(len(poses), needed)
+        fault, pose, found, needed = find_reach(
+            poses, avatar.arrays, avatar.radius, other_units, data.arrays, data.broad, reach
+        )
+        refuse(fault, pose, found)
+        if needed <= len(reach.rows):
+            return reach
+
+
+def pieces(reach: Reach, residency: Residency) -> Iterator[tuple[NDArray[np.int64], list[int], Reach]]:
+    """Cut a request into pieces whose voxels fit the budget: (pose numbers, voxel rows, reach) each.
+
+    Nearly always one piece. A pose that alone reaches more than the budget is looked at voxel by voxel run
+    (NUMERICS.md case 23), and so appears in several pieces.
+    """
+    k = len(reach.scales)
+    everything = reach.rows[: reach.starts[k]].tolist()
+    if k > 1:
+        everything = np.unique(everything).tolist()
+    budget = residency.buffer.total_bytes
+    if residency.bytes_of(everything) <= budget:
+        yield np.arange(k), everything, reach
+        return
+    which: list[int] = []
+    held: dict[int, None] = {}
+    held_bytes = 0
+    for pose in range(k):
+        own = reach.rows[reach.starts[pose] : reach.starts[pose + 1]].tolist()
+        fresh = [row for row in own if row not in held]
+        if which and held_bytes + residency.bytes_of(fresh) > budget:
+            yield np.array(which), list(held), reach
+            which, held, held_bytes, fresh = [], {}, 0, own
+        if residency.bytes_of(own) <= budget:
+            which.append(pose)
+            held.update(dict.fromkeys(fresh))
+            held_bytes += residency.bytes_of(fresh)
+            continue
+        part: list[int] = []
+        for row in [*own, -1]:
+            if row < 0 or residency.bytes_of([*part, row]) > budget:
+                yield np.array([pose]), part, _only(reach, pose, part)
+                part = []
+            part.append(row)
+    if which:
+        yield np.array(which), list(held), reach
+
+
+def _only(reach: Reach, pose: int, rows: list[int]) -> Reach:
+    """The same request with the voxels of one pose replaced by some of them."""
+    starts = np.zeros_like(reach.starts)
+    starts[pose + 1 :] = len(rows)
+    return reach._replace(starts=starts, rows=np.array(rows, np.int64))
+
+
+def in_unknown(boxes: NDArray[np.float64], unknown: NDArray[np.int64], everywhere: bool) -> NDArray[np.bool_]:
+    """Which boxes (k, 2, 3) of reach meet a region (u, 2, 3) whose scan was left out."""
+    if everywhere:
+        return np.ones(len(boxes), bool)
+    met = np.zeros(len(boxes), bool)
+    for low, high in unknown:
+        met |= ((boxes[:, 0] <= high) & (boxes[:, 1] >= low)).all(axis=1)
+    return met

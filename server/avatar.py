@@ -20,12 +20,13 @@ class AvatarModel(NamedTuple):
     """An avatar as added.
 
     points: (n, 3) float64, avatar frame [m], as given.  radius: of each point's sphere [m].
-    arrays: what the kernels read.
+    arrays: what the kernels read.  rows: (b, LANES) int32, the row of `points` that each lane of a block is.
     """
 
     points: NDArray[np.float64]
     radius: float
     arrays: Avatar
+    rows: NDArray[np.int32]
 
     @property
     def bounding_radius(self) -> float:
@@ -54,7 +55,7 @@ def make_avatar(points: ArrayLike, radius: float | None = None) -> AvatarModel:
             np.empty(0, np.int32),
             np.empty((0, 3, LANES)),
         )
-        return AvatarModel(array, float(radius or 0.0), empty)
+        return AvatarModel(array, float(radius or 0.0), empty, np.empty((0, LANES), np.int32))
     local = build_local(array, leaf=LANES, degree=DEGREE)
     if radius is None:
         radius = mean_closest_distance(local) / 2
@@ -69,9 +70,10 @@ def make_avatar(points: ArrayLike, radius: float | None = None) -> AvatarModel:
         1 + np.concatenate([[0], np.cumsum(tree.count[:leaves], dtype=np.int64)[:-1]]) if leaves else 0
     )
     first[leaves:] = ~np.arange(len(tree.begin) - leaves)
-    ordered = array[tree.order]
-    blocks = [ordered[a:b] for a, b in zip(tree.begin[leaves:], tree.end[leaves:], strict=True)]
-    lanes = np.stack([np.concatenate([b, np.repeat(b[-1:], LANES - len(b), axis=0)]).T for b in blocks])
+    # The last point of a block is repeated to its end.
+    last = tree.end[leaves:, None] - 1
+    rows = tree.order[np.minimum(tree.begin[leaves:, None] + np.arange(LANES), last)]
+    lanes = array[rows].transpose(0, 2, 1)
     # The lattice point lies within sqrt(3) steps of the point as given: two steps more hold it, rounding included.
     center = np.asarray(local.low + bounds.center * local.step)
     node_radius = np.asarray((bounds.radius + 2) * local.step, np.float64)
@@ -82,4 +84,4 @@ def make_avatar(points: ArrayLike, radius: float | None = None) -> AvatarModel:
         tree.count.astype(np.int32),
         np.ascontiguousarray(lanes),
     )
-    return AvatarModel(array, float(radius), arrays)
+    return AvatarModel(array, float(radius), arrays, np.ascontiguousarray(rows, np.int32))

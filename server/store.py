@@ -21,7 +21,11 @@ class Store:
         """Open the archive in `folder`. Raises FormatError or CorruptError."""
         self.archive = Archive(folder)
         rows = self.archive.voxels
-        self.sizes = resident_bytes(rows["rows"][:, 1].astype(np.int64), rows["leaves"].astype(np.int64))
+        self.sizes = resident_bytes(
+            rows["rows"][:, 1].astype(np.int64),
+            rows["leaves"].astype(np.int64),
+            with_scan=self.archive.header.scan_index,
+        )
 
     def load(self, row: int, arena: Arena, offset: int) -> NDArray[np.int64]:
         """Read, check and lay out the voxel of index row `row` at byte `offset` of the arena.
@@ -39,7 +43,8 @@ class Store:
                 f"{self.archive.where(row)}: {links.height} levels, expected at most {MOST_LEVELS}: rebuild it"
             )
         where = np.empty(3, np.int64)
-        parts = (voxel.cells, voxel.nodes, np.int64(voxel.top_shift), voxel.points)
+        scan_index = np.empty(0, np.uint16) if voxel.scan_index is None else voxel.scan_index
+        parts = (voxel.cells, voxel.nodes, np.int64(voxel.top_shift), voxel.points, scan_index)
         lay_out(parts, (links.first, links.is_leaf, links.cell), arena, np.int64(offset), where)
         return where
 

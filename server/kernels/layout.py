@@ -1,15 +1,18 @@
 """A voxel as the overlap kernel reads it, in the arena of resident voxels.
 
-The arena is one buffer seen as float32 words, int32 words and uint16 halfwords. A voxel takes three runs:
+The arena is one buffer seen as float32 words, int32 words and uint16 halfwords. A voxel takes three runs, and one
+more where the archive keeps scan numbers (`--keep scan`):
 
 - rows: (n, 12) words, one a node: center x, y, z, radius [voxel steps], the slab's normal x, y, z, its length,
   least and greatest dot(normal, point - center), then as int32: first child row, or ~block for a leaf node, and
   the number of children or points. 48 bytes, three rows to four cache lines;
 - blocks: (b, 4) int32, one a leaf node: low corner x, y, z of its points' box [voxel steps], points;
 - lanes: (b, 3, LANES) halfwords: x[], y[], z[] of the block's points from that corner, the last one repeated
-  to the end, so that a test of all lanes needs no mask.
+  to the end, so that a test of all lanes needs no mask;
+- scans: (b, LANES) halfwords, the scan each point came from (`scan_run`); not there where it is not kept.
 
-For a dense voxel this is 8.3 bytes a point: 6 the points, 1.8 the rows, 0.5 the blocks (scripts/bench_walk).
+For a dense voxel this is 8.3 bytes a point: 6 the points, 1.8 the rows, 0.5 the blocks (scripts/bench_walk), and 2
+more for the scans where kept.
 """
 
 from typing import NamedTuple
@@ -52,9 +55,22 @@ class SceneArrays(NamedTuple):
     voxel_steps: int
 
 
-def resident_bytes(nodes: NDArray[np.int64], leaves: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Bytes (v,) that voxels of so many nodes, of them leaf nodes, take in the arena; multiples of 16."""
-    return 4 * ROW_WORDS * nodes + 4 * BLOCK_WORDS * leaves + 2 * 3 * LANES * leaves
+def resident_bytes(
+    nodes: NDArray[np.int64], leaves: NDArray[np.int64], *, with_scan: bool = False
+) -> NDArray[np.int64]:
+    """Bytes (v,) that voxels of so many nodes, of them leaf nodes, take in the arena; multiples of 16.
+
+    with_scan: whether scan numbers are kept.
+    """
+    halves = LANES * (4 if with_scan else 3)
+    return 4 * ROW_WORDS * nodes + 4 * BLOCK_WORDS * leaves + 2 * halves * leaves
+
+
+@nb.njit(nogil=True, cache=True)
+def scan_run(where, voxel):
+    """Where a resident voxel's scans begin [halves], in an archive that keeps them: behind its lanes, LANES a block."""
+    leaves = (where[voxel, 2] // 2 - where[voxel, 1]) // BLOCK_WORDS
+    return where[voxel, 2] + leaves * 3 * LANES
 
 
 @nb.njit(nogil=True, cache=True)
@@ -72,10 +88,11 @@ def _outward(value, up):
 def lay_out(voxel, links, arena, at_bytes, where):
     """Write a checked voxel into the arena from byte `at_bytes` on (a multiple of 16).
 
-    voxel: (cells, nodes, top_shift, points) of schemas/voxel.py.  links: its Links without the height.
+    voxel: (cells, nodes, top_shift, points, scan_index) of schemas/voxel.py, scan_index (0,) where it is not kept.
+    links: its Links without the height.
     Writes where (3,) int64: first row [words], first block [ints], first lane [halves].
     """
-    cells, nodes, top_shift, points = voxel
+    cells, nodes, top_shift, points, scan_index = voxel
     first, is_leaf, cell_of = links
     n = first.shape[0]
     leaves = 0
@@ -84,6 +101,7 @@ def lay_out(voxel, links, arena, at_bytes, where):
     rows = at_bytes // 4
     blocks = rows + n * ROW_WORDS
     lanes = 2 * (blocks + leaves * BLOCK_WORDS)
+    scans = lanes + leaves * 3 * LANES
     where[0], where[1], where[2] = rows, blocks, lanes
     words, ints, halves = arena
     block = 0
@@ -113,5 +131,10 @@ def lay_out(voxel, links, arena, at_bytes, where):
             count = np.int64(nodes.count[i])
             for j in range(LANES):
                 halves[lane + j] = points[first[i] + min(j, count - 1), k]
+        if scan_index.shape[0] > 0:
+            for j in range(LANES):
+                halves[scans + block * LANES + j] = scan_index[
+                    first[i] + min(j, np.int64(nodes.count[i]) - 1)
+                ]
         ints[blocks + block * BLOCK_WORDS + 3] = np.int32(nodes.count[i])
         block += 1

@@ -101,3 +101,16 @@ def test_the_points_are_the_avatars_own(rng: np.random.Generator) -> None:
     before = points.copy()
     points += 5.0
     assert (model.points == before).all() and (np.abs(leaf_points(model, 0)) <= 1).all()
+
+
+def test_every_lane_knows_the_row_it_is(rng: np.random.Generator) -> None:
+    points = rng.uniform(-1, 1, (300, 3))
+    points[100:150] = points[:50]
+    model = make_avatar(points, 0.1)
+    assert np.array_equal(points[model.rows].transpose(0, 2, 1), model.arrays.points)
+    held = [
+        own[:count] for own, count in zip(model.rows, model.arrays.count[-len(model.rows) :], strict=True)
+    ]
+    assert sorted(np.concatenate(held).tolist()) == list(range(300)), (
+        "coincident points are points of their own"
+    )

@@ -9,7 +9,15 @@ import scans
 from solidcloud.builder.radius import voxel_points
 from solidcloud.schemas.archive import Archive
 from solidcloud.server.arena import ArenaBuffer
-from solidcloud.server.kernels.layout import BLOCK_WORDS, COUNT, FIRST, LANES, ROW_WORDS, resident_bytes
+from solidcloud.server.kernels.layout import (
+    BLOCK_WORDS,
+    COUNT,
+    FIRST,
+    LANES,
+    ROW_WORDS,
+    resident_bytes,
+    scan_run,
+)
 from solidcloud.server.store import Store
 
 pytestmark = pytest.mark.interpreted
@@ -21,6 +29,7 @@ pytestmark = pytest.mark.interpreted
         ("noise", 4.0, 1e-3, {"cell_points": 16, "leaf": 5, "degree": 3}),
         ("plane", 2.0, 1e-6, {"cell_points": 64}),  # 2 * 10^6 steps: the top BSH has a unit above a step
         ("one point", 0.5, 1e-3, {}),
+        ("noise", 1.0, 1e-3, {"leaf": 7, "keep": frozenset({"scan"})}),
         ("duplicates", 0.5, 1e-3, {"with_slab": False, "leaf": 1}),
     ],
 )
@@ -37,7 +46,10 @@ def test_the_arena_holds_what_the_archive_does(
             data, links = archive.read_voxel(row)
             rows, blocks, lanes = store.load(row, buffer.arena, 64).tolist()
             n, leaves = len(links.first), int(links.is_leaf.sum())
-            assert store.sizes[row] == resident_bytes(n, leaves)
+            kept = data.scan_index is not None
+            assert store.sizes[row] == resident_bytes(n, leaves, with_scan=kept)
+            scans_at = scan_run(np.array([[rows, blocks, lanes]]), 0)
+            assert store.sizes[row] == 2 * scans_at - 64 + 2 * LANES * leaves * kept
             # Rows, blocks and lanes follow each other from byte 64 on, and nothing is written behind them.
             assert (rows * 4, blocks - rows, lanes - 2 * blocks) == (
                 64,
@@ -59,6 +71,12 @@ def test_the_arena_holds_what_the_archive_does(
                     assert corner[3] == len(own)
                     assert (held[: len(own)] + corner[:3] == own).all()
                     assert (held[len(own) :] == held[len(own) - 1]).all()
+                    if kept:
+                        scan = buffer.arena.halves[scans_at + block * LANES :][:LANES]
+                        from_scan = data.scan_index[links.first[i] :][: len(own)]
+                        assert (scan[: len(own)] == from_scan).all() and (
+                            scan[len(own) :] == from_scan[-1]
+                        ).all()
                     block += 1
                 else:
                     assert ints[FIRST] == links.first[i]

@@ -389,7 +389,7 @@ class _BinDecoder:
             if get_origin(hint) is np.ndarray:
                 of = _array_type(hint)
                 self._arrays.append((name, of.dtype, of.tail, of.row_bytes, of.dtype.kind))
-                fields.append((name, bytes))
+                fields.append((name, bytes, b"") if _default(kind, name) else (name, bytes))
             else:
                 fields.append((name, hint, *_default(kind, name)))
         self._writeable = issubclass(kind, _Request)

@@ -88,7 +88,7 @@ class FloorScene:
         verdict = floor_verdicts(points, radius, poses, margin)
         ones = np.ones(k, np.uint32)
         outside = np.abs(poses[:, 0, 3]) > 1
-        return CollideAnswers(verdict, outside, ones * 0, ones, ones * 2, 0.25, hits=1, resident=1)
+        return CollideAnswers(verdict, outside, ones * 0, ones, ones * 2, engine_seconds=0.25, hits=1, resident=1)
 
     def drop_client(self, client):
         for key in [key for key in self.avatars if key[0] == client]:

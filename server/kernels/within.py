@@ -1,0 +1,185 @@
+"""The scan point nearest to a loose point, as a k-d tree would find it.
+
+The definition, which no tree, order, voxel size or thread can change: q = rint((point - O) 2^26) in int64, half to
+even, O the dataset's origin; b a scan point as in NUMERICS.md N5; the least integer |q - b|^2 is within reach when it
+is at most the square of the reach in units of 2^-26 m; of several points at that distance the least (x, y, z) is
+named. The distance is the float64 root of that square, divided by 2^26.
+
+Everything else here prunes and never decides: node bounds in float64, 32 points at a time in float32, both inflated.
+"""
+
+import math
+
+import numba as nb
+import numpy as np
+
+from .layout import BLOCK_WORDS, COUNT, FIRST, LANES, ROW_WORDS
+from .placed import U32
+from .placing import MAX_REACH_UNITS, lattice_to_units
+from .rays import STACK, is_less, push_sorted
+
+
+@nb.njit(nogil=True, cache=True)
+def _below_node(words, row, x, y, z):
+    """Lower bound of the distance [steps] from a point (float64, from the voxel's low corner) to a node's points.
+
+    They lie in the node's sphere and in its slab, and so in the round disc that holds both. Rounding: under 2^-24 of
+    the distance to the centre, where the root of a small difference magnifies it.
+    """
+    dx, dy, dz = x - words[row], y - words[row + 1], z - words[row + 2]
+    nx, ny, nz = np.float64(words[row + 4]), np.float64(words[row + 5]), np.float64(words[row + 6])
+    square = dx * dx + dy * dy + dz * dz
+    radius = np.float64(words[row + 3])
+    length = np.float64(words[row + 7])
+    slack = math.sqrt(square) * 2.0**-24
+    below = math.sqrt(square) - radius
+    if length > 0.0:
+        along = (nx * dx + ny * dy + nz * dz) / length
+        # The length is rounded up, so offsets divided by it come out shorter by 2^-23 at most, undone by the slack.
+        gap = max(along - words[row + 9] / length, words[row + 8] / length - along, 0.0)
+        gap -= (abs(along) + radius) * 2.0**-21
+        across = math.sqrt(max(square - along * along * (1.0 + 2.0**-21), 0.0)) - radius
+        if gap > 0.0:
+            across = max(across - slack, 0.0)
+            below = max(below, math.sqrt(gap * gap + across * across))
+    return max(below - slack, 0.0)
+
+
+@nb.njit(nogil=True, cache=True)
+def _test_block(scene, voxel, row, x, y, z, error, at_units, i, best, limit):
+    """All points of a leaf node against point i: 32 in float32, those within the band in integers.
+
+    limit: the best square so far, or that of the reach [units^2]. Returns it, lowered.
+    Rounding in float32: where a scan point is within the limit, coordinates from the block's corner are at most its
+    root and four radii large, and differences below that: under 16 U32 of it.
+    """
+    words, ints, halves = scene.words, scene.ints, scene.halves
+    block = ~ints[row + FIRST]
+    block_at = scene.where[voxel, 1] + block * BLOCK_WORDS
+    lane_at = scene.where[voxel, 2] + block * 3 * LANES
+    qx = np.float32(x - ints[block_at])
+    qy = np.float32(y - ints[block_at + 1])
+    qz = np.float32(z - ints[block_at + 2])
+    span = math.sqrt(np.float64(limit)) / scene.units_per_step + error
+    span += 16.0 * U32 * (span + 4.0 * words[row + 3] + 1.0)
+    far = np.float32(span * span * (1.0 + 64.0 * U32))
+    least = np.float32(np.inf)
+    met = False
+    for j in range(LANES):
+        dx = np.float32(halves[lane_at + j]) - qx
+        dy = np.float32(halves[lane_at + LANES + j]) - qy
+        dz = np.float32(halves[lane_at + 2 * LANES + j]) - qz
+        met |= dx * dx + dy * dy + dz * dz <= far
+    if not met:
+        return limit
+    for j in range(ints[block_at + 3]):
+        dx = np.float32(halves[lane_at + j]) - qx
+        dy = np.float32(halves[lane_at + LANES + j]) - qy
+        dz = np.float32(halves[lane_at + 2 * LANES + j]) - qz
+        least = min(least, dx * dx + dy * dy + dz * dz)
+    # None beyond the least by more than twice the rounding can be nearest.
+    nearest = math.sqrt(np.float64(least)) * (1.0 + 8.0 * U32)
+    nearest += 2.0 * error + 32.0 * U32 * (nearest + 4.0 * words[row + 3] + 1.0)
+    far = min(far, np.float32(nearest * nearest * (1.0 + 64.0 * U32)))
+    lx = scene.coordinates[voxel, 0] * scene.voxel_steps + np.int64(ints[block_at])
+    ly = scene.coordinates[voxel, 1] * scene.voxel_steps + np.int64(ints[block_at + 1])
+    lz = scene.coordinates[voxel, 2] * scene.voxel_steps + np.int64(ints[block_at + 2])
+    for j in range(ints[block_at + 3]):
+        dx = np.float32(halves[lane_at + j]) - qx
+        dy = np.float32(halves[lane_at + LANES + j]) - qy
+        dz = np.float32(halves[lane_at + 2 * LANES + j]) - qz
+        if not dx * dx + dy * dy + dz * dz <= far:
+            continue
+        sx, sy, sz = (
+            lx + np.int64(halves[lane_at + j]),
+            ly + np.int64(halves[lane_at + LANES + j]),
+            lz + np.int64(halves[lane_at + 2 * LANES + j]),
+        )
+        ux = lattice_to_units(sx, scene.units_per_step) - at_units[i, 0]
+        uy = lattice_to_units(sy, scene.units_per_step) - at_units[i, 1]
+        uz = lattice_to_units(sz, scene.units_per_step) - at_units[i, 2]
+        if abs(ux) > MAX_REACH_UNITS or abs(uy) > MAX_REACH_UNITS or abs(uz) > MAX_REACH_UNITS:
+            continue
+        square = ux * ux + uy * uy + uz * uz
+        if square > limit:
+            continue
+        if best.square[i] < 0 or square < limit or is_less(sx, sy, sz, best.lattice[i]):
+            best.square[i] = limit = square
+            best.lattice[i, 0], best.lattice[i, 1], best.lattice[i, 2] = sx, sy, sz
+    return limit
+
+
+@nb.njit(nogil=True, cache=True)
+def _search(scene, voxel, at_units, i, tolerance, visits, best, limit, rows, bounds):
+    """Search one resident voxel, nearest nodes first. Returns the limit, lowered; updates `best`."""
+    words, ints = scene.words, scene.ints
+    per_unit = 1.0 / scene.units_per_step
+    farthest, x, y, z = 0.0, 0.0, 0.0, 0.0
+    for r in range(3):
+        corner = scene.coordinates[voxel, r] * scene.voxel_steps
+        away = np.float64(at_units[i, r] - lattice_to_units(corner, scene.units_per_step)) * per_unit
+        farthest = max(farthest, abs(away), abs(np.float64(corner)))
+        if r == 0:
+            x = away
+        elif r == 1:
+            y = away
+        else:
+            z = away
+    error = 2.0 * per_unit + (farthest + scene.voxel_steps) * 2.0**-45
+    base = scene.where[voxel, 0]
+    spent, tests = np.int64(best.counts[1, i]) + 1, np.int64(best.counts[2, i])
+    rows[0], bounds[0], depth = base, _below_node(words, base, x, y, z), 1
+    nearest = math.sqrt(np.float64(limit))
+    while depth > 0:
+        depth -= 1
+        row, bound = rows[depth], (bounds[depth] - error) * scene.units_per_step
+        if bound > nearest - (tolerance if best.square[i] >= 0 else 0.0) or spent >= visits:
+            if bound <= nearest:
+                best.unseen[i] = min(best.unseen[i], max(bound, 0.0))
+            continue
+        first = ints[row + FIRST]
+        if first < 0:
+            tests += LANES
+            limit = _test_block(scene, voxel, row, x, y, z, error, at_units, i, best, limit)
+            nearest = math.sqrt(np.float64(limit))
+            continue
+        spent += ints[row + COUNT]
+        begin = depth
+        steps = nearest * per_unit + error
+        for child in range(first, first + ints[row + COUNT]):
+            child_row = base + child * ROW_WORDS
+            bound = _below_node(words, child_row, x, y, z)
+            if bound <= steps:
+                push_sorted(rows, bounds, begin, depth, child_row, bound)
+                depth += 1
+    best.counts[1, i], best.counts[2, i] = spent, tests
+    return limit
+
+
+@nb.njit(nogil=True, cache=True)
+def search_points(at_units, reach, lists, cursor, held, scene, tolerance, visits, best):
+    """Search for the points nearest to k loose points, each along its list up to the first voxel that is not held.
+
+    at_units: (k, 3) int64.  reach: exact units, at most MAX_REACH_UNITS. The rest as in `rays.follow_rays`.
+    """
+    rows, bounds = np.empty(STACK, np.int64), np.empty(STACK)
+    for i in range(cursor.shape[0]):
+        end = lists.starts[i + 1]
+        limit = best.square[i] if best.square[i] >= 0 else np.int64(reach) * np.int64(reach)
+        while cursor[i] < end:
+            at = cursor[i]
+            near, voxel = lists.near[at], lists.rows[at]
+            nearest = math.sqrt(np.float64(limit)) * (1.0 + 2.0**-52)
+            if near > nearest - (tolerance if best.square[i] >= 0 else 0.0) or best.counts[1, i] >= visits:
+                if near <= nearest:
+                    best.unseen[i] = min(best.unseen[i], near)
+                cursor[i] = end
+                break
+            if not held[voxel]:
+                break
+            if scene.where[voxel, 0] < 0:
+                best.counts[0, i] += np.uint32(1)
+                best.unseen[i] = min(best.unseen[i], near)
+            else:
+                limit = _search(scene, voxel, at_units, i, tolerance, visits, best, limit, rows, bounds)
+            cursor[i] = at + 1

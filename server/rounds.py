@@ -1,0 +1,190 @@
+"""What `raycast` and `within` share: voxels looked at front to back, in rounds, so that no more is loaded than asked.
+
+A round holds the next voxel of every ray or point that is not done, and of the voxels further on those that are in
+memory already, and makes one kernel call for all of them. So a request whose voxels are resident takes one round, and a
+hit in the first voxel loads no second one. What is held at a time stays within the cache's budget.
+"""
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+from weakref import WeakKeyDictionary
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..schemas.errors import BadRequestError
+from ..schemas.voxel_grid import MAX_COORDINATE, UNITS_PER_METRE
+from .effort import Effort
+from .kernels.rays import Nearest
+from .kernels.voxel_tree import Lists, VoxelTree, list_voxels, make_voxel_tree
+from .request import SceneData
+from .residency import Residency
+
+# Rays or points whose lists are in memory together; a deadline is looked at between batches too.
+BATCH = 1 << 14
+
+_trees: WeakKeyDictionary[Residency, VoxelTree] = WeakKeyDictionary()
+
+
+class Found(NamedTuple):
+    """All of a request's answers, and what it took. best: of k rays or points.  hits, misses, faults: as in `Cost`."""
+
+    best: Nearest
+    hits: int
+    misses: int
+    faults: tuple[str, ...]
+
+
+def voxel_tree(data: SceneData) -> VoxelTree:
+    """The tree over a scene's voxels, made at the first question."""
+    tree = _trees.get(data.residency)
+    if tree is None:
+        tree = make_voxel_tree(data.broad.low, data.broad.high, data.unknown)
+        _trees[data.residency] = tree
+    return tree
+
+
+def make_vectors(values: ArrayLike, what: str) -> NDArray[np.float64]:
+    """Positions or directions (k, 3) float64, finite, of a writeable array. Raises BadRequestError."""
+    try:
+        array = np.asarray(values, np.float64)
+    except (TypeError, ValueError) as error:
+        raise BadRequestError(f"{what}: {error}: expected numbers") from None
+    if array.ndim != 2 or array.shape[1] != 3:
+        raise BadRequestError(f"{what} of shape {array.shape}: expected (k, 3)")
+    if not np.isfinite(array).all():
+        row = int(np.flatnonzero(~np.isfinite(array).all(axis=1))[0])
+        raise BadRequestError(f"{what} {row} holds {array[row].tolist()}: expected finite numbers")
+    return array
+
+
+def make_origins(
+    data: SceneData, values: ArrayLike, what: str
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """World positions (k, 3) [m], and the same in exact units from the dataset's origin, half to even."""
+    array = make_vectors(values, what)
+    if len(array) and np.abs(array).max() > MAX_COORDINATE:
+        raise BadRequestError(f"{what} at {np.abs(array).max():g} m: expected within {MAX_COORDINATE:g} m")
+    return array, np.rint((array - data.arrays.origin) * UNITS_PER_METRE).astype(np.int64)
+
+
+def make_best(k: int) -> Nearest:
+    """Nothing found yet."""
+    return Nearest(
+        np.full(k, np.inf),
+        np.full(k, -1, np.int64),
+        np.zeros((k, 3), np.int64),
+        np.full(k, np.inf),
+        np.zeros((3, k), np.uint32),
+    )
+
+
+def _part(best: Nearest, begin: int, end: int) -> Nearest:
+    """Views of rows [begin, end); counts contiguous, to be written back."""
+    return Nearest(*[column[begin:end] for column in best[:4]], best.counts[:, begin:end].copy())
+
+
+def look(
+    data: SceneData,
+    at_units: NDArray[np.int64],
+    direction: NDArray[np.float64] | None,
+    reach_units: int,
+    radius_units: int,
+    effort: Effort,
+    kernel: Callable[..., Any],
+) -> Found:
+    """Answer k rays (direction (k, 3)) or loose points (None) by rounds.
+
+    kernel(begin, end, lists, cursor, held, best) looks as far as it may; see `kernels.rays.follow_rays`.
+    What a deadline left undone is in best.unseen.
+    """
+    k = len(at_units)
+    best = make_best(k)
+    hits = misses = 0
+    faults: dict[str, None] = {}
+    capacity = 64
+    for begin in range(0, k, BATCH):
+        end = min(begin + BATCH, k)
+        if effort.spent:
+            best.unseen[begin:] = 0.0
+            break
+        capacity = max(capacity, 8 * (end - begin))
+        part = _part(best, begin, end)
+        directions = np.empty((0, 3)) if direction is None else direction[begin:end]
+        while True:
+            lists = Lists(
+                np.zeros(end - begin + 1, np.int64),
+                np.empty(capacity, np.int64),
+                np.empty(capacity),
+                part.unseen,
+            )
+            needed = list_voxels(
+                voxel_tree(data), at_units[begin:end], directions, direction is not None, reach_units, radius_units,
+                data.arrays.units_per_step, lists,
+            )  # fmt: skip
+            if needed <= capacity:
+                break
+            capacity = needed
+        if data.unknown_everywhere:
+            part.unseen[:] = 0.0
+        cursor = lists.starts[:-1].copy()
+        looked: NDArray[np.bool_] = np.zeros(len(data.arrays.where), bool)
+        while (open_ := cursor < lists.starts[1:]).any():
+            if effort.spent:
+                part.unseen[open_] = np.minimum(part.unseen[open_], lists.near[cursor[open_]])
+                break
+            rows = _next_rows(data, lists, cursor, open_)
+            held = np.zeros(len(looked), bool)
+            held[rows] = True
+            with data.residency.hold(rows.tolist()) as found:
+                kernel(begin, end, lists, cursor, held, part)
+            hits += max(0, found.hits - int(looked[rows].sum()))
+            misses += found.misses
+            faults.update(dict.fromkeys(found.faults))
+            looked |= held
+        best.counts[:, begin:end] = part.counts
+    return Found(best, hits, misses, tuple(faults))
+
+
+def _next_rows(
+    data: SceneData, lists: Lists, cursor: NDArray[np.int64], open_: NDArray[np.bool_]
+) -> NDArray[np.int64]:
+    """The voxels to hold in the next round: those wanted next, the most wanted first, then what is resident already.
+
+    At least one is wanted next and fits, as the cache holds every voxel alone; so each round comes further.
+    """
+    v = len(data.arrays.where)
+    wanted = np.bincount(lists.rows[cursor[open_]], minlength=v)
+    order = np.flatnonzero(wanted)
+    later = np.zeros(v, bool)
+    later[lists.rows[: lists.starts[-1]]] = True
+    later &= (data.arrays.where[:, 0] >= 0) & (wanted == 0)
+    rows = np.concatenate([order, np.flatnonzero(later)])
+    residency, budget = data.residency, data.residency.buffer.total_bytes
+    if residency.bytes_of(rows.tolist()) <= budget:
+        return rows
+    rows = np.concatenate([order[np.argsort(-wanted[order], kind="stable")], np.flatnonzero(later)])
+    chosen, taken = [], 0
+    for row in rows.tolist():
+        size = residency.bytes_of([row])
+        if taken + size <= budget:
+            chosen.append(row)
+            taken += size
+    return np.array(chosen, np.int64)
+
+
+def finish(
+    found: NDArray[np.float64], unseen: NDArray[np.float64], reach_units: int
+) -> tuple[NDArray[np.uint8], NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+    """verdict, lower, upper [m] and exact of distances found (k,) [exact units], inf: none.
+
+    unseen: (k,) lower bounds of what was not looked at [exact units]. A hit found is a hit, whatever is missing; it is
+    the first one, as `exact` says, when all that is missing lies farther.
+    """
+    missing = np.where(unseen > reach_units, math.inf, unseen)
+    hit = np.isfinite(found)
+    exact = np.where(hit, found < missing, np.isinf(missing))
+    lower = np.where(exact & ~hit, float(reach_units), np.minimum(found, missing)) / UNITS_PER_METRE
+    verdict = np.where(hit, 1, np.where(exact, 0, 2)).astype(np.uint8)  # CONTACT, CLEAR, UNKNOWN
+    return verdict, lower, found / UNITS_PER_METRE, exact

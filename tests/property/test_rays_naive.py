@@ -1,0 +1,272 @@
+"""`raycast` and `within` equal their definitions, bit for bit, whatever the scan, the tree and the order of points."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from fractions import Fraction
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import cases
+import naive
+import naive_rays
+import numpy as np
+import pytest
+import scans
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from solidcloud.schemas.answers import RaycastAnswers, WithinAnswers
+from solidcloud.server.kernels.rays import first_meeting
+from solidcloud.server.rays import raycast
+from solidcloud.server.request import SceneData, make_scene_data
+from solidcloud.server.residency import Residency
+from solidcloud.server.store import Store
+from solidcloud.server.within import within
+
+KINDS = ("cluster", "plane", "line", "grid", "duplicates", "noise", "one point")
+TREES = st.fixed_dictionaries(
+    {
+        "degree": st.sampled_from([2, 3, 8, 16]),
+        "leaf": st.sampled_from([1, 2, 31, 32]),
+        "cell_points": st.sampled_from([1, 20, 4096]),
+        "with_slab": st.booleans(),
+    }
+)
+
+
+@contextmanager
+def opened(case: cases.Case, budget: int = 64 << 20) -> Iterator[SceneData]:
+    """What the questions read of an archive."""
+    store = Store(case.archive)
+    try:
+        yield make_scene_data(store.archive, Residency(store, budget))
+    finally:
+        store.close()
+
+
+def cloud(rng: np.random.Generator, kind: str, count: int) -> NDArray[np.float64]:
+    """Points (n, 3) in [-1, 1]^3."""
+    if kind == "one point":
+        count = 1
+    points = rng.uniform(-1, 1, (count, 3))
+    if kind == "cluster":
+        centers = rng.uniform(-1, 1, (max(1, count // 40), 3))
+        points = centers[rng.integers(len(centers), size=count)] + points * 10.0 ** rng.uniform(-6, -1)
+    elif kind == "plane":
+        points = points * [1, 1, 1e-5] @ cases.random_rotation(rng)
+    elif kind == "line":
+        points = points[:, :1] * rng.uniform(-1, 1, 3)
+    elif kind == "grid":
+        points = np.rint(points * 3) / 3
+    elif kind == "duplicates":
+        points = points[rng.integers(0, max(1, count // 10), count)]
+    return points
+
+
+def some_rays(
+    rng: np.random.Generator, points: NDArray[np.float64], extent: float, radius: float, count: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Rays of every kind: free, along an axis, from point to point, grazing, from within, from far away."""
+    origins, directions = [], []
+    for number in range(count):
+        at = points[rng.integers(len(points))]
+        free = rng.normal(size=3)
+        free /= np.linalg.norm(free)
+        origin = at + rng.normal(size=3) * extent
+        kind = number % 7
+        if kind == 0:
+            direction = free
+        elif kind == 1:  # along an axis, through a point
+            direction = np.zeros(3)
+            direction[rng.integers(3)] = rng.choice([-1.0, 1.0])
+            origin = at - direction * rng.uniform(0, 3) * extent
+        elif kind == 2:  # from one point to another: along scan lines
+            direction = points[rng.integers(len(points))] - at
+            origin = at - direction * rng.integers(0, 2)
+        elif kind == 3:  # tangent, as near as float64 can make it
+            across = np.cross(at - origin, free)
+            across /= max(np.linalg.norm(across), 1e-300)
+            direction = at + across * radius - origin
+        elif kind == 4:  # from inside a sphere, or from its centre
+            origin, direction = at + free * radius * rng.choice([0.0, 0.5, 1.0]), rng.normal(size=3)
+        elif kind == 5:  # from far away
+            origin = at - free * extent * 10.0 ** rng.uniform(0, 4)
+            direction = at - origin
+        else:
+            direction = (at - origin) * 10.0 ** rng.uniform(-300, 300)
+        if not np.abs(direction).max() > 0:
+            direction = free
+        origins.append(origin)
+        directions.append(direction)
+    return np.clip(origins, -1e9, 1e9), np.array(directions)
+
+
+def same_rays(answers: RaycastAnswers, expected: naive_rays.Hits, lattice: NDArray[np.float64]) -> None:
+    """The answers are those of the judge, bit for bit. lattice: (n, 3) scan points, world, as stored."""
+    hit = expected.row >= 0
+    assert answers.distance.tolist() == expected.distance.tolist()
+    assert answers.upper.tolist() == expected.distance.tolist()
+    assert answers.verdict.tolist() == hit.astype(int).tolist()
+    assert answers.exact.all()
+    assert answers.outside.tolist() == expected.outside.tolist()
+    np.testing.assert_array_equal(answers.cloud_point[hit], lattice[expected.row[hit]])
+    assert np.isnan(answers.cloud_point[~hit]).all() and np.isnan(answers.normal[~hit]).all()
+
+
+def same_points(answers: WithinAnswers, expected: naive_rays.Hits, lattice: NDArray[np.float64]) -> None:
+    """The answers are those of the judge, bit for bit."""
+    near = expected.row >= 0
+    assert answers.distance.tolist() == expected.distance.tolist()
+    assert answers.verdict.tolist() == near.astype(int).tolist()
+    assert answers.exact.all()
+    assert answers.outside.tolist() == expected.outside.tolist()
+    np.testing.assert_array_equal(answers.cloud_point[near], lattice[expected.row[near]])
+
+
+def stored(case: cases.Case, data: SceneData) -> NDArray[np.float64]:
+    """The case's points (n, 3) as the archive has them, world."""
+    origin, step = data.arrays.origin, data.arrays.step
+    return np.asarray(naive.lattice_of(case.points, origin, step) * step + origin)
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    kind=st.sampled_from(KINDS),
+    count=st.sampled_from([1, 2, 33, 300, 1500]),
+    step=st.sampled_from([1e-6, cases.BINARY_STEP, 1e-4, 1e-2, 0.3]),
+    voxel_steps=st.sampled_from([1, 7, 1000, 70_000, 1 << 21]),
+    far=st.sampled_from([0.0, 5e5, 6.4e6, 1e8]),
+    thick=st.sampled_from([0.0, 0.7, 9.0, 4000.0]),
+    tree=TREES,
+)
+def test_rays_and_points_are_answered_as_defined(
+    seed: int,
+    kind: str,
+    count: int,
+    step: float,
+    voxel_steps: int,
+    far: float,
+    thick: float,
+    tree: dict[str, Any],
+) -> None:
+    rng = np.random.default_rng(seed)
+    if step <= far * 1e-14:
+        far = 0.0
+    extent = step * min(voxel_steps * rng.uniform(0.1, 3), 1 << 21)
+    points = cloud(rng, kind, count) * extent + far * rng.uniform(-1, 1, 3)
+    radius = min(step * thick, 8.0)
+    with TemporaryDirectory() as folder:
+        case = cases.build(
+            Path(folder), points, voxel=step * voxel_steps, resolution=step, radius=radius, **tree
+        )
+        with opened(case) as data:
+            lattice = stored(case, data)
+            space = data.arrays.origin, data.arrays.step
+            o, d = some_rays(rng, lattice, extent, radius, 70)
+            for reach in (min(extent * rng.uniform(0.3, 4), 1e6), 1e6):
+                expected = naive_rays.raycast(points, *space, radius, o, d, reach)
+                same_rays(raycast(data, o, d, reach), expected, lattice)
+            loose = np.concatenate([lattice[rng.integers(len(lattice), size=9)], o[:40]])
+            for reach in (0.0, min(extent * rng.uniform(0, 0.5), 16.0), 16.0):
+                same_points(
+                    within(data, loose, reach), naive_rays.within(points, *space, loose, reach), lattice
+                )
+
+
+@settings(max_examples=10, deadline=None, derandomize=True)
+@given(seed=st.integers(0, 2**32 - 1), kind=st.sampled_from(KINDS))
+def test_no_tree_voxel_order_or_cache_changes_an_answer(seed: int, kind: str) -> None:
+    rng = np.random.default_rng(seed)
+    points = cloud(rng, kind, 300)
+    o, d = some_rays(rng, points, 1.0, 0.02, 70)
+    seen = []
+    with TemporaryDirectory() as folder:
+        for options in (
+            {"voxel": 4.0},
+            {"voxel": 0.5, "degree": 2, "leaf": 1},
+            {"voxel": 0.2, "degree": 16, "leaf": 32, "cell_points": 10, "with_slab": False},
+        ):
+            case = cases.build(Path(folder), rng.permutation(points), resolution=1e-3, radius=0.02, **options)
+            for budget in (64 << 20, None):  # None: no more than the largest voxel
+                with opened(case) as data:
+                    largest = max(data.residency.bytes_of([row]) for row in range(len(data.arrays.where)))
+                with opened(case, budget or largest) as data:
+                    rays, loose = raycast(data, o, d, 5.0), within(data, o, 2.0)
+                    data.residency.check()
+                    columns = rays.distance, rays.cloud_point, rays.hit, rays.normal, rays.outside
+                    seen.append([c.tobytes() for c in (*columns, loose.distance, loose.cloud_point)])
+    assert all(one == seen[0] for one in seen)
+
+
+@settings(max_examples=10, deadline=None, derandomize=True)
+@example(seed=1, shift=(6_378_137, -6_378_137, 6_356_752))
+@given(seed=st.integers(0, 2**32 - 1), shift=st.tuples(*[st.integers(-(10**7), 10**7)] * 3))
+def test_far_from_the_origin_is_as_at_the_origin(seed: int, shift: tuple[int, int, int]) -> None:
+    """Shifts of whole metres of coordinates that are whole 2^-20 m are exact: nothing at all may differ."""
+    rng = np.random.default_rng(seed)
+    points = np.rint(cloud(rng, "plane", 300) * 2.0**20) * 2.0**-20
+    o, d = some_rays(rng, points, 1.0, 0.02, 70)
+    o = np.rint(o * 2.0**20) * 2.0**-20
+    answers = []
+    with TemporaryDirectory() as folder:
+        for by in (np.zeros(3), np.array(shift)):
+            with opened(cases.build(Path(folder), points + by, radius=0.02)) as data:
+                rays, loose = raycast(data, o + by, d, 4.0), within(data, o + by, 3.0)
+                columns = rays.distance, rays.normal, rays.outside, rays.node_visits, rays.point_tests
+                answers.append([c.tobytes() for c in (*columns, loose.distance, loose.node_visits)])
+                assert 0 < rays.verdict.sum() < 70 and 0 < loose.verdict.sum() < 70
+    assert answers[0] == answers[1]
+
+
+@settings(max_examples=300, deadline=None, derandomize=True)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    size=st.sampled_from([1e3, 1e6, 1e9, 1e12, 6e13]),
+    radius=st.sampled_from([0, 1, 10**5, 10**6, 2**30]),
+    grazing=st.booleans(),
+)
+@pytest.mark.interpreted
+def test_the_formula_is_as_near_the_ideal_as_it_says(
+    seed: int, size: float, radius: int, grazing: bool
+) -> None:
+    """In fractions, for the direction given: which spheres are hit, and where. The bounds of kernels/rays.py."""
+    rng = np.random.default_rng(seed)
+    d = np.rint(rng.normal(size=3) * size).astype(np.int64)
+    direction = rng.normal(size=3)
+    if grazing:
+        across = np.cross(d, direction)
+        direction = d + across / np.linalg.norm(across) * radius
+    if rng.random() < 0.5:
+        direction = rng.normal(size=3) * np.abs(direction).max() * 1e-9 + direction
+    u = naive_rays.unit_vectors(direction[None])[0]
+    t = float(first_meeting(*d, *u, np.int64(radius)))
+    miss2, along2 = naive_rays.ideal_miss(d.tolist(), direction.tolist())
+    if sum(int(c) ** 2 for c in d) <= radius**2:
+        assert t == 0.0
+        return
+    length = naive_rays.root(sum((Fraction(int(c)) ** 2 for c in d), Fraction(0))) + 1
+    off = length / 2**49
+    forward = sum(Fraction(int(a)) * Fraction(float(c)) for a, c in zip(d, direction, strict=True)) > 0
+    if forward and miss2 <= max(radius - off, Fraction(0)) ** 2 and radius > off and along2 > off**2:
+        assert t < np.inf
+    if (not forward and along2 > off**2) or miss2 > (radius + off) ** 2:
+        assert t == np.inf
+    if t < np.inf:
+        ideal = naive_rays.root(along2) - naive_rays.root(max(radius**2 - miss2, Fraction(0)))
+        assert abs(Fraction(t) - ideal) <= off * 2 + naive_rays.root(off * 4 * radius) + Fraction(1, 2**40)
+
+
+@pytest.mark.interpreted
+@pytest.mark.parametrize("kind", scans.WITH_POINTS)
+def test_a_few_rays_of_every_kind_of_scan(tmp_path: Path, rng: np.random.Generator, kind: str) -> None:
+    case = cases.build(tmp_path, scans.make_scan(kind, 11, 60), radius=0.05)
+    with opened(case) as data:
+        lattice = stored(case, data)
+        space = data.arrays.origin, data.arrays.step
+        o, d = some_rays(rng, lattice, 1.0, 0.05, 14)
+        expected = naive_rays.raycast(case.points, *space, 0.05, o, d, 3.0)
+        same_rays(raycast(data, o, d, 3.0), expected, lattice)
+        same_points(within(data, o, 1.0), naive_rays.within(case.points, *space, o, 1.0), lattice)
+        assert (expected.row >= 0).any()

@@ -45,6 +45,7 @@ class SceneData(NamedTuple):
 
     arrays: what the overlap kernel reads.  broad: what the broad phase reads.  radius_units: of every scan point,
     exact units.  unknown: (u, 2, 3) int64, lattice boxes of scans left out; unknown_everywhere: also elsewhere.
+    keeps_scan: whether the arena holds the scan each point came from.
     """
 
     residency: Residency
@@ -53,6 +54,7 @@ class SceneData(NamedTuple):
     radius_units: int
     unknown: NDArray[np.int64]
     unknown_everywhere: bool
+    keeps_scan: bool
 
 
 def to_units(metres: float, what: str) -> int:
@@ -89,6 +91,7 @@ def make_scene_data(archive: Archive, residency: Residency) -> SceneData:
         to_units(header.radius, "radius of the archive"),
         header.unknown,
         header.unknown_everywhere,
+        header.scan_index,
     )
 
 

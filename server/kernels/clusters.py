@@ -1,0 +1,255 @@
+"""Pairs in contact, gathered: the deepest of them, and the connected regions of scan points they touch.
+
+A pair is a record of whole numbers whose first columns, read in order, say which of two is deeper, so that no tree
+and no order of visits can change what is listed. Touched scan points fall into cells of a uniform grid over the
+lattice; cells that share a face, an edge or a corner are one cluster, found by union-find (Tarjan, "Efficiency of a
+good but not linear set union algorithm", 1975). What is kept grows with the cells touched and with the pairs
+listed, never with the pairs found.
+"""
+
+from typing import NamedTuple
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+
+# Columns of a record; the first ORDER of them, compared in turn, put the deeper pair first: |a - b|^2 [exact units^2],
+# scan point x, y, z [lattice], avatar centre x, y, z [exact units], row of the avatar's point, scan number.
+SQUARE, POINT, CENTER, ROW, SCAN, ORDER, TAG, RECORD = 0, 1, 4, 7, 8, 9, 9, 10
+# A cluster is its deepest pair's record, then pairs in it and the box of its touched points; so is a cell, and then
+# its place in the grid.
+PAIRS, LOW, HIGH, CLUSTER, PLACE, CELL = 10, 11, 14, 17, 17, 20
+# Counters of `Memory.sizes`: cells, pairs kept, pairs listed, clusters listed, the cell met last.
+CELLS, KEPT, LISTED, CLUSTERS, LAST = range(5)
+
+
+class Cells(NamedTuple):
+    """The grid cells touched under one pose: an open-addressing hash.
+
+    table: (c, CELL) int64.  bound: (c,) float32, a pair whose float32 square is above cannot be the cell's deepest.
+    slots: (s,) int64, s a power of two, rows of `table` or -1; never more than half of them taken.
+    """
+
+    table: NDArray[np.int64]
+    bound: NDArray[np.float32]
+    slots: NDArray[np.int64]
+
+
+class Memory(NamedTuple):
+    """What a request has found so far and where it stands, so that it can go on; grown by the kernels.
+
+    cells: of the pose at hand.  heap: (limit, RECORD) int64, its deepest pairs, the least deep first.  sizes: (5,)
+    int64, see above.  cursor: (3,) int64, position among the poses, among the pose's voxels (-1: not begun), and
+    depth of the stack.  stack: (STACK, 2) int64.
+    pairs: (p, RECORD), clusters: (c, CLUSTER) int64: those of the poses done, with room behind; a pair's TAG is its row
+    among the pose's clusters.
+    """
+
+    cells: Cells
+    heap: NDArray[np.int64]
+    sizes: NDArray[np.int64]
+    cursor: NDArray[np.int64]
+    stack: NDArray[np.int64]
+    pairs: NDArray[np.int64]
+    clusters: NDArray[np.int64]
+
+
+@nb.njit(nogil=True, cache=True)
+def deeper(a, i, b, j):
+    """Whether record a[i] comes before record b[j]."""
+    for c in range(ORDER):
+        if a[i, c] != b[j, c]:
+            return a[i, c] < b[j, c]
+    return False
+
+
+@nb.njit(nogil=True, cache=True)
+def _swap(rows, i, j):
+    for c in range(rows.shape[1]):
+        rows[i, c], rows[j, c] = rows[j, c], rows[i, c]
+
+
+@nb.njit(nogil=True, cache=True)
+def _sift_down(rows, n, at):
+    """Restore the heap rows[:n], least deep first, below row `at`."""
+    while True:
+        child = 2 * at + 1
+        if child >= n:
+            return
+        if child + 1 < n and deeper(rows, child, rows, child + 1):
+            child += 1
+        if not deeper(rows, at, rows, child):
+            return
+        _swap(rows, at, child)
+        at = child
+
+
+@nb.njit(nogil=True, cache=True)
+def sort_rows(rows, n):
+    """Sort rows[:n] deepest first, in place (Williams, heapsort)."""
+    for at in range(n // 2 - 1, -1, -1):
+        _sift_down(rows, n, at)
+    for end in range(n - 1, 0, -1):
+        _swap(rows, 0, end)
+        _sift_down(rows, end, 0)
+
+
+@nb.njit(nogil=True, cache=True)
+def keep_deepest(heap, kept, record):
+    """Take record[0] among the `kept` deepest pairs if it belongs there; returns how many are kept then."""
+    if kept < heap.shape[0]:
+        heap[kept] = record[0]
+        at = kept
+        while at > 0 and deeper(heap, (at - 1) // 2, heap, at):
+            _swap(heap, (at - 1) // 2, at)
+            at = (at - 1) // 2
+        return kept + 1
+    if kept > 0 and deeper(record, 0, heap, 0):
+        heap[0] = record[0]
+        _sift_down(heap, kept, 0)
+    return kept
+
+
+@nb.njit(nogil=True, cache=True)
+def make_cells(count):
+    """Room for `count` cells, a power of two."""
+    slots = np.full(2 * count, -1, np.int64)
+    return Cells(np.empty((count, CELL), np.int64), np.empty(count, np.float32), slots)
+
+
+@nb.njit(nogil=True, cache=True)
+def find_slot(cells, x, y, z):
+    """The slot of cell (x, y, z), or the free slot where it would go."""
+    # 21 bits of each, so that no product leaves 63 bits.
+    h = ((x & 0x1FFFFF) * 73856093) ^ ((y & 0x1FFFFF) * 19349663) ^ ((z & 0x1FFFFF) * 83492791)
+    last = cells.slots.shape[0] - 1
+    slot = (h ^ (h >> 19)) & last
+    table = cells.table
+    while True:
+        row = cells.slots[slot]
+        if row < 0 or (table[row, PLACE] == x and table[row, PLACE + 1] == y and table[row, PLACE + 2] == z):
+            return slot
+        slot = (slot + 1) & last
+
+
+@nb.njit(nogil=True, cache=True)
+def enter_cell(cells, used, x, y, z):
+    """The row of cell (x, y, z), made when new: then it is row `used`, and there must be room."""
+    slot = find_slot(cells, x, y, z)
+    row = cells.slots[slot]
+    if row < 0:
+        row = used
+        cells.slots[slot] = row
+        table = cells.table
+        table[row, PLACE], table[row, PLACE + 1], table[row, PLACE + 2] = x, y, z
+        table[row, SQUARE], table[row, PAIRS] = np.iinfo(np.int64).max, 0
+        for r in range(3):
+            table[row, LOW + r], table[row, HIGH + r] = np.iinfo(np.int64).max, np.iinfo(np.int64).min
+        cells.bound[row] = np.float32(np.inf)
+    return row
+
+
+@nb.njit(nogil=True, cache=True)
+def grow_cells(cells, used):
+    """The same `used` cells with twice the room."""
+    grown = make_cells(2 * cells.table.shape[0])
+    grown.table[:used] = cells.table[:used]
+    grown.bound[:used] = cells.bound[:used]
+    for row in range(used):
+        table = grown.table
+        grown.slots[find_slot(grown, table[row, PLACE], table[row, PLACE + 1], table[row, PLACE + 2])] = row
+    return grown
+
+
+@nb.njit(nogil=True, cache=True)
+def empty_cells(cells, used):
+    """Forget all `used` cells, in time that grows with them and not with the room."""
+    table = cells.table
+    # Last come, first gone: what lies between a cell's hash and its slot came before it.
+    for row in range(used - 1, -1, -1):
+        cells.slots[find_slot(cells, table[row, PLACE], table[row, PLACE + 1], table[row, PLACE + 2])] = -1
+
+
+@nb.njit(nogil=True, cache=True)
+def _root(parent, row):
+    while parent[row] != row:
+        parent[row] = parent[parent[row]]
+        row = parent[row]
+    return row
+
+
+@nb.njit(nogil=True, cache=True)
+def _join_neighbours(cells, used, parent):
+    """Fill parent (used,): union-find over cells that share a face, an edge or a corner."""
+    table = cells.table
+    for row in range(used):
+        parent[row] = row
+    for row in range(used):
+        # Half of the 26 neighbours: of two neighbours each other's, one looks.
+        for n in range(14, 27):
+            slot = find_slot(
+                cells,
+                table[row, PLACE] + n // 9 - 1,
+                table[row, PLACE + 1] + n // 3 % 3 - 1,
+                table[row, PLACE + 2] + n % 3 - 1,
+            )
+            other = cells.slots[slot]
+            if other >= 0:
+                a, b = _root(parent, row), _root(parent, other)
+                parent[max(a, b)] = min(a, b)
+
+
+@nb.njit(nogil=True, cache=True)
+def _with_room(rows, used, more):
+    """`rows` with room for `more` behind those used."""
+    if used + more <= rows.shape[0]:
+        return rows
+    grown = np.empty((2 * (used + more), rows.shape[1]), np.int64)
+    grown[:used] = rows[:used]
+    return grown
+
+
+@nb.njit(nogil=True, cache=True)
+def list_pose(memory, runs):
+    """List the pairs and clusters of the pose at hand, deepest first, and forget its cells.
+
+    Writes runs (4,) int64: first pair, pairs, first cluster, clusters. Returns the memory, its lists grown.
+    """
+    cells, heap, sizes = memory.cells, memory.heap, memory.sizes
+    table, used, kept = cells.table, sizes[CELLS], sizes[KEPT]
+    parent, found = np.empty(used, np.int64), 0
+    _join_neighbours(cells, used, parent)
+    for row in range(used):
+        found += 1 if parent[row] == row else 0
+    clusters = _with_room(memory.clusters, sizes[CLUSTERS], found)
+    own = clusters[sizes[CLUSTERS] :]
+    rank, at = np.empty(used, np.int64), 0
+    for row in range(used):  # a root comes before all that hang below it
+        root = _root(parent, row)
+        if root == row:
+            own[at] = table[row, :CLUSTER]
+            own[at, TAG] = row
+            rank[row] = at
+            at += 1
+            continue
+        mine = rank[root]
+        if deeper(table, row, own, mine):
+            own[mine, :ORDER] = table[row, :ORDER]
+        own[mine, PAIRS] += table[row, PAIRS]
+        for r in range(3):
+            own[mine, LOW + r] = min(own[mine, LOW + r], table[row, LOW + r])
+            own[mine, HIGH + r] = max(own[mine, HIGH + r], table[row, HIGH + r])
+    sort_rows(own, found)
+    for at in range(found):
+        rank[own[at, TAG]] = at
+    sort_rows(heap, kept)
+    pairs = _with_room(memory.pairs, sizes[LISTED], kept)
+    for i in range(kept):
+        pairs[sizes[LISTED] + i] = heap[i]
+        pairs[sizes[LISTED] + i, TAG] = rank[_root(parent, heap[i, TAG])]
+    runs[0], runs[1], runs[2], runs[3] = sizes[LISTED], kept, sizes[CLUSTERS], found
+    sizes[LISTED] += kept
+    sizes[CLUSTERS] += found
+    empty_cells(cells, used)
+    sizes[CELLS], sizes[KEPT], sizes[LAST] = 0, 0, -1
+    return Memory(cells, heap, sizes, memory.cursor, memory.stack, pairs, clusters)

@@ -1,0 +1,381 @@
+"""All pairs of points in contact under a pose: two hierarchies descended together, to the end.
+
+The descent is that of overlap.py ([Fig12] section 6, corrected), but nothing ends it early: every pair of leaf nodes
+whose bounds meet is looked at. There a float32 pass certifies most pairs as near or far; integers (NUMERICS.md N5)
+decide the band between, and measure those pairs that may be the deepest of their cell or among the deepest listed.
+"""
+
+from typing import NamedTuple
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+
+from .clusters import (
+    CELLS,
+    CENTER,
+    HIGH,
+    KEPT,
+    LAST,
+    LOW,
+    ORDER,
+    PAIRS,
+    PLACE,
+    POINT,
+    RECORD,
+    ROW,
+    SCAN,
+    SQUARE,
+    TAG,
+    Memory,
+    deeper,
+    enter_cell,
+    grow_cells,
+    keep_deepest,
+    list_pose,
+)  # fmt: skip
+from .layout import BLOCK_WORDS, COUNT, FIRST, LANES, ROW_WORDS, scan_run
+from .overlap import nodes_meet
+from .placed import ONE_SLACK, SLACK, U32, make_limits, make_placed, place_block, place_nodes
+from .placing import MAX_REACH_UNITS, lattice_to_units, place, to_units
+
+FAR_LANE = np.float32(1e18)  # where the lanes behind a block's last point are put: its square fits float32
+
+
+class Asked(NamedTuple):
+    """What is asked beside the poses.
+
+    rows: (b, LANES) int32, the row of the avatar's point in each lane.  edges: (k,) int64, edge of a cell [steps].
+    kept: whether the arena holds scan numbers.  limit: pairs to list a pose.  visits: node visits a pose, -1: the time
+    is up, look at nothing more.
+    """
+
+    rows: NDArray[np.int32]
+    edges: NDArray[np.int64]
+    kept: bool
+    limit: int
+    visits: int
+
+
+class Tally(NamedTuple):
+    """What is known of k poses. counts: (3, k) int64, voxels missing, node visits, point tests.  pairs: (k,) int64.
+
+    cut: (k,) bool, not all was looked at.  runs: (k, 4) int64, first pair listed, pairs, first cluster, clusters.
+    """
+
+    counts: NDArray[np.int64]
+    pairs: NDArray[np.int64]
+    cut: NDArray[np.bool_]
+    runs: NDArray[np.int64]
+
+
+class Work(NamedTuple):
+    """Scratch of one call. keep: (LANES,) bool.  mine: (3, LANES), squares: (LANES,), off: (3,), bound: (1,) float32,
+    bound as in `Cells`, of the pairs listed.  record: (1, RECORD) int64."""
+
+    keep: NDArray[np.bool_]
+    mine: NDArray[np.float32]
+    squares: NDArray[np.float32]
+    off: NDArray[np.float32]
+    bound: NDArray[np.float32]
+    record: NDArray[np.int64]
+
+
+@nb.njit(nogil=True, cache=True)
+def _bound_of(square, units_per_step, limits):
+    """A float32 square above which no pair can be as near as `square` [exact units^2]: `far` of make_limits for it."""
+    above = np.sqrt(np.float64(square)) / units_per_step * (1.0 + 2.0 * U32) + np.float64(limits.error)
+    return np.nextafter(np.float32(above * above * (1.0 + 8.0 * U32)), np.float32(np.inf))
+
+
+@nb.njit(nogil=True, cache=True)
+def _listing_bound(memory, limit, units_per_step, limits):
+    """Above which float32 square no pair can be among those listed."""
+    if limit == 0:
+        return np.float32(-1.0)
+    if memory.sizes[KEPT] < limit:
+        return np.float32(np.inf)
+    return _bound_of(memory.heap[0, SQUARE], units_per_step, limits)
+
+
+@nb.njit(nogil=True, cache=True)
+def _measure(avatar, m, block, lane, placed, scene, record):
+    """Write |a - b|^2 and the avatar's centre of one pair, exact units, into `record`, which holds the scan's point.
+
+    Returns whether the square fits: False beyond any reach (`placed.pair_square`, which asks the same).
+    """
+    square = np.int64(0)
+    points = avatar.points
+    for r in range(3):
+        world = place(
+            m, placed.shift, r, points[block, 0, lane], points[block, 1, lane], points[block, 2, lane]
+        )
+        units = to_units(world)
+        record[0, CENTER + r] = units
+        difference = units - lattice_to_units(record[0, POINT + r], scene.units_per_step)
+        if abs(difference) > MAX_REACH_UNITS:
+            return False
+        square += difference * difference
+    record[0, SQUARE] = square
+    return True
+
+
+@nb.njit(nogil=True, cache=True)
+def _cell_of(memory, record, edge):
+    """The row of the cell that the record's scan point falls in; room for a new one must be there."""
+    table, last = memory.cells.table, memory.sizes[LAST]
+    x, y, z = record[0, POINT], record[0, POINT + 1], record[0, POINT + 2]
+    if last >= 0:  # nearly always the last one, and divisions are slow
+        x0, y0, z0 = table[last, PLACE] * edge, table[last, PLACE + 1] * edge, table[last, PLACE + 2] * edge
+        if x0 <= x < x0 + edge and y0 <= y < y0 + edge and z0 <= z < z0 + edge:
+            return last
+    cell = enter_cell(memory.cells, memory.sizes[CELLS], x // edge, y // edge, z // edge)
+    if cell == memory.sizes[CELLS]:
+        memory.sizes[CELLS] += 1
+    memory.sizes[LAST] = cell
+    return cell
+
+
+@nb.njit(nogil=True, cache=True)
+def _gather_point(avatar, m, a, block, placed, scene, limits, asked, edge, memory, work):
+    """Count the pairs of one scan point, in work.record, with a block's points, their float32 squares in work.squares.
+
+    Returns how many are in contact.
+    """
+    record, squares = work.record, work.squares
+    cells, sizes = memory.cells, memory.sizes
+    cell, count, bound = np.int64(-1), np.int64(0), np.float32(np.inf)
+    for lane in range(avatar.count[a]):
+        square = squares[lane]
+        if square > limits.far:
+            continue
+        if square <= limits.near:
+            if cell < 0:
+                cell = _cell_of(memory, record, edge)
+                bound = max(cells.bound[cell], work.bound[0])
+            count += 1
+            if square > bound:
+                continue
+            _measure(avatar, m, block, lane, placed, scene, record)
+        else:
+            if not _measure(avatar, m, block, lane, placed, scene, record):
+                continue
+            if record[0, SQUARE] > limits.units * limits.units:
+                continue
+            if cell < 0:
+                cell = _cell_of(memory, record, edge)
+            count += 1
+        record[0, ROW] = asked.rows[block, lane]
+        record[0, TAG] = cell
+        if deeper(record, 0, cells.table, cell):
+            cells.table[cell, :ORDER] = record[0, :ORDER]
+            cells.bound[cell] = _bound_of(record[0, SQUARE], scene.units_per_step, limits)
+        if square <= work.bound[0]:
+            sizes[KEPT] = keep_deepest(memory.heap, sizes[KEPT], record)
+            work.bound[0] = _listing_bound(memory, asked.limit, scene.units_per_step, limits)
+        bound = max(cells.bound[cell], work.bound[0])
+    if count > 0:
+        table = cells.table
+        table[cell, PAIRS] += count
+        for r in range(3):
+            table[cell, LOW + r] = min(table[cell, LOW + r], record[0, POINT + r])
+            table[cell, HIGH + r] = max(table[cell, HIGH + r], record[0, POINT + r])
+    return count
+
+
+@nb.njit(nogil=True, cache=True)
+def _gather_leaves(
+    avatar, m, a, block, placed, scene, voxel, row, limits, asked, edge, memory, work, i, tally
+):
+    """Gather the pairs in contact of a leaf node of the avatar and one of the scene, voxel `voxel` at work.off.
+
+    First all avatar points against the scene node's bound and all scan points against the avatar node's sphere, in
+    vector loops; then each scan point that remains against all of the avatar's.
+    """
+    words, ints, halves = scene.words, scene.ints, scene.halves
+    lanes, nodes, off, keep, mine = placed.lanes, placed.nodes, work.off, work.keep, work.mine
+    cx, cy, cz = words[row] + off[0], words[row + 1] + off[1], words[row + 2] + off[2]
+    nx, ny, nz = words[row + 4], words[row + 5], words[row + 6]
+    both = words[row + 3] + limits.reach + limits.error
+    room = words[row + 7] * (limits.reach + limits.error + SLACK * both + SLACK * both)
+    least, most = words[row + 8] - room, words[row + 9] + room
+    square = both * both * ONE_SLACK
+    met = False
+    for j in range(LANES):
+        dx, dy, dz = lanes[block, 0, j] - cx, lanes[block, 1, j] - cy, lanes[block, 2, j] - cz
+        along = nx * dx + ny * dy + nz * dz
+        met |= (dx * dx + dy * dy + dz * dz <= square) & (along <= most) & (along >= least)
+    if not met:
+        return
+    scene_block = ~ints[row + FIRST]
+    block_at = scene.where[voxel, 1] + scene_block * BLOCK_WORDS
+    lane_at = scene.where[voxel, 2] + scene_block * 3 * LANES
+    lx = off[0] + np.float32(ints[block_at])
+    ly = off[1] + np.float32(ints[block_at + 1])
+    lz = off[2] + np.float32(ints[block_at + 2])
+    cx, cy, cz = nodes[0, a] - lx, nodes[1, a] - ly, nodes[2, a] - lz
+    both = nodes[3, a] + limits.reach + limits.error
+    square = both * both * ONE_SLACK
+    for j in range(LANES):
+        dx = np.float32(halves[lane_at + j]) - cx
+        dy = np.float32(halves[lane_at + LANES + j]) - cy
+        dz = np.float32(halves[lane_at + 2 * LANES + j]) - cz
+        keep[j] = dx * dx + dy * dy + dz * dz <= square
+    for j in range(LANES):
+        mine[0, j], mine[1, j], mine[2, j] = (
+            lanes[block, 0, j] - lx,
+            lanes[block, 1, j] - ly,
+            lanes[block, 2, j] - lz,
+        )
+    for j in range(avatar.count[a], LANES):
+        mine[0, j] = FAR_LANE
+    record, squares = work.record, work.squares
+    for j in range(ints[row + COUNT]):
+        if not keep[j]:
+            continue
+        x = np.float32(halves[lane_at + j])
+        y = np.float32(halves[lane_at + LANES + j])
+        z = np.float32(halves[lane_at + 2 * LANES + j])
+        tally.counts[2, i] += LANES
+        touched = False
+        for lane in range(LANES):
+            dx, dy, dz = x - mine[0, lane], y - mine[1, lane], z - mine[2, lane]
+            squares[lane] = dx * dx + dy * dy + dz * dz
+            touched |= squares[lane] <= limits.far
+        if not touched:
+            continue
+        for r in range(3):
+            low = scene.coordinates[voxel, r] * scene.voxel_steps + np.int64(ints[block_at + r])
+            record[0, POINT + r] = low + np.int64(halves[lane_at + r * LANES + j])
+        record[0, SCAN] = -1
+        if asked.kept:
+            record[0, SCAN] = halves[scan_run(scene.where, voxel) + scene_block * LANES + j]
+        tally.pairs[i] += _gather_point(avatar, m, a, block, placed, scene, limits, asked, edge, memory, work)
+
+
+@nb.njit(nogil=True, cache=True)
+def _gather_voxel(avatar, m, i, placed, scene, voxel, limits, asked, memory, work, tally, stop):
+    """Gather all pairs in contact of the placed avatar and one resident voxel, the two trees descended together.
+
+    Goes on where memory.cursor and its stack say, and stops before the pose costs more than `stop` node visits and a
+    node's children: then the cursor's depth is not 0. Returns the memory, its cells grown.
+    """
+    words, ints = scene.words, scene.ints
+    base = scene.where[voxel, 0]
+    nodes, off, stack, counts = placed.nodes, work.off, memory.stack, tally.counts
+    for r in range(3):
+        off[r] = np.float32(scene.coordinates[voxel, r] * scene.voxel_steps - placed.frame[r])
+    depth = memory.cursor[2]
+    if depth == 0:
+        counts[1, i] += 1
+        if nodes_meet(
+            words, base, nodes[0, 0] - off[0], nodes[1, 0] - off[1], nodes[2, 0] - off[2], nodes[3, 0], limits
+        ):
+            stack[0, 0], stack[0, 1] = 0, base
+            depth = 1
+    while depth > 0:
+        a, row = stack[depth - 1, 0], stack[depth - 1, 1]
+        a_first, b_first = avatar.first[a], ints[row + FIRST]
+        if counts[1, i] >= stop and (
+            a_first >= 0 or b_first >= 0
+        ):  # a pair of leaf nodes costs no more visits
+            break
+        depth -= 1
+        if a_first < 0 and b_first < 0:
+            block = ~a_first
+            if placed.stamp[block] != i:
+                place_block(avatar, m, block, placed, scene)
+                placed.stamp[block] = i
+            if memory.sizes[CELLS] + LANES > memory.cells.table.shape[0]:
+                memory = Memory(
+                    grow_cells(memory.cells, memory.sizes[CELLS]), memory.heap, memory.sizes, memory.cursor,
+                    memory.stack, memory.pairs, memory.clusters,
+                )  # fmt: skip
+            _gather_leaves(
+                avatar,
+                m,
+                a,
+                block,
+                placed,
+                scene,
+                voxel,
+                row,
+                limits,
+                asked,
+                asked.edges[i],
+                memory,
+                work,
+                i,
+                tally,
+            )
+        elif b_first < 0 or (a_first >= 0 and nodes[3, a] > words[row + 3]):
+            counts[1, i] += avatar.count[a]
+            for child in range(a_first, a_first + avatar.count[a]):
+                if nodes_meet(
+                    words, row, nodes[0, child] - off[0], nodes[1, child] - off[1], nodes[2, child] - off[2],
+                    nodes[3, child], limits,
+                ):  # fmt: skip
+                    stack[depth, 0], stack[depth, 1] = child, row
+                    depth += 1
+        else:
+            x, y, z = nodes[0, a] - off[0], nodes[1, a] - off[1], nodes[2, a] - off[2]
+            counts[1, i] += ints[row + COUNT]
+            for child in range(ints[row + COUNT]):
+                child_row = base + (b_first + child) * ROW_WORDS
+                if nodes_meet(words, child_row, x, y, z, nodes[3, a], limits):
+                    stack[depth, 0], stack[depth, 1] = a, child_row
+                    depth += 1
+    memory.cursor[2] = depth
+    return memory
+
+
+@nb.njit(nogil=True, cache=True)
+def gather_contacts(poses, avatar, scene, reach, which, asked, closes, pause, memory, tally):
+    """Answer `contacts` for the poses numbered in `which`: nearly always one call a request.
+
+    poses: (k, 4, 4), checked.  avatar: not empty.  reach: Reach of these poses; a voxel in it that is not resident is
+    counted as missing.  closes: whether this call sees the last voxels of its poses; they are listed then.
+    pause: node visits after which the call returns with the work as it stands, 1 or more. It is done when
+    memory.cursor[0] == len(which); until then it is called again with the memory it returned. A pose that has
+    cost `asked.visits` with something left is cut. Adds to `tally`.
+    """
+    placed = make_placed(avatar)
+    work = Work(
+        np.empty(LANES, np.bool_), np.empty((3, LANES), np.float32), np.empty(LANES, np.float32),
+        np.empty(3, np.float32), np.empty(1, np.float32), np.empty((1, RECORD), np.int64),
+    )  # fmt: skip
+    cursor, left = memory.cursor, np.int64(pause)
+    while cursor[0] < which.shape[0]:
+        i = which[cursor[0]]
+        end = reach.starts[i + 1]
+        if cursor[1] < 0:
+            cursor[1], cursor[2] = reach.starts[i], 0
+        if cursor[1] < end and asked.visits >= 0:
+            extent, farthest = place_nodes(avatar, poses[i], reach.scales[i], placed, scene)
+            limits = make_limits(reach.units[i], scene.units_per_step, extent, farthest, scene.voxel_steps)
+            work.bound[0] = _listing_bound(memory, asked.limit, scene.units_per_step, limits)
+            while cursor[1] < end:
+                voxel = reach.rows[cursor[1]]
+                if scene.where[voxel, 0] < 0:
+                    tally.counts[0, i] += 1
+                    cursor[1] += 1
+                    continue
+                before = tally.counts[1, i]
+                if before >= asked.visits:
+                    break
+                if left <= 0:
+                    return memory
+                stop = min(np.int64(asked.visits), before + left)
+                memory = _gather_voxel(
+                    avatar, poses[i], i, placed, scene, voxel, limits, asked, memory, work, tally, stop
+                )
+                left -= tally.counts[1, i] - before
+                if cursor[2] == 0:
+                    cursor[1] += 1
+        if cursor[1] < end:
+            tally.cut[i] = True
+        if closes:
+            memory = list_pose(memory, tally.runs[i])
+        cursor[0] += 1
+        cursor[1] = -1
+    return memory

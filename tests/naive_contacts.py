@@ -1,0 +1,91 @@
+"""The judge of `contacts`: every pair of points, in integers, sorted and gathered the plain way."""
+
+import math
+from itertools import product
+from typing import NamedTuple
+
+import naive
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+
+class Pair(NamedTuple):
+    """One pair in contact; in the order in which pairs are listed. Lattice point, exact units."""
+
+    square: int
+    point: tuple[int, int, int]
+    center: tuple[int, int, int]
+    row: int
+    scan: int
+
+
+class Cluster(NamedTuple):
+    """One cluster: its deepest pair, its pairs, the box of its points [lattice]."""
+
+    deepest: Pair
+    count: int
+    low: tuple[int, int, int]
+    high: tuple[int, int, int]
+
+
+def edge_steps(units: int, step: float) -> int:
+    """The edge of a grid cell of a cluster distance in exact units: rounded up to steps, but for its own rounding."""
+    steps = units / (step * naive.UNITS)
+    whole = round(steps)
+    close = abs(steps - whole) <= 1e-9 * whole + 1 / (step * naive.UNITS)
+    return max(1, whole if close else math.ceil(steps))
+
+
+def pairs_of(
+    lattice: NDArray[np.int64],
+    numbers: NDArray[np.int64],
+    step: float,
+    origin: ArrayLike,
+    avatar: NDArray[np.float64],
+    pose: NDArray[np.float64],
+    reach: int,
+) -> list[Pair]:
+    """All pairs within `reach` of scan points (n, 3) of scans (n,) and a placed avatar (m, 3), deepest first."""
+    b, a = naive.scan_units(lattice, step), naive.placed_units(avatar, pose, origin)
+    found = []
+    for row, center in enumerate(a):
+        apart = np.abs(b - center)
+        for at in np.flatnonzero((apart <= reach).all(axis=1)):
+            square = sum(int(d) ** 2 for d in apart[at])
+            if square <= reach * reach:
+                point = tuple(lattice[at].tolist())
+                found.append(Pair(square, point, tuple(center.tolist()), row, int(numbers[at])))
+    return sorted(found)
+
+
+def clusters_of(pairs: list[Pair], edge: int) -> tuple[list[Cluster], list[int]]:
+    """The clusters of sorted pairs, deepest first, and the number of each pair's: a search through grid cells."""
+    cell_of = [tuple(c // edge for c in pair.point) for pair in pairs]
+    touched, number = set(cell_of), {}
+    count = 0
+    for start in cell_of:  # pairs come deepest first, and so do their clusters
+        if start in number:
+            continue
+        number[start], queue = count, [start]
+        while queue:
+            cell = queue.pop()
+            for by in product((-1, 0, 1), repeat=3):
+                near = tuple(c + d for c, d in zip(cell, by, strict=True))
+                if near in touched and near not in number:
+                    number[near] = count
+                    queue.append(near)
+        count += 1
+    of_pair = [number[cell] for cell in cell_of]
+    clusters = []
+    for i in range(count):
+        own = [pair for pair, n in zip(pairs, of_pair, strict=True) if n == i]
+        points = list(zip(*(pair.point for pair in own), strict=True))
+        low, high = tuple(map(min, points)), tuple(map(max, points))
+        clusters.append(Cluster(own[0], len(own), low, high))  # type: ignore[arg-type]
+    return clusters, of_pair
+
+
+def signed_distance(square: int, radii: int) -> float:
+    """Of a pair, [m]: sqrt(square) - radii without cancellation, as `distance` defines it."""
+    both = math.sqrt(float(square)) + float(radii)
+    return float(square - radii * radii) / both / naive.UNITS if both else 0.0

@@ -6,11 +6,13 @@ out the same types.
 
 from collections.abc import Iterator
 from enum import IntEnum
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
+
+from .arrays import IndexPairs, Positions
 
 
 class Verdict(IntEnum):
@@ -100,9 +102,9 @@ class DistanceAnswers(Cost, frozen=True, eq=False):
     lower: NDArray[np.float64]
     upper: NDArray[np.float64]
     exact: NDArray[np.bool_]
-    witness_avatar: NDArray[np.float64]
-    witness_cloud: NDArray[np.float64]
-    normal: NDArray[np.float64]
+    witness_avatar: Positions
+    witness_cloud: Positions
+    normal: Positions
     outside: NDArray[np.bool_]
     voxels_missing: NDArray[np.uint32]
     node_visits: NDArray[np.uint32]
@@ -132,8 +134,8 @@ class ContactsAnswers(Cost, frozen=True, eq=False):
     exact: NDArray[np.bool_]
     pairs_found: NDArray[np.int64]
     pair_starts: NDArray[np.int64]
-    avatar_point: NDArray[np.float64]
-    cloud_point: NDArray[np.float64]
+    avatar_point: Positions
+    cloud_point: Positions
     signed_distance: NDArray[np.float64]
     avatar_index: NDArray[np.int32]
     scan_index: NDArray[np.int32]
@@ -141,11 +143,11 @@ class ContactsAnswers(Cost, frozen=True, eq=False):
     cluster_starts: NDArray[np.int64]
     cluster_count: NDArray[np.int64]
     cluster_deepest: NDArray[np.float64]
-    cluster_avatar: NDArray[np.float64]
-    cluster_cloud: NDArray[np.float64]
+    cluster_avatar: Positions
+    cluster_cloud: Positions
     cluster_scan: NDArray[np.int32]
-    cluster_low: NDArray[np.float64]
-    cluster_high: NDArray[np.float64]
+    cluster_low: Positions
+    cluster_high: Positions
     outside: NDArray[np.bool_]
     voxels_missing: NDArray[np.uint32]
     node_visits: NDArray[np.uint32]
@@ -172,8 +174,8 @@ class SweepAnswers(Cost, frozen=True, eq=False):
     lower: NDArray[np.float64]
     upper: NDArray[np.float64]
     exact: NDArray[np.bool_]
-    witness_avatar: NDArray[np.float64]
-    witness_cloud: NDArray[np.float64]
+    witness_avatar: Positions
+    witness_cloud: Positions
     steps: NDArray[np.uint32]
     outside: NDArray[np.bool_]
     voxels_missing: NDArray[np.uint32]
@@ -201,9 +203,9 @@ class RaycastAnswers(Cost, frozen=True, eq=False):
     lower: NDArray[np.float64]
     upper: NDArray[np.float64]
     exact: NDArray[np.bool_]
-    hit: NDArray[np.float64]
-    cloud_point: NDArray[np.float64]
-    normal: NDArray[np.float64]
+    hit: Positions
+    cloud_point: Positions
+    normal: Positions
     outside: NDArray[np.bool_]
     voxels_missing: NDArray[np.uint32]
     node_visits: NDArray[np.uint32]
@@ -229,7 +231,7 @@ class WithinAnswers(Cost, frozen=True, eq=False):
     lower: NDArray[np.float64]
     upper: NDArray[np.float64]
     exact: NDArray[np.bool_]
-    cloud_point: NDArray[np.float64]
+    cloud_point: Positions
     outside: NDArray[np.bool_]
     voxels_missing: NDArray[np.uint32]
     node_visits: NDArray[np.uint32]
@@ -256,7 +258,7 @@ class ObjectsAnswers(Cost, frozen=True, eq=False):
     voxels_missing: NDArray[np.uint32]
     node_visits: NDArray[np.uint32]
     point_tests: NDArray[np.uint32]
-    pairs: NDArray[np.int32]
+    pairs: IndexPairs
     pair_verdict: NDArray[np.uint8]
     pairs_tested: int = 0
     pairs_filtered: int = 0
@@ -268,8 +270,40 @@ class ObjectsAnswers(Cost, frozen=True, eq=False):
         return len(self.verdict)
 
 
-def unknown_answers(k: int) -> CollideAnswers:
-    """The answers for k poses when nobody answered: all `UNKNOWN`, nothing looked at."""
-    zeros = np.zeros(k, np.uint32)
-    verdict = np.full(k, Verdict.UNKNOWN, np.uint8)
-    return CollideAnswers(verdict, np.zeros(k, bool), zeros, zeros.copy(), zeros.copy())
+class CollidePart(CollideAnswers, frozen=True, eq=False, kw_only=True):
+    """The answers of `collide` for [first, first + n) of the `total` poses of a path; see CollideAnswers."""
+
+    first: int
+    total: int
+
+
+class DistancePart(DistanceAnswers, frozen=True, eq=False, kw_only=True):
+    """The answers of `distance` for [first, first + n) of the `total` poses of a path; see DistanceAnswers."""
+
+    first: int
+    total: int
+
+
+class ContactsPart(ContactsAnswers, frozen=True, eq=False, kw_only=True):
+    """The answers of `contacts` for [first, first + n) of the `total` poses of a path; see ContactsAnswers."""
+
+    first: int
+    total: int
+
+
+class SweepPart(SweepAnswers, frozen=True, eq=False, kw_only=True):
+    """The answers of `sweep` for [first, first + n) of the `total` motions of a path; see SweepAnswers."""
+
+    first: int
+    total: int
+
+
+Part = CollidePart | DistancePart | ContactsPart | SweepPart
+
+# By the kind of answer.
+PARTS: dict[type, Any] = {
+    CollideAnswers: CollidePart,
+    DistanceAnswers: DistancePart,
+    ContactsAnswers: ContactsPart,
+    SweepAnswers: SweepPart,
+}

@@ -8,7 +8,9 @@ from .errors import BadRequestError
 
 # The 1 is WIRE.md's version: servers of two versions can live side by side, neither hears the other.
 ROOT = "solidcloud/1"
-OPERATIONS = ("info", "add_avatar", "collide")
+OPERATIONS = (
+    "info", "add_avatar", "collide", "distance", "contacts", "sweep", "raycast", "within", "objects", "path",
+)  # fmt: skip
 
 _NAME = re.compile(r"[A-Za-z0-9._-]{1,64}")
 
@@ -51,7 +53,7 @@ def questions_key(scene: str) -> str:
 def parse_question(key: str) -> Route:
     """The route of a question's key; BadRequestError where it is not one, wildcards included.
 
-    Remembered, because every question of a client comes under the same three keys.
+    Remembered, because every question of a client comes under the same few keys.
     """
     prefix = f"{ROOT}/scene/"
     parts = key.removeprefix(prefix).split("/")

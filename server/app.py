@@ -7,12 +7,12 @@ import logging
 import signal
 import socket
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from ..schemas import keys
-from ..schemas.answers import CollideAnswers
+from ..schemas.answers import Part
 from ..schemas.errors import (
     BadRequestError,
     ErrorCode,
@@ -21,18 +21,27 @@ from ..schemas.errors import (
     UnknownSceneError,
 )
 from ..schemas.messages import (
+    MAX_MESSAGE_BYTES,
     MSGPACK,
     WIRE_VERSION,
     AddAvatarRequest,
     AvatarInfo,
     CollideRequest,
+    ContactsRequest,
+    DistanceRequest,
     ErrorReply,
+    ObjectsRequest,
+    PathRequest,
+    RaycastRequest,
     SceneInfo,
     ScenesAnswer,
+    SweepRequest,
+    WithinRequest,
     decode_request,
     encode,
     wire_encoding,
 )
+from ..schemas.requests import Question
 from .config import ServerConfig
 from .transport import Answer, Transport
 
@@ -40,7 +49,10 @@ log = logging.getLogger(__name__)
 
 
 class SceneLike(Protocol):
-    """What a service asks its questions of; thread-safe. Raises SolidcloudErrors for what it refuses."""
+    """What a service asks its questions of; thread-safe. Raises SolidcloudErrors for what it refuses.
+
+    Questions take tolerance, budget_ms and budget_visits by name, those about avatars also client: see `Scene`.
+    """
 
     name: str
 
@@ -48,10 +60,83 @@ class SceneLike(Protocol):
     def add_avatar(
         self, name: str, points: Any, radius: float | None = None, *, client: str = ""
     ) -> AvatarInfo: ...
-    def collide(self, name: str, poses: Any, margin: float = 0.0, *, client: str = "") -> CollideAnswers: ...
+    def collide(self, name: str, poses: Any, margin: float = 0.0, **effort: Any) -> Any: ...
+    def distance(self, name: str, poses: Any, reach: float, **effort: Any) -> Any: ...
+    def contacts(
+        self, name: str, poses: Any, limit: int, margin: float, cluster_distance: float | None, **effort: Any
+    ) -> Any: ...
+    def sweep(self, name: str, pose_from: Any, pose_to: Any, margin: float, **effort: Any) -> Any: ...
+    def raycast(self, origins: Any, directions: Any, reach: float, **effort: Any) -> Any: ...
+    def within(self, points: Any, reach: float, **effort: Any) -> Any: ...
+    def objects(self, objects: Any, margin: float, **effort: Any) -> Any: ...
+    def path(self, name: str, poses: Any, op: str, *, client: str, **parameters: Any) -> Iterator[Part]: ...
     def drop_client(self, client: str) -> None: ...
     def warm(self) -> None: ...
     def close(self) -> None: ...
+
+
+class _Operation(NamedTuple):
+    """How an operation with a payload is answered.
+
+    request: its type.  counted: the field whose length is bounded by `ServerConfig.max_poses`, "" for none.
+    ask: a scene, the request and the client to an answer, or to the parts of one.
+    """
+
+    request: type
+    counted: str
+    ask: Callable[[SceneLike, Any, str], Any]
+
+
+def _effort(request: Question) -> dict[str, Any]:
+    """What the answer may cost, as the questions of a scene take it."""
+    return {
+        "tolerance": request.tolerance,
+        "budget_ms": request.budget_ms,
+        "budget_visits": request.budget_visits,
+    }
+
+
+def _ask_objects(scene: SceneLike, request: ObjectsRequest, client: str) -> Any:
+    items = zip(request.objects, request.poses, strict=True)
+    listed = [(item.avatar, pose, item.group, item.mask) for item, pose in items]
+    return scene.objects(listed, request.margin, client=client, **_effort(request))
+
+
+_OPERATIONS = {
+    "add_avatar": _Operation(
+        AddAvatarRequest, "", lambda s, r, c: s.add_avatar(r.name, r.points, r.radius, client=c)
+    ),
+    "collide": _Operation(
+        CollideRequest,
+        "poses",
+        lambda s, r, c: s.collide(r.avatar, r.poses, r.margin, client=c, **_effort(r)),
+    ),
+    "distance": _Operation(
+        DistanceRequest,
+        "poses",
+        lambda s, r, c: s.distance(r.avatar, r.poses, r.reach, client=c, **_effort(r)),
+    ),
+    "contacts": _Operation(
+        ContactsRequest,
+        "poses",
+        lambda s, r, c: s.contacts(
+            r.avatar, r.poses, r.limit, r.margin, r.cluster_distance, client=c, **_effort(r)
+        ),
+    ),
+    "sweep": _Operation(
+        SweepRequest,
+        "pose_from",
+        lambda s, r, c: s.sweep(r.avatar, r.pose_from, r.pose_to, r.margin, client=c, **_effort(r)),
+    ),
+    "raycast": _Operation(
+        RaycastRequest, "origins", lambda s, r, c: s.raycast(r.origins, r.directions, r.reach, **_effort(r))
+    ),
+    "within": _Operation(WithinRequest, "points", lambda s, r, c: s.within(r.points, r.reach, **_effort(r))),
+    "objects": _Operation(ObjectsRequest, "poses", _ask_objects),
+    "path": _Operation(
+        PathRequest, "poses", lambda s, r, c: s.path(r.avatar, r.poses, r.op, client=c, **r.parameters())
+    ),
+}
 
 
 class Service:
@@ -76,17 +161,43 @@ class Service:
         except SolidcloudError as error:
             return self._error(encoding, error.code, str(error))
 
-    def answer(self, key: str, payload: bytes, encoding: str | None) -> Answer:
-        """The answer to the question asked under this key."""
+    def answer(self, key: str, payload: bytes, encoding: str | None) -> Answer | Iterator[Answer]:
+        """The answer to the question asked under this key; an iterator where it comes in parts."""
         try:
             stated = wire_encoding(encoding)
-            return Answer(encode(self._ask(key, payload, stated), stated), stated, True)
-        except SolidcloudError as error:
-            return self._error(encoding, error.code, str(error))
+            found = self._ask(key, payload, stated)
+            if isinstance(found, Iterator):
+                return self._parts(key, found, stated)
+            return self._encoded(found, stated)
         except Exception as error:
-            log.exception("a request failed for no reason of its own: %s", key)
-            text = f"{type(error).__name__} in the server: its log says more"
-            return self._error(encoding, ErrorCode.INTERNAL, text)
+            return self._failed(key, encoding, error)
+
+    def _parts(self, key: str, parts: Iterator[Any], encoding: str) -> Iterator[Answer]:
+        """Parts as answers; an error is the last one."""
+        try:
+            for part in parts:
+                yield self._encoded(part, encoding)
+        except Exception as error:
+            yield self._failed(key, encoding, error)
+
+    def _encoded(self, message: Any, encoding: str) -> Answer:
+        """A message as an answer. TooLargeError: its receiver would drop it unread."""
+        payload = encode(message, encoding)
+        # zenoh's own part of the message takes some of it, far less than this.
+        if len(payload) > MAX_MESSAGE_BYTES - (1 << 16):
+            raise TooLargeError(
+                f"the answer takes {len(payload)} bytes, a message holds {MAX_MESSAGE_BYTES}: ask for less at a time"
+            )
+        return Answer(payload, encoding, True)
+
+    def _failed(self, key: str, encoding: str | None, error: Exception) -> Answer:
+        """What went wrong as an answer; what is no SolidcloudError is logged, and told by its kind alone."""
+        if isinstance(error, SolidcloudError):
+            return self._error(encoding, error.code, str(error))
+        log.error("a request failed for no reason of its own: %s", key, exc_info=error)
+        return self._error(
+            encoding, ErrorCode.INTERNAL, f"{type(error).__name__} in the server: its log says more"
+        )
 
     def busy(self, encoding: str | None) -> Answer:
         """The answer to a question there is no room for."""
@@ -111,25 +222,24 @@ class Service:
         if scene is None:
             served = ", ".join(sorted(self._scenes))
             raise UnknownSceneError(f"scene {route.scene!r} is not served here; served: {served}")
-        if route.operation == "collide":
-            return self._collide(scene, decode_request(CollideRequest, payload, encoding), route.client)
-        if route.operation == "add_avatar":
-            return self._add_avatar(scene, decode_request(AddAvatarRequest, payload, encoding), route.client)
-        if payload:
-            raise BadRequestError(f"info with a payload of {len(payload)} bytes: expected none")
-        return self._infos[route.scene]
+        operation = _OPERATIONS.get(route.operation)
+        if operation is None:
+            if payload:
+                raise BadRequestError(f"info with a payload of {len(payload)} bytes: expected none")
+            return self._infos[route.scene]
+        request = decode_request(operation.request, payload, encoding)
+        self._check_size(operation, request)
+        return operation.ask(scene, request, route.client)
 
-    def _collide(self, scene: SceneLike, request: CollideRequest, client: str) -> CollideAnswers:
-        most = self._config.max_poses
-        if len(request.poses) > most:
-            raise TooLargeError(f"{len(request.poses)} poses in a request: at most {most}: split them")
-        return scene.collide(request.avatar, request.poses, request.margin, client=client)
-
-    def _add_avatar(self, scene: SceneLike, request: AddAvatarRequest, client: str) -> AvatarInfo:
-        most = self._config.max_avatar_points
-        if len(request.points) > most:
+    def _check_size(self, operation: _Operation, request: Any) -> None:
+        """TooLargeError for more than this server takes."""
+        if operation.counted:
+            count, most = len(getattr(request, operation.counted)), self._config.max_poses
+            if count > most:
+                raise TooLargeError(f"{count} {operation.counted} in a request: at most {most}: split them")
+        elif len(request.points) > self._config.max_avatar_points:
+            most = self._config.max_avatar_points
             raise TooLargeError(f"avatar of {len(request.points)} points: at most {most}: thin it out first")
-        return scene.add_avatar(request.name, request.points, request.radius, client=client)
 
     def _error(self, encoding: str | None, code: ErrorCode, message: str) -> Answer:
         """An error as an answer, in the encoding that was stated if it is one."""

@@ -5,8 +5,10 @@ there, a server died or a message was dropped (WIRE.md, "Empty replies").
 """
 
 import logging
+import queue
 import threading
 import uuid
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from types import TracebackType
 from typing import Any, NamedTuple, Self
@@ -15,43 +17,61 @@ import numpy as np
 import zenoh
 
 from ..schemas import keys
-from ..schemas.answers import CollideAnswers, unknown_answers
+from ..schemas.answers import (
+    PARTS,
+    CollideAnswers,
+    ContactsAnswers,
+    Cost,
+    DistanceAnswers,
+    Part,
+    SweepAnswers,
+)
+from ..schemas.columns import as_part, check_answers, unknown
 from ..schemas.errors import (
     BadRequestError,
     BusyError,
     InternalError,
     SolidcloudError,
+    TooLargeError,
     UnknownAvatarError,
     UnknownSceneError,
     error_from_code,
 )
 from ..schemas.messages import (
+    MAX_POSES,
     MSGPACK,
     WIRE_VERSION,
     AddAvatarRequest,
     AvatarInfo,
-    CollideRequest,
     ErrorReply,
-    Poses,
+    PathRequest,
     Positions,
     SceneInfo,
     ScenesAnswer,
-    check_answers,
     decode_answer,
     encode,
+)
+from ..schemas.requests import (
+    check_path_parameters,
     make_poses,
     make_positions,
 )
 from .config import DEFAULT_ENDPOINT
+from .questions import Questions
 from .transport import session_config
 
 log = logging.getLogger(__name__)
 
-# Poses in one request: 512 KiB, so that one client's long path does not keep others waiting for seconds, and
-# an answer comes well within the timeout.
-BATCH_POSES = 4096
+# A path's query is kept open for so long [s]; how long a part of it may take is the client's timeout.
+_PATH_SECONDS = 3600.0
 
 _ENCODING = zenoh.Encoding(MSGPACK)
+PATH_ANSWERS: dict[str, type[Cost]] = {
+    "collide": CollideAnswers,
+    "distance": DistanceAnswers,
+    "contacts": ContactsAnswers,
+    "sweep": SweepAnswers,
+}
 
 
 class _Avatar(NamedTuple):
@@ -61,7 +81,7 @@ class _Avatar(NamedTuple):
     radius: float | None
 
 
-class Client:
+class Client(Questions):
     """A scene served elsewhere; a context manager, thread-safe, with the methods of `Scene`.
 
     endpoint: where the server listens.  scene: the name it is served under.
@@ -101,7 +121,8 @@ class Client:
                         keys.question_key(self.name, self._id, operation),
                         # By default zenoh keeps a reply back until the server has said that no other comes.
                         consolidation=zenoh.ConsolidationMode.NONE,
-                        timeout=self._timeout,
+                        # Of a path the whole answer counts; what may take `timeout` is each of its parts.
+                        timeout=_PATH_SECONDS if operation == "path" else self._timeout,
                     )
                 )
                 for operation in keys.OPERATIONS
@@ -160,47 +181,85 @@ class Client:
             return AvatarInfo(name, len(avatar.points), avatar.radius)
         return decode_answer(AvatarInfo, payload)
 
-    def collide(self, name: str, poses: Any, margin: float = 0.0) -> CollideAnswers:
-        """Whether an avatar touches the scene, for k poses (k, 4, 4) float64, avatar to world.
+    def path(self, name: str, poses: Any, op: str = "collide", **parameters: Any) -> Iterator[Part]:
+        """Ask `op` (collide, distance, contacts, sweep) along up to 100,000 poses, in one request.
 
-        margin: distance below which it is called contact [m]. What nobody answered in time is `UNKNOWN`.
-        BadRequestError, BadTransformError, UnknownAvatarError, BusyError and others: as the server says.
+        parameters: what `op` takes beside the poses, tolerance and budgets included; `budget_ms` is for the whole path.
+        sweep: k - 1 motions, from each pose to the next. Yields answers for [first, first + n) of `total` as they
+        come, in order and without gaps: what never came, within `timeout` of what came before, is `UNKNOWN`.
         """
         array = make_poses(poses)
-        margin = float(margin)
-        parts = []
-        for start in range(0, max(1, len(array)), BATCH_POSES):
-            part = self._collide_batch(name, array[start : start + BATCH_POSES], margin)
-            if part is None:
-                # Not asked for the rest: a server that is frozen would cost a timeout for every batch.
-                parts.append(unknown_answers(len(array) - start))
-                break
-            parts.append(part)
-        return parts[0] if len(parts) == 1 else _join(parts)
+        check_path_parameters(op, parameters)
+        if len(array) > MAX_POSES:
+            raise TooLargeError(f"path of {len(array)} poses: at most {MAX_POSES}: ask for it in pieces")
+        request = PathRequest(name, array, op, **parameters)  # type: ignore[arg-type]
+        bounded = any(parameters.get(what) for what in ("tolerance",)) or any(
+            parameters.get(what) is not None for what in ("budget_ms", "budget_visits")
+        )
+        total = max(0, len(array) - 1) if op == "sweep" else len(array)
+        return self._parts(PATH_ANSWERS[op], encode(request), name, total, bounded)
 
-    def _collide_batch(self, name: str, poses: Poses, margin: float) -> CollideAnswers | None:
-        """One request; None: nobody answered."""
-        request = encode(CollideRequest(name, poses, margin))
+    def _parts(
+        self, kind: type[Cost], request: bytes, name: str, total: int, bounded: bool
+    ) -> Iterator[Part]:
+        """The parts of a path, each once and in order, whatever came of them."""
+
+        def missing(stop: int) -> Part:
+            part: Part = as_part(unknown(kind, stop - expected, bounded=bounded), expected, total)
+            return part
+
+        expected, complete = 0, False
+        for payload in self._replies(request, name):
+            part = decode_answer(PARTS[kind], payload)
+            check_answers(part, len(part))
+            if part.total != total or part.first < 0 or part.first + len(part) > total:
+                raise InternalError(
+                    f"part of a path for {part.first} to {part.first + len(part)} of {part.total}: "
+                    f"expected some of {total}"
+                )
+            if part.first < expected or (len(part) == 0 and total):
+                log.warning("part of a path for %d of %d came twice, or late: left out", part.first, total)
+                continue
+            if part.first > expected:
+                yield missing(part.first)
+            expected = part.first + len(part)
+            complete = expected == total
+            yield part
+            if complete:
+                break
+        if not complete:
+            yield missing(total)
+
+    def _replies(self, request: bytes, name: str) -> Iterator[bytes]:
+        """The replies to a path until there are no more, or none came in time; errors are raised."""
         try:
-            payload = self._ask("collide", request)
+            yield from self._stream("path", request)
         except UnknownAvatarError:
-            # A server that was restarted, or that took us for gone, does not know what we added.
-            with self._lock:
-                avatar = self._avatars.get(name)
-            if avatar is None:
-                raise
-            if self._ask("add_avatar", _add_request(name, avatar)) is None:
-                return None
-            payload = self._ask("collide", request)
-        if payload is None:
-            return None
-        return check_answers(decode_answer(CollideAnswers, payload), len(poses))
+            # Said before the first part, if at all: nothing was taken yet.
+            if self._add_again([name]):
+                yield from self._stream("path", request)
+
+    def _ask_about(self, operation: str, request: bytes, names: Sequence[str]) -> bytes | None:
+        """Ask about avatars, adding them again where the server does not know them; None: nobody answered."""
+        try:
+            return self._ask(operation, request)
+        except UnknownAvatarError:
+            return self._ask(operation, request) if self._add_again(names) else None
+
+    def _add_again(self, names: Sequence[str]) -> bool:
+        """Add avatars to a server that was restarted, or that took us for gone; False: nobody answered.
+
+        To be called while an UnknownAvatarError is handled: it is raised again if we do not know one either.
+        """
+        with self._lock:
+            known = [(name, self._avatars[name]) for name in names if name in self._avatars]
+        if len(known) < len(names):
+            raise
+        return all(self._ask("add_avatar", _add_request(*each)) is not None for each in known)
 
     def _ask(self, operation: str, request: bytes) -> bytes | None:
         """Ask, and wait for the answer; None: nobody answered in time. Raises what an error reply says."""
-        if self._stack is None:
-            raise BadRequestError("this client is closed: ask inside `with Client(...) as scene`")
-        for reply in self._queriers[operation].get(payload=request, encoding=_ENCODING):
+        for reply in self._querier(operation).get(payload=request, encoding=_ENCODING):
             sample = reply.ok
             if sample is not None:
                 self._seen = True
@@ -209,6 +268,35 @@ class Client:
         if not self._seen:
             self._check_served()
         return None
+
+    def _stream(self, operation: str, request: bytes) -> Iterator[bytes]:
+        """Ask, and yield every reply as it comes, until there are no more or none came for `timeout`."""
+        # Without bound: a channel that is full would hold up all that comes over this session.
+        came: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        handler = zenoh.handlers.Callback(came.put, lambda: came.put(None))
+        self._querier(operation).get(handler, payload=request, encoding=_ENCODING)
+        answered = False
+        while True:
+            try:
+                reply = came.get(timeout=self._timeout)
+            except queue.Empty:
+                log.debug("no part for %g s", self._timeout)
+                break
+            if reply is None:
+                break
+            if reply.ok is None:
+                _raise_error(reply.err)
+                continue
+            self._seen = answered = True
+            yield reply.ok.payload.to_bytes()
+        if not answered and not self._seen:
+            self._check_served()
+
+    def _querier(self, operation: str) -> zenoh.Querier:
+        """What asks one operation."""
+        if self._stack is None:
+            raise BadRequestError("this client is closed: ask inside `with Client(...) as scene`")
+        return self._queriers[operation]
 
     def _check_served(self) -> None:
         """UnknownSceneError if servers answer and none of them serves this scene."""
@@ -257,21 +345,3 @@ def _raise_error(error: Any) -> None:
         return
     reply = decode_answer(ErrorReply, error.payload.to_bytes())
     raise error_from_code(reply.code, reply.message)
-
-
-def _join(parts: list[CollideAnswers]) -> CollideAnswers:
-    """The answers of several requests as those of one, in order. Residency is that after the last answer."""
-    answered = [part for part in parts if part.resident or part.hits or part.misses] or parts
-    return CollideAnswers(
-        np.concatenate([part.verdict for part in parts]),
-        np.concatenate([part.outside for part in parts]),
-        np.concatenate([part.voxels_missing for part in parts]),
-        np.concatenate([part.node_visits for part in parts]),
-        np.concatenate([part.point_tests for part in parts]),
-        engine_seconds=sum(part.engine_seconds for part in parts),
-        hits=sum(part.hits for part in parts),
-        misses=sum(part.misses for part in parts),
-        resident=answered[-1].resident,
-        resident_bytes=answered[-1].resident_bytes,
-        faults=tuple(dict.fromkeys(fault for part in parts for fault in part.faults)),
-    )

@@ -21,6 +21,7 @@ class ServerConfig:
     workers: requests answered at the same time. 2: one client that does not take its replies holds one.
     max_in_flight: requests accepted and not yet answered, over all clients; one more is answered `busy`.
     max_in_flight_bytes: the same for the bytes of their payloads.
+    max_paths: paths answered at the same time, each by a thread that sends its parts; one more is answered `busy`.
     max_poses, max_avatar_points: of one request; more is answered `too_large`.
     stop_seconds: how long a stop waits for accepted requests to be answered.
     """
@@ -30,6 +31,7 @@ class ServerConfig:
     workers: int = 2
     max_in_flight: int = 1024
     max_in_flight_bytes: int = 256 << 20
+    max_paths: int = 16
     max_poses: int = MAX_POSES
     max_avatar_points: int = MAX_AVATAR_POINTS
     stop_seconds: float = 10.0
@@ -45,7 +47,7 @@ class ServerConfig:
         for name, most in (("max_poses", MAX_POSES), ("max_avatar_points", MAX_AVATAR_POINTS)):
             if not 1 <= getattr(self, name) <= most:
                 raise BadRequestError(f"{name} is {getattr(self, name)}: expected 1 to {most} (WIRE.md)")
-        for name in ("workers", "max_in_flight", "max_in_flight_bytes"):
+        for name in ("workers", "max_in_flight", "max_in_flight_bytes", "max_paths"):
             if getattr(self, name) < 1:
                 raise BadRequestError(f"{name} is {getattr(self, name)}: expected at least 1")
 

@@ -1,17 +1,33 @@
 """Scene: an archive opened in this process, and the questions asked of it. The same methods as `Client`."""
 
+import os
 import threading
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..schemas.answers import CollideAnswers
+from ..schemas.answers import (
+    CollideAnswers,
+    ContactsAnswers,
+    DistanceAnswers,
+    ObjectsAnswers,
+    Part,
+    RaycastAnswers,
+    SweepAnswers,
+    WithinAnswers,
+)
 from ..schemas.archive import FORMAT_VERSION
 from ..schemas.errors import BadRequestError, UnknownAvatarError
 from ..schemas.messages import WIRE_VERSION, AvatarInfo, SceneInfo, SourceInfo
+from ..schemas.requests import make_objects, make_poses
 from .avatar import AvatarModel, make_avatar
 from .collide import collide
+from .effort import Effort, make_effort
+from .path import PATH_THREADS, largest_part, path_parts, path_question
 from .request import make_scene_data
 from .residency import Residency
 from .store import Store
@@ -31,6 +47,7 @@ class Scene:
         self._store = store
         self._data = make_scene_data(store.archive, Residency(store, budget_bytes))
         self._avatars: dict[tuple[str, str], AvatarModel] = {}
+        self._pool: ThreadPoolExecutor | None = None
         self._lock = threading.Lock()
 
     @classmethod
@@ -57,8 +74,28 @@ class Scene:
         self.close()
 
     def close(self) -> None:
-        """Close the archive's files."""
+        """Close the archive's files, once no part of a path is being computed."""
+        with self._lock:
+            pool, self._pool = self._pool, None
+        if pool is not None:
+            pool.shutdown(cancel_futures=True)
         self._store.close()
+
+    def _pool_of_threads(self) -> ThreadPoolExecutor:
+        """The threads that compute parts of paths, one a core; started when first needed, shared by all paths."""
+        with self._lock:
+            if self._pool is None:
+                workers = max(PATH_THREADS, os.cpu_count() or 1)
+                self._pool = ThreadPoolExecutor(workers, thread_name_prefix=f"solidcloud-{self.name}-path")
+            return self._pool
+
+    def _avatar(self, name: str, client: str) -> AvatarModel:
+        """A client's avatar; UnknownAvatarError."""
+        with self._lock:
+            avatar = self._avatars.get((client, name))
+        if avatar is None:
+            raise UnknownAvatarError(f"avatar {name!r} is not known: add it with add_avatar first")
+        return avatar
 
     @property
     def residency(self) -> Residency:
@@ -99,20 +136,164 @@ class Scene:
         return AvatarInfo(name, len(model.points), model.radius, model.bounding_radius)
 
     def collide(
-        self, name: str, poses: ArrayLike, margin: float = 0.0, *, client: str = ""
+        self,
+        name: str,
+        poses: ArrayLike,
+        margin: float = 0.0,
+        *,
+        tolerance: float = 0.0,
+        budget_ms: float | None = None,
+        budget_visits: int | None = None,
+        client: str = "",
     ) -> CollideAnswers:
-        """Whether avatar `name` touches the scene under each of the poses (k, 4, 4); see server/collide.py."""
-        with self._lock:
-            avatar = self._avatars.get((client, name))
-        if avatar is None:
-            raise UnknownAvatarError(f"avatar {name!r} is not known: add it with add_avatar first")
-        return collide(self._data, avatar, poses, margin)
+        """Whether avatar `name` touches the scene under each of the poses (k, 4, 4); see server/collide.py.
+
+        tolerance [m], budget_ms, budget_visits: what the answer may cost, here and below; see server/effort.py.
+        """
+        effort = make_effort(tolerance, budget_ms, budget_visits)
+        return collide(self._data, self._avatar(name, client), poses, margin, **_only_if_bounded(effort))
+
+    def distance(
+        self,
+        name: str,
+        poses: ArrayLike,
+        reach: float,
+        *,
+        tolerance: float = 0.0,
+        budget_ms: float | None = None,
+        budget_visits: int | None = None,
+        client: str = "",
+    ) -> DistanceAnswers:
+        """How far avatar `name` is from the scene under each pose, up to `reach` [m]; see server/distance.py."""
+        from .distance import distance
+
+        effort = make_effort(tolerance, budget_ms, budget_visits)
+        return distance(self._data, self._avatar(name, client), poses, reach, effort)
+
+    def contacts(
+        self,
+        name: str,
+        poses: ArrayLike,
+        limit: int = 100,
+        margin: float = 0.0,
+        cluster_distance: float | None = None,
+        *,
+        tolerance: float = 0.0,
+        budget_ms: float | None = None,
+        budget_visits: int | None = None,
+        client: str = "",
+    ) -> ContactsAnswers:
+        """Which pairs of points are in contact under each of the poses, deepest first; see server/contacts.py."""
+        from .contacts import contacts
+
+        effort = make_effort(tolerance, budget_ms, budget_visits)
+        avatar = self._avatar(name, client)
+        return contacts(self._data, avatar, poses, limit, margin, cluster_distance, effort)
+
+    def sweep(
+        self,
+        name: str,
+        pose_from: ArrayLike,
+        pose_to: ArrayLike,
+        margin: float = 0.0,
+        *,
+        tolerance: float = 1e-6,
+        budget_ms: float | None = None,
+        budget_visits: int | None = None,
+        client: str = "",
+    ) -> SweepAnswers:
+        """When avatar `name` first touches the scene on its way between poses; see server/sweep.py."""
+        from .sweep import sweep
+
+        effort = make_effort(tolerance, budget_ms, budget_visits)
+        avatar = self._avatar(name, client)
+        return sweep(self._data, avatar, pose_from, pose_to, margin, tolerance, effort)
+
+    def raycast(
+        self,
+        origins: ArrayLike,
+        directions: ArrayLike,
+        reach: float,
+        *,
+        tolerance: float = 0.0,
+        budget_ms: float | None = None,
+        budget_visits: int | None = None,
+    ) -> RaycastAnswers:
+        """Which scan point's sphere rays (k, 3), (k, 3) hit first, up to `reach` [m]; see server/rays.py."""
+        from .rays import raycast
+
+        effort = make_effort(tolerance, budget_ms, budget_visits)
+        return raycast(self._data, origins, directions, reach, effort)
+
+    def within(
+        self,
+        points: ArrayLike,
+        reach: float,
+        *,
+        tolerance: float = 0.0,
+        budget_ms: float | None = None,
+        budget_visits: int | None = None,
+    ) -> WithinAnswers:
+        """Which scan point is nearest to each loose point (k, 3), up to `reach` [m]; see server/rays.py."""
+        from .within import within
+
+        effort = make_effort(tolerance, budget_ms, budget_visits)
+        return within(self._data, points, reach, effort)
+
+    def objects(
+        self,
+        objects: Sequence[Sequence[Any]],
+        margin: float = 0.0,
+        *,
+        tolerance: float = 0.0,
+        budget_ms: float | None = None,
+        budget_visits: int | None = None,
+        client: str = "",
+    ) -> ObjectsAnswers:
+        """Which of several avatars (name, pose, group = 1, mask = all) touch the scene and one another.
+
+        See server/objects.py.
+        """
+        from .objects import objects as ask_objects
+
+        effort = make_effort(tolerance, budget_ms, budget_visits)
+        items, poses = make_objects(objects)
+        avatars = [self._avatar(item.avatar, client) for item in items]
+        groups = np.array([item.group for item in items], np.uint32)
+        masks = np.array([item.mask for item in items], np.uint32)
+        return ask_objects(self._data, avatars, poses, groups, masks, margin, effort)
+
+    def path(
+        self,
+        name: str,
+        poses: ArrayLike,
+        op: str = "collide",
+        *,
+        threads: int = PATH_THREADS,
+        client: str = "",
+        **parameters: Any,
+    ) -> Iterator[Part]:
+        """Ask `op` (collide, distance, contacts, sweep) along the poses; the answers come part by part, in order.
+
+        parameters: what `op` takes beside the poses, tolerance and budgets included; `budget_ms` is for the whole path.
+        threads: parts computed at a time.  sweep: k - 1 motions, from each pose to the next. Every part is the answer
+        of its question for [first, first + n) of `total`. All poses are checked before the first part.
+        """
+        ask, total = path_question(self._data, self._avatar(name, client), make_poses(poses), op, parameters)
+        most = largest_part(op, parameters)
+        if threads <= 1:
+            return path_parts(ask, total, most)
+        return path_parts(ask, total, most, self._pool_of_threads(), 2 * threads)
 
     def drop_client(self, client: str) -> None:
         """Forget the avatars of a client that is gone."""
         with self._lock:
             for key in [key for key in self._avatars if key[0] == client]:
                 del self._avatars[key]
+
+
+def _only_if_bounded(effort: Effort) -> dict[str, Any]:
+    return {"effort": effort} if effort.bounded else {}
 
 
 def describe(store: Store, name: str) -> SceneInfo:

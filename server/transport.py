@@ -10,7 +10,7 @@ import logging
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from enum import Enum
 from types import TracebackType
@@ -44,7 +44,7 @@ class ServiceLike(Protocol):
     """What a transport carries questions to. No method raises: an error is an answer too."""
 
     def scenes(self, encoding: str | None) -> Answer: ...
-    def answer(self, key: str, payload: bytes, encoding: str | None) -> Answer: ...
+    def answer(self, key: str, payload: bytes, encoding: str | None) -> Answer | Iterator[Answer]: ...
     def busy(self, encoding: str | None) -> Answer: ...
     def client_gone(self, scene: str, client: str) -> None: ...
 
@@ -70,6 +70,7 @@ class FairQueues:
         self._waiting: dict[str, deque[tuple[Any, int]]] = {}
         self._ready: deque[str] = deque()  # clients with something waiting and nothing in flight
         self._running: dict[str, int] = {}  # client: bytes of its request in flight
+        self._detached: dict[str, int] = {}  # the same of those in flight that take up no worker
         self._requests = self._bytes = 0
 
     def offer(self, client: str, request: Any, size: int, *, always: bool = False) -> Offer:
@@ -80,12 +81,13 @@ class FairQueues:
                 return Offer.FULL
             self._requests += 1
             self._bytes += size
-            if client not in self._running and len(self._running) < self._workers:
+            at_work = client in self._running or client in self._detached
+            if not at_work and len(self._running) < self._workers:
                 self._running[client] = size
                 return Offer.RUN
             if client not in self._waiting:
                 self._waiting[client] = deque()
-                if client not in self._running:
+                if not at_work:
                     self._ready.append(client)
             self._waiting[client].append((request, size))
             return Offer.WAIT
@@ -94,17 +96,31 @@ class FairQueues:
         """The client's request in flight is answered. Returns the (client, request) to run next, if any."""
         with self._lock:
             self._requests -= 1
-            self._bytes -= self._running.pop(client)
+            detached = self._detached.pop(client, None)
+            self._bytes -= self._running.pop(client) if detached is None else detached
             if client in self._waiting:
                 self._ready.append(client)
-            if not self._ready:
-                return None
-            following = self._ready.popleft()
-            request, size = self._waiting[following].popleft()
-            if not self._waiting[following]:
-                del self._waiting[following]
-            self._running[following] = size
-            return following, request
+            return self._next()
+
+    def detach(self, client: str) -> tuple[str, Any] | None:
+        """The client's request in flight goes on, but takes up no worker; `finished` follows all the same.
+
+        Returns the (client, request) to run next, if any.
+        """
+        with self._lock:
+            self._detached[client] = self._running.pop(client)
+            return self._next()
+
+    def _next(self) -> tuple[str, Any] | None:
+        """The next request, if one is ready and a worker free for it; with the lock held."""
+        if not self._ready or len(self._running) >= self._workers:
+            return None
+        following = self._ready.popleft()
+        request, size = self._waiting[following].popleft()
+        if not self._waiting[following]:
+            del self._waiting[following]
+        self._running[following] = size
+        return following, request
 
     def __len__(self) -> int:
         """Requests taken in and not yet finished."""
@@ -168,6 +184,7 @@ class Transport:
     def __init__(self, scenes: Sequence[str], service: ServiceLike, config: ServerConfig) -> None:
         self._scenes, self._service, self._config = tuple(scenes), service, config
         self._threads: list[threading.Thread] = []
+        self._lock = threading.Lock()
         self._declared: list[Any] = []
 
     def __enter__(self) -> Self:
@@ -191,11 +208,15 @@ class Transport:
             for declared in reversed(self._declared):
                 declared.undeclare()
             deadline = time.monotonic() + self._config.stop_seconds
-            for thread in self._threads:
-                thread.join(max(0.0, deadline - time.monotonic()))
-            late = sum(thread.is_alive() for thread in self._threads)
-            if late:
-                log.error("stopped with %d threads at work after %g s", late, self._config.stop_seconds)
+            # One may have started another, for a path, before it ended.
+            while alive := [thread for thread in list(self._threads) if thread.is_alive()]:
+                left = deadline - time.monotonic()
+                if left <= 0:
+                    log.error(
+                        "stopped with %d threads at work after %g s", len(alive), self._config.stop_seconds
+                    )
+                    break
+                alive[0].join(left)
 
     def _open(self) -> zenoh.Session:
         """A session that listens; SolidcloudError when it cannot."""
@@ -210,7 +231,7 @@ class Transport:
         """Answer the questions about one scene, and watch for clients that go."""
         config = self._config
         queues = FairQueues(config.workers, config.max_in_flight, config.max_in_flight_bytes)
-        lane = _Lane(self._service, scene, queues)
+        lane = _Lane(self._service, scene, queues, self._start, config.max_paths)
         watch = session.liveliness().declare_subscriber(
             keys.clients_alive_key(scene), zenoh.handlers.FifoChannel(_CHANNEL)
         )
@@ -237,11 +258,12 @@ class Transport:
 
         self._start("scenes", take, queryable.handler)
 
-    def _start(self, name: str, run: Callable[[Any], None], handler: Any) -> None:
-        """A thread that takes what a channel hands out, until that ends."""
-        thread = threading.Thread(target=run, args=(handler,), name=f"solidcloud-{name}", daemon=True)
+    def _start(self, name: str, run: Callable[..., None], *arguments: Any) -> None:
+        """A thread that is waited for at the end."""
+        thread = threading.Thread(target=run, args=arguments, name=f"solidcloud-{name}", daemon=True)
         thread.start()
-        self._threads.append(thread)
+        with self._lock:
+            self._threads = [other for other in self._threads if other.is_alive()] + [thread]
 
 
 class _Gone(NamedTuple):
@@ -253,8 +275,12 @@ class _Gone(NamedTuple):
 class _Lane:
     """The questions about one scene, on their way from the channel to the service."""
 
-    def __init__(self, service: ServiceLike, scene: str, queues: FairQueues) -> None:
+    def __init__(
+        self, service: ServiceLike, scene: str, queues: FairQueues, start: Callable[..., None], max_paths: int
+    ) -> None:
         self._service, self._scene, self._queues = service, scene, queues
+        self._start, self._max_paths = start, max_paths
+        self._streaming: set[str] = set()  # clients whose answer is on its way in parts
 
     def take(self, queries: Any) -> None:
         """One thread's work: take queries, answer them or leave them to the thread that is at work."""
@@ -280,6 +306,7 @@ class _Lane:
             if sample.kind != zenoh.SampleKind.DELETE:
                 continue
             client = str(sample.key_expr).rpartition("/")[2]
+            self._streaming.discard(client)  # nobody takes the rest
             if self._queues.offer(client, _Gone(client), 0, always=True) is Offer.RUN:
                 self._run(client, _Gone(client))
 
@@ -288,21 +315,48 @@ class _Lane:
         following: tuple[str, Any] | None = (client, request)
         while following is not None:
             client, request = following
+            parts = None
             try:
                 if isinstance(request, _Gone):
                     self._service.client_gone(self._scene, request.client)
                 else:
-                    self._answer(request)
+                    parts = self._answer(request)
             except Exception:
                 log.exception("request of client %s of scene %s", client, self._scene)
             finally:
-                following = self._queues.finished(client)
+                if parts is None:
+                    following = self._queues.finished(client)
+                else:
+                    following = self._queues.detach(client)
+                    self._start(f"{self._scene}-parts", self._stream, request, parts)
 
-    def _answer(self, request: "_Request") -> None:
-        """Have one query answered. Leaving `with query` tells the client that no more will come."""
+    def _answer(self, request: "_Request") -> Iterator[Answer] | None:
+        """Have one query answered. What comes in parts is returned, to be sent by a thread of its own."""
+        answer = self._service.answer(request.key, request.payload, _encoding(request.query))
+        if not isinstance(answer, Answer):
+            if len(self._streaming) < self._max_paths:
+                self._streaming.add(request.client)
+                return answer
+            answer = self._service.busy(_encoding(request.query))
+        # Leaving `with query` tells the client that no more will come.
         with request.query as query:
-            answer = self._service.answer(request.key, request.payload, _encoding(query))
             _reply(query, request.key_expr, answer)
+        return None
+
+    def _stream(self, request: "_Request", answers: Iterator[Answer]) -> None:
+        """Send an answer's parts; then run what waits. A thread's work."""
+        try:
+            with request.query as query:
+                for answer in answers:
+                    if request.client not in self._streaming or not _reply(query, request.key_expr, answer):
+                        break
+        except Exception:
+            log.exception("parts for client %s of scene %s", request.client, self._scene)
+        finally:
+            self._streaming.discard(request.client)
+            following = self._queues.finished(request.client)
+        if following is not None:
+            self._run(*following)
 
 
 class _Request:
@@ -327,8 +381,8 @@ def _encoding(query: zenoh.Query) -> str | None:
     return None if query.encoding is None else str(query.encoding)
 
 
-def _reply(query: zenoh.Query, key: Any, answer: Answer) -> None:
-    """Send one answer; where that fails the client is gone, or its link is: logged, nothing else to do."""
+def _reply(query: zenoh.Query, key: Any, answer: Answer) -> bool:
+    """Send one answer; False where that fails: the client is gone, or its link is. Logged, nothing else to do."""
     try:
         if answer.ok:
             query.reply(key, answer.payload, encoding=_ENCODINGS[answer.encoding])
@@ -336,3 +390,5 @@ def _reply(query: zenoh.Query, key: Any, answer: Answer) -> None:
             query.reply_err(answer.payload, encoding=_ENCODINGS[answer.encoding])
     except zenoh.ZError as error:
         log.warning("reply to %s: %s", query.key_expr, error)
+        return False
+    return True

@@ -8,11 +8,23 @@ import threading
 import time
 
 import numpy as np
-from solidcloud.schemas.answers import CollideAnswers, Verdict
+from solidcloud.schemas.answers import (
+    CollideAnswers,
+    ContactsAnswers,
+    DistanceAnswers,
+    ObjectsAnswers,
+    RaycastAnswers,
+    SweepAnswers,
+    Verdict,
+    WithinAnswers,
+)
+from solidcloud.schemas.columns import as_part, unknown
 from solidcloud.schemas.errors import BadRequestError, BadTransformError, UnknownAvatarError
 from solidcloud.schemas.messages import WIRE_VERSION, AvatarInfo, SceneInfo, SourceInfo
 from solidcloud.server.app import serve
 from solidcloud.server.config import ServerConfig
+
+PART = 10  # poses in a part of a path
 
 
 def floor_verdicts(points, radius, poses, margin=0.0):
@@ -29,8 +41,8 @@ class FloorScene:
         self.name, self.delay = name, delay
         self.gate = threading.Event()
         self.avatars = {}
-        self.gone = []
-        self.at_work = self.warmed = 0
+        self.gone, self.asked = [], []
+        self.at_work = self.warmed = self.parts = 0
         self.lock = threading.Lock()
 
     def warm(self):
@@ -70,11 +82,9 @@ class FloorScene:
         self.avatars[client, name] = (points, radius)
         return AvatarInfo(name, len(points), radius, 1.0)
 
-    def collide(self, name, poses, margin=0.0, *, client=""):
-        if (client, name) not in self.avatars:
-            raise UnknownAvatarError(f"avatar {name!r}")
-        if not np.array_equal(poses[:, 3], np.tile([0.0, 0, 0, 1], (len(poses), 1))):
-            raise BadTransformError("last row")
+    def collide(self, name, poses, margin=0.0, *, client="", **effort):
+        self.check(name, poses, client)
+        self.asked.append(("collide", (name, margin), effort))
         if name == "crash":
             raise RuntimeError("a secret of the server's own")
         with self.lock:
@@ -89,6 +99,70 @@ class FloorScene:
         ones = np.ones(k, np.uint32)
         outside = np.abs(poses[:, 0, 3]) > 1
         return CollideAnswers(verdict, outside, ones * 0, ones, ones * 2, engine_seconds=0.25, hits=1, resident=1)
+
+    # The other questions say nothing, but what they were asked is kept.
+    def distance(self, name, poses, reach, *, client="", **effort):
+        self.check(name, poses, client)
+        return self.keep(DistanceAnswers, len(poses), "distance", (name, reach), effort)
+
+    def contacts(self, name, poses, limit, margin, cluster_distance, *, client="", **effort):
+        self.check(name, poses, client)
+        asked = (name, limit, margin, cluster_distance)
+        return self.keep(ContactsAnswers, len(poses), "contacts", asked, effort)
+
+    def sweep(self, name, pose_from, pose_to, margin, *, client="", **effort):
+        self.check(name, pose_from, client)
+        self.check(name, pose_to, client)
+        return self.keep(SweepAnswers, len(pose_from), "sweep", (name, margin), effort)
+
+    def raycast(self, origins, directions, reach, **effort):
+        assert origins.shape == directions.shape == (len(origins), 3)
+        return self.keep(RaycastAnswers, len(origins), "raycast", (reach,), effort)
+
+    def within(self, points, reach, **effort):
+        assert points.shape == (len(points), 3)
+        return self.keep(WithinAnswers, len(points), "within", (reach,), effort)
+
+    def objects(self, objects, margin, *, client="", **effort):
+        for name, pose, _, _ in objects:
+            self.check(name, pose[None], client)
+        asked = tuple((name, group, mask) for name, _, group, mask in objects)
+        return self.keep(ObjectsAnswers, len(objects), "objects", (asked, margin), effort)
+
+    def path(self, name, poses, op, *, client="", **parameters):
+        """Parts of PART poses; an avatar named "wait" waits after the first, "crash" raises there."""
+        self.check(name, poses, client)
+        self.asked.append(("path", (name, op), parameters))
+
+        def parts():
+            for first in range(0, max(1, len(poses)), PART):
+                if first and name == "wait":
+                    assert self.gate.wait(30)
+                if first and name == "crash":
+                    raise RuntimeError("a secret of the server's own")
+                if first and name == "refuse":
+                    raise BadTransformError("as such")
+                if self.delay:
+                    time.sleep(self.delay)
+                points, radius = self.avatars[client, name]
+                part = poses[first : first + PART]
+                verdict = floor_verdicts(points, radius, part, parameters.get("margin", 0.0))
+                ones = np.ones(len(part), np.uint32)
+                self.parts += 1
+                answers = CollideAnswers(verdict, ones > 1, ones * 0, ones, ones * 2)
+                yield as_part(answers, first, len(poses))
+
+        return parts()
+
+    def check(self, name, poses, client):
+        if (client, name) not in self.avatars:
+            raise UnknownAvatarError(f"avatar {name!r}")
+        if not np.array_equal(poses[:, 3], np.tile([0.0, 0, 0, 1], (len(poses), 1))):
+            raise BadTransformError("last row")
+
+    def keep(self, kind, k, operation, asked, effort):
+        self.asked.append((operation, asked, effort))
+        return unknown(kind, k)
 
     def drop_client(self, client):
         for key in [key for key in self.avatars if key[0] == client]:

@@ -33,7 +33,7 @@ from solidcloud.schemas.messages import (
     decode_answer,
     encode,
 )
-from solidcloud.server import client as client_module
+from solidcloud.server import questions as questions_module
 from solidcloud.server.app import serve, serving
 from solidcloud.server.client import Client
 from solidcloud.server.config import ServerConfig
@@ -103,7 +103,7 @@ def test_client_answers_as_the_judge_does(client):
 
 
 def test_long_lists_are_split_and_joined_in_order(client, monkeypatch):
-    monkeypatch.setattr(client_module, "BATCH_POSES", 7)
+    monkeypatch.setattr(questions_module, "BATCH_POSES", 7)
     poses = heights(np.random.default_rng(3).normal(-0.5, 0.3, 40))
     poses[:, 0, 3] = np.arange(40) % 3
     client.add_avatar("al", POINTS, 0.125)
@@ -199,7 +199,7 @@ def test_a_killed_server_is_unknown_and_its_successor_right(endpoint):
 
 
 def test_a_frozen_server_is_unknown_after_the_timeout(endpoint, monkeypatch):
-    monkeypatch.setattr(client_module, "BATCH_POSES", 1)
+    monkeypatch.setattr(questions_module, "BATCH_POSES", 1)
     poses = heights([-1.0, 1.0, 1.0])
     with server_process(endpoint) as process, Client(endpoint, scene="floor", timeout=0.3) as client:
         client.add_avatar("al", POINTS, 0.1)
@@ -322,7 +322,7 @@ def test_plain_zenoh_is_enough_to_ask(scene, endpoint, encoding):
         assert str(reply.ok.encoding) == encoding
         assert decode_answer(ScenesAnswer, reply.ok.payload.to_bytes(), encoding).scenes == ["floor"]
         for key, code in {
-            "solidcloud/1/scene/floor/c/distance": "bad_request",
+            "solidcloud/1/scene/floor/c/effects": "bad_request",
             "solidcloud/1/scene/floor/*/info": "bad_request",
             "solidcloud/1/scene/floor/c/info": None,
         }.items():
@@ -352,7 +352,7 @@ def test_over_the_caps_is_an_error_and_the_next_request_is_answered(client, monk
     client.add_avatar("al", POINTS, 0.1)
     with pytest.raises(TooLargeError):
         client.add_avatar("huge", np.zeros((1_000_001, 3)))
-    monkeypatch.setattr(client_module, "BATCH_POSES", 10**6)
+    monkeypatch.setattr(questions_module, "BATCH_POSES", 10**6)
     with pytest.raises(TooLargeError, match="100001"):
         client.collide("al", np.tile(np.eye(4), (100_001, 1, 1)))
     assert client.collide("al", heights([-1.0])).verdict.tolist() == [Verdict.CONTACT]

@@ -44,7 +44,7 @@ def test_longest_name_is_allowed():
     [
         "solidcloud/1/scene/hall/c",
         "solidcloud/1/scene/hall/c/info/x",
-        "solidcloud/1/scene/hall/c/distance",
+        "solidcloud/1/scene/hall/c/effects",
         "solidcloud/1/scene/hall/*/info",
         "solidcloud/1/scene/**",
         "solidcloud/2/scene/hall/c/info",

@@ -8,7 +8,8 @@ import msgspec
 import numpy as np
 import pytest
 from solidcloud.schemas import messages
-from solidcloud.schemas.answers import CollideAnswers, Verdict, unknown_answers
+from solidcloud.schemas.answers import CollideAnswers, Verdict
+from solidcloud.schemas.columns import unknown
 from solidcloud.schemas.errors import BadRequestError, InternalError, TooLargeError
 from solidcloud.schemas.messages import (
     JSON,
@@ -222,7 +223,7 @@ def test_answers_that_are_none_are_internal_errors_never_guesses():
 
 
 def test_json_counts_beyond_uint32_are_refused():
-    text = encode(unknown_answers(1), JSON).replace(b'"node_visits":[0]', b'"node_visits":[4294967296]')
+    text = encode(unknown(CollideAnswers, 1), JSON).replace(b'"node_visits":[0]', b'"node_visits":[4294967296]')
     with pytest.raises(InternalError, match="uint32"):
         decode_answer(CollideAnswers, text, JSON)
 

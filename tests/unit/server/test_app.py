@@ -112,7 +112,7 @@ def test_an_unknown_scene_names_those_served(service):
     assert reply.code == "unknown_scene" and "floor" in reply.message and "attic" in reply.message
 
 
-@pytest.mark.parametrize("path", ["solidcloud/**", "solidcloud/1/scene/floor/*/info", key("distance"), ""])
+@pytest.mark.parametrize("path", ["solidcloud/**", "solidcloud/1/scene/floor/*/info", key("effects"), ""])
 def test_keys_that_are_no_question_are_bad_request(service, path):
     assert error(service.answer(path, b"", MSGPACK)).code == "bad_request"
 

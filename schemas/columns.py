@@ -1,0 +1,138 @@
+"""What answers of all kinds have in common: their columns. Unknown ones, joined ones, parts of a path, checked ones."""
+
+from collections.abc import Sequence
+from typing import Any, TypeVar
+
+import numpy as np
+from msgspec.structs import asdict
+from numpy.typing import NDArray
+
+from .answers import (
+    PARTS,
+    CollideAnswers,
+    ContactsAnswers,
+    Cost,
+    ObjectsAnswers,
+    RaycastAnswers,
+    SweepAnswers,
+    Verdict,
+    WithinAnswers,
+)
+from .arrays import array_fields
+from .errors import InternalError
+
+_LAST_VERDICT = int(max(Verdict))
+_A = TypeVar("_A", bound=Cost)
+
+_BOUNDS = frozenset(("lower", "upper", "exact"))
+_PAIR_COLUMNS = ("avatar_point", "cloud_point", "signed_distance", "avatar_index", "scan_index", "cluster")
+_CLUSTER_COLUMNS = (
+    "cluster_count", "cluster_deepest", "cluster_avatar", "cluster_cloud", "cluster_scan", "cluster_low",
+    "cluster_high",
+)  # fmt: skip
+# Of the columns that have not one element an answer: the column of starts that says how many.
+_ROWS = {
+    **dict.fromkeys(_PAIR_COLUMNS, "pair_starts"),
+    **dict.fromkeys(_CLUSTER_COLUMNS, "cluster_starts"),
+}
+# What `upper`, distances and vectors are where nothing is known; `lower` is a fraction or a length along a ray in some.
+_UNKNOWN = {"verdict": float(Verdict.UNKNOWN), "upper": np.inf, "distance": np.inf, "signed_distance": np.inf}
+
+
+def unknown(kind: type[_A], k: int, *, bounded: bool = True) -> _A:
+    """The answers of one kind for k poses (rays, points, motions, objects) when nobody answered: all `UNKNOWN`.
+
+    bounded: whether `CollideAnswers` state bounds, as they do where a tolerance or a budget was given.
+    """
+    columns: dict[str, Any] = {}
+    for name, (dtype, tail, _) in array_fields(kind).items():
+        rows = k
+        if issubclass(kind, ContactsAnswers):
+            rows = 0 if name in _ROWS else k + (name in _ROWS.values())
+        elif issubclass(kind, CollideAnswers) and name in _BOUNDS and not bounded:
+            rows = 0
+        filling = np.nan if tail and dtype.kind == "f" else _UNKNOWN.get(name, 0)
+        if name == "lower" and not issubclass(kind, SweepAnswers | RaycastAnswers | WithinAnswers):
+            filling = -np.inf
+        columns[name] = np.full((rows, *tail), filling, dtype)
+    if issubclass(kind, ObjectsAnswers):
+        columns["pairs"] = np.column_stack(np.triu_indices(k, 1)).astype(np.int32)
+        columns["pair_verdict"] = np.full(len(columns["pairs"]), Verdict.UNKNOWN, np.uint8)
+    return kind(**columns)
+
+
+def join(parts: Sequence[_A]) -> _A:
+    """The answers of several requests as those of one, in order. Residency is that after the last answer."""
+    if len(parts) == 1:
+        return parts[0]
+    kind = type(parts[0])
+    answered = [part for part in parts if part.resident or part.hits or part.misses] or parts
+    fields: dict[str, Any] = {}
+    for name in array_fields(kind):
+        columns = [getattr(part, name) for part in parts]
+        fields[name] = _joined_starts(columns) if name in _ROWS.values() else np.concatenate(columns)
+    return kind(
+        **fields,
+        engine_seconds=sum(part.engine_seconds for part in parts),
+        hits=sum(part.hits for part in parts),
+        misses=sum(part.misses for part in parts),
+        resident=answered[-1].resident,
+        resident_bytes=answered[-1].resident_bytes,
+        faults=tuple(dict.fromkeys(fault for part in parts for fault in part.faults)),
+    )
+
+
+def as_part(answers: Cost, first: int, total: int) -> Any:
+    """The same answers as those for [first, first + n) of the `total` along a path."""
+    return PARTS[type(answers)](**asdict(answers), first=first, total=total)
+
+
+def without_part(kind: type[_A], part: Any) -> _A:
+    """The answers of a part, of their own kind again."""
+    fields = asdict(part)
+    del fields["first"], fields["total"]
+    return kind(**fields)
+
+
+def check_answers(answers: _A, k: int) -> _A:
+    """The same answers, if they are the answers to k poses; InternalError if not, never a guess."""
+    kind = type(answers)
+    contacts, collide = isinstance(answers, ContactsAnswers), isinstance(answers, CollideAnswers)
+    pairs = len(answers.pairs) if isinstance(answers, ObjectsAnswers) else 0
+    for name in array_fields(kind):
+        column = getattr(answers, name)
+        expected = k
+        if contacts and name in _ROWS.values():
+            expected = k + 1
+        elif contacts and name in _ROWS:
+            expected = _last(getattr(answers, _ROWS[name]))
+        elif name in ("pairs", "pair_verdict"):
+            expected = pairs
+        elif collide and name in _BOUNDS and len(answers.exact) == 0:
+            expected = 0
+        if len(column) != expected:
+            raise InternalError(
+                f"{kind.__name__}: {len(column)} values in {name!r}, expected {expected}, for {k} asked"
+            )
+        if name.endswith("verdict") and expected and max(column.tobytes()) > _LAST_VERDICT:
+            raise InternalError(
+                f"{kind.__name__}: verdict {column.max()}, expected at most {_LAST_VERDICT}: upgrade the client"
+            )
+        if contacts and name in _ROWS.values() and (column[0] != 0 or (np.diff(column) < 0).any()):
+            raise InternalError(f"{kind.__name__}: {name!r} does not rise from 0")
+    if pairs and not 0 <= int(answers.pairs.min()) <= int(answers.pairs.max()) < k:  # type: ignore[attr-defined]
+        raise InternalError(f"{kind.__name__}: pairs of objects that were not asked about, of {k}")
+    return answers
+
+
+def _last(starts: NDArray[np.int64]) -> int:
+    """How many rows a column of starts tells of."""
+    return int(starts[-1]) if len(starts) else 0
+
+
+def _joined_starts(columns: list[NDArray[np.int64]]) -> NDArray[np.int64]:
+    """Columns of starts, each from 0, as one."""
+    joined = [np.zeros(1, np.int64)]
+    for column in columns:
+        joined.append(column[1:] + joined[-1][-1])
+    return np.concatenate(joined)

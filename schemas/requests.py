@@ -1,0 +1,353 @@
+"""What may be asked: a type for each request, and the checks that make one a request.
+
+A request is checked when it is made, so a client is refused before it sends what a server would refuse.
+"""
+
+import math
+import operator
+from collections.abc import Sequence
+from functools import cache
+from typing import Annotated, Any, Literal, get_type_hints
+
+import msgspec
+import numpy as np
+
+from .arrays import Poses, Positions
+from .errors import BadRequestError, TooLargeError
+
+# Caps of the protocol. They bound what one request can cost a server: 24 MB of points, 12.8 MB of poses (a sweep's
+# twice that), all under the largest message. Raised, a server of version 1 would drop the larger messages unanswered.
+MAX_AVATAR_POINTS = 1_000_000
+MAX_POSES = 100_000
+# All pairs of so many objects fit one answer: 19 MB.
+MAX_OBJECTS = 2048
+# Pairs listed for a pose: of so many, one pose's answer is 7 MB.
+MAX_CONTACTS = 10_000
+
+ALL_GROUPS = 0xFFFFFFFF
+
+Name = Annotated[str, msgspec.Meta(min_length=1, max_length=64)]
+Length = Annotated[float, msgspec.Meta(ge=0)]
+Duration = Annotated[float, msgspec.Meta(ge=0, description="milliseconds")]
+Count = Annotated[int, msgspec.Meta(ge=0, le=1 << 62)]
+Bits = Annotated[int, msgspec.Meta(ge=0, le=ALL_GROUPS)]
+PathOperation = Literal["collide", "distance", "contacts", "sweep"]
+
+# What each operation takes along a path, beside the avatar, the poses, the tolerance and the budgets.
+PATH_PARAMETERS: dict[str, tuple[str, ...]] = {
+    "collide": ("margin",),
+    "distance": ("reach",),
+    "contacts": ("limit", "margin", "cluster_distance"),
+    "sweep": ("margin",),
+}
+
+_FLOAT64 = np.dtype("<f8")
+
+
+class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A request refuses fields it does not know: one that was ignored could have changed the answer."""
+
+    def __post_init__(self) -> None:
+        for name, check in _checks(type(self)):
+            value = getattr(self, name)
+            if value is not None:
+                check(name, value)
+
+
+class AddAvatarRequest(Request, frozen=True):
+    """Give this client an avatar.
+
+    name: 1 to 64 characters.  points: (n, 3) float64, the avatar's frame [m].
+    radius: of every point [m], finite and >= 0; null: half the mean closest-point distance of `points`.
+    """
+
+    name: Name
+    points: Positions
+    radius: Length | None = None
+
+
+class Question(Request, frozen=True, kw_only=True):
+    """What every question takes.
+
+    tolerance: how early contact may be called and how far bounds may lie apart [m]; 0: exact.
+    budget_ms: time for loads and work together [ms]; null: none.  budget_visits: node visits a pose (ray, point,
+    motion); null: none.
+    """
+
+    tolerance: Length = 0.0
+    budget_ms: Duration | None = None
+    budget_visits: Count | None = None
+
+
+class CollideRequest(Question, frozen=True):
+    """Ask, for each pose, whether an avatar touches the scene.
+
+    avatar: the name it was added under.  poses: (k, 4, 4) float64, avatar to world, row-major, metres.
+    margin: distance below which two spheres are called in contact [m], finite and >= 0.
+    """
+
+    avatar: Name
+    poses: Poses
+    margin: Length = 0.0
+
+
+class DistanceRequest(Question, frozen=True):
+    """Ask, for each pose, how far an avatar is from the scene, and between which points.
+
+    avatar, poses: as in CollideRequest.  reach: farthest distance worth reporting [m], finite and >= 0.
+    """
+
+    avatar: Name
+    poses: Poses
+    reach: Length
+
+
+class ContactsRequest(Question, frozen=True):
+    """Ask, for each pose, which pairs of points are in contact.
+
+    avatar, poses, margin: as in CollideRequest.  limit: pairs listed for a pose, the deepest, at most 10,000.
+    cluster_distance: scan points at most this far apart belong to one cluster [m]; null: the server's choice.
+    """
+
+    avatar: Name
+    poses: Poses
+    limit: Annotated[int, msgspec.Meta(ge=0, le=MAX_CONTACTS)] = 100
+    margin: Length = 0.0
+    cluster_distance: Length | None = None
+
+
+class SweepRequest(Question, frozen=True, kw_only=True):
+    """Ask, for each motion, when an avatar that moves from one pose to another first touches the scene.
+
+    avatar, margin: as in CollideRequest.  pose_from, pose_to: (k, 4, 4) float64, avatar to world, as many of each.
+    tolerance: how far a point of the avatar may move inside the interval that is answered [m].
+    """
+
+    avatar: Name
+    pose_from: Poses
+    pose_to: Poses
+    margin: Length = 0.0
+    tolerance: Length = 1e-6
+
+    def __post_init__(self) -> None:
+        Request.__post_init__(self)
+        _same_length(self, "pose_from", "pose_to")
+
+
+class RaycastRequest(Question, frozen=True):
+    """Ask, for each ray, which scan point's sphere it hits first.
+
+    origins, directions: (k, 3) float64, world [m], as many of each; a direction of any length but 0.
+    reach: length of the rays [m], finite and >= 0.
+    """
+
+    origins: Positions
+    directions: Positions
+    reach: Length
+
+    def __post_init__(self) -> None:
+        Request.__post_init__(self)
+        _same_length(self, "origins", "directions")
+
+
+class WithinRequest(Question, frozen=True):
+    """Ask, for each loose point, which scan point is nearest.
+
+    points: (k, 3) float64, world [m].  reach: farthest distance worth reporting [m], finite and >= 0.
+    """
+
+    points: Positions
+    reach: Length
+
+
+class ObjectItem(Request, frozen=True):
+    """One of several avatars at once.
+
+    avatar: the name it was added under.  group: bits of the groups it belongs to.  mask: bits of those it meets.
+    """
+
+    avatar: Name
+    group: Bits = 1
+    mask: Bits = ALL_GROUPS
+
+
+class ObjectsRequest(Question, frozen=True):
+    """Ask which of several avatars touch the scene, and which of them touch one another.
+
+    objects: at most 2,048; an avatar may be named more than once.  poses: (n, 4, 4) float64, one an object.
+    margin: as in CollideRequest.
+    """
+
+    objects: list[ObjectItem]
+    poses: Poses
+    margin: Length = 0.0
+
+    def __post_init__(self) -> None:
+        Request.__post_init__(self)
+        _same_length(self, "objects", "poses")
+        if len(self.objects) > MAX_OBJECTS:
+            raise TooLargeError(f"{len(self.objects)} objects: at most {MAX_OBJECTS}: ask in groups")
+
+
+class PathRequest(Request, frozen=True):
+    """Ask one thing along a path; the answers come in parts.
+
+    avatar: the name it was added under.  poses: (k, 4, 4) float64, at most 100,000.
+    op: "collide", "distance", "contacts" or "sweep", the last of the k - 1 motions from each pose to the next.
+    The rest is null where `op` does not take it, or for its default; `reach` is needed for "distance". `budget_ms` is
+    for the whole path.
+    """
+
+    avatar: Name
+    poses: Poses
+    op: PathOperation = "collide"
+    margin: Length | None = None
+    reach: Length | None = None
+    limit: Annotated[int, msgspec.Meta(ge=0, le=MAX_CONTACTS)] | None = None
+    cluster_distance: Length | None = None
+    tolerance: Length | None = None
+    budget_ms: Duration | None = None
+    budget_visits: Count | None = None
+
+    def __post_init__(self) -> None:
+        Request.__post_init__(self)
+        self.parameters()
+
+    def parameters(self) -> dict[str, Any]:
+        """What was given for `op`; BadRequestError for what it does not take, or lacks."""
+        names = ("margin", "reach", "limit", "cluster_distance", "tolerance", "budget_ms", "budget_visits")
+        given = {name: value for name in names if (value := getattr(self, name)) is not None}
+        check_path_parameters(self.op, given)
+        return given
+
+
+def check_path_parameters(op: str, parameters: dict[str, Any]) -> None:
+    """BadRequestError unless these are parameters that `op` takes along a path, with all that it needs."""
+    if op not in PATH_PARAMETERS:
+        raise BadRequestError(f"op {op!r} along a path: expected one of {', '.join(PATH_PARAMETERS)}")
+    taken = (*PATH_PARAMETERS[op], "tolerance", "budget_ms", "budget_visits")
+    for name in parameters:
+        if name not in taken:
+            raise BadRequestError(f"{name} is no parameter of {op} along a path: it takes {', '.join(taken)}")
+    if op == "distance" and parameters.get("reach") is None:
+        raise BadRequestError("distance along a path needs reach, the farthest distance worth reporting [m]")
+
+
+def make_positions(points: Any, what: str = "points") -> Positions:
+    """An avatar's points as the wire has them: (n, 3) float64, finite [m]. BadRequestError, TooLargeError."""
+    array = make_vectors(points, what)
+    if len(array) > MAX_AVATAR_POINTS:
+        raise TooLargeError(f"avatar of {len(array)} points: at most {MAX_AVATAR_POINTS}: thin it out first")
+    return array
+
+
+def make_vectors(vectors: Any, what: str) -> Positions:
+    """Vectors as the wire has them: (n, 3) float64, finite. BadRequestError says what `what` is instead."""
+    array = _as_float64(what, vectors)
+    if array.ndim != 2 or array.shape[1] != 3:
+        raise BadRequestError(f"{what} of shape {array.shape}: expected (n, 3)")
+    try:
+        check_finite(what, array)
+    except ValueError as error:
+        raise BadRequestError(str(error)) from None
+    return array  # type: ignore[return-value]
+
+
+def make_poses(poses: Any, what: str = "poses") -> Poses:
+    """Poses as the wire has them: (k, 4, 4) float64. Only the shape is checked: the server judges them."""
+    array = _as_float64(what, poses)
+    if array.ndim != 3 or array.shape[1:] != (4, 4):
+        raise BadRequestError(f"{what} of shape {array.shape}: expected (k, 4, 4), avatar to world")
+    return array  # type: ignore[return-value]
+
+
+def make_objects(objects: Sequence[Sequence[Any]]) -> tuple[list[ObjectItem], Poses]:
+    """Objects (name, pose, group = 1, mask = all groups), poses (4, 4) float64, as the wire has them.
+
+    BadRequestError says which is none.
+    """
+    items = []
+    for number, entry in enumerate(objects):
+        if not 2 <= len(entry) <= 4:
+            raise BadRequestError(
+                f"object {number} of {len(entry)} values: expected name, pose and, where wanted, group and mask"
+            )
+        items.append(ObjectItem(entry[0], *(_as_bits(number, value) for value in entry[2:])))
+    if not items:
+        return items, make_poses(np.zeros((0, 4, 4)))
+    return items, make_poses([entry[1] for entry in objects])
+
+
+def _as_bits(number: int, value: Any) -> int:
+    """A group or mask as an integer; BadRequestError for what is none."""
+    try:
+        return operator.index(value)
+    except TypeError:
+        raise BadRequestError(f"object {number}: group or mask {value!r}: expected an integer") from None
+
+
+def check_finite(name: str, array: np.ndarray) -> None:
+    """ValueError for a number no answer exists for (NUMERICS.md N7)."""
+    # Of one pose this takes a third of the time that `np.isfinite(array).all()` does.
+    if 0 in np.isfinite(array).tobytes():
+        where = [int(i) for i in np.argwhere(~np.isfinite(array))[0]]
+        raise ValueError(f"{name}{where} is {array[tuple(where)]}, expected finite numbers")
+
+
+def _as_float64(name: str, values: Any) -> np.ndarray:
+    """Numbers as a C-ordered little-endian float64 array; BadRequestError for what is not numbers."""
+    try:
+        return np.ascontiguousarray(values, _FLOAT64)
+    except (TypeError, ValueError) as error:
+        raise BadRequestError(f"{name}: {error}: expected an array of numbers") from None
+
+
+def _check_name(_: str, name: str) -> None:
+    """BadRequestError for an avatar's name that is empty or too long."""
+    if not 1 <= len(name) <= 64:
+        raise BadRequestError(f"avatar {name[:64]!r} of {len(name)} characters: expected 1 to 64")
+
+
+def _check_length(what: str, value: float) -> None:
+    """BadRequestError for a length no answer exists for (NUMERICS.md N7, cases 14 and 15)."""
+    if not 0 <= value < math.inf:
+        raise BadRequestError(f"{what} is {value}: expected a finite number of metres, 0 or more")
+
+
+def _check_duration(what: str, value: float) -> None:
+    """BadRequestError for what is no duration."""
+    if not 0 <= value < math.inf:
+        raise BadRequestError(f"{what} is {value}: expected milliseconds, 0 or more")
+
+
+def _check_integer(what: str, value: int, most: int) -> None:
+    """BadRequestError for what is no integer from 0 to `most`."""
+    if not isinstance(value, int) or not 0 <= value <= most:
+        raise BadRequestError(f"{what} is {value}: expected an integer from 0 to {most}")
+
+
+def _same_length(request: Request, first: str, second: str) -> None:
+    """BadRequestError unless two fields have as many elements each."""
+    a, b = len(getattr(request, first)), len(getattr(request, second))
+    if a != b:
+        raise BadRequestError(f"{a} {first} and {b} {second}: expected as many of each")
+
+
+@cache
+def _checks(kind: type[Request]) -> tuple[tuple[str, Any], ...]:
+    """The checks of a request's fields, by what their types say; an array's are made where it is read."""
+    found: list[tuple[str, Any]] = []
+    for name, hint in get_type_hints(kind, include_extras=True).items():
+        kinds = {hint, *getattr(hint, "__args__", ())}
+        if Name in kinds:
+            found.append((name, _check_name))
+        elif Length in kinds:
+            found.append((name, _check_length))
+        elif Duration in kinds:
+            found.append((name, _check_duration))
+        else:
+            for one in kinds:
+                for meta in getattr(one, "__metadata__", ()):
+                    if getattr(meta, "le", None) is not None:
+                        found.append((name, lambda what, value, le=meta.le: _check_integer(what, value, le)))
+    return tuple(found)

@@ -1,0 +1,137 @@
+"""`path`: one question asked along thousands of poses, its answers in parts, order kept.
+
+Parts are computed by a few threads ahead of whoever takes them; kernels hold no GIL. How many answers a part holds
+follows from how long they took so far, so that the first part comes soon and no part keeps others waiting for long.
+What is answered does not depend on it, cost counters of a part apart.
+"""
+
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, Future
+from typing import Any
+
+import numpy as np
+
+from ..schemas.answers import Cost, Part
+from ..schemas.arrays import Poses
+from ..schemas.columns import as_part
+from ..schemas.errors import SolidcloudError
+from ..schemas.requests import check_path_parameters
+from .avatar import AvatarModel
+from .collide import collide
+from .effort import make_effort
+from .kernels.placing import check_poses
+from .request import SceneData, refuse, to_units
+
+# Parts computed at a time, by default.
+PATH_THREADS = 2
+# Answers in a part. The first is small, so that it comes soon; later ones take about PART_SECONDS. At 1,024 answers the
+# overhead of a part, a few tenths of a millisecond with zenoh, is a few per cent of the fastest question.
+FIRST_PART = 64
+LARGEST_PART = 1024
+PART_SECONDS = 0.01
+# Of a part's answer, far under the largest message; a contact takes 68 bytes and its cluster up to 116.
+_PART_BYTES = 8 << 20
+_CONTACT_BYTES = 184
+
+Ask = Callable[[int, int], Cost]
+
+
+def path_question(
+    data: SceneData, avatar: AvatarModel, poses: Poses, op: str, parameters: dict[str, Any]
+) -> tuple[Ask, int]:
+    """What answers [start, stop) of a path, and how many answers there are. The budget's time begins now.
+
+    poses: (k, 4, 4) float64.  parameters: of `op`, tolerance and budgets included. All poses are checked here, so that
+    an error names one by its place on the path. BadRequestError, BadTransformError, TooLargeError.
+    """
+    given = {name: value for name, value in parameters.items() if value is not None}
+    check_path_parameters(op, given)
+    budgets = {name: given.pop(name) for name in ("budget_ms", "budget_visits") if name in given}
+    tolerance = given.pop("tolerance", 1e-6 if op == "sweep" else 0.0)
+    effort = make_effort(tolerance, **budgets)
+    if not poses.flags.writeable:
+        poses = poses.copy()  # once, or every part would copy its own
+    other = (
+        to_units(given["reach"], "reach")
+        if op == "distance"
+        else to_units(given.get("margin", 0.0), "margin")
+    )
+    scales, units = np.empty(len(poses)), np.empty(len(poses), np.int64)
+    other += data.radius_units
+    fault, pose, found = check_poses(
+        poses, avatar.arrays.radius, avatar.radius, other, data.arrays, scales, units
+    )
+    refuse(fault, pose, found)
+
+    from .contacts import contacts
+    from .distance import distance
+
+    if op == "sweep":
+        from .sweep import sweep
+
+        margin = given.get("margin", 0.0)
+        return (
+            lambda a, b: sweep(data, avatar, poses[a:b], poses[a + 1 : b + 1], margin, tolerance, effort)
+        ), max(0, len(poses) - 1)
+    if effort.bounded:
+        given["effort"] = effort
+    question: Any = {"collide": collide, "distance": distance, "contacts": contacts}[op]
+    return (lambda a, b: question(data, avatar, poses[a:b], **given)), len(poses)
+
+
+def largest_part(op: str, parameters: dict[str, Any]) -> int:
+    """How many answers of `op` a part may hold, so that it fits a message."""
+    if op != "contacts":
+        return LARGEST_PART
+    limit = parameters.get("limit")
+    return min(
+        LARGEST_PART, max(1, _PART_BYTES // (_CONTACT_BYTES * max(1, 100 if limit is None else limit)))
+    )
+
+
+def path_parts(
+    ask: Ask, total: int, most: int = LARGEST_PART, pool: Executor | None = None, ahead: int = 1
+) -> Iterator[Part]:
+    """The parts of a path in order; at least one, empty if the path is.
+
+    most: answers in a part.  pool: computes parts, up to `ahead` of them before they are taken; None: each is computed
+    when it is asked for. A generator: closing it leaves what is being computed to end by itself.
+    """
+    waiting: deque[tuple[int, Future[Cost]]] = deque()
+    size, start = min(FIRST_PART, most), 0
+    try:
+        while waiting or start < max(1, total):
+            while pool is not None and start < max(1, total) and len(waiting) < ahead:
+                stop = min(start + size, total)
+                waiting.append((start, pool.submit(_ask_part, ask, start, stop)))
+                start = max(1, stop)
+            if pool is None:
+                first, stop = start, min(start + size, total)
+                answers = _ask_part(ask, first, stop)
+                start = max(1, stop)
+            else:
+                first, future = waiting.popleft()
+                answers = future.result()
+            yield as_part(answers, first, total)
+            size = _next_size(size, answers, most)
+    finally:
+        for _, future in waiting:
+            future.cancel()
+
+
+def _ask_part(ask: Ask, start: int, stop: int) -> Cost:
+    """The answers for [start, stop); an error says where on the path."""
+    try:
+        return ask(start, stop)
+    except SolidcloudError as error:
+        if start == 0:
+            raise
+        raise type(error)(f"in the part of the path that begins at {start}: {error}") from None
+
+
+def _next_size(size: int, answers: Any, most: int) -> int:
+    """How many answers the next part is to hold, by what these took; at most four times as many as before."""
+    each = answers.engine_seconds / max(1, len(answers))
+    fitting = most if each <= 0 else int(PART_SECONDS / each)
+    return max(1, min(fitting, 4 * size, most))

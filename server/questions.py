@@ -1,0 +1,266 @@
+"""What a client asks: each question as requests, their answers as one.
+
+`Client` carries them; there is nothing of zenoh here.
+"""
+
+import time
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
+
+from ..schemas.answers import (
+    CollideAnswers,
+    ContactsAnswers,
+    Cost,
+    DistanceAnswers,
+    ObjectsAnswers,
+    RaycastAnswers,
+    SweepAnswers,
+    WithinAnswers,
+)
+from ..schemas.columns import check_answers, join, unknown
+from ..schemas.errors import BadRequestError
+from ..schemas.messages import (
+    CollideRequest,
+    ContactsRequest,
+    DistanceRequest,
+    ObjectsRequest,
+    RaycastRequest,
+    SweepRequest,
+    WithinRequest,
+    decode_answer,
+    encode,
+)
+from ..schemas.requests import Question, make_objects, make_poses, make_vectors
+
+# Poses in one request: 512 KiB, so that one client's long list does not keep others waiting for seconds, and
+# an answer comes well within the timeout.
+BATCH_POSES = 4096
+# The same of questions that take up to milliseconds a pose.
+SLOW_BATCH = 256
+
+_OPERATIONS: dict[type, str] = {
+    CollideAnswers: "collide",
+    DistanceAnswers: "distance",
+    ContactsAnswers: "contacts",
+    SweepAnswers: "sweep",
+    RaycastAnswers: "raycast",
+    WithinAnswers: "within",
+    ObjectsAnswers: "objects",
+}
+_A = TypeVar("_A", bound=Cost)
+
+
+class Questions:
+    """The questions of a `Client` that have one answer each; those of a path come in parts, see `Client.path`.
+
+    What nobody answered in time is `UNKNOWN`, never clear. Raises what the server refuses: BadRequestError,
+    BadTransformError, UnknownAvatarError, BusyError and others.
+    """
+
+    def _ask_about(self, operation: str, request: bytes, names: Sequence[str]) -> bytes | None:
+        """Ask about avatars of these names; None: nobody answered. Raises what an error reply says."""
+        raise NotImplementedError
+
+    def collide(
+        self,
+        name: str,
+        poses: Any,
+        margin: float = 0.0,
+        *,
+        tolerance: float = 0.0,
+        budget_ms: float | None = None,
+        budget_visits: int | None = None,
+    ) -> CollideAnswers:
+        """Whether an avatar touches the scene, for k poses (k, 4, 4) float64, avatar to world.
+
+        margin: distance below which it is called contact [m].  tolerance [m], budget_ms, budget_visits: here and below,
+        what the answer may cost (WIRE.md).
+        """
+        array = make_poses(poses)
+
+        def request(part: slice, left: float | None) -> CollideRequest:
+            return CollideRequest(
+                name,
+                array[part],
+                float(margin),
+                tolerance=tolerance,
+                budget_ms=left,
+                budget_visits=budget_visits,
+            )
+
+        bounded = tolerance > 0 or budget_ms is not None or budget_visits is not None
+        return self._question(CollideAnswers, request, len(array), budget_ms, [name], bounded=bounded)
+
+    def distance(
+        self,
+        name: str,
+        poses: Any,
+        reach: float,
+        *,
+        tolerance: float = 0.0,
+        budget_ms: float | None = None,
+        budget_visits: int | None = None,
+    ) -> DistanceAnswers:
+        """How far an avatar is from the scene under each of k poses, up to `reach` [m]."""
+        array = make_poses(poses)
+
+        def request(part: slice, left: float | None) -> DistanceRequest:
+            return DistanceRequest(
+                name,
+                array[part],
+                float(reach),
+                tolerance=tolerance,
+                budget_ms=left,
+                budget_visits=budget_visits,
+            )
+
+        return self._question(DistanceAnswers, request, len(array), budget_ms, [name])
+
+    def contacts(
+        self,
+        name: str,
+        poses: Any,
+        limit: int = 100,
+        margin: float = 0.0,
+        cluster_distance: float | None = None,
+        *,
+        tolerance: float = 0.0,
+        budget_ms: float | None = None,
+        budget_visits: int | None = None,
+    ) -> ContactsAnswers:
+        """Which pairs of points are in contact under each of k poses: the deepest `limit` listed, all in clusters."""
+        array = make_poses(poses)
+
+        def request(part: slice, left: float | None) -> ContactsRequest:
+            return ContactsRequest(
+                name, array[part], limit, float(margin), cluster_distance,
+                tolerance=tolerance, budget_ms=left, budget_visits=budget_visits,
+            )  # fmt: skip
+
+        # A pair takes 68 bytes and its cluster up to 116: a batch's answer stays far under the largest message.
+        batch = max(1, min(SLOW_BATCH, (8 << 20) // (184 * max(1, limit))))
+        return self._question(ContactsAnswers, request, len(array), budget_ms, [name], batch=batch)
+
+    def sweep(
+        self,
+        name: str,
+        pose_from: Any,
+        pose_to: Any,
+        margin: float = 0.0,
+        *,
+        tolerance: float = 1e-6,
+        budget_ms: float | None = None,
+        budget_visits: int | None = None,
+    ) -> SweepAnswers:
+        """When an avatar first touches the scene on its way from each of k poses to another."""
+        begins, ends = make_poses(pose_from, "pose_from"), make_poses(pose_to, "pose_to")
+        if len(begins) != len(ends):
+            raise BadRequestError(
+                f"{len(begins)} pose_from and {len(ends)} pose_to: expected as many of each"
+            )
+
+        def request(part: slice, left: float | None) -> SweepRequest:
+            return SweepRequest(
+                avatar=name, pose_from=begins[part], pose_to=ends[part], margin=float(margin),
+                tolerance=tolerance, budget_ms=left, budget_visits=budget_visits,
+            )  # fmt: skip
+
+        return self._question(SweepAnswers, request, len(begins), budget_ms, [name], batch=SLOW_BATCH)
+
+    def raycast(
+        self,
+        origins: Any,
+        directions: Any,
+        reach: float,
+        *,
+        tolerance: float = 0.0,
+        budget_ms: float | None = None,
+        budget_visits: int | None = None,
+    ) -> RaycastAnswers:
+        """Which scan point's sphere each of k rays, (k, 3) and (k, 3), hits first, up to `reach` [m]."""
+        begins, towards = make_vectors(origins, "origins"), make_vectors(directions, "directions")
+        if len(begins) != len(towards):
+            raise BadRequestError(
+                f"{len(begins)} origins and {len(towards)} directions: expected as many of each"
+            )
+
+        def request(part: slice, left: float | None) -> RaycastRequest:
+            return RaycastRequest(
+                begins[part], towards[part], float(reach),
+                tolerance=tolerance, budget_ms=left, budget_visits=budget_visits,
+            )  # fmt: skip
+
+        return self._question(RaycastAnswers, request, len(begins), budget_ms)
+
+    def within(
+        self,
+        points: Any,
+        reach: float,
+        *,
+        tolerance: float = 0.0,
+        budget_ms: float | None = None,
+        budget_visits: int | None = None,
+    ) -> WithinAnswers:
+        """Which scan point is nearest to each of k loose points (k, 3), up to `reach` [m]."""
+        array = make_vectors(points, "points")
+
+        def request(part: slice, left: float | None) -> WithinRequest:
+            return WithinRequest(
+                array[part], float(reach), tolerance=tolerance, budget_ms=left, budget_visits=budget_visits
+            )
+
+        return self._question(WithinAnswers, request, len(array), budget_ms)
+
+    def objects(
+        self,
+        objects: Sequence[Sequence[Any]],
+        margin: float = 0.0,
+        *,
+        tolerance: float = 0.0,
+        budget_ms: float | None = None,
+        budget_visits: int | None = None,
+    ) -> ObjectsAnswers:
+        """Which of several avatars (name, pose, group = 1, mask = all) touch the scene and one another.
+
+        Where nobody answers, every pair is listed as `UNKNOWN`.
+        """
+        items, poses = make_objects(objects)
+
+        def request(_: slice, left: float | None) -> ObjectsRequest:
+            return ObjectsRequest(
+                items, poses, float(margin), tolerance=tolerance, budget_ms=left, budget_visits=budget_visits
+            )
+
+        names = list(dict.fromkeys(item.avatar for item in items))
+        return self._question(ObjectsAnswers, request, len(items), budget_ms, names, batch=max(1, len(items)))
+
+    def _question(
+        self,
+        kind: type[_A],
+        request: Callable[[slice, float | None], Question],
+        k: int,
+        budget_ms: float | None,
+        names: Sequence[str] = (),
+        *,
+        batch: int | None = None,
+        bounded: bool = True,
+    ) -> _A:
+        """Ask for k answers, in several requests where they are many.
+
+        request: makes the one for a slice, with so much left of the budget [ms].  names: the avatars it is about.
+        """
+        batch = batch or BATCH_POSES
+        parts: list[_A] = []
+        begin = time.monotonic()
+        for start in range(0, max(1, k), batch):
+            stop = min(start + batch, k)
+            left = budget_ms
+            if left is not None and start:
+                left = max(0.0, left - (time.monotonic() - begin) * 1e3)
+            payload = self._ask_about(_OPERATIONS[kind], encode(request(slice(start, stop), left)), names)
+            if payload is None:
+                # Not asked for the rest: a server that is frozen would cost a timeout for every batch.
+                parts.append(unknown(kind, k - start, bounded=bounded))
+                break
+            parts.append(check_answers(decode_answer(kind, payload), stop - start))
+        return join(parts)

@@ -1,0 +1,190 @@
+"""`distance` equals the definition bit for bit, witnesses and all, whatever the scan, the avatar, the pose and the tree."""
+
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import cases
+import naive
+import naive_distance
+import numpy as np
+import pytest
+import scans
+from clouds import KINDS, TREES, cloud, signed_permutations
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from solidcloud.schemas.answers import DistanceAnswers, Verdict
+from solidcloud.server.scene import Scene
+
+
+def compare(answers: DistanceAnswers, expected: list[naive_distance.Expected | None], reach: float) -> None:
+    """Assert that answers are the judge's, to the last bit."""
+    assert answers.exact.all()
+    for i, judged in enumerate(expected):
+        found = (
+            answers.signed_distance[i], answers.witness_avatar[i], answers.witness_cloud[i], answers.normal[i]
+        )  # fmt: skip
+        if judged is None:
+            assert found[0] == answers.upper[i] == np.inf and answers.lower[i] == reach
+            assert all(np.isnan(column).all() for column in found[1:])
+            assert answers.verdict[i] == Verdict.CLEAR
+            continue
+        assert found[0] == answers.lower[i] == answers.upper[i] == judged.signed, (i, found, judged)
+        assert [column.tolist() for column in found[1:]] == list(judged[1:4]), (i, found, judged)
+        assert answers.verdict[i] == (Verdict.CONTACT if judged.signed <= 0 else Verdict.CLEAR)
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    kind=st.sampled_from(KINDS),
+    count=st.sampled_from([1, 2, 33, 300]),
+    body=st.sampled_from(KINDS),
+    step=st.sampled_from([1e-6, cases.BINARY_STEP, 1e-4, 1e-2, 0.3]),
+    voxel_steps=st.sampled_from([1, 7, 1000, 70_000, 1 << 21]),
+    far=st.sampled_from([0.0, 5e5, 6.4e6, 1e8]),
+    scale=st.sampled_from([1.0, 1.0, 1e-3, 0.3, 999.0]),
+    off=st.sampled_from([0.0, 0.0, 1e3, 1e5]),
+    tree=TREES,
+)
+def test_distance_and_witnesses_are_those_of_the_definition(
+    seed: int,
+    kind: str,
+    count: int,
+    body: str,
+    step: float,
+    voxel_steps: int,
+    far: float,
+    scale: float,
+    off: float,
+    tree: dict[str, Any],
+) -> None:
+    rng = np.random.default_rng(seed)
+    extent = step * min(voxel_steps * rng.uniform(0.1, 3), 1 << 21)
+    if step <= far * 1e-14:  # float64 holds no such lattice there
+        far = 0.0
+    points = cloud(rng, kind, count) * extent + far * rng.uniform(-1, 1, 3)
+    avatar = cloud(rng, body, 40) * (extent / scale * rng.uniform(0.01, 0.5)) + off * rng.uniform(-1, 1, 3)
+    radius, scan_radius = float(step / scale * rng.choice([0, 0.7, 9])), float(step * rng.choice([0, 0.5, 9]))
+    poses = cases.near_poses(rng, points, avatar, 16, 2 * extent, scale)
+    poses = poses[np.abs(poses[:, :3, 3]).max(axis=1) < 1e9]
+    reach = float(extent * 10.0 ** rng.uniform(-2, 1))
+    with TemporaryDirectory() as folder:
+        case = cases.build(
+            Path(folder), points, voxel=step * voxel_steps, resolution=step, radius=scan_radius, **tree
+        )
+        with Scene.open(case.archive) as scene:
+            info = scene.info()
+            scan = (points, info.origin, step, info.radius)
+            most = (
+                15.9 - max(naive.reach_units(pose, radius, info.radius, 0.0) for pose in poses) / naive.UNITS
+            )
+            if most <= 0:
+                return
+            reach = min(reach, most)
+            scene.add_avatar("avatar", avatar, radius)
+            judged = naive_distance.distance(*scan, avatar, radius, poses, reach)
+            compare(scene.distance("avatar", poses, reach), judged, reach)
+            for pose, found in list(zip(poses, judged, strict=True))[:4]:
+                # The reach to the very unit, and one less.
+                radii = naive.reach_units(pose, radius, info.radius, 0.0)
+                if found is None or found.square <= radii * radii:
+                    continue
+                root = round(found.square**0.5)
+                for units in range(root - 1 - radii, root + 2 - radii):
+                    if units < 0:
+                        continue
+                    limit = units / naive.UNITS
+                    again = naive_distance.distance(*scan, avatar, radius, pose[None], limit)
+                    compare(scene.distance("avatar", pose[None], limit), again, limit)
+                    assert (again[0] is None) == (found.square > (units + radii) ** 2)
+
+
+@settings(max_examples=12, deadline=None, derandomize=True)
+@given(seed=st.integers(0, 2**32 - 1), kind=st.sampled_from(KINDS))
+def test_no_tree_voxel_order_or_budget_changes_an_answer(seed: int, kind: str) -> None:
+    rng = np.random.default_rng(seed)
+    # A coarse lattice and poses on it: ties abound.
+    points = np.rint(cloud(rng, kind, 300) * 16) / 16
+    avatar = np.rint(cloud(rng, "sphere", 60) * 4) / 32
+    turns = signed_permutations()
+    poses = np.array(
+        [cases.pose_of(turns[rng.integers(24)], np.rint(rng.uniform(-24, 24, 3)) / 16) for _ in range(40)]
+    )
+    expected = None
+    with TemporaryDirectory() as folder:
+        for options in (
+            {"voxel": 4.0},
+            {"voxel": 0.5, "degree": 2, "leaf": 1},
+            {"voxel": 0.25, "degree": 16, "leaf": 32, "cell_points": 10, "with_slab": False},
+            {"voxel": 0.5, "degree": 5, "leaf": 7, "cell_points": 10},
+        ):
+            case = cases.build(Path(folder), rng.permutation(points), resolution=2.0**-6, **options)
+            with Scene.open(case.archive) as scene:
+                info = scene.info()
+                budget = 2 * max(scene.residency.bytes_of([row]) for row in range(info.voxels))
+            if expected is None:
+                expected = naive_distance.distance(
+                    points, info.origin, info.lattice_step, info.radius, avatar, 0.01, poses, 1.5
+                )
+            for options in ({}, {"budget_bytes": budget}):  # as a whole, and in pieces
+                with Scene.open(case.archive, **options) as scene:
+                    scene.add_avatar("avatar", rng.permutation(avatar), 0.01)
+                    compare(scene.distance("avatar", poses, 1.5), expected, 1.5)
+                    scene.residency.check()
+
+
+@settings(max_examples=10, deadline=None, derandomize=True)
+@given(seed=st.integers(0, 2**32 - 1), kinds=st.tuples(st.sampled_from(KINDS), st.sampled_from(KINDS)))
+def test_either_may_be_the_scan(seed: int, kinds: tuple[str, str]) -> None:
+    """distance(A, B, M) == distance(B, A, M^-1) for M exactly invertible (NUMERICS.md case 29)."""
+    rng = np.random.default_rng(seed)
+    step, radii = cases.BINARY_STEP, (3 * cases.BINARY_STEP, 7 * cases.BINARY_STEP)
+    clouds = [
+        np.rint(cloud(rng, kind, count) / step) * step for kind, count in zip(kinds, (8, 400), strict=True)
+    ]
+    turns = signed_permutations()
+    poses = []
+    for _ in range(30):
+        turn = turns[rng.integers(24)]
+        a, b = (c[rng.integers(len(c))] for c in clouds)
+        poses.append(cases.pose_of(turn, a - turn @ b + rng.integers(-300, 301, 3) * step))
+    back = [cases.pose_of(p[:3, :3].T, -p[:3, :3].T @ p[:3, 3]) for p in poses]
+    with TemporaryDirectory() as folder:
+        signed = []
+        for own, other, way in ((0, 1, poses), (1, 0, back)):
+            case = cases.build(
+                Path(folder), clouds[own], resolution=step, radius=radii[own], leaf=2, degree=2
+            )
+            with Scene.open(case.archive) as scene:
+                scene.add_avatar("avatar", clouds[other], radii[other])
+                signed.append(scene.distance("avatar", np.array(way), 2.0).signed_distance.tolist())
+        assert signed[0] == signed[1]
+
+
+def test_collide_is_distance_within_the_margin(tmp_path: Path, rng: np.random.Generator) -> None:
+    case = cases.build(tmp_path, scans.make_scan("corner", 3, 2000), voxel=0.4)
+    avatar = rng.uniform(-0.2, 0.2, (60, 3))
+    poses = cases.near_poses(rng, case.points, avatar, 300, 0.4)
+    with Scene.open(case.archive) as scene:
+        scene.add_avatar("avatar", avatar, 0.01)
+        found = scene.distance("avatar", poses, 0.3)
+        for margin in (0.0, 0.01, 0.1, 0.3):
+            verdict = scene.collide("avatar", poses, margin).verdict
+            assert verdict.tolist() == (found.signed_distance <= margin).astype(int).tolist()
+    assert 0 < (found.verdict == Verdict.CONTACT).sum() < 300
+
+
+@pytest.mark.interpreted
+@pytest.mark.parametrize("kind", scans.WITH_POINTS)
+def test_a_few_poses_of_every_kind_of_scan(tmp_path: Path, rng: np.random.Generator, kind: str) -> None:
+    case = cases.build(tmp_path, scans.make_scan(kind, 11, 60), radius=0.05)
+    avatar = rng.uniform(-0.2, 0.2, (9, 3))
+    poses = np.concatenate([cases.near_poses(rng, case.points, avatar, 6, 0.5, s) for s in (1.0, 0.4)])
+    with Scene.open(case.archive) as scene:
+        info = scene.info()
+        scene.add_avatar("avatar", avatar, 0.05)
+        expected = naive_distance.distance(
+            case.points, info.origin, info.lattice_step, info.radius, avatar, 0.05, poses, 0.2
+        )
+        compare(scene.distance("avatar", poses, 0.2), expected, 0.2)

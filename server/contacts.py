@@ -1,0 +1,216 @@
+"""`contacts`: all pairs of spheres in contact, the deepest listed, all of them gathered into clusters.
+
+What users of clash detection ask for: not that two things touch, which `collide` says, but where, how deep, and how
+many places it is.
+"""
+
+import math
+import operator
+import time
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..schemas.answers import ContactsAnswers, Verdict
+from ..schemas.errors import BadRequestError
+from ..schemas.messages import make_poses
+from ..schemas.voxel_grid import UNITS_PER_METRE
+from .avatar import AvatarModel
+from .distance import signed_from_square
+from .effort import EXACT, NO_LIMIT, Effort
+from .kernels.clusters import (
+    CENTER,
+    CLUSTER,
+    HIGH,
+    LOW,
+    PAIRS,
+    POINT,
+    RECORD,
+    ROW,
+    SCAN,
+    SQUARE,
+    TAG,
+    Memory,
+    make_cells,
+)
+from .kernels.contacts import Asked, Tally, gather_contacts
+from .kernels.overlap import STACK
+from .kernels.reach import Reach
+from .request import SceneData, check_request, in_unknown, pieces, to_units
+
+# Pairs listed a pose. A record takes 80 bytes and each pose of a request keeps its own; the clusters count the rest.
+MOST_PAIRS = 10_000
+# Node visits between two looks at the clock, about a millisecond; no look without a deadline.
+SLICE_VISITS = 1 << 15
+# Cells there is room for at first, a power of two and LANES or more; a kernel doubles them as it needs.
+FIRST_CELLS = 256
+
+
+def contacts(
+    data: SceneData,
+    avatar: AvatarModel,
+    poses: ArrayLike,
+    limit: int = 100,
+    margin: float = 0.0,
+    cluster_distance: float | None = None,
+    effort: Effort = EXACT,
+) -> ContactsAnswers:
+    """All pairs in contact under each pose: counted, the deepest `limit` listed, gathered into clusters.
+
+    poses, margin: as for `collide`.  limit: pairs listed a pose, 0 to MOST_PAIRS; all are counted.
+    cluster_distance: edge of the grid cells that touched scan points fall in [m], rounded up to whole lattice steps,
+    at least one; cells lie on multiples of it from the dataset's origin. None: twice r_a + r_b + margin. Touched cells
+    that share a face, an edge or a corner are one cluster: points at most this far apart always are in one cluster, and
+    points of two clusters are farther apart than it along an axis.
+    Coincident points are pairs each. Ties go by scan point, avatar centre, avatar row, scan number.
+    effort: a budget leaves pairs out, and says so in `exact`; what is listed then is in contact, but there may be
+    deeper. A tolerance changes nothing: counting has no end that it would allow earlier.
+    CONTACT where a pair was found; else CLEAR, or UNKNOWN where not all in reach was looked at.
+    Raises BadRequestError, BadTransformError, TooLargeError.
+    """
+    begin = time.perf_counter()
+    array = make_poses(poses)
+    if not array.flags.writeable:
+        array = array.copy()  # numba compiles a read-only array anew
+    limit = _checked_limit(limit)
+    margin_units = to_units(margin, "margin")
+    edge_units = None if cluster_distance is None else to_units(cluster_distance, "cluster_distance")
+    reach = check_request(data, avatar, array, data.radius_units + margin_units)
+    k = len(array)
+    tally = Tally(
+        np.zeros((3, k), np.int64), np.zeros(k, np.int64), np.zeros(k, bool), np.zeros((k, 4), np.int64)
+    )
+    memory = _empty_memory(limit)
+    hits = misses = 0
+    faults: dict[str, None] = {}
+    if len(avatar.points):
+        edges = _edges(reach, edge_units, data.arrays.units_per_step)
+        asked = Asked(avatar.rows, edges, data.keeps_scan, limit, effort.visits)
+        parts = list(pieces(reach, data.residency))
+        for number, (which, rows, part) in enumerate(parts):
+            # A pose in several pieces is alone in each of them, and they follow one another.
+            closes = (
+                number + 1 == len(parts) or len(which) > 1 or parts[number + 1][0].tolist() != which.tolist()
+            )
+            if effort.spent:
+                memory = _gather(data, avatar, array, part, which, asked, closes, effort, memory, tally)
+                continue
+            with data.residency.hold(rows) as held:
+                memory = _gather(data, avatar, array, part, which, asked, closes, effort, memory, tally)
+            hits, misses = hits + held.hits, misses + held.misses
+            faults.update(dict.fromkeys(held.faults))
+    residency = data.residency
+    columns = _columns(data, reach, margin_units, tally, memory, len(avatar.points) > 0)
+    return ContactsAnswers(
+        **columns, engine_seconds=time.perf_counter() - begin, hits=hits, misses=misses,
+        resident=residency.resident, resident_bytes=residency.resident_bytes, faults=tuple(faults),
+    )  # fmt: skip
+
+
+def _checked_limit(limit: int) -> int:
+    """The number of pairs to list, as an int. Raises BadRequestError."""
+    try:
+        number = operator.index(limit)
+    except TypeError:
+        number = -1
+    if isinstance(limit, bool) or not 0 <= number <= MOST_PAIRS:
+        raise BadRequestError(f"limit {limit!r}: expected a whole number of pairs a pose, 0 to {MOST_PAIRS}")
+    return number
+
+
+def _edges(reach: Reach, edge_units: int | None, units_per_step: float) -> NDArray[np.int64]:
+    """The edge (k,) of a cell under each pose [steps]."""
+    units = 2 * reach.units if edge_units is None else np.full(len(reach.units), edge_units)
+    steps = units / units_per_step
+    whole = np.rint(steps)
+    # A distance that is a whole number of steps but for its rounding is that number.
+    steps = np.where(np.abs(steps - whole) <= 1e-9 * whole + 1.0 / units_per_step, whole, np.ceil(steps))
+    return np.asarray(np.maximum(steps, 1.0).astype(np.int64))
+
+
+def _empty_memory(limit: int) -> Memory:
+    """Nothing found yet, nothing begun."""
+    return Memory(
+        make_cells(FIRST_CELLS), np.empty((limit, RECORD), np.int64), np.array([0, 0, 0, 0, -1]), np.zeros(3, np.int64),
+        np.empty((STACK, 2), np.int64), np.empty((0, RECORD), np.int64), np.empty((0, CLUSTER), np.int64),
+    )  # fmt: skip
+
+
+def _gather(
+    data: SceneData,
+    avatar: AvatarModel,
+    poses: NDArray[np.float64],
+    part: Reach,
+    which: NDArray[np.int64],
+    asked: Asked,
+    closes: bool,
+    effort: Effort,
+    memory: Memory,
+    tally: Tally,
+) -> Memory:
+    """Answer one piece, to its end or to the deadline; what is left then is cut."""
+    memory.cursor[:] = 0, -1, 0
+    pause = NO_LIMIT if effort.deadline == math.inf else SLICE_VISITS
+    while memory.cursor[0] < len(which):
+        if effort.spent:
+            asked = asked._replace(visits=-1)
+        memory = gather_contacts(
+            poses, avatar.arrays, data.arrays, part, which, asked, closes, pause, memory, tally
+        )
+    return memory
+
+
+def _by_pose(rows: NDArray[np.int64], runs: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The rows of each pose's run (k, 2) first, count, one behind the other; with where each begins (k + 1,)."""
+    starts = np.concatenate([[0], np.cumsum(runs[:, 1])])
+    taken = np.arange(starts[-1]) + np.repeat(runs[:, 0] - starts[:-1], runs[:, 1])
+    return starts, rows[taken]
+
+
+def _columns(
+    data: SceneData, reach: Reach, margin_units: int, tally: Tally, memory: Memory, has_points: bool
+) -> dict[str, NDArray[Any]]:
+    """The fields of `ContactsAnswers` but the cost of the request."""
+    exact = ~tally.cut & (tally.counts[0] == 0)
+    if has_points:  # an empty avatar is clear, whatever is unknown here
+        exact &= ~in_unknown(reach.boxes, data.unknown, data.unknown_everywhere)
+    verdict = np.where(exact, Verdict.CLEAR, Verdict.UNKNOWN)
+    verdict[tally.pairs > 0] = Verdict.CONTACT
+    pair_starts, pairs = _by_pose(memory.pairs, tally.runs[:, :2])
+    cluster_starts, clusters = _by_pose(memory.clusters, tally.runs[:, 2:])
+    radii = reach.units - margin_units
+    avatar_point, cloud_point, signed = _places(data, pairs, np.repeat(radii, np.diff(pair_starts)))
+    cluster_avatar, cluster_cloud, deepest = _places(
+        data, clusters, np.repeat(radii, np.diff(cluster_starts))
+    )
+    low, high = clusters[:, LOW : LOW + 3], clusters[:, HIGH : HIGH + 3]
+    missing, visits, tests = np.minimum(tally.counts, np.iinfo(np.uint32).max).astype(np.uint32)
+    return {
+        "verdict": verdict.astype(np.uint8), "exact": exact, "pairs_found": tally.pairs,
+        "pair_starts": pair_starts, "avatar_point": avatar_point, "cloud_point": cloud_point,
+        "signed_distance": signed, "avatar_index": pairs[:, ROW].astype(np.int32),
+        "scan_index": pairs[:, SCAN].astype(np.int32), "cluster": pairs[:, TAG].astype(np.int32),
+        "cluster_starts": cluster_starts, "cluster_count": clusters[:, PAIRS].copy(), "cluster_deepest": deepest,
+        "cluster_avatar": cluster_avatar, "cluster_cloud": cluster_cloud,
+        "cluster_scan": clusters[:, SCAN].astype(np.int32),
+        "cluster_low": _to_world(data, low), "cluster_high": _to_world(data, high),
+        "outside": reach.outside, "voxels_missing": missing, "node_visits": visits, "point_tests": tests,
+    }  # fmt: skip
+
+
+def _to_world(data: SceneData, lattice: NDArray[np.int64]) -> NDArray[np.float64]:
+    """World positions (n, 3) [m] of lattice points, as schemas/voxel_grid.py Lattice.to_world."""
+    return np.asarray(lattice * data.arrays.step + data.arrays.origin)
+
+
+def _places(
+    data: SceneData, records: NDArray[np.int64], radii: NDArray[np.int64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Avatar centres and scan points (n, 3), world [m], and signed distances (n,) [m] of records of pairs."""
+    avatar = records[:, CENTER : CENTER + 3] / UNITS_PER_METRE + data.arrays.origin
+    return (
+        avatar,
+        _to_world(data, records[:, POINT : POINT + 3]),
+        signed_from_square(records[:, SQUARE], radii),
+    )

@@ -6,9 +6,10 @@ import subprocess
 import sys
 import threading
 import time
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 import zenoh
@@ -250,6 +251,198 @@ def test_one_slow_client_does_not_hold_up_others(client, scene, endpoint):
         for thread in threads:
             thread.join(DEADLINE)
         assert len(answers) == 5
+
+
+def joined(parts):
+    """The verdicts of a path's parts, which are all of it and in order."""
+    stops = np.cumsum([len(part) for part in parts]).tolist()
+    assert [part.first for part in parts] == [0, *stops[:-1]]
+    assert {part.total for part in parts} == {stops[-1]}
+    return np.concatenate([part.verdict for part in parts])
+
+
+PATH = heights(np.random.default_rng(6).normal(-0.5, 0.3, 95))
+TRUTH = floor_verdicts(POINTS, 0.125, PATH)
+
+
+def test_a_path_comes_in_parts_and_in_order(client):
+    client.add_avatar("al", POINTS, 0.125)
+    parts = list(client.path("al", PATH))
+    assert len(parts) == 10
+    assert np.array_equal(joined(parts), TRUTH) and {0, 1} == set(TRUTH)
+
+
+def test_a_path_that_nobody_answers_is_unknown_until_a_server_comes(scene, endpoint):
+    with Client(endpoint, scene="floor") as client:
+        client.add_avatar("al", POINTS, 0.125)
+        assert set(joined(list(client.path("al", PATH)))) == {Verdict.UNKNOWN}
+        with serving([scene], ServerConfig(listen=endpoint)):
+            eventually(lambda: np.array_equal(joined(list(client.path("al", PATH))), TRUTH))
+
+
+@pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGSTOP])
+def test_a_server_that_ends_in_mid_path_leaves_the_rest_unknown(endpoint, end):
+    with server_process(endpoint, "--delay", "0.1") as process, Client(endpoint, scene="floor") as client:
+        client.add_avatar("al", POINTS, 0.125)
+        client._timeout = 1.0
+        parts = []
+        for part in client.path("al", PATH):
+            parts.append(part)
+            if len(parts) == 3:
+                process.send_signal(end)
+        process.kill()
+    verdicts = joined(parts)
+    known = verdicts != Verdict.UNKNOWN
+    assert 30 <= known.sum() < len(PATH)
+    assert known[: known.sum()].all() and np.array_equal(verdicts[known], TRUTH[known])
+
+
+@pytest.mark.parametrize(
+    "order, known",
+    [
+        ([0, 1, 2, 4, 5, 6, 7, 8, 9], [0, 1, 2, 4, 5, 6, 7, 8, 9]),
+        ([1, 2], [1, 2]),
+        ([0, 1, 1, 0, 2, 3, 4, 5, 6, 7, 8, 9], range(10)),
+        ([0, 2, 1, 3], [0, 2, 3]),
+        ([9], [9]),
+        ([], []),
+    ],
+)
+def test_parts_that_are_lost_are_unknown_and_none_counts_twice(client, scene, monkeypatch, order, known):
+    client.add_avatar("al", POINTS, 0.125)
+    whole = FloorScene.path
+    monkeypatch.setattr(
+        scene,
+        "path",
+        lambda *a, **b: (lambda parts: iter([parts[i] for i in order]))(list(whole(scene, *a, **b))),
+    )
+    verdicts = joined(list(client.path("al", PATH)))
+    told = np.isin(np.arange(95) // 10, list(known))
+    assert np.array_equal(verdicts[told], TRUTH[told])
+    assert (verdicts[~told] == Verdict.UNKNOWN).all()
+
+
+@pytest.mark.parametrize("change", [{"total": 96}, {"first": -10}, {"first": 90}])
+def test_parts_that_are_none_of_the_path_are_internal_errors(client, scene, monkeypatch, change):
+    client.add_avatar("al", POINTS, 0.125)
+    whole = FloorScene.path
+    monkeypatch.setattr(
+        scene,
+        "path",
+        lambda *a, **b: (msgspec.structs.replace(part, **change) for part in whole(scene, *a, **b)),
+    )
+    with pytest.raises(InternalError, match="expected some of 95"):
+        list(client.path("al", PATH))
+
+
+def test_what_goes_wrong_along_a_path_is_raised_after_what_went_right(client):
+    client.add_avatar("refuse", POINTS)
+    parts = client.path("refuse", PATH)
+    assert len(next(parts)) == 10
+    with pytest.raises(BadTransformError):
+        next(parts)
+    with pytest.raises(UnknownAvatarError, match="bo"):
+        list(client.path("bo", PATH))
+
+
+def test_a_server_that_forgot_an_avatar_is_given_it_again_for_a_path(client, scene):
+    client.add_avatar("al", POINTS, 0.125)
+    scene.avatars.clear()
+    assert np.array_equal(joined(list(client.path("al", PATH))), TRUTH)
+
+
+def test_long_paths_hold_up_nobody_else(client, scene, endpoint):
+    config = ServerConfig().workers
+    with ExitStack() as stack:
+        walkers = [
+            stack.enter_context(Client(endpoint, scene="floor", timeout=DEADLINE)) for _ in range(config + 1)
+        ]
+        paths = []
+        for walker in walkers:
+            walker.add_avatar("wait", POINTS, 0.125)
+            paths.append(walker.path("wait", PATH))
+            next(paths[-1])
+        client.add_avatar("al", POINTS, 0.125)
+        for _ in range(20):
+            assert client.collide("al", heights([-1.0])).verdict.tolist() == [Verdict.CONTACT]
+        scene.gate.set()
+        for path in paths:
+            assert sum(len(part) for part in path) == 85
+
+
+def test_a_client_that_goes_is_sent_no_more_parts(scene, endpoint):
+    with serving([scene], ServerConfig(listen=endpoint)):
+        with Client(endpoint, scene="floor", timeout=DEADLINE) as client:
+            client.add_avatar("wait", POINTS, 0.125)
+            path = client.path("wait", PATH)
+            next(path)
+            client.close()
+        eventually(lambda: scene.parts == 1)
+        time.sleep(0.2)  # for the server to hear of it; were that too short, the test would fail, not pass
+        scene.gate.set()
+        eventually(lambda: scene.gone)
+        assert scene.parts <= 3 and not scene.avatars
+
+
+def test_more_paths_than_the_server_takes_are_busy(scene, endpoint):
+    with (
+        serving([scene], ServerConfig(listen=endpoint, max_paths=1)),
+        Client(endpoint, scene="floor", timeout=DEADLINE) as one,
+        Client(endpoint, scene="floor", timeout=DEADLINE) as two,
+    ):
+        one.add_avatar("wait", POINTS, 0.125)
+        two.add_avatar("al", POINTS, 0.125)
+        path = one.path("wait", PATH)
+        next(path)
+        with pytest.raises(BusyError):
+            list(two.path("al", PATH))
+        scene.gate.set()
+        assert sum(len(part) for part in path) == 85
+        assert np.array_equal(joined(list(two.path("al", PATH))), TRUTH)
+
+
+def test_a_server_that_stops_finishes_the_paths_it_accepted(scene, endpoint):
+    with Client(endpoint, scene="floor", timeout=DEADLINE) as client:
+        with serving([scene], ServerConfig(listen=endpoint)):
+            client.add_avatar("al", POINTS, 0.125)
+            eventually(lambda: client.collide("al", heights([-1.0])).verdict.tolist() == [Verdict.CONTACT])
+            client.add_avatar("wait", POINTS, 0.125)
+            path = client.path("wait", PATH)
+            first = next(path)
+            threading.Timer(0.2, scene.gate.set).start()
+        assert np.array_equal(joined([first, *path]), TRUTH)
+
+
+@pytest.mark.parametrize(
+    "ask",
+    [
+        lambda client: client.collide("al", PATH),
+        lambda client: client.collide("al", PATH, budget_visits=5),
+        lambda client: client.distance("al", PATH, 1.0),
+        lambda client: client.contacts("al", PATH),
+        lambda client: client.sweep("al", PATH, PATH),
+        lambda client: client.raycast(PATH[:, :3, 3], np.ones((95, 3)), 1.0),
+        lambda client: client.within(PATH[:, :3, 3], 1.0),
+        lambda client: client.objects([("al", pose) for pose in PATH]),
+    ],
+    ids=["collide", "budget", "distance", "contacts", "sweep", "raycast", "within", "objects"],
+)
+def test_every_question_that_nobody_answers_is_unknown(endpoint, ask):
+    with Client(endpoint, scene="floor") as client:
+        client.add_avatar("al", POINTS, 0.125)
+        answers = ask(client)
+    assert answers.verdict.tolist() == [Verdict.UNKNOWN] * 95
+    for name, value in {
+        "lower": -np.inf,
+        "upper": np.inf,
+        "distance": np.inf,
+        "signed_distance": np.inf,
+    }.items():
+        found = getattr(answers, name, np.zeros(0))
+        assert ((found == value) | ((name == "lower") & (found == 0))).all()
+    if hasattr(answers, "pairs"):
+        assert len(answers.pairs) == 95 * 94 // 2 and (answers.pair_verdict == Verdict.UNKNOWN).all()
+    assert not getattr(answers, "exact", np.zeros(0)).any()
 
 
 def test_what_is_too_much_is_busy_and_the_rest_is_answered(scene, endpoint):

@@ -5,7 +5,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from solidcloud.schemas.answers import CollideAnswers
+from solidcloud.schemas.answers import (
+    CollideAnswers,
+    CollidePart,
+    ContactsAnswers,
+    DistanceAnswers,
+    ObjectsAnswers,
+    RaycastAnswers,
+    SweepAnswers,
+    WithinAnswers,
+)
 from solidcloud.schemas.errors import BadRequestError
 from solidcloud.schemas.messages import (
     JSON,
@@ -13,12 +22,22 @@ from solidcloud.schemas.messages import (
     AddAvatarRequest,
     AvatarInfo,
     CollideRequest,
+    ContactsRequest,
+    DistanceRequest,
     ErrorReply,
+    ObjectsRequest,
+    PathRequest,
+    RaycastRequest,
     SceneInfo,
     ScenesAnswer,
+    SweepRequest,
+    WithinRequest,
+    check_answers,
     decode_answer,
     encode,
 )
+from solidcloud.schemas.requests import ObjectItem
+from solidcloud.server import app as app_module
 from solidcloud.server.app import Service
 from solidcloud.server.config import ServerConfig
 
@@ -66,6 +85,92 @@ def test_every_operation_answers_in_both_encodings(service, encoding):
     assert (info.scene, info.points, info.sources[0].skipped) == ("floor", 4, {"nan": 1})
     scenes = decode_answer(ScenesAnswer, service.scenes(encoding).payload, encoding)
     assert scenes == ScenesAnswer(["floor"], 1, 1)
+
+
+EFFORT = {"tolerance": 0.5, "budget_ms": 20.0, "budget_visits": 7}
+PLAIN = {"tolerance": 0.0, "budget_ms": None, "budget_visits": None}
+POSES = np.tile(np.eye(4), (3, 1, 1))
+ONE = [ObjectItem("al"), ObjectItem("al", 2, 5)]
+QUESTIONS = [
+    (CollideRequest("al", POSES, 0.125, **EFFORT), CollideAnswers, 3, ("al", 0.125), EFFORT),
+    (DistanceRequest("al", POSES, 0.75, **EFFORT), DistanceAnswers, 3, ("al", 0.75), EFFORT),
+    (ContactsRequest("al", POSES, 9, 0.125, 0.5), ContactsAnswers, 3, ("al", 9, 0.125, 0.5), PLAIN),
+    (
+        SweepRequest(avatar="al", pose_from=POSES, pose_to=POSES, margin=0.125),
+        SweepAnswers,
+        3,
+        ("al", 0.125),
+        PLAIN | {"tolerance": 1e-6},
+    ),
+    (RaycastRequest(POINTS, POINTS, 2.0, **EFFORT), RaycastAnswers, 2, (2.0,), EFFORT),
+    (WithinRequest(POINTS, 2.0), WithinAnswers, 2, (2.0,), PLAIN),
+    (
+        ObjectsRequest(ONE, POSES[:2], 0.125),
+        ObjectsAnswers,
+        2,
+        ((("al", 1, 2**32 - 1), ("al", 2, 5)), 0.125),
+        PLAIN,
+    ),
+]
+
+
+@pytest.mark.parametrize("encoding", [MSGPACK, JSON])
+@pytest.mark.parametrize(
+    "request_, kind, k, asked, effort", QUESTIONS, ids=lambda value: type(value).__name__
+)
+def test_what_is_asked_reaches_the_scene(service, scene, request_, kind, k, asked, effort, encoding):
+    operation = type(request_).__name__.removesuffix("Request").lower()
+    ask(service, "add_avatar", AddAvatarRequest("al", POINTS, 0.25))
+    answer = ask(service, operation, request_, encoding)
+    assert answer.ok and len(check_answers(decode_answer(kind, answer.payload, encoding), k)) == k
+    assert scene.asked == [(operation, asked, effort)]
+
+
+@pytest.mark.parametrize("encoding", [MSGPACK, JSON])
+def test_a_path_is_answered_in_parts(scene, encoding):
+    service = Service([scene], ServerConfig())
+    ask(service, "add_avatar", AddAvatarRequest("al", POINTS, 0.25))
+    poses = np.tile(np.eye(4), (25, 1, 1))
+    poses[:, 2, 3] = np.linspace(-0.4, 0.0, 25)
+    answers = list(ask(service, "path", PathRequest("al", poses, margin=0.125, budget_ms=9.0), encoding))
+    assert all(answer.ok and answer.encoding == encoding for answer in answers)
+    parts = [decode_answer(CollidePart, answer.payload, encoding) for answer in answers]
+    assert [(part.first, len(part), part.total) for part in parts] == [(0, 10, 25), (10, 10, 25), (20, 5, 25)]
+    verdicts = np.concatenate([part.verdict for part in parts])
+    assert np.array_equal(verdicts, floor_verdicts(POINTS, 0.25, poses, 0.125)) and {0, 1} == set(verdicts)
+    assert scene.asked == [("path", ("al", "collide"), {"margin": 0.125, "budget_ms": 9.0})]
+
+
+def test_what_ends_a_path_early_is_its_last_answer(scene, caplog):
+    service = Service([scene], ServerConfig())
+    poses = np.tile(np.eye(4), (25, 1, 1))
+    for name, code in {"crash": "internal", "refuse": "bad_transform"}.items():
+        ask(service, "add_avatar", AddAvatarRequest(name, POINTS))
+        first, last = ask(service, "path", PathRequest(name, poses))
+        assert first.ok and error(last).code == code and "secret" not in error(last).message
+    assert error(ask(service, "path", PathRequest("bo", poses))).code == "unknown_avatar"
+
+
+def test_an_answer_that_no_message_holds_is_too_large(service, monkeypatch):
+    ask(service, "add_avatar", AddAvatarRequest("al", POINTS))
+    monkeypatch.setattr(app_module, "MAX_MESSAGE_BYTES", (1 << 16) + 100)
+    reply = error(ask(service, "collide", CollideRequest("al", np.eye(4)[None])))
+    assert reply.code == "too_large" and "ask for less" in reply.message
+
+
+@pytest.mark.parametrize(
+    "request_",
+    [
+        RaycastRequest(np.ones((6, 3)), np.ones((6, 3)), 1.0),
+        WithinRequest(np.ones((6, 3)), 1.0),
+        PathRequest("al", np.zeros((6, 4, 4))),
+        SweepRequest(avatar="al", pose_from=np.zeros((6, 4, 4)), pose_to=np.zeros((6, 4, 4))),
+    ],
+    ids=lambda value: type(value).__name__,
+)
+def test_every_list_has_a_cap(service, request_):
+    operation = type(request_).__name__.removesuffix("Request").lower()
+    assert error(ask(service, operation, request_)).code == "too_large"
 
 
 def test_without_a_stated_encoding_it_is_messagepack(service):

@@ -55,9 +55,31 @@ def test_what_is_over_the_bounds_is_refused():
     assert queues.offer("a", 5, 1000) is Offer.RUN, "one alone is never refused"
 
 
+def test_a_detached_request_takes_up_no_worker_but_its_clients_next_waits():
+    queues = FairQueues(1, 10, 1000)
+    assert queues.offer("path", 1, 60) is Offer.RUN
+    assert queues.offer("other", 2, 1) is Offer.WAIT
+    assert queues.detach("path") == ("other", 2)
+    assert queues.offer("path", 3, 1) is Offer.WAIT
+    assert queues.offer("third", 4, 1) is Offer.WAIT
+    assert queues.finished("other") == ("third", 4), "the path's client has a request in flight"
+    assert queues.finished("path") is None, "no worker is free"
+    assert queues.offer("path", 5, 1) is Offer.WAIT
+    assert queues.finished("third") == ("path", 3)
+    assert queues.finished("path") == ("path", 5)
+    assert queues.finished("path") is None
+    assert len(queues) == 0
+    assert queues.offer("path", 6, 1) is Offer.RUN
+    assert queues.detach("path") is None
+    assert queues.offer("other", 7, 1) is Offer.RUN
+    assert queues.finished("other") is None
+    assert queues.offer("path", 8, 1) is Offer.WAIT
+    assert queues.finished("path") == ("path", 8), "whoever ends the path runs what waits"
+
+
 def test_nothing_is_forgotten_by_several_threads():
     queues = FairQueues(3, 10**6, 10**9)
-    lock, seen, at_work = threading.Lock(), [], {}
+    lock, seen, at_work, others = threading.Lock(), [], {}, []
 
     def run(client, request):
         following = (client, request)
@@ -69,7 +91,18 @@ def test_nothing_is_forgotten_by_several_threads():
                 seen.append((client, request))
             with lock:
                 del at_work[client]
-            following = queues.finished(client)
+            if request % 7 == 0:  # its answer goes on in a thread of its own
+                following = queues.detach(client)
+                other = threading.Thread(target=end, args=(client,))
+                other.start()
+                others.append(other)
+            else:
+                following = queues.finished(client)
+
+    def end(client):
+        following = queues.finished(client)
+        if following is not None:
+            run(*following)
 
     def offer(seed):
         rng = np.random.default_rng(seed)
@@ -83,6 +116,8 @@ def test_nothing_is_forgotten_by_several_threads():
         thread.start()
     for thread in threads:
         thread.join(20)
+    while others:
+        others.pop().join(20)
     assert len(seen) == 2000 and len(queues) == 0
     for client in {client for client, _ in seen}:
         requests = [request for owner, request in seen if owner == client]

@@ -19,7 +19,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from .codec import CELL_DTYPE, NODE_DTYPE, Record, RecordShape, decode_voxel, point_dtype
+from .codec import CELL_DTYPE, NODE_DTYPE, OpenRecord, Record, RecordShape, open_record, point_dtype
 from .errors import CorruptError, FormatError
 from .index import VOXEL_DTYPE, Header, index_columns, index_digest, read_header
 from .voxel import Links, VoxelData
@@ -352,17 +352,29 @@ class Archive:
         x, y, z = self.coordinates[row]
         return f"{self.shard_path(int(entry['shard']))}: voxel ({x}, {y}, {z})"
 
-    def read_voxel(self, row: int) -> tuple[VoxelData, Links]:
-        """Read, decompress and check the voxel in index row `row`. Raises CorruptError saying where."""
-        frames = self.read_frames(row)
-        entry = self.voxels[row]
-        cells, nodes, points = (int(n) for n in entry["rows"])
-        shape = RecordShape(cells, nodes, points, self._shape_dtype)
+    @contextlib.contextmanager
+    def locating(self, row: int) -> Iterator[None]:
+        """Say of a CorruptError raised inside where the record of index row `row` lies, and what to do."""
         try:
-            return decode_voxel(
-                *frames, shape, int(entry["key"]), self.header.archive_id, self.header.lattice.voxel_steps
-            )
+            yield
         except CorruptError as error:
             raise CorruptError(
                 f"{self.where(row)}: {error}: restore the shard or rebuild the archive"
             ) from error
+
+    def open_voxel(self, row: int) -> OpenRecord:
+        """Read and decompress the voxel in index row `row`, its points still unread. Raises CorruptError saying where."""
+        frames = self.read_frames(row)
+        entry = self.voxels[row]
+        cells, nodes, points = (int(n) for n in entry["rows"])
+        shape = RecordShape(cells, nodes, points, self._shape_dtype)
+        with self.locating(row):
+            return open_record(
+                *frames, shape, int(entry["key"]), self.header.archive_id, self.header.lattice.voxel_steps
+            )
+
+    def read_voxel(self, row: int) -> tuple[VoxelData, Links]:
+        """Read, decompress and check the voxel in index row `row`. Raises CorruptError saying where."""
+        record = self.open_voxel(row)
+        with self.locating(row):
+            return record.decode()

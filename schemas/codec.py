@@ -5,6 +5,7 @@ shuffle filter followed by the registered zstd filter 32015, so that any HDF5 to
 FORMAT.md says the same in prose; change both together.
 """
 
+import threading
 from typing import NamedTuple
 
 import numpy as np
@@ -12,11 +13,24 @@ import zstandard
 from numpy.typing import NDArray
 
 from .errors import CorruptError
-from .kernels.rows import delta_along, undo_delta_along
-from .voxel import Cells, Links, Nodes, VoxelData, check_voxel, link_nodes, top_shift
+from .kernels.rows import delta_along, interleave, lanes_to_points, leaf_column
+from .voxel import (
+    MAX_LEAF,
+    Cells,
+    Links,
+    Nodes,
+    VoxelData,
+    check_tree,
+    link_nodes,
+    link_tree,
+    read_lanes,
+    top_shift,
+)
 
 # zstd's own default; higher levels gain little here, as the entropy is in the low bytes.
 ZSTD_LEVEL = 3
+
+_OF_THREAD = threading.local()
 
 CELL_DTYPE = np.dtype(
     [
@@ -94,6 +108,83 @@ def encode_voxel(voxel: VoxelData, archive_id: bytes) -> Record:
     return Record(_pack(cells), _pack(nodes), _pack(points), len(cells), len(nodes), len(points), len(first))
 
 
+class OpenRecord(NamedTuple):
+    """A record decompressed, its tree checked; its points still as the frame has them, to be read once, in place.
+
+    voxel: its data, but no points (0, 3) and no columns.  links: see there.  leaves: leaf nodes, b.
+    planes: (w, p) uint8, the byte planes of the points' rows.  dtype: of a row.  voxel_steps: edge of a voxel.
+    """
+
+    voxel: VoxelData
+    links: Links
+    leaves: int
+    planes: NDArray[np.uint8]
+    dtype: np.dtype
+    voxel_steps: int
+
+    def read_points(self, lanes: NDArray[np.uint16]) -> None:
+        """Write the points into lanes (b, 3, MAX_LEAF), the last of a leaf node repeated to its end.
+
+        Raises CorruptError when one lies outside its cell; what is in `lanes` then means nothing.
+        """
+        v = self.voxel
+        read_lanes(
+            f"voxel {v.key:#x}", self.planes[:6], v.cells, v.nodes, self.links, self.voxel_steps, lanes
+        )
+
+    def read_scans(self, lanes: NDArray[np.uint16]) -> None:
+        """Write scan_index, in a record that has it, into lanes (b, MAX_LEAF), as `read_points` does."""
+        at = self.dtype.fields["scan_index"][1]  # type: ignore[index]  # its dtype has fields
+        links = self.links
+        leaf_column(
+            self.planes[at : at + 2], (links.first, links.is_leaf, links.cell), self.voxel.nodes.count, lanes
+        )
+
+    def decode(self) -> tuple[VoxelData, Links]:
+        """The whole voxel, its points in rows. Raises CorruptError when a point lies outside its cell."""
+        lanes = np.empty((self.leaves, 3, MAX_LEAF), np.uint16)
+        self.read_points(lanes)
+        links = self.links
+        points = np.empty((self.planes.shape[1], 3), np.uint16)
+        lanes_to_points(lanes, (links.first, links.is_leaf, links.cell), self.voxel.nodes.count, points)
+        columns = {
+            field: _column(self.planes, self.dtype, field)
+            for field in ("scan_index", "intensity")
+            if field in (self.dtype.names or ())
+        }
+        return self.voxel._replace(points=points, **columns), links
+
+
+def open_record(
+    cells: bytes,
+    nodes: bytes,
+    points: bytes,
+    shape: RecordShape,
+    key: int,
+    archive_id: bytes,
+    voxel_steps: int,
+) -> OpenRecord:
+    """Decompress a record and check all of it but the points, which `OpenRecord.read_points` checks as it reads them.
+
+    Raises CorruptError when a frame is damaged, of another size than `shape`, of another voxel or archive, or
+    holds what `check_voxel` refuses.
+    """
+    name = f"voxel {key:#x}"
+    cell_planes = _unpack(cells, CELL_DTYPE, shape.cell_rows, f"{name}, cells")
+    node_planes = _unpack(nodes, NODE_DTYPE, shape.node_rows, f"{name}, nodes")
+    point_planes = _unpack(points, shape.point_dtype, shape.point_rows, f"{name}, points")
+    identity = np.frombuffer(archive_id + key.to_bytes(8, "little"), np.uint8)
+    if (cell_planes[: len(identity)] != identity[:, None]).any():  # archive and voxel come first in a row
+        raise CorruptError(f"{name}: the record found is another voxel's or another archive's")
+    cell_columns = Cells(*(_column(cell_planes, CELL_DTYPE, field) for field in Cells._fields))
+    node_columns = Nodes(*(_column(node_planes, NODE_DTYPE, field) for field in Nodes._fields))
+    links = link_tree(name, cell_columns, node_columns.count)
+    check_tree(name, cell_columns, node_columns, links, shape.point_rows, voxel_steps)
+    voxel = VoxelData(key, top_shift(voxel_steps), cell_columns, node_columns, np.empty((0, 3), np.uint16))
+    leaves = int(np.count_nonzero(links.is_leaf))
+    return OpenRecord(voxel, links, leaves, point_planes, shape.point_dtype, voxel_steps)
+
+
 def decode_voxel(
     cells: bytes,
     nodes: bytes,
@@ -103,31 +194,8 @@ def decode_voxel(
     archive_id: bytes,
     voxel_steps: int,
 ) -> tuple[VoxelData, Links]:
-    """Decompress and check a record. Inverse of `encode_voxel`.
-
-    Raises CorruptError when a frame is damaged, of another size than `shape`, of another voxel or archive, or
-    holds what `check_voxel` refuses.
-    """
-    cell_rows = _unpack(cells, CELL_DTYPE, shape.cell_rows, f"voxel {key:#x}, cells")
-    node_rows = _unpack(nodes, NODE_DTYPE, shape.node_rows, f"voxel {key:#x}, nodes")
-    point_rows = _unpack(points, shape.point_dtype, shape.point_rows, f"voxel {key:#x}, points")
-    if (cell_rows["voxel"] != key).any() or (cell_rows["archive"] != np.frombuffer(archive_id, "<u8")).any():
-        raise CorruptError(f"voxel {key:#x}: the record found is another voxel's or another archive's")
-    names = shape.point_dtype.names or ()
-    voxel = VoxelData(
-        key,
-        top_shift(voxel_steps),
-        Cells(*(np.ascontiguousarray(cell_rows[name]) for name in Cells._fields)),
-        Nodes(*(np.ascontiguousarray(node_rows[name]) for name in Nodes._fields)),
-        np.ascontiguousarray(point_rows["xyz"]),
-        np.ascontiguousarray(point_rows["scan_index"]) if "scan_index" in names else None,
-        np.ascontiguousarray(point_rows["intensity"]) if "intensity" in names else None,
-    )
-    links = link_nodes(voxel)
-    if int(voxel.cells.points.sum(dtype=np.int64)) != len(voxel.points) or (voxel.nodes.axis > 2).any():
-        raise CorruptError(f"voxel {key:#x}: counts or sort axes out of range")
-    undo_delta_along(voxel.points, *_leaf_runs(voxel, links))
-    return voxel, check_voxel(voxel, voxel_steps)
+    """Decompress and check a record, points and all. Inverse of `encode_voxel`. Raises as `open_record` does."""
+    return open_record(cells, nodes, points, shape, key, archive_id, voxel_steps).decode()
 
 
 def _leaf_runs(
@@ -149,8 +217,11 @@ def _pack(rows: NDArray) -> bytes:
     return compressor.compress(planes.data)
 
 
-def _unpack(frame: bytes, dtype: np.dtype, count: int, what: str) -> NDArray:
-    """Undo `_pack`, refusing a frame that declares another size before anything is allocated for it."""
+def _unpack(frame: bytes, dtype: np.dtype, count: int, what: str) -> NDArray[np.uint8]:
+    """The byte planes (itemsize, count) that `_pack` compressed, read-only.
+
+    Refuses a frame that declares another size before anything is allocated for it.
+    """
     expected = count * dtype.itemsize
     try:
         declared = zstandard.get_frame_parameters(frame)
@@ -159,11 +230,23 @@ def _unpack(frame: bytes, dtype: np.dtype, count: int, what: str) -> NDArray:
         # One flipped bit turns the checksum off: the frame would be read unchecked, its checksum as extra bytes.
         if not declared.has_checksum:
             raise CorruptError(f"{what}: frame without checksum, expected one")
-        plain = zstandard.ZstdDecompressor().decompress(
-            frame, max_output_size=expected, allow_extra_data=False
-        )
+        plain = _decompressor().decompress(frame, max_output_size=expected, allow_extra_data=False)
     except zstandard.ZstdError as error:
         raise CorruptError(f"{what}: damaged frame ({error})") from error
-    planes = np.frombuffer(plain, np.uint8).reshape(dtype.itemsize, count)
-    # A copy always: planes of a single row are contiguous both ways, and a view of `plain` would be read-only.
-    return planes.T.copy().view(dtype).reshape(count)
+    return np.frombuffer(plain, np.uint8).reshape(dtype.itemsize, count)
+
+
+def _decompressor() -> zstandard.ZstdDecompressor:
+    """This thread's own: making one costs 0.1 ms, and none may be used by two threads at once."""
+    found: zstandard.ZstdDecompressor | None = getattr(_OF_THREAD, "decompressor", None)
+    if found is None:
+        found = _OF_THREAD.decompressor = zstandard.ZstdDecompressor()
+    return found
+
+
+def _column(planes: NDArray[np.uint8], dtype: np.dtype, field: str) -> NDArray:
+    """One field of packed rows, as an array of its own, from their byte planes (itemsize, n)."""
+    kind, at = dtype.fields[field][:2]  # type: ignore[index]  # compound, all of them
+    column = np.empty((planes.shape[1], *kind.shape), kind.base)
+    interleave(planes[at : at + kind.itemsize], column.view(np.uint8).reshape(planes.shape[1], kind.itemsize))
+    return column

@@ -132,7 +132,8 @@ def _last(starts: NDArray[np.int64]) -> int:
 
 def _joined_starts(columns: list[NDArray[np.int64]]) -> NDArray[np.int64]:
     """Columns of starts, each from 0, as one."""
-    joined = [np.zeros(1, np.int64)]
+    total, joined = 0, [np.zeros(1, np.int64)]
     for column in columns:
-        joined.append(column[1:] + joined[-1][-1])
+        joined.append(column[1:] + total)
+        total += int(column[-1])
     return np.concatenate(joined)

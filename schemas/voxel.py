@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 
 from .errors import CorruptError
 from .kernels.links import link_rows
+from .kernels.rows import LANES, NO_AXIS, leaf_lanes
 
 # A leaf node's points fill at most this many lanes of the vector test (server/kernels/overlap.py); 32 is
 # what LLVM vectorises and 8 or 16 are not (see there).
-MAX_LEAF = 32
+MAX_LEAF = LANES
 MIN_DEGREE, MAX_DEGREE = 2, 16
 
 # Coordinates inside a leaf cell are 16 bits an axis (NUMERICS.md N3).
@@ -95,16 +96,65 @@ def top_shift(voxel_steps: int) -> int:
 
 def link_nodes(voxel: VoxelData) -> Links:
     """Derive where every node's children are. Raises CorruptError when the counts do not add up."""
-    cells, count = voxel.cells, voxel.nodes.count
+    return link_tree(f"voxel {voxel.key:#x}", voxel.cells, voxel.nodes.count)
+
+
+def link_tree(name: str, cells: Cells, count: NDArray[np.uint8]) -> Links:
+    """`link_nodes` of cells and the counts (n,) of nodes. name: of the voxel, for messages."""
     n, c = len(count), len(cells.nodes)
     top = n - int(cells.nodes.sum(dtype=np.int64))
     if c == 0 or not cells.nodes.all() or not cells.points.all() or top < 0 or (top == 0) != (c == 1):
-        raise CorruptError(f"voxel {voxel.key:#x}: {n} nodes for {c} cells do not add up")
+        raise CorruptError(f"{name}: {n} nodes for {c} cells do not add up")
     first, cell_of, is_leaf = np.empty(n, np.int32), np.empty(n, np.int32), np.zeros(n, bool)
     height = link_rows(count, cells.nodes, cells.points, first, is_leaf, cell_of)
     if height < 0:
-        raise CorruptError(f"voxel {voxel.key:#x}: the counts of node {-1 - height} do not add up to a tree")
+        raise CorruptError(f"{name}: the counts of node {-1 - height} do not add up to a tree")
     return Links(first, is_leaf, cell_of, height)
+
+
+def check_tree(
+    name: str, cells: Cells, nodes: Nodes, links: Links, points: int, voxel_steps: int
+) -> None:
+    """Check what a kernel relies on in a voxel whose counts `link_nodes` has added up, but for the points.
+
+    name: of the voxel, for messages.  points: how many there are. Raises CorruptError naming the fault.
+    """
+    claimed = int(cells.points.sum(dtype=np.int64))
+    if claimed != points:
+        raise CorruptError(f"{name}: cells claim {claimed} points, found {points}")
+    if (cells.log2_size > CELL_BITS).any():
+        raise CorruptError(f"{name}: a cell larger than 2^{CELL_BITS} steps")
+    size = np.int64(1) << cells.log2_size.astype(np.int64)
+    low = cells.low.astype(np.int64)
+    if (low < 0).any() or (low % size[:, None] != 0).any() or (low >= voxel_steps).any():
+        raise CorruptError(f"{name}: a cell off its grid or outside the voxel")
+    if (nodes.count > np.where(links.is_leaf, np.uint8(MAX_LEAF), np.uint8(MAX_DEGREE))).any():
+        raise CorruptError(f"{name}: a node over {MAX_LEAF} points or {MAX_DEGREE} children")
+    if (nodes.axis > 2).any():
+        raise CorruptError(f"{name}: sort axis {int(nodes.axis.max())}, expected 0, 1 or 2")
+
+
+def read_lanes(
+    name: str,
+    planes: NDArray[np.uint8],
+    cells: Cells,
+    nodes: Nodes,
+    links: Links,
+    voxel_steps: int,
+    lanes: NDArray[np.uint16],
+    *,
+    deltas: bool = True,
+) -> None:
+    """Read the points of a checked tree from their byte planes (6, p) into lanes (leaf nodes, 3, MAX_LEAF).
+
+    Points lie inside their cell, so their sums with block_low stay inside 16 bits and kernels that add them
+    cannot leave the certified range: CorruptError where one does not. deltas: whether they are, see codec.py.
+    """
+    axis = nodes.axis if deltas else np.full(len(nodes.axis), NO_AXIS, np.uint8)
+    tree = (links.first, links.is_leaf, links.cell)
+    leaf = (nodes.count, axis, nodes.block_low)
+    if not leaf_lanes(planes, tree, leaf, (cells.low, cells.log2_size), voxel_steps, lanes):
+        raise CorruptError(f"{name}: a point outside its cell")
 
 
 def check_voxel(voxel: VoxelData, voxel_steps: int) -> Links:
@@ -122,27 +172,9 @@ def check_voxel(voxel: VoxelData, voxel_steps: int) -> Links:
     if voxel.top_shift != top_shift(voxel_steps):
         raise CorruptError(f"{name}: top unit 2^{voxel.top_shift} steps, expected 2^{top_shift(voxel_steps)}")
     links = link_nodes(voxel)
-    if int(cells.points.sum(dtype=np.int64)) != p:
-        raise CorruptError(f"{name}: cells claim {int(cells.points.sum(dtype=np.int64))} points, found {p}")
-    if (cells.log2_size > CELL_BITS).any():
-        raise CorruptError(f"{name}: a cell larger than 2^{CELL_BITS} steps")
-    size = np.int64(1) << cells.log2_size.astype(np.int64)
-    low = cells.low.astype(np.int64)
-    if (low < 0).any() or (low % size[:, None] != 0).any() or (low >= voxel_steps).any():
-        raise CorruptError(f"{name}: a cell off its grid or outside the voxel")
-    leaf = links.is_leaf
-    if (nodes.count[leaf] > MAX_LEAF).any() or (nodes.count[~leaf] > MAX_DEGREE).any():
-        raise CorruptError(f"{name}: a node over {MAX_LEAF} points or {MAX_DEGREE} children")
-    if (nodes.axis > 2).any():
-        raise CorruptError(f"{name}: sort axis {int(nodes.axis.max())}, expected 0, 1 or 2")
-    # Points from their cell's low corner: inside the cell, so their sums stay inside 16 bits and kernels
-    # that add block_low to them cannot leave the certified range.
-    rows = np.flatnonzero(leaf)
-    rows = rows[np.argsort(links.first[rows], kind="stable")]
-    high = (
-        np.maximum.reduceat(voxel.points, links.first[rows], axis=0).astype(np.int64) + nodes.block_low[rows]
-    )
-    cell = links.cell[rows]
-    if (high >= size[cell, None]).any() or (high + low[cell] >= voxel_steps).any():
-        raise CorruptError(f"{name}: a point outside its cell")
+    check_tree(name, cells, nodes, links, p, voxel_steps)
+    planes = np.ascontiguousarray(np.ascontiguousarray(voxel.points).view(np.uint8).T)
+    planes.flags.writeable = False  # as a record's are: one compiled form for both
+    lanes = np.empty((int(np.count_nonzero(links.is_leaf)), 3, MAX_LEAF), np.uint16)
+    read_lanes(name, planes, cells, nodes, links, voxel_steps, lanes, deltas=False)
     return links

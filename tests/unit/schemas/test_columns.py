@@ -1,0 +1,184 @@
+"""Answers of all kinds: unknown, joined, checked, in parts; and how their arrays travel, infinities included."""
+
+import msgspec
+import numpy as np
+import pytest
+from solidcloud.schemas.answers import (
+    PARTS,
+    CollideAnswers,
+    ContactsAnswers,
+    DistanceAnswers,
+    ObjectsAnswers,
+    RaycastAnswers,
+    SweepAnswers,
+    Verdict,
+    WithinAnswers,
+)
+from solidcloud.schemas.arrays import array_fields
+from solidcloud.schemas.columns import as_part, check_answers, join, unknown, without_part
+from solidcloud.schemas.errors import InternalError
+from solidcloud.schemas.messages import JSON, MSGPACK, decode_answer, encode
+
+KINDS = [
+    CollideAnswers,
+    DistanceAnswers,
+    ContactsAnswers,
+    SweepAnswers,
+    RaycastAnswers,
+    WithinAnswers,
+    ObjectsAnswers,
+]
+
+
+def some(kind, k, seed=1, pairs=(2, 0, 3)):
+    """Answers of one kind with something else in every place. pairs: of contacts, a pose's in turn."""
+    rng = np.random.default_rng([seed, k])
+    starts = np.concatenate([[0], np.cumsum([pairs[i % len(pairs)] for i in range(k)])]).astype(np.int64)
+    columns = {}
+    for name, (dtype, tail, _) in array_fields(kind).items():
+        rows = k
+        if kind is ContactsAnswers and not len(getattr(unknown(kind, 1), name)):
+            rows = int(starts[-1])
+        if name in ("pairs", "pair_verdict"):
+            rows = 3 if k else 0
+        if dtype.kind == "f":
+            columns[name] = rng.normal(size=(rows, *tail))
+        elif name.endswith("verdict") or dtype.kind == "b":
+            columns[name] = rng.integers(0, 2, rows).astype(dtype)
+        else:
+            columns[name] = rng.integers(0, max(k, 1), (rows, *tail)).astype(dtype)
+    if kind is ContactsAnswers:
+        columns |= {"pair_starts": starts, "cluster_starts": starts.copy()}
+    return kind(**columns, engine_seconds=0.5, hits=3, faults=("voxel 7: checksum",))
+
+
+def same(one, other):
+    assert type(one) is type(other)
+    for name in array_fields(type(one)):
+        a, b = getattr(one, name), getattr(other, name)
+        assert (a.dtype, a.shape, a.tobytes()) == (b.dtype, b.shape, b.tobytes()), name
+
+
+@pytest.mark.parametrize("encoding", [MSGPACK, JSON])
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("k", [0, 1, 5])
+def test_answers_of_all_kinds_arrive_as_sent(kind, k, encoding):
+    for sent in (some(kind, k), unknown(kind, k)):
+        got = check_answers(decode_answer(kind, encode(sent, encoding), encoding), k)
+        same(got, sent)
+        assert (got.engine_seconds, got.hits, got.faults) == (sent.engine_seconds, sent.hits, sent.faults)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_nobody_answered_is_never_clear(kind):
+    answers = unknown(kind, 3)
+    assert answers.verdict.tolist() == [Verdict.UNKNOWN] * 3
+    assert not any(getattr(answers, "exact", []))
+    if kind not in (ContactsAnswers, ObjectsAnswers):
+        assert np.isinf(answers.upper).all() and (answers.lower <= 0).all()
+    assert len(unknown(CollideAnswers, 3, bounded=False).lower) == 0
+
+
+def test_every_pair_of_objects_that_nobody_answered_is_unknown():
+    answers = unknown(ObjectsAnswers, 4)
+    assert answers.pairs.tolist() == [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]]
+    assert answers.pair_verdict.tolist() == [Verdict.UNKNOWN] * 6
+
+
+@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind is not ObjectsAnswers])
+def test_joined_answers_are_those_of_all(kind):
+    parts = [some(kind, k, seed) for seed, k in enumerate((3, 0, 5, 1))]
+    whole = check_answers(join(parts), 9)
+    for name in array_fields(kind):
+        if not name.endswith("_starts"):
+            assert np.array_equal(
+                getattr(whole, name), np.concatenate([getattr(part, name) for part in parts])
+            )
+    assert (whole.engine_seconds, whole.hits, whole.faults) == (2.0, 12, ("voxel 7: checksum",))
+    if kind is ContactsAnswers:
+        counts = np.concatenate([np.diff(part.pair_starts) for part in parts])
+        assert np.diff(whole.pair_starts).tolist() == counts.tolist()
+
+
+@pytest.mark.parametrize("kind", PARTS)
+def test_a_part_says_where_it_belongs(kind):
+    answers = some(kind, 4)
+    part = as_part(answers, 7, 20)
+    for encoding in (MSGPACK, JSON):
+        got = decode_answer(PARTS[kind], encode(part, encoding), encoding)
+        assert (got.first, got.total, len(check_answers(got, 4))) == (7, 20, 4)
+        same(got, part)
+    assert isinstance(part, kind)
+    same(without_part(kind, part), answers)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_column_of_the_wrong_length_is_an_internal_error(kind):
+    good = some(kind, 4)
+    with pytest.raises(InternalError, match="for 5 asked"):
+        check_answers(good, 5)
+    for name in array_fields(kind):
+        column = getattr(good, name)
+        for bad in (column[:-1], np.concatenate([column, column[-1:]])):
+            with pytest.raises(InternalError, match="expected"):
+                check_answers(msgspec.structs.replace(good, **{name: bad}), 4)
+    with pytest.raises(InternalError, match="verdict 3"):
+        check_answers(msgspec.structs.replace(good, verdict=np.full(4, 3, np.uint8)), 4)
+
+
+def test_starts_that_do_not_rise_are_an_internal_error():
+    good = some(ContactsAnswers, 3)
+    for bad in ([0, 3, 2, 5], [1, 2, 2, 5], [0, -1, 2, 5]):
+        with pytest.raises(InternalError, match="'pair_starts' does not rise"):
+            check_answers(msgspec.structs.replace(good, pair_starts=np.array(bad)), 3)
+
+
+def test_pairs_of_objects_that_were_not_asked_about_are_an_internal_error():
+    good = some(ObjectsAnswers, 4)
+    for bad in (4, -1):
+        with pytest.raises(InternalError, match="not asked about, of 4"):
+            check_answers(msgspec.structs.replace(good, pairs=np.full((3, 2), bad, np.int32)), 4)
+    with pytest.raises(InternalError, match="verdict 3"):
+        check_answers(msgspec.structs.replace(good, pair_verdict=np.full(3, 3, np.uint8)), 4)
+
+
+def test_null_says_least_in_json():
+    text = encode(unknown(DistanceAnswers, 1), JSON)
+    assert text.count(b"null") == 12 and b"NaN" not in text and b"Infinity" not in text
+    got = decode_answer(DistanceAnswers, text, JSON)
+    assert (got.lower[0], got.upper[0], got.signed_distance[0]) == (-np.inf, np.inf, np.inf)
+    assert np.isnan([got.witness_avatar, got.witness_cloud, got.normal]).all()
+    mixed = text.replace(b'"normal":[[null,null,null]]', b'"normal":[[1,null,0.5]]')
+    assert np.array_equal(
+        decode_answer(DistanceAnswers, mixed, JSON).normal, [[1, np.nan, 0.5]], equal_nan=True
+    )
+
+
+@pytest.mark.parametrize(
+    "old, new",
+    [
+        (b'"lower":[null]', b'"lower":["x"]'),
+        (b'"lower":[null]', b'"lower":[[null]]'),
+        (b'"lower":[null]', b'"lower":[true,null]'),
+        (b'"lower":[null]', b'"lower":null'),
+        (b'"normal":[[null,null,null]]', b'"normal":[[null,null]]'),
+        (b'"normal":[[null,null,null]]', b'"normal":[[null,null,null],null]'),
+        (b'"node_visits":[0]', b'"node_visits":[null]'),
+        (b'"outside":[false]', b'"outside":[null]'),
+        (b'"verdict":[2]', b'"verdict":[2.0]'),
+    ],
+)
+def test_what_is_no_column_in_json_is_an_internal_error(old, new):
+    text = encode(unknown(DistanceAnswers, 1), JSON)
+    assert old in text
+    with pytest.raises(InternalError):
+        decode_answer(DistanceAnswers, text.replace(old, new), JSON)
+
+
+@pytest.mark.parametrize("value", [2**31, -(2**31) - 1])
+def test_json_integers_beyond_int32_are_refused(value):
+    text = encode(some(ObjectsAnswers, 4), JSON)
+    got = msgspec.json.decode(text)
+    got["pairs"][0][0] = value
+    with pytest.raises(InternalError, match="do not fit int32"):
+        decode_answer(ObjectsAnswers, msgspec.json.encode(got), JSON)

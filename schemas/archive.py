@@ -363,7 +363,7 @@ class Archive:
             ) from error
 
     def open_voxel(self, row: int) -> OpenRecord:
-        """Read and decompress the voxel in index row `row`, its points still unread. Raises CorruptError saying where."""
+        """The voxel in index row `row`, decompressed, its points still unread. Raises CorruptError saying where."""
         frames = self.read_frames(row)
         entry = self.voxels[row]
         cells, nodes, points = (int(n) for n in entry["rows"])

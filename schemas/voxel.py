@@ -112,9 +112,7 @@ def link_tree(name: str, cells: Cells, count: NDArray[np.uint8]) -> Links:
     return Links(first, is_leaf, cell_of, height)
 
 
-def check_tree(
-    name: str, cells: Cells, nodes: Nodes, links: Links, points: int, voxel_steps: int
-) -> None:
+def check_tree(name: str, cells: Cells, nodes: Nodes, links: Links, points: int, voxel_steps: int) -> None:
     """Check what a kernel relies on in a voxel whose counts `link_nodes` has added up, but for the points.
 
     name: of the voxel, for messages.  points: how many there are. Raises CorruptError naming the fault.

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from ..schemas.archive import Archive
 from ..schemas.errors import CorruptError
-from .kernels.layout import Arena, lay_out, resident_bytes
+from .kernels.layout import LANES, Arena, lay_out, resident_bytes, scan_run
 from .kernels.overlap import MOST_LEVELS
 
 
@@ -32,8 +32,8 @@ class Store:
 
         Returns where its runs are (3,) int64, see layout.py. Raises CorruptError, OSError.
         """
-        voxel, links = self.archive.read_voxel(row)
-        leaves = int(np.count_nonzero(links.is_leaf))
+        record = self.archive.open_voxel(row)
+        voxel, links, leaves = record.voxel, record.links, record.leaves
         if leaves != int(self.archive.voxels["leaves"][row]):
             raise CorruptError(
                 f"{self.archive.where(row)}: {leaves} leaf nodes, the index says otherwise: rebuild it"
@@ -43,9 +43,14 @@ class Store:
                 f"{self.archive.where(row)}: {links.height} levels, expected at most {MOST_LEVELS}: rebuild it"
             )
         where = np.empty(3, np.int64)
-        scan_index = np.empty(0, np.uint16) if voxel.scan_index is None else voxel.scan_index
-        parts = (voxel.cells, voxel.nodes, np.int64(voxel.top_shift), voxel.points, scan_index)
+        parts = (voxel.cells, voxel.nodes, np.int64(voxel.top_shift))
         lay_out(parts, (links.first, links.is_leaf, links.cell), arena, np.int64(offset), where)
+        lanes = arena.halves[where[2] :]
+        with self.archive.locating(row):
+            record.read_points(lanes[: leaves * 3 * LANES].reshape(leaves, 3, LANES))
+        if self.archive.header.scan_index:
+            scans = arena.halves[scan_run(where[None], 0) :]
+            record.read_scans(scans[: leaves * LANES].reshape(leaves, LANES))
         return where
 
     def close(self) -> None:

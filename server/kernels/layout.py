@@ -75,8 +75,10 @@ def scan_run(where, voxel):
 
 @nb.njit(nogil=True, cache=True)
 def _outward(value, up):
-    """The float32 nearest to an int64 on the side asked for, so that a bound stays one."""
+    """The float32 nearest to an int32 on the side asked for, so that a bound stays one."""
     narrow = np.float32(value)
+    if abs(value) <= 1 << 24:  # exact
+        return narrow
     if up and np.float64(narrow) < np.float64(value):
         return np.nextafter(narrow, np.float32(np.inf))
     if not up and np.float64(narrow) > np.float64(value):
@@ -86,55 +88,46 @@ def _outward(value, up):
 
 @nb.njit(nogil=True, cache=True)
 def lay_out(voxel, links, arena, at_bytes, where):
-    """Write a checked voxel into the arena from byte `at_bytes` on (a multiple of 16).
+    """Write the nodes of a checked voxel into the arena from byte `at_bytes` on (a multiple of 16): rows and blocks.
 
-    voxel: (cells, nodes, top_shift, points, scan_index) of schemas/voxel.py, scan_index (0,) where it is not kept.
-    links: its Links without the height.
-    Writes where (3,) int64: first row [words], first block [ints], first lane [halves].
+    voxel: (cells, nodes, top_shift) of schemas/voxel.py.  links: its Links without the height.
+    Writes where (3,) int64: first row [words], first block [ints], first lane [halves], where the points belong
+    (schemas/codec.py, `OpenRecord.read_points`).
     """
-    cells, nodes, top_shift, points, scan_index = voxel
+    cells, nodes, top_shift = voxel
     first, is_leaf, cell_of = links
+    words, ints, _ = arena
     n = first.shape[0]
-    leaves = 0
-    for i in range(n):
-        leaves += 1 if is_leaf[i] else 0
-    rows = at_bytes // 4
-    blocks = rows + n * ROW_WORDS
-    lanes = 2 * (blocks + leaves * BLOCK_WORDS)
-    scans = lanes + leaves * 3 * LANES
-    where[0], where[1], where[2] = rows, blocks, lanes
-    words, ints, halves = arena
-    block = 0
-    for i in range(n):
-        row = rows + i * ROW_WORDS
-        cell = cell_of[i]
-        unit = np.int64(1) if cell >= 0 else np.int64(1) << np.int64(top_shift)
-        square = np.int64(0)
-        for k in range(3):
-            low = np.int64(cells.low[cell, k]) if cell >= 0 else np.int64(0)
-            words[row + k] = np.float32(low + np.int64(nodes.center[i, k]) * unit)
-            component = np.int64(nodes.normal[i, k])
-            words[row + 4 + k] = np.float32(component)
+    # Unsigned: see schemas/kernels/rows.py.
+    row = np.uint64(at_bytes // 4)
+    block_at = row + np.uint64(n * ROW_WORDS)
+    where[0], where[1] = row, block_at
+    block = np.int32(0)
+    for i in range(np.uint64(n)):
+        top = cell_of[i] < 0
+        cell = np.uint64(0) if top else np.uint64(cell_of[i])
+        unit = np.int32(1) << np.int32(top_shift) if top else np.int32(1)
+        square = np.int32(0)
+        for k in range(np.uint64(3)):
+            # Whole numbers below 2^24: a voxel has at most 2^21 steps, a cell 2^16.
+            low = np.int32(0) if top else cells.low[cell, k]
+            words[row + k] = np.float32(low + np.int32(nodes.center[i, k]) * unit)
+            component = np.int32(nodes.normal[i, k])
+            words[row + np.uint64(4) + k] = np.float32(component)
             square += component * component
-        words[row + 3] = _outward(np.int64(nodes.radius[i]) * unit, True)
-        words[row + 7] = np.nextafter(np.float32(np.sqrt(np.float64(square))), np.float32(np.inf))
-        words[row + 8] = _outward(np.int64(nodes.slab[i, 0]), False)
-        words[row + 9] = _outward(np.int64(nodes.slab[i, 1]), True)
-        ints[row + COUNT] = np.int32(nodes.count[i])
-        if not is_leaf[i]:
-            ints[row + FIRST] = first[i]
-            continue
-        ints[row + FIRST] = ~block
-        for k in range(3):
-            ints[blocks + block * BLOCK_WORDS + k] = cells.low[cell, k] + np.int32(nodes.block_low[i, k])
-            lane = lanes + (block * 3 + k) * LANES
-            count = np.int64(nodes.count[i])
-            for j in range(LANES):
-                halves[lane + j] = points[first[i] + min(j, count - 1), k]
-        if scan_index.shape[0] > 0:
-            for j in range(LANES):
-                halves[scans + block * LANES + j] = scan_index[
-                    first[i] + min(j, np.int64(nodes.count[i]) - 1)
-                ]
-        ints[blocks + block * BLOCK_WORDS + 3] = np.int32(nodes.count[i])
-        block += 1
+        words[row + np.uint64(3)] = np.float32(np.int32(nodes.radius[i]) * unit)
+        # The next float32 up, what np.nextafter gives of a number that is not negative; a call of it costs 5 ns.
+        length = np.float32(np.sqrt(np.float64(square)))
+        ints[row + np.uint64(7)] = length.view(np.int32) + np.int32(1)
+        words[row + np.uint64(8)] = _outward(nodes.slab[i, np.uint64(0)], False)
+        words[row + np.uint64(9)] = _outward(nodes.slab[i, np.uint64(1)], True)
+        ints[row + np.uint64(FIRST)] = ~block if is_leaf[i] else first[i]
+        ints[row + np.uint64(COUNT)] = np.int32(nodes.count[i])
+        row += np.uint64(ROW_WORDS)
+        if is_leaf[i]:
+            for k in range(np.uint64(3)):
+                ints[block_at + k] = cells.low[cell, k] + np.int32(nodes.block_low[i, k])
+            ints[block_at + np.uint64(3)] = np.int32(nodes.count[i])
+            block_at += np.uint64(BLOCK_WORDS)
+            block += np.int32(1)
+    where[2] = np.uint64(2) * block_at

@@ -13,7 +13,7 @@ from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.octree import VoxelPoints, build_voxel
 from solidcloud.schemas.codec import Record, RecordShape, decode_voxel, encode_voxel, point_dtype
 from solidcloud.schemas.errors import CorruptError
-from solidcloud.schemas.voxel import Links, VoxelData
+from solidcloud.schemas.voxel import Links, VoxelData, link_nodes
 
 ARCHIVE_ID = bytes(range(16))
 KEY = 0x1234567
@@ -214,6 +214,40 @@ def test_what_check_voxel_refuses_is_refused(small: tuple[VoxelData, Record]) ->
         decode(record, voxel, 1000)
 
 
+@pytest.mark.interpreted
+@pytest.mark.parametrize("along", ["the sort axis", "another axis"])
+def test_a_point_outside_its_cell_is_refused(along: str, small: tuple[VoxelData, Record]) -> None:
+    voxel, _ = small
+    links = link_nodes(voxel)
+    node = int(np.flatnonzero(links.is_leaf)[-1])
+    axis = int(voxel.nodes.axis[node]) if along == "the sort axis" else (int(voxel.nodes.axis[node]) + 1) % 3
+    last = int(links.first[node]) + int(voxel.nodes.count[node]) - 1
+    size = 1 << int(voxel.cells.log2_size[links.cell[node]])
+    points = voxel.points.copy()
+    for value, inside in ((size - 1, True), (size, False), (65535, False)):
+        points[last, axis] = value - int(voxel.nodes.block_low[node, axis])
+        record = encode_voxel(voxel._replace(points=points), ARCHIVE_ID)
+        if inside:
+            assert_same_bits(decode(record, voxel, 1024)[0], voxel._replace(points=points))
+        else:
+            with pytest.raises(CorruptError, match=f"voxel {KEY:#x}: a point outside its cell"):
+                decode(record, voxel, 1024)
+
+
+@pytest.mark.interpreted
+def test_deltas_that_run_beyond_16_bits_are_refused(small: tuple[VoxelData, Record]) -> None:
+    voxel, _ = small
+    links = link_nodes(voxel)
+    node = int(np.flatnonzero(links.is_leaf & (voxel.nodes.count > 1))[0])
+    first, axis = int(links.first[node]), int(voxel.nodes.axis[node])
+    points = voxel.points.copy()
+    # Descending: the second delta is 65,535, and the sum comes back inside the cell if it wraps.
+    points[first : first + 2, axis] = [1, 0]
+    record = encode_voxel(voxel._replace(points=points), ARCHIVE_ID)
+    with pytest.raises(CorruptError, match="a point outside its cell"):
+        decode(record, voxel, 1000)
+
+
 def test_a_sort_axis_out_of_range_is_refused_before_it_is_used(small: tuple[VoxelData, Record]) -> None:
     voxel, record = small
     axis = voxel.nodes.axis.copy()
@@ -222,5 +256,5 @@ def test_a_sort_axis_out_of_range_is_refused_before_it_is_used(small: tuple[Voxe
     # The byte plane of `axis` is the 21st of a node's 27.
     rows.reshape(27, -1)[20] = axis
     frame = zstandard.ZstdCompressor(write_checksum=True).compress(rows.tobytes())
-    with pytest.raises(CorruptError, match="sort axes out of range"):
+    with pytest.raises(CorruptError, match="sort axis 3"):
         decode(record, voxel, 1000, nodes=frame)

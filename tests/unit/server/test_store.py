@@ -7,6 +7,7 @@ import cases
 import numpy as np
 import pytest
 import scans
+from solidcloud.schemas.codec import encode_voxel
 from solidcloud.schemas.errors import CorruptError, FormatError
 from solidcloud.server import store as store_module
 from solidcloud.server.arena import ArenaBuffer
@@ -47,6 +48,17 @@ def test_a_flipped_byte_is_corrupt_and_named(store: Store) -> None:
     x, y, z = store.archive.coordinates[row]
     assert f"{path}: voxel ({x}, {y}, {z})" in str(caught.value)
     assert store.load(row + 1, arena, 0)[0] == 0
+
+
+def test_a_point_outside_its_cell_is_corrupt_and_named(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    voxel, _ = store.archive.read_voxel(1)
+    points = voxel.points.copy()
+    points[-1] = 65535
+    record = encode_voxel(voxel._replace(points=points), store.archive.header.archive_id)
+    monkeypatch.setattr(store.archive, "read_frames", lambda row: (record.cells, record.nodes, record.points))
+    x, y, z = store.archive.coordinates[1]
+    with pytest.raises(CorruptError, match=rf"voxel \({x}, {y}, {z}\): .*a point outside its cell"):
+        store.load(1, ArenaBuffer(1 << 20).arena, 0)
 
 
 def test_leaf_nodes_that_the_index_does_not_count_are_corrupt(store: Store) -> None:

@@ -280,33 +280,73 @@ def serve(
 @app.command()
 def query(
     scene: Annotated[str, typer.Option(help="Name of the scene.")],
-    avatar: Annotated[Path, typer.Option(help="Points of the avatar: OBJ PLY XYZ and what build reads.")],
-    poses: Annotated[Path, typer.Option(help="CSV file of poses: t,x,y,z,qw,qx,qy,qz.")],
+    op: Annotated[
+        str,
+        typer.Option(help="collide, distance, contacts, sweep, raycast, within, objects, or path in parts."),
+    ] = "collide",
+    avatar: Annotated[
+        Path | None, typer.Option(help="Points of the avatar: OBJ PLY XYZ and what build reads.")
+    ] = None,
+    poses: Annotated[
+        Path | None,
+        typer.Option(help="CSV file of poses: t,x,y,z,qw,qx,qy,qz; a sweep moves from each to the next."),
+    ] = None,
+    rays: Annotated[Path | None, typer.Option(help="CSV file of rays: x,y,z,dx,dy,dz.")] = None,
+    points: Annotated[Path | None, typer.Option(help="Loose points: PLY XYZ and what build reads.")] = None,
+    objects: Annotated[
+        Path | None, typer.Option(help="CSV file of objects: avatar,x,y,z,qw,qx,qy,qz,group,mask.")
+    ] = None,
+    along: Annotated[
+        str | None, typer.Option(help="What path asks: collide (default), distance, contacts or sweep.")
+    ] = None,
     connect: Annotated[str, typer.Option(help="zenoh endpoint of the server.")] = "tcp/127.0.0.1:7447",
-    margin: Annotated[float, typer.Option(help="Distance below which it is contact [m].")] = 0.0,
+    margin: Annotated[
+        float | None, typer.Option(help="Distance below which it is contact [m]; default 0.")
+    ] = None,
+    reach: Annotated[float | None, typer.Option(help="Farthest distance worth reporting [m].")] = None,
+    limit: Annotated[
+        int | None, typer.Option(help="Contacts listed for a pose, the deepest; default 100.")
+    ] = None,
+    cluster_distance: Annotated[
+        float | None, typer.Option(help="How far apart points of one cluster may lie [m].")
+    ] = None,
     radius: Annotated[
         float | None,
         typer.Option(help="Radius of an avatar point [m]; left out: half the mean closest-point distance."),
     ] = None,
+    tolerance: Annotated[
+        float | None, typer.Option(help="How early contact may be called [m]; default 0, of a sweep 1e-6.")
+    ] = None,
+    budget_ms: Annotated[float | None, typer.Option(help="Time for it all [ms]; default none.")] = None,
+    budget_visits: Annotated[int | None, typer.Option(help="Node visits a pose; default none.")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Ask a server which poses of an avatar touch."""
+    """Ask a server what poses of an avatar, rays, points or objects touch."""
+    options = {name: value for name, value in locals().items() if name not in _NOT_OF_THE_QUESTION}
+    from .answer_text import answer_lines, answers_json, summary_line
     from .client import Client
-    from .console import answers_json, print_answers
-    from .pose_file import read_poses
+    from .query import ask, check_query, joined
     from .report.points import read_avatar
 
-    times, matrices = read_poses(poses)
-    points = read_avatar(avatar)
+    question = check_query(op, options)
+    found = []
     with Client(connect, scene=scene) as client:
-        client.add_avatar("avatar", points, radius)
-        answers = client.collide("avatar", matrices, margin)
-    if len(answers) and answers.engine_seconds == 0.0:
+        for part in ask(client, question, read_avatar):
+            found.append(part)
+            if not as_json:
+                for line in answer_lines(*part):
+                    print(line, flush=op == "path")
+    whole = joined(found)
+    if whole.labels and whole.answers.engine_seconds == 0.0:
         print(f"no server of scene {scene!r} answered at {connect}", file=sys.stderr)
     if as_json:
-        _print_json(answers_json(times.tolist(), answers))
+        _print_json(answers_json(whole.times, whole.answers))
     else:
-        print_answers(times.tolist(), answers)
+        print(summary_line(whole.answers))
+
+
+# Options of `query` that are not parameters of what is asked.
+_NOT_OF_THE_QUESTION = ("scene", "op", "connect", "as_json")
 
 
 def parse_bytes(text: str, option: str) -> int:

@@ -1,16 +1,13 @@
 """How work and results look on a terminal: progress on standard error, results on standard output."""
 
 from collections.abc import Iterable, Iterator
-from itertools import groupby
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Self
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 from rich.text import Text
-
-from ..schemas.answers import CollideAnswers, Verdict
 
 if TYPE_CHECKING:
     # Numba and HDF5 come with these; a bar needs neither.
@@ -87,27 +84,6 @@ def print_build(summary: "BuildSummary") -> None:
 def print_info(found: "SceneInfo") -> None:
     """What an archive says of itself."""
     print_facts(_info_facts(found))
-
-
-def print_answers(times: list[float], answers: CollideAnswers) -> None:
-    """Each stretch of one verdict, then the counts. times: (k,) of the poses [s]."""
-    found = zip(times, answers.verdict.tolist(), strict=True)
-    for verdict, group in groupby(found, key=lambda pair: pair[1]):
-        stretch = [t for t, _ in group]
-        span = f"{stretch[0]:10.3f} .. {stretch[-1]:10.3f} s"
-        print(f"{span}  {Verdict(verdict).name.lower()}, {len(stretch)} poses")
-    counts = ", ".join(f"{(answers.verdict == verdict).sum()} {verdict.name.lower()}" for verdict in Verdict)
-    print(f"{len(answers)} poses: {counts}; {answers.engine_seconds * 1e3:.2f} ms in the engine")
-
-
-def answers_json(times: list[float], answers: CollideAnswers) -> dict[str, Any]:
-    """Answers as they are printed with --json. times: (k,) of the poses [s]."""
-    rows = [
-        {"t": t, **answer._asdict(), "verdict": answer.verdict.name.lower()}
-        for t, answer in zip(times, answers, strict=True)
-    ]
-    totals = ("engine_seconds", "hits", "misses", "resident", "resident_bytes", "faults")
-    return {"answers": rows, **{name: getattr(answers, name) for name in totals}}
 
 
 def bytes_text(count: float) -> str:

@@ -1,8 +1,13 @@
-"""Poses in a CSV file: t,x,y,z,qw,qx,qy,qz, a row a pose. Its quaternions become matrices here only."""
+"""What the command asks about, in CSV files: poses t,x,y,z,qw,qx,qy,qz, a row a pose; rays; objects.
+
+Quaternions become matrices here only.
+"""
 
 import csv
 import math
+from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,9 +15,20 @@ from numpy.typing import NDArray
 from ..schemas.errors import BadRequestError, ScanError
 
 COLUMNS = ("t", "x", "y", "z", "qw", "qx", "qy", "qz")
+RAY_COLUMNS = ("x", "y", "z", "dx", "dy", "dz")
+OBJECT_COLUMNS = ("avatar", "x", "y", "z", "qw", "qx", "qy", "qz", "group", "mask")
 # A quaternion farther than this from unit length is a mistake, not rounding (NUMERICS.md, case 4): |q| = 1.01
 # taken as it is would stretch space by 2 %.
 UNIT_WITHIN = 1e-6
+
+
+class ObjectRow(NamedTuple):
+    """One object of an objects file. avatar: the file of its points.  pose: (4, 4)."""
+
+    avatar: Path
+    pose: NDArray[np.float64]
+    group: int
+    mask: int
 
 
 def read_poses(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -21,25 +37,61 @@ def read_poses(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     Its first line names the columns, in any order. Quaternions within 1e-6 of unit length are normalised.
     ScanError: the file cannot be read. BadRequestError: a line of it is wrong, and which.
     """
-    rows: list[list[float]] = []
+    rows = [
+        _unit_quaternion(where, _numbers(where, row), 4) for where, row in _read_rows(path, COLUMNS, "poses")
+    ]
+    table = np.array(rows, np.float64).reshape(-1, len(COLUMNS))
+    return table[:, 0].copy(), _matrices(table)
+
+
+def read_rays(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Origins (k, 3) and directions (k, 3), world [m], of a CSV file x,y,z,dx,dy,dz; errors as `read_poses`."""
+    rows = [_numbers(where, row) for where, row in _read_rows(path, RAY_COLUMNS, "rays")]
+    table = np.array(rows, np.float64).reshape(-1, len(RAY_COLUMNS))
+    return table[:, :3].copy(), table[:, 3:].copy()
+
+
+def read_objects(path: Path) -> list[ObjectRow]:
+    """The objects of a CSV file avatar,x,y,z,qw,qx,qy,qz,group,mask; errors as `read_poses`.
+
+    avatar: a file of points, from the folder of the CSV file.  group, mask: integers; 0x and 0b are understood.
+    """
+    found = []
+    for where, row in _read_rows(path, OBJECT_COLUMNS, "objects"):
+        values = _unit_quaternion(where, _numbers(where, row[1:8]), 3)
+        try:
+            group, mask = (int(value, 0) for value in row[8:])
+        except ValueError as error:
+            raise BadRequestError(f"{where}: {error}: expected integers for group and mask") from None
+        pose = _matrices(np.array([[0.0, *values]]))[0]
+        found.append(ObjectRow(path.parent / row[0], pose, group, mask))
+    return found
+
+
+def _read_rows(path: Path, columns: tuple[str, ...], what: str) -> Iterator[tuple[str, list[str]]]:
+    """Where it stands, and the values in the order of `columns`, of each row of a CSV file."""
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             reader = csv.reader(file)
             header = [name.strip() for name in next(reader, [])]
-            if sorted(header) != sorted(COLUMNS):
+            if sorted(header) != sorted(columns):
                 raise BadRequestError(
-                    f"{path}, line 1: columns {','.join(header) or 'missing'}: expected {','.join(COLUMNS)}"
+                    f"{path}, line 1: columns {','.join(header) or 'missing'}: expected {','.join(columns)}"
                 )
-            order = [header.index(name) for name in COLUMNS]
+            order = [header.index(name) for name in columns]
             for row in reader:
-                if row:
-                    rows.append(_numbers(f"{path}, line {reader.line_num}", row, order))
+                if not row:
+                    continue
+                where = f"{path}, line {reader.line_num}"
+                if len(row) != len(columns):
+                    raise BadRequestError(
+                        f"{where}: {len(row)} values: expected {len(columns)}, one a column"
+                    )
+                yield where, [row[column].strip() for column in order]
     except OSError as error:
-        raise ScanError(f"{path}: {error.strerror}: expected a CSV file of poses: check the path") from None
+        raise ScanError(f"{path}: {error.strerror}: expected a CSV file of {what}: check the path") from None
     except (UnicodeDecodeError, csv.Error) as error:
-        raise ScanError(f"{path}: {error}: expected a CSV file of poses: check the file") from None
-    table = np.array(rows, np.float64).reshape(-1, len(COLUMNS))
-    return table[:, 0].copy(), _matrices(table)
+        raise ScanError(f"{path}: {error}: expected a CSV file of {what}: check the file") from None
 
 
 def write_poses(path: Path, times: NDArray[np.float64], poses: NDArray[np.float64]) -> None:
@@ -60,22 +112,25 @@ def write_poses(path: Path, times: NDArray[np.float64], poses: NDArray[np.float6
         temporary.unlink(missing_ok=True)
 
 
-def _numbers(where: str, row: list[str], order: list[int]) -> list[float]:
-    """One row's numbers in the order of COLUMNS; the quaternion checked and normalised."""
-    if len(row) != len(COLUMNS):
-        raise BadRequestError(f"{where}: {len(row)} values: expected {len(COLUMNS)}, one a column")
+def _numbers(where: str, row: list[str]) -> list[float]:
+    """A row's numbers, finite."""
     try:
-        values = [float(row[column]) for column in order]
+        values = [float(value) for value in row]
     except ValueError as error:
         raise BadRequestError(f"{where}: {error}: expected numbers") from None
     if not all(map(math.isfinite, values)):
         raise BadRequestError(f"{where}: {','.join(row)}: expected finite numbers")
-    length = math.hypot(*values[4:])
+    return values
+
+
+def _unit_quaternion(where: str, values: list[float], first: int) -> list[float]:
+    """The same numbers with those from `first` on, a quaternion, checked and normalised."""
+    length = math.hypot(*values[first:])
     if abs(length - 1) > UNIT_WITHIN:
         raise BadRequestError(
             f"{where}: quaternion of length {length:.9g}: expected 1 within {UNIT_WITHIN:g}: normalise it"
         )
-    return values[:4] + [value / length for value in values[4:]]
+    return values[:first] + [value / length for value in values[first:]]
 
 
 def _matrices(table: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,0 +1,146 @@
+"""What `solidcloud query` asks: which options each question takes, and what they become."""
+
+from collections.abc import Callable, Iterator
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..schemas.answers import Cost
+from ..schemas.columns import join, without_part
+from ..schemas.errors import BadRequestError
+from ..schemas.requests import PATH_PARAMETERS
+from .client import PATH_ANSWERS
+from .pose_file import read_objects, read_poses, read_rays
+
+_EFFORT = ("tolerance", "budget_ms", "budget_visits")
+
+# What each question takes beside the scene, the effort and what all take; the first of these are needed.
+_OPTIONS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "collide": (("avatar", "poses"), ("radius", "margin")),
+    "distance": (("avatar", "poses", "reach"), ("radius",)),
+    "contacts": (("avatar", "poses"), ("radius", "margin", "limit", "cluster_distance")),
+    "sweep": (("avatar", "poses"), ("radius", "margin")),
+    "raycast": (("rays", "reach"), ()),
+    "within": (("points", "reach"), ()),
+    "objects": (("objects",), ("radius", "margin")),
+    "path": (("avatar", "poses"), ("radius", "along", "margin", "reach", "limit", "cluster_distance")),
+}
+
+
+ReadPoints = Callable[[Path], NDArray[np.float64]]
+
+
+class Asker(Protocol):
+    """What is asked: a `Client`, or a `Scene`."""
+
+    def add_avatar(self, name: str, points: Any, radius: float | None = None) -> Any: ...
+    def __getattr__(self, name: str) -> Any: ...
+
+
+class Asked(NamedTuple):
+    """Answers and what each is the answer to, as words; `times`, where it is a pose or motion, [s]."""
+
+    labels: list[str]
+    times: list[float]
+    answers: Cost
+
+
+class Query(NamedTuple):
+    """A question with its options as `check_query` leaves them: those that were given.
+
+    op: what of; along a path what of is `along`.
+    """
+
+    op: str
+    along: str
+    given: dict[str, Any]
+
+
+def check_query(op: str, options: dict[str, Any]) -> Query:
+    """A question of the options that are not None; BadRequestError says which does not fit, or is missing."""
+    if op not in _OPTIONS:
+        raise BadRequestError(f"--op {op}: expected one of {', '.join(_OPTIONS)}")
+    needed, others = _OPTIONS[op]
+    given = {name: value for name, value in options.items() if value is not None}
+    along = given.get("along", "collide")
+    if op == "path":
+        if along not in PATH_PARAMETERS:
+            raise BadRequestError(f"--along {along}: expected one of {', '.join(PATH_PARAMETERS)}")
+        needed, others = _OPTIONS[along][0], (*_OPTIONS[along][1], "along")
+    asked = f"--op path --along {along}" if op == "path" else f"--op {op}"
+    takes = ", ".join(map(_option, (*needed, *others, *_EFFORT)))
+    for name in given:
+        if name not in (*needed, *others, *_EFFORT):
+            raise BadRequestError(f"{_option(name)} does not go with {asked}: it takes {takes}")
+    for name in needed:
+        if name not in given:
+            raise BadRequestError(f"{asked} needs {_option(name)}: it takes {takes}")
+    return Query(op, along, given)
+
+
+def ask(scene: Asker, query: Query, read_points: ReadPoints) -> Iterator[Asked]:
+    """The answers, in one piece, of a path in parts. read_points: the points (n, 3) of a file [m]."""
+    given = dict(query.given)
+    parameters = {name: value for name, value in given.items() if name not in ("along", *_FILES)}
+    if query.op == "objects":
+        yield _ask_objects(scene, given["objects"], read_points, parameters, given.get("radius"))
+        return
+    if query.op in ("raycast", "within"):
+        what = read_rays(given["rays"]) if query.op == "raycast" else (read_points(given["points"]),)
+        answers = getattr(scene, query.op)(*what, **parameters)
+        word = "ray" if query.op == "raycast" else "point"
+        yield Asked([f"{word} {number}" for number in range(len(answers))], [], answers)
+        return
+    times, poses = read_poses(given["poses"])
+    scene.add_avatar("avatar", read_points(given["avatar"]), given.get("radius"))
+    op = query.along if query.op == "path" else query.op
+    labels, begins = _labels(op, times.tolist())
+    if query.op == "path":
+        for part in scene.path("avatar", poses, op, **parameters):
+            which = slice(part.first, part.first + len(part))
+            yield Asked(labels[which], begins[which], without_part(PATH_ANSWERS[op], part))
+    elif op == "sweep":
+        yield Asked(labels, begins, scene.sweep("avatar", poses[:-1], poses[1:], **parameters))
+    else:
+        yield Asked(labels, begins, getattr(scene, op)("avatar", poses, **parameters))
+
+
+def joined(found: list[Asked]) -> Asked:
+    """The parts of one question as one piece."""
+    labels = [label for part in found for label in part.labels]
+    times = [time for part in found for time in part.times]
+    return Asked(labels, times, join([part.answers for part in found]))
+
+
+_FILES = ("avatar", "radius", "poses", "rays", "points", "objects")
+
+
+def _ask_objects(
+    scene: Asker, path: Path, read_points: ReadPoints, parameters: dict[str, Any], radius: float | None
+) -> Asked:
+    """The answers about the objects of a file."""
+    rows = read_objects(path)
+    names = {
+        avatar: f"avatar-{number}" for number, avatar in enumerate(dict.fromkeys(row.avatar for row in rows))
+    }
+    for avatar, name in names.items():
+        scene.add_avatar(name, read_points(avatar), radius)
+    answers = scene.objects(
+        [(names[row.avatar], row.pose, row.group, row.mask) for row in rows], **parameters
+    )
+    return Asked([f"object {number} {row.avatar.name}" for number, row in enumerate(rows)], [], answers)
+
+
+def _labels(op: str, times: list[float]) -> tuple[list[str], list[float]]:
+    """What each answer is for, and the time it begins at [s]."""
+    if op != "sweep":
+        return [f"{time:10.3f} s" for time in times], times
+    return [f"{begin:10.3f} .. {end:10.3f} s" for begin, end in pairwise(times)], times[:-1]
+
+
+def _option(name: str) -> str:
+    """A parameter as the option it is."""
+    return "--" + name.replace("_", "-")

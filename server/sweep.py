@@ -1,0 +1,174 @@
+"""`sweep`: when does an avatar on its way from one pose to another first touch the scene? One request -> one result."""
+
+import time
+
+import msgspec
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..schemas.answers import SweepAnswers, Verdict
+from ..schemas.errors import BadRequestError, BadTransformError
+from ..schemas.messages import make_poses
+from ..schemas.voxel_grid import MAX_COORDINATE, UNITS_PER_METRE
+from .avatar import AvatarModel
+from .effort import EXACT, Effort
+from .kernels.advance import Progress, look_around, plan_segments, sweep_segments
+from .kernels.placing import SIMILARITY_TOLERANCE, check_poses
+from .kernels.reach import Reach
+from .request import SceneData, pieces, refuse, to_units
+
+# Motions of one kernel call where there is a deadline: it is looked at between calls.
+_PER_CALL = 64
+
+
+def _poses(given: ArrayLike) -> NDArray[np.float64]:
+    """Poses (k, 4, 4) that the kernels may have: numba compiles a read-only array anew."""
+    array = make_poses(given)
+    return array if array.flags.writeable else array.copy()
+
+
+def _check(
+    data: SceneData,
+    avatar: AvatarModel,
+    first: NDArray[np.float64],
+    last: NDArray[np.float64],
+    other_units: int,
+) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
+    """Check the poses of k motions. Returns, each (k,), the larger scale and reach of either end, the latter in exact
+    units, and by how many units the reach may differ on the way."""
+    k = len(first)
+    scales, units = np.empty((2, k)), np.empty((2, k), np.int64)
+    for end, poses in enumerate((first, last)):
+        fault, pose, found = check_poses(
+            poses, avatar.arrays.radius, avatar.radius, other_units, data.arrays, scales[end], units[end]
+        )
+        refuse(fault, pose, found)
+    apart = np.abs(scales[1] - scales[0]) > SIMILARITY_TOLERANCE * scales[0]
+    if apart.any():
+        i = int(apart.argmax())
+        raise BadTransformError(
+            f"motion {i} begins at scale {scales[0, i]:g} and ends at {scales[1, i]:g}: expected one scale "
+            "within 1e-9: a rigid motion changes no size"
+        )
+    # On the way the scale lies between those of the ends. Well within 1e-9 of 1 it is 1 all the way (placing.py).
+    rigid = np.ones(k, bool)
+    for poses in (first, last):
+        rigid &= np.abs((poses[:, :3, :3] ** 2).sum(axis=(1, 2)) / 3.0 - 1.0) <= SIMILARITY_TOLERANCE
+    most = units.max(axis=0)
+    loose = np.where(rigid, 0.0, most - units.min(axis=0) + 2.0)
+    loose[~rigid] += 2.0 * SIMILARITY_TOLERANCE * scales.max(axis=0)[~rigid] * avatar.radius * UNITS_PER_METRE
+    return scales.max(axis=0), most, loose
+
+
+def _answers(
+    progress: Progress, frozen: NDArray[np.float64], counts: NDArray[np.uint32], outside: NDArray[np.bool_],
+    tolerance: float,
+) -> SweepAnswers:  # fmt: skip
+    """The answers, from how far each motion came. frozen: (k,) up to where it was proved that nothing touches."""
+    touches = progress.upper < np.inf
+    verdict = np.full(len(frozen), Verdict.UNKNOWN, np.uint8)
+    verdict[touches] = Verdict.CONTACT
+    verdict[~touches & (frozen >= 1.0)] = Verdict.CLEAR
+    with np.errstate(invalid="ignore"):
+        moved = progress.speed * (progress.upper - frozen)
+    exact = (verdict == Verdict.CLEAR) | (touches & ((moved <= tolerance) | (progress.upper == frozen)))
+    return SweepAnswers(
+        verdict=verdict, lower=frozen, upper=progress.upper, exact=exact,
+        witness_avatar=progress.witness[:, 0].copy(), witness_cloud=progress.witness[:, 1].copy(),
+        steps=counts[3], outside=outside, voxels_missing=counts[0], node_visits=counts[1], point_tests=counts[2],
+    )  # fmt: skip
+
+
+def sweep(
+    data: SceneData,
+    avatar: AvatarModel,
+    pose_from: ArrayLike,
+    pose_to: ArrayLike,
+    margin: float = 0.0,
+    tolerance: float = 1e-6,
+    effort: Effort = EXACT,
+) -> SweepAnswers:
+    """When the avatar first touches the scene on the screw motion (kernels/motion.py) from one pose to the other.
+
+    pose_from, pose_to: (k, 4, 4) float64, avatar to world, rigid or of one scale, bits used as given.
+    margin: distance below or at which two spheres are called in contact [m].  tolerance: how far any avatar point may
+    go between `lower` and `upper` [m]; that of `effort` where it is larger.
+    CONTACT in [lower, upper]; CLEAR; UNKNOWN from `lower` on: something is missing there, the effort was spent, or a
+    graze of some hundredths of a micrometre cannot be told from a touch. A contact found after such a place is CONTACT
+    all the same, with exact=False. Raises BadRequestError, BadTransformError, TooLargeError.
+    """
+    begin = time.perf_counter()
+    if not 0.0 <= tolerance <= MAX_COORDINATE:
+        raise BadRequestError(f"tolerance {tolerance!r}: expected zero or a positive length in metres")
+    tolerance = max(tolerance, effort.tolerance)
+    first, last = _poses(pose_from), _poses(pose_to)
+    if len(first) != len(last):
+        raise BadRequestError(f"{len(first)} poses to begin at and {len(last)} to end at: expected as many")
+    k = len(first)
+    other_units = data.radius_units + to_units(margin, "margin")
+    scales, units, loose = _check(data, avatar, first, last, other_units)
+    progress = Progress(
+        np.zeros(k), np.ones(k), np.ones(k), np.full(k, np.inf), np.zeros(k), np.full((k, 2, 3), np.nan),
+        np.full(k, effort.visits, np.int64),
+    )  # fmt: skip
+    counts, outside = np.zeros((4, k), np.uint32), np.zeros(k, bool)
+    proved = np.ones(k)
+    if not len(avatar.points) or not k:
+        return _answers(progress, proved, counts, outside, tolerance)
+    residency = data.residency
+    hits = misses = 0
+    faults: dict[str, None] = {}
+    starts, rows = np.zeros(k + 1, np.int64), np.empty(16 * k + 64, np.int64)
+    which = np.arange(k)
+    while len(which):
+        needed = plan_segments(
+            first, last, avatar.arrays, scales, units, data.arrays, data.broad, which, progress, starts, rows
+        )
+        if needed > len(rows):
+            rows = np.empty(2 * needed, np.int64)
+            continue
+        progress.lower[which] = progress.end[which]
+        boxes = np.empty((k, 2, 3))  # of no use here
+        for part, held_rows, reach in pieces(Reach(scales, units, starts, rows, boxes, outside), residency):
+            chunk = len(part) if effort.deadline == np.inf else _PER_CALL
+            with residency.hold(held_rows) as held:
+                for at in range(0, len(part), chunk):
+                    if effort.spent:
+                        progress.visits[part[at:]] = -1
+                    sweep_segments(
+                        first, last, avatar.arrays, avatar.radius, other_units, scales, units, loose, data.arrays,
+                        data.broad, reach.starts, reach.rows, part[at : at + chunk], tolerance, progress, counts,
+                    )  # fmt: skip
+            hits, misses = hits + held.hits, misses + held.misses
+            faults.update(dict.fromkeys(held.faults))
+        which = _next_round(which, progress, proved)
+    until = np.minimum(progress.upper, 1.0)
+    lost = np.empty(k)
+    look_around(
+        first, last, avatar.arrays, scales, units, data.arrays, data.broad, data.unknown, until, outside, lost
+    )
+    if data.unknown_everywhere:
+        lost[:] = 0.0
+    met = lost <= until
+    proved[met] = np.minimum(proved, lost)[met]
+    answers = _answers(progress, proved, counts, outside, tolerance)
+    return msgspec.structs.replace(
+        answers, engine_seconds=time.perf_counter() - begin, hits=hits, misses=misses,
+        resident=residency.resident, resident_bytes=residency.resident_bytes, faults=tuple(faults),
+    )  # fmt: skip
+
+
+def _next_round(
+    which: NDArray[np.int64], progress: Progress, proved: NDArray[np.float64]
+) -> NDArray[np.int64]:
+    """Take up what a round of segments found; returns the motions that go on.
+
+    proved: (k,) up to where nothing touches, 1 while nothing has stood against it: the first doubt fixes it.
+    """
+    at, end, lower = progress.at[which], progress.end[which], progress.lower[which]
+    touches = progress.upper[which] < np.inf
+    looked = at < 1.0  # else nothing was left in reach
+    doubt = looked & ((lower < end) | touches) & (proved[which] >= 1.0)
+    proved[which[doubt]] = lower[doubt]
+    progress.at[which] = np.where(looked, end, at)
+    return which[looked & ~touches & (end < 1.0) & (progress.visits[which] >= 0)]

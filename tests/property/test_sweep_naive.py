@@ -1,0 +1,183 @@
+"""`sweep` against brute force at sampled poses, whatever the scan, the avatar, the motion, the tree and the order."""
+
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import cases
+import numpy as np
+import pytest
+import scans
+import swept
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from solidcloud.schemas.answers import Verdict
+from solidcloud.server.avatar import make_avatar
+from solidcloud.server.collide import collide
+from solidcloud.server.effort import Effort
+
+CLOUDS = ("plane", "corner", "pillar", "noise", "duplicates", "one point")
+
+
+def turned(rng: np.random.Generator, turn: NDArray[np.float64], most: float) -> NDArray[np.float64]:
+    """A rotation turned by at most so many radians."""
+    axis = rng.normal(size=3)
+    x, y, z = axis / np.linalg.norm(axis)
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    angle = rng.uniform(0, most)
+    return (np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross) @ turn
+
+
+def motions(
+    rng: np.random.Generator,
+    points: NDArray[np.float64],
+    avatar: NDArray[np.float64],
+    count: int,
+    near: float,
+    way: float,
+    turn: float,
+    scale: float = 1.0,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Motions (count, 4, 4) twice that begin within `near` of some scan point, go some way and turn as they go."""
+    first = cases.near_poses(rng, points, avatar, count, near, scale)
+    last = first.copy()
+    for pose in last:
+        pose[:3, :3] = turned(rng, pose[:3, :3], turn)
+        pose[:3, 3] += rng.normal(size=3) * way
+    return first, last
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    kind=st.sampled_from(CLOUDS),
+    step=st.sampled_from([1e-5, 1e-4, cases.BINARY_STEP, 1e-2]),
+    far=st.sampled_from([0.0, 5e5, 6.4e6]),
+    scale=st.sampled_from([1.0, 1.0, 0.3, 7.0]),
+    way=st.sampled_from([0.0, 1e-3, 0.1, 2.0]),
+    turn=st.sampled_from([0.0, 1e-6, 0.1, np.pi]),
+    tolerance=st.sampled_from([1e-6, 1e-6, 1e-3]),
+    margin=st.sampled_from([0.0, 0.02]),
+    tree=st.fixed_dictionaries(
+        {"degree": st.sampled_from([2, 8]), "leaf": st.sampled_from([1, 32]), "with_slab": st.booleans()}
+    ),
+)
+def test_no_sampled_pose_contradicts_the_answer(
+    seed: int,
+    kind: str,
+    step: float,
+    far: float,
+    scale: float,
+    way: float,
+    turn: float,
+    tolerance: float,
+    margin: float,
+    tree: dict[str, Any],
+) -> None:
+    rng = np.random.default_rng(seed)
+    points = scans.make_scan(kind, seed, 120) + far
+    avatar, radius = rng.uniform(-0.2, 0.2, (9, 3)) / scale, float(rng.choice([0, 1e-3, 0.03])) / scale
+    near = float(rng.choice([0.05, 0.3]))
+    first, last = motions(rng, points, avatar, 8, near, way, turn, scale)
+    with TemporaryDirectory() as folder:
+        case = cases.build(Path(folder), points, resolution=step, radius=float(rng.choice([0, 0.01])), **tree)
+        with swept.opened(case) as data:
+            answers = swept.ask(data, avatar, radius, first, last, margin=margin, tolerance=tolerance)
+            swept.judge(case, data, avatar, radius, first, last, answers, margin=margin, tolerance=tolerance)
+            back = swept.ask(data, avatar, radius, first, first, margin=margin)
+            model = make_avatar(avatar, radius)
+            assert back.verdict.tolist() == collide(data, model, first, margin).verdict.tolist()
+    assert (answers.verdict != Verdict.UNKNOWN).all() or kind == "duplicates" or radius + margin < 2e-3
+
+
+@settings(max_examples=10, deadline=None, derandomize=True)
+@given(seed=st.integers(0, 2**32 - 1), kind=st.sampled_from(CLOUDS), turn=st.sampled_from([0.0, 0.3, 2.0]))
+def test_no_tree_voxel_or_order_changes_an_answer(seed: int, kind: str, turn: float) -> None:
+    """To the last bit, and the witness with it, but for motions that begin in contact: of those any pair may be it."""
+    rng = np.random.default_rng(seed)
+    points, avatar = scans.make_scan(kind, seed, 300), rng.uniform(-0.2, 0.2, (60, 3))
+    first, last = motions(rng, points, avatar, 40, 0.4, 0.5, turn)
+    expected: list[Any] | None = None
+    with TemporaryDirectory() as folder:
+        for options in (
+            {"voxel": 4.0},
+            {"voxel": 0.25, "degree": 2, "leaf": 1},
+            {"voxel": 0.9, "degree": 16, "leaf": 32, "cell_points": 10, "with_slab": False},
+        ):
+            case = cases.build(Path(folder), rng.permutation(points), resolution=1e-3, **options)
+            with swept.opened(case) as data:
+                answers = swept.ask(data, rng.permutation(avatar), 0.01, first, last)
+            moving = answers.upper > 0
+            found = [answers.verdict, answers.lower, answers.upper, answers.exact, answers.outside]
+            found += [answers.witness_avatar[moving], answers.witness_cloud[moving]]
+            # As text: NaN is like itself.
+            if expected is None:
+                expected = [str(column.tolist()) for column in found]
+            assert [str(column.tolist()) for column in found] == expected
+
+
+@settings(max_examples=8, deadline=None, derandomize=True)
+@given(seed=st.integers(0, 2**32 - 1), turn=st.sampled_from([0.0, 0.5]))
+def test_far_from_the_origin_is_as_at_the_origin(seed: int, turn: float) -> None:
+    """The way between exactly shifted poses rounds differently, by 10^-9 m at 5 * 10^6 m: no more may differ."""
+    rng = np.random.default_rng(seed)
+    shift = np.array([5e5, 5.6e6, 100.0])
+    points = np.rint(scans.make_scan("corner", seed, 300) * 2.0**20) * 2.0**-20
+    avatar = rng.uniform(-0.2, 0.2, (30, 3))
+    first, last = motions(rng, points, avatar, 40, 0.3, 0.3, turn)
+    for poses in (first, last):
+        poses[:, :3, 3] = np.rint(poses[:, :3, 3] * 2.0**20) * 2.0**-20
+    moved = first.copy(), last.copy()
+    for poses in moved:
+        poses[:, :3, 3] += shift
+    with TemporaryDirectory() as folder:
+        found = []
+        for place, (a, b) in ((points, (first, last)), (points + shift, moved)):
+            case = cases.build(Path(folder), place, resolution=cases.BINARY_STEP)
+            with swept.opened(case) as data:
+                found.append(swept.ask(data, avatar, 0.01, a, b))
+    one, other = found
+    assert one.verdict.tolist() == other.verdict.tolist()
+    touches = one.verdict == Verdict.CONTACT
+    assert 5 < touches.sum() < 40
+    for bound in ("lower", "upper"):
+        assert np.abs(getattr(one, bound) - getattr(other, bound))[touches].max() < 1e-5
+
+
+@settings(max_examples=15, deadline=None, derandomize=True)
+@given(seed=st.integers(0, 2**32 - 1), visits=st.sampled_from([0, 1, 10, 100, 1000]))
+def test_a_budget_never_makes_a_false_claim(seed: int, visits: int) -> None:
+    """Case 30: with fewer visits the bounds are wider, and still hold; what is clear stays clear."""
+    rng = np.random.default_rng(seed)
+    points, avatar = scans.make_scan("corner", seed, 300), rng.uniform(-0.2, 0.2, (30, 3))
+    first, last = motions(rng, points, avatar, 20, 0.3, 0.5, 0.5)
+    with TemporaryDirectory() as folder:
+        case = cases.build(Path(folder), points)
+        with swept.opened(case) as data:
+            full = swept.ask(data, avatar, 0.01, first, last)
+            part = swept.ask(data, avatar, 0.01, first, last, effort=Effort(visits=visits))
+            late = swept.ask(data, avatar, 0.01, first, last, effort=Effort(deadline=0.0))
+            swept.judge(case, data, avatar, 0.01, first, last, part, samples=20)
+    assert (part.node_visits <= visits + 64).all()
+    clear = part.verdict == Verdict.CLEAR
+    assert (full.verdict[clear] == Verdict.CLEAR).all()
+    assert (part.lower <= full.upper).all() and (part.upper >= full.lower).all()
+    out = full.node_visits > visits
+    assert (part.verdict[out] != Verdict.CLEAR).all()
+    assert (late.verdict == np.where(full.node_visits == 0, Verdict.CLEAR, Verdict.UNKNOWN)).all()
+    assert (late.lower[late.verdict == Verdict.UNKNOWN] == 0).all()
+
+
+@pytest.mark.interpreted
+def test_a_few_motions_of_every_sort(tmp_path: Path, rng: np.random.Generator) -> None:
+    case = cases.build(tmp_path, scans.make_scan("corner", 11, 60), radius=0.05)
+    avatar = rng.uniform(-0.2, 0.2, (5, 3))
+    verdicts = []
+    with swept.opened(case) as data:
+        for way, turn, scale in ((0.3, 0.0, 1.0), (0.0, 1.0, 1.0), (0.3, 0.5, 0.4)):
+            first, last = motions(rng, case.points, avatar, 5, 0.5, way, turn, scale)
+            answers = swept.ask(data, avatar, 0.05, first, last)
+            swept.judge(case, data, avatar, 0.05, first, last, answers, samples=20)
+            verdicts += answers.verdict.tolist()
+    assert {int(Verdict.CLEAR), int(Verdict.CONTACT)} <= set(verdicts)

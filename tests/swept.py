@@ -1,0 +1,94 @@
+"""What the tests of `sweep` share: a scene opened for it, and what the judge has to say about an answer."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import cases
+import naive_sweep
+import numpy as np
+from numpy.typing import NDArray
+from solidcloud.schemas.answers import SweepAnswers, Verdict
+from solidcloud.server.avatar import make_avatar
+from solidcloud.server.request import SceneData, make_scene_data
+from solidcloud.server.residency import Residency
+from solidcloud.server.store import Store
+from solidcloud.server.sweep import sweep
+
+
+@contextmanager
+def opened(case: cases.Case, budget_bytes: int = 1 << 26) -> Iterator[SceneData]:
+    """What `sweep` reads of an archive."""
+    store = Store(case.archive)
+    try:
+        data = make_scene_data(store.archive, Residency(store, budget_bytes))
+        yield data
+        data.residency.check()
+    finally:
+        store.close()
+
+
+def ask(
+    data: SceneData,
+    avatar: NDArray[np.float64],
+    radius: float,
+    first: NDArray[np.float64],
+    last: NDArray[np.float64],
+    **options: Any,
+) -> SweepAnswers:
+    """The answers for motions from first to last (k, 4, 4)."""
+    return sweep(data, make_avatar(avatar, radius), first, last, **options)
+
+
+def moved(avatar: NDArray[np.float64], one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
+    """How far the avatar point that moves farthest lies apart under two poses [m]."""
+    apart = avatar @ (other[:3, :3] - one[:3, :3]).T + (other[:3, 3] - one[:3, 3])
+    return float(np.linalg.norm(apart, axis=1).max())
+
+
+def judge(
+    case: cases.Case,
+    data: SceneData,
+    avatar: NDArray[np.float64],
+    radius: float,
+    first: NDArray[np.float64],
+    last: NDArray[np.float64],
+    answers: SweepAnswers,
+    *,
+    margin: float = 0.0,
+    tolerance: float = 1e-6,
+    samples: int = 60,
+) -> None:
+    """Assert of every answer that sampled poses, judged by brute force in integers, do not contradict it.
+
+    Samples lie evenly on the whole way, and closely before `lower` and between the two bounds.
+    """
+    arrays = data.arrays
+    scan = (case.points, arrays.origin, arrays.step, data.radius_units * 2.0**-26)
+    for i, motion in enumerate(zip(first, last, strict=True)):
+        lower, upper = float(answers.lower[i]), float(answers.upper[i])
+        said = (Verdict(int(answers.verdict[i])).name, lower, upper, motion[0].tolist(), motion[1].tolist())
+        assert 0 <= lower <= 1 and lower <= upper, said
+        close = lower - lower * np.geomspace(1e-15, 1e-2, 14)
+        between = np.linspace(lower, min(upper, 1.0), 9)
+        at = np.unique(np.concatenate([np.linspace(0, 1, samples), close, between]))
+        touching = naive_sweep.touching(*scan, avatar, radius, motion, at, margin)
+        assert not touching[at < lower].any(), ("contact before lower", at[touching].tolist(), said)
+        if answers.verdict[i] == Verdict.CLEAR:
+            assert lower == 1 and upper == np.inf and answers.exact[i], said
+            assert not touching.any(), ("contact on a clear way", at[touching].tolist(), said)
+        if answers.verdict[i] != Verdict.CONTACT:
+            assert upper == np.inf and np.isnan(answers.witness_avatar[i]).all(), said
+            continue
+        assert naive_sweep.touching(*scan, avatar, radius, motion, [upper], margin)[0], (
+            "upper is clear",
+            said,
+        )
+        poses = [naive_sweep.pose_at(*motion, t) for t in (lower, upper)]
+        far = max(float(np.abs(p[:3, 3] - arrays.origin).max()) for p in poses) + 1.0
+        if answers.exact[i]:
+            assert moved(avatar, *poses) <= tolerance * (1 + 1e-9) + far * 2.0**-45, said
+        apart = np.linalg.norm(answers.witness_avatar[i] - answers.witness_cloud[i])
+        scale = np.cbrt(np.linalg.det(poses[1][:3, :3]))
+        assert apart <= scan[3] + margin + radius * scale + 1e-7 + far * 2.0**-45, said
+        assert np.abs(case.points - answers.witness_cloud[i]).max(axis=1).min() <= arrays.step, said

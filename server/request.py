@@ -13,7 +13,7 @@ from .avatar import AvatarModel
 from .kernels import placing
 from .kernels.layout import SceneArrays
 from .kernels.reach import Reach, SceneIndex, find_reach
-from .residency import Residency
+from .residency import Held, Residency
 
 _POSE_FAULTS: dict[int, tuple[type[SolidcloudError], str]] = {
     placing.NOT_FINITE: (BadRequestError, "holds {}: expected finite numbers"),
@@ -171,6 +171,15 @@ def _only(reach: Reach, pose: int, rows: list[int]) -> Reach:
     starts = np.zeros_like(reach.starts)
     starts[pose + 1 :] = len(rows)
     return reach._replace(starts=starts, rows=np.array(rows, np.int64))
+
+
+def as_held(data: SceneData, held: Held) -> SceneData:
+    """What a kernel may read while `held`: what is late is not resident, though it may become so meanwhile."""
+    if not held.late:
+        return data
+    where = data.arrays.where.copy()  # rows that others write now are not among those held, or late
+    where[list(held.late)] = -1
+    return data._replace(arrays=data.arrays._replace(where=where))
 
 
 def in_unknown(boxes: NDArray[np.float64], unknown: NDArray[np.int64], everywhere: bool) -> NDArray[np.bool_]:

@@ -7,7 +7,9 @@ A request takes all its voxels or none: it never waits for room while holding pi
 hold half of what the other needs cannot wait for each other for ever.
 """
 
+import math
 import threading
+import time
 from collections import OrderedDict
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
@@ -21,29 +23,39 @@ from .store import Store
 
 
 class Held(NamedTuple):
-    """What a hold found. hits, misses: voxels resident before, and not.  faults: one sentence an unreadable voxel."""
+    """What a hold found. hits, misses: voxels resident before, and not.  faults: one sentence an unreadable voxel.
+
+    late: rows that were not resident by the deadline. They may become so while held: read `where` without them
+    (`request.as_held`).
+    """
 
     hits: int
     misses: int
     faults: tuple[str, ...]
+    late: tuple[int, ...] = ()
 
 
 class Hold:
     """A hold on voxels, for a `with`; a class and not a generator, which costs a request twice as much."""
 
-    __slots__ = ("_residency", "_rows")
+    __slots__ = ("_deadline", "_residency", "_rows")
 
-    def __init__(self, residency: "Residency", rows: Sequence[int]) -> None:
+    def __init__(self, residency: "Residency", rows: Sequence[int], deadline: float) -> None:
         """Use `Residency.hold`."""
-        self._residency, self._rows = residency, rows
+        self._residency, self._rows, self._deadline = residency, rows, deadline
 
     def __enter__(self) -> Held:
-        """Wait until all that can be read is resident."""
-        return self._residency.acquire(self._rows)
+        """Wait until all that can be read is resident, or the deadline."""
+        return self._residency.acquire(self._rows, self._deadline)
 
     def __exit__(self, *_: object) -> None:
         """Let the voxels go."""
         self._residency.release(self._rows)
+
+
+def _seconds_to(deadline: float) -> float | None:
+    """Seconds left, 0 when there are none; None: no deadline."""
+    return None if deadline == math.inf else max(0.0, deadline - time.perf_counter())
 
 
 class Residency:
@@ -74,6 +86,8 @@ class Residency:
         # Of voxels that could not be read this once. Tried again only when nobody holds them any more: a voxel never
         # becomes resident under a kernel that has begun without it.
         self._passing: dict[int, str] = {}
+        # Of those in `_loading`: reserved by one whose deadline came before the load began. Who waits takes it over.
+        self._left: set[int] = set()
         self.resident_bytes = 0
         self.hits = 0
         self.misses = 0
@@ -88,13 +102,14 @@ class Residency:
         """Bytes these voxels take when resident."""
         return sum(self._sizes[row] for row in rows)
 
-    def hold(self, rows: Sequence[int]) -> "Hold":
+    def hold(self, rows: Sequence[int], deadline: float = math.inf) -> "Hold":
         """Make the voxels of distinct index rows resident and keep them so inside a `with`, which gives a `Held`.
 
         Together they must fit the budget. Voxels that cannot be read stay at -1 in `where` and are named in
-        the result's faults; everything else is resident.
+        the result's faults; everything else is resident. deadline: on time.perf_counter()'s clock [s]; what is not
+        resident by then is `late`. No load is begun after it, one that has begun is finished.
         """
-        return Hold(self, rows)
+        return Hold(self, rows, deadline)
 
     def still(self) -> AbstractContextManager[bool]:
         """For a `with` inside which what is resident stays so, and nobody else goes on: for tens of microseconds."""
@@ -106,20 +121,36 @@ class Residency:
             self._offsets.move_to_end(row)
         self.hits += len(rows)
 
-    def acquire(self, rows: Sequence[int]) -> Held:
+    def acquire(self, rows: Sequence[int], deadline: float = math.inf) -> Held:
         """Begin a hold; `release` must follow, unless this raises."""
-        mine, hits = self._reserve(rows)
-        if not mine and not self._loading and not self._faults and not self._passing:
+        mine, hits, roomy = self._reserve(rows, deadline)
+        if roomy and not mine and not self._loading and not self._faults and not self._passing:
             return Held(len(rows), 0, ())  # all resident and pinned: nothing can change that
         try:
-            self._load(mine)
-            with self._changed:
-                self._changed.wait_for(lambda: not any(row in self._loading for row in rows))
-                faults = tuple(fault for row in rows if (fault := self._fault(row)))
+            wanted = mine
+            while True:
+                self._load(wanted, deadline)
+                with self._changed:
+                    self._changed.wait_for(lambda: self._settled(rows), _seconds_to(deadline))
+                    wanted = [row for row in rows if row in self._left] if _seconds_to(deadline) != 0 else []
+                    if not wanted:
+                        faults = tuple(fault for row in rows if (fault := self._fault(row)))
+                        late = tuple(row for row in rows if not self._fault(row) and not self._there(row))
+                        break
+                    self._left.difference_update(wanted)
         except BaseException:
             self.release(rows)
             raise
-        return Held(hits, len(mine), faults)
+        return Held(hits, len(mine), faults, late)
+
+    def _there(self, row: int) -> bool:
+        """Whether a voxel is resident and whole."""
+        return row in self._offsets and row not in self._loading
+
+    def _settled(self, rows: Sequence[int]) -> bool:
+        """Whether nobody loads any of these, or one was left to be loaded."""
+        loading = [row for row in rows if row in self._loading]
+        return not loading or any(row in self._left for row in loading)
 
     def release(self, rows: Sequence[int]) -> None:
         """End a hold."""
@@ -127,10 +158,11 @@ class Residency:
             self._unpin(rows)
             self._changed.notify_all()
 
-    def _reserve(self, rows: Sequence[int]) -> tuple[list[int], int]:
+    def _reserve(self, rows: Sequence[int], deadline: float) -> tuple[list[int], int, bool]:
         """Pin all rows and allocate for those to be loaded by this caller.
 
-        Returns these, and how many of the others are resident or being loaded: a voxel with a fault is neither.
+        Returns these, how many of the others are resident or being loaded (a voxel with a fault is neither), and
+        whether there was room before the deadline: without it nothing is to be loaded.
         """
         if self.bytes_of(rows) > self.buffer.total_bytes:
             raise ValueError(
@@ -142,6 +174,7 @@ class Residency:
                     self._pins[row] = self._pins.get(row, 0) + 1
                 mine = [row for row in rows if row not in self._offsets and not self._fault(row)]
                 if self._allocate_all(mine):
+                    roomy = True
                     break
                 self._unpin(rows)
                 if not self._pins:
@@ -149,7 +182,11 @@ class Residency:
                     for row in list(self._offsets):
                         self._evict(row)
                     continue
-                self._changed.wait()
+                if not self._changed.wait(_seconds_to(deadline)):
+                    for row in rows:
+                        self._pins[row] = self._pins.get(row, 0) + 1
+                    roomy, mine = False, []
+                    break
             self._loading.update(mine)
             for row in rows:
                 if row in self._offsets:
@@ -157,7 +194,7 @@ class Residency:
             hits = sum(row in self._offsets for row in rows) - len(mine)
             self.hits += hits
             self.misses += len(mine)
-            return mine, hits
+            return mine, hits, roomy
 
     def _allocate_all(self, rows: list[int]) -> bool:
         """Allocate for every row, evicting what is neither pinned nor loading; all or nothing."""
@@ -195,14 +232,34 @@ class Residency:
             if not self._pins[row]:
                 del self._pins[row]
                 self._passing.pop(row, None)
+                if row in self._left:
+                    self._drop_left(row)
+
+    def _drop_left(self, row: int) -> None:
+        """Give back the room of a voxel whose load never began."""
+        self._left.discard(row)
+        self._loading.discard(row)
+        self._forget(row)
+
+    def _leave(self, rows: list[int]) -> None:
+        """Leave loads that have not begun to whoever else holds these rows."""
+        with self._changed:
+            for row in rows:
+                self._left.add(row)
+                if self._pins[row] == 1:  # nobody but the caller
+                    self._drop_left(row)
+            self._changed.notify_all()
 
     def _fault(self, row: int) -> str:
         """Why a voxel cannot be read, or ""."""
         return self._faults.get(row, "") or self._passing.get(row, "")
 
-    def _load(self, rows: list[int]) -> None:
-        """Load what this caller reserved; every row leaves `_loading`, loaded or with a fault."""
+    def _load(self, rows: list[int], deadline: float) -> None:
+        """Load what this caller reserved; every row leaves `_loading`, loaded or with a fault, or is left to others."""
         for number, row in enumerate(rows):
+            if _seconds_to(deadline) == 0:
+                self._leave(rows[number:])
+                return
             where = None
             faults, fault = self._passing, ""
             try:
@@ -246,4 +303,5 @@ class Residency:
             assert at == self.buffer.total_bytes
             resident = {int(row) for row in np.flatnonzero(self.where[:, 0] >= 0)}
             assert resident == set(self._offsets) - self._loading
+            assert self._left <= self._loading <= set(self._offsets) and self._left <= set(self._pins)
             assert all(count > 0 for count in self._pins.values())

@@ -25,8 +25,8 @@ class Nearest(NamedTuple):
     """The nearest pair of each of k poses, among what was looked at.
 
     square: (k,) int64, |a - b|^2, exact units; -1: none within reach.  pair: (k, 6) int64, the scan point's lattice
-    x, y, z, then the avatar's placed centre [exact units].  gap: (k,) float64, what a missing voxel may hold is at least
-    so far from the avatar's centres [steps]; inf: nothing is missing.
+    x, y, z, then the avatar's placed centre [exact units].  gap: (k,) float64, what missing voxels hold is at least so
+    far from the avatar's centres [steps]; inf: nothing is missing.
     """
 
     square: NDArray[np.int64]
@@ -132,10 +132,10 @@ def _consider(
 
 
 @nb.njit(nogil=True, cache=True)
-def keep_near(lanes, block, words, row, off, cut, keep):
+def keep_near(lanes, block, words, row, off_x, off_y, off_z, cut, keep):
     """Which points of an avatar's block (LANES) may be within `cut` [steps] of a scene node; writes keep (LANES,)."""
     at = np.uint64(row)
-    cx, cy, cz = words[at] + off[0], words[at + _1] + off[1], words[at + _2] + off[2]
+    cx, cy, cz = words[at] + off_x, words[at + _1] + off_y, words[at + _2] + off_z
     nx, ny, nz = words[at + _4], words[at + _5], words[at + _6]
     both = words[at + _3] + cut
     room = words[at + _7] * (cut + SLACK * both + SLACK * both)
@@ -260,7 +260,7 @@ def _nearest_voxel(avatar, m, pose, placed, scene, voxel, stack, keys, off, best
             lx = off[0] + np.float32(ints[block_at])
             ly = off[1] + np.float32(ints[block_at + 1])
             lz = off[2] + np.float32(ints[block_at + 2])
-            keep_near(lanes, block, words, row, off, cut[0], keep)
+            keep_near(lanes, block, words, row, off[0], off[1], off[2], cut[0], keep)
             for lane in range(avatar_count[a]):
                 if not keep[lane]:
                     continue

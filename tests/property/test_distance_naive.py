@@ -1,4 +1,4 @@
-"""`distance` equals the definition bit for bit, witnesses and all, whatever the scan, the avatar, the pose and the tree."""
+"""`distance` equals the definition bit for bit, witnesses and all, whatever the scan, the pose and the tree."""
 
 from pathlib import Path
 from tempfile import TemporaryDirectory

@@ -1,0 +1,182 @@
+"""`collide` and `distance` with a tolerance or a budget: bounds that hold whenever the search stops.
+
+See kernels/priority.py for the search. Without a deadline one kernel call answers a request, and the same request gets
+the same answer. With one, the time left is shared among the poses left, and looked at between slices of the search.
+"""
+
+import math
+import time
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..schemas.answers import CollideAnswers, Cost, DistanceAnswers, Verdict
+from ..schemas.messages import make_poses
+from ..schemas.voxel_grid import UNITS_PER_METRE
+from .avatar import AvatarModel
+from .effort import Effort
+from .kernels.nearest import Nearest
+from .kernels.placing import MAX_REACH_UNITS
+from .kernels.priority import OPEN, Goal, Known, end_search, go_on, make_search, search_poses
+from .kernels.reach import Reach
+from .request import SceneData, as_held, check_request, in_unknown, pieces, to_units
+from .signed import distance_columns, signed_bound, signed_from_square, unknown_gaps
+
+# Pairs the heap holds before the search turns depth first: half a megabyte a request.
+HEAP_PAIRS = 1 << 14
+# Node visits between two looks at the clock: some 20 to 100 µs.
+SLICE_VISITS = 2000
+# Of the time left, what loads may take: what is resident is to be searched as well.
+LOAD_SHARE = 0.5
+# Bounds are widened by some exact units when they become metres; a tolerance below that is none.
+TOLERANCE_SLACK = 8.0
+
+
+class _Gathered(NamedTuple):
+    """What a request has found out: known, counts (3, k) uint32, and the fields of `Cost`."""
+
+    known: Known
+    counts: NDArray[np.uint32]
+    cost: Cost
+
+
+def _search_until(
+    data: SceneData,
+    avatar: AvatarModel,
+    array: NDArray[np.float64],
+    part: Reach,
+    which: NDArray[np.int64],
+    heap: int,
+    goal: Goal,
+    deadline: float,
+    known: Known,
+    counts: NDArray[np.uint32],
+) -> None:
+    """Search for the poses `which`, each with its share of the time left. data: its arrays as held."""
+    search = make_search(avatar.arrays, heap)
+    for done, pose in enumerate(which.tolist()):
+        now = time.perf_counter()
+        share = now + (deadline - now) / (len(which) - done)
+        fresh, until = True, SLICE_VISITS if now < share else 0
+        while True:
+            status = go_on(
+                array, avatar.arrays, data.arrays, data.broad, part, pose, fresh, until, search, goal, known, counts
+            )  # fmt: skip
+            if status != OPEN:
+                break
+            if time.perf_counter() >= share:
+                end_search(search, pose, known, counts)
+                break
+            fresh, until = False, until + SLICE_VISITS
+
+
+def _gather(
+    data: SceneData, avatar: AvatarModel, array: NDArray[np.float64], reach: Reach, goal: Goal, effort: Effort
+) -> _Gathered:
+    """Search for all poses, piece by piece."""
+    begin = time.perf_counter()
+    k = len(array)
+    known = Known(
+        np.full(k, -1, np.int64), np.zeros((k, 6), np.int64), np.full(k, math.inf), np.full(k, math.inf),
+        np.full(k, math.inf),
+    )  # fmt: skip
+    counts = np.zeros((3, k), np.uint32)
+    residency = data.residency
+    hits = misses = 0
+    faults: dict[str, None] = {}
+    for which, rows, part in pieces(reach, residency) if len(avatar.points) else ():
+        heap = max(HEAP_PAIRS, int(np.diff(part.starts).max(initial=0)))
+        now = time.perf_counter()
+        until = now + (effort.deadline - now) * LOAD_SHARE if effort.deadline < math.inf else math.inf
+        with residency.hold(rows, until) as held:
+            seen = as_held(data, held)
+            if effort.deadline < math.inf:
+                _search_until(seen, avatar, array, part, which, heap, goal, effort.deadline, known, counts)
+            else:
+                search_poses(
+                    array, avatar.arrays, seen.arrays, data.broad, part, which, heap, goal, known, counts
+                )
+        hits, misses = hits + held.hits, misses + held.misses
+        faults.update(dict.fromkeys(held.faults))
+    cost = Cost(
+        engine_seconds=time.perf_counter() - begin, hits=hits, misses=misses, resident=residency.resident,
+        resident_bytes=residency.resident_bytes, faults=tuple(faults),
+    )  # fmt: skip
+    return _Gathered(known, counts, cost)
+
+
+def _fields(cost: Cost) -> dict[str, object]:
+    return {name: getattr(cost, name) for name in Cost.__struct_fields__}
+
+
+def _upper(data: SceneData, known: Known, radii: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Signed distances (k,) [m] that some pair surely has at most; inf where no pair was bounded."""
+    signed = np.where(known.square >= 0, signed_from_square(np.maximum(known.square, 0), radii), np.inf)
+    steps = known.upper * data.arrays.step * (1.0 + 1e-12)
+    return np.minimum(signed, steps - radii / UNITS_PER_METRE + 2.0 / UNITS_PER_METRE)
+
+
+def distance_bounded(
+    data: SceneData, avatar: AvatarModel, poses: ArrayLike, reach: float, effort: Effort
+) -> DistanceAnswers:
+    """`distance` (see there) with a tolerance, a budget or both.
+
+    Ends when the bounds lie within the tolerance, or when the budget is spent; the bounds hold either way. A pair is
+    found before the tolerance ends anything; where the budget ended it first there may be none, `upper` can say
+    all the same that one is in reach.
+    """
+    array = _as_poses(poses)
+    reach_units = to_units(reach, "reach")
+    around = check_request(data, avatar, array, data.radius_units + reach_units)
+    tolerance = max(0.0, effort.tolerance - TOLERANCE_SLACK / UNITS_PER_METRE) / data.arrays.step
+    goal = Goal(False, 0, np.zeros(len(array)), tolerance, effort.visits)
+    known, counts, cost = _gather(data, avatar, array, around, goal, effort)
+    if len(avatar.points):
+        np.minimum(known.gap, unknown_gaps(data, around), out=known.gap)
+    # What was left open is as what is missing: somewhere, no nearer than that.
+    np.minimum(known.gap, known.lower, out=known.gap)
+    upper = _upper(data, known, around.units - reach_units)
+    nearest = Nearest(known.square, known.pair, known.gap)
+    columns = distance_columns(data, around, float(reach), reach_units, nearest, counts, upper)
+    return DistanceAnswers(**columns, **_fields(cost))  # type: ignore[arg-type]
+
+
+def collide_bounded(
+    data: SceneData, avatar: AvatarModel, poses: ArrayLike, margin: float, effort: Effort
+) -> CollideAnswers:
+    """`collide` (see there) with a tolerance, a budget or both.
+
+    CONTACT where a pair is within the margin, or within margin and tolerance (then not `exact`); CLEAR where surely
+    none is; else UNKNOWN: the budget was spent, or something in reach is missing.
+    """
+    array = _as_poses(poses)
+    margin_units = to_units(margin, "margin")
+    around = check_request(data, avatar, array, data.radius_units + margin_units)
+    radii = around.units - margin_units
+    early = min(math.floor(effort.tolerance * UNITS_PER_METRE), MAX_REACH_UNITS)
+    # Sums of float64 on both sides of a comparison: some units of slack make it one of the true numbers.
+    certain = (around.units - TOLERANCE_SLACK) / data.arrays.units_per_step
+    enough = (around.units + early - TOLERANCE_SLACK) / data.arrays.units_per_step
+    goal = Goal(True, early, enough, 0.0, effort.visits)
+    known, counts, cost = _gather(data, avatar, array, around, goal, effort)
+    upper = _upper(data, known, radii)
+    found = known.square >= 0
+    truly = (found & (known.square <= around.units**2)) | (known.upper <= certain)
+    contact = truly | found | (known.upper <= enough)
+    lost = (counts[0] > 0) | (known.lower < math.inf)
+    if len(avatar.points):
+        lost |= in_unknown(around.boxes, data.unknown, data.unknown_everywhere)
+        np.minimum(known.gap, unknown_gaps(data, around), out=known.gap)
+    floor = signed_bound(np.minimum(known.gap, known.lower), data, radii)
+    lower = np.minimum(np.maximum(floor, -radii / UNITS_PER_METRE), np.minimum(upper, margin))
+    verdict = np.where(contact, Verdict.CONTACT, np.where(lost, Verdict.UNKNOWN, Verdict.CLEAR))
+    return CollideAnswers(
+        verdict.astype(np.uint8), around.outside, counts[0], counts[1], counts[2], lower, upper,
+        truly | (verdict == Verdict.CLEAR), **_fields(cost),
+    )  # type: ignore[arg-type]  # fmt: skip
+
+
+def _as_poses(poses: ArrayLike) -> NDArray[np.float64]:
+    array = make_poses(poses)
+    return array if array.flags.writeable else array.copy()  # numba compiles a read-only array anew

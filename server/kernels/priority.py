@@ -1,0 +1,347 @@
+"""The nearest pair by priority, within a budget: a search that can stop at any time and say what it knows.
+
+Best first with a heap of node pairs, as in Hubbard, "Approximating polyhedra with spheres for time-critical collision
+detection" (1996), and Klein and Zachmann, "ADB-Trees: controlling the error of time-critical collision detection"
+(2003). How far an answer may be off is the distance between the best pair and the least lower bound of the open
+ones: so the pair of the least lower bound is opened next, and of those at equal bound the one whose points are surely
+nearest, for it is the likeliest to hold a contact.
+
+The order of visits depends on the request alone, so a larger budget continues what a smaller one began, and no bound
+gets worse (NUMERICS.md case 30). All state lies in arrays: the search is left and resumed at will. What does not fit
+the heap is searched depth first, to its end, before the heap goes on: memory is bounded, and nothing is dropped.
+"""
+
+import math
+from typing import NamedTuple
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+
+from .layout import BLOCK_WORDS, COUNT, FIRST, LANES, ROW_WORDS
+from .nearest import (
+    Best,
+    any_near,
+    box_gap,
+    keep_near,
+    lower_bound,
+    make_best,
+    search_lanes,
+    set_cut,
+)
+from .overlap import STACK
+from .placed import ONE_SLACK, SLACK, Placed, make_limits, make_placed, place_block, place_nodes
+from .placing import MAX_REACH_UNITS
+
+# The search goes on; nothing is open; what was asked is known; the budget of visits is spent.
+OPEN, DONE, ENOUGH, SPENT = range(4)
+NO_VOXEL = -1  # in place of a row: the voxel has not been looked into
+
+
+class Known(NamedTuple):
+    """What is known of k poses, gathered over pieces of a request.
+
+    square, pair, gap: of `Nearest`.  lower: (k,) float64, centres are nowhere nearer than that where something was left
+    open [steps]; inf: nothing was.  upper: (k,) float64, some pair is at least as near [steps].
+    """
+
+    square: NDArray[np.int64]
+    pair: NDArray[np.int64]
+    gap: NDArray[np.float64]
+    lower: NDArray[np.float64]
+    upper: NDArray[np.float64]
+
+
+class Search(NamedTuple):
+    """A search that may be resumed; scratch of one request.
+
+    keys: (h + STACK, 2) float32, lower and upper bound of a pair [steps], without the error of placing.  pairs:
+    (h + STACK, 3) int64: avatar node, row or NO_VOXEL, voxel. The first h are the heap, the others the stack of what
+    did not fit it.  sizes: (2,) int64, of heap and stack.  bounds: (4,) float64 [steps]: lower and upper bound of the
+    answer, lower bound of the stack, error of placing.  status: (1,) int64.
+    """
+
+    keys: NDArray[np.float32]
+    pairs: NDArray[np.int64]
+    sizes: NDArray[np.int64]
+    bounds: NDArray[np.float64]
+    status: NDArray[np.int64]
+    placed: Placed
+    best: Best
+
+
+class Goal(NamedTuple):
+    """When a search ends. first: at the first pair within reach and `early` (`collide`).
+
+    early: exact units that a pair may be beyond reach and still be taken, for `first`.  enough: (k,) float64, for
+    `first`: a pair surely as near as this is one, though not known [steps].  tolerance: else, the bounds may lie so
+    far apart [steps].  visits: node visits a pose.
+    """
+
+    first: bool
+    early: int
+    enough: NDArray[np.float64]
+    tolerance: float
+    visits: int
+
+
+@nb.njit(nogil=True, cache=True)
+def make_search(avatar, heap):
+    """Scratch for one avatar (not empty) and a heap of so many pairs."""
+    return Search(
+        np.empty((heap + STACK, 2), np.float32), np.empty((heap + STACK, 3), np.int64), np.zeros(2, np.int64),
+        np.zeros(4), np.zeros(1, np.int64), make_placed(avatar), make_best(),
+    )  # fmt: skip
+
+
+@nb.njit(nogil=True, cache=True)
+def _sift_up(keys, pairs, at):
+    """Let the pair at the end of a heap rise to its place."""
+    key, tie, a, row, voxel = keys[at, 0], keys[at, 1], pairs[at, 0], pairs[at, 1], pairs[at, 2]
+    while at > 0:
+        parent = (at - 1) // 2
+        if keys[parent, 0] < key or (keys[parent, 0] == key and keys[parent, 1] <= tie):
+            break
+        keys[at, 0], keys[at, 1] = keys[parent, 0], keys[parent, 1]
+        pairs[at, 0], pairs[at, 1], pairs[at, 2] = pairs[parent, 0], pairs[parent, 1], pairs[parent, 2]
+        at = parent
+    keys[at, 0], keys[at, 1], pairs[at, 0], pairs[at, 1], pairs[at, 2] = key, tie, a, row, voxel
+
+
+@nb.njit(nogil=True, cache=True)
+def _drop_top(keys, pairs, size):
+    """Remove the top of a heap of `size` pairs."""
+    last = size - 1
+    key, tie, a, row, voxel = keys[last, 0], keys[last, 1], pairs[last, 0], pairs[last, 1], pairs[last, 2]
+    at = 0
+    while 2 * at + 1 < last:
+        child = 2 * at + 1
+        right = child + 1
+        if right < last and (
+            keys[right, 0] < keys[child, 0]
+            or (keys[right, 0] == keys[child, 0] and keys[right, 1] < keys[child, 1])
+        ):
+            child = right
+        if key < keys[child, 0] or (key == keys[child, 0] and tie <= keys[child, 1]):
+            break
+        keys[at, 0], keys[at, 1] = keys[child, 0], keys[child, 1]
+        pairs[at, 0], pairs[at, 1], pairs[at, 2] = pairs[child, 0], pairs[child, 1], pairs[child, 2]
+        at = child
+    keys[at, 0], keys[at, 1], pairs[at, 0], pairs[at, 1], pairs[at, 2] = key, tie, a, row, voxel
+
+
+@nb.njit(nogil=True, cache=True)
+def _upper_bound(words, row, x, y, z, radius):
+    """How far a sphere's points are from a node's at most, as `lower_bound`: both hold at least one point."""
+    dx, dy, dz = x - words[row], y - words[row + 1], z - words[row + 2]
+    both = np.sqrt(dx * dx + dy * dy + dz * dz) + (words[row + 3] + radius)
+    return both + SLACK * both
+
+
+@nb.njit(nogil=True, cache=True)
+def _begin(poses, avatar, scene, index, reach, i, search, goal, known, counts):
+    """Set a search out for pose i: all voxels in reach, as the index bounds them; nothing visited yet."""
+    best, placed = search.best, search.placed
+    best.frame[0], best.frame[1] = place_nodes(avatar, poses[i], reach.scales[i], placed, scene)
+    best.frame[2], best.frame[3] = scene.units_per_step, scene.voxel_steps
+    best.units[0] = reach.units[i] + min(goal.early, MAX_REACH_UNITS - reach.units[i])
+    best.found[0] = known.square[i]
+    best.found[1:] = known.pair[i]
+    best.counters[:] = 0
+    set_cut(best.cut, best.frame, best.units[0], best.found[0])
+    limits = make_limits(
+        reach.units[i], scene.units_per_step, best.frame[0], best.frame[1], scene.voxel_steps
+    )
+    if goal.first:
+        # Nodes are looked into for what is in reach; a pair a little beyond is taken where one is met.
+        best.cut[0] = (limits.reach + limits.error) * ONE_SLACK
+    search.bounds[0], search.bounds[1], search.bounds[2], search.bounds[3] = 0.0, np.inf, 0.0, limits.error
+    search.sizes[0], search.sizes[1], search.status[0] = 0, 0, OPEN
+    keys, pairs = search.keys, search.pairs
+    for at in range(reach.starts[i], reach.starts[i + 1]):
+        voxel = reach.rows[at]
+        root = avatar.radius[0] * reach.scales[i]
+        gap = box_gap(root, placed, best.frame[1], scene, index, voxel)
+        if scene.where[voxel, 0] < 0:
+            counts[0, i] += np.uint32(1)
+            known.gap[i] = min(known.gap[i], gap)
+            continue
+        size = search.sizes[0]
+        keys[size, 0], keys[size, 1] = np.float32(gap * (1.0 - 1e-6)), np.float32(np.inf)
+        pairs[size, 0], pairs[size, 1], pairs[size, 2] = 0, NO_VOXEL, voxel
+        _sift_up(keys, pairs, size)
+        search.sizes[0] = size + 1
+
+
+@nb.njit(nogil=True, cache=True)
+def _enough(goal, enough, best, bounds):
+    """Whether what was asked is known."""
+    if goal.first:
+        return best.found[0] >= 0 or bounds[1] <= enough
+    if best.found[0] < 0 or goal.tolerance <= 0.0:
+        return False
+    return math.sqrt(np.float64(best.found[0])) / best.frame[2] - bounds[0] <= goal.tolerance
+
+
+@nb.njit(nogil=True, cache=True)
+def _put(keys, pairs, sizes, heap, spilling, cut, bounds, parent, low, high, a, row, voxel):
+    """Add a pair to the heap, or to the stack where spilling. low, high: its bounds; parent: the bound above it."""
+    bounds[1] = min(bounds[1], np.float64(high) + bounds[3])
+    # What holds above holds below, and no two centres are nearer than 0.
+    low = max(low, parent)
+    if low > cut[0]:
+        return
+    at = heap + sizes[1] if spilling else sizes[0]
+    keys[at, 0], keys[at, 1] = low, high
+    pairs[at, 0], pairs[at, 1], pairs[at, 2] = a, row, voxel
+    if spilling:
+        sizes[1] += 1
+    else:
+        sizes[0] += 1
+        _sift_up(keys, pairs, at)
+
+
+@nb.njit(nogil=True, cache=True)
+def _go_on(m, pose, avatar, scene, search, goal, enough, budget, until):
+    """Visit node pairs until the search ends, or `until` are visited; budget: how many may be. Sets the status."""
+    words, ints, halves, where, coordinates = (
+        scene.words,
+        scene.ints,
+        scene.halves,
+        scene.where,
+        scene.coordinates,
+    )
+    placed, best = search.placed, search.best
+    nodes, lanes, stamp, frame_at, shift = (
+        placed.nodes,
+        placed.lanes,
+        placed.stamp,
+        placed.frame,
+        placed.shift,
+    )
+    found, cut, frame, corner, keep = best.found, best.cut, best.frame, best.corner, best.keep
+    squares, counters, units = best.squares, best.counters, best.units[0]
+    keys, pairs, sizes, bounds = search.keys, search.pairs, search.sizes, search.bounds
+    avatar_first, avatar_count, points = avatar.first, avatar.count, avatar.points
+    heap = keys.shape[0] - STACK
+    while True:
+        if sizes[1] == 0 and (sizes[0] == 0 or keys[0, 0] > cut[0]):
+            search.status[0] = DONE
+            return
+        least = np.float64(keys[0, 0]) if sizes[1] == 0 else bounds[2]
+        bounds[0] = max(bounds[0], least * (1.0 - 2e-6) - bounds[3])
+        if _enough(goal, enough, best, bounds):
+            search.status[0] = ENOUGH
+            return
+        if counters[0] >= until:
+            return
+        at = 0 if sizes[1] == 0 else heap + sizes[1] - 1
+        key, a, row, voxel = keys[at, 0], pairs[at, 0], pairs[at, 1], pairs[at, 2]
+        a_first = avatar_first[a]
+        b_first = 0 if row == NO_VOXEL else np.int64(ints[row + FIRST])
+        leaves = row != NO_VOXEL and a_first < 0 and b_first < 0
+        avatar_side = b_first < 0 or (a_first >= 0 and row != NO_VOXEL and nodes[3, a] > words[row + 3])
+        cost = 1
+        if row != NO_VOXEL and not leaves:
+            cost = np.int64(avatar_count[a]) if avatar_side else np.int64(ints[row + COUNT])
+        if counters[0] + cost > budget:
+            search.status[0] = SPENT
+            return
+        # What is on the stack may have been overtaken by a nearer pair; visits are counted all the same.
+        counters[0] += cost
+        spilling = sizes[1] > 0 or sizes[0] - 1 + cost > heap
+        if sizes[1] > 0:
+            sizes[1] -= 1
+        else:
+            bounds[2] = np.float64(key)
+            _drop_top(keys, pairs, sizes[0])
+            sizes[0] -= 1
+        if key > cut[0]:
+            continue
+        base = where[voxel, 0]
+        for r in range(3):
+            corner[r] = coordinates[voxel, r] * scene.voxel_steps
+        off_x = np.float32(corner[0] - frame_at[0])
+        off_y = np.float32(corner[1] - frame_at[1])
+        off_z = np.float32(corner[2] - frame_at[2])
+        x, y, z = nodes[0, a] - off_x, nodes[1, a] - off_y, nodes[2, a] - off_z
+        if row == NO_VOXEL:
+            low = lower_bound(words, base, x, y, z, nodes[3, a])
+            high = _upper_bound(words, base, x, y, z, nodes[3, a])
+            _put(keys, pairs, sizes, heap, spilling, cut, bounds, key, low, high, a, base, voxel)
+        elif leaves:
+            block, scene_block = ~a_first, ~b_first
+            if stamp[block] != pose:
+                place_block(avatar, m, block, placed, scene)
+                stamp[block] = pose
+            block_at = where[voxel, 1] + scene_block * BLOCK_WORDS
+            lane_at = where[voxel, 2] + scene_block * 3 * LANES
+            lx, ly = off_x + np.float32(ints[block_at]), off_y + np.float32(ints[block_at + 1])
+            lz = off_z + np.float32(ints[block_at + 2])
+            keep_near(lanes, block, words, row, off_x, off_y, off_z, cut[0], keep)
+            for lane in range(avatar_count[a]):
+                if not keep[lane]:
+                    continue
+                px, py, pz = (
+                    lanes[block, 0, lane] - lx,
+                    lanes[block, 1, lane] - ly,
+                    lanes[block, 2, lane] - lz,
+                )
+                counters[1] += LANES
+                if any_near(halves, lane_at, px, py, pz, cut[1]):
+                    search_lanes(
+                        points, m, shift, block, lane, ints, halves, corner, block_at, lane_at, px, py, pz, frame,
+                        units, squares, found, cut,
+                    )  # fmt: skip
+        elif avatar_side:
+            for child in range(a_first, a_first + cost):
+                x, y, z = nodes[0, child] - off_x, nodes[1, child] - off_y, nodes[2, child] - off_z
+                low = lower_bound(words, row, x, y, z, nodes[3, child])
+                high = _upper_bound(words, row, x, y, z, nodes[3, child])
+                _put(keys, pairs, sizes, heap, spilling, cut, bounds, key, low, high, child, row, voxel)
+        else:
+            for number in range(cost):
+                child = base + (b_first + number) * ROW_WORDS
+                low = lower_bound(words, child, x, y, z, nodes[3, a])
+                high = _upper_bound(words, child, x, y, z, nodes[3, a])
+                _put(keys, pairs, sizes, heap, spilling, cut, bounds, key, low, high, a, child, voxel)
+
+
+@nb.njit(nogil=True, cache=True)
+def end_search(search, i, known, counts):
+    """Add what a search has found out to what is known of pose i."""
+    best = search.best
+    known.square[i] = best.found[0]
+    known.pair[i] = best.found[1:]
+    known.upper[i] = min(known.upper[i], search.bounds[1])
+    if search.status[0] != DONE:
+        known.lower[i] = min(known.lower[i], search.bounds[0])
+    counts[1, i] += np.uint32(best.counters[0])
+    counts[2, i] += np.uint32(best.counters[1])
+
+
+@nb.njit(nogil=True, cache=True)
+def go_on(poses, avatar, scene, index, reach, i, fresh, until, search, goal, known, counts):
+    """Search for the nearest pair of pose i: from the start if `fresh`, else from where it was left.
+
+    poses: (k, 4, 4), checked.  avatar: not empty.  reach: Reach of the poses; a voxel in it that is not resident is
+    counted as missing.  until: the visits, of this piece, at which to leave off. Once it has ended its results are
+    added to known and counts (3, k) uint32; where it has not, `end_search` does that. Returns the status.
+    """
+    if fresh:
+        _begin(poses, avatar, scene, index, reach, i, search, goal, known, counts)
+    budget = goal.visits - np.int64(counts[1, i])
+    _go_on(poses[i], i, avatar, scene, search, goal, goal.enough[i], budget, until)
+    if search.status[0] != OPEN:
+        end_search(search, i, known, counts)
+    return search.status[0]
+
+
+@nb.njit(nogil=True, cache=True)
+def search_poses(poses, avatar, scene, index, reach, which, heap, goal, known, counts):
+    """`go_on` to the end for each of the poses numbered in `which`: one call for a request without a deadline."""
+    search = make_search(avatar, heap)
+    for number in range(which.shape[0]):
+        go_on(
+            poses, avatar, scene, index, reach, which[number], True, np.int64(1) << 62, search, goal, known, counts
+        )  # fmt: skip

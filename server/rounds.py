@@ -82,7 +82,14 @@ def make_best(k: int) -> Nearest:
 
 def _part(best: Nearest, begin: int, end: int) -> Nearest:
     """Views of rows [begin, end); counts contiguous, to be written back."""
-    return Nearest(*[column[begin:end] for column in best[:4]], best.counts[:, begin:end].copy())
+    rows = slice(begin, end)
+    return Nearest(
+        best.value[rows],
+        best.square[rows],
+        best.lattice[rows],
+        best.unseen[rows],
+        best.counts[:, rows].copy(),
+    )
 
 
 def look(

@@ -47,7 +47,7 @@ def within(data: SceneData, points: ArrayLike, reach: float, effort: Effort = EX
     best = found.best
     near = np.where(best.square >= 0, np.sqrt(np.maximum(best.square, 0).astype(np.float64)), np.inf)
     verdict, lower, upper, exact = finish(near, best.unseen, reach_units)
-    cloud = np.full((len(units), 3), np.nan)
+    cloud: NDArray[np.float64] = np.full((len(units), 3), np.nan)
     touched = best.square >= 0
     cloud[touched] = best.lattice[touched] * data.arrays.step + data.arrays.origin
     low, high = (

@@ -132,7 +132,7 @@ def _test_block(scene, voxel, row, ray, radius, rays, i, best):
     bx, by, bz = np.float32(ray[9]), np.float32(ray[10]), np.float32(ray[11])
     span = radius + 64.0 * U32 * (words[row + 3] + radius + 1.0)
     far = np.float32(span * span * (1.0 + 64.0 * U32))
-    met = False
+    met: bool | np.bool_ = False
     for j in range(LANES):
         x = np.float32(halves[lane_at + j]) - qx
         y = np.float32(halves[lane_at + LANES + j]) - qy

@@ -32,13 +32,13 @@ def _below_node(words, row, x, y, z):
     radius = np.float64(words[row + 3])
     length = np.float64(words[row + 7])
     slack = math.sqrt(square) * 2.0**-24
-    below = math.sqrt(square) - radius
+    below: float = math.sqrt(square) - radius
     if length > 0.0:
         along = (nx * dx + ny * dy + nz * dz) / length
         # The length is rounded up, so offsets divided by it come out shorter by 2^-23 at most, undone by the slack.
-        gap = max(along - words[row + 9] / length, words[row + 8] / length - along, 0.0)
-        gap -= (abs(along) + radius) * 2.0**-21
-        across = math.sqrt(max(square - along * along * (1.0 + 2.0**-21), 0.0)) - radius
+        gap: float = max(along - words[row + 9] / length, words[row + 8] / length - along, 0.0)
+        gap = gap - (abs(along) + radius) * 2.0**-21
+        across: float = math.sqrt(max(square - along * along * (1.0 + 2.0**-21), 0.0)) - radius
         if gap > 0.0:
             across = max(across - slack, 0.0)
             below = max(below, math.sqrt(gap * gap + across * across))
@@ -64,7 +64,7 @@ def _test_block(scene, voxel, row, x, y, z, error, at_units, i, best, limit):
     span += 16.0 * U32 * (span + 4.0 * words[row + 3] + 1.0)
     far = np.float32(span * span * (1.0 + 64.0 * U32))
     least = np.float32(np.inf)
-    met = False
+    met: bool | np.bool_ = False
     for j in range(LANES):
         dx = np.float32(halves[lane_at + j]) - qx
         dy = np.float32(halves[lane_at + LANES + j]) - qy

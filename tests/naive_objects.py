@@ -1,0 +1,44 @@
+"""The judge of objects: every pair of points of every pair of objects, in integers. Nothing but numpy and `naive`."""
+
+from collections.abc import Sequence
+
+import naive
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+
+def touching_pairs(
+    bodies: Sequence[NDArray[np.float64]],
+    radii: Sequence[float],
+    poses: NDArray[np.float64],
+    groups: Sequence[int],
+    masks: Sequence[int],
+    origin: ArrayLike,
+    margin: float = 0.0,
+) -> list[list[int]]:
+    """Pairs of objects in contact, lesser first, ascending. bodies: (m, 3) points of each object, avatar frame."""
+    placed = [naive.placed_units(body, pose, origin) for body, pose in zip(bodies, poses, strict=True)]
+    units = [pair_radius(radius, pose) for radius, pose in zip(radii, poses, strict=True)]
+    more = int(np.rint(margin * naive.UNITS))
+    found = []
+    for i in range(len(placed)):
+        for j in range(i + 1, len(placed)):
+            if not (groups[i] & masks[j] and groups[j] & masks[i]):
+                continue
+            if _touch(placed[i], placed[j], units[i] + units[j] + more):
+                found.append([i, j])
+    return found
+
+
+def pair_radius(radius: float, pose: NDArray[np.float64]) -> int:
+    """A placed radius in exact units."""
+    return int(np.rint(naive.scale_of(pose) * radius * naive.UNITS))
+
+
+def _touch(a: NDArray[np.int64], b: NDArray[np.int64], reach: int) -> bool:
+    """Whether any pair is within reach; points outside the other's box and the reach are farther along one axis."""
+    for _ in range(2):
+        if not len(a) or not len(b):
+            return False
+        a, b = b[((b >= a.min(axis=0) - reach) & (b <= a.max(axis=0) + reach)).all(axis=1)], a
+    return naive.touches(a, b, reach)

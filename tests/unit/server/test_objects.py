@@ -1,0 +1,105 @@
+"""`objects`: budgets, groups, and what is refused."""
+
+import time
+from collections.abc import Iterator
+
+import cases
+import numpy as np
+import pytest
+import scans
+from numpy.typing import NDArray
+from solidcloud.schemas.answers import Verdict
+from solidcloud.schemas.errors import BadRequestError, BadTransformError
+from solidcloud.server.avatar import make_avatar
+from solidcloud.server.effort import Effort
+from solidcloud.server.objects import SCENE_GROUP, objects
+from solidcloud.server.request import SceneData, make_scene_data
+from solidcloud.server.residency import Residency
+from solidcloud.server.store import Store
+
+CLEAR, CONTACT, UNKNOWN = Verdict
+BALL = make_avatar([[0.0, 0, 0]], 0.5)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SceneData]:
+    """A plane of 50 points."""
+    case = cases.build(tmp_path_factory.mktemp("objects"), scans.make_scan("plane", 1, 50))
+    store = Store(case.archive)
+    yield make_scene_data(store.archive, Residency(store, 64 << 20))
+    store.close()
+
+
+def at(*places: float) -> NDArray[np.float64]:
+    """Poses along x, above the plane."""
+    return np.array([cases.pose_of(np.eye(3), np.array([x, 0.0, 30.0])) for x in places])
+
+
+def test_a_pair_needs_each_group_in_the_other_mask(data: SceneData) -> None:
+    for groups, masks, touch in [
+        ((1, 1), (1, 1), True),
+        ((1, 2), (2, 1), True),
+        ((1, 2), (2, 2), False),
+        ((1, 2), (1, 1), False),
+        ((0, 1), (1, 1), False),
+        ((6, 1), (3, 4), True),
+        ((SCENE_GROUP, SCENE_GROUP), (SCENE_GROUP, SCENE_GROUP), True),
+    ]:
+        answers = objects(data, [BALL, BALL], at(0, 0.5), groups, masks)
+        assert answers.pairs.tolist() == ([[0, 1]] if touch else [])
+        assert (answers.pairs_tested, answers.pairs_filtered) == ((1, 0) if touch else (0, 1))
+    assert objects(data, [BALL, BALL], at(0, 1.5), [1, 1], [1, 1]).pairs_tested == 0
+
+
+def test_pairs_cut_off_by_a_budget_are_listed_as_unknown(data: SceneData, rng: np.random.Generator) -> None:
+    shell = rng.normal(size=(2000, 3))
+    model = make_avatar(shell / np.linalg.norm(shell, axis=1)[:, None], 0.001)
+    poses = np.array(
+        [cases.pose_of(np.eye(3), rng.uniform(-1.5, 1.5, 3) + np.array([0, 0, 30])) for _ in range(12)]
+    )
+    ones = np.ones(12, int)
+    truth = {tuple(pair) for pair in objects(data, [model] * 12, poses, ones, ones).pairs.tolist()}
+    unknown = []
+    for visits in (0, 10, 100, 1000, 10**6):
+        answers = objects(data, [model] * 12, poses, ones, ones, effort=Effort(visits=visits))
+        said = dict(zip(map(tuple, answers.pairs.tolist()), answers.pair_verdict.tolist(), strict=True))
+        assert {pair for pair, verdict in said.items() if verdict == CONTACT} <= truth <= set(said)
+        unknown.append(sum(verdict == UNKNOWN for verdict in said.values()))
+    assert len(truth) < unknown[0] <= answers.pairs_tested and unknown[-1] == 0
+    assert unknown == sorted(unknown, reverse=True) and unknown[0] > unknown[3] > 0
+
+
+def test_a_deadline_that_has_passed_leaves_all_unknown(data: SceneData) -> None:
+    late = Effort(deadline=time.perf_counter() - 1)
+    answers = objects(data, [BALL] * 3, at(0, 0.5, 9), [1] * 3, [1, 1 | SCENE_GROUP, 1], effort=late)
+    assert answers.verdict.tolist() == [CLEAR, UNKNOWN, CLEAR]
+    assert answers.pairs.tolist() == [[0, 1]] and answers.pair_verdict.tolist() == [UNKNOWN]
+    assert answers.pairs_tested == 0 and answers.misses == 0
+    soon = Effort(deadline=time.perf_counter() + 600)
+    answers = objects(data, [BALL] * 300, np.repeat(at(0), 300, axis=0), [1] * 300, [1] * 300, effort=soon)
+    assert len(answers.pairs) == 300 * 299 // 2 and (answers.pair_verdict == CONTACT).all()
+
+
+def test_what_is_refused(data: SceneData) -> None:
+    for arguments, error, text in [
+        (([BALL], at(0, 1), [1, 1], [1, 1]), BadRequestError, "1 avatars, 2 poses"),
+        (([BALL], at(0), [1, 1], [1]), BadRequestError, "2 groups"),
+        (([BALL], np.eye(4), [1], [1]), BadRequestError, "shape"),
+        (([BALL] * 2, at(0, 1), [1, 1], [1, 1], -1.0), BadRequestError, "margin"),
+        (([BALL] * 2, at(0, 1), [1, 1], [1, 1], 15.5), BadRequestError, "add up to 16.5 m"),
+        (([BALL] * 2, at(0, np.nan), [1, 1], [1, 1]), BadRequestError, "pose 1 holds nan"),
+        (
+            (
+                [BALL, make_avatar([[0, 0, 1.0]], 1), BALL],
+                at(0, 1, 2) * [[[1], [1], [-1], [1]]],
+                [1] * 3,
+                [1] * 3,
+            ),
+            BadTransformError,
+            "pose 0 mirrors",
+        ),
+    ]:
+        with pytest.raises(error, match=text):
+            objects(data, *arguments)
+    assert len(objects(data, [], np.empty((0, 4, 4)), [], [])) == 0
+    assert objects(data, [BALL], at(0), [1], [1], 15.5).verdict.tolist() == [CLEAR]

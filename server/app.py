@@ -213,6 +213,7 @@ class Service:
     def warm(self) -> None:
         """Warm every scene, so that the first client does not wait for compilers."""
         for scene in self._scenes.values():
+            log.info("warming %s: the first start on a machine compiles, for a minute or two", scene.name)
             scene.warm()
 
     def _ask(self, key: str, payload: bytes, encoding: str) -> Any:

@@ -19,9 +19,12 @@ from ..schemas.errors import SolidcloudError
 from ..schemas.requests import check_path_parameters
 from .avatar import AvatarModel
 from .collide import collide
+from .contacts import contacts
+from .distance import distance
 from .effort import make_effort
 from .kernels.placing import check_poses
 from .request import SceneData, refuse, to_units
+from .sweep import sweep
 
 # Parts computed at a time, by default.
 PATH_THREADS = 2
@@ -64,12 +67,7 @@ def path_question(
     )
     refuse(fault, pose, found)
 
-    from .contacts import contacts
-    from .distance import distance
-
     if op == "sweep":
-        from .sweep import sweep
-
         margin = given.get("margin", 0.0)
         return (
             lambda a, b: sweep(data, avatar, poses[a:b], poses[a + 1 : b + 1], margin, tolerance, effort)

@@ -26,11 +26,17 @@ from ..schemas.messages import WIRE_VERSION, AvatarInfo, SceneInfo, SourceInfo
 from ..schemas.requests import make_objects, make_poses
 from .avatar import AvatarModel, make_avatar
 from .collide import collide
-from .effort import Effort, make_effort
+from .contacts import contacts
+from .distance import distance
+from .effort import EXACT, Effort, make_effort
+from .objects import objects as ask_objects
 from .path import PATH_THREADS, largest_part, path_parts, path_question
+from .rays import raycast
 from .request import make_scene_data
 from .residency import Residency
 from .store import Store
+from .sweep import sweep
+from .within import within
 
 DEFAULT_BUDGET = 512 << 20
 
@@ -109,7 +115,19 @@ class Scene:
         corner = archive.coordinates[row] * archive.header.lattice.voxel_steps + archive.voxels["low"][row]
         pose = np.eye(4)[None]
         pose[0, :3, 3] = archive.header.lattice.to_world(corner)
-        collide(self._data, make_avatar([[0.0, 0, 0], [0.1, 0, 0]]), pose)
+        place = pose[:, :3, 3].copy()
+        avatar = make_avatar([[0.0, 0, 0], [0.1, 0, 0]])
+        both = np.full(2, 0xFFFFFFFF, np.uint32)
+        # A budget that is never spent: what is bounded has kernels of its own.
+        for effort in (EXACT, Effort(tolerance=1e-3, visits=1 << 20)):
+            for poses in (pose, np.concatenate([pose, pose])):
+                collide(self._data, avatar, poses)
+            distance(self._data, avatar, pose, 0.01, effort)
+            contacts(self._data, avatar, pose, effort=effort)
+            sweep(self._data, avatar, pose, pose, effort=effort)
+            raycast(self._data, place, np.array([[0.0, 0.0, 1.0]]), 0.01, effort)
+            within(self._data, place, 0.01, effort)
+            ask_objects(self._data, [avatar, avatar], np.concatenate([pose, pose]), both, both, effort=effort)
 
     def info(self) -> SceneInfo:
         """What is served: counts, bounds, lattice, radius, sources."""
@@ -165,8 +183,6 @@ class Scene:
         client: str = "",
     ) -> DistanceAnswers:
         """How far avatar `name` is from the scene under each pose, up to `reach` [m]; see server/distance.py."""
-        from .distance import distance
-
         effort = make_effort(tolerance, budget_ms, budget_visits)
         return distance(self._data, self._avatar(name, client), poses, reach, effort)
 
@@ -184,8 +200,6 @@ class Scene:
         client: str = "",
     ) -> ContactsAnswers:
         """Which pairs of points are in contact under each of the poses, deepest first; see server/contacts.py."""
-        from .contacts import contacts
-
         effort = make_effort(tolerance, budget_ms, budget_visits)
         avatar = self._avatar(name, client)
         return contacts(self._data, avatar, poses, limit, margin, cluster_distance, effort)
@@ -203,8 +217,6 @@ class Scene:
         client: str = "",
     ) -> SweepAnswers:
         """When avatar `name` first touches the scene on its way between poses; see server/sweep.py."""
-        from .sweep import sweep
-
         effort = make_effort(tolerance, budget_ms, budget_visits)
         avatar = self._avatar(name, client)
         return sweep(self._data, avatar, pose_from, pose_to, margin, tolerance, effort)
@@ -220,8 +232,6 @@ class Scene:
         budget_visits: int | None = None,
     ) -> RaycastAnswers:
         """Which scan point's sphere rays (k, 3), (k, 3) hit first, up to `reach` [m]; see server/rays.py."""
-        from .rays import raycast
-
         effort = make_effort(tolerance, budget_ms, budget_visits)
         return raycast(self._data, origins, directions, reach, effort)
 
@@ -235,8 +245,6 @@ class Scene:
         budget_visits: int | None = None,
     ) -> WithinAnswers:
         """Which scan point is nearest to each loose point (k, 3), up to `reach` [m]; see server/rays.py."""
-        from .within import within
-
         effort = make_effort(tolerance, budget_ms, budget_visits)
         return within(self._data, points, reach, effort)
 
@@ -254,8 +262,6 @@ class Scene:
 
         See server/objects.py.
         """
-        from .objects import objects as ask_objects
-
         effort = make_effort(tolerance, budget_ms, budget_visits)
         items, poses = make_objects(objects)
         avatars = [self._avatar(item.avatar, client) for item in items]

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -73,6 +74,39 @@ def test_help_loads_no_numpy(verb: str) -> None:
         ("serve {out} --listen tcp/0.0.0.0:7447", 2, "--insecure"),
         ("query --scene hall --avatar {scan} --poses {scan}", 2, "line 1: columns"),
         ("query --scene hall --avatar {scan} --poses {out}", 3, "expected a CSV file"),
+        ("query --scene hall --op hop", 2, "--op hop: expected one of collide, distance"),
+        (
+            "query --scene hall",
+            2,
+            "--op collide needs --avatar: it takes --avatar, --poses, --radius, --margin",
+        ),
+        (
+            "query --scene hall --avatar {scan} --poses {scan} --reach 1",
+            2,
+            "--reach does not go with --op collide",
+        ),
+        ("query --scene hall --op distance --avatar {scan} --poses {scan}", 2, "--op distance needs --reach"),
+        (
+            "query --scene hall --op raycast --reach 1 --poses {scan}",
+            2,
+            "--poses does not go with --op raycast",
+        ),
+        (
+            "query --scene hall --op path --along raycast --reach 1",
+            2,
+            "--along raycast: expected one of collide",
+        ),
+        (
+            "query --scene hall --op path --along sweep --avatar {scan} --poses {scan} --limit 3",
+            2,
+            "--limit does not",
+        ),
+        ("query --scene hall --op raycast --reach 1 --rays {scan}", 2, "expected x,y,z,dx,dy,dz"),
+        (
+            "query --scene hall --op objects --objects {scan}",
+            2,
+            "expected avatar,x,y,z,qw,qx,qy,qz,group,mask",
+        ),
         ("make facade -o {out}.obj", 2, "cannot write '.obj'"),
     ],
 )
@@ -174,6 +208,115 @@ def test_query_agrees_with_the_floor(
     assert run([*ask, "--connect", endpoint, "--scene", "hall"]) == 0
     shown = capsys.readouterr()
     assert "5 unknown" in shown.out and "no server of scene 'hall'" in shown.err
+
+
+def ask_all(folder: Path) -> dict[str, list[str]]:
+    """What is asked of the floor, by a ball of 0.05 m; every point of it too is a ball of 0.05 m."""
+    (folder / "ball.xyz").write_text("0 0 0\n")
+    heights = [0.3, 0.09, 5.0]
+    rows = "".join(f"{t},0,0,{z},1,0,0,0\n" for t, z in enumerate(heights))
+    (folder / "poses.csv").write_text("t,x,y,z,qw,qx,qy,qz\n" + rows)
+    (folder / "rays.csv").write_text("x,y,z,dx,dy,dz\n0,0,1,0,0,-2\n0,0,1,0,0,1\n")
+    (folder / "loose.xyz").write_text("0 0 0.25\n0.5 0.5 3\n")
+    objects = "ball.xyz,0,0,0.09,1,0,0,0,1,0xffffffff\nball.xyz,0,0,0.18,1,0,0,0,1,0xffffffff\n"
+    (folder / "objects.csv").write_text("avatar,x,y,z,qw,qx,qy,qz,group,mask\n" + objects)
+    ball = [
+        "--avatar",
+        str(folder / "ball.xyz"),
+        "--poses",
+        str(folder / "poses.csv"),
+        "--radius",
+        str(RADIUS),
+    ]
+    return {
+        "distance": [*ball, "--reach", "1"],
+        "contacts": [*ball, "--limit", "5"],
+        "sweep": [*ball, "--tolerance", "0.001"],
+        "raycast": ["--rays", str(folder / "rays.csv"), "--reach", "2"],
+        "within": ["--points", str(folder / "loose.xyz"), "--reach", "1"],
+        "objects": ["--objects", str(folder / "objects.csv"), "--radius", str(RADIUS)],
+        "path": [*ball, "--along", "distance", "--reach", "1"],
+    }
+
+
+# A line each of what is said: verdict and figure. One pair in contact at 0.09 m: the point below, 0.01 m deep.
+LINES = {
+    "distance": [
+        r"0\.000 s  clear +0\.200000 m from .*",
+        r"1\.000 s  contact +-0\.010000 m from 0\.0000 0\.0000 0\.0900 to 0\.0000 0\.0000 0\.0000",
+        r"2\.000 s  clear +nothing within 1\.000000 m",
+        r"3 poses: 2 clear, 1 contact, 0 unknown; .*",
+    ],
+    "contacts": [
+        r"0\.000 s  clear",
+        r"1\.000 s  contact +1 pairs in 1 clusters, -0\.010000 m at 0\.0000 0\.0000 0\.0000",
+        r"2\.000 s  clear",
+        r"3 poses: .*",
+    ],
+    "sweep": [
+        r"0\.000 .. +1\.000 s  contact +from 0\.9\d+ to 0\.9\d+ of the motion, at 0\.0000 0\.0000 0\.0000",
+        r"1\.000 .. +2\.000 s  contact +from 0\.0+ to 0\.0+ of the motion, at .*",
+        r"2 motions: 0 clear, 2 contact, 0 unknown; .*",
+    ],
+    "raycast": [
+        r"ray 0  contact +0\.950000 m at -?0\.0000 -?0\.0000 0\.0500",
+        r"ray 1  clear +nothing within 2\.000000 m",
+        r"2 rays: .*",
+    ],
+    "within": [
+        r"point 0  contact +0\.250000 m at .*",
+        r"point 1  clear +nothing within 1\.000000 m",
+        r"2 points: .*",
+    ],
+    "objects": [
+        r"object 0 ball\.xyz  contact",
+        r"object 1 ball\.xyz  clear",
+        r"objects 0 and 1  contact",
+        r"2 objects: 1 clear, 1 contact, 0 unknown; .*",
+    ],
+}
+LINES["path"] = LINES["distance"]
+
+
+def test_every_question_from_the_command_line(
+    archive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asks = ask_all(tmp_path)
+    with served(archive, "hall", "--cache", "64MB") as endpoint:
+        for op, options in asks.items():
+            ask = ["query", "--connect", endpoint, "--scene", "hall", "--op", op, *options]
+            assert run(ask) == 0, errors(capsys)
+            lines = capsys.readouterr().out.splitlines()
+            assert len(lines) == len(LINES[op]), lines
+            for line, expected in zip(lines, LINES[op], strict=True):
+                assert re.fullmatch(expected, line.strip()), line
+            assert run([*ask, "--json"]) == 0
+            told = json.loads(capsys.readouterr().out)
+            words = [word for line in lines[:-1] for word in ("clear", "contact") if f"  {word}" in line]
+            assert [answer["verdict"] for answer in told["answers"]] == words[: len(told["answers"])]
+            assert told["faults"] == [] and told["engine_seconds"] > 0
+            check_json(op, told)
+    # Nobody there any more: unknown, and it says why.
+    for op, options in asks.items():
+        assert run(["query", "--connect", endpoint, "--scene", "hall", "--op", op, *options]) == 0
+        shown = capsys.readouterr()
+        assert " 0 clear, 0 contact, " in shown.out and "no server of scene 'hall'" in shown.err
+
+
+def check_json(op: str, told: dict[str, Any]) -> None:
+    """Figures of the JSON that the text does not have."""
+    answers = told["answers"]
+    if op in ("distance", "path"):
+        assert [answer["t"] for answer in answers] == [0.0, 1.0, 2.0]
+        assert answers[2]["signed_distance"] is None and answers[2]["witness_cloud"] is None
+        assert answers[1]["normal"] == pytest.approx([0, 0, 1], abs=1e-3)
+    if op == "contacts":
+        (contact,), (cluster,) = answers[1]["contacts"], answers[1]["clusters"]
+        assert contact["avatar_index"] == 0 and contact["signed_distance"] == pytest.approx(-0.01, abs=1e-6)
+        assert cluster["count"] == 1 and cluster["low"] == cluster["high"] == contact["cloud_point"]
+        assert answers[0]["contacts"] == answers[0]["clusters"] == []
+    if op == "objects":
+        assert told["pairs"] == [{"objects": [0, 1], "verdict": "contact"}] and told["pairs_tested"] == 1
 
 
 def test_serve_stops_when_told_to(archive: Path) -> None:

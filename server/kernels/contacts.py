@@ -39,8 +39,6 @@ from .overlap import nodes_meet
 from .placed import ONE_SLACK, SLACK, U32, make_limits, make_placed, place_block, place_nodes
 from .placing import MAX_REACH_UNITS, lattice_to_units, place, to_units
 
-FAR_LANE = np.float32(1e18)  # where the lanes behind a block's last point are put: its square fits float32
-
 
 class Asked(NamedTuple):
     """What is asked beside the poses.
@@ -89,13 +87,13 @@ def _bound_of(square, units_per_step, limits):
 
 
 @nb.njit(nogil=True, cache=True)
-def _listing_bound(memory, limit, units_per_step, limits):
-    """Above which float32 square no pair can be among those listed."""
-    if limit == 0:
+def _listing_bound(heap, kept, units_per_step, limits):
+    """Above which float32 square no pair can be among those listed; `kept` of them are."""
+    if heap.shape[0] == 0:
         return np.float32(-1.0)
-    if memory.sizes[KEPT] < limit:
+    if kept < heap.shape[0]:
         return np.float32(np.inf)
-    return _bound_of(memory.heap[0, SQUARE], units_per_step, limits)
+    return _bound_of(heap[0, SQUARE], units_per_step, limits)
 
 
 @nb.njit(nogil=True, cache=True)
@@ -121,18 +119,18 @@ def _measure(avatar, m, block, lane, placed, scene, record):
 
 
 @nb.njit(nogil=True, cache=True)
-def _cell_of(memory, record, edge):
+def _cell_of(cells, sizes, record, edge):
     """The row of the cell that the record's scan point falls in; room for a new one must be there."""
-    table, last = memory.cells.table, memory.sizes[LAST]
+    table, last = cells.table, sizes[LAST]
     x, y, z = record[0, POINT], record[0, POINT + 1], record[0, POINT + 2]
     if last >= 0:  # nearly always the last one, and divisions are slow
         x0, y0, z0 = table[last, PLACE] * edge, table[last, PLACE + 1] * edge, table[last, PLACE + 2] * edge
         if x0 <= x < x0 + edge and y0 <= y < y0 + edge and z0 <= z < z0 + edge:
             return last
-    cell = enter_cell(memory.cells, memory.sizes[CELLS], x // edge, y // edge, z // edge)
-    if cell == memory.sizes[CELLS]:
-        memory.sizes[CELLS] += 1
-    memory.sizes[LAST] = cell
+    cell = enter_cell(cells, sizes[CELLS], x // edge, y // edge, z // edge)
+    if cell == sizes[CELLS]:
+        sizes[CELLS] += 1
+    sizes[LAST] = cell
     return cell
 
 
@@ -142,8 +140,10 @@ def _gather_point(avatar, m, a, block, placed, scene, limits, asked, edge, memor
 
     Returns how many are in contact.
     """
-    record, squares = work.record, work.squares
-    cells, sizes = memory.cells, memory.sizes
+    # Arrays are taken out of their tuples here: in the loop each would be counted as referenced in every turn.
+    record, squares, listing, rows = work.record, work.squares, work.bound, asked.rows
+    cells, heap, sizes, per_step = memory.cells, memory.heap, memory.sizes, scene.units_per_step
+    table, bounds = cells.table, cells.bound
     cell, count, bound = np.int64(-1), np.int64(0), np.float32(np.inf)
     for lane in range(avatar.count[a]):
         square = squares[lane]
@@ -151,8 +151,8 @@ def _gather_point(avatar, m, a, block, placed, scene, limits, asked, edge, memor
             continue
         if square <= limits.near:
             if cell < 0:
-                cell = _cell_of(memory, record, edge)
-                bound = max(cells.bound[cell], work.bound[0])
+                cell = _cell_of(cells, sizes, record, edge)
+                bound = max(bounds[cell], listing[0])
             count += 1
             if square > bound:
                 continue
@@ -163,19 +163,18 @@ def _gather_point(avatar, m, a, block, placed, scene, limits, asked, edge, memor
             if record[0, SQUARE] > limits.units * limits.units:
                 continue
             if cell < 0:
-                cell = _cell_of(memory, record, edge)
+                cell = _cell_of(cells, sizes, record, edge)
             count += 1
-        record[0, ROW] = asked.rows[block, lane]
+        record[0, ROW] = rows[block, lane]
         record[0, TAG] = cell
-        if deeper(record, 0, cells.table, cell):
-            cells.table[cell, :ORDER] = record[0, :ORDER]
-            cells.bound[cell] = _bound_of(record[0, SQUARE], scene.units_per_step, limits)
-        if square <= work.bound[0]:
-            sizes[KEPT] = keep_deepest(memory.heap, sizes[KEPT], record)
-            work.bound[0] = _listing_bound(memory, asked.limit, scene.units_per_step, limits)
-        bound = max(cells.bound[cell], work.bound[0])
+        if deeper(record, 0, table, cell):
+            table[cell, :ORDER] = record[0, :ORDER]
+            bounds[cell] = _bound_of(record[0, SQUARE], per_step, limits)
+        if square <= listing[0]:
+            sizes[KEPT] = keep_deepest(heap, sizes[KEPT], record)
+            listing[0] = _listing_bound(heap, sizes[KEPT], per_step, limits)
+        bound = max(bounds[cell], listing[0])
     if count > 0:
-        table = cells.table
         table[cell, PAIRS] += count
         for r in range(3):
             table[cell, LOW + r] = min(table[cell, LOW + r], record[0, POINT + r])
@@ -227,16 +226,15 @@ def _gather_leaves(
             lanes[block, 1, j] - ly,
             lanes[block, 2, j] - lz,
         )
-    for j in range(avatar.count[a], LANES):
-        mine[0, j] = FAR_LANE
     record, squares = work.record, work.squares
+    coordinates, where, counts, pairs = scene.coordinates, scene.where, tally.counts, tally.pairs
     for j in range(ints[row + COUNT]):
         if not keep[j]:
             continue
         x = np.float32(halves[lane_at + j])
         y = np.float32(halves[lane_at + LANES + j])
         z = np.float32(halves[lane_at + 2 * LANES + j])
-        tally.counts[2, i] += LANES
+        counts[2, i] += LANES
         touched = False
         for lane in range(LANES):
             dx, dy, dz = x - mine[0, lane], y - mine[1, lane], z - mine[2, lane]
@@ -245,24 +243,26 @@ def _gather_leaves(
         if not touched:
             continue
         for r in range(3):
-            low = scene.coordinates[voxel, r] * scene.voxel_steps + np.int64(ints[block_at + r])
+            low = coordinates[voxel, r] * scene.voxel_steps + np.int64(ints[block_at + r])
             record[0, POINT + r] = low + np.int64(halves[lane_at + r * LANES + j])
         record[0, SCAN] = -1
         if asked.kept:
-            record[0, SCAN] = halves[scan_run(scene.where, voxel) + scene_block * LANES + j]
-        tally.pairs[i] += _gather_point(avatar, m, a, block, placed, scene, limits, asked, edge, memory, work)
+            record[0, SCAN] = halves[scan_run(where, voxel) + scene_block * LANES + j]
+        pairs[i] += _gather_point(avatar, m, a, block, placed, scene, limits, asked, edge, memory, work)
 
 
 @nb.njit(nogil=True, cache=True)
 def _gather_voxel(avatar, m, i, placed, scene, voxel, limits, asked, memory, work, tally, stop):
     """Gather all pairs in contact of the placed avatar and one resident voxel, the two trees descended together.
 
-    Goes on where memory.cursor and its stack say, and stops before the pose costs more than `stop` node visits and a
-    node's children: then the cursor's depth is not 0. Returns the memory, its cells grown.
+    Goes on where memory.cursor and its stack say. Stops, and then the cursor's depth is not 0, before a node test once
+    the pose has cost `stop` node visits, and where the cells have no room for another LANES.
     """
     words, ints = scene.words, scene.ints
     base = scene.where[voxel, 0]
     nodes, off, stack, counts = placed.nodes, work.off, memory.stack, tally.counts
+    first, held, stamp, edges = avatar.first, avatar.count, placed.stamp, asked.edges
+    sizes, room = memory.sizes, memory.cells.table.shape[0]
     for r in range(3):
         off[r] = np.float32(scene.coordinates[voxel, r] * scene.voxel_steps - placed.frame[r])
     depth = memory.cursor[2]
@@ -275,22 +275,17 @@ def _gather_voxel(avatar, m, i, placed, scene, voxel, limits, asked, memory, wor
             depth = 1
     while depth > 0:
         a, row = stack[depth - 1, 0], stack[depth - 1, 1]
-        a_first, b_first = avatar.first[a], ints[row + FIRST]
-        if counts[1, i] >= stop and (
-            a_first >= 0 or b_first >= 0
-        ):  # a pair of leaf nodes costs no more visits
+        a_first, b_first = first[a], ints[row + FIRST]
+        leaves = a_first < 0 and b_first < 0
+        # A pair of leaf nodes costs no visits, but room.
+        if sizes[CELLS] + LANES > room if leaves else counts[1, i] >= stop:
             break
         depth -= 1
-        if a_first < 0 and b_first < 0:
+        if leaves:
             block = ~a_first
-            if placed.stamp[block] != i:
+            if stamp[block] != i:
                 place_block(avatar, m, block, placed, scene)
-                placed.stamp[block] = i
-            if memory.sizes[CELLS] + LANES > memory.cells.table.shape[0]:
-                memory = Memory(
-                    grow_cells(memory.cells, memory.sizes[CELLS]), memory.heap, memory.sizes, memory.cursor,
-                    memory.stack, memory.pairs, memory.clusters,
-                )  # fmt: skip
+                stamp[block] = i
             _gather_leaves(
                 avatar,
                 m,
@@ -302,15 +297,15 @@ def _gather_voxel(avatar, m, i, placed, scene, voxel, limits, asked, memory, wor
                 row,
                 limits,
                 asked,
-                asked.edges[i],
+                edges[i],
                 memory,
                 work,
                 i,
                 tally,
             )
         elif b_first < 0 or (a_first >= 0 and nodes[3, a] > words[row + 3]):
-            counts[1, i] += avatar.count[a]
-            for child in range(a_first, a_first + avatar.count[a]):
+            counts[1, i] += held[a]
+            for child in range(a_first, a_first + held[a]):
                 if nodes_meet(
                     words, row, nodes[0, child] - off[0], nodes[1, child] - off[1], nodes[2, child] - off[2],
                     nodes[3, child], limits,
@@ -326,7 +321,6 @@ def _gather_voxel(avatar, m, i, placed, scene, voxel, limits, asked, memory, wor
                     stack[depth, 0], stack[depth, 1] = a, child_row
                     depth += 1
     memory.cursor[2] = depth
-    return memory
 
 
 @nb.njit(nogil=True, cache=True)
@@ -353,7 +347,7 @@ def gather_contacts(poses, avatar, scene, reach, which, asked, closes, pause, me
         if cursor[1] < end and asked.visits >= 0:
             extent, farthest = place_nodes(avatar, poses[i], reach.scales[i], placed, scene)
             limits = make_limits(reach.units[i], scene.units_per_step, extent, farthest, scene.voxel_steps)
-            work.bound[0] = _listing_bound(memory, asked.limit, scene.units_per_step, limits)
+            work.bound[0] = _listing_bound(memory.heap, memory.sizes[KEPT], scene.units_per_step, limits)
             while cursor[1] < end:
                 voxel = reach.rows[cursor[1]]
                 if scene.where[voxel, 0] < 0:
@@ -361,12 +355,21 @@ def gather_contacts(poses, avatar, scene, reach, which, asked, closes, pause, me
                     cursor[1] += 1
                     continue
                 before = tally.counts[1, i]
-                if before >= asked.visits:
+                short = memory.sizes[CELLS] + LANES > memory.cells.table.shape[0]
+                # Over the budget, and not only stopped for want of room?
+                if before >= asked.visits and not (short and cursor[2] > 0):
                     break
                 if left <= 0:
                     return memory
                 stop = min(np.int64(asked.visits), before + left)
-                memory = _gather_voxel(
+                if short:
+                    # Here and not in the descent: a loop that changes a tuple of arrays counts their references in
+                    # every turn, which took a third of the time.
+                    memory = Memory(
+                        grow_cells(memory.cells, memory.sizes[CELLS]), memory.heap, memory.sizes, cursor, memory.stack,
+                        memory.pairs, memory.clusters,
+                    )  # fmt: skip
+                _gather_voxel(
                     avatar, poses[i], i, placed, scene, voxel, limits, asked, memory, work, tally, stop
                 )
                 left -= tally.counts[1, i] - before

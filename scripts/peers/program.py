@@ -35,6 +35,11 @@ def _nightly() -> list[str] | None:
     return None
 
 
+def _flat(poses: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Poses (k, 4, 4) as README.md describes them, (k, 12)."""
+    return np.concatenate([poses[:, :3, :3].reshape(-1, 9), poses[:, :3, 3]], axis=1).astype("<f4")
+
+
 class Peers:
     """The program kept running on one case, so that its loops can alternate with another side's.
 
@@ -57,8 +62,7 @@ class Peers:
         be near, for all becomes float32.  distance: both radii together [m].
         """
         self.folder = folder
-        flat = np.concatenate([poses[:, :3, :3].reshape(-1, 9), poses[:, :3, 3]], axis=1)
-        for name, rows in (("scene", scene), ("avatar", avatar), ("poses", flat)):
+        for name, rows in (("scene", scene), ("avatar", avatar), ("poses", _flat(poses))):
             rows.astype("<f4").tofile(folder / f"{name}.f32")
         words = [program, folder, distance, "--loops", loops, "--per-pose", folder, "--turns"]
         self.process = subprocess.Popen(
@@ -81,12 +85,22 @@ class Peers:
             raise RuntimeError(f"scripts/peers: exit code {self.process.wait()}: its reason is above")
         return line
 
-    def turn(self, name: str) -> float:
-        """One loop of a side over all poses, after one that warms it [us a pose]."""
+    def turn(self, name: str, file: Path | None = None) -> float:
+        """One loop of a side over all poses, or those of a file, after one that warms it [us a pose]."""
         assert self.process.stdin is not None
-        self.process.stdin.write(name + "\n")
+        self.process.stdin.write(f"{name} {file}\n" if file else f"{name}\n")
         self.process.stdin.flush()
         return float(self._line())
+
+    def give(self, label: str, poses: NDArray[np.float64]) -> Path:
+        """Write other poses (k, 4, 4), avatar to the scene's frame, as a file for `turn`."""
+        file = self.folder / f"{label}.f32"
+        _flat(poses).tofile(file)
+        return file
+
+    def touching_of(self, name: str, file: Path) -> NDArray[np.bool_]:
+        """Which poses (k,) of a file touch, says this side, once it had a turn with it."""
+        return np.fromfile(f"{file}.{name}.u8", np.uint8) == 1
 
     def touching(self, name: str) -> NDArray[np.bool_]:
         """Which poses (k,) touch, says this side."""

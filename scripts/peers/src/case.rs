@@ -19,9 +19,14 @@ impl Case {
         Ok(Self {
             scene: rows(&folder.join("scene.f32"))?,
             avatar: rows(&folder.join("avatar.f32"))?,
-            poses: rows(&folder.join("poses.f32"))?,
+            poses: read_poses(&folder.join("poses.f32"))?,
         })
     }
+}
+
+/// The poses of a file such as `poses.f32`.
+pub fn read_poses(path: &Path) -> Result<Vec<Pose>, String> {
+    rows(path)
 }
 
 fn rows<const K: usize>(path: &Path) -> Result<Vec<[f32; K]>, String> {

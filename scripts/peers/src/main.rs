@@ -8,7 +8,7 @@ mod side;
 use case::{Case, morton_order};
 use side::Side;
 use std::io::Write;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 #[global_allocator]
 static HEAP: heap::Counting = heap::Counting;
@@ -134,14 +134,21 @@ fn report(side: &Side, case: &Case, options: &Options, times: &[f64]) -> Result<
     ))
 }
 
-/// Answer each name on standard input with one timed loop of that side, after one that warms its caches.
+/// Answer each line on standard input, `SIDE` or `SIDE FILE`, with one timed loop of that side, after one that warms
+/// its caches. FILE has other poses, as poses.f32 has them; their verdicts go to `FILE.SIDE.u8`.
 fn take_turns(sides: &[Side], case: &Case) -> Result<(), String> {
     for line in std::io::stdin().lines() {
         let line = line.map_err(|e| format!("standard input: {e}"))?;
-        let side =
-            sides.iter().find(|s| s.name == line.trim()).ok_or(format!("no side is named {line:?}"))?;
-        side.time(&case.poses);
-        println!("{:.4}", side.time(&case.poses));
+        let (name, file) = line.trim().split_once(' ').unwrap_or((line.trim(), ""));
+        let side = sides.iter().find(|s| s.name == name).ok_or(format!("no side is named {name:?}"))?;
+        let given = if file.is_empty() { None } else { Some(case::read_poses(Path::new(file))?) };
+        let poses = given.as_ref().unwrap_or(&case.poses);
+        if given.is_some() {
+            let target = format!("{file}.{name}.u8");
+            std::fs::write(&target, side.verdicts(poses)).map_err(|e| format!("{target}: {e}"))?;
+        }
+        side.time(poses);
+        println!("{:.4}", side.time(poses));
         std::io::stdout().flush().map_err(|e| format!("standard output: {e}"))?;
     }
     Ok(())

@@ -1,0 +1,226 @@
+"""What the benchmark found: figures, goals and notes, as a table, JSON and CSV."""
+
+import csv
+import dataclasses
+import json
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+# One process at a time is ours, two in `paths`; above this others took turns with them.
+BUSY_SECTION = 2.0
+MET, MISSED, NOT_MEASURED = "met", "missed", "not measured"
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One figure. case: what was asked about.  side: who answered.  what: what was measured.
+
+    value: the median of the repetitions.  best: the best of them.  count: poses, rays, points behind it.
+    """
+
+    section: str
+    case: str
+    side: str
+    what: str
+    value: float
+    unit: str
+    best: float | None = None
+    repetitions: int = 1
+    count: int | None = None
+
+
+@dataclass(frozen=True)
+class Goal:
+    """A goal beside its figure. measured, limit: None where not measured.  at_least: else the figure is at most it.
+
+    key: of its note in notes.py.
+    """
+
+    key: str
+    section: str
+    text: str
+    measured: float | None
+    limit: float | None
+    unit: str
+    at_least: bool = False
+
+    @property
+    def met(self) -> bool | None:
+        """Whether it is reached; None: not measured. A figure that is no number reaches nothing."""
+        if self.measured is None or self.limit is None:
+            return None
+        return self.measured >= self.limit if self.at_least else self.measured <= self.limit
+
+    @property
+    def word(self) -> str:
+        """`met`, `missed` or `not measured`."""
+        return {True: MET, False: MISSED, None: NOT_MEASURED}[self.met]
+
+
+@dataclass
+class Part:
+    """What one section found. remarks: sentences.  wrong: verdicts that are not as the judge says, a sentence each.
+
+    missing: what could not be measured, and why.  error: why the section ended early, or None.
+    load: average while it ran, itself included.
+    """
+
+    section: str
+    figures: list[Figure] = field(default_factory=list)
+    goals: list[Goal] = field(default_factory=list)
+    remarks: list[str] = field(default_factory=list)
+    wrong: list[str] = field(default_factory=list)
+    missing: list[str] = field(default_factory=list)
+    error: str | None = None
+    seconds: float = 0.0
+    load: float = 0.0
+
+    def add(
+        self,
+        case: str,
+        side: str,
+        what: str,
+        values: float | Iterable[float],
+        unit: str,
+        count: int | None = None,
+    ) -> float:
+        """Add a figure of one or more repetitions; returns its value, their median."""
+        times = np.atleast_1d(np.asarray(values, np.float64))
+        best = float(times.max() if unit.endswith("/s") else times.min())
+        value = float(np.median(times))
+        self.figures.append(Figure(self.section, case, side, what, value, unit, best, len(times), count))
+        return value
+
+    def goal(
+        self,
+        key: str,
+        text: str,
+        measured: float | None,
+        limit: float | None,
+        unit: str,
+        *,
+        at_least: bool = False,
+    ) -> None:
+        """Add a goal."""
+        self.goals.append(Goal(key, self.section, text, measured, limit, unit, at_least))
+
+    def value(self, case: str, side: str, what: str) -> float | None:
+        """A figure that was added; None: it was not."""
+        for figure in self.figures:
+            if (figure.case, figure.side, figure.what) == (case, side, what):
+                return figure.value
+        return None
+
+
+def ratio(above: float | None, below: float | None) -> float | None:
+    """above / below; None where either is missing, or below is zero."""
+    return None if above is None or not below else above / below
+
+
+def number(value: float | None) -> str:
+    """A figure for people: three digits that count, thousands apart."""
+    if value is None:
+        return "-"
+    if not math.isfinite(value) or value == 0:
+        return f"{value:g}"
+    digits = max(0, 2 - math.floor(math.log10(abs(value))))
+    return f"{value:,.{digits}f}"
+
+
+def busy(parts: Iterable[Part]) -> str:
+    """What to say of other work on the machine; empty where there was none to speak of."""
+    loads = [part.load for part in parts]
+    worst = max(loads, default=0.0)
+    return f"the machine was busy with other work, load {worst:.1f}" if worst > BUSY_SECTION else ""
+
+
+def goal_rows(parts: Iterable[Part], notes: dict[str, str]) -> list[dict[str, Any]]:
+    """One row a goal, for the table, the JSON and the picture."""
+    return [
+        {
+            "section": goal.section,
+            "goal": goal.text,
+            "measured": goal.measured,
+            "limit": goal.limit,
+            "sense": ">=" if goal.at_least else "<=",
+            "unit": goal.unit,
+            "verdict": goal.word,
+            "note": notes.get(goal.key, ""),
+        }
+        for part in parts
+        for goal in part.goals
+    ]
+
+
+def show(parts: list[Part], notes: dict[str, str]) -> None:
+    """Print figures, then goals with what was tried, then what is wrong or missing."""
+    console = Console(width=150)
+    for part in parts:
+        if part.figures:
+            console.print(_figures_table(part))
+        for line in part.remarks:
+            console.print(f"  {line}", style="dim")
+    rows = goal_rows(parts, notes)
+    if rows:
+        table = Table(title="goals of section `Speed`")
+        for name, justify in (
+            ("goal", "left"), ("figure", "right"), ("", "center"), ("limit", "right"), ("unit", "left"), ("", "left"),
+        ):  # fmt: skip
+            table.add_column(name, justify=justify)  # type: ignore[arg-type]
+        for row in rows:
+            style = {MET: "green", MISSED: "bold red", NOT_MEASURED: "yellow"}[row["verdict"]]
+            table.add_row(
+                row["goal"], number(row["measured"]), row["sense"], number(row["limit"]), row["unit"],
+                f"[{style}]{row['verdict']}[/]",
+            )  # fmt: skip
+        console.print(table)
+    if busy(parts):
+        console.print(f"{busy(parts)}: not figures to quote", style="bold red")
+    for row in rows:
+        if row["note"] or row["verdict"] == MISSED:
+            console.print(f"{row['verdict']}: {row['goal']}: {row['note'] or 'no note yet'}")
+    for part in parts:
+        for line in part.missing:
+            console.print(f"not measured ({part.section}): {line}", style="yellow")
+        if part.error:
+            console.print(f"section {part.section} ended early: {part.error}", style="bold red")
+        for line in part.wrong:
+            console.print(f"WRONG ({part.section}): {line}", style="bold red")
+
+
+def _figures_table(part: Part) -> Table:
+    table = Table(title=f"{part.section} ({part.seconds:.0f} s)")
+    for name, justify in (("case", "left"), ("side", "left"), ("what", "left")):
+        table.add_column(name, justify=justify)  # type: ignore[arg-type]
+    for name in ("median", "best", "unit", "of"):
+        table.add_column(name, justify="left" if name == "unit" else "right")
+    last = ""
+    for f in part.figures:
+        table.add_row(
+            "" if f.case == last else f.case, f.side, f.what, number(f.value),
+            number(f.best) if f.repetitions > 1 else "", f.unit, "" if f.count is None else f"{f.count:,}",
+        )  # fmt: skip
+        last = f.case
+    return table
+
+
+def write(parts: list[Part], notes: dict[str, str], about: dict[str, Any], target: Path) -> None:
+    """Write the report as JSON, and all figures as CSV beside it."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    report = {
+        **about,
+        "goals": goal_rows(parts, notes),
+        "sections": [dataclasses.asdict(part) for part in parts],
+    }
+    target.write_text(json.dumps(report, indent=1) + "\n")
+    with open(target.with_suffix(".csv"), "w", newline="") as file:
+        writer = csv.DictWriter(file, [f.name for f in dataclasses.fields(Figure)])
+        writer.writeheader()
+        writer.writerows(dataclasses.asdict(figure) for part in parts for figure in part.figures)

@@ -1,0 +1,31 @@
+"""Section `structures`: the paper's structure beside ours, degrees 4 to 16; only when asked for (--only structures).
+
+`scripts/walkthrough` says more of each, frame by frame, with the paper's own table.
+"""
+
+from solidcloud.server.report.case import PAPER_VOXEL, STEP, Case, made_case
+from solidcloud.server.report.walkthrough import DEGREES, build_structures, measure
+
+from .context import Bench
+from .machine import Clock, say
+from .results import Part
+from .sides import COLLIDE
+
+
+def run(bench: Bench, clock: Clock) -> Part:
+    """Build a façade for each degree and kind of node, and time the walk in each."""
+    part = Part("structures")
+    scratch = bench.folder / "structures"
+    scratch.mkdir()
+    case: Case = made_case(scratch, PAPER_VOXEL)
+    structures = build_structures(case, DEGREES, scratch, say)
+    # `measure` raises when two structures answer differently. It also walks frame by frame: minutes a loop.
+    measure(case, structures, max(1, min(bench.loops, 3)), say)
+    for s in structures:
+        label = f"{s.kind}, degree {s.degree}"
+        part.add("walk", label, COLLIDE, s.loops / len(case.poses) * 1e6, "µs", len(case.poses))
+        part.add("walk", label, "node visits a pose", s.node_visits, "")
+        part.add("walk", label, "point tests a pose", s.point_tests, "")
+        part.add("walk", label, "resident", s.resident_bytes / s.points, "bytes/point", s.points)
+    part.remarks.append(f"lattice {STEP * 1e3:g} mm, voxel {PAPER_VOXEL:g} m; {clock.spent:.0f} s")
+    return part

@@ -8,6 +8,8 @@ from numpy.typing import ArrayLike, NDArray
 from ..schemas.answers import CollideAnswers
 from ..schemas.messages import make_poses
 from .avatar import AvatarModel
+from .bounded import collide_bounded
+from .effort import EXACT, Effort
 from .kernels.overlap import CLEAR, UNKNOWN, answer_resident, overlap_poses
 from .request import SceneData, check_request, in_unknown, pieces, refuse, to_units
 
@@ -50,14 +52,19 @@ def _answer_at_once(
     )  # fmt: skip
 
 
-def collide(data: SceneData, avatar: AvatarModel, poses: ArrayLike, margin: float = 0.0) -> CollideAnswers:
+def collide(
+    data: SceneData, avatar: AvatarModel, poses: ArrayLike, margin: float = 0.0, effort: Effort = EXACT
+) -> CollideAnswers:
     """Whether the avatar touches the scene under each pose.
 
     poses: (k, 4, 4) float64, avatar to world, rigid or with a uniform scale, bits used as given.
     margin: distance below or at which two spheres are called in contact [m].
+    effort: with a tolerance or a budget, see `collide_bounded`.
     CONTACT, CLEAR or UNKNOWN (a voxel in reach cannot be read, or a scan was left out there, and no contact was
     found elsewhere); the definition is NUMERICS.md N5. Raises BadRequestError, BadTransformError, TooLargeError.
     """
+    if effort.bounded:
+        return collide_bounded(data, avatar, poses, margin, effort)
     begin = time.perf_counter()
     array = make_poses(poses)
     if not array.flags.writeable:

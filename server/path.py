@@ -72,10 +72,8 @@ def path_question(
         return (
             lambda a, b: sweep(data, avatar, poses[a:b], poses[a + 1 : b + 1], margin, tolerance, effort)
         ), max(0, len(poses) - 1)
-    if effort.bounded:
-        given["effort"] = effort
     question: Any = {"collide": collide, "distance": distance, "contacts": contacts}[op]
-    return (lambda a, b: question(data, avatar, poses[a:b], **given)), len(poses)
+    return (lambda a, b: question(data, avatar, poses[a:b], **given, effort=effort)), len(poses)
 
 
 def largest_part(op: str, parameters: dict[str, Any]) -> int:

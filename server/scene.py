@@ -121,7 +121,7 @@ class Scene:
         # A budget that is never spent: what is bounded has kernels of its own.
         for effort in (EXACT, Effort(tolerance=1e-3, visits=1 << 20)):
             for poses in (pose, np.concatenate([pose, pose])):
-                collide(self._data, avatar, poses)
+                collide(self._data, avatar, poses, 0.0, effort)
             distance(self._data, avatar, pose, 0.01, effort)
             contacts(self._data, avatar, pose, effort=effort)
             sweep(self._data, avatar, pose, pose, effort=effort)
@@ -169,7 +169,7 @@ class Scene:
         tolerance [m], budget_ms, budget_visits: what the answer may cost, here and below; see server/effort.py.
         """
         effort = make_effort(tolerance, budget_ms, budget_visits)
-        return collide(self._data, self._avatar(name, client), poses, margin, **_only_if_bounded(effort))
+        return collide(self._data, self._avatar(name, client), poses, margin, effort)
 
     def distance(
         self,
@@ -296,10 +296,6 @@ class Scene:
         with self._lock:
             for key in [key for key in self._avatars if key[0] == client]:
                 del self._avatars[key]
-
-
-def _only_if_bounded(effort: Effort) -> dict[str, Any]:
-    return {"effort": effort} if effort.bounded else {}
 
 
 def describe(store: Store, name: str) -> SceneInfo:

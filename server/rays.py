@@ -7,13 +7,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..schemas.answers import RaycastAnswers
 from ..schemas.errors import BadRequestError
+from ..schemas.requests import make_vectors
 from ..schemas.voxel_grid import UNITS_PER_METRE
 from .effort import EXACT, Effort
 from .kernels.placing import MAX_REACH_UNITS
 from .kernels.rays import Nearest, Rays, follow_rays
 from .kernels.voxel_tree import Lists
 from .request import SceneData, to_units
-from .rounds import finish, look, make_origins, make_vectors
+from .rounds import finish, look, make_origins
 
 # Differences within this reach are exact in float64: 2^53 units are 134,000 km.
 MAX_RAY_REACH = 1e6

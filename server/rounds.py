@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..schemas.errors import BadRequestError
+from ..schemas.requests import make_vectors
 from ..schemas.voxel_grid import MAX_COORDINATE, UNITS_PER_METRE
 from .effort import Effort
 from .kernels.rays import Nearest
@@ -43,20 +44,6 @@ def voxel_tree(data: SceneData) -> VoxelTree:
         tree = make_voxel_tree(data.broad.low, data.broad.high, data.unknown)
         _trees[data.residency] = tree
     return tree
-
-
-def make_vectors(values: ArrayLike, what: str) -> NDArray[np.float64]:
-    """Positions or directions (k, 3) float64, finite, of a writeable array. Raises BadRequestError."""
-    try:
-        array = np.asarray(values, np.float64)
-    except (TypeError, ValueError) as error:
-        raise BadRequestError(f"{what}: {error}: expected numbers") from None
-    if array.ndim != 2 or array.shape[1] != 3:
-        raise BadRequestError(f"{what} of shape {array.shape}: expected (k, 3)")
-    if not np.isfinite(array).all():
-        row = int(np.flatnonzero(~np.isfinite(array).all(axis=1))[0])
-        raise BadRequestError(f"{what} {row} holds {array[row].tolist()}: expected finite numbers")
-    return array
 
 
 def make_origins(
@@ -144,7 +131,8 @@ def look(
             rows = _next_rows(data, lists, cursor, open_)
             held = np.zeros(len(looked), bool)
             held[rows] = True
-            with data.residency.hold(rows.tolist()) as found:
+            with data.residency.hold(rows.tolist(), effort.deadline) as found:
+                held[list(found.late)] = False  # they may be written to just now
                 kernel(begin, end, lists, cursor, held, part)
             hits += max(0, found.hits - int(looked[rows].sum()))
             misses += found.misses

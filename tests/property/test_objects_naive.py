@@ -53,7 +53,7 @@ def at_random(
     return cases.pose_of(turn, rng.uniform(-box, box, 3) + ORIGIN_SHIFT - turn @ middle)
 
 
-@settings(max_examples=40, deadline=None, derandomize=True)
+@settings(max_examples=25, deadline=None, derandomize=True)
 @given(
     seed=st.integers(0, 2**32 - 1),
     kinds=st.lists(
@@ -62,7 +62,7 @@ def at_random(
     n=st.sampled_from([0, 1, 2, 7, 14]),
     box=st.sampled_from([0.2, 0.6, 2.0]),
     margin=st.sampled_from([0.0, 0.02, 0.3]),
-    bits=st.sampled_from([ALL, 7, 3]),
+    bits=st.sampled_from([SCENE_GROUP - 1, 7, 3]),
 )
 def test_pairs_are_those_of_the_definition(
     data: SceneData, seed: int, kinds: list[str], n: int, box: float, margin: float, bits: int
@@ -89,7 +89,7 @@ def test_pairs_are_those_of_the_definition(
     assert turned.pairs_tested == answers.pairs_tested and turned.pairs_filtered == answers.pairs_filtered
 
 
-@settings(max_examples=30, deadline=None, derandomize=True)
+@settings(max_examples=20, deadline=None, derandomize=True)
 @given(
     seed=st.integers(0, 2**32 - 1),
     kinds=st.tuples(*[st.sampled_from(["point", "few", "many", "off"])] * 2),

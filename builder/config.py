@@ -14,6 +14,7 @@ RADIUS_SAMPLE = 1_000_000
 SHARD_POINTS = 1 << 22
 
 DEFAULT_STEP = 1e-4
+CELL_KINDS = ("octree", "balanced")
 
 # Radii and margins are compared as integers whose squares must fit (schemas/NUMERICS.md N5): 16 m in all.
 MAX_RADIUS = 8.0
@@ -31,6 +32,7 @@ class BuildConfig:
     leaf: points a leaf node, up to 32, the width of the vector test.
     cell_points: an octree cell above this is split: small enough for 16-bit trees, large enough that a
     cell's own row is noise in the archive.
+    cells: "octree", or "balanced": cells are merged too, so that all trees have one height (balance.py).
     spacing: meshes are sampled about this far apart [m]; None: their vertices are taken.
     with_slab: cut each sphere by a slab; False is the paper's structure, for comparison.
     jobs: worker processes; 0: one a core.  memory_bytes: bound on what the passes hold.
@@ -44,6 +46,7 @@ class BuildConfig:
     degree: int = 8
     leaf: int = 32
     cell_points: int = 4096
+    cells: str = "octree"
     spacing: float | None = None
     radius: float | None = None
     with_slab: bool = True
@@ -64,6 +67,7 @@ class BuildConfig:
             ),
             (1 <= self.leaf <= MAX_LEAF, f"--leaf {self.leaf}", f"1 to {MAX_LEAF}"),
             (self.cell_points >= 1, f"cell_points {self.cell_points}", "at least 1"),
+            (self.cells in CELL_KINDS, f"--cells {self.cells}", " or ".join(CELL_KINDS)),
             (0 < self.voxel < math.inf, f"--voxel {self.voxel}", "a positive length in metres"),
             (
                 self.resolution is None or 0 < self.resolution < math.inf,
@@ -104,4 +108,6 @@ class BuildConfig:
             "radius": self.radius,
             "with_slab": self.with_slab,
             "keep": ",".join(sorted(self.keep)),
+            # Named only where it is not the default: archives without it stay what they were, byte for byte.
+            **({} if self.cells == "octree" else {"cells": self.cells}),
         }

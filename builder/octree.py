@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..schemas.voxel import CELL_BITS, Cells, Nodes, VoxelData, top_shift
+from .balance import balance_cells, tree_limits
 from .config import BuildConfig
 from .hierarchy import Bounds, Hierarchy, bound_runs, build_hierarchy
 from .kernels.octree import split_octree, voxel_codes
@@ -28,12 +29,12 @@ def _canonical(points: VoxelPoints) -> tuple[VoxelPoints, NDArray[np.uint64]]:
     codes = voxel_codes(points.local)
     columns = [c for c in (points.intensity, points.scan_index) if c is not None]
     order = np.lexsort((*columns, codes)) if columns else np.argsort(codes, kind="stable")
-    taken = VoxelPoints(
-        points.local[order],
-        None if points.scan_index is None else points.scan_index[order],
-        None if points.intensity is None else points.intensity[order],
-    )
-    return taken, codes[order]
+    return _taken(points, order), codes[order]
+
+
+def _taken(points: VoxelPoints, order: NDArray[np.int64]) -> VoxelPoints:
+    """The points in another order."""
+    return VoxelPoints(*(None if column is None else column[order] for column in points))
 
 
 def build_voxel(key: int, points: VoxelPoints, voxel_steps: int, config: BuildConfig) -> VoxelData:
@@ -44,7 +45,12 @@ def build_voxel(key: int, points: VoxelPoints, voxel_steps: int, config: BuildCo
     """
     points, codes = _canonical(points)
     root_log2 = int(voxel_steps - 1).bit_length()
-    starts, log2_size = split_octree(codes, root_log2, CELL_BITS, config.cell_points)
+    if config.cells == "balanced":
+        limits = tree_limits(config.cell_points, config.leaf, config.degree)
+        order, starts, log2_size = balance_cells(codes, root_log2, CELL_BITS, *limits)
+        points = _taken(points, order)
+    else:
+        starts, log2_size = split_octree(codes, root_log2, CELL_BITS, config.cell_points)
     ends = np.append(starts[1:], len(codes))
     size = np.int64(1) << log2_size.astype(np.int64)
     low = points.local[starts] // size[:, None] * size[:, None]

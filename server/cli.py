@@ -167,6 +167,9 @@ def build(
     ] = None,
     degree: Annotated[int, typer.Option(help="Children of a node.")] = 8,
     leaf: Annotated[int, typer.Option(help="Points of a leaf node, at most.")] = 32,
+    cells: Annotated[
+        str, typer.Option(help="octree, or balanced: cells merged too, so that all trees have one height.")
+    ] = "octree",
     jobs: Annotated[int, typer.Option(help="Worker processes; 0: one a core.")] = 0,
     memory: Annotated[str, typer.Option(help="What the build may hold in memory.")] = "2GB",
     spacing: Annotated[
@@ -196,6 +199,7 @@ def build(
         resolution=resolution,
         degree=degree,
         leaf=leaf,
+        cells=cells,
         jobs=jobs,
         memory_bytes=parse_bytes(memory, "--memory"),
         spacing=spacing,

@@ -122,8 +122,10 @@ def _filled(found: np.ndarray, of_null: float) -> np.ndarray:
     )
 
 
-def _array_to_bin(value: Any) -> bytes:
-    """The bytes of an array, for MessagePack."""
+def _array_to_bin(value: Any) -> Any:
+    """The bytes of an array, for MessagePack; a number of numpy's as one of Python's."""
+    if isinstance(value, np.generic):
+        return value.item()
     if not isinstance(value, np.ndarray):
         raise NotImplementedError(f"a message cannot hold {type(value).__name__}")
     if not value.dtype.isnative or sys.byteorder == "big":
@@ -132,9 +134,9 @@ def _array_to_bin(value: Any) -> bytes:
     return value.tobytes()
 
 
-def _array_to_lists(value: Any) -> list:
-    """The nested lists of an array, for JSON; msgspec writes what is not finite as null."""
-    if not isinstance(value, np.ndarray):
+def _array_to_lists(value: Any) -> Any:
+    """The nested lists of an array, or a number of numpy's, for JSON; msgspec writes what is not finite as null."""
+    if not isinstance(value, np.ndarray | np.generic):
         raise NotImplementedError(f"a message cannot hold {type(value).__name__}")
     return value.tolist()
 

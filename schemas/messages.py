@@ -210,7 +210,7 @@ def json_schemas() -> dict[str, str]:
             definition["description"] = inspect.cleandoc(definition["description"])
         properties = components["$defs"][kind.__name__]["properties"]
         for name, of in array_fields(kind).items():
-            default = {"default": []} if "default" in properties[name] else {}
+            default: dict[str, Any] = {"default": []} if "default" in properties[name] else {}
             properties[name] = _array_schema(of, nullable=not issubclass(kind, Request)) | default
         text = msgspec.json.format(msgspec.json.encode(components, order="sorted"), indent=2)
         texts[kind.__name__] = text.decode() + "\n"

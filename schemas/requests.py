@@ -322,7 +322,11 @@ def _check_duration(what: str, value: float) -> None:
 
 def _check_integer(what: str, value: int, most: int) -> None:
     """BadRequestError for what is no integer from 0 to `most`."""
-    if not isinstance(value, int) or not 0 <= value <= most:
+    try:
+        fits = 0 <= operator.index(value) <= most
+    except TypeError:
+        fits = False
+    if not fits:
         raise BadRequestError(f"{what} is {value}: expected an integer from 0 to {most}")
 
 

@@ -50,9 +50,9 @@ def summary_line(answers: Any) -> str:
     return f"{len(answers)} {word}: {counts}; {answers.engine_seconds * 1e3:.2f} ms in the engine"
 
 
-def answers_json(times: list[float], answers: Any) -> dict[str, Any]:
+def answers_json(times: list[float], answers: Cost) -> dict[str, Any]:
     """Answers as they are printed with --json; what is infinite or NaN is null. times: (k,) [s], or empty."""
-    k = len(answers)
+    k = len(answers)  # type: ignore[arg-type]
     rows: list[dict[str, Any]] = [{"t": t} for t in times] or [{} for _ in range(k)]
     for name, of in array_fields(type(answers)).items():
         column = getattr(answers, name)

@@ -21,7 +21,8 @@ class ServerConfig:
     workers: requests answered at the same time. 2: one client that does not take its replies holds one.
     max_in_flight: requests accepted and not yet answered, over all clients; one more is answered `busy`.
     max_in_flight_bytes: the same for the bytes of their payloads.
-    max_paths: paths answered at the same time, each by a thread that sends its parts; one more is answered `busy`.
+    max_paths: paths answered at the same time, each by a thread that sends its parts, half of them of one client; one
+    more is answered `busy`.
     max_poses, max_avatar_points: of one request; more is answered `too_large`.
     stop_seconds: how long a stop waits for accepted requests to be answered.
     """

@@ -2,7 +2,8 @@
 
 zenoh hands queries to a bounded channel; our own threads take them from there, since nothing may block in
 one of its callbacks. Requests of one client are answered one at a time and in order, those of several
-clients side by side, so that a client that does not take its replies stalls no other.
+clients side by side, so that a client that does not take its replies stalls no other. An answer in parts is sent by a
+thread of its own, beside all others.
 """
 
 import json
@@ -60,8 +61,8 @@ class Offer(Enum):
 class FairQueues:
     """A queue for each client: one request of each in flight, the clients in turn, the whole bounded.
 
-    Thread-safe. Every RUN is followed by `finished`, and so is every request that `finished` returns;
-    that is why nothing that waits is ever forgotten.
+    Thread-safe. Every RUN is followed by `finished`, or by `detach` and `release`, and so is every request that these
+    return; that is why nothing that waits is ever forgotten.
     """
 
     def __init__(self, workers: int, max_requests: int, max_bytes: int) -> None:
@@ -70,7 +71,6 @@ class FairQueues:
         self._waiting: dict[str, deque[tuple[Any, int]]] = {}
         self._ready: deque[str] = deque()  # clients with something waiting and nothing in flight
         self._running: dict[str, int] = {}  # client: bytes of its request in flight
-        self._detached: dict[str, int] = {}  # the same of those in flight that take up no worker
         self._requests = self._bytes = 0
 
     def offer(self, client: str, request: Any, size: int, *, always: bool = False) -> Offer:
@@ -81,46 +81,45 @@ class FairQueues:
                 return Offer.FULL
             self._requests += 1
             self._bytes += size
-            at_work = client in self._running or client in self._detached
-            if not at_work and len(self._running) < self._workers:
+            if client not in self._running and len(self._running) < self._workers:
                 self._running[client] = size
                 return Offer.RUN
             if client not in self._waiting:
                 self._waiting[client] = deque()
-                if not at_work:
+                if client not in self._running:
                     self._ready.append(client)
             self._waiting[client].append((request, size))
             return Offer.WAIT
 
     def finished(self, client: str) -> tuple[str, Any] | None:
         """The client's request in flight is answered. Returns the (client, request) to run next, if any."""
-        with self._lock:
-            self._requests -= 1
-            detached = self._detached.pop(client, None)
-            self._bytes -= self._running.pop(client) if detached is None else detached
-            if client in self._waiting:
-                self._ready.append(client)
-            return self._next()
+        size, following = self.detach(client)
+        self.release(size)
+        return following
 
-    def detach(self, client: str) -> tuple[str, Any] | None:
-        """The client's request in flight goes on, but takes up no worker; `finished` follows all the same.
+    def detach(self, client: str) -> tuple[int, tuple[str, Any] | None]:
+        """The client's request in flight goes on, but takes up neither a worker nor its client's turn.
 
-        Returns the (client, request) to run next, if any.
+        Returns its size, to be given to `release` once it is answered, and the (client, request) to run next, if any.
         """
         with self._lock:
-            self._detached[client] = self._running.pop(client)
-            return self._next()
+            size = self._running.pop(client)
+            if client in self._waiting:
+                self._ready.append(client)
+            if not self._ready:
+                return size, None
+            following = self._ready.popleft()
+            request, following_size = self._waiting[following].popleft()
+            if not self._waiting[following]:
+                del self._waiting[following]
+            self._running[following] = following_size
+            return size, (following, request)
 
-    def _next(self) -> tuple[str, Any] | None:
-        """The next request, if one is ready and a worker free for it; with the lock held."""
-        if not self._ready or len(self._running) >= self._workers:
-            return None
-        following = self._ready.popleft()
-        request, size = self._waiting[following].popleft()
-        if not self._waiting[following]:
-            del self._waiting[following]
-        self._running[following] = size
-        return following, request
+    def release(self, size: int) -> None:
+        """A request of `size` bytes is answered."""
+        with self._lock:
+            self._requests -= 1
+            self._bytes -= size
 
     def __len__(self) -> int:
         """Requests taken in and not yet finished."""
@@ -280,7 +279,7 @@ class _Lane:
     ) -> None:
         self._service, self._scene, self._queues = service, scene, queues
         self._start, self._max_paths = start, max_paths
-        self._streaming: set[str] = set()  # clients whose answer is on its way in parts
+        self._streaming: set[_Request] = set()  # whose answers are on their way in parts
 
     def take(self, queries: Any) -> None:
         """One thread's work: take queries, answer them or leave them to the thread that is at work."""
@@ -306,7 +305,8 @@ class _Lane:
             if sample.kind != zenoh.SampleKind.DELETE:
                 continue
             client = str(sample.key_expr).rpartition("/")[2]
-            self._streaming.discard(client)  # nobody takes the rest
+            # Nobody takes the rest of its paths.
+            self._streaming.difference_update([r for r in list(self._streaming) if r.client == client])
             if self._queues.offer(client, _Gone(client), 0, always=True) is Offer.RUN:
                 self._run(client, _Gone(client))
 
@@ -327,15 +327,17 @@ class _Lane:
                 if parts is None:
                     following = self._queues.finished(client)
                 else:
-                    following = self._queues.detach(client)
-                    self._start(f"{self._scene}-parts", self._stream, request, parts)
+                    size, following = self._queues.detach(client)
+                    self._start(f"{self._scene}-parts", self._stream, request, parts, size)
 
     def _answer(self, request: "_Request") -> Iterator[Answer] | None:
         """Have one query answered. What comes in parts is returned, to be sent by a thread of its own."""
         answer = self._service.answer(request.key, request.payload, _encoding(request.query))
         if not isinstance(answer, Answer):
-            if len(self._streaming) < self._max_paths:
-                self._streaming.add(request.client)
+            # One client may take half of the room, so that there is always some for another.
+            own = sum(other.client == request.client for other in list(self._streaming))
+            if len(self._streaming) < self._max_paths and own < max(1, self._max_paths // 2):
+                self._streaming.add(request)
                 return answer
             answer = self._service.busy(_encoding(request.query))
         # Leaving `with query` tells the client that no more will come.
@@ -343,20 +345,18 @@ class _Lane:
             _reply(query, request.key_expr, answer)
         return None
 
-    def _stream(self, request: "_Request", answers: Iterator[Answer]) -> None:
-        """Send an answer's parts; then run what waits. A thread's work."""
+    def _stream(self, request: "_Request", answers: Iterator[Answer], size: int) -> None:
+        """Send an answer's parts. A thread's work."""
         try:
             with request.query as query:
                 for answer in answers:
-                    if request.client not in self._streaming or not _reply(query, request.key_expr, answer):
+                    if request not in self._streaming or not _reply(query, request.key_expr, answer):
                         break
         except Exception:
             log.exception("parts for client %s of scene %s", request.client, self._scene)
         finally:
-            self._streaming.discard(request.client)
-            following = self._queues.finished(request.client)
-        if following is not None:
-            self._run(*following)
+            self._streaming.discard(request)
+            self._queues.release(size)
 
 
 class _Request:

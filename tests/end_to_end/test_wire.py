@@ -370,6 +370,17 @@ def test_long_paths_hold_up_nobody_else(client, scene, endpoint):
             assert sum(len(part) for part in path) == 85
 
 
+def test_a_client_may_ask_while_its_path_is_on_its_way(client, scene):
+    client.add_avatar("wait", POINTS, 0.125)
+    client.add_avatar("al", POINTS, 0.125)
+    path = client.path("wait", PATH)
+    first = next(path)
+    assert np.array_equal(joined(list(client.path("al", PATH))), TRUTH)
+    assert client.collide("al", heights([-1.0])).verdict.tolist() == [Verdict.CONTACT]
+    scene.gate.set()
+    assert np.array_equal(joined([first, *path]), TRUTH)
+
+
 def test_a_client_that_goes_is_sent_no_more_parts(scene, endpoint):
     with serving([scene], ServerConfig(listen=endpoint)):
         with Client(endpoint, scene="floor", timeout=DEADLINE) as client:
@@ -396,6 +407,7 @@ def test_more_paths_than_the_server_takes_are_busy(scene, endpoint):
         next(path)
         with pytest.raises(BusyError):
             list(two.path("al", PATH))
+        assert two.collide("al", heights([-1.0])).verdict.tolist() == [Verdict.CONTACT]
         scene.gate.set()
         assert sum(len(part) for part in path) == 85
         assert np.array_equal(joined(list(two.path("al", PATH))), TRUTH)

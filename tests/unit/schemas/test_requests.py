@@ -99,6 +99,15 @@ def test_fields_that_are_not_known_are_refused(request_):
             decode_request(type(request_), coder.encode(raw), encoding)
 
 
+@pytest.mark.parametrize("encoding", [MSGPACK, JSON])
+def test_numbers_of_numpys_are_numbers(encoding):
+    given = {"limit": np.int64(5), "margin": np.float32(0.25), "budget_visits": np.uint32(7)}
+    got = decode_request(ContactsRequest, encode(ContactsRequest("al", POSES, **given), encoding), encoding)
+    assert (got.limit, got.margin, got.budget_visits) == (5, 0.25, 7)
+    with pytest.raises(BadRequestError, match=r"limit is 2\.5"):
+        ContactsRequest("al", POSES, 2.5)
+
+
 def test_a_sweep_defaults_to_a_micrometre():
     assert SweepRequest(avatar="al", pose_from=POSES, pose_to=POSES).tolerance == 1e-6
     assert CollideRequest("al", POSES).tolerance == 0.0

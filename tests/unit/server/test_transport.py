@@ -55,26 +55,20 @@ def test_what_is_over_the_bounds_is_refused():
     assert queues.offer("a", 5, 1000) is Offer.RUN, "one alone is never refused"
 
 
-def test_a_detached_request_takes_up_no_worker_but_its_clients_next_waits():
-    queues = FairQueues(1, 10, 1000)
+def test_a_detached_request_takes_up_neither_a_worker_nor_its_clients_turn():
+    queues = FairQueues(1, 3, 1000)
     assert queues.offer("path", 1, 60) is Offer.RUN
     assert queues.offer("other", 2, 1) is Offer.WAIT
-    assert queues.detach("path") == ("other", 2)
+    assert queues.detach("path") == (60, ("other", 2))
     assert queues.offer("path", 3, 1) is Offer.WAIT
-    assert queues.offer("third", 4, 1) is Offer.WAIT
-    assert queues.finished("other") == ("third", 4), "the path's client has a request in flight"
-    assert queues.finished("path") is None, "no worker is free"
-    assert queues.offer("path", 5, 1) is Offer.WAIT
-    assert queues.finished("third") == ("path", 3)
-    assert queues.finished("path") == ("path", 5)
+    assert queues.offer("third", 4, 1) is Offer.FULL, "what is detached counts until it is released"
+    assert queues.finished("other") == ("path", 3)
+    queues.release(60)
+    assert len(queues) == 1
     assert queues.finished("path") is None
     assert len(queues) == 0
-    assert queues.offer("path", 6, 1) is Offer.RUN
-    assert queues.detach("path") is None
-    assert queues.offer("other", 7, 1) is Offer.RUN
-    assert queues.finished("other") is None
-    assert queues.offer("path", 8, 1) is Offer.WAIT
-    assert queues.finished("path") == ("path", 8), "whoever ends the path runs what waits"
+    assert queues.offer("other", 5, 1000) is Offer.RUN, "its bytes are released too"
+    assert queues.detach("other") == (1000, None)
 
 
 def test_nothing_is_forgotten_by_several_threads():
@@ -92,17 +86,12 @@ def test_nothing_is_forgotten_by_several_threads():
             with lock:
                 del at_work[client]
             if request % 7 == 0:  # its answer goes on in a thread of its own
-                following = queues.detach(client)
-                other = threading.Thread(target=end, args=(client,))
+                size, following = queues.detach(client)
+                other = threading.Thread(target=queues.release, args=(size,))
                 other.start()
                 others.append(other)
             else:
                 following = queues.finished(client)
-
-    def end(client):
-        following = queues.finished(client)
-        if following is not None:
-            run(*following)
 
     def offer(seed):
         rng = np.random.default_rng(seed)

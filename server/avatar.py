@@ -9,6 +9,7 @@ from ..builder.radius import build_local, mean_closest_distance
 from ..schemas.errors import BadRequestError
 from ..schemas.messages import make_positions
 from ..schemas.voxel_grid import MAX_COORDINATE
+from .kernels.front import MAX_FRONT
 from .kernels.layout import LANES
 from .kernels.placing import Avatar
 
@@ -54,6 +55,8 @@ def make_avatar(points: ArrayLike, radius: float | None = None) -> AvatarModel:
             np.empty(0, np.int32),
             np.empty(0, np.int32),
             np.empty((0, 3, LANES)),
+            np.empty((4, 0)),
+            0,
         )
         return AvatarModel(array, float(radius or 0.0), empty, np.empty((0, LANES), np.int32))
     local = build_local(array, leaf=LANES, degree=DEGREE)
@@ -77,11 +80,17 @@ def make_avatar(points: ArrayLike, radius: float | None = None) -> AvatarModel:
     # The lattice point lies within sqrt(3) steps of the point as given: two steps more hold it, rounding included.
     center = np.asarray(local.low + bounds.center * local.step)
     node_radius = np.asarray((bounds.radius + 2) * local.step, np.float64)
+    # The deepest level that fits: the leaf nodes, for avatars of up to some 8,000 points.
+    sizes = np.diff(tree.levels)
+    level = int(np.flatnonzero(sizes <= MAX_FRONT)[-1])
+    front = slice(int(tree.levels[level]), int(tree.levels[level + 1]))
     arrays = Avatar(
         center,
         node_radius,
         first,
         tree.count.astype(np.int32),
         np.ascontiguousarray(lanes),
+        np.concatenate([center[front].T, node_radius[None, front]]),
+        front.start,
     )
     return AvatarModel(array, float(radius), arrays, np.ascontiguousarray(rows, np.int32))

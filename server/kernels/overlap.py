@@ -1,8 +1,12 @@
 """Do two bounding sphere hierarchies touch under a pose? [Fig12] section 6, figures 5 and 6, corrected.
 
 As printed, the figures descend into "all children A[i] and B[j]" when A is a leaf and B is not: a leaf has no
-children, the loop runs zero times, and the contact is lost. Here the larger inner node is descended, and a
-leaf never is.
+children, the loop runs zero times, and the contact is lost. Here an inner node is descended, whichever side it is on,
+and a leaf never is.
+
+The scene's tree is descended with the whole front of the avatar's (front.py). Where a scene node is a leaf, or flat
+compared with the avatar's leaf nodes, the avatar's points themselves are held against its bound, LANES in a vector
+step: a slab over a floor then clears a foot that stands a centimetre above it, where the foot's sphere would not.
 
 What decides is an inequality of integers (NUMERICS.md N5). A float32 pass finds nearly all there is to know:
 distances are in lattice steps from a lattice point near the avatar, where scene coordinates are whole numbers
@@ -10,78 +14,169 @@ below 2^24 and so exact, and the placed avatar carries an error `error` that is 
 points below `near` touch, above `far` do not; only between them are the integers asked.
 """
 
+from typing import NamedTuple
+
 import numba as nb
 import numpy as np
+from numpy.typing import NDArray
 
+from .front import MOST_LEVELS, make_front, move_node, pad, place_front, sift, take_kept
 from .layout import BLOCK_WORDS, COUNT, FIRST, LANES, ROW_WORDS
-from .placed import ONE_SLACK, SLACK, make_limits, make_placed, pair_in_reach, place_block, place_nodes
-from .placing import GOOD
+from .placed import (
+    ONE_SLACK,
+    SLACK,
+    make_limits,
+    make_placed,
+    node_reach,
+    pair_in_reach,
+    place_block,
+    place_lanes,
+    place_root,
+)
+from .placing import GOOD, place
 from .reach import Reach, find_reach
 
 # A pair is pushed for each child of one of its nodes, so at most 15 a level stay behind on the stack: this holds
-# two trees of MOST_LEVELS. Trees of degree 2 over 2^31 points have 32 levels a BSH.
-MOST_LEVELS = 80
+# two trees of MOST_LEVELS.
 STACK = 2 * MOST_LEVELS * 15 + 16
 CLEAR, CONTACT, UNKNOWN = 0, 1, 2  # schemas/answers.py Verdict
+
+U = np.uint64  # see front.py
+# A scene node whose slab is thinner than this many radii of an avatar's leaf node is called flat: the avatar's points
+# are tested against it at once. 0.5 to 2 take the same time on the walk, 8 takes a fifth more.
+FLAT = np.float32(1.0)
+# Scene nodes of more than this many radii of the avatar's root are met by most of its front: the root alone is tested.
+BROAD = np.float32(2.0)
+
+
+class Work(NamedTuple):
+    """Scratch of one call. stack: (STACK, 3) int64: scene row, where its list begins, length.
+
+    pairs: (STACK, 2) int64: avatar node, scene row; one element where the front is leaf nodes.  keep: (LANES,) bool,
+    and keep8: the same as uint64, eight at a time.  counters: (2,) int64: node visits, point tests.
+    """
+
+    stack: NDArray[np.int64]
+    pairs: NDArray[np.int64]
+    keep: NDArray[np.bool_]
+    keep8: NDArray[np.uint64]
+    counters: NDArray[np.int64]
+
+
+class Spot(NamedTuple):
+    """Where the arena holds one voxel: its first row, block and lane, and float32 offsets from the frame."""
+
+    rows: int
+    blocks: int
+    lanes: int
+    x: np.float32
+    y: np.float32
+    z: np.float32
+
+
+@nb.njit(nogil=True, cache=True)
+def make_work(avatar):
+    """Scratch for one avatar (not empty)."""
+    pairs = STACK if avatar.first[avatar.front_first] >= 0 else 1
+    keep = np.zeros(LANES, np.bool_)
+    stack, counters = np.empty((STACK, 3), np.int64), np.zeros(2, np.int64)
+    return Work(stack, np.empty((pairs, 2), np.int64), keep, keep.view(np.uint64), counters)
 
 
 @nb.njit(nogil=True, cache=True)
 def nodes_meet(words, row, x, y, z, radius, limits):
     """Whether a sphere (float32, from the voxel's low corner) comes within reach of a node's points, as far as its
     bound can tell: the sphere test of [Fig12] line 2, then the slab."""
-    dx, dy, dz = x - words[row], y - words[row + 1], z - words[row + 2]
+    w = U(row)
+    dx, dy, dz = x - words[w], y - words[w + U(1)], z - words[w + U(2)]
     span = radius + limits.reach + limits.error
-    both = words[row + 3] + span
-    if dx * dx + dy * dy + dz * dz > both * both * ONE_SLACK:
-        return False
-    along = words[row + 4] * dx + words[row + 5] * dy + words[row + 6] * dz
-    # Beyond `both` the line above has answered, so rounding of `along` is SLACK of that at most.
-    room = words[row + 7] * (span + SLACK * both + SLACK * both)
-    return along <= words[row + 9] + room and along >= words[row + 8] - room
+    both = words[w + U(3)] + span
+    along = words[w + U(4)] * dx + words[w + U(5)] * dy + words[w + U(6)] * dz
+    # Beyond `both` the sphere has answered, so rounding of `along` is SLACK of that at most.
+    room = words[w + U(7)] * (span + SLACK * both + SLACK * both)
+    # One branch on all three costs less than three that are hard to foresee.
+    return (
+        (dx * dx + dy * dy + dz * dz <= both * both * ONE_SLACK)
+        & (along <= words[w + U(9)] + room)
+        & (along >= words[w + U(8)] - room)
+    )
 
 
 @nb.njit(nogil=True, cache=True)
-def _leaves_touch(avatar, m, block, placed, scene, voxel, row, off, limits, keep, counters):
-    """Whether a leaf node of the avatar and one of the scene hold a pair in contact.
-
-    First all avatar points against the scene node's bound, in one vector loop; of those that remain, each
-    against all points of the node. Most avatar points end at the bound.
-    """
-    words, ints, halves = scene.words, scene.ints, scene.halves
-    lanes = placed.lanes
-    cx, cy, cz = words[row] + off[0], words[row + 1] + off[1], words[row + 2] + off[2]
-    nx, ny, nz, length = words[row + 4], words[row + 5], words[row + 6], words[row + 7]
-    both = words[row + 3] + limits.reach + limits.error
-    room = length * (limits.reach + limits.error + SLACK * both + SLACK * both)
-    least, most = words[row + 8] - room, words[row + 9] + room
+def lanes_meet(words, row, lanes, block, off_x, off_y, off_z, room, keep):
+    """Mark in `keep` which points of an avatar's block (from the frame) come within `room`, reach and error together,
+    of the bound of the scene node `row`. Returns whether any does."""
+    w = U(row)
+    cx, cy, cz = words[w] + off_x, words[w + U(1)] + off_y, words[w + U(2)] + off_z
+    nx, ny, nz = words[w + U(4)], words[w + U(5)], words[w + U(6)]
+    both = words[w + U(3)] + room
+    wide = words[w + U(7)] * (room + SLACK * both + SLACK * both)
+    low, high = words[w + U(8)] - wide, words[w + U(9)] + wide
     square = both * both * ONE_SLACK
+    b = U(block)
+    any_meets = False
     for j in range(LANES):
-        dx, dy, dz = lanes[block, 0, j] - cx, lanes[block, 1, j] - cy, lanes[block, 2, j] - cz
+        dx, dy, dz = lanes[b, 0, U(j)] - cx, lanes[b, 1, U(j)] - cy, lanes[b, 2, U(j)] - cz
         along = nx * dx + ny * dy + nz * dz
-        keep[j] = (dx * dx + dy * dy + dz * dz <= square) & (along <= most) & (along >= least)
-    scene_block = ~ints[row + FIRST]
-    block_at = scene.where[voxel, 1] + scene_block * BLOCK_WORDS
-    lane_at = scene.where[voxel, 2] + scene_block * 3 * LANES
-    lx = off[0] + np.float32(ints[block_at])
-    ly = off[1] + np.float32(ints[block_at + 1])
-    lz = off[2] + np.float32(ints[block_at + 2])
-    for lane in range(LANES):
-        if not keep[lane]:
+        meets = (dx * dx + dy * dy + dz * dz <= square) & (along <= high) & (along >= low)
+        keep[U(j)] = meets
+        any_meets |= meets
+    return any_meets
+
+
+@nb.njit(nogil=True, cache=True)
+def next_near(halves, lane_at, low_x, low_y, low_z, lanes, block, far, keep, keep8, begin):
+    """The first marked point, from `begin` on, of an avatar's block that may be near a point of a scene's block.
+
+    lane_at: the scene's block in `halves`; low: its corner from the frame.  far: a square, see `Limits`.
+    Returns (lane or -1, how many were tested against the block).
+    """
+    h, b = U(lane_at), U(block)
+    tested = 0
+    for eight in range(begin // 8, LANES // 8):
+        if keep8[U(eight)] == U(0):
             continue
-        x, y, z = lanes[block, 0, lane] - lx, lanes[block, 1, lane] - ly, lanes[block, 2, lane] - lz
-        counters[1] += LANES
-        touched = False
+        for lane in range(8 * eight, 8 * eight + 8):
+            if lane < begin or not keep[U(lane)]:
+                continue
+            tested += 1
+            x, y, z = lanes[b, 0, U(lane)] - low_x, lanes[b, 1, U(lane)] - low_y, lanes[b, 2, U(lane)] - low_z
+            touched = False
+            for j in range(LANES):
+                i = h + U(j)
+                dx = np.float32(halves[i]) - x
+                dy = np.float32(halves[i + U(LANES)]) - y
+                dz = np.float32(halves[i + U(2 * LANES)]) - z
+                touched |= dx * dx + dy * dy + dz * dz <= far
+            if touched:
+                return lane, tested
+    return -1, tested
+
+
+@nb.njit(nogil=True, cache=True, inline="always")
+def leaves_touch(avatar, m, block, placed, scene, voxel, spot, row, limits, work):
+    """Whether a marked point of an avatar's block touches a point of the scene's leaf node `row`."""
+    halves, lanes = scene.halves, placed.lanes
+    number = ~np.int64(scene.ints[U(row + FIRST)])
+    block_at = spot.blocks + number * BLOCK_WORDS
+    lane_at = spot.lanes + number * 3 * LANES
+    low_x = spot.x + np.float32(scene.ints[U(block_at)])
+    low_y = spot.y + np.float32(scene.ints[U(block_at + 1)])
+    low_z = spot.z + np.float32(scene.ints[U(block_at + 2)])
+    begin = 0
+    while begin < LANES:
+        lane, tested = next_near(
+            halves, lane_at, low_x, low_y, low_z, lanes, block, limits.far, work.keep, work.keep8, begin
+        )
+        work.counters[1] += LANES * tested
+        if lane < 0:
+            return False
+        x, y, z = lanes[block, 0, lane] - low_x, lanes[block, 1, lane] - low_y, lanes[block, 2, lane] - low_z
         for j in range(LANES):
-            dx = np.float32(halves[lane_at + j]) - x
-            dy = np.float32(halves[lane_at + LANES + j]) - y
-            dz = np.float32(halves[lane_at + 2 * LANES + j]) - z
-            touched |= dx * dx + dy * dy + dz * dz <= limits.far
-        if not touched:
-            continue
-        for j in range(LANES):
-            dx = np.float32(halves[lane_at + j]) - x
-            dy = np.float32(halves[lane_at + LANES + j]) - y
-            dz = np.float32(halves[lane_at + 2 * LANES + j]) - z
+            i = U(lane_at + j)
+            dx = np.float32(halves[i]) - x
+            dy = np.float32(halves[i + U(LANES)]) - y
+            dz = np.float32(halves[i + U(2 * LANES)]) - z
             square = dx * dx + dy * dy + dz * dz
             if square <= limits.near:
                 return True
@@ -89,53 +184,159 @@ def _leaves_touch(avatar, m, block, placed, scene, voxel, row, off, limits, keep
                 avatar, m, block, lane, placed, scene, voxel, lane_at, block_at, j, limits.units
             ):
                 return True
+        begin = lane + 1
     return False
 
 
 @nb.njit(nogil=True, cache=True)
-def _overlap_voxel(avatar, m, pose, placed, scene, voxel, limits, stack, keep, off, counters):
-    """Whether the placed avatar touches one resident voxel: the two trees descended together, depth first."""
-    words, ints = scene.words, scene.ints
-    base = scene.where[voxel, 0]
-    nodes = placed.nodes
-    for r in range(3):
-        off[r] = np.float32(scene.coordinates[voxel, r] * scene.voxel_steps - placed.frame[r])
-    counters[0] += 1
-    if not nodes_meet(
-        words, base, nodes[0, 0] - off[0], nodes[1, 0] - off[1], nodes[2, 0] - off[2], nodes[3, 0], limits
-    ):
-        return False
-    stack[0, 0], stack[0, 1] = 0, base
+def _block_placed(avatar, m, pose, block, placed, scene):
+    """Place a block of the avatar unless it is already placed for this pose."""
+    if placed.stamp[U(block)] != pose:
+        place_block(avatar, m, block, placed, scene)
+        placed.stamp[U(block)] = pose
+
+
+@nb.njit(nogil=True, cache=True)
+def _pairs_touch(avatar, m, scale, extent, pose, placed, scene, voxel, spot, a, row, limits, work):
+    """Whether the subtrees of an avatar's node and a scene's hold a pair in contact: both descended, depth first, the
+    larger inner node first. For avatars whose front is not their leaf nodes."""
+    words, ints, pairs = scene.words, scene.ints, work.pairs
+    room = limits.reach + limits.error
+    steps = scale / scene.step
+    pairs[0, 0], pairs[0, 1] = a, row
     depth = 1
     while depth > 0:
         depth -= 1
-        a, row = stack[depth, 0], stack[depth, 1]
-        a_first, b_first = avatar.first[a], ints[row + FIRST]
-        if a_first < 0 and b_first < 0:
-            block = ~a_first
-            if placed.stamp[block] != pose:
-                place_block(avatar, m, block, placed, scene)
-                placed.stamp[block] = pose
-            if _leaves_touch(avatar, m, block, placed, scene, voxel, row, off, limits, keep, counters):
-                return True
-        elif b_first < 0 or (a_first >= 0 and nodes[3, a] > words[row + 3]):
-            counters[0] += avatar.count[a]
-            for child in range(a_first, a_first + avatar.count[a]):
-                if nodes_meet(
-                    words, row, nodes[0, child] - off[0], nodes[1, child] - off[1], nodes[2, child] - off[2],
-                    nodes[3, child], limits,
-                ):  # fmt: skip
-                    stack[depth, 0], stack[depth, 1] = child, row
-                    depth += 1
+        a, row = pairs[depth, 0], pairs[depth, 1]
+        a_first, b_first = avatar.first[a], np.int64(ints[U(row + FIRST)])
+        work.counters[0] += 1
+        if a_first < 0:
+            block = np.int64(~a_first)
+            _block_placed(avatar, m, pose, block, placed, scene)
+            if not lanes_meet(words, row, placed.lanes, block, spot.x, spot.y, spot.z, room, work.keep):
+                continue
+            if b_first < 0:
+                if leaves_touch(avatar, m, block, placed, scene, voxel, spot, row, limits, work):
+                    return True
+                continue
         else:
-            x, y, z = nodes[0, a] - off[0], nodes[1, a] - off[1], nodes[2, a] - off[2]
-            counters[0] += ints[row + COUNT]
-            for i in range(ints[row + COUNT]):
-                child_row = base + (b_first + i) * ROW_WORDS
-                if nodes_meet(words, child_row, x, y, z, nodes[3, a], limits):
-                    stack[depth, 0], stack[depth, 1] = a, child_row
-                    depth += 1
+            x, y, z = _place_node(avatar, m, a, placed, scene)
+            radius = node_reach(avatar.radius[a], steps, extent)
+            if not nodes_meet(words, row, x - spot.x, y - spot.y, z - spot.z, radius, limits):
+                continue
+        if b_first < 0 or (a_first >= 0 and avatar.radius[a] * steps > words[U(row + 3)]):
+            for i in range(avatar.count[a]):
+                pairs[depth, 0], pairs[depth, 1] = a_first + i, row
+                depth += 1
+        else:
+            for i in range(ints[U(row + COUNT)]):
+                pairs[depth, 0], pairs[depth, 1] = a, spot.rows + (b_first + i) * ROW_WORDS
+                depth += 1
     return False
+
+
+@nb.njit(nogil=True, cache=True)
+def _place_node(avatar, m, a, placed, scene):
+    """Place one node of the avatar: x, y, z from the frame [steps], float32."""
+    per_step = 1.0 / scene.step
+    x, y, z = avatar.center[a, 0], avatar.center[a, 1], avatar.center[a, 2]
+    return (
+        np.float32(
+            (place(m, placed.shift, 0, x, y, z) - np.float64(placed.frame[0]) * scene.step) * per_step
+        ),
+        np.float32(
+            (place(m, placed.shift, 1, x, y, z) - np.float64(placed.frame[1]) * scene.step) * per_step
+        ),
+        np.float32(
+            (place(m, placed.shift, 2, x, y, z) - np.float64(placed.frame[2]) * scene.step) * per_step
+        ),
+    )
+
+
+@nb.njit(nogil=True, cache=True, inline="always")
+def _overlap_voxel(avatar, m, scale, extent, pose, placed, scene, voxel, spot, limits, front, count, work):
+    """Whether the placed avatar touches one resident voxel, whose root it meets: the scene's tree descended, depth
+    first, each node with a list of those front nodes that met its parent.
+
+    Long, because each of its inner steps takes some ten nanoseconds: a call that hands over tuples of arrays, or takes
+    arrays out of them, costs as much again (all of them in functions: 11 us a pose instead of 4).
+    """
+    words, ints, stack, counters = scene.words, scene.ints, work.stack, work.counters
+    bounds, which, nodes, lanes, stamp = front.bounds, front.which, placed.nodes, placed.lanes, placed.stamp
+    listed, listed8, keep = front.keep, front.keep8, work.keep
+    firsts, front_first, points = avatar.first, avatar.front_first, avatar.points
+    shift, frame, step = placed.shift, placed.frame, scene.step
+    off_x, off_y, off_z = spot.x, spot.y, spot.z
+    room = limits.reach + limits.error
+    x, y, z, radius = nodes[0, 0] - off_x, nodes[1, 0] - off_y, nodes[2, 0] - off_z, nodes[3, 0]
+    stack[0, 0], stack[0, 1], stack[0, 2] = spot.rows, 0, count
+    depth = 1
+    while depth > 0:
+        depth -= 1
+        row, at, count = stack[U(depth), 0], stack[U(depth), 1], stack[U(depth), 2]
+        first = np.int64(ints[U(row + FIRST)])
+        if first < 0 or words[U(row + 3)] < BROAD * radius:
+            counters[0] += count
+            steps = (count + LANES - 1) // LANES
+            if not sift(words, row, bounds, at, steps, off_x, off_y, off_z, room, listed):
+                continue
+            to = at + steps * LANES
+            count = take_kept(bounds, which, listed, listed8, at, steps, to)
+            at = to
+            thick = words[U(row + 9)] - words[U(row + 8)]
+            if first < 0 or thick < FLAT * words[U(row + 7)] * bounds[3, U(at)]:
+                left = at
+                for i in range(at, at + count):
+                    a = front_first + np.int64(which[U(i)])
+                    a_first = np.int64(firsts[U(a)])
+                    if a_first < 0:
+                        block = ~a_first
+                        if stamp[U(block)] != pose:
+                            place_lanes(points, m, block, lanes, shift, frame, step)
+                            stamp[U(block)] = pose
+                        counters[0] += 1
+                        if not lanes_meet(words, row, lanes, block, off_x, off_y, off_z, room, keep):
+                            continue
+                        if first < 0:
+                            if leaves_touch(avatar, m, block, placed, scene, voxel, spot, row, limits, work):
+                                return True
+                            continue
+                    elif first < 0:
+                        if _pairs_touch(
+                            avatar, m, scale, extent, pose, placed, scene, voxel, spot, a, row, limits, work
+                        ):
+                            return True
+                        continue
+                    move_node(bounds, which, U(i), U(left))
+                    left += 1
+                if left == at:  # always so at a leaf
+                    continue
+                pad(bounds, left, at + (count + LANES - 1) // LANES * LANES)
+                count = left - at
+        children = np.int64(ints[U(row + COUNT)])
+        child = spot.rows + first * ROW_WORDS
+        counters[0] += children
+        for _ in range(children):
+            u = U(depth)
+            stack[u, 0], stack[u, 1], stack[u, 2] = child, at, count
+            if nodes_meet(words, child, x, y, z, radius, limits):
+                depth += 1
+            child += ROW_WORDS
+    return False
+
+
+@nb.njit(nogil=True, cache=True)
+def make_spot(scene, voxel, placed):
+    """Where a resident voxel is, from the arena's start and from the frame."""
+    coordinates, where, frame = scene.coordinates, scene.where, placed.frame
+    return Spot(
+        where[voxel, 0],
+        where[voxel, 1],
+        where[voxel, 2],
+        np.float32(coordinates[voxel, 0] * scene.voxel_steps - frame[0]),
+        np.float32(coordinates[voxel, 1] * scene.voxel_steps - frame[1]),
+        np.float32(coordinates[voxel, 2] * scene.voxel_steps - frame[2]),
+    )
 
 
 @nb.njit(nogil=True, cache=True)
@@ -148,29 +349,37 @@ def overlap_poses(poses, avatar, scene, reach, which, verdict, counts):
     and 0 to begin with, so that a pose may be answered in pieces: a contact wins over anything missing, and
     that over CLEAR.
     """
-    placed = make_placed(avatar)
-    stack = np.empty((STACK, 2), np.int64)
-    keep = np.empty(LANES, np.bool_)
-    off = np.empty(3, np.float32)
-    counters = np.zeros(2, np.int64)
+    placed, front, work = make_placed(avatar), make_front(avatar), make_work(avatar)
+    nodes = placed.nodes
     for number in range(which.shape[0]):
         i = which[number]
-        counters[0], counters[1] = 0, 0
-        if verdict[i] != CONTACT and reach.starts[i + 1] > reach.starts[i]:
-            extent, farthest = place_nodes(avatar, poses[i], reach.scales[i], placed, scene)
-            limits = make_limits(reach.units[i], scene.units_per_step, extent, farthest, scene.voxel_steps)
-            for at in range(reach.starts[i], reach.starts[i + 1]):
-                voxel = reach.rows[at]
-                if scene.where[voxel, 0] < 0:
-                    counts[0, i] += np.uint32(1)
-                    verdict[i] = UNKNOWN
-                elif _overlap_voxel(
-                    avatar, poses[i], i, placed, scene, voxel, limits, stack, keep, off, counters
-                ):
-                    verdict[i] = CONTACT
-                    break
-        counts[1, i] += np.uint32(counters[0])
-        counts[2, i] += np.uint32(counters[1])
+        if verdict[i] == CONTACT or reach.starts[i + 1] == reach.starts[i]:
+            continue
+        m, scale = poses[i], reach.scales[i]
+        work.counters[0], work.counters[1] = 0, 0
+        extent, farthest = place_root(avatar, m, scale, placed, scene)
+        limits = make_limits(reach.units[i], scene.units_per_step, extent, farthest, scene.voxel_steps)
+        count = 0  # of the front: not placed, as most far poses never need it
+        for at in range(reach.starts[i], reach.starts[i + 1]):
+            voxel = reach.rows[at]
+            if scene.where[voxel, 0] < 0:
+                counts[0, i] += np.uint32(1)
+                verdict[i] = UNKNOWN
+                continue
+            spot = make_spot(scene, voxel, placed)
+            x, y, z = nodes[0, 0] - spot.x, nodes[1, 0] - spot.y, nodes[2, 0] - spot.z
+            work.counters[0] += 1
+            if not nodes_meet(scene.words, spot.rows, x, y, z, nodes[3, 0], limits):
+                continue
+            if count == 0:
+                count = place_front(avatar, m, scale, placed, scene, extent, front.bounds)
+            if _overlap_voxel(
+                avatar, m, scale, extent, i, placed, scene, voxel, spot, limits, front, count, work
+            ):
+                verdict[i] = CONTACT
+                break
+        counts[1, i] += np.uint32(work.counters[0])
+        counts[2, i] += np.uint32(work.counters[1])
 
 
 @nb.njit(nogil=True, cache=True)

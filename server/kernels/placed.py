@@ -83,39 +83,68 @@ def make_limits(units, units_per_step, extent, farthest, voxel_steps):
 
 
 @nb.njit(nogil=True, cache=True)
+def place_root(avatar, m, scale, placed, scene):
+    """Choose the frame and place an avatar's root; fills placed.frame, shift and node 0.
+
+    Returns (extent, farthest) for `make_limits`, of the whole avatar.
+    """
+    per_step = 1.0 / scene.step
+    x, y, z = avatar.center[0, 0], avatar.center[0, 1], avatar.center[0, 2]
+    extent = avatar.radius[0] * scale * per_step + 1.0
+    for r in range(3):
+        placed.shift[r] = m[r, 3] - scene.origin[r]
+        root = place(m, placed.shift, r, x, y, z)
+        placed.frame[r] = np.int64(np.rint(root * per_step))
+        placed.nodes[r, 0] = np.float32((root - np.float64(placed.frame[r]) * scene.step) * per_step)
+    placed.nodes[3, 0] = node_reach(avatar.radius[0], scale * per_step, extent)
+    return extent, largest_term(m, placed.shift, x, y, z) * per_step + extent
+
+
+@nb.njit(nogil=True, cache=True)
+def node_reach(radius, steps, extent):
+    """The radius [steps] of a placed node, rounded outward. steps: lattice steps a metre of the avatar.
+
+    1e-6: the float32 centre is off by at most U32 of `extent`, and the radius by U32 of itself.
+    """
+    return np.float32(radius * steps * (1.0 + 1e-6) + extent * 1e-6)
+
+
+@nb.njit(nogil=True, cache=True)
 def place_nodes(avatar, m, scale, placed, scene):
-    """Place an avatar's nodes; fills placed.frame, shift and nodes. Returns (extent, farthest) for `make_limits`."""
+    """Place all of an avatar's nodes; fills placed.frame, shift and nodes. Returns as `place_root` does."""
+    extent, farthest = place_root(avatar, m, scale, placed, scene)
     step = scene.step
     per_step = 1.0 / step
     nodes = placed.nodes
     for r in range(3):
-        placed.shift[r] = m[r, 3] - scene.origin[r]
-        root = place(m, placed.shift, r, avatar.center[0, 0], avatar.center[0, 1], avatar.center[0, 2])
-        placed.frame[r] = np.int64(np.rint(root * per_step))
-    center = avatar.center[0]
-    farthest = largest_term(m, placed.shift, center[0], center[1], center[2]) * per_step
-    extent = avatar.radius[0] * scale * per_step + 1.0
-    for r in range(3):
         base = np.float64(placed.frame[r]) * step
-        for i in range(avatar.center.shape[0]):
+        for i in range(1, avatar.center.shape[0]):
             world = place(m, placed.shift, r, avatar.center[i, 0], avatar.center[i, 1], avatar.center[i, 2])
             nodes[r, i] = np.float32((world - base) * per_step)
-    for i in range(avatar.center.shape[0]):
-        # + 1e-6: the float32 centre is off by at most U32 of `extent`, and the radius by U32 of itself.
-        nodes[3, i] = np.float32(avatar.radius[i] * scale * per_step * (1.0 + 1e-6) + extent * 1e-6)
-    return extent, farthest + extent
+    for i in range(1, avatar.center.shape[0]):
+        nodes[3, i] = node_reach(avatar.radius[i], scale * per_step, extent)
+    return extent, farthest
 
 
 @nb.njit(nogil=True, cache=True)
 def place_block(avatar, m, block, placed, scene):
     """Place the points of one leaf node of the avatar, all LANES at once."""
-    per_step = 1.0 / scene.step
+    place_lanes(avatar.points, m, block, placed.lanes, placed.shift, placed.frame, scene.step)
+
+
+@nb.njit(nogil=True, cache=True)
+def place_lanes(points, m, block, lanes, shift, frame, step):
+    """`place_block` with the arrays themselves: to hand over three tuples of arrays takes as long as the work."""
+    per_step = 1.0 / step
+    b = np.uint64(block)
     for r in range(3):
-        base = np.float64(placed.frame[r]) * scene.step
-        for j in range(LANES):
-            points = avatar.points
-            world = place(m, placed.shift, r, points[block, 0, j], points[block, 1, j], points[block, 2, j])
-            placed.lanes[block, r, j] = np.float32((world - base) * per_step)
+        base = np.float64(frame[r]) * step
+        m0, m1, m2, along = m[r, 0], m[r, 1], m[r, 2], shift[r]
+        for lane in range(LANES):
+            j = np.uint64(lane)
+            # As placing.place has it.
+            world = ((m0 * points[b, 0, j] + m1 * points[b, 1, j]) + m2 * points[b, 2, j]) + along
+            lanes[b, r, j] = np.float32((world - base) * per_step)
 
 
 @nb.njit(nogil=True, cache=True)

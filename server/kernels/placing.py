@@ -30,6 +30,7 @@ class Avatar(NamedTuple):
     center: (a, 3), radius: (a,) float64, avatar frame [m], rounded outward.  first: (a,) int32, first child, or
     ~block for a leaf node.  count: (a,) int32, children or points.  points: (b, 3, LANES) float64 [m], as given
     by the client, the last one repeated.
+    front: (4, f) float64, x[], y[], z[], radius[] of a level of the tree, see front.py.  front_first: its first node.
     """
 
     center: NDArray[np.float64]
@@ -37,6 +38,8 @@ class Avatar(NamedTuple):
     first: NDArray[np.int32]
     count: NDArray[np.int32]  # type: ignore[assignment]  # hides tuple.count, which nobody calls
     points: NDArray[np.float64]
+    front: NDArray[np.float64]
+    front_first: int
 
 
 @nb.njit(nogil=True, cache=True)

@@ -152,3 +152,19 @@ def _moved(node: _Node, pose: NDArray[np.float64]) -> _Node:
     copy.radius = node.radius
     copy.children = [_moved(child, pose) for child in node.children]
     return copy
+
+
+@pytest.mark.parametrize("degree", [2, 8])
+def test_an_avatar_whose_front_is_inner_nodes_equals_brute_force(
+    tmp_path: Path, rng: np.random.Generator, degree: int
+) -> None:
+    # 12,000 points: more leaf nodes than a front holds, so that the avatar's side is descended as well.
+    points = scans.make_scan("corner", 5, 4_000)
+    case = cases.build(tmp_path, points, degree=degree, leaf=8)
+    direction = rng.normal(size=(12_000, 3))
+    avatar = direction / np.linalg.norm(direction, axis=1)[:, None] * rng.uniform(0.28, 0.3, (12_000, 1))
+    low, high = points.min(axis=0) - 0.35, points.max(axis=0) + 0.35
+    poses = np.stack([cases.pose_of(cases.random_rotation(rng), rng.uniform(low, high)) for _ in range(60)])
+    expected = case.judge(avatar, 0.002, poses)
+    assert cases.ask(case, avatar, 0.002, poses).tolist() == expected.astype(int).tolist()
+    assert 5 < expected.sum() < 55

@@ -208,6 +208,21 @@ def test_a_few_objects_in_all_their_groups(data: SceneData, rng: np.random.Gener
     assert answers.pairs_filtered > 0 and not answers.verdict.any(), "the scene's bit is in no mask"
 
 
+@pytest.mark.interpreted
+def test_tangent_objects_touch_and_one_unit_apart_do_not(data: SceneData) -> None:
+    """Lengths of 3, 4, 12 and 13, as near and as far from the origin as the unit is exact."""
+    ball = make_avatar([[0.0, 0, 0]], 13 / 128)
+    for far in (0.0, 2.0**26):
+        for more, touch in ((0.0, True), (2.0**-26, False), (-(2.0**-26), True)):
+            places = np.array([[far, far, -far], [far + 3 / 64 + more, far + 4 / 64, -far + 12 / 64]])
+            poses = np.array([cases.pose_of(np.eye(3), place + data.arrays.origin) for place in places])
+            if (poses[:, :3, 3] - data.arrays.origin != places).any():
+                continue  # the origin takes bits of the place
+            for order in ([0, 1], [1, 0]):
+                found = objects(data, [ball, ball], poses[order], [1, 1], [1, 1])
+                assert (len(found.pairs) == 1) == touch
+
+
 def test_against_the_scene_as_each_alone(data: SceneData, rng: np.random.Generator) -> None:
     from solidcloud.server.collide import collide
 

@@ -259,6 +259,39 @@ def test_the_formula_is_as_near_the_ideal_as_it_says(
 
 
 @pytest.mark.interpreted
+@pytest.mark.parametrize("leaf", [1, 32])
+def test_of_spheres_hit_at_once_the_least_point_is_named(tmp_path: Path, leaf: int) -> None:
+    """The four corners of a square, by a ray through its middle; from within all four; nearest to its middle."""
+    h = 2.0**-4
+    corners = np.array([[0, h, -h], [0, h, h], [0, -h, -h], [0, -h, h]])
+    for points, least in ((corners, (0, -h, -h)), (corners[[0, 1, 3]], (0, -h, h))):
+        for order in (points, points[::-1]):
+            case = cases.build(
+                tmp_path, np.concatenate([order, [[1, 1, 1]]]), resolution=2.0**-10, radius=0.125, leaf=leaf
+            )
+            with opened(case) as data:
+                answers = raycast(data, [(-1.0, 0, 0), (0.0, 0, 0)], [(1.0, 0, 0), (0.0, 1, 0)], 9.0)
+                assert answers.cloud_point.tolist() == [list(least)] * 2
+                assert answers.distance[1] == 0 and 0.9 < answers.distance[0] < 1
+                assert within(data, [(0.0, 0, 0)], 1.0).cloud_point.tolist() == [list(least)]
+
+
+@pytest.mark.interpreted
+def test_reach_is_inclusive_to_the_unit(tmp_path: Path) -> None:
+    """Lengths of 3, 4, 12 and 13: at the reach, one unit of 2^-26 m short of it, and one beyond."""
+    unit = 2.0**-26
+    case = cases.build(tmp_path, np.array([[0.0, 0, 0], [1, 1, 1]]), resolution=2.0**-10, radius=0.25)
+    away = np.array([[3.0, 4, 12]]) / 64
+    with opened(case) as data:
+        for more, found in ((0, 1), (unit, 1), (-unit, 0)):
+            assert within(data, away, 13 / 64 + more).verdict.tolist() == [found]
+            assert raycast(data, [(-1.0, 0, 0)], [(1.0, 0, 0)], 0.75 + more).verdict.tolist() == [found]
+            # A ray along x that passes at the radius grazes; one unit farther it does not.
+            passing = [(-1.0, 0.25 - more, 0)]
+            assert raycast(data, passing, [(1.0, 0, 0)], 1.5).verdict.tolist() == [found]
+
+
+@pytest.mark.interpreted
 @pytest.mark.parametrize("kind", scans.WITH_POINTS)
 def test_a_few_rays_of_every_kind_of_scan(tmp_path: Path, rng: np.random.Generator, kind: str) -> None:
     case = cases.build(tmp_path, scans.make_scan(kind, 11, 60), radius=0.05)

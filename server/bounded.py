@@ -6,7 +6,7 @@ the same answer. With one, the time left is shared among the poses left, and loo
 
 import math
 import time
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -106,7 +106,7 @@ def _gather(
     return _Gathered(known, counts, cost)
 
 
-def _fields(cost: Cost) -> dict[str, object]:
+def _fields(cost: Cost) -> dict[str, Any]:
     return {name: getattr(cost, name) for name in Cost.__struct_fields__}
 
 
@@ -139,7 +139,7 @@ def distance_bounded(
     upper = _upper(data, known, around.units - reach_units)
     nearest = Nearest(known.square, known.pair, known.gap)
     columns = distance_columns(data, around, float(reach), reach_units, nearest, counts, upper)
-    return DistanceAnswers(**columns, **_fields(cost))  # type: ignore[arg-type]
+    return DistanceAnswers(**columns, **_fields(cost))
 
 
 def collide_bounded(
@@ -154,10 +154,10 @@ def collide_bounded(
     margin_units = to_units(margin, "margin")
     around = check_request(data, avatar, array, data.radius_units + margin_units)
     radii = around.units - margin_units
-    early = min(math.floor(effort.tolerance * UNITS_PER_METRE), MAX_REACH_UNITS)
+    early = math.floor(min(effort.tolerance * UNITS_PER_METRE, float(MAX_REACH_UNITS)))
     # Sums of float64 on both sides of a comparison: some units of slack make it one of the true numbers.
     certain = (around.units - TOLERANCE_SLACK) / data.arrays.units_per_step
-    enough = (around.units + early - TOLERANCE_SLACK) / data.arrays.units_per_step
+    enough = np.asarray((around.units + early - TOLERANCE_SLACK) / data.arrays.units_per_step, np.float64)
     goal = Goal(True, early, enough, 0.0, effort.visits)
     known, counts, cost = _gather(data, avatar, array, around, goal, effort)
     upper = _upper(data, known, radii)
@@ -174,7 +174,7 @@ def collide_bounded(
     return CollideAnswers(
         verdict.astype(np.uint8), around.outside, counts[0], counts[1], counts[2], lower, upper,
         truly | (verdict == Verdict.CLEAR), **_fields(cost),
-    )  # type: ignore[arg-type]  # fmt: skip
+    )  # fmt: skip
 
 
 def _as_poses(poses: ArrayLike) -> NDArray[np.float64]:

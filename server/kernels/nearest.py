@@ -173,9 +173,9 @@ def list_squares(halves, lane_at, x, y, z, squares):
         dz = np.float32(halves[at_z + j]) - z
         squares[j] = dx * dx + dy * dy + dz * dz
     first, least = 0, squares[0]
-    for j in range(1, LANES):
-        if squares[j] < least:
-            first, least = j, squares[j]
+    for lane in range(1, LANES):
+        if squares[lane] < least:
+            first, least = lane, squares[lane]
     return first
 
 

@@ -241,7 +241,7 @@ def _go_on(m, pose, avatar, scene, search, goal, enough, budget, until):
         b_first = 0 if row == NO_VOXEL else np.int64(ints[row + FIRST])
         leaves = row != NO_VOXEL and a_first < 0 and b_first < 0
         avatar_side = b_first < 0 or (a_first >= 0 and row != NO_VOXEL and nodes[3, a] > words[row + 3])
-        cost = 1
+        cost = np.int64(1)
         if row != NO_VOXEL and not leaves:
             cost = np.int64(avatar_count[a]) if avatar_side else np.int64(ints[row + COUNT])
         if counters[0] + cost > budget:

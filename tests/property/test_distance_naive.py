@@ -34,7 +34,7 @@ def compare(answers: DistanceAnswers, expected: list[naive_distance.Expected | N
         assert answers.verdict[i] == (Verdict.CONTACT if judged.signed <= 0 else Verdict.CLEAR)
 
 
-@settings(max_examples=60, deadline=None, derandomize=True)
+@settings(max_examples=40, deadline=None, derandomize=True)
 @given(
     seed=st.integers(0, 2**32 - 1),
     kind=st.sampled_from(KINDS),
@@ -100,7 +100,7 @@ def test_distance_and_witnesses_are_those_of_the_definition(
                     assert (again[0] is None) == (found.square > (units + radii) ** 2)
 
 
-@settings(max_examples=12, deadline=None, derandomize=True)
+@settings(max_examples=8, deadline=None, derandomize=True)
 @given(seed=st.integers(0, 2**32 - 1), kind=st.sampled_from(KINDS))
 def test_no_tree_voxel_order_or_budget_changes_an_answer(seed: int, kind: str) -> None:
     rng = np.random.default_rng(seed)

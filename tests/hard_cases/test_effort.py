@@ -1,0 +1,79 @@
+"""Hard case of tolerances and budgets; a test's number is its row in NUMERICS.md."""
+
+from pathlib import Path
+
+import cases
+import numpy as np
+import pytest
+import scans
+from solidcloud.schemas.answers import Verdict
+from solidcloud.server.bounded import collide_bounded, distance_bounded
+from solidcloud.server.effort import NO_LIMIT, Effort
+from solidcloud.server.scene import Scene
+
+CLEAR, CONTACT, UNKNOWN = Verdict
+
+
+@pytest.mark.interpreted
+def test_case_30_a_budget_takes_nothing_back(tmp_path: Path, rng: np.random.Generator) -> None:
+    case = cases.build(tmp_path, scans.make_scan("corner", 7, 300), voxel=0.7, leaf=4)
+    avatar = rng.uniform(-0.2, 0.2, (30, 3))
+    poses = cases.near_poses(rng, case.points, avatar, 25, 0.3)
+    truth = case.judge(avatar, 0.01, poses)
+    known = np.full(len(poses), UNKNOWN)
+    with Scene.open(case.archive) as scene:
+        scene.add_avatar("avatar", avatar, 0.01)
+        data, model = scene._data, scene._avatars["", "avatar"]
+        told = []
+        for visits in (0, 3, 10, 30, 100, 300, NO_LIMIT - 1):
+            verdict = collide_bounded(data, model, poses, 0.0, Effort(visits=visits)).verdict
+            assert (verdict[known != UNKNOWN] == known[known != UNKNOWN]).all()
+            assert not truth[verdict == CLEAR].any() and truth[verdict == CONTACT].all()
+            known = verdict
+            told.append(int((verdict != UNKNOWN).sum()))
+    assert told[0] < told[-1] == len(poses) and told == sorted(told) and truth.any() and not truth.all()
+
+
+@pytest.mark.interpreted
+def test_case_30_early_by_at_most_the_tolerance(tmp_path: Path) -> None:
+    # One point, one ball of 0.25 m: contact begins at a distance of exactly 0.25 m, and early at 0.25 m + 1/8 m.
+    case = cases.build(tmp_path, np.zeros((1, 3)), radius=0.0, resolution=cases.BINARY_STEP)
+    unit = 2.0**-26
+    away = np.array([0.25, 0.25 + unit, 0.375 - unit, 0.375, 0.375 + unit, 0.5])
+    poses = np.array([cases.pose_of(np.eye(3), np.array([0.0, 0.0, z])) for z in away])
+    with Scene.open(case.archive) as scene:
+        scene.add_avatar("ball", np.zeros((1, 3)), 0.25)
+        data, model = scene._data, scene._avatars["", "ball"]
+        answers = collide_bounded(data, model, poses, 0.0, Effort(tolerance=0.125))
+        near = distance_bounded(data, model, poses, 1.0, Effort(tolerance=0.125))
+    assert answers.verdict[0] == CONTACT
+    # Whether it is called early is the engine's choice; not after the tolerance, and said not to be exact.
+    assert not (answers.exact & (answers.verdict == CONTACT))[1:].any()
+    assert (answers.verdict[4:] == CLEAR).all() and answers.exact[4:].all()
+    assert (answers.verdict != UNKNOWN).all()
+    assert (near.lower <= away - 0.25).all() and (near.upper >= away - 0.25).all()
+    assert (near.upper - near.lower <= 0.125 + 1e-7).all()
+
+
+@pytest.mark.interpreted
+def test_case_30_what_is_not_resident_by_the_deadline_is_unknown(tmp_path: Path) -> None:
+    case = cases.build(tmp_path, np.array([[0.0, 0, 0], [2.0, 0, 0]]), voxel=1.0, resolution=1e-3)
+    places = [(0.5, 0, 0), (1.5, 0, 0), (1.0, 5.0, 0)]
+    poses = np.array([cases.pose_of(np.eye(3), np.array(place)) for place in places])
+    with Scene.open(case.archive) as scene:
+        scene.add_avatar("ball", np.zeros((1, 3)), 0.1)
+        data, model = scene._data, scene._avatars["", "ball"]
+        over = Effort(deadline=0.0)
+        answers = collide_bounded(data, model, poses, 0.4, over)
+        assert answers.verdict.tolist() == [UNKNOWN, UNKNOWN, CLEAR] and answers.misses == 2
+        assert answers.voxels_missing.tolist() == [1, 1, 0] and scene.residency.resident == 0
+        near = distance_bounded(data, model, poses, 1.0, over)
+        # The index alone knows that 0.39 m are free: box to box, radii of 0.1 and 0.01 m taken off.
+        assert not near.exact[:2].any() and near.exact[2] and (near.lower[:2] <= 0.39).all()
+        assert (near.lower[:2] > 0.38).all() and (near.verdict == CLEAR).all()
+        later = collide_bounded(data, model, poses, 0.4, Effort(deadline=1e12))
+        assert later.verdict.tolist() == [CONTACT, CONTACT, CLEAR] and later.exact.all()
+        again = collide_bounded(data, model, poses, 0.4, over)
+        assert again.voxels_missing.tolist() == [0, 0, 0], "resident now, though there is no time to look"
+        assert again.verdict.tolist() == [UNKNOWN, UNKNOWN, CLEAR]
+        scene.residency.check()

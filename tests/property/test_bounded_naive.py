@@ -1,0 +1,146 @@
+"""With any tolerance and any budget: bounds that hold, no false clear, no contact earlier than the tolerance."""
+
+import math
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import cases
+import naive_distance
+import numpy as np
+import pytest
+from clouds import KINDS, TREES, cloud
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from solidcloud.schemas.answers import CollideAnswers, DistanceAnswers, Verdict
+from solidcloud.server import bounded
+from solidcloud.server.bounded import collide_bounded, distance_bounded
+from solidcloud.server.effort import NO_LIMIT, Effort
+from solidcloud.server.scene import Scene
+
+# Bounds are rounded outward, by some exact units of 2^-26 m.
+ROUNDED = 2e-7
+BUDGETS = (0, 1, 5, 30, 200, 2000, NO_LIMIT - 1)
+
+
+def judge_distance(
+    answers: DistanceAnswers, signed: NDArray[np.float64], reach: float, tolerance: float, ended: bool
+) -> None:
+    """Assert what `distance` promises of true signed distances (k,), inf beyond reach; ended: not for its budget."""
+    beyond = np.isinf(signed)
+    assert (answers.lower <= np.where(beyond, reach, signed)).all() and (answers.upper >= signed).all()
+    assert (answers.signed_distance >= signed).all() and (answers.signed_distance >= answers.upper).all()
+    assert (answers.signed_distance[answers.exact] == signed[answers.exact]).all()
+    assert (signed[answers.verdict == Verdict.CONTACT] <= 0).all()
+    assert (signed[answers.verdict == Verdict.CLEAR] > 0).all()
+    found = ~np.isinf(answers.signed_distance)
+    assert (np.isfinite(answers.witness_cloud).all(axis=1) == found).all()
+    if ended:
+        assert (found == ~beyond).all()
+        assert (answers.upper[found] - answers.lower[found] <= tolerance + ROUNDED).all()
+        assert tolerance > 0 or answers.exact.all()
+
+
+def judge_collide(
+    answers: CollideAnswers, signed: NDArray[np.float64], margin: float, tolerance: float, ended: bool
+) -> None:
+    """Assert what `collide` promises of true signed distances (k,), inf beyond reach and tolerance."""
+    contact, verdict = signed <= margin, answers.verdict
+    assert (answers.lower <= np.minimum(signed, margin)).all() and (answers.upper >= signed).all()
+    assert contact[answers.exact & (verdict == Verdict.CONTACT)].all()
+    assert (signed[verdict == Verdict.CONTACT] <= margin + tolerance).all(), "too early"
+    assert not contact[verdict == Verdict.CLEAR].any(), "a false clear"
+    assert (
+        answers.exact[verdict == Verdict.CLEAR].all() and not answers.exact[verdict == Verdict.UNKNOWN].any()
+    )
+    if ended:
+        assert (verdict != Verdict.UNKNOWN).all()
+        assert tolerance > 0 or answers.exact.all()
+
+
+@settings(max_examples=15, deadline=None, derandomize=True)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    kind=st.sampled_from(KINDS),
+    body=st.sampled_from(KINDS),
+    voxel=st.sampled_from([0.3, 0.7, 5.0]),
+    heap=st.sampled_from([1, 20, bounded.HEAP_PAIRS]),
+    tree=TREES,
+)
+def test_bounds_hold_and_a_larger_budget_never_gives_worse(
+    seed: int, kind: str, body: str, voxel: float, heap: int, tree: dict[str, Any]
+) -> None:
+    rng = np.random.default_rng(seed)
+    points, avatar = cloud(rng, kind, 300), cloud(rng, body, 50) * rng.uniform(0.05, 0.5)
+    poses = cases.near_poses(rng, points, avatar, 20, 0.6)
+    tolerance = float(rng.choice([0.0, 1e-3, 0.03, 0.3]))
+    margin, reach = float(rng.choice([0.0, 0.02, 0.2])), float(rng.choice([0.05, 1.0]))
+    with TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
+        patch.setattr(bounded, "HEAP_PAIRS", heap)
+        case = cases.build(Path(folder), points, voxel=voxel, **tree)
+        with Scene.open(case.archive) as scene:
+            info = scene.info()
+            scene.add_avatar("avatar", avatar, 0.02)
+            data, model = scene._data, scene._avatars["", "avatar"]
+            scan = (points, info.origin, info.lattice_step, info.radius)
+            signed = _signed(naive_distance.distance(*scan, avatar, 0.02, poses, 5.0))
+            within = np.where(signed <= reach, signed, np.inf)
+            known = np.zeros(len(poses), bool)
+            last: DistanceAnswers | None = None
+            before: CollideAnswers | None = None
+            for visits in BUDGETS:
+                effort = Effort(tolerance, visits)
+                ended = visits == BUDGETS[-1]
+                near = distance_bounded(data, model, poses, reach, effort)
+                judge_distance(near, within, reach, tolerance, ended)
+                touch = collide_bounded(data, model, poses, margin, effort)
+                judge_collide(touch, signed, margin, tolerance, ended)
+                assert (near.node_visits <= visits).all() and (touch.node_visits <= visits).all()
+                if last is not None and before is not None:
+                    assert (near.lower >= last.lower).all() and (near.upper <= last.upper).all()
+                    assert (near.exact >= last.exact).all()
+                    # What was said stays said (NUMERICS.md case 30).
+                    assert (touch.verdict[known] == before.verdict[known]).all()
+                    assert (touch.lower >= before.lower).all() and (touch.upper <= before.upper).all()
+                last, before, known = near, touch, touch.verdict != Verdict.UNKNOWN
+            if tolerance == 0.0:
+                exact = scene.distance("avatar", poses, reach)
+                assert exact.signed_distance.tolist() == near.signed_distance.tolist()
+                assert np.array_equal(exact.witness_cloud, near.witness_cloud, equal_nan=True)
+                assert np.array_equal(exact.witness_avatar, near.witness_avatar, equal_nan=True)
+                assert scene.collide("avatar", poses, margin).verdict.tolist() == touch.verdict.tolist()
+
+
+def _signed(judged: list[naive_distance.Expected | None]) -> NDArray[np.float64]:
+    return np.array([math.inf if found is None else found.signed for found in judged])
+
+
+@settings(max_examples=4, deadline=None, derandomize=True)
+@given(seed=st.integers(0, 2**32 - 1), kind=st.sampled_from(KINDS), tree=TREES)
+def test_in_pieces_and_in_slices_the_bounds_hold_as_well(seed: int, kind: str, tree: dict[str, Any]) -> None:
+    """A cache of two voxels; and a deadline far away, so that the search is left and resumed."""
+    rng = np.random.default_rng(seed)
+    points, avatar = cloud(rng, kind, 300), cloud(rng, "sphere", 50) * 0.3
+    poses = cases.near_poses(rng, points, avatar, 12, 0.6)
+    with TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
+        patch.setattr(bounded, "SLICE_VISITS", 7)
+        case = cases.build(Path(folder), points, voxel=0.5, **tree)
+        with Scene.open(case.archive) as scene:
+            info = scene.info()
+            budget = 2 * max(scene.residency.bytes_of([row]) for row in range(info.voxels))
+            scan = (points, info.origin, info.lattice_step, info.radius)
+        signed = _signed(naive_distance.distance(*scan, avatar, 0.02, poses, 0.8))
+        for options in ({}, {"budget_bytes": budget}):
+            with Scene.open(case.archive, **options) as scene:
+                scene.add_avatar("avatar", avatar, 0.02)
+                data, model = scene._data, scene._avatars["", "avatar"]
+                for visits in (0, 40, 300, NO_LIMIT - 1):
+                    for deadline in (math.inf, 1e12, 0.0):
+                        effort = Effort(0.01, visits, deadline)
+                        ended = visits == NO_LIMIT - 1 and deadline > 0
+                        near = distance_bounded(data, model, poses, 0.8, effort)
+                        judge_distance(near, signed, 0.8, 0.01, ended)
+                        touch = collide_bounded(data, model, poses, 0.1, effort)
+                        judge_collide(touch, signed, 0.1, 0.01, ended)
+                        scene.residency.check()

@@ -13,7 +13,7 @@ import zstandard
 from numpy.typing import NDArray
 
 from .errors import CorruptError
-from .kernels.rows import delta_along, interleave, lanes_to_points, leaf_column
+from .kernels.rows import delta_along, join_planes, lanes_to_points, leaf_column
 from .voxel import (
     MAX_LEAF,
     Cells,
@@ -25,6 +25,7 @@ from .voxel import (
     link_tree,
     read_lanes,
     top_shift,
+    transposed,
 )
 
 # zstd's own default; higher levels gain little here, as the entropy is in the low bytes.
@@ -111,48 +112,51 @@ def encode_voxel(voxel: VoxelData, archive_id: bytes) -> Record:
 class OpenRecord(NamedTuple):
     """A record decompressed, its tree checked; its points still as the frame has them, to be read once, in place.
 
-    voxel: its data, but no points (0, 3) and no columns.  links: see there.  leaves: leaf nodes, b.
-    planes: (w, p) uint8, the byte planes of the points' rows.  dtype: of a row.  voxel_steps: edge of a voxel.
+    cells, nodes: columns of several components as (3, n), as the byte planes give them.  links: see there.
+    leaves: leaf nodes, b.  planes: (w, p) uint8, the byte planes of the points' rows, of dtype `dtype`.
     """
 
-    voxel: VoxelData
+    key: int
+    voxel_steps: int
+    cells: Cells
+    nodes: Nodes
     links: Links
     leaves: int
     planes: NDArray[np.uint8]
     dtype: np.dtype
-    voxel_steps: int
+
+    @property
+    def tree(self) -> tuple[NDArray[np.int32], NDArray[np.bool_], NDArray[np.int32]]:
+        """The links as kernels take them."""
+        return self.links.first, self.links.is_leaf, self.links.cell
 
     def read_points(self, lanes: NDArray[np.uint16]) -> None:
         """Write the points into lanes (b, 3, MAX_LEAF), the last of a leaf node repeated to its end.
 
         Raises CorruptError when one lies outside its cell; what is in `lanes` then means nothing.
         """
-        v = self.voxel
-        read_lanes(
-            f"voxel {v.key:#x}", self.planes[:6], v.cells, v.nodes, self.links, self.voxel_steps, lanes
-        )
+        name = f"voxel {self.key:#x}"
+        read_lanes(name, self.planes[:6], self.cells, self.nodes, self.links, self.voxel_steps, lanes)
 
     def read_scans(self, lanes: NDArray[np.uint16]) -> None:
         """Write scan_index, in a record that has it, into lanes (b, MAX_LEAF), as `read_points` does."""
         at = self.dtype.fields["scan_index"][1]  # type: ignore[index]  # its dtype has fields
-        links = self.links
-        leaf_column(
-            self.planes[at : at + 2], (links.first, links.is_leaf, links.cell), self.voxel.nodes.count, lanes
-        )
+        leaf_column(self.planes[at : at + 2], self.tree, self.nodes.count, lanes)
 
     def decode(self) -> tuple[VoxelData, Links]:
         """The whole voxel, its points in rows. Raises CorruptError when a point lies outside its cell."""
         lanes = np.empty((self.leaves, 3, MAX_LEAF), np.uint16)
         self.read_points(lanes)
-        links = self.links
         points = np.empty((self.planes.shape[1], 3), np.uint16)
-        lanes_to_points(lanes, (links.first, links.is_leaf, links.cell), self.voxel.nodes.count, points)
-        columns = {
+        lanes_to_points(lanes, self.tree, self.nodes.count, points)
+        kept = {
             field: _column(self.planes, self.dtype, field)
             for field in ("scan_index", "intensity")
             if field in (self.dtype.names or ())
         }
-        return self.voxel._replace(points=points, **columns), links
+        cells, nodes = transposed(self.cells), transposed(self.nodes)
+        voxel = VoxelData(self.key, top_shift(self.voxel_steps), cells, nodes, points, **kept)
+        return voxel, self.links
 
 
 def open_record(
@@ -180,9 +184,10 @@ def open_record(
     node_columns = Nodes(*(_column(node_planes, NODE_DTYPE, field) for field in Nodes._fields))
     links = link_tree(name, cell_columns, node_columns.count)
     check_tree(name, cell_columns, node_columns, links, shape.point_rows, voxel_steps)
-    voxel = VoxelData(key, top_shift(voxel_steps), cell_columns, node_columns, np.empty((0, 3), np.uint16))
     leaves = int(np.count_nonzero(links.is_leaf))
-    return OpenRecord(voxel, links, leaves, point_planes, shape.point_dtype, voxel_steps)
+    return OpenRecord(
+        key, voxel_steps, cell_columns, node_columns, links, leaves, point_planes, shape.point_dtype
+    )
 
 
 def decode_voxel(
@@ -245,8 +250,9 @@ def _decompressor() -> zstandard.ZstdDecompressor:
 
 
 def _column(planes: NDArray[np.uint8], dtype: np.dtype, field: str) -> NDArray:
-    """One field of packed rows, as an array of its own, from their byte planes (itemsize, n)."""
+    """One field of packed rows from their byte planes (itemsize, n): (n,), or (3, n) where it has three components."""
     kind, at = dtype.fields[field][:2]  # type: ignore[index]  # compound, all of them
-    column = np.empty((planes.shape[1], *kind.shape), kind.base)
-    interleave(planes[at : at + kind.itemsize], column.view(np.uint8).reshape(planes.shape[1], kind.itemsize))
-    return column
+    n, size = planes.shape[1], kind.base.itemsize
+    words = np.empty((kind.itemsize // size, n), f"u{size}")
+    join_planes(planes[at : at + kind.itemsize], words)
+    return words.view(kind.base).reshape(*kind.shape, n)

@@ -8,7 +8,7 @@ Node order: the nodes of the top BSH, level by level from its root; then the roo
 cell order; then, cell by cell, the cell's other nodes, level by level. A voxel of one cell has no top BSH.
 """
 
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -112,10 +112,19 @@ def link_tree(name: str, cells: Cells, count: NDArray[np.uint8]) -> Links:
     return Links(first, is_leaf, cell_of, height)
 
 
+Columns = TypeVar("Columns", Cells, Nodes)
+
+
+def transposed(columns: Columns) -> Columns:
+    """The columns with those of several components as (3, n) instead of (n, 3), contiguous, or the other way round."""
+    return type(columns)(*(np.ascontiguousarray(column.T) for column in columns))
+
+
 def check_tree(name: str, cells: Cells, nodes: Nodes, links: Links, points: int, voxel_steps: int) -> None:
     """Check what a kernel relies on in a voxel whose counts `link_nodes` has added up, but for the points.
 
-    name: of the voxel, for messages.  points: how many there are. Raises CorruptError naming the fault.
+    name: of the voxel, for messages.  cells, nodes: transposed.  points: how many there are. Raises CorruptError
+    naming the fault.
     """
     claimed = int(cells.points.sum(dtype=np.int64))
     if claimed != points:
@@ -124,7 +133,7 @@ def check_tree(name: str, cells: Cells, nodes: Nodes, links: Links, points: int,
         raise CorruptError(f"{name}: a cell larger than 2^{CELL_BITS} steps")
     size = np.int64(1) << cells.log2_size.astype(np.int64)
     low = cells.low.astype(np.int64)
-    if (low < 0).any() or (low % size[:, None] != 0).any() or (low >= voxel_steps).any():
+    if (low < 0).any() or (low % size != 0).any() or (low >= voxel_steps).any():
         raise CorruptError(f"{name}: a cell off its grid or outside the voxel")
     if (nodes.count > np.where(links.is_leaf, np.uint8(MAX_LEAF), np.uint8(MAX_DEGREE))).any():
         raise CorruptError(f"{name}: a node over {MAX_LEAF} points or {MAX_DEGREE} children")
@@ -145,8 +154,9 @@ def read_lanes(
 ) -> None:
     """Read the points of a checked tree from their byte planes (6, p) into lanes (leaf nodes, 3, MAX_LEAF).
 
-    Points lie inside their cell, so their sums with block_low stay inside 16 bits and kernels that add them
-    cannot leave the certified range: CorruptError where one does not. deltas: whether they are, see codec.py.
+    cells, nodes: transposed.  deltas: whether the points are, see codec.py. They lie inside their cell, so their
+    sums with block_low stay inside 16 bits and kernels that add them cannot leave the certified range: CorruptError
+    where one does not.
     """
     axis = nodes.axis if deltas else np.full(len(nodes.axis), NO_AXIS, np.uint8)
     tree = (links.first, links.is_leaf, links.cell)
@@ -170,6 +180,7 @@ def check_voxel(voxel: VoxelData, voxel_steps: int) -> Links:
     if voxel.top_shift != top_shift(voxel_steps):
         raise CorruptError(f"{name}: top unit 2^{voxel.top_shift} steps, expected 2^{top_shift(voxel_steps)}")
     links = link_nodes(voxel)
+    cells, nodes = transposed(cells), transposed(nodes)
     check_tree(name, cells, nodes, links, p, voxel_steps)
     planes = np.ascontiguousarray(np.ascontiguousarray(voxel.points).view(np.uint8).T)
     planes.flags.writeable = False  # as a record's are: one compiled form for both

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from ..schemas.archive import Archive
 from ..schemas.errors import CorruptError
+from ..schemas.voxel import top_shift
 from .kernels.layout import LANES, Arena, lay_out, resident_bytes, scan_run
 from .kernels.overlap import MOST_LEVELS
 
@@ -33,7 +34,7 @@ class Store:
         Returns where its runs are (3,) int64, see layout.py. Raises CorruptError, OSError.
         """
         record = self.archive.open_voxel(row)
-        voxel, links, leaves = record.voxel, record.links, record.leaves
+        links, leaves = record.links, record.leaves
         if leaves != int(self.archive.voxels["leaves"][row]):
             raise CorruptError(
                 f"{self.archive.where(row)}: {leaves} leaf nodes, the index says otherwise: rebuild it"
@@ -43,8 +44,8 @@ class Store:
                 f"{self.archive.where(row)}: {links.height} levels, expected at most {MOST_LEVELS}: rebuild it"
             )
         where = np.empty(3, np.int64)
-        parts = (voxel.cells, voxel.nodes, np.int64(voxel.top_shift))
-        lay_out(parts, (links.first, links.is_leaf, links.cell), arena, np.int64(offset), where)
+        shift = np.int64(top_shift(record.voxel_steps))
+        lay_out((record.cells, record.nodes, shift), record.tree, arena, np.int64(offset), where)
         lanes = arena.halves[where[2] :]
         with self.archive.locating(row):
             record.read_points(lanes[: leaves * 3 * LANES].reshape(leaves, 3, LANES))

@@ -29,11 +29,17 @@ def delta_along(points, first, count, axis):
 
 
 @nb.njit(nogil=True, cache=True)
-def interleave(planes, rows):
-    """Undo HDF5's shuffle: rows[i, b] = planes[b, i], twice as fast as numpy. planes: (w, n), rows: (n, w), uint8."""
-    for b in range(np.uint64(planes.shape[0])):
-        for i in range(np.uint64(planes.shape[1])):
-            rows[i, b] = planes[b, i]
+def join_planes(planes, words):
+    """Join byte planes (k w, n) uint8, low bytes first, to words (k, n) of w bytes, unsigned: HDF5's shuffle undone."""
+    width = np.uint64(planes.shape[0] // words.shape[0])
+    for k in range(np.uint64(words.shape[0])):
+        out, first = words[k], planes[k * width]
+        for i in range(np.uint64(out.shape[0])):
+            out[i] = first[i]
+        for b in range(np.uint64(1), width):
+            plane, shift = planes[k * width + b], out.dtype.type(8 * b)
+            for i in range(np.uint64(out.shape[0])):
+                out[i] |= out.dtype.type(plane[i]) << shift
 
 
 @nb.njit(nogil=True, inline="always")
@@ -74,7 +80,7 @@ def leaf_lanes(planes, links, nodes, cells, voxel_steps, lanes):
     """Read the points of every leaf node, undo their deltas, and check that they lie in their cell and voxel.
 
     planes: (6 or more, p) uint8: low and high bytes of x, y, z.  links: (first, is_leaf, cell) of schemas/voxel.py.
-    nodes: (count, axis, block_low) (n,), (n,), (n, 3); axis NO_AXIS: no deltas.  cells: (low (c, 3), log2_size (c,)).
+    nodes: (count, axis, block_low) (n,), (n,), (3, n); axis NO_AXIS: no deltas.  cells: (low (3, c), log2_size (c,)).
     Writes lanes (b, 3, LANES) uint16: x[], y[], z[] of each leaf node's points from its block_low, in the order of
     the rows, the last one repeated to the end. Returns whether all lie inside; stops at the first that does not.
     Assumes that the tree has been checked: runs inside the planes, at most LANES points, axis 0 to 3, b leaf nodes.
@@ -92,8 +98,8 @@ def leaf_lanes(planes, links, nodes, cells, voxel_steps, lanes):
             out = lanes[block, k]
             _join(planes[np.uint64(2) * k], planes[np.uint64(2) * k + np.uint64(1)], begin, held, out)
             high = np.int64(_undo_delta(held, out) if np.uint64(axis[i]) == k else _greatest(out))
-            high += np.int64(block_low[i, k])
-            if high >= size or high + np.int64(cell_low[cell, k]) >= voxel_steps:
+            high += np.int64(block_low[k, i])
+            if high >= size or high + np.int64(cell_low[k, cell]) >= voxel_steps:
                 return False
         block += np.uint64(1)
     return True

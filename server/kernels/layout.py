@@ -90,7 +90,8 @@ def _outward(value, up):
 def lay_out(voxel, links, arena, at_bytes, where):
     """Write the nodes of a checked voxel into the arena from byte `at_bytes` on (a multiple of 16): rows and blocks.
 
-    voxel: (cells, nodes, top_shift) of schemas/voxel.py.  links: its Links without the height.
+    voxel: (cells, nodes, top_shift) of schemas/codec.py `OpenRecord`, so center is (3, n).  links: its Links without
+    the height.
     Writes where (3,) int64: first row [words], first block [ints], first lane [halves], where the points belong
     (schemas/codec.py, `OpenRecord.read_points`).
     """
@@ -110,23 +111,23 @@ def lay_out(voxel, links, arena, at_bytes, where):
         square = np.int32(0)
         for k in range(np.uint64(3)):
             # Whole numbers below 2^24: a voxel has at most 2^21 steps, a cell 2^16.
-            low = np.int32(0) if top else cells.low[cell, k]
-            words[row + k] = np.float32(low + np.int32(nodes.center[i, k]) * unit)
-            component = np.int32(nodes.normal[i, k])
+            low = np.int32(0) if top else cells.low[k, cell]
+            words[row + k] = np.float32(low + np.int32(nodes.center[k, i]) * unit)
+            component = np.int32(nodes.normal[k, i])
             words[row + np.uint64(4) + k] = np.float32(component)
             square += component * component
         words[row + np.uint64(3)] = np.float32(np.int32(nodes.radius[i]) * unit)
         # The next float32 up, what np.nextafter gives of a number that is not negative; a call of it costs 5 ns.
         length = np.float32(np.sqrt(np.float64(square)))
         ints[row + np.uint64(7)] = length.view(np.int32) + np.int32(1)
-        words[row + np.uint64(8)] = _outward(nodes.slab[i, np.uint64(0)], False)
-        words[row + np.uint64(9)] = _outward(nodes.slab[i, np.uint64(1)], True)
+        words[row + np.uint64(8)] = _outward(nodes.slab[np.uint64(0), i], False)
+        words[row + np.uint64(9)] = _outward(nodes.slab[np.uint64(1), i], True)
         ints[row + np.uint64(FIRST)] = ~block if is_leaf[i] else first[i]
         ints[row + np.uint64(COUNT)] = np.int32(nodes.count[i])
         row += np.uint64(ROW_WORDS)
         if is_leaf[i]:
             for k in range(np.uint64(3)):
-                ints[block_at + k] = cells.low[cell, k] + np.int32(nodes.block_low[i, k])
+                ints[block_at + k] = cells.low[k, cell] + np.int32(nodes.block_low[k, i])
             ints[block_at + np.uint64(3)] = np.int32(nodes.count[i])
             block_at += np.uint64(BLOCK_WORDS)
             block += np.int32(1)

@@ -34,7 +34,7 @@ def _canonical(points: VoxelPoints) -> tuple[VoxelPoints, NDArray[np.uint64]]:
 
 def _taken(points: VoxelPoints, order: NDArray[np.int64]) -> VoxelPoints:
     """The points in another order."""
-    return VoxelPoints(*(None if column is None else column[order] for column in points))
+    return VoxelPoints._make(None if column is None else column[order] for column in points)
 
 
 def build_voxel(key: int, points: VoxelPoints, voxel_steps: int, config: BuildConfig) -> VoxelData:

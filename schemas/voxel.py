@@ -117,7 +117,8 @@ Columns = TypeVar("Columns", Cells, Nodes)
 
 def transposed(columns: Columns) -> Columns:
     """The columns with those of several components as (3, n) instead of (n, 3), contiguous, or the other way round."""
-    return type(columns)(*(np.ascontiguousarray(column.T) for column in columns))
+    turned = (np.ascontiguousarray(column.T) for column in columns)
+    return type(columns)(*turned)  # type: ignore[arg-type]  # each keeps its type
 
 
 def check_tree(name: str, cells: Cells, nodes: Nodes, links: Links, points: int, voxel_steps: int) -> None:

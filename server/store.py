@@ -9,7 +9,7 @@ from ..schemas.archive import Archive
 from ..schemas.errors import CorruptError
 from ..schemas.voxel import top_shift
 from .kernels.layout import LANES, Arena, lay_out, resident_bytes, scan_run
-from .kernels.overlap import MOST_LEVELS
+from .kernels.front import MOST_LEVELS
 
 
 class Store:

@@ -46,6 +46,7 @@ def run(bench: Bench, clock: Clock) -> Part:
     place = bench.facade
     sets = pose_sets(bench)
     part.remarks += place.settings()
+    clock.restart()
     for k, poses in enumerate(sets):
         # The walk first, for as many repetitions as asked; the rest share what time is left.
         compare_set(part, CASE, place, poses, bench.loops, clock, bench.rng, 0.6 if k == 0 else 0.5)

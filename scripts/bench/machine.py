@@ -69,6 +69,10 @@ class Clock:
         self.seconds = seconds
         self._start = time.perf_counter()
 
+    def restart(self) -> None:
+        """Begin now: what came before was preparing."""
+        self._start = time.perf_counter()
+
     @property
     def spent(self) -> float:
         """Since the section began [s]."""

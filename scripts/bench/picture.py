@@ -9,7 +9,7 @@ from solidcloud.server.report.spheres import load_pyplot
 
 from .collide import CAPT_PART, TABLE_PART
 from .growth import FACADES
-from .results import MET, MISSED, Figure, Part, busy, goal_rows, number
+from .results import MET, MISSED, Figure, Part, busy, goal_rows, limit_text, number
 from .sides import BRUTE, CAPT, CAPT16, COLLIDE, OURS, SCIPY, TABLE
 
 COLOURS = {
@@ -83,7 +83,7 @@ def _bars(axes: Any, walk: list[Figure]) -> None:
     values = [f.value for f in order]
     axes.barh(range(len(order)), values, color=[_colour(f.side, ours) for f in order], height=0.7)
     axes.set_yticks(range(len(order)), [f.side for f in order])
-    axes.set(xscale="log", xlim=(min(values) / 6, max(values) * 6))
+    axes.set(xscale="log", xlim=(min(values) / 8, max(values) * 8))
     for k, value in enumerate(values):
         axes.text(
             value * 1.06, k, number(value), va="center", fontsize=9, color=INK, zorder=4,
@@ -115,7 +115,8 @@ def _sets(axes: Any, sets: list[Figure], cases: list[str]) -> None:
         else:
             colour, label = _colour(side, ours), side
         axes.scatter(
-            [f.value for f in own], [cases.index(f.case) for f in own], s=58, color=colour, label=label, zorder=3,
+            [f.value for f in own], [cases.index(f.case) for f in own], s=58, color=colour, label=label,
+            zorder=4 if side.startswith(OURS) else 3,  # ours on top
             edgecolors="white", linewidths=0.6,
         )  # fmt: skip
     axes.set_yticks(range(len(cases)), cases, fontsize=9)
@@ -156,7 +157,7 @@ def _growth(axes: Any, growth: list[Figure]) -> None:
         ylim=(0, max(*values, values[0] * 1.3) * 1.25),
     )
     axes.set_title(
-        "growth: collide on one façade's walk, over the scene's points, all resident, µs a pose",
+        "growth: one façade's walk, over the points of the scene, µs a pose",
         loc="left",
         fontsize=11,
     )
@@ -175,7 +176,7 @@ def _table(axes: Any, rows: list[dict[str, Any]], height: float) -> None:
     title = f"goals: {counts[MET]} met, {counts[MISSED]} missed" + (f", {rest} not measured" if rest else "")
     axes.text(0.0, y, title, fontsize=12, weight="bold", color=INK, va="top")
     y -= 1.5 * line
-    for x, text, align in ((0.735, "figure", "right"), (0.865, "goal", "right")):
+    for x, text, align in ((0.715, "figure", "right"), (0.875, "goal", "right")):
         axes.text(x, y, text, fontsize=9, color=FAINT, va="center", ha=align)
     for k, row in enumerate(rows):
         y -= line
@@ -184,27 +185,7 @@ def _table(axes: Any, rows: list[dict[str, Any]], height: float) -> None:
         colour = VERDICTS.get(row["verdict"], "#b8860b")
         text = textwrap.shorten(row["goal"], 72, placeholder="…")
         axes.text(0.005, y, text, fontsize=9, color=INK, va="center")
-        sense = "≥" if row["sense"] == ">=" else "≤"
-        unit = row["unit"]
-        axes.text(
-            0.735,
-            y,
-            number(row["measured"]),
-            fontsize=9.5,
-            color=colour,
-            va="center",
-            ha="right",
-            weight="bold",
-        )
-        axes.text(
-            0.865,
-            y,
-            f"{sense} {number(row['limit'])} {unit}",
-            fontsize=9,
-            color=FAINT,
-            va="center",
-            ha="right",
-        )
-        axes.text(
-            0.995, y, row["verdict"], fontsize=9.5, color=colour, va="center", ha="right", weight="bold"
-        )
+        shown = {"va": "center", "ha": "right", "color": colour, "fontsize": 9.5, "weight": "bold"}
+        axes.text(0.715, y, number(row["measured"]), **shown)
+        axes.text(0.875, y, limit_text(row), fontsize=9, color=FAINT, va="center", ha="right")
+        axes.text(0.995, y, row["verdict"], **shown)

@@ -1,6 +1,6 @@
 """The poses that are asked about: jittered, sorted into classes, and sets made to be hard."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -18,6 +18,7 @@ SLIDING = 0.01  # between the nearest spheres of a wall and of an avatar that sl
 # About the height at which the feet touch the floor exactly [m]; 15 nm is the exact unit.
 FOOT_STEPS = (-1e-3, -1e-4, -1e-5, -1e-6, -3e-8, 0.0, 3e-8, 1e-6, 1e-5, 1e-4, 1e-3)
 WALK_SECONDS = 40.0
+PILOT = 200  # poses asked to find the distance at which half of them touch
 
 
 class PoseSet(NamedTuple):
@@ -100,6 +101,18 @@ def random_poses(
     poses[:, :3, 3] = points[rng.integers(len(points), size=count)] + away - turned
     poses[:, 3, 3] = 1.0
     return poses
+
+
+def half_touching(
+    rng: np.random.Generator, points: Floats, avatar: Floats, touching: Callable[[Floats], NDArray[np.bool_]]
+) -> float:
+    """A distance [m] at which about half of `random_poses` touch; only a choice of poses, so the engine may tell."""
+    distance = float(np.ptp(avatar, axis=0).max()) / 32
+    for _ in range(12):
+        if touching(random_poses(rng, points, avatar, PILOT, distance)).mean() <= 0.5:
+            break
+        distance *= 1.5
+    return distance
 
 
 def touching_shift(points: Floats, placed: Floats, axis: Sequence[float], distance: float) -> float:

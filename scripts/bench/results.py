@@ -134,6 +134,12 @@ def number(value: float | None) -> str:
     return f"{value:,.{digits}f}"
 
 
+def limit_text(row: dict[str, Any]) -> str:
+    """The goal of a row for people: its sense, limit and unit."""
+    limit = "-" if row["limit"] is None else f"{row['limit']:,g}"
+    return f"{'≥' if row['sense'] == '>=' else '≤'} {limit} {row['unit']}"
+
+
 def busy(parts: Iterable[Part]) -> str:
     """What to say of other work on the machine; empty where there was none to speak of."""
     loads = [part.load for part in parts]
@@ -170,16 +176,13 @@ def show(parts: list[Part], notes: dict[str, str]) -> None:
     rows = goal_rows(parts, notes)
     if rows:
         table = Table(title="goals of section `Speed`")
-        for name, justify in (
-            ("goal", "left"), ("figure", "right"), ("", "center"), ("limit", "right"), ("unit", "left"), ("", "left"),
-        ):  # fmt: skip
+        for name, justify in (("goal", "left"), ("figure", "right"), ("limit", "right"), ("", "left")):
             table.add_column(name, justify=justify)  # type: ignore[arg-type]
         for row in rows:
             style = {MET: "green", MISSED: "bold red", NOT_MEASURED: "yellow"}[row["verdict"]]
             table.add_row(
-                row["goal"], number(row["measured"]), row["sense"], number(row["limit"]), row["unit"],
-                f"[{style}]{row['verdict']}[/]",
-            )  # fmt: skip
+                row["goal"], number(row["measured"]), limit_text(row), f"[{style}]{row['verdict']}[/]"
+            )
         console.print(table)
     if busy(parts):
         console.print(f"{busy(parts)}: not figures to quote", style="bold red")

@@ -362,9 +362,12 @@ class Archive:
                 f"{self.where(row)}: {error}: restore the shard or rebuild the archive"
             ) from error
 
-    def open_voxel(self, row: int) -> OpenRecord:
-        """The voxel in index row `row`, decompressed, its points still unread. Raises CorruptError saying where."""
-        frames = self.read_frames(row)
+    def open_voxel(self, row: int, frames: tuple[bytes, bytes, bytes] | None = None) -> OpenRecord:
+        """The voxel in index row `row`, decompressed, its points still unread; frames: where they are read already.
+
+        Raises CorruptError saying where.
+        """
+        frames = frames or self.read_frames(row)
         entry = self.voxels[row]
         cells, nodes, points = (int(n) for n in entry["rows"])
         shape = RecordShape(cells, nodes, points, self._shape_dtype)

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from ..schemas.archive import Archive
 from ..schemas.errors import CorruptError
 from ..schemas.voxel import top_shift
-from .kernels.layout import LANES, Arena, lay_out, resident_bytes, scan_run
 from .kernels.front import MOST_LEVELS
+from .kernels.layout import LANES, Arena, lay_out, resident_bytes, scan_run
 
 
 class Store:
@@ -33,7 +33,13 @@ class Store:
 
         Returns where its runs are (3,) int64, see layout.py. Raises CorruptError, OSError.
         """
-        record = self.archive.open_voxel(row)
+        return self.decode(row, self.archive.read_frames(row), arena, offset)
+
+    def decode(
+        self, row: int, frames: tuple[bytes, bytes, bytes], arena: Arena, offset: int
+    ) -> NDArray[np.int64]:
+        """`load` from the frames already read (`Archive.read_frames`), for the benchmark to time alone."""
+        record = self.archive.open_voxel(row, frames)
         links, leaves = record.links, record.leaves
         if leaves != int(self.archive.voxels["leaves"][row]):
             raise CorruptError(

@@ -307,3 +307,11 @@ PARTS: dict[type, Any] = {
     ContactsAnswers: ContactsPart,
     SweepAnswers: SweepPart,
 }
+
+# What an operation along a path is answered with.
+PATH_ANSWERS: dict[str, type[Cost]] = {
+    "collide": CollideAnswers,
+    "distance": DistanceAnswers,
+    "contacts": ContactsAnswers,
+    "sweep": SweepAnswers,
+}

@@ -90,7 +90,8 @@ def make_avatar(points: ArrayLike, radius: float | None = None) -> AvatarModel:
         first,
         tree.count.astype(np.int32),
         np.ascontiguousarray(lanes),
-        np.concatenate([center[front].T, node_radius[None, front]]),
+        # Not in the order concatenate leaves it in: of an array in another order numba compiles every kernel anew.
+        np.ascontiguousarray(np.concatenate([center[front].T, node_radius[None, front]])),
         front.start,
     )
     return AvatarModel(array, float(radius), arrays, np.ascontiguousarray(rows, np.int32))

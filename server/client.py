@@ -17,15 +17,7 @@ import numpy as np
 import zenoh
 
 from ..schemas import keys
-from ..schemas.answers import (
-    PARTS,
-    CollideAnswers,
-    ContactsAnswers,
-    Cost,
-    DistanceAnswers,
-    Part,
-    SweepAnswers,
-)
+from ..schemas.answers import PARTS, PATH_ANSWERS, Cost, Part
 from ..schemas.columns import as_part, check_answers, unknown
 from ..schemas.errors import (
     BadRequestError,
@@ -66,12 +58,6 @@ log = logging.getLogger(__name__)
 _PATH_SECONDS = 3600.0
 
 _ENCODING = zenoh.Encoding(MSGPACK)
-PATH_ANSWERS: dict[str, type[Cost]] = {
-    "collide": CollideAnswers,
-    "distance": DistanceAnswers,
-    "contacts": ContactsAnswers,
-    "sweep": SweepAnswers,
-}
 
 
 class _Avatar(NamedTuple):

@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from ..schemas.answers import Cost, Part
+from ..schemas.answers import PATH_ANSWERS, Cost, Part
 from ..schemas.arrays import Poses
-from ..schemas.columns import as_part
+from ..schemas.columns import as_part, unknown
 from ..schemas.errors import SolidcloudError
 from ..schemas.requests import check_path_parameters
 from .avatar import AvatarModel
@@ -67,13 +67,18 @@ def path_question(
     )
     refuse(fault, pose, found)
 
+    question: Any = {"collide": collide, "distance": distance, "contacts": contacts, "sweep": sweep}[op]
     if op == "sweep":
-        margin = given.get("margin", 0.0)
-        return (
-            lambda a, b: sweep(data, avatar, poses[a:b], poses[a + 1 : b + 1], margin, tolerance, effort)
-        ), max(0, len(poses) - 1)
-    question: Any = {"collide": collide, "distance": distance, "contacts": contacts}[op]
-    return (lambda a, b: question(data, avatar, poses[a:b], **given, effort=effort)), len(poses)
+        given["tolerance"] = tolerance
+
+    def ask(start: int, stop: int) -> Cost:
+        if effort.spent:
+            return unknown(PATH_ANSWERS[op], stop - start)
+        what = [poses[start:stop], poses[start + 1 : stop + 1]] if op == "sweep" else [poses[start:stop]]
+        answers: Cost = question(data, avatar, *what, **given, effort=effort)
+        return answers
+
+    return ask, max(0, len(poses) - 1) if op == "sweep" else len(poses)
 
 
 def largest_part(op: str, parameters: dict[str, Any]) -> int:

@@ -8,11 +8,10 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ..schemas.answers import Cost
+from ..schemas.answers import PATH_ANSWERS, Cost
 from ..schemas.columns import join, without_part
 from ..schemas.errors import BadRequestError
 from ..schemas.requests import PATH_PARAMETERS
-from .client import PATH_ANSWERS
 from .pose_file import read_objects, read_poses, read_rays
 
 _EFFORT = ("tolerance", "budget_ms", "budget_visits")

@@ -1,7 +1,9 @@
 """Every question over zenoh: what comes back is what the scene in this process says, bit for bit."""
 
+import importlib
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import cases
 import numpy as np
@@ -37,6 +39,7 @@ from solidcloud.schemas.messages import (
     encode,
 )
 from solidcloud.schemas.requests import make_objects
+from solidcloud.server import kernels
 from solidcloud.server import path as path_module
 from solidcloud.server.app import serving
 from solidcloud.server.client import Client
@@ -242,11 +245,64 @@ def test_a_spent_budget_is_unknown_all_along_the_path(scene, client):
         assert len(verdicts) == len(POSES) and Verdict.CLEAR not in verdicts[~clear_at_once(parts)]
 
 
+@pytest.mark.parametrize(
+    "op, parameters", [("collide", {}), ("distance", {"reach": 0.1}), ("contacts", {}), ("sweep", {})]
+)
+def test_what_the_time_did_not_suffice_for_is_unknown(scene, client, op, parameters):
+    for one in (scene, client):
+        parts = list(one.path("al", POSES, op, budget_ms=0.0, **parameters))
+        verdicts = np.concatenate([part.verdict for part in parts])
+        assert verdicts.tolist() == [Verdict.UNKNOWN] * (len(POSES) - (op == "sweep"))
+        parts = list(one.path("al", POSES, op, budget_ms=60_000.0, **parameters))
+        assert Verdict.UNKNOWN not in np.concatenate([part.verdict for part in parts])
+
+
 def clear_at_once(parts):
     """Which poses were clear without a visit: out of reach of every voxel."""
     visits = np.concatenate([part.node_visits for part in parts])
     bounds = np.concatenate([part.lower for part in parts])
     return (visits == 0) & (bounds > 0)
+
+
+def compiled():
+    """How many versions of each kernel there are; none where nothing is compiled."""
+    found = {}
+    for path in Path(kernels.__file__).parent.glob("*.py"):
+        module = importlib.import_module(f"{kernels.__name__}.{path.stem}")
+        for name, kernel in vars(module).items():
+            if hasattr(kernel, "signatures"):
+                found[path.stem, name] = len(kernel.signatures)
+    return found
+
+
+def test_who_asks_after_warming_waits_for_no_compiler(tmp_path):
+    with Scene.open(cases.build(tmp_path, POINTS).archive) as scene:
+        scene.warm()
+        before = compiled()
+        add_avatars(scene)
+        scene.add_avatar("cy", np.asfortranarray(RNG.normal(size=(700, 3))), 0.01)
+        scene.add_avatar("dot", np.zeros((1, 3)), 0.01)
+        poses = POSES.copy()
+        poses.flags.writeable = False
+        efforts = (
+            {},
+            {"tolerance": 0.01},
+            {"budget_visits": 9},
+            {"budget_ms": 1e4},
+            {"budget_ms": 1e4, "tolerance": 0.01},
+        )
+        for name in ("al", "cy", "dot"):
+            for effort in efforts:
+                scene.collide(name, poses[:1], **effort)
+                scene.collide(name, poses, 0.01, **effort)
+                scene.distance(name, poses, 0.05, **effort)
+                scene.contacts(name, poses, 3, 0.05, 0.1, **effort)
+                scene.sweep(name, poses, ENDS, **effort)
+                scene.raycast(RAYS, TOWARDS, 1.5, **effort)
+                scene.within(RAYS, 0.5, **effort)
+                scene.objects([(name, poses[0]), ("bo", poses[0], 2)], **effort)
+                list(scene.path(name, poses, "distance", reach=0.1, **effort))
+        assert compiled() == before
 
 
 def test_two_clients_at_once_are_each_answered_in_order(scene, endpoint):

@@ -14,6 +14,7 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from .compiled import borrowing
 from .layout import LANES
 from .placed import ONE_SLACK, SLACK, node_reach
 
@@ -51,7 +52,7 @@ def make_front(avatar):
     return Front(np.empty((4, POOL), np.float32), which, keep, keep.view(np.uint64))
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def pad(bounds, begin, end):
     """Fill places [begin, end) of the lists with nodes that no test keeps."""
     for i in range(begin, end):
@@ -61,7 +62,7 @@ def pad(bounds, begin, end):
         bounds[3, U(i)] = np.float32(0.0)
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def place_front(avatar, m, scale, placed, scene, extent, bounds):
     """Place the front, after `place_root`, as the first list of `bounds`. Returns its length."""
     step = scene.step
@@ -81,7 +82,7 @@ def place_front(avatar, m, scale, placed, scene, extent, bounds):
     return n
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def sift(words, row, bounds, at, steps, off_x, off_y, off_z, room, keep):
     """Mark in `keep` which nodes of a list meet the scene node `row`: the sphere, then the slab, as in `nodes_meet`.
 
@@ -115,7 +116,7 @@ def sift(words, row, bounds, at, steps, off_x, off_y, off_z, room, keep):
     return any_meets
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def take_kept(bounds, which, keep, keep8, at, steps, to):
     """Write the nodes of the list at `at` that are marked as a new list at `to`. Returns its length."""
     n = U(to)
@@ -131,7 +132,7 @@ def take_kept(bounds, which, keep, keep8, at, steps, to):
     return count
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def move_node(bounds, which, at, to):
     """Copy one node of the lists; at, to: uint64."""
     bounds[0, to] = bounds[0, at]

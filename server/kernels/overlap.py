@@ -20,6 +20,7 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from .compiled import borrowing
 from .front import MOST_LEVELS, make_front, move_node, pad, place_front, sift, take_kept
 from .layout import BLOCK_WORDS, COUNT, FIRST, LANES, ROW_WORDS
 from .placed import (
@@ -83,7 +84,7 @@ def make_work(avatar):
     return Work(stack, np.empty((pairs, 2), np.int64), keep, keep.view(np.uint64), counters)
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def nodes_meet(words, row, x, y, z, radius, limits):
     """Whether a sphere (float32, from the voxel's low corner) comes within reach of a node's points, as far as its
     bound can tell: the sphere test of [Fig12] line 2, then the slab."""
@@ -102,7 +103,7 @@ def nodes_meet(words, row, x, y, z, radius, limits):
     )
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def lanes_meet(words, row, lanes, block, off_x, off_y, off_z, room, keep):
     """Mark in `keep` which points of an avatar's block (from the frame) come within `room`, reach and error together,
     of the bound of the scene node `row`. Returns whether any does."""
@@ -124,7 +125,7 @@ def lanes_meet(words, row, lanes, block, off_x, off_y, off_z, room, keep):
     return any_meets
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def next_near(halves, lane_at, low_x, low_y, low_z, lanes, block, far, keep, keep8, begin):
     """The first marked point, from `begin` on, of an avatar's block that may be near a point of a scene's block.
 
@@ -153,7 +154,7 @@ def next_near(halves, lane_at, low_x, low_y, low_z, lanes, block, far, keep, kee
     return -1, tested
 
 
-@nb.njit(nogil=True, cache=True, inline="always")
+@borrowing
 def leaves_touch(avatar, m, block, placed, scene, voxel, spot, row, limits, work):
     """Whether a marked point of an avatar's block touches a point of the scene's leaf node `row`."""
     halves, lanes = scene.halves, placed.lanes
@@ -188,7 +189,7 @@ def leaves_touch(avatar, m, block, placed, scene, voxel, spot, row, limits, work
     return False
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def _block_placed(avatar, m, pose, block, placed, scene):
     """Place a block of the avatar unless it is already placed for this pose."""
     if placed.stamp[U(block)] != pose:
@@ -196,7 +197,7 @@ def _block_placed(avatar, m, pose, block, placed, scene):
         placed.stamp[U(block)] = pose
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def _pairs_touch(avatar, m, scale, extent, pose, placed, scene, voxel, spot, a, row, limits, work):
     """Whether the subtrees of an avatar's node and a scene's hold a pair in contact: both descended, depth first, the
     larger inner node first. For avatars whose front is not their leaf nodes."""
@@ -235,7 +236,7 @@ def _pairs_touch(avatar, m, scale, extent, pose, placed, scene, voxel, spot, a, 
     return False
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def _place_node(avatar, m, a, placed, scene):
     """Place one node of the avatar: x, y, z from the frame [steps], float32."""
     per_step = 1.0 / scene.step
@@ -253,7 +254,7 @@ def _place_node(avatar, m, a, placed, scene):
     )
 
 
-@nb.njit(nogil=True, cache=True, inline="always")
+@borrowing
 def _overlap_voxel(avatar, m, scale, extent, pose, placed, scene, voxel, spot, limits, front, count, work):
     """Whether the placed avatar touches one resident voxel, whose root it meets: the scene's tree descended, depth
     first, each node with a list of those front nodes that met its parent.
@@ -325,7 +326,7 @@ def _overlap_voxel(avatar, m, scale, extent, pose, placed, scene, voxel, spot, l
     return False
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def make_spot(scene, voxel, placed):
     """Where a resident voxel is, from the arena's start and from the frame."""
     coordinates, where, frame = scene.coordinates, scene.where, placed.frame
@@ -350,6 +351,12 @@ def overlap_poses(poses, avatar, scene, reach, which, verdict, counts):
     that over CLEAR.
     """
     placed, front, work = make_placed(avatar), make_front(avatar), make_work(avatar)
+    _overlap_poses(poses, avatar, scene, reach, which, verdict, counts, placed, front, work)
+
+
+@borrowing
+def _overlap_poses(poses, avatar, scene, reach, which, verdict, counts, placed, front, work):
+    """`overlap_poses`, with its scratch."""
     nodes = placed.nodes
     for number in range(which.shape[0]):
         i = which[number]

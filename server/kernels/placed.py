@@ -12,6 +12,7 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from .compiled import borrowing
 from .layout import LANES
 from .placing import MAX_REACH_UNITS, largest_term, lattice_to_units, place, to_units
 
@@ -49,7 +50,7 @@ class Limits(NamedTuple):
     units: np.int64
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def make_limits(units, units_per_step, extent, farthest, voxel_steps):
     """The thresholds for a reach of `units`.
 
@@ -82,7 +83,7 @@ def make_limits(units, units_per_step, extent, farthest, voxel_steps):
     )
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def place_root(avatar, m, scale, placed, scene):
     """Choose the frame and place an avatar's root; fills placed.frame, shift and node 0.
 
@@ -100,7 +101,7 @@ def place_root(avatar, m, scale, placed, scene):
     return extent, largest_term(m, placed.shift, x, y, z) * per_step + extent
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def node_reach(radius, steps, extent):
     """The radius [steps] of a placed node, rounded outward. steps: lattice steps a metre of the avatar.
 
@@ -109,7 +110,7 @@ def node_reach(radius, steps, extent):
     return np.float32(radius * steps * (1.0 + 1e-6) + extent * 1e-6)
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def place_nodes(avatar, m, scale, placed, scene):
     """Place all of an avatar's nodes; fills placed.frame, shift and nodes. Returns as `place_root` does."""
     extent, farthest = place_root(avatar, m, scale, placed, scene)
@@ -126,13 +127,13 @@ def place_nodes(avatar, m, scale, placed, scene):
     return extent, farthest
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def place_block(avatar, m, block, placed, scene):
     """Place the points of one leaf node of the avatar, all LANES at once."""
     place_lanes(avatar.points, m, block, placed.lanes, placed.shift, placed.frame, scene.step)
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def place_lanes(points, m, block, lanes, shift, frame, step):
     """`place_block` with the arrays themselves: to hand over three tuples of arrays takes as long as the work."""
     per_step = 1.0 / step
@@ -160,7 +161,7 @@ def make_placed(avatar):
     )
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def pair_square(avatar, m, block, lane, placed, scene, voxel, lane_at, block_at, j):
     """The definition (NUMERICS.md N5): |a - b|^2 of one pair in integers, exact units, int64.
 
@@ -182,7 +183,7 @@ def pair_square(avatar, m, block, lane, placed, scene, voxel, lane_at, block_at,
     return square
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def pair_in_reach(avatar, m, block, lane, placed, scene, voxel, lane_at, block_at, j, units):
     """Whether one pair is within `units`, tangency included."""
     square = pair_square(avatar, m, block, lane, placed, scene, voxel, lane_at, block_at, j)

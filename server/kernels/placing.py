@@ -7,11 +7,11 @@ A placed coordinate is ((r0 p0 + r1 p1) + r2 p2) + (t - O), float64, in this ord
 import math
 from typing import NamedTuple
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas.voxel_grid import MAX_COORDINATE, UNITS_PER_METRE
+from .compiled import borrowing
 
 SIMILARITY_TOLERANCE = 1e-9  # NUMERICS.md N6
 SMALLEST_SCALE, LARGEST_SCALE = 1e-3, 1e3
@@ -42,7 +42,7 @@ class Avatar(NamedTuple):
     front_first: int
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def check_poses(poses, node_radius, radius, other_units, scene, scales, units):
     """Check poses (k, 4, 4) float64 to be similarities (N6), writing scales (k,) and reaches units (k,) int64.
 
@@ -100,13 +100,13 @@ def check_poses(poses, node_radius, radius, other_units, scene, scales, units):
     return GOOD, 0, 0.0
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def place(m, shift, r, x, y, z):
     """Coordinate r of an avatar point placed by pose m, from the dataset's origin [m]. shift: t - O (3,)."""
     return ((m[r, 0] * x + m[r, 1] * y) + m[r, 2] * z) + shift[r]
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def largest_term(m, shift, x, y, z):
     """The largest sum of sizes of the terms of a placed coordinate [m]: 2^-50 of it bounds the rounding of `place`
     for this point and for one beside it, also where large terms cancel."""
@@ -117,13 +117,13 @@ def largest_term(m, shift, x, y, z):
     return largest
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def to_units(metres):
     """Exact units of a placed coordinate: times 2^26, half to even, int64."""
     return np.int64(np.rint(metres * UNITS_PER_METRE))
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def lattice_to_units(steps, units_per_step):
     """Exact units of a lattice coordinate: one float64 product, half to even, int64."""
     return np.int64(np.rint(np.float64(steps) * units_per_step))

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from ...schemas.kernels.morton import morton_code
 from ...schemas.voxel_grid import KEY_BIAS
+from .compiled import borrowing
 from .placing import GOOD, check_poses, largest_term, place
 
 
@@ -42,7 +43,7 @@ class Reach(NamedTuple):
     outside: NDArray[np.bool_]
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def find_key(keys, key):
     """Row of `key` in sorted keys (v,) uint64, or -1."""
     lo, hi = 0, keys.shape[0]
@@ -55,7 +56,7 @@ def find_key(keys, key):
     return lo if lo < keys.shape[0] and keys[lo] == key else -1
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def _near_box(center, reach, low, high):
     """Whether a ball (center (3,), reach) touches the box [low, high] (3,) float64; all [steps]."""
     square = 0.0

@@ -59,11 +59,11 @@ def run(bench: Bench, clock: Clock) -> Part:
         singles = []
         scene.collide("avatar", bench.walk[:1])
         for _ in clock.loops(min(bench.loops, 5), 0.3):
-            poses = [np.ascontiguousarray(pose[None]) for pose in jittered(bench.walk, bench.rng)]
+            frames = [np.ascontiguousarray(pose[None]) for pose in jittered(bench.walk, bench.rng)]
             begin = time.perf_counter()
-            for pose in poses:
-                scene.collide("avatar", pose)
-            singles.append((time.perf_counter() - begin) / len(poses) * 1e6)
+            for frame in frames:
+                scene.collide("avatar", frame)
+            singles.append((time.perf_counter() - begin) / len(frames) * 1e6)
         single = part.add(walk, name, "one call a pose", singles, "µs", len(bench.walk))
         whole = part.value(walk, name, COLLIDE)
         assert whole is not None

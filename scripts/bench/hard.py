@@ -1,5 +1,7 @@
 """Section `hard`: the façade again, with poses that are hard for a hierarchy; every side beside ours."""
 
+import numpy as np
+
 from .collide import CASE
 from .context import Bench
 from .machine import Clock, say
@@ -17,7 +19,7 @@ def pose_sets(bench: Bench) -> list[PoseSet]:
     points = place.case.points + place.case.origin
     clear = bench.walk[~place.contact(bench.walk)]
     distance = place.case.distance
-    bounds = place.case.points.min(axis=0), place.case.points.max(axis=0)
+    bounds = np.array([place.case.points.min(axis=0), place.case.points.max(axis=0)])
     free = free_space(place.tree, bounds, avatar, distance, rng, COUNT, 0.0)
     free.poses[:, :3, 3] += place.case.origin
     return [

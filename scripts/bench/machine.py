@@ -62,16 +62,40 @@ def cpu_name() -> str:
     )
 
 
-class Clock:
-    """How long a section may take [s]: it repeats while there is time, and once in any case."""
+def others_running() -> int | None:
+    """How many processes or threads but this one want a core at this moment; None where the system does not say."""
+    try:
+        running = Path("/proc/loadavg").read_text().split()[3]
+    except OSError:
+        return None
+    return int(running.split("/")[0]) - 1
 
-    def __init__(self, seconds: float) -> None:
+
+class Clock:
+    """How long a section may take [s]: it repeats while there is time, and once in any case.
+
+    others: how many others wanted a core, each time it was looked at; what we started waits at these moments.
+    """
+
+    def __init__(self, seconds: float, others: list[int] | None = None) -> None:
         self.seconds = seconds
+        self.others: list[int] = [] if others is None else others
         self._start = time.perf_counter()
 
     def restart(self) -> None:
         """Begin now: what came before was preparing."""
         self._start = time.perf_counter()
+
+    def look_around(self) -> None:
+        """Count who else wants a core."""
+        found = others_running()
+        if found is not None:
+            self.others.append(found)
+
+    @property
+    def busy(self) -> float:
+        """How many others wanted a core, on average; 0 where it is not known."""
+        return sum(self.others) / len(self.others) if self.others else 0.0
 
     @property
     def spent(self) -> float:
@@ -91,4 +115,5 @@ class Clock:
             if k and passed * (k + 1) / k > limit:
                 say(f"no time for more than {k} of {most} loops")
                 return
+            self.look_around()
             yield k

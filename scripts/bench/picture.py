@@ -176,7 +176,7 @@ def _table(axes: Any, rows: list[dict[str, Any]], height: float) -> None:
     title = f"goals: {counts[MET]} met, {counts[MISSED]} missed" + (f", {rest} not measured" if rest else "")
     axes.text(0.0, y, title, fontsize=12, weight="bold", color=INK, va="top")
     y -= 1.5 * line
-    for x, text, align in ((0.715, "figure", "right"), (0.875, "goal", "right")):
+    for x, text, align in ((0.715, "figure", "right"), (0.862, "goal", "right")):
         axes.text(x, y, text, fontsize=9, color=FAINT, va="center", ha=align)
     for k, row in enumerate(rows):
         y -= line
@@ -187,5 +187,5 @@ def _table(axes: Any, rows: list[dict[str, Any]], height: float) -> None:
         axes.text(0.005, y, text, fontsize=9, color=INK, va="center")
         shown = {"va": "center", "ha": "right", "color": colour, "fontsize": 9.5, "weight": "bold"}
         axes.text(0.715, y, number(row["measured"]), **shown)
-        axes.text(0.875, y, limit_text(row), fontsize=9, color=FAINT, va="center", ha="right")
+        axes.text(0.862, y, limit_text(row), fontsize=9, color=FAINT, va="center", ha="right")
         axes.text(0.995, y, row["verdict"], **shown)

@@ -13,8 +13,8 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-# One process at a time is ours, two in `paths`; above this others took turns with them.
-BUSY_SECTION = 2.0
+# Others that wanted a core, on average; with more, long turns suffer more than short ones and ratios mean little.
+BUSY = 0.3
 MET, MISSED, NOT_MEASURED = "met", "missed", "not measured"
 
 
@@ -69,7 +69,7 @@ class Part:
     """What one section found. remarks: sentences.  wrong: verdicts that are not as the judge says, a sentence each.
 
     missing: what could not be measured, and why.  error: why the section ended early, or None.
-    load: average while it ran, itself included.
+    others: how many others wanted a core while it was timed, on average.
     """
 
     section: str
@@ -80,7 +80,7 @@ class Part:
     missing: list[str] = field(default_factory=list)
     error: str | None = None
     seconds: float = 0.0
-    load: float = 0.0
+    others: float = 0.0
 
     def add(
         self,
@@ -142,9 +142,8 @@ def limit_text(row: dict[str, Any]) -> str:
 
 def busy(parts: Iterable[Part]) -> str:
     """What to say of other work on the machine; empty where there was none to speak of."""
-    loads = [part.load for part in parts]
-    worst = max(loads, default=0.0)
-    return f"the machine was busy with other work, load {worst:.1f}" if worst > BUSY_SECTION else ""
+    worst = max((part.others for part in parts), default=0.0)
+    return f"the machine was busy: {worst:.1f} others wanted a core" if worst > BUSY else ""
 
 
 def goal_rows(parts: Iterable[Part], notes: dict[str, str]) -> list[dict[str, Any]]:

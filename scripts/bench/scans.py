@@ -36,11 +36,11 @@ def run(bench: Bench, clock: Clock) -> Part:
         part.missing.append(f"of {', '.join(REAL_SCANS)}: {there} in the folder that SOLIDCLOUD_SCANS names")
     for file in files:
         say(file.name)
-        _one(bench, clock.seconds / len(files), part, file)
+        _one(bench, Clock(clock.seconds / len(files), clock.others), part, file)
     return part
 
 
-def _one(bench: Bench, seconds: float, part: Part, file: Path) -> None:
+def _one(bench: Bench, clock: Clock, part: Part, file: Path) -> None:
     folder = bench.folder / f"scan-{file.stem}"
     folder.mkdir()
     archive = build(file, folder / "archive", step=None)
@@ -53,7 +53,7 @@ def _one(bench: Bench, seconds: float, part: Part, file: Path) -> None:
         )
         part.remarks += [f"{file.name}: {line}" for line in place.settings()]
         sets = [walk, near_set(bench, place)]
-        clock = Clock(seconds)
+        clock.restart()
         for k, poses in enumerate(sets):
             compare_set(part, file.name, place, poses, bench.loops, clock, bench.rng, 0.8 / (len(sets) - k))
 

@@ -179,8 +179,8 @@ def timer(ask: Callable[[Floats], Any]) -> Callable[[Floats, Floats], float]:
     return turn
 
 
-def evenly(poses: Floats, most: int | None) -> Floats:
-    """At most so many of the poses, evenly spread."""
+def evenly(poses: NDArray[Any], most: int | None) -> NDArray[Any]:
+    """At most so many of the poses (k, ...), evenly spread."""
     if most is None or len(poses) <= most:
         return poses
     return poses[np.linspace(0, len(poses) - 1, most).astype(int)]
@@ -199,6 +199,7 @@ def time_in_turn(
     for loop in clock.loops(loops, share):
         warm, asked = jittered(poses, rng), jittered(poses, rng)
         for c in contenders:
+            clock.look_around()
             if c.loops is None or loop < c.loops:
                 times[c.name].append(c.time(evenly(warm, c.most), evenly(asked, c.most)))
     return times

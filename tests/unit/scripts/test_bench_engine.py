@@ -17,7 +17,7 @@ from solidcloud.builder.made.walk import walk_poses
 # Appended, so that nothing of scripts/ hides a module of the tests.
 sys.path.append(str(Path(__file__).parents[3] / "scripts"))
 
-from bench import picture, poses, results, sides
+from bench import machine, picture, poses, results, sides
 from bench.definition import Judge, least_distance
 from bench.machine import Clock
 
@@ -194,7 +194,7 @@ def test_numbers_have_three_digits_that_count(value: float | None, text: str) ->
 
 def a_report() -> list[results.Part]:
     """Two sections: one with a met, a missed and an unmeasured goal, one that failed."""
-    part = results.Part("collide", missing=["peers"], load=0.9)
+    part = results.Part("collide", missing=["peers"], others=0.1)
     part.add("façade, walk", "ours, voxel 32 m", "collide", [9.0, 10.0], "µs", 1200)
     part.add("façade, walk", sides.TABLE, "collide", 39.0, "µs", 1200)
     part.goal("table", "mean / table", 10 / 39, 0.25, "x")
@@ -220,9 +220,9 @@ def test_a_miss_is_printed_with_its_note(capsys: pytest.CaptureFixture[str]) -> 
 
 def test_other_work_on_the_machine_is_said(capsys: pytest.CaptureFixture[str]) -> None:
     parts = a_report()
-    parts[0].load = 5.0
+    parts[0].others = 5.0
     results.show(parts, {})
-    assert "busy with other work, load 5.0: not figures to quote" in capsys.readouterr().out
+    assert "busy: 5.0 others wanted a core: not figures to quote" in capsys.readouterr().out
 
 
 def test_the_report_is_written_and_drawn(tmp_path: Path) -> None:
@@ -264,6 +264,15 @@ def test_sides_take_turns_and_no_pose_comes_twice(rng: np.random.Generator) -> N
 def test_a_clock_that_is_late_allows_one_loop() -> None:
     assert list(Clock(1e9).loops(3)) == [0, 1, 2]
     assert list(Clock(-1.0).loops(3)) == [0]
+
+
+def test_a_clock_averages_who_else_wanted_a_core(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = iter([0, 3, 0])
+    monkeypatch.setattr(machine, "others_running", lambda: next(seen))
+    clock = Clock(1e9)
+    assert clock.busy == 0.0
+    assert len(list(clock.loops(3))) == 3
+    assert clock.busy == 1.0
 
 
 def test_the_judge_says_what_the_naive_one_says(rng: np.random.Generator) -> None:

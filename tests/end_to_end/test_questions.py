@@ -257,6 +257,18 @@ def test_what_the_time_did_not_suffice_for_is_unknown(scene, client, op, paramet
         assert Verdict.UNKNOWN not in np.concatenate([part.verdict for part in parts])
 
 
+def test_nothing_is_asked_once_the_time_is_up(scene, monkeypatch):
+    def question(*_, **__):
+        raise AssertionError("asked")
+
+    for op in ("collide", "contacts", "sweep"):
+        monkeypatch.setattr(path_module, op, question)
+        assert {len(part) for part in scene.path("al", POSES, op, budget_ms=0.0)} <= {
+            len(POSES),
+            len(POSES) - 1,
+        }
+
+
 def clear_at_once(parts):
     """Which poses were clear without a visit: out of reach of every voxel."""
     visits = np.concatenate([part.node_visits for part in parts])

@@ -30,11 +30,13 @@ from solidcloud.schemas.messages import (
     AvatarInfo,
     CollideRequest,
     ErrorReply,
+    PathRequest,
     ScenesAnswer,
     decode_answer,
     encode,
 )
 from solidcloud.server import questions as questions_module
+from solidcloud.server import transport as transport_module
 from solidcloud.server.app import serve, serving
 from solidcloud.server.client import Client
 from solidcloud.server.config import ServerConfig
@@ -388,11 +390,54 @@ def test_a_client_that_goes_is_sent_no_more_parts(scene, endpoint):
             path = client.path("wait", PATH)
             next(path)
             client.close()
-        eventually(lambda: scene.parts == 1)
-        time.sleep(0.2)  # for the server to hear of it; were that too short, the test would fail, not pass
-        scene.gate.set()
         eventually(lambda: scene.gone)
-        assert scene.parts <= 3 and not scene.avatars
+        scene.gate.set()
+        eventually(lambda: not sending())
+    assert scene.parts <= 2 and not scene.avatars
+
+
+def test_a_client_whose_token_goes_is_sent_no_more_parts(scene, endpoint):
+    with (
+        serving([scene], ServerConfig(listen=endpoint)),
+        zenoh.open(session_config(connect=endpoint)) as session,
+    ):
+        token = session.liveliness().declare_token("solidcloud/1/client/floor/c")
+        scene.avatars["c", "wait"] = (POINTS, 0.125)
+        request = encode(PathRequest("wait", PATH))
+        replies = session.get("solidcloud/1/scene/floor/c/path", payload=request, timeout=DEADLINE)
+        assert replies.recv().ok
+        token.undeclare()
+        eventually(lambda: scene.gone)
+        scene.gate.set()
+        assert not list(replies), "its link is there, but nobody who asked"
+
+
+def sending():
+    """The threads that send parts."""
+    return [thread for thread in threading.enumerate() if thread.name == "solidcloud-floor-parts"]
+
+
+def test_paths_that_ended_are_no_longer_in_flight(scene, endpoint, monkeypatch):
+    made = []
+
+    class Queues(transport_module.FairQueues):
+        def __init__(self, *bounds):
+            super().__init__(*bounds)
+            made.append(self)
+
+    monkeypatch.setattr(transport_module, "FairQueues", Queues)
+    with serving([scene], ServerConfig(listen=endpoint)), Client(endpoint, scene="floor") as client:
+        client.add_avatar("al", POINTS, 0.125)
+        client.add_avatar("wait", POINTS, 0.125)
+        path = client.path("wait", PATH)
+        next(path)
+        assert np.array_equal(joined(list(client.path("al", PATH))), TRUTH)
+        eventually(lambda: len(sending()) == 1)
+        assert len(made[0]) == 1
+        scene.gate.set()
+        assert sum(len(part) for part in path) == 85
+        eventually(lambda: not sending())
+        assert len(made[0]) == 0
 
 
 def test_more_paths_than_the_server_takes_are_busy(scene, endpoint):

@@ -16,12 +16,13 @@ import numpy as np
 from .layout import BLOCK_WORDS, COUNT, FIRST, LANES, ROW_WORDS
 from .placed import U32
 from .placing import MAX_REACH_UNITS, lattice_to_units
-from .rays import STACK, is_less, push_sorted
+from .rays import STACK, is_less
 
 
 @nb.njit(nogil=True, cache=True)
-def _below_node(words, row, x, y, z):
-    """Lower bound of the distance [steps] from a point (float64, from the voxel's low corner) to a node's points.
+def _below_node(words, row, x, y, z, limit):
+    """Lower bound of the distance [steps] from a point (float64, from the voxel's low corner) to a node's points, and
+    the distance to its centre. Beyond `limit` the bound may be as low as the sphere alone makes it.
 
     They lie in the node's sphere and in its slab, and so in the round disc that holds both. Rounding: under 2^-24 of
     the distance to the centre, where the root of a small difference magnifies it.
@@ -31,18 +32,20 @@ def _below_node(words, row, x, y, z):
     square = dx * dx + dy * dy + dz * dz
     radius = np.float64(words[row + 3])
     length = np.float64(words[row + 7])
-    slack = math.sqrt(square) * 2.0**-24
-    below: float = math.sqrt(square) - radius
-    if length > 0.0:
-        along = (nx * dx + ny * dy + nz * dz) / length
+    middle = math.sqrt(square)
+    slack = middle * 2.0**-24
+    below: float = middle - radius
+    if length > 0.0 and below <= limit:
+        inverse = 1.0 / length
+        along = (nx * dx + ny * dy + nz * dz) * inverse
         # The length is rounded up, so offsets divided by it come out shorter by 2^-23 at most, undone by the slack.
-        gap: float = max(along - words[row + 9] / length, words[row + 8] / length - along, 0.0)
+        gap: float = max(along - words[row + 9] * inverse, words[row + 8] * inverse - along, 0.0)
         gap = gap - (abs(along) + radius) * 2.0**-21
-        across: float = math.sqrt(max(square - along * along * (1.0 + 2.0**-21), 0.0)) - radius
         if gap > 0.0:
+            across: float = math.sqrt(max(square - along * along * (1.0 + 2.0**-21), 0.0)) - radius
             across = max(across - slack, 0.0)
             below = max(below, math.sqrt(gap * gap + across * across))
-    return max(below - slack, 0.0)
+    return max(below - slack, 0.0), middle
 
 
 @nb.njit(nogil=True, cache=True)
@@ -110,7 +113,7 @@ def _test_block(scene, voxel, row, x, y, z, error, at_units, i, best, limit):
 
 
 @nb.njit(nogil=True, cache=True)
-def _search(scene, voxel, at_units, i, tolerance, visits, best, limit, rows, bounds):
+def _search(scene, voxel, at_units, i, tolerance, visits, best, limit, rows, bounds, keys):
     """Search one resident voxel, nearest nodes first. Returns the limit, lowered; updates `best`."""
     words, ints = scene.words, scene.ints
     per_unit = 1.0 / scene.units_per_step
@@ -128,7 +131,7 @@ def _search(scene, voxel, at_units, i, tolerance, visits, best, limit, rows, bou
     error = 2.0 * per_unit + (farthest + scene.voxel_steps) * 2.0**-45
     base = scene.where[voxel, 0]
     spent, tests = np.int64(best.counts[1, i]) + 1, np.int64(best.counts[2, i])
-    rows[0], bounds[0], depth = base, _below_node(words, base, x, y, z), 1
+    rows[0], bounds[0], depth = base, _below_node(words, base, x, y, z, np.inf)[0], 1
     nearest = math.sqrt(np.float64(limit))
     while depth > 0:
         depth -= 1
@@ -148,9 +151,21 @@ def _search(scene, voxel, at_units, i, tolerance, visits, best, limit, rows, bou
         steps = nearest * per_unit + error
         for child in range(first, first + ints[row + COUNT]):
             child_row = base + child * ROW_WORDS
-            bound = _below_node(words, child_row, x, y, z)
+            bound, middle = _below_node(words, child_row, x, y, z, steps)
+            # Its farthest point is no farther than that: no sibling beyond holds the nearest.
+            steps = min(steps, (middle + words[child_row + 3]) * (1.0 + 2.0**-24) + 2.0 * error)
             if bound <= steps:
-                push_sorted(rows, bounds, begin, depth, child_row, bound)
+                # Many bounds are 0: of these the one with the nearest centre first.
+                key = bound + middle / 16.0
+                place = depth
+                while place > begin and keys[place - 1] < key:
+                    rows[place], bounds[place], keys[place] = (
+                        rows[place - 1],
+                        bounds[place - 1],
+                        keys[place - 1],
+                    )
+                    place -= 1
+                rows[place], bounds[place], keys[place] = child_row, bound, key
                 depth += 1
     best.counts[1, i], best.counts[2, i] = spent, tests
     return limit
@@ -162,7 +177,7 @@ def search_points(at_units, reach, lists, cursor, held, scene, tolerance, visits
 
     at_units: (k, 3) int64.  reach: exact units, at most MAX_REACH_UNITS. The rest as in `rays.follow_rays`.
     """
-    rows, bounds = np.empty(STACK, np.int64), np.empty(STACK)
+    rows, bounds, keys = np.empty(STACK, np.int64), np.empty(STACK), np.empty(STACK)
     for i in range(cursor.shape[0]):
         end = lists.starts[i + 1]
         limit = best.square[i] if best.square[i] >= 0 else np.int64(reach) * np.int64(reach)
@@ -181,5 +196,5 @@ def search_points(at_units, reach, lists, cursor, held, scene, tolerance, visits
                 best.counts[0, i] += np.uint32(1)
                 best.unseen[i] = min(best.unseen[i], near)
             else:
-                limit = _search(scene, voxel, at_units, i, tolerance, visits, best, limit, rows, bounds)
+                limit = _search(scene, voxel, at_units, i, tolerance, visits, best, limit, rows, bounds, keys)
             cursor[i] = at + 1

@@ -219,7 +219,9 @@ def test_what_check_voxel_refuses_is_refused(small: tuple[VoxelData, Record]) ->
 def test_a_point_outside_its_cell_is_refused(along: str, small: tuple[VoxelData, Record]) -> None:
     voxel, _ = small
     links = link_nodes(voxel)
-    node = int(np.flatnonzero(links.is_leaf)[-1])
+    # In a cell that ends inside the voxel, so that it is the cell's edge that counts.
+    ends = voxel.cells.low + (1 << voxel.cells.log2_size.astype(np.int64))[:, None]
+    node = int(np.flatnonzero(links.is_leaf & (ends < 1024).all(axis=1)[links.cell])[0])
     axis = int(voxel.nodes.axis[node]) if along == "the sort axis" else (int(voxel.nodes.axis[node]) + 1) % 3
     last = int(links.first[node]) + int(voxel.nodes.count[node]) - 1
     size = 1 << int(voxel.cells.log2_size[links.cell[node]])

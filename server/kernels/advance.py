@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from ...schemas.kernels.morton import morton_code
 from ...schemas.voxel_grid import KEY_BIAS, UNITS_PER_METRE
+from .compiled import borrowing
 from .motion import make_motion, pose_at
 from .placing import largest_term, place
 from .reach import find_key
@@ -54,7 +55,7 @@ def avatar_box(avatar):
     return box
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def _size_of(box, scale, units):
     """An avatar with its reach, across [m], whatever the order of its points and its tree."""
     square = 0.0
@@ -63,7 +64,7 @@ def _size_of(box, scale, units):
     return math.sqrt(square) * scale + 2.0 * np.float64(units) / UNITS_PER_METRE + 1e-6
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def _longest(motion, most, sagitta):
     """The longest part of a motion on which no point goes farther than `most` nor strays from its chord by more [m]."""
     length = 1.0
@@ -74,7 +75,7 @@ def _longest(motion, most, sagitta):
     return length
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def _root_at(motion, t, avatar, scale, units, scene, pose, shift, center):
     """Where the avatar's root sphere is under M(t): center (3,) [steps], pose and shift scratch.
 
@@ -91,7 +92,7 @@ def _root_at(motion, t, avatar, scale, units, scene, pose, shift, center):
     return span + largest_term(pose, shift, x, y, z) / scene.step * 2.0**-49
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def _strays(motion, length, scene):
     """How far points stray from their chords on a part of the motion, at most [steps]; 0 for one that stands still."""
     if motion.speed == 0.0:
@@ -99,7 +100,7 @@ def _strays(motion, length, scene):
     return (motion.bend * length * length / 8.0 + 4.0 * motion.slip + 2.0 / UNITS_PER_METRE) / scene.step
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def _enters(begin, end, span, low, high):
     """When a cube (half edge span) on its way from begin to end (3,) meets the box [low, high]: a fraction, rounded
     down, or inf."""
@@ -121,7 +122,7 @@ def _enters(begin, end, span, low, high):
     return max(0.0, least - 1e-9)
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def _still_near(center, span, low, high):
     """As voxels_in_reach asks: whether a ball touches a voxel's box."""
     square = 0.0
@@ -279,7 +280,7 @@ def sweep_segments(
         counts[3, i] += np.uint32(steps)
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def _advance(job, start, stop, rows, size, tolerance):
     """Advance one motion over [start, stop] through some voxels. Returns (lower, upper, advances).
 
@@ -288,7 +289,7 @@ def _advance(job, start, stop, rows, size, tolerance):
     """
     motion, moving = job.motion, job.moving
     t, lower, upper, refused, steps = start, -1.0, INFINITE, 0, 0
-    best = np.zeros(6, np.int64)
+    best = moving.best
     still, begun = motion.speed == 0.0, False
     longest = _longest(motion, size, _CHORD_BEND * size)
     length = longest
@@ -307,7 +308,8 @@ def _advance(job, start, stop, rows, size, tolerance):
             sure = after if certain >= 1.0 else min(after, t + certain * (after - t))
             if touches_at(job, sure, moving.pair):
                 upper, stop = sure, sure
-                best[:] = moving.pair
+                for n in range(6):
+                    best[n] = moving.pair[n]
             else:  # the proof says that it does: nothing is claimed if it does not
                 sure, enters = INFINITE, 0.0
         since = t
@@ -334,11 +336,12 @@ def _advance(job, start, stop, rows, size, tolerance):
             t, refused = since, refused + 1
         if t >= stop:
             break
-    moving.pair[:] = best
+    for n in range(6):
+        moving.pair[n] = best[n]
     return (t if lower < 0.0 else lower), upper, steps
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def _name_witness(job, t, witness):
     """Write the centres (2, 3) of moving.pair under M(t), world [m]: the avatar's as placed, and the scan's."""
     scene, moving, points = job.scene, job.moving, job.avatar.points

@@ -21,6 +21,8 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from .compiled import borrowing
+
 # Of sin(x) / x and cos(x), by powers of x^2, highest first. Up to pi/2 what is left out is below 2^-58.
 _SINE = tuple((-1.0) ** n / math.factorial(2 * n + 1) for n in range(10, -1, -1))
 _COSINE = tuple((-1.0) ** n / math.factorial(2 * n) for n in range(11, -1, -1))
@@ -50,7 +52,7 @@ class Motion(NamedTuple):
     slip: float
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def sine_cosine(x):
     """sin(x) and cos(x) for 0 <= x <= pi/2, within a few half units in the last place, the same on any machine."""
     square = x * x
@@ -62,7 +64,7 @@ def sine_cosine(x):
     return s * x, c
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def angle_of(s, c):
     """The angle in [0, pi/2] whose sine and cosine these are; s^2 + c^2 is 1 to rounding.
 
@@ -75,7 +77,7 @@ def angle_of(s, c):
     return min(max(x, 0.0), 0.5 * math.pi)
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def _turn(axis, s, c, x, y, z):
     """(x, y, z) turned about `axis` by the angle whose HALF has sine s and cosine c."""
     cx, cy, cz = axis[1] * z - axis[2] * y, axis[2] * x - axis[0] * z, axis[0] * y - axis[1] * x
@@ -181,7 +183,7 @@ def make_motion(first, last, box, origin):
     return Motion(first, last, axis, half, sine, along, across, strain, speed, bend, slip)
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def _turn_back(axis, s, c, v):
     """v (3,), square to the axis, turned back by the angle with sine s and cosine c."""
     return (
@@ -191,7 +193,7 @@ def _turn_back(axis, s, c, v):
     )
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def pose_at(motion, t, pose):
     """Write M(t), the pose at fraction t in [0, 1], into pose (4, 4): the one formula."""
     if t <= 0.0 or t >= 1.0:
@@ -218,7 +220,7 @@ def pose_at(motion, t, pose):
     pose[3, 3] = 1.0
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def poses_on(motion, fractions, poses):
     """Write M(t) for each of fractions (n,) into poses (n, 4, 4)."""
     for i in range(fractions.shape[0]):

@@ -30,6 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas.voxel_grid import UNITS_PER_METRE
+from .compiled import borrowing
 from .layout import BLOCK_WORDS, COUNT, FIRST, LANES, ROW_WORDS, SceneArrays
 from .motion import Motion, pose_at
 from .overlap import STACK
@@ -55,9 +56,11 @@ class Moving(NamedTuple):
     square.  lanes: (b, 3, LANES), ways: (b, 4, LANES) likewise of the points.  stamp: (b,) int64, the chord a block was
     placed for.  frame: (3,) int64.  ends: (2, 4, 4), shifts: (2, 3), poses at the ends and t - O.
     pose, shift: (4, 4), (3,) of the one pose that integers are asked about.
-    pair: (6,) int64, block, lane, voxel, lane_at, block_at, j of one pair of points (placed.py).  first: (3,) float64,
-    fractions of the chord, inf: never: when anything could touch first; when `pair` is sure to; that of the two which
-    prunes. On a chord worth halving `pair` is the one that could touch first, else the first one sure to.
+    pair: (6,) int64, block, lane, voxel, lane_at, block_at, j of one pair of points (placed.py).  best: (6,) that of
+    the earliest contact found.
+    first: (3,) float64, fractions of the chord, inf: never: when anything could touch first; when `pair` is sure to;
+    that of the two which prunes. On a chord worth halving `pair` is the one that could touch first, else the first one
+    sure to.
     counters: (4,) int64, node visits, point tests, chords placed, most visits.  gap, way, keep, off, stack: scratch.
     """
 
@@ -71,6 +74,7 @@ class Moving(NamedTuple):
     pose: NDArray[np.float64]
     shift: NDArray[np.float64]
     pair: NDArray[np.int64]
+    best: NDArray[np.int64]
     first: NDArray[np.float64]
     counters: NDArray[np.int64]
     gap: NDArray[np.float64]
@@ -123,6 +127,7 @@ def make_moving(avatar):
         np.empty((4, 4)),
         np.empty(3),
         np.zeros(6, np.int64),
+        np.zeros(6, np.int64),
         np.empty(3),
         np.zeros(4, np.int64),
         np.empty(3),
@@ -133,14 +138,14 @@ def make_moving(avatar):
     )
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def _inverse(x, y, z):
     """1 / (x^2 + y^2 + z^2), or 0 where that is too small to matter (a way of 10^-10 steps) or to be divided by."""
     square = x * x + y * y + z * z
     return np.float32(ONE / square) if square > np.float32(1e-20) else ZERO
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def _place_nodes(avatar, scale, speed, moving, scene):
     """Place an avatar's nodes at both ends of a chord; speed: the farthest any point goes on it [m].
 
@@ -177,7 +182,7 @@ def _place_nodes(avatar, scale, speed, moving, scene):
     return extent + CHORD_ERROR * longest, farthest + extent
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def _place_block(avatar, block, moving, scene):
     """Place the points of one leaf node of the avatar at both ends of a chord."""
     per_step = 1.0 / scene.step
@@ -194,7 +199,7 @@ def _place_block(avatar, block, moving, scene):
         ways[block, 3, j] = _inverse(ways[block, 0, j], ways[block, 1, j], ways[block, 2, j])
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def _nodes_meet(words, row, x, y, z, dx, dy, dz, inverse, radius, latest, limits):
     """Whether a sphere that goes from (x, y, z) by (dx, dy, dz) comes within reach of a node's points before the
     fraction `latest` of that way, as far as its bound can tell: the sphere, then the slab. All float32."""
@@ -212,7 +217,7 @@ def _nodes_meet(words, row, x, y, z, dx, dy, dz, inverse, radius, latest, limits
     return min(begin, end) <= words[row + 9] + room and max(begin, end) >= words[row + 8] - room
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def pair_times(gap, way, inner, outer):
     """When a point that goes from `gap` by `way` (3,) comes within `outer` of 0, and within `inner`: fractions.
 
@@ -249,7 +254,7 @@ def pair_times(gap, way, inner, outer):
     return enters, certain, closest
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def _scale_of(pose):
     """The scale of a pose, as `check_poses` has it."""
     square = 0.0
@@ -260,7 +265,7 @@ def _scale_of(pose):
     return 1.0 if abs(scale - 1.0) <= SIMILARITY_TOLERANCE else scale
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def touches_at(job, t, pair):
     """Whether one pair (as in Moving) is in contact under M(t), by NUMERICS.md N5."""
     scene, moving = job.scene, job.moving
@@ -273,14 +278,14 @@ def touches_at(job, t, pair):
     return square >= 0 and square <= units * units
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def scan_coordinate(scene, pair, r):
     """Lattice coordinate r of a pair's scan point [steps]."""
     low = scene.coordinates[pair[2], r] * scene.voxel_steps + np.int64(scene.ints[pair[4] + r])
     return low + np.int64(scene.halves[pair[3] + r * LANES + pair[5]])
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def _comes_first(job, pair, other):
     """Of two pairs that touch at the same moment, whether one is named first: by scan point, then avatar's."""
     for r in range(3):
@@ -294,7 +299,7 @@ def _comes_first(job, pair, other):
     return False
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def _certain_by_integers(job, chord, pair, enters, certain, closest):
     """The fraction at which a pair is known to touch, where its integers are asked at two poses of a final chord.
 
@@ -309,7 +314,7 @@ def _certain_by_integers(job, chord, pair, enters, certain, closest):
     return certain
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def _try_pair(job, chord, pair):
     """Take one pair into account, in float64: may lower moving.first and name another moving.pair."""
     scene, moving, points = job.scene, job.moving, job.avatar.points
@@ -336,13 +341,13 @@ def _try_pair(job, chord, pair):
             moving.pair[n] = pair[n]
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def _latest(moving):
     """The fraction of the chord that still matters, float32, rounded up."""
     return np.float32(min(moving.first[2] * (1.0 + 1e-6) + 1e-30, 1.0))
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def _leaves(job, chord, voxel, block, row, limits):
     """Take all pairs of a leaf node of the avatar and one of the scene into account.
 
@@ -406,7 +411,7 @@ def _leaves(job, chord, voxel, block, row, limits):
                 latest = _latest(moving)
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def _sweep_voxel(job, chord, voxel, limits):
     """Take one resident voxel into account: the two trees descended together, depth first.
 
@@ -464,7 +469,7 @@ def _sweep_voxel(job, chord, voxel, limits):
     return True
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def search(job, t0, t1, rows):
     """One descent over the interval [t0, t1], through the voxels `rows`; those not resident are passed by.
 
@@ -483,7 +488,7 @@ def search(job, t0, t1, rows):
     widest = np.int64(math.ceil(chord.outer)) + 1
     limits = make_limits(widest, scene.units_per_step, extent, farthest, scene.voxel_steps)
     moving.counters[2] += 1
-    moving.first[:] = INFINITE
+    moving.first[0], moving.first[1], moving.first[2] = INFINITE, INFINITE, INFINITE
     for row in rows:
         if scene.where[row, 0] >= 0 and not _sweep_voxel(job, chord, row, limits):
             break

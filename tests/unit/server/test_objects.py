@@ -80,6 +80,15 @@ def test_a_deadline_that_has_passed_leaves_all_unknown(data: SceneData) -> None:
     assert len(answers.pairs) == 300 * 299 // 2 and (answers.pair_verdict == CONTACT).all()
 
 
+def test_a_budget_holds_against_the_scene_too(data: SceneData) -> None:
+    pose = cases.pose_of(np.eye(3), scans.make_scan("plane", 1, 50)[0])[None]
+    said = [
+        objects(data, [BALL], pose, [1], [SCENE_GROUP], effort=Effort(visits=visits)).verdict[0]
+        for visits in (0, 10**6)
+    ]
+    assert said == [UNKNOWN, CONTACT]
+
+
 def test_what_is_refused(data: SceneData) -> None:
     for arguments, error, text in [
         (([BALL], at(0, 1), [1, 1], [1, 1]), BadRequestError, "1 avatars, 2 poses"),

@@ -12,6 +12,8 @@ import scans
 import zenoh
 from solidcloud.schemas import keys
 from solidcloud.schemas.answers import (
+    PARTS,
+    PATH_ANSWERS,
     CollideAnswers,
     ContactsAnswers,
     DistanceAnswers,
@@ -31,6 +33,7 @@ from solidcloud.schemas.messages import (
     ContactsRequest,
     DistanceRequest,
     ObjectsRequest,
+    PathRequest,
     RaycastRequest,
     SweepRequest,
     WithinRequest,

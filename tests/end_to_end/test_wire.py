@@ -404,7 +404,9 @@ def test_a_client_whose_token_goes_is_sent_no_more_parts(scene, endpoint):
         token = session.liveliness().declare_token("solidcloud/1/client/floor/c")
         scene.avatars["c", "wait"] = (POINTS, 0.125)
         request = encode(PathRequest("wait", PATH))
-        replies = session.get("solidcloud/1/scene/floor/c/path", payload=request, timeout=DEADLINE)
+        # By default zenoh keeps of several replies the last.
+        every = {"consolidation": zenoh.ConsolidationMode.NONE, "timeout": DEADLINE}
+        replies = session.get("solidcloud/1/scene/floor/c/path", payload=request, **every)
         assert replies.recv().ok
         token.undeclare()
         eventually(lambda: scene.gone)

@@ -205,6 +205,26 @@ def test_a_path_is_its_question_in_parts(scene, client, op, parameters, monkeypa
         same(join([without_part(type(expected), part) for part in parts]), expected)
 
 
+@pytest.mark.parametrize("encoding", [MSGPACK, JSON])
+@pytest.mark.parametrize("op, parameters", [("distance", {"reach": 0.05}), ("contacts", {}), ("sweep", {})])
+def test_plain_zenoh_gets_the_parts_of_a_path(scene, endpoint, op, parameters, encoding, monkeypatch):
+    monkeypatch.setattr(path_module, "FIRST_PART", 3)
+    monkeypatch.setattr(path_module, "LARGEST_PART", 9)
+    expected = list(scene.path("al", POSES, op, **parameters))
+    key = keys.question_key("hall", "plain", "path")
+    payload = encode(PathRequest("al", POSES, op, **parameters), encoding)
+    with zenoh.open(session_config(connect=endpoint)) as session:
+        every = {"consolidation": zenoh.ConsolidationMode.NONE, "encoding": encoding}
+        replies = [reply.ok.payload.to_bytes() for reply in session.get(key, payload=payload, **every)]
+    assert len(replies) > 3
+    kind = PATH_ANSWERS[op]
+    parts = [decode_answer(PARTS[kind], reply, encoding) for reply in replies]
+    same(
+        join([without_part(kind, part) for part in parts]),
+        join([without_part(kind, part) for part in expected]),
+    )
+
+
 @pytest.mark.parametrize(
     "op, poses, total", [("collide", 0, 0), ("sweep", 0, 0), ("sweep", 1, 0), ("collide", 1, 1)]
 )

@@ -1,10 +1,10 @@
 """The poses that are asked about: jittered, sorted into classes, and sets made to be hard."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 from solidcloud.builder.made.truth import FacadeTruth
 from solidcloud.builder.made.walk import floor_height, walk_poses
@@ -18,6 +18,8 @@ SLIDING = 0.01  # between the nearest spheres of a wall and of an avatar that sl
 # About the height at which the feet touch the floor exactly [m]; 15 nm is the exact unit.
 FOOT_STEPS = (-1e-3, -1e-4, -1e-5, -1e-6, -3e-8, 0.0, 3e-8, 1e-6, 1e-5, 1e-4, 1e-3)
 WALK_SECONDS = 40.0
+# Of `near_surfaces`: how far around a figure it is moved out of, and what gap is left [m].
+AROUND, LEFT = 0.3, (-0.005, 0.05)
 PILOT = 200  # poses asked to find the distance at which half of them touch
 
 
@@ -115,7 +117,7 @@ def half_touching(
     return distance
 
 
-def touching_shift(points: Floats, placed: Floats, axis: Sequence[float], distance: float) -> float:
+def touching_shift(points: Floats, placed: Floats, axis: ArrayLike, distance: float) -> float:
     """How far along a unit axis to move centres placed (m, 3) so that the nearest pair is `distance` apart [m].
 
     Moved farther, no pair is as near as that. -inf where no pair can be, for all lie beside one another.
@@ -179,7 +181,7 @@ def along_walls(
             place[2] = floor_height(truth, place[None, :2])[0] + SOLE
             pose = upright(place[None], rng.uniform(-np.pi, np.pi, 1))[0]
             of_wall = points[np.abs(points[:, axis] - wall.offset) < 0.15]
-            shift = touching_shift(of_wall, _placed(avatar, pose), normal.tolist(), distance + SLIDING)
+            shift = touching_shift(of_wall, _placed(avatar, pose), normal, distance + SLIDING)
             if np.isfinite(shift):
                 pose[:3, 3] += shift * normal
                 found.append(pose)
@@ -193,6 +195,31 @@ def inside_columns(truth: FacadeTruth, rng: np.random.Generator, count: int) -> 
     chosen = [truth.columns[i] for i in rng.integers(len(truth.columns), size=count)]
     places = np.array([(c.x, c.y, rng.uniform(c.z_low, c.z_high)) for c in chosen])
     return PoseSet("inside columns", upright(places, rng.uniform(-np.pi, np.pi, count)), "in a column's axis")
+
+
+def near_surfaces(
+    tree: cKDTree, points: Floats, avatar: Floats, distance: float, rng: np.random.Generator, count: int
+) -> PoseSet:
+    """Poses turned at random, moved along a random direction out of what is around them until a small gap is left.
+
+    tree: over points (n, 3), the frame of the poses. What was not around may be touched: some are in contact.
+    """
+    centre = avatar.mean(axis=0)
+    around = float(np.linalg.norm(avatar - centre, axis=1).max()) + AROUND
+    poses = random_poses(rng, points, avatar, count, AROUND)
+    axes = rng.normal(size=(count, 3))
+    axes /= np.linalg.norm(axes, axis=1)[:, None]
+    left = rng.uniform(*LEFT, count)
+    moved: NDArray[np.bool_] = np.zeros(count, bool)
+    for i, (pose, axis, gap) in enumerate(zip(poses, axes, left, strict=True)):
+        near = tree.query_ball_point(pose[:3, :3] @ centre + pose[:3, 3], around)
+        shift = touching_shift(points[near], _placed(avatar, pose), axis, distance + gap)
+        moved[i] = np.isfinite(shift)  # not where all that is around lies beside it
+        if moved[i]:
+            pose[:3, 3] += shift * axis
+    low, high = (f"{edge * 1e3:g}" for edge in LEFT)
+    said = f"turned at random, moved out of what is within {AROUND:g} m to a gap of {low} to {high} mm"
+    return PoseSet("near surfaces", poses[moved], said)
 
 
 def free_space(

@@ -12,12 +12,12 @@ from solidcloud.server.report.floor_walk import floor_walk
 from .archives import build, stored_points
 from .context import Bench
 from .machine import Clock, say
-from .poses import PoseSet, half_touching, random_poses
+from .poses import PoseSet, near_surfaces, random_poses
 from .results import Part
 from .sides import OURS, Place, compare_set
 
 REAL_SCANS = ("pumpA.e57", "lone_star.copc.laz", "campus_scan_a.ply")
-NEAR_POSES = 600
+NEAR_POSES = 240
 LONELY = 0.3  # [m]
 
 
@@ -76,10 +76,9 @@ def walk_set(bench: Bench, archive: Path) -> PoseSet:
 
 
 def near_set(bench: Bench, place: Place) -> PoseSet:
-    """Poses near surfaces, about half of them in contact."""
-    points = place.case.points + place.case.origin
-    distance = half_touching(bench.rng, points, bench.avatar, place.contact)
-    poses = random_poses(bench.rng, points, bench.avatar, NEAR_POSES, distance)
-    return PoseSet(
-        "near surfaces", poses, f"turned at random, a point within {distance:.2g} m of one of the scan"
+    """Poses near surfaces, world."""
+    poses = near_surfaces(
+        place.tree, place.case.points, bench.avatar, place.case.distance, bench.rng, NEAR_POSES
     )
+    poses.poses[:, :3, 3] += place.case.origin
+    return poses

@@ -111,6 +111,15 @@ def test_feet_are_at_the_height_of_contact_or_a_step_beside_it() -> None:
     assert (np.abs(gaps) <= np.abs(steps) + 1e-12).all()
 
 
+def test_near_surfaces_leaves_a_small_gap(rng: np.random.Generator) -> None:
+    found = poses.near_surfaces(cKDTree(PLANE), PLANE, BODY, 0.06, rng, 40).poses
+    gaps = np.array([least(PLANE, BODY, pose) - 0.06 for pose in found])
+    low, high = poses.LEFT
+    assert len(found) >= 20
+    assert (gaps <= high + 1e-9).all(), "what was not around may be nearer, not farther"
+    assert ((gaps >= low - 1e-9) & (gaps > 0)).any() and (gaps < 0).any()
+
+
 def test_free_space_keeps_away(rng: np.random.Generator) -> None:
     bounds = np.array([[0.0, 0, -1], [2, 2, 2]])
     for far in (0.0, 0.3):

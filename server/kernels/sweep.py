@@ -98,7 +98,7 @@ class Job(NamedTuple):
     radius: float
     scale: float
     other_units: int
-    units: int
+    units: np.int64
     loose: float
 
 

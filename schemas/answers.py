@@ -122,8 +122,8 @@ class ContactsAnswers(Cost, frozen=True, eq=False):
     were counted.  pairs_found: (k,) int64, pairs in contact, listed or not.
     pair_starts: (k + 1,) int64: the pairs listed for pose i are rows [pair_starts[i], pair_starts[i + 1]) of the pair
     columns, deepest first, ties by scan point (x, y, z), then by avatar centre: avatar_point, cloud_point (p, 3)
-    float64 centres, world [m]; signed_distance (p,) float64 [m]; avatar_index (p,) int32, row of the avatar's points as added;
-    scan_index (p,) int32, the scan it came from (`SceneInfo.sources`), -1 where not kept;
+    float64 centres, world [m]; signed_distance (p,) float64 [m]; avatar_index (p,) int32, row of the avatar's points
+    as added; scan_index (p,) int32, the scan it came from (`SceneInfo.sources`), -1 where not kept;
     cluster (p,) int32, row among the pose's clusters.
     cluster_starts: (k + 1,) int64, rows of the cluster columns, deepest first: cluster_count (c,) int64 pairs in it,
     all of them; cluster_deepest (c,) float64 signed distance; cluster_avatar, cluster_cloud (c, 3) the deepest pair's
@@ -193,7 +193,8 @@ class RaycastAnswers(Cost, frozen=True, eq=False):
     verdict: (k,) uint8: CONTACT, the ray hits a scan point's sphere within reach; CLEAR, it hits none; UNKNOWN.
     distance: (k,) float64, along the ray to the first hit [m], 0 where the ray starts inside, inf where none.
     lower, upper: (k,) float64, the true distance lies between them; beyond reach: the reach, and inf.
-    exact: (k,) bool.  hit: (k, 3) float64, where, world [m].  cloud_point: (k, 3), the centre of the sphere that is hit, of several at
+    exact: (k,) bool.
+    hit: (k, 3) float64, where, world [m].  cloud_point: (k, 3), the centre of the sphere that is hit, of several at
     equal distance the least (x, y, z).  normal: (k, 3) unit vector from it to `hit`. All NaN where there is no hit.
     outside, voxels_missing, node_visits, point_tests: as in `CollideAnswers`.
     """
@@ -222,7 +223,8 @@ class WithinAnswers(Cost, frozen=True, eq=False):
     verdict: (k,) uint8: CONTACT, a scan point lies within reach; CLEAR, none does; UNKNOWN.
     distance: (k,) float64, to the nearest scan point's centre [m], inf where none is within reach.
     lower, upper: (k,) float64, the true distance lies between them; beyond reach: the reach, and inf.
-    exact: (k,) bool.  cloud_point: (k, 3) float64, the nearest scan point, world [m], of several the least (x, y, z); NaN where none.
+    exact: (k,) bool.
+    cloud_point: (k, 3) float64, the nearest scan point, world [m], of several the least (x, y, z); NaN where none.
     outside, voxels_missing, node_visits, point_tests: as in `CollideAnswers`.
     """
 

@@ -150,6 +150,7 @@ def goal_rows(parts: Iterable[Part], notes: dict[str, str]) -> list[dict[str, An
     """One row a goal, for the table, the JSON and the picture."""
     return [
         {
+            "key": goal.key,
             "section": goal.section,
             "goal": goal.text,
             "measured": goal.measured,
@@ -185,9 +186,11 @@ def show(parts: list[Part], notes: dict[str, str]) -> None:
         console.print(table)
     if busy(parts):
         console.print(f"{busy(parts)}: not figures to quote", style="bold red")
-    for row in rows:
-        if row["note"] or row["verdict"] == MISSED:
-            console.print(f"{row['verdict']}: {row['goal']}: {row['note'] or 'no note yet'}")
+    for key in dict.fromkeys(row["key"] for row in rows):
+        own = [row for row in rows if row["key"] == key]
+        missed = sum(row["verdict"] == MISSED for row in own)
+        if missed or own[0]["note"]:
+            console.print(f"{key}: {missed} of {len(own)} missed: {own[0]['note'] or 'no note yet'}")
     for part in parts:
         for line in part.missing:
             console.print(f"not measured ({part.section}): {line}", style="yellow")

@@ -221,7 +221,8 @@ def test_goal_rows_carry_their_notes() -> None:
 def test_a_miss_is_printed_with_its_note(capsys: pytest.CaptureFixture[str]) -> None:
     results.show(a_report(), {"table": "tried a grid"})
     said = capsys.readouterr().out
-    assert "missed: mean / table: tried a grid" in said
+    assert "table: 1 of 1 missed: tried a grid" in said
+    assert "far:" not in said and "capt:" not in said, "met, or not measured, and nothing to note"
     assert "not measured (collide): peers" in said
     assert "section scans ended early: RuntimeError: no" in said
     assert "busy" not in said

@@ -21,9 +21,11 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from ...schemas.voxel import MAX_LEAF
+
 # 32 uint16 lanes become 32 float32 in one vector loop. LLVM unrolls loops of 8 or 16 constant trips and
 # then does not vectorise them, which costs several times as much a pair.
-LANES = 32
+LANES = MAX_LEAF
 ROW_WORDS = 12
 BLOCK_WORDS = 4
 FIRST, COUNT = 10, 11  # columns of a row that hold int32

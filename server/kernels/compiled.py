@@ -4,9 +4,15 @@ A kernel that is handed tuples of arrays counts references: an atomic increment 
 out of a tuple or hands on, in the middle of its loops, though whoever called it holds the arrays all the while. In the
 descents that was a fifth to a half of the time (scripts/bench_engine: collide 5.0 us a pose with, 4.1 without).
 `borrowing` leaves the counting out. It is for functions that make no array: slices are as good as elements, but
-np.empty and its like are refused by the compiler.
+np.empty and its like, and assignments of whole arrays, are refused by the compiler.
 """
+
+from typing import Any
 
 import numba as nb
 
-borrowing = nb.njit(nogil=True, cache=True, _nrt=False)
+# By name, because numba's own types leave the option out: its underscore says that it may change. Without it kernels are
+# slower and as right.
+_NO_COUNTING: dict[str, Any] = {"_nrt": False}
+
+borrowing = nb.njit(nogil=True, cache=True, **_NO_COUNTING)

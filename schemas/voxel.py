@@ -1,4 +1,6 @@
-"""The data of one voxel as flat arrays, and `check_voxel`, the door every decoded voxel passes.
+"""The data of one voxel as flat arrays, and the checks that every decoded voxel passes.
+
+They are `link_tree`, `check_tree` and, as the points are read, `read_lanes` (codec.py); `check_voxel` runs all three.
 
 A voxel is an octree whose leaf cells each hold a bounding sphere hierarchy (BSH), with one more BSH over
 the cells ([Fig12] section 4 and figures 3, 4). Every BSH is an R-tree-like tree of degree m with all

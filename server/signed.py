@@ -9,6 +9,8 @@ The difference in int64, the rest in float64, in this order; 0 where D2 and r ar
 cancellation: it is negative, zero or positive as the spheres overlap, touch or do not.
 """
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -57,7 +59,7 @@ def distance_columns(
     nearest: Nearest,
     counts: NDArray[np.uint32],
     upper: NDArray[np.float64] | None = None,
-) -> dict[str, NDArray]:
+) -> dict[str, Any]:
     """The fields of `DistanceAnswers` that say where the nearest pair is.
 
     farthest: the reach asked for [m].  reach_units: the same, exact units.  nearest: what was found; its gap counts

@@ -11,8 +11,8 @@ from typing import Any
 
 import numba as nb
 
-# By name, because numba's own types leave the option out: its underscore says that it may change. Without it kernels are
-# slower and as right.
+# By name, because numba's own types leave the option out: its underscore says that it may change. Without it kernels
+# are slower and as right.
 _NO_COUNTING: dict[str, Any] = {"_nrt": False}
 
 borrowing = nb.njit(nogil=True, cache=True, **_NO_COUNTING)

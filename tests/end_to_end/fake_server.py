@@ -98,7 +98,9 @@ class FloorScene:
         verdict = floor_verdicts(points, radius, poses, margin)
         ones = np.ones(k, np.uint32)
         outside = np.abs(poses[:, 0, 3]) > 1
-        return CollideAnswers(verdict, outside, ones * 0, ones, ones * 2, engine_seconds=0.25, hits=1, resident=1)
+        return CollideAnswers(
+            verdict, outside, ones * 0, ones, ones * 2, engine_seconds=0.25, hits=1, resident=1
+        )
 
     # The other questions say nothing, but what they were asked is kept.
     def distance(self, name, poses, reach, *, client="", **effort):

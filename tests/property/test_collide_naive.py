@@ -4,7 +4,6 @@ Few builds and many questions: a build takes a tenth of a second, a question a t
 """
 
 from concurrent.futures import ThreadPoolExecutor
-from itertools import permutations, product
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -14,41 +13,11 @@ import naive
 import numpy as np
 import pytest
 import scans
+from clouds import KINDS, TREES, cloud, signed_permutations
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from solidcloud.server.scene import Scene
-
-KINDS = ("cluster", "plane", "line", "sphere", "corners", "duplicates", "noise", "one point")
-TREES = st.fixed_dictionaries(
-    {
-        "degree": st.sampled_from([2, 3, 8, 16]),
-        "leaf": st.sampled_from([1, 2, 31, 32]),
-        "cell_points": st.sampled_from([1, 20, 4096]),
-        "with_slab": st.booleans(),
-    }
-)
-
-
-def cloud(rng: np.random.Generator, kind: str, count: int) -> NDArray[np.float64]:
-    """Points (n, 3) in [-1, 1]^3."""
-    if kind == "one point":
-        count = 1
-    points = rng.uniform(-1, 1, (count, 3))
-    if kind == "cluster":
-        centers = rng.uniform(-1, 1, (max(1, count // 40), 3))
-        points = centers[rng.integers(len(centers), size=count)] + points * 10.0 ** rng.uniform(-6, -1)
-    elif kind == "plane":
-        points = points * [1, 1, 1e-5] @ cases.random_rotation(rng)
-    elif kind == "line":
-        points = points[:, :1] * rng.uniform(-1, 1, 3)
-    elif kind == "sphere":
-        points /= np.linalg.norm(points, axis=1)[:, None]
-    elif kind == "corners":
-        points = np.sign(points)
-    elif kind == "duplicates":
-        points = points[rng.integers(0, max(1, count // 10), count)]
-    return points
 
 
 def build(points: NDArray[np.float64], folder: str, **options: Any) -> cases.Case:
@@ -131,17 +100,6 @@ def test_no_tree_voxel_order_or_thread_changes_an_answer(seed: int, kind: str, m
                 assert scene.collide("avatar", poses, margin).verdict.tolist() == expected
                 parts = pool.map(lambda p, s=scene: s.collide("avatar", p[None], margin).verdict[0], poses)
                 assert list(parts) == expected
-
-
-def signed_permutations() -> list[NDArray[np.float64]]:
-    """The 24 rotations that map the axes onto themselves."""
-    found = []
-    for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
-        turn = np.zeros((3, 3))
-        turn[range(3), order] = signs
-        if np.linalg.det(turn) > 0:
-            found.append(turn)
-    return found
 
 
 @settings(max_examples=10, deadline=None, derandomize=True)

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Iterator
-from itertools import permutations, product
 from pathlib import Path
 
 import cases
@@ -11,6 +10,7 @@ import naive_objects
 import numpy as np
 import pytest
 import scans
+from clouds import signed_permutations
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -122,17 +122,6 @@ def test_contact_begins_at_the_unit_the_definition_says(
                     (reach - given_units) / naive.UNITS,
                 )
                 assert (len(answers.pairs) == 1) == (reach >= least), (reach, least)
-
-
-def signed_permutations() -> list[NDArray[np.float64]]:
-    """The 24 rotations that map the axes onto themselves."""
-    found = []
-    for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
-        turn = np.zeros((3, 3))
-        turn[range(3), order] = signs
-        if np.linalg.det(turn) > 0:
-            found.append(turn)
-    return found
 
 
 @settings(max_examples=20, deadline=None, derandomize=True)

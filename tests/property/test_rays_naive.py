@@ -13,6 +13,7 @@ import naive_rays
 import numpy as np
 import pytest
 import scans
+from clouds import TREES, cloud
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -25,14 +26,6 @@ from solidcloud.server.store import Store
 from solidcloud.server.within import within
 
 KINDS = ("cluster", "plane", "line", "grid", "duplicates", "noise", "one point")
-TREES = st.fixed_dictionaries(
-    {
-        "degree": st.sampled_from([2, 3, 8, 16]),
-        "leaf": st.sampled_from([1, 2, 31, 32]),
-        "cell_points": st.sampled_from([1, 20, 4096]),
-        "with_slab": st.booleans(),
-    }
-)
 
 
 @contextmanager
@@ -43,25 +36,6 @@ def opened(case: cases.Case, budget: int = 64 << 20) -> Iterator[SceneData]:
         yield make_scene_data(store.archive, Residency(store, budget))
     finally:
         store.close()
-
-
-def cloud(rng: np.random.Generator, kind: str, count: int) -> NDArray[np.float64]:
-    """Points (n, 3) in [-1, 1]^3."""
-    if kind == "one point":
-        count = 1
-    points = rng.uniform(-1, 1, (count, 3))
-    if kind == "cluster":
-        centers = rng.uniform(-1, 1, (max(1, count // 40), 3))
-        points = centers[rng.integers(len(centers), size=count)] + points * 10.0 ** rng.uniform(-6, -1)
-    elif kind == "plane":
-        points = points * [1, 1, 1e-5] @ cases.random_rotation(rng)
-    elif kind == "line":
-        points = points[:, :1] * rng.uniform(-1, 1, 3)
-    elif kind == "grid":
-        points = np.rint(points * 3) / 3
-    elif kind == "duplicates":
-        points = points[rng.integers(0, max(1, count // 10), count)]
-    return points
 
 
 def some_rays(

@@ -223,7 +223,9 @@ def test_answers_that_are_none_are_internal_errors_never_guesses():
 
 
 def test_json_counts_beyond_uint32_are_refused():
-    text = encode(unknown(CollideAnswers, 1), JSON).replace(b'"node_visits":[0]', b'"node_visits":[4294967296]')
+    text = encode(unknown(CollideAnswers, 1), JSON).replace(
+        b'"node_visits":[0]', b'"node_visits":[4294967296]'
+    )
     with pytest.raises(InternalError, match="uint32"):
         decode_answer(CollideAnswers, text, JSON)
 

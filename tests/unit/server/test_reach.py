@@ -10,8 +10,8 @@ import scans
 from numpy.typing import NDArray
 from solidcloud.schemas.archive import Archive
 from solidcloud.server.avatar import AvatarModel, make_avatar
-from solidcloud.server.request import SceneData, check_request, make_scene_data, to_units
 from solidcloud.server.kernels.reach import Reach, find_key
+from solidcloud.server.request import SceneData, check_request, make_scene_data, to_units
 from solidcloud.server.residency import Residency
 from solidcloud.server.scene import Scene
 from solidcloud.server.store import Store

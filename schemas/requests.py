@@ -185,8 +185,7 @@ class ObjectsRequest(Question, frozen=True):
     def __post_init__(self) -> None:
         Request.__post_init__(self)
         _same_length(self, "objects", "poses")
-        if len(self.objects) > MAX_OBJECTS:
-            raise TooLargeError(f"{len(self.objects)} objects: at most {MAX_OBJECTS}: ask in groups")
+        _check_count(self.objects)
 
 
 class PathRequest(Request, frozen=True):
@@ -264,8 +263,9 @@ def make_poses(poses: Any, what: str = "poses") -> Poses:
 def make_objects(objects: Sequence[Sequence[Any]]) -> tuple[list[ObjectItem], Poses]:
     """Objects (name, pose, group = 1, mask = all groups), poses (4, 4) float64, as the wire has them.
 
-    BadRequestError says which is none.
+    BadRequestError says which is none. TooLargeError: more than `MAX_OBJECTS`.
     """
+    _check_count(objects)
     items = []
     for number, entry in enumerate(objects):
         if not 2 <= len(entry) <= 4:
@@ -276,6 +276,12 @@ def make_objects(objects: Sequence[Sequence[Any]]) -> tuple[list[ObjectItem], Po
     if not items:
         return items, make_poses(np.zeros((0, 4, 4)))
     return items, make_poses([entry[1] for entry in objects])
+
+
+def _check_count(objects: Sequence[Any]) -> None:
+    """TooLargeError for more objects than one request may hold."""
+    if len(objects) > MAX_OBJECTS:
+        raise TooLargeError(f"{len(objects)} objects: at most {MAX_OBJECTS}: ask in groups")
 
 
 def _as_bits(number: int, value: Any) -> int:

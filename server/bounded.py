@@ -27,8 +27,6 @@ from .signed import distance_columns, signed_bound, signed_from_square, unknown_
 HEAP_PAIRS = 1 << 14
 # Node visits between two looks at the clock: some 20 to 100 µs.
 SLICE_VISITS = 2000
-# Of the time left, what loads may take: what is resident is to be searched as well.
-LOAD_SHARE = 0.5
 # Bounds are widened by some exact units when they become metres; a tolerance below that is none.
 TOLERANCE_SLACK = 8.0
 
@@ -57,8 +55,11 @@ def _search_until(
     search = make_search(avatar.arrays, heap)
     for done, pose in enumerate(which.tolist()):
         now = time.perf_counter()
+        if now >= deadline:
+            _leave_open(data, part, which[done:], known, counts)
+            return
         share = now + (deadline - now) / (len(which) - done)
-        fresh, until = True, SLICE_VISITS if now < share else 0
+        fresh, until = True, SLICE_VISITS
         while True:
             status = go_on(
                 array, avatar.arrays, data.arrays, data.broad, part, pose, fresh, until, search, goal, known, counts
@@ -69,6 +70,20 @@ def _search_until(
                 end_search(search, pose, known, counts)
                 break
             fresh, until = False, until + SLICE_VISITS
+
+
+def _leave_open(
+    data: SceneData, part: Reach, left: NDArray[np.int64], known: Known, counts: NDArray[np.uint32]
+) -> None:
+    """Give up the poses `left`, all at once: a kernel call for each took a deadline of 5 ms to half a second.
+
+    What is in reach of them may be anywhere, so their bounds say no more than that.
+    """
+    begins, ends = part.starts[left], part.starts[left + 1]
+    absent = data.arrays.where[part.rows[: part.starts[-1]], 0] < 0
+    before = np.concatenate([[0], np.cumsum(absent)])
+    counts[0, left] += (before[ends] - before[begins]).astype(np.uint32)
+    known.lower[left[ends > begins]] = 0.0
 
 
 def _gather(
@@ -87,9 +102,7 @@ def _gather(
     faults: dict[str, None] = {}
     for which, rows, part in pieces(reach, residency) if len(avatar.points) else ():
         heap = max(HEAP_PAIRS, int(np.diff(part.starts).max(initial=0)))
-        now = time.perf_counter()
-        until = now + (effort.deadline - now) * LOAD_SHARE if effort.deadline < math.inf else math.inf
-        with residency.hold(rows, until) as held:
+        with residency.hold(rows, effort.loads_until()) as held:
             seen = as_held(data, held)
             if effort.deadline < math.inf:
                 _search_until(seen, avatar, array, part, which, heap, goal, effort.deadline, known, counts)

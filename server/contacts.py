@@ -13,16 +13,18 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..schemas.answers import ContactsAnswers, Verdict
-from ..schemas.errors import BadRequestError
-from ..schemas.messages import make_poses
+from ..schemas.errors import BadRequestError, TooLargeError
+from ..schemas.requests import MAX_CONTACTS, make_poses
 from ..schemas.voxel_grid import UNITS_PER_METRE
 from .avatar import AvatarModel
 from .distance import signed_from_square
-from .effort import EXACT, NO_LIMIT, Effort
+from .effort import EXACT, Effort
 from .kernels.clusters import (
     CENTER,
     CLUSTER,
+    CLUSTERS,
     HIGH,
+    LISTED,
     LOW,
     PAIRS,
     POINT,
@@ -37,12 +39,14 @@ from .kernels.clusters import (
 from .kernels.contacts import Asked, Tally, gather_contacts
 from .kernels.overlap import STACK
 from .kernels.reach import Reach
-from .request import SceneData, check_request, in_unknown, pieces, to_units
+from .request import SceneData, as_held, check_request, in_unknown, pieces, to_units
 
-# Pairs listed a pose. A record takes 80 bytes and each pose of a request keeps its own; the clusters count the rest.
-MOST_PAIRS = 10_000
-# Node visits between two looks at the clock, about a millisecond; no look without a deadline.
+# Pairs and clusters that one request may list, all poses together [bytes]; some three times as much is needed for a
+# moment, to make columns of them. The wire's largest message holds an eighth of it.
+MOST_BYTES = 256 << 20
+# Node visits between two looks at the clock, about a millisecond; and at what is listed, where there is no deadline.
 SLICE_VISITS = 1 << 15
+SIZE_VISITS = 1 << 19
 # Cells there is room for at first, a power of two and LANES or more; a kernel doubles them as it needs.
 FIRST_CELLS = 256
 
@@ -58,7 +62,7 @@ def contacts(
 ) -> ContactsAnswers:
     """All pairs in contact under each pose: counted, the deepest `limit` listed, gathered into clusters.
 
-    poses, margin: as for `collide`.  limit: pairs listed a pose, 0 to MOST_PAIRS; all are counted.
+    poses, margin: as for `collide`.  limit: pairs listed a pose, 0 to MAX_CONTACTS; all are counted.
     cluster_distance: edge of the grid cells that touched scan points fall in [m], rounded up to whole lattice steps,
     at least one; cells lie on multiples of it from the dataset's origin. None: twice r_a + r_b + margin. Touched cells
     that share a face, an edge or a corner are one cluster: points at most this far apart always are in one cluster, and
@@ -96,8 +100,9 @@ def contacts(
             if effort.spent:
                 memory = _gather(data, avatar, array, part, which, asked, closes, effort, memory, tally)
                 continue
-            with data.residency.hold(rows) as held:
-                memory = _gather(data, avatar, array, part, which, asked, closes, effort, memory, tally)
+            with data.residency.hold(rows, effort.loads_until()) as held:
+                seen = as_held(data, held)
+                memory = _gather(seen, avatar, array, part, which, asked, closes, effort, memory, tally)
             hits, misses = hits + held.hits, misses + held.misses
             faults.update(dict.fromkeys(held.faults))
     residency = data.residency
@@ -114,8 +119,10 @@ def _checked_limit(limit: int) -> int:
         number = operator.index(limit)
     except TypeError:
         number = -1
-    if isinstance(limit, bool) or not 0 <= number <= MOST_PAIRS:
-        raise BadRequestError(f"limit {limit!r}: expected a whole number of pairs a pose, 0 to {MOST_PAIRS}")
+    if isinstance(limit, bool) or not 0 <= number <= MAX_CONTACTS:
+        raise BadRequestError(
+            f"limit {limit!r}: expected a whole number of pairs a pose, 0 to {MAX_CONTACTS}"
+        )
     return number
 
 
@@ -151,14 +158,25 @@ def _gather(
 ) -> Memory:
     """Answer one piece, to its end or to the deadline; what is left then is cut."""
     memory.cursor[:] = 0, -1, 0
-    pause = NO_LIMIT if effort.deadline == math.inf else SLICE_VISITS
+    pause = SIZE_VISITS if effort.deadline == math.inf else SLICE_VISITS
     while memory.cursor[0] < len(which):
         if effort.spent:
             asked = asked._replace(visits=-1)
         memory = gather_contacts(
             poses, avatar.arrays, data.arrays, part, which, asked, closes, pause, memory, tally
         )
+        _check_room(memory)
     return memory
+
+
+def _check_room(memory: Memory) -> None:
+    """TooLargeError where more is listed than a request may list."""
+    pairs, clusters = int(memory.sizes[LISTED]), int(memory.sizes[CLUSTERS])
+    if 8 * (pairs * RECORD + clusters * CLUSTER) > MOST_BYTES:
+        raise TooLargeError(
+            f"{pairs} pairs and {clusters} clusters listed, more than the {MOST_BYTES >> 20} MiB of a request: ask for "
+            "fewer poses, a smaller limit or a larger cluster_distance"
+        )
 
 
 def _by_pose(rows: NDArray[np.int64], runs: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

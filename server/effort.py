@@ -12,6 +12,8 @@ from ..schemas.errors import BadRequestError
 
 # No budget: more node visits than any request could make.
 NO_LIMIT = 1 << 62
+# Of the time left, what loads may take: what is resident is to be searched as well.
+LOAD_SHARE = 0.5
 
 
 class Effort(NamedTuple):
@@ -34,6 +36,13 @@ class Effort(NamedTuple):
     def spent(self) -> bool:
         """Whether the time is up."""
         return self.deadline < math.inf and time.perf_counter() >= self.deadline
+
+    def loads_until(self) -> float:
+        """Until when loads that begin now may go on, on the same clock [s]; inf: until they are done."""
+        if self.deadline == math.inf:
+            return math.inf
+        now = time.perf_counter()
+        return now + (self.deadline - now) * LOAD_SHARE
 
 
 EXACT = Effort()

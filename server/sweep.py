@@ -15,7 +15,7 @@ from .effort import EXACT, Effort
 from .kernels.advance import Progress, look_around, plan_segments, sweep_segments
 from .kernels.placing import SIMILARITY_TOLERANCE, check_poses
 from .kernels.reach import Reach
-from .request import SceneData, pieces, refuse, to_units
+from .request import SceneData, as_held, pieces, refuse, to_units
 
 # Motions of one kernel call where there is a deadline: it is looked at between calls.
 _PER_CALL = 64
@@ -131,12 +131,13 @@ def sweep(
         boxes = np.empty((k, 2, 3))  # of no use here
         for part, held_rows, reach in pieces(Reach(scales, units, starts, rows, boxes, outside), residency):
             chunk = len(part) if effort.deadline == np.inf else _PER_CALL
-            with residency.hold(held_rows) as held:
+            with residency.hold(held_rows, effort.loads_until()) as held:
+                seen = as_held(data, held)
                 for at in range(0, len(part), chunk):
                     if effort.spent:
                         progress.visits[part[at:]] = -1
                     sweep_segments(
-                        first, last, avatar.arrays, avatar.radius, other_units, scales, units, loose, data.arrays,
+                        first, last, avatar.arrays, avatar.radius, other_units, scales, units, loose, seen.arrays,
                         data.broad, reach.starts, reach.rows, part[at : at + chunk], tolerance, progress, counts,
                     )  # fmt: skip
             hits, misses = hits + held.hits, misses + held.misses

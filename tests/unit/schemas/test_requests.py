@@ -161,6 +161,8 @@ def test_too_many_objects_are_too_large():
     many = [ObjectItem("al")] * (MAX_OBJECTS + 1)
     with pytest.raises(TooLargeError, match="2049 objects"):
         ObjectsRequest(many, np.zeros((MAX_OBJECTS + 1, 4, 4)))
+    with pytest.raises(TooLargeError, match="2049 objects"):
+        make_objects([("al", np.eye(4))] * (MAX_OBJECTS + 1))
 
 
 @pytest.mark.parametrize(

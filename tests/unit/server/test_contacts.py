@@ -16,9 +16,10 @@ from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import build_archive
 from solidcloud.schemas.answers import ContactsAnswers, Verdict
 from solidcloud.schemas.errors import BadRequestError, BadTransformError, SolidcloudError, TooLargeError
+from solidcloud.schemas.requests import MAX_CONTACTS
 from solidcloud.server import contacts as contacts_module
 from solidcloud.server.avatar import make_avatar
-from solidcloud.server.contacts import MOST_PAIRS, contacts
+from solidcloud.server.contacts import contacts
 from solidcloud.server.effort import Effort, make_effort
 from solidcloud.server.request import make_scene_data
 from solidcloud.server.residency import Residency
@@ -187,14 +188,14 @@ def test_a_deadline_leaves_out_and_never_invents(
     poses = np.concatenate(
         [at((0, 0, 0), (99, 0, 0)), cases.near_poses(rng, case.points, avatar.points, 3, 0.05)]
     )
-    whole = contacts(case.data, avatar, poses, MOST_PAIRS)
+    whole = contacts(case.data, avatar, poses, MAX_CONTACTS)
     assert (whole.pairs_found[[0, 2, 3, 4]] > 0).all() and whole.pairs_found.sum() > 50
     for own in (case, tight(case, 2 * int(case.store.sizes.max()))):
         looks, unfinished = 0, True
         while unfinished:
             effort = Stops(deadline=1e300)
             effort.looks = iter([False] * looks + [True] * 10_000)
-            answers = contacts(own.data, avatar, poses, MOST_PAIRS, 0.0, None, effort)
+            answers = contacts(own.data, avatar, poses, MAX_CONTACTS, 0.0, None, effort)
             own.data.residency.check()
             for i in range(len(poses)):
                 if answers.exact[i]:
@@ -215,7 +216,7 @@ def test_a_deadline_leaves_out_and_never_invents(
 
 
 @pytest.mark.interpreted
-@pytest.mark.parametrize("limit", [-1, MOST_PAIRS + 1, 1.5, "9", None, True, np.float64(3), 1 << 70])
+@pytest.mark.parametrize("limit", [-1, MAX_CONTACTS + 1, 1.5, "9", None, True, np.float64(3), 1 << 70])
 def test_a_limit_that_is_no_number_of_pairs_is_refused(row: ScanCase, limit: Any) -> None:
     for avatar in (BALL, NOBODY):
         with pytest.raises(BadRequestError, match="limit"):
@@ -259,7 +260,7 @@ def test_no_poses_and_no_avatar_are_answered(row: ScanCase) -> None:
     assert len(none) == 0 and none.pair_starts.tolist() == [0] and none.cluster_starts.tolist() == [0]
     nobody = contacts(row.data, NOBODY, at((0, 0, 0), (50, 0, 0)), np.int64(5), 0.5)
     assert nobody.verdict.tolist() == [CLEAR, CLEAR] and nobody.pair_starts.tolist() == [0, 0, 0]
-    huge = contacts(row.data, BALL, at((0.5, 0, 0)), MOST_PAIRS, 1.0, 1e9)
+    huge = contacts(row.data, BALL, at((0.5, 0, 0)), MAX_CONTACTS, 1.0, 1e9)
     assert huge.cluster_count.tolist() == huge.pairs_found.tolist()
 
 
@@ -296,3 +297,23 @@ def test_an_avatar_in_another_order_names_the_same_points(tmp_path: Path, rng: n
     for name in ("node_visits", "point_tests"):  # of another tree
         del first[name], second[name]
     assert first == second
+
+
+def test_more_than_a_request_may_list_is_refused_before_it_is_kept(
+    row: ScanCase, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By pairs, and by clusters where no pair is listed; what has gone by then is what one look apart adds."""
+    kept = []
+    room = contacts_module._check_room
+    monkeypatch.setattr(contacts_module, "_check_room", lambda memory: kept.append(memory) or room(memory))
+    monkeypatch.setattr(contacts_module, "SIZE_VISITS", 64)
+    monkeypatch.setattr(contacts_module, "MOST_BYTES", 100_000)
+    poses = at(*((0.05 * i, 0.0, 0.0) for i in range(60))).repeat(20, axis=0)
+    avatar = make_avatar(row_of_points(8), 0.06)
+    for limit in (MAX_CONTACTS, 0):
+        kept.clear()
+        few = contacts(row.data, avatar, poses[:10], limit, 0.0, 0.0)
+        assert few.pairs_found.all() and (np.diff(few.cluster_starts) > 1).all()
+        with pytest.raises(TooLargeError, match="clusters listed"):
+            contacts(row.data, avatar, poses, limit, 0.0, 0.0)
+        assert kept[-1].pairs.nbytes + kept[-1].clusters.nbytes < 4 * 100_000

@@ -1,0 +1,111 @@
+"""A deadline: what it left open is given up at once, no load is begun after it, and nothing is clear wrongly."""
+
+import math
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cases
+import cases_contacts
+import numpy as np
+import pytest
+import scans
+from numpy.typing import NDArray
+from solidcloud.schemas.answers import Verdict
+from solidcloud.server import bounded
+from solidcloud.server.avatar import make_avatar
+from solidcloud.server.collide import collide
+from solidcloud.server.contacts import contacts
+from solidcloud.server.distance import distance
+from solidcloud.server.effort import LOAD_SHARE, Effort
+from solidcloud.server.request import SceneData
+from solidcloud.server.sweep import sweep
+
+pytestmark = pytest.mark.interpreted
+CLEAR, CONTACT, UNKNOWN = Verdict
+FAR = cases.pose_of(np.eye(3), np.array([99.0, 0, 0]))
+
+QUESTIONS: dict[str, Callable[..., Any]] = {
+    "collide": lambda data, avatar, poses, effort: collide(data, avatar, poses, 0.0, effort),
+    "distance": lambda data, avatar, poses, effort: distance(data, avatar, poses, 0.1, effort),
+    "contacts": lambda data, avatar, poses, effort: contacts(data, avatar, poses, effort=effort),
+    "sweep": lambda data, avatar, poses, effort: sweep(data, avatar, poses, poses, effort=effort),
+}
+
+
+@pytest.fixture
+def case(tmp_path: Path, rng: np.random.Generator) -> cases_contacts.ScanCase:
+    """A cube of noise in eight voxels and more, none resident."""
+    return cases_contacts.open_case(tmp_path, scans.make_scan("noise", 2, 800), rng, scan_count=1)
+
+
+def near(case: cases_contacts.ScanCase, rng: np.random.Generator) -> tuple[Any, NDArray[np.float64]]:
+    """An avatar that reaches several voxels, and poses of which the last is out of all reach."""
+    avatar = make_avatar(rng.uniform(0, scans.SIZE, (8, 3)), 0.1)
+    return avatar, np.concatenate([cases.near_poses(rng, case.points, avatar.points, 5, 0.05), FAR[None]])
+
+
+@pytest.mark.parametrize("question", ["collide", "distance"])
+def test_what_is_left_when_the_time_is_up_takes_no_kernel(
+    case: cases_contacts.ScanCase, rng: np.random.Generator, question: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    avatar, poses = near(case, rng)
+    exact = QUESTIONS[question](case.data, avatar, poses, Effort())
+    truth = distance(case.data, avatar, poses, 15.0).signed_distance
+    assert (exact.verdict[:-1] == CONTACT).any()
+
+    def kernel(*_: Any) -> int:
+        raise AssertionError("searched")
+
+    monkeypatch.setattr(bounded, "go_on", kernel)
+    late = QUESTIONS[question](case.data, avatar, poses, Effort(deadline=0.0))
+    assert late.verdict.tolist() == [UNKNOWN] * 5 + [CLEAR]
+    assert (late.lower <= truth).all() and np.isinf(late.upper).all()
+    assert late.exact.tolist() == [False] * 5 + [True]
+    assert not late.voxels_missing.any(), "all of them were resident"
+
+
+@pytest.mark.parametrize("question", ["collide", "distance"])
+def test_what_is_not_resident_when_the_time_is_up_is_counted(
+    case: cases_contacts.ScanCase, rng: np.random.Generator, question: str
+) -> None:
+    avatar, poses = near(case, rng)
+    late = QUESTIONS[question](case.data, avatar, poses, Effort(deadline=0.0))
+    assert (late.voxels_missing[:-1] > 1).all() and late.voxels_missing[-1] == 0
+    assert late.verdict.tolist() == [UNKNOWN] * 5 + [CLEAR]
+    assert case.data.residency.resident == 0
+
+
+@pytest.mark.parametrize("question", QUESTIONS)
+def test_no_load_is_begun_once_the_time_for_loads_is_up(
+    case: cases_contacts.ScanCase, rng: np.random.Generator, question: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first load ends when the whole time is up."""
+    avatar, poses = near(case, rng)
+    exact = QUESTIONS[question](cases_contacts.tight(case, 64 << 20).data, avatar, poses, Effort())
+    data: SceneData = case.data
+    effort = Effort(deadline=time.perf_counter() + 0.3)
+    load, begun = case.store.load, []
+
+    def slow(row: int, *where: Any) -> Any:
+        begun.append(row)
+        while not effort.spent:
+            time.sleep(0.01)
+        return load(row, *where)
+
+    monkeypatch.setattr(case.store, "load", slow)
+    found = QUESTIONS[question](data, avatar, poses, effort)
+    assert len(begun) == 1 and data.residency.resident == 1
+    data.residency.check()
+    assert found.verdict[-1] == CLEAR and (found.verdict[:-1] != CLEAR).all()
+    assert (found.verdict == UNKNOWN).any()
+    assert (exact.verdict[found.verdict == CONTACT] == CONTACT).all()
+
+
+def test_loads_have_half_of_the_time() -> None:
+    begin = time.perf_counter()
+    until = Effort(deadline=begin + 1000.0).loads_until()
+    assert begin + 1000.0 * LOAD_SHARE <= until <= begin + (1000.0 + time.perf_counter() - begin) * LOAD_SHARE
+    assert Effort(visits=1, tolerance=1.0).loads_until() == math.inf
+    assert Effort(deadline=begin - 1.0).loads_until() < begin, "and none where it is past"

@@ -54,8 +54,10 @@ class Hold:
 
 
 def _seconds_to(deadline: float) -> float | None:
-    """Seconds left, 0 when there are none; None: no deadline."""
-    return None if deadline == math.inf else max(0.0, deadline - time.perf_counter())
+    """Seconds left, 0 when there are none and never more than a lock can be waited for; None: no deadline."""
+    if deadline == math.inf:
+        return None
+    return min(max(0.0, deadline - time.perf_counter()), threading.TIMEOUT_MAX)
 
 
 class Residency:

@@ -43,6 +43,22 @@ def test_after_the_deadline_no_load_is_begun() -> None:
     assert take(residency, [0, 1, 2], deadline=0.0) == Held(3, 0, ()), "what is there is not late"
 
 
+def test_a_deadline_of_ages_is_waited_for() -> None:
+    """Longer than a lock can be waited for: `budget_ms` has no upper end."""
+    store = FakeStore([1])
+    residency = Residency(store, BLOCK)
+    store.gate.clear()
+    with ThreadPoolExecutor(2) as pool:
+        loader = pool.submit(take, residency, [0])
+        assert store.wait_for_load(0, PATIENCE)
+        other = pool.submit(take, residency, [0], 1e300)
+        while not other.done() and not residency._changed._waiters:  # type: ignore[attr-defined]
+            time.sleep(0.001)
+        store.gate.set()
+        assert loader.result(PATIENCE) == Held(0, 1, ())
+        assert other.result(PATIENCE).late == ()
+
+
 def test_a_load_of_another_is_waited_for_until_the_deadline_and_goes_on() -> None:
     store = FakeStore([1])
     residency = Residency(store, BLOCK)

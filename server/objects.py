@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..schemas.answers import ObjectsAnswers
-from ..schemas.errors import BadRequestError
+from ..schemas.errors import BadRequestError, BadTransformError
 from ..schemas.requests import make_poses
 from ..schemas.voxel_grid import UNITS_PER_METRE
 from .avatar import AvatarModel
@@ -25,6 +25,9 @@ from .request import SceneData, refuse, to_units
 SCENE_GROUP = 1 << 31
 # Pairs between two looks at a deadline.
 TIMED_PAIRS = 64
+# How far from the dataset's origin an object may be put [m]: exact units of 2^37 m do not fit 63 bits. Against the
+# scene nothing so far is ever compared; objects are compared wherever they are.
+MAX_PLACE = 1e11
 
 
 class Placing(NamedTuple):
@@ -128,6 +131,7 @@ def _check(
         )
         refuse(fault, int(rows[pose]), found)
         scales[rows], units[rows] = scale, unit
+        _check_places(model, array, rows, scale, data.arrays.origin)
     if n > 1:
         first, second = (int(row) for row in np.argsort(-units, kind="stable")[:2])
         together = int(units[first] + units[second]) + margin_units
@@ -137,6 +141,27 @@ def _check(
                 "expected at most 16 m: give a smaller margin or radius"
             )
     return Placing(list(distinct.values()), model_of, array, group, mask, scales, units, margin_units)
+
+
+def _check_places(
+    model: AvatarModel,
+    poses: NDArray[np.float64],
+    rows: NDArray[np.int64],
+    scales: NDArray[np.float64],
+    origin: NDArray[np.float64],
+) -> None:
+    """Raise BadTransformError for an object, of those of one avatar, that is put too far away for exact units."""
+    if not len(model.points):
+        return
+    center = np.abs(poses[rows, :3, :3]) @ np.abs(model.arrays.center[0]) + np.abs(
+        poses[rows, :3, 3] - origin
+    )
+    farthest = center.max(axis=1) + scales * model.arrays.radius[0]
+    if (farthest > MAX_PLACE).any():
+        i = int(farthest.argmax())
+        raise BadTransformError(
+            f"object {rows[i]} reaches {farthest[i]:g} m from the dataset's origin: expected within {MAX_PLACE:g} m"
+        )
 
 
 def find_pairs(placing: Placing, origin: NDArray[np.float64]) -> tuple[NDArray[np.int64], int]:

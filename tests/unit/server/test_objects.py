@@ -89,6 +89,18 @@ def test_a_budget_holds_against_the_scene_too(data: SceneData) -> None:
     assert said == [UNKNOWN, CONTACT]
 
 
+def test_an_object_beyond_the_exact_units_is_refused(data: SceneData) -> None:
+    """Coordinates of 2^37 m and more have no int64 in exact units: two points 2 mm apart were one."""
+    far = make_avatar([[9e8, 0, 0]], 0.0)
+    poses = at(0, 0.002)
+    poses[:, :3, :3] *= 8
+    assert objects(data, [far] * 2, poses, [1] * 2, [1] * 2, 0.0021).pairs.tolist() == [[0, 1]]
+    assert objects(data, [far] * 2, poses, [1] * 2, [1] * 2, 0.0019).pairs.tolist() == []
+    poses[:, :3, :3] *= 125
+    with pytest.raises(BadTransformError, match=r"object 0 reaches 9e\+11 m"):
+        objects(data, [far] * 2, poses, [1] * 2, [1] * 2, 0.0019)
+
+
 def test_what_is_refused(data: SceneData) -> None:
     for arguments, error, text in [
         (([BALL], at(0, 1), [1, 1], [1, 1]), BadRequestError, "1 avatars, 2 poses"),

@@ -29,6 +29,8 @@ log = logging.getLogger(__name__)
 # Queries that zenoh may hand over before a thread takes them; a full channel holds up zenoh's receiver, which
 # is what bounds memory in a storm. The threads empty it at once, into `FairQueues` or with `busy`.
 _CHANNEL = 1024
+# How long a stop waits for threads whose work was given up: for a part of a path that is being computed.
+_GIVE_UP_SECONDS = 2.0
 
 _ENCODINGS = {name: zenoh.Encoding(name) for name in (MSGPACK, JSON)}
 
@@ -177,7 +179,7 @@ class Transport:
     """Carries questions to a service and its answers back, from `__enter__` until `__exit__`.
 
     SolidcloudError on entry when the endpoint cannot be listened on. Leaving it stops accepting, answers
-    what was accepted (up to `config.stop_seconds`), then closes.
+    what was accepted (up to `config.stop_seconds`), gives up the rest, then closes.
     """
 
     def __init__(self, scenes: Sequence[str], service: ServiceLike, config: ServerConfig) -> None:
@@ -185,6 +187,7 @@ class Transport:
         self._threads: list[threading.Thread] = []
         self._lock = threading.Lock()
         self._declared: list[Any] = []
+        self._given_up = threading.Event()
 
     def __enter__(self) -> Self:
         with ExitStack() as stack:
@@ -206,16 +209,25 @@ class Transport:
             # The tokens first. An undeclared queryable's channel still hands out what it holds, then ends.
             for declared in reversed(self._declared):
                 declared.undeclare()
-            deadline = time.monotonic() + self._config.stop_seconds
-            # One may have started another, for a path, before it ended.
-            while alive := [thread for thread in list(self._threads) if thread.is_alive()]:
-                left = deadline - time.monotonic()
-                if left <= 0:
-                    log.error(
-                        "stopped with %d threads at work after %g s", len(alive), self._config.stop_seconds
-                    )
-                    break
-                alive[0].join(left)
+            if not self._wait(self._config.stop_seconds):
+                log.warning("not all is answered after %g s: the rest is given up", self._config.stop_seconds)
+                self._given_up.set()
+                self._wait(_GIVE_UP_SECONDS)
+        # Closing the session ends what waits for a client that takes nothing. A thread that is still at work when the
+        # interpreter ends, inside zenoh, would abort the process.
+        if not self._wait(_GIVE_UP_SECONDS):
+            log.error("stopped with threads at work")
+
+    def _wait(self, seconds: float) -> bool:
+        """Wait for all threads, for so long at most; whether they have ended."""
+        deadline = time.monotonic() + seconds
+        # One may have started another, for a path, before it ended.
+        while alive := [thread for thread in list(self._threads) if thread.is_alive()]:
+            left = deadline - time.monotonic()
+            if left <= 0:
+                return False
+            alive[0].join(left)
+        return True
 
     def _open(self) -> zenoh.Session:
         """A session that listens; SolidcloudError when it cannot."""
@@ -230,7 +242,7 @@ class Transport:
         """Answer the questions about one scene, and watch for clients that go."""
         config = self._config
         queues = FairQueues(config.workers, config.max_in_flight, config.max_in_flight_bytes)
-        lane = _Lane(self._service, scene, queues, self._start, config.max_paths)
+        lane = _Lane(self._service, scene, queues, self._start, config.max_paths, self._given_up)
         watch = session.liveliness().declare_subscriber(
             keys.clients_alive_key(scene), zenoh.handlers.FifoChannel(_CHANNEL)
         )
@@ -275,10 +287,17 @@ class _Lane:
     """The questions about one scene, on their way from the channel to the service."""
 
     def __init__(
-        self, service: ServiceLike, scene: str, queues: FairQueues, start: Callable[..., None], max_paths: int
+        self,
+        service: ServiceLike,
+        scene: str,
+        queues: FairQueues,
+        start: Callable[..., None],
+        max_paths: int,
+        given_up: threading.Event,
     ) -> None:
         self._service, self._scene, self._queues = service, scene, queues
         self._start, self._max_paths = start, max_paths
+        self._given_up = given_up  # set: nothing more is answered
         self._streaming: set[_Request] = set()  # whose answers are on their way in parts
 
     def take(self, queries: Any) -> None:
@@ -332,6 +351,9 @@ class _Lane:
 
     def _answer(self, request: "_Request") -> Iterator[Answer] | None:
         """Have one query answered. What comes in parts is returned, to be sent by a thread of its own."""
+        if self._given_up.is_set():
+            with request.query:
+                return None
         answer = self._service.answer(request.key, request.payload, _encoding(request.query))
         if not isinstance(answer, Answer):
             # One client may take half of the room, so that there is always some for another.
@@ -350,7 +372,8 @@ class _Lane:
         try:
             with request.query as query:
                 for answer in answers:
-                    if request not in self._streaming or not _reply(query, request.key_expr, answer):
+                    left = self._given_up.is_set() or request not in self._streaming
+                    if left or not _reply(query, request.key_expr, answer):
                         break
         except Exception:
             log.exception("parts for client %s of scene %s", request.client, self._scene)

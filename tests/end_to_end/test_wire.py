@@ -472,6 +472,26 @@ def test_a_server_that_stops_finishes_the_paths_it_accepted(scene, endpoint):
         assert np.array_equal(joined([first, *path]), TRUTH)
 
 
+def test_a_server_that_stops_gives_up_what_takes_too_long(endpoint):
+    """A path without end in sight, and a queue behind a slow answer: cut short, and no thread is left at work."""
+    scene = FloorScene(delay=0.05)
+    with Client(endpoint, scene="floor", timeout=DEADLINE) as client, ExitStack() as stack:
+        with serving([scene], ServerConfig(listen=endpoint, stop_seconds=0.1)):
+            client.add_avatar("al", POINTS, 0.125)
+            eventually(lambda: client.collide("al", heights([-1.0])).verdict.tolist() == [Verdict.CONTACT])
+            path = client.path("al", np.tile(PATH, (100, 1, 1)))
+            first = next(path)
+            asked = [threading.Thread(target=client.collide, args=("al", PATH)) for _ in range(100)]
+            for thread in asked:
+                thread.start()
+                stack.callback(thread.join)
+            eventually(lambda: scene.at_work > 3)
+        assert [t.name for t in threading.enumerate() if t.name.startswith("solidcloud-")] == []
+        verdicts = joined([first, *path])
+        assert len(verdicts) == 100 * len(PATH) and verdicts[-1] == Verdict.UNKNOWN
+        assert scene.parts < 40 and scene.at_work < 100
+
+
 @pytest.mark.parametrize(
     "ask",
     [

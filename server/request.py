@@ -31,7 +31,7 @@ _POSE_FAULTS: dict[int, tuple[type[SolidcloudError], str]] = {
     placing.TOO_FAR: (BadTransformError, "translates by {:g} m: expected within 1e9 m"),
     placing.LONG_REACH: (
         BadRequestError,
-        "has radii and margin that add up to {:g} m: expected at most 16 m: give a smaller margin or radius",
+        "has radii and margin, or reach, that add up to {:g} m: expected at most 16 m: give a smaller one",
     ),
     placing.LARGE_AVATAR: (
         TooLargeError,

@@ -246,7 +246,7 @@ class Scene:
         budget_ms: float | None = None,
         budget_visits: int | None = None,
     ) -> WithinAnswers:
-        """Which scan point is nearest to each loose point (k, 3), up to `reach` [m]; see server/rays.py."""
+        """Which scan point is nearest to each loose point (k, 3), up to `reach` [m]; see server/within.py."""
         effort = make_effort(tolerance, budget_ms, budget_visits)
         return within(self._data, points, reach, effort)
 

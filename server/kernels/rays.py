@@ -207,8 +207,11 @@ def push_sorted(rows, bounds, begin, depth, row, bound):
 
 
 @nb.njit(nogil=True, cache=True)
-def _follow(scene, voxel, rays, i, ray, tolerance, visits, best, rows, bounds):
-    """Follow ray i through the tree of one resident voxel, front to back; `best`, its counts included, is updated."""
+def _follow(scene, voxel, rays, i, ray, near, tolerance, visits, best, rows, bounds):
+    """Follow ray i through the tree of one resident voxel, front to back; `best`, its counts included, is updated.
+
+    near: exact units, as in Lists. What holds of a node holds of its children, so no bound gets worse with more visits.
+    """
     words, ints = scene.words, scene.ints
     per_unit = 1.0 / scene.units_per_step
     farthest = 0.0
@@ -226,10 +229,11 @@ def _follow(scene, voxel, rays, i, ray, tolerance, visits, best, rows, bounds):
     rows[0], depth = base, 0
     bounds[0] = _meet_node(words, base, ray, radius, min(best.value[i], reach) * per_unit + error)
     if bounds[0] < np.inf:
-        depth = 1
+        bounds[0], depth = max(bounds[0], near * per_unit + error), 1
     while depth > 0:
         depth -= 1
-        row, bound = rows[depth], (bounds[depth] - error) * scene.units_per_step
+        row, above = rows[depth], bounds[depth]
+        bound = (above - error) * scene.units_per_step
         if bound > best.value[i] - tolerance or spent >= visits:
             if bound <= best.value[i]:
                 best.unseen[i] = min(best.unseen[i], max(bound, 0.0))
@@ -246,7 +250,7 @@ def _follow(scene, voxel, rays, i, ray, tolerance, visits, best, rows, bounds):
             child_row = base + child * ROW_WORDS
             bound = _meet_node(words, child_row, ray, radius, limit)
             if bound < np.inf:
-                push_sorted(rows, bounds, begin, depth, child_row, bound)
+                push_sorted(rows, bounds, begin, depth, child_row, max(bound, above))
                 depth += 1
     best.counts[1, i], best.counts[2, i] = spent, tests
 
@@ -280,5 +284,5 @@ def follow_rays(rays, lists, cursor, held, scene, tolerance, visits, best):
                 best.counts[0, i] += np.uint32(1)
                 best.unseen[i] = min(best.unseen[i], near)
             else:
-                _follow(scene, voxel, rays, i, ray, tolerance, visits, best, rows, bounds)
+                _follow(scene, voxel, rays, i, ray, near, tolerance, visits, best, rows, bounds)
             cursor[i] = at + 1

@@ -113,8 +113,11 @@ def _test_block(scene, voxel, row, x, y, z, error, at_units, i, best, limit):
 
 
 @nb.njit(nogil=True, cache=True)
-def _search(scene, voxel, at_units, i, tolerance, visits, best, limit, rows, bounds, keys):
-    """Search one resident voxel, nearest nodes first. Returns the limit, lowered; updates `best`."""
+def _search(scene, voxel, at_units, i, near, tolerance, visits, best, limit, rows, bounds, keys):
+    """Search one resident voxel, nearest nodes first. Returns the limit, lowered; updates `best`.
+
+    near: exact units, as in Lists. What holds of a node holds of its children, so no bound gets worse with more visits.
+    """
     words, ints = scene.words, scene.ints
     per_unit = 1.0 / scene.units_per_step
     farthest, x, y, z = 0.0, 0.0, 0.0, 0.0
@@ -131,11 +134,13 @@ def _search(scene, voxel, at_units, i, tolerance, visits, best, limit, rows, bou
     error = 2.0 * per_unit + (farthest + scene.voxel_steps) * 2.0**-45
     base = scene.where[voxel, 0]
     spent, tests = np.int64(best.counts[1, i]) + 1, np.int64(best.counts[2, i])
-    rows[0], bounds[0], depth = base, _below_node(words, base, x, y, z, np.inf)[0], 1
+    rows[0], depth = base, 1
+    bounds[0] = max(_below_node(words, base, x, y, z, np.inf)[0], near * per_unit + error)
     nearest = math.sqrt(np.float64(limit))
     while depth > 0:
         depth -= 1
-        row, bound = rows[depth], (bounds[depth] - error) * scene.units_per_step
+        row, above = rows[depth], bounds[depth]
+        bound = (above - error) * scene.units_per_step
         if bound > nearest - (tolerance if best.square[i] >= 0 else 0.0) or spent >= visits:
             if bound <= nearest:
                 best.unseen[i] = min(best.unseen[i], max(bound, 0.0))
@@ -154,6 +159,7 @@ def _search(scene, voxel, at_units, i, tolerance, visits, best, limit, rows, bou
             bound, middle = _below_node(words, child_row, x, y, z, steps)
             # Its farthest point is no farther than that: no sibling beyond holds the nearest.
             steps = min(steps, (middle + words[child_row + 3]) * (1.0 + 2.0**-24) + 2.0 * error)
+            bound = max(bound, above)
             if bound <= steps:
                 # Many bounds are 0: of these the one with the nearest centre first.
                 key = bound + middle / 16.0
@@ -196,5 +202,7 @@ def search_points(at_units, reach, lists, cursor, held, scene, tolerance, visits
                 best.counts[0, i] += np.uint32(1)
                 best.unseen[i] = min(best.unseen[i], near)
             else:
-                limit = _search(scene, voxel, at_units, i, tolerance, visits, best, limit, rows, bounds, keys)
+                limit = _search(
+                    scene, voxel, at_units, i, near, tolerance, visits, best, limit, rows, bounds, keys
+                )  # fmt: skip
             cursor[i] = at + 1

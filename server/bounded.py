@@ -94,7 +94,7 @@ def _gather(
     k = len(array)
     known = Known(
         np.full(k, -1, np.int64), np.zeros((k, 6), np.int64), np.full(k, math.inf), np.full(k, math.inf),
-        np.full(k, math.inf),
+        np.full(k, math.inf), np.zeros(k, bool),
     )  # fmt: skip
     counts = np.zeros((3, k), np.uint32)
     residency = data.residency

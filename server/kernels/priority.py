@@ -42,7 +42,8 @@ class Known(NamedTuple):
     """What is known of k poses, gathered over pieces of a request.
 
     square, pair, gap: of `Nearest`.  lower: (k,) float64, centres are nowhere nearer than that where something was left
-    open [steps]; inf: nothing was.  upper: (k,) float64, some pair is at least as near [steps].
+    open [steps]; inf: nothing was.  upper: (k,) float64, some pair is at least as near [steps].  spent: (k,) bool, the
+    budget has ended a search: further pieces get none of it, or a larger one would see less of them.
     """
 
     square: NDArray[np.int64]
@@ -50,6 +51,7 @@ class Known(NamedTuple):
     gap: NDArray[np.float64]
     lower: NDArray[np.float64]
     upper: NDArray[np.float64]
+    spent: NDArray[np.bool_]
 
 
 class Search(NamedTuple):
@@ -314,6 +316,7 @@ def end_search(search, i, known, counts):
     known.square[i] = best.found[0]
     known.pair[i] = best.found[1:]
     known.upper[i] = min(known.upper[i], search.bounds[1])
+    known.spent[i] |= search.status[0] == SPENT
     if search.status[0] != DONE:
         known.lower[i] = min(known.lower[i], search.bounds[0])
     counts[1, i] += np.uint32(best.counters[0])
@@ -330,7 +333,7 @@ def go_on(poses, avatar, scene, index, reach, i, fresh, until, search, goal, kno
     """
     if fresh:
         _begin(poses, avatar, scene, index, reach, i, search, goal, known, counts)
-    budget = goal.visits - np.int64(counts[1, i])
+    budget = np.int64(0) if known.spent[i] else goal.visits - np.int64(counts[1, i])
     _go_on(poses[i], i, avatar, scene, search, goal, goal.enough[i], budget, until)
     if search.status[0] != OPEN:
         end_search(search, i, known, counts)

@@ -1,0 +1,56 @@
+"""A larger budget of visits takes back nothing that a smaller one said (NUMERICS.md case 30): pieces, rays, points.
+
+Of poses whose voxels fit the cache together tests/property/test_bounded_naive.py says it.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cases
+import numpy as np
+import pytest
+from clouds import KINDS, cloud
+from solidcloud.schemas.answers import Verdict
+from solidcloud.server.avatar import make_avatar
+from solidcloud.server.bounded import collide_bounded, distance_bounded
+from solidcloud.server.effort import Effort
+from solidcloud.server.rays import raycast
+from solidcloud.server.request import make_scene_data
+from solidcloud.server.residency import Residency
+from solidcloud.server.store import Store
+from solidcloud.server.within import within
+
+BUDGETS = (*range(0, 150, 7), 200, 300, 500, 1000, 5000)
+
+
+def judge(ask: Callable[[Effort], Any], tolerance: float, rounding: float = 0.0) -> None:
+    """Assert that verdicts stay said and bounds get no worse, budget by budget."""
+    before = ask(Effort(tolerance, BUDGETS[0]))
+    for visits in BUDGETS[1:]:
+        after = ask(Effort(tolerance, visits))
+        said = before.verdict != Verdict.UNKNOWN
+        assert (after.verdict[said] == before.verdict[said]).all(), visits
+        assert (after.lower >= before.lower - rounding).all() and (after.upper <= before.upper).all(), visits
+        assert (after.exact >= before.exact).all(), visits
+        before = after
+
+
+@pytest.mark.parametrize("seed", [11, 22, 24])
+@pytest.mark.parametrize("tolerance", [0.0, 0.02])
+def test_a_larger_budget_takes_nothing_back(tmp_path: Path, seed: int, tolerance: float) -> None:
+    """Of poses that are looked at piece by piece, in a cache of two voxels; of rays and loose points at once."""
+    rng = np.random.default_rng(seed)
+    points, avatar = cloud(rng, rng.choice(KINDS[:-1]), 200), cloud(rng, "noise", 60) * 0.3
+    case = cases.build(tmp_path, points, voxel=0.6, leaf=1, cell_points=20)
+    poses = cases.near_poses(rng, points, avatar, 20, 0.4)
+    store = Store(case.archive)
+    data = make_scene_data(store.archive, Residency(store, 2 * int(store.sizes.max()) + 128))
+    model = make_avatar(avatar, 0.02)
+    judge(lambda effort: distance_bounded(data, model, poses, 0.5, effort), tolerance)
+    judge(lambda effort: collide_bounded(data, model, poses, 0.05, effort), tolerance)
+    at, along = rng.uniform(-1.5, 1.5, (2, 40, 3))
+    # Bounds are compared in units and given in metres.
+    judge(lambda effort: raycast(data, at, along, 5.0, effort), tolerance, 1e-12)
+    judge(lambda effort: within(data, at, 5.0, effort), tolerance, 1e-12)
+    store.close()

@@ -16,7 +16,7 @@ from ..schemas.messages import make_poses
 from ..schemas.voxel_grid import UNITS_PER_METRE
 from .avatar import AvatarModel
 from .effort import Effort
-from .kernels.nearest import Nearest
+from .kernels.closest import Nearest
 from .kernels.placing import MAX_REACH_UNITS
 from .kernels.priority import OPEN, Goal, Known, end_search, go_on, make_search, search_poses
 from .kernels.reach import Reach

@@ -11,7 +11,8 @@ from ..schemas.messages import make_poses
 from .avatar import AvatarModel
 from .bounded import distance_bounded
 from .effort import EXACT, Effort
-from .kernels.nearest import Nearest, nearest_poses
+from .kernels.closest import Nearest
+from .kernels.nearest import nearest_poses
 from .request import SceneData, check_request, pieces, to_units
 from .signed import distance_columns, signed_from_square, unknown_gaps
 
@@ -45,7 +46,9 @@ def distance(
     if len(avatar.points):
         for which, rows, part in pieces(around, residency):
             with residency.hold(rows) as held:
-                nearest_poses(array, avatar.arrays, data.arrays, data.broad, part, which, nearest, counts)
+                nearest_poses(
+                    array, avatar.arrays, data.arrays, data.broad, part, reach_units, which, nearest, counts
+                )
             hits, misses = hits + held.hits, misses + held.misses
             faults.update(dict.fromkeys(held.faults))
         np.minimum(nearest.gap, unknown_gaps(data, around), out=nearest.gap)

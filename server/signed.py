@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ..schemas.answers import Verdict
 from ..schemas.voxel_grid import UNITS_PER_METRE
-from .kernels.nearest import Nearest
+from .kernels.closest import Nearest
 from .kernels.reach import Reach
 from .request import SceneData
 

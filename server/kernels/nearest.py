@@ -1,9 +1,14 @@
 """The nearest pair of two bounding sphere hierarchies under a pose: [Fig12] figures 5 and 6, made to measure.
 
-Depth first, the nearest child first, with the best pair so far as the bound (branch and bound). A node pair is left
-alone only when its lower bound, less what float32 may have lost, is above the best; a pair of points that float32
-cannot tell from the best is squared in integers (NUMERICS.md N5). So the least square and which pair has it are those
-of the definition, whatever the trees and the order.
+Branch and bound, with the best pair so far as the bound: the scene's tree is descended with a list of those nodes of
+the avatar's front that may hold a nearer pair, as overlap.py does with the reach for a bound. Nothing is left alone but
+what its lower bound, less what float32 may have lost, puts above the best. closest.py has what is done with points.
+
+The first bound is a narrow one, and is widened where nothing is found within it. That comes to as many node visits as
+though the distance had been known beforehand and a tenth more. One way down both trees, the nearest child each time,
+is no way to a first bound: it ended ten times as far as the nearest pair, and the search took twice as long; so did
+children in the order of their bounds, which are all alike over a floor, a tenth longer than in the order they come in.
+(scripts/bench_engine, distance on the walk.)
 """
 
 import math
@@ -13,207 +18,97 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from .closest import (
+    keep_in_box,
+    keep_near,
+    least_squares,
+    lower_bound,
+    make_best,
+    set_cut,
+    settle,
+    take_candidates,
+)
+from .compiled import borrowing
+from .front import make_front, move_node, pad, place_front, sift, take_kept
 from .layout import BLOCK_WORDS, COUNT, FIRST, LANES, ROW_WORDS
-from .overlap import STACK
-from .placed import ONE_SLACK, SLACK, make_limits, make_placed, place_block, place_nodes
-from .placing import lattice_to_units, place, to_units
+from .overlap import BROAD, FLAT, STACK
+from .placed import ONE_SLACK, SLACK, make_placed, node_reach, place_lanes, place_root
+from .placing import place
 
-_1, _2, _3, _4, _5, _6, _7, _8, _9 = (np.uint64(column) for column in range(1, 10))
+U = np.uint64  # see front.py
 
 
-class Nearest(NamedTuple):
-    """The nearest pair of each of k poses, among what was looked at.
+class Descent(NamedTuple):
+    """Scratch of one call, beside `Best`.
 
-    square: (k,) int64, |a - b|^2, exact units; -1: none within reach.  pair: (k, 6) int64, the scan point's lattice
-    x, y, z, then the avatar's placed centre [exact units].  gap: (k,) float64, what missing voxels hold is at least so
-    far from the avatar's centres [steps]; inf: nothing is missing.
+    stack: (STACK, 3) int64, scene nodes to look into: row, where its list of front nodes begins, length.
+    pairs: (STACK, 2) int64, node pairs below the front: avatar node, row; pair_keys: (STACK,) float32, their lower
+    bounds.  off: (3,) float32, from the frame to the voxel's low corner.
     """
 
-    square: NDArray[np.int64]
-    pair: NDArray[np.int64]
-    gap: NDArray[np.float64]
+    stack: NDArray[np.int64]
+    pairs: NDArray[np.int64]
+    pair_keys: NDArray[np.float32]
+    off: NDArray[np.float32]
 
 
-class Best(NamedTuple):
-    """The nearest pair of one pose so far, and what it rules out; scratch of one call.
+@nb.njit(nogil=True, cache=True)
+def make_descent():
+    """Scratch."""
+    return Descent(
+        np.empty((STACK, 3), np.int64),
+        np.empty((STACK, 2), np.int64),
+        np.empty(STACK, np.float32),
+        np.empty(3, np.float32),
+    )
 
-    found: (7,) int64, square or -1, then a row of `Nearest.pair`.  cut: (2,) float32, no node pair whose
-    `lower_bound` is above cut[0] [steps] and no points whose square is above cut[1] can be nearer, or tie.
-    frame: (4,) float64, extent and farthest of `make_limits`, units per step, voxel steps.  corner: (3,) int64, of the
-    voxel looked at [steps].  keep, squares: (LANES,), of `keep_near` and `list_squares`.  units: (1,) int64, the reach.
-    counters: (2,) int64, node visits, point tests.
+
+@borrowing
+def place_all(avatar, m, scale, placed, scene, bounds):
+    """Place an avatar: its root and what is below its front into placed.nodes, the front as the first list of `bounds`.
+
+    Fills placed.frame and shift. Returns (extent, farthest) for `make_limits` and the length of the list.
     """
-
-    found: NDArray[np.int64]
-    cut: NDArray[np.float32]
-    frame: NDArray[np.float64]
-    corner: NDArray[np.int64]
-    keep: NDArray[np.bool_]
-    squares: NDArray[np.float32]
-    units: NDArray[np.int64]
-    counters: NDArray[np.int64]
-
-
-@nb.njit(nogil=True, cache=True)
-def make_best():
-    """Scratch, nothing found."""
-    return Best(
-        np.empty(7, np.int64), np.empty(2, np.float32), np.empty(4), np.empty(3, np.int64), np.empty(LANES, np.bool_),
-        np.empty(LANES, np.float32), np.empty(1, np.int64), np.zeros(2, np.int64),
-    )  # fmt: skip
+    extent, farthest = place_root(avatar, m, scale, placed, scene)
+    count = place_front(avatar, m, scale, placed, scene, extent, bounds)
+    if avatar.first[avatar.front_first] < 0:
+        return extent, farthest, count  # nothing is below but points
+    center, radius, nodes, shift = avatar.center, avatar.radius, placed.nodes, placed.shift
+    per_step = 1.0 / scene.step
+    for a in range(avatar.front_first, center.shape[0]):
+        for r in range(3):
+            world = place(m, shift, r, center[a, 0], center[a, 1], center[a, 2])
+            nodes[r, a] = np.float32((world - np.float64(placed.frame[r]) * scene.step) * per_step)
+        nodes[3, a] = node_reach(radius[a], scale * per_step, extent)
+    return extent, farthest, count
 
 
-@nb.njit(nogil=True, cache=True)
-def lower_bound(words, row, x, y, z, radius):
-    """How far a sphere's points (float32, from the voxel's low corner) are from a node's at least [steps].
-
-    The larger of the sphere's and the slab's bound, less all that float32 rounds here; negative where it says
-    nothing. The errors of placed coordinates are not in it: they are in `Best.cut`.
-    """
-    at = np.uint64(row)  # not negative: spares a comparison for every index
-    dx, dy, dz = x - words[at], y - words[at + _1], z - words[at + _2]
-    apart = np.sqrt(dx * dx + dy * dy + dz * dz)
-    both = words[at + _3] + radius
-    along = words[at + _4] * dx + words[at + _5] * dy + words[at + _6] * dz
-    gap = max(along - words[at + _9], words[at + _8] - along)
-    # Without a slab gap is 0; its length is never 0, and rounded up.
-    bound = max(apart - both, gap / words[at + _7] - radius)
-    return bound - SLACK * (apart + both)
-
-
-@nb.njit(nogil=True, cache=True)
-def set_cut(cut, scales, units, square):
-    """Rule out what is farther than a square (int64), or than the reach, `units`, where it is -1; see `Best`."""
-    if square >= 0:
-        # Two more than the root rounded down: nothing that ties is ruled out.
-        units = np.int64(math.sqrt(np.float64(square))) + 2
-    limits = make_limits(units, scales[2], scales[0], scales[1], scales[3])
-    cut[0] = (limits.reach + limits.error) * ONE_SLACK
-    cut[1] = limits.far
+@borrowing
+def _search_leaves(m, a, row, avatar, placed, scene, spot, best, off):
+    """Take up what is nearer than the best of the points of an avatar's leaf node that are marked and those of a
+    scene's leaf node."""
+    ints, lanes, keep, block = scene.ints, placed.lanes, best.keep, ~np.int64(avatar.first[U(a)])
+    for lane in range(avatar.count[U(a)], LANES):
+        keep[U(lane)] = False  # repeats the last point
+    number = ~np.int64(ints[U(row + FIRST)])
+    block_at = spot[1] + number * BLOCK_WORDS
+    lane_at = spot[2] + number * 3 * LANES
+    low_x = off[0] + np.float32(ints[U(block_at)])
+    low_y = off[1] + np.float32(ints[U(block_at + 1)])
+    low_z = off[2] + np.float32(ints[U(block_at + 2)])
+    halves = scene.halves
+    keep_in_box(halves, lane_at, low_x, low_y, low_z, lanes, block, best.cut[1], keep)
+    least, tested = least_squares(
+        halves, lane_at, low_x, low_y, low_z, lanes, block, keep, best.keep8, best.squares
+    )
+    best.counters[1] += LANES * tested
+    if least <= best.cut[1]:
+        take_candidates(
+            least, block, block_at, lane_at, off, best, avatar.points, m, placed.shift, ints, scene.halves, lanes
+        )  # fmt: skip
 
 
-@nb.njit(nogil=True, cache=True)
-def _consider(
-    points, m, shift, block, lane, ints, halves, corner, block_at, lane_at, j, units_per_step, units, found
-):  # fmt: skip
-    """Take a pair as the best one if it is: nearer, or as near with the lesser scan point, then avatar's centre.
-
-    points, shift: of Avatar and Placed.  corner: (3,) int64, of the voxel [steps]. The square is that of
-    `pair_square`. Returns whether it is nearer.
-    """
-    square = np.int64(0)
-    for r in range(3):
-        world = place(m, shift, r, points[block, 0, lane], points[block, 1, lane], points[block, 2, lane])
-        steps = corner[r] + np.int64(ints[block_at + r]) + np.int64(halves[lane_at + r * LANES + j])
-        difference = to_units(world) - lattice_to_units(steps, units_per_step)
-        if abs(difference) > units:
-            return False
-        square += difference * difference
-    if square > units * units or (found[0] >= 0 and square > found[0]):
-        return False
-    nearer = found[0] < 0 or square < found[0]
-    lesser = nearer
-    for r in range(6):
-        if r < 3:
-            value = corner[r] + np.int64(ints[block_at + r]) + np.int64(halves[lane_at + r * LANES + j])
-        else:
-            world = place(
-                m, shift, r - 3, points[block, 0, lane], points[block, 1, lane], points[block, 2, lane]
-            )
-            value = to_units(world)
-        if not lesser:
-            if value > found[1 + r]:
-                return False
-            lesser = value < found[1 + r]
-        # While all before are equal this writes what is there.
-        found[1 + r] = value
-    found[0] = square
-    return nearer
-
-
-@nb.njit(nogil=True, cache=True)
-def keep_near(lanes, block, words, row, off_x, off_y, off_z, cut, keep):
-    """Which points of an avatar's block (LANES) may be within `cut` [steps] of a scene node; writes keep (LANES,)."""
-    at = np.uint64(row)
-    cx, cy, cz = words[at] + off_x, words[at + _1] + off_y, words[at + _2] + off_z
-    nx, ny, nz = words[at + _4], words[at + _5], words[at + _6]
-    both = words[at + _3] + cut
-    room = words[at + _7] * (cut + SLACK * both + SLACK * both)
-    least, most = words[at + _8] - room, words[at + _9] + room
-    limit = both * both * ONE_SLACK
-    for j in range(LANES):
-        dx, dy, dz = lanes[block, 0, j] - cx, lanes[block, 1, j] - cy, lanes[block, 2, j] - cz
-        along = nx * dx + ny * dy + nz * dz
-        keep[j] = (dx * dx + dy * dy + dz * dz <= limit) & (along <= most) & (along >= least)
-
-
-@nb.njit(nogil=True, cache=True)
-def any_near(halves, lane_at, x, y, z, far):
-    """Whether any of a scene block's points is within a square of a point, both from the block's low corner."""
-    # Unsigned: an index that may be negative, as numba sees it, is not vectorised, 70 ns for 32 lanes and not 5.
-    at_x = np.uint64(lane_at)
-    at_y, at_z = at_x + np.uint64(LANES), at_x + np.uint64(2 * LANES)
-    near = False
-    for lane in range(LANES):
-        j = np.uint64(lane)
-        dx, dy = np.float32(halves[at_x + j]) - x, np.float32(halves[at_y + j]) - y
-        dz = np.float32(halves[at_z + j]) - z
-        near |= dx * dx + dy * dy + dz * dz <= far
-    return near
-
-
-@nb.njit(nogil=True, cache=True)
-def list_squares(halves, lane_at, x, y, z, squares):
-    """The squares (LANES,) of the distances of a scene block's points to a point; returns the lane of the least."""
-    at_x = np.uint64(lane_at)
-    at_y, at_z = at_x + np.uint64(LANES), at_x + np.uint64(2 * LANES)
-    for lane in range(LANES):
-        j = np.uint64(lane)
-        dx, dy = np.float32(halves[at_x + j]) - x, np.float32(halves[at_y + j]) - y
-        dz = np.float32(halves[at_z + j]) - z
-        squares[j] = dx * dx + dy * dy + dz * dz
-    first, least = 0, squares[0]
-    for lane in range(1, LANES):
-        if squares[lane] < least:
-            first, least = lane, squares[lane]
-    return first
-
-
-@nb.njit(nogil=True, cache=True)
-def search_lanes(
-    points, m, shift, block, lane, ints, halves, corner, block_at, lane_at, x, y, z, scales, units, best_squares,
-    best_found, cut,
-):  # fmt: skip
-    """Take the best of the pairs of one avatar point (float32 x, y, z from the block's low corner) and a scene block.
-
-    The nearest first: it shrinks the cut, and few of the others are asked in integers after it.
-    scales: (4,) float64, `Best.frame`.
-    """
-    first = list_squares(halves, lane_at, x, y, z, best_squares)
-    for number in range(-1, LANES):
-        j = first if number < 0 else number
-        if best_squares[j] <= cut[1] and (number < 0 or j != first):
-            nearer = _consider(
-                points,
-                m,
-                shift,
-                block,
-                lane,
-                ints,
-                halves,
-                corner,
-                block_at,
-                lane_at,
-                j,
-                scales[2],
-                units,
-                best_found,
-            )
-            if nearer:
-                set_cut(cut, scales, units, best_found[0])
-
-
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def _push(stack, keys, begin, depth, a, row, key):
     """Put a pair into stack[begin:depth], which descends by key; the least lies on top."""
     at = depth
@@ -223,56 +118,31 @@ def _push(stack, keys, begin, depth, a, row, key):
     stack[at, 0], stack[at, 1], keys[at] = a, row, key
 
 
-@nb.njit(nogil=True, cache=True)
-def _nearest_voxel(avatar, m, pose, placed, scene, voxel, stack, keys, off, best):
-    """Search one resident voxel for a nearer pair: the two trees descended together, depth first."""
-    # Every array by its own name, once: unpacked in the loop they are counted up and down, atomically, which took
-    # most of the time.
-    words, ints, halves = scene.words, scene.ints, scene.halves
-    nodes, lanes, stamp = placed.nodes, placed.lanes, placed.stamp
-    cut, keep, squares, counters = best.cut, best.keep, best.squares, best.counters
-    found, frame, units, corner = best.found, best.frame, best.units[0], best.corner
-    avatar_first, avatar_count, points, shift = avatar.first, avatar.count, avatar.points, placed.shift
-    base, block_base, lane_base = scene.where[voxel, 0], scene.where[voxel, 1], scene.where[voxel, 2]
-    for r in range(3):
-        corner[r] = scene.coordinates[voxel, r] * scene.voxel_steps
-        off[r] = np.float32(corner[r] - placed.frame[r])
-    counters[0] += 1
-    stack[0, 0], stack[0, 1] = 0, base
-    keys[0] = lower_bound(
-        words, base, nodes[0, 0] - off[0], nodes[1, 0] - off[1], nodes[2, 0] - off[2], nodes[3, 0]
-    )
+@borrowing
+def _search_pairs(avatar, m, pose, a, row, placed, scene, spot, best, descent):
+    """Search the subtrees of two nodes for a nearer pair, both descended, depth first, the nearest child first: for
+    avatars whose front is not their leaf nodes."""
+    words, ints, nodes = scene.words, scene.ints, placed.nodes
+    avatar_first, avatar_count = avatar.first, avatar.count
+    stack, keys, off, cut, base = descent.pairs, descent.pair_keys, descent.off, best.cut, spot[0]
+    stack[0, 0], stack[0, 1], keys[0] = a, row, np.float32(-1.0)
     depth = 1
     while depth > 0:
         depth -= 1
         if keys[depth] > cut[0]:
             continue
         a, row = stack[depth, 0], stack[depth, 1]
-        a_first, b_first = avatar_first[a], ints[row + FIRST]
+        a_first, b_first = np.int64(avatar_first[a]), np.int64(ints[row + FIRST])
         begin = depth
         if a_first < 0 and b_first < 0:
-            block, scene_block = ~a_first, ~b_first
-            if stamp[block] != pose:
-                place_block(avatar, m, block, placed, scene)
-                stamp[block] = pose
-            block_at = block_base + scene_block * BLOCK_WORDS
-            lane_at = lane_base + scene_block * 3 * LANES
-            lx = off[0] + np.float32(ints[block_at])
-            ly = off[1] + np.float32(ints[block_at + 1])
-            lz = off[2] + np.float32(ints[block_at + 2])
-            keep_near(lanes, block, words, row, off[0], off[1], off[2], cut[0], keep)
-            for lane in range(avatar_count[a]):
-                if not keep[lane]:
-                    continue
-                x, y, z = lanes[block, 0, lane] - lx, lanes[block, 1, lane] - ly, lanes[block, 2, lane] - lz
-                counters[1] += LANES
-                if any_near(halves, lane_at, x, y, z, cut[1]):
-                    search_lanes(
-                        points, m, shift, block, lane, ints, halves, corner, block_at, lane_at, x, y, z, frame, units,
-                        squares, found, cut,
-                    )  # fmt: skip
+            block = ~a_first
+            if placed.stamp[block] != pose:
+                place_lanes(avatar.points, m, block, placed.lanes, placed.shift, placed.frame, scene.step)
+                placed.stamp[block] = pose
+            if keep_near(placed.lanes, block, words, row, off[0], off[1], off[2], cut[0], best.keep):
+                _search_leaves(m, a, row, avatar, placed, scene, spot, best, off)
         elif b_first < 0 or (a_first >= 0 and nodes[3, a] > words[row + 3]):
-            counters[0] += avatar_count[a]
+            best.counters[0] += avatar_count[a]
             for child in range(a_first, a_first + avatar_count[a]):
                 key = lower_bound(
                     words, row, nodes[0, child] - off[0], nodes[1, child] - off[1], nodes[2, child] - off[2],
@@ -283,7 +153,7 @@ def _nearest_voxel(avatar, m, pose, placed, scene, voxel, stack, keys, off, best
                     depth += 1
         else:
             x, y, z = nodes[0, a] - off[0], nodes[1, a] - off[1], nodes[2, a] - off[2]
-            counters[0] += ints[row + COUNT]
+            best.counters[0] += ints[row + COUNT]
             for i in range(ints[row + COUNT]):
                 child_row = base + (b_first + i) * ROW_WORDS
                 key = lower_bound(words, child_row, x, y, z, nodes[3, a])
@@ -292,7 +162,95 @@ def _nearest_voxel(avatar, m, pose, placed, scene, voxel, stack, keys, off, best
                     depth += 1
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
+def node_near(words, row, x, y, z, span):
+    """Whether a scene node may hold a point within `span` of a place (float32, from the voxel's low corner), the error
+    included: the sphere, then the slab, as in `nodes_meet`."""
+    w = U(row)
+    dx, dy, dz = x - words[w], y - words[w + U(1)], z - words[w + U(2)]
+    both = words[w + U(3)] + span
+    along = words[w + U(4)] * dx + words[w + U(5)] * dy + words[w + U(6)] * dz
+    room = words[w + U(7)] * (span + SLACK * both + SLACK * both)
+    return (
+        (dx * dx + dy * dy + dz * dz <= both * both * ONE_SLACK)
+        & (along <= words[w + U(9)] + room)
+        & (along >= words[w + U(8)] - room)
+    )
+
+
+@borrowing
+def _nearest_voxel(avatar, m, pose, placed, scene, voxel, front, count, descent, best):
+    """Search one resident voxel for a nearer pair; a descent as overlap.py has it, and as long for the same reason."""
+    words, ints = scene.words, scene.ints
+    nodes, lanes, stamp = placed.nodes, placed.lanes, placed.stamp
+    cut, keep, counters, corner, off = best.cut, best.keep, best.counters, best.corner, descent.off
+    bounds, which, listed, listed8 = front.bounds, front.which, front.keep, front.keep8
+    firsts, front_first, points = avatar.first, avatar.front_first, avatar.points
+    stack = descent.stack
+    shift, frame, step = placed.shift, placed.frame, scene.step
+    spot = (scene.where[voxel, 0], scene.where[voxel, 1], scene.where[voxel, 2])
+    for r in range(3):
+        corner[r] = scene.coordinates[voxel, r] * scene.voxel_steps
+        off[r] = np.float32(corner[r] - placed.frame[r])
+    off_x, off_y, off_z = off[0], off[1], off[2]
+    counters[0] += 1
+    x, y, z, radius = nodes[0, 0] - off_x, nodes[1, 0] - off_y, nodes[2, 0] - off_z, nodes[3, 0]
+    broad = BROAD * radius
+    if not node_near(words, spot[0], x, y, z, radius + cut[0]):
+        return
+    stack[0, 0], stack[0, 1], stack[0, 2] = spot[0], 0, count
+    depth = 1
+    while depth > 0:
+        depth -= 1
+        row, at, count = stack[U(depth), 0], stack[U(depth), 1], stack[U(depth), 2]
+        first = np.int64(ints[U(row + FIRST)])
+        if first < 0 or words[U(row + 3)] < broad:
+            counters[0] += count
+            steps = (count + LANES - 1) // LANES
+            if not sift(words, row, bounds, at, steps, off_x, off_y, off_z, cut[0], listed):
+                continue
+            to = at + steps * LANES
+            count = take_kept(bounds, which, listed, listed8, at, steps, to)
+            at = to
+            thick = words[U(row + 9)] - words[U(row + 8)]
+            if first < 0 or thick < FLAT * words[U(row + 7)] * bounds[3, U(at)]:
+                left = at
+                for i in range(at, at + count):
+                    a = front_first + np.int64(which[U(i)])
+                    a_first = np.int64(firsts[U(a)])
+                    if a_first < 0:
+                        block = ~a_first
+                        if stamp[U(block)] != pose:
+                            place_lanes(points, m, block, lanes, shift, frame, step)
+                            stamp[U(block)] = pose
+                        counters[0] += 1
+                        if not keep_near(lanes, block, words, row, off_x, off_y, off_z, cut[0], keep):
+                            continue
+                        if first < 0:
+                            _search_leaves(m, a, row, avatar, placed, scene, spot, best, off)
+                            continue
+                    elif first < 0:
+                        _search_pairs(avatar, m, pose, a, row, placed, scene, spot, best, descent)
+                        continue
+                    move_node(bounds, which, U(i), U(left))
+                    left += 1
+                if left == at:  # always so at a leaf
+                    continue
+                pad(bounds, left, at + (count + LANES - 1) // LANES * LANES)
+                count = left - at
+        children = np.int64(ints[U(row + COUNT)])
+        child = spot[0] + first * ROW_WORDS
+        counters[0] += children
+        span = radius + cut[0]
+        for _ in range(children):
+            stack[U(depth), 0], stack[U(depth), 1], stack[U(depth), 2] = child, at, count
+            if node_near(words, child, x, y, z, span):
+                depth += 1
+            child += ROW_WORDS
+    settle(best, points, m, placed.shift, ints, scene.halves, lanes, off)
+
+
+@borrowing
 def box_gap(root, placed, farthest, scene, index, voxel):
     """How far the avatar's centres are from all points of a voxel at least [steps], from the index; not below 0.
 
@@ -308,44 +266,97 @@ def box_gap(root, placed, farthest, scene, index, voxel):
     return max(math.sqrt(square) * (1.0 - 1e-9) - root / scene.step * (1.0 + 1e-9) - error, 0.0)
 
 
+@borrowing
+def _widen(m, pose, avatar, placed, scene, reach, beyond, first, last, front, count, descent, best, gaps):
+    """Search the voxels reach.rows[first:last] for the nearest pair, within ever wider bounds until there is one.
+
+    Where nothing is near, to have looked for it costs little: nearly all nodes are far, too.
+    gaps: of each voxel, see `box_gap`; inf: not resident.
+    """
+    units, found = best.units, best.found
+    # Twice the radii: a distance of the size of the spheres. Of spheres without size, a share of the reach.
+    near = max(2 * (units[0] - beyond), units[0] >> 6, 1)
+    while True:
+        limit = units[0]
+        if found[0] >= 0:
+            limit = min(limit, np.int64(math.sqrt(np.float64(found[0]))) + 2)
+        bound = min(near, limit)
+        units[1] = bound
+        set_cut(best.cut, best.frame, bound, -1)
+        while True:
+            # The nearest voxel first. Few are looked into, so they are not sorted.
+            at, least = -1, np.float64(best.cut[0])
+            for other in range(last - first):
+                if 0.0 <= gaps[other] <= least:
+                    at, least = other, gaps[other]
+            if at < 0:
+                break
+            gaps[at] = -1.0 - least
+            _nearest_voxel(
+                avatar, m, pose, placed, scene, reach.rows[first + at], front, count, descent, best
+            )
+        if units[1] < bound or bound == limit:
+            break
+        near *= 4
+        for at in range(last - first):
+            if gaps[at] < 0.0:
+                gaps[at] = -1.0 - gaps[at]
+
+
 @nb.njit(nogil=True, cache=True)
-def nearest_poses(poses, avatar, scene, index, reach, which, nearest, counts):
+def nearest_poses(poses, avatar, scene, index, reach, beyond, which, nearest, counts):
     """Answer `distance` for the poses numbered in `which`: one call a request, all its poses and voxels.
 
     poses: (k, 4, 4), checked.  avatar: not empty.  reach: Reach of these poses (reach.py), to the farthest distance of
-    interest; a voxel in it that is not resident is counted as missing.
+    interest; a voxel in it that is not resident is counted as missing.  beyond: how much of it is not the radii, exact
+    units.
     Adds to what `nearest` and counts (3, k) uint32 (voxels missing, node visits, point tests) hold, -1, inf and 0 to
     begin with, so that a pose may be answered in pieces.
     """
     placed, best = make_placed(avatar), make_best()
-    stack, keys = np.empty((STACK, 2), np.int64), np.empty(STACK, np.float32)
-    off = np.empty(3, np.float32)
+    front, descent = make_front(avatar), make_descent()
+    most = 0
+    for number in range(which.shape[0]):
+        most = max(most, reach.starts[which[number] + 1] - reach.starts[which[number]])
+    gaps = np.empty(most)
+    _nearest_poses(
+        poses, avatar, scene, index, reach, beyond, which, nearest, counts, placed, best, front, descent, gaps
+    )
+
+
+@borrowing
+def _nearest_poses(
+    poses, avatar, scene, index, reach, beyond, which, nearest, counts, placed, best, front, descent, gaps
+):
+    """`nearest_poses`, with its scratch."""
     for number in range(which.shape[0]):
         i = which[number]
         first, last = reach.starts[i], reach.starts[i + 1]
         if first == last:
             continue
-        best.frame[0], best.frame[1] = place_nodes(avatar, poses[i], reach.scales[i], placed, scene)
-        best.units[0] = reach.units[i]
+        best.frame[0], best.frame[1], count = place_all(
+            avatar, poses[i], reach.scales[i], placed, scene, front.bounds
+        )
+        best.units[0], best.units[1] = reach.units[i], reach.units[i]
         best.found[0] = nearest.square[i]
-        best.found[1:] = nearest.pair[i]
-        best.counters[:] = 0
+        for r in range(6):
+            best.found[1 + r] = nearest.pair[i, r]
+        best.counters[0], best.counters[1], best.counters[2] = 0, 0, 0
         best.frame[2], best.frame[3] = scene.units_per_step, scene.voxel_steps
-        set_cut(best.cut, best.frame, best.units[0], best.found[0])
-        gaps = np.full(last - first, np.inf)
+        root = avatar.radius[0] * reach.scales[i]
         for at in range(first, last):
-            root = avatar.radius[0] * reach.scales[i]
             gap = box_gap(root, placed, best.frame[1], scene, index, reach.rows[at])
             if scene.where[reach.rows[at], 0] >= 0:
                 gaps[at - first] = gap
             else:
+                gaps[at - first] = np.inf
                 counts[0, i] += np.uint32(1)
                 nearest.gap[i] = min(nearest.gap[i], gap)
-        for at in np.argsort(gaps) if last - first > 1 else np.zeros(1, np.int64):
-            if gaps[at] > best.cut[0]:
-                break
-            _nearest_voxel(avatar, poses[i], i, placed, scene, reach.rows[first + at], stack, keys, off, best)
+        _widen(
+            poses[i], i, avatar, placed, scene, reach, beyond, first, last, front, count, descent, best, gaps
+        )
         nearest.square[i] = best.found[0]
-        nearest.pair[i] = best.found[1:]
+        for r in range(6):
+            nearest.pair[i, r] = best.found[1 + r]
         counts[1, i] += np.uint32(best.counters[0])
         counts[2, i] += np.uint32(best.counters[1])

@@ -18,17 +18,17 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from .layout import BLOCK_WORDS, COUNT, FIRST, LANES, ROW_WORDS
-from .nearest import (
+from .closest import (
     Best,
     any_near,
-    box_gap,
     keep_near,
     lower_bound,
     make_best,
     search_lanes,
     set_cut,
 )
+from .layout import BLOCK_WORDS, COUNT, FIRST, LANES, ROW_WORDS
+from .nearest import box_gap
 from .overlap import STACK
 from .placed import ONE_SLACK, SLACK, Placed, make_limits, make_placed, place_block, place_nodes
 from .placing import MAX_REACH_UNITS

@@ -176,6 +176,22 @@ def test_collide_is_distance_within_the_margin(tmp_path: Path, rng: np.random.Ge
 
 
 @pytest.mark.interpreted
+def test_more_ties_than_are_kept_until_the_end(tmp_path: Path, rng: np.random.Generator) -> None:
+    """Two planes, every point of one above a point of the other: all pairs tie, and the least by coordinates counts."""
+    grid = np.stack(np.meshgrid(np.arange(12), np.arange(12), [0]), -1).reshape(-1, 3) / 16
+    case = cases.build(tmp_path, rng.permutation(grid), resolution=2.0**-6, radius=0.0, leaf=4, degree=2)
+    shifts = [(0, 0, 2), (2, -3, 2), (0, 1, -5), (1, 1, 0)]
+    poses = np.array([cases.pose_of(np.eye(3), np.array(shift) / 16) for shift in shifts])
+    with Scene.open(case.archive) as scene:
+        info = scene.info()
+        scene.add_avatar("avatar", rng.permutation(grid), 0.0)
+        expected = naive_distance.distance(
+            grid, info.origin, info.lattice_step, info.radius, grid, 0.0, poses, 1.0
+        )
+        compare(scene.distance("avatar", poses, 1.0), expected, 1.0)
+
+
+@pytest.mark.interpreted
 @pytest.mark.parametrize("kind", scans.WITH_POINTS)
 def test_a_few_poses_of_every_kind_of_scan(tmp_path: Path, rng: np.random.Generator, kind: str) -> None:
     case = cases.build(tmp_path, scans.make_scan(kind, 11, 60), radius=0.05)

@@ -1,6 +1,6 @@
 """What answers of all kinds have in common: their columns. Unknown ones, joined ones, parts of a path, checked ones."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, TypeVar
 
 import numpy as np
@@ -80,6 +80,35 @@ def join(parts: Sequence[_A]) -> _A:
         resident_bytes=answered[-1].resident_bytes,
         faults=tuple(dict.fromkeys(fault for part in parts for fault in part.faults)),
     )
+
+
+def in_pieces(answers: ContactsAnswers, most_bytes: int) -> Iterator[ContactsAnswers]:
+    """The same answers in pieces whose pairs and clusters take at most so many bytes, or are those of one pose.
+
+    `join` makes them one again; what the request cost is said of the first.
+    """
+    fields = array_fields(ContactsAnswers)
+    ends = np.zeros(len(answers) + 1, np.int64)
+    for name, starts in _ROWS.items():
+        ends += getattr(answers, starts) * fields[name].row_bytes
+    rest = asdict(answers)
+    start = 0
+    while start < max(1, len(answers)):
+        stop = int(np.searchsorted(ends, ends[start] + most_bytes, side="right")) - 1
+        stop = min(max(stop, start + 1), len(answers))
+        piece: dict[str, Any] = {}
+        for name in fields:
+            column = getattr(answers, name)
+            if name in _ROWS:
+                rows = getattr(answers, _ROWS[name])
+                piece[name] = column[rows[start] : rows[stop]]
+            elif name in _ROWS.values():
+                piece[name] = column[start : stop + 1] - column[start]
+            else:
+                piece[name] = column[start:stop]
+        yield ContactsAnswers(**(rest | piece))
+        rest |= {"engine_seconds": 0.0, "hits": 0, "misses": 0}
+        start = max(stop, 1)
 
 
 def as_part(answers: Cost, first: int, total: int) -> Any:

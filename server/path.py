@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from ..schemas.answers import PATH_ANSWERS, Cost, Part
+from ..schemas.answers import PATH_ANSWERS, ContactsAnswers, Cost, Part
 from ..schemas.arrays import Poses
-from ..schemas.columns import as_part, unknown
+from ..schemas.columns import as_part, in_pieces, unknown
 from ..schemas.errors import SolidcloudError
 from ..schemas.requests import check_path_parameters
 from .avatar import AvatarModel
@@ -33,7 +33,8 @@ PATH_THREADS = 2
 FIRST_PART = 64
 LARGEST_PART = 1024
 PART_SECONDS = 0.01
-# Of a part's answer, far under the largest message; a contact takes 68 bytes and its cluster up to 116.
+# Of a part's answer, under the largest message even as JSON; a contact takes 68 bytes and its cluster up to 116. There
+# may be more clusters than contacts listed, so what a part holds is looked at again when it is there.
 _PART_BYTES = 8 << 20
 _CONTACT_BYTES = 184
 
@@ -114,7 +115,11 @@ def path_parts(
             else:
                 first, future = waiting.popleft()
                 answers = future.result()
-            yield as_part(answers, first, total)
+            for piece in (
+                in_pieces(answers, _PART_BYTES) if isinstance(answers, ContactsAnswers) else [answers]
+            ):
+                yield as_part(piece, first, total)
+                first += len(piece)  # type: ignore[arg-type]
             size = _next_size(size, answers, most)
     finally:
         for _, future in waiting:

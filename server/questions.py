@@ -18,7 +18,7 @@ from ..schemas.answers import (
     WithinAnswers,
 )
 from ..schemas.columns import check_answers, join, unknown
-from ..schemas.errors import BadRequestError
+from ..schemas.errors import BadRequestError, TooLargeError
 from ..schemas.messages import (
     CollideRequest,
     ContactsRequest,
@@ -248,19 +248,28 @@ class Questions:
         """Ask for k answers, in several requests where they are many.
 
         request: makes the one for a slice, with so much left of the budget [ms].  names: the avatars it is about.
+        An answer that no message holds is asked for again in smaller requests, but for that of `objects`, which is one.
         """
         batch = batch or BATCH_POSES
         parts: list[_A] = []
         begin = time.monotonic()
-        for start in range(0, max(1, k), batch):
+        start, left = 0, budget_ms
+        while not parts or start < k:
             stop = min(start + batch, k)
-            left = budget_ms
-            if left is not None and start:
-                left = max(0.0, left - (time.monotonic() - begin) * 1e3)
-            payload = self._ask_about(_OPERATIONS[kind], encode(request(slice(start, stop), left)), names)
+            try:
+                payload = self._ask_about(_OPERATIONS[kind], encode(request(slice(start, stop), left)), names)
+            except TooLargeError:
+                if stop - start <= 1 or issubclass(kind, ObjectsAnswers):
+                    raise
+                batch = (stop - start + 1) // 2
+                continue
+            finally:
+                if budget_ms is not None:
+                    left = max(0.0, budget_ms - (time.monotonic() - begin) * 1e3)
             if payload is None:
                 # Not asked for the rest: a server that is frozen would cost a timeout for every batch.
                 parts.append(unknown(kind, k - start, bounded=bounded))
                 break
             parts.append(check_answers(decode_answer(kind, payload), stop - start))
+            start = stop
         return join(parts)

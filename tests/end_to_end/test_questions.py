@@ -25,7 +25,7 @@ from solidcloud.schemas.answers import (
 )
 from solidcloud.schemas.arrays import array_fields
 from solidcloud.schemas.columns import join, without_part
-from solidcloud.schemas.errors import BadRequestError, BadTransformError
+from solidcloud.schemas.errors import BadRequestError, BadTransformError, TooLargeError
 from solidcloud.schemas.messages import (
     JSON,
     MSGPACK,
@@ -174,6 +174,26 @@ def test_what_is_split_is_what_was_asked_at_once(scene, client, question, monkey
     monkeypatch.setattr(questions_module, "SLOW_BATCH", 7)
     ask, _, _, _ = QUESTIONS[question]
     same(ask(client), ask(scene))
+
+
+def test_contacts_that_no_message_holds_come_in_smaller_ones(scene, client, monkeypatch):
+    """Clusters are not bounded by `limit`: here there are many of them, and messages are small."""
+    from solidcloud.server import app as app_module
+
+    parameters = {"limit": 0, "margin": 0.5, "cluster_distance": 0.0}
+    expected = scene.contacts("al", POSES, **parameters)
+    most = 116 * int(np.diff(expected.cluster_starts).max())
+    assert most > 1000 and 116 * expected.cluster_starts[-1] > 3 * most
+    monkeypatch.setattr(app_module, "MAX_MESSAGE_BYTES", (1 << 16) + most + 5000)
+    monkeypatch.setattr(path_module, "_PART_BYTES", most)
+    same(client.contacts("al", POSES, **parameters), expected)
+    parts = [
+        without_part(ContactsAnswers, part) for part in client.path("al", POSES, "contacts", **parameters)
+    ]
+    same(join(parts), expected)
+    monkeypatch.setattr(app_module, "MAX_MESSAGE_BYTES", (1 << 16) + 1000)
+    with pytest.raises(TooLargeError, match="a message holds"):
+        client.contacts("al", POSES, **parameters)
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,7 @@
 """Answers of all kinds: unknown, joined, checked, in parts; and how their arrays travel, infinities included."""
 
+from itertools import pairwise
+
 import msgspec
 import numpy as np
 import pytest
@@ -15,7 +17,7 @@ from solidcloud.schemas.answers import (
     WithinAnswers,
 )
 from solidcloud.schemas.arrays import array_fields
-from solidcloud.schemas.columns import as_part, check_answers, join, unknown, without_part
+from solidcloud.schemas.columns import as_part, check_answers, in_pieces, join, unknown, without_part
 from solidcloud.schemas.errors import InternalError
 from solidcloud.schemas.messages import JSON, MSGPACK, decode_answer, encode
 
@@ -182,3 +184,19 @@ def test_json_integers_beyond_int32_are_refused(value):
     got["pairs"][0][0] = value
     with pytest.raises(InternalError, match="do not fit int32"):
         decode_answer(ObjectsAnswers, msgspec.json.encode(got), JSON)
+
+
+@pytest.mark.parametrize("k", [0, 1, 2, 9])
+@pytest.mark.parametrize("most", [0, 2 * 184, 5 * 184 + 100, 1 << 20])
+def test_contacts_in_pieces_are_joined_again(k, most):
+    whole = some(ContactsAnswers, k)
+    pieces = list(in_pieces(whole, most))
+    for piece in pieces:
+        check_answers(piece, len(piece))
+        assert len(piece) == 1 or 184 * int(piece.pair_starts[-1]) <= most or not k
+    same(join(pieces), whole)
+    # None could have taken the next one's first pose.
+    for piece, following in pairwise(pieces):
+        assert 184 * int(piece.pair_starts[-1] + following.pair_starts[1]) > most
+    assert [p.engine_seconds for p in pieces] == [0.5] + [0.0] * (len(pieces) - 1)
+    assert {p.faults for p in pieces} == {whole.faults}

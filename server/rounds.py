@@ -22,8 +22,10 @@ from .kernels.voxel_tree import Lists, VoxelTree, list_voxels, make_voxel_tree
 from .request import SceneData
 from .residency import Residency
 
-# Rays or points whose lists are in memory together; a deadline is looked at between batches too.
+# Rays or points whose lists are in memory together.
 BATCH = 1 << 14
+# The same where there is a deadline, which is looked at between batches and rounds: some 10 ms of work.
+TIMED_BATCH = 1 << 11
 
 _trees: WeakKeyDictionary[Residency, VoxelTree] = WeakKeyDictionary()
 
@@ -98,8 +100,9 @@ def look(
     hits = misses = 0
     faults: dict[str, None] = {}
     capacity = 64
-    for begin in range(0, k, BATCH):
-        end = min(begin + BATCH, k)
+    batch = BATCH if effort.deadline == math.inf else TIMED_BATCH
+    for begin in range(0, k, batch):
+        end = min(begin + batch, k)
         if effort.spent:
             best.unseen[begin:] = 0.0
             break

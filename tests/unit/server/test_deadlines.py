@@ -13,7 +13,7 @@ import pytest
 import scans
 from numpy.typing import NDArray
 from solidcloud.schemas.answers import Verdict
-from solidcloud.server import bounded
+from solidcloud.server import bounded, rounds
 from solidcloud.server.avatar import make_avatar
 from solidcloud.server.collide import collide
 from solidcloud.server.contacts import contacts
@@ -21,6 +21,7 @@ from solidcloud.server.distance import distance
 from solidcloud.server.effort import LOAD_SHARE, Effort
 from solidcloud.server.request import SceneData
 from solidcloud.server.sweep import sweep
+from solidcloud.server.within import within
 
 pytestmark = pytest.mark.interpreted
 CLEAR, CONTACT, UNKNOWN = Verdict
@@ -101,6 +102,32 @@ def test_no_load_is_begun_once_the_time_for_loads_is_up(
     assert found.verdict[-1] == CLEAR and (found.verdict[:-1] != CLEAR).all()
     assert (found.verdict == UNKNOWN).any()
     assert (exact.verdict[found.verdict == CONTACT] == CONTACT).all()
+
+
+class Stops(Effort):
+    """An effort whose time is up after so many looks at the clock."""
+
+    looks: list[int]
+
+    @property
+    def spent(self) -> bool:
+        """Whether this look is too late."""
+        self.looks[0] -= 1
+        return self.looks[0] < 0
+
+
+def test_loose_points_are_looked_at_some_at_a_time(
+    case: cases_contacts.ScanCase, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two batches of four, each with a look before it and before its one round; the third comes too late."""
+    monkeypatch.setattr(rounds, "TIMED_BATCH", 4)
+    exact = within(case.data, case.points[:12], 0.2)
+    effort = Stops(deadline=1e300)
+    effort.looks = [4]
+    found = within(case.data, case.points[:12], 0.2, effort)
+    assert exact.verdict.tolist() == [CONTACT] * 12
+    assert found.verdict.tolist() == [CONTACT] * 8 + [UNKNOWN] * 4
+    assert (found.lower <= exact.distance).all()
 
 
 def test_loads_have_half_of_the_time() -> None:

@@ -35,6 +35,7 @@ from .path import PATH_THREADS, largest_part, path_parts, path_question
 from .rays import raycast
 from .request import make_scene_data
 from .residency import Residency
+from .session import Walker
 from .store import Store
 from .sweep import sweep
 from .within import within
@@ -121,6 +122,8 @@ class Scene:
         both = np.full(2, 0xFFFFFFFF, np.uint32)
         # Budgets that are hardly ever spent: what is bounded has kernels of its own, and so have deadlines.
         later = time.perf_counter() + 3600.0
+        for poses in (pose, np.concatenate([pose, pose])):
+            Walker(self._data, avatar).collide(poses)
         for effort in (EXACT, Effort(tolerance=1e-3, visits=1 << 20), Effort(deadline=later)):
             for poses in (pose, np.concatenate([pose, pose])):
                 collide(self._data, avatar, poses, 0.0, effort)
@@ -172,6 +175,10 @@ class Scene:
         """
         effort = make_effort(tolerance, budget_ms, budget_visits)
         return collide(self._data, self._avatar(name, client), poses, margin, effort)
+
+    def walker(self, name: str, margin: float = 0.0, *, client: str = "") -> Walker:
+        """A session of avatar `name`: its `collide` remembers the last pose; see server/session.py."""
+        return Walker(self._data, self._avatar(name, client), margin)
 
     def distance(
         self,

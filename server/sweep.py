@@ -95,7 +95,8 @@ def sweep(
     go between `lower` and `upper` [m]; that of `effort` where it is larger.
     CONTACT in [lower, upper]; CLEAR; UNKNOWN from `lower` on: something is missing there, the effort was spent, or a
     graze of some hundredths of a micrometre cannot be told from a touch. A contact found after such a place is CONTACT
-    all the same, with exact=False. Raises BadRequestError, BadTransformError, TooLargeError.
+    all the same, with exact=False. With a budget of visits what is clear stays clear under a larger one; a contact may
+    not: it may be spent on a doubt before it. Raises BadRequestError, BadTransformError, TooLargeError.
     """
     begin = time.perf_counter()
     if not 0.0 <= tolerance <= MAX_COORDINATE:

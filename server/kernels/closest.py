@@ -11,7 +11,7 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from .compiled import borrowing
+from .compiled import borrowing, inlined
 from .layout import LANES
 from .placed import ONE_SLACK, SLACK, U32, make_limits
 from .placing import lattice_to_units, place, to_units
@@ -143,7 +143,7 @@ def _consider(
     return nearer
 
 
-@borrowing
+@inlined
 def keep_near(lanes, block, words, row, off_x, off_y, off_z, cut, keep):
     """Which points of an avatar's block (LANES) may be within `cut` [steps] of a scene node; writes keep (LANES,).
 
@@ -233,7 +233,7 @@ def search_lanes(
                 set_cut(cut, scales, units, best_found[0])
 
 
-@borrowing
+@inlined
 def keep_in_box(halves, lane_at, low_x, low_y, low_z, lanes, block, far, keep):
     """Unmark, of the marked points of an avatar's block, those that the box of a scene's block alone shows to be beyond
     `far`, a square; arguments as of `least_squares`.
@@ -257,7 +257,7 @@ def keep_in_box(halves, lane_at, low_x, low_y, low_z, lanes, block, far, keep):
         keep[j] = keep[j] & (dx * dx + dy * dy + dz * dz <= far)
 
 
-@borrowing
+@inlined
 def least_squares(halves, lane_at, low_x, low_y, low_z, lanes, block, keep, keep8, squares):
     """The least square of the distances of each marked point of an avatar's block to a scene's block; writes squares.
 

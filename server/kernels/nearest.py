@@ -28,7 +28,7 @@ from .closest import (
     settle,
     take_candidates,
 )
-from .compiled import borrowing
+from .compiled import borrowing, inlined
 from .front import make_front, move_node, pad, place_front, sift, take_kept
 from .layout import BLOCK_WORDS, COUNT, FIRST, LANES, ROW_WORDS
 from .overlap import BROAD, FLAT, STACK
@@ -83,7 +83,7 @@ def place_all(avatar, m, scale, placed, scene, bounds):
     return extent, farthest, count
 
 
-@borrowing
+@inlined
 def _search_leaves(m, a, row, avatar, placed, scene, spot, best, off):
     """Take up what is nearer than the best of the points of an avatar's leaf node that are marked and those of a
     scene's leaf node."""

@@ -141,6 +141,24 @@ def test_contact_begins_at_the_unit_it_begins_at(tmp_path: Path, rng: np.random.
             assert 0 < expected.sum() < 80
 
 
+def test_a_corner_against_a_point(tmp_path: Path, rng: np.random.Generator) -> None:
+    """The box around a leaf node's points is tight at its corners: there it has to be given all the room there is."""
+    case = cases.build(tmp_path, np.zeros((1, 3)), radius=0.02, voxel=0.9)
+    avatar = np.stack(np.meshgrid(*[[-0.1, 0.1]] * 3), axis=-1).reshape(-1, 3)
+    with Scene.open(case.archive) as scene:
+        scene.add_avatar("avatar", avatar, 0.005)
+        walker, found = scene.walker("avatar"), []
+        for _ in range(20):
+            turn = cases.random_rotation(rng)
+            away = turn @ avatar[rng.integers(8)] / np.linalg.norm(avatar[0])
+            # The corner goes from 1 mm outside of contact to 1 mm inside, in steps of 20 um.
+            ways = np.linalg.norm(avatar[0]) + 0.025 + np.arange(50, -50, -1) * 2e-5 + 1e-6
+            poses = np.array([cases.pose_of(turn, -away * way) for way in ways])
+            found.append(walker.collide(poses).verdict.tolist())
+            assert found[-1] == scene.collide("avatar", poses).verdict.tolist()
+        assert 0 < sum(map(sum, found)) < 2000
+
+
 def test_voxels_may_come_and_go(tmp_path: Path, rng: np.random.Generator) -> None:
     """A cache of a few voxels: what is remembered of one holds when it is loaded again, elsewhere in memory."""
     case = cases.build(tmp_path, room(rng, 4000), radius=0.008, voxel=0.4)

@@ -250,11 +250,11 @@ def keep_in_box(halves, lane_at, low_x, low_y, low_z, lanes, block, far, keep):
     most_x, most_y, most_z = np.float32(high_x), np.float32(high_y), np.float32(high_z)
     zero = np.float32(0.0)
     for lane in range(LANES):
-        j = U(lane)
-        x, y, z = lanes[b, 0, j] - low_x, lanes[b, 1, j] - low_y, lanes[b, 2, j] - low_z
+        u = U(lane)
+        x, y, z = lanes[b, 0, u] - low_x, lanes[b, 1, u] - low_y, lanes[b, 2, u] - low_z
         dx, dy, dz = max(x - most_x, -x), max(y - most_y, -y), max(z - most_z, -z)
         dx, dy, dz = max(dx, zero), max(dy, zero), max(dz, zero)
-        keep[j] = keep[j] & (dx * dx + dy * dy + dz * dz <= far)
+        keep[u] = keep[u] & (dx * dx + dy * dy + dz * dz <= far)
 
 
 @inlined

@@ -14,7 +14,7 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from .compiled import borrowing
+from .compiled import borrowing, inlined
 from .layout import LANES
 from .placed import ONE_SLACK, SLACK, node_reach
 
@@ -82,7 +82,7 @@ def place_front(avatar, m, scale, placed, scene, extent, bounds):
     return n
 
 
-@borrowing
+@inlined
 def sift(words, row, bounds, at, steps, off_x, off_y, off_z, room, keep):
     """Mark in `keep` which nodes of a list meet the scene node `row`: the sphere, then the slab, as in `nodes_meet`.
 
@@ -116,7 +116,7 @@ def sift(words, row, bounds, at, steps, off_x, off_y, off_z, room, keep):
     return any_meets
 
 
-@borrowing
+@inlined
 def take_kept(bounds, which, keep, keep8, at, steps, to):
     """Write the nodes of the list at `at` that are marked as a new list at `to`. Returns its length."""
     n = U(to)

@@ -20,7 +20,7 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from .compiled import borrowing
+from .compiled import borrowing, inlined
 from .front import MOST_LEVELS, make_front, move_node, pad, place_front, sift, take_kept
 from .layout import BLOCK_WORDS, COUNT, FIRST, LANES, ROW_WORDS
 from .placed import (
@@ -103,7 +103,7 @@ def nodes_meet(words, row, x, y, z, radius, limits):
     )
 
 
-@borrowing
+@inlined
 def lanes_meet(words, row, lanes, block, off_x, off_y, off_z, room, keep):
     """Mark in `keep` which points of an avatar's block (from the frame) come within `room`, reach and error together,
     of the bound of the scene node `row`. Returns whether any does."""

@@ -204,3 +204,22 @@ def test_a_few_poses_of_every_kind_of_scan(tmp_path: Path, rng: np.random.Genera
             case.points, info.origin, info.lattice_step, info.radius, avatar, 0.05, poses, 0.2
         )
         compare(scene.distance("avatar", poses, 0.2), expected, 0.2)
+
+
+def test_an_avatar_whose_front_is_inner_nodes(tmp_path: Path, rng: np.random.Generator) -> None:
+    # 10,000 points: more leaf nodes than a front holds, so that the avatar's side is descended as well.
+    points = scans.make_scan("corner", 5, 300)
+    case = cases.build(tmp_path, points, leaf=4, degree=3)
+    direction = rng.normal(size=(10_000, 3))
+    avatar = direction / np.linalg.norm(direction, axis=1)[:, None] * rng.uniform(0.2, 0.21, (10_000, 1))
+    low, high = points.min(axis=0) - 0.3, points.max(axis=0) + 0.3
+    poses = np.stack([cases.pose_of(cases.random_rotation(rng), rng.uniform(low, high)) for _ in range(12)])
+    with Scene.open(case.archive) as scene:
+        info = scene.info()
+        scene.add_avatar("avatar", avatar, 0.002)
+        answers = scene.distance("avatar", poses, 0.15)
+        expected = naive_distance.distance(
+            points, info.origin, info.lattice_step, info.radius, avatar, 0.002, poses, 0.15
+        )
+    compare(answers, expected, 0.15)
+    assert {answer is None for answer in expected} == {True, False}

@@ -11,7 +11,7 @@ more where the archive keeps scan numbers (`--keep scan`):
   to the end, so that a test of all lanes needs no mask;
 - scans: (b, LANES) halfwords, the scan each point came from (`scan_run`); not there where it is not kept.
 
-For a dense voxel this is 8.3 bytes a point: 6 the points, 1.8 the rows, 0.5 the blocks (scripts/bench_walk), and 2
+For the façade this is 8.7 bytes a point, 6 of them the points (scripts/bench_engine --only memory), and 2
 more for the scans where kept.
 """
 

@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass, field
 
 from ..schemas.errors import BadRequestError
+from ..schemas.radius_model import MAX_RADIUS, STORED_MODELS
 from ..schemas.voxel import MAX_DEGREE, MAX_LEAF, MIN_DEGREE
 
 # Closest-point distances are measured at about this many points; of fewer, at all.
@@ -15,9 +16,6 @@ SHARD_POINTS = 1 << 22
 
 DEFAULT_STEP = 1e-4
 CELL_KINDS = ("octree", "balanced")
-
-# Radii and margins are compared as integers whose squares must fit (schemas/NUMERICS.md N5): 16 m in all.
-MAX_RADIUS = 8.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -34,6 +32,8 @@ class BuildConfig:
     takes 3 % less time than with 4096 where a voxel is 32 m and 16 % where it is 8 m, for 4 % more memory and 1 % more
     archive; with 256 it gains little more, for 16 % more memory (scripts/bench_engine --only cells).
     cells: "octree", or "balanced": cells are merged too, so that all trees have one height (balance.py).
+    models: radius models stored, "mean" always and "local", "border" where asked: those need a byte a point.
+    radius: the figure that stands for `mean` [m]; None: half the mean closest-point distance.
     spacing: meshes are sampled about this far apart [m]; None: their vertices are taken.
     with_slab: cut each sphere by a slab; False is the paper's structure, for comparison.
     jobs: worker processes; 0: one a core.  memory_bytes: bound on what the passes hold.
@@ -50,6 +50,7 @@ class BuildConfig:
     cells: str = "octree"
     spacing: float | None = None
     radius: float | None = None
+    models: frozenset[str] = frozenset({"mean"})
     with_slab: bool = True
     jobs: int = 0
     memory_bytes: int = 2 << 30
@@ -85,6 +86,11 @@ class BuildConfig:
                 f"--radius {self.radius}",
                 f"0 to {MAX_RADIUS} m",
             ),
+            (
+                {"mean"} <= self.models <= set(STORED_MODELS),
+                f"--radius {','.join(sorted(self.models))}",
+                "mean, and local or border where wanted",
+            ),
             (self.jobs >= 0, f"--jobs {self.jobs}", "0 (all cores) or more"),
             (self.memory_bytes >= 64 << 20, f"--memory {self.memory_bytes} bytes", "at least 64MB"),
             (
@@ -96,6 +102,10 @@ class BuildConfig:
         for good, found, expected in checks:
             if not good:
                 raise BadRequestError(f"{found}: expected {expected}")
+
+    def stored_models(self) -> tuple[str, ...]:
+        """The radius models stored, in the order of STORED_MODELS."""
+        return tuple(name for name in STORED_MODELS if name in self.models)
 
     def identity(self) -> dict[str, float | int | bool | str | None]:
         """The options that the archive's bytes depend on, for the index."""
@@ -111,4 +121,5 @@ class BuildConfig:
             "keep": ",".join(sorted(self.keep)),
             # Named only where it is not the default: archives without it stay what they were, byte for byte.
             **({} if self.cells == "octree" else {"cells": self.cells}),
+            **({} if self.models == {"mean"} else {"models": ",".join(self.stored_models())}),
         }

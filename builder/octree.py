@@ -17,11 +17,13 @@ class VoxelPoints(NamedTuple):
     """The points of one voxel, in any order.
 
     local: (n, 3) int32 [voxel steps].  scan_index: (n,) uint16 or None.  intensity: (n,) float32 or None.
+    radius_class: (n,) uint8 or None, the same for equal points.
     """
 
     local: NDArray[np.int32]
     scan_index: NDArray[np.uint16] | None = None
     intensity: NDArray[np.float32] | None = None
+    radius_class: NDArray[np.uint8] | None = None
 
 
 def _canonical(points: VoxelPoints) -> tuple[VoxelPoints, NDArray[np.uint64]]:
@@ -91,6 +93,7 @@ def build_voxel(key: int, points: VoxelPoints, voxel_steps: int, config: BuildCo
         np.concatenate([_from_block_low(t) for t in trees]),
         None if points.scan_index is None else points.scan_index[ranks],
         None if points.intensity is None else points.intensity[ranks],
+        None if points.radius_class is None else points.radius_class[ranks],
     )
 
 

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from ..schemas.archive import INDEX_NAME, SHARD_FOLDER, Archive, sync_folder, write_index
 from ..schemas.errors import BadRequestError, CorruptError, ScanError, SolidcloudError
 from ..schemas.index import Header, Source
+from ..schemas.radius_model import RADIUS_CLASSES
 from ..schemas.voxel_grid import Lattice
 from .config import RADIUS_SAMPLE, BuildConfig
 from .executor import Executor, worker_count
@@ -376,6 +377,9 @@ def _header(
         leaf=config.leaf,
         scan_index="scan" in config.keep,
         intensity="intensity" in config.keep,
+        models=config.stored_models(),
+        radius_counts=np.zeros(RADIUS_CLASSES, np.int64),
+        radius_capped=0,
         options=config.identity(),
         sources=tuple(sources),
         unknown=np.array(boxes, np.int64).reshape(-1, 2, 3),
@@ -414,9 +418,9 @@ def _build_voxels(
 ) -> list[Shard]:
     """Third pass: every voxel's octree and hierarchies, into the shards planned."""
     runs: tuple[Run, ...] = tuple(run for s in spooled for run in s.runs)
-    steps, shards = header.lattice.voxel_steps, folder / SHARD_FOLDER
+    shards = folder / SHARD_FOLDER
     units = [
-        ShardUnit(number, keys, points, runs, steps, config, header.archive_id, shards)
+        ShardUnit(number, keys, points, runs, header.lattice, config, header.archive_id, shards)
         for number, (keys, points) in enumerate(plans)
     ]
     with stages.stage("build", header.points, "points"):
@@ -448,6 +452,11 @@ def _measure_radius(
 ) -> Header:
     """Fourth pass: the mean closest-point distance over what is stored; then the final index is written."""
     rows = np.concatenate([s.rows for s in shards])
+    header = replace(
+        header,
+        radius_counts=np.sum([s.radius_counts for s in shards], axis=0, dtype=np.int64),
+        radius_capped=sum(s.radius_capped for s in shards),
+    )
     names = [(s.name, s.size) for s in shards]
     if config.radius is not None:
         header = replace(header, radius=config.radius)

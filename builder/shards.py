@@ -9,31 +9,39 @@ from numpy.typing import NDArray
 
 from ..schemas.archive import shard_name, write_shard
 from ..schemas.codec import Record, encode_voxel
+from ..schemas.radius_model import RADIUS_CLASSES
 from ..schemas.voxel import VoxelData
+from ..schemas.voxel_grid import Lattice
+from .classes import classify
 from .config import SHARD_POINTS, BuildConfig
 from .octree import build_voxel
 from .partition import Run, gather_voxel, spool_dtype
 
 
 class ShardUnit(NamedTuple):
-    """One shard to be written. keys: its voxels, ascending.  points: in all of them."""
+    """One shard to be written. keys: its voxels, ascending.  points: in all of them.  lattice: the dataset's."""
 
     number: int
     keys: tuple[int, ...]
     points: int
     runs: tuple[Run, ...]
-    voxel_steps: int
+    lattice: Lattice
     config: BuildConfig
     archive_id: bytes
     folder: Path
 
 
 class Shard(NamedTuple):
-    """A shard written. rows: of the index.  size: of the file [bytes]."""
+    """A shard written. rows: of the index.  size: of the file [bytes].
+
+    radius_counts: (32,) int64, points of each radius class; radius_capped: see schemas/index.py Header.
+    """
 
     name: str
     rows: NDArray
     size: int
+    radius_counts: NDArray[np.int64]
+    radius_capped: int
 
 
 def plan_shards(keys: NDArray[np.uint64], counts: NDArray[np.int64]) -> list[tuple[tuple[int, ...], int]]:
@@ -57,11 +65,20 @@ def plan_shards(keys: NDArray[np.uint64], counts: NDArray[np.int64]) -> list[tup
 
 def build_shard(unit: ShardUnit) -> Shard:
     """Gather, build, compress and write the voxels of one shard, one at a time."""
+    models = unit.config.stored_models()
+    with_classes = models != ("mean",)
+    counts, capped = np.zeros(RADIUS_CLASSES, np.int64), 0
 
     def voxels() -> Iterator[tuple[VoxelData, Record, NDArray[np.int64], NDArray[np.int64]]]:
+        nonlocal counts, capped
         for key in unit.keys:
             points = gather_voxel(key, unit.runs, spool_dtype(unit.config))
-            voxel = build_voxel(key, points, unit.voxel_steps, unit.config)
+            if with_classes:
+                classes, alone = classify(points, unit.lattice.step, models)
+                counts += np.bincount(classes, minlength=RADIUS_CLASSES)
+                capped += alone
+                points = points._replace(radius_class=classes)
+            voxel = build_voxel(key, points, unit.lattice.voxel_steps, unit.config)
             record = encode_voxel(voxel, unit.archive_id)
             yield (
                 voxel,
@@ -71,5 +88,5 @@ def build_shard(unit: ShardUnit) -> Shard:
             )
 
     path = unit.folder / shard_name(unit.number)
-    rows = write_shard(path, unit.number, unit.archive_id, voxels())
-    return Shard(path.name, rows, path.stat().st_size)
+    rows = write_shard(path, unit.number, unit.archive_id, voxels(), version=2 if with_classes else 1)
+    return Shard(path.name, rows, path.stat().st_size, counts, capped)

@@ -19,13 +19,23 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from .codec import CELL_DTYPE, NODE_DTYPE, OpenRecord, Record, RecordShape, open_record, point_dtype
+from .codec import (
+    CELL_DTYPE,
+    NODE_DTYPE,
+    OpenRecord,
+    Record,
+    RecordShape,
+    open_record,
+    point_dtype,
+    voxel_point_dtype,
+)
 from .errors import CorruptError, FormatError
 from .index import VOXEL_DTYPE, Header, index_columns, index_digest, read_header
 from .voxel import Links, VoxelData
 from .voxel_grid import voxel_coordinates
 
-FORMAT_VERSION = 1
+# What this software reads, and writes: the first version that holds what is to be said (schemas/index.py Header).
+FORMAT_VERSIONS = (1, 2)
 INDEX_NAME = "index.h5"
 SHARD_FOLDER = "shards"
 ZSTD_FILTER = 32015  # registered with the HDF Group
@@ -105,24 +115,22 @@ def write_shard(
     number: int,
     archive_id: bytes,
     voxels: Iterable[tuple[VoxelData, Record, NDArray[np.int64], NDArray[np.int64]]],
+    *,
+    version: int = 1,
 ) -> NDArray:
     """Write one shard; returns its rows of the index, VOXEL_DTYPE.
 
     voxels: per voxel its data, record, and the bounds low, high (3,) of its points [voxel steps, inclusive].
-    The file is verified by offsets before it is given its name.
+    version: of the format, as the index will say it. The file is verified by offsets before it is given its name.
     """
     rows = []
     with _new_file(path) as file:
         file.attrs["format"] = np.bytes_("solidcloud shard")
-        file.attrs["format_version"] = np.uint32(FORMAT_VERSION)
+        file.attrs["format_version"] = np.uint32(version)
         file.attrs["archive_id"] = np.frombuffer(archive_id, np.uint8)
         parent = file.create_group("voxels", track_times=False)
         for voxel, record, low, high in voxels:
-            dtypes = (
-                CELL_DTYPE,
-                NODE_DTYPE,
-                point_dtype(scan_index=voxel.scan_index is not None, intensity=voxel.intensity is not None),
-            )
+            dtypes = (CELL_DTYPE, NODE_DTYPE, voxel_point_dtype(voxel))
             group = parent.create_group(f"{voxel.key:016x}", track_times=False)
             counts = (record.cell_rows, record.node_rows, record.point_rows)
             frames = (record.cells, record.nodes, record.points)
@@ -172,7 +180,7 @@ def write_index(folder: Path, header: Header, voxels: NDArray, shards: list[tupl
     columns = index_columns(header, voxels, shards)
     with _new_file(path) as file:
         file.attrs["format"] = np.bytes_("solidcloud")
-        file.attrs["format_version"] = np.uint32(FORMAT_VERSION)
+        file.attrs["format_version"] = np.uint32(header.format_version)
         file.attrs["units"] = np.bytes_("m")
         file.attrs["archive_id"] = np.frombuffer(header.archive_id, np.uint8)
         file.attrs["sha256"] = np.frombuffer(index_digest(header.archive_id, columns), np.uint8)
@@ -204,9 +212,10 @@ def _read_columns(path: Path) -> tuple[bytes, dict[str, NDArray]]:
                 f"{path}: not a solidcloud index: give the folder that `solidcloud build` wrote"
             )
         version = int(file.attrs["format_version"])
-        if version != FORMAT_VERSION:
+        if version not in FORMAT_VERSIONS:
+            known = " and ".join(map(str, FORMAT_VERSIONS))
             raise FormatError(
-                f"{path}: format version {version}, this software reads {FORMAT_VERSION}: use the one that wrote it"
+                f"{path}: format version {version}, this software reads {known}: use the one that wrote it"
             )
         units = _text_attribute(file, "units")
         if units != "m":
@@ -263,7 +272,11 @@ class Archive:
                 f"{path}: not a readable archive index ({error}): restore or rebuild it"
             ) from error
         self.coordinates = voxel_coordinates(self.voxels["key"])
-        self._shape_dtype = point_dtype(scan_index=self.header.scan_index, intensity=self.header.intensity)
+        self._shape_dtype = point_dtype(
+            scan_index=self.header.scan_index,
+            intensity=self.header.intensity,
+            radius_class=self.header.radius_class,
+        )
         self._check_shards()
         # All of them now: an archive that is replaced while it is read stays the one that was opened.
         self._descriptors: list[int] = []

@@ -13,7 +13,8 @@ import zstandard
 from numpy.typing import NDArray
 
 from .errors import CorruptError
-from .kernels.rows import delta_along, join_planes, lanes_to_points, leaf_column
+from .kernels.rows import delta_along, join_planes, lanes_to_points, leaf_bytes, leaf_column
+from .radius_model import RADIUS_CLASSES
 from .voxel import (
     MAX_LEAF,
     Cells,
@@ -68,14 +69,25 @@ NODE_DTYPE = np.dtype(
 )
 
 
-def point_dtype(*, scan_index: bool, intensity: bool) -> np.dtype:
+# The optional columns of the points, in the order of their fields in a row.
+OPTIONAL_COLUMNS = ("scan_index", "intensity", "radius_class")
+
+
+def point_dtype(*, scan_index: bool, intensity: bool, radius_class: bool) -> np.dtype:
     """The row of the points dataset: x, y, z and the optional columns."""
     fields: list[tuple] = [("xyz", "<u2", (3,))]
     if scan_index:
         fields.append(("scan_index", "<u2"))
     if intensity:
         fields.append(("intensity", "<f4"))
+    if radius_class:
+        fields.append(("radius_class", "u1"))
     return np.dtype(fields)
+
+
+def voxel_point_dtype(voxel: VoxelData) -> np.dtype:
+    """The row of the points dataset of this voxel."""
+    return point_dtype(**{name: getattr(voxel, name) is not None for name in OPTIONAL_COLUMNS})
 
 
 class Record(NamedTuple):
@@ -110,14 +122,12 @@ def encode_voxel(voxel: VoxelData, archive_id: bytes) -> Record:
     nodes = np.zeros(len(voxel.nodes.count), NODE_DTYPE)
     for name, column in zip(Nodes._fields, voxel.nodes, strict=True):
         nodes[name] = column
-    dtype = point_dtype(scan_index=voxel.scan_index is not None, intensity=voxel.intensity is not None)
-    points = np.zeros(len(voxel.points), dtype)
+    points = np.zeros(len(voxel.points), voxel_point_dtype(voxel))
     first, count, axis = _leaf_runs(voxel, links)
     points["xyz"] = delta_along(voxel.points, first, count, axis)
-    if voxel.scan_index is not None:
-        points["scan_index"] = voxel.scan_index
-    if voxel.intensity is not None:
-        points["intensity"] = voxel.intensity
+    for name in OPTIONAL_COLUMNS:
+        if getattr(voxel, name) is not None:
+            points[name] = getattr(voxel, name)
     return Record(_pack(cells), _pack(nodes), _pack(points), len(cells), len(nodes), len(points), len(first))
 
 
@@ -155,17 +165,35 @@ class OpenRecord(NamedTuple):
         at = self.dtype.fields["scan_index"][1]  # type: ignore[index]  # its dtype has fields
         leaf_column(self.planes[at : at + 2], self.tree, self.nodes.count, lanes)
 
+    def read_classes(self, lanes: NDArray[np.uint8]) -> None:
+        """Write radius_class, in a record that has it, into lanes (b, MAX_LEAF), as `read_points` does.
+
+        Raises CorruptError for a class that no table of radii has: a kernel would look it up beyond the table's end.
+        """
+        at = self.dtype.fields["radius_class"][1]  # type: ignore[index]  # its dtype has fields
+        self._check_classes(leaf_bytes(self.planes[at], self.tree, self.nodes.count, lanes))
+
+    def _check_classes(self, greatest: int) -> None:
+        """Refuse a record whose greatest radius class is not below RADIUS_CLASSES."""
+        if greatest >= RADIUS_CLASSES:
+            raise CorruptError(
+                f"voxel {self.key:#x}: radius class {greatest}, expected at most {RADIUS_CLASSES - 1}"
+            )
+
     def decode(self) -> tuple[VoxelData, Links]:
-        """The whole voxel, its points in rows. Raises CorruptError when a point lies outside its cell."""
+        """The whole voxel, its points in rows. Raises CorruptError when a point lies outside its cell, and for a
+        radius class that there is none of."""
         lanes = np.empty((self.leaves, 3, MAX_LEAF), np.uint16)
         self.read_points(lanes)
         points = np.empty((self.planes.shape[1], 3), np.uint16)
         lanes_to_points(lanes, self.tree, self.nodes.count, points)
         kept = {
             field: _column(self.planes, self.dtype, field)
-            for field in ("scan_index", "intensity")
+            for field in OPTIONAL_COLUMNS
             if field in (self.dtype.names or ())
         }
+        if "radius_class" in kept:
+            self._check_classes(int(kept["radius_class"].max()))
         cells, nodes = transposed(self.cells), transposed(self.nodes)
         voxel = VoxelData(self.key, top_shift(self.voxel_steps), cells, nodes, points, **kept)
         return voxel, self.links

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .radius_model import RADIUS_CLASSES
 from .voxel_grid import Lattice
 
 # One row a voxel, sorted by key. frame_*: where the dataset's only chunk lies in its shard, in the order of
@@ -58,8 +59,10 @@ class Header:
     coordinates of the points, inclusive.  radius: half the mean closest-point distance [m]; radius_error: its
     standard error [m], 0 when all points were asked; radius_sample: points asked.  moved_max: farthest that
     quantising moved a point along an axis [m].  lattice_source: "sources", "given" or "default".
-    options: the build's.  unknown: (u, 2, 3) int64, lattice boxes, inclusive, of scans left out;
-    unknown_everywhere: one was left out of which not even the bounds are known.
+    models: the radius models stored, in the order of STORED_MODELS; radius_counts: (32,) int64, the points of each
+    radius class, zeros where none are stored; radius_capped: points that had too few neighbours for a local class,
+    and were given the largest.  options: the build's.  unknown: (u, 2, 3) int64, lattice boxes, inclusive, of scans
+    left out; unknown_everywhere: one was left out of which not even the bounds are known.
     """
 
     archive_id: bytes
@@ -77,10 +80,23 @@ class Header:
     leaf: int
     scan_index: bool
     intensity: bool
+    models: tuple[str, ...]
+    radius_counts: NDArray[np.int64]
+    radius_capped: int
     options: dict[str, Any]
     sources: tuple[Source, ...]
     unknown: NDArray[np.int64]
     unknown_everywhere: bool
+
+    @property
+    def radius_class(self) -> bool:
+        """Whether every point has a radius class."""
+        return self.models != ("mean",)
+
+    @property
+    def format_version(self) -> int:
+        """The version of the format that says all of this: the first where nothing newer is in it."""
+        return 2 if self.radius_class else 1
 
 
 def _texts(header: Header) -> bytes:
@@ -108,6 +124,14 @@ def _texts(header: Header) -> bytes:
 def index_columns(header: Header, voxels: NDArray, shards: list[tuple[str, int]]) -> dict[str, NDArray]:
     """Every dataset of the index by name. One place for writer, reader and digest."""
     lattice = header.lattice
+    columns = [header.scan_index, header.intensity]
+    classes = {}
+    if header.radius_class:
+        columns += ["local" in header.models, "border" in header.models]
+        classes = {
+            "radius_counts": header.radius_counts.astype("<u8"),
+            "radius_capped": np.array([header.radius_capped], "<u8"),
+        }
     return {
         "origin": np.array(lattice.origin, "<f8"),
         "step": np.array([lattice.step], "<f8"),
@@ -118,7 +142,8 @@ def index_columns(header: Header, voxels: NDArray, shards: list[tuple[str, int]]
         "radius_sample": np.array([header.radius_sample], "<u8"),
         "moved_max": np.array([header.moved_max], "<f8"),
         "tree": np.array([header.degree, header.leaf], "<u4"),
-        "columns": np.array([header.scan_index, header.intensity], "u1"),
+        "columns": np.array(columns, "u1"),
+        **classes,
         "unknown": header.unknown.reshape(-1, 2, 3).astype("<i8"),
         "unknown_everywhere": np.array([header.unknown_everywhere], "u1"),
         "source_pose": np.array([s.pose for s in header.sources], "<f8").reshape(-1, 4, 4),
@@ -158,6 +183,9 @@ def read_header(archive_id: bytes, columns: dict[str, NDArray]) -> Header:
         for i, s in enumerate(texts["sources"])
     )
     x, y, z = (float(v) for v in columns["origin"])
+    held = columns["columns"].astype(bool).tolist()
+    models = ("mean", *(name for name, here in zip(("local", "border"), held[2:], strict=False) if here))
+    counts = columns["radius_counts"] if len(models) > 1 else np.zeros(RADIUS_CLASSES)
     return Header(
         archive_id=archive_id,
         lattice=Lattice((x, y, z), float(columns["step"][0]), int(columns["voxel_steps"][0])),
@@ -172,8 +200,11 @@ def read_header(archive_id: bytes, columns: dict[str, NDArray]) -> Header:
         moved_max=float(columns["moved_max"][0]),
         degree=int(columns["tree"][0]),
         leaf=int(columns["tree"][1]),
-        scan_index=bool(columns["columns"][0]),
-        intensity=bool(columns["columns"][1]),
+        scan_index=held[0],
+        intensity=held[1],
+        models=models,
+        radius_counts=counts.astype(np.int64),
+        radius_capped=int(columns["radius_capped"][0]) if len(models) > 1 else 0,
         options=texts["options"],
         sources=sources,
         unknown=columns["unknown"].astype(np.int64),

@@ -66,7 +66,8 @@ class VoxelData(NamedTuple):
 
     key: voxel key.  top_shift: see Nodes.center.  cells, nodes: see there.
     points: (p, 3) uint16 x, y, z from their leaf node's block_low, in leaf-node order [steps].
-    scan_index: (p,) uint16 or None.  intensity: (p,) float32 or None.
+    scan_index: (p,) uint16 or None.  intensity: (p,) float32 or None.  radius_class: (p,) uint8 below
+    RADIUS_CLASSES, or None.
     """
 
     key: int
@@ -76,6 +77,7 @@ class VoxelData(NamedTuple):
     points: NDArray[np.uint16]
     scan_index: NDArray[np.uint16] | None = None
     intensity: NDArray[np.float32] | None = None
+    radius_class: NDArray[np.uint8] | None = None
 
 
 class Links(NamedTuple):

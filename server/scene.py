@@ -5,6 +5,7 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,6 @@ from ..schemas.answers import (
     SweepAnswers,
     WithinAnswers,
 )
-from ..schemas.archive import FORMAT_VERSION
 from ..schemas.errors import BadRequestError, UnknownAvatarError
 from ..schemas.messages import WIRE_VERSION, AvatarInfo, SceneInfo, SourceInfo
 from ..schemas.requests import make_objects, make_poses
@@ -33,7 +33,7 @@ from .effort import EXACT, Effort, make_effort
 from .objects import objects as ask_objects
 from .path import PATH_THREADS, largest_part, path_parts, path_question
 from .rays import raycast
-from .request import make_scene_data
+from .request import make_scene_data, with_radius_model
 from .residency import Residency
 from .session import Walker
 from .store import Store
@@ -41,6 +41,8 @@ from .sweep import sweep
 from .within import within
 
 DEFAULT_BUDGET = 512 << 20
+# Radius models whose tables are remembered; asked for by name, and by clients, so there may be any number.
+MOST_MODELS = 64
 
 
 class Scene:
@@ -53,7 +55,8 @@ class Scene:
         """Serve the voxels of `store`; use `Scene.open`."""
         self.name = name
         self._store = store
-        self._data = make_scene_data(store.archive, Residency(store, budget_bytes))
+        self._data = make_scene_data(store.archive, Residency(store, budget_bytes), store.block_words)
+        self._radius_model = lru_cache(MOST_MODELS)(partial(with_radius_model, self._data, store.archive))
         self._avatars: dict[tuple[str, str], AvatarModel] = {}
         self._pool: ThreadPoolExecutor | None = None
         self._lock = threading.Lock()
@@ -167,18 +170,23 @@ class Scene:
         tolerance: float = 0.0,
         budget_ms: float | None = None,
         budget_visits: int | None = None,
+        radius_model: str | None = None,
         client: str = "",
     ) -> CollideAnswers:
         """Whether avatar `name` touches the scene under each of the poses (k, 4, 4); see server/collide.py.
 
         tolerance [m], budget_ms, budget_visits: what the answer may cost, here and below; see server/effort.py.
+        radius_model: how large the scan's spheres are, here and below; None: the archive's one figure. See
+        schemas/radius_model.py.
         """
         effort = make_effort(tolerance, budget_ms, budget_visits)
-        return collide(self._data, self._avatar(name, client), poses, margin, effort)
+        return collide(self._radius_model(radius_model), self._avatar(name, client), poses, margin, effort)
 
-    def walker(self, name: str, margin: float = 0.0, *, client: str = "") -> Walker:
+    def walker(
+        self, name: str, margin: float = 0.0, *, radius_model: str | None = None, client: str = ""
+    ) -> Walker:
         """A session of avatar `name`: its `collide` remembers the last pose; see server/session.py."""
-        return Walker(self._data, self._avatar(name, client), margin)
+        return Walker(self._radius_model(radius_model), self._avatar(name, client), margin)
 
     def distance(
         self,
@@ -189,11 +197,12 @@ class Scene:
         tolerance: float = 0.0,
         budget_ms: float | None = None,
         budget_visits: int | None = None,
+        radius_model: str | None = None,
         client: str = "",
     ) -> DistanceAnswers:
         """How far avatar `name` is from the scene under each pose, up to `reach` [m]; see server/distance.py."""
         effort = make_effort(tolerance, budget_ms, budget_visits)
-        return distance(self._data, self._avatar(name, client), poses, reach, effort)
+        return distance(self._radius_model(radius_model), self._avatar(name, client), poses, reach, effort)
 
     def contacts(
         self,
@@ -206,12 +215,15 @@ class Scene:
         tolerance: float = 0.0,
         budget_ms: float | None = None,
         budget_visits: int | None = None,
+        radius_model: str | None = None,
         client: str = "",
     ) -> ContactsAnswers:
         """Which pairs of points are in contact under each of the poses, deepest first; see server/contacts.py."""
         effort = make_effort(tolerance, budget_ms, budget_visits)
         avatar = self._avatar(name, client)
-        return contacts(self._data, avatar, poses, limit, margin, cluster_distance, effort)
+        return contacts(
+            self._radius_model(radius_model), avatar, poses, limit, margin, cluster_distance, effort
+        )
 
     def sweep(
         self,
@@ -223,12 +235,13 @@ class Scene:
         tolerance: float = 1e-6,
         budget_ms: float | None = None,
         budget_visits: int | None = None,
+        radius_model: str | None = None,
         client: str = "",
     ) -> SweepAnswers:
         """When avatar `name` first touches the scene on its way between poses; see server/sweep.py."""
         effort = make_effort(tolerance, budget_ms, budget_visits)
         avatar = self._avatar(name, client)
-        return sweep(self._data, avatar, pose_from, pose_to, margin, tolerance, effort)
+        return sweep(self._radius_model(radius_model), avatar, pose_from, pose_to, margin, tolerance, effort)
 
     def raycast(
         self,
@@ -239,10 +252,11 @@ class Scene:
         tolerance: float = 0.0,
         budget_ms: float | None = None,
         budget_visits: int | None = None,
+        radius_model: str | None = None,
     ) -> RaycastAnswers:
         """Which scan point's sphere rays (k, 3), (k, 3) hit first, up to `reach` [m]; see server/rays.py."""
         effort = make_effort(tolerance, budget_ms, budget_visits)
-        return raycast(self._data, origins, directions, reach, effort)
+        return raycast(self._radius_model(radius_model), origins, directions, reach, effort)
 
     def within(
         self,
@@ -252,10 +266,11 @@ class Scene:
         tolerance: float = 0.0,
         budget_ms: float | None = None,
         budget_visits: int | None = None,
+        radius_model: str | None = None,
     ) -> WithinAnswers:
         """Which scan point is nearest to each loose point (k, 3), up to `reach` [m]; see server/within.py."""
         effort = make_effort(tolerance, budget_ms, budget_visits)
-        return within(self._data, points, reach, effort)
+        return within(self._radius_model(radius_model), points, reach, effort)
 
     def objects(
         self,
@@ -265,6 +280,7 @@ class Scene:
         tolerance: float = 0.0,
         budget_ms: float | None = None,
         budget_visits: int | None = None,
+        radius_model: str | None = None,
         client: str = "",
     ) -> ObjectsAnswers:
         """Which of several avatars (name, pose, group = 1, mask = all) touch the scene and one another.
@@ -276,7 +292,7 @@ class Scene:
         avatars = [self._avatar(item.avatar, client) for item in items]
         groups = np.array([item.group for item in items], np.uint32)
         masks = np.array([item.mask for item in items], np.uint32)
-        return ask_objects(self._data, avatars, poses, groups, masks, margin, effort)
+        return ask_objects(self._radius_model(radius_model), avatars, poses, groups, masks, margin, effort)
 
     def path(
         self,
@@ -285,6 +301,7 @@ class Scene:
         op: str = "collide",
         *,
         threads: int = PATH_THREADS,
+        radius_model: str | None = None,
         client: str = "",
         **parameters: Any,
     ) -> Iterator[Part]:
@@ -294,7 +311,8 @@ class Scene:
         threads: parts computed at a time.  sweep: k - 1 motions, from each pose to the next. Every part is the answer
         of its question for [first, first + n) of `total`. All poses are checked before the first part.
         """
-        ask, total = path_question(self._data, self._avatar(name, client), make_poses(poses), op, parameters)
+        data, avatar = self._radius_model(radius_model), self._avatar(name, client)
+        ask, total = path_question(data, avatar, make_poses(poses), op, parameters)
         most = largest_part(op, parameters)
         if threads <= 1:
             return path_parts(ask, total, most)
@@ -313,7 +331,7 @@ def describe(store: Store, name: str) -> SceneInfo:
     lattice = header.lattice
     return SceneInfo(
         scene=name,
-        format_version=FORMAT_VERSION,
+        format_version=header.format_version,
         wire_version=WIRE_VERSION,
         points=header.points,
         voxels=len(store.sizes),

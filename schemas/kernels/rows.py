@@ -117,6 +117,29 @@ def leaf_column(planes, links, count, lanes):
 
 
 @nb.njit(nogil=True, cache=True)
+def leaf_bytes(plane, links, count, lanes):
+    """A column of one byte a point as `leaf_lanes` lays it out: lanes (b, LANES) uint8 from plane (p,) uint8.
+
+    Returns the greatest byte.
+    """
+    first, is_leaf, _ = links
+    block = np.uint64(0)
+    greatest = np.uint8(0)
+    for i in range(np.uint64(first.shape[0])):
+        if not is_leaf[i]:
+            continue
+        out, begin, held = lanes[block], np.uint64(first[i]), np.uint64(count[i])
+        for j in range(held):
+            out[j] = plane[begin + j]
+        for j in range(held, np.uint64(out.shape[0])):
+            out[j] = out[held - np.uint64(1)]
+        for j in range(np.uint64(out.shape[0])):
+            greatest = max(greatest, out[j])
+        block += np.uint64(1)
+    return greatest
+
+
+@nb.njit(nogil=True, cache=True)
 def lanes_to_points(lanes, links, count, points):
     """Write the points (p, 3) uint16 of lanes (b, 3, LANES), each leaf node's where its run is."""
     first, is_leaf, _ = links

@@ -11,9 +11,18 @@ from hypothesis import strategies as st
 from scans import WITH_POINTS, make_steps
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.octree import VoxelPoints, build_voxel
-from solidcloud.schemas.codec import Record, RecordShape, decode_voxel, encode_voxel, point_dtype
+from solidcloud.schemas.codec import (
+    OPTIONAL_COLUMNS,
+    Record,
+    RecordShape,
+    decode_voxel,
+    encode_voxel,
+    open_record,
+    voxel_point_dtype,
+)
 from solidcloud.schemas.errors import CorruptError
-from solidcloud.schemas.voxel import Links, VoxelData, link_nodes
+from solidcloud.schemas.radius_model import RADIUS_CLASSES
+from solidcloud.schemas.voxel import MAX_LEAF, Links, VoxelData, link_nodes
 
 ARCHIVE_ID = bytes(range(16))
 KEY = 0x1234567
@@ -22,8 +31,8 @@ INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
 
 def shape_of(voxel: VoxelData) -> RecordShape:
     """What an index would say of this voxel's record."""
-    dtype = point_dtype(scan_index=voxel.scan_index is not None, intensity=voxel.intensity is not None)
-    return RecordShape(len(voxel.cells.nodes), len(voxel.nodes.count), len(voxel.points), dtype)
+    counts = len(voxel.cells.nodes), len(voxel.nodes.count), len(voxel.points)
+    return RecordShape(*counts, voxel_point_dtype(voxel))
 
 
 def decode(record: Record, voxel: VoxelData, steps: int, **other: object) -> tuple[VoxelData, Links]:
@@ -48,7 +57,7 @@ def assert_same_bits(found: VoxelData, expected: VoxelData) -> None:
     columns = [
         *zip(found.cells, expected.cells, strict=True),
         *zip(found.nodes, expected.nodes, strict=True),
-        *((getattr(found, f), getattr(expected, f)) for f in ("points", "scan_index", "intensity")),
+        *((getattr(found, f), getattr(expected, f)) for f in ("points", *OPTIONAL_COLUMNS)),
     ]
     for a, b in columns:
         assert (a is None) == (b is None)
@@ -60,7 +69,11 @@ def kept(n: int, seed: int) -> dict[str, np.ndarray]:
     """Optional columns of any bits, NaN among them."""
     rng = np.random.default_rng(seed)
     bits = rng.integers(0, 2**32, n, np.uint32)
-    return {"scan_index": rng.integers(0, 2**16, n).astype(np.uint16), "intensity": bits.view(np.float32)}
+    return {
+        "scan_index": rng.integers(0, 2**16, n).astype(np.uint16),
+        "intensity": bits.view(np.float32),
+        "radius_class": rng.integers(0, RADIUS_CLASSES, n).astype(np.uint8),
+    }
 
 
 @st.composite
@@ -78,7 +91,7 @@ def voxels(draw: st.DrawFn) -> tuple[VoxelData, int]:
         cell_points=draw(st.sampled_from([1, 5, 4096])),
         with_slab=draw(st.booleans()),
     )
-    columns = draw(st.sets(st.sampled_from(["scan_index", "intensity"])))
+    columns = draw(st.sets(st.sampled_from(OPTIONAL_COLUMNS)))
     columns_of = {name: column for name, column in kept(len(rows), 7).items() if name in columns}
     return build_voxel(KEY, VoxelPoints(np.array(rows, np.int32), **columns_of), steps, config), steps
 
@@ -117,6 +130,36 @@ def test_the_same_voxel_has_the_same_bytes_in_any_order_of_points() -> None:
         KEY, VoxelPoints(points[order], **{k: c[order] for k, c in columns.items()}), 1000, config
     )
     assert encode_voxel(a, ARCHIVE_ID) == encode_voxel(b, ARCHIVE_ID)
+
+
+@pytest.mark.interpreted
+def test_classes_are_read_into_lanes_and_those_there_are_none_of_refused() -> None:
+    points = make_steps("corner", 3, 200, 1000)
+    config = BuildConfig(leaf=9, cell_points=40, degree=3)
+    voxel = build_voxel(KEY, VoxelPoints(points, **kept(len(points), 4)), 1000, config)
+    links = link_nodes(voxel)
+
+    def lanes_of(voxel: VoxelData) -> np.ndarray:
+        record = encode_voxel(voxel, ARCHIVE_ID)
+        opened = open_record(*record[:3], shape_of(voxel), KEY, ARCHIVE_ID, 1000)
+        lanes = np.empty((opened.leaves, MAX_LEAF), np.uint8)
+        opened.read_classes(lanes)
+        return lanes
+
+    classes = voxel.radius_class
+    assert classes is not None
+    for lane, node in zip(lanes_of(voxel), np.flatnonzero(links.is_leaf), strict=True):
+        first, count = int(links.first[node]), int(voxel.nodes.count[node])
+        held = classes[first : first + count]
+        assert np.array_equal(lane, np.append(held, np.full(MAX_LEAF - count, held[-1])))
+    for at in (0, 77, 199):
+        wrong = classes.copy()
+        wrong[at] = RADIUS_CLASSES
+        broken = voxel._replace(radius_class=wrong)
+        with pytest.raises(CorruptError, match=f"radius class {RADIUS_CLASSES}, expected at most"):
+            lanes_of(broken)
+        with pytest.raises(CorruptError, match=f"radius class {RADIUS_CLASSES}, expected at most"):
+            decode(encode_voxel(broken, ARCHIVE_ID), broken, 1000)
 
 
 @pytest.fixture(scope="module")

@@ -32,7 +32,7 @@ def _walk(count, total, root, rest, first, is_leaf, cell_of, cell, point, leaves
         if last:
             return levels, below
         if below > total - done:
-            return -1, rest + done - 1
+            return -1, root if done == 1 else rest + done - 2
         size = below
 
 

@@ -31,6 +31,7 @@ Length = Annotated[float, msgspec.Meta(ge=0)]
 Duration = Annotated[float, msgspec.Meta(ge=0, description="milliseconds")]
 Count = Annotated[int, msgspec.Meta(ge=0, le=1 << 62)]
 Bits = Annotated[int, msgspec.Meta(ge=0, le=ALL_GROUPS)]
+ModelName = Annotated[str, msgspec.Meta(min_length=1, max_length=64)]
 PathOperation = Literal["collide", "distance", "contacts", "sweep"]
 
 # What each operation takes along a path, beside the avatar, the poses, the tolerance and the budgets.
@@ -72,11 +73,14 @@ class Question(Request, frozen=True, kw_only=True):
     tolerance: how early contact may be called and how far bounds may lie apart [m]; 0: exact.
     budget_ms: time for loads and work together [ms]; null: none.  budget_visits: node visits a pose (ray, point,
     motion); null: none.
+    radius_model: how large the scan's spheres are: mean, local, border or local+border, each with a factor as in
+    local:0.8 if wanted, or fixed:METRES; null: the scene's one figure.
     """
 
     tolerance: Length = 0.0
     budget_ms: Duration | None = None
     budget_visits: Count | None = None
+    radius_model: ModelName | None = None
 
 
 class CollideRequest(Question, frozen=True):

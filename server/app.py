@@ -95,12 +95,8 @@ class _Operation(NamedTuple):
 
 
 def _effort(request: Question) -> dict[str, Any]:
-    """What the answer may cost, as the questions of a scene take it."""
-    return {
-        "tolerance": request.tolerance,
-        "budget_ms": request.budget_ms,
-        "budget_visits": request.budget_visits,
-    }
+    """What every question takes, as those of a scene take it."""
+    return {name: getattr(request, name) for name in Question.__struct_fields__}
 
 
 def _ask_objects(scene: SceneLike, request: ObjectsRequest, client: str) -> Any:

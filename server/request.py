@@ -8,10 +8,11 @@ from numpy.typing import NDArray
 
 from ..schemas.archive import Archive
 from ..schemas.errors import BadRequestError, BadTransformError, SolidcloudError, TooLargeError
+from ..schemas.radius_model import class_radii
 from ..schemas.voxel_grid import MAX_COORDINATE, UNITS_PER_METRE
 from .avatar import AvatarModel
 from .kernels import placing
-from .kernels.layout import SceneArrays
+from .kernels.layout import SceneArrays, block_words
 from .kernels.reach import Reach, SceneIndex, find_reach
 from .residency import Held, Residency
 
@@ -43,8 +44,8 @@ _POSE_FAULTS: dict[int, tuple[type[SolidcloudError], str]] = {
 class SceneData(NamedTuple):
     """What every question about one scene reads; made once, by `make_scene_data`.
 
-    arrays: what the overlap kernel reads.  broad: what the broad phase reads.  radius_units: of every scan point,
-    exact units.  unknown: (u, 2, 3) int64, lattice boxes of scans left out; unknown_everywhere: also elsewhere.
+    arrays: what the kernels read.  broad: what the broad phase reads.  radius_units: of the largest sphere of a scan
+    point, exact units.  unknown: (u, 2, 3) int64, lattice boxes of scans left out; unknown_everywhere: also elsewhere.
     keeps_scan: whether the arena holds the scan each point came from.
     """
 
@@ -65,7 +66,7 @@ def to_units(metres: float, what: str) -> int:
 
 
 def make_scene_data(archive: Archive, residency: Residency) -> SceneData:
-    """What the questions read of an archive whose voxels `residency` holds."""
+    """What the questions read of an archive whose voxels `residency` holds; radii are the archive's one figure."""
     header = archive.header
     lattice = header.lattice
     base = archive.coordinates * lattice.voxel_steps
@@ -77,6 +78,8 @@ def make_scene_data(archive: Archive, residency: Residency) -> SceneData:
         lattice.step,
         lattice.units_per_step,
         lattice.voxel_steps,
+        block_words(header.radius_class),
+        np.zeros(1, np.int64),
     )
     return SceneData(
         residency,
@@ -93,6 +96,16 @@ def make_scene_data(archive: Archive, residency: Residency) -> SceneData:
         header.unknown_everywhere,
         header.scan_index,
     )
+
+
+def with_radius_model(data: SceneData, archive: Archive, text: str | None) -> SceneData:
+    """The same scene with the radii of a model (schemas/radius_model.py); None: the archive's one figure.
+
+    Raises BadRequestError for a model that is none, or that the archive does not hold.
+    """
+    radii = class_radii(text, archive.header.radius, archive.header.models)
+    largest = int(radii.max())
+    return data._replace(arrays=data.arrays._replace(drop=largest - radii), radius_units=largest)
 
 
 def _empty_reach(k: int, rows: int) -> Reach:

@@ -55,7 +55,7 @@ class Scene:
         """Serve the voxels of `store`; use `Scene.open`."""
         self.name = name
         self._store = store
-        self._data = make_scene_data(store.archive, Residency(store, budget_bytes), store.block_words)
+        self._data = make_scene_data(store.archive, Residency(store, budget_bytes))
         self._radius_model = lru_cache(MOST_MODELS)(partial(with_radius_model, self._data, store.archive))
         self._avatars: dict[tuple[str, str], AvatarModel] = {}
         self._pool: ThreadPoolExecutor | None = None

@@ -9,7 +9,15 @@ from ..schemas.archive import Archive
 from ..schemas.errors import CorruptError
 from ..schemas.voxel import top_shift
 from .kernels.front import MOST_LEVELS
-from .kernels.layout import LANES, Arena, lay_out, resident_bytes, scan_run
+from .kernels.layout import (
+    LANES,
+    Arena,
+    block_words,
+    lay_classes,
+    lay_out,
+    resident_bytes,
+    scan_run,
+)
 
 
 class Store:
@@ -21,11 +29,12 @@ class Store:
     def __init__(self, folder: str | Path) -> None:
         """Open the archive in `folder`. Raises FormatError or CorruptError."""
         self.archive = Archive(folder)
-        rows = self.archive.voxels
+        rows, header = self.archive.voxels, self.archive.header
         self.sizes = resident_bytes(
             rows["rows"][:, 1].astype(np.int64),
             rows["leaves"].astype(np.int64),
-            with_scan=self.archive.header.scan_index,
+            with_scan=header.scan_index,
+            with_class=header.radius_class,
         )
 
     def load(self, row: int, arena: Arena, offset: int) -> NDArray[np.int64]:
@@ -51,12 +60,19 @@ class Store:
             )
         where = np.empty(3, np.int64)
         shift = np.int64(top_shift(record.voxel_steps))
-        lay_out((record.cells, record.nodes, shift), record.tree, arena, np.int64(offset), where)
+        voxel = (record.cells, record.nodes, shift)
+        header = self.archive.header
+        words = block_words(header.radius_class)
+        lay_out(voxel, record.tree, arena, np.int64(offset), words, where)
         lanes = arena.halves[where[2] :]
         with self.archive.locating(row):
             record.read_points(lanes[: leaves * 3 * LANES].reshape(leaves, 3, LANES))
-        if self.archive.header.scan_index:
-            scans = arena.halves[scan_run(where[None], 0) :]
+        if header.radius_class:
+            classes = np.empty((leaves, LANES), np.uint8)
+            record.read_classes(classes)
+            lay_classes(record.tree, classes, arena.ints, where)
+        if header.scan_index:
+            scans = arena.halves[scan_run(where[None], 0, words) :]
             record.read_scans(scans[: leaves * LANES].reshape(leaves, LANES))
         return where
 

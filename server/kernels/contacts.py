@@ -34,7 +34,7 @@ from .clusters import (
     keep_deepest,
     list_pose,
 )  # fmt: skip
-from .layout import BLOCK_WORDS, COUNT, FIRST, LANES, ROW_WORDS, scan_run
+from .layout import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, scan_run
 from .overlap import nodes_meet
 from .placed import ONE_SLACK, SLACK, U32, make_limits, make_placed, place_block, place_nodes
 from .placing import MAX_REACH_UNITS, lattice_to_units, place, to_units
@@ -207,7 +207,7 @@ def _gather_leaves(
     if not met:
         return
     scene_block = ~ints[row + FIRST]
-    block_at = scene.where[voxel, 1] + scene_block * BLOCK_WORDS
+    block_at = scene.where[voxel, 1] + scene_block * scene.block_words
     lane_at = scene.where[voxel, 2] + scene_block * 3 * LANES
     lx = off[0] + np.float32(ints[block_at])
     ly = off[1] + np.float32(ints[block_at + 1])
@@ -228,7 +228,7 @@ def _gather_leaves(
         )
     record, squares = work.record, work.squares
     coordinates, where, counts, pairs = scene.coordinates, scene.where, tally.counts, tally.pairs
-    for j in range(ints[row + COUNT]):
+    for j in range(ints[row + COUNT] & COUNTED):
         if not keep[j]:
             continue
         x = np.float32(halves[lane_at + j])
@@ -247,7 +247,7 @@ def _gather_leaves(
             record[0, POINT + r] = low + np.int64(halves[lane_at + r * LANES + j])
         record[0, SCAN] = -1
         if asked.kept:
-            record[0, SCAN] = halves[scan_run(where, voxel) + scene_block * LANES + j]
+            record[0, SCAN] = halves[scan_run(where, voxel, scene.block_words) + scene_block * LANES + j]
         pairs[i] += _gather_point(avatar, m, a, block, placed, scene, limits, asked, edge, memory, work)
 
 
@@ -269,7 +269,13 @@ def _gather_voxel(avatar, m, i, placed, scene, voxel, limits, asked, memory, wor
     if depth == 0:
         counts[1, i] += 1
         if nodes_meet(
-            words, base, nodes[0, 0] - off[0], nodes[1, 0] - off[1], nodes[2, 0] - off[2], nodes[3, 0], limits
+            words,
+            base,
+            nodes[0, 0] - off[0],
+            nodes[1, 0] - off[1],
+            nodes[2, 0] - off[2],
+            nodes[3, 0],
+            limits.reach + limits.error,
         ):
             stack[0, 0], stack[0, 1] = 0, base
             depth = 1
@@ -308,16 +314,16 @@ def _gather_voxel(avatar, m, i, placed, scene, voxel, limits, asked, memory, wor
             for child in range(a_first, a_first + held[a]):
                 if nodes_meet(
                     words, row, nodes[0, child] - off[0], nodes[1, child] - off[1], nodes[2, child] - off[2],
-                    nodes[3, child], limits,
+                    nodes[3, child], limits.reach + limits.error,
                 ):  # fmt: skip
                     stack[depth, 0], stack[depth, 1] = child, row
                     depth += 1
         else:
             x, y, z = nodes[0, a] - off[0], nodes[1, a] - off[1], nodes[2, a] - off[2]
-            counts[1, i] += ints[row + COUNT]
-            for child in range(ints[row + COUNT]):
+            counts[1, i] += ints[row + COUNT] & COUNTED
+            for child in range(ints[row + COUNT] & COUNTED):
                 child_row = base + (b_first + child) * ROW_WORDS
-                if nodes_meet(words, child_row, x, y, z, nodes[3, a], limits):
+                if nodes_meet(words, child_row, x, y, z, nodes[3, a], limits.reach + limits.error):
                     stack[depth, 0], stack[depth, 1] = a, child_row
                     depth += 1
     memory.cursor[2] = depth

@@ -5,14 +5,19 @@ more where the archive keeps scan numbers (`--keep scan`):
 
 - rows: (n, 12) words, one a node: center x, y, z, radius [voxel steps], the slab's normal x, y, z, its length,
   least and greatest dot(normal, point - center), then as int32: first child row, or ~block for a leaf node, and
-  the number of children or points. 48 bytes, three rows to four cache lines;
-- blocks: (b, 4) int32, one a leaf node: low corner x, y, z of its points' box [voxel steps], points;
+  in its low byte the number of children or points, in the next the node's radius class. 48 bytes, three rows to four
+  cache lines;
+- blocks: (b, 4) int32, one a leaf node: low corner x, y, z of its points' box [voxel steps], points. Where the archive
+  keeps radius classes (b, 12): the classes of the block's points follow, four to an int32, the first in its low byte;
 - lanes: (b, 3, LANES) halfwords: x[], y[], z[] of the block's points from that corner, the last one repeated
   to the end, so that a test of all lanes needs no mask;
 - scans: (b, LANES) halfwords, the scan each point came from (`scan_run`); not there where it is not kept.
 
-For the façade this is 8.7 bytes a point, 6 of them the points (scripts/bench_engine --only memory), and 2
-more for the scans where kept.
+For the façade this is 8.7 bytes a point, 6 of them the points (scripts/bench_engine --only memory), 2 more for the
+scans and 1.1 for the radius classes where kept.
+
+The radius class of a node (schemas/radius_model.py) is the largest local class of the points below it, with RIM_BIT
+where all of them have it: the class of the largest sphere below the node, whatever the radius model.
 """
 
 from typing import NamedTuple
@@ -21,14 +26,23 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from ...schemas.radius_model import LOCAL_CLASSES, RIM_BIT
 from ...schemas.voxel import MAX_LEAF
+from .compiled import borrowing
 
 # 32 uint16 lanes become 32 float32 in one vector loop. LLVM unrolls loops of 8 or 16 constant trips and
 # then does not vectorise them, which costs several times as much a pair.
 LANES = MAX_LEAF
 ROW_WORDS = 12
 BLOCK_WORDS = 4
+# A block's words where radius classes are kept: CLASSES of them on, four classes to a word.
+CLASSES = BLOCK_WORDS
+CLASSED_BLOCK_WORDS = BLOCK_WORDS + LANES // 4
 FIRST, COUNT = 10, 11  # columns of a row that hold int32
+# A row's COUNT: children or points below, the node's radius class from this bit on.
+COUNTED = 0xFF
+CLASS_SHIFT = 8
+LOCAL_MASK = LOCAL_CLASSES - 1
 
 
 class Arena(NamedTuple):
@@ -44,6 +58,8 @@ class SceneArrays(NamedTuple):
 
     words, ints, halves: the arena (layout.py).  where: (v, 3) int64, a voxel's runs in it, -1: not resident.
     coordinates: (v, 3) int64 voxel coordinates.  origin: (3,) float64 [m].  step: [m].
+    block_words: of a block, with classes or without.  drop: (1,) or (RADIUS_CLASSES,) int64, how much smaller than
+    the largest radius that of each class is, exact units; 1 where all spheres are the same.
     """
 
     words: NDArray[np.float32]
@@ -55,24 +71,51 @@ class SceneArrays(NamedTuple):
     step: float
     units_per_step: float
     voxel_steps: int
+    block_words: int
+    drop: NDArray[np.int64]
+
+
+def block_words(radius_class: bool) -> int:
+    """The words of a block in an archive whose points have a radius class, or have none."""
+    return CLASSED_BLOCK_WORDS if radius_class else BLOCK_WORDS
 
 
 def resident_bytes(
-    nodes: NDArray[np.int64], leaves: NDArray[np.int64], *, with_scan: bool = False
+    nodes: NDArray[np.int64],
+    leaves: NDArray[np.int64],
+    *,
+    with_scan: bool = False,
+    with_class: bool = False,
 ) -> NDArray[np.int64]:
     """Bytes (v,) that voxels of so many nodes, of them leaf nodes, take in the arena; multiples of 16.
 
-    with_scan: whether scan numbers are kept.
+    with_scan, with_class: whether scan numbers and radius classes are kept.
     """
     halves = LANES * (4 if with_scan else 3)
-    return 4 * ROW_WORDS * nodes + 4 * BLOCK_WORDS * leaves + 2 * halves * leaves
+    return 4 * ROW_WORDS * nodes + 4 * block_words(with_class) * leaves + 2 * halves * leaves
 
 
 @nb.njit(nogil=True, cache=True)
-def scan_run(where, voxel):
+def scan_run(where, voxel, block_words):
     """Where a resident voxel's scans begin [halves], in an archive that keeps them: behind its lanes, LANES a block."""
-    leaves = (where[voxel, 2] // 2 - where[voxel, 1]) // BLOCK_WORDS
+    leaves = (where[voxel, 2] // 2 - where[voxel, 1]) // block_words
     return where[voxel, 2] + leaves * 3 * LANES
+
+
+@borrowing
+def node_class(ints, row, mask):
+    """The index into `drop` of a scene node. mask: one less than there are classes."""
+    return np.uint64(ints[np.uint64(row + COUNT)] >> CLASS_SHIFT) & mask
+
+
+@borrowing
+def point_class(ints, block_at, lane, mask):
+    """The index into `drop` of a point of the block at `block_at`. mask: one less than there are classes.
+
+    Where blocks hold no classes this reads what follows the block in the arena, and the mask is 0.
+    """
+    word = ints[np.uint64(block_at + CLASSES + lane // 4)]
+    return np.uint64(word >> (8 * (lane % 4))) & mask
 
 
 @nb.njit(nogil=True, cache=True)
@@ -89,7 +132,7 @@ def _outward(value, up):
 
 
 @nb.njit(nogil=True, cache=True)
-def lay_out(voxel, links, arena, at_bytes, where):
+def lay_out(voxel, links, arena, at_bytes, block_words, where):
     """Write the nodes of a checked voxel into the arena from byte `at_bytes` on (a multiple of 16): rows and blocks.
 
     voxel: (cells, nodes, top_shift) of schemas/codec.py `OpenRecord`, so center is (3, n).  links: its Links without
@@ -131,6 +174,36 @@ def lay_out(voxel, links, arena, at_bytes, where):
             for k in range(np.uint64(3)):
                 ints[block_at + k] = cells.low[k, cell] + np.int32(nodes.block_low[k, i])
             ints[block_at + np.uint64(3)] = np.int32(nodes.count[i])
-            block_at += np.uint64(BLOCK_WORDS)
+            block_at += np.uint64(block_words)
             block += np.int32(1)
     where[2] = np.uint64(2) * block_at
+
+
+@nb.njit(nogil=True, cache=True)
+def lay_classes(links, classes, ints, where):
+    """Write the radius classes of a voxel that `lay_out` wrote: of its points, then of its nodes.
+
+    links: as `lay_out` takes them.  classes: (b, LANES) uint8, as `OpenRecord.read_classes` gives them, in the
+    order of the blocks.  where: (3,) int64, see `lay_out`.
+    """
+    first, is_leaf, _ = links
+    block = classes.shape[0]
+    for node in range(first.shape[0] - 1, -1, -1):  # children stand after their parents
+        row = where[0] + node * ROW_WORDS
+        largest, all_rim = 0, RIM_BIT
+        if is_leaf[node]:
+            block -= 1
+            at = where[1] + block * CLASSED_BLOCK_WORDS + CLASSES
+            for word in range(LANES // 4):
+                packed = 0
+                for k in range(4):
+                    packed |= np.int64(classes[block, 4 * word + k]) << (8 * k)
+                ints[at + word] = packed
+            for lane in range(LANES):  # the last one's is repeated, so it changes nothing
+                own = np.int64(classes[block, lane])
+                largest, all_rim = max(largest, own & LOCAL_MASK), all_rim & own
+        else:
+            for child in range(first[node], first[node] + (ints[row + COUNT] & COUNTED)):
+                own = np.int64(ints[where[0] + child * ROW_WORDS + COUNT]) >> CLASS_SHIFT
+                largest, all_rim = max(largest, own & LOCAL_MASK), all_rim & own
+        ints[row + COUNT] = (ints[row + COUNT] & COUNTED) | ((largest | all_rim) << CLASS_SHIFT)

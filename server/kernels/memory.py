@@ -51,8 +51,8 @@ BLUR = 4e-6
 class Memory(NamedTuple):
     """What is known after the last pose of an avatar with f front nodes, all leaf nodes. Lengths in lattice steps.
 
-    state: (6,) float64: way travelled since all was looked at, scale, 1 where anything is known, reach and errors, and
-    of `body` the scale and the largest radius.
+    state: (6,) float64: way travelled since all was looked at, scale, 1 where anything is known, reach and errors of
+    the largest radius, and of `body` the scale and the largest radius.
     last: (4, 4) float64, the last pose.  frame: (3,) int64, a lattice point near the avatar.
     body: (7, f padded to LANES) float32, of each front node the middle of its points' box from the root's center, half
     its sides, and the radius of a sphere around the middle; axes of the avatar's frame.
@@ -274,8 +274,8 @@ def from_box(points, body, node):
 
 
 @borrowing
-def start_afresh(avatar, scale, scene, memory, limits, placed, extent):
-    """Forget all entries, and begin at pose m."""
+def start_afresh(avatar, scale, scene, memory, rooms, placed, extent):
+    """Forget all entries, and begin at pose m. rooms: `ByClass.room`."""
     state = memory.state
     if state[MEASURED] != scale:
         _measure_body(avatar, scale, scene, memory.body)
@@ -285,7 +285,10 @@ def start_afresh(avatar, scale, scene, memory, limits, placed, extent):
     state[WAY], state[SCALE], state[KNOWN] = 0.0, scale, 1.0
     # AFRESH farther from the origin the errors are hardly greater; 1e-6 of that way is far above it.
     more = 1e-6 * (AFRESH / scene.step + extent)
-    state[ROOM] = (np.float64(limits.reach) + np.float64(limits.error)) * (1.0 + 1e-6) + more
+    largest = rooms[0]
+    for c in range(1, rooms.shape[0]):
+        largest = max(largest, rooms[c])
+    state[ROOM] = np.float64(largest) * (1.0 + 1e-6) + more
     memory.counts[0], memory.counts[1], memory.counts[2] = 0, 0, 0
     for r in range(3):
         memory.frame[r] = placed.frame[r]

@@ -30,7 +30,7 @@ from .closest import (
 )
 from .compiled import borrowing, inlined
 from .front import make_front, move_node, pad, place_front, sift, take_kept
-from .layout import BLOCK_WORDS, COUNT, FIRST, LANES, ROW_WORDS
+from .layout import COUNT, COUNTED, FIRST, LANES, ROW_WORDS
 from .overlap import BROAD, FLAT, STACK
 from .placed import ONE_SLACK, SLACK, make_placed, node_reach, place_lanes, place_root
 from .placing import place
@@ -91,7 +91,7 @@ def _search_leaves(m, a, row, avatar, placed, scene, spot, best, off):
     for lane in range(avatar.count[U(a)], LANES):
         keep[U(lane)] = False  # repeats the last point
     number = ~np.int64(ints[U(row + FIRST)])
-    block_at = spot[1] + number * BLOCK_WORDS
+    block_at = spot[1] + number * scene.block_words
     lane_at = spot[2] + number * 3 * LANES
     low_x = off[0] + np.float32(ints[U(block_at)])
     low_y = off[1] + np.float32(ints[U(block_at + 1)])
@@ -153,8 +153,8 @@ def _search_pairs(avatar, m, pose, a, row, placed, scene, spot, best, descent):
                     depth += 1
         else:
             x, y, z = nodes[0, a] - off[0], nodes[1, a] - off[1], nodes[2, a] - off[2]
-            best.counters[0] += ints[row + COUNT]
-            for i in range(ints[row + COUNT]):
+            best.counters[0] += ints[row + COUNT] & COUNTED
+            for i in range(ints[row + COUNT] & COUNTED):
                 child_row = base + (b_first + i) * ROW_WORDS
                 key = lower_bound(words, child_row, x, y, z, nodes[3, a])
                 if key <= cut[0]:
@@ -238,7 +238,7 @@ def _nearest_voxel(avatar, m, pose, placed, scene, voxel, front, count, descent,
                     continue
                 pad(bounds, left, at + (count + LANES - 1) // LANES * LANES)
                 count = left - at
-        children = np.int64(ints[U(row + COUNT)])
+        children = np.int64(ints[U(row + COUNT)] & COUNTED)
         child = spot[0] + first * ROW_WORDS
         counters[0] += children
         span = radius + cut[0]

@@ -22,17 +22,18 @@ from numpy.typing import NDArray
 
 from .compiled import borrowing, inlined
 from .front import MOST_LEVELS, make_front, move_node, pad, place_front, sift, take_kept
-from .layout import BLOCK_WORDS, COUNT, FIRST, LANES, ROW_WORDS
+from .layout import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, node_class, point_class
 from .placed import (
     ONE_SLACK,
     SLACK,
-    make_limits,
+    make_by_class,
     make_placed,
     node_reach,
     pair_in_reach,
     place_block,
     place_lanes,
     place_root,
+    set_by_class,
 )
 from .placing import GOOD, place
 from .reach import Reach, find_reach
@@ -85,21 +86,21 @@ def make_work(avatar):
 
 
 @borrowing
-def nodes_meet(words, row, x, y, z, radius, limits):
-    """Whether a sphere (float32, from the voxel's low corner) comes within reach of a node's points, as far as its
-    bound can tell: the sphere test of [Fig12] line 2, then the slab."""
+def nodes_meet(words, row, x, y, z, radius, room):
+    """Whether a sphere (float32, from the voxel's low corner) comes within `room`, reach and error together, of a
+    node's points, as far as its bound can tell: the sphere test of [Fig12] line 2, then the slab."""
     w = U(row)
     dx, dy, dz = x - words[w], y - words[w + U(1)], z - words[w + U(2)]
-    span = radius + limits.reach + limits.error
+    span = radius + room
     both = words[w + U(3)] + span
     along = words[w + U(4)] * dx + words[w + U(5)] * dy + words[w + U(6)] * dz
     # Beyond `both` the sphere has answered, so rounding of `along` is SLACK of that at most.
-    room = words[w + U(7)] * (span + SLACK * both + SLACK * both)
+    wide = words[w + U(7)] * (span + SLACK * both + SLACK * both)
     # One branch on all three costs less than three that are hard to foresee.
     return (
         (dx * dx + dy * dy + dz * dz <= both * both * ONE_SLACK)
-        & (along <= words[w + U(9)] + room)
-        & (along >= words[w + U(8)] - room)
+        & (along <= words[w + U(9)] + wide)
+        & (along >= words[w + U(8)] - wide)
     )
 
 
@@ -155,19 +156,20 @@ def next_near(halves, lane_at, low_x, low_y, low_z, lanes, block, far, keep, kee
 
 
 @borrowing
-def leaves_touch(avatar, m, block, placed, scene, voxel, spot, row, limits, work):
+def leaves_touch(avatar, m, block, placed, scene, voxel, spot, row, by_class, work):
     """Whether a marked point of an avatar's block touches a point of the scene's leaf node `row`."""
-    halves, lanes = scene.halves, placed.lanes
-    number = ~np.int64(scene.ints[U(row + FIRST)])
-    block_at = spot.blocks + number * BLOCK_WORDS
+    halves, lanes, ints, mask = scene.halves, placed.lanes, scene.ints, by_class.mask
+    number = ~np.int64(ints[U(row + FIRST)])
+    block_at = spot.blocks + number * scene.block_words
     lane_at = spot.lanes + number * 3 * LANES
-    low_x = spot.x + np.float32(scene.ints[U(block_at)])
-    low_y = spot.y + np.float32(scene.ints[U(block_at + 1)])
-    low_z = spot.z + np.float32(scene.ints[U(block_at + 2)])
+    low_x = spot.x + np.float32(ints[U(block_at)])
+    low_y = spot.y + np.float32(ints[U(block_at + 1)])
+    low_z = spot.z + np.float32(ints[U(block_at + 2)])
+    far = by_class.far[node_class(ints, row, mask)]  # of the largest sphere in the block
     begin = 0
     while begin < LANES:
         lane, tested = next_near(
-            halves, lane_at, low_x, low_y, low_z, lanes, block, limits.far, work.keep, work.keep8, begin
+            halves, lane_at, low_x, low_y, low_z, lanes, block, far, work.keep, work.keep8, begin
         )
         work.counters[1] += LANES * tested
         if lane < 0:
@@ -179,10 +181,13 @@ def leaves_touch(avatar, m, block, placed, scene, voxel, spot, row, limits, work
             dy = np.float32(halves[i + U(LANES)]) - y
             dz = np.float32(halves[i + U(2 * LANES)]) - z
             square = dx * dx + dy * dy + dz * dz
-            if square <= limits.near:
+            if square > far:
+                continue
+            c = point_class(ints, block_at, j, mask)
+            if square <= by_class.near[c]:
                 return True
-            if square <= limits.far and pair_in_reach(
-                avatar, m, block, lane, placed, scene, voxel, lane_at, block_at, j, limits.units
+            if square <= by_class.far[c] and pair_in_reach(
+                avatar, m, block, lane, placed, scene, voxel, lane_at, block_at, j, by_class.units[c]
             ):
                 return True
         begin = lane + 1
@@ -198,11 +203,11 @@ def _block_placed(avatar, m, pose, block, placed, scene):
 
 
 @borrowing
-def _pairs_touch(avatar, m, scale, extent, pose, placed, scene, voxel, spot, a, row, limits, work):
+def _pairs_touch(avatar, m, scale, extent, pose, placed, scene, voxel, spot, a, row, by_class, work):
     """Whether the subtrees of an avatar's node and a scene's hold a pair in contact: both descended, depth first, the
     larger inner node first. For avatars whose front is not their leaf nodes."""
     words, ints, pairs = scene.words, scene.ints, work.pairs
-    room = limits.reach + limits.error
+    rooms, mask = by_class.room, by_class.mask
     steps = scale / scene.step
     pairs[0, 0], pairs[0, 1] = a, row
     depth = 1
@@ -211,26 +216,27 @@ def _pairs_touch(avatar, m, scale, extent, pose, placed, scene, voxel, spot, a, 
         a, row = pairs[depth, 0], pairs[depth, 1]
         a_first, b_first = avatar.first[a], np.int64(ints[U(row + FIRST)])
         work.counters[0] += 1
+        room = rooms[node_class(ints, row, mask)]
         if a_first < 0:
             block = np.int64(~a_first)
             _block_placed(avatar, m, pose, block, placed, scene)
             if not lanes_meet(words, row, placed.lanes, block, spot.x, spot.y, spot.z, room, work.keep):
                 continue
             if b_first < 0:
-                if leaves_touch(avatar, m, block, placed, scene, voxel, spot, row, limits, work):
+                if leaves_touch(avatar, m, block, placed, scene, voxel, spot, row, by_class, work):
                     return True
                 continue
         else:
             x, y, z = _place_node(avatar, m, a, placed, scene)
             radius = node_reach(avatar.radius[a], steps, extent)
-            if not nodes_meet(words, row, x - spot.x, y - spot.y, z - spot.z, radius, limits):
+            if not nodes_meet(words, row, x - spot.x, y - spot.y, z - spot.z, radius, room):
                 continue
         if b_first < 0 or (a_first >= 0 and avatar.radius[a] * steps > words[U(row + 3)]):
             for i in range(avatar.count[a]):
                 pairs[depth, 0], pairs[depth, 1] = a_first + i, row
                 depth += 1
         else:
-            for i in range(ints[U(row + COUNT)]):
+            for i in range(ints[U(row + COUNT)] & COUNTED):
                 pairs[depth, 0], pairs[depth, 1] = a, spot.rows + (b_first + i) * ROW_WORDS
                 depth += 1
     return False
@@ -255,7 +261,7 @@ def _place_node(avatar, m, a, placed, scene):
 
 
 @borrowing
-def _overlap_voxel(avatar, m, scale, extent, pose, placed, scene, voxel, spot, limits, front, count, work):
+def _overlap_voxel(avatar, m, scale, extent, pose, placed, scene, voxel, spot, by_class, front, count, work):
     """Whether the placed avatar touches one resident voxel, whose root it meets: the scene's tree descended, depth
     first, each node with a list of those front nodes that met its parent.
 
@@ -268,7 +274,7 @@ def _overlap_voxel(avatar, m, scale, extent, pose, placed, scene, voxel, spot, l
     firsts, front_first, points = avatar.first, avatar.front_first, avatar.points
     shift, frame, step = placed.shift, placed.frame, scene.step
     off_x, off_y, off_z = spot.x, spot.y, spot.z
-    room = limits.reach + limits.error
+    rooms, mask = by_class.room, by_class.mask
     x, y, z, radius = nodes[0, 0] - off_x, nodes[1, 0] - off_y, nodes[2, 0] - off_z, nodes[3, 0]
     stack[0, 0], stack[0, 1], stack[0, 2] = spot.rows, 0, count
     depth = 1
@@ -276,6 +282,7 @@ def _overlap_voxel(avatar, m, scale, extent, pose, placed, scene, voxel, spot, l
         depth -= 1
         row, at, count = stack[U(depth), 0], stack[U(depth), 1], stack[U(depth), 2]
         first = np.int64(ints[U(row + FIRST)])
+        room = rooms[node_class(ints, row, mask)]
         if first < 0 or words[U(row + 3)] < BROAD * radius:
             counters[0] += count
             steps = (count + LANES - 1) // LANES
@@ -299,12 +306,14 @@ def _overlap_voxel(avatar, m, scale, extent, pose, placed, scene, voxel, spot, l
                         if not lanes_meet(words, row, lanes, block, off_x, off_y, off_z, room, keep):
                             continue
                         if first < 0:
-                            if leaves_touch(avatar, m, block, placed, scene, voxel, spot, row, limits, work):
+                            if leaves_touch(
+                                avatar, m, block, placed, scene, voxel, spot, row, by_class, work
+                            ):
                                 return True
                             continue
                     elif first < 0:
                         if _pairs_touch(
-                            avatar, m, scale, extent, pose, placed, scene, voxel, spot, a, row, limits, work
+                            avatar, m, scale, extent, pose, placed, scene, voxel, spot, a, row, by_class, work
                         ):
                             return True
                         continue
@@ -314,13 +323,13 @@ def _overlap_voxel(avatar, m, scale, extent, pose, placed, scene, voxel, spot, l
                     continue
                 pad(bounds, left, at + (count + LANES - 1) // LANES * LANES)
                 count = left - at
-        children = np.int64(ints[U(row + COUNT)])
+        children = np.int64(ints[U(row + COUNT)] & COUNTED)
         child = spot.rows + first * ROW_WORDS
         counters[0] += children
         for _ in range(children):
             u = U(depth)
             stack[u, 0], stack[u, 1], stack[u, 2] = child, at, count
-            if nodes_meet(words, child, x, y, z, radius, limits):
+            if nodes_meet(words, child, x, y, z, radius, rooms[node_class(ints, child, mask)]):
                 depth += 1
             child += ROW_WORDS
     return False
@@ -351,13 +360,14 @@ def overlap_poses(poses, avatar, scene, reach, which, verdict, counts):
     that over CLEAR.
     """
     placed, front, work = make_placed(avatar), make_front(avatar), make_work(avatar)
-    _overlap_poses(poses, avatar, scene, reach, which, verdict, counts, placed, front, work)
+    by_class = make_by_class(scene.drop)
+    _overlap_poses(poses, avatar, scene, reach, which, verdict, counts, placed, front, by_class, work)
 
 
 @borrowing
-def _overlap_poses(poses, avatar, scene, reach, which, verdict, counts, placed, front, work):
+def _overlap_poses(poses, avatar, scene, reach, which, verdict, counts, placed, front, by_class, work):
     """`overlap_poses`, with its scratch."""
-    nodes = placed.nodes
+    nodes, ints = placed.nodes, scene.ints
     for number in range(which.shape[0]):
         i = which[number]
         if verdict[i] == CONTACT or reach.starts[i + 1] == reach.starts[i]:
@@ -365,7 +375,9 @@ def _overlap_poses(poses, avatar, scene, reach, which, verdict, counts, placed, 
         m, scale = poses[i], reach.scales[i]
         work.counters[0], work.counters[1] = 0, 0
         extent, farthest = place_root(avatar, m, scale, placed, scene)
-        limits = make_limits(reach.units[i], scene.units_per_step, extent, farthest, scene.voxel_steps)
+        set_by_class(
+            by_class, scene.drop, reach.units[i], scene.units_per_step, extent, farthest, scene.voxel_steps
+        )
         count = 0  # of the front: not placed, as most far poses never need it
         for at in range(reach.starts[i], reach.starts[i + 1]):
             voxel = reach.rows[at]
@@ -376,12 +388,13 @@ def _overlap_poses(poses, avatar, scene, reach, which, verdict, counts, placed, 
             spot = make_spot(scene, voxel, placed)
             x, y, z = nodes[0, 0] - spot.x, nodes[1, 0] - spot.y, nodes[2, 0] - spot.z
             work.counters[0] += 1
-            if not nodes_meet(scene.words, spot.rows, x, y, z, nodes[3, 0], limits):
+            room = by_class.room[node_class(ints, spot.rows, by_class.mask)]
+            if not nodes_meet(scene.words, spot.rows, x, y, z, nodes[3, 0], room):
                 continue
             if count == 0:
                 count = place_front(avatar, m, scale, placed, scene, extent, front.bounds)
             if _overlap_voxel(
-                avatar, m, scale, extent, i, placed, scene, voxel, spot, limits, front, count, work
+                avatar, m, scale, extent, i, placed, scene, voxel, spot, by_class, front, count, work
             ):
                 verdict[i] = CONTACT
                 break

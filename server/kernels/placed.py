@@ -50,6 +50,37 @@ class Limits(NamedTuple):
     units: np.int64
 
 
+class ByClass(NamedTuple):
+    """The thresholds of one pose by radius class; scratch of one call, as long as `SceneArrays.drop`.
+
+    room: reach and error together, float32 [steps].  near, far, units: as in `Limits`.  mask: one less than there are
+    classes, uint64, for `node_class` and `point_class`.
+    """
+
+    room: NDArray[np.float32]
+    near: NDArray[np.float32]
+    far: NDArray[np.float32]
+    units: NDArray[np.int64]
+    mask: np.uint64
+
+
+@nb.njit(nogil=True, cache=True)
+def make_by_class(drop):
+    """Scratch for the radius classes of `SceneArrays.drop`."""
+    n = drop.shape[0]
+    room, near, far = np.empty(n, np.float32), np.empty(n, np.float32), np.empty(n, np.float32)
+    return ByClass(room, near, far, np.empty(n, np.int64), np.uint64(n - 1))
+
+
+@borrowing
+def set_by_class(by_class, drop, units, units_per_step, extent, farthest, voxel_steps):
+    """Fill the thresholds of one pose; arguments as of `make_limits`, whose `units` are of the largest radius."""
+    for c in range(drop.shape[0]):
+        limits = make_limits(units - drop[c], units_per_step, extent, farthest, voxel_steps)
+        by_class.room[c] = limits.reach + limits.error
+        by_class.near[c], by_class.far[c], by_class.units[c] = limits.near, limits.far, limits.units
+
+
 @borrowing
 def make_limits(units, units_per_step, extent, farthest, voxel_steps):
     """The thresholds for a reach of `units`.

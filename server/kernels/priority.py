@@ -27,7 +27,7 @@ from .closest import (
     search_lanes,
     set_cut,
 )
-from .layout import BLOCK_WORDS, COUNT, FIRST, LANES, ROW_WORDS
+from .layout import COUNT, COUNTED, FIRST, LANES, ROW_WORDS
 from .nearest import box_gap
 from .overlap import STACK
 from .placed import ONE_SLACK, SLACK, Placed, make_limits, make_placed, place_block, place_nodes
@@ -245,7 +245,7 @@ def _go_on(m, pose, avatar, scene, search, goal, enough, budget, until):
         avatar_side = b_first < 0 or (a_first >= 0 and row != NO_VOXEL and nodes[3, a] > words[row + 3])
         cost = np.int64(1)
         if row != NO_VOXEL and not leaves:
-            cost = np.int64(avatar_count[a]) if avatar_side else np.int64(ints[row + COUNT])
+            cost = np.int64(avatar_count[a]) if avatar_side else np.int64(ints[row + COUNT] & COUNTED)
         if counters[0] + cost > budget:
             search.status[0] = SPENT
             return
@@ -276,7 +276,7 @@ def _go_on(m, pose, avatar, scene, search, goal, enough, budget, until):
             if stamp[block] != pose:
                 place_block(avatar, m, block, placed, scene)
                 stamp[block] = pose
-            block_at = where[voxel, 1] + scene_block * BLOCK_WORDS
+            block_at = where[voxel, 1] + scene_block * scene.block_words
             lane_at = where[voxel, 2] + scene_block * 3 * LANES
             lx, ly = off_x + np.float32(ints[block_at]), off_y + np.float32(ints[block_at + 1])
             lz = off_z + np.float32(ints[block_at + 2])

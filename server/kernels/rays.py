@@ -25,7 +25,7 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from .layout import BLOCK_WORDS, COUNT, FIRST, LANES, ROW_WORDS
+from .layout import COUNT, COUNTED, FIRST, LANES, ROW_WORDS
 from .placed import U32
 from .placing import lattice_to_units
 
@@ -121,7 +121,7 @@ def _test_block(scene, voxel, row, ray, radius, rays, i, best):
     """
     words, ints, halves = scene.words, scene.ints, scene.halves
     block = ~ints[row + FIRST]
-    block_at = scene.where[voxel, 1] + block * BLOCK_WORDS
+    block_at = scene.where[voxel, 1] + block * scene.block_words
     lane_at = scene.where[voxel, 2] + block * 3 * LANES
     dx, dy, dz = words[row] - ray[0], words[row + 1] - ray[1], words[row + 2] - ray[2]
     along = dx * ray[3] + dy * ray[4] + dz * ray[5]
@@ -243,10 +243,10 @@ def _follow(scene, voxel, rays, i, ray, near, tolerance, visits, best, rows, bou
             tests += LANES
             _test_block(scene, voxel, row, ray, radius, rays, i, best)
             continue
-        spent += ints[row + COUNT]
+        spent += ints[row + COUNT] & COUNTED
         begin = depth
         limit = min(best.value[i], reach) * per_unit + error
-        for child in range(first, first + ints[row + COUNT]):
+        for child in range(first, first + (ints[row + COUNT] & COUNTED)):
             child_row = base + child * ROW_WORDS
             bound = _meet_node(words, child_row, ray, radius, limit)
             if bound < np.inf:

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from ...schemas.voxel_grid import UNITS_PER_METRE
 from .compiled import borrowing
-from .layout import BLOCK_WORDS, COUNT, FIRST, LANES, ROW_WORDS, SceneArrays
+from .layout import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, SceneArrays
 from .motion import Motion, pose_at
 from .overlap import STACK
 from .placed import ONE_SLACK, SLACK, make_limits, pair_square
@@ -374,7 +374,7 @@ def _leaves(job, chord, voxel, block, row, limits):
             (ex * ex + ey * ey + ez * ez <= square) & (min(begin, end) <= most) & (max(begin, end) >= least)
         )
     scene_block = ~ints[row + FIRST]
-    block_at = scene.where[voxel, 1] + scene_block * BLOCK_WORDS
+    block_at = scene.where[voxel, 1] + scene_block * scene.block_words
     lane_at = scene.where[voxel, 2] + scene_block * 3 * LANES
     lx = off[0] + np.float32(ints[block_at])
     ly = off[1] + np.float32(ints[block_at + 1])
@@ -460,8 +460,8 @@ def _sweep_voxel(job, chord, voxel, limits):
         else:
             x, y, z = nodes[0, a] - off[0], nodes[1, a] - off[1], nodes[2, a] - off[2]
             dx, dy, dz, inverse = nodes[4, a], nodes[5, a], nodes[6, a], nodes[7, a]
-            counters[0] += ints[row + COUNT]
-            for i in range(ints[row + COUNT]):
+            counters[0] += ints[row + COUNT] & COUNTED
+            for i in range(ints[row + COUNT] & COUNTED):
                 child_row = base + (b_first + i) * ROW_WORDS
                 if _nodes_meet(words, child_row, x, y, z, dx, dy, dz, inverse, nodes[3, a], latest, limits):
                     stack[depth, 0], stack[depth, 1] = a, child_row

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from .compiled import borrowing
 from .front import U
-from .layout import BLOCK_WORDS, COUNT, FIRST, LANES, ROW_WORDS
+from .layout import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, node_class
 from .memory import (
     AFRESH,
     AROUND,
@@ -44,7 +44,7 @@ from .memory import (
     turn_points,
 )
 from .overlap import CONTACT, lanes_meet, leaves_touch, make_spot, make_work, overlap_poses
-from .placed import make_limits, make_placed, place_lanes, place_root
+from .placed import make_by_class, make_placed, place_lanes, place_root, set_by_class
 from .placing import GOOD, place
 from .reach import Reach, find_reach
 
@@ -83,7 +83,7 @@ def _held(voxels, begin, end, voxel):
 
 
 @borrowing
-def _still_touching(avatar, m, pose, placed, scene, limits, memory, work):
+def _still_touching(avatar, m, pose, placed, scene, by_class, memory, work):
     """Whether the pair of leaf nodes that touched last touches still."""
     block, voxel = memory.touched[0], memory.touched[1]
     spot = make_spot(scene, voxel, placed)
@@ -92,15 +92,15 @@ def _still_touching(avatar, m, pose, placed, scene, limits, memory, work):
         place_lanes(avatar.points, m, block, placed.lanes, placed.shift, placed.frame, scene.step)
         placed.stamp[U(block)] = pose
     work.counters[0] += 1
-    room = limits.reach + limits.error
+    room = by_class.room[node_class(scene.ints, row, by_class.mask)]
     if not lanes_meet(scene.words, row, placed.lanes, block, spot.x, spot.y, spot.z, room, work.keep):
         return False
-    return leaves_touch(avatar, m, block, placed, scene, voxel, spot, row, limits, work)
+    return leaves_touch(avatar, m, block, placed, scene, voxel, spot, row, by_class, work)
 
 
 @borrowing
 def _look_again(
-    avatar, m, scale, pose, placed, scene, rows, begin, end, limits, memory, work, hands, step_way, x0, y0, z0
+    avatar, m, scale, pose, placed, scene, rows, begin, end, by_class, memory, work, hands, step_way, x0, y0, z0
 ):  # fmt: skip
     """Look at the entries that are marked in `used`, and at what they give way to, at pose m.
 
@@ -123,7 +123,10 @@ def _look_again(
     meets, meets8, turn, points = hands.meets, hands.meets8, hands.turn, hands.points
     firsts, front_first, stamp, counters = avatar.first, avatar.front_first, placed.stamp, work.counters
     per_step, inverse, front = 1.0 / scene.step, 1.0 / scale, avatar.front.shape[1]
-    way, room, extent = memory.state[WAY], memory.state[ROOM], avatar.radius[0] * scale * per_step
+    way, most_room, extent = memory.state[WAY], memory.state[ROOM], avatar.radius[0] * scale * per_step
+    # Less than the drop, by more than anything here rounds.
+    drop, per_unit = scene.drop, (1.0 - 1e-6) / scene.units_per_step
+    rooms, mask = by_class.room, by_class.mask
     near = np.float32(NEAR * per_step)
     near_bits = bits_of(near)
     enough = max(step_way * STEPS_AHEAD, LEAST_WAY * per_step)
@@ -155,6 +158,7 @@ def _look_again(
             - z0
         )
         radius, length = np.float64(words[w + U(3)]), np.float64(words[w + U(7)])
+        room = most_room - np.float64(drop[node_class(ints, row, mask)]) * per_unit
         size = math.sqrt(x * x + y * y + z * z)
         blur = BLUR * (size + radius + extent + room)
         span = radius + room + blur
@@ -211,7 +215,7 @@ def _look_again(
                 i += 1
                 continue
         if first >= 0:
-            children = np.int64(ints[w + U(COUNT)])
+            children = np.int64(ints[w + U(COUNT)] & COUNTED)
             if counts[0] + children > ENTRIES:
                 return FULL
             child = first * ROW_WORDS
@@ -228,7 +232,7 @@ def _look_again(
         # as thick as it is wide, and its points tell more than its slab.
         if g >= 0:
             open_gap(gaps, g)
-        block_at = where[U(voxel), 1] + ~first * BLOCK_WORDS
+        block_at = where[U(voxel), 1] + ~first * scene.block_words
         x += np.float64(ints[U(block_at)]) - np.float64(words[w])
         y += np.float64(ints[U(block_at + 1)]) - np.float64(words[w + U(1)])
         z += np.float64(ints[U(block_at + 2)]) - np.float64(words[w + U(2)])
@@ -251,10 +255,10 @@ def _look_again(
                 stamp[U(block)] = pose
             spot = make_spot(scene, voxel, placed)
             counters[0] += 1
-            nearby = limits.reach + limits.error
+            nearby = rooms[node_class(ints, row, mask)]
             if not lanes_meet(words, row, placed.lanes, block, spot.x, spot.y, spot.z, nearby, work.keep):
                 continue
-            if leaves_touch(avatar, m, block, placed, scene, voxel, spot, row, limits, work):
+            if leaves_touch(avatar, m, block, placed, scene, voxel, spot, row, by_class, work):
                 memory.touched[0], memory.touched[1], memory.touched[2] = block, voxel, nodes[k, 1]
                 return TOUCHES
         if least > 0.0:
@@ -272,7 +276,7 @@ def _center(avatar, m, placed, scene, frame, r):
 
 
 @borrowing
-def _walk_on(poses, begin_at, avatar, scene, reach, verdict, counts, memory, placed, work, hands):
+def _walk_on(poses, begin_at, avatar, scene, reach, verdict, counts, memory, placed, by_class, work, hands):
     """`walk_poses` from pose `begin_at` on, with its scratch. Returns the pose for which there was no room, or k."""
     state, frame, turn, used, closed = memory.state, memory.frame, hands.turn, hands.used, hands.closed
     per_step = 1.0 / scene.step
@@ -283,7 +287,9 @@ def _walk_on(poses, begin_at, avatar, scene, reach, verdict, counts, memory, pla
             continue
         work.counters[0], work.counters[1] = 0, 0
         extent, farthest = place_root(avatar, m, scale, placed, scene)
-        limits = make_limits(reach.units[i], scene.units_per_step, extent, farthest, scene.voxel_steps)
+        set_by_class(
+            by_class, scene.drop, reach.units[i], scene.units_per_step, extent, farthest, scene.voxel_steps
+        )
         step_way = 0.0
         if state[KNOWN] == 1.0:
             step_way = travelled(avatar, m, memory.last, scale) * per_step * (1.0 + 1e-9)
@@ -293,12 +299,12 @@ def _walk_on(poses, begin_at, avatar, scene, reach, verdict, counts, memory, pla
                 memory.last[r, c] = m[r, c]
         found = NOTHING
         held = memory.touched[0] >= 0 and _held(reach.rows, begin, end, memory.touched[1])
-        if held and _still_touching(avatar, m, i, placed, scene, limits, memory, work):
+        if held and _still_touching(avatar, m, i, placed, scene, by_class, memory, work):
             found = TOUCHES
         if found == NOTHING:
             memory.touched[0] = -1
             if state[KNOWN] != 1.0 or state[SCALE] != scale or state[WAY] > AFRESH * per_step:
-                start_afresh(avatar, scale, scene, memory, limits, placed, extent)
+                start_afresh(avatar, scale, scene, memory, by_class.room, placed, extent)
             if not add_voxels(reach.rows, begin, end, memory):
                 state[KNOWN] = 0.0
                 return i
@@ -319,7 +325,7 @@ def _walk_on(poses, begin_at, avatar, scene, reach, verdict, counts, memory, pla
                 some = True
             if some:
                 found = _look_again(
-                    avatar, m, scale, i, placed, scene, reach.rows, begin, end, limits, memory, work, hands, step_way,
+                    avatar, m, scale, i, placed, scene, reach.rows, begin, end, by_class, memory, work, hands, step_way,
                     x, y, z,
                 )  # fmt: skip
             if found == FULL:
@@ -346,10 +352,10 @@ def walk_poses(poses, avatar, scene, reach, verdict, counts, memory):
         np.empty(f, np.float32), meets, meets.view(np.uint64), np.empty(9, np.float32),
         np.empty((3, LANES), np.float32),
     )  # fmt: skip
-    placed, work = make_placed(avatar), make_work(avatar)
+    placed, by_class, work = make_placed(avatar), make_by_class(scene.drop), make_work(avatar)
     at = 0
     while at < poses.shape[0]:
-        at = _walk_on(poses, at, avatar, scene, reach, verdict, counts, memory, placed, work, hands)
+        at = _walk_on(poses, at, avatar, scene, reach, verdict, counts, memory, placed, by_class, work, hands)
         if at < poses.shape[0]:
             overlap_poses(poses, avatar, scene, reach, np.full(1, at), verdict, counts)
             at += 1

@@ -13,7 +13,7 @@ import math
 import numba as nb
 import numpy as np
 
-from .layout import BLOCK_WORDS, COUNT, FIRST, LANES, ROW_WORDS
+from .layout import COUNT, COUNTED, FIRST, LANES, ROW_WORDS
 from .placed import U32
 from .placing import MAX_REACH_UNITS, lattice_to_units
 from .rays import STACK, is_less
@@ -58,7 +58,7 @@ def _test_block(scene, voxel, row, x, y, z, error, at_units, i, best, limit):
     """
     words, ints, halves = scene.words, scene.ints, scene.halves
     block = ~ints[row + FIRST]
-    block_at = scene.where[voxel, 1] + block * BLOCK_WORDS
+    block_at = scene.where[voxel, 1] + block * scene.block_words
     lane_at = scene.where[voxel, 2] + block * 3 * LANES
     qx = np.float32(x - ints[block_at])
     qy = np.float32(y - ints[block_at + 1])
@@ -151,10 +151,10 @@ def _search(scene, voxel, at_units, i, near, tolerance, visits, best, limit, row
             limit = _test_block(scene, voxel, row, x, y, z, error, at_units, i, best, limit)
             nearest = math.sqrt(np.float64(limit))
             continue
-        spent += ints[row + COUNT]
+        spent += ints[row + COUNT] & COUNTED
         begin = depth
         steps = nearest * per_unit + error
-        for child in range(first, first + ints[row + COUNT]):
+        for child in range(first, first + (ints[row + COUNT] & COUNTED)):
             child_row = base + child * ROW_WORDS
             bound, middle = _below_node(words, child_row, x, y, z, steps)
             # Its farthest point is no farther than that: no sibling beyond holds the nearest.

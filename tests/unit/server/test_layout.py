@@ -48,7 +48,7 @@ def test_the_arena_holds_what_the_archive_does(
             n, leaves = len(links.first), int(links.is_leaf.sum())
             kept = data.scan_index is not None
             assert store.sizes[row] == resident_bytes(n, leaves, with_scan=kept)
-            scans_at = scan_run(np.array([[rows, blocks, lanes]]), 0)
+            scans_at = scan_run(np.array([[rows, blocks, lanes]]), 0, BLOCK_WORDS)
             assert store.sizes[row] == 2 * scans_at - 64 + 2 * LANES * leaves * kept
             # Rows, blocks and lanes follow each other from byte 64 on, and nothing is written behind them.
             assert (rows * 4, blocks - rows, lanes - 2 * blocks) == (

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from solidcloud.server.kernels import placing
-from solidcloud.server.kernels.layout import SceneArrays
+from solidcloud.server.kernels.layout import BLOCK_WORDS, SceneArrays
 
 pytestmark = pytest.mark.interpreted
 
@@ -22,6 +22,8 @@ SCENE = SceneArrays(
     1e-4,
     1e-4 * naive.UNITS,
     80_000,
+    BLOCK_WORDS,
+    np.zeros(1, np.int64),
 )
 
 

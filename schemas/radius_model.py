@@ -1,0 +1,103 @@
+"""Radius models: how large a sphere a scan point stands for, and which of them a question asks for.
+
+`mean` is the paper's: one figure for all points of a dataset ([Fig12] section 7). `local` and `border` are its future
+work (section 8): spheres after the spacing around each point, and smaller ones on the rim of a surface. What they need
+is stored as a radius class a point, one byte: the local class in the low four bits, RIM_BIT where the point is on a
+rim. A model turns classes into radii only when a question is asked, so one archive serves them all.
+"""
+
+import math
+from collections.abc import Collection
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .errors import BadRequestError
+from .voxel_grid import UNITS_PER_METRE
+
+# What `solidcloud build --radius` can store.
+STORED_MODELS = ("mean", "local", "border")
+
+LOCAL_CLASSES = 16
+RIM_BIT = 16
+RADIUS_CLASSES = 32
+# Local class c stands for FINEST_RADIUS * 2^(c / 2): 1 mm to 181 mm. The same ladder in every archive, so that a class
+# depends on a point's neighbours and on nothing else.
+FINEST_RADIUS = 0.001
+# A pair reaches 16 m at most, both radii and the margin together (server/kernels/placing.py): half of that is a scan
+# point's.
+MAX_RADIUS = 8.0
+# What `border` leaves of a rim point's radius.
+BORDER_SHARE = 0.5
+
+_EXPECTED = "expected mean, local, border or local+border, each with a factor where wanted (local:0.8), or fixed:METRES"
+
+
+class RadiusModel(NamedTuple):
+    """What a question asks for. local, border: which classes count.  factor: on all radii.
+
+    fixed: one radius for all [m]; None: stored ones.
+    """
+
+    local: bool
+    border: bool
+    factor: float
+    fixed: float | None
+
+
+def local_radii() -> NDArray[np.float64]:
+    """The radius (16,) [m] of each local class, ascending."""
+    return np.array(
+        [FINEST_RADIUS * 2.0 ** (c // 2) * (math.sqrt(2.0) if c % 2 else 1.0) for c in range(LOCAL_CLASSES)]
+    )
+
+
+def parse_radius_model(text: str) -> RadiusModel:
+    """A radius model from its name: `mean`, `local:0.8`, `local+border`, `fixed:0.01`. Raises BadRequestError."""
+    name, colon, number = text.partition(":")
+    parts = name.split("+")
+    known = {"mean", "fixed"} if len(parts) == 1 else set()
+    if len(set(parts)) < len(parts) or not set(parts) <= known | {"local", "border"}:
+        raise BadRequestError(f"radius model {text!r}: {_EXPECTED}")
+    factor = 1.0
+    if colon or name == "fixed":
+        try:
+            factor = float(number)
+        except ValueError:
+            raise BadRequestError(f"radius model {text!r}: {_EXPECTED}") from None
+    if not 0 <= factor <= MAX_RADIUS:  # not so for NaN either
+        raise BadRequestError(f"radius model {text!r}: expected a number from 0 to {MAX_RADIUS}")
+    if name == "fixed":
+        return RadiusModel(False, False, 1.0, factor)
+    return RadiusModel("local" in parts, "border" in parts, factor, None)
+
+
+def class_radii(text: str | None, radius: float, stored: Collection[str]) -> NDArray[np.int64]:
+    """The radii of scan points under a model, exact units: (1,) where all have the same, else (32,), by class.
+
+    text: as `parse_radius_model` takes it; None: the archive's one figure.  radius: that figure [m].  stored: the
+    models that the archive holds. A class with a larger local class, or without RIM_BIT, never has a smaller radius:
+    so the largest local class of some points, with RIM_BIT where all have it, stands for a radius that none of theirs
+    exceeds. Raises BadRequestError for a model that the archive does not hold.
+    """
+    model = RadiusModel(False, False, 1.0, None) if text is None else parse_radius_model(text)
+    for name in ("local", "border"):
+        if getattr(model, name) and name not in stored:
+            held = ",".join(m for m in STORED_MODELS if m in stored)
+            raise BadRequestError(
+                f"radius model {text!r}: this archive holds {held}: ask for one of those, "
+                f"or build it with --radius {held},{name}"
+            )
+    metres = np.full(1, radius if model.fixed is None else model.fixed)
+    if model.local or model.border:
+        classes = np.arange(RADIUS_CLASSES)
+        metres = local_radii()[classes % LOCAL_CLASSES] if model.local else np.full(RADIUS_CLASSES, metres[0])
+        if model.border:
+            metres = np.where(classes & RIM_BIT, metres * BORDER_SHARE, metres)
+    metres = metres * model.factor
+    if metres.max() > MAX_RADIUS:
+        raise BadRequestError(
+            f"radius model {text!r}: radii up to {metres.max():g} m: expected at most {MAX_RADIUS} m"
+        )
+    return np.rint(metres * UNITS_PER_METRE).astype(np.int64)

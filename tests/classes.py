@@ -1,0 +1,53 @@
+"""Archives whose points have radius classes of all kinds, and what the judges need to know of them."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from solidcloud.builder import shards
+from solidcloud.builder.octree import VoxelPoints
+from solidcloud.builder.radius import voxel_points
+from solidcloud.schemas.archive import Archive
+from solidcloud.schemas.radius_model import RADIUS_CLASSES, class_radii
+
+STORED = frozenset({"mean", "local", "border"})
+# Of archives of a few metres and some hundred points, so that some poses touch and some do not.
+MODELS = ("local:0.2", "border:3", "local+border:0.3", "mean:2", "fixed:0.004", None)
+
+
+def hashed_classes(local: NDArray[np.int32]) -> NDArray[np.uint8]:
+    """A class (n,) for points (n, 3), the same for equal ones; in about half of all places the same for neighbours."""
+    near = (local >> 9).sum(axis=1) % 2 == 0
+    mixed = np.where(near[:, None], local >> 7, local).astype(np.int64) @ np.array([7919, 104729, 1299709])
+    return (mixed % RADIUS_CLASSES).astype(np.uint8)
+
+
+@contextmanager
+def any_classes() -> Iterator[None]:
+    """Inside, what is built with one job has classes by `hashed_classes`, and not by its points' neighbours."""
+    build_voxel = shards.build_voxel
+
+    def with_others(key: int, points: VoxelPoints, *rest: Any) -> Any:
+        return build_voxel(key, points._replace(radius_class=hashed_classes(points.local)), *rest)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(shards, "build_voxel", with_others)
+        yield
+
+
+def stored_radii(folder: Path, model: str | None) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """All points (n, 3) of an archive [lattice steps], and the radius (n,) of each [exact units]."""
+    points, radii = [np.empty((0, 3), np.int64)], [np.empty(0, np.int64)]
+    with Archive(folder) as archive:
+        header = archive.header
+        table = class_radii(model, header.radius, header.models)
+        for row in range(len(archive.voxels)):
+            voxel, links = archive.read_voxel(row)
+            points.append(voxel_points(voxel, links) + archive.coordinates[row] * header.lattice.voxel_steps)
+            classes = np.zeros(len(voxel.points), np.int64) if len(table) == 1 else voxel.radius_class
+            radii.append(table[classes])
+    return np.concatenate(points), np.concatenate(radii)

@@ -1,0 +1,94 @@
+"""Radius models: their names, and the radii that classes stand for."""
+
+import math
+
+import numpy as np
+import pytest
+from solidcloud.schemas.errors import BadRequestError
+from solidcloud.schemas.radius_model import (
+    BORDER_SHARE,
+    LOCAL_CLASSES,
+    MAX_RADIUS,
+    RADIUS_CLASSES,
+    RIM_BIT,
+    RadiusModel,
+    class_radii,
+    local_radii,
+    parse_radius_model,
+)
+from solidcloud.schemas.voxel_grid import UNITS_PER_METRE
+
+pytestmark = pytest.mark.interpreted
+ALL = ("mean", "local", "border")
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("mean", RadiusModel(False, False, 1.0, None)),
+        ("mean:2", RadiusModel(False, False, 2.0, None)),
+        ("local:0.8", RadiusModel(True, False, 0.8, None)),
+        ("border", RadiusModel(False, True, 1.0, None)),
+        ("local+border:1e-1", RadiusModel(True, True, 0.1, None)),
+        ("border+local", RadiusModel(True, True, 1.0, None)),
+        ("fixed:0", RadiusModel(False, False, 1.0, 0.0)),
+        ("fixed:0.013", RadiusModel(False, False, 1.0, 0.013)),
+    ],
+)
+def test_models_have_names(text: str, expected: RadiusModel) -> None:
+    assert parse_radius_model(text) == expected
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "", "Mean", "fixed", "fixed:", "fixed:x", "fixed:-1", "fixed:9", "fixed:nan", "local:", "local:inf", "local+",
+        "local+local", "mean+local", "fixed+border:1", "local:1:2", "border ", "local,border",
+    ],
+)  # fmt: skip
+def test_what_is_none_is_refused(text: str) -> None:
+    with pytest.raises(BadRequestError, match="radius model"):
+        parse_radius_model(text)
+
+
+def test_the_ladder_doubles_every_second_class() -> None:
+    radii = local_radii()
+    assert len(radii) == LOCAL_CLASSES and radii[0] == 0.001
+    assert np.allclose(radii, 0.001 * np.sqrt(2.0) ** np.arange(16), rtol=1e-15, atol=0)
+    assert (radii[2:] == 2 * radii[:-2]).all()
+
+
+def test_one_radius_for_all_is_one_entry() -> None:
+    for text, metres in ((None, 0.0123), ("mean", 0.0123), ("mean:0.5", 0.00615), ("fixed:0.2", 0.2)):
+        assert class_radii(text, 0.0123, ("mean",)).tolist() == [round(metres * UNITS_PER_METRE)]
+
+
+def test_radii_by_class() -> None:
+    local = class_radii("local:2", 0.5, ALL)
+    border = class_radii("border", 0.5, ALL)
+    both = class_radii("local+border", 0.5, ALL)
+    for c in range(RADIUS_CLASSES):
+        own = 0.001 * math.sqrt(2.0) ** (c % LOCAL_CLASSES)
+        share = BORDER_SHARE if c & RIM_BIT else 1.0
+        assert abs(local[c] - 2 * own * UNITS_PER_METRE) <= 1
+        assert border[c] == round(0.5 * share * UNITS_PER_METRE)
+        assert abs(both[c] - own * share * UNITS_PER_METRE) <= 1
+
+
+@pytest.mark.parametrize("text", ["local", "local:3", "border", "border:0", "local+border"])
+def test_the_class_of_some_points_together_stands_for_the_largest_of_their_radii(text: str) -> None:
+    radii = class_radii(text, 0.02, ALL)
+    for a in range(RADIUS_CLASSES):
+        for b in range(RADIUS_CLASSES):
+            together = max(a % LOCAL_CLASSES, b % LOCAL_CLASSES) | (a & b & RIM_BIT)
+            assert radii[together] >= max(radii[a], radii[b])
+
+
+def test_what_the_archive_does_not_hold_is_refused() -> None:
+    with pytest.raises(BadRequestError, match=r"holds mean: .* --radius mean,local"):
+        class_radii("local", 0.01, ("mean",))
+    with pytest.raises(BadRequestError, match=r"holds mean,local: .* --radius mean,local,border"):
+        class_radii("local+border", 0.01, ("mean", "local"))
+    with pytest.raises(BadRequestError, match="at most"):
+        class_radii("mean:8", 1.5, ("mean",))
+    assert class_radii("mean:8", 1.0, ("mean",)).tolist() == [round(MAX_RADIUS * UNITS_PER_METRE)]

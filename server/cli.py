@@ -241,6 +241,10 @@ def info(archive: ArchivePath, as_json: AsJson = False) -> None:
 def validate(
     archive: ArchivePath,
     deep: Annotated[bool, typer.Option("--deep", help="Also measure every bound again.")] = False,
+    exact: Annotated[bool, typer.Option("--exact", help="Also prove bounds in Python's integers.")] = False,
+    sample: Annotated[
+        int | None, typer.Option(help="With --exact: only so many bounds, of all over it.")
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Check every record; exit code 3 if one is broken."""
@@ -248,11 +252,13 @@ def validate(
     from .console import Bars
 
     with Bars() as bars:
-        report = verify_archive(archive, deep=deep, progress=bars)
+        report = verify_archive(archive, deep=deep, exact=exact, sample=sample, progress=bars)
     if as_json:
         _print_json(report._asdict())
     else:
-        print(f"{archive}: {report.voxels:,} voxels, {report.points:,} points, {len(report.faults)} faults")
+        proved = f", {report.exact_nodes:,} of {report.nodes:,} bounds proved" if exact else ""
+        counted = f"{report.voxels:,} voxels, {report.points:,} points{proved}"
+        print(f"{archive}: {counted}, {len(report.faults)} faults")
     for fault in report.faults:
         _complain(fault, 3)
     raise typer.Exit(3 if report.faults else 0)

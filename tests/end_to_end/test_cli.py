@@ -173,6 +173,10 @@ def test_validate_names_the_record_with_a_flipped_byte(
     assert run(["build", str(scan), "-o", str(target), "--jobs", "1"]) == 0
     assert run(["validate", str(target), "--deep"]) == 0
     assert ", 0 faults" in capsys.readouterr().out
+    assert run(["validate", str(target), "--exact", "--sample", "5"]) == 0
+    assert re.search(r" points, 5 of \d+ bounds proved, 0 faults", capsys.readouterr().out)
+    assert run(["validate", str(target), "--sample", "5"]) == 2
+    capsys.readouterr()
     shard = next(target.rglob("shards/*.h5"))
     content = bytearray(shard.read_bytes())
     content[content.rindex(b"\x28\xb5\x2f\xfd") + 20] ^= 0x10

@@ -4,18 +4,21 @@ import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from scans import WITH_POINTS, make_scan, write_xyz
 from solidcloud.builder.config import BuildConfig
+from solidcloud.builder.exact import loose_nodes, sample_nodes
 from solidcloud.builder.pipeline import build_archive
 from solidcloud.builder.verify import verify_archive
 from solidcloud.schemas.archive import Archive, shard_name, write_index, write_shard
 from solidcloud.schemas.codec import encode_voxel
-from solidcloud.schemas.errors import FormatError
+from solidcloud.schemas.errors import BadRequestError, FormatError
 from solidcloud.schemas.index import Header
 from solidcloud.schemas.voxel import VoxelData
+from solidcloud.server.cli import run
 
 
 @pytest.fixture(scope="module")
@@ -112,14 +115,59 @@ LOOSE = {
 }
 
 
+@pytest.mark.parametrize("check", ["deep", "exact"])
 @pytest.mark.parametrize("name", LOOSE)
-def test_a_loose_bound_is_found_by_the_deep_check_alone(name: str, copy: Path) -> None:
+def test_a_loose_bound_is_found_by_the_checks_of_bounds_alone(name: str, check: str, copy: Path) -> None:
     rewrite(copy, LOOSE[name])
     assert verify_archive(copy).faults == ()
-    (fault,) = verify_archive(copy, deep=True).faults
+    report = verify_archive(copy, **{check: True})
+    (fault,) = report.faults
     with Archive(copy) as archive:
         assert fault.startswith(archive.where(1))
     assert "does not enclose its points" in fault
+    assert report.exact_nodes == (report.nodes - 1 if check == "exact" else 0)
+    assert run(["validate", str(copy), f"--{check}"]) == 3
+
+
+def test_a_bound_one_step_too_small_is_found_by_the_exact_check(copy: Path) -> None:
+    """The least a bound can be wrong: of every node in turn whose radius a step less would not enclose."""
+    with Archive(copy) as archive:
+        voxel, links = archive.read_voxel(1)
+    assert loose_nodes(voxel, links, range(len(links.first))) == []
+    found = 0
+    for node in np.flatnonzero((voxel.nodes.radius > 0) & (links.cell >= 0)):
+        radius = voxel.nodes.radius.copy()
+        radius[node] -= 1
+        tight = voxel._replace(nodes=voxel.nodes._replace(radius=radius))
+        found += loose_nodes(tight, links, range(len(radius))) == [node]
+    # Radii are rounded up from the farthest point: one less never holds it.
+    assert found == ((voxel.nodes.radius > 0) & (links.cell >= 0)).sum() > 10
+
+
+def test_a_sample_is_of_nodes_all_over_the_archive_and_the_same_again(built: Path, copy: Path) -> None:
+    whole = verify_archive(built, exact=True)
+    assert whole.faults == () and whole.exact_nodes == whole.nodes > 100
+    for sample, proved in ((1, 1), (60, 60), (whole.nodes - 1, whole.nodes - 1), (10**9, whole.nodes)):
+        assert verify_archive(built, exact=True, sample=sample).exact_nodes == proved
+    counts = np.array([5, 0, 1000, 1, 7, 0])
+    drawn = sample_nodes(counts, 600)
+    assert sum(map(len, drawn)) == 600 and [part.tolist() for part in sample_nodes(counts, 600)] == [
+        part.tolist() for part in drawn
+    ]
+    for part, count in zip(drawn, counts, strict=True):
+        assert len(np.unique(part)) == len(part) and ((part >= 0) & (part < count)).all()
+    assert len(drawn[2]) > 550 and drawn[2].min() < 20 and drawn[2].max() > 980
+    # All radii of a voxel halved: a sample finds some of them, of a node it drew.
+    rewrite(copy, lambda v: v._replace(nodes=v.nodes._replace(radius=v.nodes.radius // 2)))
+    some = verify_archive(copy, exact=True, sample=whole.nodes // 2)
+    every = verify_archive(copy, exact=True)
+    assert 3 < len(some.faults) < len(every.faults) and set(some.faults) <= set(every.faults)
+
+
+@pytest.mark.parametrize("options", [{"exact": True, "sample": 0}, {"sample": 5}])
+def test_a_sample_that_is_none_is_refused(built: Path, options: dict[str, Any]) -> None:
+    with pytest.raises(BadRequestError, match="--sample"):
+        verify_archive(built, **options)
 
 
 def test_points_that_are_not_where_the_index_says_are_found(copy: Path) -> None:

@@ -1,0 +1,102 @@
+"""The closest point by descent: trees made by hand, every tie and border of a bound, and how little is looked at."""
+
+import os
+
+import numpy as np
+import pytest
+from solidcloud.builder.kernels.nearest import FAR, SearchTree, box_distance2, closest_other
+
+pytestmark = pytest.mark.interpreted
+interpreted_only = pytest.mark.skipif(
+    os.environ.get("NUMBA_DISABLE_JIT") != "1", reason="compiled code reads arrays unseen"
+)
+
+
+class Counted(np.ndarray):
+    """An array that counts how often an element of it is read."""
+
+    reads = 0
+
+    def __getitem__(self, key: object) -> object:
+        Counted.reads += 1
+        return np.asarray(super().__getitem__(key))[()]  # type: ignore[index]
+
+
+def tree_of(points: np.ndarray, leaf: int = 3, degree: int = 3) -> SearchTree:
+    """A tree over points in the order given, bounds rounded up, level by level from the root."""
+    runs = [(a, min(a + leaf, len(points))) for a in range(0, len(points), leaf)]
+    levels = [[(a, b, a, b - a, True) for a, b in runs]]
+    while len(levels[0]) > 1:
+        below = levels[0]
+        groups = [(i, min(i + degree, len(below))) for i in range(0, len(below), degree)]
+        levels.insert(0, [(below[i][0], below[j - 1][1], i, j - i, False) for i, j in groups])
+    rows, begins = [], np.cumsum([0, *map(len, levels)]).tolist()
+    for level, behind in zip(levels, begins[1:], strict=False):
+        rows += [(a, b, first if last else behind + first, n, last) for a, b, first, n, last in level]
+    center = np.array([(points[a:b].min(axis=0) + points[a:b].max(axis=0)) // 2 for a, b, *_ in rows])
+    radius = [
+        int(np.ceil(np.sqrt(((points[a:b] - c) ** 2).sum(axis=1).max())))
+        for (a, b, *_), c in zip(rows, center, strict=True)
+    ]
+    return SearchTree(
+        center, np.array(radius), np.array([r[2] for r in rows], np.int32),
+        np.array([r[3] for r in rows], np.uint8), np.array([r[4] for r in rows]), points,
+    )  # fmt: skip
+
+
+def brute(points: np.ndarray, queries: np.ndarray) -> np.ndarray:
+    """Squared distances to the closest distinct points."""
+    d2 = ((queries[:, None] - points) ** 2).sum(axis=2)
+    return np.where(d2 > 0, d2, FAR).min(axis=1)
+
+
+@pytest.mark.parametrize("side", [4, 30, 1000, 1 << 20])
+@pytest.mark.parametrize("count", [1, 2, 9, 60])
+def test_the_closest_is_that_of_brute_force(side: int, count: int) -> None:
+    rng = np.random.default_rng([side, count])
+    points = rng.integers(0, side, (count, 3))
+    points = points[np.lexsort(points.T)]
+    queries = np.concatenate([points, rng.integers(-side, 2 * side, (40, 3))])
+    best = np.full(len(queries), FAR)
+    closest_other(tree_of(points), queries, best)
+    expected = brute(points, queries)
+    assert best.tolist() == expected.tolist()
+    known = np.clip(expected - rng.integers(-1, 2, len(queries)), 0, FAR)
+    lowered = known.copy()
+    closest_other(tree_of(points), queries, lowered)
+    assert lowered.tolist() == np.minimum(known, expected).tolist()
+
+
+def test_far_apart_nothing_overflows() -> None:
+    """Distances whose squares take 62 bits, where a bound's square would not fit."""
+    points = np.array([[0, 0, 0], [1 << 30, 0, 0], [1 << 30, 1 << 30, 1 << 30]])
+    best = np.full(3, FAR)
+    closest_other(tree_of(points, leaf=1), points, best)
+    assert best.tolist() == [1 << 60, 1 << 60, 2 << 60]
+
+
+@interpreted_only
+@pytest.mark.parametrize(("kind", "centers", "points"), [("line", 11664, 3648), ("volume", 57468, 29940)])
+def test_as_little_is_looked_at_as_ever(kind: str, centers: int, points: int) -> None:
+    """What a bound is for: reads of coordinates, of 200 points by themselves; brute force takes 120,000 of points."""
+    rng = np.random.default_rng(5)
+    cloud = rng.integers(0, 1000, (200, 3)) if kind == "volume" else np.arange(200)[:, None] * [90, 0, 0]
+    if kind == "volume":
+        cloud = cloud[np.lexsort([*cloud.T, *(cloud // 250).T])]
+    tree, best, found = tree_of(cloud, leaf=4), np.full(len(cloud), FAR), []
+    for name in ("center", "points"):
+        Counted.reads = 0
+        best[:] = FAR
+        closest_other(tree._replace(**{name: getattr(tree, name).view(Counted)}), cloud, best)
+        found.append(Counted.reads)
+    assert best.tolist() == brute(cloud, cloud).tolist()
+    assert found == [centers, points]
+
+
+def test_the_box_is_solid_and_its_corners_are_where_they_are() -> None:
+    rng = np.random.default_rng(6)
+    low, high = np.array([-7, 2, 30]), np.array([-2, 2, 41])
+    queries = rng.integers(-12, 50, (200, 3))
+    out = np.empty(200, np.int64)
+    box_distance2(queries, low, high, out)
+    assert out.tolist() == ((queries - np.clip(queries, low, high)) ** 2).sum(axis=1).tolist()

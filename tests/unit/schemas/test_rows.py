@@ -1,0 +1,173 @@
+"""The rows of a record by the kernels alone, each against a few lines of plain Python."""
+
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from solidcloud.schemas.kernels.rows import (
+    LANES,
+    NO_AXIS,
+    delta_along,
+    join_planes,
+    lanes_to_points,
+    leaf_bytes,
+    leaf_column,
+    leaf_lanes,
+)
+
+pytestmark = pytest.mark.interpreted
+
+Links = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
+class Leaves(NamedTuple):
+    """Leaf nodes among other rows. runs: (begin, count, axis) of each, in the order of the rows."""
+
+    points: np.ndarray
+    runs: list[tuple[int, int, int]]
+    links: Links
+    count: np.ndarray
+    axis: np.ndarray
+    block_low: np.ndarray
+
+
+def leaves(seed: int, most: int = 300) -> Leaves:
+    """Leaf nodes of all sizes, of two cells, with rows of no leaf between; points below `most` from their corner."""
+    rng = np.random.default_rng(seed)
+    held = [1, LANES, 2, LANES - 1, *rng.integers(1, LANES + 1, 3).tolist()]
+    axes = [0, 1, 2, NO_AXIS, 2, 0, 1]
+    begins = np.cumsum([0, *held])
+    points = rng.integers(0, most, (begins[-1], 3)).astype(np.uint16)
+    first, is_leaf, cell, count, axis = [], [], [], [], []
+    for k, (a, n, along) in enumerate(zip(begins.tolist(), held, axes, strict=False)):
+        if k % 3 == 1:  # a row that is no leaf node, with figures that would do harm as one's
+            first, is_leaf, cell = [*first, 1], [*is_leaf, False], [*cell, -1]
+            count, axis = [*count, 9], [*axis, 0]
+        first, is_leaf, cell = [*first, a], [*is_leaf, True], [*cell, k % 2]
+        count, axis = [*count, n], [*axis, along]
+        if along != NO_AXIS:
+            run = slice(a, a + n)
+            points[run] = points[run][np.argsort(points[run, along], kind="stable")]
+    n = len(first)
+    low = rng.integers(0, 500, (3, n)).astype(np.uint16)
+    links = np.array(first, np.int32), np.array(is_leaf), np.array(cell, np.int32)
+    runs = [(a, k, along) for a, k, along in zip(begins.tolist(), held, axes, strict=False)]
+    return Leaves(points, runs, links, np.array(count, np.uint8), np.array(axis, np.uint8), low)
+
+
+def plain_deltas(own: Leaves) -> np.ndarray:
+    """The points with each run's sort axis as steps from the point before."""
+    deltas = own.points.astype(int)
+    for begin, count, axis in own.runs:
+        if axis != NO_AXIS:
+            column = own.points[begin : begin + count, axis].astype(int)
+            deltas[begin + 1 : begin + count, axis] = np.diff(column)
+    return deltas.astype(np.uint16)
+
+
+def planes_of(deltas: np.ndarray) -> np.ndarray:
+    """Low and high bytes of x, y, z, (6, p), and a plane behind that is another column's."""
+    planes = [column >> shift & 255 for column in deltas.T.astype(int) for shift in (0, 8)]
+    return np.array([*planes, planes[0] ^ 255], np.uint8)
+
+
+def padded(run: np.ndarray) -> list:
+    """The rows of a run, the last one repeated to LANES."""
+    return np.concatenate([run, np.repeat(run[-1:], LANES - len(run), axis=0)]).tolist()
+
+
+def read(
+    own: Leaves, voxel_steps: int = 1 << 20, log2: tuple[int, int] = (16, 15)
+) -> tuple[bool, np.ndarray]:
+    """What `leaf_lanes` says and writes; cells of the sizes given, one at the voxel's corner, one 1,000 steps off."""
+    lanes = np.full((len(own.runs) + 1, 3, LANES), 7, np.uint16)
+    cells = np.array([[0, 1000], [0, 2000], [0, 3000]], np.int32), np.array(log2, np.uint8)
+    nodes = own.count, own.axis, own.block_low
+    said = leaf_lanes(planes_of(plain_deltas(own)), own.links, nodes, cells, voxel_steps, lanes)
+    return bool(said), lanes
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_deltas_are_steps_along_the_sort_axis(seed: int) -> None:
+    own = leaves(seed)
+    before = own.points.copy()
+    runs = np.array([run for run in own.runs if run[2] != NO_AXIS], np.int64).T
+    assert np.array_equal(delta_along(own.points, *runs), plain_deltas(own))
+    assert np.array_equal(own.points, before)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_lanes_hold_the_points_of_every_leaf_node(seed: int) -> None:
+    own = leaves(seed, 20_000)
+    said, lanes = read(own)
+    assert said
+    for block, (begin, count, _) in enumerate(own.runs):
+        assert lanes[block].T.tolist() == padded(own.points[begin : begin + count])
+    assert (lanes[-1] == 7).all()
+    points = np.zeros_like(own.points)
+    lanes_to_points(lanes, own.links, own.count, points)
+    assert np.array_equal(points, own.points)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_point_one_step_outside_its_cell_or_voxel_is_seen(seed: int) -> None:
+    own = leaves(seed)
+    high = np.array([own.points[a : a + n].max(axis=0) + own.block_low[:, i] for i, (a, n) in leaf_rows(own)])
+    corner = np.array([[0, 0, 0], [1000, 2000, 3000]])[[own.links[2][i] for i, _ in leaf_rows(own)]]
+    inside = int((high + corner).max()) + 1
+    assert read(own, inside)[0] and not read(own, inside - 1)[0]
+    # A cell of 2^9 steps, and one leaf node moved until its farthest point is on the last step of it.
+    for at, (i, _) in enumerate(leaf_rows(own)):
+        for axis in range(3):
+            moved = own._replace(block_low=np.zeros_like(own.block_low))
+            moved.block_low[axis, i] = 511 - (high[at, axis] - own.block_low[axis, i])
+            assert read(moved, log2=(9, 9))[0]
+            moved.block_low[axis, i] += 1
+            assert not read(moved, log2=(9, 9))[0]
+            other = (10, 9) if own.links[2][i] == 0 else (9, 10)
+            assert read(moved, log2=other)[0]
+
+
+def leaf_rows(own: Leaves) -> list[tuple[int, tuple[int, int]]]:
+    """Row, and (begin, count), of every leaf node."""
+    return list(zip(np.flatnonzero(own.links[1]).tolist(), [run[:2] for run in own.runs], strict=True))
+
+
+def test_deltas_that_add_up_beyond_16_bits_are_outside() -> None:
+    # 3 * 30,000 wraps to 24,464, which would lie inside.
+    links = np.zeros(1, np.int32), np.ones(1, bool), np.zeros(1, np.int32)
+    nodes = np.full(1, 3, np.uint8), np.zeros(1, np.uint8), np.zeros((3, 1), np.uint16)
+    cells = np.zeros((3, 1), np.int32), np.full(1, 16, np.uint8)
+    planes = planes_of(np.array([[30_000, 0, 0]] * 3))
+    lanes = np.empty((1, 3, LANES), np.uint16)
+    assert not leaf_lanes(planes, links, nodes, cells, 1 << 20, lanes)
+    planes = planes_of(np.array([[20_000, 0, 0]] * 3))
+    assert leaf_lanes(planes, links, nodes, cells, 1 << 20, lanes)
+    assert lanes[0, 0].tolist() == [20_000, 40_000] + [60_000] * (LANES - 2)
+
+
+def test_columns_are_laid_out_as_the_points_are() -> None:
+    own = leaves(4)
+    column = np.random.default_rng(4).integers(0, 1 << 16, len(own.points)).astype(int)
+    lanes = np.full((len(own.runs), LANES), 7, np.uint16)
+    leaf_column(np.array([column & 255, column >> 8], np.uint8), own.links, own.count, lanes)
+    small = np.full((len(own.runs), LANES), 7, np.uint8)
+    greatest = leaf_bytes((column % 200).astype(np.uint8), own.links, own.count, small)
+    for block, (begin, count, _) in enumerate(own.runs):
+        assert lanes[block].tolist() == padded(column[begin : begin + count])
+        assert small[block].tolist() == padded(column[begin : begin + count] % 200)
+    assert greatest == (column % 200).max() > (column % 200)[-own.runs[-1][1] :].max()
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.uint32, np.uint64])
+@pytest.mark.parametrize("k", [1, 3])
+def test_planes_are_joined_low_bytes_first(dtype: type, k: int) -> None:
+    width = np.dtype(dtype).itemsize
+    planes = np.random.default_rng(width).integers(0, 256, (k * width, 5)).astype(np.uint8)
+    words = np.full((k, 5), 3, dtype)
+    join_planes(planes, words)
+    expected = [
+        [sum(int(planes[row * width + b, i]) << 8 * b for b in range(width)) for i in range(5)]
+        for row in range(k)
+    ]
+    assert words.tolist() == expected

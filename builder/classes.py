@@ -1,26 +1,141 @@
-"""The radius class of every point: what `local` and `border` need to know of its neighbours."""
+"""The radius class of every point: what the radius models `local` and `border` need to know of its neighbours.
+
+A class is a function of the distinct points within reach of the point and of nothing else: not of voxels, trees, files
+or jobs. So a voxel's are found among its own points and those of the voxels around that lie near enough, as the spool
+has them.
+"""
+
+import math
+from collections.abc import Collection, Iterator
+from fractions import Fraction
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..schemas.radius_model import LOCAL_CLASSES, RIM_BIT, local_radii
-from .kernels.classes import nearest_of_all
-from .octree import VoxelPoints
+from ..schemas.radius_model import FINEST_RADIUS, LOCAL_CLASSES, RIM_BIT
+from ..schemas.voxel_grid import KEY_BIAS, Lattice, voxel_coordinates, voxel_keys
+from .kernels.classes import FEW, point_classes
+from .kernels.neighbours import bound_boxes, box_starts
+from .kernels.octree import voxel_codes
+from .partition import Run, voxel_rows
 
-NEIGHBOURS = 6
+# Bits an axis of a Morton code.
+CODE_BITS = 21
+# Points that are not parted to save memory: what lies around fewer is not much less.
+LEAST_TOGETHER = 64
 
 
-def classify(points: VoxelPoints, step: float, models: tuple[str, ...]) -> tuple[NDArray[np.uint8], int]:
-    """The class (n,) of each point of a voxel, and how many had too few neighbours within twice the largest radius."""
-    distinct, back = np.unique(points.local, axis=0, return_inverse=True)
-    limits = np.array([int(4 * (r / step) ** 2) for r in local_radii()], np.int64)
-    best = np.empty((len(distinct), NEIGHBOURS), np.int64)
-    nearest_of_all(distinct, limits[-1], NEIGHBOURS, best)
-    farthest = np.where(best[:, -1] < 0, limits[-1] + 1, best[:, -1])
-    classes = np.zeros(len(distinct), np.uint8)
-    if "local" in models:
-        classes |= np.minimum(np.searchsorted(limits, farthest), LOCAL_CLASSES - 1).astype(np.uint8)
-    if "border" in models:
-        classes |= np.where(best[:, 2] < 0, RIM_BIT, 0).astype(np.uint8)
-    back = back.reshape(-1)
-    return classes[back], int(np.count_nonzero((farthest > limits[-1])[back]))
+class Spool(NamedTuple):
+    """Where the points of a dataset lie while it is built. keys: (v,) uint64, of all its voxels, ascending.
+
+    dtype: a row of the runs.  most_near: points around those that are asked which may be held, as long as asking fewer
+    helps.
+    """
+
+    runs: tuple[Run, ...]
+    keys: NDArray[np.uint64]
+    dtype: np.dtype
+    lattice: Lattice
+    most_near: int
+
+
+class Classes(NamedTuple):
+    """Radius classes. of_point: (n,) uint8.  few: points that have too few neighbours for a local class."""
+
+    of_point: NDArray[np.uint8]
+    few: int
+
+
+def local_limits(step: float) -> NDArray[np.int64]:
+    """The squared distances (16,) [steps] of the last neighbour up to which each local class goes.
+
+    Class c stands for half of it, FINEST_RADIUS 2^(c / 2). step [m] and FINEST_RADIUS count as the decimals they are
+    written with: 20 steps of 0.1 mm are 2 mm.
+    """
+    finest2 = (2 * Fraction(repr(FINEST_RADIUS)) / Fraction(repr(step))) ** 2
+    return np.array([int(finest2 * 2**c) for c in range(LOCAL_CLASSES)], np.int64)
+
+
+def voxel_classes(key: int, local: NDArray[np.int32], models: Collection[str], spool: Spool) -> Classes:
+    """The class of each point of a voxel, local (n, 3) [voxel steps], n >= 1; equal points have the same."""
+    _, first, back = np.unique(voxel_codes(local), return_index=True, return_inverse=True)
+    own = local[first]  # in Morton order: a part of them is a part of space
+    limits2 = local_limits(spool.lattice.step)
+    reach = math.isqrt(int(limits2[-1])) + 1
+    found = np.empty(len(own), np.uint8)
+    parts = [(0, len(own))]
+    while parts:
+        begin, end = parts.pop()
+        asked = own[begin:end]
+        box = np.stack([asked.min(axis=0) - reach, asked.max(axis=0) + reach]).astype(np.int64)
+        most = spool.most_near if end - begin > LEAST_TOGETHER else None
+        near = _points_near(key, [own[:begin], own[end:]], box, spool, most)
+        if near is None:
+            middle = (begin + end) // 2
+            parts += [(begin, middle), (middle, end)]
+        else:
+            found[begin:end] = _classify(asked, near, limits2)
+    stored = (RIM_BIT - 1 if "local" in models else 0) | (RIM_BIT if "border" in models else 0)
+    return Classes((found & stored)[back], int(np.count_nonzero(found[back] & FEW)))
+
+
+def _points_near(
+    key: int, own: list[NDArray[np.int32]], box: NDArray[np.int64], spool: Spool, most: int | None
+) -> NDArray[np.int32] | None:
+    """The distinct points (m, 3) in a box (2, 3) around a part of a voxel, frame and box the voxel's; None: too many.
+
+    own: the voxel's other points.  most: how many are too many; None: any number is held.
+    """
+    held = 0
+    found = []
+    for points in (*own, *_around(key, box, spool)):
+        inside = points[((points >= box[0]) & (points <= box[1])).all(axis=1)].astype(np.int32)
+        held += len(inside)
+        if most is not None and held > most:
+            return None
+        found.append(inside)
+    return np.concatenate(found)
+
+
+def _around(key: int, box: NDArray[np.int64], spool: Spool) -> Iterator[NDArray[np.int64]]:
+    """The distinct points of each other voxel that a box reaches into, (m, 3) in this voxel's frame."""
+    steps = spool.lattice.voxel_steps
+    home = voxel_coordinates(np.array([key], np.uint64))[0]
+    low = np.maximum(home + box[0] // steps, -KEY_BIAS)
+    high = np.minimum(home + box[1] // steps, KEY_BIAS - 1)
+    if math.prod((high - low + 1).tolist()) < len(spool.keys):
+        axes = (np.arange(a, b + 1) for a, b in zip(low, high, strict=True))
+        keys = voxel_keys(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3))
+        keys = keys[np.isin(keys, spool.keys, assume_unique=True)]
+    else:  # voxels so small that there are fewer of them than places for them
+        voxels = voxel_coordinates(spool.keys)
+        keys = spool.keys[((voxels >= low) & (voxels <= high)).all(axis=1)]
+    for other in keys.tolist():
+        if other != key:
+            shift = (voxel_coordinates(np.array([other], np.uint64))[0] - home) * steps
+            inside = [
+                rows["local"][
+                    ((rows["local"] >= box[0] - shift) & (rows["local"] <= box[1] - shift)).all(axis=1)
+                ]
+                for rows in voxel_rows(other, spool.runs, spool.dtype)
+            ]
+            points = np.concatenate(inside)
+            yield points[np.unique(voxel_codes(points), return_index=True)[1]] + shift
+
+
+def _classify(
+    asked: NDArray[np.int32], near: NDArray[np.int32], limits2: NDArray[np.int64]
+) -> NDArray[np.uint8]:
+    """The classes (q,) of points (q, 3), among themselves and those near (m, 3), all distinct, FEW among the bits."""
+    points = np.concatenate([asked, near])
+    points -= points.min(axis=0)
+    # A voxel and what is around it may take more bits than a code has; only neighbours are wanted in order.
+    shift = max(0, int(points.max()).bit_length() - CODE_BITS)
+    order = np.argsort(voxel_codes(points >> shift), kind="stable")
+    points = points[order]
+    rows = np.where(order < len(asked), order, -1).astype(np.int32)
+    starts = box_starts(len(points))
+    classes = np.empty(len(asked), np.uint8)
+    point_classes(points, bound_boxes(points, starts), starts, rows, limits2, classes)
+    return classes

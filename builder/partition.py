@@ -5,7 +5,7 @@ second pass quantises the points and spools them: whenever a worker holds its sh
 that by voxel and writes it as one run. A voxel is later gathered from the few runs that hold some of it.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -254,15 +254,18 @@ def _write_run(unit: SpoolUnit, run: int, held: list[tuple[NDArray[np.uint64], N
     return Run(path, found, np.append(starts, len(keys)).astype(np.int64))
 
 
-def gather_voxel(key: int, runs: tuple[Run, ...], dtype: np.dtype) -> VoxelPoints:
-    """All points of one voxel, from the runs that hold some of it."""
-    parts = []
+def voxel_rows(key: int, runs: tuple[Run, ...], dtype: np.dtype) -> Iterator[NDArray]:
+    """The rows of one voxel, run by run, of those that hold some of it."""
     for run in runs:
         at = int(np.searchsorted(run.keys, np.uint64(key)))
         if at < len(run.keys) and int(run.keys[at]) == key:
             start, count = int(run.starts[at]), int(run.starts[at + 1] - run.starts[at])
-            parts.append(np.fromfile(run.path, dtype, count, offset=start * dtype.itemsize))
-    rows = np.concatenate(parts)
+            yield np.fromfile(run.path, dtype, count, offset=start * dtype.itemsize)
+
+
+def gather_voxel(key: int, runs: tuple[Run, ...], dtype: np.dtype) -> VoxelPoints:
+    """All points of one voxel, from the runs that hold some of it."""
+    rows = np.concatenate(list(voxel_rows(key, runs, dtype)))
     names = dtype.names or ()
     return VoxelPoints(
         np.ascontiguousarray(rows["local"]),

@@ -419,8 +419,9 @@ def _build_voxels(
     """Third pass: every voxel's octree and hierarchies, into the shards planned."""
     runs: tuple[Run, ...] = tuple(run for s in spooled for run in s.runs)
     shards = folder / SHARD_FOLDER
+    most_near = max(1 << 16, config.memory_bytes // (executor.jobs * VOXEL_BYTES_A_POINT))
     units = [
-        ShardUnit(number, keys, points, runs, header.lattice, config, header.archive_id, shards)
+        ShardUnit(number, keys, points, runs, header.lattice, config, most_near, header.archive_id, shards)
         for number, (keys, points) in enumerate(plans)
     ]
     with stages.stage("build", header.points, "points"):

@@ -12,14 +12,17 @@ from ..schemas.codec import Record, encode_voxel
 from ..schemas.radius_model import RADIUS_CLASSES
 from ..schemas.voxel import VoxelData
 from ..schemas.voxel_grid import Lattice
-from .classes import classify
+from .classes import Spool, voxel_classes
 from .config import SHARD_POINTS, BuildConfig
 from .octree import build_voxel
 from .partition import Run, gather_voxel, spool_dtype
 
 
 class ShardUnit(NamedTuple):
-    """One shard to be written. keys: its voxels, ascending.  points: in all of them.  lattice: the dataset's."""
+    """One shard to be written. keys: its voxels, ascending.  points: in all of them.
+
+    most_near: points around a voxel that may be held beside it, see classes.py.
+    """
 
     number: int
     keys: tuple[int, ...]
@@ -27,6 +30,7 @@ class ShardUnit(NamedTuple):
     runs: tuple[Run, ...]
     lattice: Lattice
     config: BuildConfig
+    most_near: int
     archive_id: bytes
     folder: Path
 
@@ -65,19 +69,21 @@ def plan_shards(keys: NDArray[np.uint64], counts: NDArray[np.int64]) -> list[tup
 
 def build_shard(unit: ShardUnit) -> Shard:
     """Gather, build, compress and write the voxels of one shard, one at a time."""
-    models = unit.config.stored_models()
-    with_classes = models != ("mean",)
+    dtype = spool_dtype(unit.config)
+    with_classes = unit.config.models != {"mean"}
+    all_keys = np.unique(np.concatenate([run.keys for run in unit.runs]))
+    spool = Spool(unit.runs, all_keys, dtype, unit.lattice, unit.most_near)
     counts, capped = np.zeros(RADIUS_CLASSES, np.int64), 0
 
     def voxels() -> Iterator[tuple[VoxelData, Record, NDArray[np.int64], NDArray[np.int64]]]:
         nonlocal counts, capped
         for key in unit.keys:
-            points = gather_voxel(key, unit.runs, spool_dtype(unit.config))
+            points = gather_voxel(key, unit.runs, dtype)
             if with_classes:
-                classes, alone = classify(points, unit.lattice.step, models)
-                counts += np.bincount(classes, minlength=RADIUS_CLASSES)
-                capped += alone
-                points = points._replace(radius_class=classes)
+                classes = voxel_classes(key, points.local, unit.config.models, spool)
+                counts += np.bincount(classes.of_point, minlength=RADIUS_CLASSES)
+                capped += classes.few
+                points = points._replace(radius_class=classes.of_point)
             voxel = build_voxel(key, points, unit.lattice.voxel_steps, unit.config)
             record = encode_voxel(voxel, unit.archive_id)
             yield (

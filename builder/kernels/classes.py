@@ -3,24 +3,44 @@
 import numba as nb
 import numpy as np
 
+from ...schemas.radius_model import RIM_BIT
+from .neighbours import STACK, closest_distinct
+
+# How many of the closest distinct points are looked at.
+NEIGHBOURS = 6
+# Set beside the class of a point that has fewer.
+FEW = 32
+
 
 @nb.njit(nogil=True, cache=True)
-def nearest_of_all(points, limit2, k, best):
-    """Write best (n, k) int64: the squared distances of the k closest distinct points, ascending; beyond limit2: -1."""
+def _local_class(closest, held, limits2):
+    """The least class whose limit holds the last of NEIGHBOURS; the last class where there are fewer."""
+    last = limits2.shape[0] - 1
+    if held < NEIGHBOURS:
+        return last
+    c = 0
+    while c < last and closest[held - 1, 0] > limits2[c]:
+        c += 1
+    return c
+
+
+@nb.njit(nogil=True, cache=True)
+def point_classes(points, boxes, starts, rows, limits2, classes):
+    """Write the radius classes of some points.
+
+    points, boxes, starts: as `closest_distinct` takes them.  rows: (n,) int32, where in `classes` a point's goes; -1:
+    nobody asks.  limits2: (c,) int64, the squared distances of the last neighbour up to which each local class goes,
+    ascending; beyond the last none is looked for.  Writes classes (q,) uint8: the local class, RIM_BIT on a rim, FEW
+    where there are not enough neighbours.
+    """
+    closest, stack = np.empty((NEIGHBOURS, 4), np.int64), np.empty((STACK, 2), np.int64)
     for i in range(points.shape[0]):
-        held = 0
-        for j in range(points.shape[0]):
-            d2 = np.int64(0)
-            for axis in range(3):
-                apart = np.int64(points[i, axis]) - np.int64(points[j, axis])
-                d2 += apart * apart
-            if d2 == 0 or d2 > limit2 or (held == k and d2 >= best[i, k - 1]):
-                continue
-            at = min(held, k - 1)
-            while at > 0 and best[i, at - 1] > d2:
-                best[i, at] = best[i, at - 1]
-                at -= 1
-            best[i, at] = d2
-            held = min(held + 1, k)
-        for j in range(held, k):
-            best[i, j] = -1
+        if rows[i] < 0:
+            continue
+        held = closest_distinct(points, boxes, starts, i, limits2[-1], closest, stack)
+        found = _local_class(closest, held, limits2)
+        if held < NEIGHBOURS:
+            found |= FEW
+        if held < 3:
+            found |= RIM_BIT
+        classes[rows[i]] = found

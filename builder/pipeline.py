@@ -4,15 +4,13 @@ Everything is made in a hidden folder beside the target and renamed at the end: 
 under the name asked for, and a failure leaves nothing behind.
 """
 
-import fcntl
 import hashlib
 import json
-import os
 import shutil
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache
 from itertools import pairwise
@@ -22,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..schemas.archive import INDEX_NAME, SHARD_FOLDER, Archive, sync_folder, write_index
+from ..schemas.archive import SHARD_FOLDER, Archive, write_index
 from ..schemas.errors import BadRequestError, CorruptError, ScanError, SolidcloudError
 from ..schemas.index import Header, Source
 from ..schemas.radius_model import RADIUS_CLASSES
@@ -47,6 +45,7 @@ from .radius import MeanDistance, archive_sums, mean_of_squares
 from .shards import Shard, ShardUnit, build_shard, plan_shards
 from .sources import NOT_FINITE, scan_files, sha256_of
 from .verify import verify_archive
+from .workplace import locked, made_parents, publish_folder, workplace
 
 # Bytes a point that building one voxel holds at its peak (measured with 10^7 points in one voxel: 128).
 VOXEL_BYTES_A_POINT = 160
@@ -110,7 +109,7 @@ def build_archive(
     target = Path(target)
     stages = _Stages(progress or Silent())
     files = scan_files(paths)
-    with _parents(target), _lock(target), _workplace(target, config.overwrite) as folder:
+    with made_parents(target), locked(target), workplace(target, config.overwrite) as folder:
         surveys, faulty = _survey(files, config, stages)
         lattice, lattice_source = choose_lattice(surveys, config)
         points = sum(s.count for s in surveys)
@@ -130,7 +129,7 @@ def build_archive(
             raise CorruptError(
                 f"{report.faults[0]}: what was written is not what reads back: check disk and memory"
             )
-        _publish(folder, target, config.overwrite)
+        publish_folder(folder, target, config.overwrite)
     return BuildSummary(
         archive=target,
         points=header.points,
@@ -147,101 +146,6 @@ def build_archive(
         skipped=dict(sum((Counter(s.skipped) for s in header.sources), Counter())),
         faults=tuple(s.fault for s in header.sources if s.fault),
     )
-
-
-def _check_target(target: Path, overwrite: bool) -> None:
-    """Refuse to write where something else is."""
-    if not target.exists() or (target.is_dir() and not any(target.iterdir())):
-        return
-    if not (target / INDEX_NAME).is_file():
-        raise BadRequestError(f"{target}: exists and is no archive, expected a new folder: give another -o")
-    if not overwrite:
-        raise BadRequestError(f"{target}: an archive is here already: give another -o, or --overwrite")
-    shards = list((target / SHARD_FOLDER).iterdir()) if (target / SHARD_FOLDER).is_dir() else []
-    strangers = [p for p in target.iterdir() if p.name not in (INDEX_NAME, SHARD_FOLDER)]
-    strangers += [p for p in shards if p.suffix != ".h5" or not p.is_file()]
-    if strangers:
-        raise BadRequestError(
-            f"{strangers[0]}: not part of an archive, and --overwrite would delete it: move it, or give another -o"
-        )
-
-
-@contextmanager
-def _parents(target: Path) -> Iterator[None]:
-    """Make the folders above the target; after a failure, remove those that were made here."""
-    made = [folder for folder in target.parents if not folder.exists()]
-    target.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        yield
-    except BaseException:
-        for folder in made:
-            with suppress(OSError):  # somebody else uses it by now
-                folder.rmdir()
-        raise
-
-
-@contextmanager
-def _lock(target: Path) -> Iterator[None]:
-    """Keep a second builder off the same target."""
-    path = target.parent / f".{target.name}.lock"
-    while True:
-        file = open(path, "w")  # noqa: SIM115  held open as long as the lock
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            file.close()
-            raise BadRequestError(
-                f"{target}: another build is writing it: wait for it, or give another -o"
-            ) from None
-        # The holder before us may have removed the file we just locked: then lock the one that is there now.
-        if path.exists() and os.fstat(file.fileno()).st_ino == path.stat().st_ino:
-            break
-        file.close()
-    try:
-        yield
-    finally:
-        path.unlink(missing_ok=True)
-        file.close()
-
-
-@contextmanager
-def _workplace(target: Path, overwrite: bool) -> Iterator[Path]:
-    """The hidden folder that the archive is made in; what an earlier, killed build left there goes first."""
-    _recover(target)
-    _check_target(target, overwrite)
-    folder = target.parent / f".{target.name}.building"
-    shutil.rmtree(folder, ignore_errors=True)
-    (folder / SHARD_FOLDER).mkdir(parents=True)
-    (folder / "spool").mkdir()
-    try:
-        yield folder
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
-
-
-def _recover(target: Path) -> None:
-    """Finish what an earlier build with `overwrite` left when it was killed between its two renames."""
-    old = target.parent / f".{target.name}.old"
-    if old.exists() and not target.exists():
-        os.rename(old, target)
-    shutil.rmtree(old, ignore_errors=True)
-
-
-def _publish(folder: Path, target: Path, overwrite: bool) -> None:
-    """Give the finished folder its name."""
-    sync_folder(folder)
-    if target.exists() and overwrite and (target / INDEX_NAME).is_file():
-        old = target.parent / f".{target.name}.old"
-        os.rename(target, old)
-        try:
-            os.rename(folder, target)
-        except OSError:
-            os.rename(old, target)
-            raise
-        shutil.rmtree(old)
-    else:
-        os.rename(folder, target)  # replaces an empty folder
-    sync_folder(target.parent)
 
 
 def _survey(paths: list[Path], config: BuildConfig, stages: _Stages) -> tuple[list[Survey], list[Survey]]:

@@ -385,7 +385,7 @@ def test_what_a_killed_build_left_is_removed(scans: list[Path], out: Path) -> No
 
 
 @pytest.mark.parametrize(
-    "stage", ["_spool", "_build_voxels", "_measure_radius", "verify_archive", "_publish"]
+    "stage", ["_spool", "_build_voxels", "_measure_radius", "verify_archive", "publish_folder"]
 )
 def test_a_failure_at_any_stage_leaves_nothing(
     stage: str, scans: list[Path], out: Path, monkeypatch: pytest.MonkeyPatch

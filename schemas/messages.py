@@ -136,7 +136,7 @@ class SceneInfo(msgspec.Struct, frozen=True):
     skipped: scans left out with `--skip-bad`.  record_bytes: of all records on disk.
     resident_bytes: of the whole archive, decoded.  effects: names a request may use; none in version 1.
     unknown: boxes like `bounds` of scans left out, where nothing is called clear; unknown_everywhere: of one of
-    them not even the bounds are known.
+    them not even the bounds are known.  radius_models: stored, so that a question may ask for them.
     """
 
     scene: str
@@ -163,6 +163,7 @@ class SceneInfo(msgspec.Struct, frozen=True):
     effects: list[str] = []
     unknown: list[list[list[float]]] = []
     unknown_everywhere: bool = False
+    radius_models: list[str] = []
 
 
 class ErrorReply(msgspec.Struct, frozen=True):

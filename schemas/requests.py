@@ -5,15 +5,16 @@ A request is checked when it is made, so a client is refused before it sends wha
 
 import math
 import operator
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
-from typing import Annotated, Any, Literal, get_type_hints
+from typing import Annotated, Any, Literal, TypedDict, get_type_hints
 
 import msgspec
 import numpy as np
 
 from .arrays import Poses, Positions
 from .errors import BadRequestError, TooLargeError
+from .radius_model import parse_radius_model
 
 # Caps of the protocol. They bound what one request can cost a server: 24 MB of points, 12.8 MB of poses (a sweep's
 # twice that), all under the largest message. Raised, a server of version 1 would drop the larger messages unanswered.
@@ -81,6 +82,22 @@ class Question(Request, frozen=True, kw_only=True):
     budget_ms: Duration | None = None
     budget_visits: Count | None = None
     radius_model: ModelName | None = None
+
+
+class QuestionOptions(TypedDict, total=False):
+    """The fields of `Question` as keyword arguments, here and in every method that asks one."""
+
+    tolerance: float
+    budget_ms: float | None
+    budget_visits: int | None
+    radius_model: str | None
+
+
+def is_bounded(options: Mapping[str, Any]) -> bool:
+    """Whether options of a question allow anything but an exact answer."""
+    return bool(options.get("tolerance")) or any(
+        options.get(name) is not None for name in ("budget_ms", "budget_visits")
+    )
 
 
 class CollideRequest(Question, frozen=True):
@@ -211,6 +228,7 @@ class PathRequest(Request, frozen=True):
     tolerance: Length | None = None
     budget_ms: Duration | None = None
     budget_visits: Count | None = None
+    radius_model: ModelName | None = None
 
     def __post_init__(self) -> None:
         Request.__post_init__(self)
@@ -218,7 +236,7 @@ class PathRequest(Request, frozen=True):
 
     def parameters(self) -> dict[str, Any]:
         """What was given for `op`; BadRequestError for what it does not take, or lacks."""
-        names = ("margin", "reach", "limit", "cluster_distance", "tolerance", "budget_ms", "budget_visits")
+        names = [name for name in self.__struct_fields__ if name not in ("avatar", "poses", "op")]
         given = {name: value for name in names if (value := getattr(self, name)) is not None}
         check_path_parameters(self.op, given)
         return given
@@ -228,7 +246,7 @@ def check_path_parameters(op: str, parameters: dict[str, Any]) -> None:
     """BadRequestError unless these are parameters that `op` takes along a path, with all that it needs."""
     if op not in PATH_PARAMETERS:
         raise BadRequestError(f"op {op!r} along a path: expected one of {', '.join(PATH_PARAMETERS)}")
-    taken = (*PATH_PARAMETERS[op], "tolerance", "budget_ms", "budget_visits")
+    taken = (*PATH_PARAMETERS[op], *Question.__struct_fields__)
     for name in parameters:
         if name not in taken:
             raise BadRequestError(f"{name} is no parameter of {op} along a path: it takes {', '.join(taken)}")
@@ -318,6 +336,11 @@ def _check_name(_: str, name: str) -> None:
         raise BadRequestError(f"avatar {name[:64]!r} of {len(name)} characters: expected 1 to 64")
 
 
+def _check_model(_: str, text: str) -> None:
+    """BadRequestError for what is no radius model."""
+    parse_radius_model(text)
+
+
 def _check_length(what: str, value: float) -> None:
     """BadRequestError for a length no answer exists for (NUMERICS.md N7, cases 14 and 15)."""
     if not 0 <= value < math.inf:
@@ -355,6 +378,8 @@ def _checks(kind: type[Request]) -> tuple[tuple[str, Any], ...]:
         kinds = {hint, *getattr(hint, "__args__", ())}
         if Name in kinds:
             found.append((name, _check_name))
+        elif ModelName in kinds:
+            found.append((name, _check_model))
         elif Length in kinds:
             found.append((name, _check_length))
         elif Duration in kinds:

@@ -177,9 +177,11 @@ def build(
     ] = None,
     keep: Annotated[str, typer.Option(help="Columns to keep: scan, intensity or both, by comma.")] = "",
     radius: Annotated[
-        float | None,
-        typer.Option(help="Radius of a point [m]; left out: half the mean closest-point distance."),
-    ] = None,
+        str,
+        typer.Option(
+            help="Radius models to store, by comma: mean, local, border; fixed:METRES, or a number, in place of mean."
+        ),
+    ] = "mean",
     strict: Annotated[bool, typer.Option("--strict", help="Fail on a point that is not finite.")] = False,
     skip_bad: Annotated[
         bool, typer.Option("--skip-bad", help="Leave out broken scans; their region is unknown.")
@@ -190,10 +192,11 @@ def build(
     as_json: AsJson = False,
 ) -> None:
     """Build one archive from scans."""
-    from ..builder.config import BuildConfig
+    from ..builder.config import BuildConfig, parse_radius
     from ..builder.pipeline import build_archive
     from .console import Bars, print_build
 
+    fixed, models = parse_radius(radius)
     config = BuildConfig(
         voxel=voxel,
         resolution=resolution,
@@ -204,7 +207,8 @@ def build(
         memory_bytes=parse_bytes(memory, "--memory"),
         spacing=spacing,
         keep=frozenset(filter(None, keep.split(","))),
-        radius=radius,
+        radius=fixed,
+        models=models,
         strict=strict,
         skip_bad=skip_bad,
         overwrite=overwrite,
@@ -224,17 +228,19 @@ def info(archive: ArchivePath, as_json: AsJson = False) -> None:
     """Say what an archive holds."""
     import msgspec
 
+    from ..schemas.index import radius_distribution
     from .console import print_info
     from .scene import describe
     from .store import Store
 
     store = Store(archive)
     found = describe(store, archive.resolve().name)
+    classes = radius_distribution(store.archive.header)
     store.close()
     if as_json:
-        _print_json(msgspec.to_builtins(found))
+        _print_json({**msgspec.to_builtins(found), "radius_classes": msgspec.to_builtins(classes)})
     else:
-        print_info(found)
+        print_info(found, classes)
 
 
 @app.command()
@@ -329,6 +335,13 @@ def query(
     ] = None,
     budget_ms: Annotated[float | None, typer.Option(help="Time for it all [ms]; default none.")] = None,
     budget_visits: Annotated[int | None, typer.Option(help="Node visits a pose; default none.")] = None,
+    radius_model: Annotated[
+        str | None,
+        typer.Option(
+            help="Radii of the scan's points: mean, local, border, local+border, each with a factor as in "
+            "local:0.8 if wanted, or fixed:METRES; default: the scene's one figure."
+        ),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Ask a server what poses of an avatar, rays, points or objects touch."""

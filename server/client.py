@@ -45,6 +45,7 @@ from ..schemas.messages import (
 )
 from ..schemas.requests import (
     check_path_parameters,
+    is_bounded,
     make_poses,
     make_positions,
 )
@@ -179,11 +180,8 @@ class Client(Questions):
         if len(array) > MAX_POSES:
             raise TooLargeError(f"path of {len(array)} poses: at most {MAX_POSES}: ask for it in pieces")
         request = PathRequest(name, array, op, **parameters)  # type: ignore[arg-type]
-        bounded = any(parameters.get(what) for what in ("tolerance",)) or any(
-            parameters.get(what) is not None for what in ("budget_ms", "budget_visits")
-        )
         total = max(0, len(array) - 1) if op == "sweep" else len(array)
-        return self._parts(PATH_ANSWERS[op], encode(request), name, total, bounded)
+        return self._parts(PATH_ANSWERS[op], encode(request), name, total, is_bounded(parameters))
 
     def _parts(
         self, kind: type[Cost], request: bytes, name: str, total: int, bounded: bool

@@ -11,12 +11,10 @@ from numpy.typing import NDArray
 from ..schemas.answers import PATH_ANSWERS, Cost
 from ..schemas.columns import join, without_part
 from ..schemas.errors import BadRequestError
-from ..schemas.requests import PATH_PARAMETERS
+from ..schemas.requests import PATH_PARAMETERS, Question
 from .pose_file import read_objects, read_poses, read_rays
 
-_EFFORT = ("tolerance", "budget_ms", "budget_visits")
-
-# What each question takes beside the scene, the effort and what all take; the first of these are needed.
+# What each question takes beside the scene and what all take; the first of these are needed.
 _OPTIONS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "collide": (("avatar", "poses"), ("radius", "margin")),
     "distance": (("avatar", "poses", "reach"), ("radius",)),
@@ -28,6 +26,8 @@ _OPTIONS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "path": (("avatar", "poses"), ("radius", "along", "margin", "reach", "limit", "cluster_distance")),
 }
 
+
+_OF_ALL = Question.__struct_fields__
 
 ReadPoints = Callable[[Path], NDArray[np.float64]]
 
@@ -72,9 +72,9 @@ def check_query(op: str, options: dict[str, Any]) -> Query:
             raise BadRequestError(f"--along {along}: expected one of {', '.join(PATH_PARAMETERS)}")
         needed, others = _OPTIONS[along][0], (*_OPTIONS[along][1], "along")
     asked = f"--op path --along {along}" if op == "path" else f"--op {op}"
-    takes = ", ".join(map(_option, (*needed, *others, *_EFFORT)))
+    takes = ", ".join(map(_option, (*needed, *others, *_OF_ALL)))
     for name in given:
-        if name not in (*needed, *others, *_EFFORT):
+        if name not in (*needed, *others, *_OF_ALL):
             raise BadRequestError(f"{_option(name)} does not go with {asked}: it takes {takes}")
     for name in needed:
         if name not in given:

@@ -5,7 +5,7 @@
 
 import time
 from collections.abc import Callable, Sequence
-from typing import Any, TypeVar
+from typing import Any, TypeVar, Unpack
 
 from ..schemas.answers import (
     CollideAnswers,
@@ -30,7 +30,14 @@ from ..schemas.messages import (
     decode_answer,
     encode,
 )
-from ..schemas.requests import Question, make_objects, make_poses, make_vectors
+from ..schemas.requests import (
+    Question,
+    QuestionOptions,
+    is_bounded,
+    make_objects,
+    make_poses,
+    make_vectors,
+)
 
 # Poses in one request: 512 KiB, so that one client's long list does not keep others waiting for seconds, and
 # an answer comes well within the timeout.
@@ -66,55 +73,34 @@ class Questions:
         name: str,
         poses: Any,
         margin: float = 0.0,
-        *,
-        tolerance: float = 0.0,
-        budget_ms: float | None = None,
-        budget_visits: int | None = None,
+        **options: Unpack[QuestionOptions],
     ) -> CollideAnswers:
         """Whether an avatar touches the scene, for k poses (k, 4, 4) float64, avatar to world.
 
-        margin: distance below which it is called contact [m].  tolerance [m], budget_ms, budget_visits: here and below,
-        what the answer may cost (WIRE.md).
+        margin: distance below which it is called contact [m].  options: here and below what every question takes:
+        tolerance [m], budget_ms, budget_visits, radius_model (WIRE.md).
         """
         array = make_poses(poses)
 
-        def request(part: slice, left: float | None) -> CollideRequest:
-            return CollideRequest(
-                name,
-                array[part],
-                float(margin),
-                tolerance=tolerance,
-                budget_ms=left,
-                budget_visits=budget_visits,
-            )
+        def request(part: slice, left: QuestionOptions) -> CollideRequest:
+            return CollideRequest(name, array[part], float(margin), **left)
 
-        bounded = tolerance > 0 or budget_ms is not None or budget_visits is not None
-        return self._question(CollideAnswers, request, len(array), budget_ms, [name], bounded=bounded)
+        return self._question(CollideAnswers, request, len(array), options, [name])
 
     def distance(
         self,
         name: str,
         poses: Any,
         reach: float,
-        *,
-        tolerance: float = 0.0,
-        budget_ms: float | None = None,
-        budget_visits: int | None = None,
+        **options: Unpack[QuestionOptions],
     ) -> DistanceAnswers:
         """How far an avatar is from the scene under each of k poses, up to `reach` [m]."""
         array = make_poses(poses)
 
-        def request(part: slice, left: float | None) -> DistanceRequest:
-            return DistanceRequest(
-                name,
-                array[part],
-                float(reach),
-                tolerance=tolerance,
-                budget_ms=left,
-                budget_visits=budget_visits,
-            )
+        def request(part: slice, left: QuestionOptions) -> DistanceRequest:
+            return DistanceRequest(name, array[part], float(reach), **left)
 
-        return self._question(DistanceAnswers, request, len(array), budget_ms, [name])
+        return self._question(DistanceAnswers, request, len(array), options, [name])
 
     def contacts(
         self,
@@ -123,23 +109,17 @@ class Questions:
         limit: int = 100,
         margin: float = 0.0,
         cluster_distance: float | None = None,
-        *,
-        tolerance: float = 0.0,
-        budget_ms: float | None = None,
-        budget_visits: int | None = None,
+        **options: Unpack[QuestionOptions],
     ) -> ContactsAnswers:
         """Which pairs of points are in contact under each of k poses: the deepest `limit` listed, all in clusters."""
         array = make_poses(poses)
 
-        def request(part: slice, left: float | None) -> ContactsRequest:
-            return ContactsRequest(
-                name, array[part], limit, float(margin), cluster_distance,
-                tolerance=tolerance, budget_ms=left, budget_visits=budget_visits,
-            )  # fmt: skip
+        def request(part: slice, left: QuestionOptions) -> ContactsRequest:
+            return ContactsRequest(name, array[part], limit, float(margin), cluster_distance, **left)
 
         # A pair takes 68 bytes and its cluster up to 116: a batch's answer stays far under the largest message.
         batch = max(1, min(SLOW_BATCH, (8 << 20) // (184 * max(1, limit))))
-        return self._question(ContactsAnswers, request, len(array), budget_ms, [name], batch=batch)
+        return self._question(ContactsAnswers, request, len(array), options, [name], batch=batch)
 
     def sweep(
         self,
@@ -147,10 +127,7 @@ class Questions:
         pose_from: Any,
         pose_to: Any,
         margin: float = 0.0,
-        *,
-        tolerance: float = 1e-6,
-        budget_ms: float | None = None,
-        budget_visits: int | None = None,
+        **options: Unpack[QuestionOptions],
     ) -> SweepAnswers:
         """When an avatar first touches the scene on its way from each of k poses to another."""
         begins, ends = make_poses(pose_from, "pose_from"), make_poses(pose_to, "pose_to")
@@ -159,23 +136,19 @@ class Questions:
                 f"{len(begins)} pose_from and {len(ends)} pose_to: expected as many of each"
             )
 
-        def request(part: slice, left: float | None) -> SweepRequest:
+        def request(part: slice, left: QuestionOptions) -> SweepRequest:
             return SweepRequest(
-                avatar=name, pose_from=begins[part], pose_to=ends[part], margin=float(margin),
-                tolerance=tolerance, budget_ms=left, budget_visits=budget_visits,
-            )  # fmt: skip
+                avatar=name, pose_from=begins[part], pose_to=ends[part], margin=float(margin), **left
+            )
 
-        return self._question(SweepAnswers, request, len(begins), budget_ms, [name], batch=SLOW_BATCH)
+        return self._question(SweepAnswers, request, len(begins), options, [name], batch=SLOW_BATCH)
 
     def raycast(
         self,
         origins: Any,
         directions: Any,
         reach: float,
-        *,
-        tolerance: float = 0.0,
-        budget_ms: float | None = None,
-        budget_visits: int | None = None,
+        **options: Unpack[QuestionOptions],
     ) -> RaycastAnswers:
         """Which scan point's sphere each of k rays, (k, 3) and (k, 3), hits first, up to `reach` [m]."""
         begins, towards = make_vectors(origins, "origins"), make_vectors(directions, "directions")
@@ -184,41 +157,30 @@ class Questions:
                 f"{len(begins)} origins and {len(towards)} directions: expected as many of each"
             )
 
-        def request(part: slice, left: float | None) -> RaycastRequest:
-            return RaycastRequest(
-                begins[part], towards[part], float(reach),
-                tolerance=tolerance, budget_ms=left, budget_visits=budget_visits,
-            )  # fmt: skip
+        def request(part: slice, left: QuestionOptions) -> RaycastRequest:
+            return RaycastRequest(begins[part], towards[part], float(reach), **left)
 
-        return self._question(RaycastAnswers, request, len(begins), budget_ms)
+        return self._question(RaycastAnswers, request, len(begins), options)
 
     def within(
         self,
         points: Any,
         reach: float,
-        *,
-        tolerance: float = 0.0,
-        budget_ms: float | None = None,
-        budget_visits: int | None = None,
+        **options: Unpack[QuestionOptions],
     ) -> WithinAnswers:
         """Which scan point is nearest to each of k loose points (k, 3), up to `reach` [m]."""
         array = make_vectors(points, "points")
 
-        def request(part: slice, left: float | None) -> WithinRequest:
-            return WithinRequest(
-                array[part], float(reach), tolerance=tolerance, budget_ms=left, budget_visits=budget_visits
-            )
+        def request(part: slice, left: QuestionOptions) -> WithinRequest:
+            return WithinRequest(array[part], float(reach), **left)
 
-        return self._question(WithinAnswers, request, len(array), budget_ms)
+        return self._question(WithinAnswers, request, len(array), options)
 
     def objects(
         self,
         objects: Sequence[Sequence[Any]],
         margin: float = 0.0,
-        *,
-        tolerance: float = 0.0,
-        budget_ms: float | None = None,
-        budget_visits: int | None = None,
+        **options: Unpack[QuestionOptions],
     ) -> ObjectsAnswers:
         """Which of several avatars (name, pose, group = 1, mask = all) touch the scene and one another.
 
@@ -226,34 +188,31 @@ class Questions:
         """
         items, poses = make_objects(objects)
 
-        def request(_: slice, left: float | None) -> ObjectsRequest:
-            return ObjectsRequest(
-                items, poses, float(margin), tolerance=tolerance, budget_ms=left, budget_visits=budget_visits
-            )
+        def request(_: slice, left: QuestionOptions) -> ObjectsRequest:
+            return ObjectsRequest(items, poses, float(margin), **left)
 
         names = list(dict.fromkeys(item.avatar for item in items))
-        return self._question(ObjectsAnswers, request, len(items), budget_ms, names, batch=max(1, len(items)))
+        return self._question(ObjectsAnswers, request, len(items), options, names, batch=max(1, len(items)))
 
     def _question(
         self,
         kind: type[_A],
-        request: Callable[[slice, float | None], Question],
+        request: Callable[[slice, QuestionOptions], Question],
         k: int,
-        budget_ms: float | None,
+        options: QuestionOptions,
         names: Sequence[str] = (),
         *,
-        batch: int | None = None,
-        bounded: bool = True,
+        batch: int = BATCH_POSES,
     ) -> _A:
         """Ask for k answers, in several requests where they are many.
 
-        request: makes the one for a slice, with so much left of the budget [ms].  names: the avatars it is about.
-        An answer that no message holds is asked for again in smaller requests, but for that of `objects`, which is one.
+        request: makes the one for a slice, with the options that are left to it: what earlier ones took is gone from
+        the budget.  names: the avatars it is about. An answer that no message holds is asked for again in smaller
+        requests, but for that of `objects`, which is one.
         """
-        batch = batch or BATCH_POSES
         parts: list[_A] = []
         begin = time.monotonic()
-        start, left = 0, budget_ms
+        start, budget, left = 0, options.get("budget_ms"), options
         while not parts or start < k:
             stop = min(start + batch, k)
             try:
@@ -264,11 +223,12 @@ class Questions:
                 batch = (stop - start + 1) // 2
                 continue
             finally:
-                if budget_ms is not None:
-                    left = max(0.0, budget_ms - (time.monotonic() - begin) * 1e3)
+                if budget is not None:
+                    rest = max(0.0, budget - (time.monotonic() - begin) * 1e3)
+                    left = {**options, "budget_ms": rest}
             if payload is None:
                 # Not asked for the rest: a server that is frozen would cost a timeout for every batch.
-                parts.append(unknown(kind, k - start, bounded=bounded))
+                parts.append(unknown(kind, k - start, bounded=is_bounded(options)))
                 break
             parts.append(check_answers(decode_answer(kind, payload), stop - start))
             start = stop

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -24,7 +24,7 @@ from ..schemas.answers import (
 )
 from ..schemas.errors import BadRequestError, UnknownAvatarError
 from ..schemas.messages import WIRE_VERSION, AvatarInfo, SceneInfo, SourceInfo
-from ..schemas.requests import make_objects, make_poses
+from ..schemas.requests import QuestionOptions, make_objects, make_poses
 from .avatar import AvatarModel, make_avatar
 from .collide import collide
 from .contacts import contacts
@@ -33,7 +33,7 @@ from .effort import EXACT, Effort, make_effort
 from .objects import objects as ask_objects
 from .path import PATH_THREADS, largest_part, path_parts, path_question
 from .rays import raycast
-from .request import make_scene_data, with_radius_model
+from .request import SceneData, make_scene_data, with_radius_model
 from .residency import Residency
 from .session import Walker
 from .store import Store
@@ -161,26 +161,34 @@ class Scene:
             )
         return AvatarInfo(name, len(model.points), model.radius, model.bounding_radius)
 
+    def _terms(
+        self,
+        tolerance: float = 0.0,
+        budget_ms: float | None = None,
+        budget_visits: int | None = None,
+        radius_model: str | None = None,
+    ) -> tuple[SceneData, Effort]:
+        """What a question with these options reads, and what it may cost."""
+        effort = make_effort(tolerance, budget_ms, budget_visits)
+        return self._data if radius_model is None else self._radius_model(radius_model), effort
+
     def collide(
         self,
         name: str,
         poses: ArrayLike,
         margin: float = 0.0,
         *,
-        tolerance: float = 0.0,
-        budget_ms: float | None = None,
-        budget_visits: int | None = None,
-        radius_model: str | None = None,
         client: str = "",
+        **options: Unpack[QuestionOptions],
     ) -> CollideAnswers:
         """Whether avatar `name` touches the scene under each of the poses (k, 4, 4); see server/collide.py.
 
-        tolerance [m], budget_ms, budget_visits: what the answer may cost, here and below; see server/effort.py.
-        radius_model: how large the scan's spheres are, here and below; None: the archive's one figure. See
-        schemas/radius_model.py.
+        options, here and below: tolerance [m], budget_ms, budget_visits: what the answer may cost, see
+        server/effort.py; radius_model: how large the scan's spheres are, see schemas/radius_model.py, None: the
+        archive's one figure.
         """
-        effort = make_effort(tolerance, budget_ms, budget_visits)
-        return collide(self._radius_model(radius_model), self._avatar(name, client), poses, margin, effort)
+        data, effort = self._terms(**options)
+        return collide(data, self._avatar(name, client), poses, margin, effort)
 
     def walker(
         self, name: str, margin: float = 0.0, *, radius_model: str | None = None, client: str = ""
@@ -194,15 +202,12 @@ class Scene:
         poses: ArrayLike,
         reach: float,
         *,
-        tolerance: float = 0.0,
-        budget_ms: float | None = None,
-        budget_visits: int | None = None,
-        radius_model: str | None = None,
         client: str = "",
+        **options: Unpack[QuestionOptions],
     ) -> DistanceAnswers:
         """How far avatar `name` is from the scene under each pose, up to `reach` [m]; see server/distance.py."""
-        effort = make_effort(tolerance, budget_ms, budget_visits)
-        return distance(self._radius_model(radius_model), self._avatar(name, client), poses, reach, effort)
+        data, effort = self._terms(**options)
+        return distance(data, self._avatar(name, client), poses, reach, effort)
 
     def contacts(
         self,
@@ -212,18 +217,13 @@ class Scene:
         margin: float = 0.0,
         cluster_distance: float | None = None,
         *,
-        tolerance: float = 0.0,
-        budget_ms: float | None = None,
-        budget_visits: int | None = None,
-        radius_model: str | None = None,
         client: str = "",
+        **options: Unpack[QuestionOptions],
     ) -> ContactsAnswers:
         """Which pairs of points are in contact under each of the poses, deepest first; see server/contacts.py."""
-        effort = make_effort(tolerance, budget_ms, budget_visits)
+        data, effort = self._terms(**options)
         avatar = self._avatar(name, client)
-        return contacts(
-            self._radius_model(radius_model), avatar, poses, limit, margin, cluster_distance, effort
-        )
+        return contacts(data, avatar, poses, limit, margin, cluster_distance, effort)
 
     def sweep(
         self,
@@ -232,67 +232,53 @@ class Scene:
         pose_to: ArrayLike,
         margin: float = 0.0,
         *,
-        tolerance: float = 1e-6,
-        budget_ms: float | None = None,
-        budget_visits: int | None = None,
-        radius_model: str | None = None,
         client: str = "",
+        **options: Unpack[QuestionOptions],
     ) -> SweepAnswers:
         """When avatar `name` first touches the scene on its way between poses; see server/sweep.py."""
-        effort = make_effort(tolerance, budget_ms, budget_visits)
+        data, effort = self._terms(**{"tolerance": 1e-6, **options})
         avatar = self._avatar(name, client)
-        return sweep(self._radius_model(radius_model), avatar, pose_from, pose_to, margin, tolerance, effort)
+        return sweep(data, avatar, pose_from, pose_to, margin, effort.tolerance, effort)
 
     def raycast(
         self,
         origins: ArrayLike,
         directions: ArrayLike,
         reach: float,
-        *,
-        tolerance: float = 0.0,
-        budget_ms: float | None = None,
-        budget_visits: int | None = None,
-        radius_model: str | None = None,
+        **options: Unpack[QuestionOptions],
     ) -> RaycastAnswers:
         """Which scan point's sphere rays (k, 3), (k, 3) hit first, up to `reach` [m]; see server/rays.py."""
-        effort = make_effort(tolerance, budget_ms, budget_visits)
-        return raycast(self._radius_model(radius_model), origins, directions, reach, effort)
+        data, effort = self._terms(**options)
+        return raycast(data, origins, directions, reach, effort)
 
     def within(
         self,
         points: ArrayLike,
         reach: float,
-        *,
-        tolerance: float = 0.0,
-        budget_ms: float | None = None,
-        budget_visits: int | None = None,
-        radius_model: str | None = None,
+        **options: Unpack[QuestionOptions],
     ) -> WithinAnswers:
         """Which scan point is nearest to each loose point (k, 3), up to `reach` [m]; see server/within.py."""
-        effort = make_effort(tolerance, budget_ms, budget_visits)
-        return within(self._radius_model(radius_model), points, reach, effort)
+        data, effort = self._terms(**options)
+        return within(data, points, reach, effort)
 
     def objects(
         self,
         objects: Sequence[Sequence[Any]],
         margin: float = 0.0,
         *,
-        tolerance: float = 0.0,
-        budget_ms: float | None = None,
-        budget_visits: int | None = None,
-        radius_model: str | None = None,
         client: str = "",
+        **options: Unpack[QuestionOptions],
     ) -> ObjectsAnswers:
         """Which of several avatars (name, pose, group = 1, mask = all) touch the scene and one another.
 
         See server/objects.py.
         """
-        effort = make_effort(tolerance, budget_ms, budget_visits)
+        data, effort = self._terms(**options)
         items, poses = make_objects(objects)
         avatars = [self._avatar(item.avatar, client) for item in items]
         groups = np.array([item.group for item in items], np.uint32)
         masks = np.array([item.mask for item in items], np.uint32)
-        return ask_objects(self._radius_model(radius_model), avatars, poses, groups, masks, margin, effort)
+        return ask_objects(data, avatars, poses, groups, masks, margin, effort)
 
     def path(
         self,
@@ -342,6 +328,7 @@ def describe(store: Store, name: str) -> SceneInfo:
         voxel_size=lattice.voxel_size,
         radius=header.radius,
         radius_model=header.radius_model,
+        radius_models=list(header.models),
         radius_error=header.radius_error,
         radius_sample=header.radius_sample,
         moved_max=header.moved_max,

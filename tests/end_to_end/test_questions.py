@@ -3,13 +3,16 @@
 import importlib
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 
 import cases
+import classes
 import numpy as np
 import pytest
 import scans
 import zenoh
+from msgspec import structs
 from solidcloud.schemas import keys
 from solidcloud.schemas.answers import (
     PARTS,
@@ -108,10 +111,40 @@ QUESTIONS = {
     ),
 }
 
+# The same with spheres of several sizes.
+MODELS = {
+    "collide": "border:2",
+    "distance": "local:0.1",
+    "contacts": "local+border:0.2",
+    "sweep": "border:2",
+    "raycast": "fixed:0.04",
+    "objects": "local:0.1",
+}
+QUESTIONS |= {
+    f"{op}-{model}": (
+        lambda scene, ask=QUESTIONS[op][0], model=model: ask(_WithModel(scene, model)),
+        structs.replace(QUESTIONS[op][1], radius_model=model),
+        *QUESTIONS[op][2:],
+    )
+    for op, model in MODELS.items()
+}
+
+
+class _WithModel:
+    """A scene or client all of whose questions are asked with one radius model."""
+
+    def __init__(self, scene, model):
+        self._scene, self._model = scene, model
+
+    def __getattr__(self, name):
+        return partial(getattr(self._scene, name), radius_model=self._model)
+
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    with Scene.open(cases.build(tmp_path_factory.mktemp("corner"), POINTS).archive, "hall") as scene:
+    with classes.any_classes():
+        case = cases.build(tmp_path_factory.mktemp("corner"), POINTS, models=classes.STORED)
+    with Scene.open(case.archive, "hall") as scene:
         add_avatars(scene)
         add_avatars(scene, client="plain")
         yield scene
@@ -204,6 +237,8 @@ def test_contacts_that_no_message_holds_come_in_smaller_ones(scene, client, monk
         ("distance", {"reach": 0.05}),
         ("contacts", {"limit": 3, "margin": 0.05, "cluster_distance": 0.1}),
         ("sweep", {"margin": 0.01, "tolerance": 1e-4}),
+        ("collide", {"radius_model": "border:2"}),
+        ("sweep", {"radius_model": "local:0.1"}),
     ],
 )
 def test_a_path_is_its_question_in_parts(scene, client, op, parameters, monkeypatch):

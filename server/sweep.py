@@ -60,6 +60,21 @@ def _check(
     return scales.max(axis=0), most, loose
 
 
+def _from_origin(
+    data: SceneData, first: NDArray[np.float64], last: NDArray[np.float64]
+) -> tuple[SceneData, NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Scene and poses with the dataset's origin at zero, and where it was, world [m].
+
+    A pose on the way is computed, and rounded, there: a scene at map coordinates answers as it does at the origin, bit
+    for bit (NUMERICS.md case 1), and its poses on the way are as fine. The ends are what they are: t - O, N5.
+    """
+    origin = data.arrays.origin
+    first, last = first.copy(), last.copy()
+    for poses in (first, last):
+        poses[:, :3, 3] -= origin
+    return data._replace(arrays=data.arrays._replace(origin=np.zeros(3))), first, last, origin
+
+
 def _answers(
     progress: Progress, frozen: NDArray[np.float64], counts: NDArray[np.uint32], outside: NDArray[np.bool_],
     tolerance: float,
@@ -90,6 +105,7 @@ def sweep(
 ) -> SweepAnswers:
     """When the avatar first touches the scene on the screw motion (kernels/motion.py) from one pose to the other.
 
+    The motion is that of the dataset's frame: its translations are t - O (NUMERICS.md N5).
     pose_from, pose_to: (k, 4, 4) float64, avatar to world, rigid or of one scale, bits used as given.
     margin: distance below or at which two spheres are called in contact [m].  tolerance: how far any avatar point may
     go between `lower` and `upper` [m]; that of `effort` where it is larger.
@@ -108,6 +124,7 @@ def sweep(
     k = len(first)
     other_units = data.radius_units + to_units(margin, "margin")
     scales, units, loose = _check(data, avatar, first, last, other_units)
+    data, first, last, origin = _from_origin(data, first, last)
     progress = Progress(
         np.zeros(k), np.ones(k), np.ones(k), np.full(k, np.inf), np.zeros(k), np.full((k, 2, 3), np.nan),
         np.full(k, effort.visits, np.int64),
@@ -153,6 +170,9 @@ def sweep(
         lost[:] = 0.0
     met = lost <= until
     proved[met] = np.minimum(proved, lost)[met]
+    # The avatar's centre as the definition has it, in exact units, as `distance` and `contacts` name it.
+    progress.witness[:, 0] = np.rint(progress.witness[:, 0] * UNITS_PER_METRE) / UNITS_PER_METRE
+    progress.witness[:] += origin
     answers = _answers(progress, proved, counts, outside, tolerance)
     return msgspec.structs.replace(
         answers, engine_seconds=time.perf_counter() - begin, hits=hits, misses=misses,

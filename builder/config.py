@@ -18,6 +18,28 @@ DEFAULT_STEP = 1e-4
 CELL_KINDS = ("octree", "balanced")
 
 
+def parse_radius(text: str) -> tuple[float | None, frozenset[str]]:
+    """The stored figure [m], None for the mean, and the models of `--radius mean,local` or `fixed:0.01,border`.
+
+    A number alone is a figure. Raises BadRequestError for anything else.
+    """
+    radius, models = None, {"mean"}
+    parts = [part.strip() for part in text.split(",")]
+    wrong = f"--radius {text!r}: expected mean, local, border by comma, or fixed:METRES in place of mean"
+    for part in parts:
+        if part in STORED_MODELS:
+            models.add(part)
+            continue
+        try:
+            metres = float(part.removeprefix("fixed:"))
+        except ValueError:
+            raise BadRequestError(wrong) from None
+        if radius is not None or "mean" in parts:
+            raise BadRequestError(f"{wrong}: one figure is stored")
+        radius = metres
+    return radius, frozenset(models)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BuildConfig:
     """How an archive is built.

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .radius_model import RADIUS_CLASSES
+from .radius_model import LOCAL_CLASSES, RADIUS_CLASSES, local_radii
 from .voxel_grid import Lattice
 
 # One row a voxel, sorted by key. frame_*: where the dataset's only chunk lies in its shard, in the order of
@@ -97,6 +97,42 @@ class Header:
     def format_version(self) -> int:
         """The version of the format that says all of this: the first where nothing newer is in it."""
         return 2 if self.radius_class else 1
+
+
+@dataclass(frozen=True, slots=True)
+class LocalRadius:
+    """The points that `local` gives one radius [m]."""
+
+    radius: float
+    points: int
+
+
+@dataclass(frozen=True, slots=True)
+class RadiusDistribution:
+    """What the radius classes of an archive's points come to.
+
+    local: ascending, of those radii that some point has, empty where `local` is not stored.  capped: points that had
+    too few neighbours for a local class, and have the largest radius.  rim: points on the rim of a surface.
+    None: not stored.
+    """
+
+    local: tuple[LocalRadius, ...]
+    capped: int | None
+    rim: int | None
+
+
+def radius_distribution(header: Header) -> RadiusDistribution | None:
+    """How the radius classes are distributed; None for an archive without."""
+    if not header.radius_class:
+        return None
+    by_class = header.radius_counts.reshape(2, LOCAL_CLASSES)  # on a rim: the second row
+    local = zip(local_radii().tolist(), by_class.sum(axis=0).tolist(), strict=True)
+    with_local = "local" in header.models
+    return RadiusDistribution(
+        tuple(LocalRadius(*held) for held in local if held[1]) if with_local else (),
+        header.radius_capped if with_local else None,
+        int(by_class[1].sum()) if "border" in header.models else None,
+    )
 
 
 def _texts(header: Header) -> bytes:

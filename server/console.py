@@ -12,6 +12,7 @@ from rich.text import Text
 if TYPE_CHECKING:
     # Numba and HDF5 come with these; a bar needs neither.
     from ..builder.pipeline import BuildSummary
+    from ..schemas.index import RadiusDistribution
     from ..schemas.messages import SceneInfo
 
 
@@ -81,9 +82,9 @@ def print_build(summary: "BuildSummary") -> None:
     print_facts(_build_facts(summary))
 
 
-def print_info(found: "SceneInfo") -> None:
-    """What an archive says of itself."""
-    print_facts(_info_facts(found))
+def print_info(found: "SceneInfo", classes: "RadiusDistribution | None" = None) -> None:
+    """What an archive says of itself; classes: of its points, where they have any."""
+    print_facts((*_info_facts(found), *(_class_facts(classes, found.points) if classes else ())))
 
 
 def bytes_text(count: float) -> str:
@@ -117,6 +118,21 @@ def _build_facts(summary: "BuildSummary") -> Iterator[tuple[str, str]]:
     for reason, count in summary.skipped.items():
         yield "left out", f"{count:,} points: {reason}"
     yield "time", f"{summary.seconds:.1f} s ({stages}), {rate:,.0f} points/s"
+
+
+def _class_facts(classes: "RadiusDistribution", points: int) -> Iterator[tuple[str, str]]:
+    """A histogram of the local radii, how many points have no better one, and how many are on a rim."""
+    most = max((held.points for held in classes.local), default=0)
+    for held in classes.local:
+        bar = "█" * round(30 * held.points / most) or "▏"
+        yield f"local {length_text(held.radius)}", f"{held.points:>13,} {held.points / points:>6.1%} {bar}"
+    if classes.capped is not None:
+        yield (
+            "local capped",
+            f"{classes.capped:>13,} {classes.capped / points:>6.1%} with too few neighbours near",
+        )
+    if classes.rim is not None:
+        yield "border", f"{classes.rim:>13,} {classes.rim / points:>6.1%} on the rim of a surface"
 
 
 def _info_facts(found: "SceneInfo") -> Iterator[tuple[str, str]]:

@@ -67,6 +67,8 @@ def test_help_loads_no_numpy(verb: str) -> None:
         ("build {scan} -o {out} --degree 99", 2, "--degree 99"),
         ("build {scan} -o {out} --memory plenty", 2, "--memory 'plenty'"),
         ("build {scan} -o {out} --keep colour", 2, "colour"),
+        ("build {scan} -o {out} --radius huge", 2, "--radius 'huge': expected mean, local, border"),
+        ("build {scan} -o {out} --radius fixed:9", 2, "--radius 9.0: expected 0 to 8.0 m"),
         ("build {out}/nowhere.las -o {out}", 3, "nowhere.las: no such file"),
         ("info {out}", 3, "no archive here"),
         ("validate {out}", 3, "no archive here"),
@@ -164,6 +166,38 @@ def test_info_tells_counts_and_bounds(archive: Path, capsys: pytest.CaptureFixtu
     assert np.allclose(told["bounds"], [floor().min(axis=0), floor().max(axis=0)], atol=told["lattice_step"])
     assert run(["info", str(archive)]) == 0
     assert f"{len(floor()):,} in" in capsys.readouterr().out
+
+
+def test_radius_models_are_stored_and_told(
+    scan: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    build = ["build", str(scan), "--voxel", "2", "--jobs", "1", "-o"]
+    for radius, figure, model, models in (
+        ("mean", 0.05, "mean", ["mean"]),
+        ("0.02", 0.02, "given", ["mean"]),
+        ("fixed:0.02", 0.02, "given", ["mean"]),
+        ("mean,local,border", 0.05, "mean", ["mean", "local", "border"]),
+        ("fixed:0.03,local", 0.03, "given", ["mean", "local"]),
+    ):
+        target = tmp_path / radius
+        assert run([*build, str(target), "--radius", radius]) == 0
+        capsys.readouterr()
+        assert run(["info", str(target), "--json"]) == 0
+        told = json.loads(capsys.readouterr().out)
+        assert told["radius"] == pytest.approx(figure, rel=1e-9)
+        assert (told["radius_model"], told["radius_models"]) == (model, models)
+        assert told["format_version"] == (1 if models == ["mean"] else 2)
+        classes = told["radius_classes"]
+        assert (classes is None) == (models == ["mean"])
+        assert run(["info", str(target)]) == 0
+        shown = capsys.readouterr().out
+        assert ("local" in shown, "on the rim" in shown) == ("local" in models, "border" in models)
+        if classes:
+            assert sum(held["points"] for held in classes["local"]) == len(floor())
+            assert classes["capped"] == 0
+            assert (classes["rim"] is None) == ("border" not in models)
+            for held in classes["local"]:
+                assert f"{held['radius'] * 1e3:.4g} mm" in shown and f"{held['points']:,}" in shown
 
 
 def test_validate_names_the_record_with_a_flipped_byte(

@@ -133,3 +133,57 @@ def tightness(kind: str) -> np.ndarray:
 def test_leaf_spheres_are_at_most_a_quarter_larger_than_the_minimal_ball(kind: str) -> None:
     # Found: at most 1.031 on each of these, 1.01 on average; the bound is the one NUMERICS.md case 20 asks for.
     assert tightness(kind).max() <= 1.25
+
+
+def plain_center(points: np.ndarray, steps: int) -> np.ndarray:
+    """The centre guessed: the box's, then so many steps toward the farthest point."""
+    center = (points.min(axis=0) + points.max(axis=0)) * 0.5
+    for step in range(steps):
+        far = ((points - center) ** 2).sum(axis=1).argmax()
+        center = center + (points[far] - center) * (1 / (step + 4))
+    return center
+
+
+@pytest.mark.interpreted
+@pytest.mark.parametrize("unit_log2", [0, 3])
+@pytest.mark.parametrize(("n", "steps"), [(1, 32), (2, 32), (30, 32), (256, 32), (257, 8)])
+def test_a_bound_is_as_tight_as_its_guess(n: int, steps: int, unit_log2: int) -> None:
+    """Centre, radius and slab against numpy's, the direction against its eigenvectors, all to the step."""
+    rng = np.random.default_rng(n)
+    for _ in range(4):
+        # Three lengths well apart along directions of no axis, so that the least variance is without doubt.
+        turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        points = np.rint((rng.uniform(-1, 1, (n, 3)) * [9000, 5000, 700]) @ turn + 20_000).astype(np.int64)
+        bounds = bound(points, unit_log2)
+        unit = 1 << unit_log2
+        center = np.rint(plain_center(points.astype(float), steps) / unit).astype(np.int64)
+        assert bounds.center[0].tolist() == center.tolist()
+        apart = points - center * unit
+        farthest = int(ceil_sqrt(np.int64((apart**2).sum(axis=1).max())))
+        assert bounds.radius[0] == -(-farthest // unit)
+        normal = bounds.normal[0].astype(np.int64)
+        if n < 3:
+            assert not normal.any()
+        else:
+            direction = np.linalg.eigh(np.cov(points.T))[1][:, 0] * 127
+            direction = direction if direction @ normal > 0 else -direction
+            assert np.abs(normal - direction).max() <= 0.5 + 1e-6
+        along = apart @ normal
+        assert bounds.slab[0].tolist() == [along.min(), along.max()]
+
+
+@pytest.mark.interpreted
+def test_a_guess_whose_radius_does_not_fit_is_given_up_for_the_box() -> None:
+    # Four corners of a cube: toward them the centre leaves the box's, and the radius grows beyond the highest.
+    rng = np.random.default_rng(3)
+    given_up = 0
+    for _ in range(60):
+        points = rng.integers(0, 2, (5, 3)) * 255 + rng.integers(0, 2, (5, 3))
+        for highest in (160, 220):
+            bounds = bound(points, highest=highest)
+            guess = np.clip(np.rint(plain_center(points.astype(float), 32)), 0, highest).astype(np.int64)
+            fits = ((points - guess) ** 2).sum(axis=1).max() <= highest**2
+            box = np.clip(np.rint(plain_center(points.astype(float), 0)), 0, highest).astype(np.int64)
+            assert bounds.center[0].tolist() == (guess if fits else box).tolist()
+            given_up += not fits
+    assert 5 < given_up < 115

@@ -94,6 +94,16 @@ def test_a_cell_is_split_only_when_it_must_be() -> None:
 
 
 @pytest.mark.interpreted
+def test_a_cell_may_be_full() -> None:
+    codes = np.sort(voxel_codes(make_steps("noise", 3, 40, 64)))
+    assert [column.tolist() for column in split_octree(codes, 6, 6, 40)] == [[0], [6]]
+    assert len(split_octree(codes, 6, 6, 39)[0]) > 1
+    assert set(split_octree(codes, 6, 5, 40)[1].tolist()) == {5}, (
+        "cells above the largest are split, full or not"
+    )
+
+
+@pytest.mark.interpreted
 def test_points_on_cell_borders_are_in_one_cell() -> None:
     # NUMERICS.md case 10: the border belongs to the cell above it.
     borders = np.array([[x, y, z] for x in (511, 512) for y in (511, 512) for z in (0, 999)])

@@ -89,3 +89,47 @@ def test_leaves_are_sorted_along_their_longest_edge() -> None:
 def test_equal_and_extreme_coordinates_pack(side: int) -> None:
     points = np.array([[0, 0, 0], [side, side, side], [side, 0, side]] * 30)
     assert_is_a_tree(pack(points, 4, 2), 90, 4, 2)
+
+
+def plain_leaves(points: np.ndarray, leaf: int, degree: int) -> list[set[int]]:
+    """The points of every leaf node in order, by sorting whole runs where the kernel only partitions them."""
+
+    def cut(rows: list[int], parts: int) -> list[list[int]]:
+        if parts == 1:
+            return [rows]
+        axis = np.ptp(points[rows], axis=0).argmax()
+        rows = sorted(rows, key=lambda row: (points[row, axis], row))
+        at = -(-len(rows) // leaf) * (parts // 2) // parts * leaf
+        return cut(rows[:at], parts // 2) + cut(rows[at:], parts - parts // 2)
+
+    def grow(rows: list[int], capacity: int) -> list[set[int]]:
+        if capacity == 1:
+            return [set(rows)]
+        leaves = -(-len(rows) // leaf)
+        parts = -(-leaves // (capacity // degree))
+        return [found for part in cut(rows, parts) for found in grow(part, capacity // degree)]
+
+    capacity = 1
+    while capacity * leaf < len(points):
+        capacity *= degree
+    return grow(list(range(len(points))), capacity)
+
+
+@pytest.mark.parametrize("kind", ["plane", "noise", "duplicates", "pillar"])
+@pytest.mark.parametrize(("n", "leaf", "degree"), [(5, 1, 2), (33, 2, 3), (100, 4, 2), (150, 7, 5)])
+def test_parts_are_cut_along_their_longest_edge_ties_by_rank(
+    kind: str, n: int, leaf: int, degree: int
+) -> None:
+    points = make_steps(kind, n, n, 50)
+    tree = pack(points, leaf, degree)
+    leaves = range(tree.levels[-2], len(tree.begin))
+    found = [set(tree.order[tree.begin[i] : tree.end[i]].tolist()) for i in leaves]
+    assert found == plain_leaves(points, leaf, degree)
+
+
+def test_leaves_are_sorted_ties_by_rank() -> None:
+    points = np.array([[x, 0, 0] for x in (3, 1, 3, 0, 1, 3, 7)], np.int32)
+    order = np.array([6, 5, 4, 3, 2, 1, 0])
+    axis, low = np.zeros(1, np.uint8), np.zeros((1, 3), np.int64)
+    sort_leaves(points, order, np.array([0]), np.array([7]), 0, axis, low)
+    assert order.tolist() == [3, 1, 4, 0, 2, 5, 6]

@@ -8,18 +8,23 @@ has them.
 import math
 from collections.abc import Collection, Iterator
 from fractions import Fraction
+from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..schemas.radius_model import FINEST_RADIUS, LOCAL_CLASSES, RIM_BIT
+from ..schemas.radius_model import LOCAL_RADII, RIM_BIT
 from ..schemas.voxel_grid import KEY_BIAS, Lattice, voxel_coordinates, voxel_keys
 from .kernels.classes import FEW, point_classes
 from .kernels.neighbours import bound_boxes, box_starts
 from .kernels.octree import voxel_codes
 from .partition import Run, voxel_rows
 
+# Neighbours farther than this do not count [m]: so it is known which voxels have a say.
+REACH = 0.362
+# The local radius is the distance of neighbour number LOCAL_NEIGHBOUR over this.
+LOCAL_SHARE = 13
 # Bits an axis of a Morton code.
 CODE_BITS = 21
 # Points that are not parted to save memory: what lies around fewer is not much less.
@@ -47,22 +52,30 @@ class Classes(NamedTuple):
     few: int
 
 
-def local_limits(step: float) -> NDArray[np.int64]:
-    """The squared distances (16,) [steps] of the last neighbour up to which each local class goes.
+class Limits(NamedTuple):
+    """Squared distances [steps]. reach2: up to which a point is a neighbour.
 
-    Class c stands for half of it, FINEST_RADIUS 2^(c / 2). step [m] and FINEST_RADIUS count as the decimals they are
-    written with: 20 steps of 0.1 mm are 2 mm.
+    local2: (15,) int64, of neighbour number LOCAL_NEIGHBOUR, up to which each local class but the last goes.
     """
-    finest2 = (2 * Fraction(repr(FINEST_RADIUS)) / Fraction(repr(step))) ** 2
-    return np.array([int(finest2 * 2**c) for c in range(LOCAL_CLASSES)], np.int64)
+
+    reach2: int
+    local2: NDArray[np.int64]
+
+
+def class_limits(step: float) -> Limits:
+    """The limits on a lattice of this step [m], which counts as its decimal text: 10 steps of 0.1 mm are 1 mm."""
+    steps_a_metre = 1 / Fraction(repr(step))
+    radii = [Fraction(radius, 1_000_000) for radius in LOCAL_RADII[:-1]]
+    local2 = [int((LOCAL_SHARE * radius * steps_a_metre) ** 2) for radius in radii]
+    return Limits(int((Fraction(repr(REACH)) * steps_a_metre) ** 2), np.array(local2, np.int64))
 
 
 def voxel_classes(key: int, local: NDArray[np.int32], models: Collection[str], spool: Spool) -> Classes:
     """The class of each point of a voxel, local (n, 3) [voxel steps], n >= 1; equal points have the same."""
     _, first, back = np.unique(voxel_codes(local), return_index=True, return_inverse=True)
     own = local[first]  # in Morton order: a part of them is a part of space
-    limits2 = local_limits(spool.lattice.step)
-    reach = math.isqrt(int(limits2[-1])) + 1
+    limits = class_limits(spool.lattice.step)
+    reach = math.isqrt(limits.reach2)
     found = np.empty(len(own), np.uint8)
     parts = [(0, len(own))]
     while parts:
@@ -75,8 +88,8 @@ def voxel_classes(key: int, local: NDArray[np.int32], models: Collection[str], s
             middle = (begin + end) // 2
             parts += [(begin, middle), (middle, end)]
         else:
-            found[begin:end] = _classify(asked, near, limits2)
-    stored = (RIM_BIT - 1 if "local" in models else 0) | (RIM_BIT if "border" in models else 0)
+            found[begin:end] = _classify(asked, near, limits)
+    stored = np.uint8((RIM_BIT - 1 if "local" in models else 0) | (RIM_BIT if "border" in models else 0))
     return Classes((found & stored)[back], int(np.count_nonzero(found[back] & FEW)))
 
 
@@ -88,8 +101,8 @@ def _points_near(
     own: the voxel's other points.  most: how many are too many; None: any number is held.
     """
     held = 0
-    found = []
-    for points in (*own, *_around(key, box, spool)):
+    found: list[NDArray[np.int32]] = []
+    for points in chain(own, _around(key, box, spool)):
         inside = points[((points >= box[0]) & (points <= box[1])).all(axis=1)].astype(np.int32)
         held += len(inside)
         if most is not None and held > most:
@@ -124,9 +137,7 @@ def _around(key: int, box: NDArray[np.int64], spool: Spool) -> Iterator[NDArray[
             yield points[np.unique(voxel_codes(points), return_index=True)[1]] + shift
 
 
-def _classify(
-    asked: NDArray[np.int32], near: NDArray[np.int32], limits2: NDArray[np.int64]
-) -> NDArray[np.uint8]:
+def _classify(asked: NDArray[np.int32], near: NDArray[np.int32], limits: Limits) -> NDArray[np.uint8]:
     """The classes (q,) of points (q, 3), among themselves and those near (m, 3), all distinct, FEW among the bits."""
     points = np.concatenate([asked, near])
     points -= points.min(axis=0)
@@ -137,5 +148,5 @@ def _classify(
     rows = np.where(order < len(asked), order, -1).astype(np.int32)
     starts = box_starts(len(points))
     classes = np.empty(len(asked), np.uint8)
-    point_classes(points, bound_boxes(points, starts), starts, rows, limits2, classes)
+    point_classes(points, bound_boxes(points, starts), starts, rows, *limits, classes)
     return classes

@@ -6,7 +6,6 @@ is stored as a radius class a point, one byte: the local class in the low four b
 rim. A model turns classes into radii only when a question is asked, so one archive serves them all.
 """
 
-import math
 from collections.abc import Collection
 from typing import NamedTuple
 
@@ -22,9 +21,12 @@ STORED_MODELS = ("mean", "local", "border")
 LOCAL_CLASSES = 16
 RIM_BIT = 16
 RADIUS_CLASSES = 32
-# Local class c stands for FINEST_RADIUS * 2^(c / 2): 1 mm to 181 mm. The same ladder in every archive, so that a class
-# depends on a point's neighbours and on nothing else.
-FINEST_RADIUS = 0.001
+# The radius of each local class [micrometres]: 1 mm to 32 mm, each 2^(1/3) of the one before, so that rounding up adds
+# 26 % at most. The same ladder in every archive, so that a class depends on a point's neighbours and on nothing else;
+# integers, so that every builder draws the same line between two classes.
+LOCAL_RADII = (
+    1000, 1260, 1587, 2000, 2520, 3175, 4000, 5040, 6350, 8000, 10079, 12699, 16000, 20159, 25398, 32000
+)  # fmt: skip
 # A pair reaches 16 m at most, both radii and the margin together (server/kernels/placing.py): half of that is a scan
 # point's.
 MAX_RADIUS = 8.0
@@ -48,9 +50,7 @@ class RadiusModel(NamedTuple):
 
 def local_radii() -> NDArray[np.float64]:
     """The radius (16,) [m] of each local class, ascending."""
-    return np.array(
-        [FINEST_RADIUS * 2.0 ** (c // 2) * (math.sqrt(2.0) if c % 2 else 1.0) for c in range(LOCAL_CLASSES)]
-    )
+    return np.array(LOCAL_RADII) / 1e6
 
 
 def parse_radius_model(text: str) -> RadiusModel:

@@ -1,13 +1,12 @@
 """Radius models: their names, and the radii that classes stand for."""
 
-import math
-
 import numpy as np
 import pytest
 from solidcloud.schemas.errors import BadRequestError
 from solidcloud.schemas.radius_model import (
     BORDER_SHARE,
     LOCAL_CLASSES,
+    LOCAL_RADII,
     MAX_RADIUS,
     RADIUS_CLASSES,
     RIM_BIT,
@@ -51,11 +50,11 @@ def test_what_is_none_is_refused(text: str) -> None:
         parse_radius_model(text)
 
 
-def test_the_ladder_doubles_every_second_class() -> None:
+def test_the_ladder_doubles_every_third_class() -> None:
     radii = local_radii()
-    assert len(radii) == LOCAL_CLASSES and radii[0] == 0.001
-    assert np.allclose(radii, 0.001 * np.sqrt(2.0) ** np.arange(16), rtol=1e-15, atol=0)
-    assert (radii[2:] == 2 * radii[:-2]).all()
+    assert len(radii) == LOCAL_CLASSES
+    assert (radii[::3] == [0.001, 0.002, 0.004, 0.008, 0.016, 0.032]).all()
+    assert np.allclose(radii, 0.001 * np.cbrt(2.0) ** np.arange(16), rtol=0, atol=0.5e-6)
 
 
 def test_one_radius_for_all_is_one_entry() -> None:
@@ -68,7 +67,7 @@ def test_radii_by_class() -> None:
     border = class_radii("border", 0.5, ALL)
     both = class_radii("local+border", 0.5, ALL)
     for c in range(RADIUS_CLASSES):
-        own = 0.001 * math.sqrt(2.0) ** (c % LOCAL_CLASSES)
+        own = LOCAL_RADII[c % LOCAL_CLASSES] * 1e-6
         share = BORDER_SHARE if c & RIM_BIT else 1.0
         assert abs(local[c] - 2 * own * UNITS_PER_METRE) <= 1
         assert border[c] == round(0.5 * share * UNITS_PER_METRE)

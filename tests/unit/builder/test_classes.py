@@ -1,0 +1,240 @@
+"""Radius classes equal brute force, and are a function of the points around: not of voxels, files, jobs or memory."""
+
+import math
+from fractions import Fraction
+from pathlib import Path
+
+import naive_classes
+import numpy as np
+import pytest
+import solidcloud.builder.shards as shards
+from numpy.typing import NDArray
+from scans import make_scan, write_xyz
+from solidcloud.builder.classes import Spool, class_limits, voxel_classes
+from solidcloud.builder.config import BuildConfig, parse_radius
+from solidcloud.builder.kernels.classes import FEW, point_classes
+from solidcloud.builder.kernels.neighbours import bound_boxes, box_starts
+from solidcloud.builder.pipeline import build_archive
+from solidcloud.builder.radius import voxel_points
+from solidcloud.builder.verify import verify_archive
+from solidcloud.schemas.archive import Archive
+from solidcloud.schemas.errors import BadRequestError
+from solidcloud.schemas.index import Header, radius_distribution
+from solidcloud.schemas.radius_model import LOCAL_CLASSES, RIM_BIT, local_radii
+
+STEP = 0.001
+ALL = frozenset({"mean", "local", "border"})
+
+
+def build(folder: Path, *clouds: NDArray[np.int64], **options: object) -> Path:
+    """An archive of scans, each of lattice points (n, 3)."""
+    name = f"{sum(1 for _ in folder.iterdir())}"
+    paths = [write_xyz(folder / f"{name}-{i}.xyz", cloud * STEP) for i, cloud in enumerate(clouds)]
+    config = BuildConfig(
+        **{"resolution": STEP, "jobs": 1, "cell_points": 40, "leaf": 8, "models": ALL, **options}
+    )
+    build_archive(paths, folder / name, config)
+    return folder / name
+
+
+def stored(folder: Path) -> tuple[NDArray[np.int64], NDArray[np.uint8], Header]:
+    """All points (n, 3) of an archive [lattice steps], sorted, with their classes (n,)."""
+    rows = []
+    with Archive(folder) as archive:
+        for row in range(len(archive.voxels)):
+            voxel, links = archive.read_voxel(row)
+            lattice = (
+                voxel_points(voxel, links) + archive.coordinates[row] * archive.header.lattice.voxel_steps
+            )
+            rows.append(np.column_stack([lattice, voxel.radius_class]))
+        table = np.concatenate(rows)
+        table = table[np.lexsort((table[:, 2], table[:, 1], table[:, 0]))]
+        return table[:, :3], table[:, 3].astype(np.uint8), archive.header
+
+
+def cloud(kind: str, seed: int, count: int = 400, size: int = 1500) -> NDArray[np.int64]:
+    """Lattice points (n, 3) with the least coordinate of each axis 0: dense and thin parts, some points twice."""
+    rng = np.random.default_rng(seed)
+    steps = np.floor(make_scan(kind, seed, count) / 2 * size).astype(np.int64)
+    steps[: count // 3] = steps[: count // 3] // 6 + size // 3
+    steps = np.concatenate([steps, steps[rng.integers(len(steps), size=count // 8)]])
+    return steps - steps.min(axis=0)
+
+
+def judge(lattice: NDArray[np.int64]) -> tuple[NDArray[np.uint8], int]:
+    """The class (n,) of each point by brute force, and how many have too few neighbours."""
+    of_place = naive_classes.judge(lattice, "0.001")
+    judged = [of_place[tuple(point)] for point in lattice.tolist()]
+    classes = np.array([found.local + RIM_BIT * found.rim for found in judged], np.uint8)
+    return classes, sum(found.few for found in judged)
+
+
+@pytest.mark.parametrize("kind", ["plane", "corner", "pillar", "noise", "duplicates"])
+def test_classes_equal_brute_force_for_any_voxels(kind: str, tmp_path: Path) -> None:
+    lattice = cloud(kind, 4)
+    # Voxels larger than all, of half of it, and smaller than what a class looks at.
+    for voxel in (8.0, 0.7, 0.16):
+        points, classes, header = stored(build(tmp_path, lattice, voxel=voxel))
+        expected, few = judge(points)
+        assert np.array_equal(classes, expected)
+        assert len(np.unique(classes)) > 4
+        assert header.radius_capped == few
+        assert header.radius_counts.tolist() == np.bincount(expected, minlength=32).tolist()
+        assert header.models == ("mean", "local", "border")
+
+
+def test_a_shifted_grid_gives_the_same_classes(tmp_path: Path) -> None:
+    lattice = cloud("corner", 5)
+    found = set()
+    for shift in ([0, 0, 0], [77, 301, 5], [349, 1, 200]):
+        # One point far off moves the origin, and with it all voxels.
+        far = -5000 - np.array(shift)
+        points, classes, _ = stored(build(tmp_path, np.concatenate([lattice, [far]]), voxel=0.35))
+        here = (points >= -far).all(axis=1)
+        assert np.array_equal(points[here] + far, sorted(lattice.tolist()))
+        found.add(classes[here].tobytes())
+    assert len(found) == 1
+
+
+def test_the_archive_is_the_same_for_any_order_of_files_jobs_and_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clouds = [cloud(kind, 6) for kind in ("plane", "corner", "noise")]
+    paths = [write_xyz(tmp_path / f"{i}.xyz", c * STEP) for i, c in enumerate(clouds)]
+
+    def built(name: str, files: list[Path], **options: object) -> dict[str, bytes]:
+        config = BuildConfig(
+            **{"resolution": STEP, "voxel": 0.4, "jobs": 1, "models": ALL, "cell_points": 40, **options}
+        )
+        build_archive(files, tmp_path / name, config)
+        assert verify_archive(tmp_path / name, deep=True).faults == ()
+        return {p.name: p.read_bytes() for p in sorted((tmp_path / name).rglob("*.h5"))}
+
+    first = built("a", paths)
+    assert built("b", paths[::-1]) == first
+    assert built("c", paths, jobs=2) == first
+    asked = []
+    classes_of = shards.voxel_classes
+
+    def short_of_memory(key: int, local: NDArray[np.int32], models: frozenset[str], spool: Spool) -> object:
+        asked.append(key)
+        return classes_of(key, local, models, spool._replace(most_near=20))
+
+    monkeypatch.setattr(shards, "voxel_classes", short_of_memory)
+    assert built("d", paths) == first
+    assert len(asked) > 8
+
+
+def test_a_part_is_asked_with_what_is_around_it_alone(tmp_path: Path) -> None:
+    # Halved until what lies around a part is few enough, or the part is.
+    local = np.unique(cloud("noise", 7, 2000), axis=0).astype(np.int32)
+    lattice = type("Lattice", (), {"step": STEP, "voxel_steps": 1 << 20})()
+    key = 0x1C0000000000000  # voxel (0, 0, 0)
+    for most in (10, 200, 10_000):
+        spool = Spool((), np.array([key], np.uint64), np.dtype([("local", "<i4", (3,))]), lattice, most)
+        found = voxel_classes(key, local, ALL, spool)
+        expected, few = judge(local.astype(np.int64))
+        assert np.array_equal(found.of_point, expected)
+        assert found.few == few
+
+
+@pytest.mark.parametrize("models", [{"local"}, {"border"}, {"local", "border"}])
+def test_only_what_is_asked_for_is_stored(models: set[str], tmp_path: Path) -> None:
+    lattice = cloud("corner", 8)
+    full = stored(build(tmp_path, lattice))[1]
+    _, classes, header = stored(build(tmp_path, lattice, models=frozenset({"mean", *models})))
+    kept = ("local" in models) * (RIM_BIT - 1) + ("border" in models) * RIM_BIT
+    assert np.array_equal(classes, full & kept)
+    assert set(header.models) == {"mean", *models}
+    found = radius_distribution(header)
+    assert found is not None
+    local = np.bincount(full % 16, minlength=16)
+    assert [(r.radius, r.points) for r in found.local] == (
+        [(r, n) for r, n in zip(local_radii(), local, strict=True) if n] if "local" in models else []
+    )
+    assert (found.capped is None) == ("local" not in models)
+    assert found.rim == (int((full >= RIM_BIT).sum()) if "border" in models else None)
+
+
+def test_without_classes_the_format_is_the_first(tmp_path: Path) -> None:
+    lattice = cloud("plane", 8)
+    versions = []
+    for models in ({"mean"}, {"mean", "local"}):
+        folder = build(tmp_path, lattice, models=frozenset(models))
+        with Archive(folder) as archive:
+            versions.append(archive.header.format_version)
+            assert (archive.read_voxel(0)[0].radius_class is None) == (models == {"mean"})
+            assert (radius_distribution(archive.header) is None) == (models == {"mean"})
+    assert versions == [1, 2]
+
+
+@pytest.mark.parametrize("step", ["0.0001", "0.001", "0.002", "1e-06", "0.25", "0.0009765625"])
+def test_limits_are_the_last_integers_that_the_definition_holds(step: str) -> None:
+    limits, size = class_limits(float(step)), Fraction(step)
+    assert limits.reach2 * size**2 <= naive_classes.REACH**2 < (limits.reach2 + 1) * size**2
+    assert len(limits.local2) == len(naive_classes.LADDER) - 1 == LOCAL_CLASSES - 1
+    for limit, radius in zip(limits.local2.tolist(), naive_classes.LADDER, strict=False):
+        assert limit * size**2 <= (13 * Fraction(radius, 1_000_000)) ** 2 < (limit + 1) * size**2
+    # So that no point farther than the last neighbour that counts could have another class than the last.
+    assert 13 * naive_classes.LADDER[-2] < 362_000 < 13 * naive_classes.LADDER[-1]
+
+
+def test_a_length_on_the_ladder_is_not_rounded_up() -> None:
+    # 130 steps of 0.1 mm are 13 mm, though 0.0001 is a little more than that as float64.
+    assert class_limits(1e-4).local2[0] == 130**2
+    assert class_limits(1e-3).local2[3] == 26**2
+
+
+@pytest.mark.interpreted
+@pytest.mark.parametrize("held", [0, 11, 12, 23, 24, 30])
+def test_the_kernel_and_the_judge_agree_at_the_edge_of_each_rule(held: int) -> None:
+    # Few neighbours or enough, symmetric or to one side, at each limit and a step beyond it.
+    limits = class_limits(STEP)
+    for limit in limits.local2[::3].tolist():
+        for beyond in (0, 1):
+            for side in (0, 1, 2):
+                points = _ring(held, math.isqrt(limit) + beyond, side)
+                rows = np.where((points == 0).all(axis=1), 0, -1).astype(np.int32)
+                starts, classes = box_starts(len(points)), np.empty(1, np.uint8)
+                point_classes(points, bound_boxes(points, starts), starts, rows, *limits, classes)
+                at = naive_classes.judge(points.astype(np.int64), "0.001")[0, 0, 0]
+                assert classes[0] == at.local + RIM_BIT * at.rim + FEW * at.few
+
+
+def _ring(held: int, radius: int, side: int) -> NDArray[np.int32]:
+    """The origin, and `held` points at most `radius` from it: all around, on two of three sides, or on one side."""
+    turns = np.arange(held) / max(held, 1) * 2 * np.pi / (1, 1.5, 2)[side]
+    lengths = np.where(np.arange(held) % 2, radius, radius * 0.9)
+    around = np.column_stack([np.cos(turns), np.sin(turns), np.zeros(held)]) * lengths[:, None]
+    return np.unique(np.concatenate([[[0, 0, 0]], np.trunc(around)]), axis=0).astype(np.int32)
+
+
+@pytest.mark.parametrize(
+    ("text", "radius", "models"),
+    [
+        ("mean", None, {"mean"}),
+        ("mean,local,border", None, {"mean", "local", "border"}),
+        ("local", None, {"mean", "local"}),
+        ("0.01", 0.01, {"mean"}),
+        ("fixed:0.01", 0.01, {"mean"}),
+        ("border, fixed:0", 0.0, {"mean", "border"}),
+    ],
+)
+def test_radius_texts(text: str, radius: float | None, models: set[str]) -> None:
+    assert parse_radius(text) == (radius, models)
+    BuildConfig(radius=radius, models=frozenset(models))
+
+
+@pytest.mark.parametrize(
+    "text", ["", "median", "mean,0.01", "0.01,fixed:0.02", "fixed:", "fixed:x", "local:2", "mean,"]
+)
+def test_other_radius_texts_are_refused(text: str) -> None:
+    with pytest.raises(BadRequestError, match=r"--radius .*expected mean, local, border by comma"):
+        parse_radius(text)
+
+
+def test_a_config_always_holds_the_mean() -> None:
+    with pytest.raises(BadRequestError, match="--radius local: expected mean, and local or border"):
+        BuildConfig(models=frozenset({"local"}))
+    with pytest.raises(BadRequestError, match="--radius colour,mean"):
+        BuildConfig(models=frozenset({"mean", "colour"}))

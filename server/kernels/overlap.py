@@ -275,6 +275,7 @@ def _overlap_voxel(avatar, m, scale, extent, pose, placed, scene, voxel, spot, b
     shift, frame, step = placed.shift, placed.frame, scene.step
     off_x, off_y, off_z = spot.x, spot.y, spot.z
     rooms, mask = by_class.room, by_class.mask
+    some_smaller, room = mask > U(0), rooms[0]
     x, y, z, radius = nodes[0, 0] - off_x, nodes[1, 0] - off_y, nodes[2, 0] - off_z, nodes[3, 0]
     stack[0, 0], stack[0, 1], stack[0, 2] = spot.rows, 0, count
     depth = 1
@@ -282,7 +283,8 @@ def _overlap_voxel(avatar, m, scale, extent, pose, placed, scene, voxel, spot, b
         depth -= 1
         row, at, count = stack[U(depth), 0], stack[U(depth), 1], stack[U(depth), 2]
         first = np.int64(ints[U(row + FIRST)])
-        room = rooms[node_class(ints, row, mask)]
+        if some_smaller:
+            room = rooms[node_class(ints, row, mask)]
         if first < 0 or words[U(row + 3)] < BROAD * radius:
             counters[0] += count
             steps = (count + LANES - 1) // LANES
@@ -329,7 +331,9 @@ def _overlap_voxel(avatar, m, scale, extent, pose, placed, scene, voxel, spot, b
         for _ in range(children):
             u = U(depth)
             stack[u, 0], stack[u, 1], stack[u, 2] = child, at, count
-            if nodes_meet(words, child, x, y, z, radius, rooms[node_class(ints, child, mask)]):
+            if some_smaller:
+                room = rooms[node_class(ints, child, mask)]
+            if nodes_meet(words, child, x, y, z, radius, room):
                 depth += 1
             child += ROW_WORDS
     return False

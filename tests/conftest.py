@@ -1,9 +1,11 @@
 """What every test may ask for. Tests see the solidcloud that is installed, never the checkout's folders."""
 
+import json
 import os
 import shutil
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +17,62 @@ SEED = 2012
 _OWN_CACHE = "NUMBA_CACHE_DIR" not in os.environ
 if _OWN_CACHE:
     os.environ["NUMBA_CACHE_DIR"] = tempfile.mkdtemp(prefix="solidcloud-numba-")
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Where to write what became of the hard cases."""
+    parser.addoption(
+        "--cases", metavar="FILE", help="write the tests marked `case` and their outcomes as JSON"
+    )
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Watch the hard cases where asked to."""
+    if path := config.getoption("--cases"):
+        config.pluginmanager.register(CaseReport(Path(path)))
+
+
+class CaseReport:
+    """Every test marked `case`, run or not, and what became of it: a JSON object by test function.
+
+    number, text: the marker's.  marks: names of its other markers.  compiled_only: the marker's reason, or "".
+    outcomes: of its runs, one a parameter set; none where it was not run.  skipped: why it was.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.cases: dict[str, dict[str, Any]] = {}
+
+    @pytest.hookimpl(tryfirst=True)  # before -m leaves any out
+    def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
+        """Note every case that exists."""
+        for item in items:
+            if mark := item.get_closest_marker("case"):
+                number, text = mark.args
+                self.cases.setdefault(
+                    item.nodeid.partition("[")[0],
+                    {
+                        "number": number,
+                        "text": text,
+                        "marks": sorted({m.name for m in item.iter_markers()} - {"case", "parametrize"}),
+                        "compiled_only": mark.kwargs.get("compiled_only", ""),
+                        "outcomes": [],
+                        "skipped": "",
+                    },
+                )
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        """Note how a run ended: its call, or what kept it from one."""
+        case = self.cases.get(report.nodeid.partition("[")[0])
+        if case is None or (report.when != "call" and report.passed):
+            return
+        case["outcomes"].append(report.outcome)
+        if report.skipped and isinstance(report.longrepr, tuple):
+            case["skipped"] = report.longrepr[2].removeprefix("Skipped: ")
+
+    def pytest_sessionfinish(self) -> None:
+        """Write it all."""
+        self.path.write_text(json.dumps(self.cases, indent=1))
 
 
 def pytest_unconfigure() -> None:

@@ -12,7 +12,7 @@ import math
 import numba as nb
 import numpy as np
 
-# Ratio to the minimal ball: see tests/unit/builder/test_bounding_sphere.py, at most 1.25 on leaf blocks.
+# Ratio to the minimal ball: see tests/hard_cases/test_bounds.py, at most 1.25 on leaf blocks.
 # Large sets get fewer steps, because each step visits every point and an upper node is tested rarely.
 SMALL_SET = 256
 SMALL_STEPS = 32

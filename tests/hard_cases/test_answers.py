@@ -37,6 +37,10 @@ def elsewhere(code: str, *arguments: str, **environment: str) -> str:
     return done.stdout
 
 
+@pytest.mark.case(
+    21,
+    "nothing there is clear; outside is clear and says so; a corrupt record and a scan left out are unknown",
+)
 @pytest.mark.interpreted
 def test_case_21_empty_outside_not_loaded_skipped(tmp_path: Path) -> None:
     good = np.array([[0.0, 0, 0], [4.0, 0, 0], [4.0, 0, 4.0]])
@@ -63,6 +67,8 @@ def test_case_21_empty_outside_not_loaded_skipped(tmp_path: Path) -> None:
     assert answers.voxels_missing.tolist() == [0, 0, 1, 0, 0]
 
 
+@pytest.mark.case(22, "10^7 points are refused as too large; the next avatar is not")
+@pytest.mark.interpreted
 def test_case_22_an_avatar_over_the_cap_is_refused(tmp_path: Path) -> None:
     with Scene.open(cases.build(tmp_path, POINT).archive) as scene:
         with pytest.raises(TooLargeError, match=f"at most {MAX_AVATAR_POINTS}"):
@@ -70,6 +76,11 @@ def test_case_22_an_avatar_over_the_cap_is_refused(tmp_path: Path) -> None:
         assert scene.add_avatar("one", POINT, 0.1).points == 1
 
 
+@pytest.mark.case(
+    23,
+    "512 voxels in reach with room for 1, 7 and 200: the answers of the whole, none missing, each read once a pose",
+)
+@pytest.mark.interpreted
 def test_case_23_a_pose_that_reaches_hundreds_of_voxels(tmp_path: Path) -> None:
     grid = np.stack(np.meshgrid(*[np.arange(8.0)] * 3), axis=-1).reshape(-1, 3)
     case = cases.build(tmp_path, grid, voxel=1.0, resolution=0.5, radius=0.01)
@@ -90,6 +101,11 @@ def test_case_23_a_pose_that_reaches_hundreds_of_voxels(tmp_path: Path) -> None:
             scene.residency.check()
 
 
+@pytest.mark.case(
+    24,
+    "placed integers, verdicts and counters of 60 poses are the interpreter's",
+    compiled_only="it runs both itself",
+)
 @pytest.mark.skipif(INTERPRETED, reason="the other side of this comparison is the interpreted one")
 def test_case_24_compiled_equals_interpreted(tmp_path: Path) -> None:
     case = cases.build(tmp_path, scans.make_scan(*same_answers.SCAN), leaf=8, cell_points=30)
@@ -101,6 +117,9 @@ def test_case_24_compiled_equals_interpreted(tmp_path: Path) -> None:
     assert {0, 1} == set(here["columns"][0])
 
 
+@pytest.mark.case(
+    24, "an archive built interpreted has the same bytes", compiled_only="it builds both itself"
+)
 @pytest.mark.skipif(INTERPRETED, reason="the other side of this comparison is the interpreted one")
 def test_case_24_an_archive_built_interpreted_has_the_same_bytes(tmp_path: Path) -> None:
     case = cases.build(tmp_path, scans.make_scan(*same_answers.SCAN), leaf=8, cell_points=30, radius=None)
@@ -120,12 +139,15 @@ def test_case_24_an_archive_built_interpreted_has_the_same_bytes(tmp_path: Path)
         assert one.header.radius == two.header.radius and one.header.archive_id == two.header.archive_id
 
 
+@pytest.mark.case(25, "500 poses, 7 times, on 1, 2 and 4 threads: the judge's verdict every time")
+@pytest.mark.interpreted
 def test_case_25_any_number_of_threads_gives_the_same_answers(
     tmp_path: Path, rng: np.random.Generator
 ) -> None:
     case = cases.build(tmp_path, scans.make_scan("corner", 5, 600), voxel=0.3)
     avatar = rng.uniform(-0.2, 0.2, (30, 3))
-    poses = cases.near_poses(rng, case.points, avatar, 500, 0.15)
+    count = 30 if INTERPRETED else 500
+    poses = cases.near_poses(rng, case.points, avatar, count, 0.15)
     expected = case.judge(avatar, 0.01, poses).astype(np.uint8)
     for threads in (1, 2, 4):
         with Scene.open(case.archive, budget_bytes=1 << 20) as scene, ThreadPoolExecutor(threads) as pool:
@@ -136,10 +158,13 @@ def test_case_25_any_number_of_threads_gives_the_same_answers(
                 return int(answers.verdict[0]), bool(answers.outside[0]), int(answers.voxels_missing[0])
 
             replies = list(pool.map(ask, np.tile(poses, (7, 1, 1))))
-        for i in range(500):
-            assert set(replies[i::500]) == {replies[i]} and replies[i][0] == expected[i]
+        for i in range(count):
+            assert set(replies[i::count]) == {replies[i]} and replies[i][0] == expected[i]
 
 
+@pytest.mark.case(
+    29, "collide(A, B, M) = collide(B, A, M⁻¹) for a small and a tall tree and quarter turns, and the judge's"
+)
 @pytest.mark.interpreted
 def test_case_29_either_tree_may_be_the_taller(tmp_path: Path, rng: np.random.Generator) -> None:
     """collide(A, B, M) == collide(B, A, M^-1), for a small and a tall tree and quarter turns."""

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import cases
 import naive
+import naive_distance
+import naive_rays
 import numpy as np
 import pytest
 import scans
@@ -20,6 +22,9 @@ INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
 POINT = np.zeros((1, 3))
 
 
+@pytest.mark.case(
+    1, "moved by 5.6e6, 6.4e6 and 1e8 m, index and verdicts are those at the origin, and the judge's"
+)
 @pytest.mark.interpreted
 @pytest.mark.parametrize(
     "shift", [(500_000, 5_600_000, 100), (4_027_894, 307_045, 4_919_475), (-(10**8), 10**8, 7)]
@@ -47,6 +52,9 @@ def test_case_01_map_coordinates_answer_as_the_origin_does(
         assert verdicts.tolist() == far.judge(avatar, 0.003, moved, margin).astype(int).tolist()
 
 
+@pytest.mark.case(
+    3, "a uniform scale scales radii, tangent to the unit; shear, mirror and 1e-6 of stretch are refused"
+)
 @pytest.mark.interpreted
 def test_case_03_scale_grows_radii_and_shear_is_refused(tmp_path: Path) -> None:
     case = cases.build(tmp_path, POINT, radius=0.25, resolution=cases.BINARY_STEP)
@@ -64,6 +72,10 @@ def test_case_03_scale_grows_radii_and_shear_is_refused(tmp_path: Path) -> None:
             cases.ask(case, POINT, 0.5, pose[None])
 
 
+@pytest.mark.case(
+    6,
+    "10,000 pairs within 3 units of 15 nm of tangency at UTM coordinates: none wrong; plain float64 gets some wrong",
+)
 @pytest.mark.interpreted
 def test_case_06_near_tangent_pairs_are_decided_exactly(tmp_path: Path, rng: np.random.Generator) -> None:
     count = 200 if INTERPRETED else 10_000
@@ -83,6 +95,10 @@ def test_case_06_near_tangent_pairs_are_decided_exactly(tmp_path: Path, rng: np.
     assert 0.3 < expected.mean() < 0.7
 
 
+@pytest.mark.case(
+    14,
+    "NaN, infinities, 1e300 and 1.1e9 m: left out of a scan and counted, an error with --strict; refused in requests",
+)
 @pytest.mark.interpreted
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e300, 1.1e9])
 def test_case_14_what_is_not_finite_reaches_no_kernel(tmp_path: Path, bad: float) -> None:
@@ -108,6 +124,9 @@ def test_case_14_what_is_not_finite_reaches_no_kernel(tmp_path: Path, bad: float
                 scene.add_avatar("thick", POINT, bad)
 
 
+@pytest.mark.case(
+    15, "radii of 0 and denormal ones touch where the integers coincide; negative ones are refused"
+)
 @pytest.mark.interpreted
 def test_case_15_radii_of_zero_and_less(tmp_path: Path) -> None:
     case = cases.build(tmp_path, POINT, radius=0.0)
@@ -126,6 +145,9 @@ def test_case_15_radii_of_zero_and_less(tmp_path: Path) -> None:
         cases.build(tmp_path, POINT, radius=-0.1)
 
 
+@pytest.mark.case(
+    16, "scan points at the corners of 1e9 m: the judge's verdicts, to a micrometre of 16 m reach"
+)
 @pytest.mark.interpreted
 def test_case_16_coordinates_up_to_their_bound_overflow_nothing(tmp_path: Path) -> None:
     corners = np.array([[-1e9, -1e9, -1e9], [1e9, 1e9, 1e9], [1e9, -1e9, 0.0]])
@@ -139,6 +161,39 @@ def test_case_16_coordinates_up_to_their_bound_overflow_nothing(tmp_path: Path) 
     assert cases.ask(case, POINT, 8.0, poses).tolist() == expected.astype(int).tolist()
 
 
+@pytest.mark.case(
+    17,
+    "|a|² - 2ab + |b|² in float64 at UTM: over a tenth negative, over a tenth of verdicts wrong; ours none",
+)
+@pytest.mark.interpreted
+def test_case_17_the_expanded_square_is_not_what_decides(tmp_path: Path, rng: np.random.Generator) -> None:
+    count = 150 if INTERPRETED else 2000
+    base = np.array([5e5, 5.6e6, 100.0])
+    case = cases.build(tmp_path, base[None], radius=0.01, resolution=cases.BINARY_STEP)
+    away = rng.normal(size=(count, 3))
+    away *= (rng.uniform(0.001, 0.06, count) / np.linalg.norm(away, axis=1))[:, None]
+    poses = np.array([cases.pose_of(np.eye(3), base + a) for a in away])
+    a, b = poses[:, :3, 3], case.points[0]
+    expanded = (a * a).sum(axis=1) - 2 * (a @ b) + b @ b
+    truth = case.judge(POINT, 0.02, poses)
+    assert (expanded < 0).mean() > 0.1 and ((expanded <= 0.03**2) != truth).mean() > 0.1
+    with Scene.open(case.archive) as scene:
+        scene.add_avatar("ball", POINT, 0.02)
+        assert scene.collide("ball", poses).verdict.tolist() == truth.astype(int).tolist()
+        near, within = scene.distance("ball", poses, 0.2), scene.within(a, 0.2)
+        info = scene.info()
+    scan = (case.points, info.origin, info.lattice_step)
+    judged = naive_distance.distance(*scan, info.radius, POINT, 0.02, poses, 0.2)
+    assert near.signed_distance.tolist() == [found.signed for found in judged if found]
+    assert within.distance.tolist() == naive_rays.within(*scan, a, 0.2).distance.tolist()
+    assert 0.3 < truth.mean() < 0.7
+
+
+@pytest.mark.case(
+    19,
+    "against the points as delivered, in fractions: early or late by at most the band, with it as margin never late",
+)
+@pytest.mark.interpreted
 def test_case_19_the_lattice_moves_contact_by_its_declared_band(
     tmp_path: Path, rng: np.random.Generator
 ) -> None:
@@ -168,6 +223,7 @@ def test_case_19_the_lattice_moves_contact_by_its_declared_band(
     assert 20 < plain.sum() < 130
 
 
+@pytest.mark.case(16, "a reach of 2^30 units is answered, more is refused")
 @pytest.mark.interpreted
 def test_case_16_reach_is_bounded_so_that_squares_fit(tmp_path: Path) -> None:
     case = cases.build(tmp_path, POINT, radius=8.0, resolution=1e-2, voxel=8.0)

@@ -1,11 +1,12 @@
-"""Bounds enclose, proved in Python integers; leaf spheres are close to the minimal ball."""
+"""Bounds enclose, proved in Python integers. How close to the minimal ball: tests/hard_cases/test_bounds.py."""
 
 import itertools
 
+import minimal_ball
 import numpy as np
 import pytest
 from scans import WITH_POINTS, make_steps
-from solidcloud.builder.hierarchy import Bounds, bound_runs, build_hierarchy
+from solidcloud.builder.hierarchy import Bounds, bound_runs
 from solidcloud.builder.kernels.bounding_sphere import ceil_sqrt
 
 

@@ -54,7 +54,7 @@ def _search_until(
     counts: NDArray[np.uint32],
 ) -> None:
     """Search for the poses `which`, each with its share of the time left. data: its arrays as held."""
-    search = make_search(avatar.arrays, heap)
+    search = make_search(avatar.arrays, data.arrays, heap)
     for done, pose in enumerate(which.tolist()):
         now = time.perf_counter()
         if now >= deadline:
@@ -102,8 +102,8 @@ def _gather(
     begin = time.perf_counter()
     k = len(array)
     known = Known(
-        np.full(k, -1, np.int64), np.zeros((k, 6), np.int64), np.full(k, math.inf), np.full(k, math.inf),
-        np.full(k, math.inf), np.zeros(k, bool),
+        np.full(k, -1, np.int64), np.zeros((k, 6), np.int64), np.zeros(k, np.int64), np.full(k, math.inf),
+        np.full(k, math.inf), np.full(k, math.inf), np.zeros(k, bool),
     )  # fmt: skip
     counts = np.zeros((3, k), np.uint32)
     residency = data.residency
@@ -133,8 +133,12 @@ def _fields(cost: Cost) -> dict[str, Any]:
 
 
 def _upper(data: SceneData, known: Known, radii: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Signed distances (k,) [m] that some pair surely has at most; inf where no pair was bounded."""
-    signed = np.where(known.square >= 0, signed_from_square(np.maximum(known.square, 0), radii), np.inf)
+    """Signed distances (k,) [m] that some pair surely has at most; inf where no pair was bounded.
+
+    radii: (k,) of avatar's and scan's largest spheres together, exact units.
+    """
+    found = signed_from_square(np.maximum(known.square, 0), radii - known.drop)
+    signed = np.where(known.square >= 0, found, np.inf)
     steps = known.upper * data.arrays.step * (1.0 + 1e-12)
     return np.minimum(signed, steps - radii / UNITS_PER_METRE + 2.0 / UNITS_PER_METRE)
 
@@ -159,7 +163,7 @@ def distance_bounded(
     # What was left open is as what is missing: somewhere, no nearer than that.
     np.minimum(known.gap, known.lower, out=known.gap)
     upper = _upper(data, known, around.units - reach_units)
-    nearest = Nearest(known.square, known.pair, known.gap)
+    nearest = Nearest(known.square, known.pair, known.drop, known.gap)
     columns = distance_columns(data, around, float(reach), reach_units, nearest, counts, upper)
     return DistanceAnswers(**columns, **_fields(cost))
 
@@ -184,7 +188,7 @@ def collide_bounded(
     known, counts, cost = _gather(data, avatar, array, around, goal, effort)
     upper = _upper(data, known, radii)
     found = known.square >= 0
-    truly = (found & (known.square <= around.units**2)) | (known.upper <= certain)
+    truly = (found & (known.square <= (around.units - known.drop) ** 2)) | (known.upper <= certain)
     contact = truly | found | (known.upper <= enough)
     lost = (counts[0] > 0) | (known.lower < math.inf)
     if len(avatar.points):

@@ -24,9 +24,9 @@ def distance(
 ) -> DistanceAnswers:
     """How far the avatar is from the scene under each pose, up to `reach` [m].
 
-    poses: (k, 4, 4) float64, avatar to world, rigid or with a uniform scale.  reach: pairs farther apart than this do
-    not count; with the radii at most 16 m. Where a voxel in reach is missing, or a scan was left out, the distance is
-    that of the nearest pair looked at, exact only if what is missing cannot hold a nearer one.
+    poses: (k, 4, 4) float64, avatar to world, rigid or with a uniform scale.  reach: pairs whose spheres are farther
+    apart than this do not count; with the largest radii at most 16 m. Where a voxel in reach is missing, or a scan was
+    left out, the distance is that of the nearest pair looked at, exact only if what is missing can hold no nearer one.
     Raises BadRequestError, BadTransformError, TooLargeError.
     """
     if effort.bounded:
@@ -38,7 +38,9 @@ def distance(
     reach_units = to_units(reach, "reach")
     k = len(array)
     around = check_request(data, avatar, array, data.radius_units + reach_units)
-    nearest = Nearest(np.full(k, -1, np.int64), np.zeros((k, 6), np.int64), np.full(k, math.inf))
+    nearest = Nearest(
+        np.full(k, -1, np.int64), np.zeros((k, 6), np.int64), np.zeros(k, np.int64), np.full(k, math.inf)
+    )
     counts = np.zeros((3, k), np.uint32)
     residency = data.residency
     hits = misses = 0

@@ -1,12 +1,15 @@
 """Squares of integers -> signed distances in metres, and the bounds of what was not looked at.
 
-The definition, in the integers of NUMERICS.md N5: of all pairs of placed avatar centre a and scan point b the one
-with the least D2 = |a - b|^2; with r = r_a + r_b, each rounded once to exact units, its signed distance is
+The definition, in the integers of NUMERICS.md N5: with D2 = |a - b|^2 and r = r_a + r_b, the pair's own radii, each
+rounded once to exact units, of all pairs of placed avatar centre a and scan point b the one with the least gap
+sqrt(D2) - r, compared exactly; its signed distance is
 
     (D2 - r^2) / (sqrt(D2) + r) / 2^26 m
 
 The difference in int64, the rest in float64, in this order; 0 where D2 and r are. That is sqrt(D2) - r without
-cancellation: it is negative, zero or positive as the spheres overlap, touch or do not.
+cancellation: it is negative, zero or positive as the spheres overlap, touch or do not. No pair has a lesser gap, so it
+is positive exactly where no pair of spheres is in contact. Where all scan points have one radius, the pair is that with
+the least D2.
 """
 
 from typing import Any
@@ -31,7 +34,10 @@ def signed_from_square(square: NDArray[np.int64], radii: NDArray[np.int64]) -> N
 def signed_bound(
     steps: NDArray[np.float64], data: SceneData, radii: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Signed distances (k,) [m] that are surely not above what centres at least `steps` apart have."""
+    """Signed distances (k,) [m] that are surely not above what centres at least `steps` apart have.
+
+    radii: (k,) of avatar's and scan's largest spheres together, exact units.
+    """
     metres = steps * data.arrays.step * (1.0 - 1e-12)
     return metres - radii / UNITS_PER_METRE - 2.0 / UNITS_PER_METRE
 
@@ -66,9 +72,9 @@ def distance_columns(
     missing voxels, unknown regions and what was not looked at.  upper: (k,) [m], where more is known than the
     pair found says.
     """
-    radii = reach.units - reach_units
+    radii = reach.units - reach_units  # of the largest spheres
     found = nearest.square >= 0
-    signed = np.where(found, signed_from_square(np.maximum(nearest.square, 0), radii), np.inf)
+    signed = np.where(found, signed_from_square(np.maximum(nearest.square, 0), radii - nearest.drop), np.inf)
     floor = np.maximum(signed_bound(nearest.gap, data, radii), -radii / UNITS_PER_METRE)
     # `farthest` itself may be a rounding above what the reach is in exact units.
     exact = floor >= np.where(found, signed, farthest)

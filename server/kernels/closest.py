@@ -1,7 +1,12 @@
 """The nearest pair of points so far, and what it rules out: what `distance` and the bounded search share.
 
+Nearest is the pair with the least gap between its spheres, |a - b| - (r_a + r_b). r_a is the same for all, and the
+scan point's radius is less than the largest by the `drop` of its class: so what is compared is |a - b| + drop, and a
+bound on it, less the drop of a class, is one on |a - b| of the pairs of that class.
+
 Float32 tells nearly all pairs of points from the best; those that it cannot tell are squared in integers (NUMERICS.md
-N5). So the least square, and which pair has it, are those of the definition, whatever the trees and the order.
+N5) and compared by closer.py. So the least gap, and which pair has it, are those of the definition, whatever the trees
+and the order.
 """
 
 import math
@@ -11,8 +16,10 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from .compiled import borrowing, inlined
-from .layout import LANES
+from .closer import compare_gaps
+from .compiled import borrowing
+from .lanes import list_squares
+from .layout import LANES, point_class
 from .placed import ONE_SLACK, SLACK, U32, make_limits
 from .placing import lattice_to_units, place, to_units
 
@@ -25,32 +32,39 @@ class Nearest(NamedTuple):
     """The nearest pair of each of k poses, among what was looked at.
 
     square: (k,) int64, |a - b|^2, exact units; -1: none within reach.  pair: (k, 6) int64, the scan point's lattice
-    x, y, z, then the avatar's placed centre [exact units].  gap: (k,) float64, what missing voxels hold is at least so
-    far from the avatar's centres [steps]; inf: nothing is missing.
+    x, y, z, then the avatar's placed centre [exact units].  drop: (k,) int64, how much smaller than the largest the
+    scan point's radius is, exact units.  gap: (k,) float64, what missing voxels hold is at least so far from the
+    avatar's centres [steps]; inf: nothing is missing.
     """
 
     square: NDArray[np.int64]
     pair: NDArray[np.int64]
+    drop: NDArray[np.int64]
     gap: NDArray[np.float64]
 
 
 class Best(NamedTuple):
     """The nearest pair of one pose so far, and what it rules out; scratch of one call.
 
-    found: (7,) int64, square or -1, then a row of `Nearest.pair`.  cut: (3,) float32, no node pair whose
-    `lower_bound` is above cut[0] [steps] and no points whose square is above cut[1] can be nearer, or tie; cut[2] is
-    the error of a distance [steps].
-    frame: (4,) float64, extent and farthest of `make_limits`, units per step, voxel steps.  corner: (3,) int64, of the
-    voxel looked at [steps].  keep, squares: (LANES,), a mark and a square for each point of an avatar's block; keep8:
-    keep as uint64, eight at a time.  listed: (LANES,) float32, a square for each point of a scene's block.
-    units: (2,) int64, the reach, and what is known to be no less than the least distance, exact units.
+    found: (8,) int64, square or -1, a row of `Nearest.pair`, drop.  cut, far: (n,) float32, by radius class: no node
+    pair whose `lower_bound` is above cut[c] [steps] and no points whose square is above far[c] can be nearer, or tie.
+    drop: (n,) int64, of SceneArrays.  mask: one less than there are classes, uint64.
+    frame: (5,) float64, extent and farthest of `make_limits`, units per step, voxel steps; the error of a distance
+    [steps].  corner: (3,) int64, of the voxel looked at [steps].  keep, squares: (LANES,), a mark and a square for each
+    point of an avatar's block; keep8: keep as uint64, eight at a time.  listed: (LANES,) float32, a square for each
+    point of a scene's block.
+    units: (2,) int64, the reach, and what is known to be no less than the least |a - b| + drop, exact units.
     counters: (3,) int64, node visits, point tests, candidates.
-    candidates: (MOST_CANDIDATES, 4) int64, points of the avatar that may be of the nearest pair, and where in the
-    scene: block, lane, block_at, lane_at.  nearly: (MOST_CANDIDATES,) float32, their least squares there.
+    candidates: (MOST_CANDIDATES, 5) int64, points of the avatar that may be of the nearest pair, and where in the
+    scene: block, lane, block_at, lane_at, class of the leaf node.  nearly: (MOST_CANDIDATES,) float32, their least
+    squares there.
     """
 
     found: NDArray[np.int64]
     cut: NDArray[np.float32]
+    far: NDArray[np.float32]
+    drop: NDArray[np.int64]
+    mask: np.uint64
     frame: NDArray[np.float64]
     corner: NDArray[np.int64]
     keep: NDArray[np.bool_]
@@ -64,13 +78,14 @@ class Best(NamedTuple):
 
 
 @nb.njit(nogil=True, cache=True)
-def make_best():
-    """Scratch, nothing found."""
-    keep = np.zeros(LANES, np.bool_)
+def make_best(drop):
+    """Scratch for the radius classes of `SceneArrays.drop`, nothing found."""
+    keep, n = np.zeros(LANES, np.bool_), drop.shape[0]
     return Best(
-        np.empty(7, np.int64), np.empty(3, np.float32), np.empty(4), np.empty(3, np.int64), keep,
-        keep.view(np.uint64), np.empty(LANES, np.float32), np.empty(LANES, np.float32), np.empty(2, np.int64),
-        np.zeros(3, np.int64), np.empty((MOST_CANDIDATES, 4), np.int64), np.empty(MOST_CANDIDATES, np.float32),
+        np.empty(8, np.int64), np.empty(n, np.float32), np.empty(n, np.float32), drop, np.uint64(n - 1), np.empty(5),
+        np.empty(3, np.int64), keep, keep.view(np.uint64), np.empty(LANES, np.float32), np.empty(LANES, np.float32),
+        np.empty(2, np.int64), np.zeros(3, np.int64), np.empty((MOST_CANDIDATES, 5), np.int64),
+        np.empty(MOST_CANDIDATES, np.float32),
     )  # fmt: skip
 
 
@@ -93,27 +108,39 @@ def lower_bound(words, row, x, y, z, radius):
 
 
 @borrowing
-def set_cut(cut, scales, units, square):
-    """Rule out what is farther than a square (int64), or than the reach, `units`, where it is -1; see `Best`."""
-    if square >= 0:
-        # Two more than the root rounded down: nothing that ties is ruled out.
-        units = np.int64(math.sqrt(np.float64(square))) + 2
-    limits = make_limits(units, scales[2], scales[0], scales[1], scales[3])
-    cut[0] = (limits.reach + limits.error) * ONE_SLACK
-    cut[1] = limits.far
-    cut[2] = limits.error
+def set_cut(cut, far, frame, drop, units):
+    """Rule out what has |a - b| + drop above `units`; see `Best`."""
+    limits = make_limits(units, frame[2], frame[0], frame[1], frame[3])
+    error = np.float64(limits.error)
+    frame[4] = error
+    for c in range(drop.shape[0]):
+        if drop[c] == 0:
+            cut[c] = (limits.reach + limits.error) * ONE_SLACK
+            far[c] = limits.far
+        else:
+            # As `make_limits` has it, all slack in one: that takes a tenth of the time of 32 of them.
+            above = (np.float64(max(units - drop[c], 0)) / frame[2] + error) * (1.0 + 2e-6)
+            cut[c] = np.float32(above)
+            far[c] = np.float32(above * above)
+
+
+@borrowing
+def found_units(found):
+    """What |a - b| + drop of the pair found is at most, exact units: nothing that ties is ruled out by it."""
+    return np.int64(math.sqrt(np.float64(found[0]))) + 2 + found[7]
 
 
 @borrowing
 def _consider(
-    points, m, shift, block, lane, ints, halves, corner, block_at, lane_at, j, units_per_step, units, found
+    points, m, shift, block, lane, ints, halves, corner, block_at, lane_at, j, units_per_step, units, drop, found
 ):  # fmt: skip
     """Take a pair as the best one if it is: nearer, or as near with the lesser scan point, then avatar's centre.
 
-    points, shift: of Avatar and Placed.  corner: (3,) int64, of the voxel [steps]. The square is that of
-    `pair_square`. Returns whether it is nearer.
+    points, shift: of Avatar and Placed.  corner: (3,) int64, of the voxel [steps].  drop: of the scan point's class.
+    The square is that of `pair_square`. Returns whether it is nearer.
     """
     square = np.int64(0)
+    units -= drop
     for r in range(3):
         world = place(m, shift, r, points[block, 0, lane], points[block, 1, lane], points[block, 2, lane])
         steps = corner[r] + np.int64(ints[block_at + r]) + np.int64(halves[lane_at + r * LANES + j])
@@ -121,9 +148,19 @@ def _consider(
         if abs(difference) > units:
             return False
         square += difference * difference
-    if square > units * units or (found[0] >= 0 and square > found[0]):
+    if square > units * units:
         return False
-    nearer = found[0] < 0 or square < found[0]
+    nearer = found[0] < 0
+    if not nearer:
+        if drop == found[7]:
+            if square > found[0]:
+                return False
+            nearer = square < found[0]
+        else:
+            order = compare_gaps(square, -drop, found[0], -found[7])
+            if order > 0:
+                return False
+            nearer = order < 0
     lesser = nearer
     for r in range(6):
         if r < 3:
@@ -139,190 +176,106 @@ def _consider(
             lesser = value < found[1 + r]
         # While all before are equal this writes what is there.
         found[1 + r] = value
-    found[0] = square
+    found[0], found[7] = square, drop
     return nearer
-
-
-@inlined
-def keep_near(lanes, block, words, row, off_x, off_y, off_z, cut, keep):
-    """Which points of an avatar's block (LANES) may be within `cut` [steps] of a scene node; writes keep (LANES,).
-
-    Returns whether any may.
-    """
-    at = U(row)
-    cx, cy, cz = words[at] + off_x, words[at + U(1)] + off_y, words[at + U(2)] + off_z
-    nx, ny, nz = words[at + U(4)], words[at + U(5)], words[at + U(6)]
-    both = words[at + U(3)] + cut
-    room = words[at + U(7)] * (cut + SLACK * both + SLACK * both)
-    least, most = words[at + U(8)] - room, words[at + U(9)] + room
-    limit = both * both * ONE_SLACK
-    b, any_near = U(block), False
-    for lane in range(LANES):
-        j = U(lane)
-        dx, dy, dz = lanes[b, 0, j] - cx, lanes[b, 1, j] - cy, lanes[b, 2, j] - cz
-        along = nx * dx + ny * dy + nz * dz
-        near = (dx * dx + dy * dy + dz * dz <= limit) & (along <= most) & (along >= least)
-        keep[j] = near
-        any_near |= near
-    return any_near
-
-
-@borrowing
-def any_near(halves, lane_at, x, y, z, far):
-    """Whether any of a scene block's points is within a square of a point, both from the block's low corner."""
-    # Unsigned: an index that may be negative, as numba sees it, is not vectorised, 70 ns for 32 lanes and not 5.
-    at_x = U(lane_at)
-    at_y, at_z = at_x + U(LANES), at_x + U(2 * LANES)
-    near = False
-    for lane in range(LANES):
-        j = U(lane)
-        dx, dy = np.float32(halves[at_x + j]) - x, np.float32(halves[at_y + j]) - y
-        dz = np.float32(halves[at_z + j]) - z
-        near |= dx * dx + dy * dy + dz * dz <= far
-    return near
-
-
-@borrowing
-def list_squares(halves, lane_at, x, y, z, squares):
-    """The squares (LANES,) of the distances of a scene block's points to a point; returns the lane of the least."""
-    at_x = U(lane_at)
-    at_y, at_z = at_x + U(LANES), at_x + U(2 * LANES)
-    for lane in range(LANES):
-        j = U(lane)
-        dx, dy = np.float32(halves[at_x + j]) - x, np.float32(halves[at_y + j]) - y
-        dz = np.float32(halves[at_z + j]) - z
-        squares[j] = dx * dx + dy * dy + dz * dz
-    first, least = 0, squares[0]
-    for lane in range(1, LANES):
-        if squares[lane] < least:
-            first, least = lane, squares[lane]
-    return first
 
 
 @borrowing
 def search_lanes(
-    points, m, shift, block, lane, ints, halves, corner, block_at, lane_at, x, y, z, scales, units, best_squares,
-    best_found, cut,
+    points, m, shift, block, lane, ints, halves, corner, block_at, lane_at, x, y, z, frame, units, squares, found,
+    cut, far, drop, mask,
 ):  # fmt: skip
     """Take the best of the pairs of one avatar point (float32 x, y, z from the block's low corner) and a scene block.
 
     The nearest first: it shrinks the cut, and few of the others are asked in integers after it.
-    scales: (4,) float64, `Best.frame`.
+    From frame on: of `Best`.
     """
-    first = list_squares(halves, lane_at, x, y, z, best_squares)
+    list_squares(halves, lane_at, x, y, z, squares)
+    first = 0
+    for lane_j in range(1, LANES):
+        if squares[lane_j] < squares[first]:
+            first = lane_j
     for number in range(-1, LANES):
         j = first if number < 0 else number
-        if best_squares[j] <= cut[1] and (number < 0 or j != first):
+        c = point_class(ints, block_at, j, mask)
+        if squares[j] <= far[c] and (number < 0 or j != first):
             nearer = _consider(
-                points,
-                m,
-                shift,
-                block,
-                lane,
-                ints,
-                halves,
-                corner,
-                block_at,
-                lane_at,
-                j,
-                scales[2],
-                units,
-                best_found,
-            )
+                points, m, shift, block, lane, ints, halves, corner, block_at, lane_at, j, frame[2], units, drop[c],
+                found,
+            )  # fmt: skip
             if nearer:
-                set_cut(cut, scales, units, best_found[0])
-
-
-@inlined
-def keep_in_box(halves, lane_at, low_x, low_y, low_z, lanes, block, far, keep):
-    """Unmark, of the marked points of an avatar's block, those that the box of a scene's block alone shows to be beyond
-    `far`, a square; arguments as of `least_squares`.
-
-    Nothing is added for rounding: it is monotonic, so each difference here is no larger than those of the points.
-    """
-    h, b = U(lane_at), U(block)
-    high_x, high_y, high_z = np.int32(0), np.int32(0), np.int32(0)
-    for j in range(LANES):
-        i = h + U(j)
-        high_x = max(high_x, np.int32(halves[i]))
-        high_y = max(high_y, np.int32(halves[i + U(LANES)]))
-        high_z = max(high_z, np.int32(halves[i + U(2 * LANES)]))
-    most_x, most_y, most_z = np.float32(high_x), np.float32(high_y), np.float32(high_z)
-    zero = np.float32(0.0)
-    for lane in range(LANES):
-        u = U(lane)
-        x, y, z = lanes[b, 0, u] - low_x, lanes[b, 1, u] - low_y, lanes[b, 2, u] - low_z
-        dx, dy, dz = max(x - most_x, -x), max(y - most_y, -y), max(z - most_z, -z)
-        dx, dy, dz = max(dx, zero), max(dy, zero), max(dz, zero)
-        keep[u] = keep[u] & (dx * dx + dy * dy + dz * dz <= far)
-
-
-@inlined
-def least_squares(halves, lane_at, low_x, low_y, low_z, lanes, block, keep, keep8, squares):
-    """The least square of the distances of each marked point of an avatar's block to a scene's block; writes squares.
-
-    lane_at: the scene's block in `halves`; low: its corner from the frame. Returns (least of all, points tested).
-    """
-    h, b = U(lane_at), U(block)
-    best, tested = np.float32(np.inf), 0
-    for eight in range(LANES // 8):
-        if keep8[U(eight)] == U(0):
-            continue
-        for lane in range(8 * eight, 8 * eight + 8):
-            if not keep[U(lane)]:
-                continue
-            tested += 1
-            x, y, z = lanes[b, 0, U(lane)] - low_x, lanes[b, 1, U(lane)] - low_y, lanes[b, 2, U(lane)] - low_z
-            # The bits of numbers that are not negative are in the order of the numbers, and the least of integers is
-            # taken in vector steps, where that of floats is not: there may be a NaN, as far as LLVM knows.
-            least = np.int32(0x7F800000)
-            for j in range(LANES):
-                i = h + U(j)
-                dx = np.float32(halves[i]) - x
-                dy = np.float32(halves[i + U(LANES)]) - y
-                dz = np.float32(halves[i + U(2 * LANES)]) - z
-                least = min(least, np.float32(dx * dx + dy * dy + dz * dz).view(np.int32))
-            bits = np.int32(least)
-            square = bits.view(np.float32)
-            squares[U(lane)] = square
-            best = min(best, square)
-    return best, tested
+                set_cut(cut, far, frame, drop, found_units(found))
 
 
 @borrowing
-def take_candidates(least, block, block_at, lane_at, off, best, points, m, shift, ints, halves, lanes):
+def _no_farther(square, frame):
+    """What a distance is at most whose square float32 has [exact units, float64]: as `make_limits` has it."""
+    return (math.sqrt(np.float64(square)) * (1.0 + 8.0 * U32) + frame[4]) * frame[2]
+
+
+@borrowing
+def _list_by_class(c, block, block_at, lane_at, off, best, ints, halves, lanes):
+    """Unmark the points of an avatar's block that are near no point of a scene's block for its own class.
+
+    c: class of the scene's leaf node; other arguments as of `take_candidates`. Returns what the least |a - b| + drop
+    is at most, exact units, float64; inf: none is near.
+    """
+    keep, squares, listed, far, drop = best.keep, best.squares, best.listed, best.far, best.drop
+    low_x = off[0] + np.float32(ints[block_at])
+    low_y = off[1] + np.float32(ints[block_at + 1])
+    low_z = off[2] + np.float32(ints[block_at + 2])
+    nearest = np.inf
+    for lane in range(LANES):
+        if not keep[lane]:
+            continue
+        keep[lane] = False
+        if not squares[lane] <= far[c]:
+            continue
+        x, y, z = lanes[block, 0, lane] - low_x, lanes[block, 1, lane] - low_y, lanes[block, 2, lane] - low_z
+        list_squares(halves, lane_at, x, y, z, listed)
+        for j in range(LANES):
+            own = point_class(ints, block_at, j, best.mask)
+            if listed[j] <= far[own]:
+                keep[lane] = True
+                nearest = min(nearest, _no_farther(listed[j], best.frame) + np.float64(drop[own]))
+    return nearest
+
+
+@borrowing
+def take_candidates(least, c, block, block_at, lane_at, off, best, points, m, shift, ints, halves, lanes):
     """Take up what `least_squares` found, `least` of it within the cut: shrinks the cut, without integers.
 
     Those are for `settle`, at the end: where the cut shrinks as points come, ten or twenty are the nearest for a while.
+    c: class of the scene's leaf node.
     """
-    cut, units, counters, nearly = best.cut, best.units, best.counters, best.nearly
+    far, units, counters, nearly = best.far, best.units, best.counters, best.nearly
     candidates, keep, squares = best.candidates, best.keep, best.squares
-    # No farther than that: as `make_limits` has it, and a unit for rounding up.
-    steps = math.sqrt(np.float64(least)) * (1.0 + 8.0 * U32) + np.float64(cut[2])
-    nearer = np.int64(steps * best.frame[2]) + 2
+    if best.mask == U(0):
+        within = _no_farther(least, best.frame)
+    else:
+        within = _list_by_class(c, block, block_at, lane_at, off, best, ints, halves, lanes)
+        if within == np.inf:
+            return
+    nearer = np.int64(within) + 2  # a unit for rounding up
     if nearer < units[1]:
         units[1] = nearer
-        set_cut(cut, best.frame, nearer, -1)
+        set_cut(best.cut, far, best.frame, best.drop, nearer)
         left = 0
         for i in range(counters[2]):
-            if nearly[i] <= cut[1]:
+            if nearly[i] <= far[candidates[i, 4]]:
                 nearly[left] = nearly[i]
-                for r in range(4):
+                for r in range(5):
                     candidates[left, r] = candidates[i, r]
                 left += 1
         counters[2] = left
     for lane in range(LANES):
-        if not keep[lane] or not squares[lane] <= cut[1]:
+        if not keep[lane] or not squares[lane] <= far[c]:
             continue
         if counters[2] == MOST_CANDIDATES:
             settle(best, points, m, shift, ints, halves, lanes, off)
         at = counters[2]
-        candidates[at, 0], candidates[at, 1], candidates[at, 2], candidates[at, 3] = (
-            block,
-            lane,
-            block_at,
-            lane_at,
-        )
+        candidates[at, 0], candidates[at, 1], candidates[at, 2] = block, lane, block_at
+        candidates[at, 3], candidates[at, 4] = lane_at, np.int64(c)
         nearly[at] = squares[lane]
         counters[2] = at + 1
 
@@ -333,9 +286,9 @@ def settle(best, points, m, shift, ints, halves, lanes, off):
 
     points: (b, 3, LANES) of Avatar.  lanes: of Placed.  off: (3,) float32, from the frame to the voxel's low corner.
     """
-    cut, frame, found, squares, units = best.cut, best.frame, best.found, best.listed, best.units
+    far, frame, found, squares, units = best.far, best.frame, best.found, best.listed, best.units
     for i in range(best.counters[2]):
-        if best.nearly[i] > cut[1]:
+        if best.nearly[i] > far[best.candidates[i, 4]]:
             continue
         block, lane = best.candidates[i, 0], best.candidates[i, 1]
         block_at, lane_at = best.candidates[i, 2], best.candidates[i, 3]
@@ -344,14 +297,15 @@ def settle(best, points, m, shift, ints, halves, lanes, off):
         z = lanes[block, 2, lane] - (off[2] + np.float32(ints[block_at + 2]))
         list_squares(halves, lane_at, x, y, z, squares)
         for j in range(LANES):
-            if squares[j] <= cut[1]:
+            c = point_class(ints, block_at, j, best.mask)
+            if squares[j] <= far[c]:
                 _consider(
                     points, m, shift, block, lane, ints, halves, best.corner, block_at, lane_at, j, frame[2],
-                    units[0], found,
+                    units[0], best.drop[c], found,
                 )  # fmt: skip
     best.counters[2] = 0
     if found[0] >= 0:
-        nearest = np.int64(math.sqrt(np.float64(found[0]))) + 2
+        nearest = found_units(found)
         if nearest < units[1]:
             units[1] = nearest
-            set_cut(cut, frame, nearest, -1)
+            set_cut(best.cut, far, frame, best.drop, nearest)

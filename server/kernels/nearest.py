@@ -2,7 +2,8 @@
 
 Branch and bound, with the best pair so far as the bound: the scene's tree is descended with a list of those nodes of
 the avatar's front that may hold a nearer pair, as overlap.py does with the reach for a bound. Nothing is left alone but
-what its lower bound, less what float32 may have lost, puts above the best. closest.py has what is done with points.
+what its lower bound, less what float32 may have lost, puts above the best, a node by the radius class of the largest
+sphere below it. closest.py says what nearest means, and has what is done with points.
 
 The first bound is a narrow one, and is widened where nothing is found within it. That comes to as many node visits as
 though the distance had been known beforehand and a tenth more. One way down both trees, the nearest child each time,
@@ -18,19 +19,11 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from .closest import (
-    keep_in_box,
-    keep_near,
-    least_squares,
-    lower_bound,
-    make_best,
-    set_cut,
-    settle,
-    take_candidates,
-)
+from .closest import found_units, lower_bound, make_best, set_cut, settle, take_candidates
 from .compiled import borrowing, inlined
 from .front import make_front, move_node, pad, place_front, sift, take_kept
-from .layout import COUNT, COUNTED, FIRST, LANES, ROW_WORDS
+from .lanes import keep_in_box, keep_near, least_squares
+from .layout import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, node_class
 from .overlap import BROAD, FLAT, STACK
 from .placed import ONE_SLACK, SLACK, make_placed, node_reach, place_lanes, place_root
 from .placing import place
@@ -96,15 +89,15 @@ def _search_leaves(m, a, row, avatar, placed, scene, spot, best, off):
     low_x = off[0] + np.float32(ints[U(block_at)])
     low_y = off[1] + np.float32(ints[U(block_at + 1)])
     low_z = off[2] + np.float32(ints[U(block_at + 2)])
-    halves = scene.halves
-    keep_in_box(halves, lane_at, low_x, low_y, low_z, lanes, block, best.cut[1], keep)
+    halves, c = scene.halves, node_class(ints, row, best.mask)
+    keep_in_box(halves, lane_at, low_x, low_y, low_z, lanes, block, best.far[c], keep)
     least, tested = least_squares(
         halves, lane_at, low_x, low_y, low_z, lanes, block, keep, best.keep8, best.squares
     )
     best.counters[1] += LANES * tested
-    if least <= best.cut[1]:
+    if least <= best.far[c]:
         take_candidates(
-            least, block, block_at, lane_at, off, best, avatar.points, m, placed.shift, ints, scene.halves, lanes
+            least, c, block, block_at, lane_at, off, best, avatar.points, m, placed.shift, ints, scene.halves, lanes
         )  # fmt: skip
 
 
@@ -125,13 +118,15 @@ def _search_pairs(avatar, m, pose, a, row, placed, scene, spot, best, descent):
     words, ints, nodes = scene.words, scene.ints, placed.nodes
     avatar_first, avatar_count = avatar.first, avatar.count
     stack, keys, off, cut, base = descent.pairs, descent.pair_keys, descent.off, best.cut, spot[0]
+    mask = best.mask
     stack[0, 0], stack[0, 1], keys[0] = a, row, np.float32(-1.0)
     depth = 1
     while depth > 0:
         depth -= 1
-        if keys[depth] > cut[0]:
-            continue
         a, row = stack[depth, 0], stack[depth, 1]
+        within = cut[node_class(ints, row, mask)]
+        if keys[depth] > within:
+            continue
         a_first, b_first = np.int64(avatar_first[a]), np.int64(ints[row + FIRST])
         begin = depth
         if a_first < 0 and b_first < 0:
@@ -139,7 +134,7 @@ def _search_pairs(avatar, m, pose, a, row, placed, scene, spot, best, descent):
             if placed.stamp[block] != pose:
                 place_lanes(avatar.points, m, block, placed.lanes, placed.shift, placed.frame, scene.step)
                 placed.stamp[block] = pose
-            if keep_near(placed.lanes, block, words, row, off[0], off[1], off[2], cut[0], best.keep):
+            if keep_near(placed.lanes, block, words, row, off[0], off[1], off[2], within, best.keep):
                 _search_leaves(m, a, row, avatar, placed, scene, spot, best, off)
         elif b_first < 0 or (a_first >= 0 and nodes[3, a] > words[row + 3]):
             best.counters[0] += avatar_count[a]
@@ -148,7 +143,7 @@ def _search_pairs(avatar, m, pose, a, row, placed, scene, spot, best, descent):
                     words, row, nodes[0, child] - off[0], nodes[1, child] - off[1], nodes[2, child] - off[2],
                     nodes[3, child],
                 )  # fmt: skip
-                if key <= cut[0]:
+                if key <= within:
                     _push(stack, keys, begin, depth, child, row, key)
                     depth += 1
         else:
@@ -157,7 +152,7 @@ def _search_pairs(avatar, m, pose, a, row, placed, scene, spot, best, descent):
             for i in range(ints[row + COUNT] & COUNTED):
                 child_row = base + (b_first + i) * ROW_WORDS
                 key = lower_bound(words, child_row, x, y, z, nodes[3, a])
-                if key <= cut[0]:
+                if key <= cut[node_class(ints, child_row, mask)]:
                     _push(stack, keys, begin, depth, a, child_row, key)
                     depth += 1
 
@@ -186,7 +181,7 @@ def _nearest_voxel(avatar, m, pose, placed, scene, voxel, front, count, descent,
     cut, keep, counters, corner, off = best.cut, best.keep, best.counters, best.corner, descent.off
     bounds, which, listed, listed8 = front.bounds, front.which, front.keep, front.keep8
     firsts, front_first, points = avatar.first, avatar.front_first, avatar.points
-    stack = descent.stack
+    stack, mask = descent.stack, best.mask
     shift, frame, step = placed.shift, placed.frame, scene.step
     spot = (scene.where[voxel, 0], scene.where[voxel, 1], scene.where[voxel, 2])
     for r in range(3):
@@ -196,7 +191,7 @@ def _nearest_voxel(avatar, m, pose, placed, scene, voxel, front, count, descent,
     counters[0] += 1
     x, y, z, radius = nodes[0, 0] - off_x, nodes[1, 0] - off_y, nodes[2, 0] - off_z, nodes[3, 0]
     broad = BROAD * radius
-    if not node_near(words, spot[0], x, y, z, radius + cut[0]):
+    if not node_near(words, spot[0], x, y, z, radius + cut[node_class(ints, spot[0], mask)]):
         return
     stack[0, 0], stack[0, 1], stack[0, 2] = spot[0], 0, count
     depth = 1
@@ -204,10 +199,11 @@ def _nearest_voxel(avatar, m, pose, placed, scene, voxel, front, count, descent,
         depth -= 1
         row, at, count = stack[U(depth), 0], stack[U(depth), 1], stack[U(depth), 2]
         first = np.int64(ints[U(row + FIRST)])
+        c = node_class(ints, row, mask)
         if first < 0 or words[U(row + 3)] < broad:
             counters[0] += count
             steps = (count + LANES - 1) // LANES
-            if not sift(words, row, bounds, at, steps, off_x, off_y, off_z, cut[0], listed):
+            if not sift(words, row, bounds, at, steps, off_x, off_y, off_z, cut[c], listed):
                 continue
             to = at + steps * LANES
             count = take_kept(bounds, which, listed, listed8, at, steps, to)
@@ -224,7 +220,7 @@ def _nearest_voxel(avatar, m, pose, placed, scene, voxel, front, count, descent,
                             place_lanes(points, m, block, lanes, shift, frame, step)
                             stamp[U(block)] = pose
                         counters[0] += 1
-                        if not keep_near(lanes, block, words, row, off_x, off_y, off_z, cut[0], keep):
+                        if not keep_near(lanes, block, words, row, off_x, off_y, off_z, cut[c], keep):
                             continue
                         if first < 0:
                             _search_leaves(m, a, row, avatar, placed, scene, spot, best, off)
@@ -241,10 +237,9 @@ def _nearest_voxel(avatar, m, pose, placed, scene, voxel, front, count, descent,
         children = np.int64(ints[U(row + COUNT)] & COUNTED)
         child = spot[0] + first * ROW_WORDS
         counters[0] += children
-        span = radius + cut[0]
         for _ in range(children):
             stack[U(depth), 0], stack[U(depth), 1], stack[U(depth), 2] = child, at, count
-            if node_near(words, child, x, y, z, span):
+            if node_near(words, child, x, y, z, radius + cut[node_class(ints, child, mask)]):
                 depth += 1
             child += ROW_WORDS
     settle(best, points, m, placed.shift, ints, scene.halves, lanes, off)
@@ -267,27 +262,33 @@ def box_gap(root, placed, farthest, scene, index, voxel):
 
 
 @borrowing
-def _widen(m, pose, avatar, placed, scene, reach, beyond, first, last, front, count, descent, best, gaps):
+def _widen(
+    m, pose, avatar, placed, scene, reach, beyond, first, last, front, count, descent, best, gaps, classes
+):
     """Search the voxels reach.rows[first:last] for the nearest pair, within ever wider bounds until there is one.
 
     Where nothing is near, to have looked for it costs little: nearly all nodes are far, too.
-    gaps: of each voxel, see `box_gap`; inf: not resident.
+    gaps: of each voxel, see `box_gap`; inf: not resident.  classes: of their root nodes.
     """
-    units, found = best.units, best.found
+    units, found, drop, cut = best.units, best.found, best.drop, best.cut
+    # No sphere here is larger than the largest by a model, less this.
+    base = drop[classes[0]]
+    for other in range(1, last - first):
+        base = min(base, drop[classes[other]])
     # Twice the radii: a distance of the size of the spheres. Of spheres without size, a share of the reach.
-    near = max(2 * (units[0] - beyond), units[0] >> 6, 1)
+    near = max(2 * (units[0] - base - beyond), (units[0] - base) >> 6, 1)
     while True:
         limit = units[0]
         if found[0] >= 0:
-            limit = min(limit, np.int64(math.sqrt(np.float64(found[0]))) + 2)
-        bound = min(near, limit)
+            limit = min(limit, found_units(found))
+        bound = min(base + near, limit)
         units[1] = bound
-        set_cut(best.cut, best.frame, bound, -1)
+        set_cut(cut, best.far, best.frame, drop, bound)
         while True:
             # The nearest voxel first. Few are looked into, so they are not sorted.
-            at, least = -1, np.float64(best.cut[0])
+            at, least = -1, np.inf
             for other in range(last - first):
-                if 0.0 <= gaps[other] <= least:
+                if 0.0 <= gaps[other] <= min(least, np.float64(cut[classes[other]])):
                     at, least = other, gaps[other]
             if at < 0:
                 break
@@ -313,21 +314,22 @@ def nearest_poses(poses, avatar, scene, index, reach, beyond, which, nearest, co
     Adds to what `nearest` and counts (3, k) uint32 (voxels missing, node visits, point tests) hold, -1, inf and 0 to
     begin with, so that a pose may be answered in pieces.
     """
-    placed, best = make_placed(avatar), make_best()
+    placed, best = make_placed(avatar), make_best(scene.drop)
     front, descent = make_front(avatar), make_descent()
     most = 0
     for number in range(which.shape[0]):
         most = max(most, reach.starts[which[number] + 1] - reach.starts[which[number]])
-    gaps = np.empty(most)
+    gaps, classes = np.empty(most), np.empty(most, np.uint64)
     _nearest_poses(
-        poses, avatar, scene, index, reach, beyond, which, nearest, counts, placed, best, front, descent, gaps
-    )
+        poses, avatar, scene, index, reach, beyond, which, nearest, counts, placed, best, front, descent, gaps,
+        classes,
+    )  # fmt: skip
 
 
 @borrowing
 def _nearest_poses(
-    poses, avatar, scene, index, reach, beyond, which, nearest, counts, placed, best, front, descent, gaps
-):
+    poses, avatar, scene, index, reach, beyond, which, nearest, counts, placed, best, front, descent, gaps, classes
+):  # fmt: skip
     """`nearest_poses`, with its scratch."""
     for number in range(which.shape[0]):
         i = which[number]
@@ -341,22 +343,25 @@ def _nearest_poses(
         best.found[0] = nearest.square[i]
         for r in range(6):
             best.found[1 + r] = nearest.pair[i, r]
+        best.found[7] = nearest.drop[i]
         best.counters[0], best.counters[1], best.counters[2] = 0, 0, 0
         best.frame[2], best.frame[3] = scene.units_per_step, scene.voxel_steps
         root = avatar.radius[0] * reach.scales[i]
         for at in range(first, last):
             gap = box_gap(root, placed, best.frame[1], scene, index, reach.rows[at])
-            if scene.where[reach.rows[at], 0] >= 0:
-                gaps[at - first] = gap
+            row = scene.where[reach.rows[at], 0]
+            if row >= 0:
+                gaps[at - first], classes[at - first] = gap, node_class(scene.ints, row, best.mask)
             else:
-                gaps[at - first] = np.inf
+                gaps[at - first], classes[at - first] = np.inf, U(0)
                 counts[0, i] += np.uint32(1)
                 nearest.gap[i] = min(nearest.gap[i], gap)
         _widen(
-            poses[i], i, avatar, placed, scene, reach, beyond, first, last, front, count, descent, best, gaps
-        )
+            poses[i], i, avatar, placed, scene, reach, beyond, first, last, front, count, descent, best, gaps, classes
+        )  # fmt: skip
         nearest.square[i] = best.found[0]
         for r in range(6):
             nearest.pair[i, r] = best.found[1 + r]
+        nearest.drop[i] = best.found[7]
         counts[1, i] += np.uint32(best.counters[0])
         counts[2, i] += np.uint32(best.counters[1])

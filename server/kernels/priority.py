@@ -9,6 +9,9 @@ nearest, for it is the likeliest to hold a contact.
 The order of visits depends on the request alone, so a larger budget continues what a smaller one began, and no bound
 gets worse (NUMERICS.md case 30). All state lies in arrays: the search is left and resumed at will. What does not fit
 the heap is searched depth first, to its end, before the heap goes on: memory is bounded, and nothing is dropped.
+
+Where scan points have spheres of several sizes, all bounds are of |a - b| + drop (closest.py): below a node no drop is
+less than that of its radius class, and some point's is at most its `sure` drop.
 """
 
 import math
@@ -18,19 +21,20 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from ...schemas.radius_model import RIM_BIT
 from .closest import (
     Best,
-    any_near,
-    keep_near,
+    found_units,
     lower_bound,
     make_best,
     search_lanes,
     set_cut,
 )
-from .layout import COUNT, COUNTED, FIRST, LANES, ROW_WORDS
+from .lanes import any_near, keep_near
+from .layout import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, node_class
 from .nearest import box_gap
 from .overlap import STACK
-from .placed import ONE_SLACK, SLACK, Placed, make_limits, make_placed, place_block, place_nodes
+from .placed import SLACK, Placed, make_placed, place_block, place_nodes
 from .placing import MAX_REACH_UNITS
 
 # The search goes on; nothing is open; what was asked is known; the budget of visits is spent.
@@ -41,13 +45,15 @@ NO_VOXEL = -1  # in place of a row: the voxel has not been looked into
 class Known(NamedTuple):
     """What is known of k poses, gathered over pieces of a request.
 
-    square, pair, gap: of `Nearest`.  lower: (k,) float64, centres are nowhere nearer than that where something was left
-    open [steps]; inf: nothing was.  upper: (k,) float64, some pair is at least as near [steps].  spent: (k,) bool, the
-    budget has ended a search: further pieces get none of it, or a larger one would see less of them.
+    square, pair, drop, gap: of `Nearest`.  lower: (k,) float64, |a - b| + drop is nowhere less than that where
+    something was left open [steps]; inf: nothing was.  upper: (k,) float64, some pair's is at most that [steps].
+    spent: (k,) bool, the budget has ended a search: further pieces get none of it, or a larger one would see less of
+    them.
     """
 
     square: NDArray[np.int64]
     pair: NDArray[np.int64]
+    drop: NDArray[np.int64]
     gap: NDArray[np.float64]
     lower: NDArray[np.float64]
     upper: NDArray[np.float64]
@@ -60,7 +66,8 @@ class Search(NamedTuple):
     keys: (h + STACK, 2) float32, lower and upper bound of a pair [steps], without the error of placing.  pairs:
     (h + STACK, 3) int64: avatar node, row or NO_VOXEL, voxel. The first h are the heap, the others the stack of what
     did not fit it.  sizes: (2,) int64, of heap and stack.  bounds: (4,) float64 [steps]: lower and upper bound of the
-    answer, lower bound of the stack, error of placing.  status: (1,) int64.
+    answer, lower bound of the stack, error of placing.  status: (1,) int64.  drops: (2, n) float32 [steps], by radius
+    class of a node: no point's drop below it is less, rounded down; some point's is no more, rounded up.
     """
 
     keys: NDArray[np.float32]
@@ -68,6 +75,7 @@ class Search(NamedTuple):
     sizes: NDArray[np.int64]
     bounds: NDArray[np.float64]
     status: NDArray[np.int64]
+    drops: NDArray[np.float32]
     placed: Placed
     best: Best
 
@@ -88,11 +96,19 @@ class Goal(NamedTuple):
 
 
 @nb.njit(nogil=True, cache=True)
-def make_search(avatar, heap):
+def make_search(avatar, scene, heap):
     """Scratch for one avatar (not empty) and a heap of so many pairs."""
+    drop = scene.drop
+    mask = drop.shape[0] - 1
+    drops = np.empty((2, drop.shape[0]), np.float32)
+    for c in range(drop.shape[0]):
+        # Some point has the node's local class, on a rim or not; where not all are on a rim, one that is not has any.
+        sure = min(drop[(c | RIM_BIT) & mask], drop[c & RIM_BIT & mask])
+        drops[0, c] = np.float32(np.float64(drop[c]) / scene.units_per_step * (1.0 - 1e-6))
+        drops[1, c] = np.float32(np.float64(sure) / scene.units_per_step * (1.0 + 1e-6))
     return Search(
         np.empty((heap + STACK, 2), np.float32), np.empty((heap + STACK, 3), np.int64), np.zeros(2, np.int64),
-        np.zeros(4), np.zeros(1, np.int64), make_placed(avatar), make_best(),
+        np.zeros(4), np.zeros(1, np.int64), drops, make_placed(avatar), make_best(drop),
     )  # fmt: skip
 
 
@@ -147,17 +163,14 @@ def _begin(poses, avatar, scene, index, reach, i, search, goal, known, counts):
     best.frame[0], best.frame[1] = place_nodes(avatar, poses[i], reach.scales[i], placed, scene)
     best.frame[2], best.frame[3] = scene.units_per_step, scene.voxel_steps
     best.units[0] = reach.units[i] + min(goal.early, MAX_REACH_UNITS - reach.units[i])
-    best.found[0] = known.square[i]
-    best.found[1:] = known.pair[i]
+    best.found[0], best.found[7] = known.square[i], known.drop[i]
+    best.found[1:7] = known.pair[i]
     best.counters[:] = 0
-    set_cut(best.cut, best.frame, best.units[0], best.found[0])
-    limits = make_limits(
-        reach.units[i], scene.units_per_step, best.frame[0], best.frame[1], scene.voxel_steps
-    )
-    if goal.first:
-        # Nodes are looked into for what is in reach; a pair a little beyond is taken where one is met.
-        best.cut[0] = (limits.reach + limits.error) * ONE_SLACK
-    search.bounds[0], search.bounds[1], search.bounds[2], search.bounds[3] = 0.0, np.inf, 0.0, limits.error
+    set_cut(best.cut, best.far, best.frame, best.drop, reach.units[i])
+    search.bounds[0], search.bounds[1], search.bounds[2], search.bounds[3] = 0.0, np.inf, 0.0, best.frame[4]
+    within = best.units[0] if best.found[0] < 0 else found_units(best.found)
+    # `collide` looks into nodes for what is in reach; a pair a little beyond is taken where one is met.
+    set_cut(best.squares if goal.first else best.cut, best.far, best.frame, best.drop, within)
     search.sizes[0], search.sizes[1], search.status[0] = 0, 0, OPEN
     keys, pairs = search.keys, search.pairs
     for at in range(reach.starts[i], reach.starts[i + 1]):
@@ -169,7 +182,8 @@ def _begin(poses, avatar, scene, index, reach, i, search, goal, known, counts):
             known.gap[i] = min(known.gap[i], gap)
             continue
         size = search.sizes[0]
-        keys[size, 0], keys[size, 1] = np.float32(gap * (1.0 - 1e-6)), np.float32(np.inf)
+        drop = search.drops[0, node_class(scene.ints, scene.where[voxel, 0], best.mask)]
+        keys[size, 0], keys[size, 1] = np.float32(gap * (1.0 - 1e-6)) + drop, np.float32(np.inf)
         pairs[size, 0], pairs[size, 1], pairs[size, 2] = 0, NO_VOXEL, voxel
         _sift_up(keys, pairs, size)
         search.sizes[0] = size + 1
@@ -182,16 +196,21 @@ def _enough(goal, enough, best, bounds):
         return best.found[0] >= 0 or bounds[1] <= enough
     if best.found[0] < 0 or goal.tolerance <= 0.0:
         return False
-    return math.sqrt(np.float64(best.found[0])) / best.frame[2] - bounds[0] <= goal.tolerance
+    found = math.sqrt(np.float64(best.found[0])) + np.float64(best.found[7])
+    return found / best.frame[2] - bounds[0] <= goal.tolerance
 
 
 @nb.njit(nogil=True, cache=True)
-def _put(keys, pairs, sizes, heap, spilling, cut, bounds, parent, low, high, a, row, voxel):
-    """Add a pair to the heap, or to the stack where spilling. low, high: its bounds; parent: the bound above it."""
+def _put(keys, pairs, sizes, heap, spilling, cut, drops, c, bounds, parent, low, high, a, row, voxel):
+    """Add a pair to the heap, or to the stack where spilling. low, high: bounds of |a - b|; parent: its key's above.
+
+    cut: above it no key is of use.  c: radius class of the scene's node.
+    """
+    high += drops[1, c]
     bounds[1] = min(bounds[1], np.float64(high) + bounds[3])
     # What holds above holds below, and no two centres are nearer than 0.
-    low = max(low, parent)
-    if low > cut[0]:
+    low = max(max(low, np.float32(0.0)) + drops[0, c], parent)
+    if low > cut:
         return
     at = heap + sizes[1] if spilling else sizes[0]
     keys[at, 0], keys[at, 1] = low, high
@@ -221,13 +240,15 @@ def _go_on(m, pose, avatar, scene, search, goal, enough, budget, until):
         placed.frame,
         placed.shift,
     )
-    found, cut, frame, corner, keep = best.found, best.cut, best.frame, best.corner, best.keep
-    squares, counters, units = best.squares, best.counters, best.units[0]
+    found, cut, far, frame, corner, keep = best.found, best.cut, best.far, best.frame, best.corner, best.keep
+    squares, counters, units, drop, mask = best.squares, best.counters, best.units[0], best.drop, best.mask
+    drops, largest = search.drops, np.argmin(drop)
     keys, pairs, sizes, bounds = search.keys, search.pairs, search.sizes, search.bounds
     avatar_first, avatar_count, points = avatar.first, avatar.count, avatar.points
     heap = keys.shape[0] - STACK
     while True:
-        if sizes[1] == 0 and (sizes[0] == 0 or keys[0, 0] > cut[0]):
+        limit = cut[largest]
+        if sizes[1] == 0 and (sizes[0] == 0 or keys[0, 0] > limit):
             search.status[0] = DONE
             return
         least = np.float64(keys[0, 0]) if sizes[1] == 0 else bounds[2]
@@ -258,7 +279,7 @@ def _go_on(m, pose, avatar, scene, search, goal, enough, budget, until):
             bounds[2] = np.float64(key)
             _drop_top(keys, pairs, sizes[0])
             sizes[0] -= 1
-        if key > cut[0]:
+        if key > limit:
             continue
         base = where[voxel, 0]
         for r in range(3):
@@ -267,10 +288,11 @@ def _go_on(m, pose, avatar, scene, search, goal, enough, budget, until):
         off_y = np.float32(corner[1] - frame_at[1])
         off_z = np.float32(corner[2] - frame_at[2])
         x, y, z = nodes[0, a] - off_x, nodes[1, a] - off_y, nodes[2, a] - off_z
+        c = node_class(ints, base if row == NO_VOXEL else row, mask)
         if row == NO_VOXEL:
             low = lower_bound(words, base, x, y, z, nodes[3, a])
             high = _upper_bound(words, base, x, y, z, nodes[3, a])
-            _put(keys, pairs, sizes, heap, spilling, cut, bounds, key, low, high, a, base, voxel)
+            _put(keys, pairs, sizes, heap, spilling, limit, drops, c, bounds, key, low, high, a, base, voxel)
         elif leaves:
             block, scene_block = ~a_first, ~b_first
             if stamp[block] != pose:
@@ -280,7 +302,7 @@ def _go_on(m, pose, avatar, scene, search, goal, enough, budget, until):
             lane_at = where[voxel, 2] + scene_block * 3 * LANES
             lx, ly = off_x + np.float32(ints[block_at]), off_y + np.float32(ints[block_at + 1])
             lz = off_z + np.float32(ints[block_at + 2])
-            keep_near(lanes, block, words, row, off_x, off_y, off_z, cut[0], keep)
+            keep_near(lanes, block, words, row, off_x, off_y, off_z, cut[c], keep)
             for lane in range(avatar_count[a]):
                 if not keep[lane]:
                     continue
@@ -290,31 +312,36 @@ def _go_on(m, pose, avatar, scene, search, goal, enough, budget, until):
                     lanes[block, 2, lane] - lz,
                 )
                 counters[1] += LANES
-                if any_near(halves, lane_at, px, py, pz, cut[1]):
+                if any_near(halves, lane_at, px, py, pz, far[c]):
                     search_lanes(
                         points, m, shift, block, lane, ints, halves, corner, block_at, lane_at, px, py, pz, frame,
-                        units, squares, found, cut,
+                        units, squares, found, cut, far, drop, mask,
                     )  # fmt: skip
         elif avatar_side:
             for child in range(a_first, a_first + cost):
                 x, y, z = nodes[0, child] - off_x, nodes[1, child] - off_y, nodes[2, child] - off_z
                 low = lower_bound(words, row, x, y, z, nodes[3, child])
                 high = _upper_bound(words, row, x, y, z, nodes[3, child])
-                _put(keys, pairs, sizes, heap, spilling, cut, bounds, key, low, high, child, row, voxel)
+                _put(
+                    keys, pairs, sizes, heap, spilling, limit, drops, c, bounds, key, low, high, child, row, voxel
+                )  # fmt: skip
         else:
             for number in range(cost):
                 child = base + (b_first + number) * ROW_WORDS
                 low = lower_bound(words, child, x, y, z, nodes[3, a])
                 high = _upper_bound(words, child, x, y, z, nodes[3, a])
-                _put(keys, pairs, sizes, heap, spilling, cut, bounds, key, low, high, a, child, voxel)
+                c = node_class(ints, child, mask)
+                _put(
+                    keys, pairs, sizes, heap, spilling, limit, drops, c, bounds, key, low, high, a, child, voxel
+                )  # fmt: skip
 
 
 @nb.njit(nogil=True, cache=True)
 def end_search(search, i, known, counts):
     """Add what a search has found out to what is known of pose i."""
     best = search.best
-    known.square[i] = best.found[0]
-    known.pair[i] = best.found[1:]
+    known.square[i], known.drop[i] = best.found[0], best.found[7]
+    known.pair[i] = best.found[1:7]
     known.upper[i] = min(known.upper[i], search.bounds[1])
     known.spent[i] |= search.status[0] == SPENT
     if search.status[0] != DONE:
@@ -343,7 +370,7 @@ def go_on(poses, avatar, scene, index, reach, i, fresh, until, search, goal, kno
 @nb.njit(nogil=True, cache=True)
 def search_poses(poses, avatar, scene, index, reach, which, heap, goal, known, counts):
     """`go_on` to the end for each of the poses numbered in `which`: one call for a request without a deadline."""
-    search = make_search(avatar, heap)
+    search = make_search(avatar, scene, heap)
     for number in range(which.shape[0]):
         go_on(
             poses, avatar, scene, index, reach, which[number], True, np.int64(1) << 62, search, goal, known, counts

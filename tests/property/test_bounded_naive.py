@@ -12,6 +12,7 @@ import pytest
 from clouds import KINDS, TREES, cloud
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from judged import judge_collide, judge_distance
 from numpy.typing import NDArray
 from solidcloud.schemas.answers import CollideAnswers, DistanceAnswers, Verdict
 from solidcloud.server import bounded
@@ -19,44 +20,7 @@ from solidcloud.server.bounded import collide_bounded, distance_bounded
 from solidcloud.server.effort import NO_LIMIT, Effort
 from solidcloud.server.scene import Scene
 
-# Bounds are rounded outward, by some exact units of 2^-26 m.
-ROUNDED = 2e-7
 BUDGETS = (0, 1, 5, 30, 200, 2000, NO_LIMIT - 1)
-
-
-def judge_distance(
-    answers: DistanceAnswers, signed: NDArray[np.float64], reach: float, tolerance: float, ended: bool
-) -> None:
-    """Assert what `distance` promises of true signed distances (k,), inf beyond reach; ended: not for its budget."""
-    beyond = np.isinf(signed)
-    assert (answers.lower <= np.where(beyond, reach, signed)).all() and (answers.upper >= signed).all()
-    assert (answers.signed_distance >= signed).all() and (answers.signed_distance >= answers.upper).all()
-    assert (answers.signed_distance[answers.exact] == signed[answers.exact]).all()
-    assert (signed[answers.verdict == Verdict.CONTACT] <= 0).all()
-    assert (signed[answers.verdict == Verdict.CLEAR] > 0).all()
-    found = ~np.isinf(answers.signed_distance)
-    assert (np.isfinite(answers.witness_cloud).all(axis=1) == found).all()
-    if ended:
-        assert (found == ~beyond).all()
-        assert (answers.upper[found] - answers.lower[found] <= tolerance + ROUNDED).all()
-        assert tolerance > 0 or answers.exact.all()
-
-
-def judge_collide(
-    answers: CollideAnswers, signed: NDArray[np.float64], margin: float, tolerance: float, ended: bool
-) -> None:
-    """Assert what `collide` promises of true signed distances (k,), inf beyond reach and tolerance."""
-    contact, verdict = signed <= margin, answers.verdict
-    assert (answers.lower <= np.minimum(signed, margin)).all() and (answers.upper >= signed).all()
-    assert contact[answers.exact & (verdict == Verdict.CONTACT)].all()
-    assert (signed[verdict == Verdict.CONTACT] <= margin + tolerance).all(), "too early"
-    assert not contact[verdict == Verdict.CLEAR].any(), "a false clear"
-    assert (
-        answers.exact[verdict == Verdict.CLEAR].all() and not answers.exact[verdict == Verdict.UNKNOWN].any()
-    )
-    if ended:
-        assert (verdict != Verdict.UNKNOWN).all()
-        assert tolerance > 0 or answers.exact.all()
 
 
 @settings(max_examples=15, deadline=None, derandomize=True)

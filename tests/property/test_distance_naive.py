@@ -13,25 +13,9 @@ import scans
 from clouds import KINDS, TREES, cloud, signed_permutations
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from solidcloud.schemas.answers import DistanceAnswers, Verdict
+from judged import compare
+from solidcloud.schemas.answers import Verdict
 from solidcloud.server.scene import Scene
-
-
-def compare(answers: DistanceAnswers, expected: list[naive_distance.Expected | None], reach: float) -> None:
-    """Assert that answers are the judge's, to the last bit."""
-    assert answers.exact.all()
-    for i, judged in enumerate(expected):
-        found = (
-            answers.signed_distance[i], answers.witness_avatar[i], answers.witness_cloud[i], answers.normal[i]
-        )  # fmt: skip
-        if judged is None:
-            assert found[0] == answers.upper[i] == np.inf and answers.lower[i] == reach
-            assert all(np.isnan(column).all() for column in found[1:])
-            assert answers.verdict[i] == Verdict.CLEAR
-            continue
-        assert found[0] == answers.lower[i] == answers.upper[i] == judged.signed, (i, found, judged)
-        assert [column.tolist() for column in found[1:]] == list(judged[1:4]), (i, found, judged)
-        assert answers.verdict[i] == (Verdict.CONTACT if judged.signed <= 0 else Verdict.CLEAR)
 
 
 @settings(max_examples=40, deadline=None, derandomize=True)

@@ -1,0 +1,201 @@
+"""`distance` and the bounded searches with spheres of several sizes: the least gap, exactly, whatever the tree."""
+
+import math
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import cases
+import classes
+import naive
+import naive_distance
+import numpy as np
+import pytest
+from clouds import KINDS, TREES, cloud
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from judged import compare, judge_collide, judge_distance
+from numpy.typing import NDArray
+from solidcloud.schemas.answers import CollideAnswers, DistanceAnswers, Verdict
+from solidcloud.server import bounded
+from solidcloud.server.effort import NO_LIMIT
+from solidcloud.server.scene import Scene
+
+# `local` and `border` as they are: spheres as large as the cloud, so that avatars are inside most of them.
+MODELS = (*classes.MODELS, "local", "local+border", "border:0.5")
+BUDGETS = (0, 5, 30, 200, NO_LIMIT - 1)
+
+
+def signed_of(judged: list[naive_distance.Expected | None]) -> NDArray[np.float64]:
+    """What was judged as numbers, inf beyond reach."""
+    return np.array([math.inf if found is None else found.signed for found in judged])
+
+
+@settings(max_examples=30, deadline=None, derandomize=True)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    kind=st.sampled_from(KINDS),
+    count=st.sampled_from([1, 2, 33, 300]),
+    body=st.sampled_from(KINDS),
+    model=st.sampled_from(MODELS),
+    voxel=st.sampled_from([0.07, 0.5, 4.0]),
+    step=st.sampled_from([1e-4, cases.BINARY_STEP, 1e-2]),
+    scale=st.sampled_from([1.0, 0.3]),
+    tree=TREES,
+)
+def test_distance_is_that_of_the_least_gap(
+    seed: int,
+    kind: str,
+    count: int,
+    body: str,
+    model: str | None,
+    voxel: float,
+    step: float,
+    scale: float,
+    tree: dict[str, Any],
+) -> None:
+    rng = np.random.default_rng(seed)
+    points, avatar = cloud(rng, kind, count), cloud(rng, body, 30) * 0.3
+    radius = float(rng.choice([0.0, 0.01]))
+    poses = cases.near_poses(rng, points, avatar, 12, 0.6, scale)
+    if step == cases.BINARY_STEP:  # all on the lattice: ties abound
+        points, avatar = np.rint(points * 16) / 16, np.rint(avatar * 16) / 16
+        poses[:, :3, :3], poses[:, :3, 3] = np.eye(3) * scale, np.rint(poses[:, :3, 3] * 16) / 16
+    reach = float(10.0 ** rng.uniform(-2, 0.5))
+    with TemporaryDirectory() as folder, classes.any_classes():
+        case = cases.build(
+            Path(folder), points, voxel=math.ceil(voxel / step) * step, resolution=step, models=classes.STORED, **tree
+        )  # fmt: skip
+        stored, radii = classes.stored_radii(case.archive, model)
+        with Scene.open(case.archive) as scene:
+            scan = (stored, scene.info().origin, step, radii, avatar, radius)
+            scene.add_avatar("avatar", avatar, radius)
+            judged = naive_distance.distance_by_radii(*scan, poses, reach)
+            answers = scene.distance("avatar", poses, reach, radius_model=model)
+            compare(answers, judged, reach)
+            touching = scene.collide("avatar", poses, radius_model=model).verdict
+            assert ((answers.verdict == Verdict.CONTACT) == touching).all()
+            for pose in poses[:4]:
+                # The reach to the very unit, and one less.
+                found = naive_distance.distance_by_radii(*scan, pose[None], 9.0)[0]
+                assert found is not None
+                root = math.isqrt(found.square)
+                for units in range(root - 1 - found.radii, root + 3 - found.radii):
+                    if units < 0:
+                        continue
+                    limit = units / naive.UNITS
+                    again = scene.distance("avatar", pose[None], limit, radius_model=model)
+                    within = found.square <= (units + found.radii) ** 2
+                    compare(again, [found if within else None], limit)
+
+
+@settings(max_examples=10, deadline=None, derandomize=True)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    kind=st.sampled_from(KINDS),
+    body=st.sampled_from(KINDS),
+    model=st.sampled_from(MODELS[:-1]),
+    voxel=st.sampled_from([0.3, 5.0]),
+    heap=st.sampled_from([1, 20, bounded.HEAP_PAIRS]),
+    cache=st.sampled_from([None, 2]),
+    tree=TREES,
+)
+def test_bounds_hold_and_a_larger_budget_never_gives_worse(
+    seed: int,
+    kind: str,
+    body: str,
+    model: str | None,
+    voxel: float,
+    heap: int,
+    cache: int | None,
+    tree: dict[str, Any],
+) -> None:
+    """cache: so many of the largest voxel, so that poses are looked at in pieces."""
+    rng = np.random.default_rng(seed)
+    points, avatar = cloud(rng, kind, 300), cloud(rng, body, 50) * rng.uniform(0.05, 0.5)
+    poses = cases.near_poses(rng, points, avatar, 20, 0.6)
+    tolerance = float(rng.choice([0.0, 1e-3, 0.03, 0.3]))
+    margin, reach = float(rng.choice([0.0, 0.02, 0.2])), float(rng.choice([0.05, 1.0]))
+    with TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch, classes.any_classes():
+        patch.setattr(bounded, "HEAP_PAIRS", heap)
+        case = cases.build(Path(folder), points, voxel=voxel, models=classes.STORED, **tree)
+        stored, radii = classes.stored_radii(case.archive, model)
+        with Scene.open(case.archive) as scene:
+            info = scene.info()
+            most = max(scene.residency.bytes_of([row]) for row in range(info.voxels))
+        scan = (stored, info.origin, info.lattice_step, radii, avatar, 0.02)
+        signed = signed_of(naive_distance.distance_by_radii(*scan, poses, 5.0))
+        within = np.where(signed <= reach, signed, np.inf)
+        with Scene.open(case.archive, **({} if cache is None else {"budget_bytes": cache * most})) as scene:
+            scene.add_avatar("avatar", avatar, 0.02)
+            last: tuple[DistanceAnswers, CollideAnswers] | None = None
+            for visits in BUDGETS:
+                options: dict[str, Any] = {
+                    "tolerance": tolerance,
+                    "budget_visits": visits,
+                    "radius_model": model,
+                }
+                ended = visits == BUDGETS[-1]
+                near = scene.distance("avatar", poses, reach, **options)
+                judge_distance(near, within, reach, tolerance, ended)
+                touch = scene.collide("avatar", poses, margin, **options)
+                judge_collide(touch, signed, margin, tolerance, ended)
+                if last is not None:
+                    for now, before in zip((near, touch), last, strict=True):
+                        assert (now.lower >= before.lower).all() and (now.upper <= before.upper).all()
+                    known = last[1].verdict != Verdict.UNKNOWN
+                    assert (touch.verdict[known] == last[1].verdict[known]).all()
+                last = near, touch
+            exact = scene.distance("avatar", poses, reach, radius_model=model)
+            assert exact.signed_distance.tolist() == within.tolist()
+            if tolerance == 0.0:
+                assert near.signed_distance.tolist() == within.tolist()
+                assert np.array_equal(exact.witness_cloud, near.witness_cloud, equal_nan=True)
+                assert np.array_equal(exact.witness_avatar, near.witness_avatar, equal_nan=True)
+            scene.residency.check()
+
+
+def test_an_avatar_whose_front_is_inner_nodes(tmp_path: Path, rng: np.random.Generator) -> None:
+    points = cloud(rng, "plane", 500) * [1, 1, 0.1]
+    direction = rng.normal(size=(10_000, 3))
+    avatar = direction / np.linalg.norm(direction, axis=1)[:, None] * rng.uniform(0.2, 0.21, (10_000, 1))
+    poses = np.stack([cases.pose_of(cases.random_rotation(rng), rng.uniform(-1.2, 1.2, 3)) for _ in range(8)])
+    with classes.any_classes():
+        case = cases.build(tmp_path, points, leaf=4, degree=3, models=classes.STORED)
+    with Scene.open(case.archive) as scene:
+        info = scene.info()
+        scene.add_avatar("avatar", avatar, 0.002)
+        for model in ("local:0.2", "local+border"):
+            stored, radii = classes.stored_radii(case.archive, model)
+            scan = (stored, info.origin, info.lattice_step, radii)
+            judged = naive_distance.distance_by_radii(*scan, avatar, 0.002, poses, 0.3)
+            compare(scene.distance("avatar", poses, 0.3, radius_model=model), judged, 0.3)
+            assert {found is None for found in judged} == {True, False}
+
+
+@pytest.mark.interpreted
+def test_a_small_sphere_in_front_of_a_large_one(tmp_path: Path, rng: np.random.Generator) -> None:
+    """The nearest centre is not that of the nearest sphere."""
+    grid = np.stack(np.meshgrid(np.arange(8), np.arange(8), [0, 1]), -1).reshape(-1, 3) * 0.2
+    avatar = grid[:9] - grid[4]
+    with classes.any_classes():
+        case = cases.build(tmp_path, grid, resolution=2.0**-8 / 5, radius=0.25, models=classes.STORED)
+    shifts = np.array([(9, 9, 10), (7, -3, 9), (6, 5, -5), (7, 7, 6), (4, 4, 2)]) / 10
+    poses = np.array([cases.pose_of(np.eye(3), shift) for shift in shifts])
+    poses = np.concatenate([poses, cases.near_poses(rng, grid, avatar, 15, 0.8)])
+    farther = 0
+    with Scene.open(case.archive) as scene:
+        info = scene.info()
+        scene.add_avatar("avatar", avatar, 0.0)
+        for model in ("local", "border"):
+            stored, radii = classes.stored_radii(case.archive, model)
+            scan = (stored, info.origin, info.lattice_step, radii)
+            judged = naive_distance.distance_by_radii(*scan, avatar, 0.0, poses, 2.0)
+            compare(scene.distance("avatar", poses, 2.0, radius_model=model), judged, 2.0)
+            near = scene.distance("avatar", poses, 2.0, tolerance=0.01, radius_model=model)
+            judge_distance(near, signed_of(judged), 2.0, 0.01, True)
+            b = naive.scan_units(stored, info.lattice_step)
+            for pose, found in zip(poses, judged, strict=True):
+                assert found is not None
+                farther += found.square > naive.least_square(naive.placed_units(avatar, pose, info.origin), b)
+    assert farther > 0 and len(set(radii)) == 2

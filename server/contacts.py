@@ -23,6 +23,7 @@ from .kernels.clusters import (
     CENTER,
     CLUSTER,
     CLUSTERS,
+    DROP,
     HIGH,
     LISTED,
     LOW,
@@ -64,10 +65,12 @@ def contacts(
 
     poses, margin: as for `collide`.  limit: pairs listed a pose, 0 to MAX_CONTACTS; all are counted.
     cluster_distance: edge of the grid cells that touched scan points fall in [m], rounded up to whole lattice steps,
-    at least one; cells lie on multiples of it from the dataset's origin. None: twice r_a + r_b + margin. Touched cells
-    that share a face, an edge or a corner are one cluster: points at most this far apart always are in one cluster, and
-    points of two clusters are farther apart than it along an axis.
-    Coincident points are pairs each. Ties go by scan point, avatar centre, avatar row, scan number.
+    at least one; cells lie on multiples of it from the dataset's origin. None: twice r_a + r_b + margin, r_b of the
+    largest sphere that the radius model has. Touched cells that share a face, an edge or a corner are one cluster:
+    points at most this far apart always are in one cluster, and points of two clusters are farther apart than it along
+    an axis.
+    Deepest is where |a - b| - r_a - r_b is least, r_b of the scan point's own sphere, compared exactly and not by the
+    rounded figure. Coincident points are pairs each. Ties go by scan point, avatar centre, avatar row, scan number.
     effort: a budget leaves pairs out, and says so in `exact`; what is listed then is in contact, but there may be
     deeper. A tolerance changes nothing: counting has no end that it would allow earlier.
     CONTACT where a pair was found; else CLEAR, or UNKNOWN where not all in reach was looked at.
@@ -127,7 +130,7 @@ def _checked_limit(limit: int) -> int:
 
 
 def _edges(reach: Reach, edge_units: int | None, units_per_step: float) -> NDArray[np.int64]:
-    """The edge (k,) of a cell under each pose [steps]."""
+    """The edge (k,) of a cell under each pose [steps]. reach: its units are of the largest sphere."""
     units = 2 * reach.units if edge_units is None else np.full(len(reach.units), edge_units)
     steps = units / units_per_step
     whole = np.rint(steps)
@@ -225,10 +228,13 @@ def _to_world(data: SceneData, lattice: NDArray[np.int64]) -> NDArray[np.float64
 def _places(
     data: SceneData, records: NDArray[np.int64], radii: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Avatar centres and scan points (n, 3), world [m], and signed distances (n,) [m] of records of pairs."""
+    """Avatar centres and scan points (n, 3), world [m], and signed distances (n,) [m] of records of pairs.
+
+    radii: (n,) int64, r_a + r_b with the largest sphere's r_b, exact units.
+    """
     avatar = records[:, CENTER : CENTER + 3] / UNITS_PER_METRE + data.arrays.origin
     return (
         avatar,
         _to_world(data, records[:, POINT : POINT + 3]),
-        signed_from_square(records[:, SQUARE], radii),
+        signed_from_square(records[:, SQUARE], radii - records[:, DROP]),
     )

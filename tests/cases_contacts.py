@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import classes
 import naive
 import naive_contacts
 import numpy as np
@@ -14,19 +15,23 @@ from solidcloud.schemas.answers import ContactsAnswers, Verdict
 from solidcloud.server.avatar import AvatarModel, make_avatar
 from solidcloud.server.contacts import contacts
 from solidcloud.server.effort import EXACT, Effort
-from solidcloud.server.request import SceneData, make_scene_data
+from solidcloud.server.request import SceneData, make_scene_data, with_radius_model
 from solidcloud.server.residency import Residency
 from solidcloud.server.scene import describe
 from solidcloud.server.store import Store
 
 
 class ScanCase(NamedTuple):
-    """An archive, its points (n, 3) [m] and the number (n,) of the scan each came from, -1: not kept."""
+    """An archive, its points (n, 3) [m] and the number (n,) of the scan each came from, -1: not kept.
+
+    radii: (n,) of the points' spheres, exact units.
+    """
 
     store: Store
     data: SceneData
     points: NDArray[np.float64]
     numbers: NDArray[np.int64]
+    radii: NDArray[np.int64]
 
 
 def open_case(
@@ -54,12 +59,25 @@ def open_case(
     # The numbers that a user sees: rows of SceneInfo.sources.
     listed = [Path(source.path).name for source in describe(store, "scene").sources]
     rows = np.array([listed.index(path.name) for path in paths])
-    return ScanCase(store, data, points, rows[which] if kept else np.full(len(points), -1))
+    radii = np.full(len(points), data.radius_units)
+    return ScanCase(store, data, points, rows[which] if kept else np.full(len(points), -1), radii)
+
+
+def with_model(case: ScanCase, model: str | None) -> ScanCase:
+    """The case asked with a radius model; points that coincide have one class, as `classes.any_classes` gives them."""
+    archive = case.store.archive
+    stored, radii = classes.stored_radii(archive.folder, model)
+    of = dict(zip(map(tuple, stored.tolist()), radii.tolist(), strict=True))
+    lattice = naive.lattice_of(case.points, archive.header.lattice.origin, archive.header.lattice.step)
+    own = np.array([of[tuple(point)] for point in lattice.tolist()], np.int64)
+    return case._replace(data=with_radius_model(case.data, archive, model), radii=own)
 
 
 def tight(case: ScanCase, budget_bytes: int) -> ScanCase:
     """The case with a cache of budget_bytes, empty."""
-    return case._replace(data=make_scene_data(case.store.archive, Residency(case.store, budget_bytes)))
+    small = make_scene_data(case.store.archive, Residency(case.store, budget_bytes))
+    arrays = small.arrays._replace(drop=case.data.arrays.drop)
+    return case._replace(data=small._replace(arrays=arrays, radius_units=case.data.radius_units))
 
 
 def compare(
@@ -92,13 +110,15 @@ def expect(
     """Compare answers with the judge's."""
     header = case.store.archive.header
     step, origin = header.lattice.step, np.array(header.lattice.origin)
+    margin_units = round(margin * naive.UNITS)
     lattice = naive.lattice_of(case.points, origin, step)
     assert len(answers) == len(answers.pair_starts) - 1 == len(answers.cluster_starts) - 1 == len(poses)
     for i, pose in enumerate(poses):
-        reach = naive.reach_units(pose, model.radius, header.radius, margin)
-        radii = naive.reach_units(pose, model.radius, header.radius, 0.0)
+        reach = case.radii + naive.reach_units(pose, model.radius, 0.0, margin)
         pairs = naive_contacts.pairs_of(lattice, case.numbers, step, origin, model.points, pose, reach)
-        cluster_units = 2 * reach if cluster_distance is None else round(cluster_distance * naive.UNITS)
+        cluster_units = 2 * (naive.reach_units(pose, model.radius, 0.0, margin) + case.data.radius_units)
+        if cluster_distance is not None:
+            cluster_units = round(cluster_distance * naive.UNITS)
         clusters, of_pair = naive_contacts.clusters_of(pairs, naive_contacts.edge_steps(cluster_units, step))
         assert answers.pairs_found[i] == len(pairs)
         assert answers.verdict[i] == (Verdict.CONTACT if pairs else Verdict.CLEAR)
@@ -110,13 +130,13 @@ def expect(
         centers = np.array([pair.center for pair in listed]).reshape(-1, 3) / naive.UNITS + origin
         assert np.array_equal(answers.avatar_point[own], centers)
         assert np.array_equal(answers.cloud_point[own], world(lattice_points(listed), step, origin))
-        signed = [naive_contacts.signed_distance(pair.square, radii) for pair in listed]
+        signed = [naive_contacts.signed_distance(pair.square, pair.reach - margin_units) for pair in listed]
         assert answers.signed_distance[own].tolist() == signed
         own = slice(answers.cluster_starts[i], answers.cluster_starts[i + 1])
         deepest = [cluster.deepest for cluster in clusters]
         assert answers.cluster_count[own].tolist() == [cluster.count for cluster in clusters]
         assert answers.cluster_scan[own].tolist() == [pair.scan for pair in deepest]
-        signed = [naive_contacts.signed_distance(pair.square, radii) for pair in deepest]
+        signed = [naive_contacts.signed_distance(pair.square, pair.reach - margin_units) for pair in deepest]
         assert answers.cluster_deepest[own].tolist() == signed
         centers = np.array([pair.center for pair in deepest]).reshape(-1, 3) / naive.UNITS + origin
         assert np.array_equal(answers.cluster_avatar[own], centers)

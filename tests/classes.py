@@ -1,6 +1,6 @@
 """Archives whose points have radius classes of all kinds, and what the judges need to know of them."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -27,12 +27,17 @@ def hashed_classes(local: NDArray[np.int32]) -> NDArray[np.uint8]:
 
 
 @contextmanager
-def any_classes() -> Iterator[None]:
-    """Inside, what is built with one job has classes by `hashed_classes`, and not by its points' neighbours."""
+def any_classes(
+    classes_of: Callable[[NDArray[np.int32]], NDArray[np.uint8]] = hashed_classes,
+) -> Iterator[None]:
+    """Inside, what is built with one job has classes by `classes_of`, and not by its points' neighbours.
+
+    classes_of: local lattice points (n, 3) of a voxel -> (n,).
+    """
     build_voxel = shards.build_voxel
 
     def with_others(key: int, points: VoxelPoints, *rest: Any) -> Any:
-        return build_voxel(key, points._replace(radius_class=hashed_classes(points.local)), *rest)
+        return build_voxel(key, points._replace(radius_class=classes_of(points.local)), *rest)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(shards, "build_voxel", with_others)

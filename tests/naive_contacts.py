@@ -10,13 +10,28 @@ from numpy.typing import ArrayLike, NDArray
 
 
 class Pair(NamedTuple):
-    """One pair in contact; in the order in which pairs are listed. Lattice point, exact units."""
+    """One pair in contact; in the order in which pairs are listed. Lattice point, exact units.
 
-    square: int
+    gap: see `gap_key`.  reach: r_a + r_b + margin of this pair.
+    """
+
+    gap: int
     point: tuple[int, int, int]
     center: tuple[int, int, int]
     row: int
     scan: int
+    square: int
+    reach: int
+
+
+def gap_key(square: int, reach: int) -> int:
+    """sqrt(square) - reach times 2^128, rounded down: as gaps compare, so do their keys, squares being below 2^62.
+
+    Where two roots differ by a whole number other than 0 they are whole themselves, and nothing is rounded. Where they
+    do not, the difference is a root of a polynomial with whole coefficients: its conjugates, three of at most 2^33,
+    times itself are a whole number, so it is not below 2^-99.
+    """
+    return math.isqrt(square << 256) - (reach << 128)
 
 
 class Cluster(NamedTuple):
@@ -43,18 +58,22 @@ def pairs_of(
     origin: ArrayLike,
     avatar: NDArray[np.float64],
     pose: NDArray[np.float64],
-    reach: int,
+    reach: int | NDArray[np.int64],
 ) -> list[Pair]:
-    """All pairs within `reach` of scan points (n, 3) of scans (n,) and a placed avatar (m, 3), deepest first."""
+    """All pairs within `reach` of scan points (n, 3) of scans (n,) and a placed avatar (m, 3), deepest first.
+
+    reach: r_a + r_b + margin, exact units, of all scan points or (n,) of each.
+    """
     b, a = naive.scan_units(lattice, step), naive.placed_units(avatar, pose, origin)
+    reaches = np.broadcast_to(np.asarray(reach, np.int64), len(b))
     found = []
     for row, center in enumerate(a):
         apart = np.abs(b - center)
-        for at in np.flatnonzero((apart <= reach).all(axis=1)):
-            square = sum(int(d) ** 2 for d in apart[at])
-            if square <= reach * reach:
-                point = tuple(lattice[at].tolist())
-                found.append(Pair(square, point, tuple(center.tolist()), row, int(numbers[at])))
+        for at in np.flatnonzero((apart <= reaches[:, None]).all(axis=1)):
+            square, own = sum(int(d) ** 2 for d in apart[at]), int(reaches[at])
+            if square <= own * own:
+                point, place = tuple(lattice[at].tolist()), tuple(center.tolist())
+                found.append(Pair(gap_key(square, own), point, place, row, int(numbers[at]), square, own))
     return sorted(found)
 
 

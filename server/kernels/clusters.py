@@ -1,10 +1,10 @@
 """Pairs in contact, gathered: the deepest of them, and the connected regions of scan points they touch.
 
-A pair is a record of whole numbers whose first columns, read in order, say which of two is deeper, so that no tree
-and no order of visits can change what is listed. Touched scan points fall into cells of a uniform grid over the
-lattice; cells that share a face, an edge or a corner are one cluster, found by union-find (Tarjan, "Efficiency of a
-good but not linear set union algorithm", 1975). What is kept grows with the cells touched and with the pairs
-listed, never with the pairs found.
+A pair is a record of whole numbers that say exactly which of two is deeper, the one with the smaller gap between its
+spheres, so that no tree and no order of visits can change what is listed. Touched scan points fall into cells of a
+uniform grid over the lattice; cells that share a face, an edge or a corner are one cluster, found by union-find
+(Tarjan, "Efficiency of a good but not linear set union algorithm", 1975). What is kept grows with the cells touched and
+with the pairs listed, never with the pairs found.
 """
 
 from typing import NamedTuple
@@ -13,12 +13,16 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-# Columns of a record; the first ORDER of them, compared in turn, put the deeper pair first: |a - b|^2 [exact units^2],
-# scan point x, y, z [lattice], avatar centre x, y, z [exact units], row of the avatar's point, scan number.
-SQUARE, POINT, CENTER, ROW, SCAN, ORDER, TAG, RECORD = 0, 1, 4, 7, 8, 9, 9, 10
+from .closer import compare_gaps
+from .placed import U32
+
+# Columns of a record; the first ORDER of them say which pair is deeper: |a - b|^2 [exact units^2] and by how much the
+# scan point's sphere is smaller than the largest [exact units]; where the gaps of two are equal, compared in turn: scan
+# point x, y, z [lattice], avatar centre x, y, z [exact units], row of the avatar's point, scan number.
+SQUARE, DROP, POINT, CENTER, ROW, SCAN, ORDER, TAG, RECORD = 0, 1, 2, 5, 8, 9, 10, 10, 11
 # A cluster is its deepest pair's record, then pairs in it and the box of its touched points; so is a cell, and then
 # its place in the grid.
-PAIRS, LOW, HIGH, CLUSTER, PLACE, CELL = 10, 11, 14, 17, 17, 20
+PAIRS, LOW, HIGH, CLUSTER, PLACE, CELL = 11, 12, 15, 18, 18, 21
 # Counters of `Memory.sizes`: cells, pairs kept, pairs listed, clusters listed, the cell met last.
 CELLS, KEPT, LISTED, CLUSTERS, LAST = range(5)
 
@@ -26,12 +30,13 @@ CELLS, KEPT, LISTED, CLUSTERS, LAST = range(5)
 class Cells(NamedTuple):
     """The grid cells touched under one pose: an open-addressing hash.
 
-    table: (c, CELL) int64.  bound: (c,) float32, a pair whose float32 square is above cannot be the cell's deepest.
+    table: (c, CELL) int64.  bound: (c,) float64 [steps], no pair farther apart, its sphere's drop added, is the cell's
+    deepest.
     slots: (s,) int64, s a power of two, rows of `table` or -1; never more than half of them taken.
     """
 
     table: NDArray[np.int64]
-    bound: NDArray[np.float32]
+    bound: NDArray[np.float64]
     slots: NDArray[np.int64]
 
 
@@ -57,7 +62,13 @@ class Memory(NamedTuple):
 @nb.njit(nogil=True, cache=True)
 def deeper(a, i, b, j):
     """Whether record a[i] comes before record b[j]."""
-    for c in range(ORDER):
+    if a[i, DROP] != b[j, DROP]:
+        order = compare_gaps(a[i, SQUARE], -a[i, DROP], b[j, SQUARE], -b[j, DROP])
+        if order != 0:
+            return order < 0
+    elif a[i, SQUARE] != b[j, SQUARE]:
+        return a[i, SQUARE] < b[j, SQUARE]
+    for c in range(POINT, ORDER):
         if a[i, c] != b[j, c]:
             return a[i, c] < b[j, c]
     return False
@@ -111,10 +122,36 @@ def keep_deepest(heap, kept, record):
 
 
 @nb.njit(nogil=True, cache=True)
+def bound_after(record, at, units_per_step, error):
+    """The bound, as in `Cells`, that record[at] sets: what is no deeper lies beyond it, whatever float32 rounds."""
+    gap = np.sqrt(np.float64(record[at, SQUARE])) + np.float64(record[at, DROP])
+    return gap / units_per_step * (1.0 + 2.0 * U32) + error
+
+
+@nb.njit(nogil=True, cache=True)
+def square_below(bound, drop, units_per_step):
+    """The float32 square above which no pair with that drop [exact units] is within a bound: `far` of make_limits."""
+    above = bound - np.float64(drop) / units_per_step
+    if above < 0.0:
+        return np.float32(-1.0)
+    return np.nextafter(np.float32(above * above * (1.0 + 8.0 * U32)), np.float32(np.inf))
+
+
+@nb.njit(nogil=True, cache=True)
+def listing_bound(heap, kept, units_per_step, error):
+    """The bound, as in `Cells`, of pairs that may be among those listed; `kept` of them are."""
+    if heap.shape[0] == 0:
+        return -1.0
+    if kept < heap.shape[0]:
+        return np.inf
+    return bound_after(heap, 0, units_per_step, error)
+
+
+@nb.njit(nogil=True, cache=True)
 def make_cells(count):
     """Room for `count` cells, a power of two."""
     slots = np.full(2 * count, -1, np.int64)
-    return Cells(np.empty((count, CELL), np.int64), np.empty(count, np.float32), slots)
+    return Cells(np.empty((count, CELL), np.int64), np.empty(count), slots)
 
 
 @nb.njit(nogil=True, cache=True)
@@ -142,10 +179,11 @@ def enter_cell(cells, used, x, y, z):
         cells.slots[slot] = row
         table = cells.table
         table[row, PLACE], table[row, PLACE + 1], table[row, PLACE + 2] = x, y, z
-        table[row, SQUARE], table[row, PAIRS] = np.iinfo(np.int64).max, 0
+        # Deeper than this is every pair: its root is 2^31.5, a reach and a drop together are below 2^31.
+        table[row, SQUARE], table[row, DROP], table[row, PAIRS] = np.iinfo(np.int64).max, 0, 0
         for r in range(3):
             table[row, LOW + r], table[row, HIGH + r] = np.iinfo(np.int64).max, np.iinfo(np.int64).min
-        cells.bound[row] = np.float32(np.inf)
+        cells.bound[row] = np.inf
     return row
 
 

@@ -3,6 +3,9 @@
 The descent is that of overlap.py ([Fig12] section 6, corrected), but nothing ends it early: every pair of leaf nodes
 whose bounds meet is looked at. There a float32 pass certifies most pairs as near or far; integers (NUMERICS.md N5)
 decide the band between, and measure those pairs that may be the deepest of their cell or among the deepest listed.
+
+Each scan point has the sphere of its radius class: its own reach says what is in contact, and the deepest pair is that
+with the least gap between its spheres, |a - b| - r_a - r_b. Nodes and blocks are pruned by the largest sphere below.
 """
 
 from typing import NamedTuple
@@ -14,6 +17,7 @@ from numpy.typing import NDArray
 from .clusters import (
     CELLS,
     CENTER,
+    DROP,
     HIGH,
     KEPT,
     LAST,
@@ -28,15 +32,28 @@ from .clusters import (
     SQUARE,
     TAG,
     Memory,
+    bound_after,
     deeper,
     enter_cell,
     grow_cells,
     keep_deepest,
     list_pose,
+    listing_bound,
+    square_below,
 )  # fmt: skip
-from .layout import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, scan_run
+from .layout import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, node_class, point_class, scan_run
 from .overlap import nodes_meet
-from .placed import ONE_SLACK, SLACK, U32, make_limits, make_placed, place_block, place_nodes
+from .placed import (
+    ONE_SLACK,
+    SLACK,
+    ByClass,
+    make_by_class,
+    make_limits,
+    make_placed,
+    place_block,
+    place_nodes,
+    set_by_class,
+)
 from .placing import MAX_REACH_UNITS, lattice_to_units, place, to_units
 
 
@@ -68,32 +85,20 @@ class Tally(NamedTuple):
 
 
 class Work(NamedTuple):
-    """Scratch of one call. keep: (LANES,) bool.  mine: (3, LANES), squares: (LANES,), off: (3,), bound: (1,) float32,
-    bound as in `Cells`, of the pairs listed.  record: (1, RECORD) int64."""
+    """Scratch of one call. keep: (LANES,) bool.  mine: (3, LANES), squares: (LANES,), off: (3,) float32.
+
+    bound: (1,) float64, as in `Cells`, of the pairs listed.  error: (1,) float64, that of the pose's `Limits`.
+    record: (1, RECORD) int64.  by_class: the pose's thresholds.
+    """
 
     keep: NDArray[np.bool_]
     mine: NDArray[np.float32]
     squares: NDArray[np.float32]
     off: NDArray[np.float32]
-    bound: NDArray[np.float32]
+    bound: NDArray[np.float64]
+    error: NDArray[np.float64]
     record: NDArray[np.int64]
-
-
-@nb.njit(nogil=True, cache=True)
-def _bound_of(square, units_per_step, limits):
-    """A float32 square above which no pair can be as near as `square` [exact units^2]: `far` of make_limits for it."""
-    above = np.sqrt(np.float64(square)) / units_per_step * (1.0 + 2.0 * U32) + np.float64(limits.error)
-    return np.nextafter(np.float32(above * above * (1.0 + 8.0 * U32)), np.float32(np.inf))
-
-
-@nb.njit(nogil=True, cache=True)
-def _listing_bound(heap, kept, units_per_step, limits):
-    """Above which float32 square no pair can be among those listed; `kept` of them are."""
-    if heap.shape[0] == 0:
-        return np.float32(-1.0)
-    if kept < heap.shape[0]:
-        return np.float32(np.inf)
-    return _bound_of(heap[0, SQUARE], units_per_step, limits)
+    by_class: ByClass
 
 
 @nb.njit(nogil=True, cache=True)
@@ -135,24 +140,28 @@ def _cell_of(cells, sizes, record, edge):
 
 
 @nb.njit(nogil=True, cache=True)
-def _gather_point(avatar, m, a, block, placed, scene, limits, asked, edge, memory, work):
+def _gather_point(avatar, m, a, block, placed, scene, own, asked, edge, memory, work):
     """Count the pairs of one scan point, in work.record, with a block's points, their float32 squares in work.squares.
 
-    Returns how many are in contact.
+    own: the point's radius class. Returns how many are in contact.
     """
     # Arrays are taken out of their tuples here: in the loop each would be counted as referenced in every turn.
     record, squares, listing, rows = work.record, work.squares, work.bound, asked.rows
     cells, heap, sizes, per_step = memory.cells, memory.heap, memory.sizes, scene.units_per_step
-    table, bounds = cells.table, cells.bound
+    table, bounds, error = cells.table, cells.bound, work.error[0]
+    drop, units = scene.drop[own], work.by_class.units[own]
+    near, far = work.by_class.near[own], work.by_class.far[own]
+    record[0, DROP] = drop
+    listed = square_below(listing[0], drop, per_step)
     cell, count, bound = np.int64(-1), np.int64(0), np.float32(np.inf)
     for lane in range(avatar.count[a]):
         square = squares[lane]
-        if square > limits.far:
+        if square > far:
             continue
-        if square <= limits.near:
+        if square <= near:
             if cell < 0:
                 cell = _cell_of(cells, sizes, record, edge)
-                bound = max(bounds[cell], listing[0])
+                bound = max(square_below(bounds[cell], drop, per_step), listed)
             count += 1
             if square > bound:
                 continue
@@ -160,7 +169,7 @@ def _gather_point(avatar, m, a, block, placed, scene, limits, asked, edge, memor
         else:
             if not _measure(avatar, m, block, lane, placed, scene, record):
                 continue
-            if record[0, SQUARE] > limits.units * limits.units:
+            if record[0, SQUARE] > units * units:
                 continue
             if cell < 0:
                 cell = _cell_of(cells, sizes, record, edge)
@@ -169,11 +178,12 @@ def _gather_point(avatar, m, a, block, placed, scene, limits, asked, edge, memor
         record[0, TAG] = cell
         if deeper(record, 0, table, cell):
             table[cell, :ORDER] = record[0, :ORDER]
-            bounds[cell] = _bound_of(record[0, SQUARE], per_step, limits)
-        if square <= listing[0]:
+            bounds[cell] = bound_after(record, 0, per_step, error)
+        if square <= listed:
             sizes[KEPT] = keep_deepest(heap, sizes[KEPT], record)
-            listing[0] = _listing_bound(heap, sizes[KEPT], per_step, limits)
-        bound = max(bounds[cell], listing[0])
+            listing[0] = listing_bound(heap, sizes[KEPT], per_step, error)
+            listed = square_below(listing[0], drop, per_step)
+        bound = max(square_below(bounds[cell], drop, per_step), listed)
     if count > 0:
         table[cell, PAIRS] += count
         for r in range(3):
@@ -183,9 +193,7 @@ def _gather_point(avatar, m, a, block, placed, scene, limits, asked, edge, memor
 
 
 @nb.njit(nogil=True, cache=True)
-def _gather_leaves(
-    avatar, m, a, block, placed, scene, voxel, row, limits, asked, edge, memory, work, i, tally
-):
+def _gather_leaves(avatar, m, a, block, placed, scene, voxel, row, asked, edge, memory, work, i, tally):
     """Gather the pairs in contact of a leaf node of the avatar and one of the scene, voxel `voxel` at work.off.
 
     First all avatar points against the scene node's bound and all scan points against the avatar node's sphere, in
@@ -193,11 +201,13 @@ def _gather_leaves(
     """
     words, ints, halves = scene.words, scene.ints, scene.halves
     lanes, nodes, off, keep, mine = placed.lanes, placed.nodes, work.off, work.keep, work.mine
+    fars, mask = work.by_class.far, work.by_class.mask
+    room = work.by_class.room[node_class(ints, row, mask)]
     cx, cy, cz = words[row] + off[0], words[row + 1] + off[1], words[row + 2] + off[2]
     nx, ny, nz = words[row + 4], words[row + 5], words[row + 6]
-    both = words[row + 3] + limits.reach + limits.error
-    room = words[row + 7] * (limits.reach + limits.error + SLACK * both + SLACK * both)
-    least, most = words[row + 8] - room, words[row + 9] + room
+    both = words[row + 3] + room
+    wide = words[row + 7] * (room + SLACK * both + SLACK * both)
+    least, most = words[row + 8] - wide, words[row + 9] + wide
     square = both * both * ONE_SLACK
     met = False
     for j in range(LANES):
@@ -213,7 +223,7 @@ def _gather_leaves(
     ly = off[1] + np.float32(ints[block_at + 1])
     lz = off[2] + np.float32(ints[block_at + 2])
     cx, cy, cz = nodes[0, a] - lx, nodes[1, a] - ly, nodes[2, a] - lz
-    both = nodes[3, a] + limits.reach + limits.error
+    both = nodes[3, a] + room
     square = both * both * ONE_SLACK
     for j in range(LANES):
         dx = np.float32(halves[lane_at + j]) - cx
@@ -235,11 +245,13 @@ def _gather_leaves(
         y = np.float32(halves[lane_at + LANES + j])
         z = np.float32(halves[lane_at + 2 * LANES + j])
         counts[2, i] += LANES
+        own = point_class(ints, block_at, j, mask)
+        far = fars[own]
         touched = False
         for lane in range(LANES):
             dx, dy, dz = x - mine[0, lane], y - mine[1, lane], z - mine[2, lane]
             squares[lane] = dx * dx + dy * dy + dz * dz
-            touched |= squares[lane] <= limits.far
+            touched |= squares[lane] <= far
         if not touched:
             continue
         for r in range(3):
@@ -248,11 +260,11 @@ def _gather_leaves(
         record[0, SCAN] = -1
         if asked.kept:
             record[0, SCAN] = halves[scan_run(where, voxel, scene.block_words) + scene_block * LANES + j]
-        pairs[i] += _gather_point(avatar, m, a, block, placed, scene, limits, asked, edge, memory, work)
+        pairs[i] += _gather_point(avatar, m, a, block, placed, scene, own, asked, edge, memory, work)
 
 
 @nb.njit(nogil=True, cache=True)
-def _gather_voxel(avatar, m, i, placed, scene, voxel, limits, asked, memory, work, tally, stop):
+def _gather_voxel(avatar, m, i, placed, scene, voxel, asked, memory, work, tally, stop):
     """Gather all pairs in contact of the placed avatar and one resident voxel, the two trees descended together.
 
     Goes on where memory.cursor and its stack say. Stops, and then the cursor's depth is not 0, before a node test once
@@ -262,21 +274,17 @@ def _gather_voxel(avatar, m, i, placed, scene, voxel, limits, asked, memory, wor
     base = scene.where[voxel, 0]
     nodes, off, stack, counts = placed.nodes, work.off, memory.stack, tally.counts
     first, held, stamp, edges = avatar.first, avatar.count, placed.stamp, asked.edges
-    sizes, room = memory.sizes, memory.cells.table.shape[0]
+    sizes, most_cells = memory.sizes, memory.cells.table.shape[0]
+    rooms, mask = work.by_class.room, work.by_class.mask
     for r in range(3):
         off[r] = np.float32(scene.coordinates[voxel, r] * scene.voxel_steps - placed.frame[r])
     depth = memory.cursor[2]
     if depth == 0:
         counts[1, i] += 1
         if nodes_meet(
-            words,
-            base,
-            nodes[0, 0] - off[0],
-            nodes[1, 0] - off[1],
-            nodes[2, 0] - off[2],
-            nodes[3, 0],
-            limits.reach + limits.error,
-        ):
+            words, base, nodes[0, 0] - off[0], nodes[1, 0] - off[1], nodes[2, 0] - off[2], nodes[3, 0],
+            rooms[node_class(ints, base, mask)],
+        ):  # fmt: skip
             stack[0, 0], stack[0, 1] = 0, base
             depth = 1
     while depth > 0:
@@ -284,7 +292,7 @@ def _gather_voxel(avatar, m, i, placed, scene, voxel, limits, asked, memory, wor
         a_first, b_first = first[a], ints[row + FIRST]
         leaves = a_first < 0 and b_first < 0
         # A pair of leaf nodes costs no visits, but room.
-        if sizes[CELLS] + LANES > room if leaves else counts[1, i] >= stop:
+        if sizes[CELLS] + LANES > most_cells if leaves else counts[1, i] >= stop:
             break
         depth -= 1
         if leaves:
@@ -293,28 +301,15 @@ def _gather_voxel(avatar, m, i, placed, scene, voxel, limits, asked, memory, wor
                 place_block(avatar, m, block, placed, scene)
                 stamp[block] = i
             _gather_leaves(
-                avatar,
-                m,
-                a,
-                block,
-                placed,
-                scene,
-                voxel,
-                row,
-                limits,
-                asked,
-                edges[i],
-                memory,
-                work,
-                i,
-                tally,
+                avatar, m, a, block, placed, scene, voxel, row, asked, edges[i], memory, work, i, tally
             )
         elif b_first < 0 or (a_first >= 0 and nodes[3, a] > words[row + 3]):
             counts[1, i] += held[a]
+            room = rooms[node_class(ints, row, mask)]
             for child in range(a_first, a_first + held[a]):
                 if nodes_meet(
                     words, row, nodes[0, child] - off[0], nodes[1, child] - off[1], nodes[2, child] - off[2],
-                    nodes[3, child], limits.reach + limits.error,
+                    nodes[3, child], room,
                 ):  # fmt: skip
                     stack[depth, 0], stack[depth, 1] = child, row
                     depth += 1
@@ -323,10 +318,21 @@ def _gather_voxel(avatar, m, i, placed, scene, voxel, limits, asked, memory, wor
             counts[1, i] += ints[row + COUNT] & COUNTED
             for child in range(ints[row + COUNT] & COUNTED):
                 child_row = base + (b_first + child) * ROW_WORDS
-                if nodes_meet(words, child_row, x, y, z, nodes[3, a], limits.reach + limits.error):
+                if nodes_meet(
+                    words, child_row, x, y, z, nodes[3, a], rooms[node_class(ints, child_row, mask)]
+                ):
                     stack[depth, 0], stack[depth, 1] = a, child_row
                     depth += 1
     memory.cursor[2] = depth
+
+
+@nb.njit(nogil=True, cache=True)
+def _set_thresholds(units, extent, farthest, scene, work):
+    """Fill work.error and work.by_class for one pose; units: reach of the largest sphere, the rest of `place_nodes`."""
+    per_step, steps = scene.units_per_step, scene.voxel_steps
+    # No class has a larger error.
+    work.error[0] = make_limits(units, per_step, extent, farthest, steps).error
+    set_by_class(work.by_class, scene.drop, units, per_step, extent, farthest, steps)
 
 
 @nb.njit(nogil=True, cache=True)
@@ -342,7 +348,8 @@ def gather_contacts(poses, avatar, scene, reach, which, asked, closes, pause, me
     placed = make_placed(avatar)
     work = Work(
         np.empty(LANES, np.bool_), np.empty((3, LANES), np.float32), np.empty(LANES, np.float32),
-        np.empty(3, np.float32), np.empty(1, np.float32), np.empty((1, RECORD), np.int64),
+        np.empty(3, np.float32), np.empty(1), np.empty(1), np.empty((1, RECORD), np.int64),
+        make_by_class(scene.drop),
     )  # fmt: skip
     cursor, left = memory.cursor, np.int64(pause)
     while cursor[0] < which.shape[0]:
@@ -352,8 +359,10 @@ def gather_contacts(poses, avatar, scene, reach, which, asked, closes, pause, me
             cursor[1], cursor[2] = reach.starts[i], 0
         if cursor[1] < end and asked.visits >= 0:
             extent, farthest = place_nodes(avatar, poses[i], reach.scales[i], placed, scene)
-            limits = make_limits(reach.units[i], scene.units_per_step, extent, farthest, scene.voxel_steps)
-            work.bound[0] = _listing_bound(memory.heap, memory.sizes[KEPT], scene.units_per_step, limits)
+            _set_thresholds(reach.units[i], extent, farthest, scene, work)
+            work.bound[0] = listing_bound(
+                memory.heap, memory.sizes[KEPT], scene.units_per_step, work.error[0]
+            )
             while cursor[1] < end:
                 voxel = reach.rows[cursor[1]]
                 if scene.where[voxel, 0] < 0:
@@ -375,9 +384,7 @@ def gather_contacts(poses, avatar, scene, reach, which, asked, closes, pause, me
                         grow_cells(memory.cells, memory.sizes[CELLS]), memory.heap, memory.sizes, cursor, memory.stack,
                         memory.pairs, memory.clusters,
                     )  # fmt: skip
-                _gather_voxel(
-                    avatar, poses[i], i, placed, scene, voxel, limits, asked, memory, work, tally, stop
-                )
+                _gather_voxel(avatar, poses[i], i, placed, scene, voxel, asked, memory, work, tally, stop)
                 left -= tally.counts[1, i] - before
                 if cursor[2] == 0:
                     cursor[1] += 1

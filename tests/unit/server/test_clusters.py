@@ -2,11 +2,14 @@
 
 import numpy as np
 import pytest
-from naive_contacts import Pair, clusters_of
+from naive_contacts import Pair, clusters_of, gap_key
 from solidcloud.server.kernels.clusters import (
     CELLS,
     CLUSTER,
+    DROP,
+    HIGH,
     KEPT,
+    LOW,
     ORDER,
     PAIRS,
     PLACE,
@@ -28,21 +31,29 @@ pytestmark = pytest.mark.interpreted
 
 
 def random_records(rng: np.random.Generator, count: int) -> np.ndarray:
-    """Records with many ties in their first columns."""
-    return rng.integers(-2, 3, (count, RECORD))
+    """Records with many ties in their first columns, also of gaps of unlike pairs: 2 less 1 is 1 less 0."""
+    records = rng.integers(-2, 3, (count, RECORD))
+    records[:, SQUARE] = rng.choice([0, 1, 2, 4, 9], count)
+    records[:, DROP] = rng.integers(0, 3, count)
+    return records
+
+
+def place_of(record: list[int]) -> tuple[int, ...]:
+    """What a record is sorted by."""
+    return gap_key(record[SQUARE], -record[DROP]), *record[DROP + 1 : ORDER]
 
 
 @pytest.mark.parametrize("limit", [1, 2, 7, 64])
 def test_the_deepest_are_kept_whatever_the_order(rng: np.random.Generator, limit: int) -> None:
     records = random_records(rng, 150)
     records[:, TAG] = 0
-    expected = sorted(records.tolist())[:limit]
+    expected = [place_of(record) for record in sorted(records.tolist(), key=place_of)[:limit]]
     for _ in range(3):
         heap, kept = np.empty((limit, RECORD), np.int64), 0
         for record in rng.permutation(records):
             kept = keep_deepest(heap, kept, record[None])
         sort_rows(heap, kept)
-        assert heap[:kept].tolist() == expected
+        assert [place_of(record) for record in heap[:kept].tolist()] == expected
 
 
 def test_nothing_is_kept_without_room(rng: np.random.Generator) -> None:
@@ -53,10 +64,10 @@ def test_nothing_is_kept_without_room(rng: np.random.Generator) -> None:
 def test_rows_are_sorted_by_all_columns_that_order(rng: np.random.Generator, count: int) -> None:
     rows = random_records(rng, count)
     rows[:, TAG] = np.arange(count)
-    expected = sorted(row[:ORDER] for row in rows.tolist())
+    expected = sorted(map(place_of, rows.tolist()))
     before = {tuple(row) for row in rows.tolist()}
     sort_rows(rows, count)
-    assert [row[:ORDER] for row in rows.tolist()] == expected
+    assert [place_of(row) for row in rows.tolist()] == expected
     assert {tuple(row) for row in rows.tolist()} == before
 
 
@@ -94,12 +105,16 @@ def test_neighbouring_cells_are_one_cluster(rng: np.random.Generator, spread: in
     )  # fmt: skip
     for _ in range(3):
         places = np.unique(rng.integers(-spread, spread, (40, 3)), axis=0)
-        pairs = [Pair(int(rng.integers(9)), tuple(place), (0, 0, 0), 0, -1) for place in places.tolist()]
+        squares, drops = rng.integers(0, 9, len(places)).tolist(), rng.integers(0, 3, len(places)).tolist()
+        pairs = [
+            Pair(gap_key(square, -drop), tuple(place), (0, 0, 0), 0, -1, square, -drop)
+            for square, drop, place in zip(squares, drops, places.tolist(), strict=True)
+        ]
         for pair in pairs:
             row = enter_cell(memory.cells, memory.sizes[CELLS], *pair.point)
             assert row == memory.sizes[CELLS]
             memory.sizes[CELLS] += 1
-            record = np.array([[pair.square, *pair.point, 0, 0, 0, 0, -1, row]])
+            record = np.array([[pair.square, -pair.reach, *pair.point, 0, 0, 0, 0, -1, row]])
             memory.cells.table[row, :ORDER] = record[0, :ORDER]
             memory.cells.table[row, PAIRS : PAIRS + 7] = [1, *pair.point, *pair.point]
             memory.sizes[KEPT] = keep_deepest(memory.heap, memory.sizes[KEPT], record)
@@ -109,6 +124,8 @@ def test_neighbouring_cells_are_one_cluster(rng: np.random.Generator, spread: in
         own = memory.clusters[runs[2] : runs[2] + runs[3]]
         assert own[:, PAIRS].tolist() == [cluster.count for cluster in clusters]
         assert own[:, SQUARE].tolist() == [cluster.deepest.square for cluster in clusters]
-        assert [tuple(row) for row in own[:, 11:17].tolist()] == [(*c.low, *c.high) for c in clusters]
+        assert own[:, DROP].tolist() == [-cluster.deepest.reach for cluster in clusters]
+        boxes = [tuple(row) for row in own[:, LOW : HIGH + 3].tolist()]
+        assert boxes == [(*c.low, *c.high) for c in clusters]
         assert memory.pairs[runs[0] : runs[0] + runs[1], TAG].tolist() == of_pair[:10]
         assert (memory.cells.slots == -1).all() and memory.sizes[CELLS] == 0

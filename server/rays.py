@@ -37,7 +37,7 @@ def make_directions(values: ArrayLike) -> NDArray[np.float64]:
 def raycast(
     data: SceneData, origins: ArrayLike, directions: ArrayLike, reach: float, effort: Effort = EXACT
 ) -> RaycastAnswers:
-    """The first sphere of the scan that each ray meets.
+    """The first sphere of the scan that each ray meets, each of the radius its point has under the radius model.
 
     origins: (k, 3) float64, world [m].  directions: (k, 3), of any length but zero.  reach: how far along [m], at
     most MAX_RAY_REACH. The definition is in kernels/rays.py. A ray is `outside` when either end of it, o or
@@ -54,7 +54,7 @@ def raycast(
     if not 0 <= reach <= MAX_RAY_REACH:
         raise BadRequestError(f"reach {reach!r}: expected 0 to {MAX_RAY_REACH:g} metres")
     if data.radius_units > MAX_REACH_UNITS:
-        raise BadRequestError("the archive's radius is over 16 m: rays cannot be told exactly against it")
+        raise BadRequestError("the scan's radius is over 16 m: rays cannot be told exactly against it")
     reach_units = to_units(reach, "reach")
     tolerance = effort.tolerance * UNITS_PER_METRE
 

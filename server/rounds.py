@@ -92,6 +92,7 @@ def look(
 ) -> Found:
     """Answer k rays (direction (k, 3)) or loose points (None) by rounds.
 
+    radius_units: of the scan's largest sphere, 0 where radii do not count: what the index alone can tell of a voxel.
     kernel(begin, end, lists, cursor, held, best) looks as far as it may; see `kernels.rays.follow_rays`.
     What a deadline left undone is in best.unseen.
     """

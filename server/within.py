@@ -18,7 +18,7 @@ from .rounds import finish, look, make_origins
 
 
 def within(data: SceneData, points: ArrayLike, reach: float, effort: Effort = EXACT) -> WithinAnswers:
-    """The scan point nearest to each of k loose points; spheres are not considered, only their centres.
+    """The scan point nearest to each of k loose points, centre to centre: no radius and no radius model matters.
 
     points: (k, 3) float64, world [m].  reach: inclusive [m], at most 16. The definition is in kernels/within.py. A
     point is `outside` when its reach, a cube of exact units, leaves the box of all scan points.

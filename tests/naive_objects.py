@@ -30,6 +30,26 @@ def touching_pairs(
     return found
 
 
+def touching_scene(
+    lattice: NDArray[np.int64],
+    step: float,
+    scan_radii: NDArray[np.int64],
+    bodies: Sequence[NDArray[np.float64]],
+    radii: Sequence[float],
+    poses: NDArray[np.float64],
+    origin: ArrayLike,
+    margin: float = 0.0,
+) -> list[bool]:
+    """Which objects touch scan points (n, 3), lattice, each with its own radius (n,), exact units."""
+    b, more = naive.scan_units(lattice, step), int(np.rint(margin * naive.UNITS))
+    found = []
+    for body, radius, pose in zip(bodies, radii, poses, strict=True):
+        a, own = naive.placed_units(body, pose, origin), pair_radius(radius, pose) + more
+        # All points that have one radius at a time.
+        found.append(any(_touch(a, b[scan_radii == r], own + int(r)) for r in np.unique(scan_radii)))
+    return found
+
+
 def pair_radius(radius: float, pose: NDArray[np.float64]) -> int:
     """A placed radius in exact units."""
     return int(np.rint(naive.scale_of(pose) * radius * naive.UNITS))

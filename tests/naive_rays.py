@@ -35,17 +35,21 @@ def unit_vectors(directions: ArrayLike) -> NDArray[np.float64]:
     return scaled / np.sqrt(square)[:, None]
 
 
-def meetings(d: NDArray[np.int64], u: NDArray[np.float64], radius: int) -> NDArray[np.float64]:
-    """t (n,) at which one ray (direction u (3,)) meets spheres at d (n, 3) from its start, inf where it does not."""
+def meetings(d: NDArray[np.int64], u: NDArray[np.float64], radii: NDArray[np.int64]) -> NDArray[np.float64]:
+    """t (n,) at which one ray (direction u (3,)) meets spheres at d (n, 3) from its start, inf where it does not.
+
+    radii: (n,) of the spheres, exact units.
+    """
+    radius = radii.astype(np.float64)
     x, y, z = d.astype(np.float64).T
     along = (x * u[0] + y * u[1]) + z * u[2]
     cx, cy, cz = y * u[2] - z * u[1], z * u[0] - x * u[2], x * u[1] - y * u[0]
     miss = np.sqrt((cx * cx + cy * cy) + cz * cz)
     with np.errstate(invalid="ignore"):
-        t = np.maximum(along - np.sqrt((float(radius) - miss) * (float(radius) + miss)), 0.0)
+        t = np.maximum(along - np.sqrt((radius - miss) * (radius + miss)), 0.0)
     t[~(along > 0) | (miss > radius)] = np.inf
-    near = (np.abs(d) <= radius).all(axis=1)
-    near[near] = (d[near] ** 2).sum(axis=1) <= radius**2
+    near = (np.abs(d) <= radii[:, None]).all(axis=1)
+    near[near] = (d[near] ** 2).sum(axis=1) <= radii[near] ** 2
     t[near] = 0.0
     return t
 
@@ -60,18 +64,19 @@ def raycast(
     points: ArrayLike,
     origin: ArrayLike,
     step: float,
-    radius: float,
+    radius: ArrayLike,
     origins: ArrayLike,
     directions: ArrayLike,
     reach: float,
 ) -> Hits:
-    """The first sphere each ray meets. points: (n, 3) world, n at least 1."""
+    """The first sphere each ray meets. points: (n, 3) world, n at least 1.  radius: [m], of all or (n,) of each."""
     b = naive.scan_units(naive.lattice_of(points, origin, step), step)
     o, u = world_units(origins, origin), unit_vectors(directions)
-    reach_units, radius_units = int(np.rint(reach * naive.UNITS)), int(np.rint(radius * naive.UNITS))
+    reach_units = int(np.rint(reach * naive.UNITS))
+    radii = np.rint(np.broadcast_to(np.asarray(radius, np.float64), len(b)) * naive.UNITS).astype(np.int64)
     distance, row = np.full(len(o), np.inf), np.full(len(o), -1)
     for i in range(len(o)):
-        t = meetings(b - o[i], u[i], radius_units)
+        t = meetings(b - o[i], u[i], radii)
         if t.min() <= reach_units:
             row[i], distance[i] = _least(t, b), t.min() / naive.UNITS
     ends = np.stack([o.astype(np.float64), o + float(reach_units) * u])

@@ -3,7 +3,7 @@
 The definition, which no tree, order, voxel size or thread can change. All lengths are exact units of 2^-26 m, from
 the dataset's origin O. The ray starts at o = rint((origin - O) 2^26), int64, half to even; its direction u is the one
 given, divided by its largest component and then by the root of (x x + y y) + z z, float64. A scan point b is as in
-NUMERICS.md N5, r its sphere's radius, and d = b - o in int64, exact in float64 within any reach allowed. Then
+NUMERICS.md N5, r the radius of its own sphere, and d = b - o in int64, exact in float64 within any reach allowed. Then
 
 - |d|^2 <= r^2 in int64: the ray starts inside, t = 0;
 - else, in float64 in the order written: s = (dx ux + dy uy) + dz uz; the sphere lies behind unless s > 0;
@@ -25,7 +25,7 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from .layout import COUNT, COUNTED, FIRST, LANES, ROW_WORDS
+from .layout import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, node_class, point_class
 from .placed import U32
 from .placing import lattice_to_units
 
@@ -35,7 +35,8 @@ STACK = MOST_LEVELS * 15 + 16
 
 
 class Rays(NamedTuple):
-    """k rays. origin: (k, 3) int64, direction: (k, 3) float64 unit vectors.  reach, radius: int64; exact units."""
+    """k rays. origin: (k, 3) int64, direction: (k, 3) float64 unit vectors.  reach, radius: int64, radius of the
+    scan's largest sphere; exact units."""
 
     origin: NDArray[np.int64]
     direction: NDArray[np.float64]
@@ -82,7 +83,8 @@ def _meet_node(words, row, ray, radius, limit):
     """Lower bound of t [steps] for the spheres of a node's points, inf when none is met before `limit`.
 
     ray: (12,) float64: origin from the voxel's low corner, direction, and two more axes of its frame.  radius: of the
-    spheres, inflated by what this function rounds. The ray is clipped by the node's sphere, then by its slab.
+    largest sphere below, inflated by what this function rounds. The ray is clipped by the node's sphere, then by its
+    slab.
     """
     dx, dy, dz = words[row] - ray[0], words[row + 1] - ray[1], words[row + 2] - ray[2]
     a = dx * ray[6] + dy * ray[7] + dz * ray[8]
@@ -123,6 +125,8 @@ def _test_block(scene, voxel, row, ray, radius, rays, i, best):
     block = ~ints[row + FIRST]
     block_at = scene.where[voxel, 1] + block * scene.block_words
     lane_at = scene.where[voxel, 2] + block * 3 * LANES
+    drop = scene.drop
+    mask = np.uint64(drop.shape[0] - 1)
     dx, dy, dz = words[row] - ray[0], words[row + 1] - ray[1], words[row + 2] - ray[2]
     along = dx * ray[3] + dy * ray[4] + dz * ray[5]
     qx = np.float32(ray[0] + along * ray[3] - ints[block_at])
@@ -161,7 +165,7 @@ def _test_block(scene, voxel, row, ray, radius, rays, i, best):
             lattice_to_units(sx, scene.units_per_step) - rays.origin[i, 0],
             lattice_to_units(sy, scene.units_per_step) - rays.origin[i, 1],
             lattice_to_units(sz, scene.units_per_step) - rays.origin[i, 2],
-            ux, uy, uz, rays.radius,
+            ux, uy, uz, rays.radius - drop[point_class(ints, block_at, j, mask)],
         )  # fmt: skip
         first = t < best.value[i] or (t == best.value[i] and is_less(sx, sy, sz, best.lattice[i]))
         if first and t <= rays.reach:
@@ -222,8 +226,9 @@ def _follow(scene, voxel, rays, i, ray, near, tolerance, visits, best, rows, bou
         farthest = max(farthest, abs(ray[r]), abs(np.float64(corner)))
     # Rounding to units, the voxel's corner and the point; float64 of all coordinates in here, with much to spare.
     error = 2.0 * per_unit + (farthest + scene.voxel_steps) * 2.0**-45
-    radius = np.float64(rays.radius) * per_unit + error
-    base = scene.where[voxel, 0]
+    base, drop = scene.where[voxel, 0], scene.drop
+    mask = np.uint64(drop.shape[0] - 1)
+    radius = np.float64(rays.radius - drop[node_class(ints, base, mask)]) * per_unit + error
     reach = np.float64(rays.reach)
     spent, tests = np.int64(best.counts[1, i]) + 1, np.int64(best.counts[2, i])
     rows[0], depth = base, 0
@@ -241,6 +246,7 @@ def _follow(scene, voxel, rays, i, ray, near, tolerance, visits, best, rows, bou
         first = ints[row + FIRST]
         if first < 0:
             tests += LANES
+            radius = np.float64(rays.radius - drop[node_class(ints, row, mask)]) * per_unit + error
             _test_block(scene, voxel, row, ray, radius, rays, i, best)
             continue
         spent += ints[row + COUNT] & COUNTED
@@ -248,6 +254,7 @@ def _follow(scene, voxel, rays, i, ray, near, tolerance, visits, best, rows, bou
         limit = min(best.value[i], reach) * per_unit + error
         for child in range(first, first + (ints[row + COUNT] & COUNTED)):
             child_row = base + child * ROW_WORDS
+            radius = np.float64(rays.radius - drop[node_class(ints, child_row, mask)]) * per_unit + error
             bound = _meet_node(words, child_row, ray, radius, limit)
             if bound < np.inf:
                 push_sorted(rows, bounds, begin, depth, child_row, max(bound, above))

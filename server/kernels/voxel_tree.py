@@ -105,7 +105,7 @@ def list_voxels(tree, at_units, direction, along, reach_units, radius_units, uni
     """Fill `lists` for k rays (along) or loose points: the voxels with a point that could be hit within reach.
 
     at_units: (k, 3) int64, origins, exact units.  direction: (k, 3) float64, unit vectors, read of rays only.
-    reach_units: of all.  radius_units: of the scan's spheres, 0 for points.  Boxes are grown by the spheres, a step,
+    reach_units: of all.  radius_units: of the scan's largest sphere, 0 for points.  Boxes are grown by it, a step,
     and more than the rounding of this function: 2^-46 of the largest figure in it.
     Returns how many entries are needed; those beyond the capacity are not written.
     """

@@ -69,9 +69,9 @@ def objects(
     avatars: n, of which several may be the same.  poses: (n, 4, 4) float64, avatar to world.  groups, masks: (n,)
     uint32, bits: a pair is tested when each one's group has a bit in common with the other's mask. The scene's group is
     SCENE_GROUP, its mask all.  margin: of each pair, and of each object with the scene [m].
-    Contact is as NUMERICS.md N5 has it, of two objects too: kernels/pairs.py; a radius model is of the scan's spheres and
-    of no object's. No tolerance is used, as these answers could not say where they are early by it; visits are counted
-    an object and a pair. Pairs that a budget cuts off are listed as UNKNOWN.
+    Contact is as NUMERICS.md N5 has it, of two objects too: kernels/pairs.py; a radius model is of the scan's spheres
+    and of no object's. No tolerance is used, as these answers could not say where they are early by it; visits are
+    counted an object and a pair. Pairs that a budget cuts off are listed as UNKNOWN.
     Raises BadRequestError, BadTransformError, TooLargeError.
     """
     begin = time.perf_counter()

@@ -103,7 +103,7 @@ def _points_near(
     held = 0
     found: list[NDArray[np.int32]] = []
     for points in chain(own, _around(key, box, spool)):
-        inside = points[((points >= box[0]) & (points <= box[1])).all(axis=1)].astype(np.int32)
+        inside = points[((points >= box[0]) & (points <= box[1])).all(axis=1)]
         held += len(inside)
         if most is not None and held > most:
             return None
@@ -111,7 +111,7 @@ def _points_near(
     return np.concatenate(found)
 
 
-def _around(key: int, box: NDArray[np.int64], spool: Spool) -> Iterator[NDArray[np.int64]]:
+def _around(key: int, box: NDArray[np.int64], spool: Spool) -> Iterator[NDArray[np.int32]]:
     """The distinct points of each other voxel that a box reaches into, (m, 3) in this voxel's frame."""
     steps = spool.lattice.voxel_steps
     home = voxel_coordinates(np.array([key], np.uint64))[0]
@@ -120,7 +120,8 @@ def _around(key: int, box: NDArray[np.int64], spool: Spool) -> Iterator[NDArray[
     if math.prod((high - low + 1).tolist()) < len(spool.keys):
         axes = (np.arange(a, b + 1) for a, b in zip(low, high, strict=True))
         keys = voxel_keys(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3))
-        keys = keys[np.isin(keys, spool.keys, assume_unique=True)]
+        at = np.minimum(np.searchsorted(spool.keys, keys), len(spool.keys) - 1)
+        keys = keys[spool.keys[at] == keys]
     else:  # voxels so small that there are fewer of them than places for them
         voxels = voxel_coordinates(spool.keys)
         keys = spool.keys[((voxels >= low) & (voxels <= high)).all(axis=1)]
@@ -134,7 +135,8 @@ def _around(key: int, box: NDArray[np.int64], spool: Spool) -> Iterator[NDArray[
                 for rows in voxel_rows(other, spool.runs, spool.dtype)
             ]
             points = np.concatenate(inside)
-            yield points[np.unique(voxel_codes(points), return_index=True)[1]] + shift
+            distinct = np.unique(voxel_codes(points), return_index=True)[1]
+            yield (points[distinct] + shift).astype(np.int32)
 
 
 def _classify(asked: NDArray[np.int32], near: NDArray[np.int32], limits: Limits) -> NDArray[np.uint8]:

@@ -323,7 +323,8 @@ def _build_voxels(
     """Third pass: every voxel's octree and hierarchies, into the shards planned."""
     runs: tuple[Run, ...] = tuple(run for s in spooled for run in s.runs)
     shards = folder / SHARD_FOLDER
-    most_near = max(1 << 16, config.memory_bytes // (executor.jobs * VOXEL_BYTES_A_POINT))
+    # Beside the densest voxel, which may take all the memory while it is built and half of it before.
+    most_near = max(1 << 16, config.memory_bytes // (executor.jobs * 2 * VOXEL_BYTES_A_POINT))
     units = [
         ShardUnit(number, keys, points, runs, header.lattice, config, most_near, header.archive_id, shards)
         for number, (keys, points) in enumerate(plans)

@@ -17,6 +17,7 @@ from solidcloud.builder.radius import voxel_points
 from solidcloud.schemas.archive import DATASETS, Archive, shard_name, write_index, write_shard
 from solidcloud.schemas.codec import encode_voxel
 from solidcloud.schemas.errors import CorruptError, FormatError
+from solidcloud.schemas.radius_model import LOCAL_RADII
 
 FORMAT = Path(archive_module.__file__).with_name("FORMAT.md")
 ORIGIN = np.array([512345.678901, 5612345.123456, -7.25])
@@ -115,6 +116,31 @@ def test_format_md_names_every_dataset_and_field(built: Path) -> None:
     assert f"c >= 1 rows of {sizes[0]} bytes" in text
     assert f"n >= 1 rows of {sizes[1]} bytes" in text
     assert f"packed, {archive_module.VOXEL_DTYPE.itemsize} bytes" in text
+
+
+def test_format_md_reads_and_names_an_archive_with_radius_classes(tmp_path: Path) -> None:
+    xyz = make_scan("corner", 4, 300) - 1.0
+    write_xyz(tmp_path / "a.xyz", xyz)
+    models = frozenset({"mean", "local", "border"})
+    build_archive([tmp_path / "a.xyz"], tmp_path / "a", BuildConfig(voxel=0.8, jobs=1, models=models))
+    names: dict[str, Callable] = {}
+    exec(compile(worked_example(), str(FORMAT), "exec"), names)
+    world, rows = names["read_archive"](tmp_path / "a")
+    assert rows.dtype.names == ("xyz", "radius_class")
+    quantised = np.rint((xyz - xyz.min(axis=0)) / 1e-4) * 1e-4 + xyz.min(axis=0)
+    assert np.array_equal(rows_of(world), rows_of(quantised))
+    text = FORMAT.read_text()
+    with (
+        h5py.File(tmp_path / "a" / "index.h5") as index,
+        h5py.File(tmp_path / "a/shards" / shard_name(0)) as shard,
+    ):
+        assert index.attrs["format_version"] == shard.attrs["format_version"] == 2
+        assert np.array_equal(np.bincount(rows["radius_class"], minlength=32), index["radius_counts"])
+        assert index["columns"][:].tolist() == [0, 0, 1, 1]
+        for name in (*index, *rows.dtype.names):
+            assert f"`{name}`" in text, name
+    for radius in LOCAL_RADII:
+        assert re.search(rf"\b{radius}\b", text), radius
 
 
 def test_hdf5_says_what_a_shard_is(built: Path) -> None:

@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import naive_classes
 import numpy as np
 import pytest
 from solidcloud.builder.config import BuildConfig
@@ -11,21 +12,36 @@ from solidcloud.builder.pipeline import build_archive
 from solidcloud.builder.radius import voxel_points
 from solidcloud.builder.verify import verify_archive
 from solidcloud.schemas.archive import Archive
+from solidcloud.schemas.radius_model import RADIUS_CLASSES, RIM_BIT
 
 GOLDEN = Path(__file__).resolve().parents[2] / "golden"
 
 
-@pytest.fixture(scope="module")
-def expected() -> dict[str, Any]:
+# The archives of each format version, and how many of the scans went into them.
+SCANS = {"archive": 2, "archive-2": 3}
+
+
+@pytest.fixture(params=SCANS)
+def name(request: pytest.FixtureRequest) -> str:
+    """Of each golden archive."""
+    return request.param
+
+
+@pytest.fixture
+def expected(name: str) -> dict[str, Any]:
     """The committed values."""
-    return json.loads((GOLDEN / "archive.json").read_text())
+    return json.loads((GOLDEN / f"{name}.json").read_text())
 
 
 @pytest.mark.interpreted
-def test_the_golden_archive_holds_what_is_written_beside_it(expected: dict[str, Any]) -> None:
-    assert verify_archive(GOLDEN / "archive", deep=True).faults == ()
-    with Archive(GOLDEN / "archive") as archive:
+def test_the_golden_archive_holds_what_is_written_beside_it(name: str, expected: dict[str, Any]) -> None:
+    assert verify_archive(GOLDEN / name, deep=True).faults == ()
+    with Archive(GOLDEN / name) as archive:
         header = archive.header
+        assert header.format_version == expected.get("format_version", 1)
+        assert list(header.models) == expected.get("models", ["mean"])
+        assert header.radius_counts.tolist() == expected.get("radius_counts", [0] * RADIUS_CLASSES)
+        assert header.radius_capped == expected.get("radius_capped", 0)
         assert header.archive_id.hex() == expected["archive_id"]
         assert [value.hex() for value in header.lattice.origin] == expected["origin"]
         assert header.lattice.step.hex() == expected["step"]
@@ -62,28 +78,54 @@ def golden_points(folder: Path) -> np.ndarray:
     return table[np.lexsort(table.T)]
 
 
-def test_the_golden_archive_holds_the_points_of_its_scans() -> None:
+def golden_classes(folder: Path) -> dict[tuple[int, ...], int]:
+    """The radius class of each place of an archive that has some."""
+    classes: dict[tuple[int, ...], int] = {}
+    with Archive(folder) as archive:
+        for row in range(len(archive.voxels)):
+            voxel, links = archive.read_voxel(row)
+            assert voxel.radius_class is not None
+            lattice = (
+                voxel_points(voxel, links) + archive.coordinates[row] * archive.header.lattice.voxel_steps
+            )
+            for point, found in zip(lattice.tolist(), voxel.radius_class.tolist(), strict=True):
+                assert classes.setdefault(tuple(point), found) == found
+    return classes
+
+
+def test_the_golden_archive_holds_the_radius_classes_of_its_points() -> None:
+    classes = golden_classes(GOLDEN / "archive-2")
+    judged = naive_classes.judge(np.array(list(classes)), "0.001")
+    assert classes == {point: found.local + RIM_BIT * found.rim for point, found in judged.items()}
+
+
+def test_the_golden_archive_holds_the_points_of_its_scans(name: str, expected: dict[str, Any]) -> None:
     tables = []
-    for number in range(2):
-        rows = np.loadtxt(GOLDEN / f"scan-{number}.xyz", skiprows=1)
+    assert len(expected["sources"]) == SCANS[name]
+    for number, (path, *_) in enumerate(expected["sources"]):
+        rows = np.loadtxt(GOLDEN / path, skiprows=1)
         # Millimetres from UTM 512345, 5612345 and -0.25 m: the numbers the scans were made of.
         steps = np.rint((rows[:, :3] - [512345, 5612345, -0.25]) * 1000)
         tables.append(np.column_stack([steps, np.full(len(rows), number), rows[:, 3]]))
-    expected = np.concatenate(tables)
-    expected[:, :3] -= expected[:, :3].min(axis=0)
-    assert np.array_equal(golden_points(GOLDEN / "archive"), expected[np.lexsort(expected.T)])
+    table = np.concatenate(tables)
+    table[:, :3] -= table[:, :3].min(axis=0)
+    assert np.array_equal(golden_points(GOLDEN / name), table[np.lexsort(table.T)])
 
 
 def test_a_build_today_gives_the_golden_points_and_cells(
-    expected: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    name: str, expected: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(GOLDEN)  # the archive keeps paths as given
     config = BuildConfig(
-        voxel=1.0, resolution=0.001, leaf=8, degree=3, cell_points=40, keep=frozenset({"scan", "intensity"}), jobs=1
+        voxel=1.0, resolution=0.001, leaf=8, degree=3, cell_points=40, keep=frozenset({"scan", "intensity"}), jobs=1,
+        models=frozenset(expected.get("models", ["mean"])),
     )  # fmt: skip
-    build_archive([Path("scan-1.xyz"), Path("scan-0.xyz")], tmp_path / "a", config)
-    assert np.array_equal(golden_points(tmp_path / "a"), golden_points(GOLDEN / "archive"))
-    with Archive(tmp_path / "a") as new, Archive(GOLDEN / "archive") as golden:
+    scans = [Path(f"scan-{number}.xyz") for number in range(SCANS[name])]
+    build_archive(scans[::-1], tmp_path / "a", config)
+    assert np.array_equal(golden_points(tmp_path / "a"), golden_points(GOLDEN / name))
+    if name != "archive":
+        assert golden_classes(tmp_path / "a") == golden_classes(GOLDEN / name)
+    with Archive(tmp_path / "a") as new, Archive(GOLDEN / name) as golden:
         assert repr(new.header) == repr(golden.header)
         assert new.header.archive_id.hex() == expected["archive_id"]
         for row in range(len(golden.voxels)):

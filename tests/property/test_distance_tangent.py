@@ -6,6 +6,7 @@ import cases
 import naive
 import naive_distance
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 from solidcloud.schemas.answers import Verdict
 from solidcloud.server.kernels.placed import U32
@@ -33,6 +34,11 @@ def judge(scene: Scene, poses: NDArray[np.float64], least: list[int], radii: int
                 assert verdict == (Verdict.CONTACT if square <= reach * reach else Verdict.CLEAR)
 
 
+@pytest.mark.case(
+    6,
+    "10^5 near-tangent pairs among 10^7: distance to the unit, collide a unit either side; none wrong",
+    compiled_only="10^7 pairs; test_case_06_… is",
+)
 def test_ten_million_pairs_none_wrong(tmp_path: Path, rng: np.random.Generator) -> None:
     # A fine lattice and a large voxel: what float32 cannot tell there is half a step wide.
     step, steps = 1e-6, 1 << 21

@@ -1,0 +1,64 @@
+"""The same questions have the same replies, byte for byte, on any number of threads and for any processor."""
+
+import json
+import os
+import subprocess
+import sys
+from collections import Counter
+from pathlib import Path
+
+import cases
+import mixed_requests
+import numpy as np
+import pytest
+import scans
+from solidcloud.schemas.archive import Archive
+from solidcloud.server.scene import Scene
+
+INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
+
+
+@pytest.fixture(scope="module")
+def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An archive of many voxels and small trees."""
+    points = scans.make_scan(*mixed_requests.SCAN)
+    return cases.build(tmp_path_factory.mktemp("mixed"), points, voxel=0.3, leaf=8, cell_points=20).archive
+
+
+@pytest.mark.case(
+    25,
+    "10,000 mixed requests on 1, 2 and 4 threads, loads and evictions between: the same reply bytes, costs aside",
+)
+@pytest.mark.interpreted
+def test_threads_change_no_byte(archive: Path) -> None:
+    count = 60 if INTERPRETED else 10_000
+    asked = mixed_requests.requests(count)
+    assert len(Counter(op for op, _ in asked)) == 8
+    with Archive(archive) as opened, Scene.open(archive) as scene:
+        whole = int(scene.residency.bytes_of(range(len(opened.voxels))))
+    first = mixed_requests.checksums(archive, asked, 1, 1 << 26)
+    assert len(first) == count and len(set(first)) > count * 0.8
+    for threads, budget in ((2, 1 << 26), (4, whole // 2)):
+        found = mixed_requests.checksums(archive, asked, threads, budget)
+        differ = np.flatnonzero(np.array(found) != first)
+        assert not len(differ), (threads, budget, len(differ), asked[1 + int(differ[0])][0])
+
+
+@pytest.mark.case(
+    25,
+    "1,000 mixed requests compiled for a generic processor without any extension: the same reply bytes",
+    compiled_only="it compiles twice",
+)
+@pytest.mark.slow
+@pytest.mark.timeout(1000)
+@pytest.mark.skipif(INTERPRETED, reason="it compiles twice")
+def test_the_processor_changes_no_byte(archive: Path) -> None:
+    """Everything is compiled once more: a minute or two."""
+    here = mixed_requests.checksums(archive, mixed_requests.requests(1000), 1, 1 << 26)
+    path = os.pathsep.join([str(Path(mixed_requests.__file__).parent), os.environ.get("PYTHONPATH", "")])
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore", mixed_requests.__file__, str(archive), "1000"],
+        env=os.environ | {"PYTHONPATH": path, "NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""},
+        capture_output=True, text=True, check=True, timeout=900,
+    )  # fmt: skip
+    assert json.loads(done.stdout) == here

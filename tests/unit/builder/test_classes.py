@@ -61,9 +61,9 @@ def cloud(kind: str, seed: int, count: int = 400, size: int = 1500) -> NDArray[n
     return steps - steps.min(axis=0)
 
 
-def judge(lattice: NDArray[np.int64]) -> tuple[NDArray[np.uint8], int]:
+def judge(lattice: NDArray[np.int64], step: str = "0.001") -> tuple[NDArray[np.uint8], int]:
     """The class (n,) of each point by brute force, and how many have too few neighbours."""
-    of_place = naive_classes.judge(lattice, "0.001")
+    of_place = naive_classes.judge(lattice, step)
     judged = [of_place[tuple(point)] for point in lattice.tolist()]
     classes = np.array([found.local + RIM_BIT * found.rim for found in judged], np.uint8)
     return classes, sum(found.few for found in judged)
@@ -81,6 +81,22 @@ def test_classes_equal_brute_force_for_any_voxels(kind: str, tmp_path: Path) -> 
         assert header.radius_capped == few
         assert header.radius_counts.tolist() == np.bincount(expected, minlength=32).tolist()
         assert header.models == ("mean", "local", "border")
+
+
+def test_the_finest_lattice_and_the_largest_voxels(tmp_path: Path) -> None:
+    # A voxel of 2 m and what is around it take more than the 21 bits of a Morton code.
+    rng = np.random.default_rng(9)
+    wide = rng.integers(0, 2_600_000, (300, 3)) * [1, 1, 0]
+    dense = rng.integers(0, 100_000, (200, 3)) * [1, 0, 1] + [1_950_000, 700_000, 0]
+    lattice = np.concatenate([[[0, 0, 0]], wide, dense])
+    path = write_xyz(tmp_path / "a.xyz", lattice * 1e-6)
+    build_archive([path], tmp_path / "a", BuildConfig(resolution=1e-6, voxel=2.0, jobs=1, models=ALL))
+    points, classes, header = stored(tmp_path / "a")
+    assert header.lattice.voxel_steps == 2_000_000
+    expected, few = judge(points, "1e-06")
+    assert np.array_equal(classes, expected)
+    assert header.radius_capped == few
+    assert len(np.unique(classes)) > 3
 
 
 def test_a_shifted_grid_gives_the_same_classes(tmp_path: Path) -> None:
@@ -194,11 +210,57 @@ def test_the_kernel_and_the_judge_agree_at_the_edge_of_each_rule(held: int) -> N
         for beyond in (0, 1):
             for side in (0, 1, 2):
                 points = _ring(held, math.isqrt(limit) + beyond, side)
-                rows = np.where((points == 0).all(axis=1), 0, -1).astype(np.int32)
-                starts, classes = box_starts(len(points)), np.empty(1, np.uint8)
-                point_classes(points, bound_boxes(points, starts), starts, rows, *limits, classes)
                 at = naive_classes.judge(points.astype(np.int64), "0.001")[0, 0, 0]
-                assert classes[0] == at.local + RIM_BIT * at.rim + FEW * at.few
+                assert class_of_origin(points) == at.local + RIM_BIT * at.rim + FEW * at.few
+
+
+def class_of_origin(points: NDArray[np.integer]) -> int:
+    """The class that the kernel gives the first of the points (n, 3) that is (0, 0, 0), FEW among the bits."""
+    points = points.astype(np.int32)
+    rows = np.where((points == 0).all(axis=1), 0, -1).astype(np.int32)
+    starts, classes = box_starts(len(points)), np.empty(1, np.uint8)
+    point_classes(points, bound_boxes(points, starts), starts, rows, *class_limits(STEP), classes)
+    return int(classes[0])
+
+
+@pytest.mark.interpreted
+def test_the_twelfth_neighbour_decides_and_at_the_limit_is_within() -> None:
+    near = [[x, y, 0] for x in (-1, 0, 1) for y in (-2, -1, 1, 2)][:11]
+    for twelfth, expected in (([26, 0, 0], 3), ([26, 0, 1], 4), ([0, -26, 0], 3), ([362, 0, 0], 15)):
+        points = np.array([[0, 0, 0], *near, twelfth])
+        assert class_of_origin(points) % RIM_BIT == expected
+        assert class_of_origin(points) & FEW == 0
+        # A thirteenth, farther, changes nothing; a nearer one takes its place.
+        assert class_of_origin(np.array([*points, [0, 300, 200]])) % RIM_BIT == expected
+        assert class_of_origin(np.array([*points, [0, 0, 2]])) % RIM_BIT == 0
+    assert class_of_origin(np.array([[0, 0, 0], *near, [362, 0, 1]])) == 15 + FEW
+
+
+@pytest.mark.interpreted
+def test_a_mean_at_the_limit_is_no_rim() -> None:
+    # The sum is (12, 0, 0): six times its square is 864, and so is 12 times the sum of squares, 72.
+    around = [
+        (1, 0),
+        (-1, 0),
+        (0, 1),
+        (0, -1),
+        (1, 1),
+        (1, -1),
+        (-1, 1),
+        (-1, -1),
+        (2, 0),
+        (-2, 0),
+        (4, 2),
+        (-4, -2),
+    ]
+    points = np.array([[0, 0, 0], *([1, y, z] for y, z in around)])
+    assert class_of_origin(points) == 0
+    points[-2:] = [[1, 4, 1], [1, -4, -1]]
+    assert class_of_origin(points) == RIM_BIT
+    # Of more than 24 neighbours the farther ones do not count.
+    far = np.array([[-40, y, z] for y in range(-3, 4) for z in range(-3, 4)])
+    beside = np.concatenate([points, points[1:] + np.array([1, 0, 0])])
+    assert class_of_origin(np.concatenate([beside, far])) == class_of_origin(beside) >= RIM_BIT
 
 
 def _ring(held: int, radius: int, side: int) -> NDArray[np.int32]:

@@ -1,0 +1,1 @@
+"""What scripts/mutation is made of."""

@@ -1,0 +1,151 @@
+"""The mutants of one kernel file: cosmic-ray's operators, less what can change nothing, in a random order by seed."""
+
+import ast
+import random
+from collections import defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import cosmic_ray.plugins
+from cosmic_ray.ast import ast_nodes, get_ast
+from cosmic_ray.mutating import mutate_code
+
+Position = tuple[int, int]  # line from 1, column from 0
+
+# Operators left out: name -> what it does, and the reason; shown in the document.
+LEFT_OUT = {
+    "NoOp": ("changes of nothing", "they are for trying the tool itself"),
+    "RemoveDecorator": ("removed decorators", "interpreted, a kernel's decorator does nothing"),
+    "_Is": (
+        "`is` for another comparison",
+        "it asks for a number's identity, which compiled code does not have",
+    ),
+}
+# Parts of a file left out, with the reason; shown in the document.
+PARTS_LEFT_OUT = {
+    "annotations": "nothing reads them when a kernel runs",
+    "NamedTuple classes": "they declare fields and hold no code",
+    "decorators": "their options are the compiler's",
+    "texts": "docstrings and other strings are not what a kernel computes with",
+}
+
+
+class Mutant(NamedTuple):
+    """One change. operator, occurrence: cosmic-ray's.  line: from 1, of its beginning.
+
+    function: the innermost one it is in, "" outside.  was, now: the changed lines, joined where there are more.
+    """
+
+    operator: str
+    occurrence: int
+    line: int
+    function: str
+    was: str
+    now: str
+
+    @property
+    def key(self) -> str:
+        """Names it among those of one source."""
+        return f"{self.operator}:{self.occurrence}"
+
+
+def operators() -> dict[str, type]:
+    """Name -> operator, those that need no arguments and are not left out."""
+    found = {}
+    for name in cosmic_ray.plugins.operator_names():
+        operator = cosmic_ray.plugins.get_operator(name)
+        short = name.split("/")[-1]
+        identity = short.endswith(("_Is", "_IsNot")) or "_Is_" in short or "_IsNot_" in short
+        if not operator.arguments() and short not in LEFT_OUT and not identity:
+            found[short] = operator
+    return found
+
+
+def spans_left_out(source: str) -> list[tuple[Position, Position]]:
+    """Begin and end of every part of a source that no mutant may begin in: see PARTS_LEFT_OUT."""
+    spans: list[ast.AST] = []
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.AnnAssign):
+            spans.append(node.annotation)
+        elif isinstance(node, ast.ClassDef):
+            if any(isinstance(base, ast.Name) and base.id == "NamedTuple" for base in node.bases):
+                spans.append(node)
+        elif isinstance(node, ast.FunctionDef):
+            arguments = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
+            spans += [a.annotation for a in arguments if a.annotation is not None]
+            spans += [*node.decorator_list, *([node.returns] if node.returns else [])]
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+            spans.append(node)
+    return [((s.lineno, s.col_offset), (s.end_lineno, s.end_col_offset)) for s in spans]  # type: ignore[attr-defined]
+
+
+def functions(source: str) -> list[tuple[int, int, str]]:
+    """First line, last line and name of every function."""
+    found = [n for n in ast.walk(ast.parse(source)) if isinstance(n, ast.FunctionDef)]
+    return [(n.lineno, n.end_lineno or n.lineno, n.name) for n in found]
+
+
+def mutated(source: str, operator: str, occurrence: int) -> str | None:
+    """The source with one change; None where that does not parse or is the same code."""
+    kind = cosmic_ray.plugins.get_operator(f"core/{operator}")
+    changed = mutate_code(source, kind(), occurrence)
+    if changed is None:
+        return None
+    try:
+        tree = ast.parse(changed)
+    except SyntaxError:
+        return None
+    return changed if ast.dump(tree) != ast.dump(ast.parse(source)) else None
+
+
+def changed_lines(source: str, changed: str) -> tuple[str, str]:
+    """What differs, in whole lines without their margins."""
+    before, after = source.splitlines(), changed.splitlines()
+    head = 0
+    while head < min(len(before), len(after)) and before[head] == after[head]:
+        head += 1
+    tail = 0
+    while tail < min(len(before), len(after)) - head and before[-1 - tail] == after[-1 - tail]:
+        tail += 1
+    own = (before[head : len(before) - tail], after[head : len(after) - tail])
+    was, now = (" ".join(" ".join(line.split()) for line in lines) for lines in own)
+    return was, now
+
+
+def all_positions(source: str) -> list[list[tuple[str, int, Position]]]:
+    """(operator, occurrence, begin) of every change, those of one place together, in the order of the source."""
+    nodes, spans = list(ast_nodes(get_ast(source))), spans_left_out(source)
+    places: dict[tuple[Position, Position, str], list[tuple[str, int, Position]]] = defaultdict(list)
+    for name, kind in operators().items():
+        operator, occurrence = kind(), -1
+        for node in nodes:
+            for begin, end in operator.mutation_positions(node):
+                occurrence += 1
+                if not any(low <= begin < high for low, high in spans):
+                    # A comparison and its `not` share a place and are two things to ask.
+                    places[begin, end, name.split("_")[0]].append((name, occurrence, begin))
+    return [places[key] for key in sorted(places)]
+
+
+def draw(path: Path, source: str, seed: int) -> Iterator[tuple[Mutant, str]]:
+    """Every mutant of a file with its source, in a random order that the seed, the name and the source decide.
+
+    All places come once, each with one of its changes, before any comes twice: else a `*`, which has eleven other
+    operators to be replaced by, would weigh eleven times as much as an `and`.
+    """
+    random_order = random.Random(f"{seed}:{path.as_posix()}")
+    places = all_positions(source)
+    for place in places:
+        random_order.shuffle(place)
+    named = functions(source)
+    for turn in range(max(map(len, places), default=0)):
+        these = [place[turn] for place in places if len(place) > turn]
+        random_order.shuffle(these)
+        for operator, occurrence, (line, _) in these:
+            changed = mutated(source, operator, occurrence)
+            if changed is None:
+                continue
+            inside = [name for first, last, name in named if first <= line <= last]
+            was, now = changed_lines(source, changed)
+            yield Mutant(operator, occurrence, line, inside[-1] if inside else "", was, now), changed

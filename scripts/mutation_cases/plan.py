@@ -1,0 +1,91 @@
+"""Which tests are to kill the mutants of which kernel file; quick ones first, for the first failure ends a trial."""
+
+SCHEMAS, BUILDER, SERVER = "tests/unit/schemas/", "tests/unit/builder/", "tests/unit/server/"
+
+
+def work(*questions: str) -> tuple[str, ...]:
+    """Tests that some answers and the work done for them are what they were."""
+    test = SERVER + "test_work.py::test_answers_and_work_are_what_they_were"
+    return tuple(
+        f"{test}[{question}-{kind}]" for kind in ("classed", "fine", "flat") for question in questions
+    )
+
+
+def tangent(question: str) -> tuple[str, ...]:
+    """Tests that contact begins at the unit that the definition says."""
+    test = SERVER + "test_tangent.py::test_contact_begins_at_the_unit_of_the_definition"
+    return tuple(f"{test}[{question}-{name}]" for name in ("small-fine", "deep-flat"))
+
+
+TESTS: dict[str, tuple[str, ...]] = {
+    "schemas/kernels/links.py": (SCHEMAS + "test_links.py",),
+    "schemas/kernels/morton.py": (SCHEMAS + "test_morton.py",),
+    "schemas/kernels/rows.py": (SCHEMAS + "test_rows.py",),
+    "builder/kernels/bounding_sphere.py": (
+        BUILDER + "test_bounding_sphere.py::test_a_bound_is_as_tight_as_its_guess",
+        BUILDER + "test_bounding_sphere.py::test_a_guess_whose_radius_does_not_fit_is_given_up_for_the_box",
+        BUILDER + "test_bounding_sphere.py::test_ceil_sqrt_is_exact",
+        BUILDER + "test_bounding_sphere.py::test_degenerate_sets_are_bounded",
+        BUILDER + "test_bounding_sphere.py::test_a_flat_set_has_a_thin_slab",
+        BUILDER + "test_bounding_sphere.py::test_bounds_enclose_in_every_unit",
+    ),
+    "builder/kernels/classes.py": (
+        BUILDER + "test_classes.py::test_the_kernel_and_the_judge_agree_at_the_edge_of_each_rule",
+        BUILDER + "test_classes.py::test_the_twelfth_neighbour_decides_and_at_the_limit_is_within",
+        BUILDER + "test_classes.py::test_a_mean_at_the_limit_is_no_rim",
+    ),
+    "builder/kernels/neighbours.py": (
+        BUILDER + "test_neighbours.py::test_the_closest_equal_brute_force",
+        BUILDER + "test_neighbours.py::test_ties_go_to_lesser_coordinates",
+        BUILDER + "test_neighbours.py::test_a_distance_at_the_limit_counts",
+        BUILDER + "test_neighbours.py::test_boxes_hold_their_points",
+    ),
+    "builder/kernels/content.py": (BUILDER + "test_content.py",),
+    "builder/kernels/enclosure.py": (BUILDER + "test_enclosure.py",),
+    "builder/kernels/nearest.py": (BUILDER + "test_nearest.py",),
+    "builder/kernels/octree.py": (
+        BUILDER + "test_octree.py::test_cells_are_runs_of_the_sorted_codes",
+        BUILDER + "test_octree.py::test_a_cell_is_split_only_when_it_must_be",
+        BUILDER + "test_octree.py::test_a_cell_may_be_full",
+        BUILDER + "test_octree.py::test_points_on_cell_borders_are_in_one_cell",
+    ),
+    "builder/kernels/pack.py": (BUILDER + "test_pack.py",),
+    "server/kernels/placing.py": (SERVER + "test_pose_checks.py", SERVER + "test_placing.py"),
+    "server/kernels/reach.py": (
+        SERVER + "test_reach_rows.py",
+        SERVER + "test_reach.py::test_find_key_finds_what_is_there_and_nothing_else",
+    ),
+    "server/kernels/pairs.py": (SERVER + "test_pairs.py",),
+    "server/kernels/motion.py": (SERVER + "test_motion.py", *work("sweep")),
+    "server/kernels/advance.py": work("sweep", "sweep bounded"),
+    "server/kernels/closer.py": (SERVER + "test_closer.py", *work("distance")),
+    "server/kernels/closest.py": work("distance", "distance deep", "distance bounded"),
+    "server/kernels/contacts.py": (*work("contacts", "contacts deep"), *tangent("contacts")),
+    "server/kernels/front.py": work("collide", "distance"),
+    "server/kernels/lanes.py": work("distance", "distance deep", "bounded deep"),
+    "server/kernels/layout.py": (SERVER + "test_layout.py", *work("collide", "contacts")),
+    "server/kernels/moments.py": work("sweep", "sweep bounded"),
+    "server/kernels/moving.py": work("sweep", "sweep bounded"),
+    "server/kernels/memory.py": work("walker"),
+    "server/kernels/nearest.py": work("distance", "distance deep"),
+    "server/kernels/overlap.py": (*work("collide", "collide deep", "collide one"), *tangent("collide")),
+    "server/kernels/placed.py": (*work("collide", "distance", "contacts"), *tangent("collide")),
+    "server/kernels/priority.py": (
+        *work("bounded deep", "collide bounded", "distance bounded"),
+        *tangent("bounded"),
+    ),
+    "server/kernels/rays.py": work("raycast", "raycast bounded"),
+    "server/kernels/sweep.py": work("sweep", "sweep bounded"),
+    "server/kernels/voxel_tree.py": work("within", "raycast"),
+    "server/kernels/walking.py": (*work("walker"), *tangent("walker")),
+    "server/kernels/within.py": work("within", "within bounded"),
+    "server/kernels/clusters.py": (
+        SERVER + "test_clusters.py",
+        SERVER + "test_cell_hash.py",
+        *work("contacts"),
+    ),
+}
+# Files without a mutant, with the reason.
+NONE = {
+    "server/kernels/compiled.py": "options of the compiler only, which an interpreted kernel does not see",
+}

@@ -1,0 +1,99 @@
+"""What has been tried, kept in results.json beside this file, so that a run goes on where the last one ended."""
+
+import hashlib
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from .mutants import Mutant
+from .trial import PASSED, REFUSED, Outcome
+
+PLACE = Path(__file__).with_name("results.json")
+EVERY = 20  # trials between two writings
+
+
+def digest(text: bytes) -> str:
+    """Names a source; long enough to tell two from each other."""
+    return hashlib.sha256(text).hexdigest()[:16]
+
+
+def digest_tests(folder: Path, tests: tuple[str, ...]) -> str:
+    """Names what the tests of a file are: they themselves and what they share."""
+    paths = sorted({*(folder / name.split("::")[0] for name in tests), *(folder / "tests").glob("*.py")})
+    return digest(b"".join(path.read_bytes() for path in paths))
+
+
+@dataclass
+class FileResults:
+    """Those of one file. source, tests: digests.  complete: no mutant is left.  tried: key -> its row.
+
+    A row: line, function, was, now of the mutant, and kind, test, what of the outcome.
+    """
+
+    source: str
+    tests: str
+    seed: int
+    complete: bool = False
+    tried: dict[str, dict[str, Any]] = field(default_factory=dict)
+    owner: "Results | None" = None
+
+    def knows(self, mutant: Mutant) -> bool:
+        """Whether it has been tried."""
+        return mutant.key in self.tried
+
+    def add(self, mutant: Mutant, outcome: Outcome) -> None:
+        """Take up an outcome."""
+        self.tried[mutant.key] = {
+            **{name: getattr(mutant, name) for name in ("line", "function", "was", "now")},
+            **{name: getattr(outcome, name) for name in ("kind", "test", "what")},
+        }
+        if self.owner and len(self.tried) % EVERY == 0:
+            self.owner.save()
+
+    def rows(self, *kinds: str) -> list[dict[str, Any]]:
+        """Rows of these kinds, in the order of the source."""
+        return sorted((r for r in self.tried.values() if r["kind"] in kinds), key=lambda row: row["line"])
+
+    def counted(self) -> int:
+        """How many count: all but those that the compiler would have refused."""
+        return sum(row["kind"] != REFUSED for row in self.tried.values())
+
+    def killed(self) -> int:
+        """How many of them a test noticed."""
+        return sum(row["kind"] not in (REFUSED, PASSED) for row in self.tried.values())
+
+
+class Results:
+    """Those of all files."""
+
+    def __init__(self, files: dict[str, FileResults]) -> None:
+        self.files = files
+        for own in files.values():
+            own.owner = self
+
+    def take(self, file: str, source: str, tests: str, seed: int) -> FileResults:
+        """The results of a file that still hold: none of another source or seed, no survivor of other tests."""
+        own = self.files.get(file)
+        if own is None or (own.source, own.seed) != (digest(source.encode()), seed):
+            own = FileResults(digest(source.encode()), tests, seed)
+        elif own.tests != tests:
+            own.tried = {key: row for key, row in own.tried.items() if row["kind"] != PASSED}
+            own.tests = tests
+        own.complete, own.owner = False, self
+        self.files[file] = own
+        return own
+
+    def save(self) -> None:
+        """Write results.json."""
+        data = {
+            name: {key: value for key, value in vars(own).items() if key != "owner"}
+            for name, own in sorted(self.files.items())
+        }
+        PLACE.write_text(json.dumps(data, indent=1, sort_keys=True) + "\n")
+
+
+def load() -> Results:
+    """What results.json holds; nothing where it is not there."""
+    data = json.loads(PLACE.read_text()) if PLACE.is_file() else {}
+    return Results({name: FileResults(**own) for name, own in data.items()})

@@ -24,6 +24,7 @@ DOORS = {
     "trimesh": ("builder/sources/surface.py", "builder/made/"),
     "embreex": ("builder/made/scanner.py",),
     "matplotlib": ("server/report/",),
+    "PIL": ("server/report/",),
     "typer": ("server/cli.py",),
     "rich": ("server/console.py", "server/report/"),
 }

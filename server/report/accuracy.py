@@ -1,0 +1,184 @@
+"""The price of accuracy: one knob at a time, what each setting costs and what it gets wrong.
+
+`solidcloud accuracy` calls `run`: accuracy.csv, accuracy.json, accuracy.html and the charts come out. All happens in
+this process: archives are built from one scan, opened, asked and closed.
+"""
+
+import csv
+import json
+import os
+import time
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from ...builder.config import BuildConfig
+from ...builder.progress import Progress
+from ...schemas.archive import Archive
+from .accuracy_arithmetic import PRIMITIVE, VOLUME, check_judge, measure_plain, plain_settings
+from .accuracy_case import (
+    AVATAR,
+    REACH,
+    Ground,
+    given_ground,
+    judged_contact,
+    made_ground,
+    tangent_poses,
+    turned_ground,
+)
+from .accuracy_engine import (
+    Archives,
+    Exact,
+    Setting,
+    count_timed,
+    engine_settings,
+    judge_engine,
+    radius_settings,
+    time_engine,
+)
+from .accuracy_felt import FELT, measure_felt
+from .accuracy_plan import Plan
+from .accuracy_row import COLUMNS, SHOWN, Row, mark_front
+from .spheres import load_pyplot
+
+TURNED = (VOLUME, PRIMITIVE)
+
+
+class Report(NamedTuple):
+    """What was measured. ground: in words.  facts: figures of the scene and the machine, for JSON and the page."""
+
+    ground: str
+    rows: list[Row]
+    facts: dict[str, Any]
+
+
+def run(
+    out: Path,
+    scratch: Path,
+    plan: Plan,
+    progress: Progress,
+    archive: Path | None = None,
+    avatar: Path | None = None,
+) -> Report:
+    """Measure everything and write it into the folder `out`.
+
+    scratch: a folder for scans and archives, the caller's to remove.  archive: of a user; None: the façade is made.
+    avatar: a file of points; None: the made figure. Raises SolidcloudError where matplotlib is missing.
+    """
+    from .accuracy_page import write_page
+    from .accuracy_picture import draw_charts
+
+    load_pyplot()  # missing: better said now than after minutes
+    out.mkdir(parents=True, exist_ok=True)
+    report = measure(scratch, plan, progress, archive, avatar)
+    progress.start("draw", 1, "page")
+    write_rows(report, out)
+    charts = draw_charts(report.rows, report.ground, out)
+    write_page(report, charts, out / "accuracy.html")
+    progress.advance(1)
+    progress.finish()
+    return report
+
+
+def measure(
+    scratch: Path, plan: Plan, progress: Progress, archive: Path | None = None, avatar: Path | None = None
+) -> Report:
+    """`run` without its files."""
+    begin = time.perf_counter()
+    progress.start("make", 1, "scene")
+    ground = given_ground(archive, plan, avatar, scratch) if archive else made_ground(plan, avatar, scratch)
+    progress.advance(1)
+    progress.finish()
+    with Archives(ground, scratch) as archives:
+        plain = BuildConfig(resolution=ground.step, overwrite=True)
+        progress.start("judge", 1, "scene")
+        exact = judge(ground, plain, archives, plan)
+        folder = archives.folder(plain)
+        with Archive(folder) as opened:
+            header = opened.header
+            checked = check_judge(opened, ground, exact, plan.brute)
+            progress.finish()
+            settings = engine_settings(plan, ground.step, header.radius)
+            settings += radius_settings(plan, ground.step, header.radius)
+            measure_engine(settings, archives, ground, exact, plan, progress)
+            progress.start("plain", len(plain_settings()) * (1 + plan.loops), "settings")
+            rows = [s.row for s in settings]
+            rows += measure_plain(opened, ground, exact, plan, lambda: progress.advance(1))
+            progress.finish()
+    rows += measure_turned(ground, scratch, plan, progress)
+    mark_front(rows, SHOWN)
+    facts = {
+        "scene": ground.name,
+        "points": header.points,
+        "lattice_step_m": ground.step,
+        "radius_m": header.radius,
+        "avatar_points": len(ground.avatar),
+        "walk_poses": len(ground.walk),
+        "judged_poses": len(ground.judged),
+        "judged_contacts": int(exact.contact.sum()),
+        "near_tangent_poses": len(exact.tangent),
+        "poses_judged_by_every_pair": checked,
+        "seconds": time.perf_counter() - begin,
+        "load_average": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
+        "processors": os.cpu_count(),
+        "plan": asdict(plan),
+    }
+    return Report(ground.name, rows, facts)
+
+
+def judge(ground: Ground, config: BuildConfig, archives: Archives, plan: Plan) -> Exact:
+    """The exact verdicts and distances, by the server's exact answers on the archive of `config`."""
+    scene = archives.scene(config)
+    tangent = tangent_poses(scene, ground.judged, plan.near_tangent)
+    distance = scene.distance(AVATAR, ground.judged, REACH).signed_distance
+    return Exact(judged_contact(scene, ground.judged), distance, judged_contact(scene, tangent), tangent)
+
+
+def measure_engine(
+    settings: list[Setting], archives: Archives, ground: Ground, exact: Exact, plan: Plan, progress: Progress
+) -> None:
+    """Everything of the server's engine, stage by stage."""
+
+    def tick() -> None:
+        progress.advance(1)
+
+    progress.start("verdicts", len(settings), "settings")
+    judge_engine(settings, archives, ground, exact, tick)
+    progress.finish()
+    if ground.truth is not None:
+        progress.start("doors, walls", sum(s.row.knob in FELT for s in settings), "settings")
+        measure_felt(settings, archives, ground, plan, tick)
+        progress.finish()
+    progress.start("times", count_timed(settings) * plan.loops, "settings")
+    time_engine(settings, archives, ground, plan, tick)
+    progress.finish()
+
+
+def measure_turned(ground: Ground, scratch: Path, plan: Plan, progress: Progress) -> list[Row]:
+    """Volumes and primitives once more where no wall stands along an axis: boxes like axes, spheres do not care."""
+    folder = scratch / "turned"
+    folder.mkdir(exist_ok=True)
+    turned = turned_ground(ground, folder)
+    count = sum(knob in TURNED for knob, _ in plain_settings())
+    progress.start("turned", count * (1 + plan.loops), "settings")
+    with Archives(turned, folder) as archives:
+        plain = BuildConfig(resolution=turned.step, overwrite=True)
+        exact = judge(turned, plain, archives, plan)
+        with Archive(archives.folder(plain)) as opened:
+            rows = measure_plain(opened, turned, exact, plan, lambda: progress.advance(1), only=TURNED)
+    for row in rows:
+        row.knob += ", turned"
+    progress.finish()
+    return rows
+
+
+def write_rows(report: Report, out: Path) -> None:
+    """accuracy.json: facts and rows; accuracy.csv: the rows."""
+    rows = [row.as_dict() for row in report.rows]
+    (out / "accuracy.json").write_text(
+        json.dumps({"facts": report.facts, "rows": rows}, indent=1, allow_nan=False) + "\n"
+    )
+    with open(out / "accuracy.csv", "w", newline="") as file:
+        writer = csv.DictWriter(file, COLUMNS)
+        writer.writeheader()
+        writer.writerows({**row, "front": " ".join(row["front"])} for row in rows)

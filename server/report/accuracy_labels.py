@@ -1,0 +1,69 @@
+"""Labels beside points of a chart, placed so that none covers another or a point."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+FONT = 9.0
+# Where a label may stand, in points from its anchor: beside it first, then farther off with a line to it.
+NEAR, FAR, FARTHER = 9.0, 26.0, 44.0
+TURNS = 16
+
+
+def place_labels(
+    panel: Any, anchors: Sequence[tuple[float, float]], labels: Sequence[str], colours: Sequence[str]
+) -> None:
+    """Write each label near its anchor, in the order given: the first has the choice of all places.
+
+    The figure must have been drawn: a layout may move its panels.
+    """
+    from matplotlib.patheffects import withStroke
+
+    figure = panel.figure
+    renderer = figure.canvas.get_renderer()
+    scale = figure.dpi / 72
+    spots = panel.transData.transform(np.asarray(anchors, float))
+    frame = panel.get_window_extent(renderer)
+    taken = [(x - 5 * scale, y - 5 * scale, x + 5 * scale, y + 5 * scale) for x, y in spots]
+    for (x, y), anchor, label, colour in zip(spots, anchors, labels, colours, strict=True):
+        text = panel.annotate(
+            label, anchor, xytext=(0, 0), textcoords="offset points", fontsize=FONT, color=colour, ha="center",
+            va="center", zorder=6, arrowprops={"arrowstyle": "-", "lw": 0.5, "color": colour, "shrinkA": 0},
+        )  # fmt: skip
+        text.set_path_effects([withStroke(linewidth=2.5, foreground="white")])  # lines run behind
+        box = text.get_window_extent(renderer)
+        half_width, half_height = box.width / 2, box.height / 2
+        best, least = (0.0, 0.0), np.inf
+        for step, distance in enumerate((NEAR, FAR, FARTHER)):
+            for k in range(TURNS):
+                turn = 2 * np.pi * k / TURNS
+                dx = np.cos(turn) * (distance * scale + half_width)
+                dy = np.sin(turn) * (distance * scale + half_height)
+                rect = (x + dx - half_width, y + dy - half_height, x + dx + half_width, y + dy + half_height)
+                cost = 300.0 * step + 20.0 * (1 - np.cos(turn)) + _outside(rect, frame) * 50
+                cost += 6.0 * sum(_shared(rect, other) for other in taken)
+                if cost < least:
+                    best, least = (dx / scale, dy / scale), cost
+        text.set_position(best)
+        if np.hypot(*best) < NEAR + half_width / scale + 2:
+            text.arrow_patch.set_visible(False)
+        x0, y0 = x + best[0] * scale - half_width, y + best[1] * scale - half_height
+        taken.append((x0, y0, x0 + 2 * half_width, y0 + 2 * half_height))
+
+
+def _shared(one: tuple[float, ...], other: tuple[float, ...]) -> float:
+    """The area two rectangles (left, low, right, high) share, in pixels."""
+    width = min(one[2], other[2]) - max(one[0], other[0])
+    height = min(one[3], other[3]) - max(one[1], other[1])
+    return max(width, 0.0) * max(height, 0.0)
+
+
+def _outside(one: tuple[float, ...], frame: Any) -> float:
+    """How far a rectangle leaves the frame, in pixels."""
+    return float(
+        max(frame.x0 - one[0], 0.0)
+        + max(frame.y0 - one[1], 0.0)
+        + max(one[2] - frame.x1, 0.0)
+        + max(one[3] - frame.y1, 0.0)
+    )

@@ -1,0 +1,136 @@
+"""The accuracy report as one HTML page: pictures inside, no network, words for who did not write it."""
+
+import base64
+import math
+from collections.abc import Iterable, Sequence
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from .accuracy_row import PLAIN, Row, knobs
+from .accuracy_timing import NOISY
+from .accuracy_words import CHARTS, KNOBS, TERMS, findings
+
+if TYPE_CHECKING:
+    from .accuracy import Report
+
+STYLE = """
+body{font:16px/1.5 system-ui,sans-serif;color:#2f2a26;background:#fbfaf7;max-width:75rem}
+body{margin:2rem auto;padding:0 1rem}
+h1{font-size:1.7rem}h2{margin-top:2.5rem;border-top:1px solid #d9cfc1;padding-top:1rem}
+img{max-width:100%;height:auto;background:#fff}p,li{max-width:48rem}
+.wide{overflow-x:auto}table{border-collapse:collapse;font-size:.85rem}
+th,td{padding:.2rem .55rem;text-align:right;border-bottom:1px solid #e4ded4;white-space:nowrap}
+th{text-align:right;vertical-align:bottom;white-space:normal}th:first-child,td:first-child{text-align:left}
+tr.default{background:#efe9dc;font-weight:600}.noisy{color:#a05a00}dt{font-weight:600}dd{margin:0 0 .5rem 1rem}
+"""
+
+# Column heads of a table, and what a row shows under each; a column that is empty for all rows is left out.
+HEADS = (
+    "setting", "time of a pose [µs]", "p50", "p99", "times default", "early", "late", "unknown",
+    "near-tangent: early", "late", "unknown", "distance off, most [mm]", "mean [mm]", "no pair found",
+    "doorway [mm]", "leak p50 [mm]", "p99 [mm]", "worst [mm]", "passed [%]", "archive [bytes]", "decode [ms]",
+    "node tests", "pair tests", "Pareto front",
+)  # fmt: skip
+
+
+def write_page(report: "Report", charts: dict[str, Path], target: Path) -> None:
+    """Write the page. charts: as `draw_charts` returns them."""
+    facts = report.facts
+    body = [
+        f"<h1>The price of accuracy</h1><p>{escape(report.ground)}; an avatar of {facts['avatar_points']:,} points; "
+        f"times on a walk of {facts['walk_poses']:,} poses, verdicts on {facts['judged_poses']:,} poses, "
+        f"{facts['judged_contacts']:,} of them in contact, and on {facts['near_tangent_poses']:,} within a micrometre "
+        f"of touching. The judge is the server's exact answer; at {facts['poses_judged_by_every_pair']:,} poses every "
+        "pair of points was compared in integers as well, and agreed.</p>",
+        _noise(report.rows),
+        "<h2>At a glance</h2>",
+        _picture(charts["main"], CHARTS["main"]),
+        "<ul>" + "".join(f"<li>{escape(line)}</li>" for line in findings(report.rows)) + "</ul>",
+    ]
+    if "verdicts" in charts:
+        body.append(_picture(charts["verdicts"], CHARTS["verdicts"]))
+    body.append(_picture(charts["volumes"], CHARTS["volumes"]))
+    body.append("<h2>The words</h2><dl>")
+    body += [f"<dt>{escape(term)}</dt><dd>{escape(said)}</dd>" for term, said in TERMS.items()]
+    body.append("</dl>")
+    for knob in knobs(report.rows):
+        own = [row for row in report.rows if row.knob == knob]
+        body.append(f"<h2>{escape(knob.capitalize())}</h2>")
+        body.append(f"<p>{escape(KNOBS[knob])}</p>{_picture(charts[knob], '')}{table(own)}")
+    page = (
+        '<!doctype html><html lang="en"><head><meta charset="utf-8"><title>The price of accuracy</title>'
+        f"<style>{STYLE}</style></head><body>{''.join(body)}</body></html>\n"
+    )
+    target.write_text(page, encoding="utf-8")
+
+
+def table(rows: Sequence[Row]) -> str:
+    """The rows of one knob as an HTML table."""
+    cells = [_cells(row) for row in rows]
+    shown = [k for k in range(len(HEADS)) if any(line[k] for line in cells)]
+    head = "".join(f"<th>{escape(HEADS[k])}</th>" for k in shown)
+    lines = []
+    for row, line in zip(rows, cells, strict=True):
+        kind = ' class="default"' if row.default else ""
+        lines.append(f"<tr{kind}>" + "".join(f"<td>{escape(line[k])}</td>" for k in shown) + "</tr>")
+    return f'<div class="wide"><table><thead><tr>{head}</tr></thead><tbody>{"".join(lines)}</tbody></table></div>'
+
+
+def _cells(row: Row) -> list[str]:
+    """What a row shows, under HEADS."""
+    noisy = " (noisy)" if row.noise is not None and row.noise > NOISY else ""
+    return [
+        row.setting + (" (default)" if row.default and row.by != PLAIN else ""),
+        _figure(row.mean_us, 2) + noisy,
+        *(_figure(value, 2) for value in (row.p50_us, row.p99_us, row.times)),
+        *_counts((row.early, row.late, row.unknown), row.poses),
+        *_counts((row.tangent_early, row.tangent_late, row.tangent_unknown), row.tangent),
+        _small(row.distance_max_mm),
+        _small(row.distance_mean_mm),
+        str(row.distance_missing or ""),
+        *(_figure(v, 1) for v in (row.doorway_mm, row.leak_p50_mm, row.leak_p99_mm, row.leak_worst_mm)),
+        "" if row.leak_share is None else f"{row.leak_share * 100:.1f}",
+        "" if row.archive_bytes is None else f"{row.archive_bytes:,}",
+        _figure(row.decode_ms, 1),
+        *(_figure(value, 0) for value in (row.node_tests, row.pair_tests)),
+        ", ".join(row.front),
+    ]
+
+
+def _counts(counts: Iterable[int], of: int) -> list[str]:
+    return [f"{count:,} of {of:,}" if count else "0" if of else "" for count in counts]
+
+
+def _figure(value: float | None, digits: int) -> str:
+    if value is None:
+        return ""
+    return f"{value:,.{digits}f}" if math.isfinite(value) else "does not pass"
+
+
+def _small(value: float | None) -> str:
+    """A length [mm] that may be 0, a rounding, or centimetres."""
+    if value is None:
+        return ""
+    return "0" if value < 1e-9 else f"{value:.3g}"
+
+
+def _picture(file: Path, said: str) -> str:
+    """A PNG inside the page, with a sentence below it."""
+    data = base64.b64encode(file.read_bytes()).decode("ascii")
+    below = f"<figcaption>{escape(said)}</figcaption>" if said else ""
+    return (
+        f'<figure><img alt="{escape(said or file.stem)}" src="data:image/png;base64,{data}">{below}</figure>'
+    )
+
+
+def _noise(rows: Sequence[Row]) -> str:
+    """A warning where other work disturbed the times."""
+    noisy: list[Any] = [row for row in rows if row.noise is not None and row.noise > NOISY]
+    if not noisy:
+        return ""
+    return (
+        f'<p class="noisy">The machine was busy: at {len(noisy)} of {len(rows)} settings the middle repetition took '
+        f"over {NOISY:g} times as long as the best. Times are the best of several repetitions taken in turn; read "
+        "them as ratios within this page.</p>"
+    )

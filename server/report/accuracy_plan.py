@@ -1,0 +1,54 @@
+"""What the accuracy report sweeps, and how long it may take; frozen."""
+
+from dataclasses import dataclass
+
+from .case import PAPER_POINTS
+
+# The values that a user has who says nothing: their rows are marked in tables and pictures.
+DEFAULT_STEP, DEFAULT_DEGREE, DEFAULT_LEAF = 1e-4, 8, 32
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Plan:
+    """The settings that are swept, one knob at a time, and how often each is measured.
+
+    points: of the made façade; of an archive that is given at most `most_points` are taken.
+    frames: poses of the walk, on which times are measured; as many more, moved off it at random, join them where
+    verdicts and distances are judged.  near_tangent: poses within a micrometre of touching.
+    brute: poses at which the judge itself is judged, by every pair of points.
+    plain_frames: of the walk, those that the plain descent is timed on.
+    loops: timed repetitions of each setting, all settings in turn.  chunk: neighbouring poses timed as one, for the
+    percentiles: a call of one pose would measure the call.
+    tolerances [m]; budgets [node visits]; steps: of the lattice [m]; factors: on the radii of each radius model.
+    places: where the leak is probed.
+    """
+
+    points: int = PAPER_POINTS
+    most_points: int = 1_000_000
+    frames: int = 1200
+    plain_frames: int = 300
+    near_tangent: int = 400
+    brute: int = 40
+    loops: int = 5
+    chunk: int = 12
+    tolerances: tuple[float, ...] = (0.0, 1e-3, 2e-3, 5e-3, 1e-2, 2e-2, 5e-2, 1e-1)
+    budgets: tuple[int, ...] = (30, 100, 300, 1000, 3000)
+    steps: tuple[float, ...] = (1e-5, 1e-4, 1e-3, 1e-2)
+    degrees: tuple[int, ...] = (4, 6, 8, 12, 16)
+    leaves: tuple[int, ...] = (8, 16, 32)
+    factors: tuple[float, ...] = (0.5, 1.0, 2.0)
+    places: int = 2000
+
+
+BRIEF = Plan()
+FULL = Plan(
+    frames=2400,
+    plain_frames=1200,
+    near_tangent=4000,
+    brute=400,
+    loops=15,
+    budgets=(10, 30, 100, 200, 300, 500, 1000, 2000, 3000, 10_000),
+    degrees=(4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16),
+    leaves=(4, 8, 12, 16, 24, 32),
+    factors=(0.25, 0.5, 0.75, 1.0, 1.5, 2.0),
+)

@@ -1,0 +1,195 @@
+"""What the accuracy report says in words: terms, a paragraph a knob, and what the figures come to."""
+
+from collections.abc import Sequence
+
+from .accuracy_arithmetic import ALL_PAIRS, ARITHMETIC, PRIMITIVE, VOLUME
+from .accuracy_row import BUDGET, DEGREE, LEAF, NODES, RADIUS, STEP, TOLERANCE, Row
+
+TERMS = {
+    "pose": "where the avatar stands and how it is turned; each is one question: does it touch the scan there?",
+    "time of a pose": "a dozen neighbouring poses are timed as one call and divided; the best of several repetitions. "
+    "p50 is the middle pose, p99 one that only one in a hundred is slower than.",
+    "early, late": "early: called contact though the exact answer is clear, so one is stopped before touching. Late: "
+    "called clear though the exact answer is contact, so one may pass through.",
+    "unknown": "neither: the work allowed was spent before an answer was certain.",
+    "near-tangent": "poses moved until the nearest spheres are within a micrometre of just touching, on either side: "
+    "where rounding shows first.",
+    "distance off": "how far the distance that is reported lies from the exact one.",
+    "doorway": "how much wider than the figure a door must be made before the figure passes it upright along the "
+    "middle. 0 would be perfect; the spheres that stand for the door's points make it narrower than it is.",
+    "leak": "how far a ball of 5 cm radius is past a wall's true surface when it is stopped: where points stand "
+    "thinly, it slips in between. Negative: stopped before the surface. A ball that goes through counts 100 mm.",
+    "passed": "the share of places where that ball goes right through the wall.",
+    "Pareto front": "settings that no other beats: nothing is both faster and at least as good, nor better and as "
+    "fast.",
+}
+
+CHARTS = {
+    "main": "Each point is a setting, the star is what you get without saying anything. Left is faster, low is "
+    "better; points ringed in green are on the Pareto front.",
+    "verdicts": "The same settings against how often the verdict is not the exact one, and how far off a distance "
+    "can be.",
+    "volumes": "The same hierarchy, descended by the same plain program, with its nodes bounded by spheres, by "
+    "spheres cut by a slab, and by boxes along the axes; and with a cube in place of each point's sphere.",
+}
+
+_PLAIN = (
+    "Measured with a plain scalar descent, so that nothing but the test differs: its times compare with one another "
+    "and not with the server's. "
+)
+
+KNOBS = {
+    TOLERANCE: "How early contact may be called [m]. An answer within a tolerance is found by another search, which "
+    "keeps bounds; it is the right choice where a bound is wanted, not where an answer is.",
+    BUDGET: "How many nodes may be looked at for one pose. When they are spent the answer is unknown: never a wrong "
+    "clear.",
+    STEP: "How fine the lattice is on which points are stored. The radius is held at the default's, so only the "
+    "moving of points shows. A coarser lattice makes a smaller archive, and moves each point by up to half a step an "
+    "axis.",
+    DEGREE: "How many children a node of the hierarchy has. No answer changes.",
+    LEAF: "How many points a leaf of the hierarchy holds at most. No answer changes.",
+    NODES: "What bounds the points below a node, in the server itself: a sphere, as in the paper, or a sphere cut by "
+    "the slab that holds its points. No answer changes.",
+    RADIUS: "How large a sphere stands for each point: one mean for all (the paper's), one after the spacing around "
+    "each point (local), smaller ones on the rims of surfaces (border), or a fixed figure; a number behind a colon is "
+    "a factor. Early and late are counted against `mean`: here they say what differs, not what is wrong.",
+    ARITHMETIC: _PLAIN + "The test of two points in five kinds of arithmetic. Map coordinates are those of a scene at "
+    "500 km east and 5,600 km north; the other kinds count from a place near the avatar or from the scan's origin.",
+    VOLUME: _PLAIN + "Two leaves are compared as the server does it: the avatar's points are first held against the "
+    "bound of the scene's leaf. The façade's walls stand along the axes, which favours boxes.",
+    VOLUME + ", turned": _PLAIN + "The same scene and poses, turned so that no wall stands along an axis.",
+    ALL_PAIRS: _PLAIN + "Two leaves are compared as the paper does it: every point of one with every point of the "
+    "other.",
+    PRIMITIVE: _PLAIN + "A cube as wide as the sphere in place of each sphere: simpler to test, and a corner reaches "
+    "1.7 times as far as a side. Cubes stay along the world's axes however the avatar turns.",
+    PRIMITIVE + ", turned": _PLAIN + "The same scene and poses, turned so that no wall stands along an axis.",
+}  # fmt: skip
+
+
+def findings(rows: Sequence[Row]) -> list[str]:
+    """What the figures come to, in sentences; each is left out where its settings were not measured."""
+    said = [_exact(rows), _tolerance(rows), _budget(rows), _lattice(rows), _radius(rows), _arithmetic(rows)]
+    said += [_volumes(rows, ""), _volumes(rows, ", turned"), _cubes(rows)]
+    return [line for line in said if line]
+
+
+def _find(rows: Sequence[Row], knob: str, setting: str | None = None) -> Row | None:
+    """A setting of a knob; None: its default."""
+    return next(
+        (r for r in rows if r.knob == knob and (r.setting == setting if setting else r.default)),
+        None,
+    )
+
+
+def _exact(rows: Sequence[Row]) -> str:
+    row = _find(rows, TOLERANCE)
+    if row is None or row.mean_us is None:
+        return ""
+    return (
+        f"The exact answer takes {row.mean_us:.1f} µs a pose, p99 {row.p99_us:.1f} µs; "
+        f"{row.early + row.late} of {row.poses:,} verdicts and {row.tangent_early + row.tangent_late} of "
+        f"{row.tangent:,} near-tangent ones are wrong."
+    )
+
+
+def _tolerance(rows: Sequence[Row]) -> str:
+    exact = _find(rows, TOLERANCE)
+    allowed = [r for r in rows if r.knob == TOLERANCE and not r.default and r.times is not None]
+    if exact is None or not allowed:
+        return ""
+    best = min(allowed, key=lambda r: r.times or 0.0)
+    if (best.times or 0.0) < 1.0:
+        return f"A tolerance of {best.setting} takes {best.times:.2f} times the time of the exact answer."
+    return (
+        f"A tolerance buys no time: at best, with {best.setting}, it takes {best.times:.1f} times as long as the "
+        f"exact answer, and calls {best.early:,} of {best.poses:,} poses early. Ask for one where bounds are wanted."
+    )
+
+
+def _budget(rows: Sequence[Row]) -> str:
+    spent = [r for r in rows if r.knob == BUDGET and not r.default]
+    enough = [r for r in spent if not r.unknown]
+    if not spent:
+        return ""
+    least = min(spent, key=lambda r: r.value or 0.0)
+    tail = f" {enough[0].setting} are enough for every pose here." if enough else ""
+    return (
+        f"A budget bounds the work and never calls clear what touches: of {least.setting} it leaves "
+        f"{least.unknown / max(least.poses, 1):.0%} of poses unknown.{tail}"
+    )
+
+
+def _lattice(rows: Sequence[Row]) -> str:
+    steps = [r for r in rows if r.knob == STEP and r.archive_bytes]
+    default = _find(rows, STEP)
+    if default is None or len(steps) < 2:
+        return ""
+    parts = [
+        f"{r.setting}: {r.archive_bytes / (default.archive_bytes or 1):.2f} times the bytes, distances off by up to "
+        f"{r.distance_max_mm or 0.0:.2g} mm"
+        for r in steps
+        if not r.default and r.archive_bytes
+    ]
+    return f"Lattice step, against {default.setting}: " + "; ".join(parts) + "."
+
+
+def _radius(rows: Sequence[Row]) -> str:
+    mean = _find(rows, RADIUS)
+    others = [r for r in rows if r.knob == RADIUS and not r.default and ":" not in r.setting]
+    if mean is None or mean.doorway_mm is None or not others:
+        return ""
+    parts = [
+        f"{r.setting} {r.doorway_mm:.0f} and {r.leak_p99_mm:.0f} mm"
+        for r in (mean, *others)
+        if r.doorway_mm is not None and r.leak_p99_mm is not None
+    ]
+    return "Radius models, doorway and 99th percentile of the leak: " + "; ".join(parts) + "."
+
+
+def _arithmetic(rows: Sequence[Row]) -> str:
+    own = [r for r in rows if r.knob == ARITHMETIC]
+    if not own:
+        return ""
+    parts = [
+        f"{r.setting} {r.times or 0.0:.2f} times the time, {r.early + r.late} of {r.poses:,} and "
+        f"{r.tangent_early + r.tangent_late} of {r.tangent:,} near-tangent wrong"
+        for r in own
+        if not r.default
+    ]
+    return (
+        "Arithmetic, against float32 with a certified bound and integers where it does not decide: "
+        + "; ".join(parts)
+        + "."
+    )
+
+
+def _volumes(rows: Sequence[Row], suffix: str) -> str:
+    own = {r.setting: r for r in rows if r.knob == VOLUME + suffix}
+    if not {"sphere", "sphere with slab", "box"} <= own.keys():
+        return ""
+    sphere, slab, box = (own[name].mean_us or 0.0 for name in ("sphere", "sphere with slab", "box"))
+    where = "walls turned off the axes" if suffix else "walls along the axes"
+    order = (
+        "Groups of boxes beat groups of spheres" if box < sphere else "Groups of spheres beat groups of boxes"
+    )
+    third = "boxes beat it too" if box < slab else "it beats boxes"
+    return (
+        f"{order} as bounds, {where}: {box:.1f} against {sphere:.1f} µs a pose in a plain descent. A sphere cut by a "
+        f"slab takes {slab:.1f} µs: {third}."
+    )
+
+
+def _cubes(rows: Sequence[Row]) -> str:
+    lines = []
+    for suffix, where in (("", "walls along the axes"), (", turned", "turned")):
+        own = [r for r in rows if r.knob == PRIMITIVE + suffix]
+        cubes = next((r for r in own if r.setting.startswith("points cubes")), None)
+        boxes = next((r for r in own if r.setting == "points spheres, nodes boxes"), None)
+        if cubes is None or boxes is None or not boxes.mean_us:
+            continue
+        lines.append(
+            f"{where}: {(cubes.mean_us or 0.0) / boxes.mean_us:.2f} times the time of spheres under the same boxes, "
+            f"{cubes.early} of {cubes.poses:,} poses early, distances off by up to "
+            f"{cubes.distance_max_mm or 0.0:.0f} mm"
+        )
+    return "Cubes in place of spheres for points, " + "; ".join(lines) + "." if lines else ""

@@ -1,0 +1,108 @@
+"""`solidcloud accuracy` from end to end, on a small façade, a few settings and few poses."""
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scans
+from solidcloud.builder.config import BuildConfig
+from solidcloud.builder.pipeline import build_archive
+from solidcloud.server import cli
+from solidcloud.server.report import accuracy_plan
+from solidcloud.server.report.accuracy_plan import Plan
+
+SMALL = Plan(
+    points=20_000, frames=48, plain_frames=24, near_tangent=12, brute=12, loops=1, tolerances=(0.0, 0.05),
+    budgets=(30,), steps=(1e-2,), degrees=(4, 8), leaves=(16, 32), factors=(1.0,), places=60,
+)  # fmt: skip
+
+
+def report_of(folder: Path, *arguments: str) -> dict:
+    """Run the command; returns what its JSON holds, once the other files are found to agree."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(accuracy_plan, "BRIEF", SMALL)
+        assert cli.run(["accuracy", *arguments, "-o", str(folder)]) == 0
+    report = json.loads((folder / "accuracy.json").read_text())
+    with open(folder / "accuracy.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["setting"] for row in rows] == [row["setting"] for row in report["rows"]]
+    page = (folder / "accuracy.html").read_text()
+    assert "http" not in page and page.count("data:image/png;base64,") == len(list(folder.glob("*.png")))
+    return report
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> dict:
+    return report_of(tmp_path_factory.mktemp("accuracy") / "report")
+
+
+def rows_of(report: dict, knob: str) -> dict[str, dict]:
+    return {row["setting"]: row for row in report["rows"] if row["knob"] == knob}
+
+
+def test_exact_settings_are_right_and_a_tolerance_is_early_at_most(made: dict) -> None:
+    exact, early = rows_of(made, "tolerance")["0"], rows_of(made, "tolerance")["5 cm"]
+    assert made["facts"]["judged_contacts"] > 0 and made["facts"]["poses_judged_by_every_pair"] == 12
+    assert exact["poses"] == 96 and exact["wrong_share"] == 0.0 and exact["distance_max_mm"] == 0.0
+    assert exact["tangent"] > 0 and exact["tangent_early"] + exact["tangent_late"] == 0
+    assert early["early"] > 0 and early["late"] == early["unknown"] == 0
+    assert 0 < early["distance_max_mm"] <= 50.0 + 1e-6
+    for knob in ("degree", "leaf size", "bounding volume"):
+        assert all(row["wrong_share"] == 0.0 for row in rows_of(made, knob).values())
+
+
+def test_a_spent_budget_is_unknown_and_never_wrong(made: dict) -> None:
+    row = rows_of(made, "budget")["30 visits"]
+    assert row["unknown"] > 0 and row["early"] == row["late"] == 0 and row["node_tests"] <= 30
+
+
+def test_a_coarser_lattice_is_smaller_and_moves_distances_by_what_it_declares(made: dict) -> None:
+    fine, coarse = rows_of(made, "lattice step")["0.1 mm"], rows_of(made, "lattice step")["1 cm"]
+    assert coarse["archive_bytes"] < fine["archive_bytes"]
+    assert fine["distance_max_mm"] == 0.0 < coarse["distance_max_mm"] <= 3**0.5 * 5.0 + 1e-3
+
+
+def test_every_row_is_timed_and_its_ratio_is_to_the_default_of_its_knob(made: dict) -> None:
+    for row in made["rows"]:
+        assert row["mean_us"] > 0 and row["p50_us"] <= row["p99_us"], row["setting"]
+        default = next(r for r in made["rows"] if r["knob"] == row["knob"] and r["default"])
+        assert row["times"] == pytest.approx(row["mean_us"] / default["mean_us"])
+
+
+def test_radius_models_and_felt_errors_are_measured(made: dict) -> None:
+    models = rows_of(made, "radius model")
+    assert {"mean", "local", "border", "local+border"} < models.keys()
+    for row in models.values():
+        assert (
+            row["leak_p50_mm"] <= row["leak_p99_mm"] <= row["leak_worst_mm"] and 0 <= row["leak_share"] <= 1
+        )
+    assert sum(name.startswith("fixed") for name in models) == 1
+    assert rows_of(made, "tolerance")["5 cm"]["doorway_mm"] != rows_of(made, "tolerance")["0"]["doorway_mm"]
+
+
+def test_bounding_volumes_agree_and_cubes_touch_too_early(made: dict) -> None:
+    for knob in ("bounding volume, plain", "bounding volume, all pairs", "bounding volume, plain, turned"):
+        own = rows_of(made, knob)
+        assert len(own) == 4 and all(row["wrong_share"] == 0.0 for row in own.values())
+        assert own["sphere with slab"]["pair_tests"] < own["sphere"]["pair_tests"]
+    for knob in ("point primitive", "point primitive, turned"):
+        cubes = rows_of(made, knob)["points cubes, nodes boxes"]
+        assert cubes["late"] == 0 and cubes["distance_max_mm"] > 1.0
+    arithmetic = rows_of(made, "arithmetic")
+    assert arithmetic["float32 of map coordinates"]["distance_max_mm"] > 1.0
+    assert arithmetic["integers"]["distance_max_mm"] < 1e-6
+
+
+def test_an_archive_that_is_given_is_walked_over_and_has_no_doors(tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+    floor = np.column_stack([rng.uniform(0, 8, 9000), rng.uniform(0, 3, 9000), rng.normal(0, 0.002, 9000)])
+    wall = np.column_stack([rng.uniform(0, 8, 5000), np.full(5000, 1.5), rng.uniform(0, 2, 5000)])
+    scan = scans.write_ply(tmp_path / "hall.ply", np.concatenate([floor, wall]))
+    build_archive([scan], tmp_path / "hall", BuildConfig(voxel=2.0, resolution=1e-3))
+    report = report_of(tmp_path / "report", str(tmp_path / "hall"))
+    assert report["facts"]["points"] == 14_000 and report["facts"]["lattice_step_m"] == 1e-3
+    assert all(row["doorway_mm"] is None and row["leak_p99_mm"] is None for row in report["rows"])
+    assert rows_of(report, "lattice step")["1 mm"]["default"]
+    assert rows_of(report, "tolerance")["0"]["wrong_share"] == 0.0

@@ -1,0 +1,158 @@
+"""The accuracy report's page and charts: self-contained, every setting named, labels that cover nothing."""
+
+import base64
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from solidcloud.server.report.accuracy import Report
+from solidcloud.server.report.accuracy_arithmetic import PRIMITIVE, VOLUME, plain_settings
+from solidcloud.server.report.accuracy_engine import engine_settings, radius_settings
+from solidcloud.server.report.accuracy_labels import place_labels
+from solidcloud.server.report.accuracy_page import table, write_page
+from solidcloud.server.report.accuracy_picture import draw_charts, points_of
+from solidcloud.server.report.accuracy_plan import BRIEF
+from solidcloud.server.report.accuracy_row import PLAIN, RADIUS, STEP, TOLERANCE, Row, mark_front
+from solidcloud.server.report.accuracy_words import KNOBS, findings
+from solidcloud.server.report.spheres import load_pyplot
+
+FACTS = {
+    "avatar_points": 3617,
+    "walk_poses": 1200,
+    "judged_poses": 2400,
+    "judged_contacts": 228,
+    "near_tangent_poses": 400,
+    "poses_judged_by_every_pair": 40,
+}
+
+
+def all_rows() -> list[Row]:
+    """A row for each setting of a brief run, with figures drawn at random, but for the defaults."""
+    rng = np.random.default_rng(5)
+    settings = [*engine_settings(BRIEF, 1e-4, 0.0124), *radius_settings(BRIEF, 1e-4, 0.0124)]
+    rows = [s.row for s in settings]
+    for knob, kind in plain_settings():
+        rows.append(Row(knob, kind.name, by=PLAIN))
+        if knob in (VOLUME, PRIMITIVE):
+            rows.append(Row(f"{knob}, turned", kind.name, by=PLAIN))
+    rows.sort(key=lambda row: list(KNOBS).index(row.knob))
+    for row in rows:
+        scale = 1.0 if row.default else float(rng.uniform(0.9, 12))
+        row.mean_us, row.p50_us, row.p99_us, row.times = 3.5 * scale, 3 * scale, 9 * scale, scale
+        row.noise, row.poses, row.tangent = 1.0, 2400, 400
+        row.early = 0 if row.default else int(rng.integers(0, 300))
+        row.distance_max_mm, row.distance_mean_mm = 0.0, 0.0
+        if row.by != PLAIN:
+            row.doorway_mm, row.leak_p99_mm = 24.0 * scale, 20.0 - scale
+            row.archive_bytes, row.decode_ms = 2_492_304, 20.0
+    mark_front(rows, (TOLERANCE, STEP, RADIUS))
+    return rows
+
+
+class Outside(HTMLParser):
+    """Collects whatever a page would fetch, and its text."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.fetched: list[str] = []
+        self.text = ""
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        for name, value in attrs:
+            if (
+                name in ("src", "href", "srcset", "data")
+                and value
+                and not value.startswith("data:image/png;base64,")
+            ):
+                self.fetched.append(f"{tag} {name}={value}")
+        if tag in ("script", "link", "iframe", "object"):
+            self.fetched.append(tag)
+
+    def handle_data(self, data: str) -> None:
+        self.text += data + "\n"
+
+
+@pytest.fixture(scope="module")
+def drawn(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Row], dict[str, Path]]:
+    out = tmp_path_factory.mktemp("page")
+    rows = all_rows()
+    charts = draw_charts(rows, "made façade", out)
+    write_page(Report("made façade", rows, FACTS), charts, out / "accuracy.html")
+    return out, rows, charts
+
+
+def test_the_page_fetches_nothing_and_names_every_knob_and_setting(
+    drawn: tuple[Path, list[Row], dict[str, Path]],
+) -> None:
+    out, rows, charts = drawn
+    page = (out / "accuracy.html").read_text(encoding="utf-8")
+    parser = Outside()
+    parser.feed(page)
+    assert parser.fetched == [] and "url(" not in page and "@import" not in page
+    for row in rows:
+        assert row.setting in parser.text, row.setting
+        assert row.knob.capitalize() in parser.text
+    assert page.count("<img") == len(charts)
+    for data in re.findall(r"data:image/png;base64,([^\"]+)", page):
+        assert base64.b64decode(data).startswith(b"\x89PNG")
+
+
+def test_the_main_chart_is_small_enough_for_a_readme(
+    drawn: tuple[Path, list[Row], dict[str, Path]],
+) -> None:
+    assert drawn[2]["main"].name == "accuracy.png"
+    assert 10_000 < drawn[2]["main"].stat().st_size < 150_000
+
+
+def test_the_default_stands_once_in_a_chart() -> None:
+    points = points_of(all_rows(), "doorway")
+    assert [p.label for p in points].count("default") == 1
+    assert len({p.label for p in points}) == len(points), "two points of one name"
+
+
+def test_columns_that_nobody_filled_are_left_out_and_a_door_nobody_passes_is_said() -> None:
+    rows = [
+        Row(TOLERANCE, "0", default=True, mean_us=1.0, poses=5, doorway_mm=3.0),
+        Row(TOLERANCE, "10 cm", poses=5),
+    ]
+    rows[1].doorway_mm, rows[1].early = float("inf"), 2
+    html = table(rows)
+    assert "does not pass" in html and "2 of 5" in html and "(default)" in html
+    assert "decode" not in html and "near-tangent" not in html
+
+
+def test_the_findings_follow_from_the_rows() -> None:
+    rows = all_rows()
+    slow = " ".join(findings(rows))
+    for row in rows:
+        if row.knob == TOLERANCE and not row.default:
+            row.times = 0.5
+    fast = " ".join(findings(rows))
+    assert "buys no time" not in fast and "0.50 times the time of the exact" in fast
+    assert slow != fast
+    by_name = {row.setting: row for row in rows if row.knob == VOLUME}
+    for sphere, box, said in ((9.0, 2.0, "Groups of boxes beat"), (2.0, 9.0, "Groups of spheres beat")):
+        by_name["sphere"].mean_us, by_name["box"].mean_us = sphere, box
+        assert said in " ".join(findings(rows))
+    assert findings([]) == []
+
+
+def test_labels_cover_neither_one_another_nor_points() -> None:
+    pyplot = load_pyplot()
+    figure, panel = pyplot.subplots(figsize=(7, 6))
+    rng = np.random.default_rng(3)
+    anchors = [(float(x), float(y)) for x, y in rng.uniform(0.2, 0.8, (12, 2))]
+    panel.set_xlim(0, 1)
+    panel.set_ylim(0, 1)
+    figure.canvas.draw()
+    place_labels(panel, anchors, [f"setting {k}" for k in range(12)], ["black"] * 12)
+    renderer = figure.canvas.get_renderer()
+    boxes = [text.get_window_extent(renderer) for text in panel.texts]
+    assert len(boxes) == 12
+    for i, one in enumerate(boxes):
+        assert not any(one.overlaps(other) for other in boxes[i + 1 :]), panel.texts[i].get_text()
+        for spot in panel.transData.transform(anchors):
+            assert not one.contains(*spot), panel.texts[i].get_text()
+    pyplot.close(figure)

@@ -1,0 +1,130 @@
+"""The accuracy report's figures: what counts as wrong, what is on the front, how times are taken."""
+
+import json
+import math
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from solidcloud.server.report import accuracy_timing
+from solidcloud.server.report.accuracy import Report, write_rows
+from solidcloud.server.report.accuracy_engine import engine_settings, length_name
+from solidcloud.server.report.accuracy_plan import BRIEF, FULL
+from solidcloud.server.report.accuracy_row import (
+    COLUMNS,
+    RADIUS,
+    STEP,
+    TOLERANCE,
+    Row,
+    error_of,
+    judge_distances,
+    judge_verdicts,
+    mark_front,
+)
+from solidcloud.server.report.accuracy_timing import Timed, take_times
+
+
+def test_early_late_and_unknown_are_told_apart() -> None:
+    exact = np.array([True, True, True, False, False, False])
+    contact = np.array([True, False, False, True, False, False])
+    unknown = np.array([False, False, True, False, False, True])
+    row = Row(TOLERANCE, "1 mm")
+    judge_verdicts(row, contact, unknown, exact)
+    assert (row.poses, row.early, row.late, row.unknown) == (6, 1, 1, 2)
+    assert row.wrong_share == 4 / 6 and row.tangent == 0
+    judge_verdicts(row, exact, np.zeros(6, bool), exact, tangent=True)
+    assert (row.tangent, row.tangent_early, row.tangent_late, row.early) == (6, 0, 0, 1)
+
+
+def test_a_distance_without_a_pair_is_counted_and_not_averaged() -> None:
+    row = Row(TOLERANCE, "1 mm")
+    judge_distances(row, np.array([0.010, math.inf, 0.5, math.inf]), np.array([0.012, 0.2, 0.5, math.inf]))
+    assert row.distance_missing == 1
+    assert row.distance_max_mm == pytest.approx(2.0) and row.distance_mean_mm == pytest.approx(1.0)
+
+
+def test_a_ball_stopped_early_does_not_leak_and_a_wide_door_is_as_wrong_as_a_narrow_one() -> None:
+    row = Row(TOLERANCE, "1 cm", leak_p99_mm=-8.0, doorway_mm=-3.0)
+    assert error_of(row, "leak") == 0.0 and error_of(row, "doorway") == 3.0
+    assert error_of(row, "distance") is None and error_of(row, "wrong") is None
+
+
+def timed(setting: str, time: float, doorway: float, knob: str = TOLERANCE) -> Row:
+    return Row(knob, setting, mean_us=time, doorway_mm=doorway, poses=10)
+
+
+def test_the_front_holds_what_nothing_beats() -> None:
+    rows = [timed("fast", 1, 20), timed("good", 4, 5), timed("between", 2, 10), timed("beaten", 3, 15)]
+    rows += [timed("as fast but worse", 1.02, 25), timed("as good but slower", 5, 5)]
+    rows += [timed("another knob", 0.1, 0.0, "leaf size"), timed("does not pass", 0.5, math.inf)]
+    mark_front(rows, (TOLERANCE,))
+    assert {row.setting for row in rows if "doorway" in row.front} == {
+        "fast",
+        "good",
+        "between",
+        "does not pass",
+    }
+    assert not any("leak" in row.front for row in rows), "nothing was measured of the leak"
+
+
+def test_rows_are_written_as_json_and_csv_that_hold_every_field(tmp_path: Path) -> None:
+    rows = [Row(TOLERANCE, "0", 0.0, True, mean_us=2.0), Row(STEP, "1 mm", math.inf, doorway_mm=math.inf)]
+    write_rows(Report("scene", rows, {"seconds": 1.0}), tmp_path)
+    found = json.loads((tmp_path / "accuracy.json").read_text())
+    assert found["facts"] == {"seconds": 1.0} and [row["setting"] for row in found["rows"]] == ["0", "1 mm"]
+    assert found["rows"][1]["doorway_mm"] is None and found["rows"][1]["value"] is None
+    assert set(found["rows"][0]) == set(COLUMNS)
+    lines = (tmp_path / "accuracy.csv").read_text().splitlines()
+    assert lines[0].split(",") == list(COLUMNS) and len(lines) == 3
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[float]]:
+    """A clock that stands still but for what is added to it."""
+    now = [0.0]
+    monkeypatch.setattr(accuracy_timing.time, "perf_counter", lambda: now[0])
+    yield now
+
+
+def test_settings_are_timed_in_turn_and_a_busy_moment_is_left_out(clock: list[float]) -> None:
+    asked: list[tuple[str, int]] = []
+
+    def answer(name: str, each: float) -> Timed:
+        def ask(poses: np.ndarray) -> None:
+            asked.append((name, len(poses)))
+            busy = 7.0 if name == "slow" and len(asked) == 5 else 0.0
+            clock[0] += each * len(poses) + busy
+
+        return Timed(ask)
+
+    subjects = [answer("slow", 3.0), answer("fast", 1.0)]
+    ticks = []
+    take_times(subjects, np.zeros((8, 4, 4)), 3, 4, lambda: ticks.append(1))
+    # All poses once, untimed; then two runs of four.
+    assert asked == [("slow", 8), ("slow", 4), ("slow", 4), ("fast", 8), ("fast", 4), ("fast", 4)] * 3
+    assert len(ticks) == 6
+    assert [s.mean for s in subjects] == [3.0, 1.0]
+    assert [s.percentile(99) for s in subjects] == [3.0, 1.0]
+
+
+def test_noise_is_what_the_middle_repetition_took_longer() -> None:
+    subject = Timed(lambda poses: None, 2, [np.array([2.0, 4.0]), np.array([4.0, 4.0]), np.array([9.0, 9.0])])
+    assert subject.mean == 1.5 and subject.noise == 8 / 6
+    assert subject.percentile(0) == 1.0 and subject.percentile(100) == 2.0
+
+
+@pytest.mark.parametrize("plan", [BRIEF, FULL])
+def test_every_knob_has_one_default_and_its_other_settings_differ(plan: object) -> None:
+    settings = engine_settings(plan, 1e-4, 0.0124)  # type: ignore[arg-type]
+    knobs = {s.row.knob for s in settings}
+    assert RADIUS not in knobs and len(knobs) == 6
+    for knob in knobs:
+        own = [s for s in settings if s.row.knob == knob]
+        assert sum(s.row.default for s in own) == 1, knob
+        assert len({(str(s.config), str(s.options)) for s in own}) == len(own), knob
+
+
+def test_lengths_are_named_as_people_say_them() -> None:
+    names = [length_name(x) for x in (0.0, 1e-5, 1e-4, 1e-3, 5e-3, 0.01, 0.1)]
+    assert names == ["0", "0.01 mm", "0.1 mm", "1 mm", "5 mm", "1 cm", "10 cm"]

@@ -71,7 +71,7 @@ def doorway_error(
     pass is its play on this side, found by bisection.
     """
     figure = _figure()
-    radius = scene.add_avatar(avatar_name, figure).radius
+    radius = scene.add_avatar(avatar_name, figure).radius or 0.0
     frame = facade_truth.door(door)
     ask = partial(
         scene.collide,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scans import WITH_POINTS, make_steps
 from solidcloud.builder.hierarchy import Bounds, bound_runs
-from solidcloud.builder.kernels.bounding_sphere import ceil_sqrt
+from solidcloud.builder.kernels.bounding_sphere import bound_nodes, ceil_sqrt
 
 
 def assert_encloses(bounds: Bounds, i: int, points: np.ndarray, unit: int) -> None:
@@ -150,3 +150,16 @@ def test_a_guess_whose_radius_does_not_fit_is_given_up_for_the_box() -> None:
             assert bounds.center[0].tolist() == (guess if fits else box).tolist()
             given_up += not fits
     assert 5 < given_up < 115
+
+
+@pytest.mark.interpreted
+def test_what_stood_in_the_arrays_before_is_not_read() -> None:
+    points = np.array([[3, 4, 5], [9, 4, 5], [6, 8, 5], [6, 6, 9]], np.int32)
+    rows = []
+    for stale in (0, 77):
+        columns = [np.full(shape, stale, np.int64) for shape in ((3, 3), 3, (3, 3), (3, 2))]
+        begin, end = np.array([0, 0, 2]), np.array([4, 2, 3])
+        bound_nodes(points, begin, end, 0, 65535, True, *columns)
+        rows.append([column.tolist() for column in columns])
+    assert rows[0] == rows[1]
+    assert rows[0][2][1] == [0, 0, 0] and any(rows[0][2][0])

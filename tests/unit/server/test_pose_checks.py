@@ -76,9 +76,11 @@ def test_a_shear_is_told_by_its_size(row: int, column: int) -> None:
         pose = entry(row, column, value + by)
         gram = pose[1, :3, :3].T @ pose[1, :3, :3]
         square = np.trace(gram) / 3
-        fault, index, found = check(pose)
-        assert (fault, index) == (placing.SHEARED, 1)
-        assert found == pytest.approx(np.abs(gram - np.eye(3) * square).max() / square, rel=1e-6)
+        for scale in (1.0, 0.25):
+            pose[1, :3, :3] *= scale
+            fault, index, found = check(pose)
+            assert (fault, index) == (placing.SHEARED, 1)
+            assert found == pytest.approx(np.abs(gram - np.eye(3) * square).max() / square, rel=1e-6)
     least, most = 0.95e-9 * (1.5 if row == column else 2), 1.05e-9 * (1.5 if row == column else 2)
     assert check(entry(row, column, value + least))[0] == placing.GOOD
     assert check(entry(row, column, value + most))[0] == placing.SHEARED

@@ -124,6 +124,17 @@ def test_the_reach_ends_where_it_is_said_to(axis: int, sign: float) -> None:
         assert reach.outside[0] == outside
 
 
+def test_a_point_deep_inside_a_box_is_in_reach_of_it() -> None:
+    """A ball of no size: its span is the step that is always added."""
+    low = np.zeros((1, 3), np.int64)
+    index = SceneIndex(
+        morton_encode(np.full((1, 3), KEY_BIAS, np.uint64)), low, low + 99, low[0], low[0] + 99
+    )
+    point = Root(AVATAR.center, np.zeros(1))
+    pose = cases.pose_of(np.eye(3), SCENE.origin + 50 * STEP - AVATAR.center[0])[None]
+    assert voxels_in_reach(pose, point, SCENE, index, room(1, 4, 0)) == 1
+
+
 def test_rounding_far_from_the_origin_is_added_to_the_reach() -> None:
     """Terms of 10^9 m leave 2^-49 of them in doubt: two micrometres, which the reach is wider by."""
     low = np.zeros((1, 3), np.int64)

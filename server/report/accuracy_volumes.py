@@ -127,7 +127,7 @@ def _make_tree(voxel: VoxelData, links: Links, corner: NDArray[np.int64], step: 
     in_cell = links.cell >= 0
     low = np.where(in_cell[:, None], voxel.cells.low[links.cell], 0).astype(np.int64) + corner
     unit = np.where(in_cell, 1, 1 << voxel.top_shift).astype(np.int64)
-    center = (low + stored.center.astype(np.int64) * unit[:, None]) * step
+    center = np.asarray((low + stored.center.astype(np.int64) * unit[:, None]) * step, np.float64)
     # Blocks are numbered in the order of their nodes, as the arena has them.
     leaf = np.flatnonzero(links.is_leaf)
     first = links.first.astype(np.int32).copy()
@@ -143,7 +143,7 @@ def _make_tree(voxel: VoxelData, links: Links, corner: NDArray[np.int64], step: 
     normal = stored.normal.astype(np.float64)
     return Forest(
         center,
-        stored.radius.astype(np.int64) * unit * step,
+        np.asarray(stored.radius.astype(np.int64) * unit * step, np.float64),
         normal,
         np.sqrt((normal * normal).sum(axis=1)),
         stored.slab.astype(np.float64) * step,

@@ -151,7 +151,7 @@ def keep_points(kind, points, block, count, m, shift, forest, b, reach, keep):
                 room = forest.norm[b] * reach
                 meets &= (along <= forest.slab[b, 1] + room) & (along >= forest.slab[b, 0] - room)
         keep[i] = meets & (i < count)
-        kept += np.int64(keep[i])
+        kept += 1 if keep[i] else 0
     return kept
 
 
@@ -234,7 +234,7 @@ def _descend(poses, body, forest, lattice, units, reach, node, leaf, sift, verdi
                 first_a, first_b = body.first[a], forest.first[b]
                 if first_a < 0 and first_b < 0:
                     block, at = ~first_a, ~first_b
-                    kept = np.int64(body.count[a])
+                    kept = int(body.count[a])
                     if sift:
                         kept = keep_points(node, body.points, block, kept, m, shift, forest, b, span, keep)
                         if kept == 0:
@@ -246,7 +246,7 @@ def _descend(poses, body, forest, lattice, units, reach, node, leaf, sift, verdi
                         place_points(leaf, body.points, m, shift, frame, block, lattice, placed)
                         placed.stamp[block] = k
                     take_points(leaf, forest.low, forest.steps, frame, at, lattice, taken)
-                    pairs += kept * np.int64(forest.count[b])
+                    pairs += kept * int(forest.count[b])
                     touched = blocks_touch(
                         leaf, m, shift, body.points, block, keep, forest.low, forest.steps, at, lattice,
                         placed, taken, limits,

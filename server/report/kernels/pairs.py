@@ -241,8 +241,8 @@ def blocks_gap(kind, block, count, lattice, placed, taken, limits):
         elif kind == FLOAT64:
             gap = math.sqrt(_least_square(placed.wide[block], i, taken.wide[0])) - limits.reach
         elif kind == INTEGERS:
-            square = np.float64(_least_square(placed.units[block], i, taken.units[0]))
-            gap = (math.sqrt(square) - limits.units) / UNITS_PER_METRE
+            exact = np.float64(_least_square(placed.units[block], i, taken.units[0]))
+            gap = (math.sqrt(exact) - limits.units) / UNITS_PER_METRE
         else:
             gap = _cube_gap(placed.units[block], i, taken.units[0], limits.units) / UNITS_PER_METRE
         least = min(least, gap)

@@ -91,12 +91,14 @@ def measure(
     progress.finish()
     with Archives(ground, scratch) as archives:
         plain = BuildConfig(resolution=ground.step, overwrite=True)
-        progress.start("judge", 1, "scene")
+        progress.start("judge", 2, "parts")
         exact = judge(ground, plain, archives, plan)
+        progress.advance(1)
         folder = archives.folder(plain)
         with Archive(folder) as opened:
             header = opened.header
             checked = check_judge(opened, ground, exact, plan.brute)
+            progress.advance(1)
             progress.finish()
             settings = engine_settings(plan, ground.step, header.radius)
             settings += radius_settings(plan, ground.step, header.radius)

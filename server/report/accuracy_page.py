@@ -3,6 +3,7 @@
 import base64
 import math
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -51,6 +52,10 @@ def write_page(report: "Report", charts: dict[str, Path], target: Path) -> None:
     if "verdicts" in charts:
         body.append(_picture(charts["verdicts"], CHARTS["verdicts"]))
     body.append(_picture(charts["volumes"], CHARTS["volumes"]))
+    body.append(
+        "<h2>The Pareto set</h2><p>Settings of the server that nothing beats, for at least one error.</p>"
+    )
+    body.append(table(front_rows(report.rows)))
     body.append("<h2>The words</h2><dl>")
     body += [f"<dt>{escape(term)}</dt><dd>{escape(said)}</dd>" for term, said in TERMS.items()]
     body.append("</dl>")
@@ -63,6 +68,17 @@ def write_page(report: "Report", charts: dict[str, Path], target: Path) -> None:
         f"<style>{STYLE}</style></head><body>{''.join(body)}</body></html>\n"
     )
     target.write_text(page, encoding="utf-8")
+
+
+def front_rows(rows: Sequence[Row]) -> list[Row]:
+    """The rows on a front, named by their knob; what everybody gets by default once."""
+    chosen = [row for row in rows if row.front]
+    first = next((row for row in chosen if row.default), None)
+    return [
+        replace(row, setting="everything" if row is first else f"{row.knob} {row.setting}")
+        for row in chosen
+        if row is first or not row.default
+    ]
 
 
 def table(rows: Sequence[Row]) -> str:

@@ -372,7 +372,8 @@ def draw_knob(knob: str, rows: Sequence[Row], target: Path) -> Path:
         wrong.barh(range(len(rows)), share, left=left, color=colour, height=0.6, label=name)
         left += share
     wrong.set_xlim(0, max(1.0, float(left.max()) * 1.15))
-    wrong.set_xlabel("verdicts that are not the judge's [% of poses]")
+    than = "mean's" if knob == RADIUS else "the judge's"
+    wrong.set_xlabel(f"verdicts that are not {than} [% of poses]")
     wrong.legend(frameon=False, fontsize=8, loc="lower right")
     for panel in (times, wrong):
         panel.grid(alpha=0.25, axis="x")

@@ -16,6 +16,7 @@ from ...builder.sources import open_scans
 from ...schemas.answers import Verdict
 from ...schemas.archive import Archive
 from ...schemas.errors import BadDataError
+from ..avatar import make_avatar
 from ..scene import Scene
 from .accuracy_plan import DEFAULT_STEP, Plan
 from .floor_walk import floor_walk
@@ -77,12 +78,14 @@ def given_ground(archive: Path, plan: Plan, avatar: Path | None, folder: Path) -
     """
     with Archive(archive) as opened:
         points, total = _middle_points(opened, plan.most_points), opened.header.points
-        step = opened.header.lattice.step
+        step, radius = opened.header.lattice.step, opened.header.radius
     scan = folder / "points.ply"
     write_ply(scan, points)
     body = figure_points() if avatar is None else read_avatar(avatar)
     walk = floor_walk(points)[1]
     walk = walk[np.linspace(0, len(walk) - 1, min(plan.frames, len(walk))).astype(int)]
+    # The walk's height is that of points over points; a thin avatar's large spheres would all stand in the floor.
+    walk[:, 2, 3] += radius + make_avatar(body).radius
     name = f"{archive.resolve().name}, {len(points):,} of {total:,} points"
     return Ground(name, scan, step, None, body, walk, _moved(walk))
 
@@ -153,8 +156,6 @@ def _scan_points(scan: Path) -> Floats:
 
 def _middle_points(archive: Archive, most: int) -> Floats:
     """The points (n, 3) world [m] of the voxels nearest to the scene's middle, so many at most (but one voxel)."""
-    if not len(archive.coordinates):
-        raise BadDataError(f"{archive.folder}: no points, expected some to walk over: give another archive")
     middle = np.median(archive.coordinates, axis=0)
     held: list[Floats] = []
     count = 0

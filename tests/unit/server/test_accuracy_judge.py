@@ -1,0 +1,124 @@
+"""The accuracy report's judge, poses and guards, on a small hall."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scans
+from solidcloud.builder.config import BuildConfig
+from solidcloud.builder.made.figure import figure_points
+from solidcloud.builder.pipeline import build_archive
+from solidcloud.schemas.archive import Archive
+from solidcloud.schemas.errors import InternalError
+from solidcloud.server.report.accuracy import judge
+from solidcloud.server.report.accuracy_arithmetic import VOLUME, check_judge, measure_plain
+from solidcloud.server.report.accuracy_case import (
+    LEAST_OFF,
+    MOST_OFF,
+    REACH,
+    Ground,
+    given_ground,
+    turned_ground,
+)
+from solidcloud.server.report.accuracy_engine import Archives, Exact, Setting, judge_engine
+from solidcloud.server.report.accuracy_plan import Plan
+from solidcloud.server.report.accuracy_row import BUDGET, DEGREE, TOLERANCE, Row
+
+PLAN = Plan(frames=40, near_tangent=20, plain_frames=10, loops=1)
+CONFIG = BuildConfig(resolution=1e-3, radius=0.01, jobs=1)
+
+
+class Judged:
+    """A hall with a wall along its middle, and what the judge says of it."""
+
+    def __init__(self, folder: Path) -> None:
+        rng = np.random.default_rng(9)
+        floor = np.column_stack(
+            [rng.uniform(0, 6, 4000), rng.uniform(0, 2, 4000), rng.normal(0, 0.002, 4000)]
+        )
+        # The walk goes through the middle of all points, y = 1.25 m: the wall is a shoulder's width beside it.
+        wall = np.column_stack([rng.uniform(0, 6, 1000), np.full(1000, 1.65), rng.uniform(0, 2, 1000)])
+        scan = scans.write_ply(folder / "hall.ply", np.concatenate([floor, wall]))
+        build_archive([scan], folder / "hall", BuildConfig(voxel=1.0, resolution=1e-3, jobs=1))
+        self.folder = folder / "work"
+        self.folder.mkdir()
+        avatar = folder / "figure.ply"
+        scans.write_ply(avatar, figure_points(200))
+        self.ground: Ground = given_ground(folder / "hall", PLAN, avatar, self.folder)
+        self.archives = Archives(self.ground, self.folder)
+        self.exact: Exact = judge(self.ground, CONFIG, self.archives, PLAN)
+        self.archive = Archive(self.archives.folder(CONFIG))
+
+
+@pytest.fixture(scope="module")
+def judged(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Judged]:
+    made = Judged(tmp_path_factory.mktemp("judged"))
+    yield made
+    made.archive.close()
+    made.archives.__exit__()
+
+
+def test_both_verdicts_are_among_the_judged_poses(judged: Judged) -> None:
+    assert 0 < judged.exact.contact.sum() < len(judged.exact.contact) == 80
+
+
+def test_near_tangent_poses_are_within_a_micrometre_on_either_side(judged: Judged) -> None:
+    scene = judged.archives.scene(CONFIG)
+    off = scene.distance("avatar", judged.exact.tangent_poses, REACH).signed_distance
+    assert len(off) >= 10 and np.abs(off).max() <= MOST_OFF and np.abs(off).min() >= LEAST_OFF / 4
+    assert (off > 0).any() and (off < 0).any()
+    assert ((off <= 0) == judged.exact.tangent).all()
+
+
+def test_every_pair_of_points_agrees_with_the_judge_and_would_say_if_not(judged: Judged) -> None:
+    exact = judged.exact
+    assert check_judge(judged.archive, judged.ground, exact, 20) == 20
+    for wrong in (exact._replace(contact=~exact.contact), exact._replace(tangent=~exact.tangent)):
+        with pytest.raises(InternalError, match="every pair of points says otherwise"):
+            check_judge(judged.archive, judged.ground, wrong, 20)
+
+
+def test_a_volume_that_changed_an_answer_would_be_an_error(judged: Judged) -> None:
+    rows = measure_plain(judged.archive, judged.ground, judged.exact, PLAN, lambda: None, only=(VOLUME,))
+    assert len(rows) == 4 and all(row.times and row.poses == 80 for row in rows)
+    wrong = judged.exact._replace(contact=~judged.exact.contact)
+    with pytest.raises(InternalError, match="verdicts differ from the server's"):
+        measure_plain(judged.archive, judged.ground, wrong, PLAN, lambda: None, only=(VOLUME,))
+
+
+@pytest.mark.parametrize(
+    ("knob", "contact", "said"),
+    [(DEGREE, False, "differ from"), (TOLERANCE, True, "called clear"), (BUDGET, True, "clear")],
+)
+def test_a_knob_that_changed_what_it_must_not_would_be_an_error(
+    judged: Judged, knob: str, contact: bool, said: str
+) -> None:
+    everywhere = np.full(len(judged.exact.contact), contact)
+    wrong = judged.exact._replace(contact=everywhere)
+    for exact, fails in ((judged.exact, False), (wrong, True)):
+        settings = [Setting(Row(knob, "as it is"), CONFIG, {})]
+        if fails:
+            with pytest.raises(InternalError, match=said):
+                judge_engine(settings, judged.archives, judged.ground, exact, lambda: None)
+        else:
+            judge_engine(settings, judged.archives, judged.ground, exact, lambda: None)
+            assert settings[0].row.wrong_share == 0 and settings[0].row.decode_ms
+
+
+def test_the_turned_scene_is_the_same_scene(judged: Judged, tmp_path: Path) -> None:
+    turned = turned_ground(judged.ground, tmp_path)
+    with Archives(turned, tmp_path) as archives:
+        found = archives.scene(CONFIG).distance("avatar", turned.judged, REACH).signed_distance
+    near = np.isfinite(found) & np.isfinite(judged.exact.distance)
+    # Points are put on the lattice anew: either is moved by sqrt(3) / 2 steps at most.
+    assert near.sum() > 40 and np.abs(found - judged.exact.distance)[near].max() <= 3**0.5 * 1e-3
+    walls = np.abs(turned.walk[0, :3, :3])
+    assert ((walls > 0.05) & (walls < 0.97)).sum() >= 7, "an axis stayed an axis"
+
+
+def test_of_a_large_archive_the_voxels_around_its_middle_are_taken(judged: Judged, tmp_path: Path) -> None:
+    few = given_ground(judged.folder.parent / "hall", Plan(most_points=3000, frames=40), None, tmp_path)
+    assert "of 5,000 points" in few.name and few.truth is None and len(few.walk) == 40
+    taken = int(few.name.split(", ", 1)[1].split(" ")[0].replace(",", ""))
+    assert 0 < taken <= 3000

@@ -17,7 +17,8 @@ from ...schemas.errors import BadRequestError
 from .shapes import Opening, Parts, arch, circle, level
 from .truth import ColumnTruth, DoorTruth, FacadeTruth, StepTruth, WallTruth
 
-NARROWEST_DOOR, WIDEST_DOOR = 0.60, 2.40
+# The narrowest is narrower than the made figure, so that one it does not pass can be made.
+NARROWEST_DOOR, WIDEST_DOOR = 0.50, 2.40
 SILL = 0.45
 RISER = SILL / 3
 TREAD = 0.35

@@ -46,7 +46,7 @@ class Doorway(NamedTuple):
 
 
 @lru_cache(1)
-def _figure() -> NDArray[np.float64]:
+def made_figure() -> NDArray[np.float64]:
     """The made figure (n, 3) [m]; it takes half a second to make."""
     figure = figure_points()
     figure.setflags(write=False)
@@ -70,7 +70,7 @@ def doorway_error(
     The figure goes straight through, shifted to a side; a pose that is not clear stops it. The shift that just lets it
     pass is its play on this side, found by bisection.
     """
-    figure = _figure()
+    figure = made_figure()
     radius = scene.add_avatar(avatar_name, figure).radius or 0.0
     frame = facade_truth.door(door)
     ask = partial(
@@ -90,7 +90,7 @@ def doorway_error(
     width = float(np.ptp(figure[:, 0])) + 2 * radius
     play = 0.0
     for lift in LIFTS:
-        poses = _passage(frame, lift, facade_truth.origin, figure)
+        poses = passage(frame, lift, facade_truth.origin, figure)
         if stops(poses, 0.0).any():
             return Doorway(math.inf, width, math.inf)
         for side in (-1, 1):
@@ -123,10 +123,13 @@ def _play(
     return free
 
 
-def _passage(
+def passage(
     door: DoorTruth, lift: float, origin: tuple[float, float, float], figure: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Poses (k, 4, 4) along the door's middle, ALONG apart, from before either jamb's edge to behind the other."""
+    """Poses (k, 4, 4) along the door's middle, ALONG apart, from before the jambs' fronts to behind their backs.
+
+    lift: of the soles above the sill [m].  origin: of the façade.
+    """
     y = np.arange(door.y_front - figure[:, 1].max(), door.y_back - figure[:, 1].min() + ALONG, ALONG)
     poses = np.tile(np.eye(4), (len(y), 1, 1))
     poses[:, 0, 3] = (door.x_left + door.x_right) / 2 + origin[0]

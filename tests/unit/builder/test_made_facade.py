@@ -14,7 +14,7 @@ def ranges(
     return scene.cast(Place(position, 0.0), np.array([azimuth]), np.array([elevation])).range[0]
 
 
-@pytest.mark.parametrize("width", [0.60, 1.20, 1.60, 2.40])
+@pytest.mark.parametrize("width", [0.50, 1.20, 1.60, 2.40])
 def test_every_door_is_as_wide_as_its_truth(width: float) -> None:
     facade = build_facade(seed=3, door=width)
     scene = RayScene(facade.mesh)
@@ -107,5 +107,5 @@ def test_facade_fits_the_papers_voxel() -> None:
 
 @pytest.mark.parametrize("width", [0.3, 5.0, float("nan")])
 def test_door_without_room_is_refused(width: float) -> None:
-    with pytest.raises(BadRequestError, match=r"expected 0\.6 to 2\.4 m"):
+    with pytest.raises(BadRequestError, match=r"expected 0\.5 to 2\.4 m"):
         build_facade(door=width)

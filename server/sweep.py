@@ -35,7 +35,7 @@ def _check(
     other_units: int,
 ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
     """Check the poses of k motions. Returns, each (k,), the larger scale and reach of either end, the latter in exact
-    units, and by how many units the reach may differ on the way."""
+    units and to the scan's largest sphere, and by how many units the reach may differ on the way."""
     k = len(first)
     scales, units = np.empty((2, k)), np.empty((2, k), np.int64)
     for end, poses in enumerate((first, last)):
@@ -105,7 +105,8 @@ def sweep(
 ) -> SweepAnswers:
     """When the avatar first touches the scene on the screw motion (kernels/motion.py) from one pose to the other.
 
-    The motion is that of the dataset's frame: its translations are t - O (NUMERICS.md N5).
+    The motion is that of the dataset's frame: its translations are t - O (NUMERICS.md N5). Each scan point has its own
+    sphere, as the radius model of `data` has it, the whole way.
     pose_from, pose_to: (k, 4, 4) float64, avatar to world, rigid or of one scale, bits used as given.
     margin: distance below or at which two spheres are called in contact [m].  tolerance: how far any avatar point may
     go between `lower` and `upper` [m]; that of `effort` where it is larger.

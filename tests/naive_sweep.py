@@ -153,13 +153,30 @@ def touching(
     points: NDArray[np.float64],
     origin: ArrayLike,
     step: float,
-    scan_radius: float,
+    scan_radius: ArrayLike,
     avatar: NDArray[np.float64],
     avatar_radius: float,
     motion: tuple[NDArray[np.float64], NDArray[np.float64]],
     fractions: ArrayLike,
     margin: float = 0.0,
 ) -> NDArray[np.bool_]:
-    """Whether the avatar touches at each of the fractions of a motion (first, last), by the definition."""
-    poses = np.array([pose_at(*motion, float(t)) for t in np.asarray(fractions)])
-    return naive.collide(points, origin, step, scan_radius, avatar, avatar_radius, poses, margin)
+    """Whether the avatar touches at each of the fractions of a motion (first, last), by the definition.
+
+    scan_radius: of all scan points, or (n,) of each [m]. The poses on the way are those of the dataset's frame: the
+    origin is subtracted from the ends.
+    """
+    first, last = (pose.copy() for pose in motion)
+    for end in (first, last):
+        end[:3, 3] -= origin
+    b = naive.scan_units(naive.lattice_of(points, origin, step), step)
+    radii = np.broadcast_to(np.rint(np.asarray(scan_radius) * naive.UNITS).astype(np.int64), len(b))
+    found = []
+    for t in np.asarray(fractions):
+        pose = pose_at(first, last, float(t))
+        reach = naive.reach_units(pose, avatar_radius, 0.0, margin) + radii
+        apart = np.abs(naive.placed_units(avatar, pose, np.zeros(3))[:, None] - b)
+        # A pair farther than its reach along one axis does not touch; the others' squares fit 63 bits.
+        near = (apart <= reach[:, None]).all(axis=2)
+        apart[~near] = 0
+        found.append(bool((near & ((apart * apart).sum(axis=2) <= reach * reach)).any()))
+    return np.array(found, bool)

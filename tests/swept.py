@@ -5,24 +5,56 @@ from contextlib import contextmanager
 from typing import Any
 
 import cases
+import classes
+import naive
 import naive_sweep
 import numpy as np
 from numpy.typing import NDArray
 from solidcloud.schemas.answers import SweepAnswers, Verdict
 from solidcloud.server.avatar import make_avatar
-from solidcloud.server.request import SceneData, make_scene_data
+from solidcloud.server.request import SceneData, make_scene_data, with_radius_model
 from solidcloud.server.residency import Residency
 from solidcloud.server.store import Store
 from solidcloud.server.sweep import sweep
 
+CLOUDS = ("plane", "corner", "pillar", "noise", "duplicates", "one point")
+
+
+def turned(rng: np.random.Generator, turn: NDArray[np.float64], most: float) -> NDArray[np.float64]:
+    """A rotation turned by at most so many radians."""
+    axis = rng.normal(size=3)
+    x, y, z = axis / np.linalg.norm(axis)
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    angle = rng.uniform(0, most)
+    return (np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross) @ turn
+
+
+def motions(
+    rng: np.random.Generator,
+    points: NDArray[np.float64],
+    avatar: NDArray[np.float64],
+    count: int,
+    near: float,
+    way: float,
+    turn: float,
+    scale: float = 1.0,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Motions (count, 4, 4) twice that begin within `near` of some scan point, go some way and turn as they go."""
+    first = cases.near_poses(rng, points, avatar, count, near, scale)
+    last = first.copy()
+    for pose in last:
+        pose[:3, :3] = turned(rng, pose[:3, :3], turn)
+        pose[:3, 3] += rng.normal(size=3) * way
+    return first, last
+
 
 @contextmanager
-def opened(case: cases.Case, budget_bytes: int = 1 << 26) -> Iterator[SceneData]:
-    """What `sweep` reads of an archive."""
+def opened(case: cases.Case, budget_bytes: int = 1 << 26, model: str | None = None) -> Iterator[SceneData]:
+    """What `sweep` reads of an archive, with the radii of a model."""
     store = Store(case.archive)
     try:
         data = make_scene_data(store.archive, Residency(store, budget_bytes))
-        yield data
+        yield with_radius_model(data, store.archive, model)
         data.residency.check()
     finally:
         store.close()
@@ -46,6 +78,14 @@ def moved(avatar: NDArray[np.float64], one: NDArray[np.float64], other: NDArray[
     return float(np.linalg.norm(apart, axis=1).max())
 
 
+def radii_of(case: cases.Case, data: SceneData, model: str | None) -> NDArray[np.float64]:
+    """The radius (n,) of each of the points a case was built of [m]: the same where they are in the same place."""
+    stored, units = classes.stored_radii(case.archive, model)
+    found = dict(zip(map(tuple, stored.tolist()), units.tolist(), strict=True))
+    lattice = naive.lattice_of(case.points, data.arrays.origin, data.arrays.step)
+    return np.array([found[tuple(place)] for place in lattice.tolist()]) / naive.UNITS
+
+
 def judge(
     case: cases.Case,
     data: SceneData,
@@ -58,13 +98,17 @@ def judge(
     margin: float = 0.0,
     tolerance: float = 1e-6,
     samples: int = 60,
+    model: str | None = None,
 ) -> None:
     """Assert of every answer that sampled poses, judged by brute force in integers, do not contradict it.
 
-    Samples lie evenly on the whole way, and closely before `lower` and between the two bounds.
+    model: of the radii that `data` was opened with. Samples lie evenly on the whole way, and closely before `lower`
+    and between the two bounds.
     """
     arrays = data.arrays
-    scan = (case.points, arrays.origin, arrays.step, data.radius_units * 2.0**-26)
+    radii = radii_of(case, data, model)
+    scan = (case.points, arrays.origin, arrays.step, radii)
+    lattice = naive.lattice_of(*scan[:3])
     for i, motion in enumerate(zip(first, last, strict=True)):
         lower, upper = float(answers.lower[i]), float(answers.upper[i])
         said = (Verdict(int(answers.verdict[i])).name, lower, upper, motion[0].tolist(), motion[1].tolist())
@@ -90,5 +134,6 @@ def judge(
             assert moved(avatar, *poses) <= tolerance * (1 + 1e-9) + far * 2.0**-45, said
         apart = np.linalg.norm(answers.witness_avatar[i] - answers.witness_cloud[i])
         scale = np.cbrt(np.linalg.det(poses[1][:3, :3]))
-        assert apart <= scan[3] + margin + radius * scale + 1e-7 + far * 2.0**-45, said
-        assert np.abs(case.points - answers.witness_cloud[i]).max(axis=1).min() <= arrays.step, said
+        named = radii[(lattice == naive.lattice_of(answers.witness_cloud[i], *scan[1:3])).all(axis=1)]
+        assert len(named), said
+        assert apart <= named[0] + margin + radius * scale + 1e-7 + far * 2.0**-45, said

@@ -10,10 +10,12 @@ from numpy.typing import NDArray
 from ...schemas.kernels.morton import morton_code
 from ...schemas.voxel_grid import KEY_BIAS, UNITS_PER_METRE
 from .compiled import borrowing
+from .moments import INFINITE, scan_coordinate, touches_at
 from .motion import make_motion, pose_at
+from .moving import Job, make_moving
 from .placing import largest_term, place
 from .reach import find_key
-from .sweep import INFINITE, MOST_REFUSED, Job, make_moving, scan_coordinate, search, touches_at
+from .sweep import search
 
 # What a segment covers, and with it what must be resident together: four avatars and 8 m more.
 _SEGMENT_SIZES, _SEGMENT_MORE = 4.0, 8.0
@@ -21,6 +23,9 @@ _SEGMENT_SIZES, _SEGMENT_MORE = 4.0, 8.0
 _SEGMENT_STEPS = 2.0**21
 # The sagitta of a segment and of a first chord, in avatars: boxes and spheres grow by it.
 _SEGMENT_BEND, _CHORD_BEND = 0.25, 1.0 / 16.0
+# Advances of one segment that settled nothing; beyond, what is undecided stays so. A full turn 1 um from a wall all the
+# way takes some hundreds.
+MOST_REFUSED = 512
 
 
 class Progress(NamedTuple):
@@ -232,7 +237,7 @@ def sweep_segments(
     A voxel that is not resident is unknown from where the root sphere's cube reaches it.
     """
     box = avatar_box(avatar)
-    moving = make_moving(avatar)
+    moving = make_moving(avatar, scene.drop)
     begin, end = np.empty(3), np.empty(3)
     for number in range(which.shape[0]):
         i = which[number]

@@ -11,47 +11,16 @@ import scans
 import swept
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from solidcloud.schemas.answers import Verdict
 from solidcloud.server.avatar import make_avatar
 from solidcloud.server.collide import collide
 from solidcloud.server.effort import Effort
 
-CLOUDS = ("plane", "corner", "pillar", "noise", "duplicates", "one point")
-
-
-def turned(rng: np.random.Generator, turn: NDArray[np.float64], most: float) -> NDArray[np.float64]:
-    """A rotation turned by at most so many radians."""
-    axis = rng.normal(size=3)
-    x, y, z = axis / np.linalg.norm(axis)
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    angle = rng.uniform(0, most)
-    return (np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross) @ turn
-
-
-def motions(
-    rng: np.random.Generator,
-    points: NDArray[np.float64],
-    avatar: NDArray[np.float64],
-    count: int,
-    near: float,
-    way: float,
-    turn: float,
-    scale: float = 1.0,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Motions (count, 4, 4) twice that begin within `near` of some scan point, go some way and turn as they go."""
-    first = cases.near_poses(rng, points, avatar, count, near, scale)
-    last = first.copy()
-    for pose in last:
-        pose[:3, :3] = turned(rng, pose[:3, :3], turn)
-        pose[:3, 3] += rng.normal(size=3) * way
-    return first, last
-
 
 @settings(max_examples=60, deadline=None, derandomize=True)
 @given(
     seed=st.integers(0, 2**32 - 1),
-    kind=st.sampled_from(CLOUDS),
+    kind=st.sampled_from(swept.CLOUDS),
     step=st.sampled_from([1e-5, 1e-4, cases.BINARY_STEP, 1e-2]),
     far=st.sampled_from([0.0, 5e5, 6.4e6]),
     scale=st.sampled_from([1.0, 1.0, 0.3, 7.0]),
@@ -79,7 +48,7 @@ def test_no_sampled_pose_contradicts_the_answer(
     points = scans.make_scan(kind, seed, 120) + far
     avatar, radius = rng.uniform(-0.2, 0.2, (9, 3)) / scale, float(rng.choice([0, 1e-3, 0.03])) / scale
     near = float(rng.choice([0.05, 0.3]))
-    first, last = motions(rng, points, avatar, 8, near, way, turn, scale)
+    first, last = swept.motions(rng, points, avatar, 8, near, way, turn, scale)
     with TemporaryDirectory() as folder:
         case = cases.build(Path(folder), points, resolution=step, radius=float(rng.choice([0, 0.01])), **tree)
         with swept.opened(case) as data:
@@ -92,12 +61,14 @@ def test_no_sampled_pose_contradicts_the_answer(
 
 
 @settings(max_examples=10, deadline=None, derandomize=True)
-@given(seed=st.integers(0, 2**32 - 1), kind=st.sampled_from(CLOUDS), turn=st.sampled_from([0.0, 0.3, 2.0]))
+@given(
+    seed=st.integers(0, 2**32 - 1), kind=st.sampled_from(swept.CLOUDS), turn=st.sampled_from([0.0, 0.3, 2.0])
+)
 def test_no_tree_voxel_or_order_changes_an_answer(seed: int, kind: str, turn: float) -> None:
     """To the last bit, and the witness with it, but for motions that begin in contact: of those any pair may be it."""
     rng = np.random.default_rng(seed)
     points, avatar = scans.make_scan(kind, seed, 300), rng.uniform(-0.2, 0.2, (60, 3))
-    first, last = motions(rng, points, avatar, 40, 0.4, 0.5, turn)
+    first, last = swept.motions(rng, points, avatar, 40, 0.4, 0.5, turn)
     expected: list[Any] | None = None
     with TemporaryDirectory() as folder:
         for options in (
@@ -125,7 +96,7 @@ def test_far_from_the_origin_is_as_at_the_origin(seed: int, turn: float) -> None
     shift = np.array([5e5, 5.6e6, 100.0])
     points = np.rint(scans.make_scan("corner", seed, 300) * 2.0**20) * 2.0**-20
     avatar = rng.uniform(-0.2, 0.2, (30, 3))
-    first, last = motions(rng, points, avatar, 40, 0.3, 0.3, turn)
+    first, last = swept.motions(rng, points, avatar, 40, 0.3, 0.3, turn)
     for poses in (first, last):
         poses[:, :3, 3] = np.rint(poses[:, :3, 3] * 2.0**20) * 2.0**-20
     moved = first.copy(), last.copy()
@@ -151,7 +122,7 @@ def test_a_budget_never_makes_a_false_claim(seed: int, visits: int) -> None:
     """Case 30: with fewer visits the bounds are wider, and still hold; what is clear stays clear."""
     rng = np.random.default_rng(seed)
     points, avatar = scans.make_scan("corner", seed, 300), rng.uniform(-0.2, 0.2, (30, 3))
-    first, last = motions(rng, points, avatar, 20, 0.3, 0.5, 0.5)
+    first, last = swept.motions(rng, points, avatar, 20, 0.3, 0.5, 0.5)
     with TemporaryDirectory() as folder:
         case = cases.build(Path(folder), points)
         with swept.opened(case) as data:
@@ -176,7 +147,7 @@ def test_a_few_motions_of_every_sort(tmp_path: Path, rng: np.random.Generator) -
     verdicts = []
     with swept.opened(case) as data:
         for way, turn, scale in ((0.3, 0.0, 1.0), (0.0, 1.0, 1.0), (0.3, 0.5, 0.4)):
-            first, last = motions(rng, case.points, avatar, 5, 0.5, way, turn, scale)
+            first, last = swept.motions(rng, case.points, avatar, 5, 0.5, way, turn, scale)
             answers = swept.ask(data, avatar, 0.05, first, last)
             swept.judge(case, data, avatar, 0.05, first, last, answers, samples=20)
             verdicts += answers.verdict.tolist()

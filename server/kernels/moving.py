@@ -32,7 +32,7 @@ class Moving(NamedTuple):
     that of the two which prunes. On a chord worth halving `pair` is the one that could touch first, else the first one
     sure to.
     limits: (2, c) float32, of the chord by radius class: reach and error together [steps], and `far` (placed.py). One
-    array, because a job is handed on whole: with the four of `ByClass` a motion of the walk took a fifth longer.
+    array, because a job is handed on whole: with the four of `ByClass` a motion of the walk took a quarter longer.
     counters: (4,) int64, node visits, point tests, chords placed, most visits.  gap, way, keep, off, stack: scratch.
     """
 

@@ -140,7 +140,8 @@ class Archives:
         if key not in self._scenes:
             target = self._folder / f"archive-{len(self._scenes)}"
             self._folders[key] = target
-            summary = build_archive([self._ground.scan], target, config)
+            # Of one shard as a rule: more processes would each load numba first, for nothing.
+            summary = build_archive([self._ground.scan], target, replace(config, jobs=1))
             self._figures[key] = (summary.bytes, decode_seconds(target))
             store = Store(target)
             budget = sum(ArenaBuffer.rounded(int(size)) for size in store.sizes)

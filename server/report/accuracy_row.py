@@ -99,6 +99,8 @@ ERRORS = {
 }
 
 
+FELT_ERRORS = ("doorway", "leak")
+
 # Times that differ by less than this factor count as equal.
 ALIKE = 1.05
 
@@ -137,31 +139,31 @@ def error_of(row: Row, error: str) -> float | None:
     return max(float(value), 0.0) if error == "leak" else abs(float(value))
 
 
-def unbeaten(places: Sequence[tuple[float, float]]) -> list[bool]:
-    """Which of some (time, error) no other beats: neither faster and no worse, nor better and no slower.
+def unbeaten(places: Sequence[tuple[float, ...]]) -> list[bool]:
+    """Which of some (time, error, ...) no other beats: as fast and as good in every error, and better in one of all.
 
     Times within ALIKE of each other are the same: less than that is noise on any machine.
     """
-    return [
-        not any(
-            (other * ALIKE < time and bad <= size) or (other <= time * ALIKE and bad < size)
-            for other, bad in places
-        )
-        for time, size in places
-    ]
+
+    def beats(other: tuple[float, ...], one: tuple[float, ...]) -> bool:
+        as_good = all(bad <= size for bad, size in zip(other[1:], one[1:], strict=True))
+        better = other[0] * ALIKE < one[0] or other[1:] != one[1:]
+        return as_good and better and other[0] <= one[0] * ALIKE
+
+    return [not any(beats(other, one) for other in places) for one in places]
 
 
 def mark_front(rows: Sequence[Row], knobs: Sequence[str]) -> None:
-    """Mark, for each error, those rows of `knobs` that no other beats."""
-    for error in ERRORS:
-        known = [
-            (row, (row.mean_us, size))
-            for row in rows
-            if row.knob in knobs and row.mean_us is not None and (size := error_of(row, error)) is not None
-        ]
+    """Mark, for each error, and for both of FELT_ERRORS at once, those rows of `knobs` that no other beats."""
+    for name, errors in (*((error, (error,)) for error in ERRORS), ("doorway and leak", FELT_ERRORS)):
+        known = []
+        for row in rows:
+            sizes = [error_of(row, error) for error in errors]
+            if row.knob in knobs and row.mean_us is not None and None not in sizes:
+                known.append((row, (row.mean_us, *(size for size in sizes if size is not None))))
         for (row, _), best in zip(known, unbeaten([place for _, place in known]), strict=True):
             if best:
-                row.front = (*row.front, error)
+                row.front = (*row.front, name)
 
 
 def knobs(rows: Iterable[Row]) -> list[str]:

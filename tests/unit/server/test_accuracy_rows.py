@@ -68,6 +68,19 @@ def test_the_front_holds_what_nothing_beats() -> None:
     assert not any("leak" in row.front for row in rows), "nothing was measured of the leak"
 
 
+def test_two_errors_at_once_leave_more_unbeaten() -> None:
+    rows = [
+        Row(RADIUS, name, mean_us=time, doorway_mm=door, leak_p99_mm=leak)
+        for name, time, door, leak in (
+            ("thick", 4.0, 50.0, 0.0), ("thin", 4.0, 10.0, 40.0), ("local", 4.8, 24.0, -10.0), ("mean", 4.8, 25.0, 20.0)
+        )
+    ]  # fmt: skip
+    mark_front(rows, (RADIUS,))
+    assert [row.front for row in rows] == [
+        ("leak", "doorway and leak"), ("doorway", "doorway and leak"), ("doorway and leak",), (),
+    ]  # fmt: skip
+
+
 def test_rows_are_written_as_json_and_csv_that_hold_every_field(tmp_path: Path) -> None:
     rows = [Row(TOLERANCE, "0", 0.0, True, mean_us=2.0), Row(STEP, "1 mm", math.inf, doorway_mm=math.inf)]
     write_rows(Report("scene", rows, {"seconds": 1.0}), tmp_path)

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .closer import compare_gaps
+from .compiled import borrowing
 from .placed import U32
 
 # Columns of a record; the first ORDER of them say which pair is deeper: |a - b|^2 [exact units^2] and by how much the
@@ -59,7 +60,7 @@ class Memory(NamedTuple):
     clusters: NDArray[np.int64]
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def deeper(a, i, b, j):
     """Whether record a[i] comes before record b[j]."""
     if a[i, DROP] != b[j, DROP]:
@@ -74,13 +75,13 @@ def deeper(a, i, b, j):
     return False
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def _swap(rows, i, j):
     for c in range(rows.shape[1]):
         rows[i, c], rows[j, c] = rows[j, c], rows[i, c]
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def _sift_down(rows, n, at):
     """Restore the heap rows[:n], least deep first, below row `at`."""
     while True:
@@ -105,39 +106,45 @@ def sort_rows(rows, n):
         _sift_down(rows, end, 0)
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
+def _copy(record, rows, at):
+    """Write record[0] to rows[at]."""
+    for c in range(rows.shape[1]):
+        rows[at, c] = record[0, c]
+
+
+@borrowing
 def keep_deepest(heap, kept, record):
     """Take record[0] among the `kept` deepest pairs if it belongs there; returns how many are kept then."""
     if kept < heap.shape[0]:
-        heap[kept] = record[0]
+        _copy(record, heap, kept)
         at = kept
         while at > 0 and deeper(heap, (at - 1) // 2, heap, at):
             _swap(heap, (at - 1) // 2, at)
             at = (at - 1) // 2
         return kept + 1
     if kept > 0 and deeper(record, 0, heap, 0):
-        heap[0] = record[0]
+        _copy(record, heap, 0)
         _sift_down(heap, kept, 0)
     return kept
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def bound_after(record, at, units_per_step, error):
     """The bound, as in `Cells`, that record[at] sets: what is no deeper lies beyond it, whatever float32 rounds."""
     gap = np.sqrt(np.float64(record[at, SQUARE])) + np.float64(record[at, DROP])
     return gap / units_per_step * (1.0 + 2.0 * U32) + error
 
 
-@nb.njit(nogil=True, cache=True)
-def square_below(bound, drop, units_per_step):
-    """The float32 square above which no pair with that drop [exact units] is within a bound: `far` of make_limits."""
-    above = bound - np.float64(drop) / units_per_step
-    if above < 0.0:
-        return np.float32(-1.0)
-    return np.nextafter(np.float32(above * above * (1.0 + 8.0 * U32)), np.float32(np.inf))
+@borrowing
+def square_below(bound, drop_steps):
+    """The float32 square above which no pair with that drop [steps] is within a bound: as `far` of make_limits."""
+    above = bound - drop_steps
+    # 8 as there, 2 for the narrowing: np.nextafter is a call, and this is asked for every scan point in contact.
+    return np.float32(above * above * (1.0 + 10.0 * U32)) if above >= 0.0 else np.float32(-1.0)
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def listing_bound(heap, kept, units_per_step, error):
     """The bound, as in `Cells`, of pairs that may be among those listed; `kept` of them are."""
     if heap.shape[0] == 0:
@@ -154,7 +161,7 @@ def make_cells(count):
     return Cells(np.empty((count, CELL), np.int64), np.empty(count), slots)
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def find_slot(cells, x, y, z):
     """The slot of cell (x, y, z), or the free slot where it would go."""
     # 21 bits of each, so that no product leaves 63 bits.
@@ -169,7 +176,7 @@ def find_slot(cells, x, y, z):
         slot = (slot + 1) & last
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def enter_cell(cells, used, x, y, z):
     """The row of cell (x, y, z), made when new: then it is row `used`, and there must be room."""
     slot = find_slot(cells, x, y, z)
@@ -185,6 +192,22 @@ def enter_cell(cells, used, x, y, z):
             table[row, LOW + r], table[row, HIGH + r] = np.iinfo(np.int64).max, np.iinfo(np.int64).min
         cells.bound[row] = np.inf
     return row
+
+
+@borrowing
+def cell_of(cells, sizes, record, edge):
+    """The row of the cell that the record's scan point falls in; room for a new one must be there."""
+    table, last = cells.table, sizes[LAST]
+    x, y, z = record[0, POINT], record[0, POINT + 1], record[0, POINT + 2]
+    if last >= 0:  # nearly always the last one, and divisions are slow
+        x0, y0, z0 = table[last, PLACE] * edge, table[last, PLACE + 1] * edge, table[last, PLACE + 2] * edge
+        if x0 <= x < x0 + edge and y0 <= y < y0 + edge and z0 <= z < z0 + edge:
+            return last
+    cell = enter_cell(cells, sizes[CELLS], x // edge, y // edge, z // edge)
+    if cell == sizes[CELLS]:
+        sizes[CELLS] += 1
+    sizes[LAST] = cell
+    return cell
 
 
 @nb.njit(nogil=True, cache=True)

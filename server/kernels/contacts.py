@@ -20,11 +20,9 @@ from .clusters import (
     DROP,
     HIGH,
     KEPT,
-    LAST,
     LOW,
     ORDER,
     PAIRS,
-    PLACE,
     POINT,
     RECORD,
     ROW,
@@ -33,14 +31,15 @@ from .clusters import (
     TAG,
     Memory,
     bound_after,
+    cell_of,
     deeper,
-    enter_cell,
     grow_cells,
     keep_deepest,
     list_pose,
     listing_bound,
     square_below,
-)  # fmt: skip
+)
+from .compiled import borrowing
 from .layout import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, node_class, point_class, scan_run
 from .overlap import nodes_meet
 from .placed import (
@@ -101,7 +100,7 @@ class Work(NamedTuple):
     by_class: ByClass
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def _measure(avatar, m, block, lane, placed, scene, record):
     """Write |a - b|^2 and the avatar's centre of one pair, exact units, into `record`, which holds the scan's point.
 
@@ -123,47 +122,31 @@ def _measure(avatar, m, block, lane, placed, scene, record):
     return True
 
 
-@nb.njit(nogil=True, cache=True)
-def _cell_of(cells, sizes, record, edge):
-    """The row of the cell that the record's scan point falls in; room for a new one must be there."""
-    table, last = cells.table, sizes[LAST]
-    x, y, z = record[0, POINT], record[0, POINT + 1], record[0, POINT + 2]
-    if last >= 0:  # nearly always the last one, and divisions are slow
-        x0, y0, z0 = table[last, PLACE] * edge, table[last, PLACE + 1] * edge, table[last, PLACE + 2] * edge
-        if x0 <= x < x0 + edge and y0 <= y < y0 + edge and z0 <= z < z0 + edge:
-            return last
-    cell = enter_cell(cells, sizes[CELLS], x // edge, y // edge, z // edge)
-    if cell == sizes[CELLS]:
-        sizes[CELLS] += 1
-    sizes[LAST] = cell
-    return cell
-
-
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def _gather_point(avatar, m, a, block, placed, scene, own, asked, edge, memory, work):
     """Count the pairs of one scan point, in work.record, with a block's points, their float32 squares in work.squares.
 
     own: the point's radius class. Returns how many are in contact.
     """
-    # Arrays are taken out of their tuples here: in the loop each would be counted as referenced in every turn.
     record, squares, listing, rows = work.record, work.squares, work.bound, asked.rows
     cells, heap, sizes, per_step = memory.cells, memory.heap, memory.sizes, scene.units_per_step
     table, bounds, error = cells.table, cells.bound, work.error[0]
     drop, units = scene.drop[own], work.by_class.units[own]
     near, far = work.by_class.near[own], work.by_class.far[own]
     record[0, DROP] = drop
-    listed = square_below(listing[0], drop, per_step)
-    cell, count, bound = np.int64(-1), np.int64(0), np.float32(np.inf)
+    drop_steps = np.float64(drop) / per_step
+    listed, deepest = square_below(listing[0], drop_steps), np.float32(np.inf)
+    cell, count = np.int64(-1), np.int64(0)
     for lane in range(avatar.count[a]):
         square = squares[lane]
         if square > far:
             continue
         if square <= near:
             if cell < 0:
-                cell = _cell_of(cells, sizes, record, edge)
-                bound = max(square_below(bounds[cell], drop, per_step), listed)
+                cell = cell_of(cells, sizes, record, edge)
+                deepest = square_below(bounds[cell], drop_steps)
             count += 1
-            if square > bound:
+            if square > deepest and square > listed:
                 continue
             _measure(avatar, m, block, lane, placed, scene, record)
         else:
@@ -172,18 +155,20 @@ def _gather_point(avatar, m, a, block, placed, scene, own, asked, edge, memory, 
             if record[0, SQUARE] > units * units:
                 continue
             if cell < 0:
-                cell = _cell_of(cells, sizes, record, edge)
+                cell = cell_of(cells, sizes, record, edge)
+                deepest = square_below(bounds[cell], drop_steps)
             count += 1
         record[0, ROW] = rows[block, lane]
         record[0, TAG] = cell
         if deeper(record, 0, table, cell):
-            table[cell, :ORDER] = record[0, :ORDER]
+            for c in range(ORDER):
+                table[cell, c] = record[0, c]
             bounds[cell] = bound_after(record, 0, per_step, error)
+            deepest = square_below(bounds[cell], drop_steps)
         if square <= listed:
             sizes[KEPT] = keep_deepest(heap, sizes[KEPT], record)
             listing[0] = listing_bound(heap, sizes[KEPT], per_step, error)
-            listed = square_below(listing[0], drop, per_step)
-        bound = max(square_below(bounds[cell], drop, per_step), listed)
+            listed = square_below(listing[0], drop_steps)
     if count > 0:
         table[cell, PAIRS] += count
         for r in range(3):
@@ -192,7 +177,7 @@ def _gather_point(avatar, m, a, block, placed, scene, own, asked, edge, memory, 
     return count
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def _gather_leaves(avatar, m, a, block, placed, scene, voxel, row, asked, edge, memory, work, i, tally):
     """Gather the pairs in contact of a leaf node of the avatar and one of the scene, voxel `voxel` at work.off.
 
@@ -263,7 +248,7 @@ def _gather_leaves(avatar, m, a, block, placed, scene, voxel, row, asked, edge, 
         pairs[i] += _gather_point(avatar, m, a, block, placed, scene, own, asked, edge, memory, work)
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def _gather_voxel(avatar, m, i, placed, scene, voxel, asked, memory, work, tally, stop):
     """Gather all pairs in contact of the placed avatar and one resident voxel, the two trees descended together.
 
@@ -318,15 +303,14 @@ def _gather_voxel(avatar, m, i, placed, scene, voxel, asked, memory, work, tally
             counts[1, i] += ints[row + COUNT] & COUNTED
             for child in range(ints[row + COUNT] & COUNTED):
                 child_row = base + (b_first + child) * ROW_WORDS
-                if nodes_meet(
-                    words, child_row, x, y, z, nodes[3, a], rooms[node_class(ints, child_row, mask)]
-                ):
+                room = rooms[node_class(ints, child_row, mask)]
+                if nodes_meet(words, child_row, x, y, z, nodes[3, a], room):
                     stack[depth, 0], stack[depth, 1] = a, child_row
                     depth += 1
     memory.cursor[2] = depth
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def _set_thresholds(units, extent, farthest, scene, work):
     """Fill work.error and work.by_class for one pose; units: reach of the largest sphere, the rest of `place_nodes`."""
     per_step, steps = scene.units_per_step, scene.voxel_steps

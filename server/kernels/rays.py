@@ -211,9 +211,10 @@ def push_sorted(rows, bounds, begin, depth, row, bound):
 
 
 @nb.njit(nogil=True, cache=True)
-def _follow(scene, voxel, rays, i, ray, near, tolerance, visits, best, rows, bounds):
+def _follow(scene, voxel, rays, i, ray, near, tolerance, visits, best, rows, bounds, drops):
     """Follow ray i through the tree of one resident voxel, front to back; `best`, its counts included, is updated.
 
+    drops: as `scene.drop`, float64 [steps].
     near: exact units, as in Lists. What holds of a node holds of its children, so no bound gets worse with more visits.
     """
     words, ints = scene.words, scene.ints
@@ -226,9 +227,9 @@ def _follow(scene, voxel, rays, i, ray, near, tolerance, visits, best, rows, bou
         farthest = max(farthest, abs(ray[r]), abs(np.float64(corner)))
     # Rounding to units, the voxel's corner and the point; float64 of all coordinates in here, with much to spare.
     error = 2.0 * per_unit + (farthest + scene.voxel_steps) * 2.0**-45
-    base, drop = scene.where[voxel, 0], scene.drop
-    mask = np.uint64(drop.shape[0] - 1)
-    radius = np.float64(rays.radius - drop[node_class(ints, base, mask)]) * per_unit + error
+    largest = np.float64(rays.radius) * per_unit + error
+    base, mask = scene.where[voxel, 0], np.uint64(drops.shape[0] - 1)
+    radius = largest - drops[node_class(ints, base, mask)]
     reach = np.float64(rays.reach)
     spent, tests = np.int64(best.counts[1, i]) + 1, np.int64(best.counts[2, i])
     rows[0], depth = base, 0
@@ -246,7 +247,7 @@ def _follow(scene, voxel, rays, i, ray, near, tolerance, visits, best, rows, bou
         first = ints[row + FIRST]
         if first < 0:
             tests += LANES
-            radius = np.float64(rays.radius - drop[node_class(ints, row, mask)]) * per_unit + error
+            radius = largest - drops[node_class(ints, row, mask)]
             _test_block(scene, voxel, row, ray, radius, rays, i, best)
             continue
         spent += ints[row + COUNT] & COUNTED
@@ -254,7 +255,7 @@ def _follow(scene, voxel, rays, i, ray, near, tolerance, visits, best, rows, bou
         limit = min(best.value[i], reach) * per_unit + error
         for child in range(first, first + (ints[row + COUNT] & COUNTED)):
             child_row = base + child * ROW_WORDS
-            radius = np.float64(rays.radius - drop[node_class(ints, child_row, mask)]) * per_unit + error
+            radius = largest - drops[node_class(ints, child_row, mask)]
             bound = _meet_node(words, child_row, ray, radius, limit)
             if bound < np.inf:
                 push_sorted(rows, bounds, begin, depth, child_row, max(bound, above))
@@ -272,6 +273,7 @@ def follow_rays(rays, lists, cursor, held, scene, tolerance, visits, best):
     """
     ray = np.empty(12)
     rows, bounds = np.empty(STACK, np.int64), np.empty(STACK)
+    drops = scene.drop.astype(np.float64) / scene.units_per_step
     for i in range(cursor.shape[0]):
         end = lists.starts[i + 1]
         if cursor[i] == end:
@@ -291,5 +293,5 @@ def follow_rays(rays, lists, cursor, held, scene, tolerance, visits, best):
                 best.counts[0, i] += np.uint32(1)
                 best.unseen[i] = min(best.unseen[i], near)
             else:
-                _follow(scene, voxel, rays, i, ray, near, tolerance, visits, best, rows, bounds)
+                _follow(scene, voxel, rays, i, ray, near, tolerance, visits, best, rows, bounds, drops)
             cursor[i] = at + 1

@@ -7,6 +7,7 @@ import numpy as np
 
 from ..schemas.archive import Archive
 from ..schemas.errors import BadRequestError, CorruptError
+from ..schemas.radius_model import RADIUS_CLASSES
 from ..schemas.voxel import Links, VoxelData
 from .exact import loose_nodes, sample_nodes
 from .kernels.enclosure import first_loose_node
@@ -46,6 +47,7 @@ def verify_archive(
     progress = progress or Silent()
     faults: list[str] = []
     points = proved = 0
+    classes = np.zeros(RADIUS_CLASSES, np.int64)
     with Archive(folder) as archive:
         header = archive.header
         counts = archive.voxels["rows"][:, 1].astype(np.int64)
@@ -64,11 +66,18 @@ def verify_archive(
                 faults.append(str(error))
             else:
                 points += len(voxel.points)
+                if voxel.radius_class is not None:
+                    classes += np.bincount(voxel.radius_class, minlength=RADIUS_CLASSES)
             progress.advance(expected)
         progress.finish()
         if not faults and points != header.points:
             faults.append(
                 f"{folder}: {points} points in the records, {header.points} in the index: rebuild it"
+            )
+        if not faults and (classes != header.radius_counts).any():
+            faults.append(
+                f"{folder}: radius classes counted {classes.tolist()} in the records, "
+                f"{header.radius_counts.tolist()} in the index: rebuild it"
             )
         return VerifyReport(len(archive.voxels), points, tuple(faults), int(counts.sum()), proved)
 

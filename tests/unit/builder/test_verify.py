@@ -51,7 +51,7 @@ def rewrite(
         for v, r in zip(voxels, rows, strict=True)
     ]
     path = folder / "shards" / shard_name(0)
-    table = write_shard(path, 0, header.archive_id, records)
+    table = write_shard(path, 0, header.archive_id, records, version=header.format_version)
     write_index(folder, header_with(header), table, [(path.name, path.stat().st_size)])
 
 
@@ -201,3 +201,18 @@ def test_what_cannot_be_opened_is_an_error(copy: Path, tmp_path: Path) -> None:
     (copy / "shards" / shard_name(0)).unlink()
     with pytest.raises(FormatError, match="missing"):
         verify_archive(copy)
+
+
+def test_radius_classes_that_are_not_those_counted_are_a_fault(tmp_path: Path) -> None:
+    scan = write_xyz(tmp_path / "a.xyz", make_scan("noise", 1, 200))
+    models = frozenset({"mean", "local"})
+    build_archive([scan], tmp_path / "a", BuildConfig(voxel=1.1, models=models, radius=0.01, jobs=1))
+    assert verify_archive(tmp_path / "a").faults == ()
+    with Archive(tmp_path / "a") as archive:
+        counts = archive.header.radius_counts.copy()
+    used = int(np.flatnonzero(counts)[0])
+    counts[used] -= 1
+    counts[31] += 1
+    rewrite(tmp_path / "a", header_with=lambda header: replace(header, radius_counts=counts))
+    (fault,) = verify_archive(tmp_path / "a").faults
+    assert "radius classes counted" in fault and str(counts.tolist()) in fault

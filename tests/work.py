@@ -179,8 +179,10 @@ QUESTIONS: dict[str, Callable[[Scene, Options], list[Any]]] = {
         for a in AVATARS
         for t, b in ((0.02, None), (0.0, 40), (0.005, 200))
     ],
-    "collide deep": lambda s, o: [s.collide("deep", poses()[:8], m, **o) for m in (0.0, 0.04)],
-    "distance deep": lambda s, o: [s.distance("deep", poses()[:6], 3.0, **o)],
+    "collide deep": lambda s, o: [
+        s.collide(a, poses()[:8], m, **o) for a in ("deep", "deepest") for m in (0.0, 0.04)
+    ],
+    "distance deep": lambda s, o: [s.distance(a, poses()[:8], 3.0, **o) for a in ("deep", "deepest")],
     "bounded deep": lambda s, o: [
         s.collide("deep", poses()[:6], 0.01, tolerance=0.001, **o),
         s.distance("deep", poses()[:6], 1.0, tolerance=0.001, budget_visits=400, **o),
@@ -254,9 +256,11 @@ def opened(archive: Path) -> Iterator[Scene]:
     with Scene.open(archive) as scene:
         for name, (points, radius) in AVATARS.items():
             scene.add_avatar(name, points, radius)
-        # As an avatar of 8,000 points and more, whose leaf nodes are too many for a front: inner nodes are its front.
-        with mock.patch.object(avatar, "MAX_FRONT", 3):
-            scene.add_avatar("deep", *DEEP)
+        # As avatars of 8,000 points and more, whose leaf nodes are too many for a front: inner nodes are their front,
+        # one level above the leaf nodes, and two.
+        for name, most in (("deep", 3), ("deepest", 1)):
+            with mock.patch.object(avatar, "MAX_FRONT", most):
+                scene.add_avatar(name, *DEEP)
         yield scene
 
 

@@ -171,6 +171,8 @@ def about_objects(scene: Scene, options: Options) -> list[Any]:
     return [scene.objects(rows, 0.05, **options)]
 
 
+# Without any time, nothing is loaded, and bounds are those of the index.
+BUDGETS = ((0.01, 20), (0.0, 2), (0.0, 7), (0.05, None))  # tolerance [m], visits
 QUESTIONS: dict[str, Callable[[Scene, Options], list[Any]]] = {
     "collide": lambda s, o: [s.collide(a, poses(), m, **o) for a in AVATARS for m in (0.0, 0.04)],
     "collide one": lambda s, o: [s.collide("large", pose[None], **o) for pose in poses()[:5]],
@@ -191,21 +193,31 @@ QUESTIONS: dict[str, Callable[[Scene, Options], list[Any]]] = {
     "walker": lambda s, o: [*walked(s, o, "small", 0.1), *walked(s, o, "large", 0.09)],
     "distance": lambda s, o: [s.distance(a, poses(), r, **o) for a in AVATARS for r in (0.1, 3.0)],
     "distance bounded": lambda s, o: [
-        s.distance(a, poses(), 1.0, tolerance=t, budget_visits=b, **o)
-        for a in AVATARS
-        for t, b in ((0.02, None), (0.0, 60), (0.005, 300))
+        s.distance("small", poses(), 3.0, budget_ms=0.0, **o),
+        *(
+            s.distance(a, poses(), 1.0, tolerance=t, budget_visits=b, **o)
+            for a in AVATARS
+            for t, b in ((0.02, None), (0.0, 60), (0.005, 300))
+        ),
     ],
     "contacts": lambda s, o: [
         s.contacts(a, poses(), limit, 0.01, **o) for a in AVATARS for limit in (5, 100)
     ],
     "sweep": lambda s, o: [s.sweep(a, *motions(), **o) for a in AVATARS],
     "sweep bounded": lambda s, o: [
-        s.sweep("small", *motions(), 0.01, tolerance=1e-3, budget_visits=400, **o)
+        *(s.sweep("small", *motions(), 0.01, tolerance=1e-3, budget_visits=b, **o) for b in (30, 400)),
+        s.sweep("small", *motions(), budget_ms=0.0, **o),
     ],
     "raycast": lambda s, o: [s.raycast(*rays(), r, **o) for r in (0.5, 8.0)],
-    "raycast bounded": lambda s, o: [s.raycast(*rays(), 8.0, tolerance=0.01, budget_visits=20, **o)],
+    "raycast bounded": lambda s, o: [
+        *(s.raycast(*rays(), 8.0, tolerance=t, budget_visits=b, **o) for t, b in BUDGETS),
+        s.raycast(*rays(), 8.0, budget_ms=0.0, **o),
+    ],
     "within": lambda s, o: [s.within(loose(), r, **o) for r in (0.05, 8.0)],
-    "within bounded": lambda s, o: [s.within(loose(), 0.3, tolerance=0.01, budget_visits=20, **o)],
+    "within bounded": lambda s, o: [
+        *(s.within(loose(), 0.3, tolerance=t, budget_visits=b, **o) for t, b in BUDGETS),
+        s.within(loose(), 8.0, budget_ms=0.0, **o),
+    ],
     "objects": about_objects,
 }
 

@@ -4,6 +4,7 @@ import math
 from pathlib import Path
 
 import cases
+import classes
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -70,24 +71,28 @@ def test_percentiles_are_those_of_the_places(tmp_path: Path) -> None:
     assert found.p99 == pytest.approx(low + 0.01 * (high - low), abs=0.01)
 
 
-@pytest.mark.parametrize("factor", [0.5, 1.0, 3.0])
-def test_depths_of_a_random_wall_are_those_of_brute_force(tmp_path: Path, factor: float) -> None:
-    """A wall of noisy points, random in density too, off the axes; a second sheet far behind changes nothing."""
+@pytest.mark.parametrize("model", ["mean:0.5", "mean", "mean:3", "local", "local+border:2"])
+def test_depths_of_a_random_wall_are_those_of_brute_force(tmp_path: Path, model: str) -> None:
+    """A wall of noisy points, random in density too, far from the origin; a second sheet far behind changes nothing."""
     rng = np.random.default_rng(2012)
     flat = np.column_stack([rng.uniform(-1, 1, 900), rng.normal(0, 0.002, 900), rng.uniform(-1, 1, 900)])
     flat = np.rint(np.concatenate([flat, flat + np.array([0, 0.4, 0])]) * 1e4) / 1e4
     spots = np.column_stack([rng.uniform(-0.8, 0.8, 300), np.zeros(300), rng.uniform(-0.8, 0.8, 300)])
-    radius = factor * RADIUS
     origin = np.array([300.0, -5000.0, 40.0])
-    with opened(tmp_path, flat + origin) as scene:
-        moved = places(spots + origin)
-        found = leak_depths(scene, moved, radius_model=f"mean:{factor}")
-    reach = PROBE + radius
+    archive = cases.build(
+        tmp_path, flat + origin, voxel=8.0, radius=RADIUS, models=frozenset({"mean", "local", "border"})
+    ).archive
+    with Scene.open(archive) as scene:
+        found = leak_depths(scene, places(spots + origin), radius_model=model)
+        low = np.array(scene.info().origin) - origin
+    steps, units = classes.stored_radii(archive, model)
+    points, reach = steps * 1e-4 + low, PROBE + units * 2.0**-26
+    assert len(points) == len(flat) and (len(np.unique(units)) > 1) == ("local" in model)
     for spot, at in zip(spots, found, strict=True):
-        under = reach**2 - (flat[:, 0] - spot[0]) ** 2 - (flat[:, 2] - spot[2]) ** 2
-        near = (under >= 0) & (flat[:, 1] < 0.1)
+        under = reach**2 - (points[:, 0] - spot[0]) ** 2 - (points[:, 2] - spot[2]) ** 2
+        near = (under >= 0) & (points[:, 1] < 0.1)
         # The centre comes from -y: it is stopped by the sphere it meets first, if before its way's end.
-        first = (flat[near, 1] - np.sqrt(under[near])).min() if near.any() else np.inf
+        first = (points[near, 1] - np.sqrt(under[near])).min() if near.any() else np.inf
         expected = min(first + PROBE, 2 * PROBE)
         assert at == pytest.approx(expected, abs=3e-6)
 

@@ -182,13 +182,13 @@ def _consider(
 
 @borrowing
 def search_lanes(
-    points, m, shift, block, lane, ints, halves, corner, block_at, lane_at, x, y, z, frame, units, squares, found,
+    points, m, shift, block, lane, ints, halves, corner, block_at, lane_at, c, x, y, z, frame, units, squares, found,
     cut, far, drop, mask,
 ):  # fmt: skip
     """Take the best of the pairs of one avatar point (float32 x, y, z from the block's low corner) and a scene block.
 
     The nearest first: it shrinks the cut, and few of the others are asked in integers after it.
-    From frame on: of `Best`.
+    c: class of the scene's leaf node.  From frame on: of `Best`.
     """
     list_squares(halves, lane_at, x, y, z, squares)
     first = 0
@@ -197,10 +197,10 @@ def search_lanes(
             first = lane_j
     for number in range(-1, LANES):
         j = first if number < 0 else number
-        c = point_class(ints, block_at, j, mask)
         if squares[j] <= far[c] and (number < 0 or j != first):
-            nearer = _consider(
-                points, m, shift, block, lane, ints, halves, corner, block_at, lane_at, j, frame[2], units, drop[c],
+            own = point_class(ints, block_at, j, mask)
+            nearer = squares[j] <= far[own] and _consider(
+                points, m, shift, block, lane, ints, halves, corner, block_at, lane_at, j, frame[2], units, drop[own],
                 found,
             )  # fmt: skip
             if nearer:

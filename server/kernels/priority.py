@@ -30,6 +30,7 @@ from .closest import (
     search_lanes,
     set_cut,
 )
+from .compiled import borrowing
 from .lanes import any_near, keep_near
 from .layout import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, node_class
 from .nearest import box_gap
@@ -112,7 +113,7 @@ def make_search(avatar, scene, heap):
     )  # fmt: skip
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def _sift_up(keys, pairs, at):
     """Let the pair at the end of a heap rise to its place."""
     key, tie, a, row, voxel = keys[at, 0], keys[at, 1], pairs[at, 0], pairs[at, 1], pairs[at, 2]
@@ -126,7 +127,7 @@ def _sift_up(keys, pairs, at):
     keys[at, 0], keys[at, 1], pairs[at, 0], pairs[at, 1], pairs[at, 2] = key, tie, a, row, voxel
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def _drop_top(keys, pairs, size):
     """Remove the top of a heap of `size` pairs."""
     last = size - 1
@@ -148,7 +149,13 @@ def _drop_top(keys, pairs, size):
     keys[at, 0], keys[at, 1], pairs[at, 0], pairs[at, 1], pairs[at, 2] = key, tie, a, row, voxel
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
+def _low(words, row, x, y, z, radius, drop):
+    """`lower_bound` with the drop; no two centres are nearer than 0."""
+    return max(lower_bound(words, row, x, y, z, radius), np.float32(0.0)) + drop
+
+
+@borrowing
 def _upper_bound(words, row, x, y, z, radius):
     """How far a sphere's points are from a node's at most, as `lower_bound`: both hold at least one point."""
     dx, dy, dz = x - words[row], y - words[row + 1], z - words[row + 2]
@@ -189,7 +196,7 @@ def _begin(poses, avatar, scene, index, reach, i, search, goal, known, counts):
         search.sizes[0] = size + 1
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def _enough(goal, enough, best, bounds):
     """Whether what was asked is known."""
     if goal.first:
@@ -200,16 +207,15 @@ def _enough(goal, enough, best, bounds):
     return found / best.frame[2] - bounds[0] <= goal.tolerance
 
 
-@nb.njit(nogil=True, cache=True)
-def _put(keys, pairs, sizes, heap, spilling, cut, drops, c, bounds, parent, low, high, a, row, voxel):
-    """Add a pair to the heap, or to the stack where spilling. low, high: bounds of |a - b|; parent: its key's above.
+@borrowing
+def _put(keys, pairs, sizes, heap, spilling, cut, bounds, parent, low, high, a, row, voxel):
+    """Add a pair to the heap, or to the stack where spilling. low, high: its bounds; parent: the bound above it.
 
-    cut: above it no key is of use.  c: radius class of the scene's node.
+    cut: above it no pair is of use.
     """
-    high += drops[1, c]
     bounds[1] = min(bounds[1], np.float64(high) + bounds[3])
-    # What holds above holds below, and no two centres are nearer than 0.
-    low = max(max(low, np.float32(0.0)) + drops[0, c], parent)
+    # What holds above holds below.
+    low = max(low, parent)
     if low > cut:
         return
     at = heap + sizes[1] if spilling else sizes[0]
@@ -222,7 +228,7 @@ def _put(keys, pairs, sizes, heap, spilling, cut, drops, c, bounds, parent, low,
         _sift_up(keys, pairs, at)
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def _go_on(m, pose, avatar, scene, search, goal, enough, budget, until):
     """Visit node pairs until the search ends, or `until` are visited; budget: how many may be. Sets the status."""
     words, ints, halves, where, coordinates = (
@@ -290,9 +296,9 @@ def _go_on(m, pose, avatar, scene, search, goal, enough, budget, until):
         x, y, z = nodes[0, a] - off_x, nodes[1, a] - off_y, nodes[2, a] - off_z
         c = node_class(ints, base if row == NO_VOXEL else row, mask)
         if row == NO_VOXEL:
-            low = lower_bound(words, base, x, y, z, nodes[3, a])
-            high = _upper_bound(words, base, x, y, z, nodes[3, a])
-            _put(keys, pairs, sizes, heap, spilling, limit, drops, c, bounds, key, low, high, a, base, voxel)
+            low = _low(words, base, x, y, z, nodes[3, a], drops[0, c])
+            high = _upper_bound(words, base, x, y, z, nodes[3, a]) + drops[1, c]
+            _put(keys, pairs, sizes, heap, spilling, limit, bounds, key, low, high, a, base, voxel)
         elif leaves:
             block, scene_block = ~a_first, ~b_first
             if stamp[block] != pose:
@@ -314,26 +320,22 @@ def _go_on(m, pose, avatar, scene, search, goal, enough, budget, until):
                 counters[1] += LANES
                 if any_near(halves, lane_at, px, py, pz, far[c]):
                     search_lanes(
-                        points, m, shift, block, lane, ints, halves, corner, block_at, lane_at, px, py, pz, frame,
-                        units, squares, found, cut, far, drop, mask,
+                        points, m, shift, block, lane, ints, halves, corner, block_at, lane_at, c, px, py, pz,
+                        frame, units, squares, found, cut, far, drop, mask,
                     )  # fmt: skip
         elif avatar_side:
             for child in range(a_first, a_first + cost):
                 x, y, z = nodes[0, child] - off_x, nodes[1, child] - off_y, nodes[2, child] - off_z
-                low = lower_bound(words, row, x, y, z, nodes[3, child])
-                high = _upper_bound(words, row, x, y, z, nodes[3, child])
-                _put(
-                    keys, pairs, sizes, heap, spilling, limit, drops, c, bounds, key, low, high, child, row, voxel
-                )  # fmt: skip
+                low = _low(words, row, x, y, z, nodes[3, child], drops[0, c])
+                high = _upper_bound(words, row, x, y, z, nodes[3, child]) + drops[1, c]
+                _put(keys, pairs, sizes, heap, spilling, limit, bounds, key, low, high, child, row, voxel)
         else:
             for number in range(cost):
                 child = base + (b_first + number) * ROW_WORDS
-                low = lower_bound(words, child, x, y, z, nodes[3, a])
-                high = _upper_bound(words, child, x, y, z, nodes[3, a])
                 c = node_class(ints, child, mask)
-                _put(
-                    keys, pairs, sizes, heap, spilling, limit, drops, c, bounds, key, low, high, a, child, voxel
-                )  # fmt: skip
+                low = _low(words, child, x, y, z, nodes[3, a], drops[0, c])
+                high = _upper_bound(words, child, x, y, z, nodes[3, a]) + drops[1, c]
+                _put(keys, pairs, sizes, heap, spilling, limit, bounds, key, low, high, a, child, voxel)
 
 
 @nb.njit(nogil=True, cache=True)

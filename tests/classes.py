@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from solidcloud.builder import shards
-from solidcloud.builder.octree import VoxelPoints
 from solidcloud.builder.radius import voxel_points
 from solidcloud.schemas.archive import Archive
 from solidcloud.schemas.radius_model import RADIUS_CLASSES, class_radii
@@ -34,13 +33,13 @@ def any_classes(
 
     classes_of: local lattice points (n, 3) of a voxel -> (n,).
     """
-    build_voxel = shards.build_voxel
+    voxel_classes = shards.voxel_classes
 
-    def with_others(key: int, points: VoxelPoints, *rest: Any) -> Any:
-        return build_voxel(key, points._replace(radius_class=classes_of(points.local)), *rest)
+    def others(key: int, local: NDArray[np.int32], *rest: Any) -> Any:
+        return voxel_classes(key, local, *rest)._replace(of_point=classes_of(local))
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(shards, "build_voxel", with_others)
+        patch.setattr(shards, "voxel_classes", others)
         yield
 
 

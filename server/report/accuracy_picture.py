@@ -374,7 +374,8 @@ def draw_knob(knob: str, rows: Sequence[Row], target: Path) -> Path:
     wrong.set_xlim(0, max(1.0, float(left.max()) * 1.15))
     than = "mean's" if knob == RADIUS else "the judge's"
     wrong.set_xlabel(f"verdicts that are not {than} [% of poses]")
-    wrong.legend(frameon=False, fontsize=8, loc="lower right")
+    # Above, where no bar is.
+    wrong.legend(frameon=False, fontsize=8, loc="lower right", bbox_to_anchor=(1.0, 0.99), ncols=3)
     for panel in (times, wrong):
         panel.grid(alpha=0.25, axis="x")
     _save(figure, target)

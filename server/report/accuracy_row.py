@@ -101,8 +101,8 @@ ERRORS = {
 
 FELT_ERRORS = ("doorway", "leak")
 
-# Times that differ by less than this factor count as equal.
-ALIKE = 1.05
+# Times that differ by less than this factor count as equal: of one archive built twice they did by 6 %, the machine busy.
+ALIKE = 1.1
 
 
 def judge_verdicts(row: Row, contact: Bools, unknown: Bools, exact: Bools, *, tangent: bool = False) -> None:
@@ -129,8 +129,11 @@ def error_of(row: Row, error: str) -> float | None:
     """An error of ERRORS, by its size, inf where nothing passes; None where it was not measured.
 
     A door too wide is as wrong as one too narrow; a ball stopped before the wall does not leak. Another radius model is
-    another definition of the scene: that its verdicts and distances differ from the mean's is no error.
+    another definition of the scene: that its verdicts and distances differ from the mean's is no error. What stops a
+    ball where a budget leaves answers unknown is the budget: that is no wall that holds.
     """
+    if error == "leak" and row.unknown:
+        return None
     if error in ("wrong", "distance") and (row.knob == RADIUS or not row.poses):
         return None
     value = getattr(row, ERRORS[error][1])

@@ -48,6 +48,9 @@ def test_a_ball_stopped_early_does_not_leak_and_a_wide_door_is_as_wrong_as_a_nar
     row = Row(TOLERANCE, "1 cm", leak_p99_mm=-8.0, doorway_mm=-3.0)
     assert error_of(row, "leak") == 0.0 and error_of(row, "doorway") == 3.0
     assert error_of(row, "distance") is None and error_of(row, "wrong") is None
+    row.poses, row.unknown = 10, 1
+    assert error_of(row, "leak") is None, "stopped by its budget, not by a wall"
+    assert error_of(Row(RADIUS, "local", poses=10, early=4), "wrong") is None, "another radius is no error"
 
 
 def timed(setting: str, time: float, doorway: float, knob: str = TOLERANCE) -> Row:
@@ -56,7 +59,7 @@ def timed(setting: str, time: float, doorway: float, knob: str = TOLERANCE) -> R
 
 def test_the_front_holds_what_nothing_beats() -> None:
     rows = [timed("fast", 1, 20), timed("good", 4, 5), timed("between", 2, 10), timed("beaten", 3, 15)]
-    rows += [timed("as fast but worse", 1.02, 25), timed("as good but slower", 5, 5)]
+    rows += [timed("as fast but worse", 1.08, 25), timed("as good but slower", 5, 5)]
     rows += [timed("another knob", 0.1, 0.0, "leaf size"), timed("does not pass", 0.5, math.inf)]
     mark_front(rows, (TOLERANCE,))
     assert {row.setting for row in rows if "doorway" in row.front} == {

@@ -163,8 +163,9 @@ def _scatter(panel: Any, points: list[Point], error: str) -> Wanted:
         panel.set_yscale("log")
         panel.set_ylim(min(sizes) / 1.6, max(sizes) * 1.5)
     else:
-        room = 0.12 * (max(sizes) - min(sizes) + 1.0)
-        panel.set_ylim(min(sizes) - room, max(sizes) + room)
+        low, high = min(*sizes, 0.0), max(*sizes, 0.0)
+        room = 0.12 * (high - low + 1.0)
+        panel.set_ylim(low - room, high + room)
         panel.axhspan(panel.get_ylim()[0], 0.0, color=FRONT, alpha=0.06, lw=0)
         panel.text(
             0.985,
@@ -247,7 +248,7 @@ def _trade(panel: Any, rows: Sequence[Row]) -> Wanted:
             anchors.append(place)
             labels.append(f"{row.setting}, default" if row.default else row.setting)
             colours.append(colour)
-    best = unbeaten([(x, max(y, 0.0)) for x, y in anchors])
+    best = unbeaten([(1.0, x, max(y, 0.0)) for x, y in anchors])  # their times are in the panels above
     low, high = min(y for _, y in anchors), max(y for _, y in anchors)
     room = 0.12 * (high - low) + 1.0
     panel.set_ylim(low - room, high + room)

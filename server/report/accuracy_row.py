@@ -101,7 +101,8 @@ ERRORS = {
 
 FELT_ERRORS = ("doorway", "leak")
 
-# Times that differ by less than this factor count as equal: of one archive built twice they did by 6 %, the machine busy.
+# Times that differ by less than this factor count as equal: of one archive built twice they did by 6 %, on a busy
+# machine.
 ALIKE = 1.1
 
 

@@ -1,5 +1,6 @@
 """`sweep` with spheres of several sizes: each pair's own reach decides, whatever the model, the motion and the tree."""
 
+import math
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -77,6 +78,33 @@ def test_no_sampled_pose_contradicts_the_answer(
                 still.verdict.tolist()
                 == collide(data, make_avatar(avatar, radius), first, margin).verdict.tolist()
             )
+
+
+@pytest.mark.interpreted
+@pytest.mark.parametrize("model", ["local:0.2", "border:3", "local+border:0.3"])
+def test_a_motion_that_stands_still_touches_from_the_very_unit_on(
+    tmp_path: Path, rng: np.random.Generator, model: str
+) -> None:
+    points, avatar = scans.make_scan("noise", 5, 60), rng.uniform(-0.1, 0.1, (4, 3))
+    with classes.any_classes():
+        case = cases.build(tmp_path, points, models=classes.STORED)
+    stored, radii = classes.stored_radii(case.archive, model)
+    found = 0
+    with swept.opened(case, model=model) as data:
+        b = naive.scan_units(stored, data.arrays.step)
+        for pose in cases.near_poses(rng, points, avatar, 10, 0.1):
+            apart = naive.placed_units(avatar, pose, data.arrays.origin)[:, None] - b
+            roots = [
+                [math.isqrt(int(square) - 1) + 1 for square in row] for row in (apart * apart).sum(axis=2)
+            ]
+            least = int((np.array(roots) - radii).min())
+            if least < 1:
+                continue
+            found += 1
+            for margin in (least - 1, least):
+                answers = swept.ask(data, avatar, 0.0, pose[None], pose[None], margin=margin / naive.UNITS)
+                assert answers.verdict[0] == (margin == least) and answers.exact[0]
+    assert found > 3
 
 
 @settings(max_examples=20, deadline=None, derandomize=True)

@@ -1,0 +1,80 @@
+"""A sheet without thickness with a door in it: a surface that ends at the jambs, of known spacing, noise and width.
+
+The doors of the façade are set in a wall 1.2 m deep: their jambs are planes, and no point of a jamb's middle is on a
+rim. Here the rim is all there is, so that what a radius model does to rims can be told from what it does to planes.
+"""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...schemas.errors import BadRequestError
+from .figure import write_figure
+from .places import WallPlaces
+from .scanner import JITTER, LATTICE
+from .truth import DoorTruth, FacadeTruth, WallTruth
+
+# The sheet stands on z = 0 in the plane y = 0, symmetric about the door's middle [m].
+HALF_WIDTH, HEIGHT = 3.0, 3.0
+DOOR = 1.0
+# Three stations' grids lie over one another: each one's spacing over the sheet's, and how much wider than high its
+# meshes are, as its station is farther off and looks at a smaller angle. Together 0.95 points a square of the spacing.
+GRIDS = ((1.46, 1.0), (1.95, 1.6), (2.14, 2.2))
+# Along the normal [m]: what 2 mm of range are at 40 degrees.
+NOISE = 0.0015
+# Probes keep this far from the rim and from the other edges [m]: a probe of 5 cm cannot get around them.
+MARGIN = 0.10
+THINNEST, WIDEST = 0.005, 0.2
+
+
+class Sheet(NamedTuple):
+    """A sheet that was written. truth: its door `main` and the wall to either side.  places: to probe, evenly."""
+
+    path: Path
+    truth: FacadeTruth
+    places: WallPlaces
+
+
+def make_sheet(path: Path, *, spacing: float = 0.03, places: int = 2000, seed: int = 2012) -> Sheet:
+    """Write the points of a sheet as OBJ or ASCII PLY; `spacing`: 1 over the root of the points per square metre [m].
+
+    The same arguments give the same coordinates. BadRequestError: a spacing outside 0.5 to 20 cm.
+    """
+    if not THINNEST <= spacing <= WIDEST:
+        raise BadRequestError(
+            f"spacing {spacing} m: expected {THINNEST} to {WIDEST} m: choose a spacing between"
+        )
+    rng = np.random.default_rng([seed, 0x5EE7])
+    flat = np.concatenate([_grid(spacing * wider, aspect, rng) for wider, aspect in GRIDS])
+    flat = flat[np.abs(flat[:, 0]) > DOOR / 2]
+    points = np.column_stack([flat[:, 0], rng.normal(0.0, NOISE, len(flat)), flat[:, 1]])
+    write_figure(path, np.rint(points / LATTICE) * LATTICE)
+    half = DOOR / 2
+    walls = tuple(
+        WallTruth(name, "y", 0.0, -1, low, high, 0.0, HEIGHT)
+        for name, low, high in (("left", -HALF_WIDTH, -half), ("right", half, HALF_WIDTH))
+    )
+    door = DoorTruth("main", -half, half, 0.0, 0.0, 0.0, HEIGHT, HEIGHT)
+    truth = FacadeTruth(seed, (0.0, 0.0, 0.0), 0.0, (door,), (), (), walls)
+    side = np.where(rng.uniform(size=places) < 0.5, -1.0, 1.0)
+    at = np.zeros((places, 3))
+    at[:, 0] = side * rng.uniform(half + MARGIN, HALF_WIDTH - MARGIN, places)
+    at[:, 2] = rng.uniform(MARGIN, HEIGHT - MARGIN, places)
+    return Sheet(
+        path, truth, WallPlaces(at, np.tile([0.0, -1.0, 0.0], (places, 1)), np.full(places, spacing))
+    )
+
+
+def _grid(spacing: float, aspect: float, rng: np.random.Generator) -> NDArray[np.float64]:
+    """One station's points (n, 2) on the sheet, x and z [m]: a jittered grid that begins anywhere in its mesh."""
+    wide, high = spacing * aspect**0.5, spacing / aspect**0.5
+    x, z = np.meshgrid(
+        np.arange(-HALF_WIDTH, HALF_WIDTH, wide) + rng.uniform(0, wide),
+        np.arange(0.0, HEIGHT, high) + rng.uniform(0, high),
+        indexing="ij",
+    )
+    x += JITTER * wide * rng.uniform(-1, 1, x.shape)
+    z += JITTER * high * rng.uniform(-1, 1, z.shape)
+    return np.column_stack([x.ravel(), z.ravel()])

@@ -25,6 +25,7 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from .compiled import borrowing
 from .layout import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, node_class, point_class
 from .placed import U32
 from .placing import lattice_to_units
@@ -59,7 +60,7 @@ class Nearest(NamedTuple):
     counts: NDArray[np.uint32]
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def first_meeting(dx, dy, dz, ux, uy, uz, radius):
     """t of one ray and one sphere by the definition above, inf when missed. dx, dy, dz, radius: int64 units."""
     inside = (
@@ -78,7 +79,7 @@ def first_meeting(dx, dy, dz, ux, uy, uz, radius):
     return max(along - math.sqrt((r - miss) * (r + miss)), 0.0)
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def _meet_node(words, row, ray, radius, limit):
     """Lower bound of t [steps] for the spheres of a node's points, inf when none is met before `limit`.
 
@@ -114,7 +115,7 @@ def _meet_node(words, row, ray, radius, limit):
     return first if first <= limit else np.inf
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def _test_block(scene, voxel, row, ray, radius, rays, i, best):
     """All points of a leaf node against ray i: 32 in float32, those within the band by the definition.
 
@@ -173,7 +174,7 @@ def _test_block(scene, voxel, row, ray, radius, rays, i, best):
             best.lattice[i, 0], best.lattice[i, 1], best.lattice[i, 2] = sx, sy, sz
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def is_less(x, y, z, other):
     """Whether a lattice point comes before another (3,), by x, then y, then z."""
     if x != other[0]:
@@ -183,7 +184,7 @@ def is_less(x, y, z, other):
     return z < other[2]
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def _set_frame(ray, direction):
     """Fill ray[3:12]: the direction and two unit vectors across it, off by a few roundings of float64."""
     ux, uy, uz = direction[0], direction[1], direction[2]
@@ -200,7 +201,7 @@ def _set_frame(ray, direction):
     ray[9], ray[10], ray[11] = uy * az - uz * ay, uz * ax - ux * az, ux * ay - uy * ax
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def push_sorted(rows, bounds, begin, depth, row, bound):
     """Push a node onto a stack so that of entries [begin, depth] the least bound comes off first."""
     at = depth
@@ -210,7 +211,7 @@ def push_sorted(rows, bounds, begin, depth, row, bound):
     rows[at], bounds[at] = row, bound
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def _follow(scene, voxel, rays, i, ray, near, tolerance, visits, best, rows, bounds, drops):
     """Follow ray i through the tree of one resident voxel, front to back; `best`, its counts included, is updated.
 

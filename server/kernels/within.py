@@ -13,13 +13,14 @@ import math
 import numba as nb
 import numpy as np
 
+from .compiled import borrowing
 from .layout import COUNT, COUNTED, FIRST, LANES, ROW_WORDS
 from .placed import U32
 from .placing import MAX_REACH_UNITS, lattice_to_units
 from .rays import STACK, is_less
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def _below_node(words, row, x, y, z, limit):
     """Lower bound of the distance [steps] from a point (float64, from the voxel's low corner) to a node's points, and
     the distance to its centre. Beyond `limit` the bound may be as low as the sphere alone makes it.
@@ -48,7 +49,7 @@ def _below_node(words, row, x, y, z, limit):
     return max(below - slack, 0.0), middle
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def _test_block(scene, voxel, row, x, y, z, error, at_units, i, best, limit):
     """All points of a leaf node against point i: 32 in float32, those within the band in integers.
 
@@ -112,7 +113,7 @@ def _test_block(scene, voxel, row, x, y, z, error, at_units, i, best, limit):
     return limit
 
 
-@nb.njit(nogil=True, cache=True)
+@borrowing
 def _search(scene, voxel, at_units, i, near, tolerance, visits, best, limit, rows, bounds, keys):
     """Search one resident voxel, nearest nodes first. Returns the limit, lowered; updates `best`.
 

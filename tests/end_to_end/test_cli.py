@@ -13,7 +13,7 @@ import pytest
 from solidcloud.server.cli import parse_bytes, run
 from solidcloud.server.report.serving import free_port, served
 
-VERBS = ["build", "info", "validate", "serve", "query", "make"]
+VERBS = ["build", "info", "validate", "serve", "query", "accuracy", "make"]
 RADIUS = 0.05
 
 

@@ -140,8 +140,10 @@ def verdict(kept: Results, files: Sequence[str]) -> bool:
     good = True
     for file in files:
         own = kept.files.get(file)
-        if own is None or share(own) < GOAL:
+        if own is None or own.again or share(own) < GOAL:
             found = "not tried" if own is None else f"{own.killed()} of {own.counted()} killed"
+            if own is not None and own.again:
+                found = f"{len(own.again)} survivors are to be tried again"
             print(f"error: {file}: {found}, expected at least {GOAL:.0%}", file=sys.stderr)
             good = False
     left = survivors(kept)[1]

@@ -28,7 +28,9 @@ def digest_tests(folder: Path, tests: tuple[str, ...]) -> str:
 class FileResults:
     """Those of one file. source, tests: digests.  complete: no mutant is left.  tried: key -> its row.
 
-    A row: line, function, was, now of the mutant, and kind, test, what of the outcome.
+    A row: line, function, was, now of the mutant, and kind, test, what of the outcome.  again: keys of those that
+    survived other tests than there are now; they are to be tried again, whatever the size of the sample, or a larger
+    share would seem killed than is.
     """
 
     source: str
@@ -36,14 +38,22 @@ class FileResults:
     seed: int
     complete: bool = False
     tried: dict[str, dict[str, Any]] = field(default_factory=dict)
+    again: list[str] = field(default_factory=list)
     owner: "Results | None" = None
 
-    def knows(self, mutant: Mutant) -> bool:
-        """Whether it has been tried."""
-        return mutant.key in self.tried
+    def wants(self, mutant: Mutant, sample: int, under_way: int) -> bool:
+        """Whether to try it, in a sample of so many, while trials of others are under way."""
+        if mutant.key in self.again:
+            return True
+        return mutant.key not in self.tried and self.lacks(sample, under_way + len(self.again))
+
+    def lacks(self, sample: int, under_way: int) -> bool:
+        """Whether mutants beyond those tried and under way are needed for a sample of so many."""
+        return self.counted() + under_way < sample
 
     def add(self, mutant: Mutant, outcome: Outcome) -> None:
         """Take up an outcome."""
+        self.again = [key for key in self.again if key != mutant.key]
         self.tried[mutant.key] = {
             **{name: getattr(mutant, name) for name in ("line", "function", "was", "now")},
             **{name: getattr(outcome, name) for name in ("kind", "test", "what")},
@@ -78,6 +88,7 @@ class Results:
         if own is None or (own.source, own.seed) != (digest(source.encode()), seed):
             own = FileResults(digest(source.encode()), tests, seed)
         elif own.tests != tests:
+            own.again += [key for key, row in own.tried.items() if row["kind"] == PASSED]
             own.tried = {key: row for key, row in own.tried.items() if row["kind"] != PASSED}
             own.tests = tests
         own.complete, own.owner = False, self

@@ -80,7 +80,8 @@ def test_what_the_compiler_would_refuse_counts_for_nothing() -> None:
     for mutant, kind in zip(drawn(), kinds, strict=False):
         own.add(mutant, outcome(kind))
     assert (own.counted(), own.killed(), document.share(own)) == (4, 3, 0.75)
-    assert own.knows(drawn()[0]) and not own.knows(drawn()[9])
+    assert not own.wants(drawn()[0], 9, 0) and own.wants(drawn()[9], 9, 0)
+    assert not own.wants(drawn()[9], 9, 5) and not own.wants(drawn()[9], 4, 0)
 
 
 def test_results_hold_for_one_source_and_survivors_for_one_set_of_tests() -> None:
@@ -89,7 +90,11 @@ def test_results_hold_for_one_source_and_survivors_for_one_set_of_tests() -> Non
     own.add(drawn()[0], outcome(trial.FAILED))
     own.add(drawn()[1], outcome(trial.PASSED))
     assert kept.take("a.py", SOURCE, "tests", 1).counted() == 2
-    assert kept.take("a.py", SOURCE, "other tests", 1).counted() == 1
+    own = kept.take("a.py", SOURCE, "other tests", 1)
+    assert own.counted() == 1 and own.again == [drawn()[1].key]
+    assert own.wants(drawn()[1], 1, 0) and not own.wants(drawn()[2], 2, 0), "the sample stays what it was"
+    own.add(drawn()[1], outcome(trial.PASSED))
+    assert own.counted() == 2 and not own.again
     assert kept.take("a.py", SOURCE, "other tests", 2).counted() == 0
     assert kept.take("a.py", SOURCE + "\n", "other tests", 2).counted() == 0
 

@@ -189,7 +189,7 @@ QUESTIONS: dict[str, Callable[[Scene, Options], list[Any]]] = {
         s.collide("deep", poses()[:6], 0.01, tolerance=0.001, **o),
         s.distance("deep", poses()[:6], 1.0, tolerance=0.001, budget_visits=400, **o),
     ],
-    "contacts deep": lambda s, o: [s.contacts("deep", poses()[:6], 20, 0.03, **o)],
+    "contacts deep": lambda s, o: [s.contacts("deep", poses()[:7], 20, m, **o) for m in (0.0, 0.03)],
     "walker": lambda s, o: [*walked(s, o, "small", 0.1), *walked(s, o, "large", 0.09)],
     "distance": lambda s, o: [s.distance(a, poses(), r, **o) for a in AVATARS for r in (0.1, 3.0)],
     "distance bounded": lambda s, o: [

@@ -1,0 +1,58 @@
+"""Answers about small fixed scenes, bit for bit, and the work done for them: both are what they were.
+
+A kernel that prunes less, visits in another order or looks at more points than it did answers the same, so no judge of
+answers sees it. Where such a change is meant, `scripts/make_work` writes the numbers anew, and the change of
+tests/golden/work.json shows what it costs.
+"""
+
+import json
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import naive
+import numpy as np
+import pytest
+import work
+from solidcloud.server.scene import Scene
+
+pytestmark = pytest.mark.interpreted
+
+GOLDEN = json.loads(work.GOLDEN.read_text())
+
+
+@pytest.fixture(scope="module")
+def archive_of(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+    """The archive of a kind, built when first asked for."""
+    return cache(lambda kind: work.build(tmp_path_factory.mktemp(kind), kind))
+
+
+@pytest.mark.parametrize("kind", work.KINDS)
+@pytest.mark.parametrize("question", work.QUESTIONS)
+def test_answers_and_work_are_what_they_were(
+    archive_of: Callable[[str], Path], question: str, kind: str
+) -> None:
+    found: dict[str, Any] = work.measure(archive_of(kind), question, kind)
+    kept = GOLDEN[f"{question}, {kind}"]
+    assert found["answers"] == kept["answers"]
+    assert found["costs"] == kept["costs"]
+    if work.INTERPRETED:
+        assert found["calls"] == kept["calls"]
+
+
+def test_every_question_is_kept_and_decides_both_ways() -> None:
+    assert set(GOLDEN) == {f"{question}, {kind}" for question in work.QUESTIONS for kind in work.KINDS}
+    for name, kept in GOLDEN.items():
+        assert {0, 1} <= {verdict for says in kept["verdicts"] for verdict in says}, name
+
+
+@pytest.mark.parametrize("kind", ["fine", "flat"])
+def test_the_verdicts_kept_are_those_of_the_definition(archive_of: Callable[[str], Path], kind: str) -> None:
+    with Scene.open(archive_of(kind)) as scene:
+        info = scene.info()
+    scan = work.scene_points(kind), np.array(info.origin), info.lattice_step, info.radius
+    kept = iter(GOLDEN[f"collide, {kind}"]["verdicts"])
+    for name, margin in ((name, margin) for name in work.AVATARS for margin in (0.0, 0.04)):
+        touches = naive.collide(*scan, *work.AVATARS[name], work.poses(), margin)
+        assert next(kept) == touches.astype(int).tolist()

@@ -30,6 +30,7 @@ def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     "10,000 mixed requests on 1, 2 and 4 threads, loads and evictions between: the same reply bytes, costs aside",
 )
 @pytest.mark.interpreted
+@pytest.mark.timeout(900)  # it may be the first to compile everything
 def test_threads_change_no_byte(archive: Path) -> None:
     count = 60 if INTERPRETED else 10_000
     asked = mixed_requests.requests(count)

@@ -1,8 +1,8 @@
 """Questions about small fixed scenes: what is answered, and the work done for it, as numbers that can be kept.
 
 The work is what bounds and orders of visits decide and no answer shows: node visits, pairs of points tested, and the
-calls of every function of server/kernels, all of it interpreted. Scenes, avatars and poses come of whole numbers, square
-roots and sums in a fixed order, so that they are the same bits on any machine.
+calls of every function of server/kernels, all of it interpreted. Scenes, avatars and poses come of whole numbers,
+square roots and sums in a fixed order, so that they are the same bits on any machine.
 """
 
 import hashlib

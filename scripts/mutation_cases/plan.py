@@ -70,7 +70,7 @@ TESTS: dict[str, tuple[str, ...]] = {
         *work("collide", "contacts"),
     ),
     "server/kernels/moments.py": work("sweep", "sweep bounded"),
-    "server/kernels/moving.py": work("sweep", "sweep bounded"),
+    "server/kernels/moving.py": (SERVER + "test_moving.py", *work("sweep", "sweep bounded")),
     "server/kernels/memory.py": work("walker"),
     "server/kernels/nearest.py": work("distance", "distance deep"),
     "server/kernels/overlap.py": (*work("collide", "collide deep", "collide one"), *tangent("collide")),

@@ -7,10 +7,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..schemas.answers import CollideAnswers
 from ..schemas.messages import make_poses
+from ..schemas.voxel_grid import UNITS_PER_METRE
 from .avatar import AvatarModel
 from .bounded import collide_bounded
 from .effort import EXACT, Effort
-from .kernels.overlap import CLEAR, UNKNOWN, answer_resident, overlap_poses
+from .kernels.overlap import CLEAR, CONTACT, UNKNOWN, answer_resident, overlap_poses
 from .request import SceneData, check_request, in_unknown, pieces, refuse, to_units
 
 # An avatar up to this size is answered under the residency's lock when a request holds one pose: 20 µs for the
@@ -59,40 +60,56 @@ def collide(
 
     poses: (k, 4, 4) float64, avatar to world, rigid or with a uniform scale, bits used as given.
     margin: distance below or at which two spheres are called in contact [m].
-    effort: with a tolerance or a budget, see `collide_bounded`.
+    effort: with a budget, see `collide_bounded`; with a tolerance alone the answer is exact, and has bounds.
     CONTACT, CLEAR or UNKNOWN (a voxel in reach cannot be read, or a scan was left out there, and no contact was
     found elsewhere); the definition is NUMERICS.md N5. Raises BadRequestError, BadTransformError, TooLargeError.
     """
-    if effort.bounded:
+    if effort.limited:
         return collide_bounded(data, avatar, poses, margin, effort)
     begin = time.perf_counter()
     array = make_poses(poses)
     if not array.flags.writeable:
         array = array.copy()  # numba compiles a read-only array anew
-    other_units = data.radius_units + to_units(margin, "margin")
+    margin_units = to_units(margin, "margin")
+    other_units = data.radius_units + margin_units
     k = len(array)
     unseen = data.unknown_everywhere or len(data.unknown) > 0
-    if k == 1 and len(avatar.points) <= QUICK_POINTS and not unseen:
+    if k == 1 and len(avatar.points) <= QUICK_POINTS and not unseen and effort.tolerance == 0:
         answers = _answer_at_once(data, avatar, array, other_units, begin)
         if answers is not None:
             return answers
     reach = check_request(data, avatar, array, other_units)
     verdict, counts = np.zeros(k, np.uint8), np.zeros((3, k), np.uint32)
-    if not len(avatar.points):
-        return CollideAnswers(verdict, reach.outside, *counts)  # clear, whatever is unknown here
     residency = data.residency
     hits = misses = 0
     faults: dict[str, None] = {}
-    for which, rows, part in pieces(reach, residency):
+    # An empty avatar is clear, whatever is unknown here.
+    for which, rows, part in pieces(reach, residency) if len(avatar.points) else ():
         with residency.hold(rows) as held:
             overlap_poses(array, avatar.arrays, data.arrays, part, which, verdict, counts)
         hits, misses = hits + held.hits, misses + held.misses
         faults.update(dict.fromkeys(held.faults))
-    if unseen:
+    if unseen and len(avatar.points):
         lost = in_unknown(reach.boxes, data.unknown, data.unknown_everywhere)
         verdict[lost & (verdict == CLEAR)] = UNKNOWN
     return CollideAnswers(
         verdict, reach.outside, counts[0], counts[1], counts[2], engine_seconds=time.perf_counter() - begin,
         hits=hits, misses=misses, resident=residency.resident, resident_bytes=residency.resident_bytes,
-        faults=tuple(faults),
+        faults=tuple(faults), **_bounds(verdict, reach.units - margin_units, margin, effort),
     )  # fmt: skip
+
+
+def _bounds(
+    verdict: NDArray[np.uint8], radii: NDArray[np.int64], margin: float, effort: Effort
+) -> dict[str, NDArray]:
+    """The bounds of `CollideAnswers` that verdicts alone give; none where no tolerance asks for them.
+
+    radii: (k,) of avatar's and scan's largest spheres together, exact units: no pair is deeper.
+    """
+    if effort.tolerance == 0:
+        return {}
+    return {
+        "lower": np.where(verdict == CLEAR, margin, -radii / UNITS_PER_METRE),
+        "upper": np.where(verdict == CONTACT, margin, np.inf),
+        "exact": verdict != UNKNOWN,
+    }

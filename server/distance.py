@@ -29,7 +29,7 @@ def distance(
     left out, the distance is that of the nearest pair looked at, exact only if what is missing can hold no nearer one.
     Raises BadRequestError, BadTransformError, TooLargeError.
     """
-    if effort.bounded:
+    if effort.limited:
         return distance_bounded(data, avatar, poses, reach, effort)
     begin = time.perf_counter()
     array = make_poses(poses)

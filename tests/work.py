@@ -179,14 +179,14 @@ QUESTIONS: dict[str, Callable[[Scene, Options], list[Any]]] = {
     "collide bounded": lambda s, o: [
         s.collide(a, poses(), 0.01, tolerance=t, budget_visits=b, **o)
         for a in AVATARS
-        for t, b in ((0.02, None), (0.0, 40), (0.005, 200))
+        for t, b in ((0.02, 1 << 40), (0.0, 40), (0.005, 200))
     ],
     "collide deep": lambda s, o: [
         s.collide(a, poses()[:8], m, **o) for a in ("deep", "deepest") for m in (0.0, 0.04)
     ],
     "distance deep": lambda s, o: [s.distance(a, poses()[:8], 3.0, **o) for a in ("deep", "deepest")],
     "bounded deep": lambda s, o: [
-        s.collide("deep", poses()[:6], 0.01, tolerance=0.001, **o),
+        s.collide("deep", poses()[:6], 0.01, tolerance=0.001, budget_visits=1 << 40, **o),
         s.distance("deep", poses()[:6], 1.0, tolerance=0.001, budget_visits=400, **o),
     ],
     "contacts deep": lambda s, o: [s.contacts("deep", poses()[:7], 20, m, **o) for m in (0.0, 0.03)],
@@ -197,7 +197,7 @@ QUESTIONS: dict[str, Callable[[Scene, Options], list[Any]]] = {
         *(
             s.distance(a, poses(), 1.0, tolerance=t, budget_visits=b, **o)
             for a in AVATARS
-            for t, b in ((0.02, None), (0.0, 60), (0.005, 300))
+            for t, b in ((0.02, 1 << 40), (0.0, 60), (0.005, 300))
         ),
     ],
     "contacts": lambda s, o: [

@@ -190,3 +190,22 @@ def test_poses_of_any_layout_give_the_same_answers(scene: Scene, rng: np.random.
     backwards = poses[::-1].copy()[::-1]
     for same in (poses.tolist(), frozen, backwards, np.asfortranarray(poses), poses.astype(">f8")):
         assert scene.collide("ball", same).verdict.tolist() == expected
+
+
+def test_a_tolerance_alone_is_answered_exactly_and_with_bounds(tmp_path: Path) -> None:
+    # One point, one ball of 0.25 m, a margin of 0.125 m: contact begins at 0.375 m.
+    case = cases.build(tmp_path, np.zeros((1, 3)), radius=0.0, resolution=cases.BINARY_STEP)
+    away = np.array([0.0, 0.375, 0.375 + 2.0**-26, 0.4, 5.0])
+    poses = np.array([cases.pose_of(np.eye(3), np.array([0.0, 0.0, z])) for z in away])
+    with Scene.open(case.archive) as scene:
+        scene.add_avatar("ball", np.zeros((1, 3)), 0.25)
+        scene.add_avatar("nothing", np.zeros((0, 3)), 0.25)
+        for asked in (poses, *poses[:, None]):
+            exact = scene.collide("ball", asked, 0.125)
+            answers = scene.collide("ball", asked, 0.125, tolerance=0.5)
+            assert answers.verdict.tolist() == exact.verdict.tolist() and answers.exact.all()
+            assert answers.node_visits.tolist() == exact.node_visits.tolist()
+            distance = asked[:, 2, 3] - 0.25
+            assert (answers.lower <= distance).all() and (distance <= answers.upper).all()
+        assert scene.collide("ball", poses, 0.125, tolerance=0.5).verdict.tolist() == [1, 1, 0, 0, 0]
+        assert scene.collide("nothing", poses, 0.125, tolerance=0.5).lower.tolist() == [0.125] * 5

@@ -44,7 +44,7 @@ def verdict(scene: Scene, question: str, name: str, pose: NDArray[np.float64], m
     if question == "collide":
         return int(scene.collide(name, pose, margin).verdict[0])
     if question == "bounded":
-        return int(scene.collide(name, pose, margin, tolerance=1e-9).verdict[0])
+        return int(scene.collide(name, pose, margin, tolerance=1e-9, budget_visits=1 << 40).verdict[0])
     if question == "walker":
         walker = scene.walker(name, margin)
         near = pose.copy()

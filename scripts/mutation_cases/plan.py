@@ -17,6 +17,21 @@ def tangent(question: str) -> tuple[str, ...]:
     return tuple(f"{test}[{question}-{name}]" for name in ("small-fine", "deep-flat"))
 
 
+# Sweeps that graze, begin or end in contact, and meet what is not known.
+SWEEPS = tuple(
+    f"tests/hard_cases/test_sweep.py::test_case_{name}"
+    for name in (
+        "26_contact_at_the_very_end_and_at_the_very_beginning",
+        "26_ways_from_a_centimetre_to_ten_kilometres",
+        "26_contact_beyond_a_graze_is_found",
+        "26_zero_motion_is_the_static_answer",
+        "26_a_graze_is_unknown_or_found_never_clear",
+        "30_a_tolerance_widens_the_interval_and_no_more",
+        "21_what_is_missing_is_unknown_from_there_on",
+        "21_regions_of_scans_left_out",
+    )
+)
+
 TESTS: dict[str, tuple[str, ...]] = {
     "schemas/kernels/links.py": (SCHEMAS + "test_links.py",),
     "schemas/kernels/morton.py": (SCHEMAS + "test_morton.py",),
@@ -58,7 +73,7 @@ TESTS: dict[str, tuple[str, ...]] = {
     ),
     "server/kernels/pairs.py": (SERVER + "test_pairs.py",),
     "server/kernels/motion.py": (SERVER + "test_motion.py", *work("sweep")),
-    "server/kernels/advance.py": work("sweep", "sweep bounded"),
+    "server/kernels/advance.py": (*work("sweep", "sweep bounded"), *SWEEPS),
     "server/kernels/closer.py": (SERVER + "test_closer.py", *work("distance")),
     "server/kernels/closest.py": work("distance", "distance deep", "distance bounded"),
     "server/kernels/contacts.py": (*work("contacts", "contacts deep"), *tangent("contacts")),
@@ -69,7 +84,7 @@ TESTS: dict[str, tuple[str, ...]] = {
         SERVER + "test_layout.py",
         *work("collide", "contacts"),
     ),
-    "server/kernels/moments.py": work("sweep", "sweep bounded"),
+    "server/kernels/moments.py": (*work("sweep", "sweep bounded"), *SWEEPS),
     "server/kernels/moving.py": (SERVER + "test_moving.py", *work("sweep", "sweep bounded")),
     "server/kernels/memory.py": work("walker"),
     "server/kernels/nearest.py": work("distance", "distance deep"),

@@ -33,7 +33,12 @@ def test_the_nearest_and_the_reach_are_those_of_the_definition(tmp_path: Path, k
         ]
         pairs = np.array([(a + units[0]) // 2 for a in units[1::9]])
         loose = np.rint((work.loose() - origin) * naive.UNITS).astype(np.int64)
-        queries = np.concatenate([near, pairs, loose, units[:3]])
+        # Metres away, where float32 tells points apart by no less than some thousandths of a step.
+        rng = np.random.default_rng(7)
+        away = rng.normal(size=(40, 3))
+        away *= (rng.uniform(1, 14, 40) / np.sqrt((away**2).sum(axis=1)))[:, None] * naive.UNITS
+        far = units[rng.integers(len(units), size=40)] + away.astype(np.int64)
+        queries = np.concatenate([near, pairs, loose, units[:3], far])
         ties = 0
         for query in queries:
             square, least = nearest(units, query)
@@ -48,7 +53,7 @@ def test_the_nearest_and_the_reach_are_those_of_the_definition(tmp_path: Path, k
                     continue
                 said = scene.within(place, reach / naive.UNITS)
                 assert said.verdict[0] == verdict, (query, reach)
-            said = scene.within(place, 8.0)
+            said = scene.within(place, 15.0)
             found = np.rint((said.cloud_point[0] - origin) * naive.UNITS).astype(int).tolist()
             assert found == least
         assert ties > 5

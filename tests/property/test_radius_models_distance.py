@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from judged import compare, judge_collide, judge_distance
 from numpy.typing import NDArray
 from solidcloud.schemas.answers import CollideAnswers, DistanceAnswers, Verdict
+from solidcloud.schemas.radius_model import RIM_BIT
 from solidcloud.server import bounded
 from solidcloud.server.effort import NO_LIMIT
 from solidcloud.server.scene import Scene
@@ -199,3 +200,53 @@ def test_a_small_sphere_in_front_of_a_large_one(tmp_path: Path, rng: np.random.G
                 assert found is not None
                 farther += found.square > naive.least_square(naive.placed_units(avatar, pose, info.origin), b)
     assert farther > 0 and len(set(radii)) == 2
+
+
+@pytest.mark.interpreted
+@pytest.mark.parametrize("rim_right", [True, False])
+def test_gaps_that_tie_across_classes_and_a_unit_less(tmp_path: Path, rim_right: bool) -> None:
+    """A whole sphere on one side, half a one as near on the other: the lesser point; and a unit decides."""
+    half, far = 2.0**-5, 0.5  # of the radius; of the whole sphere's centre
+    points = np.array([[-far, 0, 0], [far - half, 0, 0]])
+    if not rim_right:
+        points = -points
+    with classes.any_classes(
+        lambda local: np.where((local[:, 0] > 512) == rim_right, RIM_BIT, 0).astype(np.uint8)
+    ):
+        case = cases.build(
+            tmp_path, points, voxel=4.0, resolution=cases.BINARY_STEP, radius=2 * half, models=classes.STORED
+        )
+    poses = np.array(
+        [cases.pose_of(np.eye(3), np.array([units / naive.UNITS, 0, 0])) for units in (-1, 0, 1)]
+    )
+    with Scene.open(case.archive) as scene:
+        info = scene.info()
+        stored, radii = classes.stored_radii(case.archive, "border")
+        assert sorted(radii.tolist()) == [1 << 21, 1 << 22]
+        scene.add_avatar("avatar", [[0.0, 0, 0]], 0.0)
+        scan = (stored, info.origin, info.lattice_step, radii)
+        judged = naive_distance.distance_by_radii(*scan, np.zeros((1, 3)), 0.0, poses, 1.0)
+        sides = [found.witness_cloud[0] for found in judged if found is not None]
+        assert sides == [points[:, 0].min(), points[:, 0].min(), points[:, 0].max()]
+        compare(scene.distance("avatar", poses, 1.0, radius_model="border"), judged, 1.0)
+        bounded_too = scene.distance("avatar", poses, 1.0, budget_visits=1000, radius_model="border")
+        assert bounded_too.witness_cloud[:, 0].tolist() == sides
+
+
+@pytest.mark.interpreted
+def test_the_class_of_a_node_may_be_that_of_no_point(tmp_path: Path) -> None:
+    """A large sphere halved by the rim beside a small one off it: no upper bound may count on a whole one."""
+    points = np.array([[0.0, 0, 0], [2.0**-10, 0, 0]])
+    with classes.any_classes(lambda local: np.where(local[:, 0] % 2 == 0, 15 | RIM_BIT, 0).astype(np.uint8)):
+        case = cases.build(tmp_path, points, voxel=4.0, resolution=cases.BINARY_STEP, models=classes.STORED)
+    poses = np.array([cases.pose_of(np.eye(3), np.array([0, 0, z])) for z in (0.08, 0.0915, 0.1, 0.15, 0.3)])
+    with Scene.open(case.archive) as scene:
+        info = scene.info()
+        stored, radii = classes.stored_radii(case.archive, "local+border")
+        scene.add_avatar("avatar", [[0.0, 0, 0]], 0.0)
+        scan = (stored, info.origin, info.lattice_step, radii, np.zeros((1, 3)), 0.0)
+        signed = signed_of(naive_distance.distance_by_radii(*scan, poses, 1.0))
+        for visits in range(6):
+            options: dict[str, Any] = {"budget_visits": visits, "radius_model": "local+border"}
+            judge_distance(scene.distance("avatar", poses, 1.0, **options), signed, 1.0, 0.0, visits == 5)
+            judge_collide(scene.collide("avatar", poses, **options), signed, 0.0, 0.0, visits == 5)

@@ -19,6 +19,7 @@ from unittest import mock
 import cases
 import numpy as np
 from numpy.typing import NDArray
+from solidcloud.schemas.archive import Archive
 from solidcloud.schemas.arrays import array_fields
 from solidcloud.server import avatar
 from solidcloud.server.scene import Scene
@@ -127,15 +128,25 @@ def loose() -> NDArray[np.float64]:
 
 def scene_points(kind: str) -> NDArray[np.float64]:
     """The points of a scene."""
-    return wall(300 if kind == "fine" else 500)
+    return wall(300 if kind in ("fine", "broken") else 500)
 
 
 def build(folder: Path, kind: str) -> Path:
     """The archive of a kind, in an empty folder."""
-    return cases.build(folder, scene_points(kind), resolution=2.0**-10, radius=0.01, **KINDS[kind]).archive
+    archive = cases.build(folder, scene_points(kind), resolution=2.0**-10, radius=0.01, **KINDS[kind]).archive
+    if kind == "broken":
+        with Archive(archive) as opened_archive:
+            entries = opened_archive.voxels[::3].copy()
+            paths = [opened_archive.shard_path(int(entry["shard"])) for entry in entries]
+        for entry, path in zip(entries, paths, strict=True):
+            record = bytearray(path.read_bytes())
+            record[int(entry["frame_offset"][2]) + int(entry["frame_bytes"][2]) // 2] ^= 1
+            path.write_bytes(record)
+    return archive
 
 
-# Small cells and nodes in many voxels; few large nodes in one voxel; spheres of several sizes.
+# Small cells and nodes in many voxels; few large nodes in one voxel; spheres of several sizes; every third voxel is
+# not what it was written as, and so is missing.
 KINDS: dict[str, dict[str, Any]] = {
     "fine": {"voxel": 0.5, "leaf": 4, "degree": 3, "cell_points": 24},
     "flat": {"voxel": 4.0},
@@ -146,8 +157,9 @@ KINDS: dict[str, dict[str, Any]] = {
         "models": frozenset({"mean", "local", "border"}),
         "keep": frozenset({"scan"}),
     },
+    "broken": {"voxel": 0.5},
 }
-OPTIONS: dict[str, Options] = {"fine": {}, "flat": {}, "classed": {"radius_model": "local+border"}}
+OPTIONS: dict[str, Options] = {kind: {} for kind in KINDS} | {"classed": {"radius_model": "local+border"}}
 # Points, radius: one leaf node, and a tree.
 AVATARS = {"small": (shell(20, 0.25), 0.02), "large": (shell(200, 0.25), 0.01)}
 DEEP = (shell(300, 0.3), 0.01)

@@ -7,7 +7,9 @@ def work(*questions: str) -> tuple[str, ...]:
     """Tests that some answers and the work done for them are what they were."""
     test = SERVER + "test_work.py::test_answers_and_work_are_what_they_were"
     return tuple(
-        f"{test}[{question}-{kind}]" for kind in ("fine", "classed", "flat") for question in questions
+        f"{test}[{question}-{kind}]"
+        for kind in ("fine", "classed", "flat", "broken")
+        for question in questions
     )
 
 

@@ -36,9 +36,10 @@ from .accuracy_engine import (
     radius_settings,
     time_engine,
 )
-from .accuracy_felt import FELT, measure_felt
+from .accuracy_felt import FACADES, FELT, measure_felt, measure_made
 from .accuracy_plan import Plan
 from .accuracy_row import COLUMNS, SHOWN, Row, mark_front
+from .accuracy_sheet import count_sheet, measure_sheet
 from .spheres import load_pyplot
 
 TURNED = (VOLUME, PRIMITIVE)
@@ -103,8 +104,10 @@ def measure(
             settings = engine_settings(plan, ground.step, header.radius)
             settings += radius_settings(plan, ground.step, header.radius)
             measure_engine(settings, archives, ground, exact, plan, progress)
-            progress.start("plain", len(plain_settings()) * (1 + plan.loops), "settings")
             rows = [s.row for s in settings]
+            if ground.truth is not None:
+                rows += measure_made_scenes(settings, scratch, plan, progress)
+            progress.start("plain", len(plain_settings()) * (1 + plan.loops), "settings")
             rows += measure_plain(opened, ground, exact, plan, lambda: progress.advance(1))
             progress.finish()
     rows += measure_turned(ground, scratch, plan, progress)
@@ -154,6 +157,22 @@ def measure_engine(
     progress.start("times", count_timed(settings) * plan.loops, "settings")
     time_engine(settings, archives, ground, plan, tick)
     progress.finish()
+
+
+def measure_made_scenes(settings: list[Setting], scratch: Path, plan: Plan, progress: Progress) -> list[Row]:
+    """What needs other scenes than the façade as it is: the sheet with a door, its rows; and doors made narrower."""
+
+    def tick() -> None:
+        progress.advance(1)
+
+    progress.start("sheet", count_sheet(), "settings")
+    rows = measure_sheet(scratch, tick)
+    progress.finish()
+    if plan.made_models:
+        progress.start("doors made", FACADES, "façades")
+        measure_made(settings, scratch / "doors", plan, tick)
+        progress.finish()
+    return rows
 
 
 def measure_turned(ground: Ground, scratch: Path, plan: Plan, progress: Progress) -> list[Row]:

@@ -2,18 +2,22 @@
 
 import math
 from collections.abc import Callable
+from pathlib import Path
 
-from .accuracy_case import AVATAR, Ground
+from .accuracy_case import AVATAR, SEED, Ground
 from .accuracy_engine import Archives, Setting
 from .accuracy_plan import Plan
 from .accuracy_row import BUDGET, DEGREE, LEAF, NODES, RADIUS, STEP, TOLERANCE
 from .doorway import doorway_error
 from .leak import leak, leak_places
+from .made_doorway import made_doorways
 
 # Knobs that change no answer: what is felt is what is felt by default.
 ALIKE = (DEGREE, LEAF, NODES)
 FELT = (TOLERANCE, BUDGET, STEP, RADIUS)
 DOOR = "main"
+# How many façades `measure_made` makes, about: twelve for the first model, and a few for each of three others.
+FACADES = 20
 
 
 def measure_felt(
@@ -43,3 +47,17 @@ def measure_felt(
             row.leak_p50_mm, row.leak_p99_mm, row.leak_worst_mm = (
                 default.leak_p50_mm, default.leak_p99_mm, default.leak_worst_mm,
             )  # fmt: skip
+
+
+def measure_made(settings: list[Setting], folder: Path, plan: Plan, tick: Callable[[], None]) -> None:
+    """Fill in the doorway found by making doors, of the plan's models; doorway.py infers it from one wide door.
+
+    folder: an empty one, for the façades.  tick: called after each façade.
+    """
+    own = {s.row.setting: s for s in settings if s.row.knob == RADIUS and s.row.setting in plan.made_models}
+    if not own:
+        return
+    config = next(iter(own.values())).config
+    found = made_doorways(folder, config, list(own), points=plan.points, seed=SEED, tick=tick)
+    for model, doorway in found.items():
+        own[model].row.made_doorway_mm = doorway.error

@@ -31,7 +31,7 @@ def place_labels(
             label, anchor, xytext=(0, 0), textcoords="offset points", fontsize=FONT, color=colour, ha="center",
             va="center", zorder=6, arrowprops={"arrowstyle": "-", "lw": 0.5, "color": colour, "shrinkA": 0},
         )  # fmt: skip
-        text.set_path_effects([withStroke(linewidth=2.5, foreground="white")])  # lines run behind
+        text.set_path_effects([withStroke(linewidth=4.0, foreground="white")])  # lines run behind
         box = text.get_window_extent(renderer)
         half_width, half_height = box.width / 2, box.height / 2
         best, least = (0.0, 0.0), np.inf

@@ -30,7 +30,8 @@ tr.default{background:#efe9dc;font-weight:600}.noisy{color:#a05a00}dt{font-weigh
 HEADS = (
     "setting", "time of a pose [µs]", "p50", "p99", "times default", "early", "late", "unknown",
     "near-tangent: early", "late", "unknown", "distance off, most [mm]", "mean [mm]", "no pair found",
-    "doorway [mm]", "leak p50 [mm]", "p99 [mm]", "worst [mm]", "passed [%]", "archive [bytes]", "decode [ms]",
+    "doorway [mm]", "doors made [mm]", "leak p50 [mm]", "p99 [mm]", "worst [mm]", "passed [%]",
+    "archive [bytes]", "decode [ms]",
     "node tests", "pair tests", "Pareto front",
 )  # fmt: skip
 
@@ -105,8 +106,9 @@ def _cells(row: Row) -> list[str]:
         _small(row.distance_max_mm),
         _small(row.distance_mean_mm),
         str(row.distance_missing or ""),
-        *(_figure(v, 1) for v in (row.doorway_mm, row.leak_p50_mm, row.leak_p99_mm, row.leak_worst_mm)),
-        "" if row.leak_share is None else f"{row.leak_share * 100:.1f}",
+        *(_figure(v, 1) for v in (row.doorway_mm, row.made_doorway_mm)),
+        *(_figure(v, 1) for v in (row.leak_p50_mm, row.leak_p99_mm, row.leak_worst_mm)),
+        "" if row.leak_share is None else f"{row.leak_share * 100:.2f}",
         "" if row.archive_bytes is None else f"{row.archive_bytes:,}",
         _figure(row.decode_ms, 1),
         *(_figure(value, 0) for value in (row.node_tests, row.pair_tests)),

@@ -20,7 +20,8 @@ class Plan:
     loops: timed repetitions of each setting, all settings in turn.  chunk: neighbouring poses timed as one, for the
     percentiles: a call of one pose would measure the call.
     tolerances [m]; budgets [node visits]; steps: of the lattice [m]; factors: on the radii of each radius model.
-    places: where the leak is probed.
+    places: where the leak is probed.  alone: a tolerance without a budget, answered exactly [m].
+    made_models: radius models whose narrowest door is found by making doors, 12 to 20 façades; none: not at all.
     """
 
     points: int = PAPER_POINTS
@@ -38,6 +39,8 @@ class Plan:
     leaves: tuple[int, ...] = (8, 16, 32)
     factors: tuple[float, ...] = (0.5, 1.0, 2.0)
     places: int = 2000
+    alone: float = 1e-2
+    made_models: tuple[str, ...] = ()
 
 
 BRIEF = Plan()
@@ -51,4 +54,6 @@ FULL = Plan(
     degrees=(4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16),
     leaves=(4, 8, 12, 16, 24, 32),
     factors=(0.25, 0.5, 0.75, 1.0, 1.5, 2.0),
+    places=20_000,
+    made_models=("mean", "local", "border", "local+border"),
 )

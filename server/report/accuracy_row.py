@@ -17,7 +17,10 @@ ENGINE, PLAIN = "engine", "plain descent"
 
 # The knobs of the server's own engine.
 TOLERANCE, BUDGET, RADIUS = "tolerance", "budget", "radius model"
+SHEET = "radius model, a thin sheet with a door"
 STEP, DEGREE, LEAF, NODES = "lattice step", "degree", "leaf size", "bounding volume"
+# Behind a tolerance that comes without a budget: answered exactly.
+ALONE = ", alone"
 # What the charts of time against error show: degree and leaf size change no answer, and hardly any time.
 SHOWN = (TOLERANCE, BUDGET, RADIUS, STEP, NODES)
 
@@ -35,7 +38,7 @@ class Row:
     distance_max_mm, distance_mean_mm: |distance - exact distance| [mm].  distance_missing: poses where no pair was
     found though one is in reach.
     doorway_mm (inf: the figure cannot even stand in the door); leak_p50_mm, leak_p99_mm, leak_worst_mm, leak_share:
-    what a user feels, see doorway.py and leak.py.
+    what a user feels, see doorway.py and leak.py.  made_doorway_mm: the doorway by doors made, see made_doorway.py.
     archive_bytes, decode_ms: of a build.  node_tests, pair_tests: means over poses.
     front: against which errors no setting is both faster and better; of those that the charts show.  note: in words.
     """
@@ -63,6 +66,7 @@ class Row:
     distance_mean_mm: float | None = None
     distance_missing: int = 0
     doorway_mm: float | None = None
+    made_doorway_mm: float | None = None
     leak_p50_mm: float | None = None
     leak_p99_mm: float | None = None
     leak_worst_mm: float | None = None

@@ -1,9 +1,10 @@
 """What the accuracy report says in words: terms, a paragraph a knob, and what the figures come to."""
 
+import math
 from collections.abc import Sequence
 
 from .accuracy_arithmetic import ALL_PAIRS, ARITHMETIC, PRIMITIVE, VOLUME
-from .accuracy_row import BUDGET, DEGREE, LEAF, NODES, RADIUS, STEP, TOLERANCE, Row
+from .accuracy_row import ALONE, BUDGET, DEGREE, LEAF, NODES, RADIUS, SHEET, STEP, TOLERANCE, Row
 
 TERMS = {
     "pose": "where the avatar stands and how it is turned; each is one question: does it touch the scan there?",
@@ -17,6 +18,8 @@ TERMS = {
     "distance off": "how far the distance that is reported lies from the exact one.",
     "doorway": "how much wider than the figure a door must be made before the figure passes it upright along the "
     "middle. 0 would be perfect; the spheres that stand for the door's points make it narrower than it is.",
+    "doors made": "the same found the long way: façades are made with narrower and narrower doors, each is scanned and "
+    "walked through. A narrow door's jambs are seen at a smaller angle, so more sparsely.",
     "leak": "how far a ball of 5 cm radius is past a wall's true surface when it is stopped: where points stand "
     "thinly, it slips in between. Negative: stopped before the surface. A ball that goes through counts 100 mm.",
     "passed": "the share of places where that ball goes right through the wall.",
@@ -39,8 +42,10 @@ _PLAIN = (
 )
 
 KNOBS = {
-    TOLERANCE: "How early contact may be called [m]. An answer within a tolerance is found by another search, which "
-    "keeps bounds; it is the right choice where a bound is wanted, not where an answer is.",
+    TOLERANCE: "How early contact may be called [m]. A tolerance alone is answered exactly, for that is the fastest: "
+    "see the row `alone`. What the other rows show is the search that a budget asks for: it keeps bounds, may stop as "
+    "soon as they are within the tolerance, and says how far it got if the budget is spent. Here the budget is never "
+    "spent, so that the tolerance alone makes the difference.",
     BUDGET: "How many nodes may be looked at for one pose. When they are spent the answer is unknown: never a wrong "
     "clear.",
     STEP: "How fine the lattice is on which points are stored. The radius is held at the default's, so only the "
@@ -53,6 +58,9 @@ KNOBS = {
     RADIUS: "How large a sphere stands for each point: one mean for all (the paper's), one after the spacing around "
     "each point (local), smaller ones on the rims of surfaces (border), or a fixed figure; a number behind a colon is "
     "a factor. Early and late are counted against `mean`: here they say what differs, not what is wrong.",
+    SHEET: "What smaller spheres on rims are for. A sheet without thickness with a door of 1 m in it: all that the "
+    "figure can meet is the rim. The façade's jambs are planes 1.2 m deep, with hardly a point on a rim: `border` "
+    "changes next to nothing there. The ball is pushed at the sheet away from its rims.",
     ARITHMETIC: _PLAIN + "The test of two points in five kinds of arithmetic. Map coordinates are those of a scene at "
     "500 km east and 5,600 km north; the other kinds count from a place near the avatar or from the scan's origin.",
     VOLUME: _PLAIN + "Two leaves are compared as the server does it: the avatar's points are first held against the "
@@ -68,7 +76,8 @@ KNOBS = {
 
 def findings(rows: Sequence[Row]) -> list[str]:
     """What the figures come to, in sentences; each is left out where its settings were not measured."""
-    said = [_exact(rows), _tolerance(rows), _budget(rows), _lattice(rows), _radius(rows), _arithmetic(rows)]
+    said = [_exact(rows), _tolerance(rows), _budget(rows), _lattice(rows), _radius(rows), _made(rows)]
+    said += [_sheet(rows), _arithmetic(rows)]
     said += [_volumes(rows, ""), _volumes(rows, ", turned"), _cubes(rows)]
     return [line for line in said if line]
 
@@ -93,17 +102,19 @@ def _exact(rows: Sequence[Row]) -> str:
 
 
 def _tolerance(rows: Sequence[Row]) -> str:
-    exact = _find(rows, TOLERANCE)
-    allowed = [r for r in rows if r.knob == TOLERANCE and not r.default and r.times is not None]
-    if exact is None or not allowed:
+    own = [r for r in rows if r.knob == TOLERANCE and not r.default and r.times is not None]
+    searches = [r for r in own if not r.setting.endswith(ALONE)]
+    alone = next((r for r in own if r.setting.endswith(ALONE)), None)
+    if not searches or alone is None:
         return ""
-    best = min(allowed, key=lambda r: r.times or 0.0)
-    if (best.times or 0.0) < 1.0:
-        return f"A tolerance of {best.setting} takes {best.times:.2f} times the time of the exact answer."
-    return (
-        f"A tolerance buys no time: at best, with {best.setting}, it takes {best.times:.1f} times as long as the "
-        f"exact answer, and calls {best.early:,} of {best.poses:,} poses early. Ask for one where bounds are wanted."
+    best = min(searches, key=lambda r: r.times or 0.0)
+    said = (
+        f"A tolerance alone is answered exactly: {alone.early + alone.late} of {alone.poses:,} verdicts are wrong with "
+        f"{alone.setting.removesuffix(ALONE)}, in {alone.times:.2f} times the time of the exact answer. "
+        f"A budget asks for a search that may stop within the tolerance: at best, {best.setting}, it takes "
+        f"{best.times:.2f} times the time of the exact answer, and calls {best.early:,} of {best.poses:,} poses early"
     )
+    return f"{said}." if (best.times or 0.0) < 1.0 else f"{said}: it buys no time, but bounds the work."
 
 
 def _budget(rows: Sequence[Row]) -> str:
@@ -144,6 +155,30 @@ def _radius(rows: Sequence[Row]) -> str:
         if r.doorway_mm is not None and r.leak_p99_mm is not None
     ]
     return "Radius models, doorway and 99th percentile of the leak: " + "; ".join(parts) + "."
+
+
+def _made(rows: Sequence[Row]) -> str:
+    known = [r for r in rows if r.made_doorway_mm is not None and r.doorway_mm is not None]
+    if not known:
+        return ""
+    parts = [f"{r.setting} {_door(r.made_doorway_mm)} (inferred: {_door(r.doorway_mm)})" for r in known]
+    return "Doorway by doors that were made narrower and narrower: " + "; ".join(parts) + "."
+
+
+def _door(error: float | None) -> str:
+    """A doorway's error in words."""
+    return f"{error:.0f} mm" if error is not None and math.isfinite(error) else "none passes"
+
+
+def _sheet(rows: Sequence[Row]) -> str:
+    own = {r.setting: r for r in rows if r.knob == SHEET and r.doorway_mm is not None}
+    pairs = [(r, own[f"border{name[4:]}"]) for name, r in own.items() if name.startswith("mean:")]
+    parts = [
+        f"at {mean.value:g} times the mean radius {_door(mean.doorway_mm)} with mean, {_door(border.doorway_mm)} with "
+        f"border, leaks (p99) {mean.leak_p99_mm or 0.0:.0f} and {border.leak_p99_mm or 0.0:.0f} mm"
+        for mean, border in pairs
+    ]
+    return "Doorway of a thin sheet, where a surface ends: " + "; ".join(parts) + "." if parts else ""
 
 
 def _arithmetic(rows: Sequence[Row]) -> str:

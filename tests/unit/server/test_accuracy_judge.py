@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,7 +22,7 @@ from solidcloud.server.report.accuracy_case import (
     given_ground,
     turned_ground,
 )
-from solidcloud.server.report.accuracy_engine import Archives, Exact, Setting, judge_engine
+from solidcloud.server.report.accuracy_engine import UNSPENT, Archives, Exact, Setting, judge_engine
 from solidcloud.server.report.accuracy_plan import Plan
 from solidcloud.server.report.accuracy_row import BUDGET, DEGREE, TOLERANCE, Row
 
@@ -88,22 +89,30 @@ def test_a_volume_that_changed_an_answer_would_be_an_error(judged: Judged) -> No
 
 
 @pytest.mark.parametrize(
-    ("knob", "contact", "said"),
-    [(DEGREE, False, "differ from"), (TOLERANCE, True, "called clear"), (BUDGET, True, "clear")],
+    ("knob", "contact", "said", "options"),
+    [
+        (DEGREE, False, "differ from", {}),
+        (TOLERANCE, False, "differ from", {}),
+        (TOLERANCE, False, "differ from", {"tolerance": 0.01}),
+        (TOLERANCE, True, "called clear", {"tolerance": 0.01, "budget_visits": UNSPENT}),
+        (BUDGET, True, "called clear", {"budget_visits": UNSPENT}),
+    ],
 )
 def test_a_knob_that_changed_what_it_must_not_would_be_an_error(
-    judged: Judged, knob: str, contact: bool, said: str
+    judged: Judged, knob: str, contact: bool, said: str, options: dict[str, Any]
 ) -> None:
     everywhere = np.full(len(judged.exact.contact), contact)
     wrong = judged.exact._replace(contact=everywhere)
     for exact, fails in ((judged.exact, False), (wrong, True)):
-        settings = [Setting(Row(knob, "as it is"), CONFIG, {})]
+        settings = [Setting(Row(knob, "as it is"), CONFIG, options)]
         if fails:
             with pytest.raises(InternalError, match=said):
                 judge_engine(settings, judged.archives, judged.ground, exact, lambda: None)
         else:
             judge_engine(settings, judged.archives, judged.ground, exact, lambda: None)
-            assert settings[0].row.wrong_share == 0 and settings[0].row.decode_ms
+            row = settings[0].row
+            assert row.late == row.unknown == 0 and row.decode_ms
+            assert (row.early > 0) == (options == {"tolerance": 0.01, "budget_visits": UNSPENT})
 
 
 def test_the_turned_scene_is_the_same_scene(judged: Judged, tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from solidcloud.server.report.accuracy_labels import place_labels
 from solidcloud.server.report.accuracy_page import table, write_page
 from solidcloud.server.report.accuracy_picture import draw_charts, points_of
 from solidcloud.server.report.accuracy_plan import BRIEF
-from solidcloud.server.report.accuracy_row import PLAIN, RADIUS, STEP, TOLERANCE, Row, mark_front
+from solidcloud.server.report.accuracy_row import PLAIN, RADIUS, SHEET, STEP, TOLERANCE, Row, mark_front
 from solidcloud.server.report.accuracy_words import KNOBS, findings
 from solidcloud.server.report.spheres import load_pyplot
 
@@ -37,8 +37,15 @@ def all_rows() -> list[Row]:
         rows.append(Row(knob, kind.name, by=PLAIN))
         if knob in (VOLUME, PRIMITIVE):
             rows.append(Row(f"{knob}, turned", kind.name, by=PLAIN))
+    for name, factor, door, leak in (
+        ("mean", 1.0, -2.5, -11.6),
+        ("mean:3", 3.0, 33.4, -21.0),
+        ("border", 1.0, -10.0, -11.6),
+        ("border:3", 3.0, 7.0, -20.0),
+    ):
+        rows.append(Row(SHEET, name, factor, name == "mean", doorway_mm=door, leak_p99_mm=leak))
     rows.sort(key=lambda row: list(KNOBS).index(row.knob))
-    for row in rows:
+    for row in (row for row in rows if row.knob != SHEET):
         scale = 1.0 if row.default else float(rng.uniform(0.9, 12))
         row.mean_us, row.p50_us, row.p99_us, row.times = 3.5 * scale, 3 * scale, 9 * scale, scale
         row.noise, row.poses, row.tangent = 1.0, 2400, 400
@@ -110,6 +117,8 @@ def test_the_default_stands_once_in_a_chart() -> None:
     points = points_of(all_rows(), "doorway")
     assert [p.label for p in points].count("default") == 1
     assert len({p.label for p in points}) == len(points), "two points of one name"
+    assert "search within 1 cm" in {p.label for p in points}
+    assert not any("alone" in p.label for p in points), "the default once more"
 
 
 def test_columns_that_nobody_filled_are_left_out_and_a_door_nobody_passes_is_said() -> None:
@@ -120,18 +129,29 @@ def test_columns_that_nobody_filled_are_left_out_and_a_door_nobody_passes_is_sai
     rows[1].doorway_mm, rows[1].early = float("inf"), 2
     html = table(rows)
     assert "does not pass" in html and "2 of 5" in html and "(default)" in html
-    assert "decode" not in html and "near-tangent" not in html
+    assert "decode" not in html and "doors made" not in html and "near-tangent" not in html
 
 
 def test_the_findings_follow_from_the_rows() -> None:
     rows = all_rows()
     slow = " ".join(findings(rows))
+    assert "it buys no time" in slow
     for row in rows:
-        if row.knob == TOLERANCE and not row.default:
-            row.times = 0.5
+        if row.setting == "search within 5 cm":
+            row.times, row.early = 0.5, 77
+        if row.setting == "1 cm, alone":
+            row.times, row.early = 1.25, 0
     fast = " ".join(findings(rows))
-    assert "buys no time" not in fast and "0.50 times the time of the exact" in fast
-    assert slow != fast
+    assert "buys no time" not in fast
+    assert "0 of 2,400 verdicts are wrong with 1 cm, in 1.25 times the time of the exact" in fast
+    assert (
+        "search within 5 cm, it takes 0.50 times the time of the exact" in fast
+        and "calls 77 of 2,400" in fast
+    )
+    assert "narrower and narrower" not in fast, "no doors were made"
+    next(row for row in rows if row.setting == "local").made_doorway_mm = 31.2
+    assert "narrower: local 31 mm (inferred" in " ".join(findings(rows))
+    assert "at 3 times the mean radius 33 mm with mean, 7 mm with border, leaks (p99) -21 and -20 mm" in fast
     by_name = {row.setting: row for row in rows if row.knob == VOLUME}
     for sphere, box, said in ((9.0, 2.0, "Groups of boxes beat"), (2.0, 9.0, "Groups of spheres beat")):
         by_name["sphere"].mean_us, by_name["box"].mean_us = sphere, box

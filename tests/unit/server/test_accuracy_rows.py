@@ -4,13 +4,16 @@ import json
 import math
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from solidcloud.server.report import accuracy_timing
+from solidcloud.builder.config import BuildConfig
+from solidcloud.server.report import accuracy_felt, accuracy_timing
 from solidcloud.server.report.accuracy import Report, write_rows
-from solidcloud.server.report.accuracy_engine import engine_settings, length_name
-from solidcloud.server.report.accuracy_plan import BRIEF, FULL
+from solidcloud.server.report.accuracy_engine import engine_settings, length_name, radius_settings
+from solidcloud.server.report.accuracy_felt import measure_made
+from solidcloud.server.report.accuracy_plan import BRIEF, FULL, Plan
 from solidcloud.server.report.accuracy_row import (
     COLUMNS,
     RADIUS,
@@ -23,6 +26,7 @@ from solidcloud.server.report.accuracy_row import (
     mark_front,
 )
 from solidcloud.server.report.accuracy_timing import Timed, take_times
+from solidcloud.server.report.doorway import Doorway
 
 
 def test_early_late_and_unknown_are_told_apart() -> None:
@@ -139,6 +143,29 @@ def test_every_knob_has_one_default_and_its_other_settings_differ(plan: object) 
         own = [s for s in settings if s.row.knob == knob]
         assert sum(s.row.default for s in own) == 1, knob
         assert len({(str(s.config), str(s.options)) for s in own}) == len(own), knob
+
+
+def test_doors_are_made_for_the_models_of_the_plan_and_fill_their_rows_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plan = Plan(points=9000, made_models=("mean", "local+border"))
+    settings = [*engine_settings(plan, 1e-3, 0.0124), *radius_settings(plan, 1e-3, 0.0124)]
+    asked = {}
+
+    def made(folder: Path, config: BuildConfig, models: list[str], **others: Any) -> dict[str, Doorway]:
+        asked.update(others, models=models, stored=config.models, step=config.resolution)
+        others["tick"]()
+        return {"mean": Doorway(0.58, 0.555, 25.0), "local+border": Doorway(math.inf, 0.555, math.inf)}
+
+    monkeypatch.setattr(accuracy_felt, "made_doorways", made)
+    ticks: list[None] = []
+    measure_made(settings, tmp_path, plan, lambda: ticks.append(None))
+    found = {s.row.setting: s.row.made_doorway_mm for s in settings if s.row.made_doorway_mm is not None}
+    assert found == {"mean": 25.0, "local+border": math.inf} and len(ticks) == 1
+    assert asked["models"] == ["mean", "local+border"] and asked["points"] == 9000 and asked["seed"] == 2012
+    assert asked["stored"] == {"mean", "local", "border"} and asked["step"] == 1e-3
+    assert BRIEF.made_models == () and set(FULL.made_models) == {"mean", "local", "border", "local+border"}
+    assert FULL.places == 20_000
 
 
 def test_lengths_are_named_as_people_say_them() -> None:

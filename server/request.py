@@ -103,9 +103,13 @@ def with_radius_model(data: SceneData, archive: Archive, text: str | None) -> Sc
 
     Raises BadRequestError for a model that is none, or that the archive does not hold.
     """
-    radii = class_radii(text, archive.header.radius, archive.header.models)
-    largest = int(radii.max())
-    return data._replace(arrays=data.arrays._replace(drop=largest - radii), radius_units=largest)
+    header = archive.header
+    radii = class_radii(text, header.radius, header.models)
+    # Of the classes that there are: on a dense scan all are small, and so is what is in reach. A node may have a class
+    # that no point has; its points' spheres are none the larger.
+    largest = int(radii[header.radius_counts > 0].max()) if len(radii) > 1 else int(radii[0])
+    drop = np.maximum(largest - radii, 0)
+    return data._replace(arrays=data.arrays._replace(drop=drop), radius_units=largest)
 
 
 def _empty_reach(k: int, rows: int) -> Reach:

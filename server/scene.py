@@ -236,7 +236,8 @@ class Scene:
         **options: Unpack[QuestionOptions],
     ) -> SweepAnswers:
         """When avatar `name` first touches the scene on its way between poses; see server/sweep.py."""
-        data, effort = self._terms(**{"tolerance": 1e-6, **options})
+        options.setdefault("tolerance", 1e-6)
+        data, effort = self._terms(**options)
         avatar = self._avatar(name, client)
         return sweep(data, avatar, pose_from, pose_to, margin, effort.tolerance, effort)
 

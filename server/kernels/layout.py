@@ -190,20 +190,20 @@ def lay_classes(links, classes, ints, where):
     block = classes.shape[0]
     for node in range(first.shape[0] - 1, -1, -1):  # children stand after their parents
         row = where[0] + node * ROW_WORDS
-        largest, all_rim = 0, RIM_BIT
+        largest, all_rim = np.int64(0), np.int64(RIM_BIT)
         if is_leaf[node]:
             block -= 1
             at = where[1] + block * CLASSED_BLOCK_WORDS + CLASSES
             for word in range(LANES // 4):
-                packed = 0
+                packed = np.int64(0)
                 for k in range(4):
                     packed |= np.int64(classes[block, 4 * word + k]) << (8 * k)
                 ints[at + word] = packed
             for lane in range(LANES):  # the last one's is repeated, so it changes nothing
                 own = np.int64(classes[block, lane])
-                largest, all_rim = max(largest, own & LOCAL_MASK), all_rim & own
+                largest, all_rim = np.int64(max(largest, own & LOCAL_MASK)), all_rim & own
         else:
             for child in range(first[node], first[node] + (ints[row + COUNT] & COUNTED)):
                 own = np.int64(ints[where[0] + child * ROW_WORDS + COUNT]) >> CLASS_SHIFT
-                largest, all_rim = max(largest, own & LOCAL_MASK), all_rim & own
+                largest, all_rim = np.int64(max(largest, own & LOCAL_MASK)), all_rim & own
         ints[row + COUNT] = (ints[row + COUNT] & COUNTED) | ((largest | all_rim) << CLASS_SHIFT)

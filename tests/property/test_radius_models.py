@@ -110,3 +110,15 @@ def test_a_model_the_archive_does_not_hold_is_refused(tmp_path: Path) -> None:
             scene.collide("avatar", pose, radius_model="border")
         with pytest.raises(BadRequestError, match="expected mean, local"):
             scene.collide("avatar", pose, radius_model="nearest")
+
+
+@pytest.mark.interpreted
+def test_reach_is_that_of_the_largest_sphere_there_is(tmp_path: Path) -> None:
+    # A grid of 1 cm: spheres of a few millimetres, though the ladder goes to 32 mm.
+    grid = np.stack(np.meshgrid(*[np.arange(6) * 0.01] * 3), axis=-1).reshape(-1, 3)
+    case = cases.build(tmp_path, grid, models=frozenset({"mean", "local"}), radius=0.02)
+    _, radii = classes.stored_radii(case.archive, "local")
+    with Scene.open(case.archive) as scene:
+        data = scene._radius_model("local")
+        assert data.radius_units == radii.max() < 0.02 * naive.UNITS
+        assert data.arrays.drop.min() == 0 and data.arrays.drop.max() > 0

@@ -73,7 +73,7 @@ def table(kept: Results) -> list[str]:
     ]
     sums = [0] * 6
     for file, own in sorted(kept.files.items()):
-        counts = [own.counted(), *(len(own.rows(kind)) for kind in kinds)]
+        counts = [own.counted(), *map(own.count, kinds)]
         sums = [a + b for a, b in zip(sums, counts, strict=True)]
         sampled = f"{counts[0]}, all" if own.complete else str(counts[0])
         now = digest((ROOT / file).read_bytes()) if (ROOT / file).is_file() else ""
@@ -112,7 +112,7 @@ def survivors(kept: Results) -> tuple[list[str], int]:
     of = {change: group.reason for group in reasons() for change in group.changes}
     grouped: dict[str, list[str]] = defaultdict(list)
     for file, own in sorted(kept.files.items()):
-        for row in own.rows(PASSED):
+        for row in own.survivors():
             was, now = map(marked, differing(row["was"], row["now"]))
             grouped[of.get(change_of(file, row), "")].append(
                 f"- {file}:{row['line']} `{row['function'] or 'module'}`: {was} → {now}"

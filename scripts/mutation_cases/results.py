@@ -28,7 +28,7 @@ def digest_tests(folder: Path, tests: tuple[str, ...]) -> str:
 class FileResults:
     """Those of one file. source, tests: digests.  complete: no mutant is left.  tried: key -> its row.
 
-    A row: line, function, was, now of the mutant, and kind, test, what of the outcome.  again: keys of those that
+    A row: of a survivor its line, function, was and now, of another the kind of its outcome.  again: keys of those that
     survived other tests than there are now; they are to be tried again, whatever the size of the sample, or a larger
     share would seem killed than is.
     """
@@ -37,7 +37,7 @@ class FileResults:
     tests: str
     seed: int
     complete: bool = False
-    tried: dict[str, dict[str, Any]] = field(default_factory=dict)
+    tried: dict[str, dict[str, Any] | str] = field(default_factory=dict)
     again: list[str] = field(default_factory=list)
     owner: "Results | None" = None
 
@@ -54,24 +54,26 @@ class FileResults:
     def add(self, mutant: Mutant, outcome: Outcome) -> None:
         """Take up an outcome."""
         self.again = [key for key in self.again if key != mutant.key]
-        self.tried[mutant.key] = {
-            **{name: getattr(mutant, name) for name in ("line", "function", "was", "now")},
-            **{name: getattr(outcome, name) for name in ("kind", "test", "what")},
-        }
+        survivor = {name: getattr(mutant, name) for name in ("line", "function", "was", "now")}
+        self.tried[mutant.key] = survivor if outcome.kind == PASSED else outcome.kind
         if self.owner and len(self.tried) % EVERY == 0:
             self.owner.save()
 
-    def rows(self, *kinds: str) -> list[dict[str, Any]]:
-        """Rows of these kinds, in the order of the source."""
-        return sorted((r for r in self.tried.values() if r["kind"] in kinds), key=lambda row: row["line"])
+    def count(self, kind: str) -> int:
+        """How many ended so."""
+        return sum(row == kind for row in self.tried.values()) if kind != PASSED else len(self.survivors())
+
+    def survivors(self) -> list[dict[str, Any]]:
+        """Their rows, in the order of the source."""
+        return sorted((r for r in self.tried.values() if isinstance(r, dict)), key=lambda row: row["line"])
 
     def counted(self) -> int:
         """How many count: all but those that the compiler would have refused."""
-        return sum(row["kind"] != REFUSED for row in self.tried.values())
+        return len(self.tried) - self.count(REFUSED)
 
     def killed(self) -> int:
         """How many of them a test noticed."""
-        return sum(row["kind"] not in (REFUSED, PASSED) for row in self.tried.values())
+        return self.counted() - self.count(PASSED)
 
 
 class Results:
@@ -88,8 +90,8 @@ class Results:
         if own is None or (own.source, own.seed) != (digest(source.encode()), seed):
             own = FileResults(digest(source.encode()), tests, seed)
         elif own.tests != tests:
-            own.again += [key for key, row in own.tried.items() if row["kind"] == PASSED]
-            own.tried = {key: row for key, row in own.tried.items() if row["kind"] != PASSED}
+            own.again += [key for key, row in own.tried.items() if isinstance(row, dict)]
+            own.tried = {key: row for key, row in own.tried.items() if not isinstance(row, dict)}
             own.tests = tests
         own.complete, own.owner = False, self
         self.files[file] = own

@@ -101,6 +101,8 @@ def test_a_cell_may_be_full() -> None:
     assert set(split_octree(codes, 6, 5, 40)[1].tolist()) == {5}, (
         "cells above the largest are split, full or not"
     )
+    corners = np.arange(8, dtype=np.uint64)
+    assert [column.tolist() for column in split_octree(corners, 1, 1, 7)] == [list(range(8)), [0] * 8]
 
 
 @pytest.mark.interpreted

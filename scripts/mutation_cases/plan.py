@@ -57,6 +57,7 @@ TESTS: dict[str, tuple[str, ...]] = {
         BUILDER + "test_neighbours.py::test_ties_go_to_lesser_coordinates",
         BUILDER + "test_neighbours.py::test_a_distance_at_the_limit_counts",
         BUILDER + "test_neighbours.py::test_boxes_hold_their_points",
+        BUILDER + "test_neighbours.py::test_the_order_of_points_changes_nothing",
     ),
     "builder/kernels/content.py": (BUILDER + "test_content.py",),
     "builder/kernels/enclosure.py": (BUILDER + "test_enclosure.py",),

@@ -7,7 +7,7 @@ import numpy as np
 
 FONT = 9.0
 # Where a label may stand, in points from its anchor: beside it first, then farther off with a line to it.
-NEAR, FAR, FARTHER = 9.0, 26.0, 44.0
+NEAR, FAR, FARTHER = 11.0, 27.0, 45.0
 TURNS = 16
 
 

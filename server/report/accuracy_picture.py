@@ -165,7 +165,7 @@ def _scatter(panel: Any, points: list[Point], error: str) -> Wanted:
     sizes = [p.error for p in points]
     panel.set_xscale("log")
     times = [p.time for p in points]
-    panel.set_xlim(min(times) / 1.5, max(times) * 2.5)
+    panel.set_xlim(min(times) / 1.5, max(times) * 3.0)
     if error in LEAST:
         least = LEAST[error]
         panel.set_yscale("symlog", linthresh=least, linscale=0.4)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from solidcloud.server.report import accuracy_picture
 from solidcloud.server.report.accuracy import Report
 from solidcloud.server.report.accuracy_arithmetic import PRIMITIVE, VOLUME, plain_settings
 from solidcloud.server.report.accuracy_engine import engine_settings, radius_settings
@@ -119,6 +120,26 @@ def test_the_default_stands_once_in_a_chart() -> None:
     assert len({p.label for p in points}) == len(points), "two points of one name"
     assert "search within 1 cm" in {p.label for p in points}
     assert not any("alone" in p.label for p in points), "the default once more"
+
+
+def test_points_that_coincide_share_a_label_and_what_stops_a_ball_early_is_drawn_at_the_edge(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said: list[list[str]] = []
+    monkeypatch.setattr(
+        accuracy_picture, "place_labels", lambda panel, anchors, labels, colours: said.append(list(labels))
+    )
+    rows = all_rows()
+    for row in rows:
+        if row.setting in ("search within 1 mm", "search within 2 mm", "search within 5 cm"):
+            row.mean_us, row.doorway_mm, row.leak_p99_mm = 20.0, 30.0, -64.0 if "5 cm" in row.setting else 7.0
+    accuracy_picture.draw_scatter(rows, ("doorway", "leak"), "made façade", tmp_path / "chart.png")
+    doors, walls, trade = said
+    assert "search within 1 mm to 5 cm" in doors  # three of one place
+    assert "search within 1 mm, 2 mm" in walls and "search within 5 cm: -64 mm" in walls
+    assert any(label.startswith("default") for label in walls) and any("mean, default" in t for t in trade)
+    for model in ("mean:0.5", "local", "border:2", "local+border", "fixed:0.02"):
+        assert sum(model in label.split("\n") for label in trade) == 1, model
 
 
 def test_columns_that_nobody_filled_are_left_out_and_a_door_nobody_passes_is_said() -> None:

@@ -9,6 +9,8 @@ FONT = 9.0
 # Where a label may stand, in points from its anchor: beside it first, then farther off with a line to it.
 NEAR, FAR, FARTHER = 11.0, 27.0, 45.0
 TURNS = 16
+# How far a star or a ring reaches from its middle, in points.
+MARK = 8.0
 
 
 def place_labels(
@@ -25,7 +27,8 @@ def place_labels(
     scale = figure.dpi / 72
     spots = panel.transData.transform(np.asarray(anchors, float))
     frame = panel.get_window_extent(renderer)
-    taken = [(x - 5 * scale, y - 5 * scale, x + 5 * scale, y + 5 * scale) for x, y in spots]
+    half = MARK * scale
+    taken = [(x - half, y - half, x + half, y + half) for x, y in spots]
     for (x, y), anchor, label, colour in zip(spots, anchors, labels, colours, strict=True):
         text = panel.annotate(
             label, anchor, xytext=(0, 0), textcoords="offset points", fontsize=FONT, color=colour, ha="center",

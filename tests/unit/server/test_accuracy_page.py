@@ -150,7 +150,9 @@ def test_columns_that_nobody_filled_are_left_out_and_a_door_nobody_passes_is_sai
     rows[1].doorway_mm, rows[1].early = float("inf"), 2
     html = table(rows)
     assert "does not pass" in html and "2 of 5" in html and "(default)" in html
-    assert "decode" not in html and "doors made" not in html and "near-tangent" not in html
+    assert "decode" not in html and "made doorway" not in html and "near-tangent" not in html
+    rows[0].made_doorway_mm = 12.34
+    assert "<th>made doorway [mm]</th>" in table(rows) and "<td>12.3</td>" in table(rows)
 
 
 def test_the_findings_follow_from_the_rows() -> None:

@@ -17,7 +17,7 @@ from ...kernels.layout import LANES
 from ...kernels.placing import lattice_to_units, place, to_units
 
 FLOAT32, FLOAT64, CERTIFIED, INTEGERS, FLOAT32_WORLD, CUBES = range(6)
-# Where FLOAT32_WORLD has the scene stand: map coordinates of central Europe, UTM zone 32 [m].
+# Where FLOAT32_WORLD has the dataset's origin stand, wherever that is: UTM zone 32, central Europe [m].
 MAP_X, MAP_Y = 500_000.0, 5_600_000.0
 U32 = 2.0**-24  # half a unit in the last place of 1, float32
 
@@ -89,7 +89,7 @@ def place_points(kind, points, m, shift, frame, block, lattice, lanes):
     """Place a block of the avatar, points (b, 3, LANES) float64 [m], as `kind` has it. frame: (3,) int64 lattice."""
     for r in range(3):
         base = np.float64(frame[r]) * lattice.step
-        offset = lattice.origin[r] + (MAP_X if r == 0 else MAP_Y if r == 1 else 0.0)
+        offset = MAP_X if r == 0 else MAP_Y if r == 1 else 0.0
         for j in range(LANES):
             world = place(m, shift, r, points[block, 0, j], points[block, 1, j], points[block, 2, j])
             if kind in (FLOAT32, CERTIFIED):
@@ -106,7 +106,7 @@ def place_points(kind, points, m, shift, frame, block, lattice, lanes):
 def take_points(kind, low, steps, frame, block, lattice, lanes):
     """Make block 0 of `lanes` of a scene's block, as `kind` has it. low: (b, 3) int64, steps: (b, 3, LANES) uint16."""
     for r in range(3):
-        base, offset = low[block, r], lattice.origin[r] + (MAP_X if r == 0 else MAP_Y if r == 1 else 0.0)
+        base, offset = low[block, r], MAP_X if r == 0 else MAP_Y if r == 1 else 0.0
         for j in range(LANES):
             step = base + np.int64(steps[block, r, j])
             if kind in (FLOAT32, CERTIFIED):

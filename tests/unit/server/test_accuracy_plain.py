@@ -86,6 +86,18 @@ def test_distances_are_those_of_the_nearest_pair(made: Made, leaf: int) -> None:
         assert distance == pytest.approx(min(expected, FARTHEST), abs=1e-7)
 
 
+def test_map_coordinates_are_those_of_one_place_wherever_the_scan_is(made: Made) -> None:
+    """A scan that has map coordinates already is not moved as far again."""
+    there = np.array([691_000.0, 5_334_000.0, 520.0])
+    lattice, poses = made.plain.lattice, made.poses.copy()
+    poses[:, :3, 3] += there
+    moved = made.plain._replace(lattice=lattice._replace(origin=lattice.origin + there))
+    rough = Kind("", 0, FLOAT32_WORLD)
+    found = distances(moved, rough, poses, FARTHEST)
+    assert found.tolist() == distances(made.plain, rough, made.poses, FARTHEST).tolist()
+    assert len(np.unique(found)) > 1
+
+
 def test_boxes_are_those_of_the_points_below(made: Made) -> None:
     forest, step = made.plain.forest, made.plain.lattice.step
     lanes = (forest.low[:, :, None] + forest.steps.astype(np.int64)) * step

@@ -35,13 +35,13 @@ class Descent(NamedTuple):
     """Scratch of one call, beside `Best`.
 
     stack: (STACK, 3) int64, scene nodes to look into: row, where its list of front nodes begins, length.
-    pairs: (STACK, 2) int64, node pairs below the front: avatar node, row; pair_keys: (STACK,) float32, their lower
-    bounds.  off: (3,) float32, from the frame to the voxel's low corner.
+    below: (STACK,) int64, avatar nodes below its front; keys: (STACK,) float32, their lower bounds.
+    off: (3,) float32, from the frame to the voxel's low corner.
     """
 
     stack: NDArray[np.int64]
-    pairs: NDArray[np.int64]
-    pair_keys: NDArray[np.float32]
+    below: NDArray[np.int64]
+    keys: NDArray[np.float32]
     off: NDArray[np.float32]
 
 
@@ -50,7 +50,7 @@ def make_descent():
     """Scratch."""
     return Descent(
         np.empty((STACK, 3), np.int64),
-        np.empty((STACK, 2), np.int64),
+        np.empty(STACK, np.int64),
         np.empty(STACK, np.float32),
         np.empty(3, np.float32),
     )
@@ -102,59 +102,48 @@ def _search_leaves(m, a, row, avatar, placed, scene, spot, best, off):
 
 
 @borrowing
-def _push(stack, keys, begin, depth, a, row, key):
-    """Put a pair into stack[begin:depth], which descends by key; the least lies on top."""
+def _push(below, keys, begin, depth, a, key):
+    """Put a node into below[begin:depth], which descends by key; the least lies on top."""
     at = depth
     while at > begin and keys[at - 1] < key:
-        stack[at, 0], stack[at, 1], keys[at] = stack[at - 1, 0], stack[at - 1, 1], keys[at - 1]
+        below[at], keys[at] = below[at - 1], keys[at - 1]
         at -= 1
-    stack[at, 0], stack[at, 1], keys[at] = a, row, key
+    below[at], keys[at] = a, key
 
 
 @borrowing
-def _search_pairs(avatar, m, pose, a, row, placed, scene, spot, best, descent):
-    """Search the subtrees of two nodes for a nearer pair, both descended, depth first, the nearest child first: for
-    avatars whose front is not their leaf nodes."""
-    words, ints, nodes = scene.words, scene.ints, placed.nodes
-    avatar_first, avatar_count = avatar.first, avatar.count
-    stack, keys, off, cut, base = descent.pairs, descent.pair_keys, descent.off, best.cut, spot[0]
-    mask = best.mask
-    stack[0, 0], stack[0, 1], keys[0] = a, row, np.float32(-1.0)
+def _search_below(avatar, m, pose, a, row, placed, scene, spot, best, descent):
+    """Search a leaf node of the scene for a point nearer to one below a node of the avatar's front, which is descended,
+    depth first, the nearest child first. For avatars whose front is not their leaf nodes."""
+    words, nodes, firsts, held = scene.words, placed.nodes, avatar.first, avatar.count
+    below, keys, off, cut = descent.below, descent.keys, descent.off, best.cut
+    of_class = node_class(scene.ints, row, best.mask)
+    below[0], keys[0] = a, np.float32(-1.0)
     depth = 1
     while depth > 0:
         depth -= 1
-        a, row = stack[depth, 0], stack[depth, 1]
-        within = cut[node_class(ints, row, mask)]
+        a, within = below[depth], cut[of_class]
         if keys[depth] > within:
             continue
-        a_first, b_first = np.int64(avatar_first[a]), np.int64(ints[row + FIRST])
-        begin = depth
-        if a_first < 0 and b_first < 0:
+        a_first = np.int64(firsts[a])
+        if a_first < 0:
             block = ~a_first
             if placed.stamp[block] != pose:
                 place_lanes(avatar.points, m, block, placed.lanes, placed.shift, placed.frame, scene.step)
                 placed.stamp[block] = pose
             if keep_near(placed.lanes, block, words, row, off[0], off[1], off[2], within, best.keep):
                 _search_leaves(m, a, row, avatar, placed, scene, spot, best, off)
-        elif b_first < 0 or (a_first >= 0 and nodes[3, a] > words[row + 3]):
-            best.counters[0] += avatar_count[a]
-            for child in range(a_first, a_first + avatar_count[a]):
-                key = lower_bound(
-                    words, row, nodes[0, child] - off[0], nodes[1, child] - off[1], nodes[2, child] - off[2],
-                    nodes[3, child],
-                )  # fmt: skip
-                if key <= within:
-                    _push(stack, keys, begin, depth, child, row, key)
-                    depth += 1
-        else:
-            x, y, z = nodes[0, a] - off[0], nodes[1, a] - off[1], nodes[2, a] - off[2]
-            best.counters[0] += ints[row + COUNT] & COUNTED
-            for i in range(ints[row + COUNT] & COUNTED):
-                child_row = base + (b_first + i) * ROW_WORDS
-                key = lower_bound(words, child_row, x, y, z, nodes[3, a])
-                if key <= cut[node_class(ints, child_row, mask)]:
-                    _push(stack, keys, begin, depth, a, child_row, key)
-                    depth += 1
+            continue
+        begin = depth
+        best.counters[0] += held[a]
+        for child in range(a_first, a_first + held[a]):
+            key = lower_bound(
+                words, row, nodes[0, child] - off[0], nodes[1, child] - off[1], nodes[2, child] - off[2],
+                nodes[3, child],
+            )  # fmt: skip
+            if key <= within:
+                _push(below, keys, begin, depth, child, key)
+                depth += 1
 
 
 @borrowing
@@ -226,7 +215,7 @@ def _nearest_voxel(avatar, m, pose, placed, scene, voxel, front, count, descent,
                             _search_leaves(m, a, row, avatar, placed, scene, spot, best, off)
                             continue
                     elif first < 0:
-                        _search_pairs(avatar, m, pose, a, row, placed, scene, spot, best, descent)
+                        _search_below(avatar, m, pose, a, row, placed, scene, spot, best, descent)
                         continue
                     move_node(bounds, which, U(i), U(left))
                     left += 1

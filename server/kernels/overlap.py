@@ -54,12 +54,12 @@ BROAD = np.float32(2.0)
 class Work(NamedTuple):
     """Scratch of one call. stack: (STACK, 3) int64: scene row, where its list begins, length.
 
-    pairs: (STACK, 2) int64: avatar node, scene row; one element where the front is leaf nodes.  keep: (LANES,) bool,
-    and keep8: the same as uint64, eight at a time.  counters: (2,) int64: node visits, point tests.
+    below: (STACK,) int64: avatar nodes below its front; one element where the front is leaf nodes.
+    keep: (LANES,) bool, and keep8: the same as uint64, eight at a time.  counters: (2,) int64, visits, point tests.
     """
 
     stack: NDArray[np.int64]
-    pairs: NDArray[np.int64]
+    below: NDArray[np.int64]
     keep: NDArray[np.bool_]
     keep8: NDArray[np.uint64]
     counters: NDArray[np.int64]
@@ -79,10 +79,10 @@ class Spot(NamedTuple):
 @nb.njit(nogil=True, cache=True)
 def make_work(avatar):
     """Scratch for one avatar (not empty)."""
-    pairs = STACK if avatar.first[avatar.front_first] >= 0 else 1
+    below = STACK if avatar.first[avatar.front_first] >= 0 else 1
     keep = np.zeros(LANES, np.bool_)
     stack, counters = np.empty((STACK, 3), np.int64), np.zeros(2, np.int64)
-    return Work(stack, np.empty((pairs, 2), np.int64), keep, keep.view(np.uint64), counters)
+    return Work(stack, np.empty(below, np.int64), keep, keep.view(np.uint64), counters)
 
 
 @borrowing
@@ -203,41 +203,32 @@ def _block_placed(avatar, m, pose, block, placed, scene):
 
 
 @borrowing
-def _pairs_touch(avatar, m, scale, extent, pose, placed, scene, voxel, spot, a, row, by_class, work):
-    """Whether the subtrees of an avatar's node and a scene's hold a pair in contact: both descended, depth first, the
-    larger inner node first. For avatars whose front is not their leaf nodes."""
-    words, ints, pairs = scene.words, scene.ints, work.pairs
-    rooms, mask = by_class.room, by_class.mask
+def _below_touches(avatar, m, scale, extent, pose, placed, scene, voxel, spot, a, row, by_class, work):
+    """Whether a leaf node of the scene holds a point in contact with one below a node of the avatar's front, which is
+    descended, depth first. For avatars whose front is not their leaf nodes."""
+    words, below = scene.words, work.below
+    room = by_class.room[node_class(scene.ints, row, by_class.mask)]
     steps = scale / scene.step
-    pairs[0, 0], pairs[0, 1] = a, row
+    below[0] = a
     depth = 1
     while depth > 0:
         depth -= 1
-        a, row = pairs[depth, 0], pairs[depth, 1]
-        a_first, b_first = avatar.first[a], np.int64(ints[U(row + FIRST)])
+        a = below[depth]
+        a_first = avatar.first[a]
         work.counters[0] += 1
-        room = rooms[node_class(ints, row, mask)]
         if a_first < 0:
             block = np.int64(~a_first)
             _block_placed(avatar, m, pose, block, placed, scene)
-            if not lanes_meet(words, row, placed.lanes, block, spot.x, spot.y, spot.z, room, work.keep):
-                continue
-            if b_first < 0:
-                if leaves_touch(avatar, m, block, placed, scene, voxel, spot, row, by_class, work):
-                    return True
-                continue
-        else:
-            x, y, z = _place_node(avatar, m, a, placed, scene)
-            radius = node_reach(avatar.radius[a], steps, extent)
-            if not nodes_meet(words, row, x - spot.x, y - spot.y, z - spot.z, radius, room):
-                continue
-        if b_first < 0 or (a_first >= 0 and avatar.radius[a] * steps > words[U(row + 3)]):
+            if lanes_meet(
+                words, row, placed.lanes, block, spot.x, spot.y, spot.z, room, work.keep
+            ) and leaves_touch(avatar, m, block, placed, scene, voxel, spot, row, by_class, work):
+                return True
+            continue
+        x, y, z = _place_node(avatar, m, a, placed, scene)
+        radius = node_reach(avatar.radius[a], steps, extent)
+        if nodes_meet(words, row, x - spot.x, y - spot.y, z - spot.z, radius, room):
             for i in range(avatar.count[a]):
-                pairs[depth, 0], pairs[depth, 1] = a_first + i, row
-                depth += 1
-        else:
-            for i in range(ints[U(row + COUNT)] & COUNTED):
-                pairs[depth, 0], pairs[depth, 1] = a, spot.rows + (b_first + i) * ROW_WORDS
+                below[depth] = a_first + i
                 depth += 1
     return False
 
@@ -314,7 +305,7 @@ def _overlap_voxel(avatar, m, scale, extent, pose, placed, scene, voxel, spot, b
                                 return True
                             continue
                     elif first < 0:
-                        if _pairs_touch(
+                        if _below_touches(
                             avatar, m, scale, extent, pose, placed, scene, voxel, spot, a, row, by_class, work
                         ):
                             return True

@@ -79,7 +79,8 @@ def class_radii(text: str | None, radius: float, stored: Collection[str]) -> NDA
     text: as `parse_radius_model` takes it; None: the archive's one figure.  radius: that figure [m].  stored: the
     models that the archive holds. A class with a larger local class, or without RIM_BIT, never has a smaller radius:
     so the largest local class of some points, with RIM_BIT where all have it, stands for a radius that none of theirs
-    exceeds. Raises BadRequestError for a model that the archive does not hold.
+    exceeds. The figure itself is always one of the radii that may be asked for, however large: which poses that leaves
+    room for is told pose by pose. Raises BadRequestError for a model that the archive does not hold.
     """
     model = RadiusModel(False, False, 1.0, None) if text is None else parse_radius_model(text)
     for name in ("local", "border"):
@@ -96,7 +97,7 @@ def class_radii(text: str | None, radius: float, stored: Collection[str]) -> NDA
         if model.border:
             metres = np.where(classes & RIM_BIT, metres * BORDER_SHARE, metres)
     metres = metres * model.factor
-    if metres.max() > MAX_RADIUS:
+    if metres.max() > max(MAX_RADIUS, radius):
         raise BadRequestError(
             f"radius model {text!r}: radii up to {metres.max():g} m: expected at most {MAX_RADIUS} m"
         )

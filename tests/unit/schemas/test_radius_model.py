@@ -91,3 +91,12 @@ def test_what_the_archive_does_not_hold_is_refused() -> None:
     with pytest.raises(BadRequestError, match="at most"):
         class_radii("mean:8", 1.5, ("mean",))
     assert class_radii("mean:8", 1.0, ("mean",)).tolist() == [round(MAX_RADIUS * UNITS_PER_METRE)]
+
+
+def test_the_figure_itself_may_be_asked_for_however_large() -> None:
+    # Points 40 m apart have a mean radius of 20 m: which avatars have room beside it is told pose by pose.
+    for text in (None, "mean", "mean:1"):
+        assert class_radii(text, 20.0, ("mean",)).tolist() == [20 * UNITS_PER_METRE]
+    assert class_radii("border", 20.0, ALL).max() == 20 * UNITS_PER_METRE
+    with pytest.raises(BadRequestError, match="at most"):
+        class_radii("mean:1.01", 20.0, ("mean",))

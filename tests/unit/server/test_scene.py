@@ -118,3 +118,17 @@ def test_warming_loads_a_voxel_and_leaves_no_avatar(scene: Scene) -> None:
     assert scene.residency.resident >= 1
     with pytest.raises(UnknownAvatarError):
         scene.collide("warm-up", HERE)
+
+
+def test_a_scan_so_thin_that_its_radius_is_large_answers_every_way(tmp_path: Path) -> None:
+    # Points 20 m apart: a mean radius of 10 m, more than a request may ask for, and yet the figure of the scene.
+    case = cases.build(tmp_path, np.array([[0.0, 0, 0], [20, 0, 0], [40, 0, 0]]), voxel=32.0, radius=None)
+    poses = np.array([cases.pose_of(np.eye(3), np.array([0.0, 0, z])) for z in (10.0, 10.5)])
+    with Scene.open(case.archive) as scene:
+        assert scene.info().radius == 10.0
+        scene.add_avatar("al", np.zeros((1, 3)), 0.25)
+        expected = scene.collide("al", poses).verdict.tolist()
+        assert expected == [1, 0]
+        assert scene.collide("al", poses, radius_model="mean").verdict.tolist() == expected
+        assert scene.walker("al").collide(poses).verdict.tolist() == expected
+        assert [v for part in scene.path("al", poses) for v in part.verdict.tolist()] == expected

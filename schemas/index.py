@@ -201,8 +201,18 @@ def index_digest(archive_id: bytes, columns: dict[str, NDArray]) -> bytes:
     return digest.digest()
 
 
+def _check_counts(counts: NDArray, capped: int, points: int) -> None:
+    """ValueError unless every point has one radius class: radii and the reach of a question go by what is counted."""
+    counted = counts.tolist()
+    if counts.shape != (RADIUS_CLASSES,) or min(counted) < 0 or sum(counted) != points or capped > points:
+        raise ValueError(
+            f"radius_counts {counted}, radius_capped {capped}: expected those of {points} points"
+        )
+
+
 def read_header(archive_id: bytes, columns: dict[str, NDArray]) -> Header:
-    """The header from the index's datasets; the digest has vouched for them."""
+    """The header from the index's datasets; the digest has vouched for them. Raises ValueError, KeyError for what is
+    no index."""
     texts = json.loads(columns["texts"].tobytes())
     poses, counts = columns["source_pose"], columns["source_count"]
     sources = tuple(
@@ -221,7 +231,10 @@ def read_header(archive_id: bytes, columns: dict[str, NDArray]) -> Header:
     x, y, z = (float(v) for v in columns["origin"])
     held = columns["columns"].astype(bool).tolist()
     models = ("mean", *(name for name, here in zip(("local", "border"), held[2:], strict=False) if here))
-    counts = columns["radius_counts"] if len(models) > 1 else np.zeros(RADIUS_CLASSES)
+    counts, capped = np.zeros(RADIUS_CLASSES), 0
+    if len(models) > 1:
+        counts, capped = columns["radius_counts"], int(columns["radius_capped"][0])
+        _check_counts(counts, capped, int(columns["points"][0]))
     return Header(
         archive_id=archive_id,
         lattice=Lattice((x, y, z), float(columns["step"][0]), int(columns["voxel_steps"][0])),
@@ -240,7 +253,7 @@ def read_header(archive_id: bytes, columns: dict[str, NDArray]) -> Header:
         intensity=held[1],
         models=models,
         radius_counts=counts.astype(np.int64),
-        radius_capped=int(columns["radius_capped"][0]) if len(models) > 1 else 0,
+        radius_capped=capped,
         options=texts["options"],
         sources=sources,
         unknown=columns["unknown"].astype(np.int64),

@@ -17,6 +17,7 @@ from solidcloud.schemas.archive import Archive, shard_name, write_index, write_s
 from solidcloud.schemas.codec import encode_voxel
 from solidcloud.schemas.errors import BadRequestError, FormatError
 from solidcloud.schemas.index import Header
+from solidcloud.schemas.radius_model import RADIUS_CLASSES
 from solidcloud.schemas.voxel import VoxelData
 from solidcloud.server.cli import run
 
@@ -216,3 +217,21 @@ def test_radius_classes_that_are_not_those_counted_are_a_fault(tmp_path: Path) -
     rewrite(tmp_path / "a", header_with=lambda header: replace(header, radius_counts=counts))
     (fault,) = verify_archive(tmp_path / "a").faults
     assert "radius classes counted" in fault and str(counts.tolist()) in fault
+
+
+@pytest.mark.parametrize(
+    "spoilt",
+    [
+        {"radius_counts": np.zeros(RADIUS_CLASSES, np.int64)},
+        {"radius_counts": np.full(5, 40)},
+        {"radius_counts": np.full((2, 16), 6)},
+        {"radius_capped": 201},
+    ],
+)
+def test_counts_of_radius_classes_that_cannot_be_are_refused(tmp_path: Path, spoilt: dict[str, Any]) -> None:
+    scan = write_xyz(tmp_path / "a.xyz", make_scan("noise", 1, 200))
+    models = frozenset({"mean", "local"})
+    build_archive([scan], tmp_path / "a", BuildConfig(voxel=1.1, models=models, radius=0.01, jobs=1))
+    rewrite(tmp_path / "a", header_with=lambda header: replace(header, **spoilt))
+    with pytest.raises(FormatError, match=r"radius_counts .* of 200 points"):
+        verify_archive(tmp_path / "a")

@@ -69,7 +69,8 @@ class Store:
             record.read_points(lanes[: leaves * 3 * LANES].reshape(leaves, 3, LANES))
         if header.radius_class:
             classes = np.empty((leaves, LANES), np.uint8)
-            record.read_classes(classes)
+            with self.archive.locating(row):
+                record.read_classes(classes)
             lay_classes(record.tree, classes, arena.ints, where)
         if header.scan_index:
             scans = arena.halves[scan_run(where[None], 0, words) :]

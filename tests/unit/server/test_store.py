@@ -71,3 +71,23 @@ def test_a_tree_too_high_for_the_stack_is_corrupt(store: Store, monkeypatch: pyt
     monkeypatch.setattr(store_module, "MOST_LEVELS", 0)
     with pytest.raises(CorruptError, match="levels, expected at most 0"):
         store.load(int(np.argmax(store.sizes)), ArenaBuffer(1 << 20).arena, 0)
+
+
+def test_a_radius_class_that_there_is_none_of_is_corrupt_and_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    models = frozenset({"mean", "local"})
+    store = Store(cases.build(tmp_path, scans.make_scan("noise", 3, 300), models=models).archive)
+    voxel, _ = store.archive.read_voxel(1)
+    classes = voxel.radius_class.copy()
+    for greatest in (31, 32):
+        classes[-1] = greatest
+        record = encode_voxel(voxel._replace(radius_class=classes), store.archive.header.archive_id)
+        frames = (record.cells, record.nodes, record.points)
+        monkeypatch.setattr(store.archive, "read_frames", lambda row, frames=frames: frames)
+        if greatest < 32:
+            store.load(1, ArenaBuffer(1 << 20).arena, 0)
+            continue
+        x, y, z = store.archive.coordinates[1]
+        with pytest.raises(CorruptError, match=rf"voxel \({x}, {y}, {z}\): .*radius class 32"):
+            store.load(1, ArenaBuffer(1 << 20).arena, 0)

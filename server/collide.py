@@ -95,21 +95,23 @@ def collide(
     return CollideAnswers(
         verdict, reach.outside, counts[0], counts[1], counts[2], engine_seconds=time.perf_counter() - begin,
         hits=hits, misses=misses, resident=residency.resident, resident_bytes=residency.resident_bytes,
-        faults=tuple(faults), **_bounds(verdict, reach.units - margin_units, margin, effort),
+        faults=tuple(faults), **_bounds(verdict, reach.units - margin_units, margin, margin_units, effort),
     )  # fmt: skip
 
 
 def _bounds(
-    verdict: NDArray[np.uint8], radii: NDArray[np.int64], margin: float, effort: Effort
+    verdict: NDArray[np.uint8], radii: NDArray[np.int64], margin: float, margin_units: int, effort: Effort
 ) -> dict[str, NDArray]:
     """The bounds of `CollideAnswers` that verdicts alone give; none where no tolerance asks for them.
 
-    radii: (k,) of avatar's and scan's largest spheres together, exact units: no pair is deeper.
+    radii: (k,) of avatar's and scan's largest spheres together, exact units: no pair is deeper.  margin: [m];
+    margin_units: what it was rounded to, up or down, and what the verdicts go by.
     """
     if effort.tolerance == 0:
         return {}
+    rounded = margin_units / UNITS_PER_METRE
     return {
-        "lower": np.where(verdict == CLEAR, margin, -radii / UNITS_PER_METRE),
-        "upper": np.where(verdict == CONTACT, margin, np.inf),
+        "lower": np.where(verdict == CLEAR, min(margin, rounded), -radii / UNITS_PER_METRE),
+        "upper": np.where(verdict == CONTACT, max(margin, rounded), np.inf),
         "exact": verdict != UNKNOWN,
     }

@@ -209,3 +209,10 @@ def test_a_tolerance_alone_is_answered_exactly_and_with_bounds(tmp_path: Path) -
             assert (answers.lower <= distance).all() and (distance <= answers.upper).all()
         assert scene.collide("ball", poses, 0.125, tolerance=0.5).verdict.tolist() == [1, 1, 0, 0, 0]
         assert scene.collide("nothing", poses, 0.125, tolerance=0.5).lower.tolist() == [0.125] * 5
+        # Margins are rounded to whole units, up or down: bounds go by what verdicts go by.
+        apart = np.array([0.25 + 2.0**-26, 0.25 + 2 * 2.0**-26])
+        poses = np.array([cases.pose_of(np.eye(3), np.array([0.0, 0.0, z])) for z in apart])
+        for margin, right in ((0.6, [1, 0]), (1.4, [1, 0]), (1.6, [1, 1])):
+            answers = scene.collide("ball", poses, margin * 2.0**-26, tolerance=0.5)
+            assert answers.verdict.tolist() == right
+            assert (answers.lower <= apart - 0.25).all() and (apart - 0.25 <= answers.upper).all()

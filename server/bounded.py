@@ -1,4 +1,4 @@
-"""`collide` and `distance` with a tolerance or a budget: bounds that hold whenever the search stops.
+"""`collide` and `distance` with a budget, and a tolerance or none: bounds that hold whenever the search stops.
 
 See kernels/priority.py for the search. Without a deadline one kernel call answers a request, and the same request gets
 the same answer. With one, the time left is shared among the poses left, and looked at between slices of the search.
@@ -146,7 +146,7 @@ def _upper(data: SceneData, known: Known, radii: NDArray[np.int64]) -> NDArray[n
 def distance_bounded(
     data: SceneData, avatar: AvatarModel, poses: ArrayLike, reach: float, effort: Effort
 ) -> DistanceAnswers:
-    """`distance` (see there) with a tolerance, a budget or both.
+    """`distance` (see there) with a budget, with a tolerance or without.
 
     Ends when the bounds lie within the tolerance, or when the budget is spent; the bounds hold either way. A pair is
     found before the tolerance ends anything; where the budget ended it first there may be none, `upper` can say
@@ -171,7 +171,7 @@ def distance_bounded(
 def collide_bounded(
     data: SceneData, avatar: AvatarModel, poses: ArrayLike, margin: float, effort: Effort
 ) -> CollideAnswers:
-    """`collide` (see there) with a tolerance, a budget or both.
+    """`collide` (see there) with a budget, with a tolerance or without.
 
     CONTACT where a pair is within the margin, or within margin and tolerance (then not `exact`); CLEAR where surely
     none is; else UNKNOWN: the budget was spent, or something in reach is missing.

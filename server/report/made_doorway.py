@@ -1,7 +1,10 @@
 """The narrowest door made: façades are made with narrower and narrower doors, scanned, built, and walked through.
 
 The long way to what doorway.py infers from one wide door. The two differ where a narrow door is scanned otherwise than
-a wide one: the stations stand where they stand, and see its jambs at a smaller angle, so more sparsely.
+a wide one. The stations stand where they stand, and see its jambs at a smaller angle, so more sparsely. And where a
+ray grazes the near edge of one jamb and goes on to the other, the mixed return hangs in the middle of the passage: in
+doors of 0.59 to 0.61 m, scanned with two seeds, none to five points did. Such a point stops the figure whatever its
+radius: with the made façade's usual seed all radius models say 87 mm, and two of three scans agreeing 86 mm.
 """
 
 import math

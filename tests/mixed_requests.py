@@ -9,6 +9,7 @@ import sys
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import cases
 import msgspec
@@ -43,6 +44,7 @@ from solidcloud.server.config import ServerConfig
 from solidcloud.server.scene import Scene
 
 SCAN = ("corner", 21, 500)
+MODELS = ("mean:1.5", "local", "border", "local+border:0.8", "fixed:0.004")
 ANSWERS = {
     "collide": CollideAnswers,
     "distance": DistanceAnswers,
@@ -59,9 +61,11 @@ COSTS = {"engine_seconds": 0.0, "hits": 0, "misses": 0, "resident": 0, "resident
 def question(
     rng: np.random.Generator, points: NDArray[np.float64], body: NDArray[np.float64]
 ) -> tuple[str, Question]:
-    """Any question, exact or within a budget of visits."""
+    """Any question, exact or within a budget of visits, of the spheres of any radius model."""
     poses = cases.near_poses(rng, points, body, int(rng.integers(1, 4)), 0.15, float(rng.choice([1.0, 0.5])))
-    effort = {"tolerance": 1e-3, "budget_visits": 100} if rng.random() < 0.2 else {}
+    effort: dict[str, Any] = {"tolerance": 1e-3, "budget_visits": 100} if rng.random() < 0.2 else {}
+    if rng.random() < 0.5:
+        effort["radius_model"] = str(rng.choice(MODELS))
     op = str(rng.choice(list(ANSWERS)))
     starts = rng.uniform(0, 2, (2, 3))
     asked: Question

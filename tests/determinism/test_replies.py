@@ -20,9 +20,11 @@ INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
 
 @pytest.fixture(scope="module")
 def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An archive of many voxels and small trees."""
+    """An archive of many voxels and small trees, its points of several radii."""
     points = scans.make_scan(*mixed_requests.SCAN)
-    return cases.build(tmp_path_factory.mktemp("mixed"), points, voxel=0.3, leaf=8, cell_points=20).archive
+    models = frozenset({"mean", "local", "border"})
+    folder = tmp_path_factory.mktemp("mixed")
+    return cases.build(folder, points, voxel=0.3, leaf=8, cell_points=20, models=models).archive
 
 
 @pytest.mark.case(

@@ -115,11 +115,14 @@ def test_bounding_volumes_agree_and_cubes_touch_too_early(made: dict) -> None:
 def test_an_archive_that_is_given_is_walked_over_and_has_no_doors(tmp_path: Path) -> None:
     rng = np.random.default_rng(3)
     floor = np.column_stack([rng.uniform(0, 8, 9000), rng.uniform(0, 3, 9000), rng.normal(0, 0.002, 9000)])
-    wall = np.column_stack([rng.uniform(0, 8, 5000), np.full(5000, 1.5), rng.uniform(0, 2, 5000)])
+    # The walk goes through the middle of all points, y = 2.33 m: the wall is a shoulder's width beside it.
+    wall = np.column_stack([rng.uniform(0, 8, 5000), np.full(5000, 2.73), rng.uniform(0, 2, 5000)])
     scan = scans.write_ply(tmp_path / "hall.ply", np.concatenate([floor, wall]))
     build_archive([scan], tmp_path / "hall", BuildConfig(voxel=2.0, resolution=1e-3))
     report = report_of(tmp_path / "report", str(tmp_path / "hall"))
     assert report["facts"]["points"] == 14_000 and report["facts"]["lattice_step_m"] == 1e-3
+    assert 0 < report["facts"]["judged_contacts"] < report["facts"]["judged_poses"] == 96
+    assert report["facts"]["near_tangent_poses"] > 0
     assert all(row["doorway_mm"] is None and row["leak_p99_mm"] is None for row in report["rows"])
     assert rows_of(report, "lattice step")["1 mm"]["default"]
     assert rows_of(report, "tolerance")["0"]["wrong_share"] == 0.0

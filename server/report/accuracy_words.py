@@ -19,8 +19,8 @@ TERMS = {
     "doorway": "how much wider than the figure a door must be made before the figure passes it upright along the "
     "middle. 0 would be perfect; the spheres that stand for the door's points make it narrower than it is.",
     "made doorway": "the same found the long way: façades are made with narrower and narrower doors, each is scanned "
-    "and walked through. A narrow door's jambs are seen at a smaller angle, so more sparsely; and rays that graze both jambs "
-    "leave points that hang in between, which stop the figure whatever their radius.",
+    "and walked through. A narrow door's jambs are seen at a smaller angle, so more sparsely; and rays that graze "
+    "both jambs leave points that hang in between, which stop the figure whatever their radius.",
     "leak": "how far a ball of 5 cm radius is past a wall's true surface when it is stopped: where points stand "
     "thinly, it slips in between. Negative: stopped before the surface. A ball that goes through counts 100 mm.",
     "passed": "the share of places where that ball goes right through the wall.",

@@ -6,6 +6,7 @@ is stored as a radius class a point, one byte: the local class in the low four b
 rim. A model turns classes into radii only when a question is asked, so one archive serves them all.
 """
 
+import re
 from collections.abc import Collection
 from typing import NamedTuple
 
@@ -32,6 +33,9 @@ LOCAL_RADII = (
 MAX_RADIUS = 8.0
 # What `border` leaves of a rim point's radius.
 BORDER_SHARE = 0.5
+
+# As JSON has it, a point at either end allowed: Python's float also takes `0_8` for 8, spaces and `nan`.
+_NUMBER = re.compile(r"-?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 
 _EXPECTED = "expected mean, local, border or local+border, each with a factor where wanted (local:0.8), or fixed:METRES"
 
@@ -62,10 +66,9 @@ def parse_radius_model(text: str) -> RadiusModel:
         raise BadRequestError(f"radius model {text!r}: {_EXPECTED}")
     factor = 1.0
     if colon or name == "fixed":
-        try:
-            factor = float(number)
-        except ValueError:
-            raise BadRequestError(f"radius model {text!r}: {_EXPECTED}") from None
+        if not _NUMBER.fullmatch(number):
+            raise BadRequestError(f"radius model {text!r}: {_EXPECTED}")
+        factor = float(number)
     if not 0 <= factor <= MAX_RADIUS:  # not so for NaN either
         raise BadRequestError(f"radius model {text!r}: expected a number from 0 to {MAX_RADIUS}")
     if name == "fixed":

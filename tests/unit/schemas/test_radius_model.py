@@ -32,6 +32,9 @@ ALL = ("mean", "local", "border")
         ("border+local", RadiusModel(True, True, 1.0, None)),
         ("fixed:0", RadiusModel(False, False, 1.0, 0.0)),
         ("fixed:0.013", RadiusModel(False, False, 1.0, 0.013)),
+        ("fixed:1.3e-05", RadiusModel(False, False, 1.0, 1.3e-05)),
+        ("local:.5", RadiusModel(True, False, 0.5, None)),
+        ("local:2.", RadiusModel(True, False, 2.0, None)),
     ],
 )
 def test_models_have_names(text: str, expected: RadiusModel) -> None:
@@ -42,7 +45,8 @@ def test_models_have_names(text: str, expected: RadiusModel) -> None:
     "text",
     [
         "", "Mean", "fixed", "fixed:", "fixed:x", "fixed:-1", "fixed:9", "fixed:nan", "local:", "local:inf", "local+",
-        "local+local", "mean+local", "fixed+border:1", "local:1:2", "border ", "local,border",
+        "local+local", "mean+local", "fixed+border:1", "local:1:2", "border ", "local,border", "local:0_8",
+        "local: 0.8", "local:0.8 ", "fixed:.", "fixed:1e", "local:٢",
     ],
 )  # fmt: skip
 def test_what_is_none_is_refused(text: str) -> None:

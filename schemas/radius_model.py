@@ -86,13 +86,13 @@ def class_radii(text: str | None, radius: float, stored: Collection[str]) -> NDA
     room for is told pose by pose. Raises BadRequestError for a model that the archive does not hold.
     """
     model = RadiusModel(False, False, 1.0, None) if text is None else parse_radius_model(text)
-    for name in ("local", "border"):
-        if getattr(model, name) and name not in stored:
-            held = ",".join(m for m in STORED_MODELS if m in stored)
-            raise BadRequestError(
-                f"radius model {text!r}: this archive holds {held}: ask for one of those, "
-                f"or build it with --radius {held},{name}"
-            )
+    missing = [name for name in ("local", "border") if getattr(model, name) and name not in stored]
+    if missing:
+        held = ",".join(name for name in STORED_MODELS if name in stored)
+        raise BadRequestError(
+            f"radius model {text!r}: this archive holds {held}: ask for one of those, "
+            f"or build it with --radius {','.join([held, *missing])}"
+        )
     metres = np.full(1, radius if model.fixed is None else model.fixed)
     if model.local or model.border:
         classes = np.arange(RADIUS_CLASSES)

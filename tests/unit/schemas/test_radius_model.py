@@ -92,6 +92,8 @@ def test_what_the_archive_does_not_hold_is_refused() -> None:
         class_radii("local", 0.01, ("mean",))
     with pytest.raises(BadRequestError, match=r"holds mean,local: .* --radius mean,local,border"):
         class_radii("local+border", 0.01, ("mean", "local"))
+    with pytest.raises(BadRequestError, match=r"holds mean: .* --radius mean,local,border$"):
+        class_radii("border+local", 0.01, ("mean",))
     with pytest.raises(BadRequestError, match="at most"):
         class_radii("mean:8", 1.5, ("mean",))
     assert class_radii("mean:8", 1.0, ("mean",)).tolist() == [round(MAX_RADIUS * UNITS_PER_METRE)]

@@ -46,18 +46,20 @@ class BuildConfig:
 
     voxel: edge of a voxel [m]; 8: a few to a few hundred in reach of a walk, a few MB each.
     resolution: lattice step [m]; None: the sources' own where all share one, else 0.1 mm, a twentieth of
-    a terrestrial scanner's range noise.
-    degree: children a node, 2 to 16 ([Fig12] table 1 tries 4 to 16); 8: all of 4 to 16 lie within
-    a factor of 1.25 in scripts/walkthrough, and 8 is among the best there with and without slabs.
-    leaf: points a leaf node, up to 32, the width of the vector test.
+    a terrestrial scanner's range noise: 1 mm saves a third of the archive and no time, and moves distances by up to 0.7 mm
+    (`solidcloud accuracy`, as the next two).
+    degree: children a node, 2 to 16 ([Fig12] table 1 tries 4 to 16); 8: all of 4 to 16 take the same time within 3 %.
+    leaf: points a leaf node, up to 32, the width of the vector test: 16 takes 4 % less time, for 12 % more archive.
     cell_points: an octree cell above this is split. 1024: octants part surfaces better than packing does, so `collide`
     takes 3 % less time than with 4096 where a voxel is 32 m and 16 % where it is 8 m, for 4 % more memory and 1 % more
     archive; with 256 it gains little more, for 16 % more memory (scripts/bench_engine --only cells).
     cells: "octree", or "balanced": cells are merged too, so that all trees have one height (balance.py).
-    models: radius models stored, "mean" always and "local", "border" where asked: those need a byte a point.
+    models: radius models stored, "mean" always and "local", "border" where asked: those need a byte a point. "mean"
+    alone: `local` leaks 14 mm where it leaks 16, for a seventh more time, and makes narrow doors narrower, whose jambs
+    are scanned thinly; `border` pays only on thin sheets (`solidcloud accuracy`; builder/DESIGN.md).
     radius: the figure that stands for `mean` [m]; None: half the mean closest-point distance.
     spacing: meshes are sampled about this far apart [m]; None: their vertices are taken.
-    with_slab: cut each sphere by a slab; False is the paper's structure, for comparison.
+    with_slab: cut each sphere by a slab; False is the paper's structure, for comparison, five times as slow.
     jobs: worker processes; 0: one a core.  memory_bytes: bound on what the passes hold.
     keep: extra columns, among "scan" and "intensity".  strict: a non-finite point fails the build.
     skip_bad: leave out scans that cannot be read and mark their region as unknown.

@@ -46,8 +46,8 @@ class BuildConfig:
 
     voxel: edge of a voxel [m]; 8: a few to a few hundred in reach of a walk, a few MB each.
     resolution: lattice step [m]; None: the sources' own where all share one, else 0.1 mm, a twentieth of
-    a terrestrial scanner's range noise: 1 mm saves a third of the archive and no time, and moves distances by up to 0.7 mm
-    (`solidcloud accuracy`, as the next two).
+    a terrestrial scanner's range noise: 1 mm saves a third of the archive and no time, and moves distances by up to
+    0.7 mm (`solidcloud accuracy`, as the next two).
     degree: children a node, 2 to 16 ([Fig12] table 1 tries 4 to 16); 8: all of 4 to 16 take the same time within 3 %.
     leaf: points a leaf node, up to 32, the width of the vector test: 16 takes 4 % less time, for 12 % more archive.
     cell_points: an octree cell above this is split. 1024: octants part surfaces better than packing does, so `collide`

@@ -110,11 +110,11 @@ def radius_settings(plan: Plan, step: float, radius: float) -> list[Setting]:
     for model in ("mean", "local", "border", "local+border"):
         for factor in plan.factors:
             name = model if factor == 1.0 else f"{model}:{factor:g}"
-            row = Row(RADIUS, name, factor, name == "mean")
+            row = Row(RADIUS, name, factor, name == "mean", factor=factor)
             found.append(Setting(row, config, {"radius_model": name}))
     for factor in plan.factors:
-        metres = float(f"{radius * factor:.1g}")
-        row = Row(RADIUS, f"fixed:{metres:g}", metres)
+        metres = float(f"{radius * factor:.2g}")
+        row = Row(RADIUS, f"fixed:{metres:g}", metres, factor=factor)
         found.append(Setting(row, config, {"radius_model": f"fixed:{metres:g}"}))
     return found
 

@@ -110,7 +110,7 @@ def points_of(rows: Sequence[Row], error: str) -> list[Point]:
 
 def is_scaled(row: Row) -> bool:
     """Whether a radius model is another one's with a factor, or a figure that is not about the mean."""
-    return ":" in row.setting and not (row.setting.startswith("fixed") and row.value == 1.0)
+    return row.factor not in (None, 1.0)
 
 
 def label_of(row: Row) -> str:

@@ -31,6 +31,7 @@ class Row:
 
     knob, setting: what is turned, and to what.  value: the setting as a number, where it is one.  default: whether it
     is what a user gets who says nothing.  by: ENGINE or PLAIN.  scene: where it was measured.
+    factor: of a radius model, on its radii; of a fixed figure, about what it is over the mean.
     mean_us, p50_us, p99_us: time of a pose [us], see accuracy_timing.py.  times: mean_us over that of the default
     setting beside which it was timed.  noise: see Timed.
     poses, early, late, unknown: of the judged poses, how many, and called contact where the judge says clear, the
@@ -49,6 +50,7 @@ class Row:
     default: bool = False
     by: str = ENGINE
     scene: str = ""
+    factor: float | None = None
     mean_us: float | None = None
     p50_us: float | None = None
     p99_us: float | None = None

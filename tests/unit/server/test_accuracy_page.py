@@ -1,6 +1,7 @@
 """The accuracy report's page and charts: self-contained, every setting named, labels that cover nothing."""
 
 import base64
+import math
 import re
 from html.parser import HTMLParser
 from pathlib import Path
@@ -16,7 +17,7 @@ from solidcloud.server.report.accuracy_page import table, write_page
 from solidcloud.server.report.accuracy_picture import draw_charts, points_of
 from solidcloud.server.report.accuracy_plan import BRIEF
 from solidcloud.server.report.accuracy_row import PLAIN, RADIUS, SHEET, STEP, TOLERANCE, Row, mark_front
-from solidcloud.server.report.accuracy_words import KNOBS, findings
+from solidcloud.server.report.accuracy_words import KNOBS, findings, leak_at
 from solidcloud.server.report.spheres import load_pyplot
 
 FACTS = {
@@ -120,6 +121,8 @@ def test_the_default_stands_once_in_a_chart() -> None:
     assert len({p.label for p in points}) == len(points), "two points of one name"
     assert "search within 1 cm" in {p.label for p in points}
     assert not any("alone" in p.label for p in points), "the default once more"
+    models = [p.label for p in points if p.row.knob == RADIUS]
+    assert models == ["local", "border", "local+border", "fixed:0.012"], "models without a factor"
 
 
 def test_points_that_coincide_share_a_label_and_what_stops_a_ball_early_is_drawn_at_the_edge(
@@ -138,7 +141,7 @@ def test_points_that_coincide_share_a_label_and_what_stops_a_ball_early_is_drawn
     assert "search within 1 mm to 5 cm" in doors  # three of one place
     assert "search within 1 mm, 2 mm" in walls and "search within 5 cm: -64 mm" in walls
     assert any(label.startswith("default") for label in walls) and any("mean, default" in t for t in trade)
-    for model in ("mean:0.5", "local", "border:2", "local+border", "fixed:0.02"):
+    for model in ("mean:0.5", "local", "border:2", "local+border", "fixed:0.025"):
         assert sum(model in label.split("\n") for label in trade) == 1, model
 
 
@@ -175,11 +178,43 @@ def test_the_findings_follow_from_the_rows() -> None:
     next(row for row in rows if row.setting == "local").made_doorway_mm = 31.2
     assert "narrower: local 31 mm (inferred" in " ".join(findings(rows))
     assert "at 3 times the mean radius 33 mm with mean, 7 mm with border, leaks (p99) -21 and -20 mm" in fast
+    assert (
+        "at 1 times the mean radius -2 mm with mean, -10 mm with border, leaks (p99) -12 and -12 mm" in fast
+    )
+    assert "border makes this door wider than it is, by 10 mm" in fast
+    next(row for row in rows if row.knob == SHEET and row.setting == "border").doorway_mm = 1.0
+    assert "wider than it is" not in " ".join(findings(rows))
     by_name = {row.setting: row for row in rows if row.knob == VOLUME}
     for sphere, box, said in ((9.0, 2.0, "Groups of boxes beat"), (2.0, 9.0, "Groups of spheres beat")):
         by_name["sphere"].mean_us, by_name["box"].mean_us = sphere, box
         assert said in " ".join(findings(rows))
     assert findings([]) == []
+
+
+def felt(setting: str, doorway: float, leak: float) -> Row:
+    return Row(RADIUS, setting, default=setting == "mean", doorway_mm=doorway, leak_p99_mm=leak)
+
+
+def test_radius_models_are_compared_at_the_same_doorway_error() -> None:
+    mean = felt("mean", 26.0, 16.0)
+    rows = [felt("local:2", 50.0, -4.0), mean, felt("local:0.5", 12.0, 28.0), felt("local", 24.0, 14.0)]
+    rows += [felt("local+border", 26.0, 1.0), felt("local:0.1", math.inf, 0.0)]
+    assert leak_at(rows, "local", 26.0) == pytest.approx(14.0 - 18.0 * 2 / 26)
+    assert leak_at(rows, "local", 24.0) == 14.0 and leak_at(rows, "local", 50.0) == -4.0
+    assert leak_at(rows, "local", 11.9) is leak_at(rows, "local", 50.1) is leak_at(rows, "mean", 27.0) is None
+    said = " ".join(findings(rows))
+    assert (
+        "mean (26 mm) local leaks 13 mm at p99 against 16 mm" in said and "half is not reached. What" in said
+    )
+    mean.leak_p99_mm = 26.0
+    assert "local leaks 13 mm at p99 against 26 mm" in (said := " ".join(findings(rows)))
+    assert "half or less" in said and "chance gaps" not in said
+    mean.leak_p99_mm = 12.0
+    assert "no gain" in " ".join(findings(rows))
+    mean.doorway_mm = 11.0
+    assert "At the doorway error" not in " ".join(findings(rows)), (
+        "no factor of local reaches so narrow a door"
+    )
 
 
 def test_labels_cover_neither_one_another_nor_points() -> None:

@@ -105,7 +105,7 @@ def measure(
             settings += radius_settings(plan, ground.step, header.radius)
             measure_engine(settings, archives, ground, exact, plan, progress)
             rows = [s.row for s in settings]
-            if ground.truth is not None:
+            if ground.truth is not None and ground.own:
                 rows += measure_made_scenes(settings, scratch, plan, progress)
             progress.start("plain", len(plain_settings()) * (1 + plan.loops), "settings")
             rows += measure_plain(opened, ground, exact, plan, lambda: progress.advance(1))

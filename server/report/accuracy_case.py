@@ -42,6 +42,7 @@ class Ground(NamedTuple):
     """What is measured on.
 
     name: for titles.  scan: the file to build.  step: its lattice step [m].  truth: of the made façade, else None.
+    own: whether the avatar is the made figure, of which alone the doorway's error is known.
     avatar: (n, 3) [m].  walk: (k, 4, 4), on which times are measured.  around: (k, 4, 4), the walk's poses moved.
     """
 
@@ -49,6 +50,7 @@ class Ground(NamedTuple):
     scan: Path
     step: float
     truth: SceneTruth | None
+    own: bool
     avatar: Floats
     walk: Floats
     around: Floats
@@ -65,10 +67,8 @@ def made_ground(plan: Plan, avatar: Path | None, folder: Path) -> Ground:
     made = make_facade(scan, points=plan.points)
     body = figure_points() if avatar is None else read_avatar(avatar)
     _, walk = walk_poses(build_facade().truth, plan.frames)
-    truth = read_truth(made.truth) if avatar is None else None  # the door's error is known of the made figure
-    return Ground(
-        f"made façade of {made.points:,} points", scan, DEFAULT_STEP, truth, body, walk, _moved(walk)
-    )
+    name, truth = f"made façade of {made.points:,} points", read_truth(made.truth)
+    return Ground(name, scan, DEFAULT_STEP, truth, avatar is None, body, walk, _moved(walk))
 
 
 def given_ground(archive: Path, plan: Plan, avatar: Path | None, folder: Path) -> Ground:
@@ -87,7 +87,7 @@ def given_ground(archive: Path, plan: Plan, avatar: Path | None, folder: Path) -
     # The walk's height is that of points over points; a thin avatar's large spheres would all stand in the floor.
     walk[:, 2, 3] += radius + make_avatar(body).radius
     name = f"{archive.resolve().name}, {len(points):,} of {total:,} points"
-    return Ground(name, scan, step, None, body, walk, _moved(walk))
+    return Ground(name, scan, step, None, avatar is None, body, walk, _moved(walk))
 
 
 def turned_ground(ground: Ground, folder: Path) -> Ground:

@@ -23,7 +23,10 @@ FACADES = 20
 def measure_felt(
     settings: list[Setting], archives: Archives, ground: Ground, plan: Plan, tick: Callable[[], None]
 ) -> None:
-    """Fill in the doorway and the leak of each setting; nothing where the ground's truth is not known."""
+    """Fill in the doorway and the leak of each setting; nothing where the ground's truth is not known.
+
+    The doorway is that of the made figure: with another avatar the leak alone is measured, whose ball is its own.
+    """
     if ground.truth is None:
         return
     places = leak_places(ground.truth, places=plan.places)
@@ -32,9 +35,10 @@ def measure_felt(
         if setting.row.knob not in FELT:
             continue
         scene, row = archives.scene(setting.config), setting.row
-        row.doorway_mm = doorway_error(scene, AVATAR, facade, door=DOOR, **setting.options).error
-        if math.isinf(row.doorway_mm):
-            row.note = "the figure cannot stand in the door"
+        if ground.own:
+            row.doorway_mm = doorway_error(scene, AVATAR, facade, door=DOOR, **setting.options).error
+            if math.isinf(row.doorway_mm):
+                row.note = "the figure cannot stand in the door"
         found = leak(scene, places, **setting.options)
         row.leak_p50_mm, row.leak_p99_mm, row.leak_worst_mm = found.p50, found.p99, found.worst
         row.leak_share = found.passed

@@ -4,6 +4,7 @@ import json
 import math
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,10 +13,11 @@ from solidcloud.builder.config import BuildConfig
 from solidcloud.server.report import accuracy_felt, accuracy_timing
 from solidcloud.server.report.accuracy import Report, write_rows
 from solidcloud.server.report.accuracy_engine import engine_settings, length_name, radius_settings
-from solidcloud.server.report.accuracy_felt import measure_made
+from solidcloud.server.report.accuracy_felt import measure_felt, measure_made
 from solidcloud.server.report.accuracy_plan import BRIEF, FULL, Plan
 from solidcloud.server.report.accuracy_row import (
     COLUMNS,
+    DEGREE,
     RADIUS,
     STEP,
     TOLERANCE,
@@ -27,6 +29,7 @@ from solidcloud.server.report.accuracy_row import (
 )
 from solidcloud.server.report.accuracy_timing import Timed, take_times
 from solidcloud.server.report.doorway import Doorway
+from solidcloud.server.report.leak import Leak
 
 
 def test_early_late_and_unknown_are_told_apart() -> None:
@@ -143,6 +146,31 @@ def test_every_knob_has_one_default_and_its_other_settings_differ(plan: object) 
         own = [s for s in settings if s.row.knob == knob]
         assert sum(s.row.default for s in own) == 1, knob
         assert len({(str(s.config), str(s.options)) for s in own}) == len(own), knob
+
+
+@pytest.mark.parametrize("plan", [BRIEF, FULL])
+def test_no_radius_model_is_measured_twice(plan: Plan) -> None:
+    for radius in (0.0124, 0.00987, 0.003, 0.25):
+        names = [s.row.setting for s in radius_settings(plan, 1e-4, radius)]
+        assert len(set(names)) == len(names) == 5 * len(plan.factors), names
+
+
+def test_with_another_avatar_the_leak_is_measured_and_the_doorway_is_not(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(accuracy_felt, "leak_places", lambda truth, places: places)
+    monkeypatch.setattr(accuracy_felt, "leak", lambda scene, places, **_: Leak(1.0, 2.0, 3.0, 0.25))
+    monkeypatch.setattr(accuracy_felt, "doorway_error", lambda *_, **__: Doorway(math.inf, 0.5, math.inf))
+    truth = SimpleNamespace(facades=["facade"])
+    for own in (False, True):
+        settings = [s for s in engine_settings(BRIEF, 1e-4, 0.0124) if s.row.knob in (TOLERANCE, DEGREE)]
+        ground: Any = SimpleNamespace(truth=truth, own=own)
+        archives: Any = SimpleNamespace(scene=lambda config: None)
+        measure_felt(settings, archives, ground, BRIEF, lambda: None)
+        for row in (s.row for s in settings):
+            assert (row.leak_p50_mm, row.leak_p99_mm, row.leak_worst_mm, row.leak_share) == (1, 2, 3, 0.25)
+            assert row.doorway_mm == (math.inf if own else None)
+            assert bool(row.note) == (own and row.knob == TOLERANCE)
 
 
 def test_doors_are_made_for_the_models_of_the_plan_and_fill_their_rows_alone(

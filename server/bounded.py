@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..schemas.answers import CollideAnswers, Cost, DistanceAnswers, Verdict
-from ..schemas.messages import make_poses
 from ..schemas.voxel_grid import UNITS_PER_METRE
 from .avatar import AvatarModel
 from .effort import Effort
@@ -20,7 +19,7 @@ from .kernels.closest import Nearest
 from .kernels.placing import MAX_REACH_UNITS
 from .kernels.priority import OPEN, Goal, Known, end_search, go_on, make_search, search_poses
 from .kernels.reach import Reach
-from .request import SceneData, as_held, check_request, in_unknown, pieces, to_units
+from .request import SceneData, as_held, check_request, in_unknown, kernel_poses, pieces, to_units
 from .signed import distance_columns, signed_bound, signed_from_square, unknown_gaps
 
 # Pairs the heap holds before the search turns depth first: half a megabyte a request.
@@ -152,7 +151,7 @@ def distance_bounded(
     found before the tolerance ends anything; where the budget ended it first there may be none, `upper` can say
     all the same that one is in reach.
     """
-    array = _as_poses(poses)
+    array = kernel_poses(poses)
     reach_units = to_units(reach, "reach")
     around = check_request(data, avatar, array, data.radius_units + reach_units)
     tolerance = max(0.0, effort.tolerance - TOLERANCE_SLACK / UNITS_PER_METRE) / data.arrays.step
@@ -176,7 +175,7 @@ def collide_bounded(
     CONTACT where a pair is within the margin, or within margin and tolerance (then not `exact`); CLEAR where surely
     none is; else UNKNOWN: the budget was spent, or something in reach is missing.
     """
-    array = _as_poses(poses)
+    array = kernel_poses(poses)
     margin_units = to_units(margin, "margin")
     around = check_request(data, avatar, array, data.radius_units + margin_units)
     radii = around.units - margin_units
@@ -201,8 +200,3 @@ def collide_bounded(
         verdict.astype(np.uint8), around.outside, counts[0], counts[1], counts[2], lower, upper,
         truly | (verdict == Verdict.CLEAR), **_fields(cost),
     )  # fmt: skip
-
-
-def _as_poses(poses: ArrayLike) -> NDArray[np.float64]:
-    array = make_poses(poses)
-    return array if array.flags.writeable else array.copy()  # numba compiles a read-only array anew

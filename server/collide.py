@@ -6,13 +6,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..schemas.answers import CollideAnswers
-from ..schemas.messages import make_poses
 from ..schemas.voxel_grid import UNITS_PER_METRE
 from .avatar import AvatarModel
 from .bounded import collide_bounded
 from .effort import EXACT, Effort
 from .kernels.overlap import CLEAR, CONTACT, UNKNOWN, answer_resident, overlap_poses
-from .request import SceneData, check_request, in_unknown, pieces, refuse, to_units
+from .request import SceneData, check_request, in_unknown, kernel_poses, pieces, refuse, to_units
 
 # An avatar up to this size is answered under the residency's lock when a request holds one pose: 20 µs for the
 # 3,617 points of the walk. A larger one could keep others waiting, and gains little.
@@ -67,9 +66,7 @@ def collide(
     if effort.limited:
         return collide_bounded(data, avatar, poses, margin, effort)
     begin = time.perf_counter()
-    array = make_poses(poses)
-    if not array.flags.writeable:
-        array = array.copy()  # numba compiles a read-only array anew
+    array = kernel_poses(poses)
     margin_units = to_units(margin, "margin")
     other_units = data.radius_units + margin_units
     k = len(array)

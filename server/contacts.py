@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..schemas.answers import ContactsAnswers, Verdict
 from ..schemas.errors import BadRequestError, TooLargeError
-from ..schemas.requests import MAX_CONTACTS, make_poses
+from ..schemas.requests import MAX_CONTACTS
 from ..schemas.voxel_grid import UNITS_PER_METRE
 from .avatar import AvatarModel
 from .distance import signed_from_square
@@ -40,7 +40,7 @@ from .kernels.clusters import (
 from .kernels.contacts import Asked, Tally, gather_contacts
 from .kernels.overlap import STACK
 from .kernels.reach import Reach
-from .request import SceneData, as_held, check_request, in_unknown, pieces, to_units
+from .request import SceneData, as_held, check_request, in_unknown, kernel_poses, pieces, to_units
 
 # Pairs and clusters that one request may list, all poses together [bytes]; some three times as much is needed for a
 # moment, to make columns of them. The wire's largest message holds an eighth of it.
@@ -77,9 +77,7 @@ def contacts(
     Raises BadRequestError, BadTransformError, TooLargeError.
     """
     begin = time.perf_counter()
-    array = make_poses(poses)
-    if not array.flags.writeable:
-        array = array.copy()  # numba compiles a read-only array anew
+    array = kernel_poses(poses)
     limit = _checked_limit(limit)
     margin_units = to_units(margin, "margin")
     edge_units = None if cluster_distance is None else to_units(cluster_distance, "cluster_distance")

@@ -7,13 +7,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..schemas.answers import DistanceAnswers
-from ..schemas.messages import make_poses
 from .avatar import AvatarModel
 from .bounded import distance_bounded
 from .effort import EXACT, Effort
 from .kernels.closest import Nearest
 from .kernels.nearest import nearest_poses
-from .request import SceneData, check_request, pieces, to_units
+from .request import SceneData, check_request, kernel_poses, pieces, to_units
 from .signed import distance_columns, signed_from_square, unknown_gaps
 
 __all__ = ["distance", "signed_from_square"]
@@ -32,9 +31,7 @@ def distance(
     if effort.limited:
         return distance_bounded(data, avatar, poses, reach, effort)
     begin = time.perf_counter()
-    array = make_poses(poses)
-    if not array.flags.writeable:
-        array = array.copy()  # numba compiles a read-only array anew
+    array = kernel_poses(poses)
     reach_units = to_units(reach, "reach")
     k = len(array)
     around = check_request(data, avatar, array, data.radius_units + reach_units)

@@ -12,14 +12,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..schemas.answers import ObjectsAnswers
 from ..schemas.errors import BadRequestError, BadTransformError
-from ..schemas.requests import make_poses
 from ..schemas.voxel_grid import UNITS_PER_METRE
 from .avatar import AvatarModel
 from .collide import collide
 from .effort import EXACT, Effort
 from .kernels.pairs import CLEAR, UNKNOWN, bound_objects, sweep_and_prune, touch_pairs
 from .kernels.placing import MAX_REACH_UNITS, check_poses
-from .request import SceneData, refuse, to_units
+from .request import SceneData, kernel_poses, refuse, to_units
 
 # The scene's own group: an object whose mask lacks this bit is not tested against the scene.
 SCENE_GROUP = 1 << 31
@@ -109,9 +108,7 @@ def _check(
     margin: float,
 ) -> Placing:
     """The objects of a request, all poses admitted and all reaches within what squares in 63 bits allow."""
-    array = make_poses(poses)
-    if not array.flags.writeable:
-        array = array.copy()  # numba compiles a read-only array anew
+    array = kernel_poses(poses)
     n = len(array)
     group, mask = np.asarray(groups, np.uint32), np.asarray(masks, np.uint32)
     if not len(avatars) == n == len(group) == len(mask):

@@ -23,7 +23,7 @@ from .contacts import contacts
 from .distance import distance
 from .effort import make_effort
 from .kernels.placing import check_poses
-from .request import SceneData, refuse, to_units
+from .request import SceneData, kernel_poses, refuse, to_units
 from .sweep import sweep
 
 # Parts computed at a time, by default.
@@ -54,8 +54,7 @@ def path_question(
     budgets = {name: given.pop(name) for name in ("budget_ms", "budget_visits") if name in given}
     tolerance = given.pop("tolerance", 1e-6 if op == "sweep" else 0.0)
     effort = make_effort(tolerance, **budgets)
-    if not poses.flags.writeable:
-        poses = poses.copy()  # once, or every part would copy its own
+    poses = kernel_poses(poses)  # copied once if at all, or every part would copy its own
     other = (
         to_units(given["reach"], "reach")
         if op == "distance"

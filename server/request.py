@@ -4,11 +4,12 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ..schemas.archive import Archive
 from ..schemas.errors import BadRequestError, BadTransformError, SolidcloudError, TooLargeError
 from ..schemas.radius_model import class_radii
+from ..schemas.requests import make_poses
 from ..schemas.voxel_grid import MAX_COORDINATE, UNITS_PER_METRE
 from .avatar import AvatarModel
 from .kernels import placing
@@ -56,6 +57,12 @@ class SceneData(NamedTuple):
     unknown: NDArray[np.int64]
     unknown_everywhere: bool
     keeps_scan: bool
+
+
+def kernel_poses(poses: ArrayLike) -> NDArray[np.float64]:
+    """Poses (k, 4, 4) as kernels take them: numba would compile them anew for a read-only array. BadRequestError."""
+    array = make_poses(poses)
+    return array if array.flags.writeable else array.copy()
 
 
 def to_units(metres: float, what: str) -> int:

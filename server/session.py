@@ -6,12 +6,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..schemas.answers import CollideAnswers
-from ..schemas.messages import make_poses
 from .avatar import AvatarModel
 from .collide import collide
 from .kernels.memory import KNOWN, make_memory
 from .kernels.walking import walk_poses, walk_resident
-from .request import SceneData, check_request, refuse, to_units
+from .request import SceneData, check_request, kernel_poses, refuse, to_units
 
 
 class Walker:
@@ -39,9 +38,7 @@ class Walker:
     def collide(self, poses: ArrayLike) -> CollideAnswers:
         """Whether the avatar touches the scene under each of the poses (k, 4, 4), in their order; see `collide`."""
         begin = time.perf_counter()
-        array = make_poses(poses)
-        if not array.flags.writeable:
-            array = array.copy()  # numba compiles a read-only array anew
+        array = kernel_poses(poses)
         if not self._remembers:
             return collide(self._data, self._avatar, array, self._margin)
         if len(array) == 1:

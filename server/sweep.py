@@ -8,23 +8,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..schemas.answers import SweepAnswers, Verdict
 from ..schemas.errors import BadRequestError, BadTransformError
-from ..schemas.messages import make_poses
 from ..schemas.voxel_grid import MAX_COORDINATE, UNITS_PER_METRE
 from .avatar import AvatarModel
 from .effort import EXACT, Effort
 from .kernels.advance import Progress, look_around, plan_segments, sweep_segments
 from .kernels.placing import SIMILARITY_TOLERANCE, check_poses
 from .kernels.reach import Reach
-from .request import SceneData, as_held, pieces, refuse, to_units
+from .request import SceneData, as_held, kernel_poses, pieces, refuse, to_units
 
 # Motions of one kernel call where there is a deadline: it is looked at between calls.
 _PER_CALL = 64
-
-
-def _poses(given: ArrayLike) -> NDArray[np.float64]:
-    """Poses (k, 4, 4) that the kernels may have: numba compiles a read-only array anew."""
-    array = make_poses(given)
-    return array if array.flags.writeable else array.copy()
 
 
 def _check(
@@ -119,7 +112,7 @@ def sweep(
     if not 0.0 <= tolerance <= MAX_COORDINATE:
         raise BadRequestError(f"tolerance {tolerance!r}: expected zero or a positive length in metres")
     tolerance = max(tolerance, effort.tolerance)
-    first, last = _poses(pose_from), _poses(pose_to)
+    first, last = kernel_poses(pose_from), kernel_poses(pose_to)
     if len(first) != len(last):
         raise BadRequestError(f"{len(first)} poses to begin at and {len(last)} to end at: expected as many")
     k = len(first)

@@ -177,6 +177,7 @@ def _begin(poses, avatar, scene, index, reach, i, search, goal, known, counts):
     search.bounds[0], search.bounds[1], search.bounds[2], search.bounds[3] = 0.0, np.inf, 0.0, best.frame[4]
     within = best.units[0] if best.found[0] < 0 else found_units(best.found)
     # `collide` looks into nodes for what is in reach; a pair a little beyond is taken where one is met.
+    # `squares`, a scratch of LANES, holds a cut for each of at most RADIUS_CLASSES, as many.
     set_cut(best.squares if goal.first else best.cut, best.far, best.frame, best.drop, within)
     search.sizes[0], search.sizes[1], search.status[0] = 0, 0, OPEN
     keys, pairs = search.keys, search.pairs

@@ -8,6 +8,7 @@ import pytest
 import scans
 from solidcloud.builder.radius import voxel_points
 from solidcloud.schemas.archive import Archive
+from solidcloud.schemas.radius_model import RADIUS_CLASSES
 from solidcloud.server.arena import ArenaBuffer
 from solidcloud.server.kernels.layout import (
     BLOCK_WORDS,
@@ -95,3 +96,8 @@ def _points_below(node: int, links: object, count: np.ndarray) -> list[int]:
     if is_leaf[node]:
         return list(range(first[node], first[node] + count[node]))
     return [p for i in range(first[node], first[node] + count[node]) for p in _points_below(i, links, count)]
+
+
+def test_a_lane_each_is_room_for_a_figure_a_class() -> None:
+    # kernels/priority.py keeps thresholds by radius class in a scratch of as many floats as a block has lanes.
+    assert RADIUS_CLASSES <= LANES

@@ -38,10 +38,9 @@ of every function of `server/kernels`, for fixed questions about small scenes.
 
 "killed" is by an assertion, "error" by any other exception, "time" by running {patience} times as long as unchanged
 (a loop without end, mostly). The goal is {goal:.0%} of each file.
-Samples are small: of 25 mutants a share is known to about 7 points, of 60 to about 5. `builder/kernels/neighbours.py`,
-`server/kernels/nearest.py`, `walking.py` and `within.py` were below the goal at 25 or 30 and were drawn larger, the first
-of them after a test was added. `server/report/kernels` are for comparisons in a report, and are not among the files. Samples are small: of 25 mutants a share of 85 % is
-known to some 7 points either way, of 60 to some 5; a file near the goal may lie on the other side of it.
+Samples are small: of 25 mutants a share of 85 % is known to some 7 points either way, of 60 to some 5; a file near the
+goal may lie on the other side of it. `builder/kernels/neighbours.py`, `server/kernels/nearest.py`, `walking.py`
+and `within.py` were below the goal at 25 or 30, and drawn larger. `server/report/kernels` compare, and are not tried.
 """
 
 

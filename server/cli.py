@@ -318,7 +318,10 @@ def accuracy(
 
     with tempfile.TemporaryDirectory(prefix="solidcloud-accuracy-") as scratch, Bars() as bars:
         report = measure(output, Path(scratch), FULL if full else BRIEF, bars, archive, avatar)
-    for line in findings(report.rows):
+    for line in (
+        *report.facts["warnings"],
+        *findings(report.rows, report.facts["poses_judged_by_every_pair"]),
+    ):
         print(line)
     print(f"{output / 'accuracy.html'}, beside it accuracy.csv, accuracy.json and the charts")
 

@@ -8,7 +8,7 @@ import csv
 import json
 import os
 import time
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -91,18 +91,16 @@ def measure(
     progress.advance(1)
     progress.finish()
     with Archives(ground, scratch) as archives:
-        plain = BuildConfig(resolution=ground.step, overwrite=True)
         progress.start("judge", 2, "parts")
-        exact = judge(ground, plain, archives, plan)
+        exact = judge(ground, ground.config, archives, plan)
         progress.advance(1)
-        folder = archives.folder(plain)
-        with Archive(folder) as opened:
+        with Archive(archives.folder(with_slabs(ground))) as opened:
             header = opened.header
             checked = check_judge(opened, ground, exact, plan.brute)
             progress.advance(1)
             progress.finish()
-            settings = engine_settings(plan, ground.step, header.radius)
-            settings += radius_settings(plan, ground.step, header.radius)
+            settings = engine_settings(plan, ground.config, header.radius)
+            settings += radius_settings(plan, ground.config, header.radius)
             measure_engine(settings, archives, ground, exact, plan, progress)
             rows = [s.row for s in settings]
             if ground.truth is not None and ground.own:
@@ -114,6 +112,7 @@ def measure(
     mark_front(rows, SHOWN)
     facts = {
         "scene": ground.name,
+        "warnings": warnings_of(ground, exact),
         "points": header.points,
         "lattice_step_m": ground.step,
         "radius_m": header.radius,
@@ -131,12 +130,35 @@ def measure(
     return Report(ground.name, rows, facts)
 
 
+def with_slabs(ground: Ground) -> BuildConfig:
+    """The ground's build, with slabs where it has none: the plain descent compares bounds with and without."""
+    return replace(ground.config, with_slab=True)
+
+
 def judge(ground: Ground, config: BuildConfig, archives: Archives, plan: Plan) -> Exact:
     """The exact verdicts and distances, by the server's exact answers on the archive of `config`."""
     scene = archives.scene(config)
     tangent = tangent_poses(scene, ground.judged, plan.near_tangent)
     distance = scene.distance(AVATAR, ground.judged, REACH).signed_distance
     return Exact(judged_contact(scene, ground.judged), distance, judged_contact(scene, tangent), tangent)
+
+
+def warnings_of(ground: Ground, exact: Exact) -> list[str]:
+    """What the figures cannot show, in sentences."""
+    said = list(ground.warnings)
+    if not exact.contact.any():
+        said.append(
+            f"None of the {len(exact.contact):,} judged poses touches: nothing can be called clear too often."
+        )
+    if exact.contact.all():
+        said.append(
+            f"All {len(exact.contact):,} judged poses touch: nothing can be called contact too early."
+        )
+    if not len(exact.tangent):
+        said.append(
+            "No pose was found within a micrometre of touching: where rounding shows first is not measured."
+        )
+    return said
 
 
 def measure_engine(
@@ -183,9 +205,8 @@ def measure_turned(ground: Ground, scratch: Path, plan: Plan, progress: Progress
     count = sum(knob in TURNED for knob, _ in plain_settings())
     progress.start("turned", count * (1 + plan.loops), "settings")
     with Archives(turned, folder) as archives:
-        plain = BuildConfig(resolution=turned.step, overwrite=True)
-        exact = judge(turned, plain, archives, plan)
-        with Archive(archives.folder(plain)) as opened:
+        exact = judge(turned, turned.config, archives, plan)
+        with Archive(archives.folder(with_slabs(turned))) as opened:
             rows = measure_plain(opened, turned, exact, plan, lambda: progress.advance(1), only=TURNED)
     for row in rows:
         row.knob += ", turned"

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ...builder.config import DEFAULT_STEP, BuildConfig
 from ...builder.made.facade import build_facade
 from ...builder.made.figure import figure_points
 from ...builder.made.scenes import make_facade
@@ -16,9 +17,10 @@ from ...builder.sources import open_scans
 from ...schemas.answers import Verdict
 from ...schemas.archive import Archive
 from ...schemas.errors import BadDataError
+from ...schemas.index import Header
 from ..avatar import make_avatar
 from ..scene import Scene
-from .accuracy_plan import DEFAULT_STEP, Plan
+from .accuracy_plan import Plan
 from .floor_walk import floor_walk
 from .points import read_avatar
 
@@ -41,19 +43,26 @@ TURN, TILT = np.deg2rad(33.0), np.deg2rad(21.0)
 class Ground(NamedTuple):
     """What is measured on.
 
-    name: for titles.  scan: the file to build.  step: its lattice step [m].  truth: of the made façade, else None.
+    name: for titles.  scan: the file to build.  config: how, where nothing else is said; its lattice step is given.
+    warnings: what of it is not measured, in sentences.  truth: of the made façade, else None.
     own: whether the avatar is the made figure, of which alone the doorway's error is known.
     avatar: (n, 3) [m].  walk: (k, 4, 4), on which times are measured.  around: (k, 4, 4), the walk's poses moved.
     """
 
     name: str
     scan: Path
-    step: float
+    config: BuildConfig
+    warnings: tuple[str, ...]
     truth: SceneTruth | None
     own: bool
     avatar: Floats
     walk: Floats
     around: Floats
+
+    @property
+    def step(self) -> float:
+        """The lattice step [m]."""
+        return self.config.resolution or DEFAULT_STEP
 
     @property
     def judged(self) -> Floats:
@@ -68,26 +77,52 @@ def made_ground(plan: Plan, avatar: Path | None, folder: Path) -> Ground:
     body = figure_points() if avatar is None else read_avatar(avatar)
     _, walk = walk_poses(build_facade().truth, plan.frames)
     name, truth = f"made façade of {made.points:,} points", read_truth(made.truth)
-    return Ground(name, scan, DEFAULT_STEP, truth, avatar is None, body, walk, _moved(walk))
+    config = BuildConfig(resolution=DEFAULT_STEP, overwrite=True)
+    return Ground(name, scan, config, (), truth, avatar is None, body, walk, _moved(walk))
 
 
 def given_ground(archive: Path, plan: Plan, avatar: Path | None, folder: Path) -> Ground:
     """The points of an archive, those nearest to its middle voxel, written to `folder`; a straight walk over them.
 
+    They are built again as the archive was, with its radius: fewer points would have another mean.
     BadDataError: nothing to stand on.
     """
     with Archive(archive) as opened:
         points, total = _middle_points(opened, plan.most_points), opened.header.points
-        step, radius = opened.header.lattice.step, opened.header.radius
+        config, warnings = config_of(opened.header), unknown_regions(opened.header)
     scan = folder / "points.ply"
     write_ply(scan, points)
     body = figure_points() if avatar is None else read_avatar(avatar)
     walk = floor_walk(points)[1]
     walk = walk[np.linspace(0, len(walk) - 1, min(plan.frames, len(walk))).astype(int)]
     # The walk's height is that of points over points; a thin avatar's large spheres would all stand in the floor.
-    walk[:, 2, 3] += radius + make_avatar(body).radius
+    walk[:, 2, 3] += (config.radius or 0.0) + make_avatar(body).radius
     name = f"{archive.resolve().name}, {len(points):,} of {total:,} points"
-    return Ground(name, scan, step, None, avatar is None, body, walk, _moved(walk))
+    return Ground(name, scan, config, warnings, None, avatar is None, body, walk, _moved(walk))
+
+
+def config_of(header: Header) -> BuildConfig:
+    """The options that build an archive again from its points, into another of the same radius, lattice and nodes."""
+    options = header.options
+    return BuildConfig(
+        voxel=header.lattice.voxel_size, resolution=header.lattice.step, radius=header.radius, degree=header.degree,
+        leaf=header.leaf, cell_points=options["cell_points"], cells=options.get("cells", "octree"),
+        with_slab=options["with_slab"], models=frozenset(header.models), overwrite=True,
+    )  # fmt: skip
+
+
+def unknown_regions(header: Header) -> tuple[str, ...]:
+    """What is said of regions whose scans were left out: they are not built again."""
+    if header.unknown_everywhere:
+        where = "everywhere, for of a scan left out not even the bounds are known"
+    elif len(header.unknown):
+        where = f"in {len(header.unknown)} region{'s' * (len(header.unknown) > 1)}"
+    else:
+        return ()
+    return (
+        f"Scans were left out of this archive: it answers unknown {where}. That is not measured here: the points it "
+        "has are built again without.",
+    )
 
 
 def turned_ground(ground: Ground, folder: Path) -> Ground:

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...builder.config import BuildConfig
+from ...builder.config import DEFAULT_STEP, BuildConfig
 from ...builder.pipeline import build_archive
 from ...schemas.answers import Verdict
 from ...schemas.errors import InternalError
@@ -20,7 +20,7 @@ from ..arena import ArenaBuffer
 from ..scene import Scene
 from ..store import Store
 from .accuracy_case import AVATAR, REACH, Ground
-from .accuracy_plan import DEFAULT_DEGREE, DEFAULT_LEAF, Plan
+from .accuracy_plan import Plan
 from .accuracy_row import (
     ALONE,
     BUDGET,
@@ -63,14 +63,14 @@ class Setting(NamedTuple):
     options: dict[str, Any]
 
 
-def engine_settings(plan: Plan, step: float, radius: float) -> list[Setting]:
+def engine_settings(plan: Plan, plain: BuildConfig, radius: float) -> list[Setting]:
     """One setting a value of a knob, everything else as by default; each knob's default value is among them.
 
-    step: of the ground's lattice.  radius: what `mean` gives there [m], held fixed where an archive is built anew: what
-    a coarser lattice changes is then the lattice alone, and not the mean distance of the points that are left.
+    plain: the ground's own build, whose values are the defaults; its lattice step is given.
+    radius: what `mean` gives there [m], held fixed where an archive is built anew: what a coarser lattice changes is then the lattice alone, and not the mean distance of the points that are left.
     """
-    plain = BuildConfig(resolution=step, overwrite=True)
     found: list[Setting] = []
+    step = plain.resolution or DEFAULT_STEP
 
     def held(default: bool, **changes: Any) -> BuildConfig:
         """A build with the default's radius; the default itself has it anyway, and is not built twice."""
@@ -92,20 +92,21 @@ def engine_settings(plan: Plan, step: float, radius: float) -> list[Setting]:
     for value in sorted({*plan.steps, step}):
         default = value == step
         add(STEP, length_name(value), held(default, resolution=value), default, value)
-    for degree in plan.degrees:
-        default = degree == DEFAULT_DEGREE
+    for degree in sorted({*plan.degrees, plain.degree}):
+        default = degree == plain.degree
         add(DEGREE, str(degree), held(default, degree=degree), default, degree)
-    for leaf in plan.leaves:
-        default = leaf == DEFAULT_LEAF
+    for leaf in sorted({*plan.leaves, plain.leaf}):
+        default = leaf == plain.leaf
         add(LEAF, str(leaf), held(default, leaf=leaf), default, leaf)
-    add(NODES, "sphere with slab", plain, True, 1.0)
-    add(NODES, "sphere", held(False, with_slab=False), False, 0.0)
+    for slab, name in ((True, "sphere with slab"), (False, "sphere")):
+        default = slab == plain.with_slab
+        add(NODES, name, held(default, with_slab=slab), default, float(slab))
     return found
 
 
-def radius_settings(plan: Plan, step: float, radius: float) -> list[Setting]:
+def radius_settings(plan: Plan, plain: BuildConfig, radius: float) -> list[Setting]:
     """The radius models, each with the plan's factors; `fixed` with radii rounded to what a user would type."""
-    config = BuildConfig(resolution=step, models=frozenset({"mean", "local", "border"}), overwrite=True)
+    config = replace(plain, models=frozenset({"mean", "local", "border"}))
     found = []
     for model in ("mean", "local", "border", "local+border"):
         for factor in plan.factors:

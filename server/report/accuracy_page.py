@@ -44,11 +44,16 @@ def write_page(report: "Report", charts: dict[str, Path], target: Path) -> None:
         f"times on a walk of {facts['walk_poses']:,} poses, verdicts on {facts['judged_poses']:,} poses, "
         f"{facts['judged_contacts']:,} of them in contact, and on {facts['near_tangent_poses']:,} within a micrometre "
         f"of touching. The judge is the server's exact answer; at {facts['poses_judged_by_every_pair']:,} poses every "
-        "pair of points was compared in integers as well, and agreed.</p>",
+        "pair of points was compared in integers as well, and agreed."
+        f"{''.join(f' <strong>{escape(said)}</strong>' for said in facts['warnings'])}</p>",
         _noise(report.rows),
         "<h2>At a glance</h2>",
         _picture(charts["main"], CHARTS["main"]),
-        "<ul>" + "".join(f"<li>{escape(line)}</li>" for line in findings(report.rows)) + "</ul>",
+        "<ul>"
+        + "".join(
+            f"<li>{escape(line)}</li>" for line in findings(report.rows, facts["poses_judged_by_every_pair"])
+        )
+        + "</ul>",
     ]
     if "verdicts" in charts:
         body.append(_picture(charts["verdicts"], CHARTS["verdicts"]))

@@ -116,7 +116,7 @@ def is_scaled(row: Row) -> bool:
 def label_of(row: Row) -> str:
     """A setting's name beside its point."""
     if row.knob == NODES:
-        return "spheres without slab"
+        return "spheres with slab" if row.value else "spheres without slab"
     return f"lattice {row.setting}" if row.knob == STEP else row.setting
 
 

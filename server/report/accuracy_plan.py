@@ -4,9 +4,6 @@ from dataclasses import dataclass
 
 from .case import PAPER_POINTS
 
-# The values that a user has who says nothing: their rows are marked in tables and pictures.
-DEFAULT_STEP, DEFAULT_DEGREE, DEFAULT_LEAF = 1e-4, 8, 32
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Plan:

@@ -1,6 +1,7 @@
 """The accuracy report's judge, poses and guards, on a small hall."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,15 +13,17 @@ from solidcloud.builder.made.figure import figure_points
 from solidcloud.builder.pipeline import build_archive
 from solidcloud.schemas.archive import Archive
 from solidcloud.schemas.errors import InternalError
-from solidcloud.server.report.accuracy import judge
+from solidcloud.server.report.accuracy import judge, warnings_of
 from solidcloud.server.report.accuracy_arithmetic import VOLUME, check_judge, measure_plain
 from solidcloud.server.report.accuracy_case import (
     LEAST_OFF,
     MOST_OFF,
     REACH,
     Ground,
+    config_of,
     given_ground,
     turned_ground,
+    unknown_regions,
 )
 from solidcloud.server.report.accuracy_engine import UNSPENT, Archives, Exact, Setting, judge_engine
 from solidcloud.server.report.accuracy_plan import Plan
@@ -62,6 +65,44 @@ def judged(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Judged]:
 
 def test_both_verdicts_are_among_the_judged_poses(judged: Judged) -> None:
     assert 0 < judged.exact.contact.sum() < len(judged.exact.contact) == 80
+
+
+def test_an_archive_is_built_again_as_it_was(judged: Judged, tmp_path: Path) -> None:
+    given = BuildConfig(
+        voxel=1.5, resolution=2e-3, radius=0.031, degree=5, leaf=9, cells="balanced", cell_points=200,
+        with_slab=False, models=frozenset({"mean", "local"}), jobs=1,
+    )  # fmt: skip
+    build_archive([judged.ground.scan], tmp_path / "given", given)
+    ground = given_ground(tmp_path / "given", PLAN, None, tmp_path)
+    with (
+        Archives(ground, tmp_path) as archives,
+        Archive(archives.folder(ground.config)) as again,
+        Archive(tmp_path / "given") as first,
+    ):
+        assert again.header.options == first.header.options
+        for name in ("radius", "degree", "leaf", "models", "points"):
+            assert getattr(again.header, name) == getattr(first.header, name), name
+        assert again.header.lattice == first.header.lattice
+        assert config_of(first.header) == ground.config and ground.warnings == ()
+
+
+def test_what_is_not_measured_is_said(judged: Judged) -> None:
+    header, exact = judged.archive.header, judged.exact
+    one = replace(header, unknown=np.zeros((1, 2, 3), np.int64))
+    assert "unknown in 1 region." in unknown_regions(one)[0]
+    assert (
+        "unknown in 2 regions." in unknown_regions(replace(header, unknown=np.zeros((2, 2, 3), np.int64)))[0]
+    )
+    assert "unknown everywhere" in unknown_regions(replace(one, unknown_everywhere=True))[0]
+    assert unknown_regions(header) == () and warnings_of(judged.ground, exact) == []
+    ground = judged.ground._replace(warnings=("left out",))
+    for changed, said in (
+        ({"contact": np.zeros(80, bool)}, "None of the 80 judged poses touches"),
+        ({"contact": np.ones(80, bool)}, "All 80 judged poses touch"),
+        ({"tangent": exact.tangent[:0]}, "No pose was found within a micrometre"),
+    ):
+        first, second = warnings_of(ground, exact._replace(**changed))
+        assert first == "left out" and second.startswith(said)
 
 
 def test_near_tangent_poses_are_within_a_micrometre_on_either_side(judged: Judged) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from solidcloud.builder.config import BuildConfig
 from solidcloud.server.report import accuracy_picture
 from solidcloud.server.report.accuracy import Report
 from solidcloud.server.report.accuracy_arithmetic import PRIMITIVE, VOLUME, plain_settings
@@ -20,7 +21,9 @@ from solidcloud.server.report.accuracy_row import PLAIN, RADIUS, SHEET, STEP, TO
 from solidcloud.server.report.accuracy_words import KNOBS, findings, leak_at
 from solidcloud.server.report.spheres import load_pyplot
 
+PLAIN_BUILD = BuildConfig(resolution=1e-4)
 FACTS = {
+    "warnings": ["A < B is not measured."],
     "avatar_points": 3617,
     "walk_poses": 1200,
     "judged_poses": 2400,
@@ -33,7 +36,7 @@ FACTS = {
 def all_rows() -> list[Row]:
     """A row for each setting of a brief run, with figures drawn at random, but for the defaults."""
     rng = np.random.default_rng(5)
-    settings = [*engine_settings(BRIEF, 1e-4, 0.0124), *radius_settings(BRIEF, 1e-4, 0.0124)]
+    settings = [*engine_settings(BRIEF, PLAIN_BUILD, 0.0124), *radius_settings(BRIEF, PLAIN_BUILD, 0.0124)]
     rows = [s.row for s in settings]
     for knob, kind in plain_settings():
         rows.append(Row(knob, kind.name, by=PLAIN))
@@ -103,6 +106,8 @@ def test_the_page_fetches_nothing_and_names_every_knob_and_setting(
     for row in rows:
         assert row.setting in parser.text, row.setting
         assert row.knob.capitalize() in parser.text
+    assert "<strong>A &lt; B is not measured.</strong></p>" in page
+    assert "every pair of points in integers at 40 poses" in parser.text
     assert page.count("<img") == len(charts)
     for data in re.findall(r"data:image/png;base64,([^\"]+)", page):
         assert base64.b64decode(data).startswith(b"\x89PNG")
@@ -189,6 +194,15 @@ def test_the_findings_follow_from_the_rows() -> None:
         by_name["sphere"].mean_us, by_name["box"].mean_us = sphere, box
         assert said in " ".join(findings(rows))
     assert findings([]) == []
+    assert "The judge" not in fast
+    integers = next(row for row in rows if row.setting == "integers")
+    integers.early = 0
+    assert (
+        "every pair of points in integers at 40 poses, and the plain integer descent at 2,800 poses, 400 of them "
+        "near-tangent, agree with it." in findings(rows, 40)[0]
+    )
+    integers.tangent_late = 2
+    assert "disagree 2 times" in findings(rows, 40)[0]
 
 
 def felt(setting: str, doorway: float, leak: float) -> Row:

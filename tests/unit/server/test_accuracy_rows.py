@@ -16,8 +16,11 @@ from solidcloud.server.report.accuracy_engine import engine_settings, length_nam
 from solidcloud.server.report.accuracy_felt import measure_felt, measure_made
 from solidcloud.server.report.accuracy_plan import BRIEF, FULL, Plan
 from solidcloud.server.report.accuracy_row import (
+    BUDGET,
     COLUMNS,
     DEGREE,
+    LEAF,
+    NODES,
     RADIUS,
     STEP,
     TOLERANCE,
@@ -139,7 +142,7 @@ def test_noise_is_what_the_middle_repetition_took_longer() -> None:
 
 @pytest.mark.parametrize("plan", [BRIEF, FULL])
 def test_every_knob_has_one_default_and_its_other_settings_differ(plan: object) -> None:
-    settings = engine_settings(plan, 1e-4, 0.0124)  # type: ignore[arg-type]
+    settings = engine_settings(plan, BuildConfig(resolution=1e-4), 0.0124)  # type: ignore[arg-type]
     knobs = {s.row.knob for s in settings}
     assert RADIUS not in knobs and len(knobs) == 6
     for knob in knobs:
@@ -148,10 +151,25 @@ def test_every_knob_has_one_default_and_its_other_settings_differ(plan: object) 
         assert len({(str(s.config), str(s.options)) for s in own}) == len(own), knob
 
 
+def test_the_defaults_are_those_of_the_archive_that_is_given() -> None:
+    own = BuildConfig(
+        resolution=3e-3, degree=5, leaf=7, with_slab=False, voxel=2.0, radius=0.03, cells="balanced"
+    )
+    settings = engine_settings(BRIEF, own, 0.03)
+    marked = {s.row.knob: s.row.setting for s in settings if s.row.default}
+    assert marked == {
+        TOLERANCE: "0", BUDGET: "none", STEP: "3 mm", DEGREE: "5", LEAF: "7", NODES: "sphere",
+    }  # fmt: skip
+    assert all(s.config == own for s in settings if s.row.default)
+    for config in [s.config for s in (*settings, *radius_settings(BRIEF, own, 0.03))]:
+        assert (config.voxel, config.radius, config.cells) == (2.0, 0.03, "balanced")
+    assert [s.config.with_slab for s in settings if s.row.knob == NODES] == [True, False]
+
+
 @pytest.mark.parametrize("plan", [BRIEF, FULL])
 def test_no_radius_model_is_measured_twice(plan: Plan) -> None:
     for radius in (0.0124, 0.00987, 0.003, 0.25):
-        names = [s.row.setting for s in radius_settings(plan, 1e-4, radius)]
+        names = [s.row.setting for s in radius_settings(plan, BuildConfig(resolution=1e-4), radius)]
         assert len(set(names)) == len(names) == 5 * len(plan.factors), names
 
 
@@ -163,7 +181,11 @@ def test_with_another_avatar_the_leak_is_measured_and_the_doorway_is_not(
     monkeypatch.setattr(accuracy_felt, "doorway_error", lambda *_, **__: Doorway(math.inf, 0.5, math.inf))
     truth = SimpleNamespace(facades=["facade"])
     for own in (False, True):
-        settings = [s for s in engine_settings(BRIEF, 1e-4, 0.0124) if s.row.knob in (TOLERANCE, DEGREE)]
+        settings = [
+            s
+            for s in engine_settings(BRIEF, BuildConfig(resolution=1e-4), 0.0124)
+            if s.row.knob in (TOLERANCE, DEGREE)
+        ]
         ground: Any = SimpleNamespace(truth=truth, own=own)
         archives: Any = SimpleNamespace(scene=lambda config: None)
         measure_felt(settings, archives, ground, BRIEF, lambda: None)
@@ -177,7 +199,8 @@ def test_doors_are_made_for_the_models_of_the_plan_and_fill_their_rows_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     plan = Plan(points=9000, made_models=("mean", "local+border"))
-    settings = [*engine_settings(plan, 1e-3, 0.0124), *radius_settings(plan, 1e-3, 0.0124)]
+    plain = BuildConfig(resolution=1e-3)
+    settings = [*engine_settings(plan, plain, 0.0124), *radius_settings(plan, plain, 0.0124)]
     asked = {}
 
     def made(folder: Path, config: BuildConfig, models: list[str], **others: Any) -> dict[str, Doorway]:

@@ -91,7 +91,7 @@ def draw_knob(knob: str, rows: Sequence[Row], target: Path) -> Path:
     times.invert_yaxis()
     most = max((row.p99_us or 0.0) for row in rows)
     times.set_xlim(0, most * 1.08)
-    times.set_xlabel("time of a pose [µs]: p50 to p99, mean as a point")
+    times.set_xlabel("time of a pose [µs]: p50 to p99 of dozens, mean as a point")
     left = np.zeros(len(rows))
     for name, colour in (("early", "#d62839"), ("late", "#5b1a8b"), ("unknown", "#b9b2a8")):
         share = np.array([getattr(row, name) / max(row.poses, 1) * 100 for row in rows])

@@ -67,7 +67,8 @@ def engine_settings(plan: Plan, plain: BuildConfig, radius: float) -> list[Setti
     """One setting a value of a knob, everything else as by default; each knob's default value is among them.
 
     plain: the ground's own build, whose values are the defaults; its lattice step is given.
-    radius: what `mean` gives there [m], held fixed where an archive is built anew: what a coarser lattice changes is then the lattice alone, and not the mean distance of the points that are left.
+    radius: what `mean` gives there [m], held fixed where an archive is built anew: what a coarser lattice changes is
+    then the lattice alone, and not the mean distance of the points that are left.
     """
     found: list[Setting] = []
     step = plain.resolution or DEFAULT_STEP

@@ -28,11 +28,11 @@ tr.default{background:#efe9dc;font-weight:600}.noisy{color:#a05a00}dt{font-weigh
 
 # Column heads of a table, and what a row shows under each; a column that is empty for all rows is left out.
 HEADS = (
-    "setting", "time of a pose [µs]", "p50", "p99", "times default", "early", "late", "unknown",
+    "setting", "time of a pose [µs]", "p50 of dozens", "p99 of dozens", "times default", "early", "late", "unknown",
     "near-tangent: early", "late", "unknown", "distance off, most [mm]", "mean [mm]", "no pair found",
     "doorway [mm]", "made doorway [mm]", "leak p50 [mm]", "p99 [mm]", "worst [mm]", "passed [%]",
     "archive [bytes]", "decode [ms]",
-    "node tests", "pair tests", "Pareto front",
+    "node tests", "pair tests", "Pareto front", "note",
 )  # fmt: skip
 
 
@@ -118,6 +118,7 @@ def _cells(row: Row) -> list[str]:
         _figure(row.decode_ms, 1),
         *(_figure(value, 0) for value in (row.node_tests, row.pair_tests)),
         ", ".join(row.front),
+        row.note,
     ]
 
 

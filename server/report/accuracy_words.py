@@ -6,11 +6,16 @@ from itertools import pairwise
 
 from .accuracy_arithmetic import ALL_PAIRS, ARITHMETIC, PRIMITIVE, VOLUME
 from .accuracy_row import ALONE, BUDGET, DEGREE, LEAF, NODES, RADIUS, SHEET, STEP, TOLERANCE, Row
+from .accuracy_timing import NOISY
+
+# Times that differ by less than this factor are called the same: of one archive built twice they did by 6 %.
+SAME_TIME = 1.15
 
 TERMS = {
     "pose": "where the avatar stands and how it is turned; each is one question: does it touch the scan there?",
     "time of a pose": "a dozen neighbouring poses are timed as one call and divided; the best of several repetitions. "
-    "p50 is the middle pose, p99 one that only one in a hundred is slower than.",
+    "p50 is the middle one of these dozens, p99 the one that only one dozen in a hundred is slower than: a single pose "
+    "may take longer.",
     "early, late": "early: called contact though the exact answer is clear, so one is stopped before touching. Late: "
     "called clear though the exact answer is contact, so one may pass through.",
     "unknown": "neither: the work allowed was spent before an answer was certain.",
@@ -115,7 +120,7 @@ def _exact(rows: Sequence[Row], brute: int) -> str:
     row = _find(rows, TOLERANCE)
     if row is None or row.mean_us is None:
         return ""
-    said = f"The exact answer takes {row.mean_us:.1f} µs a pose, p99 {row.p99_us:.1f} µs."
+    said = f"The exact answer takes {row.mean_us:.1f} µs a pose, p99 of dozens {row.p99_us:.1f} µs."
     plain = _find(rows, ARITHMETIC, "integers")
     if plain is None or not brute:
         return said
@@ -137,11 +142,35 @@ def _tolerance(rows: Sequence[Row]) -> str:
     best = min(searches, key=lambda r: r.times or 0.0)
     said = (
         f"A tolerance alone is answered exactly: {alone.early + alone.late} of {alone.poses:,} verdicts are wrong with "
-        f"{alone.setting.removesuffix(ALONE)}, in {alone.times:.2f} times the time of the exact answer. "
+        f"{alone.setting.removesuffix(ALONE)}, in {_ratio(alone, 'the exact answer')}. "
         f"A budget asks for a search that may stop within the tolerance: at best, {best.setting}, it takes "
-        f"{best.times:.2f} times the time of the exact answer, and calls {best.early:,} of {best.poses:,} poses early"
+        f"{_ratio(best, 'the exact answer')}, and calls {best.early:,} of {best.poses:,} poses early"
     )
-    return f"{said}." if (best.times or 0.0) < 1.0 else f"{said}: it buys no time, but bounds the work."
+    faster = not _noisy(best) and (best.times or 0.0) * SAME_TIME < 1.0
+    return f"{said}." if faster else f"{said}: no time is seen to be won, but the work is bounded."
+
+
+def _noisy(row: Row) -> bool:
+    """Whether other work disturbed a row's times."""
+    return row.noise is not None and row.noise > NOISY
+
+
+def _alike(one: float, other: float) -> bool:
+    """Whether two times differ by no more than noise."""
+    return max(one, other) <= SAME_TIME * min(one, other)
+
+
+def _ratio(row: Row, of: str = "", base: Row | None = None) -> str:
+    """A row's time over that of its knob's default, or of `base`, in words that claim no more than was seen.
+
+    of: what it is compared with, in words; empty where that is said before.
+    """
+    times = (row.times if base is None else (row.mean_us or 0.0) / (base.mean_us or math.inf)) or 0.0
+    if _alike(times, 1.0):
+        return f"the same time{of and f' as {of}'}, within noise"
+    if _noisy(row) or (base is not None and _noisy(base)):
+        return f"a time too noisy to compare{of and f' with {of}'}"
+    return f"{times:.2f} times the time{of and f' of {of}'}"
 
 
 def _budget(rows: Sequence[Row]) -> str:
@@ -259,7 +288,7 @@ def _arithmetic(rows: Sequence[Row]) -> str:
     if not own:
         return ""
     parts = [
-        f"{r.setting} {r.times or 0.0:.2f} times the time, {r.early + r.late} of {r.poses:,} and "
+        f"{r.setting} {_ratio(r)}, {r.early + r.late} of {r.poses:,} and "
         f"{r.tangent_early + r.tangent_late} of {r.tangent:,} near-tangent wrong"
         for r in own
         if not r.default
@@ -277,10 +306,17 @@ def _volumes(rows: Sequence[Row], suffix: str) -> str:
         return ""
     sphere, slab, box = (own[name].mean_us or 0.0 for name in ("sphere", "sphere with slab", "box"))
     where = "walls turned off the axes" if suffix else "walls along the axes"
-    order = (
-        "Groups of boxes beat groups of spheres" if box < sphere else "Groups of spheres beat groups of boxes"
+    if _alike(box, sphere):
+        order = "Groups of boxes and groups of spheres take the same time, within noise,"
+    elif box < sphere:
+        order = "Groups of boxes beat groups of spheres"
+    else:
+        order = "Groups of spheres beat groups of boxes"
+    third = (
+        "as long as boxes, within noise"
+        if _alike(box, slab)
+        else f"{'more' if box < slab else 'less'} than boxes"
     )
-    third = "boxes beat it too" if box < slab else "it beats boxes"
     return (
         f"{order} as bounds, {where}: {box:.1f} against {sphere:.1f} µs a pose in a plain descent. A sphere cut by a "
         f"slab takes {slab:.1f} µs: {third}."
@@ -296,7 +332,7 @@ def _cubes(rows: Sequence[Row]) -> str:
         if cubes is None or boxes is None or not boxes.mean_us:
             continue
         lines.append(
-            f"{where}: {(cubes.mean_us or 0.0) / boxes.mean_us:.2f} times the time of spheres under the same boxes, "
+            f"{where}: {_ratio(cubes, 'spheres under the same boxes', boxes)}, "
             f"{cubes.early} of {cubes.poses:,} poses early, distances off by up to "
             f"{cubes.distance_max_mm or 0.0:.0f} mm"
         )

@@ -70,6 +70,8 @@ def run(
     from .accuracy_picture import draw_charts
 
     load_pyplot()  # missing: better said now than after minutes
+    if archive is not None:
+        Archive(archive).close()  # what cannot be opened leaves no empty folder
     out.mkdir(parents=True, exist_ok=True)
     report = measure(scratch, plan, progress, archive, avatar)
     progress.start("draw", 1, "page")

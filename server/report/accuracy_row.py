@@ -86,8 +86,14 @@ class Row:
         return (self.early + self.late + self.unknown) / self.poses if self.poses else 0.0
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON and CSV: the fields, and the share that is wrong; None in place of what is infinite."""
+        """For JSON and CSV: the fields, and the share that is wrong; None for what is infinite, named in the note."""
         found = {**asdict(self), "front": list(self.front), "wrong_share": self.wrong_share}
+        endless = [
+            f"{name} is infinite"
+            for name, value in found.items()
+            if isinstance(value, float) and math.isinf(value)
+        ]
+        found["note"] = "; ".join(filter(None, (self.note, *endless)))
         return {
             name: None if isinstance(value, float) and not math.isfinite(value) else value
             for name, value in found.items()

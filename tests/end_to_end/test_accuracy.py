@@ -41,6 +41,11 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> dict:
     return report_of(tmp_path_factory.mktemp("accuracy") / "report")
 
 
+def test_an_archive_that_cannot_be_opened_leaves_no_folder(tmp_path: Path) -> None:
+    assert cli.run(["accuracy", str(tmp_path / "none"), "-o", str(tmp_path / "report")]) != 0
+    assert not (tmp_path / "report").exists()
+
+
 def rows_of(report: dict, knob: str) -> dict[str, dict]:
     return {row["setting"]: row for row in report["rows"] if row["knob"] == knob}
 
@@ -118,11 +123,15 @@ def test_an_archive_that_is_given_is_walked_over_and_has_no_doors(tmp_path: Path
     # The walk goes through the middle of all points, y = 2.33 m: the wall is a shoulder's width beside it.
     wall = np.column_stack([rng.uniform(0, 8, 5000), np.full(5000, 2.73), rng.uniform(0, 2, 5000)])
     scan = scans.write_ply(tmp_path / "hall.ply", np.concatenate([floor, wall]))
-    build_archive([scan], tmp_path / "hall", BuildConfig(voxel=2.0, resolution=1e-3))
+    build_archive(
+        [scan], tmp_path / "hall", BuildConfig(voxel=2.0, resolution=1e-3, degree=5, leaf=20, radius=0.03)
+    )
     report = report_of(tmp_path / "report", str(tmp_path / "hall"))
     assert report["facts"]["points"] == 14_000 and report["facts"]["lattice_step_m"] == 1e-3
     assert 0 < report["facts"]["judged_contacts"] < report["facts"]["judged_poses"] == 96
     assert report["facts"]["near_tangent_poses"] > 0
     assert all(row["doorway_mm"] is None and row["leak_p99_mm"] is None for row in report["rows"])
     assert rows_of(report, "lattice step")["1 mm"]["default"]
+    assert rows_of(report, "degree")["5"]["default"] and rows_of(report, "leaf size")["20"]["default"]
+    assert report["facts"]["radius_m"] == 0.03 and report["facts"]["warnings"] == []
     assert rows_of(report, "tolerance")["0"]["wrong_share"] == 0.0

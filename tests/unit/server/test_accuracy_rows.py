@@ -100,6 +100,10 @@ def test_rows_are_written_as_json_and_csv_that_hold_every_field(tmp_path: Path) 
     found = json.loads((tmp_path / "accuracy.json").read_text())
     assert found["facts"] == {"seconds": 1.0} and [row["setting"] for row in found["rows"]] == ["0", "1 mm"]
     assert found["rows"][1]["doorway_mm"] is None and found["rows"][1]["value"] is None
+    assert (
+        found["rows"][1]["note"] == "value is infinite; doorway_mm is infinite"
+        and not found["rows"][0]["note"]
+    )
     assert set(found["rows"][0]) == set(COLUMNS)
     lines = (tmp_path / "accuracy.csv").read_text().splitlines()
     assert lines[0].split(",") == list(COLUMNS) and len(lines) == 3

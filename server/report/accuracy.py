@@ -150,11 +150,11 @@ def warnings_of(ground: Ground, exact: Exact) -> list[str]:
     said = list(ground.warnings)
     if not exact.contact.any():
         said.append(
-            f"None of the {len(exact.contact):,} judged poses touches: nothing can be called clear too often."
+            f"None of the {len(exact.contact):,} judged poses touches: clear where it should be contact cannot show."
         )
     if exact.contact.all():
         said.append(
-            f"All {len(exact.contact):,} judged poses touch: nothing can be called contact too early."
+            f"All {len(exact.contact):,} judged poses touch: contact where it should be clear cannot show."
         )
     if not len(exact.tangent):
         said.append(

@@ -203,8 +203,11 @@ def _lattice(rows: Sequence[Row]) -> str:
 def _radius(rows: Sequence[Row]) -> str:
     mean = _find(rows, RADIUS)
     others = [r for r in rows if r.knob == RADIUS and not r.default and ":" not in r.setting]
-    if mean is None or mean.doorway_mm is None or not others:
+    if mean is None or mean.leak_p99_mm is None or not others:
         return ""
+    if mean.doorway_mm is None:  # another avatar than the made figure
+        leaks = [f"{r.setting} {r.leak_p99_mm:.0f} mm" for r in (mean, *others) if r.leak_p99_mm is not None]
+        return "Radius models, 99th percentile of the leak: " + "; ".join(leaks) + "."
     parts = [
         f"{r.setting} {r.doorway_mm:.0f} and {r.leak_p99_mm:.0f} mm"
         for r in (mean, *others)

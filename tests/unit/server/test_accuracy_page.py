@@ -254,6 +254,11 @@ def test_radius_models_are_compared_at_the_same_doorway_error() -> None:
     assert "At the doorway error" not in " ".join(findings(rows)), (
         "no factor of local reaches so narrow a door"
     )
+    for row in rows:
+        row.doorway_mm = None
+    assert findings(rows) == [
+        "Radius models, 99th percentile of the leak: mean 12 mm; local 14 mm; local+border 1 mm."
+    ]
 
 
 def test_labels_cover_neither_one_another_nor_points() -> None:

@@ -202,7 +202,7 @@ class Questions:
         options: QuestionOptions,
         names: Sequence[str] = (),
         *,
-        batch: int = BATCH_POSES,
+        batch: int | None = None,
     ) -> _A:
         """Ask for k answers, in several requests where they are many.
 
@@ -210,6 +210,7 @@ class Questions:
         the budget.  names: the avatars it is about. An answer that no message holds is asked for again in smaller
         requests, but for that of `objects`, which is one.
         """
+        batch = batch or BATCH_POSES
         parts: list[_A] = []
         begin = time.monotonic()
         start, budget, left = 0, options.get("budget_ms"), options

@@ -49,7 +49,7 @@ def test_threads_change_no_byte(archive: Path) -> None:
 
 @pytest.mark.case(
     25,
-    "1,000 mixed requests compiled for a generic processor without any extension: the same reply bytes",
+    "10,000 mixed requests compiled for a generic processor without any extension: the same reply bytes",
     compiled_only="it compiles twice",
 )
 @pytest.mark.slow
@@ -57,10 +57,10 @@ def test_threads_change_no_byte(archive: Path) -> None:
 @pytest.mark.skipif(INTERPRETED, reason="it compiles twice")
 def test_the_processor_changes_no_byte(archive: Path) -> None:
     """Everything is compiled once more: a minute or two."""
-    here = mixed_requests.checksums(archive, mixed_requests.requests(1000), 1, 1 << 26)
+    here = mixed_requests.checksums(archive, mixed_requests.requests(10_000), 1, 1 << 26)
     path = os.pathsep.join([str(Path(mixed_requests.__file__).parent), os.environ.get("PYTHONPATH", "")])
     done = subprocess.run(
-        [sys.executable, "-W", "ignore", mixed_requests.__file__, str(archive), "1000"],
+        [sys.executable, "-W", "ignore", mixed_requests.__file__, str(archive), "10000"],
         env=os.environ | {"PYTHONPATH": path, "NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""},
         capture_output=True, text=True, check=True, timeout=900,
     )  # fmt: skip

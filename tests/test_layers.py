@@ -25,7 +25,7 @@ DOORS = {
     "embreex": ("builder/made/scanner.py",),
     "matplotlib": ("server/report/",),
     "PIL": ("server/report/",),
-    "typer": ("server/cli.py",),
+    "typer": ("server/cli.py", "server/verbs/"),
     "rich": ("server/console.py", "server/report/"),
 }
 # Needed everywhere; numpy and msgspec are the language that arrays and messages are written in.
@@ -34,7 +34,7 @@ FREE = frozenset({"numpy", "msgspec"}) | sys.stdlib_module_names
 # An avatar's tree is built by the code that builds a voxel's; nothing else crosses from builder to server.
 CROSSING = ("builder/hierarchy", "builder/radius")
 # Above both sides: the command line, and the reports.
-ABOVE = ("server/cli.py", "server/console.py", "server/report/")
+ABOVE = ("server/cli.py", "server/console.py", "server/report/", "server/verbs/")
 
 
 class Import(NamedTuple):
@@ -128,7 +128,7 @@ def stray_inside(where: str, file: str, top: str, target: str) -> str | None:
     above = file.startswith(ABOVE)
     if top == "server" and aim == "builder" and not above and not target.startswith(CROSSING):
         return f"{where}: imports {target}; the server uses {' and '.join(CROSSING)} alone"
-    if target.startswith(ABOVE[2]) and not above:
+    if target.startswith(ABOVE[2:]) and not above:
         return f"{where}: imports {target}; only the command line and the reports stand that high"
     return None
 

@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from solidcloud.server.cli import parse_bytes, run
+from solidcloud.server.cli import run
+from solidcloud.server.verbs.options import parse_bytes
 from solidcloud.server.report.serving import free_port, served
 
 VERBS = ["build", "info", "validate", "serve", "query", "accuracy", "make"]

@@ -1,0 +1,40 @@
+"""`solidcloud accuracy`: what accuracy costs in time."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from .options import needs_extra
+
+
+def accuracy(
+    archive: Annotated[
+        Path | None, typer.Argument(help="Folder of an archive; left out: a façade is made.")
+    ] = None,
+    avatar: Annotated[
+        Path | None, typer.Option(help="Points of the avatar; left out: a made figure.")
+    ] = None,
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder to write.")] = Path("report"),
+    full: Annotated[bool, typer.Option("--full", help="More settings, poses and repetitions.")] = False,
+) -> None:
+    """Measure what accuracy costs.
+
+    Each knob is turned by itself. Writes a table, a page and charts.
+    """
+    import tempfile
+
+    with needs_extra("made"):
+        from ..report.accuracy import run as measure
+    from ..console import Bars
+    from ..report.accuracy_plan import BRIEF, FULL
+    from ..report.accuracy_words import findings
+
+    with tempfile.TemporaryDirectory(prefix="solidcloud-accuracy-") as scratch, Bars() as bars:
+        report = measure(output, Path(scratch), FULL if full else BRIEF, bars, archive, avatar)
+    for line in (
+        *report.facts["warnings"],
+        *findings(report.rows, report.facts["poses_judged_by_every_pair"]),
+    ):
+        print(line)
+    print(f"{output / 'accuracy.html'}, beside it accuracy.csv, accuracy.json and the charts")

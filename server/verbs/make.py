@@ -1,0 +1,81 @@
+"""`solidcloud make`: scenes with known truth, and what walks through them."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from .options import needs_extra
+
+ScanOutput = Annotated[
+    Path,
+    typer.Option("-o", "--output", help=".laz, .las or .e57 file, or a folder for a LAZ file a station."),
+]
+Seed = Annotated[int, typer.Option(help="The same seed gives the same points.")]
+
+
+def make_facade(
+    output: ScanOutput,
+    points: Annotated[int, typer.Option(help="Points of the scan, exactly.")] = 587_923,
+    seed: Seed = 2012,
+    door: Annotated[float, typer.Option(help="Clear width of the main door [m].")] = 1.60,
+) -> None:
+    """Make a Gothic façade, scanned by casting rays.
+
+    Its truth is written beside the scan, as NAME.truth.json.
+    """
+    with needs_extra("made"):
+        from ...builder.made.scenes import make_facade as make_it
+    from ..console import Bars
+
+    with Bars() as bars:
+        made = make_it(output, points=points, seed=seed, door=door, progress=bars.made)
+    print(f"{made.points:,} points in {output}, the truth in {made.truth}")
+
+
+def make_town(
+    output: ScanOutput,
+    points: Annotated[int, typer.Option(help="Points of all scans, exactly; as many façades as that takes.")],
+    seed: Seed = 2012,
+) -> None:
+    """Make a town of façades, each as dense as one.
+
+    Its truth is written beside the scan, as NAME.truth.json.
+    """
+    with needs_extra("made"):
+        from ...builder.made.scenes import make_town as make_it
+    from ..console import Bars
+
+    with Bars() as bars:
+        made = make_it(output, points=points, seed=seed, progress=bars.made)
+    print(f"{made.points:,} points in {output}, the truth in {made.truth}")
+
+
+def make_figure(
+    output: Annotated[Path, typer.Option("-o", "--output", help=".obj or .ply file to write.")],
+    points: Annotated[int, typer.Option(help="Points of the figure, exactly.")] = 3617,
+    seed: Seed = 2012,
+    height: Annotated[float, typer.Option(help="Height of the figure [m].")] = 1.75,
+) -> None:
+    """Make a human figure in mid-walk: an avatar."""
+    from ...builder.made.figure import figure_points, write_figure
+
+    write_figure(output, figure_points(points, seed, height))
+    print(f"{points:,} points in {output}")
+
+
+def make_walk(
+    truth: Annotated[Path, typer.Argument(help="The NAME.truth.json of a made façade.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="CSV file of poses to write.")],
+    frames: Annotated[int, typer.Option(min=2, help="Poses, 30 a second.")] = 1200,
+) -> None:
+    """Write the walk through a made façade as poses.
+
+    Columns t,x,y,z,qw,qx,qy,qz, as query takes them.
+    """
+    from ...builder.made.truth import read_truth
+    from ...builder.made.walk import walk_poses
+    from ..pose_file import write_poses
+
+    write_poses(output, *walk_poses(read_truth(truth).facades[0], frames))
+    print(f"{frames} poses in {output}")

@@ -1,0 +1,47 @@
+"""What the verbs of the command line have in common: options that several take, sizes, missing libraries, JSON."""
+
+import json
+import re
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from ...schemas.errors import BadRequestError, SolidcloudError
+
+ArchivePath = Annotated[Path, typer.Argument(help="Folder of an archive.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")]
+
+
+def parse_bytes(text: str, option: str) -> int:
+    """A size such as 512MB or 2GB in bytes, in steps of 1024; BadRequestError names the option."""
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([KMGT]?)i?B?", text.strip(), re.IGNORECASE)
+    if not match:
+        raise BadRequestError(f"{option} {text!r}: expected a size such as 512MB or 2GB")
+    return int(float(match[1]) * 1024 ** " KMGT".index(match[2].upper() or " "))
+
+
+@contextmanager
+def needs_extra(name: str) -> Iterator[None]:
+    """Say which extra to install where a library of it is missing."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        if (error.name or "").startswith("solidcloud"):
+            raise
+        raise SolidcloudError(
+            f"the library {error.name!r} is not installed: pip install 'solidcloud[{name}]'"
+        ) from None
+
+
+def complain(message: str, code: int) -> int:
+    """Print one line on standard error; returns the exit code."""
+    print(f"error: {' '.join(message.splitlines())}", file=sys.stderr)
+    return code
+
+
+def print_json(value: Any) -> None:
+    print(json.dumps(value, indent=1, allow_nan=False))

@@ -1,10 +1,10 @@
-"""LAS, LAZ and COPC (which is LAZ with an index that is not needed to read every point), by laspy and lazrs.
+"""LAS, LAZ and COPC (which is LAZ with an index that is not needed to read every point), the latter two by lazrs.
 
-The header is checked here before laspy sees the file: told of 10^9 variable length records in a file of
-14 kB, laspy 2.7 makes an object for each of them and never returns.
+The header is read here: laspy 2.7, told of 10^9 variable length records in a file of 14 kB, makes an object
+for each of them and never returns. Of a point no more is looked at than its coordinates and intensity, which
+stand first in every format of records.
 """
 
-import logging
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,8 +19,10 @@ from .scan import (
     Block,
     Lattice,
     Scan,
+    SeekableScan,
     checked_bounds,
     library_errors,
+    read_records,
     reader_library,
     scan_error,
 )
@@ -29,8 +31,8 @@ from .scan import (
 HEADER_BYTES = 227
 # Sizes of the point record formats 0 to 10 [LAS 1.4 R15, tables 7 to 17]; extra bytes may follow each.
 RECORD_BYTES = (20, 28, 26, 34, 57, 63, 30, 36, 38, 59, 67)
-# laspy reads all that lies before the points at once. Real files have kilobytes there (a coordinate system,
-# names of extra bytes); waveform tables, the largest known, stay below 16 KiB.
+# Real files have kilobytes before the points (a coordinate system, names of extra bytes); waveform tables,
+# the largest known, stay below 16 KiB.
 LONGEST_PREAMBLE = 16 << 20
 
 
@@ -48,10 +50,11 @@ class Header(NamedTuple):
     bounds: NDArray[np.float64] | None
 
 
-class LasScan(Scan):
+class LasScan(SeekableScan):
     """One LAS or LAZ file."""
 
-    def __init__(self, path: Path, header: Header) -> None:
+    def __init__(self, path: Path, header: Header, laszip: bytes) -> None:
+        """laszip: the record by which lazrs decompresses, of a file with points that is compressed."""
         super().__init__(
             path,
             "laz" if header.compressed else "las",
@@ -59,41 +62,64 @@ class LasScan(Scan):
             lattice=header.lattice,
             bounds=header.bounds,
         )
-        self._record_bytes = header.record_bytes
+        self._start = header.offset_to_points
+        self._laszip = laszip
+        self._record = np.dtype(
+            {
+                "names": ["x", "y", "z", "intensity"],
+                "formats": ["<i4", "<i4", "<i4", "<u2"],
+                "offsets": [0, 4, 8, 12],
+                "itemsize": header.record_bytes,
+            }
+        )
 
-    def _read(self, block_points: int) -> Iterator[Block]:
-        laspy = reader_library("laspy", self.path)
-        # laspy logs what it raises as well; the ScanError says it once.
-        logging.getLogger("laspy").addHandler(logging.NullHandler())
+    def _read_between(self, block_points: int, start: int, stop: int) -> Iterator[Block]:
+        with self.path.open("rb") as file:
+            file.seek(self._start)
+            if self.format == "laz":
+                records = self._decompressed(file, block_points, start, stop)
+            else:
+                file.seek(start * self._record.itemsize, 1)
+                records = read_records(file, self.path, self._record, stop - start, block_points, "points")
+            for record in records:
+                yield self._block(record)
+
+    def _decompressed(
+        self, file: BinaryIO, block_points: int, start: int, stop: int
+    ) -> Iterator[NDArray[np.void]]:
+        """The records [start, stop) of a LAZ file, (n,), overwritten by the next."""
+        lazrs = reader_library("lazrs", self.path)
+        # Layers that nobody asks for are skipped (formats 6 to 10): colours, times, angles.
+        wanted = lazrs.DecompressionSelection(
+            lazrs.SELECTIVE_DECOMPRESS_XY_RETURNS_CHANNEL
+            | lazrs.SELECTIVE_DECOMPRESS_Z
+            | lazrs.SELECTIVE_DECOMPRESS_INTENSITY
+        )
         # Serial decompression: one process a core is what the builder runs already.
-        with laspy.open(
-            self.path, laz_backend=laspy.LazBackend.Lazrs, read_evlrs=False, closefd=True
-        ) as reader:
-            if self.format == "laz" and not laspy.LazBackend.Lazrs.is_available():
-                reader_library("lazrs", self.path)
-            step = max(1, min(block_points, BLOCK_BYTES // self._record_bytes))
-            seen = 0
-            for record in reader.chunk_iterator(step):
-                seen += len(record)
-                yield self._block(record.array)
-        if seen != self.declared_count:
-            raise scan_error(
-                self.path,
-                f"the file ends after {seen} points",
-                f"the {self.declared_count} its header declares",
-                "fetch the file again, it is truncated",
-            )
+        decompressor = lazrs.LasZipDecompressor(file, self._laszip, wanted)
+        if start:
+            # To the beginning of its chunk, and from there on (50,000 points at most, as a rule).
+            decompressor.seek(start)
+        step = max(1, min(block_points, stop - start, BLOCK_BYTES // self._record.itemsize))
+        buffer = np.empty(step, self._record)
+        raw = buffer.view(np.uint8)
+        for seen in range(start, stop, step):
+            count = min(step, stop - seen)
+            decompressor.decompress_many(raw[: count * self._record.itemsize])
+            yield buffer[:count]
 
     def _block(self, record: NDArray[np.void]) -> Block:
         """One block out of point records: raw * scale + offset, in that order, as laspy and others do."""
         lattice = self.lattice
         assert lattice is not None
         xyz = np.empty((len(record), 3))
-        for axis, name in enumerate("XYZ"):
-            xyz[:, axis] = record[name]
         with np.errstate(over="ignore"):  # a scale of 1e300 gives infinities, which the caller counts
-            xyz *= np.array(lattice.scale)
-            xyz += np.array(lattice.offset)
+            # Axis by axis, from the records straight to where they belong: 2.7 ns a point against 8.4 for a copy
+            # that is multiplied and added to as a whole (2^18 records of 20 bytes, one core).
+            for axis, name in enumerate("xyz"):
+                column = xyz[:, axis]
+                np.multiply(record[name], lattice.scale[axis], out=column)
+                column += lattice.offset[axis]
         return Block(xyz, record["intensity"].astype(np.float32))
 
 
@@ -102,8 +128,9 @@ def open_las(path: Path) -> list[Scan]:
     with library_errors(path), path.open("rb") as file:
         header = _read_header(file, path)
         _check_header(header, path, path.stat().st_size)
+        laszip = b""
         if header.compressed and header.points:
-            check_chunks(
+            laszip = check_chunks(
                 file,
                 path,
                 header_size=header.header_size,
@@ -112,7 +139,7 @@ def open_las(path: Path) -> list[Scan]:
                 record_bytes=header.record_bytes,
                 points=header.points,
             )
-        return [LasScan(path, header)]
+        return [LasScan(path, header, laszip)]
 
 
 def las_bounds(path: Path) -> NDArray[np.float64] | None:

@@ -14,6 +14,7 @@ from .scan import scan_error
 LASZIP_VLR = (b"laszip encoded", 22204)
 VLR_HEADER_BYTES = 54
 CHUNKED = 2  # the compressor of point formats 0 to 5
+VARIABLE = 0xFFFFFFFF  # in place of the points a chunk: each chunk has its own number of them
 LAYERED = 3  # the compressor of point formats 6 to 10: each chunk is split into layers
 
 # Item type -> its layers in a layered chunk; each has its size written before the chunk's data.
@@ -31,14 +32,16 @@ def check_chunks(
     start: int,
     record_bytes: int,
     points: int,
-) -> None:
+) -> bytes:
     """Check that a LAZ file's chunks and the table of them lie in the file, and hold all its points.
 
     start: byte where the points begin.  record_bytes, points: of the uncompressed records, as declared.
-    Reads some bytes a chunk (50,000 points as a rule). Raises ScanError.
+    Reads some bytes a chunk (50,000 points as a rule). Returns the record by which the points are decompressed.
+    Raises ScanError.
     """
     size = file.seek(0, 2)
-    compressor, items = _items(file, path, header_size, vlr_count)
+    laszip, items = _laszip_record(file, path, header_size, vlr_count)
+    compressor, chunk_points = struct.unpack_from("<H10xI", laszip)
     if compressor not in (CHUNKED, LAYERED):
         raise scan_error(
             path,
@@ -49,8 +52,12 @@ def check_chunks(
     if sum(length for _, length in items) != record_bytes:
         raise _damaged(path, f"compressed items {items} (type, bytes)", f"{record_bytes} bytes together")
     table, chunks = _chunk_table(file, path, start, size)
+    if not chunks or (chunk_points != VARIABLE and not chunk_points):
+        raise _damaged(path, f"{chunks} chunks of {chunk_points} points", "at least one of each")
+    if chunk_points != VARIABLE and points > chunks * chunk_points:
+        raise _damaged(path, f"{points} points in {chunks} chunks of {chunk_points}", "as many as they hold")
     if compressor != LAYERED:
-        return
+        return laszip
     layers = sum(LAYERS.get(kind, length if kind == EXTRA_BYTES else 0) for kind, length in items)
     sizes = struct.Struct(f"<{1 + layers}I")
     at, seen, number = start + 8, 0, 0
@@ -67,10 +74,13 @@ def check_chunks(
         number += 1
     if seen != points or number != chunks:
         raise _damaged(path, f"{seen} points in {number} chunks", f"{points} in {chunks} chunks")
+    return laszip
 
 
-def _items(file: BinaryIO, path: Path, header_size: int, vlr_count: int) -> tuple[int, list[tuple[int, int]]]:
-    """The compressor's number, and (type, bytes) of each item of a point, by the LASzip record."""
+def _laszip_record(
+    file: BinaryIO, path: Path, header_size: int, vlr_count: int
+) -> tuple[bytes, list[tuple[int, int]]]:
+    """The LASzip record, and (type, bytes) of each item of a point that it names."""
     file.seek(header_size)
     for _ in range(vlr_count):
         user, record_id, length = struct.unpack_from(
@@ -82,7 +92,7 @@ def _items(file: BinaryIO, path: Path, header_size: int, vlr_count: int) -> tupl
             if len(record) < 34 + 6 * count or not count:
                 break
             items = [struct.unpack_from("<HH", record, 34 + 6 * k) for k in range(count)]
-            return struct.unpack_from("<H", record)[0], items
+            return record, items
         file.seek(length, 1)
     raise _damaged(path, "no whole record 22204 of 'laszip encoded'", "it before the points of a LAZ file")
 

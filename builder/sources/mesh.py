@@ -12,7 +12,7 @@ from typing import BinaryIO
 import numpy as np
 
 from .rows import keyword_rows
-from .scan import BLOCK_BYTES, Block, Scan, library_errors, scan_error
+from .scan import Block, Scan, SeekableScan, library_errors, read_records, scan_error
 
 # A binary STL: 80 bytes of anything, the number of triangles (uint32), then a record each.
 STL_HEADER_BYTES = 84
@@ -33,25 +33,26 @@ class VertexLines(Scan):
                     yield Block(rows[start : start + block_points], None)
 
 
-class BinaryStl(Scan):
+class BinaryStl(SeekableScan):
     """The corners of the triangles of a binary STL."""
 
     def __init__(self, path: Path, triangles: int) -> None:
         super().__init__(path, "mesh", declared_count=3 * triangles)
-        self._triangles = triangles
 
-    def _read(self, block_points: int) -> Iterator[Block]:
-        step = min(max(1, block_points // 3), BLOCK_BYTES // STL_TRIANGLE.itemsize)
+    def _read_between(self, block_points: int, start: int, stop: int) -> Iterator[Block]:
+        first, past = start // 3, -(-stop // 3)
         with self.path.open("rb") as file:
-            file.seek(STL_HEADER_BYTES)
-            for start in range(0, self._triangles, step):
-                wanted = min(step, self._triangles - start)
-                record = np.fromfile(file, STL_TRIANGLE, wanted)
-                if len(record) < wanted:
-                    raise _truncated_stl(self.path, f"{start + len(record)} triangles", f"{self._triangles}")
+            file.seek(STL_HEADER_BYTES + first * STL_TRIANGLE.itemsize)
+            at = 3 * first
+            for record in read_records(
+                file, self.path, STL_TRIANGLE, past - first, block_points // 3, "triangles"
+            ):
                 corners = record["corners"].reshape(-1, 3).astype(np.float64)
-                for first in range(0, len(corners), block_points):
-                    yield Block(corners[first : first + block_points], None)
+                end = at + len(corners)
+                corners = corners[max(0, start - at) : len(corners) - max(0, end - stop)]
+                at = end
+                for k in range(0, len(corners), block_points):
+                    yield Block(corners[k : k + block_points], None)
 
 
 def open_obj(path: Path) -> list[Scan]:

@@ -14,7 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .rows import number_rows
-from .scan import BLOCK_BYTES, INTENSITY_NAMES, Block, Scan, library_errors, reader_library, scan_error
+from .scan import (
+    INTENSITY_NAMES,
+    Block,
+    Scan,
+    SeekableScan,
+    library_errors,
+    read_records,
+    reader_library,
+    scan_error,
+)
 
 # A header is some hundred bytes; with no end in this many it is not one.
 LONGEST_HEADER = 1 << 20
@@ -32,8 +41,25 @@ class Header(NamedTuple):
     intensity: str | None  # the property's name
 
 
-class PlyScan(Scan):
-    """The vertices of one PLY file."""
+class BinaryPly(SeekableScan):
+    """The vertices of one binary PLY file."""
+
+    def __init__(self, path: Path, header: Header) -> None:
+        super().__init__(path, "ply", declared_count=header.points)
+        self._header = header
+
+    def _read_between(self, block_points: int, start: int, stop: int) -> Iterator[Block]:
+        header = self._header
+        with self.path.open("rb") as file:
+            file.seek(header.start + header.skip + start * header.record.itemsize)
+            for record in read_records(
+                file, self.path, header.record, stop - start, block_points, "vertices"
+            ):
+                yield _block(record, header.intensity)
+
+
+class AsciiPly(Scan):
+    """The vertices of one PLY file in text."""
 
     def __init__(self, path: Path, header: Header) -> None:
         super().__init__(path, "ply", declared_count=header.points)
@@ -41,54 +67,37 @@ class PlyScan(Scan):
 
     def _read(self, block_points: int) -> Iterator[Block]:
         header = self._header
+        if not header.points:
+            return
+        # Rows are handed on as float64 under the vertex's own names, as the records of a binary file are.
+        names = header.record.names or ()
+        row = np.dtype([(name, np.float64) for name in names])
         seen = 0
         with self.path.open("rb") as file:
             file.seek(header.start)
-            records = self._ascii_records(file) if header.ascii else self._binary_records(file, block_points)
-            for record in records:
-                seen += len(record)
-                for start in range(0, len(record), block_points):
-                    yield self._block(record[start : start + block_points])
+            for _ in islice(file, header.skip):
+                pass
+            for rows in number_rows(
+                file,
+                self.path,
+                columns=len(names),
+                delimiter=None,
+                first_line=header.lines + header.skip + 1,
+                limit=header.points,
+            ):
+                seen += len(rows)
+                for start in range(0, len(rows), block_points):
+                    yield _block(rows.view(row)[start : start + block_points, 0], header.intensity)
         if seen < header.points:
             raise _truncated(self.path, seen, header.points)
 
-    def _block(self, record: NDArray[np.void]) -> Block:
-        """One block out of vertices as they lie in the file."""
-        xyz = np.empty((len(record), 3))
-        for axis, name in enumerate("xyz"):
-            xyz[:, axis] = record[name]
-        name_of_intensity = self._header.intensity
-        return Block(xyz, record[name_of_intensity].astype(np.float32) if name_of_intensity else None)
 
-    def _binary_records(self, file: BinaryIO, block_points: int) -> Iterator[NDArray[np.void]]:
-        header = self._header
-        file.seek(header.skip, 1)
-        step = max(1, min(block_points, BLOCK_BYTES // header.record.itemsize))
-        for start in range(0, header.points, step):
-            wanted = min(step, header.points - start)
-            record = np.fromfile(file, header.record, wanted)
-            yield record
-            if len(record) < wanted:
-                return
-
-    def _ascii_records(self, file: BinaryIO) -> Iterator[NDArray[np.void]]:
-        header = self._header
-        for _ in islice(file, header.skip):
-            pass
-        if not header.points:
-            return
-        # Rows are handed on as float64 under the vertex's own names, so that _block() serves both kinds.
-        names = header.record.names or ()
-        row = np.dtype([(name, np.float64) for name in names])
-        for rows in number_rows(
-            file,
-            self.path,
-            columns=len(names),
-            delimiter=None,
-            first_line=header.lines + header.skip + 1,
-            limit=header.points,
-        ):
-            yield rows.view(row)[:, 0]
+def _block(record: NDArray[np.void], intensity: str | None) -> Block:
+    """One block out of vertices as they lie in the file."""
+    xyz = np.empty((len(record), 3))
+    for axis, name in enumerate("xyz"):
+        xyz[:, axis] = record[name]
+    return Block(xyz, record[intensity].astype(np.float32) if intensity else None)
 
 
 def open_ply(path: Path) -> list[Scan]:
@@ -100,7 +109,7 @@ def open_ply(path: Path) -> list[Scan]:
         # The last ASCII row may lack its line end, hence the one byte more.
         if header.points * least > left + header.ascii:
             raise _truncated(path, max(0, left // least), header.points)
-        return [PlyScan(path, header)]
+        return [(AsciiPly if header.ascii else BinaryPly)(path, header)]
 
 
 def _truncated(path: Path, found: int, declared: int) -> Exception:

@@ -9,9 +9,10 @@ import importlib
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager
+from io import BufferedReader
 from pathlib import Path
 from types import ModuleType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,13 +59,16 @@ class Scan(ABC):
     """One posed cloud in one file, read in blocks.
 
     path, index: the file, and which of its scans this is, from 0.
-    format: "las", "laz", "e57", "ply", "text" or "mesh".
+    format: "las", "laz", "e57", "ply", "pcd", "ptx", "pts", "text" or "mesh".
     declared_count: points the header says there are, invalid ones included; None where it says nothing.
     pose: (4, 4) float64, scan frame -> world frame, the identity where the file has none.
     lattice: the grid of the source's coordinates, None where there is none.
     bounds: (2, 3) float64 world frame [m], low and high corner as the header declares them, or None.
     dropped: reason -> points left out by the reader; filled while blocks() is iterated, reset when it starts.
+    seekable: blocks() can begin and end anywhere, at the cost of what it reads (`SeekableScan`).
     """
+
+    seekable = False
 
     def __init__(
         self,
@@ -86,21 +90,77 @@ class Scan(ABC):
         self.bounds = bounds
         self.dropped: dict[str, int] = {}
 
-    def blocks(self, block_points: int = BLOCK_POINTS) -> Iterator[Block]:
+    def blocks(
+        self, block_points: int = BLOCK_POINTS, start: int = 0, stop: int | None = None
+    ) -> Iterator[Block]:
         """Read the points, in the order of the file, at most `block_points` at a time.
 
-        Memory is bounded by the block, whatever the file claims. Each call starts anew.
+        start, stop: which of the declared points to read, those that are dropped counted too; only a seekable scan
+        takes other than 0 and None. Memory is bounded by the block, whatever the file claims. Each call starts anew.
         Raises ScanError when the file is broken or ends before its header said.
         """
         if block_points < 1:
             raise ValueError(f"block_points is {block_points}, expected at least 1")
         self.dropped = {}
+        blocks = self._read_range(block_points, start, stop)
         with library_errors(self.path):
-            yield from self._read(block_points)
+            yield from blocks
+
+    def _read_range(self, block_points: int, start: int, stop: int | None) -> Iterator[Block]:
+        """The blocks of a range; refuses any but the whole, which SeekableScan does not."""
+        if (start, stop) != (0, None):
+            raise ValueError(f"points {start} to {stop} of a scan that cannot seek, expected 0 to None")
+        return self._read(block_points)
 
     @abstractmethod
     def _read(self, block_points: int) -> Iterator[Block]:
         """Yield the blocks; may raise anything, blocks() converts it."""
+
+
+class SeekableScan(Scan):
+    """A scan of records that can be found without reading those before: `_read_between` in place of `_read`."""
+
+    seekable = True
+
+    def _read(self, block_points: int) -> Iterator[Block]:
+        return self._read_range(block_points, 0, None)
+
+    def _read_range(self, block_points: int, start: int, stop: int | None) -> Iterator[Block]:
+        count = self.declared_count or 0
+        stop = count if stop is None else stop
+        if not 0 <= start <= stop <= count:
+            raise ValueError(f"points {start} to {stop} of a scan of {count}")
+        return self._read_between(block_points, start, stop) if start < stop else iter(())
+
+    @abstractmethod
+    def _read_between(self, block_points: int, start: int, stop: int) -> Iterator[Block]:
+        """Yield the blocks of points [start, stop), start < stop; may raise anything, blocks() converts it."""
+
+
+def read_records(
+    file: BufferedReader, path: Path, record: np.dtype[Any], count: int, block_points: int, what: str
+) -> Iterator[NDArray[Any]]:
+    """Read `count` records of one size from where the file stands, in blocks of bounded memory.
+
+    what: of the records, for the message.  Yields (n,) of `record`, n > 0, overwritten by the next.
+    Raises ScanError where the file ends before.
+    """
+    step = max(1, min(block_points, count, BLOCK_BYTES // record.itemsize))
+    # One buffer for all blocks: fresh memory a block costs as much in page faults as the copy into it.
+    buffer = np.empty(step, record)
+    raw = buffer.view(np.uint8).data
+    for seen in range(0, count, step):
+        wanted = min(step, count - seen)
+        # readinto() of a buffered file reads on until it has all, or the file ends.
+        got = file.readinto(raw[: wanted * record.itemsize]) // record.itemsize
+        if got < wanted:
+            raise scan_error(
+                path,
+                f"the file ends {count - seen - got} {what} too soon",
+                "as many as its header declares",
+                "fetch the file again, it is truncated",
+            )
+        yield buffer[:wanted]
 
 
 def scan_error(path: Path, found: str, expected: str, what_to_do: str) -> ScanError:

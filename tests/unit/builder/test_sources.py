@@ -171,6 +171,38 @@ def test_small_blocks_give_the_same_bits_as_large_ones(case: Case, written: Path
         assert intensity is None or np.array_equal(small_intensity, intensity)
 
 
+SEEKABLE = {"a.las", "a.laz", "little.ply", "big.ply", "single.ply", "binary.stl"}
+
+
+def test_a_range_gives_the_points_that_a_run_through_gives_there(case: Case, written: Path) -> None:
+    (scan,) = open_scans(written)
+    assert scan.seekable == (case.name in SEEKABLE)
+    if not scan.seekable:
+        for start, stop in ((1, None), (0, 5)):
+            with pytest.raises(ValueError, match="cannot seek"):
+                list(scan.blocks(100, start, stop))
+        return
+    xyz, intensity = read(scan)
+    for start, stop in (
+        (0, None),
+        (0, 0),
+        (0, 1),
+        (1, 5),
+        (499, 731),
+        (998, 1000),
+        (700, None),
+        (1000, 1000),
+    ):
+        blocks = list(scan.blocks(100, start, stop))
+        assert all(0 < len(block.xyz) <= 100 for block in blocks)
+        assert np.array_equal(np.concatenate([np.empty((0, 3)), *(b.xyz for b in blocks)]), xyz[start:stop])
+        for block, at in zip(blocks, np.cumsum([start, *(len(b.xyz) for b in blocks)]), strict=False):
+            assert intensity is None or np.array_equal(block.intensity, intensity[at : at + len(block.xyz)])
+    for start, stop in ((-1, 5), (5, 4), (0, len(xyz) + 1)):
+        with pytest.raises(ValueError, match=f"of a scan of {len(xyz)}"):
+            list(scan.blocks(100, start, stop))
+
+
 def test_a_block_stays_as_it_is_when_the_next_one_is_read(written: Path) -> None:
     (scan,) = open_scans(written)
     blocks = scan.blocks(100)
@@ -290,7 +322,7 @@ def test_importing_the_readers_imports_no_format_library() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "library"), [("a.las", "laspy"), ("a.e57", "pye57"), ("little.ply", "plyfile")]
+    ("name", "library"), [("a.laz", "lazrs"), ("a.e57", "pye57"), ("little.ply", "plyfile")]
 )
 def test_a_missing_library_says_what_to_install(
     name: str, library: str, truth: Truth, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -119,6 +119,26 @@ def test_laz_of_every_kind_and_number_of_chunks_is_read(
     assert np.array_equal(read_all(path), xyz)
 
 
+@pytest.mark.parametrize("point_format", [3, 6])
+def test_a_range_of_a_laz_is_found_by_its_chunks(point_format: int, tmp_path: Path) -> None:
+    path = tmp_path / "a.laz"
+    xyz = write_laz(path, 120_001, point_format)
+    (scan,) = open_scans(path)
+    for start, stop in ((0, 10), (49_999, 50_001), (50_000, 100_000), (77_777, 120_001), (120_000, None)):
+        found = np.concatenate([block.xyz for block in scan.blocks(20_011, start, stop)])
+        assert np.array_equal(found, xyz[start:stop])
+
+
+def test_a_laz_that_claims_more_points_than_its_chunks_hold_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.laz"
+    write_laz(path, 100, 3)
+    data = bytearray(path.read_bytes())
+    struct.pack_into("<Q", data, 247, 50_001)
+    path.write_bytes(data)
+    with pytest.raises(ScanError, match="50001 points in 1 chunks of 50000"):
+        open_scans(path)
+
+
 def test_a_laz_chunk_that_claims_gigabytes_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.laz"
     write_laz(path, 100, 6)

@@ -82,6 +82,17 @@ def test_real_las_equals_what_laspy_reads_at_once(name: str, folder: Path) -> No
     assert np.array_equal(read_all(folder / name, 10_007), np.column_stack([judge.x, judge.y, judge.z]))
 
 
+@pytest.mark.parametrize("name", ["lone_star.copc.laz", "indoor_atrium.laz"])
+def test_a_range_of_a_real_laz_is_that_of_a_run_through(name: str, folder: Path) -> None:
+    """COPC has chunks of all sizes, an octree node each."""
+    (scan,) = open_scans(folder / name)
+    xyz = read_all(folder / name)
+    rng = np.random.default_rng(5)
+    for start in rng.integers(0, len(xyz) - 1000, 5):
+        found = np.concatenate([block.xyz for block in scan.blocks(300, int(start), int(start) + 1000)])
+        assert np.array_equal(found, xyz[start : start + 1000])
+
+
 @pytest.mark.parametrize("name", ["pumpA.e57", "format_samples/translationWithoutRotation.e57"])
 def test_real_e57_equals_what_pye57_reads_at_once(name: str, folder: Path) -> None:
     with pye57.E57(str(folder / name)) as file:

@@ -1,6 +1,7 @@
 """The options of a build, frozen; each default with its reason."""
 
 import math
+import re
 from dataclasses import dataclass, field
 
 from ..schemas.errors import BadRequestError
@@ -40,6 +41,24 @@ def parse_radius(text: str) -> tuple[float | None, frozenset[str]]:
     return radius, frozenset(models)
 
 
+def parse_rule(text: str | None, option: str) -> tuple[float, int] | None:
+    """`0.1,5` -> (0.1, 5), a distance [m] and a count; None for None. Raises BadRequestError for anything else."""
+    if text is None:
+        return None
+    try:
+        distance, count = text.split(",")
+        return float(distance), int(count)
+    except ValueError:
+        raise BadRequestError(
+            f"{option} {text!r}: expected a distance in metres and a count, such as 0.1,5"
+        ) from None
+
+
+def _is_rule(rule: tuple[float, int] | None) -> bool:
+    """Whether this is a distance and a count, or None."""
+    return rule is None or (0 < rule[0] < math.inf and rule[1] >= 1)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BuildConfig:
     """How an archive is built.
@@ -64,6 +83,12 @@ class BuildConfig:
     keep: extra columns, among "scan" and "intensity".  strict: a non-finite point fails the build.
     skip_bad: leave out scans that cannot be read and mark their region as unknown.
     overwrite: replace an archive of the same name, once the new one is whole.
+    fresh: forget what a build of the same name that was interrupted has done.
+    thin: keep one point a cell of this size [m]; None: all.
+    outliers: leave out points with fewer than the second number of others within the first [m]; None: none.
+    moving: leave out points that other scans saw through, see builder/filter.py: (distance [m], scans); None: none.
+    scheduler: the address of a dask scheduler whose workers do the work; cluster: "local:N", one that is started for
+    the build. Both None: processes of this one.
     """
 
     voxel: float = 8.0
@@ -82,6 +107,12 @@ class BuildConfig:
     strict: bool = False
     skip_bad: bool = False
     overwrite: bool = False
+    fresh: bool = False
+    thin: float | None = None
+    outliers: tuple[float, int] | None = None
+    moving: tuple[float, int] | None = None
+    scheduler: str | None = None
+    cluster: str | None = None
 
     def __post_init__(self) -> None:
         """Refuse options outside what the format and the kernels hold."""
@@ -122,6 +153,23 @@ class BuildConfig:
                 f"--keep {','.join(sorted(self.keep))}",
                 "scan, intensity or both",
             ),
+            (self.thin is None or 0 < self.thin < math.inf, f"--thin {self.thin}", "a positive distance"),
+            (
+                _is_rule(self.outliers),
+                f"--outliers {self.outliers}",
+                "a positive distance and a count, 0.1,5",
+            ),
+            (_is_rule(self.moving), f"--moving {self.moving}", "a positive distance and a count, 0.1,5"),
+            (
+                self.scheduler is None or self.cluster is None,
+                "--scheduler and --cluster",
+                "one of them: the workers of a scheduler that runs, or some that are started",
+            ),
+            (
+                self.cluster is None or re.fullmatch(r"local:[1-9][0-9]{0,3}", self.cluster) is not None,
+                f"--cluster {self.cluster}",
+                "local:N, N workers",
+            ),
         ]
         for good, found, expected in checks:
             if not good:
@@ -146,4 +194,7 @@ class BuildConfig:
             # Named only where it is not the default: archives without it stay what they were, byte for byte.
             **({} if self.cells == "octree" else {"cells": self.cells}),
             **({} if self.models == {"mean"} else {"models": ",".join(self.stored_models())}),
+            **({} if self.thin is None else {"thin": self.thin}),
+            **({} if self.outliers is None else {"outliers": "{!r},{}".format(*self.outliers)}),
+            **({} if self.moving is None else {"moving": "{!r},{}".format(*self.moving)}),
         }

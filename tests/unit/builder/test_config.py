@@ -1,0 +1,42 @@
+"""Options of a build: what is refused by name, and which of them an archive's bytes depend on."""
+
+import pytest
+from solidcloud.builder.config import BuildConfig, parse_rule
+from solidcloud.schemas.errors import BadRequestError
+
+WRONG = {
+    "--thin 0": {"thin": 0.0},
+    "--thin inf": {"thin": float("inf")},
+    "--outliers (0.0, 5)": {"outliers": (0.0, 5)},
+    "--outliers (0.1, 0)": {"outliers": (0.1, 0)},
+    "--moving (nan, 5)": {"moving": (float("nan"), 5)},
+    "--scheduler and --cluster": {"scheduler": "tcp://here:8786", "cluster": "local:2"},
+    "--cluster local:0": {"cluster": "local:0"},
+    "--cluster two": {"cluster": "two"},
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_what_cannot_be_is_refused_by_name(name: str) -> None:
+    with pytest.raises(BadRequestError) as caught:
+        BuildConfig(**WRONG[name])
+    assert str(caught.value).startswith(name)
+    assert "expected" in str(caught.value)
+
+
+def test_rules_are_a_distance_and_a_count() -> None:
+    assert parse_rule("0.1,5", "--outliers") == (0.1, 5)
+    assert parse_rule(None, "--outliers") is None
+    for text in ("0.1", "0.1,5,6", "5,0.1", "a,b", ""):
+        with pytest.raises(BadRequestError, match="--moving .*expected a distance in metres and a count"):
+            parse_rule(text, "--moving")
+
+
+def test_an_archive_depends_on_filters_and_not_on_who_does_the_work() -> None:
+    plain = BuildConfig().identity()
+    assert not {"thin", "outliers", "moving"} & set(plain)
+    for options in ({"jobs": 3}, {"memory_bytes": 1 << 30}, {"fresh": True}, {"cluster": "local:2"}):
+        assert BuildConfig(**options).identity() == plain
+    filters = BuildConfig(thin=0.01, outliers=(0.1, 5), moving=(0.25, 2)).identity()
+    added = {name: value for name, value in filters.items() if name not in plain}
+    assert added == {"thin": 0.01, "outliers": "0.1,5", "moving": "0.25,2"}

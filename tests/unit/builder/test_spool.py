@@ -1,0 +1,111 @@
+"""Sorted runs: every row once, in canonical order, found by voxel and by block of a voxel."""
+
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+import solidcloud.builder.spool as spool_module
+from solidcloud.builder.config import BuildConfig
+from solidcloud.builder.spool import KEYS_SUFFIX, Spool, read_directory, spool_dtype, write_run
+from solidcloud.schemas.errors import CorruptError
+from solidcloud.schemas.voxel_grid import make_lattice
+
+LATTICE = make_lattice((0, 0, 0), 0.001, 0.1)
+KEYS = np.array([3, 7, 1 << 61], np.uint64)
+
+
+def interleaved(x: int, y: int, z: int) -> int:
+    """The Morton code, bit by bit."""
+    return sum(
+        (value >> bit & 1) << (3 * bit + axis) for axis, value in enumerate((x, y, z)) for bit in range(21)
+    )
+
+
+def made(seed: int, count: int, keep: frozenset[str]) -> tuple[np.ndarray, np.ndarray]:
+    """Keys and rows in no order, many of them equal."""
+    rng = np.random.default_rng(seed)
+    rows = np.zeros(count, spool_dtype(BuildConfig(keep=keep)))
+    rows["local"] = rng.integers(0, 7, (count, 3))
+    if keep:
+        rows["scan_index"] = rng.integers(0, 3, count)
+        rows["intensity"] = rng.choice(np.array([-2.5, 0, 1, np.nan], np.float32), count)
+    return rng.choice(KEYS, count), rows
+
+
+def judged(rows: np.ndarray) -> list[tuple]:
+    """The canonical order of rows, as plain tuples; a NaN comes last."""
+    plain = []
+    for row in rows:
+        more = ()
+        if "intensity" in rows.dtype.names:
+            value = float(row["intensity"])
+            more = (int(row["scan_index"]), value != value, 0.0 if value != value else value)
+        plain.append((interleaved(*row["local"].tolist()), *more))
+    return plain
+
+
+@pytest.mark.interpreted
+@pytest.mark.parametrize("keep", [frozenset(), frozenset({"scan", "intensity"})])
+def test_a_voxels_rows_are_found_once_and_in_order(keep: frozenset[str], tmp_path: Path) -> None:
+    written = [made(seed, count, keep) for seed, count in enumerate((300, 1, 41))]
+    for number, (keys, rows) in enumerate(written):
+        write_run(tmp_path / f"{number}.run", keys, rows)
+    all_keys = np.concatenate([k for k, _ in written])
+    all_rows = np.concatenate([r for _, r in written])
+    spool = pickle.loads(pickle.dumps(Spool(tmp_path, all_rows.dtype, LATTICE)))
+    assert spool.keys.tolist() == sorted(set(all_keys.tolist()))
+    for key, count in zip(spool.keys.tolist(), spool.counts.tolist(), strict=True):
+        parts = spool.rows(key)
+        assert len(parts) == sum(key in keys for keys, _ in written)
+        for part in parts:
+            assert judged(part) == sorted(judged(part))
+        expected = all_rows[all_keys == key]
+        assert sorted(judged(np.concatenate(parts))) == sorted(judged(expected))
+        assert count == spool.count(key) == len(expected)
+    assert (spool.rows(4), spool.count(4), spool.block_rows(4, 0, 1 << 63)) == ([], 0, [])
+
+
+@pytest.mark.parametrize("stride", [1, 3, 64, 4096])
+def test_a_block_is_what_brute_force_finds(
+    stride: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(spool_module, "CODE_STRIDE", stride)
+    for number in range(3):
+        write_run(tmp_path / f"{number}.run", *made(number, 150, frozenset()))
+    spool = Spool(tmp_path, spool_dtype(BuildConfig()), LATTICE)
+    rng = np.random.default_rng(9)
+    blocks = [(0, 1 << 63), (0, 1), (5, 5), (0, 0), (511, 512), (512, 1 << 63)]
+    blocks += [tuple(sorted(pair)) for pair in rng.integers(0, 520, (40, 2)).tolist()]
+    for key in KEYS.tolist():
+        for low, high in blocks:
+            expected = [[code for code, *_ in judged(rows) if low <= code < high] for rows in spool.rows(key)]
+            found = [[code for code, *_ in judged(rows)] for rows in spool.block_rows(key, low, high)]
+            assert found == [codes for codes in expected if codes]
+            assert spool.block_count(key, low, high) == sum(map(len, expected))
+
+
+def test_a_folder_without_runs_holds_nothing(tmp_path: Path) -> None:
+    spool = Spool(tmp_path, spool_dtype(BuildConfig()), LATTICE)
+    assert (len(spool.keys), len(spool.counts), spool.rows(3)) == (0, 0, [])
+
+
+def test_a_run_that_lost_its_end_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.run"
+    write_run(path, *made(1, 50, frozenset()))
+    path.write_bytes(path.read_bytes()[:-1])
+    spool = Spool(tmp_path, spool_dtype(BuildConfig()), LATTICE)
+    spool.rows(int(spool.keys[0]))
+    with pytest.raises(CorruptError, match=r"a\.run: ends before row 50"):
+        spool.rows(int(spool.keys[-1]))
+
+
+def test_the_directory_is_as_its_description_says(tmp_path: Path) -> None:
+    keys, rows = made(2, 60, frozenset())
+    write_run(tmp_path / "a.run", keys, rows)
+    words = np.fromfile((tmp_path / "a.run").with_suffix(KEYS_SUFFIX), "<u8").tolist()
+    assert words[:3] == KEYS.tolist()
+    assert np.diff(words[3:]).tolist() == [int((keys == key).sum()) for key in KEYS]
+    assert words[3] == 0
+    found, starts = read_directory(tmp_path / "a.run")
+    assert (found.tolist(), starts.tolist()) == (words[:3], words[3:])

@@ -1,14 +1,16 @@
-"""Runs pure work units: in this process, or in a pool of processes. Results come in the order of the units."""
+"""Runs pure work units: in this process, in a pool of processes, or on a cluster. Results come in the units' order."""
 
 import multiprocessing
 import os
 import signal
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from typing import TypeVar
+from types import TracebackType
+from typing import Protocol, Self, TypeVar
 
 from ..schemas.errors import SolidcloudError
+from .config import BuildConfig
 from .progress import Progress
 
 Unit = TypeVar("Unit")
@@ -18,6 +20,35 @@ Result = TypeVar("Result")
 POINTS_WORTH_A_PROCESS = 4_000_000
 
 
+class Executor(Protocol):
+    """Maps a picklable function over work units. A context manager.
+
+    jobs: units that run at a time.
+    """
+
+    jobs: int
+
+    def __enter__(self) -> Self:
+        """The executor itself."""
+        ...
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Stop; after a failure, without starting what still waits."""
+        ...
+
+    def map(
+        self,
+        function: Callable[[Unit], Result],
+        units: Sequence[Unit],
+        progress: Progress,
+        size: Callable[[Unit], int],
+    ) -> Iterator[Result]:
+        """function(unit) for each unit, in order; progress advances by size(unit) as each result is taken."""
+        ...
+
+
 def worker_count(jobs: int, points: int) -> int:
     """Processes to use: as asked, or, for 0, one a core where the points are worth it."""
     if jobs:
@@ -25,13 +56,24 @@ def worker_count(jobs: int, points: int) -> int:
     return min(os.cpu_count() or 1, max(1, points // POINTS_WORTH_A_PROCESS))
 
 
+def make_executor(config: BuildConfig, jobs: int) -> Executor:
+    """What runs the units: a cluster where one is named, else `jobs` processes, one of which is this one alone."""
+    address = config.scheduler or config.cluster
+    if address is None:
+        return ProcessExecutor(jobs)
+    # Loads dask, which nobody else needs.
+    from .cluster import ClusterExecutor
+
+    return ClusterExecutor(address, config.memory_bytes)
+
+
 def _leave_interrupts() -> None:
     """Ctrl-C is the builder's: it stops its workers, and they say nothing."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-class Executor:
-    """Maps a picklable function over work units. A context manager; with one job nothing is started."""
+class ProcessExecutor:
+    """Maps a picklable function over work units in processes of its own; with one job nothing is started."""
 
     def __init__(self, jobs: int) -> None:
         """Use `jobs` processes."""
@@ -42,11 +84,13 @@ class Executor:
             ProcessPoolExecutor(jobs, mp_context=context, initializer=_leave_interrupts) if jobs > 1 else None
         )
 
-    def __enter__(self) -> "Executor":
+    def __enter__(self) -> Self:
         """The executor itself."""
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
         """Stop the processes; after a failure, without starting what still waits."""
         if self._pool is not None:
             self._pool.shutdown(wait=True, cancel_futures=kind is not None)
@@ -68,15 +112,18 @@ class Executor:
                 progress.advance(size(unit))
             return
         ahead = 4 * self.jobs
-        futures = [self._pool.submit(function, unit) for unit in units[:ahead]]
+        futures: list[Future[Result] | None] = [self._pool.submit(function, unit) for unit in units[:ahead]]
         for i, unit in enumerate(units):
+            future = futures[i]
+            assert future is not None
             try:
-                result = futures[i].result()
+                result = future.result()
             except BrokenProcessPool:
                 raise SolidcloudError(
-                    "a worker process ended at once: out of memory? give fewer --jobs or a smaller --memory"
+                    "a worker process ended at once: out of memory? give fewer --jobs or a smaller --memory; the same "
+                    "command goes on where it was"
                 ) from None
-            futures[i] = None  # type: ignore[call-overload]
+            futures[i] = future = None  # the result is held by nobody but who takes it
             if i + ahead < len(units):
                 futures.append(self._pool.submit(function, units[i + ahead]))
             yield result

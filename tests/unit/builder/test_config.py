@@ -28,7 +28,7 @@ def test_rules_are_a_distance_and_a_count() -> None:
     assert parse_rule("0.1,5", "--outliers") == (0.1, 5)
     assert parse_rule(None, "--outliers") is None
     for text in ("0.1", "0.1,5,6", "5,0.1", "a,b", ""):
-        with pytest.raises(BadRequestError, match="--moving .*expected a distance in metres and a count"):
+        with pytest.raises(BadRequestError, match=r"--moving .*expected a distance in metres and a count"):
             parse_rule(text, "--moving")
 
 

@@ -5,7 +5,8 @@ from functools import partial
 
 import pytest
 import solidcloud.builder.executor as executor_module
-from solidcloud.builder.executor import POINTS_WORTH_A_PROCESS, Executor, worker_count
+from solidcloud.builder.config import BuildConfig
+from solidcloud.builder.executor import POINTS_WORTH_A_PROCESS, ProcessExecutor, make_executor, worker_count
 
 
 class Counted:
@@ -27,7 +28,7 @@ class Counted:
 
 def test_results_come_in_the_order_of_the_units() -> None:
     progress = Counted()
-    with Executor(1) as executor:
+    with ProcessExecutor(1) as executor:
         results = executor.map(divmod_by_7, range(20), progress, lambda unit: unit)
         assert next(results) == (0, 0)
         assert progress.done == 0  # advances when a result is taken
@@ -43,7 +44,7 @@ def divmod_by_7(value: int) -> tuple[int, int]:
 def test_processes_give_the_same_in_the_same_order() -> None:
     progress = Counted()
     # A builtin, because spawned processes cannot import a test module by its name.
-    with Executor(2) as executor:
+    with ProcessExecutor(2) as executor:
         results = list(executor.map(partial(divmod, 100), range(1, 21), progress, lambda unit: 1))
         processes = set(executor.map(eval, ["__import__('os').getpid()"] * 8, progress, lambda unit: 0))
         with pytest.raises(ZeroDivisionError):
@@ -54,7 +55,7 @@ def test_processes_give_the_same_in_the_same_order() -> None:
 
 
 def test_a_failure_here_stops_at_its_unit() -> None:
-    with Executor(1) as executor:
+    with ProcessExecutor(1) as executor:
         results = executor.map(partial(divmod, 1), [1, 0, 1], Counted(), lambda unit: 1)
         assert next(results) == (1, 0)
         with pytest.raises(ZeroDivisionError):
@@ -69,3 +70,9 @@ def test_processes_are_started_only_where_they_pay(monkeypatch: pytest.MonkeyPat
     assert worker_count(3, 0) == 3
     monkeypatch.setattr(executor_module.os, "cpu_count", lambda: None)
     assert worker_count(0, POINTS_WORTH_A_PROCESS * 100) == 1
+
+
+def test_processes_do_the_work_where_no_cluster_is_named() -> None:
+    with make_executor(BuildConfig(), 1) as executor:
+        assert isinstance(executor, ProcessExecutor)
+        assert executor.jobs == 1

@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..schemas.radius_model import LOCAL_RADII, RIM_BIT
-from ..schemas.voxel_grid import KEY_BIAS, Lattice, voxel_coordinates, voxel_keys
+from ..schemas.voxel_grid import KEY_BIAS, voxel_coordinates, voxel_keys
 from .kernels.classes import FEW, point_classes
 from .kernels.neighbours import bound_boxes, box_starts
 from .kernels.octree import voxel_codes
-from .partition import Run, voxel_rows
+from .spool import Spool
 
 # Neighbours farther than this do not count [m]: so it is known which voxels have a say.
 REACH = 0.362
@@ -29,20 +29,6 @@ LOCAL_SHARE = 13
 CODE_BITS = 21
 # Points that are not parted to save memory: what lies around fewer is not much less.
 LEAST_TOGETHER = 64
-
-
-class Spool(NamedTuple):
-    """Where the points of a dataset lie while it is built. keys: (v,) uint64, of all its voxels, ascending.
-
-    dtype: a row of the runs.  most_near: points around those that are asked which may be held, as long as asking fewer
-    helps.
-    """
-
-    runs: tuple[Run, ...]
-    keys: NDArray[np.uint64]
-    dtype: np.dtype
-    lattice: Lattice
-    most_near: int
 
 
 class Classes(NamedTuple):
@@ -70,8 +56,13 @@ def class_limits(step: float) -> Limits:
     return Limits(int((Fraction(repr(REACH)) * steps_a_metre) ** 2), np.array(local2, np.int64))
 
 
-def voxel_classes(key: int, local: NDArray[np.int32], models: Collection[str], spool: Spool) -> Classes:
-    """The class of each point of a voxel, local (n, 3) [voxel steps], n >= 1; equal points have the same."""
+def voxel_classes(
+    key: int, local: NDArray[np.int32], models: Collection[str], spool: Spool, most_near: int
+) -> Classes:
+    """The class of each point of a voxel, local (n, 3) [voxel steps], n >= 1; equal points have the same.
+
+    most_near: points around those that are asked which may be held, as long as asking fewer helps.
+    """
     _, first, back = np.unique(voxel_codes(local), return_index=True, return_inverse=True)
     own = local[first]  # in Morton order: a part of them is a part of space
     limits = class_limits(spool.lattice.step)
@@ -82,7 +73,7 @@ def voxel_classes(key: int, local: NDArray[np.int32], models: Collection[str], s
         begin, end = parts.pop()
         asked = own[begin:end]
         box = np.stack([asked.min(axis=0) - reach, asked.max(axis=0) + reach]).astype(np.int64)
-        most = spool.most_near if end - begin > LEAST_TOGETHER else None
+        most = most_near if end - begin > LEAST_TOGETHER else None
         near = _points_near(key, [own[:begin], own[end:]], box, spool, most)
         if near is None:
             middle = (begin + end) // 2
@@ -132,7 +123,7 @@ def _around(key: int, box: NDArray[np.int64], spool: Spool) -> Iterator[NDArray[
                 rows["local"][
                     ((rows["local"] >= box[0] - shift) & (rows["local"] <= box[1] - shift)).all(axis=1)
                 ]
-                for rows in voxel_rows(other, spool.runs, spool.dtype)
+                for rows in spool.rows(other)
             ]
             points = np.concatenate(inside)
             distinct = np.unique(voxel_codes(points), return_index=True)[1]

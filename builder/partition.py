@@ -19,6 +19,7 @@ from .config import DEFAULT_STEP, BuildConfig
 from .kernels.content import content_sum
 from .octree import VoxelPoints
 from .sources import Block, Scan, header_bounds, open_scans, sha256_of
+from .spool import canonical_columns, row_codes
 
 # Bytes a point that a spooling worker holds while it sorts: coordinates, keys, order and the sorted copy.
 SPOOL_BYTES_A_POINT = 120
@@ -272,3 +273,27 @@ def gather_voxel(key: int, runs: tuple[Run, ...], dtype: np.dtype) -> VoxelPoint
         np.ascontiguousarray(rows["scan_index"]) if "scan_index" in names else None,
         np.ascontiguousarray(rows["intensity"]) if "intensity" in names else None,
     )
+
+
+class RunSpool(NamedTuple):
+    """The runs of this pass as builder/spool.py `Spool` gives its own, as far as shards.py and classes.py ask."""
+
+    runs: tuple[Run, ...]
+    dtype: np.dtype
+    lattice: Lattice
+
+    @property
+    def keys(self) -> NDArray[np.uint64]:
+        """(v,) the voxels that hold points, ascending."""
+        return np.unique(np.concatenate([run.keys for run in self.runs]))
+
+    def rows(self, key: int) -> list[NDArray]:
+        """A voxel's rows, one array a run that holds some, each in canonical order."""
+        return [
+            r[np.lexsort((*canonical_columns(r), row_codes(r)))]
+            for r in voxel_rows(key, self.runs, self.dtype)
+        ]
+
+    def count(self, key: int) -> int:
+        """How many points a voxel holds."""
+        return sum(map(len, voxel_rows(key, self.runs, self.dtype)))

@@ -15,7 +15,7 @@ from dataclasses import replace
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,10 +26,11 @@ from ..schemas.index import Header, Source
 from ..schemas.radius_model import RADIUS_CLASSES
 from ..schemas.voxel_grid import Lattice
 from .config import RADIUS_SAMPLE, BuildConfig
-from .executor import Executor, worker_count
+from .executor import Executor, ProcessExecutor, worker_count
 from .partition import (
     SPOOL_BYTES_A_POINT,
     Run,
+    RunSpool,
     Spooled,
     SpoolUnit,
     Survey,
@@ -115,11 +116,11 @@ def build_archive(
         points = sum(s.count for s in surveys)
         jobs = worker_count(config.jobs, points)
         _check_space(target.parent, points, config)
-        with Executor(jobs) as executor:
+        with ProcessExecutor(jobs) as executor:
             spooled = _spool(surveys, lattice, folder, executor, config, stages)
         header = _header(surveys, faulty, spooled, lattice, lattice_source, config)
         keys, counts = _voxel_counts(spooled)
-        with Executor(_jobs_that_fit(jobs, int(counts.max()), config)) as executor:
+        with ProcessExecutor(_jobs_that_fit(jobs, int(counts.max()), config)) as executor:
             plans = plan_shards(keys, counts)
             shards = _build_voxels(spooled, plans, header, folder, executor, config, stages)
             header = _measure_radius(header, shards, folder, executor, config, stages)
@@ -323,10 +324,13 @@ def _build_voxels(
     """Third pass: every voxel's octree and hierarchies, into the shards planned."""
     runs: tuple[Run, ...] = tuple(run for s in spooled for run in s.runs)
     shards = folder / SHARD_FOLDER
+    spool: Any = RunSpool(runs, spool_dtype(config), header.lattice)
     # Beside the densest voxel, which may take all the memory while it is built and half of it before.
     most_near = max(1 << 16, config.memory_bytes // (executor.jobs * 2 * VOXEL_BYTES_A_POINT))
     units = [
-        ShardUnit(number, keys, points, runs, header.lattice, config, most_near, header.archive_id, shards)
+        ShardUnit(
+            number, 0, keys, points, spool, header.lattice, config, most_near, header.archive_id, shards
+        )
         for number, (keys, points) in enumerate(plans)
     ]
     with stages.stage("build", header.points, "points"):

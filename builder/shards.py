@@ -12,22 +12,24 @@ from ..schemas.codec import Record, encode_voxel
 from ..schemas.radius_model import RADIUS_CLASSES
 from ..schemas.voxel import VoxelData
 from ..schemas.voxel_grid import Lattice
-from .classes import Spool, voxel_classes
+from .classes import voxel_classes
 from .config import SHARD_POINTS, BuildConfig
-from .octree import build_voxel
-from .partition import Run, gather_voxel, spool_dtype
+from .octree import VoxelPoints, build_voxel
+from .spool import Spool
 
 
 class ShardUnit(NamedTuple):
-    """One shard to be written. keys: its voxels, ascending.  points: in all of them.
+    """One shard to be written. number, generation: its name's.  keys: its voxels, ascending.  points: in all of them.
 
-    most_near: points around a voxel that may be held beside it, see classes.py.
+    spool: where the points lie.  most_near: points around a voxel that may be held beside it, see classes.py.
+    folder: where the shard goes.
     """
 
     number: int
+    generation: int
     keys: tuple[int, ...]
     points: int
-    runs: tuple[Run, ...]
+    spool: Spool
     lattice: Lattice
     config: BuildConfig
     most_near: int
@@ -69,18 +71,15 @@ def plan_shards(keys: NDArray[np.uint64], counts: NDArray[np.int64]) -> list[tup
 
 def build_shard(unit: ShardUnit) -> Shard:
     """Gather, build, compress and write the voxels of one shard, one at a time."""
-    dtype = spool_dtype(unit.config)
     with_classes = unit.config.models != {"mean"}
-    all_keys = np.unique(np.concatenate([run.keys for run in unit.runs]))
-    spool = Spool(unit.runs, all_keys, dtype, unit.lattice, unit.most_near)
     counts, capped = np.zeros(RADIUS_CLASSES, np.int64), 0
 
     def voxels() -> Iterator[tuple[VoxelData, Record, NDArray[np.int64], NDArray[np.int64]]]:
         nonlocal counts, capped
         for key in unit.keys:
-            points = gather_voxel(key, unit.runs, dtype)
+            points = gather_voxel(unit.spool.rows(key))
             if with_classes:
-                classes = voxel_classes(key, points.local, unit.config.models, spool)
+                classes = voxel_classes(key, points.local, unit.config.models, unit.spool, unit.most_near)
                 counts += np.bincount(classes.of_point, minlength=RADIUS_CLASSES)
                 capped += classes.few
                 points = points._replace(radius_class=classes.of_point)
@@ -93,6 +92,17 @@ def build_shard(unit: ShardUnit) -> Shard:
                 points.local.max(axis=0).astype(np.int64),
             )
 
-    path = unit.folder / shard_name(unit.number)
+    path = unit.folder / shard_name(unit.number, unit.generation)
     rows = write_shard(path, unit.number, unit.archive_id, voxels(), version=2 if with_classes else 1)
     return Shard(path.name, rows, path.stat().st_size, counts, capped)
+
+
+def gather_voxel(parts: list[NDArray]) -> VoxelPoints:
+    """All points of one voxel, from its rows in each run."""
+    rows = np.concatenate(parts)
+    names = rows.dtype.names or ()
+    return VoxelPoints(
+        np.ascontiguousarray(rows["local"]),
+        np.ascontiguousarray(rows["scan_index"]) if "scan_index" in names else None,
+        np.ascontiguousarray(rows["intensity"]) if "intensity" in names else None,
+    )

@@ -10,12 +10,13 @@ import pytest
 import solidcloud.builder.shards as shards
 from numpy.typing import NDArray
 from scans import make_scan, write_xyz
-from solidcloud.builder.classes import Spool, class_limits, voxel_classes
+from solidcloud.builder.classes import class_limits, voxel_classes
 from solidcloud.builder.config import BuildConfig, parse_radius
 from solidcloud.builder.kernels.classes import FEW, point_classes
 from solidcloud.builder.kernels.neighbours import bound_boxes, box_starts
 from solidcloud.builder.pipeline import build_archive
 from solidcloud.builder.radius import voxel_points
+from solidcloud.builder.spool import Spool, write_run
 from solidcloud.builder.verify import verify_archive
 from solidcloud.schemas.archive import Archive
 from solidcloud.schemas.errors import BadRequestError
@@ -132,9 +133,11 @@ def test_the_archive_is_the_same_for_any_order_of_files_jobs_and_memory(
     asked = []
     classes_of = shards.voxel_classes
 
-    def short_of_memory(key: int, local: NDArray[np.int32], models: frozenset[str], spool: Spool) -> object:
+    def short_of_memory(
+        key: int, local: NDArray[np.int32], models: frozenset[str], spool: Spool, _: int
+    ) -> object:
         asked.append(key)
-        return classes_of(key, local, models, spool._replace(most_near=20))
+        return classes_of(key, local, models, spool, 20)
 
     monkeypatch.setattr(shards, "voxel_classes", short_of_memory)
     assert built("d", paths) == first
@@ -146,9 +149,12 @@ def test_a_part_is_asked_with_what_is_around_it_alone(tmp_path: Path) -> None:
     local = np.unique(cloud("noise", 7, 2000), axis=0).astype(np.int32)
     lattice = type("Lattice", (), {"step": STEP, "voxel_steps": 1 << 20})()
     key = 0x1C0000000000000  # voxel (0, 0, 0)
+    rows = np.zeros(len(local), [("local", "<i4", (3,))])
+    rows["local"] = local
+    write_run(tmp_path / "0.run", np.full(len(rows), key, np.uint64), rows)
     for most in (10, 200, 10_000):
-        spool = Spool((), np.array([key], np.uint64), np.dtype([("local", "<i4", (3,))]), lattice, most)
-        found = voxel_classes(key, local, ALL, spool)
+        spool = Spool(tmp_path, np.dtype([("local", "<i4", (3,))]), lattice)
+        found = voxel_classes(key, local, ALL, spool, most)
         expected, few = judge(local.astype(np.int64))
         assert np.array_equal(found.of_point, expected)
         assert found.few == few

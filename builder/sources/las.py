@@ -8,12 +8,12 @@ stand first in every format of records.
 import struct
 from collections.abc import Iterator
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .laz_chunks import VLR_HEADER_BYTES, check_chunks
+from .laz_chunks import VLR_HEADER_BYTES, ChunksFrom, check_chunks
 from .scan import (
     BLOCK_BYTES,
     Block,
@@ -95,14 +95,18 @@ class LasScan(SeekableScan):
             | lazrs.SELECTIVE_DECOMPRESS_Z
             | lazrs.SELECTIVE_DECOMPRESS_INTENSITY
         )
+        source: Any = ChunksFrom(lazrs, file, self._start, self._laszip, start) if start else file
         # Serial decompression: one process a core is what the builder runs already.
-        decompressor = lazrs.LasZipDecompressor(file, self._laszip, wanted)
-        if start:
-            # To the beginning of its chunk, and from there on (50,000 points at most, as a rule).
-            decompressor.seek(start)
-        step = max(1, min(block_points, stop - start, BLOCK_BYTES // self._record.itemsize))
+        decompressor = lazrs.LasZipDecompressor(source, self._laszip, wanted)
+        step = max(1, min(block_points, BLOCK_BYTES // self._record.itemsize))
         buffer = np.empty(step, self._record)
         raw = buffer.view(np.uint8)
+        # The points of the first chunk before `start`: 50,000 at most, as a rule.
+        before = source.skip if start else 0
+        while before:
+            count = min(step, before)
+            decompressor.decompress_many(raw[: count * self._record.itemsize])
+            before -= count
         for seen in range(start, stop, step):
             count = min(step, stop - seen)
             decompressor.decompress_many(raw[: count * self._record.itemsize])

@@ -5,9 +5,10 @@ two runs of random damage to a file of 2.5 kB both ended so, at 3.6 and 4.3 GB. 
 3.4, whose chunks of point formats 6 to 10 are written layer by layer.
 """
 
+import io
 import struct
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 from .scan import scan_error
 
@@ -75,6 +76,60 @@ def check_chunks(
     if seen != points or number != chunks:
         raise _damaged(path, f"{seen} points in {number} chunks", f"{points} in {chunks} chunks")
     return laszip
+
+
+class ChunksFrom(io.RawIOBase):
+    """A LAZ file's points from one of its chunks on, as lazrs reads them from a file that begins there.
+
+    lazrs 0.8 can seek, but not where chunks differ in size (COPC): its `seek` takes the point's number modulo the
+    size of its own chunk, and delivers others. So it is given a file without the chunks before: the place of the
+    table, the chunks, and a table of those.
+    """
+
+    def __init__(self, lazrs: Any, file: BinaryIO, start: int, laszip: bytes, point: int) -> None:
+        """file: the LAZ file, open; its position is used.  start: byte where its points begin.  laszip: its record.
+
+        point: the point whose chunk is the first here; `skip` is how many others stand before it in there.
+        """
+        vlr = lazrs.LazVlr(laszip)
+        file.seek(start)
+        chunks = lazrs.read_chunk_table(file, vlr)
+        at, self.skip, first = start + 8, point, 0
+        for points, size in chunks:
+            if self.skip < points:
+                break
+            at, self.skip, first = at + size, self.skip - points, first + 1
+        if first == len(chunks):
+            raise ValueError(f"point {point} lies behind the last chunk")
+        table = io.BytesIO()
+        lazrs.write_chunk_table(table, chunks[first:], vlr)
+        self._file, self._from = file, at
+        self._past = 8 + sum(size for _, size in chunks[first:])
+        self._table = table.getvalue()
+        self._at = 0
+
+    def readable(self) -> bool:
+        return True
+
+    def seekable(self) -> bool:
+        return True
+
+    def seek(self, offset: int, whence: int = 0) -> int:
+        self._at = offset + (0, self._at, self._past + len(self._table))[whence]
+        return self._at
+
+    def readinto(self, buffer: Any) -> int:
+        """Fill as much of the buffer as comes from one of the three parts; returns the number of bytes."""
+        view = memoryview(buffer).cast("B")
+        if 8 <= self._at < self._past:
+            self._file.seek(self._from + self._at - 8)
+            data = self._file.read(min(len(view), self._past - self._at))
+        else:
+            part, begin = (struct.pack("<q", self._past), 0) if self._at < 8 else (self._table, self._past)
+            data = part[self._at - begin : self._at - begin + len(view)]
+        view[: len(data)] = data
+        self._at += len(data)
+        return len(data)
 
 
 def _laszip_record(

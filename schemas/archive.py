@@ -11,6 +11,7 @@ import contextlib
 import functools
 import os
 import re
+import threading
 import zlib
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -49,6 +50,9 @@ _PROPERTIES = (
     rb"k%XsVgv%H9E@h>VPF*CfblsPSb?r$=H`}VU}RzfIgk-7!(Yn^W>poJq%bgp6v{9#umDvcnTQfP480743lx@TKLG&yO*Ul"
 )
 
+# Of this process, or of the one it was forked from: process ids are given on many hosts.
+_PROCESS = os.urandom(6).hex()
+
 _SHARD_NAME = re.compile(r"[0-9]{1,9}-[0-9]{1,9}\.h5")
 
 
@@ -60,10 +64,15 @@ def shard_name(number: int, generation: int = 0) -> str:
 # --- writing -------------------------------------------------------------------------------------------
 
 
+def _temporary(path: Path) -> Path:
+    """The name that `path` is written under: this thread's own, for a cluster may run one unit in two places at once."""
+    return path.with_name(f"{path.name}.{_PROCESS}-{os.getpid()}-{threading.get_ident()}.tmp")
+
+
 @contextlib.contextmanager
 def _new_file(path: Path) -> Iterator[h5py.File]:
     """An HDF5 file under a temporary name. Given its own only once it is closed and synced."""
-    temporary = path.with_name(path.name + ".tmp")
+    temporary = _temporary(path)
     try:
         # Metadata of format 1.10 and later is checksummed; in older ones 5 of 1,600 flips were silently wrong.
         with h5py.File(temporary, "w", libver=("v110", "v110")) as file:
@@ -75,7 +84,7 @@ def _new_file(path: Path) -> Iterator[h5py.File]:
 
 def publish(path: Path) -> None:
     """Sync the temporary file of `path`, rename it, sync its folder."""
-    temporary = path.with_name(path.name + ".tmp")
+    temporary = _temporary(path)
     with open(temporary, "rb") as file:
         os.fsync(file.fileno())
     os.replace(temporary, path)
@@ -149,7 +158,7 @@ def write_shard(
                 row["frame_checksum"][i] = int.from_bytes(frames[i][-4:], "little")
             rows.append(row)
     table = np.array(rows, VOXEL_DTYPE)
-    temporary = path.with_name(path.name + ".tmp")
+    temporary = _temporary(path)
     try:
         _verify_frames(temporary, table)
     except BaseException:

@@ -46,7 +46,7 @@ def draw(parts: list[Part], notes: dict[str, str], machine: str, target: Path) -
         panels = columns[0].subplots(len(left), 1, height_ratios=[size for _, size in left], squeeze=False)
         for axes, (draw_it, _) in zip(panels[:, 0], left, strict=True):
             draw_it(axes)
-    _table(columns[1].subplots(), rows, height)
+    goals_table(columns[1].subplots(), rows, height)
     title = f"solidcloud: the engine's goals and its peers, one run  ({machine})"
     warning = busy(parts)
     if warning:
@@ -165,7 +165,7 @@ def _growth(axes: Any, growth: list[Figure]) -> None:
     axes.grid(alpha=0.3)
 
 
-def _table(axes: Any, rows: list[dict[str, Any]], height: float) -> None:
+def goals_table(axes: Any, rows: list[dict[str, Any]], height: float) -> None:
     """The goals: what was asked for, what was measured, met or missed."""
     axes.set_axis_off()
     axes.set(xlim=(0, 1), ylim=(0, 1))

@@ -165,8 +165,8 @@ def goal_rows(parts: Iterable[Part], notes: dict[str, str]) -> list[dict[str, An
     ]
 
 
-def show(parts: list[Part], notes: dict[str, str]) -> None:
-    """Print figures, then goals with what was tried, then what is wrong or missing."""
+def show(parts: list[Part], notes: dict[str, str], section: str = "Speed") -> None:
+    """Print figures, then goals, of `section` of the README, with what was tried, then what is wrong or missing."""
     console = Console(width=150)
     for part in parts:
         if part.figures:
@@ -175,7 +175,7 @@ def show(parts: list[Part], notes: dict[str, str]) -> None:
             console.print(f"  {line}", style="dim")
     rows = goal_rows(parts, notes)
     if rows:
-        table = Table(title="goals of section `Speed`")
+        table = Table(title=f"goals of section `{section}`")
         for name, justify in (("goal", "left"), ("figure", "right"), ("limit", "right"), ("", "left")):
             table.add_column(name, justify=justify)  # type: ignore[arg-type]
         for row in rows:

@@ -1,0 +1,156 @@
+"""Builds of made façades with the real command, watched: times, memory, bytes a point."""
+
+import itertools
+import shutil
+import sys
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from .build_watch import Sample, Watched, last_json, watch
+from .machine import say
+
+COMMAND = [sys.executable, "-m", "solidcloud.server.cli"]
+# What a build does outside its stages: the interpreter, kernels from numba's cache, processes, renaming.
+REST = "start, rest"
+
+
+@dataclass(frozen=True)
+class Built:
+    """One build. summary: what the command said of it.  watched: what it took, seen from outside.
+
+    step: of its lattice [m].
+    """
+
+    points: int
+    summary: dict[str, Any]
+    watched: Watched
+    step: float
+
+    @property
+    def seconds(self) -> float:
+        """On the clock, from the command's start to its end."""
+        return self.watched.seconds
+
+    @property
+    def bytes_a_point(self) -> float:
+        """Of the archive, everything in it."""
+        return float(self.summary["bytes"]) / self.points
+
+    @property
+    def stages(self) -> dict[str, float]:
+        """Seconds of each stage, and of what is in none."""
+        named = {name: float(seconds) for name, seconds in self.summary["stages"].items()}
+        return {**named, REST: max(0.0, self.seconds - sum(named.values()))}
+
+
+class BuildError(RuntimeError):
+    """The command ended with an error."""
+
+
+def scan_path(work: Path, points: int) -> Path:
+    """Where the façade of so many points is kept."""
+    return work / f"facade-{points}.las"
+
+
+def made_scan(work: Path, points: int) -> Path:
+    """The made façade of so many points as LAS; made where the folder has none."""
+    path = scan_path(work, points)
+    if not path.exists():
+        say(f"making a façade of {points:,} points, once")
+        work.mkdir(parents=True, exist_ok=True)
+        _must([*COMMAND, "make", "facade", "-o", str(path), "--points", str(points)])
+    return path
+
+
+def build(
+    scan: Path,
+    target: Path,
+    *,
+    memory: str,
+    jobs: int,
+    voxel: float | None = None,
+    step: float | None = None,
+    extra: Iterable[str] = (),
+) -> Built:
+    """Build an archive, watched, then validate it, which is not counted: the build verifies what it wrote itself.
+
+    Raises BuildError with what the command said.
+    """
+    shutil.rmtree(target, ignore_errors=True)
+    options = ["--memory", memory, "--jobs", str(jobs), "--json", *extra]
+    options += ["--voxel", f"{voxel:g}"] if voxel else []
+    options += ["--resolution", f"{step:g}"] if step else []
+    watched = _must([*COMMAND, "build", str(scan), "-o", str(target), *options])
+    summary = last_json(watched.out)
+    return Built(int(summary["points"]), summary, watched, float(summary["lattice_step"]))
+
+
+def validate(target: Path) -> int:
+    """The faults that `validate` finds in an archive."""
+    return len(last_json(_must([*COMMAND, "validate", str(target), "--json"], (0, 3)).out)["faults"])
+
+
+def _must(command: list[str], codes: tuple[int, ...] = (0,)) -> Watched:
+    watched = watch(command)
+    if watched.code not in codes:
+        raise BuildError(f"{' '.join(command[2:])}: exit code {watched.code}: {watched.err.strip()[-2000:]}")
+    return watched
+
+
+def stage_peaks(stages: dict[str, float], samples: list[Sample], seconds: float) -> dict[str, int]:
+    """Most memory during each stage [bytes], sum of PSS.
+
+    Stages follow one another and end with the command, about: what was in none is taken to come before them.
+    """
+    named = {name: spent for name, spent in stages.items() if name != REST}
+    ends = list(itertools.accumulate(named.values()))
+    start = max(0.0, seconds - (ends[-1] if ends else 0.0))
+    peaks = dict.fromkeys(stages, 0)
+    for sample in samples:
+        into = sample.at - start
+        name = (
+            REST if into < 0 else next((n for n, end in zip(named, ends, strict=True) if into <= end), REST)
+        )
+        peaks[name] = max(peaks[name], sample.pss)
+    return peaks
+
+
+def linearity(built: dict[int, list[Built]]) -> dict[tuple[int, int], float]:
+    """Seconds a point of each size over those of the size before it, medians: (smaller, larger) -> ratio."""
+    found = {}
+    for small, large in itertools.pairwise(sorted(built)):
+        found[small, large] = (_median_seconds(built[large]) / large) / (
+            _median_seconds(built[small]) / small
+        )
+    return found
+
+
+def _median_seconds(runs: list[Built]) -> float:
+    ordered = sorted(run.seconds for run in runs)
+    return ordered[len(ordered) // 2]
+
+
+def median_run(runs: list[Built]) -> Built:
+    """The run whose time is the median, the slower of two."""
+    return sorted(runs, key=lambda run: run.seconds)[len(runs) // 2]
+
+
+def report(built: Built) -> dict[str, Any]:
+    """A build for the JSON, its memory over time included."""
+    return {
+        "points": built.points,
+        "step": built.step,
+        "seconds": built.seconds,
+        "cpu_seconds": built.watched.cpu,
+        "others": built.watched.others,
+        "looking": built.watched.looking,
+        "stages": built.stages,
+        "bytes": built.summary["bytes"],
+        "voxels": built.summary["voxels"],
+        "peak_pss": built.watched.peak,
+        "peak_anonymous": built.watched.peak_anonymous,
+        "stage_peaks": stage_peaks(built.stages, built.watched.samples, built.seconds),
+        "memory": [s._asdict() for s in built.watched.samples],
+    }

@@ -1,0 +1,76 @@
+"""Bytes a point of archives, beside LAZ of the same xyz on the same lattice."""
+
+import os
+import shutil
+from pathlib import Path
+
+import laspy
+import numpy as np
+from numpy.typing import NDArray
+from solidcloud.builder.sources import open_scans, scan_files
+from solidcloud.schemas.archive import Archive
+
+# The real scans that are built, of the folder that SOLIDCLOUD_SCANS names.
+REAL_SCANS = (
+    "indoor_atrium.laz", "pumpA.e57", "cupola_las", "octomap_hall.xyz", "campus_scan_a.ply", "lone_star.copc.laz",
+)  # fmt: skip
+
+
+def real_scans() -> list[Path]:
+    """Those of REAL_SCANS that are here."""
+    folder = os.environ.get("SOLIDCLOUD_SCANS")
+    return [path for name in REAL_SCANS if folder and (path := Path(folder) / name).exists()]
+
+
+def archive_bytes(folder: Path) -> int:
+    """Of all files of an archive."""
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+
+
+def quantised(scans: Path, archive: Path) -> NDArray[np.int64]:
+    """The points of a file or folder (n, 3) on an archive's lattice, in the order they were scanned.
+
+    Raises ValueError when they are not as many as the archive holds.
+    """
+    with Archive(archive) as opened:
+        lattice, expected = opened.header.lattice, opened.header.points
+    blocks = [
+        lattice.to_lattice(block.xyz[np.isfinite(block.xyz).all(axis=1)])
+        for path in scan_files([scans])
+        for scan in open_scans(path)
+        for block in scan.blocks()
+    ]
+    found = np.concatenate(blocks)
+    if len(found) != expected:
+        raise ValueError(f"{scans}: {len(found)} points read, {expected} in the archive: not the same points")
+    return found
+
+
+def laz_bytes(points: NDArray[np.int64], folder: Path) -> int:
+    """Size of a LAZ file of these lattice integers (n, 3) and nothing else, header included.
+
+    Point format 0 cannot leave out intensity, returns, class and source; being all zero they take about nothing.
+    """
+    low = points.min(axis=0)
+    if int((points - low).max()) >= 1 << 31:
+        raise ValueError(f"lattice integers up to {(points - low).max()}: LAZ holds 31 bits")
+    header = laspy.LasHeader(point_format=0, version="1.2")
+    header.scales = np.full(3, 1e-4)
+    record = laspy.ScaleAwarePointRecord.zeros(len(points), header=header)
+    for name, column in zip("XYZ", (points - low).T, strict=True):
+        record[name] = column.astype(np.int32)
+    path = folder / "xyz.laz"
+    with laspy.open(path, "w", header=header, do_compress=True) as file:
+        file.write_points(record)
+    size = path.stat().st_size
+    path.unlink()
+    return size
+
+
+def beside_laz(scans: Path, archive: Path, folder: Path) -> tuple[int, int]:
+    """Bytes of an archive, and of LAZ of the same xyz in the order of the scan."""
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        return archive_bytes(archive), laz_bytes(quantised(scans, archive), folder)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)

@@ -23,6 +23,8 @@ DOORS = {
     "plyfile": ("builder/sources/ply.py",),
     "trimesh": ("builder/sources/surface.py", "builder/made/"),
     "embreex": ("builder/made/scanner.py",),
+    "distributed": ("builder/cluster.py",),
+    "dask": ("builder/cluster.py",),
     "matplotlib": ("server/report/",),
     "PIL": ("server/report/",),
     "typer": ("server/cli.py", "server/verbs/"),

@@ -1,0 +1,344 @@
+"""Runs pure work units on a dask cluster: one that is there, or one started here. The only user of distributed.
+
+Who runs what, what happens when a worker dies, and how often a unit is tried again is dask's: a unit is pure, and
+written under a temporary name of its own, so that one which was killed half-way, or runs twice, changes nothing.
+Results come in the order of the units, as from `executor.py`.
+"""
+
+import asyncio
+import functools
+import hashlib
+import importlib.util
+import logging
+import os
+import platform
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from importlib import metadata
+from pathlib import Path
+from typing import Any, TypeVar
+
+import dask
+from distributed import (
+    Client,
+    Future,
+    KilledWorker,
+    LocalCluster,
+    Scheduler,
+    SchedulerPlugin,
+    Worker,
+    get_worker,
+)
+from distributed.client import FutureCancelledError
+from distributed.comm.core import connect
+
+from ..schemas.errors import BadRequestError, SolidcloudError
+from .progress import Progress
+
+Unit = TypeVar("Unit")
+Result = TypeVar("Result")
+
+# For a scheduler to answer, and to show its first worker.
+REACH_SECONDS = 10
+# A cluster without any worker for so long is given up: a batch system may take a while to start others in their place.
+LONELY_SECONDS = 300
+# How often a unit that is waited for is asked about; a result that comes is taken at once.
+ASK_SECONDS = 5
+# Beside its share of --memory a worker of the local cluster has what Python, numba, HDF5, the readers and dask itself
+# take, and some air: dask kills what is over, it does not ask.
+WORKER_BASE_BYTES = 384 << 20
+# What the bytes of an archive may depend on, beside the software itself.
+LIBRARIES = ("numpy", "numba", "llvmlite", "h5py", "zstandard")
+
+LOCAL = "local:"
+_START_WORKERS = "start its workers as `dask worker tcp://HOST:PORT --nthreads 1 --nworkers N`"
+
+
+def local_workers(address: str) -> int | None:
+    """N of "local:N", None of "tcp://HOST:PORT"; BadRequestError for anything else."""
+    if address.startswith(LOCAL):
+        number = address.removeprefix(LOCAL)
+        if number.isascii() and number.isdigit() and int(number):
+            return int(number)
+        raise BadRequestError(f"--cluster {address}: expected local:N, N worker processes, such as local:2")
+    scheme, found, host = address.partition("://")
+    if scheme not in ("tcp", "tls") or not (found and host):
+        raise BadRequestError(
+            f"--scheduler {address}: expected the address of a dask scheduler, tcp://HOST:PORT"
+        )
+    return None
+
+
+@functools.cache
+def software() -> dict[str, str]:
+    """What a unit's bytes may depend on, name -> version; solidcloud's own with a hash of its sources."""
+    root = Path(__file__).resolve().parent.parent
+    sources = hashlib.sha256()
+    for package in ("schemas", "builder"):
+        for path in sorted((root / package).rglob("*.py")):
+            sources.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
+    return {
+        "solidcloud": f"{metadata.version('solidcloud')} ({sources.hexdigest()[:12]})",
+        "Python": platform.python_version(),
+        **{name: metadata.version(name) for name in LIBRARIES},
+    }
+
+
+def _run_unit(
+    function: Callable[[Unit], Result], unit: Unit, expected: dict[str, str], folder: str
+) -> Result:
+    """Run one unit in a worker, which may have joined since the others were looked at."""
+    worker = get_worker()
+    _check_worker(worker.address, software(), expected, worker.state.nthreads)
+    try:
+        # Relative paths mean what they mean to the builder. A worker runs one unit at a time, so nobody else is moved.
+        if os.getcwd() != folder:
+            os.chdir(folder)
+    except OSError as error:
+        raise BadRequestError(
+            f"worker {worker.address}: no folder {folder} ({error.strerror}), expected the builder's: all workers need "
+            "the same files under the same paths"
+        ) from None
+    return function(unit)
+
+
+def _look(dask_worker: Worker) -> tuple[dict[str, str], int]:
+    """What a worker runs, and how many units at a time; asked of each before any work is handed out."""
+    return software(), dask_worker.state.nthreads
+
+
+def _check_worker(address: str, found: dict[str, str], expected: dict[str, str], threads: int) -> None:
+    """Refuse a worker whose bytes could be others, or that would run units side by side in one process."""
+    for name, version in expected.items():
+        if found.get(name) != version:
+            raise BadRequestError(
+                f"worker {address}: {name} {found.get(name, 'missing')}, expected {version} as the builder has: "
+                "install the same there, and start the worker again"
+            )
+    if threads != 1:
+        raise BadRequestError(
+            f"worker {address}: {threads} threads, expected one, as HDF5 takes one call at a time: {_START_WORKERS}"
+        )
+
+
+class ClusterExecutor:
+    """Maps a picklable function over work units on dask workers. A context manager, like `executor.Executor`.
+
+    jobs: workers, as they were when this was made; others may come and go.
+    """
+
+    def __init__(
+        self, address: str, memory_bytes: int = 2 << 30, say: Callable[[str], None] | None = None
+    ) -> None:
+        """Reach the scheduler at `address`, or start N workers here for "local:N".
+
+        memory_bytes: what N workers may hold together; those of a scheduler have limits of their own.  say: told the
+        dashboard's address; standard error where left out.  Raises BadRequestError for a scheduler that is not there
+        and for workers that are not as the builder is, naming them.
+        """
+        number = local_workers(address)
+        self._say = say or _say
+        self._watch = _Watch(self._say)
+        self._cluster = None if number is None else _start_local(number, memory_bytes, self._watch)
+        self._given: set[Future] = set()
+        self._address = address if self._cluster is None else self._cluster.scheduler_address
+        try:
+            self._client = _reach(self._address)
+        except BaseException:
+            if self._cluster is not None:
+                self._cluster.close()
+            raise
+        try:
+            self.jobs = self._check_workers(number)
+            self._say_dashboard()
+        except BaseException:
+            self._close()
+            raise
+
+    def _check_workers(self, number: int | None) -> int:
+        """Wait for the workers and look at each; returns how many there are."""
+        address = self._address
+        try:
+            # Those started here load Python first: on a busy machine that takes a while.
+            self._client.wait_for_workers(number or 1, REACH_SECONDS if number is None else 60)
+        except TimeoutError:
+            raise BadRequestError(
+                f"{address}: the scheduler has no worker, expected at least one: {_START_WORKERS}"
+            ) from None
+        try:
+            looks = self._client.run(_look)
+        except ModuleNotFoundError as error:
+            raise BadRequestError(
+                f"{address}: a worker has no {error.name}: install solidcloud, the same version, where workers run"
+            ) from None
+        for worker, (found, threads) in looks.items():
+            _check_worker(worker, found, software(), threads)
+        return len(looks)
+
+    def _say_dashboard(self) -> None:
+        """Where to watch the cluster; one started here has nothing to show without bokeh."""
+        if self._cluster is not None and importlib.util.find_spec("bokeh") is None:
+            self._say(
+                f"cluster: {self.jobs} workers; no dashboard, for bokeh is not installed: pip install bokeh"
+            )
+        else:
+            self._say(f"cluster: {self.jobs} workers; dashboard {self._client.dashboard_link}")
+
+    def __enter__(self) -> "ClusterExecutor":
+        """The executor itself."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Take back what waits, and stop what was started here. What others' workers run just now runs to its end."""
+        self._close()
+
+    def _close(self) -> None:
+        self._watch.closing = True
+        self._take_back()
+        self._client.close()
+        if self._cluster is not None:
+            self._cluster.close()
+
+    def _take_back(self) -> None:
+        """Cancel whatever was handed out and not taken."""
+        if self._given and self._client.status == "running":
+            self._client.cancel(list(self._given), force=True)
+        self._given.clear()
+
+    def map(
+        self,
+        function: Callable[[Unit], Result],
+        units: Sequence[Unit],
+        progress: Progress,
+        size: Callable[[Unit], int],
+    ) -> Iterator[Result]:
+        """function(unit) for each unit, in order; progress advances by size(unit) as each result is taken.
+
+        At most four units a worker are handed out ahead. What a unit raises is raised here, and what waits is
+        cancelled; SolidcloudError where the cluster is lost, or a unit's worker died each time it was tried.
+        """
+        ahead = 4 * self.jobs
+        futures: list[Future | None] = [self._submit(function, unit) for unit in units[:ahead]]
+        try:
+            for i, unit in enumerate(units):
+                future = futures[i]
+                assert future is not None
+                result: Result = self._result(future)
+                # The worker forgets the result when the last reference goes.
+                self._given.discard(future)
+                futures[i] = future = None
+                if i + ahead < len(units):
+                    futures.append(self._submit(function, units[i + ahead]))
+                yield result
+                progress.advance(size(unit))
+        finally:
+            self._take_back()
+
+    def _submit(self, function: Callable[[Unit], Result], unit: Unit) -> Future:
+        """Hand out one unit. Not `pure` in dask's sense: the same unit asked for again is to be done again."""
+        future = self._client.submit(
+            _run_unit, function, unit, software(), os.getcwd(), pure=False, key=_key(function)
+        )
+        self._given.add(future)
+        return future
+
+    def _result(self, future: Future) -> Any:
+        """Wait for a result, for as long as there is anybody to give it."""
+        alone_since: float | None = None
+        while True:
+            try:
+                return future.result(timeout=ASK_SECONDS)
+            except KilledWorker as error:
+                raise SolidcloudError(
+                    f"a unit's worker died {error.allowed_failures + 1} times, at last {error.last_worker.address}: "
+                    "out of memory? give a larger --memory or fewer workers, or look at its log"
+                ) from None
+            except FutureCancelledError as error:
+                raise SolidcloudError(
+                    f"the cluster was lost ({error.reason}): the same command again goes on where it was"
+                ) from None
+            except TimeoutError:
+                # Of the function itself, or of waiting: only the one that is done has an answer.
+                if future.done():
+                    raise
+            if self._client.scheduler_info(n_workers=-1)["workers"]:
+                alone_since = None
+                continue
+            alone_since = alone_since or time.monotonic()
+            if time.monotonic() - alone_since > LONELY_SECONDS:
+                raise SolidcloudError(
+                    f"{self._address}: no worker left for {LONELY_SECONDS} s: start some, then the "
+                    "same command again goes on where it was"
+                )
+
+
+def _key(function: Callable[..., object]) -> str:
+    """A name nobody else has; the dashboard groups by what stands before the dash."""
+    inner = function.func if isinstance(function, functools.partial) else function
+    return f"{getattr(inner, '__name__', 'unit')}-{os.urandom(16).hex()}"
+
+
+def _say(text: str) -> None:
+    """Where nobody else listens. The stream is asked for each time: bars on a terminal put their own in its place."""
+    print(text, file=sys.stderr, flush=True)
+
+
+class _Watch(SchedulerPlugin):
+    """Says of a worker started here that it died: dask starts another and runs the units again, and is silent then."""
+
+    def __init__(self, say: Callable[[str], None]) -> None:
+        self.say = say
+        self.closing = False
+
+    def remove_worker(self, scheduler: Scheduler, worker: str, *, stimulus_id: str, **_: object) -> None:
+        """Called by the scheduler, in its thread."""
+        if not self.closing:
+            self.say(f"cluster: worker {worker} died; its units are run again")
+
+
+def dask_setup(_: Worker) -> None:
+    """Called by dask in each worker started here: Ctrl-C is the builder's, as in `executor.py`."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def _start_local(number: int, memory_bytes: int, watch: _Watch) -> LocalCluster:
+    """A scheduler in this process and `number` workers of one thread, all on the loopback interface alone."""
+    with dask.config.set(
+        {
+            # Results are small. A worker that is over its limit is killed; paused, it would wait for ever.
+            "distributed.worker.memory.target": False,
+            "distributed.worker.memory.spill": False,
+            "distributed.worker.memory.pause": False,
+        }
+    ):
+        return LocalCluster(
+            n_workers=number,
+            threads_per_worker=1,
+            processes=True,
+            host="127.0.0.1",
+            dashboard_address="127.0.0.1:0",
+            memory_limit=memory_bytes // number + WORKER_BASE_BYTES,
+            preload=[__name__],
+            scheduler_kwargs={"plugins": [watch]},
+            # A unit that fails is reported here, by one line; dask would show its call stack besides.
+            silence_logs=logging.CRITICAL,
+        )
+
+
+def _reach(address: str) -> Client:
+    """A client of the scheduler at `address`."""
+
+    async def knock() -> None:
+        (await connect(address, timeout=REACH_SECONDS)).abort()
+
+    try:
+        # A Client that reached nobody takes 20 s more to be thrown away.
+        asyncio.run(knock())
+        return Client(address, timeout=REACH_SECONDS, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise BadRequestError(
+            f"--scheduler {address}: no dask scheduler answers within {REACH_SECONDS} s ({error}): start one with "
+            "`dask scheduler`, or give --cluster local:N"
+        ) from None

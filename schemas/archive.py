@@ -36,7 +36,7 @@ from .voxel import Links, VoxelData
 from .voxel_grid import voxel_coordinates
 
 # What this software reads, and writes: the first version that holds what is to be said (schemas/index.py Header).
-FORMAT_VERSIONS = (1, 2)
+FORMAT_VERSIONS = (1, 2, 3)
 INDEX_NAME = "index.h5"
 SHARD_FOLDER = "shards"
 ZSTD_FILTER = 32015  # registered with the HDF Group
@@ -65,7 +65,7 @@ def shard_name(number: int, generation: int = 0) -> str:
 
 
 def _temporary(path: Path) -> Path:
-    """The name that `path` is written under: this thread's own, for a cluster may run one unit in two places at once."""
+    """The name that `path` is written under: this thread's own, as a cluster may run one unit in two places at once."""
     return path.with_name(f"{path.name}.{_PROCESS}-{os.getpid()}-{threading.get_ident()}.tmp")
 
 
@@ -222,7 +222,7 @@ def _read_columns(path: Path) -> tuple[bytes, dict[str, NDArray]]:
             )
         version = int(file.attrs["format_version"])
         if version not in FORMAT_VERSIONS:
-            known = " and ".join(map(str, FORMAT_VERSIONS))
+            known = ", ".join(map(str, FORMAT_VERSIONS))
             raise FormatError(
                 f"{path}: format version {version}, this software reads {known}: use the one that wrote it"
             )
@@ -264,6 +264,26 @@ class Archive:
     def __init__(self, folder: str | os.PathLike[str]) -> None:
         """Open the archive in `folder`. Raises FormatError or CorruptError naming the file and the fault."""
         self.folder = Path(folder)
+        self._descriptors: list[int] = []
+        while True:
+            index = self._index_file()
+            try:
+                self._open()
+                return
+            except FormatError:
+                # Whoever adds scans replaces the index and then deletes the shards that it no longer names.
+                if self._index_file() == index:
+                    raise
+
+    def _index_file(self) -> tuple[int, int] | None:
+        """Which file the index is, and when it was written; None where there is none."""
+        with contextlib.suppress(OSError):
+            found = (self.folder / INDEX_NAME).stat()
+            return found.st_ino, found.st_mtime_ns
+        return None
+
+    def _open(self) -> None:
+        """Read the index and open the shards it names."""
         path = self.folder / INDEX_NAME
         if not path.is_file():
             raise FormatError(
@@ -288,7 +308,6 @@ class Archive:
         )
         self._check_shards()
         # All of them now: an archive that is replaced while it is read stays the one that was opened.
-        self._descriptors: list[int] = []
         try:
             for number in range(len(self._shards)):
                 self._descriptors.append(os.open(self.shard_path(number), os.O_RDONLY | os.O_CLOEXEC))
@@ -344,6 +363,10 @@ class Archive:
     def shard_path(self, number: int) -> Path:
         """The file of shard `number`."""
         return self.folder / SHARD_FOLDER / self._shards[number][0]
+
+    def shards(self) -> list[tuple[str, int]]:
+        """The name and bytes of each shard file, in the order of their numbers."""
+        return list(self._shards)
 
     def shard_count(self) -> int:
         """The number of shard files."""

@@ -51,6 +51,15 @@ class Source:
     fault: str = ""
 
 
+@dataclass(frozen=True, slots=True)
+class RadiusNow:
+    """Half the mean closest-point distance of the points of this generation, its standard error [m], points asked."""
+
+    radius: float
+    error: float
+    sample: int
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Header:
     """What the index says of the dataset as a whole.
@@ -63,6 +72,8 @@ class Header:
     radius class, zeros where none are stored; radius_capped: points that had too few neighbours for a local class,
     and were given the largest.  options: the build's.  unknown: (u, 2, 3) int64, lattice boxes, inclusive, of scans
     left out; unknown_everywhere: one was left out of which not even the bounds are known.
+    generation: how often scans were added or removed since the build.  radius_now: what `radius` would be if it were
+    measured now; None in generation 0, where it is, and where it was given.
     """
 
     archive_id: bytes
@@ -87,6 +98,8 @@ class Header:
     sources: tuple[Source, ...]
     unknown: NDArray[np.int64]
     unknown_everywhere: bool
+    generation: int = 0
+    radius_now: RadiusNow | None = None
 
     @property
     def radius_class(self) -> bool:
@@ -96,6 +109,8 @@ class Header:
     @property
     def format_version(self) -> int:
         """The version of the format that says all of this: the first where nothing newer is in it."""
+        if self.generation:
+            return 3
         return 2 if self.radius_class else 1
 
 
@@ -168,6 +183,13 @@ def index_columns(header: Header, voxels: NDArray, shards: list[tuple[str, int]]
             "radius_counts": header.radius_counts.astype("<u8"),
             "radius_capped": np.array([header.radius_capped], "<u8"),
         }
+    later: dict[str, NDArray] = {}
+    if header.generation:
+        now = header.radius_now or RadiusNow(header.radius, header.radius_error, 0)
+        later = {
+            "generation": np.array([header.generation], "<u4"),
+            "radius_now": np.array([now.radius, now.error, now.sample], "<f8"),
+        }
     return {
         "origin": np.array(lattice.origin, "<f8"),
         "step": np.array([lattice.step], "<f8"),
@@ -180,6 +202,7 @@ def index_columns(header: Header, voxels: NDArray, shards: list[tuple[str, int]]
         "tree": np.array([header.degree, header.leaf], "<u4"),
         "columns": np.array(columns, "u1"),
         **classes,
+        **later,
         "unknown": header.unknown.reshape(-1, 2, 3).astype("<i8"),
         "unknown_everywhere": np.array([header.unknown_everywhere], "u1"),
         "source_pose": np.array([s.pose for s in header.sources], "<f8").reshape(-1, 4, 4),
@@ -229,6 +252,15 @@ def read_header(archive_id: bytes, columns: dict[str, NDArray]) -> Header:
         for i, s in enumerate(texts["sources"])
     )
     x, y, z = (float(v) for v in columns["origin"])
+    generation, now = 0, None
+    if "generation" in columns:
+        generation = int(columns["generation"][0])
+        radius, error, sample = (float(v) for v in columns["radius_now"])
+        if generation < 1 or not (0 <= radius < np.inf and 0 <= error < np.inf and 0 <= sample < 2**53):
+            raise ValueError(
+                f"generation {generation}, radius_now {radius} {error} {sample}: not what is written"
+            )
+        now = RadiusNow(radius, error, int(sample)) if sample else None
     held = columns["columns"].astype(bool).tolist()
     models = ("mean", *(name for name, here in zip(("local", "border"), held[2:], strict=False) if here))
     counts, capped = np.zeros(RADIUS_CLASSES), 0
@@ -258,4 +290,6 @@ def read_header(archive_id: bytes, columns: dict[str, NDArray]) -> Header:
         sources=sources,
         unknown=columns["unknown"].astype(np.int64),
         unknown_everywhere=bool(columns["unknown_everywhere"][0]),
+        generation=generation,
+        radius_now=now,
     )

@@ -71,6 +71,7 @@ __all__ = [
     "Poses",
     "Positions",
     "RaycastRequest",
+    "ReloadAnswer",
     "SceneInfo",
     "ScenesAnswer",
     "SourceInfo",
@@ -114,7 +115,8 @@ class SourceInfo(msgspec.Struct, frozen=True):
     """One scan that was built into the archive.
 
     index: which scan inside the file.  sha256: of the file, hexadecimal.  count: points taken.
-    pose: 4x4 row-major, scan to world.  skipped: points left out, by reason.
+    pose: 4x4 row-major, scan to world.  skipped: points left out, by reason.  fault: why none of it is in the archive
+    (any more), or "".
     """
 
     path: str
@@ -124,6 +126,7 @@ class SourceInfo(msgspec.Struct, frozen=True):
     format: str
     pose: list[list[float]]
     skipped: dict[str, int]
+    fault: str = ""
 
 
 class SceneInfo(msgspec.Struct, frozen=True):
@@ -137,6 +140,8 @@ class SceneInfo(msgspec.Struct, frozen=True):
     resident_bytes: of the whole archive, decoded.  effects: names a request may use; none in version 1.
     unknown: boxes like `bounds` of scans left out, where nothing is called clear; unknown_everywhere: of one of
     them not even the bounds are known.  radius_models: stored, so that a question may ask for them.
+    generation: how often scans were added or removed since the build.  radius_now: what `radius` would be, were it
+    measured of the points of this generation; radius_now_error: its standard error [m]; null: not known.
     """
 
     scene: str
@@ -164,6 +169,23 @@ class SceneInfo(msgspec.Struct, frozen=True):
     unknown: list[list[list[float]]] = []
     unknown_everywhere: bool = False
     radius_models: list[str] = []
+    generation: int = 0
+    radius_now: float | None = None
+    radius_now_error: float | None = None
+
+
+class ReloadAnswer(msgspec.Struct, frozen=True):
+    """What a scene serves since it was reloaded.
+
+    generation_before, generation_after: of the archive, the same where nothing was added or removed meanwhile.
+    points: in it now.  seconds: from the request until it was swapped in.
+    """
+
+    scene: str
+    generation_before: int
+    generation_after: int
+    points: int
+    seconds: float = 0.0
 
 
 class ErrorReply(msgspec.Struct, frozen=True):
@@ -197,6 +219,7 @@ MESSAGES: tuple[type, ...] = (
     DistancePart,
     ContactsPart,
     SweepPart,
+    ReloadAnswer,
     ErrorReply,
 )
 

@@ -7,8 +7,9 @@ import logging
 import signal
 import socket
 import sys
+import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any, NamedTuple, Protocol
 
 from ..schemas import keys
@@ -42,6 +43,7 @@ from ..schemas.messages import (
     ObjectsRequest,
     PathRequest,
     RaycastRequest,
+    ReloadAnswer,
     SceneInfo,
     ScenesAnswer,
     SweepRequest,
@@ -78,6 +80,7 @@ class SceneLike(Protocol):
     def objects(self, *what: Any, **effort: Any) -> ObjectsAnswers: ...
     def path(self, *what: Any, **parameters: Any) -> Iterator[Part]: ...
     def drop_client(self, client: str) -> None: ...
+    def reload(self) -> ReloadAnswer: ...
     def warm(self) -> None: ...
     def close(self) -> None: ...
 
@@ -151,12 +154,10 @@ class Service:
             raise BadRequestError(f"scenes {', '.join(names)}: each needs a name of its own")
         self._scenes = {scene.name: scene for scene in scenes}
         self._config = config
-        # Read once: it does not change, and nobody is to wait for it.
-        self._infos = {scene.name: scene.info() for scene in scenes}
 
     def scenes(self, encoding: str | None) -> Answer:
         """Which scenes are served here."""
-        formats = {info.format_version for info in self._infos.values()}
+        formats = {scene.info().format_version for scene in self._scenes.values()}
         answer = ScenesAnswer(sorted(self._scenes), WIRE_VERSION, max(formats, default=0))
         try:
             stated = wire_encoding(encoding)
@@ -229,11 +230,33 @@ class Service:
         operation = _OPERATIONS.get(route.operation)
         if operation is None:
             if payload:
-                raise BadRequestError(f"info with a payload of {len(payload)} bytes: expected none")
-            return self._infos[route.scene]
+                raise BadRequestError(
+                    f"{route.operation} with a payload of {len(payload)} bytes: expected none"
+                )
+            # As an answer in one part: whoever sends parts has a thread for it, and nobody else waits meanwhile.
+            return self._reload(scene) if route.operation == "reload" else scene.info()
         request: Any = decode_request(operation.request, payload, encoding)
         self._check_size(operation, request)
         return operation.ask(scene, request, route.client)
+
+    def _reload(self, scene: SceneLike) -> Iterator[ReloadAnswer]:
+        """Reload one scene when the answer is asked for; what goes wrong is logged here, and raised."""
+        try:
+            answer = scene.reload()
+        except Exception as error:
+            log.error("%s is not reloaded, what was served is served on: %s", scene.name, error)
+            raise
+        log.info(
+            "reloaded %s in %.1f s: generation %d, was %d; %d points",
+            scene.name, answer.seconds, answer.generation_after, answer.generation_before, answer.points,
+        )  # fmt: skip
+        yield answer
+
+    def reload(self) -> None:
+        """Reload every scene, one after the other; what goes wrong is logged, and that scene served on as it was."""
+        for scene in self._scenes.values():
+            with suppress(Exception):
+                next(self._reload(scene))
 
     def _check_size(self, operation: _Operation, request: Any) -> None:
         """TooLargeError for more than this server takes."""
@@ -255,7 +278,7 @@ class Service:
 
 
 @contextmanager
-def serving(scenes: Sequence[SceneLike], config: ServerConfig) -> Iterator[None]:
+def serving(scenes: Sequence[SceneLike], config: ServerConfig) -> Iterator[Service]:
     """Serve scenes while inside; they stay the caller's, to be closed after.
 
     Entered once everything is warm and reachable. SolidcloudError: a scene or the endpoint is unusable.
@@ -263,19 +286,46 @@ def serving(scenes: Sequence[SceneLike], config: ServerConfig) -> Iterator[None]
     service = Service(scenes, config)
     service.warm()
     with Transport([scene.name for scene in scenes], service, config):
-        yield
+        yield service
 
 
 def serve(scenes: Sequence[SceneLike], config: ServerConfig) -> None:
-    """Serve scenes until SIGTERM or SIGINT, then answer what was accepted and return. Main thread only."""
+    """Serve scenes until SIGTERM or SIGINT, then answer what was accepted and return. Main thread only.
+
+    SIGHUP: what is in the archives' folders now is served from then on, see `Scene.reload`.
+    """
     # A thread in pure Python may keep the interpreter for 5 ms by default while a reply waits for it.
     sys.setswitchinterval(0.0005)
     if config.insecure:
         log.warning("--insecure: whoever reaches %s may ask anything, unauthenticated", config.listen)
-    with _signalled(signal.SIGTERM, signal.SIGINT) as stop, serving(scenes, config):
+    with (
+        _signalled(signal.SIGTERM, signal.SIGINT, signal.SIGHUP) as signals,
+        serving(scenes, config) as service,
+        _reloader(service) as wanted,
+    ):
         names = ", ".join(scene.name for scene in scenes)
         print(f"serving {names} at {config.listen}", flush=True)
-        stop.recv(1)
+        while signals.recv(1)[0] == signal.SIGHUP:
+            wanted.set()
+
+
+@contextmanager
+def _reloader(service: Service) -> Iterator[threading.Event]:
+    """A thread that reloads all scenes each time the event is set, so that a stop need not wait for it to come back."""
+    wanted, ended = threading.Event(), threading.Event()
+
+    def run() -> None:
+        while wanted.wait() and not ended.is_set():
+            wanted.clear()
+            service.reload()
+
+    # A reload that is under way at the end is given up when its scene is closed (`Scene.close` waits for that).
+    threading.Thread(target=run, name="solidcloud-reload", daemon=True).start()
+    try:
+        yield wanted
+    finally:
+        ended.set()
+        wanted.set()
 
 
 @contextmanager

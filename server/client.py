@@ -38,6 +38,7 @@ from ..schemas.messages import (
     ErrorReply,
     PathRequest,
     Positions,
+    ReloadAnswer,
     SceneInfo,
     ScenesAnswer,
     decode_answer,
@@ -55,8 +56,9 @@ from .transport import session_config
 
 log = logging.getLogger(__name__)
 
-# A path's query is kept open for so long [s]; how long a part of it may take is the client's timeout.
-_PATH_SECONDS = 3600.0
+# How long some queries are kept open [s]. Of a path; how long a part of it may take is the client's timeout. A reload
+# opens an archive and fills a cache, at some 100 MB/s.
+_SECONDS = {"path": 3600.0, "reload": 600.0}
 
 _ENCODING = zenoh.Encoding(MSGPACK)
 
@@ -108,8 +110,7 @@ class Client(Questions):
                         keys.question_key(self.name, self._id, operation),
                         # By default zenoh keeps a reply back until the server has said that no other comes.
                         consolidation=zenoh.ConsolidationMode.NONE,
-                        # Of a path the whole answer counts; what may take `timeout` is each of its parts.
-                        timeout=_PATH_SECONDS if operation == "path" else self._timeout,
+                        timeout=max(self._timeout, _SECONDS.get(operation, 0.0)),
                     )
                 )
                 for operation in keys.OPERATIONS
@@ -131,13 +132,25 @@ class Client(Questions):
 
     def info(self) -> SceneInfo:
         """What the scene is. BusyError: nobody answered."""
-        payload = self._ask("info", b"")
+        return decode_answer(SceneInfo, self._answered("info", self._timeout))
+
+    def reload(self) -> ReloadAnswer:
+        """Have the server serve what is in the archive's folder now; what is asked after this is answered of it.
+
+        BusyError: nobody answered, or the server still answers of the generation before the one served. FormatError
+        and others: what is there cannot be served; the server serves on what it did.
+        """
+        return decode_answer(ReloadAnswer, self._answered("reload", _SECONDS["reload"]))
+
+    def _answered(self, operation: str, seconds: float) -> bytes:
+        """The answer to a question without payload; BusyError: nobody answered."""
+        payload = self._ask(operation, b"")
         if payload is None:
             raise BusyError(
-                f"no server of scene {self.name!r} answered at {self._endpoint} within {self._timeout} s: "
+                f"no server of scene {self.name!r} answered at {self._endpoint} within {seconds:g} s: "
                 f"start one with: solidcloud serve ARCHIVE --name {self.name} --listen {self._endpoint}"
             )
-        return decode_answer(SceneInfo, payload)
+        return payload
 
     def add_avatar(self, name: str, points: Any, radius: float | None = None) -> AvatarInfo:
         """Give this client an avatar: (n, 3) float64, its own frame [m]; radius [m], see AddAvatarRequest.

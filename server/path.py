@@ -6,7 +6,7 @@ What is answered does not depend on it, cost counters of a part apart.
 """
 
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from concurrent.futures import Executor, Future
 from typing import Any
 
@@ -93,7 +93,7 @@ def largest_part(op: str, parameters: dict[str, Any]) -> int:
 
 def path_parts(
     ask: Ask, total: int, most: int = LARGEST_PART, pool: Executor | None = None, ahead: int = 1
-) -> Iterator[Part]:
+) -> Generator[Part, None, None]:
     """The parts of a path in order; at least one, empty if the path is.
 
     most: answers in a part.  pool: computes parts, up to `ahead` of them before they are taken; None: each is computed

@@ -100,6 +100,11 @@ class Residency:
         """The number of voxels resident or being loaded."""
         return len(self._offsets)
 
+    def recent(self) -> list[int]:
+        """The index rows of the resident voxels, those used last at the end."""
+        with self._lock:
+            return [row for row in self._offsets if row not in self._loading]
+
     def bytes_of(self, rows: Sequence[int]) -> int:
         """Bytes these voxels take when resident."""
         return sum(self._sizes[row] for row in rows)

@@ -3,9 +3,8 @@
 import os
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, Unpack
 
@@ -15,6 +14,7 @@ from numpy.typing import ArrayLike
 from ..schemas.answers import (
     CollideAnswers,
     ContactsAnswers,
+    Cost,
     DistanceAnswers,
     ObjectsAnswers,
     Part,
@@ -22,18 +22,19 @@ from ..schemas.answers import (
     SweepAnswers,
     WithinAnswers,
 )
-from ..schemas.errors import BadRequestError, UnknownAvatarError
-from ..schemas.messages import WIRE_VERSION, AvatarInfo, SceneInfo, SourceInfo
+from ..schemas.errors import BadRequestError, BusyError, UnknownAvatarError
+from ..schemas.messages import WIRE_VERSION, AvatarInfo, ReloadAnswer, SceneInfo, SourceInfo
 from ..schemas.requests import QuestionOptions, make_objects, make_poses
 from .avatar import AvatarModel, make_avatar
 from .collide import collide
 from .contacts import contacts
 from .distance import distance
-from .effort import EXACT, Effort, make_effort
+from .effort import Effort, make_effort
 from .objects import objects as ask_objects
+from .opened import Opened
 from .path import PATH_THREADS, largest_part, path_parts, path_question
 from .rays import raycast
-from .request import SceneData, make_scene_data, with_radius_model
+from .request import SceneData
 from .residency import Residency
 from .session import Walker
 from .store import Store
@@ -41,25 +42,30 @@ from .sweep import sweep
 from .within import within
 
 DEFAULT_BUDGET = 512 << 20
-# Radius models whose tables are remembered; asked for by name, and by clients, so there may be any number.
-MOST_MODELS = 64
+# How long a reload waits for the last reader of the generation before the one that is current [s]: with a third one
+# opened meanwhile, three budgets would be in memory.
+RELOAD_WAIT = 10.0
 
 
 class Scene:
     """A served archive. Thread-safe; a context manager.
 
-    name: what clients call it; the archive's folder name unless given.
+    name: what clients call it; the archive's folder name unless given. What is in the folder when the scene is opened
+    stays what is asked, whatever becomes of the folder, until `reload`.
     """
 
     def __init__(self, store: Store, name: str, budget_bytes: int) -> None:
         """Serve the voxels of `store`; use `Scene.open`."""
         self.name = name
-        self._store = store
-        self._data = make_scene_data(store.archive, Residency(store, budget_bytes))
-        self._radius_model = lru_cache(MOST_MODELS)(partial(with_radius_model, self._data, store.archive))
+        self._folder, self._budget_bytes = store.archive.folder, budget_bytes
+        self._opened = Opened(store, budget_bytes)
+        self._before: Opened | None = None  # swapped out; perhaps not ended yet
+        self._info = describe(store, name)
         self._avatars: dict[tuple[str, str], AvatarModel] = {}
         self._pool: ThreadPoolExecutor | None = None
+        self._closed = False
         self._lock = threading.Lock()
+        self._reloading = threading.Lock()
 
     @classmethod
     def open(
@@ -85,12 +91,61 @@ class Scene:
         self.close()
 
     def close(self) -> None:
-        """Close the archive's files, once no part of a path is being computed."""
+        """Close the archive's files, once no part of a path is being computed and no reload is under way."""
         with self._lock:
+            closed, self._closed = self._closed, True
             pool, self._pool = self._pool, None
         if pool is not None:
             pool.shutdown(cancel_futures=True)
-        self._store.close()
+        if not closed:
+            with self._reloading:
+                self._opened.release()
+
+    def reload(self) -> ReloadAnswer:
+        """Serve what is in the archive's folder now, opened and warmed beside what is served, then swapped for it.
+
+        What was asked before is answered of the old generation, what is asked after this returns of the new one;
+        avatars stay. The old one is closed with its last reader: until then both keep voxels in memory, `budget_bytes`
+        each. Raises FormatError, CorruptError or BadRequestError, saying why, when the new one cannot be opened, and
+        BusyError when the one before the old is still being read; the old one is served on.
+        """
+        begin = time.perf_counter()
+        with self._reloading:
+            if self._before is not None and not self._before.ended.wait(RELOAD_WAIT):
+                raise BusyError(
+                    f"{self.name}: the generation before the one served is still asked, by a path perhaps: reload later"
+                )
+            old = self._opened
+            store = Store(self._folder)
+            try:
+                new = Opened(store, self._budget_bytes, old.number + 1)
+            except BaseException:
+                store.close()
+                raise
+            try:
+                new.warm()
+                new.follow(old, lambda: self._closed)
+                with self._lock:
+                    if self._closed:
+                        raise BadRequestError(f"{self.name}: closed while it was reloaded: open it again")
+                    self._opened, self._before, self._info = new, old, describe(store, self.name)
+            except BaseException:
+                new.release()
+                raise
+            old.release()
+        before, now = old.store.archive.header, store.archive.header
+        return ReloadAnswer(
+            self.name, before.generation, now.generation, now.points, time.perf_counter() - begin
+        )
+
+    def _take(self) -> Opened:
+        """What is asked now, to be released: for a `with`. BadRequestError when closed."""
+        while True:
+            opened = self._opened
+            if opened.take():
+                return opened
+            if opened is self._opened:  # nobody swapped it: it was closed
+                return opened.taken()
 
     def _pool_of_threads(self) -> ThreadPoolExecutor:
         """The threads that compute parts of paths, one a core; started when first needed, shared by all paths."""
@@ -109,37 +164,23 @@ class Scene:
         return avatar
 
     @property
+    def _data(self) -> SceneData:
+        """What a question without a radius model reads now."""
+        return self._opened.data
+
+    @property
     def residency(self) -> Residency:
         """The resident voxels, for counters and checks."""
         return self._data.residency
 
     def warm(self) -> None:
         """Ask one of everything, a load included, so that nobody waits for compilers after."""
-        archive = self._store.archive
-        row = int(np.argmin(self._store.sizes))
-        corner = archive.coordinates[row] * archive.header.lattice.voxel_steps + archive.voxels["low"][row]
-        pose = np.eye(4)[None]
-        pose[0, :3, 3] = archive.header.lattice.to_world(corner)
-        place = pose[:, :3, 3].copy()
-        avatar = make_avatar([[0.0, 0, 0], [0.1, 0, 0]])
-        both = np.full(2, 0xFFFFFFFF, np.uint32)
-        # Budgets that are hardly ever spent: what is bounded has kernels of its own, and so have deadlines.
-        later = time.perf_counter() + 3600.0
-        for poses in (pose, np.concatenate([pose, pose])):
-            Walker(self._data, avatar).collide(poses)
-        for effort in (EXACT, Effort(tolerance=1e-3, visits=1 << 20), Effort(deadline=later)):
-            for poses in (pose, np.concatenate([pose, pose])):
-                collide(self._data, avatar, poses, 0.0, effort)
-            distance(self._data, avatar, pose, 0.01, effort)
-            contacts(self._data, avatar, pose, effort=effort)
-            sweep(self._data, avatar, pose, pose, effort=effort)
-            raycast(self._data, place, np.array([[0.0, 0.0, 1.0]]), 0.01, effort)
-            within(self._data, place, 0.01, effort)
-            ask_objects(self._data, [avatar, avatar], np.concatenate([pose, pose]), both, both, effort=effort)
+        with self._take() as opened:
+            opened.warm()
 
     def info(self) -> SceneInfo:
         """What is served: counts, bounds, lattice, radius, sources."""
-        return describe(self._store, self.name)
+        return self._info
 
     def add_avatar(
         self, name: str, points: ArrayLike, radius: float | None = None, *, client: str = ""
@@ -163,6 +204,7 @@ class Scene:
 
     def _terms(
         self,
+        opened: Opened,
         tolerance: float = 0.0,
         budget_ms: float | None = None,
         budget_visits: int | None = None,
@@ -170,7 +212,7 @@ class Scene:
     ) -> tuple[SceneData, Effort]:
         """What a question with these options reads, and what it may cost."""
         effort = make_effort(tolerance, budget_ms, budget_visits)
-        return self._data if radius_model is None else self._radius_model(radius_model), effort
+        return opened.data if radius_model is None else opened.radius_model(radius_model), effort
 
     def collide(
         self,
@@ -187,14 +229,15 @@ class Scene:
         server/effort.py; radius_model: how large the scan's spheres are, see schemas/radius_model.py, None: the
         archive's one figure.
         """
-        data, effort = self._terms(**options)
-        return collide(data, self._avatar(name, client), poses, margin, effort)
+        with self._take() as opened:
+            data, effort = self._terms(opened, **options)
+            return collide(data, self._avatar(name, client), poses, margin, effort)
 
     def walker(
         self, name: str, margin: float = 0.0, *, radius_model: str | None = None, client: str = ""
     ) -> Walker:
         """A session of avatar `name`: its `collide` remembers the last pose; see server/session.py."""
-        return Walker(self._radius_model(radius_model), self._avatar(name, client), margin)
+        return Walker(self._take, self._avatar(name, client), margin, radius_model)
 
     def distance(
         self,
@@ -206,8 +249,9 @@ class Scene:
         **options: Unpack[QuestionOptions],
     ) -> DistanceAnswers:
         """How far avatar `name` is from the scene under each pose, up to `reach` [m]; see server/distance.py."""
-        data, effort = self._terms(**options)
-        return distance(data, self._avatar(name, client), poses, reach, effort)
+        with self._take() as opened:
+            data, effort = self._terms(opened, **options)
+            return distance(data, self._avatar(name, client), poses, reach, effort)
 
     def contacts(
         self,
@@ -221,9 +265,10 @@ class Scene:
         **options: Unpack[QuestionOptions],
     ) -> ContactsAnswers:
         """Which pairs of points are in contact under each of the poses, deepest first; see server/contacts.py."""
-        data, effort = self._terms(**options)
-        avatar = self._avatar(name, client)
-        return contacts(data, avatar, poses, limit, margin, cluster_distance, effort)
+        with self._take() as opened:
+            data, effort = self._terms(opened, **options)
+            avatar = self._avatar(name, client)
+            return contacts(data, avatar, poses, limit, margin, cluster_distance, effort)
 
     def sweep(
         self,
@@ -237,9 +282,10 @@ class Scene:
     ) -> SweepAnswers:
         """When avatar `name` first touches the scene on its way between poses; see server/sweep.py."""
         options.setdefault("tolerance", 1e-6)
-        data, effort = self._terms(**options)
-        avatar = self._avatar(name, client)
-        return sweep(data, avatar, pose_from, pose_to, margin, effort.tolerance, effort)
+        with self._take() as opened:
+            data, effort = self._terms(opened, **options)
+            avatar = self._avatar(name, client)
+            return sweep(data, avatar, pose_from, pose_to, margin, effort.tolerance, effort)
 
     def raycast(
         self,
@@ -249,8 +295,9 @@ class Scene:
         **options: Unpack[QuestionOptions],
     ) -> RaycastAnswers:
         """Which scan point's sphere rays (k, 3), (k, 3) hit first, up to `reach` [m]; see server/rays.py."""
-        data, effort = self._terms(**options)
-        return raycast(data, origins, directions, reach, effort)
+        with self._take() as opened:
+            data, effort = self._terms(opened, **options)
+            return raycast(data, origins, directions, reach, effort)
 
     def within(
         self,
@@ -259,8 +306,9 @@ class Scene:
         **options: Unpack[QuestionOptions],
     ) -> WithinAnswers:
         """Which scan point is nearest to each loose point (k, 3), up to `reach` [m]; see server/within.py."""
-        data, effort = self._terms(**options)
-        return within(data, points, reach, effort)
+        with self._take() as opened:
+            data, effort = self._terms(opened, **options)
+            return within(data, points, reach, effort)
 
     def objects(
         self,
@@ -274,12 +322,13 @@ class Scene:
 
         See server/objects.py.
         """
-        data, effort = self._terms(**options)
-        items, poses = make_objects(objects)
-        avatars = [self._avatar(item.avatar, client) for item in items]
-        groups = np.array([item.group for item in items], np.uint32)
-        masks = np.array([item.mask for item in items], np.uint32)
-        return ask_objects(data, avatars, poses, groups, masks, margin, effort)
+        with self._take() as opened:
+            data, effort = self._terms(opened, **options)
+            items, poses = make_objects(objects)
+            avatars = [self._avatar(item.avatar, client) for item in items]
+            groups = np.array([item.group for item in items], np.uint32)
+            masks = np.array([item.mask for item in items], np.uint32)
+            return ask_objects(data, avatars, poses, groups, masks, margin, effort)
 
     def path(
         self,
@@ -298,12 +347,21 @@ class Scene:
         threads: parts computed at a time.  sweep: k - 1 motions, from each pose to the next. Every part is the answer
         of its question for [first, first + n) of `total`. All poses are checked before the first part.
         """
-        data, avatar = self._radius_model(radius_model), self._avatar(name, client)
-        ask, total = path_question(data, avatar, make_poses(poses), op, parameters)
-        most = largest_part(op, parameters)
-        if threads <= 1:
-            return path_parts(ask, total, most)
-        return path_parts(ask, total, most, self._pool_of_threads(), 2 * threads)
+        opened = self._take()
+        try:
+            data, avatar = opened.radius_model(radius_model), self._avatar(name, client)
+            ask, total = path_question(data, avatar, make_poses(poses), op, parameters)
+
+            def ask_held(start: int, stop: int) -> Cost:
+                with opened.taken():  # whoever wanted the parts may be gone, and their hold with them
+                    return ask(start, stop)
+
+            most = largest_part(op, parameters)
+            ahead = (self._pool_of_threads(), 2 * threads) if threads > 1 else (None, 1)
+            return _Held(path_parts(ask_held, total, most, *ahead), opened)
+        except BaseException:
+            opened.release()
+            raise
 
     def drop_client(self, client: str) -> None:
         """Forget the avatars of a client that is gone."""
@@ -312,10 +370,37 @@ class Scene:
                 del self._avatars[key]
 
 
+class _Held(Iterator[Part]):
+    """The parts of a path, holding the generation they are of until the last was taken or nobody wants more."""
+
+    def __init__(self, parts: Generator[Part, None, None], opened: Opened) -> None:
+        self._parts = parts
+        self._opened: Opened | None = opened
+
+    def __next__(self) -> Part:
+        try:
+            return next(self._parts)
+        except BaseException:  # the end, too
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Take no more."""
+        opened, self._opened = self._opened, None
+        if opened is not None:
+            self._parts.close()
+            opened.release()
+
+    def __del__(self) -> None:
+        self.close()
+
+
 def describe(store: Store, name: str) -> SceneInfo:
     """What the archive of `store` holds: counts, bounds, lattice, radius, sources. Reads no voxel."""
     header = store.archive.header
-    lattice = header.lattice
+    lattice, now = header.lattice, header.radius_now
+    # Those of a point's scan_index are rows of this: what was left out stays in its place where others stand behind.
+    listed = max((number for number, s in enumerate(header.sources, 1) if not s.fault), default=0)
     return SceneInfo(
         scene=name,
         format_version=header.format_version,
@@ -336,13 +421,15 @@ def describe(store: Store, name: str) -> SceneInfo:
         degree=header.degree,
         leaf=header.leaf,
         sources=[
-            SourceInfo(s.path, s.index, s.sha256, s.count, s.format, s.pose.tolist(), s.skipped)
-            for s in header.sources
-            if not s.fault
+            SourceInfo(s.path, s.index, s.sha256, s.count, s.format, s.pose.tolist(), s.skipped, s.fault)
+            for s in header.sources[:listed]
         ],
         skipped=[s.fault for s in header.sources if s.fault],
         record_bytes=int(store.archive.voxels["frame_bytes"].sum(dtype=np.int64)),
         resident_bytes=int(store.sizes.sum()),
         unknown=[lattice.to_world(box).tolist() for box in header.unknown],
         unknown_everywhere=header.unknown_everywhere,
+        generation=header.generation,
+        radius_now=now.radius if now else None,
+        radius_now_error=now.error if now else None,
     )

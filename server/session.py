@@ -1,6 +1,9 @@
 """One walker: an avatar that is asked about pose after pose, and what is remembered between them."""
 
 import time
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,23 +16,43 @@ from .kernels.walking import walk_poses, walk_resident
 from .request import SceneData, check_request, kernel_poses, refuse, to_units
 
 
+class Readable(Protocol):
+    """An archive opened, as server/opened.py has it."""
+
+    @property
+    def number(self) -> int: ...
+    def radius_model(self, text: str | None) -> SceneData: ...
+
+
 class Walker:
     """`collide` for poses that follow one another, each looked at with what is known of the one before.
 
     The verdicts are those of `collide`, whatever the poses; the closer they are, the faster. Not thread-safe. For an
     avatar of more leaf nodes than a front holds (some 8,000 points), for a scene of which scans were left out, and
     where not all voxels in reach of one call can be read and held at once, nothing is remembered and `collide` answers.
+    After a reload it goes on, and what it remembers is dropped.
     """
 
-    def __init__(self, data: SceneData, avatar: AvatarModel, margin: float = 0.0) -> None:
-        """margin: distance below or at which two spheres are called in contact [m]. Raises BadRequestError."""
-        self._data, self._avatar, self._margin = data, avatar, margin
-        self._units = data.radius_units + to_units(margin, "margin")
+    def __init__(
+        self,
+        take: Callable[[], AbstractContextManager[Readable]],
+        avatar: AvatarModel,
+        margin: float = 0.0,
+        radius_model: str | None = None,
+    ) -> None:
+        """take: the archive that is current, held for a `with`.  margin: distance below or at which two spheres are
+        called in contact [m]. Raises BadRequestError, also for a radius model that the archive does not hold."""
+        self._take, self._avatar, self._margin, self._model = take, avatar, margin, radius_model
+        self._margin_units = to_units(margin, "margin")
         front = avatar.arrays.front.shape[1]
         leaves = avatar.arrays.first[avatar.arrays.front_first :]
-        unseen = data.unknown_everywhere or len(data.unknown) > 0
-        self._remembers = front > 0 and bool((leaves < 0).all()) and not unseen
+        self._front = front > 0 and bool((leaves < 0).all())
         self._memory = make_memory(front)
+        with take() as opened:
+            opened.radius_model(radius_model)
+            self._number = (
+                opened.number
+            )  # not the archive itself: who is idle must not keep an old one in memory
 
     def forget(self) -> None:
         """Start afresh."""
@@ -39,36 +62,47 @@ class Walker:
         """Whether the avatar touches the scene under each of the poses (k, 4, 4), in their order; see `collide`."""
         begin = time.perf_counter()
         array = kernel_poses(poses)
-        if not self._remembers:
-            return collide(self._data, self._avatar, array, self._margin)
-        if len(array) == 1:
-            answers = self._collide_at_once(array, begin)
+        with self._take() as opened:
+            if opened.number != self._number:
+                self.forget()
+                self._number = opened.number
+            return self._collide(opened.radius_model(self._model), array, begin)
+
+    def _collide(self, data: SceneData, poses: NDArray[np.float64], begin: float) -> CollideAnswers:
+        """`collide` of the archive that is current."""
+        if not self._front or data.unknown_everywhere or len(data.unknown):
+            return collide(data, self._avatar, poses, self._margin)
+        if len(poses) == 1:
+            answers = self._collide_at_once(data, poses, begin)
             if answers is not None:
                 return answers
-        data, residency = self._data, self._data.residency
-        reach = check_request(data, self._avatar, array, self._units)
+        residency = data.residency
+        reach = check_request(data, self._avatar, poses, data.radius_units + self._margin_units)
         rows = np.unique(reach.rows[: reach.starts[-1]]).tolist()
         if residency.bytes_of(rows) > residency.buffer.total_bytes:
-            return self._collide_afresh(array)
-        verdict, counts = np.zeros(len(array), np.uint8), np.zeros((3, len(array)), np.uint32)
+            return self._collide_afresh(data, poses)
+        verdict, counts = np.zeros(len(poses), np.uint8), np.zeros((3, len(poses)), np.uint32)
         with residency.hold(rows) as held:
             if not held.faults:
-                walk_poses(array, self._avatar.arrays, data.arrays, reach, verdict, counts, self._memory)
+                walk_poses(poses, self._avatar.arrays, data.arrays, reach, verdict, counts, self._memory)
         if held.faults:
-            return self._collide_afresh(array)
+            return self._collide_afresh(data, poses)
         return CollideAnswers(
             verdict, reach.outside, counts[0], counts[1], counts[2], engine_seconds=time.perf_counter() - begin,
             hits=held.hits, misses=held.misses, resident=residency.resident, resident_bytes=residency.resident_bytes,
         )  # fmt: skip
 
-    def _collide_at_once(self, poses: NDArray[np.float64], begin: float) -> CollideAnswers | None:
+    def _collide_at_once(
+        self, data: SceneData, poses: NDArray[np.float64], begin: float
+    ) -> CollideAnswers | None:
         """Answer one pose in one kernel call, as collide.py does; None: not all it needs is resident."""
-        data, avatar, residency = self._data, self._avatar, self._data.residency
+        avatar, residency = self._avatar, data.residency
+        units = data.radius_units + self._margin_units
         rows, outside = np.empty(64, np.int64), np.zeros(1, bool)
         verdict, counts = np.zeros(1, np.uint8), np.zeros((3, 1), np.uint32)
         with residency.still():
             fault, pose, found, needed = walk_resident(
-                poses, avatar.arrays, avatar.radius, self._units, data.arrays, data.broad, rows, outside, verdict,
+                poses, avatar.arrays, avatar.radius, units, data.arrays, data.broad, rows, outside, verdict,
                 counts, self._memory,
             )  # fmt: skip
             if needed > 0:
@@ -81,7 +115,7 @@ class Walker:
             hits=needed, resident=residency.resident, resident_bytes=residency.resident_bytes,
         )  # fmt: skip
 
-    def _collide_afresh(self, poses: NDArray[np.float64]) -> CollideAnswers:
+    def _collide_afresh(self, data: SceneData, poses: NDArray[np.float64]) -> CollideAnswers:
         """Answer without memory, and keep none."""
         self.forget()
-        return collide(self._data, self._avatar, poses, self._margin)
+        return collide(data, self._avatar, poses, self._margin)

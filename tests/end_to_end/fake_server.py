@@ -20,7 +20,7 @@ from solidcloud.schemas.answers import (
 )
 from solidcloud.schemas.columns import as_part, unknown
 from solidcloud.schemas.errors import BadRequestError, BadTransformError, UnknownAvatarError
-from solidcloud.schemas.messages import WIRE_VERSION, AvatarInfo, SceneInfo, SourceInfo
+from solidcloud.schemas.messages import WIRE_VERSION, AvatarInfo, ReloadAnswer, SceneInfo, SourceInfo
 from solidcloud.server.app import serve
 from solidcloud.server.config import ServerConfig
 
@@ -42,7 +42,8 @@ class FloorScene:
         self.gate = threading.Event()
         self.avatars = {}
         self.gone, self.asked = [], []
-        self.at_work = self.warmed = self.parts = 0
+        self.at_work = self.warmed = self.parts = self.reloaded = 0
+        self.refuses = None  # what a reload raises
         self.lock = threading.Lock()
 
     def warm(self):
@@ -73,6 +74,12 @@ class FloorScene:
             record_bytes=100,
             resident_bytes=200,
         )
+
+    def reload(self):
+        if self.refuses is not None:
+            raise self.refuses
+        self.reloaded += 1
+        return ReloadAnswer(self.name, self.reloaded - 1, self.reloaded, 4)
 
     def add_avatar(self, name, points, radius=None, *, client=""):
         known = self.avatars.get((client, name))

@@ -164,7 +164,7 @@ def test_voxels_may_come_and_go(tmp_path: Path, rng: np.random.Generator) -> Non
     case = cases.build(tmp_path, room(rng, 4000), radius=0.008, voxel=0.4)
     avatar = body(rng, 200)
     with Scene.open(case.archive) as whole:
-        sizes = np.sort(whole._store.sizes)
+        sizes = np.sort(whole._opened.store.sizes)
         whole.add_avatar("avatar", avatar, 0.005)
         with Scene.open(case.archive, budget_bytes=int(sizes[-14:].sum())) as scene:
             scene.add_avatar("avatar", avatar, 0.005)
@@ -214,14 +214,14 @@ def test_a_voxel_that_cannot_be_read_is_unknown(
 ) -> None:
     case = cases.build(tmp_path, room(rng, 600), radius=0.008, voxel=0.5)
     with Scene.open(case.archive) as scene:
-        load = scene._store.load
+        load = scene._opened.store.load
 
         def broken(row: int, arena: Arena, at: int) -> NDArray[np.int64]:
             if row % 3 == 0:
                 raise CorruptError("made for this test")
             return load(row, arena, at)
 
-        monkeypatch.setattr(scene._store, "load", broken)
+        monkeypatch.setattr(scene._opened.store, "load", broken)
         scene.add_avatar("avatar", body(rng, 200), 0.005)
         walker = scene.walker("avatar")
         for kind in ("smooth", "jumps"):

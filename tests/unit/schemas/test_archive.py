@@ -277,7 +277,7 @@ def virtual(file: h5py.File, name: str) -> None:
 
 
 EDITS: dict[str, tuple[Callable[[h5py.File], None], str]] = {
-    "other version": (set_attribute("format_version", np.uint32(3)), "format version 3, this software reads 1 and 2"),
+    "other version": (set_attribute("format_version", np.uint32(4)), "format version 4, this software reads 1, 2, 3"),
     "other format": (set_attribute("format", np.bytes_("solidcloud shard")), "not a solidcloud index"),
     "other units": (set_attribute("units", np.bytes_("ft")), "units 'ft', expected 'm'"),
     "text of variable length": (set_attribute("format", "solidcloud"), "not a solidcloud index"),

@@ -1,0 +1,143 @@
+"""One generation of an archive, opened: what questions read of it, and how many still do.
+
+A scene swaps one for another while it is asked (`Scene.reload`). Who reads takes the one that is current and lets it go
+when the answer is there; files and memory of one that was swapped out go with its last reader.
+"""
+
+import threading
+import time
+from collections.abc import Callable
+from functools import lru_cache, partial
+from typing import Self
+
+import numpy as np
+
+from ..schemas.errors import BadRequestError
+from .avatar import make_avatar
+from .collide import collide
+from .contacts import contacts
+from .distance import distance
+from .effort import EXACT, Effort
+from .objects import objects as ask_objects
+from .rays import raycast
+from .request import SceneData, make_scene_data, with_radius_model
+from .residency import Residency
+from .session import Walker
+from .store import Store
+from .sweep import sweep
+from .within import within
+
+# Radius models whose tables are remembered; asked for by name, and by clients, so there may be any number.
+MOST_MODELS = 64
+
+
+class _Parts:
+    """What an archive's questions read, in one place, so that all of it goes at once."""
+
+    def __init__(self, store: Store, budget_bytes: int) -> None:
+        self.data = make_scene_data(store.archive, Residency(store, budget_bytes))
+        self.radius_model = lru_cache(MOST_MODELS)(partial(with_radius_model, self.data, store.archive))
+
+
+class Opened:
+    """An archive's store and resident voxels, held open by who reads them. Thread-safe.
+
+    number: tells those of one scene apart.  ended: set once the last reader is gone and all is closed.
+    """
+
+    def __init__(self, store: Store, budget_bytes: int, number: int = 0) -> None:
+        """Hold `store` open for a first reader, the scene, which must `release` it."""
+        self.store, self.number = store, number
+        self.ended = threading.Event()
+        self._parts: _Parts | None = _Parts(store, budget_bytes)
+        self._lock = threading.Lock()
+        self._readers = 1
+
+    def take(self) -> bool:
+        """Read it too, until `release`; False where the last reader is gone already."""
+        with self._lock:
+            self._readers += self._readers > 0
+            return self._readers > 0
+
+    def release(self) -> None:
+        """Read it no more. The last reader closes its files and gives its memory back."""
+        with self._lock:
+            self._readers -= 1
+            if self._readers:
+                return
+            self._parts = None
+        self.store.close()
+        self.ended.set()
+
+    def __enter__(self) -> Self:
+        """What was taken."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Let it go."""
+        self.release()
+
+    def _held(self) -> _Parts:
+        parts = self._parts
+        if parts is None:
+            raise BadRequestError(f"{self.store.archive.folder}: this scene is closed: open it again")
+        return parts
+
+    @property
+    def data(self) -> SceneData:
+        """What every question reads, spheres of the archive's one figure. BadRequestError: closed."""
+        return self._held().data
+
+    def radius_model(self, text: str | None) -> SceneData:
+        """The same under a radius model; BadRequestError for one that is none, or not stored, and when closed."""
+        return self._held().radius_model(text)
+
+    def taken(self) -> Self:
+        """Itself, taken once more. BadRequestError: closed."""
+        if not self.take():
+            self._held()
+        return self
+
+    def warm(self) -> None:
+        """Ask one of everything, a load included, so that nobody waits for compilers after."""
+        data, archive = self.data, self.store.archive
+        row = int(np.argmin(self.store.sizes))
+        corner = archive.coordinates[row] * archive.header.lattice.voxel_steps + archive.voxels["low"][row]
+        pose = np.eye(4)[None]
+        pose[0, :3, 3] = archive.header.lattice.to_world(corner)
+        place = pose[:, :3, 3].copy()
+        avatar = make_avatar([[0.0, 0, 0], [0.1, 0, 0]])
+        both = np.full(2, 0xFFFFFFFF, np.uint32)
+        # Budgets that are hardly ever spent: what is bounded has kernels of its own, and so have deadlines.
+        later = time.perf_counter() + 3600.0
+        for poses in (pose, np.concatenate([pose, pose])):
+            Walker(self.taken, avatar).collide(poses)
+        for effort in (EXACT, Effort(tolerance=1e-3, visits=1 << 20), Effort(deadline=later)):
+            for poses in (pose, np.concatenate([pose, pose])):
+                collide(data, avatar, poses, 0.0, effort)
+            distance(data, avatar, pose, 0.01, effort)
+            contacts(data, avatar, pose, effort=effort)
+            sweep(data, avatar, pose, pose, effort=effort)
+            raycast(data, place, np.array([[0.0, 0.0, 1.0]]), 0.01, effort)
+            within(data, place, 0.01, effort)
+            ask_objects(data, [avatar, avatar], np.concatenate([pose, pose]), both, both, effort=effort)
+
+    def follow(self, other: "Opened", stopped: Callable[[], bool]) -> None:
+        """Load the voxels that `other` has in memory, as many of those used last as fit; until `stopped`.
+
+        So that who asks where it asked before does not wait for a disk because of a reload.
+        """
+        residency, keys = self.data.residency, self.store.archive.voxels["key"]
+        wanted = other.store.archive.voxels["key"][other.data.residency.recent()]
+        at = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
+        rows, room = [], residency.buffer.total_bytes
+        for row in at[keys[at] == wanted][::-1].tolist():
+            room -= residency.bytes_of([row])
+            if room < 0:
+                break
+            rows.append(row)
+        for row in reversed(rows):
+            if stopped():
+                return
+            with residency.hold([row]):
+                pass

@@ -1,0 +1,256 @@
+"""A server that is reloaded while it is asked, over zenoh: nothing is lost, and an answer is of one generation."""
+
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import cases
+import numpy as np
+import pytest
+import scans
+from numpy.typing import NDArray
+from solidcloud.schemas.answers import Verdict
+from solidcloud.schemas.errors import BusyError, FormatError, UnknownSceneError
+from solidcloud.schemas.messages import ReloadAnswer
+from solidcloud.server.app import serving
+from solidcloud.server.client import Client
+from solidcloud.server.config import ServerConfig
+from solidcloud.server.scene import Scene
+
+sys.path.insert(0, str(Path(__file__).parent))
+from fake_server import FloorScene
+
+BODY = np.array([[0.0, 0, 0], [0.15, 0, 0], [0.0, 0.1, 0.2]])
+RADIUS = 0.03
+DEADLINE = 60.0
+
+
+class Generations(NamedTuple):
+    """Two archives of one folder name. poses: (k, 4, 4); verdicts: (2, k), what is true of each, by brute force."""
+
+    archives: tuple[Path, Path]
+    poses: NDArray[np.float64]
+    verdicts: NDArray[np.uint8]
+
+
+@pytest.fixture(scope="module")
+def generations(tmp_path_factory: pytest.TempPathFactory) -> Generations:
+    """Two archives that touch at different poses."""
+    folder = tmp_path_factory.mktemp("generations")
+    rng = np.random.default_rng(5)
+    # The corners of all make the lattice the same for both.
+    shared = np.vstack([scans.make_scan("plane", 1, 500), [[0, 0, 0], [2, 2, 2]]])
+    built = [cases.build(folder, np.vstack([shared, scans.make_scan("noise", n, 500)])) for n in (2, 3)]
+    poses = cases.near_poses(rng, built[0].points, BODY, 300, 0.2)
+    verdicts = np.array([case.judge(BODY, RADIUS, poses) for case in built]).astype(np.uint8)
+    assert (verdicts[0] != verdicts[1]).sum() > 50 and (verdicts[0] == verdicts[1]).sum() > 50
+    return Generations((built[0].archive, built[1].archive), poses, verdicts)
+
+
+@pytest.fixture
+def endpoint() -> str:
+    """A free port on loopback."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{free.getsockname()[1]}"
+
+
+def put(archive: Path, place: Path) -> None:
+    """What `build --overwrite` does to a folder, in its effect on who reads it."""
+    shutil.rmtree(place, ignore_errors=True)
+    shutil.copytree(archive, place)
+
+
+def which(generations: Generations, verdicts: NDArray[np.uint8]) -> set[int]:
+    """The generations of which verdicts of all poses are right."""
+    return {n for n in (0, 1) if np.array_equal(verdicts, generations.verdicts[n])}
+
+
+class Asking:
+    """Threads, a client each, that ask without pause. found: when it was asked, when answered, of which it is right."""
+
+    def __init__(self, generations: Generations, endpoint: str) -> None:
+        self._generations, self._endpoint = generations, endpoint
+        self._stop = threading.Event()
+        self.found: list[tuple[float, float, set[int]]] = []
+        self.faults: list[str] = []
+        self._threads = [threading.Thread(target=self._run, args=(path,)) for path in (False, False, True)]
+
+    def __enter__(self) -> "Asking":
+        for thread in self._threads:
+            thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        for thread in self._threads:
+            thread.join(DEADLINE)
+
+    def _run(self, path: bool) -> None:
+        try:
+            with Client(self._endpoint, scene="hall") as client:
+                client.add_avatar("al", BODY, RADIUS)
+                while not self._stop.is_set():
+                    asked = time.monotonic()
+                    if path:
+                        parts = list(client.path("al", self._generations.poses))
+                        verdicts = np.concatenate([part.verdict for part in parts])
+                    else:
+                        verdicts = client.collide("al", self._generations.poses).verdict
+                    right = which(self._generations, verdicts)
+                    self.found.append((asked, time.monotonic(), right))
+        except Exception as error:
+            self.faults.append(repr(error))
+
+    def wait_for_more(self, count: int) -> None:
+        """Wait until so many more answers came."""
+        goal, deadline = len(self.found) + count, time.monotonic() + DEADLINE
+        while len(self.found) < goal and not self.faults:
+            assert time.monotonic() < deadline, "no answers"
+            time.sleep(0.005)
+
+
+def test_no_question_is_lost_and_each_is_answered_of_one_generation(
+    generations: Generations, endpoint: str, tmp_path: Path
+) -> None:
+    place = tmp_path / "hall"
+    put(generations.archives[0], place)
+    swaps: list[tuple[float, float, int]] = []  # a reload was asked, was answered, what is served since
+    with (
+        Scene.open(place) as scene,
+        serving([scene], ServerConfig(listen=endpoint)),
+        Client(endpoint, scene="hall") as operator,
+        Asking(generations, endpoint) as asking,
+    ):
+        asking.wait_for_more(20)
+        for number in range(1, 9):
+            put(generations.archives[number % 2], place)
+            asked = time.monotonic()
+            answer = operator.reload()
+            swaps.append((asked, time.monotonic(), number % 2))
+            assert isinstance(answer, ReloadAnswer) and answer.points == 1002
+            asking.wait_for_more(10)
+    assert not asking.faults
+    assert len(asking.found) > 100
+    for begin, end, right in asking.found:
+        before = [now for _, done, now in swaps if done <= begin]
+        meanwhile = [now for asked, done, now in swaps if asked < end and done > begin]
+        assert right & {*(before[-1:] or [0]), *meanwhile}, (
+            "of neither generation, of one that was gone, or unknown"
+        )
+
+
+def test_after_a_reload_the_new_one_alone_answers(
+    generations: Generations, endpoint: str, tmp_path: Path
+) -> None:
+    place = tmp_path / "hall"
+    put(generations.archives[0], place)
+    with (
+        Scene.open(place) as scene,
+        serving([scene], ServerConfig(listen=endpoint)),
+        Client(endpoint, scene="hall") as client,
+    ):
+        client.add_avatar("al", BODY, RADIUS)
+        for number in (0, 1, 0, 1):
+            put(generations.archives[number], place)
+            client.reload()
+            for _ in range(3):
+                assert which(generations, client.collide("al", generations.poses).verdict) == {number}
+
+
+def test_what_cannot_be_opened_is_said_and_the_old_one_served_on(
+    generations: Generations, endpoint: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    place = tmp_path / "hall"
+    put(generations.archives[0], place)
+    with (
+        Scene.open(place) as scene,
+        serving([scene], ServerConfig(listen=endpoint)),
+        Client(endpoint, scene="hall") as client,
+    ):
+        client.add_avatar("al", BODY, RADIUS)
+        shutil.rmtree(place)
+        with pytest.raises(FormatError, match="no archive here"):
+            client.reload()
+        assert "served on" in caplog.text
+        assert which(generations, client.collide("al", generations.poses).verdict) == {0}
+
+
+def test_a_reload_that_nobody_answers_says_so(endpoint: str) -> None:
+    with Client(endpoint, scene="floor") as client, pytest.raises(BusyError, match="no server of scene"):
+        client.reload()
+    with (
+        serving([FloorScene()], ServerConfig(listen=endpoint)),
+        pytest.raises(UnknownSceneError),
+        Client(endpoint, scene="hall") as client,
+    ):
+        client.reload()
+
+
+@pytest.fixture
+def server(generations: Generations, endpoint: str, tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
+    """`solidcloud serve` in a process of its own, of the first generation."""
+    put(generations.archives[0], tmp_path / "hall")
+    command = [
+        sys.executable,
+        "-m",
+        "solidcloud.server.cli",
+        "serve",
+        str(tmp_path / "hall"),
+        "--listen",
+        endpoint,
+    ]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            assert process.stdout.readline().startswith("serving hall")
+            yield process
+        finally:
+            process.kill()
+
+
+def test_the_command_and_the_signal_reload(
+    generations: Generations, endpoint: str, tmp_path: Path, server: subprocess.Popen[str]
+) -> None:
+    place = tmp_path / "hall"
+    with Client(endpoint, scene="hall") as client:
+        client.add_avatar("al", BODY, RADIUS)
+
+        def now() -> set[int]:
+            verdicts = client.collide("al", generations.poses).verdict
+            assert not (verdicts == Verdict.UNKNOWN).any()
+            return which(generations, verdicts)
+
+        assert now() == {0}
+        put(generations.archives[1], place)
+        assert now() == {0}
+        command = ["reload", "--scene", "hall", "--connect", endpoint]
+        ran = subprocess.run(
+            [sys.executable, "-m", "solidcloud.server.cli", *command],
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        assert ran.stdout.startswith("hall: generation 0, was 0; 1,002 points")
+        assert now() == {1}
+        put(generations.archives[0], place)
+        os.kill(server.pid, signal.SIGHUP)
+        deadline = time.monotonic() + DEADLINE
+        while now() != {0}:
+            assert time.monotonic() < deadline, "the signal did nothing"
+        # One that cannot be opened ends nothing, and a signal to stop is heard after.
+        shutil.rmtree(place)
+        os.kill(server.pid, signal.SIGHUP)
+        assert now() == {0}
+    os.kill(server.pid, signal.SIGTERM)
+    _, log = server.communicate(timeout=DEADLINE)
+    assert server.returncode == 0
+    assert "reloaded hall" in log

@@ -13,14 +13,13 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..schemas.archive import SHARD_FOLDER, Archive, write_index
+from ..schemas.archive import SHARD_FOLDER, write_index
 from ..schemas.errors import BadRequestError, CorruptError, ScanError, SolidcloudError
 from ..schemas.index import Header, Source
 from ..schemas.radius_model import RADIUS_CLASSES
@@ -42,9 +41,9 @@ from .partition import (
     unopened,
 )
 from .progress import Progress, Silent
-from .radius import MeanDistance, archive_sums, mean_of_squares
 from .shards import Shard, ShardUnit, build_shard, plan_shards
 from .sources import NOT_FINITE, scan_files, sha256_of
+from .spacing import archive_mean
 from .verify import verify_archive
 from .workplace import locked, made_parents, publish_folder, workplace
 
@@ -337,21 +336,6 @@ def _build_voxels(
         return list(executor.map(build_shard, units, stages.progress, lambda unit: unit.points))
 
 
-class _RadiusUnit(NamedTuple):
-    """A run of voxels to measure closest-point distances in."""
-
-    folder: Path
-    rows: range
-    share: float
-    points: int
-
-
-def _radius_sums(unit: _RadiusUnit) -> tuple[int, int, int]:
-    """`archive_sums` of a run of voxels, in any process."""
-    with Archive(unit.folder) as archive:
-        return archive_sums(archive, unit.rows, unit.share, lambda: None)
-
-
 def _measure_radius(
     header: Header,
     shards: list[Shard],
@@ -373,18 +357,9 @@ def _measure_radius(
         write_index(folder, header, rows, names)
         return header
     write_index(folder, header, rows, names)  # for the workers to read by; nobody else sees this folder
-    share = min(1.0, RADIUS_SAMPLE / header.points)
-    points = rows["rows"][:, 2].astype(np.int64)
-    cuts = np.searchsorted(np.cumsum(points), np.arange(1, 65) * header.points / 64, side="left") + 1
-    edges = np.unique(np.concatenate([[0], np.minimum(cuts, len(rows))]))
-    units = [
-        _RadiusUnit(folder, range(int(a), int(b)), share, int(points[a:b].sum())) for a, b in pairwise(edges)
-    ]
     with stages.stage("radius", header.points, "points"):
-        sums = list(executor.map(_radius_sums, units, stages.progress, lambda unit: unit.points))
-    total, squares, sample = (sum(s[i] for s in sums) for i in range(3))
-    found: MeanDistance = mean_of_squares(total, squares, sample, share >= 1.0)
-    if sample == 0:
+        found = archive_mean(folder, RADIUS_SAMPLE, executor, stages.progress)
+    if found.sample == 0:
         raise BadRequestError("a single distinct point has no closest point: give --radius")
     header = replace(header, radius=found.mean / 2, radius_error=found.error / 2, radius_sample=found.sample)
     write_index(folder, header, rows, names)

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .bounding_sphere import ceil_sqrt
+from .records import LANES, U, read_leaf
 
 FAR = np.int64(1) << np.int64(62)
 
@@ -85,3 +86,128 @@ def box_distance2(queries, low, high, out):
             gap = max(low[k] - queries[q, k], queries[q, k] - high[k], 0)
             total += gap * gap
         out[q] = total
+
+
+class Spheres(NamedTuple):
+    """The bounds of an opened record: center (3, n) uint16, radius (n,) uint16 (schemas/voxel.py Nodes).
+
+    unit: int64, how many voxel steps one is in the top hierarchy.
+    """
+
+    center: NDArray[np.uint16]
+    radius: NDArray[np.uint16]
+    unit: np.int64
+
+
+# Differences are clamped to this before they are squared, so that three squares stay inside int32: what is clamped is
+# farther than anything that is looked for there.
+_CLAMP = 26754
+# A bound is lowered by this share, more than float64 can lose in it.
+_SURE = 1 - 1e-14
+
+
+@nb.njit(nogil=True, inline="always")
+def _nearest_lane(lanes, held, x, y, z, found):
+    """The least squared distance of the points lanes (3, LANES) from (x, y, z), int64, other than 0; or `found`."""
+    if found <= _CLAMP * _CLAMP:
+        # int32 at every step, which numba would leave for int64: eight at a time.
+        far = np.int32(_CLAMP)
+        qx, qy, qz = np.int32(x), np.int32(y), np.int32(z)
+        least = np.int32(0x7FFFFFFF)
+        for j in range(held):
+            dx = np.int32(min(max(np.int32(lanes[U(0), j] - qx), -far), far))
+            dy = np.int32(min(max(np.int32(lanes[U(1), j] - qy), -far), far))
+            dz = np.int32(min(max(np.int32(lanes[U(2), j] - qz), -far), far))
+            d2 = np.int32(np.int32(dx * dx) + np.int32(np.int32(dy * dy) + np.int32(dz * dz)))
+            least = np.int32(min(least, d2 if d2 > 0 else np.int32(0x7FFFFFFF)))
+        return min(found, np.int64(least))
+    for j in range(held):
+        dx, dy, dz = lanes[U(0), j] - x, lanes[U(1), j] - y, lanes[U(2), j] - z
+        d2 = dx * dx + dy * dy + dz * dz
+        if d2 > 0:
+            found = min(found, d2)
+    return found
+
+
+@nb.njit(nogil=True, inline="always")
+def _ask_leaf(leaves, node, queries, a, b, lanes, best):
+    """Lower best[a:b] by the points of a leaf node; returns the greatest of them."""
+    held, cell, farthest = read_leaf(leaves, node, lanes), U(leaves.cell[node]), np.int64(0)
+    x = np.int64(leaves.cell_low[U(0), cell]) + np.int64(leaves.block_low[U(0), node])
+    y = np.int64(leaves.cell_low[U(1), cell]) + np.int64(leaves.block_low[U(1), node])
+    z = np.int64(leaves.cell_low[U(2), cell]) + np.int64(leaves.block_low[U(2), node])
+    for q in range(U(a), U(b)):
+        found = _nearest_lane(
+            lanes, held, queries[q, U(0)] - x, queries[q, U(1)] - y, queries[q, U(2)] - z, best[q]
+        )
+        best[q] = found
+        farthest = max(farthest, found)
+    return farthest
+
+
+@nb.njit(nogil=True, cache=True)
+def closest_in_record(leaves, spheres, queries, groups, home, best):
+    """Lower best (q,) int64 to the squared distance of the closest point of a record *distinct* from each query.
+
+    queries: (q, 3) int64 [voxel steps], at most 2^31 from any point; groups (g + 1,) int64: query groups[i] to
+    groups[i + 1] are asked together, and had better lie side by side; home (g,) int64: the leaf node a group stands in,
+    which is looked at first, or -1. best holds what is known before, FAR for nothing. What is at FAR or beyond is not
+    found. A point equal to its query is passed over, so duplicates are nobody's neighbour (NUMERICS.md case 28). A node
+    is pruned when it is surely farther from the box of the group than the worst of what its queries know.
+    """
+    center, radius, unit = spheres
+    stack, bounds = np.empty(1280, np.int64), np.empty(1280, np.float64)  # 80 levels of at most 16 children
+    lanes = np.empty((3, LANES), np.int32)
+    for g in range(groups.shape[0] - 1):
+        a, b = groups[g], groups[g + 1]
+        lx, ly, lz = queries[a, 0], queries[a, 1], queries[a, 2]
+        hx, hy, hz = lx, ly, lz
+        farthest = np.int64(0)
+        for q in range(a, b):
+            lx, hx = min(lx, queries[q, 0]), max(hx, queries[q, 0])
+            ly, hy = min(ly, queries[q, 1]), max(hy, queries[q, 1])
+            lz, hz = min(lz, queries[q, 2]), max(hz, queries[q, 2])
+            farthest = max(farthest, best[q])
+        if home[g] >= 0:
+            farthest = _ask_leaf(leaves, U(home[g]), queries, a, b, lanes, best)
+        reach = np.sqrt(np.float64(farthest))
+        stack[0], bounds[0], depth = 0, 0.0, 1
+        while depth > 0:
+            depth -= 1
+            node = U(stack[depth])
+            if bounds[depth] > reach:
+                continue
+            if leaves.is_leaf[node]:
+                if np.int64(node) != home[g]:
+                    farthest = _ask_leaf(leaves, node, queries, a, b, lanes, best)
+                    reach = np.sqrt(np.float64(farthest))
+                continue
+            nearest, least = depth, np.inf
+            for child in range(U(leaves.first[node]), U(leaves.first[node]) + U(leaves.count[node])):
+                scale, cell = np.int64(1), leaves.cell[child]
+                x, y, z = (
+                    np.int64(center[U(0), child]),
+                    np.int64(center[U(1), child]),
+                    np.int64(center[U(2), child]),
+                )
+                if cell < 0:
+                    scale, x, y, z = unit, x * unit, y * unit, z * unit
+                else:
+                    low = leaves.cell_low
+                    x, y, z = x + low[U(0), U(cell)], y + low[U(1), U(cell)], z + low[U(2), U(cell)]
+                dx = np.float64(max(lx - x, x - hx, 0))
+                dy = np.float64(max(ly - y, y - hy, 0))
+                dz = np.float64(max(lz - z, z - hz, 0))
+                bound = np.sqrt(dx * dx + dy * dy + dz * dz) * _SURE - np.float64(
+                    np.int64(radius[child]) * scale
+                )
+                if bound <= reach:
+                    if bound < least:
+                        nearest, least = depth, bound
+                    stack[depth], bounds[depth] = child, bound
+                    depth += 1
+            # The closest child is looked at first: what it holds prunes most of the others.
+            if least < np.inf:
+                last = depth - 1
+                stack[nearest], stack[last] = stack[last], stack[nearest]
+                bounds[nearest], bounds[last] = bounds[last], bounds[nearest]

@@ -1,0 +1,72 @@
+"""The points of an opened record a block at a time: all, those in a box, or a sample."""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..schemas.codec import OpenRecord
+from .kernels.records import Leaves, take_points
+
+BLOCK_POINTS = 1 << 16
+# No coordinate of a lattice is beyond.
+_EVERYWHERE = np.array([[-(1 << 62)] * 3, [1 << 62] * 3], np.int64)
+
+
+class Taken(NamedTuple):
+    """Points of a record. xyz: (m, 3) int32 [voxel steps].  rows: (m,) int64, which point of the record each is.
+    nodes: (m,) int32, its leaf node."""
+
+    xyz: NDArray[np.int32]
+    rows: NDArray[np.int64]
+    nodes: NDArray[np.int32]
+
+
+def leaves_of(record: OpenRecord) -> Leaves:
+    """A record as kernels take it."""
+    first, is_leaf, cell = record.tree
+    nodes, cells = record.nodes, record.cells
+    return Leaves(
+        record.planes,
+        first,
+        is_leaf,
+        cell,
+        nodes.count,
+        nodes.axis,
+        nodes.block_low,
+        cells.low,
+        cells.log2_size,
+    )
+
+
+def hash_limit(share: float) -> np.uint64:
+    """What a point's hash must be below to be one of about `share` of all points; 0, which takes all, from 1 on.
+
+    A point is taken or not by its lattice coordinates alone, whatever the order of scans, the voxel size or the number
+    of jobs.
+    """
+    return np.uint64(0 if share >= 1.0 else max(1, int(share * 2.0**64)))
+
+
+def taken(
+    record: OpenRecord,
+    base: NDArray[np.int64],
+    *,
+    box: NDArray[np.int64] | None = None,
+    limit: np.uint64 = np.uint64(0),  # noqa: B008  a number
+    block: int = BLOCK_POINTS,
+) -> Iterator[Taken]:
+    """Blocks of at most `block` points of a record, in stored order. None is empty.
+
+    base: (3,) lattice coordinates of the voxel's corner.  box: (2, 3) lattice coordinates, both corners inclusive.
+    limit: see `hash_limit`; then of equal points in one leaf node the first alone.
+    """
+    leaves = leaves_of(record)
+    low, high = _EVERYWHERE if box is None else box
+    at, nodes = 0, len(leaves.first)
+    xyz, rows, node = np.empty((block, 3), np.int32), np.empty(block, np.int64), np.empty(block, np.int32)
+    while at < nodes:
+        at, held = take_points(leaves, at, base, low, high, limit, xyz, rows, node)
+        if held:
+            yield Taken(xyz[:held].copy(), rows[:held].copy(), node[:held].copy())

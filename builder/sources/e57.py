@@ -14,21 +14,25 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from .scan import Block, Scan, apply_pose, checked_bounds, library_errors, reader_library, scan_error
+from .scan import (
+    BOUNDS_MARGIN,
+    Block,
+    Scan,
+    apply_pose,
+    checked_bounds,
+    library_errors,
+    quaternion_pose,
+    reader_library,
+    scan_error,
+)
 
 CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
+INVALID_STATE = "invalid state"
 SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
 
 # The XML of 700 scans, each with a pose and bounds, is about 4 MiB; more than this is not looked at.
 LONGEST_XML = 16 << 20
 PAGE_BYTES = 1024  # the last four are the page's checksum [ASTM E2807, 7]
-
-# How far a quaternion's length may be from 1 (NUMERICS.md, case 4): float32 rounding passes, |q| = 1.01,
-# which would stretch space by 1.5 %, does not.
-QUATERNION_SLACK = 1e-6
-
-# Added to bounds that were computed and not read [m]: covers float64 rounding up to 1e9 m (0.12 um a step).
-BOUNDS_MARGIN = 1e-6
 
 
 class Fields(NamedTuple):
@@ -94,14 +98,14 @@ class E57Scan(Scan):
             valid = columns[fields.invalid_state] == 0
             left_out = len(valid) - int(np.count_nonzero(valid))
             if left_out:
-                self.dropped["invalid state"] = self.dropped.get("invalid state", 0) + left_out
+                self.dropped[INVALID_STATE] = self.dropped.get(INVALID_STATE, 0) + left_out
         xyz = np.stack([columns[name][valid] for name in fields.coordinates], axis=1)
         if fields.coordinates == SPHERICAL:
             xyz = _cartesian(xyz)
-        if not np.array_equal(self.pose, np.eye(4)):
-            xyz = apply_pose(self.pose, xyz)
-        # A copy: the reader fills the same array again.
-        return Block(xyz, columns[fields.intensity][valid].copy() if fields.intensity else None)
+        # A copy of the intensity: the reader fills the same array again.
+        return Block(
+            apply_pose(self.pose, xyz), columns[fields.intensity][valid].copy() if fields.intensity else None
+        )
 
 
 def _cartesian(spherical: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -184,36 +188,9 @@ def _number(node: Any, *names: str) -> float | None:
 
 def _pose(path: Path, index: int, numbers: dict[str, float | None]) -> NDArray[np.float64]:
     """The pose of a scan, (4, 4); the identity for what it does not state. Raises ScanError."""
-    pose = np.eye(4)
-    quaternion = [numbers[name] for name in _QUATERNION]
-    translation = [numbers[name] for name in _TRANSLATION]
-    given = [number for number in (*quaternion, *translation) if number is not None]
-    if not np.isfinite(given).all() or quaternion.count(None) % 4 or translation.count(None) % 3:
-        raise scan_error(
-            path,
-            f"scan {index} with rotation {quaternion} and translation {translation}",
-            "four and three finite numbers",
-            "register the scan again",
-        )
-    if None not in quaternion:
-        w, x, y, z = (float(number or 0.0) for number in quaternion)
-        length = np.sqrt(w * w + x * x + y * y + z * z)
-        if not abs(length - 1.0) <= QUATERNION_SLACK:
-            raise scan_error(
-                path,
-                f"scan {index} with a rotation quaternion of length {length:.9g}",
-                f"1 within {QUATERNION_SLACK:g}",
-                "register the scan again",
-            )
-        w, x, y, z = w / length, x / length, y / length, z / length
-        pose[:3, :3] = [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    if None not in translation:
-        pose[:3, 3] = [float(number or 0.0) for number in translation]
-    return pose
+    return quaternion_pose(
+        path, index, [numbers[name] for name in _QUATERNION], [numbers[name] for name in _TRANSLATION]
+    )
 
 
 def _bounds(numbers: dict[str, float | None], pose: NDArray[np.float64]) -> NDArray[np.float64] | None:

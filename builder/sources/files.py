@@ -10,9 +10,13 @@ from numpy.typing import NDArray
 
 from ...schemas.errors import BadRequestError
 from .e57 import e57_bounds, open_e57
+from .glb import open_glb
 from .las import las_bounds, open_las
 from .mesh import open_obj, open_stl
+from .pcd import open_pcd
 from .ply import open_ply
+from .pts import open_pts
+from .ptx import open_ptx
 from .scan import Scan, library_errors, scan_error
 from .surface import SurfaceSamples
 from .text import open_text
@@ -23,24 +27,27 @@ READERS: dict[str, Callable[[Path], list[Scan]]] = {
     ".laz": open_las,
     ".e57": open_e57,
     ".ply": open_ply,
+    ".pcd": open_pcd,
     ".xyz": open_text,
-    ".pts": open_text,
+    ".pts": open_pts,
+    ".ptx": open_ptx,
     ".txt": open_text,
     ".csv": open_text,
     ".obj": open_obj,
     ".stl": open_stl,
+    ".glb": open_glb,
 }
 # Taken from a folder. Text of any name may be notes, which would stop a build: it is read when named.
 IN_FOLDERS = frozenset(READERS) - {".txt", ".csv"}
-MESHES = frozenset({".obj", ".stl", ".ply"})
+MESHES = frozenset({".obj", ".stl", ".ply", ".glb"})
 
 
 def open_scans(path: Path, *, spacing: float | None = None) -> list[Scan]:
     """The scans of one file, headers read and checked, points not yet.
 
-    spacing: sample the surface of a mesh (OBJ, STL, PLY) with about this distance between points [m],
+    spacing: sample the surface of a mesh (OBJ, STL, PLY, GLB) with about this distance between points [m],
     instead of taking its vertices; other formats are not touched by it.
-    An E57 file may hold many scans, or none. A valid file without points gives a scan without blocks.
+    An E57, PTX or PTS file may hold many scans, an E57 none. A valid file without points gives a scan without blocks.
     Raises ScanError for what is missing, empty, of no known format, truncated or inconsistent, and
     BadRequestError for a spacing that is no positive number.
     """

@@ -7,7 +7,7 @@ so that scans can be listed by the thousand and sent to other processes.
 import hashlib
 import importlib
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from io import BufferedReader
 from pathlib import Path
@@ -33,8 +33,21 @@ FARTHEST = 1e9
 # The reason under which points are counted that are not finite, or beyond FARTHEST.
 NOT_FINITE = "not finite"
 
+# The reason under which directions are counted that a scanner measured nothing in.
+NO_RETURN = "no return"
+
+# How far a quaternion's length may be from 1 (NUMERICS.md, case 4): float32 rounding passes, |q| = 1.01,
+# which would stretch space by 1.5 %, does not.
+QUATERNION_SLACK = 1e-6
+
+# Added to bounds that were computed and not read [m]: covers float64 rounding up to 1e9 m (0.12 um a step).
+BOUNDS_MARGIN = 1e-6
+
 # Names a column of intensities goes by, in lower case; CloudCompare writes "scalar_" before its own.
 INTENSITY_NAMES = ("intensity", "scalar_intensity")
+
+
+_IDENTITY = np.eye(4)
 
 
 class Lattice(NamedTuple):
@@ -59,16 +72,22 @@ class Scan(ABC):
     """One posed cloud in one file, read in blocks.
 
     path, index: the file, and which of its scans this is, from 0.
-    format: "las", "laz", "e57", "ply", "pcd", "ptx", "pts", "text" or "mesh".
+    format: "las", "laz", "e57", "ply", "pcd", "ptx", "pts", "text", "mesh" or "glb".
     declared_count: points the header says there are, invalid ones included; None where it says nothing.
     pose: (4, 4) float64, scan frame -> world frame, the identity where the file has none.
     lattice: the grid of the source's coordinates, None where there is none.
     bounds: (2, 3) float64 world frame [m], low and high corner as the header declares them, or None.
     dropped: reason -> points left out by the reader; filled while blocks() is iterated, reset when it starts.
     seekable: blocks() can begin and end anywhere, at the cost of what it reads (`SeekableScan`).
+    units: what one of its lengths is, a key of METRES (placed.py); up: its axis that is up, "z", "y" or "x"; as the
+    format prescribes or, usual, nobody says. blocks() gives coordinates as they are.  crs: the coordinate reference
+    system's text, or "".
     """
 
     seekable = False
+    units = "m"
+    up = "z"
+    crs = ""
 
     def __init__(
         self,
@@ -224,12 +243,52 @@ def apply_pose(pose: NDArray[np.float64], xyz: NDArray[np.float64]) -> NDArray[n
     number of rows, so the same point would come out with other bits in a block of another size.
     """
     x, y, z = xyz[:, 0], xyz[:, 1], xyz[:, 2]
+    if np.array_equal(pose, _IDENTITY):
+        return xyz
     moved = np.empty_like(xyz)
     with np.errstate(over="ignore", invalid="ignore"):  # points that are not finite stay so
         for axis in range(3):
             r = pose[axis]
             moved[:, axis] = ((x * r[0] + y * r[1]) + z * r[2]) + r[3]
     return moved
+
+
+def quaternion_pose(
+    path: Path, index: int, quaternion: Sequence[float | None], translation: Sequence[float | None]
+) -> NDArray[np.float64]:
+    """A pose (4, 4) of a rotation w, x, y, z and a translation x, y, z [m]; the identity for what is None.
+
+    index: of the scan, for the message. Raises ScanError for numbers that are no pose.
+    """
+    pose = np.eye(4)
+    given = [number for number in (*quaternion, *translation) if number is not None]
+    whole = list(quaternion).count(None) % 4 == 0 and list(translation).count(None) % 3 == 0
+    if not whole or not np.isfinite(given).all():
+        raise scan_error(
+            path,
+            f"scan {index} with rotation {list(quaternion)} and translation {list(translation)}",
+            "four and three finite numbers",
+            "register the scan again",
+        )
+    if None not in quaternion:
+        w, x, y, z = (float(number or 0.0) for number in quaternion)
+        length = np.sqrt(w * w + x * x + y * y + z * z)
+        if not abs(length - 1.0) <= QUATERNION_SLACK:
+            raise scan_error(
+                path,
+                f"scan {index} with a rotation quaternion of length {length:.9g}",
+                f"1 within {QUATERNION_SLACK:g}",
+                "register the scan again",
+            )
+        w, x, y, z = w / length, x / length, y / length, z / length
+        pose[:3, :3] = [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    if None not in translation:
+        pose[:3, 3] = [float(number or 0.0) for number in translation]
+    return pose
 
 
 def sha256_of(path: Path) -> str:

@@ -1,10 +1,13 @@
-"""Points spread over the triangles of a mesh (OBJ, STL, PLY with faces), by trimesh."""
+"""Points spread over the triangles of a mesh (OBJ, STL, PLY with faces, by trimesh; GLB)."""
 
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from .glb import GlbScan
 from .scan import NOT_FINITE, Block, Scan, reader_library, scan_error
 
 # Steps of the additive sequence in two dimensions with the plastic number 1.3247...: of all such known the
@@ -13,6 +16,9 @@ from .scan import NOT_FINITE, Block, Scan, reader_library, scan_error
 STEP_U = 0.7548776662466927
 STEP_V = 0.5698402909980532
 
+# trimesh holds a mesh whole: an OBJ takes about five times its file while it is read.
+LARGEST_MESH = 512 << 20
+
 
 class SurfaceSamples(Scan):
     """A mesh's surface as points, area / spacing**2 of them."""
@@ -20,6 +26,7 @@ class SurfaceSamples(Scan):
     def __init__(self, vertices: Scan, spacing: float) -> None:
         """vertices: the same file as points.  spacing: side of the square that one point stands for [m]."""
         super().__init__(vertices.path, "mesh")
+        self.up = vertices.up
         self._vertices = vertices
         self._spacing = spacing
 
@@ -47,26 +54,42 @@ class SurfaceSamples(Scan):
             a, b, c = corners[face, 0], corners[face, 1], corners[face, 2]
             yield Block(a + u[:, None] * (b - a) + v[:, None] * (c - a), None)
 
-    def _triangles(self) -> Any:
-        """The corners of all triangles, (n, 3, 3) float64."""
-        trimesh = reader_library("trimesh", self.path)
-        # Materials would make trimesh open whatever files the OBJ names.
-        mesh = trimesh.load_mesh(self.path, process=False, skip_materials=True)
-        faces = np.asarray(mesh.faces) if hasattr(mesh, "faces") else np.empty((0, 3), np.int64)
-        vertices = np.asarray(mesh.vertices, np.float64)
+    def _triangles(self) -> NDArray[np.float64]:
+        """The corners of all triangles, (n, 3, 3)."""
+        corners = (
+            self._vertices.triangles() if isinstance(self._vertices, GlbScan) else _by_trimesh(self.path)
+        )
         # Of a file without faces trimesh gives nothing, vertices or not.
-        if not len(faces) and any(len(block.xyz) for block in self._vertices.blocks()):
+        if not len(corners) and any(len(block.xyz) for block in self._vertices.blocks()):
             raise scan_error(
                 self.path, "vertices and no faces", "a mesh to sample", "build it without --spacing"
             )
-        if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices)):
-            raise scan_error(
-                self.path,
-                f"a face with vertex {faces.max()} (counted from 0) of {len(vertices)}",
-                "faces between its own vertices",
-                "fetch the file again, it is truncated or damaged",
-            )
-        return vertices[faces]
+        return corners
+
+
+def _by_trimesh(path: Path) -> NDArray[np.float64]:
+    """The corners of all triangles of an OBJ, STL or PLY file, (n, 3, 3). Raises ScanError."""
+    size = path.stat().st_size
+    if size > LARGEST_MESH:
+        raise scan_error(
+            path,
+            f"a mesh of {size} bytes",
+            f"at most {LARGEST_MESH} to sample",
+            "split it, or build it without --spacing",
+        )
+    trimesh = reader_library("trimesh", path)
+    # Materials would make trimesh open whatever files the OBJ names.
+    mesh = trimesh.load_mesh(path, process=False, skip_materials=True)
+    faces = np.asarray(mesh.faces) if hasattr(mesh, "faces") else np.empty((0, 3), np.int64)
+    vertices = np.asarray(mesh.vertices, np.float64)
+    if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices)):
+        raise scan_error(
+            path,
+            f"a face with vertex {faces.max()} (counted from 0) of {len(vertices)}",
+            "faces between its own vertices",
+            "fetch the file again, it is truncated or damaged",
+        )
+    return np.asarray(vertices[faces], np.float64)
 
 
 def _unit_triangle(u: Any, v: Any) -> tuple[Any, Any]:

@@ -1,9 +1,9 @@
-"""Text scans: XYZ, PTS, TXT and CSV, one point a line.
+"""Text scans: XYZ, TXT and CSV, and PTS without counts, one point a line.
 
 What a file may look like, all of it read from its first lines:
 - comments ("#" or "//" first) and blank lines, then perhaps a header row of names, then rows of numbers
   separated by blanks, commas or semicolons; LF or CRLF;
-- a first line that is one whole number is the count of points, as PTS files have it. It is held against
+- a first line that is one whole number is the count of points. It is held against
   the rows: fewer of them is a truncated file, more of them a broken one.
 - x, y and z are the columns the header (a row, or a comment with as many names as there are columns) calls
   so, else the first three.

@@ -15,6 +15,14 @@ import numpy as np
 import plyfile
 import pye57
 import pytest
+from formats import (
+    glb_document,
+    glb_vertices,
+    ptx_scan,
+    write_glb,
+    write_pcd,
+    write_pts,
+)
 from solidcloud.builder.sources import Scan, header_bounds, open_scans, scan_files, sha256_of
 from solidcloud.builder.sources.files import READERS
 from solidcloud.schemas.errors import BadRequestError, ScanError
@@ -117,6 +125,14 @@ CASES = [
         "header.csv", lambda p, t: p.write_text('"X",Y,z,Intensity\n' + rows_of(t, ",")) and None, 0.0, True
     ),
     Case("crlf.txt", lambda p, t: p.write_bytes(rows_of(t, ";", "\r\n").encode()) and None, 0.0, False),
+    Case("a.pts", lambda p, t: write_pts(p, [(t.xyz, t.intensity)]) and None, 0.0, True),
+    Case("a.ptx", lambda p, t: p.write_text(ptx_scan(t.xyz, t.intensity, columns=8)) and None, 0.0, True),
+    Case("ascii.pcd", lambda p, t: write_pcd(p, *t, "ascii") and None, 0.0, True),
+    Case("binary.pcd", lambda p, t: write_pcd(p, *t, "binary") and None, 0.0, True),
+    Case("packed.pcd", lambda p, t: write_pcd(p, *t, "binary_compressed") and None, 0.0, True),
+    Case(
+        "a.glb", lambda p, t: write_glb(p, glb_document(COUNT), glb_vertices(t.xyz)) and None, SINGLE, False
+    ),
     Case("a.obj", write_obj, 0.0, False),
     Case("binary.stl", write_stl, SINGLE, False, 2),
     Case("ascii.stl", write_ascii_stl, 0.0, False, 2),
@@ -171,7 +187,7 @@ def test_small_blocks_give_the_same_bits_as_large_ones(case: Case, written: Path
         assert intensity is None or np.array_equal(small_intensity, intensity)
 
 
-SEEKABLE = {"a.las", "a.laz", "little.ply", "big.ply", "single.ply", "binary.stl"}
+SEEKABLE = {"a.las", "a.laz", "little.ply", "big.ply", "single.ply", "binary.stl", "binary.pcd"}
 
 
 def test_a_range_gives_the_points_that_a_run_through_gives_there(case: Case, written: Path) -> None:
@@ -263,9 +279,9 @@ def test_a_missing_file_is_an_error(tmp_path: Path) -> None:
 
 
 def test_an_unknown_suffix_names_the_known_ones(tmp_path: Path) -> None:
-    path = tmp_path / "a.ptx"
+    path = tmp_path / "a.rcp"
     path.write_text("1\n1\n")
-    with pytest.raises(ScanError, match=r"'\.ptx', expected one of \.las \.laz \.e57 \.ply .*\.stl"):
+    with pytest.raises(ScanError, match=r"'\.rcp', expected one of \.las \.laz \.e57 \.ply .*\.stl"):
         open_scans(path)
 
 

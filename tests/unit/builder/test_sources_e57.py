@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pye57 import libe57
+from formats import write_e57
 from solidcloud.builder.sources import header_bounds, open_scans
 from solidcloud.schemas.errors import ScanError
 
@@ -17,53 +17,6 @@ def read_all(path: Path, spacing: float | None = None, block_points: int = 1 << 
 
 TURN = np.array([0.5, 0.5, -0.5, 0.5])  # w, x, y, z: a third of a turn about a diagonal, exact in float64
 TURNED = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
-
-
-def write_e57(path: Path, scans: list[dict]) -> None:
-    """Scans with the keys columns (name -> array), and perhaps rotation, translation and bounds (2, 3).
-
-    By libE57Format itself: pye57 cannot write spherical coordinates, and writes bounds against the standard.
-    """
-    image = libe57.ImageFile(str(path), "w")
-    image.extensionsAdd("", libe57.E57_V1_0_URI)
-    root = image.root()
-    root.set("formatName", libe57.StringNode(image, "ASTM E57 3D Imaging Data File"))
-    root.set("guid", libe57.StringNode(image, "{1}"))
-    root.set("versionMajor", libe57.IntegerNode(image, 1))
-    root.set("versionMinor", libe57.IntegerNode(image, 0))
-    data3d = libe57.VectorNode(image, True)
-    root.set("data3D", data3d)
-
-    def numbers(names: list[str], values: np.ndarray) -> libe57.StructureNode:
-        node = libe57.StructureNode(image)
-        for name, value in zip(names, values, strict=True):
-            node.set(name, libe57.FloatNode(image, float(value)))
-        return node
-
-    for scan in scans:
-        node = libe57.StructureNode(image)
-        pose = libe57.StructureNode(image)
-        if "rotation" in scan:
-            pose.set("rotation", numbers(list("wxyz"), scan["rotation"]))
-        if "translation" in scan:
-            pose.set("translation", numbers(list("xyz"), scan["translation"]))
-        if "rotation" in scan or "translation" in scan:
-            node.set("pose", pose)
-        if "bounds" in scan:
-            names = [f"{axis}{end}" for end in ("Minimum", "Maximum") for axis in "xyz"]
-            node.set("cartesianBounds", numbers(names, np.ravel(scan["bounds"])))
-        prototype, buffers = libe57.StructureNode(image), libe57.VectorSourceDestBuffer()
-        for name, column in scan["columns"].items():
-            whole = column.dtype == np.int8
-            prototype.set(name, libe57.IntegerNode(image, 0, 0, 2) if whole else libe57.FloatNode(image, 0.0))
-            buffers.append(libe57.SourceDestBuffer(image, name, column, len(column), True, True))
-        points = libe57.CompressedVectorNode(image, prototype, libe57.VectorNode(image, True))
-        node.set("points", points)
-        data3d.append(node)
-        writer = points.writer(buffers)
-        writer.write(len(column))
-        writer.close()
-    image.close()
 
 
 def cartesian(xyz: np.ndarray) -> dict[str, np.ndarray]:

@@ -1,0 +1,263 @@
+"""GLB, the binary form of glTF 2: the vertices of what its scene shows, each where its node puts it.
+
+Read here and in blocks, header and all: a general loader would hold the file whole, open what other files it names, and
+make arrays as large as it is told to. glTF is in metres with y up [glTF 2.0, 3.4]; coordinates stay as they are here.
+"""
+
+import json
+import struct
+from collections.abc import Iterator
+from io import BufferedReader
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .scan import BLOCK_BYTES, Block, Scan, apply_pose, library_errors, quaternion_pose, scan_error
+
+# The words of a scene of ten thousand parts take about 4 MiB; parsed they take thirty times that.
+LONGEST_JSON = 8 << 20
+# Corners of a triangle take 72 bytes while a mesh is sampled, which holds all of them: 1.2 GB for these.
+MOST_TRIANGLES = 1 << 24
+
+FLOAT = 5126
+INDEX_TYPES = {5121: "<u1", 5123: "<u2", 5125: "<u4"}
+TRIANGLES, STRIP, FAN = 4, 5, 6
+
+
+class Column(NamedTuple):
+    """An accessor: `count` rows of a type, `stride` bytes apart from byte `start` of the file on."""
+
+    start: int
+    stride: int
+    count: int
+    type: str
+    width: int
+
+
+class Part(NamedTuple):
+    """A primitive of a mesh at a node. pose: (4, 4), to the scene.  indices: of the corners; None: in order."""
+
+    vertices: Column
+    pose: NDArray[np.float64]
+    mode: int
+    indices: Column | None
+
+
+class GlbScan(Scan):
+    """The vertices of a GLB file's scene."""
+
+    up = "y"
+
+    def __init__(self, path: Path, parts: list[Part]) -> None:
+        # Parts of a mesh share vertices as a rule, and differ in material and triangles.
+        at_nodes = {(part.vertices, part.pose.tobytes()): part for part in parts}
+        self._shown = list(at_nodes.values())
+        self._parts = parts
+        super().__init__(path, "glb", declared_count=sum(part.vertices.count for part in self._shown))
+
+    def _read(self, block_points: int) -> Iterator[Block]:
+        with self.path.open("rb") as file:
+            for part in self._shown:
+                for rows in _rows(file, self.path, part.vertices, block_points):
+                    yield Block(apply_pose(part.pose, rows.astype(np.float64)), None)
+
+    def triangles(self) -> NDArray[np.float64]:
+        """The corners of all triangles, (n, 3, 3). Raises ScanError for more than MOST_TRIANGLES."""
+        total = sum(part.indices.count if part.indices else part.vertices.count for part in self._parts)
+        if total > 3 * MOST_TRIANGLES:
+            raise scan_error(
+                self.path,
+                f"about {total // 3} triangles",
+                f"at most {MOST_TRIANGLES} to sample",
+                "split the mesh, or build it without --spacing",
+            )
+        found = [np.empty((0, 3, 3))]
+        with library_errors(self.path), self.path.open("rb") as file:
+            for part in self._parts:
+                rows = [np.empty((0, 3)), *_rows(file, self.path, part.vertices, part.vertices.count or 1)]
+                vertices = apply_pose(part.pose, np.concatenate(rows).astype(np.float64))
+                corners = _corners(file, self.path, part)
+                if len(corners) and corners.max() >= len(vertices):
+                    raise _damaged(
+                        self.path, f"a triangle with vertex {corners.max()}", f"{len(vertices)} at most"
+                    )
+                found.append(vertices[corners])
+        return np.concatenate(found)
+
+
+def _corners(file: BufferedReader, path: Path, part: Part) -> NDArray[np.int64]:
+    """The numbers of the vertices of a part's triangles, (n, 3)."""
+    if part.mode not in (TRIANGLES, STRIP, FAN):
+        return np.empty((0, 3), np.int64)
+    order = np.arange(part.vertices.count, dtype=np.int64)
+    if part.indices is not None:
+        rows = [np.empty((0, 1)), *_rows(file, path, part.indices, part.indices.count or 1)]
+        order = np.concatenate(rows).astype(np.int64)[:, 0]
+    if part.mode == TRIANGLES:
+        return order[: len(order) // 3 * 3].reshape(-1, 3)
+    if len(order) < 3:
+        return np.empty((0, 3), np.int64)
+    first = order[:-2] if part.mode == STRIP else np.full(len(order) - 2, order[0])
+    return np.stack([first, order[1:-1], order[2:]], axis=1)
+
+
+def _rows(file: BufferedReader, path: Path, column: Column, block_rows: int) -> Iterator[NDArray[Any]]:
+    """The rows of an accessor, (n, width) of its type, in blocks of bounded memory."""
+    item = np.dtype(column.type).itemsize
+    step = max(1, min(block_rows, BLOCK_BYTES // column.stride))
+    for begin in range(0, column.count, step):
+        count = min(step, column.count - begin)
+        # The last row may end before its stride does, and the file with it.
+        wanted = (count - 1) * column.stride + column.width * item
+        file.seek(column.start + begin * column.stride)
+        data = file.read(wanted)
+        if len(data) < wanted:
+            raise _damaged(path, "a file that ends within its vertices", "all of them")
+        yield np.ndarray((count, column.width), column.type, data, strides=(column.stride, item))
+
+
+def open_glb(path: Path) -> list[Scan]:
+    """The one scan of a GLB file; reads its header only. Raises ScanError."""
+    with library_errors(path), path.open("rb") as file:
+        document, start, size = _read_header(file, path)
+        return [GlbScan(path, _Document(path, document, start, size).parts())]
+
+
+def _read_header(file: BufferedReader, path: Path) -> tuple[dict[str, Any], int, int]:
+    """The JSON, and where the binary chunk begins and how long it is (0 where there is none)."""
+    held = path.stat().st_size
+    head = file.read(20)
+    magic, version, length, words, kind = struct.unpack("<4sIII4s", head.ljust(20, b"\0"))
+    if magic != b"glTF" or version != 2 or kind != b"JSON":
+        raise _damaged(path, f"a file that begins with {head[:8]!r}", "b'glTF' of version 2, and JSON in it")
+    if length > held or words > min(length - 20, LONGEST_JSON):
+        raise _damaged(
+            path,
+            f"{length} bytes with {words} of JSON in a file of {held}",
+            f"no more than it has, and {LONGEST_JSON} of JSON",
+        )
+    document = json.loads(file.read(words))
+    head = file.read(8)
+    size, kind = struct.unpack("<I4s", head) if len(head) == 8 else (0, b"")
+    if kind != b"BIN\0":
+        size = 0
+    if 28 + words + size > length and size:
+        raise _damaged(path, f"a binary part of {size} bytes", f"at most the {length - 28 - words} left")
+    if not isinstance(document, dict):
+        raise _damaged(path, "JSON that is no object", "a glTF document")
+    return document, 28 + words, size
+
+
+class _Document:
+    """The JSON of a GLB file: what it shows, every figure checked. Its methods may raise anything."""
+
+    def __init__(self, path: Path, document: dict[str, Any], start: int, size: int) -> None:
+        """start, size: of the binary chunk [bytes]."""
+        self.path, self.document, self.start, self.size = path, document, start, size
+
+    def parts(self) -> list[Part]:
+        """Every primitive where the scene's nodes put it; the tree is walked once, a node at a time."""
+        nodes = self.document.get("nodes", [])
+        scenes = self.document.get("scenes", [])
+        if scenes:
+            roots = self._at("scenes", self.document.get("scene", 0)).get("nodes", [])
+        else:
+            children = {child for node in nodes for child in node.get("children", [])}
+            roots = [k for k in range(len(nodes)) if k not in children]
+        found: list[Part] = []
+        waiting = [(root, np.eye(4)) for root in roots]
+        seen: set[int] = set()
+        while waiting:
+            number, outer = waiting.pop()
+            if number in seen:
+                raise _damaged(self.path, f"node {number} twice in its scene", "a tree of nodes")
+            seen.add(number)
+            node = self._at("nodes", number)
+            pose = outer @ self._pose(number, node)
+            if "mesh" in node:
+                mesh = self._at("meshes", node["mesh"])
+                found += [
+                    part for primitive in mesh["primitives"] for part in self._primitive(primitive, pose)
+                ]
+            waiting += [(child, pose) for child in reversed(node.get("children", []))]
+        return found
+
+    def _pose(self, number: int, node: dict[str, Any]) -> NDArray[np.float64]:
+        """Where a node is in its parent, (4, 4): a matrix by columns, or scale, then rotation, then translation."""
+        if "matrix" in node:
+            pose = np.array(node["matrix"], np.float64).reshape(4, 4).T
+        else:
+            x, y, z, w = (float(v) for v in node.get("rotation", (0, 0, 0, 1)))
+            pose = quaternion_pose(self.path, number, (w, x, y, z), node.get("translation", (0, 0, 0)))
+            pose[:3, :3] *= np.array(node.get("scale", (1, 1, 1)), np.float64).reshape(3)
+        if not np.isfinite(pose).all() or pose[3].tolist() != [0, 0, 0, 1]:
+            raise _damaged(
+                self.path, f"node {number} with the matrix {pose.tolist()}", "one that moves points"
+            )
+        return pose
+
+    def _primitive(self, primitive: dict[str, Any], pose: NDArray[np.float64]) -> Iterator[Part]:
+        """A primitive as a part; none where it has no positions."""
+        if primitive.get("extensions", {}).get("KHR_draco_mesh_compression") is not None:
+            raise _damaged(
+                self.path, "a mesh compressed by Draco", "plain vertices (write it without compression)"
+            )
+        if "POSITION" not in primitive["attributes"]:
+            return
+        vertices = self._column(primitive["attributes"]["POSITION"], "VEC3", {FLOAT: "<f4"})
+        indices = None
+        if "indices" in primitive:
+            indices = self._column(primitive["indices"], "SCALAR", INDEX_TYPES)
+        yield Part(vertices, pose, int(primitive.get("mode", TRIANGLES)), indices)
+
+    def _column(self, number: int, shape: str, types: dict[int, str]) -> Column:
+        """An accessor, held against its buffer view and that against the binary chunk."""
+        accessor = self._at("accessors", number)
+        if accessor["type"] != shape or accessor["componentType"] not in types or "sparse" in accessor:
+            raise _damaged(
+                self.path,
+                f"accessor {number} of {accessor['type']} of type {accessor['componentType']}",
+                f"{shape} of one of {sorted(types)}, not sparse",
+            )
+        view = self._at("bufferViews", accessor["bufferView"])
+        if view.get("buffer", 0) != 0 or view.get("extensions") or "uri" in self._at("buffers", 0):
+            raise _damaged(
+                self.path,
+                f"accessor {number} in another file or compressed",
+                "all within the GLB (write it as one file, without compression)",
+            )
+        type_, width = types[accessor["componentType"]], 3 if shape == "VEC3" else 1
+        row = np.dtype(type_).itemsize * width
+        offset, count = self._whole(accessor.get("byteOffset", 0)), self._whole(accessor["count"])
+        begin, length = self._whole(view.get("byteOffset", 0)), self._whole(view["byteLength"])
+        stride = self._whole(view.get("byteStride", row)) or row
+        if (
+            stride < row
+            or begin + length > self.size
+            or (count and offset + (count - 1) * stride + row > length)
+        ):
+            raise _damaged(
+                self.path,
+                f"accessor {number}: {count} rows of {row} bytes, {stride} apart, from byte {offset} of {length}",
+                f"it within its buffer view, and that within the {self.size} bytes of the file's",
+            )
+        return Column(self.start + begin + offset, stride, count, type_, width)
+
+    def _at(self, name: str, number: Any) -> dict[str, Any]:
+        """One entry of a list of the document."""
+        entries = self.document.get(name, [])
+        if not isinstance(number, int) or not 0 <= number < len(entries):
+            raise _damaged(self.path, f"number {number!r} of {len(entries)} {name}", "one of them")
+        found: dict[str, Any] = entries[number]
+        return found
+
+    def _whole(self, number: Any) -> int:
+        if not isinstance(number, int) or number < 0:
+            raise _damaged(self.path, f"the number {number!r}", "a whole one, 0 or more")
+        return number
+
+
+def _damaged(path: Path, found: str, expected: str) -> Exception:
+    return scan_error(path, found, expected, "check what wrote this file, and that it is whole")

@@ -1,69 +1,19 @@
-"""How work and results look on a terminal: progress on standard error, results on standard output."""
+"""How results look on a terminal: on standard output. How work goes on meanwhile is `progress.py`'s."""
 
 from collections.abc import Iterable, Iterator
-from types import TracebackType
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 from rich.text import Text
 
+from .progress import Bars as Bars
+
 if TYPE_CHECKING:
-    # Numba and HDF5 come with these; a bar needs neither.
+    # Numba and HDF5 come with these; a table needs neither.
     from ..builder.pipeline import BuildSummary
     from ..schemas.index import RadiusDistribution
     from ..schemas.messages import SceneInfo
-
-
-class Bars:
-    """A bar for each stage of long work: what `builder.progress.Progress` asks for; a context manager.
-
-    Where standard error is no terminal nothing moves, and a line a stage is left when all is done.
-    """
-
-    def __init__(self) -> None:
-        self._bars = Progress(
-            TextColumn("{task.description:<12}"),
-            BarColumn(bar_width=30),
-            TextColumn("{task.completed:>13,.0f} of {task.total:,.0f} {task.fields[unit]}"),
-            TimeElapsedColumn(),
-            TimeRemainingColumn(compact=True),
-            console=Console(stderr=True),
-        )
-        self._task: TaskID | None = None
-
-    def __enter__(self) -> Self:
-        self._bars.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._bars.stop()
-
-    def start(self, stage: str, total: int, unit: str) -> None:
-        """A stage begins."""
-        self._task = self._bars.add_task(stage, total=total, unit=unit)
-
-    def advance(self, amount: int) -> None:
-        """So much more of the stage is done."""
-        if self._task is not None:
-            self._bars.advance(self._task, amount)
-
-    def finish(self) -> None:
-        """The stage is over; a total that was an estimate becomes what was done."""
-        if self._task is not None:
-            done = next(task.completed for task in self._bars.tasks if task.id == self._task)
-            self._bars.update(self._task, total=done)
-            self._task = None
-
-    def made(self, done: int, total: int) -> None:
-        """What `builder.made` calls: points written so far, of all."""
-        if self._task is None:
-            self.start("scan", total, "points")
-        if self._task is not None:
-            self._bars.update(self._task, completed=done)
 
 
 def print_facts(facts: Iterable[tuple[str, str]]) -> None:

@@ -28,7 +28,7 @@ DOORS = {
     "matplotlib": ("server/report/",),
     "PIL": ("server/report/",),
     "typer": ("server/cli.py", "server/verbs/"),
-    "rich": ("server/console.py", "server/report/"),
+    "rich": ("server/console.py", "server/progress.py", "server/report/"),
 }
 # Needed everywhere; numpy and msgspec are the language that arrays and messages are written in.
 FREE = frozenset({"numpy", "msgspec"}) | sys.stdlib_module_names

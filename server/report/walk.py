@@ -25,7 +25,8 @@ from ...schemas.answers import CollideAnswers, Verdict
 from ...schemas.errors import SolidcloudError
 from ...schemas.messages import SceneInfo
 from ..client import Client
-from ..console import Bars, bytes_text, print_build, print_facts
+from ..console import bytes_text, print_build, print_facts
+from ..progress import progress_listener
 from .floor_walk import floor_walk
 from .points import read_thinned
 from .serving import served
@@ -91,7 +92,7 @@ def demonstrate(out: Path, scans: Sequence[Path] = (), *, realtime: bool = False
     out.mkdir(parents=True, exist_ok=True)
     facade = None if scans else make_scan(out)
     scans = scans or [out / "facade.laz"]
-    with Bars() as bars:
+    with progress_listener() as bars:
         summary = build_archive(scans, out / "archive", BuildConfig(overwrite=True), bars)
     print_build(summary)
     walk = _facade_walk(scans, facade, summary.points) if facade else _scan_walk(scans, summary.points)
@@ -116,7 +117,7 @@ def make_scan(out: Path) -> Path:
     """Make the façade's scan in the folder `out`; returns the path of its truth."""
     from ...builder.made.scenes import make_facade
 
-    with Bars() as bars:
+    with progress_listener() as bars:
         return make_facade(out / "facade.laz", progress=bars.made).truth
 
 

@@ -26,11 +26,11 @@ def accuracy(
 
     with needs_extra("made"):
         from ..report.accuracy import run as measure
-    from ..console import Bars
+    from ..progress import progress_listener
     from ..report.accuracy_plan import BRIEF, FULL
     from ..report.accuracy_words import findings
 
-    with tempfile.TemporaryDirectory(prefix="solidcloud-accuracy-") as scratch, Bars() as bars:
+    with tempfile.TemporaryDirectory(prefix="solidcloud-accuracy-") as scratch, progress_listener() as bars:
         report = measure(output, Path(scratch), FULL if full else BRIEF, bars, archive, avatar)
     for line in (
         *report.facts["warnings"],

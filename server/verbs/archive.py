@@ -37,9 +37,9 @@ def validate(
 ) -> None:
     """Check every record; exit code 3 if one is broken."""
     from ...builder.verify import verify_archive
-    from ..console import Bars
+    from ..progress import progress_listener
 
-    with Bars() as bars:
+    with progress_listener() as bars:
         report = verify_archive(archive, deep=deep, exact=exact, sample=sample, progress=bars)
     if as_json:
         print_json(report._asdict())

@@ -26,9 +26,9 @@ def make_facade(
     """
     with needs_extra("made"):
         from ...builder.made.scenes import make_facade as make_it
-    from ..console import Bars
+    from ..progress import progress_listener
 
-    with Bars() as bars:
+    with progress_listener() as bars:
         made = make_it(output, points=points, seed=seed, door=door, progress=bars.made)
     print(f"{made.points:,} points in {output}, the truth in {made.truth}")
 
@@ -44,9 +44,9 @@ def make_town(
     """
     with needs_extra("made"):
         from ...builder.made.scenes import make_town as make_it
-    from ..console import Bars
+    from ..progress import progress_listener
 
-    with Bars() as bars:
+    with progress_listener() as bars:
         made = make_it(output, points=points, seed=seed, progress=bars.made)
     print(f"{made.points:,} points in {output}, the truth in {made.truth}")
 

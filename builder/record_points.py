@@ -57,7 +57,7 @@ def taken(
     limit: np.uint64 = np.uint64(0),  # noqa: B008  a number
     block: int = BLOCK_POINTS,
 ) -> Iterator[Taken]:
-    """Blocks of at most `block` points of a record, in stored order. None is empty.
+    """Blocks of at most `block` points of a record, in the order of their leaf nodes' rows. None is empty.
 
     base: (3,) lattice coordinates of the voxel's corner.  box: (2, 3) lattice coordinates, both corners inclusive.
     limit: see `hash_limit`; then of equal points in one leaf node the first alone.

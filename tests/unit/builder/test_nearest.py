@@ -4,7 +4,18 @@ import os
 
 import numpy as np
 import pytest
-from solidcloud.builder.kernels.nearest import FAR, SearchTree, box_distance2, closest_other
+from opened import open_points, open_scan, points_of
+from solidcloud.builder.kernels.nearest import (
+    FAR,
+    SearchTree,
+    box_distance2,
+    closest_in_record,
+    closest_other,
+)
+from solidcloud.builder.octree import VoxelPoints
+from solidcloud.builder.record_points import leaves_of
+from solidcloud.builder.spacing import spheres_of
+from solidcloud.schemas.codec import OpenRecord
 
 pytestmark = pytest.mark.interpreted
 interpreted_only = pytest.mark.skipif(
@@ -100,3 +111,76 @@ def test_the_box_is_solid_and_its_corners_are_where_they_are() -> None:
     out = np.empty(200, np.int64)
     box_distance2(queries, low, high, out)
     assert out.tolist() == ((queries - np.clip(queries, low, high)) ** 2).sum(axis=1).tolist()
+
+
+def asked(
+    record: OpenRecord, queries: np.ndarray, best: np.ndarray, homes: np.ndarray | None = None
+) -> np.ndarray:
+    """What `closest_in_record` makes of best: queries one by one, or with the leaf node of each, a node's together."""
+    starts = np.arange(len(queries)) if homes is None else np.flatnonzero(np.diff(homes, prepend=-1))
+    home = np.full(len(starts), -1, np.int32) if homes is None else homes[starts].astype(np.int32)
+    lowered = best.copy()
+    groups = np.append(starts, len(queries)).astype(np.int64)
+    closest_in_record(leaves_of(record), spheres_of(record), queries, groups, home, lowered)
+    return lowered
+
+
+@pytest.mark.parametrize("kind", ["plane", "noise", "duplicates", "pillar", "one point"])
+@pytest.mark.parametrize("steps", [50, 4000, 200_000, 1 << 21])
+@pytest.mark.parametrize("cells", ["octree", "balanced"])
+def test_the_closest_in_a_record_is_that_of_brute_force(kind: str, steps: int, cells: str) -> None:
+    record = open_scan(kind, 2, 120, steps, cells=cells)
+    points, nodes = points_of(record)
+    rng = np.random.default_rng(3)
+    far = np.full(len(points), FAR)
+    expected = brute(points, points)
+    assert asked(record, points, far, nodes).tolist() == expected.tolist()
+    others = np.concatenate([points[:30], rng.integers(-2 * steps, 3 * steps, (30, 3))])
+    expected = brute(points, others)
+    assert asked(record, others, np.full(len(others), FAR)).tolist() == expected.tolist()
+    # What is known before is never raised, and what is farther out is not found.
+    known = np.clip(expected - rng.integers(-1, 2, len(others)), 0, FAR)
+    assert asked(record, others, known).tolist() == np.minimum(known, expected).tolist()
+
+
+def test_the_closest_in_a_record_is_found_from_very_far_off() -> None:
+    """Where squares take 62 bits; and none where they would not fit."""
+    record = open_points(VoxelPoints(np.array([[0, 0, 0], [9, 0, 0], [100, 50, 7]], np.int32)), 1000)
+    away = (1 << 31) - 1
+    queries = np.array([[away, 0, 0], [0, -away, 0], [-(1 << 31), 0, 0], [9, 1 << 30, 1 << 30]])
+    found = asked(record, queries, np.full(4, FAR)).tolist()
+    assert found == [
+        (away - 100) ** 2 + 50**2 + 7**2,
+        away**2,
+        FAR,
+        (2 << 60) - 2 * 50 * (1 << 30) - 2 * 7 * (1 << 30) + 91**2 + 50**2 + 7**2,
+    ]
+
+
+def test_long_differences_are_told_from_clamped_ones() -> None:
+    """Around the greatest difference that three squares of fit 32 bits, on every axis."""
+    for far in (26753, 26754, 26755, 46340, 65535):
+        for axis in range(3):
+            points = np.zeros((2, 3), np.int32)
+            points[1, axis] = far
+            record = open_points(VoxelPoints(points), 1 << 17, leaf=32)
+            for known in (int(FAR), far * far + 1, far * far, 26754**2, 26754**2 + 1):
+                expected = min(known, far * far)
+                stored, nodes = points_of(record)
+                assert asked(record, stored, np.full(2, known), nodes).tolist() == [expected] * 2
+
+
+@interpreted_only
+@pytest.mark.parametrize(("kind", "most"), [("plane", 4000), ("noise", 8000)])
+def test_as_little_of_a_record_is_looked_at_as_ever(kind: str, most: int) -> None:
+    """Reads of coordinates of centres, of 300 points asked leaf node by leaf node; it was 3,177 and 6,177."""
+    record = open_scan(kind, 4, 300, 4000)
+    points, nodes = points_of(record)
+    spheres, best = spheres_of(record), np.full(len(points), FAR)
+    starts = np.flatnonzero(np.diff(nodes, prepend=-1))
+    Counted.reads = 0
+    counted = spheres._replace(center=spheres.center.view(Counted))
+    groups = np.append(starts, len(points))
+    closest_in_record(leaves_of(record), counted, points, groups, nodes[starts].astype(np.int32), best)
+    assert best.tolist() == brute(points, points).tolist()
+    assert 300 < Counted.reads < most

@@ -13,7 +13,7 @@ import os
 import re
 import threading
 import zlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
 
 import h5py
@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from .codec import (
     CELL_DTYPE,
     NODE_DTYPE,
+    OPTIONAL_COLUMNS,
     OpenRecord,
     Record,
     RecordShape,
@@ -407,9 +408,15 @@ class Archive:
                 f"{self.where(row)}: {error}: restore the shard or rebuild the archive"
             ) from error
 
-    def open_voxel(self, row: int, frames: tuple[bytes, bytes, bytes] | None = None) -> OpenRecord:
+    def open_voxel(
+        self,
+        row: int,
+        frames: tuple[bytes, bytes, bytes] | None = None,
+        columns: Collection[str] = OPTIONAL_COLUMNS,
+    ) -> OpenRecord:
         """The voxel in index row `row`, decompressed, its points still unread; frames: where they are read already.
 
+        columns: of the optional columns those wanted; others are not held.
         Raises CorruptError saying where.
         """
         frames = frames or self.read_frames(row)
@@ -418,7 +425,12 @@ class Archive:
         shape = RecordShape(cells, nodes, points, self._shape_dtype)
         with self.locating(row):
             return open_record(
-                *frames, shape, int(entry["key"]), self.header.archive_id, self.header.lattice.voxel_steps
+                *frames,
+                shape,
+                int(entry["key"]),
+                self.header.archive_id,
+                self.header.lattice.voxel_steps,
+                columns,
             )
 
     def read_voxel(self, row: int) -> tuple[VoxelData, Links]:

@@ -6,6 +6,7 @@ FORMAT.md says the same in prose; change both together.
 """
 
 import threading
+from collections.abc import Collection, Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -180,6 +181,16 @@ class OpenRecord(NamedTuple):
                 f"voxel {self.key:#x}: radius class {greatest}, expected at most {RADIUS_CLASSES - 1}"
             )
 
+    def class_counts(self) -> NDArray[np.int64]:
+        """The points of each radius class, (RADIUS_CLASSES,); zeros in a record without. Raises as `read_classes`."""
+        counts = np.zeros(256, np.int64)
+        if "radius_class" in (self.dtype.names or ()):
+            plane = self.planes[self.dtype.fields["radius_class"][1]]  # type: ignore[index]  # its dtype has fields
+            for begin in range(0, len(plane), 1 << 16):  # bincount makes int64 of what it is given
+                counts += np.bincount(plane[begin : begin + (1 << 16)], minlength=256)
+            self._check_classes(int(np.flatnonzero(counts)[-1]))
+        return counts[:RADIUS_CLASSES]
+
     def decode(self) -> tuple[VoxelData, Links]:
         """The whole voxel, its points in rows. Raises CorruptError when a point lies outside its cell, and for a
         radius class that there is none of."""
@@ -207,16 +218,20 @@ def open_record(
     key: int,
     archive_id: bytes,
     voxel_steps: int,
+    columns: Collection[str] = OPTIONAL_COLUMNS,
 ) -> OpenRecord:
     """Decompress a record and check all of it but the points, which `OpenRecord.read_points` checks as it reads them.
 
+    columns: of the optional columns those wanted; the record is then one that has no others, and holds no others.
     Raises CorruptError when a frame is damaged, of another size than `shape`, of another voxel or archive, or
     holds what `check_voxel` refuses.
     """
     name = f"voxel {key:#x}"
     cell_planes = _unpack(cells, CELL_DTYPE, shape.cell_rows, f"{name}, cells")
     node_planes = _unpack(nodes, NODE_DTYPE, shape.node_rows, f"{name}, nodes")
-    point_planes = _unpack(points, shape.point_dtype, shape.point_rows, f"{name}, points")
+    names = [n for n in shape.point_dtype.names or () if n == "xyz" or n in columns]
+    kept = np.dtype([(n, shape.point_dtype[n]) for n in names])
+    point_planes = _unpack(points, shape.point_dtype, shape.point_rows, f"{name}, points", kept)
     identity = np.frombuffer(archive_id + key.to_bytes(8, "little"), np.uint8)
     if (cell_planes[: len(identity)] != identity[:, None]).any():  # archive and voxel come first in a row
         raise CorruptError(f"{name}: the record found is another voxel's or another archive's")
@@ -225,9 +240,7 @@ def open_record(
     links = link_tree(name, cell_columns, node_columns.count)
     check_tree(name, cell_columns, node_columns, links, shape.point_rows, voxel_steps)
     leaves = int(np.count_nonzero(links.is_leaf))
-    return OpenRecord(
-        key, voxel_steps, cell_columns, node_columns, links, leaves, point_planes, shape.point_dtype
-    )
+    return OpenRecord(key, voxel_steps, cell_columns, node_columns, links, leaves, point_planes, kept)
 
 
 def decode_voxel(
@@ -261,8 +274,10 @@ def _pack(rows: NDArray) -> bytes:
     return zstandard.ZstdCompressor(compression_params=_PARAMETERS).compress(planes.data)
 
 
-def _unpack(frame: bytes, dtype: np.dtype, count: int, what: str) -> NDArray[np.uint8]:
-    """The byte planes (itemsize, count) that `_pack` compressed, read-only.
+def _unpack(
+    frame: bytes, dtype: np.dtype, count: int, what: str, kept: np.dtype | None = None
+) -> NDArray[np.uint8]:
+    """The byte planes (itemsize, count) that `_pack` compressed, read-only; of the fields of `kept` alone.
 
     Refuses a frame that declares another size before anything is allocated for it.
     """
@@ -274,10 +289,50 @@ def _unpack(frame: bytes, dtype: np.dtype, count: int, what: str) -> NDArray[np.
         # One flipped bit turns the checksum off: the frame would be read unchecked, its checksum as extra bytes.
         if not declared.has_checksum:
             raise CorruptError(f"{what}: frame without checksum, expected one")
+        if kept is not None and kept != dtype:
+            return _unpack_fields(frame, dtype, count, kept)
         plain = _decompressor().decompress(frame, max_output_size=expected, allow_extra_data=False)
     except zstandard.ZstdError as error:
         raise CorruptError(f"{what}: damaged frame ({error})") from error
     return np.frombuffer(plain, np.uint8).reshape(dtype.itemsize, count)
+
+
+def _unpack_fields(frame: bytes, dtype: np.dtype, count: int, kept: np.dtype) -> NDArray[np.uint8]:
+    """The byte planes of the fields of `kept`, the others read past in pieces: a checksum is of all of a frame.
+
+    Raises ZstdError. Its declared size has been checked, and its last bytes, which a stream could do without.
+    """
+    planes = np.empty((kept.itemsize, count), np.uint8)
+    past = np.empty(min(count, 1 << 16), np.uint8)
+    stream = _decompressor().stream_reader(frame, read_across_frames=False)
+    at = 0
+    for name in dtype.names or ():
+        width = dtype[name].itemsize
+        wanted = name in (kept.names or ())
+        parts = [planes[at + i] for i in range(width)] if wanted else _pieces(past, width * count)
+        for part in parts:
+            _fill(stream, part)
+        at += width * wanted
+    if stream.readinto(bytearray(1)):
+        raise zstandard.ZstdError("more than was declared")
+    planes.flags.writeable = False
+    return planes
+
+
+def _pieces(scratch: NDArray[np.uint8], size: int) -> Iterator[NDArray[np.uint8]]:
+    """`scratch`, or its beginning, as often as it takes for `size` bytes."""
+    for begin in range(0, size, len(scratch)):
+        yield scratch[: size - begin]
+
+
+def _fill(stream: zstandard.ZstdDecompressionReader, out: NDArray[np.uint8]) -> None:
+    """Read so many bytes; ZstdError where there are not as many."""
+    begin = 0
+    while begin < len(out):
+        read = stream.readinto(out[begin:].data)
+        if not read:
+            raise zstandard.ZstdError("it ends early")
+        begin += read
 
 
 def _decompressor() -> zstandard.ZstdDecompressor:

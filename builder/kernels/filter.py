@@ -1,0 +1,195 @@
+"""Kernels of the filter stage: how many points, or points of how many scans, lie around each of many; a cell's best.
+
+All in integers. Positions are int32 lattice steps from a corner chosen so that none is negative, and points are sorted
+by the cell of a grid they are in, cells numbered as `cell_numbers` does. Cells are as long as the distance asked for,
+so that all that is near a point is in its own cell and the 26 around it: nine runs of three.
+"""
+
+import numba as nb
+import numpy as np
+
+
+@nb.njit(nogil=True, cache=True)
+def cell_numbers(positions, edge, across, deep):
+    """The cell (n,) uint64 of positions (n, 3) int32 >= 0 [steps]: edge: of a cell [steps].
+
+    across, deep: cells along y and z, two more than any position needs: cells are numbered from 1 on each axis, so that
+    every cell has one below it and one above.
+    """
+    n = positions.shape[0]
+    cells = np.empty(n, np.uint64)
+    for i in range(n):
+        x = np.uint64(positions[i, 0] // edge + 1)
+        y = np.uint64(positions[i, 1] // edge + 1)
+        z = np.uint64(positions[i, 2] // edge + 1)
+        cells[i] = (x * np.uint64(across) + y) * np.uint64(deep) + z
+    return cells
+
+
+@nb.njit(nogil=True, cache=True)
+def _first_at_least(values, value):
+    """The first index of sorted values that is not below value; their number when there is none."""
+    lo, hi = 0, values.shape[0]
+    while lo < hi:
+        mid = (lo + hi) // 2
+        if values[mid] < value:
+            lo = mid + 1
+        else:
+            hi = mid
+    return lo
+
+
+@nb.njit(nogil=True, cache=True)
+def _runs_around(cells, cell, across, deep, begins, ends):
+    """Where the cells around a cell lie in sorted `cells`: nine runs, the middle first. Writes begins, ends (9,)."""
+    k = 0
+    for turn in range(2):
+        for dx in range(-1, 2):
+            for dy in range(-1, 2):
+                middle = dx == 0 and dy == 0
+                if middle == (turn == 0):
+                    # dx and dy may be negative: sums modulo 2^64 are what they should be.
+                    shift = np.uint64(np.int64(dx) * np.int64(across * deep) + np.int64(dy) * np.int64(deep))
+                    at = cell + shift
+                    begins[k] = _first_at_least(cells, at - np.uint64(1))
+                    ends[k] = _first_at_least(cells, at + np.uint64(2))
+                    k += 1
+
+
+@nb.njit(nogil=True, cache=True)
+def count_others(queries, query_cells, points, cells, across, deep, reach2, most, counts):
+    """Count the points within reach of each query, other than those where it is itself, up to `most`.
+
+    queries: (q, 3) int32.  query_cells: (q,) uint64.  points: (n, 3) int32, distinct, in the order of their cells (n,)
+    uint64, ascending.  reach2: the square of the reach [steps^2], inclusive.  counts: (q,) int64, added to; where it is
+    `most` already, nothing is looked for.
+    """
+    begins, ends = np.empty(9, np.int64), np.empty(9, np.int64)
+    known = False
+    last = np.uint64(0)
+    for i in range(queries.shape[0]):
+        if counts[i] >= most:
+            continue
+        if not known or query_cells[i] != last:
+            _runs_around(cells, query_cells[i], across, deep, begins, ends)
+            last, known = query_cells[i], True
+        x, y, z = np.int64(queries[i, 0]), np.int64(queries[i, 1]), np.int64(queries[i, 2])
+        found = counts[i]
+        for k in range(9):
+            for j in range(begins[k], ends[k]):
+                dx, dy, dz = points[j, 0] - x, points[j, 1] - y, points[j, 2] - z
+                d2 = dx * dx + dy * dy + dz * dz
+                if 0 < d2 <= reach2:
+                    found += 1
+                    if found >= most:
+                        break
+            if found >= most:
+                break
+        counts[i] = found
+
+
+@nb.njit(nogil=True, cache=True)
+def _has(row, count, value):
+    """Whether one of the first `count` entries of a row is value."""
+    for k in range(count):  # noqa: SIM110  numba has no any() of a generator
+        if row[k] == value:
+            return True
+    return False
+
+
+@nb.njit(nogil=True, cache=True)
+def _group_in_reach(points, begin, end, low, high, x, y, z, reach2):
+    """Whether one of points[begin:end], whose box is low to high (3,), lies within reach of x, y, z."""
+    least, most = np.int64(0), np.int64(0)
+    for axis in range(3):
+        q = x if axis == 0 else (y if axis == 1 else z)
+        below, above = np.int64(low[axis]) - q, q - np.int64(high[axis])
+        out = max(below, above, np.int64(0))
+        far = max(-below, -above)  # to the box's far side; of a q outside it as well
+        least += out * out
+        most += far * far
+    if least > reach2:
+        return False
+    if most <= reach2:
+        return True
+    for j in range(begin, end):
+        dx, dy, dz = points[j, 0] - x, points[j, 1] - y, points[j, 2] - z
+        if dx * dx + dy * dy + dz * dz <= reach2:
+            return True
+    return False
+
+
+@nb.njit(nogil=True, cache=True)
+def other_scans(
+    queries, query_cells, query_scans, points, groups, group_cells, group_scans, across, deep, reach2, found,
+    counts,
+):  # fmt: skip
+    """Find which other scans have a point within reach of each query, up to as many as `found` has room for.
+
+    queries: (q, 3) int32, query_cells: (q,) uint64, query_scans: (q,) int64.
+    points: (n, 3) int32 in the order of their groups: a group is the points of one scan in one cell. groups: (g + 1,)
+    int64, where each begins, the groups ordered by cell.  group_cells: (g,) uint64.  group_scans: (g,) int64.
+    reach2: inclusive [steps^2].  found: (q, most) int64, scans found so far, the first counts[i] of row i; both are
+    added to.
+    """
+    most = found.shape[1]
+    count = group_scans.shape[0]
+    low, high = np.empty((count, 3), np.int32), np.empty((count, 3), np.int32)
+    for g in range(count):
+        for axis in range(3):
+            low[g, axis] = high[g, axis] = points[groups[g], axis]
+            for j in range(groups[g], groups[g + 1]):
+                low[g, axis] = min(low[g, axis], points[j, axis])
+                high[g, axis] = max(high[g, axis], points[j, axis])
+    begins, ends = np.empty(9, np.int64), np.empty(9, np.int64)
+    known = False
+    last = np.uint64(0)
+    for i in range(queries.shape[0]):
+        if counts[i] >= most:
+            continue
+        if not known or query_cells[i] != last:
+            _runs_around(group_cells, query_cells[i], across, deep, begins, ends)
+            last, known = query_cells[i], True
+        x, y, z = np.int64(queries[i, 0]), np.int64(queries[i, 1]), np.int64(queries[i, 2])
+        for k in range(9):
+            for g in range(begins[k], ends[k]):
+                scan = group_scans[g]
+                if counts[i] >= most or scan == query_scans[i] or _has(found[i], counts[i], scan):
+                    continue
+                if _group_in_reach(points, groups[g], groups[g + 1], low[g], high[g], x, y, z, reach2):
+                    found[i, counts[i]] = scan
+                    counts[i] += 1
+
+
+@nb.njit(nogil=True, cache=True)
+def best_of_cells(order, cells, away, ranks, scans, intensities):
+    """The best point of each cell: (c,) int64 indices, cells ascending.
+
+    order: (n,) int64, n >= 1, sorts the points by cell.  cells: (n,) uint64.  The least away (n,) int64 is best, then
+    the least rank (n,) uint64, scan (n,) int64, intensity (n,) float32, NaN last; of equals the first in `order`.
+    """
+    n = order.shape[0]
+    best = np.empty(n, np.int64)
+    count = 0
+    held = order[0]
+    for k in range(1, n):
+        i = order[k]
+        if cells[i] != cells[held]:
+            best[count] = held
+            count += 1
+            held = i
+        elif away[i] != away[held]:
+            if away[i] < away[held]:
+                held = i
+        elif ranks[i] != ranks[held]:
+            if ranks[i] < ranks[held]:
+                held = i
+        elif scans[i] != scans[held]:
+            if scans[i] < scans[held]:
+                held = i
+        elif intensities[i] < intensities[held] or (
+            np.isnan(intensities[held]) and not np.isnan(intensities[i])
+        ):
+            held = i
+    best[count] = held
+    return best[: count + 1].copy()

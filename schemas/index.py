@@ -39,6 +39,8 @@ class Source:
 
     index: of the scan inside its file.  sha256: of the file.  pose: (4, 4) float64, scan to world.
     count: points stored.  skipped: reason -> points left out.  fault: why the whole scan was left out, or "".
+    crs: the text of the coordinate reference system that the file names, or "".  units, up: what a length of the file
+    was taken for, and which of its axes for up; `pose` has both in it.
     """
 
     path: str
@@ -49,6 +51,13 @@ class Source:
     pose: NDArray[np.float64]
     skipped: dict[str, int]
     fault: str = ""
+    crs: str = ""
+    units: str = "m"
+    up: str = "z"
+
+
+# Fields of a source that texts name only where they are not the default: without, an archive stays what it was.
+_OPTIONAL = {"crs": "", "units": "m", "up": "z"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,6 +169,7 @@ def _texts(header: Header) -> bytes:
             "sha256": s.sha256,
             "skipped": s.skipped,
             "fault": s.fault,
+            **{name: getattr(s, name) for name, usual in _OPTIONAL.items() if getattr(s, name) != usual},
         }
         for s in header.sources
     ]
@@ -248,6 +258,7 @@ def read_header(archive_id: bytes, columns: dict[str, NDArray]) -> Header:
             poses[i],
             s["skipped"],
             s["fault"],
+            **{name: str(s[name]) for name in _OPTIONAL if name in s},
         )
         for i, s in enumerate(texts["sources"])
     )

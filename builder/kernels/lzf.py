@@ -2,7 +2,6 @@
 
 import numba as nb
 import numpy as np
-from numpy.typing import NDArray
 
 # A reference copies at most this many bytes, from at most so far back [liblzf, lzf_d.c].
 LONGEST_COPY = 264
@@ -12,10 +11,8 @@ LONGEST_CODE = 33
 
 
 @nb.njit(cache=True, nogil=True)
-def decode(
-    source: NDArray[np.uint8], at: int, past: int, out: NDArray[np.uint8], have: int, limit: int
-) -> tuple[int, int, bool]:
-    """Decode whole steps of LZF from source[at:past] into `out` behind its first `have` bytes.
+def decode(source, at, past, out, have, limit):
+    """Decode whole steps of LZF from source[at:past] into `out` behind its first `have` bytes; both (n,) uint8.
 
     Stops where fewer than LONGEST_CODE bytes are left of the source, unless `past` is its end (then where a step
     does not fit), or at least `limit` bytes are there; `out` must have room for limit + LONGEST_COPY.

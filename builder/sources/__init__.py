@@ -1,6 +1,10 @@
 """One reader a scan format, all behind open_scans(): each gives scans, and a scan gives blocks of points."""
 
 from .files import header_bounds, open_scans, scan_files
-from .scan import NOT_FINITE, Block, Lattice, Scan, sha256_of
+from .placed import METRES, TURNS, placed
+from .scan import NO_RETURN, NOT_FINITE, Block, Lattice, Scan, sha256_of
 
-__all__ = ["NOT_FINITE", "Block", "Lattice", "Scan", "header_bounds", "open_scans", "scan_files", "sha256_of"]
+__all__ = [
+    "METRES", "NOT_FINITE", "NO_RETURN", "TURNS", "Block", "Lattice", "Scan", "header_bounds", "open_scans", "placed",
+    "scan_files", "sha256_of",
+]  # fmt: skip

@@ -32,6 +32,7 @@ SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
 
 # The XML of 700 scans, each with a pose and bounds, is about 4 MiB; more than this is not looked at.
 LONGEST_XML = 16 << 20
+LONGEST_CRS = 1 << 16  # longer than any real one, several times; more is cut
 PAGE_BYTES = 1024  # the last four are the page's checksum [ASTM E2807, 7]
 
 
@@ -126,7 +127,11 @@ def open_e57(path: Path) -> list[Scan]:
         if not image.root().isDefined("data3D"):
             return []
         data3d = image.root()["data3D"]
-        return [_open_scan(path, index, data3d[index]) for index in range(len(data3d))]
+        scans: list[Scan] = [_open_scan(path, index, data3d[index]) for index in range(len(data3d))]
+        if image.root().isDefined("coordinateMetadata"):
+            for scan in scans:
+                scan.crs = str(image.root()["coordinateMetadata"].value())[:LONGEST_CRS]
+        return scans
 
 
 def _libe57(path: Path) -> Any:

@@ -27,11 +27,11 @@ TRIANGLES, STRIP, FAN = 4, 5, 6
 
 
 class Column(NamedTuple):
-    """An accessor: `count` rows of a type, `stride` bytes apart from byte `start` of the file on."""
+    """An accessor: `rows` rows of a type, `stride` bytes apart from byte `start` of the file on."""
 
     start: int
     stride: int
-    count: int
+    rows: int
     type: str
     width: int
 
@@ -55,7 +55,7 @@ class GlbScan(Scan):
         at_nodes = {(part.vertices, part.pose.tobytes()): part for part in parts}
         self._shown = list(at_nodes.values())
         self._parts = parts
-        super().__init__(path, "glb", declared_count=sum(part.vertices.count for part in self._shown))
+        super().__init__(path, "glb", declared_count=sum(part.vertices.rows for part in self._shown))
 
     def _read(self, block_points: int) -> Iterator[Block]:
         with self.path.open("rb") as file:
@@ -65,7 +65,7 @@ class GlbScan(Scan):
 
     def triangles(self) -> NDArray[np.float64]:
         """The corners of all triangles, (n, 3, 3). Raises ScanError for more than MOST_TRIANGLES."""
-        total = sum(part.indices.count if part.indices else part.vertices.count for part in self._parts)
+        total = sum(part.indices.rows if part.indices else part.vertices.rows for part in self._parts)
         if total > 3 * MOST_TRIANGLES:
             raise scan_error(
                 self.path,
@@ -76,7 +76,7 @@ class GlbScan(Scan):
         found = [np.empty((0, 3, 3))]
         with library_errors(self.path), self.path.open("rb") as file:
             for part in self._parts:
-                rows = [np.empty((0, 3)), *_rows(file, self.path, part.vertices, part.vertices.count or 1)]
+                rows = [np.empty((0, 3)), *_rows(file, self.path, part.vertices, part.vertices.rows or 1)]
                 vertices = apply_pose(part.pose, np.concatenate(rows).astype(np.float64))
                 corners = _corners(file, self.path, part)
                 if len(corners) and corners.max() >= len(vertices):
@@ -91,9 +91,9 @@ def _corners(file: BufferedReader, path: Path, part: Part) -> NDArray[np.int64]:
     """The numbers of the vertices of a part's triangles, (n, 3)."""
     if part.mode not in (TRIANGLES, STRIP, FAN):
         return np.empty((0, 3), np.int64)
-    order = np.arange(part.vertices.count, dtype=np.int64)
+    order = np.arange(part.vertices.rows, dtype=np.int64)
     if part.indices is not None:
-        rows = [np.empty((0, 1)), *_rows(file, path, part.indices, part.indices.count or 1)]
+        rows = [np.empty((0, 1)), *_rows(file, path, part.indices, part.indices.rows or 1)]
         order = np.concatenate(rows).astype(np.int64)[:, 0]
     if part.mode == TRIANGLES:
         return order[: len(order) // 3 * 3].reshape(-1, 3)
@@ -107,8 +107,8 @@ def _rows(file: BufferedReader, path: Path, column: Column, block_rows: int) -> 
     """The rows of an accessor, (n, width) of its type, in blocks of bounded memory."""
     item = np.dtype(column.type).itemsize
     step = max(1, min(block_rows, BLOCK_BYTES // column.stride))
-    for begin in range(0, column.count, step):
-        count = min(step, column.count - begin)
+    for begin in range(0, column.rows, step):
+        count = min(step, column.rows - begin)
         # The last row may end before its stride does, and the file with it.
         wanted = (count - 1) * column.stride + column.width * item
         file.seek(column.start + begin * column.stride)

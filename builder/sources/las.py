@@ -13,6 +13,7 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from .las_crs import las_crs
 from .laz_chunks import VLR_HEADER_BYTES, ChunksFrom, check_chunks
 from .scan import (
     BLOCK_BYTES,
@@ -48,6 +49,7 @@ class Header(NamedTuple):
     points: int
     lattice: Lattice
     bounds: NDArray[np.float64] | None
+    evlrs: tuple[int, int]  # byte of the first record behind the points, and their number
 
 
 class LasScan(SeekableScan):
@@ -143,7 +145,10 @@ def open_las(path: Path) -> list[Scan]:
                 record_bytes=header.record_bytes,
                 points=header.points,
             )
-        return [LasScan(path, header, laszip)]
+        scan = LasScan(path, header, laszip)
+        start = header.offset_to_points
+        scan.crs = las_crs(file, header.header_size, header.vlr_count, start, header.evlrs)
+        return [scan]
 
 
 def las_bounds(path: Path) -> NDArray[np.float64] | None:
@@ -194,6 +199,7 @@ def _read_header(file: BinaryIO, path: Path) -> Header:
         count,
         Lattice(scale, offset),
         _bounds_of(start) if count else None,
+        struct.unpack_from("<QI", start, 235) if minor >= 4 else (0, 0),
     )
 
 

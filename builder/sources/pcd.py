@@ -62,7 +62,7 @@ def _block(scan: Scan, columns: list[NDArray[Any]]) -> Block:
     """A block out of the columns of x, y, z and perhaps intensity, (n,) each."""
     xyz = np.stack(columns[:3], axis=1, dtype=np.float64, casting="unsafe")
     intensity = columns[3].astype(np.float32) if len(columns) > 3 else None
-    hit = ~np.isnan(xyz).any(axis=1)
+    hit = np.asarray(~np.isnan(xyz).any(axis=1))
     lost = len(hit) - int(np.count_nonzero(hit))
     if lost:
         scan.dropped[NO_RETURN] = scan.dropped.get(NO_RETURN, 0) + lost

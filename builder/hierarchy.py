@@ -10,8 +10,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .kernels.bounding_sphere import bound_nodes
-from .kernels.pack import pack_tree, sort_leaves
+from .kernels.bounding_sphere import SPREAD
+from .kernels.pack import ROWS
+from .kernels.trees import build_tree, tree_rows, tree_space
 
 
 class Tree(NamedTuple):
@@ -52,38 +53,22 @@ class Hierarchy(NamedTuple):
     block_low: NDArray[np.int64]
 
 
-def bound_runs(
-    points: NDArray[np.int32],
-    begin: NDArray[np.int64],
-    end: NDArray[np.int64],
-    *,
-    unit_log2: int,
-    highest: int,
-    with_slab: bool,
-) -> Bounds:
-    """Bound the runs points[begin[i]:end[i]], none empty, by spheres cut by slabs.
-
-    points: (n, 3) int32 [steps], 0 to 2^23.  unit_log2: the stored unit of centres and radii is 2^unit_log2
-    steps.  highest: greatest stored coordinate of a centre. Every bound encloses its points exactly.
-    """
-    t = len(begin)
-    bounds = Bounds(*(np.zeros(shape, np.int64) for shape in ((t, 3), t, (t, 3), (t, 2))))
-    bound_nodes(points, begin, end, unit_log2, highest, with_slab, *bounds)
-    return bounds
-
-
 def build_hierarchy(
     points: NDArray[np.int32], *, leaf: int, degree: int, with_slab: bool = True, highest: int = (1 << 16) - 1
 ) -> Hierarchy:
     """Build the BSH of points (n, 3) int32, n >= 1, coordinates 0 to 2^23 [steps].
 
     The result is a function of the points and their order alone; give them in a canonical order, and it
-    is a function of the set. leaf: 1 to 32 points, degree: 2 to 16 children.
+    is a function of the set. leaf: 1 to 32 points, degree: 2 to 16 children.  highest: greatest stored coordinate of a
+    centre. Every bound encloses its points exactly.
     """
-    tree = Tree(*pack_tree(points, leaf, degree))
-    t = len(tree.begin)
-    axis, block_low = np.zeros(t, np.uint8), np.zeros((t, 3), np.int64)
-    sort_leaves(points, tree.order, tree.begin, tree.end, tree.levels[-2], axis, block_low)
-    ordered = points[tree.order]
-    bounds = bound_runs(ordered, tree.begin, tree.end, unit_log2=0, highest=highest, with_slab=with_slab)
-    return Hierarchy(tree, bounds, ordered, axis, block_low)
+    n = len(points)
+    own = np.empty((ROWS, n), np.int32)
+    own[:3], own[3] = points.T, np.arange(n)
+    space, rows = tree_space(n, leaf, degree), tree_rows(n, leaf)
+    total, height = build_tree(own, n, leaf, degree, with_slab, highest, space, rows, np.empty(SPREAD))
+    begin, end, levels = space[2]
+    center, radius, normal, slab, count, axis, block_low = (column[:total] for column in rows)
+    tree = Tree(own[3].astype(np.int64), begin[:total], end[:total], count, levels[: height + 2])
+    ordered = np.ascontiguousarray(own[:3].T)
+    return Hierarchy(tree, Bounds(center, radius, normal, slab), ordered, axis, block_low)

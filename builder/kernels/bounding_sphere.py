@@ -3,8 +3,9 @@
 The centre comes from Badoiu and Clarkson's iteration ("Smaller core-sets for balls", 2003): step toward
 the farthest point by 1 / (i + 1); it never fails on collinear, coplanar or cospherical points, as solvers
 for the minimal ball do (NUMERICS.md case 8). The slab's direction is the eigenvector of least variance.
-Both are only guesses of where a good bound lies: the bound itself is measured afterwards from the *stored*
-integers, and rounded outward, so it encloses whatever the guess (NUMERICS.md N3).
+Both are only guesses of where a good bound lies, so float32 will do for the one, and sums over children for the other:
+the bound itself is measured afterwards from the *stored* integers, and rounded outward, so it encloses whatever the
+guess (NUMERICS.md N3).
 """
 
 import math
@@ -17,9 +18,15 @@ import numpy as np
 SMALL_SET = 256
 SMALL_STEPS = 32
 LARGE_STEPS = 8
+# Points whose distances are compared at once; their place among them fits the low bits of a distance.
+BLOCK = 256
 
 # The slab's direction is stored in three int8; finer directions gained nothing measurable.
 NORMAL_LENGTH = 127.0
+
+# Numbers that say how points are spread: how many; their mean; the sums of products of what they are off it: xx, xy,
+# xz, yy, yz, zz.
+SPREAD = 10
 
 
 @nb.njit(nogil=True, cache=True)
@@ -34,55 +41,151 @@ def ceil_sqrt(value):
 
 
 @nb.njit(nogil=True, cache=True)
-def _ball_center(points, lo, hi, steps, center):
-    """Guess the centre (3,) float64 of the least ball around points[lo:hi], int32; 0 steps: the box's centre."""
-    for k in range(3):
-        least, most = points[lo, k], points[lo, k]
-        for i in range(lo + 1, hi):
-            least = min(least, points[i, k])
-            most = max(most, points[i, k])
-        center[k] = (float(least) + float(most)) * 0.5
-    for step in range(steps):
-        far, best = lo, -1.0
-        for i in range(lo, hi):
-            dx = float(points[i, 0]) - center[0]
-            dy = float(points[i, 1]) - center[1]
-            dz = float(points[i, 2]) - center[2]
-            d2 = dx * dx + dy * dy + dz * dz
-            if d2 > best:
-                best, far = d2, i
-        # The box's centre is a good start already: the first steps of 1/2, 1/3 would only leave it.
-        weight = 1.0 / (step + 4.0)
-        for k in range(3):
-            center[k] += (float(points[far, k]) - center[k]) * weight
+def bound_space(n):
+    """What `ball_center` works in, for up to n points: their coordinates (3, n) float32; distances, and their bits."""
+    distances = np.empty(BLOCK, np.float32)
+    return np.empty((3, n), np.float32), distances, distances.view(np.int32)
 
 
 @nb.njit(nogil=True, cache=True)
-def _least_variance(points, lo, hi, normal):
-    """Write the direction (3,) of least variance of points[lo:hi], by cyclic Jacobi rotations (unit length)."""
-    n = float(hi - lo)
-    mean = np.zeros(3)
-    for i in range(lo, hi):
-        for k in range(3):
-            mean[k] += float(points[i, k])
-    for k in range(3):
-        mean[k] /= n
-    a = np.zeros((3, 3))
+def ball_center(space, lo, hi, steps, center):
+    """Move a guess of the centre (3,) float64 of the least ball around the points [lo, hi) of `space` by some steps.
+
+    The farthest is found among distances as their bits, which ascend as they do; a loop over floats that looks for the
+    greatest would stay scalar.
+    """
+    points, distances, bits = space
+    place = np.int32(BLOCK - 1)
+    for step in range(steps):
+        x, y, z = np.float32(center[0]), np.float32(center[1]), np.float32(center[2])
+        far, best = lo, np.int32(-1)
+        for begin in range(lo, hi, np.uint64(BLOCK)):
+            held = min(np.uint64(BLOCK), hi - begin)
+            for j in range(held):
+                dx, dy, dz = points[0, begin + j] - x, points[1, begin + j] - y, points[2, begin + j] - z
+                distances[j] = dx * dx + dy * dy + dz * dz
+            greatest = np.int32(-1)
+            for j in range(held):
+                greatest = max(greatest, np.int32((bits[j] & ~place) | np.int32(j)))
+            if np.int32(greatest & ~place) > best:
+                best, far = np.int32(greatest & ~place), begin + np.uint64(greatest & place)
+        # The box's centre is a good start already: the first steps of 1/2, 1/3 would only leave it.
+        weight = 1.0 / (step + 4.0)
+        for k in range(np.uint64(3)):
+            center[k] += (float(points[k, far]) - center[k]) * weight
+
+
+@nb.njit(nogil=True, cache=True)
+def leaf_spread(own, lo, hi, spread):
+    """Write how the points [lo, hi) of a leaf node are spread: (SPREAD,) float64. Sums are exact until divided."""
+    n = np.int64(hi - lo)
+    x0, y0, z0 = own[0, lo], own[1, lo], own[2, lo]
+    x = y = z = xx = xy = xz = yy = yz = zz = np.int64(0)
     for i in range(lo, hi):
         dx, dy, dz = (
-            float(points[i, 0]) - mean[0],
-            float(points[i, 1]) - mean[1],
-            float(points[i, 2]) - mean[2],
+            np.int64(np.int32(own[0, i] - x0)),
+            np.int64(np.int32(own[1, i] - y0)),
+            np.int64(np.int32(own[2, i] - z0)),
         )
-        a[0, 0] += dx * dx
-        a[0, 1] += dx * dy
-        a[0, 2] += dx * dz
-        a[1, 1] += dy * dy
-        a[1, 2] += dy * dz
-        a[2, 2] += dz * dz
-    a[1, 0], a[2, 0], a[2, 1] = a[0, 1], a[0, 2], a[1, 2]
-    v = np.eye(3)
-    for _ in range(8):
+        x, y, z = x + dx, y + dy, z + dz
+        xx, xy, xz = xx + dx * dx, xy + dx * dy, xz + dx * dz
+        yy, yz, zz = yy + dy * dy, yz + dy * dz, zz + dz * dz
+    by = 1.0 / float(n)
+    spread[0] = float(n)
+    spread[1], spread[2], spread[3] = (
+        float(x0) + float(x) * by,
+        float(y0) + float(y) * by,
+        float(z0) + float(z) * by,
+    )
+    spread[4], spread[5], spread[6] = (
+        float(n * xx - x * x) * by,
+        float(n * xy - x * y) * by,
+        float(n * xz - x * z) * by,
+    )
+    spread[7], spread[8], spread[9] = (
+        float(n * yy - y * y) * by,
+        float(n * yz - y * z) * by,
+        float(n * zz - z * z) * by,
+    )
+
+
+@nb.njit(nogil=True, cache=True)
+def join_spread(spreads, first, count, spread):
+    """Write how all points of the rows first to first + count of spreads (n, SPREAD) are spread together: (SPREAD,)."""
+    n = 0.0
+    x = y = z = 0.0
+    for i in range(first, first + count):
+        held = spreads[i, 0]
+        n += held
+        x, y, z = x + held * spreads[i, 1], y + held * spreads[i, 2], z + held * spreads[i, 3]
+    x, y, z = x / n, y / n, z / n
+    xx = xy = xz = yy = yz = zz = 0.0
+    for i in range(first, first + count):
+        held, dx, dy, dz = spreads[i, 0], spreads[i, 1] - x, spreads[i, 2] - y, spreads[i, 3] - z
+        xx, xy, xz = (
+            xx + spreads[i, 4] + held * dx * dx,
+            xy + spreads[i, 5] + held * dx * dy,
+            xz + spreads[i, 6] + held * dx * dz,
+        )
+        yy, yz, zz = (
+            yy + spreads[i, 7] + held * dy * dy,
+            yz + spreads[i, 8] + held * dy * dz,
+            zz + spreads[i, 9] + held * dz * dz,
+        )
+    spread[0], spread[1], spread[2], spread[3] = n, x, y, z
+    spread[4], spread[5], spread[6], spread[7], spread[8], spread[9] = xx, xy, xz, yy, yz, zz
+
+
+@nb.njit(nogil=True, cache=True)
+def _flat_direction(spread, direction):
+    """Write the direction (3,) of least variance where it is far from the others' and found at once; whether it is.
+
+    The least root of the characteristic polynomial by Newton from 0, which is never beyond it; then the direction is
+    across two rows of the matrix less that root. Only + - * / and sqrt: the same on any machine.
+    """
+    size = (spread[4] + spread[7] + spread[9]) / 3.0
+    if not size > 0.0:
+        return False
+    xx, xy, xz = spread[4] / size, spread[5] / size, spread[6] / size
+    yy, yz, zz = spread[7] / size, spread[8] / size, spread[9] / size
+    second = xx * yy - xy * xy + xx * zz - xz * xz + yy * zz - yz * yz
+    third = xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)
+    root = 0.0
+    for _ in range(40):
+        slope = second - root * (6.0 - 3.0 * root)
+        value = third - root * (second - root * (3.0 - root))
+        if not slope > 1e-3:  # a double root, or nearly
+            return False
+        step = value / slope
+        root += step
+        if abs(step) <= 1e-15:
+            break
+    xx, yy, zz = xx - root, yy - root, zz - root
+    ax, ay, az = xy * yz - xz * yy, xz * xy - xx * yz, xx * yy - xy * xy
+    bx, by, bz = xy * zz - xz * yz, xz * xz - xx * zz, xx * yz - xy * xz
+    cx, cy, cz = yy * zz - yz * yz, yz * xz - xy * zz, xy * yz - yy * xz
+    a, b, c = ax * ax + ay * ay + az * az, bx * bx + by * by + bz * bz, cx * cx + cy * cy + cz * cz
+    if b > a:
+        ax, ay, az, a = bx, by, bz, b
+    if c > a:
+        ax, ay, az, a = cx, cy, cz, c
+    if not a > 1e-8:
+        return False
+    length = math.sqrt(a)
+    direction[0], direction[1], direction[2] = ax / length, ay / length, az / length
+    return True
+
+
+@nb.njit(nogil=True, cache=True)
+def least_variance(spread, direction):
+    """Write the direction (3,) float64 of least variance of a spread (SPREAD,), of unit length."""
+    if _flat_direction(spread, direction):
+        return
+    a, v = np.zeros((3, 3)), np.eye(3)
+    a[0, 0], a[0, 1], a[0, 2] = spread[4], spread[5], spread[6]
+    a[1, 0], a[1, 1], a[1, 2] = spread[5], spread[7], spread[8]
+    a[2, 0], a[2, 1], a[2, 2] = spread[6], spread[8], spread[9]
+    for _ in range(8):  # cyclic Jacobi rotations
         for p in range(2):
             for q in range(p + 1, 3):
                 if abs(a[p, q]) <= 1e-12 * (abs(a[p, p]) + abs(a[q, q])):
@@ -106,63 +209,84 @@ def _least_variance(points, lo, hi, normal):
         if a[k, k] < a[least, least]:
             least = k
     for k in range(3):
-        normal[k] = v[k, least]
+        direction[k] = v[k, least]
 
 
 @nb.njit(nogil=True, cache=True)
-def _radius(points, lo, hi, center, unit):
-    """Radius [units], rounded up, of the ball around a stored centre (3,) int64 [units] that holds points[lo:hi]."""
-    cx, cy, cz = center[0] * unit, center[1] * unit, center[2] * unit
+def farthest2(own, lo, hi, x, y, z):
+    """The greatest squared distance, int64, of the points [lo, hi) of own from (x, y, z); all within 2^30 of it."""
+    x, y, z = np.int32(x), np.int32(y), np.int32(z)
     farthest = np.int64(0)
     for i in range(lo, hi):
-        dx, dy, dz = np.int64(points[i, 0]) - cx, np.int64(points[i, 1]) - cy, np.int64(points[i, 2]) - cz
+        dx, dy, dz = (
+            np.int64(np.int32(own[0, i] - x)),
+            np.int64(np.int32(own[1, i] - y)),
+            np.int64(np.int32(own[2, i] - z)),
+        )
         farthest = max(farthest, dx * dx + dy * dy + dz * dz)
-    return (ceil_sqrt(farthest) + unit - 1) // unit
+    return farthest
 
 
 @nb.njit(nogil=True, cache=True)
-def bound_points(points, lo, hi, unit_log2, highest, with_slab, center, normal, slab):
-    """Bound points[lo:hi] by a sphere cut by a slab, stored as integers.
+def extent_along(own, lo, hi, normal, x, y, z):
+    """The least and greatest dot(normal, point - (x, y, z)) of the points [lo, hi) of own; normal: (3,), int8."""
+    x, y, z = np.int32(x), np.int32(y), np.int32(z)
+    a, b, c = np.int64(np.int32(normal[0])), np.int64(np.int32(normal[1])), np.int64(np.int32(normal[2]))
+    least, most = np.int64(1) << 62, -(np.int64(1) << 62)
+    for i in range(lo, hi):
+        dx, dy, dz = (
+            np.int64(np.int32(own[0, i] - x)),
+            np.int64(np.int32(own[1, i] - y)),
+            np.int64(np.int32(own[2, i] - z)),
+        )
+        along = a * dx + b * dy + c * dz
+        least, most = min(least, along), max(most, along)
+    return least, most
 
-    points: (n, 3) int32, 0 to 2^23 [steps], lo < hi.  unit_log2: the stored unit, 2^unit_log2 steps.
-    highest: greatest coordinate a stored centre may have, and the
-    greatest radius wanted.  with_slab: False leaves the normal zero.
-    Writes center (3,) int64 [units], normal (3,) int64 of length about 127, slab (2,) int64: least and greatest
-    dot(normal, point - center) [steps]. Returns the radius [units], int64, rounded up.
+
+@nb.njit(nogil=True, cache=True)
+def box_center(own, lo, hi, center):
+    """Write the centre (3,) float64 of the box of the points [lo, hi) of own."""
+    for k in range(np.uint64(3)):
+        least, most = own[k, lo], own[k, lo]
+        for i in range(lo, hi):
+            least, most = min(least, own[k, i]), max(most, own[k, i])
+        center[k] = (float(least) + float(most)) * 0.5
+
+
+@nb.njit(nogil=True, cache=True)
+def bound_run(own, space, lo, hi, highest, spread, with_slab, guess, center, normal, slab):
+    """Bound the points [lo, hi) of own (>= 3, n) int32, 0 to 2^23 [steps], lo < hi, by a sphere cut by a slab.
+
+    space: of `bound_space`, its coordinates written.  highest: greatest coordinate a stored centre may have, and the
+    greatest radius wanted.  spread: of these points.  with_slab: False leaves the normal zero.  guess: (3,) float64,
+    to work in. Writes integers: center (3,), normal (3,) of length about 127, slab (2,): least and greatest
+    dot(normal, point - center) [steps]. Returns the radius [steps], int64, rounded up.
     """
-    guess = np.empty(3)
-    unit = np.int64(1) << np.int64(unit_log2)
-    steps = SMALL_STEPS if hi - lo <= SMALL_SET else LARGE_STEPS
+    steps = SMALL_STEPS if hi - lo <= np.uint64(SMALL_SET) else LARGE_STEPS
     radius = highest + 1
     while radius > highest:
         # A ball around the box's centre, tried last, has at most half the diagonal: 0.87 of `highest`, and fits.
-        _ball_center(points, lo, hi, steps, guess)
-        for k in range(3):
-            center[k] = min(max(np.int64(np.rint(guess[k] / float(unit))), 0), highest)
-        radius = _radius(points, lo, hi, center, unit)
+        box_center(own, lo, hi, guess)
+        ball_center(space, lo, hi, steps, guess)
+        for k in range(np.uint64(3)):
+            center[k] = min(max(np.int64(np.rint(guess[k])), 0), highest)
+        x, y, z = np.int64(center[0]), np.int64(center[1]), np.int64(center[2])
+        radius = ceil_sqrt(farthest2(own, lo, hi, x, y, z))
         if steps == 0:
             break
         steps = 0
-    for k in range(3):
-        normal[k] = 0
-    if with_slab and hi - lo >= 3:
-        _least_variance(points, lo, hi, guess)
-        for k in range(3):
-            normal[k] = np.int64(np.rint(guess[k] * NORMAL_LENGTH))
-    cx, cy, cz = center[0] * unit, center[1] * unit, center[2] * unit
-    least, most = np.int64(1) << 62, -(np.int64(1) << 62)
-    for i in range(lo, hi):
-        dx, dy, dz = np.int64(points[i, 0]) - cx, np.int64(points[i, 1]) - cy, np.int64(points[i, 2]) - cz
-        along = normal[0] * dx + normal[1] * dy + normal[2] * dz
-        least, most = min(least, along), max(most, along)
-    slab[0], slab[1] = least, most
+    stored_direction(spread, with_slab, guess, normal)
+    slab[0], slab[1] = extent_along(own, lo, hi, normal, x, y, z)
     return radius
 
 
 @nb.njit(nogil=True, cache=True)
-def bound_nodes(points, begin, end, unit_log2, highest, with_slab, center, radius, normal, slab):
-    """`bound_points` for every run points[begin[i]:end[i]]; writes row i of center, radius, normal, slab (int64)."""
-    for i in range(begin.shape[0]):
-        radius[i] = bound_points(
-            points, begin[i], end[i], unit_log2, highest, with_slab, center[i], normal[i], slab[i]
-        )
+def stored_direction(spread, with_slab, guess, normal):
+    """Write the slab's direction (3,) for points of a spread, of length about 127; zero for fewer than 3 points."""
+    if not with_slab or spread[0] < 3.0:
+        normal[0] = normal[1] = normal[2] = 0
+        return
+    least_variance(spread, guess)
+    for k in range(np.uint64(3)):
+        normal[k] = np.int64(np.rint(guess[k] * NORMAL_LENGTH))

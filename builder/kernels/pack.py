@@ -3,48 +3,105 @@
 [Fig12] inserts into an R-tree; a tree known whole is better packed from the top (Lee and Lee, "OMT:
 Overlap minimizing top-down bulk loading", 2003): cut along the longest edge, at a multiple of the leaf
 size, until every part is one child.
+
+The points are moved while they are cut, so that every loop runs over neighbours in memory: `own` holds x, y, z and
+rank in rows, and what stands there at the end is the order of the leaf nodes. Loops index by uint64, see rows.py of
+schemas/kernels.
 """
 
 import numba as nb
 import numpy as np
 
+# Most bins of the histogram that a median is looked for in.
+BINS = 256
+# Rows of `own`: x, y, z [steps], and which point it was.
+ROWS = 4
+RANK = np.uint64(3)
+
 
 @nb.njit(nogil=True, cache=True)
-def _longest_edge(points, order, lo, hi):
-    """The axis along which points[order[lo:hi]] extend farthest; the lower axis on a tie."""
-    axis, widest = 0, np.int64(-1)
-    for k in range(3):
-        least, most = points[order[lo], k], points[order[lo], k]
-        for i in range(lo + 1, hi):
-            least = min(least, points[order[i], k])
-            most = max(most, points[order[i], k])
+def longest_edge(own, lo, hi):
+    """The axis along which points [lo, hi) of own (4, n) extend farthest, the lower one on a tie; its least, extent."""
+    axis, low, widest = np.uint64(0), np.int64(0), np.int64(-1)
+    for k in range(np.uint64(3)):
+        least, most = own[k, lo], own[k, lo]
+        for i in range(lo, hi):
+            least, most = min(least, own[k, i]), max(most, own[k, i])
         if np.int64(most) - np.int64(least) > widest:
-            axis, widest = k, np.int64(most) - np.int64(least)
-    return axis
+            axis, low, widest = k, np.int64(least), np.int64(most) - np.int64(least)
+    return axis, low, widest
 
 
 @nb.njit(nogil=True, cache=True)
-def _cut(points, order, lo, hi, at):
-    """Reorder order[lo:hi] so that the `at - lo` least along the longest edge stand first.
+def _nth(keys, count, nth):
+    """The key that `nth` of keys[:count], all distinct, are less than; the keys are reordered."""
+    if count > 32:
+        return np.partition(keys[:count], nth)[nth]
+    for i in range(1, count):
+        key, j = keys[i], i
+        while j > 0 and keys[j - 1] > key:
+            keys[j] = keys[j - 1]
+            j -= 1
+        keys[j] = key
+    return keys[nth]
 
-    Ties go by rank (the number in `order`), so the two sets are a function of the points alone.
+
+@nb.njit(nogil=True, cache=True)
+def _border(own, keys, bins, lo, hi, at, axis, low, extent):
+    """The key, coordinate << 32 | rank, that `at - lo` of the points [lo, hi) are less than, along an axis.
+
+    The points are counted into bins along it; the key is looked for in the one bin that it must be in.
     """
-    axis = _longest_edge(points, order, lo, hi)
-    keys = np.empty(hi - lo, np.int64)
+    wanted = np.int64(at - lo)
+    limit = min(np.int64(BINS), np.int64(hi - lo))
+    shift = np.int64(0)
+    while extent >> shift >= limit:
+        shift += 1
+    for b in range(limit):
+        bins[b] = 0
     for i in range(lo, hi):
-        keys[i - lo] = (np.int64(points[order[i], axis]) << 32) | np.int64(order[i])
-    keys = np.partition(keys, at - lo)
+        bins[(np.int64(own[axis, i]) - low) >> shift] += 1
+    chosen, below = np.int64(0), np.int64(0)
+    while below + bins[chosen] <= wanted:
+        below += bins[chosen]
+        chosen += 1
+    if below == wanted:
+        return (low + (chosen << shift)) << 32
+    found = 0
     for i in range(lo, hi):
-        order[i] = keys[i - lo] & 0xFFFFFFFF
+        coordinate = np.int64(own[axis, i])
+        keys[found] = coordinate << 32 | np.int64(own[RANK, i])
+        found += (coordinate - low) >> shift == chosen
+    return _nth(keys, found, wanted - below)
 
 
 @nb.njit(nogil=True, cache=True)
-def _cut_into(points, order, lo, hi, leaf, parts, ends):
-    """Cut order[lo:hi] into `parts` runs of as equal whole leaves as can be; writes their ends, in order.
+def _cut(own, spare, keys, bins, lo, hi, at):
+    """Move the points [lo, hi) so that the `at - lo` least along the longest edge stand first.
+
+    Ties go by rank, so the two sets are a function of the points and their ranks alone.
+    """
+    axis, low, extent = longest_edge(own, lo, hi)
+    border = _border(own, keys, bins, lo, hi, at, axis, low, extent)
+    left, right = lo, at
+    for i in range(lo, hi):
+        is_left = (np.int64(own[axis, i]) << 32 | np.int64(own[RANK, i])) < border
+        to = left if is_left else right
+        for q in range(np.uint64(ROWS)):
+            spare[q, to] = own[q, i]
+        left += np.uint64(is_left)
+        right += np.uint64(not is_left)
+    for q in range(np.uint64(ROWS)):
+        for i in range(lo, hi):
+            own[q, i] = spare[q, i]
+
+
+@nb.njit(nogil=True, cache=True)
+def _cut_into(own, spare, keys, bins, stack, lo, hi, leaf, parts, ends):
+    """Cut the points [lo, hi) into `parts` runs of as equal whole leaves as can be; writes their ends, in order.
 
     Halving: a stack of (lo, hi, parts), the left part on top, so ends come out in order.
     """
-    stack = np.empty((parts + 1, 3), np.int64)
     stack[0, 0], stack[0, 1], stack[0, 2] = lo, hi, parts
     depth, found = 1, 0
     while depth > 0:
@@ -57,35 +114,48 @@ def _cut_into(points, order, lo, hi, leaf, parts, ends):
         leaves = (b - a + leaf - 1) // leaf
         left = k // 2
         middle = a + (leaves * left // k) * leaf
-        _cut(points, order, a, b, middle)
+        _cut(own, spare, keys, bins, np.uint64(a), np.uint64(b), np.uint64(middle))
         stack[depth, 0], stack[depth, 1], stack[depth, 2] = middle, b, k - left
         stack[depth + 1, 0], stack[depth + 1, 1], stack[depth + 1, 2] = a, middle, left
         depth += 2
 
 
 @nb.njit(nogil=True, cache=True)
-def pack_tree(points, leaf, degree):
-    """Pack points (n, 3) int32, 1 <= n < 2^31, into a tree.
+def most_nodes(n, leaf):
+    """At least as many nodes as a tree of n points in leaf nodes of `leaf` has.
 
-    leaf: most points a leaf node, degree: most children an inner node.
-    Returns (order (n,) int64: the points in leaf-node order; begin, end (t,) int64: each node's run in
-    `order`; count (t,) uint8: children, or points of a leaf node; levels (h + 1,) int64: first node of
-    each level, and t). Nodes stand level by level from the root, children in order.
+    Degree 2 is the worst: a level for 2^l leaves has at most 2 leaves / 2^l + 1.
     """
-    n = points.shape[0]
+    return 4 * ((n + leaf - 1) // leaf) + 64
+
+
+@nb.njit(nogil=True, cache=True)
+def pack_space(n, degree):
+    """What `pack_points` works in, for up to n points: spare, keys, bins, stack, ends."""
+    return (
+        np.empty((ROWS, n), np.int32),
+        np.empty(n + 1, np.int64),
+        np.empty(BINS, np.int64),
+        np.empty((degree + 1, 3), np.int64),
+        np.empty(degree, np.int64),
+    )
+
+
+@nb.njit(nogil=True, cache=True)
+def pack_points(own, n, leaf, degree, space, begin, end, count, levels):
+    """Pack the first n points of own (4, >= n) int32, 1 <= n < 2^31: x, y, z of 0 to 2^23, distinct ranks.
+
+    leaf: most points a leaf node, degree: most children an inner node.  space: of `pack_space`.
+    Moves the points into leaf-node order; inside a leaf node they stand in none. Writes, nodes level by level from the
+    root, children in order: begin, end (>= t,) int64, each node's run; count (>= t,) uint8, children, or points of a
+    leaf node; levels (>= h + 2,) int64, first node of each level, and t. Returns h, the level of the leaf nodes.
+    """
+    spare, keys, bins, stack, ends = space
     leaves = (n + leaf - 1) // leaf
     height, capacity = 0, np.int64(1)  # capacity: leaf nodes below one node of this level
     while capacity < leaves:
         capacity *= degree
         height += 1
-    order = np.arange(n)
-    most = (
-        4 * leaves + height + 1
-    )  # degree 2 is the worst: a level for 2^l leaves has at most 2 leaves / 2^l + 1
-    begin, end = np.empty(most, np.int64), np.empty(most, np.int64)
-    count = np.empty(most, np.uint8)
-    levels = np.empty(height + 2, np.int64)
-    ends = np.empty(degree, np.int64)
     begin[0], end[0] = 0, n
     levels[0], total = 0, 1
     for level in range(height):
@@ -96,7 +166,7 @@ def pack_tree(points, leaf, degree):
             a, b = begin[node], end[node]
             held = (b - a + leaf - 1) // leaf
             parts = (held + capacity - 1) // capacity
-            _cut_into(points, order, a, b, leaf, parts, ends)
+            _cut_into(own, spare, keys, bins, stack, a, b, leaf, parts, ends)
             count[node] = parts
             for part in range(parts):
                 begin[total], end[total] = a, ends[part]
@@ -105,28 +175,45 @@ def pack_tree(points, leaf, degree):
     levels[height + 1] = total
     for node in range(levels[height], total):
         count[node] = end[node] - begin[node]
-    return order, begin[:total].copy(), end[:total].copy(), count[:total].copy(), levels
+    return height
 
 
 @nb.njit(nogil=True, cache=True)
-def sort_leaves(points, order, begin, end, first_leaf, axis, block_low):
-    """Sort every leaf node's points along the longest edge of their box, ties by rank.
+def sort_run(own, spare, lo, hi, axis):
+    """Sort the points [lo, hi) of own along an axis, ties by rank: each goes where as many stand as are before it."""
+    for j in range(lo, hi):
+        coordinate, rank = own[axis, j], own[RANK, j]
+        before = np.int32(0)
+        for i in range(lo, hi):
+            is_before = (own[axis, i] < coordinate) | ((own[axis, i] == coordinate) & (own[RANK, i] < rank))
+            before = np.int32(before + np.int32(is_before))
+        for q in range(np.uint64(ROWS)):
+            spare[q, lo + np.uint64(before)] = own[q, j]
+    for q in range(np.uint64(ROWS)):
+        for i in range(lo, hi):
+            own[q, i] = spare[q, i]
 
-    points: (n, 3) int32.  order: (n,) int64, reordered in place.  begin, end: (t,) runs of the nodes, leaf
-    nodes from row first_leaf on. Writes axis (t,) uint8 and block_low (t, 3) int64 of the leaf nodes.
+
+@nb.njit(nogil=True, cache=True)
+def pack_tree(points, leaf, degree):
+    """Pack points (n, 3) int32, 1 <= n < 2^31, coordinates 0 to 2^23, into a tree, as `pack_points` says.
+
+    Returns (order (n,) int64: the points in leaf-node order; begin, end (t,) int64; count (t,) uint8; levels (h + 2,)
+    int64).
     """
-    for node in range(first_leaf, begin.shape[0]):
-        lo, hi = begin[node], end[node]
-        along = _longest_edge(points, order, lo, hi)
-        axis[node] = along
-        keys = np.empty(hi - lo, np.int64)
-        for i in range(lo, hi):
-            keys[i - lo] = (np.int64(points[order[i], along]) << 32) | np.int64(order[i])
-        keys.sort()
-        for i in range(lo, hi):
-            order[i] = keys[i - lo] & 0xFFFFFFFF
-        for k in range(3):
-            least = np.int64(points[order[lo], k])
-            for i in range(lo + 1, hi):
-                least = min(least, np.int64(points[order[i], k]))
-            block_low[node, k] = least
+    n = points.shape[0]
+    own = np.empty((ROWS, n), np.int32)
+    for i in range(n):
+        own[0, i], own[1, i], own[2, i], own[3, i] = points[i, 0], points[i, 1], points[i, 2], i
+    most = most_nodes(n, leaf)
+    begin, end = np.empty(most, np.int64), np.empty(most, np.int64)
+    count, levels = np.empty(most, np.uint8), np.empty(64, np.int64)
+    height = pack_points(own, n, leaf, degree, pack_space(n, degree), begin, end, count, levels)
+    total = levels[height + 1]
+    return (
+        own[RANK].astype(np.int64),
+        begin[:total].copy(),
+        end[:total].copy(),
+        count[:total].copy(),
+        levels[: height + 2].copy(),
+    )

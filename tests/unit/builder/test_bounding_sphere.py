@@ -6,15 +6,22 @@ import minimal_ball
 import numpy as np
 import pytest
 from scans import WITH_POINTS, make_steps
-from solidcloud.builder.hierarchy import Bounds, bound_runs
-from solidcloud.builder.kernels.bounding_sphere import bound_nodes, ceil_sqrt
+from solidcloud.builder.hierarchy import Bounds, build_hierarchy
+from solidcloud.builder.kernels.bounding_sphere import (
+    SPREAD,
+    ceil_sqrt,
+    join_spread,
+    leaf_spread,
+    least_variance,
+)
+from solidcloud.builder.kernels.trees import build_tree, tree_rows, tree_space
 
 
-def assert_encloses(bounds: Bounds, i: int, points: np.ndarray, unit: int) -> None:
+def assert_encloses(bounds: Bounds, i: int, points: np.ndarray) -> None:
     """Sphere and slab i hold every point (n, 3), in integers without bound."""
     xyz = points.astype(object)  # Python integers
-    apart = xyz - bounds.center[i].astype(object) * unit
-    assert max((apart * apart).sum(axis=1)) <= (int(bounds.radius[i]) * unit) ** 2
+    apart = xyz - bounds.center[i].astype(object)
+    assert max((apart * apart).sum(axis=1)) <= int(bounds.radius[i]) ** 2
     normal = bounds.normal[i].astype(object)
     if any(normal):
         along = (apart * normal).sum(axis=1)
@@ -22,12 +29,10 @@ def assert_encloses(bounds: Bounds, i: int, points: np.ndarray, unit: int) -> No
         assert max(along) <= int(bounds.slab[i, 1])
 
 
-def bound(points: np.ndarray, unit_log2: int = 0, with_slab: bool = True, highest: int = 65535) -> Bounds:
-    """The bound of all points as one run."""
-    run = np.array([0]), np.array([len(points)])
-    return bound_runs(
-        points.astype(np.int32), *run, unit_log2=unit_log2, highest=highest, with_slab=with_slab
-    )
+def bound(points: np.ndarray, with_slab: bool = True, highest: int = 65535) -> Bounds:
+    """The bounds of a tree over the points; the first is of all of them."""
+    options = {"leaf": 32, "degree": 16, "with_slab": with_slab, "highest": highest}
+    return build_hierarchy(points.astype(np.int32), **options).bounds
 
 
 @pytest.mark.interpreted
@@ -57,7 +62,7 @@ DEGENERATE = {
 def test_degenerate_sets_are_bounded(name: str, with_slab: bool) -> None:
     points = np.array(DEGENERATE[name])
     bounds = bound(points, with_slab=with_slab)
-    assert_encloses(bounds, 0, points, 1)
+    assert_encloses(bounds, 0, points)
     assert bounds.normal.any() == (with_slab and len(points) >= 3)
     if name in ("one", "equal"):
         assert bounds.radius[0] == 0
@@ -71,11 +76,10 @@ def test_a_flat_set_has_a_thin_slab(name: str) -> None:
     assert (bounds.slab[0, 1] - bounds.slab[0, 0]) / np.linalg.norm(bounds.normal[0]) < 2
 
 
-@pytest.mark.parametrize("unit_log2", [0, 1, 5])
 @pytest.mark.parametrize("kind", WITH_POINTS)
-def test_bounds_enclose_in_every_unit(kind: str, unit_log2: int) -> None:
-    points = make_steps(kind, 2, 300, 65536 << unit_log2)
-    assert_encloses(bound(points, unit_log2), 0, points, 1 << unit_log2)
+def test_bounds_of_scans_enclose(kind: str) -> None:
+    points = make_steps(kind, 2, 300, 65536)
+    assert_encloses(bound(points), 0, points)
 
 
 def test_a_radius_fits_sixteen_bits_for_any_points_of_a_cell() -> None:
@@ -99,31 +103,34 @@ def test_the_judge_of_minimal_balls_knows_the_known_ones() -> None:
 
 
 def plain_center(points: np.ndarray, steps: int) -> np.ndarray:
-    """The centre guessed: the box's, then so many steps toward the farthest point."""
+    """The centre guessed: the box's, then so many steps toward the farthest point.
+
+    By distances of 16 bits, as their float32 begins; of equal ones in a block of 256 the last, of blocks the first.
+    """
     center = (points.min(axis=0) + points.max(axis=0)) * 0.5
+    single = points.astype(np.float32)
     for step in range(steps):
-        far = ((points - center) ** 2).sum(axis=1).argmax()
+        d = single - center.astype(np.float32)
+        distance = (d[:, 0] * d[:, 0] + d[:, 1] * d[:, 1] + d[:, 2] * d[:, 2]).view(np.int32) // 256
+        far = max(range(len(points)), key=lambda i: (distance[i], -(i // 256), i))
         center = center + (points[far] - center) * (1 / (step + 4))
     return center
 
 
 @pytest.mark.interpreted
-@pytest.mark.parametrize("unit_log2", [0, 3])
 @pytest.mark.parametrize(("n", "steps"), [(1, 32), (2, 32), (30, 32), (256, 32), (257, 8)])
-def test_a_bound_is_as_tight_as_its_guess(n: int, steps: int, unit_log2: int) -> None:
-    """Centre, radius and slab against numpy's, the direction against its eigenvectors, all to the step."""
+def test_a_bound_is_as_tight_as_its_guess(n: int, steps: int) -> None:
+    """Centre to the step, radius and slab exactly against numpy's, the direction against its eigenvectors."""
     rng = np.random.default_rng(n)
     for _ in range(4):
         # Three lengths well apart along directions of no axis, so that the least variance is without doubt.
         turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
         points = np.rint((rng.uniform(-1, 1, (n, 3)) * [9000, 5000, 700]) @ turn + 20_000).astype(np.int64)
-        bounds = bound(points, unit_log2)
-        unit = 1 << unit_log2
-        center = np.rint(plain_center(points.astype(float), steps) / unit).astype(np.int64)
-        assert bounds.center[0].tolist() == center.tolist()
-        apart = points - center * unit
-        farthest = int(ceil_sqrt(np.int64((apart**2).sum(axis=1).max())))
-        assert bounds.radius[0] == -(-farthest // unit)
+        found = build_hierarchy(points.astype(np.int32), leaf=32, degree=16)
+        bounds, points = found.bounds, found.points.astype(np.int64)
+        assert bounds.center[0].tolist() == np.rint(plain_center(points, steps)).tolist()
+        apart = points - bounds.center[0]
+        assert bounds.radius[0] == int(ceil_sqrt(np.int64((apart**2).sum(axis=1).max())))
         normal = bounds.normal[0].astype(np.int64)
         if n < 3:
             assert not normal.any()
@@ -143,10 +150,11 @@ def test_a_guess_whose_radius_does_not_fit_is_given_up_for_the_box() -> None:
     for _ in range(60):
         points = rng.integers(0, 2, (5, 3)) * 255 + rng.integers(0, 2, (5, 3))
         for highest in (160, 220):
-            bounds = bound(points, highest=highest)
-            guess = np.clip(np.rint(plain_center(points.astype(float), 32)), 0, highest).astype(np.int64)
+            found = build_hierarchy(points.astype(np.int32), leaf=8, degree=2, highest=highest)
+            bounds, points = found.bounds, found.points.astype(np.int64)
+            guess = np.clip(np.rint(plain_center(points, 32)), 0, highest).astype(np.int64)
             fits = ((points - guess) ** 2).sum(axis=1).max() <= highest**2
-            box = np.clip(np.rint(plain_center(points.astype(float), 0)), 0, highest).astype(np.int64)
+            box = np.clip(np.rint(plain_center(points, 0)), 0, highest).astype(np.int64)
             assert bounds.center[0].tolist() == (guess if fits else box).tolist()
             given_up += not fits
     assert 5 < given_up < 115
@@ -154,12 +162,49 @@ def test_a_guess_whose_radius_does_not_fit_is_given_up_for_the_box() -> None:
 
 @pytest.mark.interpreted
 def test_what_stood_in_the_arrays_before_is_not_read() -> None:
-    points = np.array([[3, 4, 5], [9, 4, 5], [6, 8, 5], [6, 6, 9]], np.int32)
-    rows = []
+    points = make_steps("noise", 5, 40, 500)
+    found = []
     for stale in (0, 77):
-        columns = [np.full(shape, stale, np.int64) for shape in ((3, 3), 3, (3, 3), (3, 2))]
-        begin, end = np.array([0, 0, 2]), np.array([4, 2, 3])
-        bound_nodes(points, begin, end, 0, 65535, True, *columns)
-        rows.append([column.tolist() for column in columns])
-    assert rows[0] == rows[1]
-    assert rows[0][2][1] == [0, 0, 0] and any(rows[0][2][0])
+        own = np.stack([*points.T, np.arange(40)]).astype(np.int32)
+        space, rows = tree_space(40, 8, 4), tree_rows(40, 8)
+        for column in rows:
+            column[:] = stale
+        total, height = build_tree(own, 40, 8, 4, True, 65535, space, rows, np.full(SPREAD, stale))
+        found.append([total, height, own.tolist(), *(column[:total].tolist() for column in rows)])
+    assert found[0] == found[1]
+    assert found[0][0] > 5
+
+
+def plain_spread(points: np.ndarray) -> np.ndarray:
+    """How points (n, 3) are spread, by numpy."""
+    off = points - points.mean(axis=0)
+    products = off.T @ off
+    return np.array([len(points), *points.mean(axis=0), *products[np.triu_indices(3)]])
+
+
+@pytest.mark.interpreted
+def test_spreads_of_parts_join_to_that_of_all() -> None:
+    rng = np.random.default_rng(4)
+    parts = [rng.integers(0, high, (n, 3)) + low for n, high, low in ((1, 9, 0), (20, 300, 65000), (7, 2, 5))]
+    own = np.concatenate(parts).T.astype(np.int32).copy()
+    ends = np.cumsum([len(part) for part in parts]).astype(np.uint64)
+    spreads, joined = np.empty((3, SPREAD)), np.empty(SPREAD)
+    for i, part in enumerate(parts):
+        leaf_spread(own, ends[i] - np.uint64(len(part)), ends[i], spreads[i])
+        assert np.allclose(spreads[i], plain_spread(part), rtol=1e-12, atol=1e-9)
+    join_spread(spreads, 0, 3, joined)
+    assert np.allclose(joined, plain_spread(np.concatenate(parts)), rtol=1e-12, atol=1e-6)
+
+
+@pytest.mark.interpreted
+def test_the_direction_of_least_variance_is_an_eigenvector() -> None:
+    """Where Newton finds it, and where it hands over: two variances alike, or all points on a line."""
+    rng = np.random.default_rng(7)
+    for lengths in ([900, 500, 70], [900, 890, 0], [900, 71, 70], [900, 1e-3, 0], [5, 5, 5], [3, 0, 0]):
+        turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        matrix = turn @ np.diag(np.square(lengths)) @ turn.T
+        spread, direction = np.array([9, 0, 0, 0, *matrix[np.triu_indices(3)]], float), np.empty(3)
+        least_variance(spread, direction)
+        assert np.linalg.norm(direction) == pytest.approx(1, abs=1e-9)
+        # Its variance is the least there is, to rounding.
+        assert direction @ matrix @ direction <= min(lengths) ** 2 + 1e-9 * max(lengths) ** 2

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 from scans import WITH_POINTS, make_steps
-from solidcloud.builder.hierarchy import Tree
-from solidcloud.builder.kernels.pack import pack_tree, sort_leaves
+from solidcloud.builder.hierarchy import Tree, build_hierarchy
+from solidcloud.builder.kernels.pack import most_nodes, pack_tree, sort_run
 
 pytestmark = pytest.mark.interpreted
 
@@ -69,20 +69,20 @@ def test_the_packing_is_a_function_of_the_points_and_their_order() -> None:
 
 
 def test_leaves_are_sorted_along_their_longest_edge() -> None:
-    points = make_steps("corner", 1, 200, 1000)
-    tree = pack(points, 16, 4)
-    t = len(tree.begin)
-    order, axis, low = tree.order.copy(), np.zeros(t, np.uint8), np.zeros((t, 3), np.int64)
-    sort_leaves(points, order, tree.begin, tree.end, tree.levels[-2], axis, low)
-    for node in range(tree.levels[-2], t):
+    points = make_steps("corner", 1, 200, 1000).astype(np.int32)
+    found, packed = build_hierarchy(points, leaf=16, degree=4), pack(points, 16, 4)
+    tree = found.tree
+    assert tree.begin.tolist() == packed.begin.tolist()
+    for node in range(tree.levels[-2], len(tree.begin)):
         run = slice(tree.begin[node], tree.end[node])
-        block = points[order[run]]
-        assert sorted(order[run]) == sorted(tree.order[run])
-        assert axis[node] == np.ptp(block, axis=0).argmax()
-        assert (np.diff(block[:, axis[node]]) >= 0).all()
-        assert np.array_equal(low[node], block.min(axis=0))
-    assert not axis[: tree.levels[-2]].any()
-    assert not low[: tree.levels[-2]].any()
+        block = points[tree.order[run]]
+        assert np.array_equal(found.points[run], block)
+        assert sorted(tree.order[run]) == sorted(packed.order[run])
+        assert found.axis[node] == np.ptp(block, axis=0).argmax()
+        assert (np.diff(block[:, found.axis[node]]) >= 0).all()
+        assert np.array_equal(found.block_low[node], block.min(axis=0))
+    assert not found.axis[: tree.levels[-2]].any()
+    assert not found.block_low[: tree.levels[-2]].any()
 
 
 @pytest.mark.parametrize("side", [2**23, 1])
@@ -127,9 +127,29 @@ def test_parts_are_cut_along_their_longest_edge_ties_by_rank(
     assert found == plain_leaves(points, leaf, degree)
 
 
-def test_leaves_are_sorted_ties_by_rank() -> None:
-    points = np.array([[x, 0, 0] for x in (3, 1, 3, 0, 1, 3, 7)], np.int32)
-    order = np.array([6, 5, 4, 3, 2, 1, 0])
-    axis, low = np.zeros(1, np.uint8), np.zeros((1, 3), np.int64)
-    sort_leaves(points, order, np.array([0]), np.array([7]), 0, axis, low)
-    assert order.tolist() == [3, 1, 4, 0, 2, 5, 6]
+def test_runs_are_sorted_ties_by_rank() -> None:
+    x = [9, 3, 1, 3, 0, 1, 3, 7, 9]
+    own = np.array([[5] * 9, x, range(10, 19), [0, 6, 5, 4, 3, 2, 1, 0, 0]], np.int32)
+    before = own.copy()
+    sort_run(own, np.zeros_like(own), np.uint64(1), np.uint64(8), np.uint64(1))
+    assert own[3].tolist() == [0, 3, 2, 5, 1, 4, 6, 0, 0]
+    assert own[1].tolist() == [9, 0, 1, 1, 3, 3, 3, 7, 9]
+    assert sorted(map(tuple, own.T.tolist())) == sorted(map(tuple, before.T.tolist()))
+
+
+@pytest.mark.parametrize("kind", ["line", "heaps", "equal", "far"])
+def test_the_border_of_a_cut_is_found_in_any_crowd(kind: str) -> None:
+    """Bins of a histogram that hold one point, and ones that hold nearly all."""
+    i = np.arange(300)
+    x = {"line": i * 7, "heaps": i % 2 * 5000 + i % 3, "equal": i * 0, "far": (i == 299) * 2**23}[kind]
+    points = np.stack([x, i * 0, i * 0], axis=1)[np.random.default_rng(1).permutation(300)]
+    tree = pack(points, 10, 2)
+    found = [set(tree.order[a:b].tolist()) for a, b in zip(tree.begin, tree.end, strict=True)]
+    leaves = [s for s in found[tree.levels[-2] :]]
+    assert leaves == plain_leaves(points, 10, 2)
+
+
+@pytest.mark.parametrize("degree", [2, 3, 16])
+def test_no_tree_has_more_nodes_than_are_made_room_for(degree: int) -> None:
+    for n in [*range(1, 70), 129, 257, 513]:
+        assert len(pack(np.zeros((n, 3)), 1, degree).begin) <= most_nodes(n, 1)

@@ -24,10 +24,8 @@ is taken in cubes by Morton range, and what lies around one is read piece by pie
 whole, however many points are there.
 """
 
-from collections import OrderedDict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from fractions import Fraction
-from itertools import product
 from math import isqrt
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -36,23 +34,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..schemas.errors import BadRequestError
-from ..schemas.kernels.morton import morton_decode
-from ..schemas.voxel_grid import KEY_BIAS, Lattice, voxel_coordinates, voxel_keys
+from ..schemas.voxel_grid import Lattice
+from .blocks import Block, BlockReader, Box, Grid, NearPoints
 from .config import BuildConfig
 from .executor import Executor
 from .journal import Journal, Work, new_file, resumed
-from .kernels.filter import best_of_cells, cell_numbers, count_others, other_scans
+from .kernels.filter import best_of_cells, count_others, other_scans
 from .progress import Progress
 from .spool import RUN_SUFFIX, Spool, canonical_columns, row_codes, spool_dtype, write_directory
 
 # Why a point was left out, as `info` says it.
 MOVING, OUTLIER, THINNED = "moving", "outliers", "thinned"
 
-# Points held at a time, of a voxel and of what lies around it: memory, not results, depends on it.
-BLOCK_POINTS = 1 << 19
-# Voxels of more are read in cubes of at most so many where only their border is wanted; smaller ones whole, and kept
-# while a unit works its way along, for they are neighbours of the next voxel too.
-BORDER_POINTS = 1 << 17
 # Points in a work unit.
 UNIT_POINTS = 1 << 21
 # How far from a point `moving` asks whether others saw the place, in its distance.
@@ -60,7 +53,6 @@ SEEN = 8
 # Scans that `moving` remembers of a point: 16 bytes each.
 MAX_SCANS_ASKED = 16
 
-Box = tuple[NDArray[np.int64], NDArray[np.int64]]
 # Reason -> scan -> points left out.
 Counts = dict[str, dict[int, int]]
 
@@ -235,13 +227,13 @@ def _add(total: Counts, more: Counts) -> None:
 def filter_voxels(unit: FilterUnit) -> Filtered:
     """Write what stays of the unit's voxels as one run. Pure and idempotent; run in any process."""
     left_out: Counts = {}
-    reader = _Reader(unit.spool)
+    reader = BlockReader(unit.spool)
     keys: list[int] = []
     starts = [0]
     with new_file(unit.path) as file:
         for key in unit.keys:
             kept = 0
-            for block in reader.blocks(key, None, BLOCK_POINTS):
+            for block in reader.blocks(key):
                 thin = unit.rules.thin
                 verdict = _thinned(block, reader, thin) if thin else _near(block, reader, unit.rules)
                 _add(left_out, _counted(block.rows, verdict))
@@ -281,135 +273,7 @@ def _narrowed(rows: NDArray, dtype: np.dtype) -> NDArray:
     return found
 
 
-class Block(NamedTuple):
-    """Points of one cube of a voxel. low: (3,) int64 lattice, the voxel's.  corner, size: the cube's, in the voxel."""
-
-    key: int
-    low: NDArray[np.int64]
-    corner: NDArray[np.int64]
-    size: int
-    rows: NDArray
-
-    def bounds(self) -> Box:
-        """The least and greatest position (3,) in the lattice."""
-        local = self.rows["local"]
-        return self.low + local.min(axis=0), self.low + local.max(axis=0)
-
-
-class _Points(NamedTuple):
-    """Points near a block. positions: (n, 3) int32 from a base.  scans: (n,) int64.  intensities: (n,) float32."""
-
-    positions: NDArray[np.int32]
-    scans: NDArray[np.int64]
-    intensities: NDArray[np.float32]
-
-    @classmethod
-    def of(cls, rows: NDArray, shift: NDArray[np.int64]) -> "_Points":
-        """Rows, `shift` (3,) added to their position in the voxel."""
-        names = rows.dtype.names or ()
-        return cls(
-            rows["local"] + shift.astype(np.int32),
-            rows["scan_index"].astype(np.int64),
-            rows["intensity"].copy() if "intensity" in names else np.zeros(len(rows), np.float32),
-        )
-
-    def taken(self, which: NDArray) -> "_Points":
-        """Some of them."""
-        return _Points(*(column[which] for column in self))
-
-    @classmethod
-    def joined(cls, parts: Sequence["_Points"]) -> "_Points":
-        """All of some."""
-        return cls(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
-
-
-class _Reader:
-    """Reads blocks of voxels, and what lies around them; keeps small voxels that it read last."""
-
-    def __init__(self, spool: Spool) -> None:
-        self.spool = spool
-        self.root = int(spool.lattice.voxel_steps - 1).bit_length()
-        self._kept: OrderedDict[int, NDArray] = OrderedDict()
-        self._held = 0
-
-    def blocks(self, key: int, box: Box | None, most: int) -> Iterator[Block]:
-        """A voxel's points in cubes of at most `most`, in Morton order; those that a box (in the lattice) reaches."""
-        low = voxel_coordinates(np.array([key], np.uint64))[0] * self.spool.lattice.voxel_steps
-        stack = [(0, self.root)]
-        while stack:
-            code, log2 = stack.pop()
-            corner = morton_decode(np.array([code], np.uint64))[0].astype(np.int64)
-            size, end = 1 << log2, code + (1 << 3 * log2)
-            if box is not None and ((low + corner > box[1]).any() or (low + corner + size <= box[0]).any()):
-                continue
-            whole = log2 == self.root
-            count = self.spool.count(key) if whole else self.spool.block_count(key, code, end)
-            if count > most and log2 > 0:
-                part = 1 << 3 * (log2 - 1)
-                stack += [(code + child * part, log2 - 1) for child in reversed(range(8))]
-            elif count:
-                rows = self._whole(key) if whole else np.concatenate(self.spool.block_rows(key, code, end))
-                yield Block(key, low, corner, size, rows)
-
-    def _whole(self, key: int) -> NDArray:
-        """The rows of a voxel; small ones are kept, all together as many as a block."""
-        if key in self._kept:
-            self._kept.move_to_end(key)
-            return self._kept[key]
-        rows = np.concatenate(self.spool.rows(key))
-        if len(rows) <= BORDER_POINTS:
-            self._kept[key] = rows
-            self._held += len(rows)
-            while self._held > BLOCK_POINTS:
-                self._held -= len(self._kept.popitem(last=False)[1])
-        return rows
-
-    def around(self, block: Block, box: Box) -> Iterator[_Points]:
-        """All points in a box (inclusive, lattice) but those of the block, in pieces, from the box's low corner.
-
-        A position's points are in one piece, all of them.
-        """
-        voxel_steps = self.spool.lattice.voxel_steps
-        held: list[_Points] = []
-        first, last = box[0] // voxel_steps, box[1] // voxel_steps
-        for place in product(*(range(int(a), int(b) + 1) for a, b in zip(first, last, strict=True))):
-            if min(place) < -KEY_BIAS or max(place) >= KEY_BIAS:
-                continue
-            key = int(voxel_keys(np.array([place], np.int64))[0])
-            for near in self.blocks(key, box, BORDER_POINTS):
-                positions = near.rows["local"] + near.low
-                inside = ((positions >= box[0]) & (positions <= box[1])).all(axis=1)
-                if key == block.key:
-                    cube = near.rows["local"] - block.corner
-                    inside &= ~((cube >= 0) & (cube < block.size)).all(axis=1)
-                if inside.any():
-                    held.append(_Points.of(near.rows[inside], near.low - box[0]))
-                if sum(len(points.scans) for points in held) >= BORDER_POINTS:
-                    yield _Points.joined(held)
-                    held = []
-        if held:
-            yield _Points.joined(held)
-
-
-class _Grid(NamedTuple):
-    """Cells of one length over a box: `cell_numbers` with these."""
-
-    edge: int
-    across: int
-    deep: int
-
-    @classmethod
-    def over(cls, box: Box, edge: int) -> "_Grid":
-        """Cells of `edge` over a box (inclusive)."""
-        cells = (box[1] - box[0]) // edge + 3
-        return cls(edge, int(cells[1]), int(cells[2]))
-
-    def cells(self, positions: NDArray[np.int32]) -> NDArray[np.uint64]:
-        """The cell of each position, from the box's low corner."""
-        return np.asarray(cell_numbers(positions, *self))
-
-
-def _near(block: Block, reader: _Reader, rules: Rules) -> NDArray[np.uint8]:
+def _near(block: Block, reader: BlockReader, rules: Rules) -> NDArray[np.uint8]:
     """Verdicts of `moving` and `outliers`."""
     verdict = np.full(len(block.rows), KEPT, np.uint8)
     if rules.outliers is not None:
@@ -426,8 +290,8 @@ def _near(block: Block, reader: _Reader, rules: Rules) -> NDArray[np.uint8]:
 
 
 def _pieces(
-    block: Block, reader: _Reader, reach: Reach, left: NDArray[np.bool_]
-) -> Iterator[tuple[_Points, NDArray[np.int64], NDArray[np.int32], _Grid]]:
+    block: Block, reader: BlockReader, reach: Reach, left: NDArray[np.bool_]
+) -> Iterator[tuple[NearPoints, NDArray[np.int64], NDArray[np.int32], Grid]]:
     """What lies within reach of the points that are `left` (n,), piece by piece, as long as some are.
 
     Each time: a piece, the queries left in the order of their cells, their positions, and the grid. The block's own
@@ -435,8 +299,8 @@ def _pieces(
     """
     low, high = block.bounds()
     box = low - reach.steps, high + reach.steps
-    own = _Points.of(block.rows, block.low - box[0])
-    grid = _Grid.over(box, reach.steps)
+    own = NearPoints.of(block.rows, block.low - box[0])
+    grid = Grid.over(box, reach.steps)
 
     def queries() -> NDArray[np.int64]:
         which = np.flatnonzero(left)
@@ -449,7 +313,7 @@ def _pieces(
         return
     low, high = own.positions[which].min(axis=0) + box[0], own.positions[which].max(axis=0) + box[0]
     base, box = box[0], (low - reach.steps, high + reach.steps)
-    grid = _Grid.over(box, reach.steps)
+    grid = Grid.over(box, reach.steps)
     own = own._replace(positions=own.positions - (box[0] - base).astype(np.int32))
     for piece in reader.around(block, box):
         which = queries()
@@ -458,7 +322,7 @@ def _pieces(
         yield piece, which, own.positions[which], grid
 
 
-def _is_outlier(block: Block, reader: _Reader, reach: Reach) -> NDArray[np.bool_]:
+def _is_outlier(block: Block, reader: BlockReader, reach: Reach) -> NDArray[np.bool_]:
     """Which points have too few others around."""
     counts = np.zeros(len(block.rows), np.int64)
     left = np.ones(len(block.rows), np.bool_)
@@ -486,7 +350,9 @@ def _is_outlier(block: Block, reader: _Reader, reach: Reach) -> NDArray[np.bool_
     return counts < reach.count
 
 
-def _scans_around(block: Block, reader: _Reader, reach: Reach, asked: NDArray[np.bool_]) -> NDArray[np.int64]:
+def _scans_around(
+    block: Block, reader: BlockReader, reach: Reach, asked: NDArray[np.bool_]
+) -> NDArray[np.int64]:
     """How many other scans, up to `reach.count`, have a point within reach of each point; 0 where not asked."""
     counts = np.zeros(len(block.rows), np.int64)
     found = np.full((len(block.rows), reach.count), -1, np.int64)
@@ -507,12 +373,12 @@ def _scans_around(block: Block, reader: _Reader, reach: Reach, asked: NDArray[np
     return counts
 
 
-def _thinned(block: Block, reader: _Reader, edge: int) -> NDArray[np.uint8]:
+def _thinned(block: Block, reader: BlockReader, edge: int) -> NDArray[np.uint8]:
     """Verdicts of `thin`: the best of each cube of the lattice stays, of all voxels' points in it."""
     low, high = block.bounds()
     box = low // edge * edge, high // edge * edge + (edge - 1)
-    grid = _Grid.over(box, edge)
-    own = _Points.of(block.rows, block.low - box[0])
+    grid = Grid.over(box, edge)
+    own = NearPoints.of(block.rows, block.low - box[0])
     best = _best(own, grid, edge)
     cells = grid.cells(own.positions[best])
     candidates = [own.taken(best)]
@@ -523,7 +389,7 @@ def _thinned(block: Block, reader: _Reader, edge: int) -> NDArray[np.uint8]:
                 candidates.append(rival.taken(_best(rival, grid, edge)))
     # The block's own come first, so that of equal points one of them is found here, and by nobody else: others that
     # are equal are at the same place, and so in the same block.
-    chosen = _best(_Points.joined(candidates), grid, edge)
+    chosen = _best(NearPoints.joined(candidates), grid, edge)
     verdict = np.full(len(block.rows), 1 + REASONS.index(THINNED), np.uint8)
     verdict[best[chosen[chosen < len(best)]]] = KEPT
     return verdict
@@ -536,7 +402,7 @@ def _lies_across(block: Block, box: Box, voxel_steps: int) -> bool:
     return bool((box[0] < low).any() or (box[1] >= high).any())
 
 
-def _best(points: _Points, grid: _Grid, edge: int) -> NDArray[np.int64]:
+def _best(points: NearPoints, grid: Grid, edge: int) -> NDArray[np.int64]:
     """The index of the best point of each cube, by cube."""
     cells = grid.cells(points.positions)
     inside = points.positions % edge

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from solidcloud.builder import blocks
 from solidcloud.builder import filter as filters
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.executor import make_executor
@@ -120,8 +121,8 @@ VOXELS = [(64, 3, None), (1 << 12, 1, None), (100, 5, 16), (37, 2, 50)]  # steps
 def layout(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> tuple[int, int]:
     steps, runs, held = request.param
     if held is not None:
-        monkeypatch.setattr(filters, "BLOCK_POINTS", held)
-        monkeypatch.setattr(filters, "BORDER_POINTS", held // 2)
+        monkeypatch.setattr(blocks, "BLOCK_POINTS", held)
+        monkeypatch.setattr(blocks, "BORDER_POINTS", held // 2)
         monkeypatch.setattr(filters, "UNIT_POINTS", 100)
     return steps, runs
 
@@ -247,7 +248,7 @@ def test_processes_give_the_same_run_and_a_second_call_does_nothing_again(
 def test_a_place_with_more_duplicates_than_are_held_is_one_block(
     rng: np.random.Generator, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(filters, "BLOCK_POINTS", 16)
+    monkeypatch.setattr(blocks, "BLOCK_POINTS", 16)
     points = cloud(rng)
     points.at[:200] = points.at[0]
     config = BuildConfig(keep=ALL, thin=STEP)

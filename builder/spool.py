@@ -10,18 +10,17 @@ A `Spool` is a folder of runs. It holds no rows: a voxel's are read from the few
 """
 
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..schemas.archive import sync_folder
 from ..schemas.errors import CorruptError
 from ..schemas.voxel_grid import Lattice
 from .config import BuildConfig
+from .journal import new_file
 from .kernels.octree import voxel_codes
 
 RUN_SUFFIX = ".run"
@@ -62,21 +61,15 @@ def write_run(path: Path, keys: NDArray[np.uint64], rows: NDArray) -> None:
     write_directory(path, found, np.append(starts, len(keys)).astype(np.int64))
 
 
-@contextmanager
-def new_run(path: Path) -> Iterator[Any]:
-    """The file of a run, to be written in order; on disk for good when it is closed."""
-    with open(path, "wb", buffering=0) as file:
-        yield file
-        os.fsync(file.fileno())
+def new_run(path: Path) -> AbstractContextManager[BinaryIO]:
+    """The file of a run, to be written in order; it has its name when it is whole and on disk for good."""
+    return new_file(path)
 
 
 def write_directory(path: Path, keys: NDArray[np.uint64], starts: NDArray[np.int64]) -> None:
-    """Write the directory of the run `path`: keys (s,) ascending, starts (s + 1,), and sync both names."""
-    with open(path.with_suffix(KEYS_SUFFIX), "wb") as file:
+    """Write the directory of the run `path`: keys (s,) ascending, starts (s + 1,)."""
+    with new_file(path.with_suffix(KEYS_SUFFIX)) as file:
         file.write(np.concatenate([keys.astype("<u8"), starts.astype("<u8")]).tobytes())
-        file.flush()
-        os.fsync(file.fileno())
-    sync_folder(path.parent)
 
 
 def read_directory(path: Path) -> tuple[NDArray[np.uint64], NDArray[np.int64]]:

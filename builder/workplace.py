@@ -1,20 +1,27 @@
-"""The folder that an archive is made in, and how it gets the name asked for: locked, hidden, renamed when whole.
-
-A failure leaves nothing behind, and what a killed build left is removed by the next one of the same name.
-"""
+"""The folder that an archive is made in, and how it gets the name asked for: locked, hidden, renamed when whole."""
 
 import fcntl
+import json
 import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from ..schemas.archive import INDEX_NAME, SHARD_FOLDER, sync_folder
-from ..schemas.errors import BadRequestError
+from ..schemas.errors import BadRequestError, CorruptError, ScanError
+from .journal import Journal, remove_temporaries
+from .resume import check_same
+
+# The note of what is built, the first of all.
+BEGUN = "build"
+# What an archive's folder may hold beside its shards.
+PREVIEW_NAME = "preview.vtkhdf"
 
 
-def _check_target(target: Path, overwrite: bool) -> None:
+def check_target(target: Path, overwrite: bool) -> None:
     """Refuse to write where something else is."""
     if not target.exists() or (target.is_dir() and not any(target.iterdir())):
         return
@@ -23,7 +30,7 @@ def _check_target(target: Path, overwrite: bool) -> None:
     if not overwrite:
         raise BadRequestError(f"{target}: an archive is here already: give another -o, or --overwrite")
     shards = list((target / SHARD_FOLDER).iterdir()) if (target / SHARD_FOLDER).is_dir() else []
-    strangers = [p for p in target.iterdir() if p.name not in (INDEX_NAME, SHARD_FOLDER)]
+    strangers = [p for p in target.iterdir() if p.name not in (INDEX_NAME, SHARD_FOLDER, PREVIEW_NAME)]
     strangers += [p for p in shards if p.suffix != ".h5" or not p.is_file()]
     if strangers:
         raise BadRequestError(
@@ -69,22 +76,72 @@ def locked(target: Path) -> Iterator[None]:
         file.close()
 
 
+def building_folder(target: Path) -> Path:
+    """The hidden folder that the archive `target` is made in."""
+    return target.parent / f".{target.name}.building"
+
+
+@dataclass
+class Workplace:
+    """The hidden folder of a build. journal: what is done.  archive: what will be renamed to the target.
+
+    surveyed: all scans were read to their end once, so that a scan at fault is no reason to forget what was done.
+    """
+
+    journal: Journal
+    archive: Path
+    surveyed: bool = False
+
+    @property
+    def folder(self) -> Path:
+        """The hidden folder itself."""
+        return self.journal.folder
+
+
 @contextmanager
-def workplace(target: Path, overwrite: bool) -> Iterator[Path]:
-    """The hidden folder that the archive is made in; what an earlier, killed build left there goes first."""
-    _recover(target)
-    _check_target(target, overwrite)
-    folder = target.parent / f".{target.name}.building"
-    shutil.rmtree(folder, ignore_errors=True)
-    (folder / SHARD_FOLDER).mkdir(parents=True)
-    (folder / "spool").mkdir()
+def workplace(target: Path, what: dict[str, Any], *, fresh: bool) -> Iterator[Workplace]:
+    """Go on with a build of `what` that was interrupted, or begin one; see resume.py `described`.
+
+    What is done stays when the build is interrupted, killed, or fails by the disk. A request that cannot be done, a
+    scan at fault in the survey, and what was written but does not read back leave nothing. Raises BadRequestError for a
+    build that was begun of something else, which it leaves as it is.
+    """
+    folder = building_folder(target)
+    journal = Journal(folder)
+    if fresh:
+        shutil.rmtree(folder, ignore_errors=True)
+    begun = journal.recall(BEGUN)
+    if begun is not None:
+        check_same(folder, begun, json.loads(json.dumps(what)))
+    place = Workplace(journal, folder / "archive")
     try:
-        yield folder
-    finally:
+        if begun is None:  # nothing, or killed before it could say what it was
+            shutil.rmtree(folder, ignore_errors=True)
+            folder.mkdir()
+            journal.note(BEGUN, what)
+        remove_temporaries(folder)
+        for name in ("spool", "archive", f"archive/{SHARD_FOLDER}"):
+            (folder / name).mkdir(exist_ok=True)
+        yield place
+    except BaseException as error:
+        if isinstance(error, BadRequestError | CorruptError) or (
+            isinstance(error, ScanError) and not place.surveyed
+        ):
+            shutil.rmtree(folder, ignore_errors=True)
+        elif folder.exists():
+            remove_temporaries(folder)
+        raise
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+def forget_finished(target: Path, what: dict[str, Any]) -> None:
+    """Remove what a build left that was killed just after it had published `what`."""
+    folder = building_folder(target)
+    if Journal(folder).recall(BEGUN) == json.loads(json.dumps(what)):
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def _recover(target: Path) -> None:
+def recover(target: Path) -> None:
     """Finish what an earlier build with `overwrite` left when it was killed between its two renames."""
     old = target.parent / f".{target.name}.old"
     if old.exists() and not target.exists():

@@ -1,130 +1,80 @@
-"""Survey, lattice and spool: counts, bounds, runs of any size, and one lattice for all sources."""
+"""The second pass: every point quantised once, in runs of any size, in the order that plain sorting gives."""
 
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
-from scans import make_scan, write_las, write_xyz
+import solidcloud.builder.partition as partition
+from scans import make_scan
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.partition import (
-    Run,
+    RunsHold,
     Spooled,
     SpoolUnit,
-    Survey,
-    choose_lattice,
-    gather_voxel,
-    open_all,
-    spool_dtype,
-    spool_scan,
-    survey_scan,
+    dump_spooled,
+    load_spooled,
+    ranks,
+    run_points,
+    sort_voxel,
+    spool_range,
+    usable,
 )
 from solidcloud.builder.sources import Block, Scan
-from solidcloud.builder.sources import Lattice as SourceLattice
+from solidcloud.builder.spool import Spool, row_codes, spool_dtype, write_run
 from solidcloud.schemas.errors import BadRequestError, ScanError
-from solidcloud.schemas.voxel_grid import MAX_COORDINATE, Lattice, make_lattice
+from solidcloud.schemas.voxel_grid import MAX_COORDINATE, Lattice, make_lattice, voxel_keys
 
 
 class Listed(Scan):
     """A scan of points in memory, in blocks of a size of its own."""
 
-    def __init__(self, path: Path, xyz: np.ndarray, size: int, fails_after: int | None = None) -> None:
-        super().__init__(path, "text")
-        self.xyz, self.size, self.fails_after = xyz, size, fails_after
+    def __init__(self, xyz: np.ndarray, size: int = 50, intensity: np.ndarray | None = None) -> None:
+        super().__init__(Path("listed.xyz"), "text")
+        self.xyz, self.size = xyz, size
+        self.intensity = np.arange(len(xyz), dtype=np.float32) if intensity is None else intensity
 
     def _read(self, block_points: int) -> Iterator[Block]:
         for start in range(0, len(self.xyz), self.size):
-            if self.fails_after is not None and start >= self.fails_after:
-                raise ScanError(f"{self.path}: broke off")
-            xyz = self.xyz[start : start + self.size]
-            yield Block(xyz, np.arange(start, start + len(xyz), dtype=np.float32))
-
-
-def listed(folder: Path, xyz: np.ndarray, size: int = 50, fails_after: int | None = None) -> Listed:
-    """A scan with a file that can be hashed."""
-    path = folder / "listed.xyz"
-    path.write_bytes(b"any")
-    return Listed(path, xyz, size, fails_after)
+            part = slice(start, start + self.size)
+            yield Block(self.xyz[part], self.intensity[part])
 
 
 def spooled(
-    folder: Path, scan: Scan, count: int, lattice: Lattice, run_points: int, keep: frozenset[str]
-) -> tuple[Spooled, np.dtype]:
+    folder: Path,
+    scan: Scan,
+    count: int,
+    lattice: Lattice,
+    run_points: int = 10_000,
+    keep: frozenset[str] = frozenset(),
+) -> tuple[Spooled, Spool]:
     """Spool a scan."""
     folder.mkdir(exist_ok=True)
     config = BuildConfig(keep=keep)
-    return spool_scan(SpoolUnit(scan, 3, count, lattice, config, folder, run_points)), spool_dtype(config)
-
-
-def test_a_survey_counts_usable_points_and_their_bounds(tmp_path: Path) -> None:
-    xyz = make_scan("noise", 1, 300) - 1
-    xyz[5, 1], xyz[6, 0], xyz[250, 2] = np.nan, np.inf, np.nextafter(MAX_COORDINATE, np.inf)
-    good = np.delete(xyz, [5, 6, 250], axis=0)
-    survey = survey_scan(listed(tmp_path, xyz))
-    assert (survey.count, survey.not_finite, survey.fault) == (297, 3, "")
-    assert np.array_equal(survey.low, good.min(axis=0))
-    assert np.array_equal(survey.high, good.max(axis=0))
-
-
-def test_a_scan_without_points_is_at_fault_but_loses_nothing(tmp_path: Path) -> None:
-    survey = survey_scan(listed(tmp_path, np.empty((0, 3))))
-    assert "holds no usable point, expected at least one" in survey.fault
-    assert survey.empty
-    assert survey.region is None
-
-
-def test_points_that_are_all_unusable_were_somewhere(tmp_path: Path) -> None:
-    scan = listed(tmp_path, np.full((4, 3), np.nan))
-    survey = survey_scan(scan)
-    assert "holds no usable point, expected at least one" in survey.fault
-    assert (survey.empty, survey.region) == (False, None)
-    scan.bounds = np.array([[0.0, 0, 0], [1.0, 1, 1]])
-    assert np.array_equal(survey_scan(scan).region, scan.bounds)
-
-
-def test_a_scan_that_breaks_off_may_have_covered_header_and_points(tmp_path: Path) -> None:
-    xyz = make_scan("noise", 1, 300)
-    scan = listed(tmp_path, xyz, fails_after=200)
-    survey = survey_scan(scan)
-    assert (survey.count, survey.region, survey.empty) == (0, None, False)
-    assert "broke off" in survey.fault
-    low, high = xyz[:200].min(axis=0), xyz[:200].max(axis=0)
-    scan.bounds = np.array([low + 0.001, high + 9.0])  # rounded, but not by more
-    region = survey_scan(scan).region
-    assert region is not None
-    assert np.array_equal(region, [low, high + 9.0])
-    scan.bounds = np.array([low + 0.5, high + 9.0])
-    assert survey_scan(scan).region is None, "a point lies outside: the header's bounds are wrong"
-
-
-def test_a_file_that_cannot_be_opened_gives_its_fault(tmp_path: Path) -> None:
-    (tmp_path / "a.las").write_bytes(b"no LAS at all")
-    scans, fault = open_all(tmp_path / "a.las", None)
-    assert scans == []
-    assert "a.las" in fault
+    dtype = spool_dtype(config)
+    unit = SpoolUnit(scan, 3, 0, None, count, lattice, config, dtype, folder, "unit", run_points)
+    return spool_range(unit), Spool(folder, dtype, lattice)
 
 
 @pytest.mark.parametrize("run_points", [1, 100, 10_000])
 @pytest.mark.parametrize("keep", [frozenset(), frozenset({"scan", "intensity"})])
-def test_every_point_is_gathered_once_whatever_the_runs(
+def test_every_point_is_spooled_once_whatever_the_runs(
     run_points: int, keep: frozenset[str], tmp_path: Path
 ) -> None:
-    xyz = make_scan("corner", 2, 410) + np.array([5e5, -1, 0])
+    xyz = make_scan("corner", 2, 410)[: 41 if run_points == 1 else 410] + np.array([5e5, -1, 0])
     lattice = make_lattice(xyz.min(axis=0), 0.001, 0.5)
-    result, dtype = spooled(tmp_path / "s", listed(tmp_path, xyz), 410, lattice, run_points, keep)
-    assert len(result.runs) == {1: 9, 100: 5, 10_000: 1}[run_points]
+    result, spool = spooled(tmp_path / "s", Listed(xyz), len(xyz), lattice, run_points, keep)
+    assert len(result.runs) == {1: 41, 100: 5, 10_000: 1}[run_points]
     steps = lattice.to_lattice(xyz)
-    keys = sorted({int(key) for run in result.runs for key in run.keys})
     found, intensity = [], []
-    for key in keys:
-        points = gather_voxel(key, result.runs, dtype)
-        assert points.local.min() >= 0
-        assert points.local.max() < lattice.voxel_steps
-        corner = (np.array(_coordinate(key)) * lattice.voxel_steps).astype(np.int64)
-        found.append(points.local + corner)
-        if keep:
-            assert (points.scan_index == 3).all()
-            intensity.append(points.intensity)
+    for key in spool.keys.tolist():
+        for rows in spool.rows(key):
+            assert rows["local"].min() >= 0
+            assert rows["local"].max() < lattice.voxel_steps
+            found.append(rows["local"] + np.array(_coordinate(key)) * lattice.voxel_steps)
+            if keep:
+                assert (rows["scan_index"] == 3).all()
+                intensity.append(rows["intensity"])
     assert sorted(np.concatenate(found).tolist()) == sorted(steps.tolist())
     if keep:
         assert np.array_equal(np.concatenate(found), steps[np.concatenate(intensity).astype(int)])
@@ -136,16 +86,72 @@ def _coordinate(key: int) -> list[int]:
     return [sum((key >> (3 * b + a) & 1) << b for b in range(21)) - (1 << 20) for a in range(3)]
 
 
-def test_runs_are_sorted_and_say_where_each_voxel_begins(tmp_path: Path) -> None:
-    xyz = make_scan("noise", 2, 300)
-    lattice = make_lattice(xyz.min(axis=0), 0.001, 0.5)
-    result, dtype = spooled(tmp_path / "s", listed(tmp_path, xyz), 300, lattice, 100, frozenset())
-    run: Run
-    for run in result.runs:
-        assert (np.diff(run.keys.astype(np.int64)) > 0).all()
-        assert run.starts[0] == 0
-        assert (np.diff(run.starts) > 0).all()
-        assert run.path.stat().st_size == run.starts[-1] * dtype.itemsize
+@pytest.mark.parametrize("keep", [frozenset(), frozenset({"scan", "intensity"})])
+@pytest.mark.parametrize("voxel", [0.002, 0.5, 2097.152])
+def test_a_run_is_what_sorting_all_columns_gives(voxel: float, keep: frozenset[str], tmp_path: Path) -> None:
+    rng = np.random.default_rng(4)
+    xyz = rng.integers(-12, 12, (4000, 3)) * 0.001 * np.array([1, 1, 0.05])
+    values = np.array([0.0, -0.0, 1.5, -3, np.nan, -np.nan, np.inf, -np.inf], np.float32)
+    scan = Listed(xyz, 700, rng.choice(values, len(xyz)))
+    lattice = make_lattice((0.0005, 0, 0), 0.001, voxel)
+    result, _ = spooled(tmp_path / "s", scan, len(xyz), lattice, keep=keep)
+    steps = lattice.to_lattice(xyz)
+    rows = np.zeros(len(xyz), spool_dtype(BuildConfig(keep=keep)))
+    rows["local"] = steps - lattice.voxel_of(steps) * lattice.voxel_steps
+    if keep:
+        rows["scan_index"] = 3
+        rows["intensity"] = np.where(np.isnan(scan.intensity), np.float32(np.nan), scan.intensity + 0)
+    (tmp_path / "judge").mkdir()
+    write_run(tmp_path / "judge" / "a.run", voxel_keys(lattice.voxel_of(steps)), rows)
+    (name,) = result.runs
+    for suffix in (".run", ".keys"):
+        found = (tmp_path / "s" / name).with_suffix(suffix).read_bytes()
+        assert found == (tmp_path / "judge" / "a").with_suffix(suffix).read_bytes()
+    assert result.runs[name] == [len(xyz) * rows.dtype.itemsize, len(found)]
+
+
+@pytest.mark.interpreted
+def test_equal_codes_are_ordered_by_intensity_few_or_many() -> None:
+    rng = np.random.default_rng(3)
+    codes = np.concatenate([rng.integers(0, 60, 200), np.full(90, 77)]).astype(np.uint64)
+    values = rng.choice(np.array([0, -1, 2, np.nan, 7.5, -8], np.float32), len(codes)).astype(np.float32)
+    shuffled = rng.permutation(len(codes))
+    codes, values = codes[shuffled], values[shuffled]
+    order = np.lexsort((values, codes))
+    bits = values.view(np.uint32).copy()
+    found = codes.copy()
+    sort_voxel(found, bits)
+    assert np.array_equal(found, codes[order])
+    assert np.array_equal(bits.view(np.float32), values[order], equal_nan=True)
+    ordered = np.array([-np.inf, -2, -1e-45, 0, 1e-45, 3, np.inf, np.nan], np.float32)
+    assert (np.diff(ranks(ordered.view(np.uint32)).astype(np.int64)) > 0).all()
+
+
+def test_more_voxels_than_the_table_has_room_for(tmp_path: Path) -> None:
+    xyz = np.random.default_rng(6).permutation(np.arange(60_000))[:, None] * np.array([0.01, 0, 0])
+    lattice = make_lattice((0, 0, 0), 0.001, 0.01)
+    result, spool = spooled(tmp_path / "s", Listed(xyz, 25_000), 60_000, lattice, 1 << 20)
+    assert len(result.runs) == 1
+    assert len(spool.keys) == 60_000
+    assert (spool.counts == 1).all()
+
+
+def test_a_point_too_far_for_its_voxel_is_refused(tmp_path: Path) -> None:
+    xyz = np.array([[0.0, 0, 0], [2e4, 0, 0]])
+    with pytest.raises(BadRequestError, match="a stray point far from the rest"):
+        spooled(tmp_path / "s", Listed(xyz), 2, make_lattice((0, 0, 0), 0.001, 0.01))
+
+
+def test_only_usable_points_are_spooled(tmp_path: Path) -> None:
+    xyz = make_scan("noise", 1, 60) + 1
+    xyz[5, 1], xyz[6, 0], xyz[50, 2] = np.nan, np.inf, np.nextafter(MAX_COORDINATE, np.inf)
+    kept = usable(Block(xyz, np.arange(60, dtype=np.float32)))
+    assert kept.intensity is not None
+    assert kept.intensity.tolist() == [i for i in range(60) if i not in (5, 6, 50)]
+    assert np.array_equal(kept.xyz, np.delete(xyz, [5, 6, 50], axis=0))
+    assert usable(Block(xyz, None)).intensity is None
+    result, _ = spooled(tmp_path / "s", Listed(xyz, 9), 57, make_lattice((0, 0, 0), 0.001, 0.5))
+    assert result.count == 57
 
 
 def test_the_content_sum_names_the_points_and_not_their_order(tmp_path: Path) -> None:
@@ -153,75 +159,54 @@ def test_the_content_sum_names_the_points_and_not_their_order(tmp_path: Path) ->
     lattice = make_lattice((0, 0, 0), 0.001, 0.5)
     sums = set()
     for number, points in enumerate((xyz, xyz[::-1].copy(), np.roll(xyz, 77, axis=0))):
-        scan = listed(tmp_path, points, size=40 + number)
-        sums.add(spooled(tmp_path / "s", scan, 300, lattice, 100, frozenset())[0].content)
+        result, _ = spooled(tmp_path / "s", Listed(points, 40 + number), 300, lattice, 100)
+        sums.add(tuple(result.content))
     assert len(sums) == 1
     moved = xyz.copy()
     moved[7, 1] += 0.001
-    other = spooled(tmp_path / "s", listed(tmp_path, moved), 300, lattice, 100, frozenset())[0].content
-    assert other not in sums
+    other = spooled(tmp_path / "s", Listed(moved), 300, lattice, 100)[0].content
     assert all(a != b for a, b in zip(other, next(iter(sums)), strict=True))
 
 
-def test_a_scan_that_grows_between_the_passes_is_refused(tmp_path: Path) -> None:
+def test_a_point_is_named_by_what_is_kept_of_it(tmp_path: Path) -> None:
+    """A scan number that only the filters need is no part of what the archive's id is made of."""
     xyz = make_scan("noise", 2, 300)
+    lattice = make_lattice((0, 0, 0), 0.001, 0.5)
+    plain = spooled(tmp_path / "s", Listed(xyz), 300, lattice)[0].content
+    kept = spooled(tmp_path / "s", Listed(xyz), 300, lattice, keep=frozenset({"scan"}))[0].content
+    dtype = spool_dtype(BuildConfig(keep=frozenset({"scan"})))
+    unit = SpoolUnit(Listed(xyz), 3, 0, None, 300, lattice, BuildConfig(), dtype, tmp_path / "s", "n", 999)
+    result = spool_range(unit)
+    assert result.content == plain != kept
+    (rows,) = Spool(tmp_path / "s", dtype, lattice).rows(int(voxel_keys(np.zeros((1, 3), np.int64))[0]))[-1:]
+    assert (rows["scan_index"] == 3).all()
+    assert (np.diff(row_codes(rows).astype(np.int64)) >= 0).all()
+
+
+@pytest.mark.parametrize("count", [299, 301])
+def test_a_scan_that_changes_between_the_passes_is_refused(count: int, tmp_path: Path) -> None:
     lattice = make_lattice((0, 0, 0), 0.001, 8.0)
-    with pytest.raises(ScanError, match="300 points, 299 a moment ago"):
-        spooled(tmp_path / "s", listed(tmp_path, xyz), 299, lattice, 100, frozenset())
+    with pytest.raises(ScanError, match=f"300 points, {count} a moment ago"):
+        spooled(tmp_path / "s", Listed(make_scan("noise", 2, 300), 300), count, lattice, 100)
 
 
-# --- the lattice ------------------------------------------------------------------------------------------
+def test_a_note_of_runs_holds_while_they_are_as_long_as_they_were(tmp_path: Path) -> None:
+    lattice = make_lattice((0, 0, 0), 0.001, 8.0)
+    result, _ = spooled(tmp_path / "s", Listed(make_scan("noise", 2, 300)), 300, lattice, 200)
+    noted = load_spooled(dump_spooled(result))
+    assert noted == result
+    holds = RunsHold(tmp_path / "s")
+    assert holds(noted)
+    path = tmp_path / "s" / list(result.runs)[1]
+    path.write_bytes(path.read_bytes()[:-1])
+    assert not holds(noted)
+    path.unlink()
+    assert not holds(noted)
 
 
-def survey_on(folder: Path, lattice: SourceLattice | None, low: float = 0.0) -> Survey:
-    """The survey of a scan whose source says this of its lattice."""
-    scan = listed(folder, np.full((1, 3), low))
-    scan.lattice = lattice
-    return survey_scan(scan)
-
-
-def grid(scale: float, offset: float = 0.0) -> SourceLattice:
-    """A source's lattice, the same on each axis."""
-    return SourceLattice((scale,) * 3, (offset,) * 3)
-
-
-CHOICES = {
-    "one lattice": ([grid(0.002), grid(0.002)], {}, 0.002, "sources"),
-    "offsets apart by whole steps": ([grid(0.01), grid(0.01, 123456.78)], {}, 0.01, "sources"),
-    "offsets apart by a part": ([grid(0.01), grid(0.01, 0.005)], {}, 1e-4, "default"),
-    "other scales": ([grid(0.01), grid(0.001)], {}, 1e-4, "default"),
-    "axes of other scales": ([SourceLattice((0.01, 0.01, 0.001), (0.0,) * 3)], {}, 1e-4, "default"),
-    "one without": ([grid(0.01), None], {}, 1e-4, "default"),
-    "none with": ([None], {}, 1e-4, "default"),
-    "given": ([grid(0.01)], {"resolution": 0.005}, 0.005, "given"),
-    "too fine to store": ([grid(1e-7)], {}, 1e-4, "default"),
-    "too fine for the voxel": ([grid(2e-6)], {"voxel": 80.0}, 1e-4, "default"),
-    "coarser than a voxel": ([grid(10.0)], {}, 1e-4, "default"),
-    "no number": ([grid(0.01), grid(0.01, float("nan"))], {}, 1e-4, "default"),
-}
-
-
-@pytest.mark.parametrize("name", CHOICES)
-def test_the_sources_lattice_is_taken_where_they_share_one(name: str, tmp_path: Path) -> None:
-    lattices, options, step, source = CHOICES[name]
-    surveys = [survey_on(tmp_path, lattice, low=7.0 - i) for i, lattice in enumerate(lattices)]
-    lattice, found = choose_lattice(surveys, BuildConfig(**options))
-    assert (lattice.step, found) == (step, source)
-    assert lattice.origin == (7.0 - (len(lattices) - 1),) * 3
-
-
-def test_an_impossible_resolution_is_refused(tmp_path: Path) -> None:
-    for resolution in (1e-7, 100.0):
-        with pytest.raises(BadRequestError):
-            choose_lattice([survey_on(tmp_path, None)], BuildConfig(resolution=resolution))
-
-
-def test_las_and_text_files_are_surveyed_alike(tmp_path: Path) -> None:
-    xyz = write_las(tmp_path / "a.las", np.random.default_rng(1).integers(-1000, 1000, (50, 3)))
-    write_xyz(tmp_path / "a.xyz", xyz)
-    for name in ("a.las", "a.xyz"):
-        (scan,), fault = open_all(tmp_path / name, None)
-        survey = survey_scan(scan)
-        assert (survey.count, survey.fault, fault) == (50, "", "")
-        assert np.array_equal([survey.low, survey.high], [xyz.min(axis=0), xyz.max(axis=0)])
-        assert len(survey.sha256) == 64
+def test_memory_bounds_a_run() -> None:
+    plain, full = (spool_dtype(BuildConfig(keep=keep)) for keep in (frozenset(), frozenset({"intensity"})))
+    assert run_points(0, plain) == partition.LEAST_RUN_POINTS
+    most = run_points(1 << 30, plain)
+    assert most * partition.SPOOL_BYTES_A_POINT + partition.SPOOL_BYTES <= 1 << 30
+    assert run_points(1 << 30, full) < most

@@ -1,7 +1,6 @@
 """Scans in, one archive out: the same bytes however it is made, every error by name, nothing left behind."""
 
 import fcntl
-import re
 import shutil
 import subprocess
 import sys
@@ -13,8 +12,10 @@ import hdf5plugin  # noqa: F401  see test_two_jobs_write_the_bytes_of_one
 import laspy
 import numpy as np
 import pytest
+import solidcloud.builder.partition as partition
 import solidcloud.builder.pipeline as pipeline
 import solidcloud.builder.shards as shards
+import solidcloud.builder.survey as survey
 from scans import WITH_POINTS, make_scan, write_las, write_ply, write_xyz
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import BuildSummary, build_archive
@@ -120,11 +121,14 @@ def test_a_small_memory_bound_gives_several_runs_and_the_same_bytes(
     monkeypatch.setattr(pipeline, "_spool", counted)
     options = {"radius": 0.001, "leaf": 32, "degree": 8, "cell_points": 4096}
     build([tmp_path / "a.las"], out / "a", **options)
-    # 64 MB, and 1,000 bytes a point claimed by the spool: runs of 67,108 points, at least one a block.
-    monkeypatch.setattr(pipeline, "SPOOL_BYTES_A_POINT", 1000)
+    # 64 MB, and 100,000 bytes a point claimed by the spool: runs of 2^18 points.
+    monkeypatch.setattr(partition, "SPOOL_BYTES_A_POINT", 100_000)
+    monkeypatch.setattr(partition, "LEAST_RUN_POINTS", 1 << 18)
     build([tmp_path / "a.las"], out / "b", memory_bytes=64 << 20, **options)
-    assert runs == [1, 3]
-    assert content(out / "a") == content(out / "b")
+    monkeypatch.setattr(survey, "RANGE_POINTS", (1 << 17, 1 << 17))
+    build([tmp_path / "a.las"], out / "c", **options)
+    assert runs == [1, 3, 5]
+    assert content(out / "a") == content(out / "b") == content(out / "c")
 
 
 def test_the_same_points_from_any_format_give_the_same_shards(out: Path, tmp_path: Path) -> None:
@@ -177,7 +181,7 @@ def test_an_archive_is_sound_and_summed_up(scans: list[Path], out: Path) -> None
         assert summary.voxels == len(archive.voxels)
         assert (summary.radius, summary.moved_max) == (header.radius, header.moved_max)
     assert summary.bytes == sum(map(len, content(out / "a").values()))
-    assert set(summary.stages) == {"survey", "spool", "build", "radius"}
+    assert list(summary.stages) == ["survey", "spool", "build", "radius", "verify", "publish"]
     assert (summary.skipped, summary.faults) == ({}, ())
 
 
@@ -386,8 +390,8 @@ def test_the_lock_of_another_process_is_seen(scans: list[Path], out: Path) -> No
     build(scans, out / "a")
 
 
-def test_what_a_killed_build_left_is_removed(scans: list[Path], out: Path) -> None:
-    left = out / ".a.building" / "shards"
+def test_what_no_note_vouches_for_is_removed(scans: list[Path], out: Path) -> None:
+    left = out / ".a.building" / "archive" / "shards"
     left.mkdir(parents=True)
     (left / "0-000000.h5").write_bytes(b"half a shard")
     build(scans, out / "a")
@@ -396,18 +400,27 @@ def test_what_a_killed_build_left_is_removed(scans: list[Path], out: Path) -> No
 
 
 @pytest.mark.parametrize(
-    "stage", ["_spool", "_build_voxels", "_measure_radius", "verify_archive", "publish_folder"]
+    "stage", ["_spool", "_build_shards", "_measure_radius", "verify_archive", "publish_folder"]
 )
-def test_a_failure_at_any_stage_leaves_nothing(
+def test_a_full_disk_is_named_and_the_same_command_goes_on(
     stage: str, scans: list[Path], out: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(*_: object, **__: object) -> None:
-        raise OSError(28, "No space left on device")
+        (out / ".a.building" / "half.tmp").write_bytes(b"half")
+        raise OSError(28, "No space left on device", "some.file")
 
-    monkeypatch.setattr(pipeline, stage, fail)
-    with pytest.raises(OSError, match="No space left"):
-        build(scans, out / "a")
-    assert not list(out.iterdir())
+    build(scans, out / "b")
+    with monkeypatch.context() as full:
+        full.setattr(pipeline, stage, fail)
+        with pytest.raises(SolidcloudError, match=r"no space left on the disk.*same command again") as caught:
+            build(scans, out / "a")
+    assert str(caught.value).startswith(str(out))
+    assert caught.value.exit_code == 1
+    assert sorted(p.name for p in out.iterdir()) == [".a.building", "b"]
+    assert not list(out.rglob("*.tmp"))
+    build(scans, out / "a")
+    assert content(out / "a") == content(out / "b")
+    assert sorted(p.name for p in out.iterdir()) == ["a", "b"]
 
 
 def test_a_record_that_does_not_read_back_fails_the_build(
@@ -438,16 +451,7 @@ def test_a_build_that_cannot_fit_the_disk_is_refused(
     monkeypatch.setattr(pipeline.shutil, "disk_usage", lambda _: usage)
     with pytest.raises(SolidcloudError, match="1000 bytes free, the build needs about"):
         build(scans, out / "a")
-    assert not list(out.iterdir())
-
-
-def test_a_voxel_too_dense_for_the_memory_is_refused(
-    scans: list[Path], out: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(pipeline, "VOXEL_BYTES_A_POINT", 64 << 20)
-    with pytest.raises(BadRequestError, match=re.escape("give a smaller --voxel, a larger --memory")):
-        build(scans, out / "a")
-    assert not list(out.iterdir())
+    assert not list(out.rglob("*.run"))
 
 
 BAD_OPTIONS = [
@@ -469,8 +473,7 @@ def test_a_build_killed_between_its_two_renames_is_finished(tmp_path: Path) -> N
     target = tmp_path / "hall"
     build([scan], target)
     target.rename(tmp_path / ".hall.old")  # what --overwrite does first, and then it was killed
-    with pytest.raises(BadRequestError, match="already"):
-        build([scan], target)
+    assert build([scan], target).already
     assert sorted(path.name for path in tmp_path.iterdir()) == ["hall", "scan.xyz"]
     assert verify_archive(target).faults == ()
 

@@ -1,0 +1,162 @@
+"""What is being built, as a note says it: so that a build goes on only where it is the same, and says what is not."""
+
+from collections.abc import Callable, Mapping, Sequence
+from importlib import metadata
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from ..schemas.archive import Archive
+from ..schemas.errors import BadRequestError, FormatError
+from .config import BuildConfig
+from .sources import NOT_FINITE, Scan, sha256_of
+
+# To be raised when software of the same version may write other bytes than it did, or notes that mean other things.
+RESUME_VERSION = 1
+# Differences named in a message, at most.
+NAMED = 5
+
+# Options that are not named as they are stored, or that the command line does not have.
+_OPTION_NAMES = {"models": "--radius", "cell_points": "cell_points", "with_slab": "with_slab"}
+
+
+class Input(NamedTuple):
+    """One file of scans, or why it cannot be opened."""
+
+    path: Path
+    scans: list[Scan]
+    fault: str = ""
+
+
+def described(inputs: Sequence[Input], config: BuildConfig) -> dict[str, Any]:
+    """What is to be built: software, options and inputs, as JSON holds them. Memory and jobs are no part of it."""
+    return {
+        "software": {
+            "solidcloud": metadata.version("solidcloud"),
+            "resume": RESUME_VERSION,
+            # Its frames may differ from version to version.
+            "zstandard": metadata.version("zstandard"),
+        },
+        "options": {**config.identity(), "strict": config.strict, "skip_bad": config.skip_bad},
+        "inputs": [
+            entry for item in sorted(inputs, key=lambda item: str(item.path)) for entry in _entries(item)
+        ],
+    }
+
+
+def _entries(item: Input) -> list[dict[str, Any]]:
+    """What is noted of a file: its size and time, and of each scan in it its place in the world."""
+    try:
+        status = item.path.stat()
+        file = {"path": str(item.path), "bytes": status.st_size, "changed_ns": status.st_mtime_ns}
+    except OSError:
+        file = {"path": str(item.path), "bytes": -1, "changed_ns": -1}
+    if not item.scans:
+        return [{**file, "scan": 0, "pose": []}]
+    return [{**file, "scan": scan.index, "pose": scan.pose.tolist()} for scan in item.scans]
+
+
+def check_same(folder: Path, was: Mapping[str, Any], now: Mapping[str, Any]) -> None:
+    """Raise BadRequestError unless a build begun in `folder` is the one asked for, naming what differs."""
+    if was.get("software") != now["software"]:
+        found, here = _software(was.get("software", {})), _software(now["software"])
+        raise BadRequestError(
+            f"{folder}: a build was begun by {found}, this is {here}: use that, or give --fresh to start over"
+        )
+    options, remedies = _option_differences(was["options"], now["options"])
+    inputs = _input_differences(was["inputs"], now["inputs"])
+    if not options and not inputs:
+        return
+    remedies += ["the same scans as they were"] if inputs else []
+    raise BadRequestError(
+        f"{folder}: a build that was begun is another: {_listed(options + inputs)}: give {_listed(remedies)} to go on, "
+        "or --fresh to start over"
+    )
+
+
+def _software(noted: Mapping[str, Any]) -> str:
+    """Versions for a reader."""
+    return " ".join(f"{name} {version}" for name, version in sorted(noted.items())) or "other software"
+
+
+def _option_differences(was: Mapping[str, Any], now: Mapping[str, Any]) -> tuple[list[str], list[str]]:
+    """What differs, and what to give to go on."""
+    differ, give = [], []
+    for name in sorted({*was, *now}):
+        before, after = was.get(name), now.get(name)
+        if before == after:
+            continue
+        option = _OPTION_NAMES.get(name, f"--{name.replace('_', '-')}")
+        differ.append(f"{option} was {_value(before)}, is {_value(after)}")
+        unset = before in (None, False, "")
+        give.append(f"no {option}" if unset else option if before is True else f"{option} {before}")
+    return differ, give
+
+
+def _value(value: Any) -> str:
+    """The value of an option for a reader."""
+    if value is True:
+        return "given"
+    return "not given" if value in (None, False, "") else str(value)
+
+
+def _input_differences(was: list[dict[str, Any]], now: list[dict[str, Any]]) -> list[str]:
+    """Which scans came, went or changed."""
+    before, after = ({(e["path"], e["scan"]): e for e in entries} for entries in (was, now))
+    differ = []
+    for key in sorted({*before, *after}):
+        name = key[0] if key[1] == 0 else f"{key[0]} scan {key[1]}"
+        if key not in before:
+            differ.append(f"{name} was not there")
+        elif key not in after:
+            differ.append(f"{name} is missing")
+        elif before[key]["bytes"] != after[key]["bytes"]:
+            differ.append(f"{name} had {before[key]['bytes']} bytes, has {after[key]['bytes']}")
+        elif before[key] != after[key]:
+            what = "time" if before[key]["changed_ns"] != after[key]["changed_ns"] else "pose"
+            differ.append(f"{name} has another {what}")
+    return differ
+
+
+def _listed(items: list[str]) -> str:
+    """Some items for a reader."""
+    more = len(items) - NAMED
+    return "; ".join(items[:NAMED]) + (f"; and {more} more" if more > 0 else "")
+
+
+def is_whole(
+    target: Path, inputs: Sequence[Input], config: BuildConfig, tick: Callable[[int], None] = lambda _: None
+) -> bool:
+    """Whether `target` is already the archive of these scans with these options, by the scans' SHA-256.
+
+    tick: told the bytes of each file as it is hashed; none is where anything cheaper tells that it is another.
+    """
+    try:
+        with Archive(target) as archive:
+            header = archive.header
+    except FormatError:
+        return False
+    sources = header.sources
+    lost = any(s.fault for s in sources) and not config.skip_bad
+    unclean = any(NOT_FINITE in s.skipped for s in sources) and config.strict
+    if header.options != config.identity() or header.generation or lost or unclean:
+        return False
+    asked = {
+        (str(item.path), scan.index if scan else 0): scan
+        for item in inputs
+        for scan in (item.scans or [None])  # type: ignore[list-item]
+    }
+    if {(s.path, s.index) for s in sources} != set(asked) or len(sources) != len(asked):
+        return False
+    for s in sources:
+        scan = asked[s.path, s.index]
+        if (scan is None) != (not s.format) or (scan and not s.fault and (scan.pose != s.pose).any()):
+            return False
+    hashes: dict[str, str] = {}
+    for s in sources:
+        path = Path(s.path)
+        if asked[s.path, s.index] is not None and s.path not in hashes:
+            hashes[s.path] = sha256_of(path)
+            tick(path.stat().st_size)
+        if hashes.get(s.path, "") != s.sha256:
+            return False
+    return True

@@ -1,0 +1,250 @@
+"""The first pass over scans: bounds, counts, hashes and faults of each; then the lattice that all are quantised to.
+
+A scan that can seek is surveyed in ranges of its points, in any process, and its file's SHA-256 in another.
+"""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..schemas.errors import ScanError
+from ..schemas.voxel_grid import MAX_COORDINATE, MAX_VOXEL_STEPS, MIN_STEP, Lattice, make_lattice
+from .config import DEFAULT_STEP, BuildConfig
+from .kernels.spool import usable_bounds
+from .sources import NOT_FINITE, Scan, header_bounds, open_scans, sha256_of
+
+# A header's bounds are believed when no point lies farther outside [m]: they are rounded, but not by more.
+BOUNDS_WITHIN = 0.01
+
+# Points of a range, at least and at most. A worker is done with 2^24 in 2 s; a small scan is cut as well, so that two
+# workers have something to do. A file is cut into about RANGES, whatever the machine.
+RANGE_POINTS = (1 << 20, 1 << 24)
+RANGES = 32
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Survey:
+    """What the first pass found of one scan.
+
+    scan: the reader.  sha256: of its file.  count: points that can be kept.
+    low, high: (3,) float64 world [m] of those; infinite when there are none.  not_finite: points left out.
+    fault: why the scan cannot be used, or "".  region: (2, 3) world [m] that a faulty scan may have covered; None:
+    not known.  empty: nothing was lost with it.  parts: of each of its ranges.
+    """
+
+    scan: Scan | None
+    path: Path
+    sha256: str
+    count: int
+    low: NDArray[np.float64]
+    high: NDArray[np.float64]
+    not_finite: int
+    fault: str = ""
+    region: NDArray[np.float64] | None = None
+    empty: bool = False
+    parts: "tuple[Part, ...]" = ()
+
+    @property
+    def dropped(self) -> dict[str, int]:
+        """Reason -> points left out: by the reader, and for being not finite or too far away."""
+        found = sum((Counter(part.dropped) for part in self.parts), Counter[str]())
+        found[NOT_FINITE] += self.not_finite
+        return {reason: count for reason, count in found.items() if count}
+
+    @property
+    def unclean(self) -> int:
+        """Points, or triangles of a sampled mesh, that were left out because they are not finite."""
+        return self.dropped.get(NOT_FINITE, 0)
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """What was found in a range of a scan. dropped: reason -> points the reader left out.
+
+    fault: why it could not be read to its end, or "".
+    """
+
+    start: int
+    stop: int | None
+    count: int
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+    not_finite: int
+    dropped: dict[str, int]
+    fault: str
+
+
+class RangeUnit(NamedTuple):
+    """A range of a scan to be surveyed; 0 to None of one that cannot seek. points: about."""
+
+    scan: Scan
+    start: int
+    stop: int | None
+    points: int
+
+
+def ranges(scan: Scan, points: int) -> list[RangeUnit]:
+    """The ranges a scan is read in: a function of it and of the points of all scans together (about)."""
+    count = scan.declared_count
+    if not scan.seekable or not count:
+        return [RangeUnit(scan, 0, None, count or 0)]
+    least, most = RANGE_POINTS
+    step = min(max(points // RANGES, least), most)
+    return [
+        RangeUnit(scan, start, min(start + step, count), min(step, count - start))
+        for start in range(0, count, step)
+    ]
+
+
+def survey_range(unit: RangeUnit) -> Part:
+    """Read a range of a scan once. A scan at fault is a result; nothing is raised but by the disk."""
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    count = seen = 0
+    fault = ""
+    try:
+        for block in unit.scan.blocks(start=unit.start, stop=unit.stop):
+            count += usable_bounds(block.xyz, MAX_COORDINATE, low, high)
+            seen += len(block.xyz)
+    except ScanError as error:
+        fault = str(error)
+    return Part(
+        unit.start,
+        unit.stop,
+        count,
+        tuple(low.tolist()),
+        tuple(high.tolist()),
+        seen - count,
+        dict(unit.scan.dropped),
+        fault,
+    )
+
+
+def dump_part(part: Part) -> dict[str, Any]:
+    """A part as its note says it."""
+    return asdict(part)
+
+
+def load_part(noted: dict[str, Any]) -> Part:
+    """A part from its note."""
+    return Part(**{**noted, "low": tuple(noted["low"]), "high": tuple(noted["high"])})
+
+
+def hash_file(path: Path) -> tuple[str, str]:
+    """The SHA-256 of a file, and "", or "" and why it cannot be read."""
+    try:
+        return sha256_of(path), ""
+    except ScanError as error:
+        return "", str(error)
+
+
+def joined(scan: Scan, parts: Sequence[Part], sha256: tuple[str, str]) -> Survey:
+    """The survey of a scan from those of its ranges and `hash_file`."""
+    low = np.min([part.low for part in parts], axis=0)
+    high = np.max([part.high for part in parts], axis=0)
+    count, not_finite = sum(part.count for part in parts), sum(part.not_finite for part in parts)
+    digest, unread = sha256
+    fault = unread or next((part.fault for part in parts if part.fault), "")
+    if fault:
+        return Survey(
+            scan,
+            scan.path,
+            digest,
+            0,
+            low,
+            high,
+            not_finite,
+            fault,
+            _region(scan, low, high),
+            False,
+            tuple(parts),
+        )
+    fault = (
+        ""
+        if count
+        else f"{scan.path}: scan {scan.index} holds no usable point, expected at least one: leave it out"
+    )
+    nothing_lost = count == 0 and not_finite == 0
+    region = None if count or nothing_lost else _region(scan, low, high)
+    return Survey(
+        scan, scan.path, digest, count, low, high, not_finite, fault, region, nothing_lost, tuple(parts)
+    )
+
+
+def survey_scan(scan: Scan) -> Survey:
+    """Survey one scan here and now: bounds, counts, and whether it can be read to its end."""
+    parts = [survey_range(unit) for unit in ranges(scan, scan.declared_count or 0)]
+    return joined(scan, parts, hash_file(scan.path))
+
+
+def open_all(path: Path, spacing: float | None) -> tuple[list[Scan], str]:
+    """The scans of one file, or the fault that keeps it from being opened."""
+    try:
+        return open_scans(path, spacing=spacing), ""
+    except ScanError as error:
+        return [], str(error)
+
+
+def unopened(path: Path, fault: str) -> Survey:
+    """The survey of a file that cannot be opened, or, with no fault, that holds no scan at all."""
+    none = np.zeros(3)
+    if not fault:
+        fault = f"{path}: holds no scan, expected at least one: leave it out"
+        return Survey(None, path, "", 0, none, none, 0, fault, None, empty=True)
+    return Survey(None, path, "", 0, none, none, 0, fault, header_bounds(path))
+
+
+def _region(scan: Scan, low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """Where a scan that broke off may have had points: its header's bounds and what was read of it.
+
+    None, not known: without such bounds, or when a point read lies outside them, for then they are wrong.
+    """
+    if scan.bounds is None:
+        return None
+    if (low < scan.bounds[0] - BOUNDS_WITHIN).any() or (high > scan.bounds[1] + BOUNDS_WITHIN).any():
+        return None
+    return np.stack([np.minimum(scan.bounds[0], low), np.maximum(scan.bounds[1], high)])
+
+
+def choose_lattice(surveys: list[Survey], config: BuildConfig) -> tuple[Lattice, str]:
+    """The dataset's lattice, and where its step is from: "given", "sources" or "default".
+
+    The origin is the least coordinate on each axis, exactly: so a scene moved by a shift that float64 holds exactly
+    is quantised to the same integers (NUMERICS.md case 1). Raises BadRequestError for impossible sizes.
+    """
+    origin = np.min([s.low for s in surveys], axis=0)
+    step, source = config.resolution, "given"
+    if step is None:
+        step, source = _shared_step(surveys), "sources"
+    if source == "sources" and not (
+        step and max(MIN_STEP, config.voxel / MAX_VOXEL_STEPS) <= step <= config.voxel
+    ):
+        step, source = DEFAULT_STEP, "default"
+    assert step is not None
+    return make_lattice(origin, step, config.voxel), source
+
+
+def _shared_step(surveys: list[Survey]) -> float | None:
+    """The step of the lattice on which all sources lie, if they share one: same scale, offsets apart by whole steps."""
+    lattices = [s.scan.lattice for s in surveys if s.scan is not None]
+    if not lattices or any(lattice is None for lattice in lattices):
+        return None
+    first = lattices[0]
+    assert first is not None
+    step = first.scale[0]
+    for lattice in lattices:
+        assert lattice is not None
+        if any(scale != step for scale in lattice.scale):
+            return None
+        apart = (np.array(lattice.offset) - np.array(first.offset)) / step
+        # Offsets are decimal text rounded to float64: a millionth of a step is theirs, more is another lattice.
+        if (
+            not np.isfinite(apart).all()
+            or (np.abs(apart - np.rint(apart)) > 1e-6 * np.maximum(1, np.abs(apart) * 1e-9)).any()
+        ):
+            return None
+    return float(step)

@@ -1,0 +1,325 @@
+"""The list of scans that a build reads: found by their headers, written as TOML for hands to edit, read back.
+
+`inspect` makes entries of files and folders, `write_scan_list` and `read_scan_list` a file of them, `inputs` what a
+build opens: files and folders as they are, or a list with what was changed in it. Nothing here reads points, but the
+text of PTX and PTS files, in which the second scan can only be found by reading past the first.
+"""
+
+import math
+import os
+import tomllib
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import tomli_w
+from numpy.typing import NDArray
+
+from ..schemas.errors import BadRequestError, ScanError
+from .progress import Progress, Silent
+from .sources import METRES, TURNS, Scan, header_bounds, open_scans, placed, scan_files, sha256_of
+
+SUFFIX = ".toml"
+VERSION = 1
+
+HEAD = """\
+# Scans for `solidcloud build`, as their headers describe them. Edit by hand:
+#   use    false leaves a scan out: the archive says nothing of where it was.
+#   units  what a length in the file is: {units}.
+#   scale  multiplies coordinates besides.
+#   up     which axis of the file is up: z, y or x. Scans are turned so that it is z.
+#   pose   four rows of four: where the scan is, in metres with z up, after units, scale and up. Written here
+#          is what the file itself says, in its own units; left as it is, or left out, that is applied first.
+# The rest is for the record: count, low and high (bounds in the file's units, as declared), crs, sha256, fault.
+"""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScanEntry:
+    """One scan of a list.
+
+    path, index: its file, and which of the scans in it, from 0.  format: as `Scan` says, "" where not known.
+    count: points that its header declares; None: not said.  bounds: (2, 3) as declared, in the file's units and frame
+    or where its pose puts it; None: not said.  pose: (4, 4), None where there is none.  units, up: keys of METRES and
+    TURNS.  scale: besides.  crs: text of the coordinate reference system, or "".  sha256: of the file, "" where not
+    asked.  use: whether a build takes it.  fault: why it cannot be read, or "".
+    """
+
+    path: Path
+    index: int = 0
+    format: str = ""
+    count: int | None = None
+    bounds: NDArray[np.float64] | None = None
+    pose: NDArray[np.float64] | None = None
+    units: str = "m"
+    up: str = "z"
+    scale: float = 1.0
+    crs: str = ""
+    sha256: str = ""
+    use: bool = True
+    fault: str = ""
+
+
+class Input(NamedTuple):
+    """One file of a build: its scans, opened and placed, or why there are none.
+
+    region: (2, 3) world [m], where the points of a file that cannot be opened may have been; None: not known.
+    """
+
+    path: Path
+    scans: list[Scan]
+    fault: str = ""
+    region: NDArray[np.float64] | None = None
+
+
+def inspect(
+    paths: Iterable[Path], *, with_sha256: bool = False, progress: Progress | None = None
+) -> list[ScanEntry]:
+    """The scans of files and folders by their headers, in the order of `scan_files`.
+
+    A file that cannot be read is an entry with a fault, a file that holds no scan (E57 may) one too. Raises ScanError
+    for a path that does not exist and a folder without scans.
+    """
+    files = scan_files(paths)
+    progress = progress or Silent()
+    progress.start("inspect", len(files), "files")
+    entries: list[ScanEntry] = []
+    for path in files:
+        entries += _inspect_file(path, with_sha256)
+        progress.advance(1)
+    progress.finish()
+    return entries
+
+
+def _inspect_file(path: Path, with_sha256: bool) -> list[ScanEntry]:
+    """The scans of one file."""
+    digest = ""
+    try:
+        digest = sha256_of(path) if with_sha256 else ""
+        scans = open_scans(path)
+    except ScanError as error:
+        return [ScanEntry(path, bounds=header_bounds(path), sha256=digest, fault=str(error))]
+    if not scans:
+        return [ScanEntry(path, sha256=digest, fault=f"{path}: holds no scan, expected at least one")]
+    return [
+        ScanEntry(
+            path,
+            scan.index,
+            scan.format,
+            scan.declared_count,
+            scan.bounds,
+            None if np.array_equal(scan.pose, np.eye(4)) else scan.pose,
+            scan.units,
+            scan.up,
+            1.0,
+            scan.crs,
+            digest,
+        )
+        for scan in scans
+    ]
+
+
+def write_scan_list(path: Path, entries: Sequence[ScanEntry]) -> None:
+    """Write a list of scans as TOML, their paths relative to it. Replaces a file of that name."""
+    folder = Path(path).parent
+    tables = [_table(entry, folder) for entry in entries]
+    head = HEAD.format(units=", ".join(METRES))
+    text = head + "\n" + tomli_w.dumps({"version": VERSION, "scan": tables})
+    Path(path).write_text(text, encoding="utf-8")
+
+
+def _table(entry: ScanEntry, folder: Path) -> dict[str, Any]:
+    """One scan as a table, without what is not known."""
+    low, high = ([], []) if entry.bounds is None else entry.bounds.tolist()
+    table = {
+        "path": _relative(entry.path, folder),
+        "index": entry.index,
+        "use": entry.use,
+        "units": entry.units,
+        "scale": float(entry.scale),
+        "up": entry.up,
+        "pose": [] if entry.pose is None else entry.pose.tolist(),
+        "format": entry.format,
+        "count": entry.count,
+        "low": low,
+        "high": high,
+        "crs": entry.crs,
+        "sha256": entry.sha256,
+        "fault": entry.fault,
+    }
+    return {name: value for name, value in table.items() if value not in (None, "", [])}
+
+
+def _relative(path: Path, folder: Path) -> str:
+    """A path as seen from a folder, with slashes."""
+    seen = os.path.relpath(os.path.abspath(path), os.path.abspath(folder))
+    if seen.startswith(".."):
+        # Up from a folder that is reached by a link leads elsewhere.
+        seen = os.path.relpath(path.resolve(), folder.resolve())
+    return Path(seen).as_posix()
+
+
+def read_scan_list(path: Path) -> list[ScanEntry]:
+    """The scans of a list that was written here, and edited perhaps. Reads no scan.
+
+    Raises BadRequestError that names the file, the scan and the field, what was found and what was expected.
+    """
+    path = Path(path)
+    try:
+        with path.open("rb") as file:
+            document = tomllib.load(file)
+    except (OSError, ValueError) as error:
+        raise BadRequestError(
+            f"{path}: {error}, expected a list of scans: correct it, or write it with `solidcloud inspect`"
+        ) from error
+    unknown = sorted(set(document) - {"version", "scan"})
+    if unknown or document.get("version", VERSION) != VERSION or not isinstance(document.get("scan"), list):
+        found = f"unknown {unknown[0]}" if unknown else f"version {document.get('version')}"
+        raise BadRequestError(f"{path}: {found}, expected version = {VERSION} and a [[scan]] for each scan")
+    entries = [_entry(path, number, table) for number, table in enumerate(document["scan"], 1)]
+    seen: dict[tuple[Path, int], int] = {}
+    for number, entry in enumerate(entries, 1):
+        first = seen.setdefault((entry.path, entry.index), number)
+        if first != number:
+            raise BadRequestError(
+                f"{path}: scan {number} ({entry.path}, index {entry.index}): the same as scan {first}, "
+                "expected each scan once: remove one"
+            )
+    return entries
+
+
+class _Field(NamedTuple):
+    """What a field of a table may be. good: says whether a value is."""
+
+    expected: str
+    good: Any
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _is_numbers(value: Any, length: int) -> bool:
+    return isinstance(value, list) and len(value) == length and all(map(_is_number, value))
+
+
+def _is_pose(value: Any) -> bool:
+    rows = isinstance(value, list) and len(value) == 4 and all(_is_numbers(row, 4) for row in value)
+    return rows and list(value[3]) == [0, 0, 0, 1] and np.linalg.matrix_rank(np.array(value, float)) == 4
+
+
+def _is_whole(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and value >= 0
+
+
+_TEXT = _Field("text in quotes", lambda value: isinstance(value, str))
+_FIELDS = {
+    "path": _Field(
+        "the path of a file, seen from the list", lambda v: isinstance(v, str) and v and "\0" not in v
+    ),
+    "index": _Field("a whole number, 0 or more", _is_whole),
+    "use": _Field("true or false", lambda value: isinstance(value, bool)),
+    "units": _Field(" or ".join(METRES), lambda value: isinstance(value, str) and value in METRES),
+    "scale": _Field("a number above 0", lambda value: _is_number(value) and value > 0),
+    "up": _Field(" or ".join(TURNS), lambda value: isinstance(value, str) and value in TURNS),
+    "pose": _Field("four rows of four numbers that move points, the last 0 0 0 1", _is_pose),
+    "format": _TEXT,
+    "count": _Field("a whole number, 0 or more", _is_whole),
+    "low": _Field("three numbers", lambda value: _is_numbers(value, 3)),
+    "high": _Field("three numbers", lambda value: _is_numbers(value, 3)),
+    "crs": _TEXT,
+    "sha256": _TEXT,
+    "fault": _TEXT,
+}
+
+
+def _entry(path: Path, number: int, table: Any) -> ScanEntry:
+    """One scan out of its table, every field checked."""
+    name = table.get("path", "without path") if isinstance(table, dict) else "no table"
+    where = f"{path}: scan {number} ({name})"
+    if not isinstance(table, dict) or "path" not in table:
+        raise BadRequestError(f'{where}: no path, expected the path of its file: give path = "..."')
+    for field, value in table.items():
+        if field not in _FIELDS:
+            raise BadRequestError(
+                f"{where}: unknown field {field!r}, expected one of {', '.join(_FIELDS)}: correct or remove it"
+            )
+        if not _FIELDS[field].good(value):
+            raise BadRequestError(
+                f"{where}: {field} is {str(value)[:80]!r}, expected {_FIELDS[field].expected}: correct it"
+            )
+    if ("low" in table) != ("high" in table):
+        raise BadRequestError(f"{where}: low or high alone, expected both or none: remove it")
+    return ScanEntry(
+        path.parent / table["path"],
+        table.get("index", 0),
+        table.get("format", ""),
+        table.get("count"),
+        np.array([table["low"], table["high"]], np.float64) if "low" in table else None,
+        np.array(table["pose"], np.float64) if "pose" in table else None,
+        table.get("units", "m"),
+        table.get("up", "z"),
+        float(table.get("scale", 1.0)),
+        table.get("crs", ""),
+        table.get("sha256", ""),
+        table.get("use", True),
+        table.get("fault", ""),
+    )
+
+
+def inputs(paths: Sequence[Path], spacing: float | None = None) -> list[Input]:
+    """What a build reads: files and folders, and lists of scans (.toml), opened and placed in metres with z up.
+
+    spacing: of sampled meshes [m].  A file that cannot be opened is kept with its fault, for all of them to be named.
+    Raises ScanError for a path that does not exist and a folder without scans, BadRequestError for a broken list.
+    """
+    found: list[Input] = []
+    for path in map(Path, paths):
+        if path.suffix.lower() != SUFFIX or path.is_dir():
+            found += [_opened(file, None, spacing) for file in scan_files([path])]
+            continue
+        used = [entry for entry in read_scan_list(path) if entry.use]
+        if not used:
+            raise BadRequestError(f"{path}: no scan to use, expected at least one: set use = true")
+        files: dict[Path, list[ScanEntry]] = {}
+        for entry in used:
+            files.setdefault(entry.path, []).append(entry)
+        found += [_opened(file, entries, spacing) for file, entries in files.items()]
+    return found
+
+
+def _opened(path: Path, entries: list[ScanEntry] | None, spacing: float | None) -> Input:
+    """One file with the scans that are listed of it; None: all, as they are."""
+
+    @cache
+    def scans_spaced(factor: float) -> list[Scan]:
+        # A mesh is sampled in its own units.
+        return open_scans(path, spacing=None if spacing is None else spacing / factor)
+
+    try:
+        if entries is None:
+            return Input(path, [placed(scan) for scan in scans_spaced(1.0)])
+        scans = []
+        for entry in entries:
+            listed = scans_spaced(METRES[entry.units] * entry.scale)
+            if entry.index >= len(listed):
+                raise ScanError(
+                    f"{path}: holds {len(listed)} scans, expected one of index {entry.index}: correct the list"
+                )
+            scan = placed(
+                listed[entry.index], pose=entry.pose, units=entry.units, up=entry.up, scale=entry.scale
+            )
+            scan.crs = entry.crs or scan.crs
+            scans.append(scan)
+        return Input(path, scans)
+    except ScanError as error:
+        region = header_bounds(path)
+        moved = entries is not None and any(
+            (entry.units, entry.up, entry.scale) != ("m", "z", 1.0) or entry.pose is not None
+            for entry in entries
+        )
+        # A header's bounds say nothing of where a list has put the scan.
+        return Input(path, [], str(error), None if moved else region)

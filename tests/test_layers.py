@@ -21,6 +21,7 @@ DOORS = {
     "lazrs": ("builder/sources/las.py",),
     "pye57": ("builder/sources/e57.py", "builder/made/write.py"),
     "plyfile": ("builder/sources/ply.py",),
+    "tomli_w": ("builder/scan_list.py",),
     "trimesh": ("builder/sources/surface.py", "builder/made/"),
     "embreex": ("builder/made/scanner.py",),
     "distributed": ("builder/cluster.py",),

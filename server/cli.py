@@ -29,7 +29,7 @@ makers.command("figure")(make.make_figure)
 makers.command("walk")(make.make_walk)
 for verb in (inspect.inspect, build.build, archive.info, archive.validate, serve.serve, accuracy.accuracy, query.query):
     app.command()(verb)
-for verb in (generation.reload,):
+for verb in (generation.add, generation.remove, generation.reload):
     app.command()(verb)
 
 

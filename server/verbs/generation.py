@@ -1,10 +1,103 @@
-"""`solidcloud reload`: what a generation more of an archive means to a server."""
+"""`solidcloud add`, `remove`, `reload`: one generation more of an archive, and a server that is told of it."""
 
-from typing import Annotated
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from .options import AsJson, print_json
+from .options import ArchivePath, AsJson, parse_bytes, print_json
+
+if TYPE_CHECKING:
+    from ...builder.generation import ChangeSummary
+
+Jobs = Annotated[int, typer.Option(help="Worker processes; 0: one a core where it pays.")]
+Memory = Annotated[str, typer.Option(help="Bound on what the passes hold.")]
+
+
+def add(
+    archive: ArchivePath,
+    scans: Annotated[
+        list[Path], typer.Argument(help="Scans or folders of scans, or scans.toml, as build takes them.")
+    ],
+    again: Annotated[bool, typer.Option("--again", help="Also scans that are in already.")] = False,
+    jobs: Jobs = 0,
+    memory: Memory = "2GB",
+    as_json: AsJson = False,
+) -> None:
+    """Add scans to an archive: what they touch is built anew.
+
+    As a new generation, that a running server serves when it is told to reload.
+    """
+    from ...builder.generation import add_scans
+    from ..progress import progress_listener
+
+    with progress_listener() as bars:
+        summary = add_scans(
+            archive,
+            scans,
+            again=again,
+            jobs=jobs,
+            memory_bytes=parse_bytes(memory, "--memory"),
+            progress=bars,
+        )
+    _print(summary, "added", as_json)
+
+
+def remove(
+    archive: ArchivePath,
+    scans: Annotated[
+        list[str], typer.Argument(help="Paths of scans as info prints them, or their numbers in the index.")
+    ],
+    jobs: Jobs = 0,
+    memory: Memory = "2GB",
+    as_json: AsJson = False,
+) -> None:
+    """Remove scans from an archive that was built with --keep scan: what they touch is built anew.
+
+    As a new generation, that a running server serves when it is told to reload.
+    """
+    from ...builder.generation import remove_scans
+    from ..progress import progress_listener
+
+    with progress_listener() as bars:
+        summary = remove_scans(
+            archive, scans, jobs=jobs, memory_bytes=parse_bytes(memory, "--memory"), progress=bars
+        )
+    _print(summary, "removed", as_json)
+
+
+def _print(summary: "ChangeSummary", what: str, as_json: bool) -> None:
+    """Say what was done."""
+    now = summary.radius_now
+    if as_json:
+        print_json(
+            {
+                **summary._asdict(),
+                "archive": str(summary.archive),
+                "radius_now": None if now is None else now.radius,
+                "radius_now_error": None if now is None else now.error,
+            }
+        )
+        return
+    from ..console import bytes_text, length_text, print_facts
+
+    stages = ", ".join(f"{stage} {seconds:.1f}" for stage, seconds in summary.stages.items())
+    dead = f", {bytes_text(summary.dead_bytes)} left behind in older ones" if summary.dead_bytes else ""
+    radius = length_text(summary.radius)
+    if now is not None:
+        change = 100 * (now.radius / summary.radius - 1) if summary.radius else 0.0
+        radius += f" as it was; of the points now {length_text(now.radius)} ({change:+.1f} %)"
+    print_facts(
+        (
+            ("archive", f"{summary.archive}, generation {summary.generation}"),
+            *((what, scan) for scan in summary.scans),
+            ("points", f"{summary.points:,}, were {summary.points_before:,}"),
+            ("voxels", f"{summary.built:,} of {summary.voxels:,} built, {summary.gone:,} emptied"),
+            ("written", f"{bytes_text(summary.bytes)} in new shards{dead}"),
+            ("radius", radius),
+            ("time", f"{summary.seconds:.1f} s ({stages})"),
+        )
+    )
 
 
 def reload(

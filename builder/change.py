@@ -1,0 +1,193 @@
+"""An archive that is being changed: locked, what is made of it in a hidden folder, put in its place in one rename.
+
+New shards stand beside the old ones under names of their own, and the index that names them replaces the old one: so
+there is never anything but the old archive or the new one. A shard that no index names any more is deleted after, and
+what a killed run left goes with the next one.
+"""
+
+import os
+import re
+import shutil
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..schemas.archive import INDEX_NAME, SHARD_FOLDER, Archive, sync_folder
+from ..schemas.errors import BadRequestError, FormatError
+from ..schemas.index import Header
+from .config import BuildConfig
+from .executor import Executor, make_executor, worker_count
+from .pipeline import jobs_that_fit
+from .progress import Progress, Silent
+from .spool import spool_dtype
+from .workplace import PREVIEW_NAME, locked
+
+# Points of a unit that reads stored voxels: a few records at a time, whatever the machine.
+UNIT_POINTS = 1 << 21
+
+_OURS = re.compile(r"[0-9]{1,9}-[0-9]{1,9}\.h5(\..*\.?tmp|\.tmp)?")
+
+
+class Change:
+    """A change on its way. archive: as it is.  target: its folder.  folder: the hidden one."""
+
+    def __init__(
+        self,
+        target: Path,
+        folder: Path,
+        archive: Archive,
+        config: BuildConfig,
+        executor: Executor,
+        progress: Progress,
+    ) -> None:
+        self.target, self.folder, self.archive, self.config = target, folder, archive, config
+        self.executor, self.progress = executor, progress
+        self.dtype = spool_dtype(config)
+        self.begin = time.perf_counter()
+        self.seconds: dict[str, float] = {}
+
+    @property
+    def share(self) -> int:
+        """The bytes that each job may hold."""
+        return self.config.memory_bytes // self.executor.jobs
+
+    @property
+    def with_classes(self) -> bool:
+        """Whether points have radius classes."""
+        return self.archive.header.radius_class
+
+    @contextmanager
+    def stage(self, name: str, total: int, unit: str) -> Iterator[None]:
+        """Time a stage, and tell who listens."""
+        begin = time.perf_counter()
+        self.progress.start(name, total, unit)
+        try:
+            yield
+        finally:
+            self.progress.finish()
+            self.seconds[name] = time.perf_counter() - begin
+
+    def run(self, function: Callable[[Any], Any], units: Sequence[Any]) -> list[Any]:
+        """function(unit) of each unit, which has `points`, in order; progress goes by them."""
+        return list(self.executor.map(function, units, self.progress, lambda unit: unit.points))
+
+    def units_of(self, rows: NDArray[np.int64]) -> list[tuple[tuple[int, ...], int]]:
+        """Rows of the index in runs of about UNIT_POINTS: (rows, points) each."""
+        points = self.archive.voxels["rows"][rows, 2].astype(np.int64)
+        if not len(rows):
+            return []
+        cuts = np.flatnonzero(np.diff((np.cumsum(points) - points) // UNIT_POINTS, prepend=-1))
+        ends = [*cuts[1:].tolist(), len(rows)]
+        return [
+            (tuple(rows[a:b].tolist()), int(points[a:b].sum()))
+            for a, b in zip(cuts.tolist(), ends, strict=True)
+        ]
+
+
+@contextmanager
+def changing(target: Path, jobs: int, memory_bytes: int, progress: Progress | None) -> Iterator[Change]:
+    """An archive locked and opened to be changed, and a hidden folder to do it in, which goes in the end."""
+    target = target.resolve()
+    if not (target / INDEX_NAME).is_file():
+        raise FormatError(
+            f"{target}: no archive here ({INDEX_NAME} not found): build one with `solidcloud build`"
+        )
+    with locked(target), Archive(target) as archive:
+        config = config_of(archive.header, target, jobs, memory_bytes)
+        folder = target.parent / f".{target.name}.changing"
+        shutil.rmtree(folder, ignore_errors=True)
+        delete_orphans(target, {name for name, _ in archive.shards()})
+        for name in ("spool", "before", SHARD_FOLDER):
+            (folder / name).mkdir(parents=True)
+        try:
+            jobs = jobs_that_fit(worker_count(jobs, archive.header.points), config)
+            with make_executor(config, jobs) as executor:
+                yield Change(target, folder, archive, config, executor, progress or Silent())
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+def config_of(header: Header, target: Path, jobs: int, memory_bytes: int) -> BuildConfig:
+    """The options an archive was built with. BadRequestError for those under which a scan cannot be added later."""
+    stored = dict(header.options)
+    known = set(BuildConfig().identity()) | {"cells", "models"}
+    if others := sorted(set(stored) - known):
+        raise BadRequestError(
+            f"{target}: built with {', '.join(others)}, which look at all scans at once: build again"
+        )
+    for name in ("keep", "models"):
+        if name in stored:
+            stored[name] = frozenset(filter(None, stored[name].split(",")))
+    return BuildConfig(**stored, jobs=jobs, memory_bytes=memory_bytes)
+
+
+def delete_orphans(target: Path, named: set[str]) -> None:
+    """Delete the shards that an archive's index does not name, and what was being written when a run was killed."""
+    for path in (target / SHARD_FOLDER).iterdir():
+        if path.name not in named and _OURS.fullmatch(path.name):
+            path.unlink()
+
+
+def show_kept(change: Change, files: list[tuple[str, int]], new: set[str]) -> None:
+    """Show the shards that stay in the hidden folder too, so that it is read as an archive."""
+    for name, _ in files:
+        if name not in new:
+            (change.folder / SHARD_FOLDER / name).symlink_to(change.target / SHARD_FOLDER / name)
+
+
+class _ReadUnit(NamedTuple):
+    """New voxels to be read back. rows: of the index in `folder`.  points: in them."""
+
+    folder: Path
+    rows: tuple[int, ...]
+    points: int
+
+
+def _read_back(unit: _ReadUnit) -> None:
+    """Read voxels as a server does. Raises CorruptError."""
+    with Archive(unit.folder) as archive:
+        for row in unit.rows:
+            archive.read_voxel(row)
+
+
+def verify_new(change: Change, new: set[str]) -> None:
+    """Read back every voxel that was built; those that were not touched stand where they stood."""
+    with Archive(change.folder) as archive:
+        fresh = np.array([name in new for name, _ in archive.shards()], bool)
+        rows = np.flatnonzero(fresh[archive.voxels["shard"]])
+        points = archive.voxels["rows"][:, 2].astype(np.int64)
+    if not len(rows):
+        return
+    cuts = np.array_split(rows, max(1, int(points[rows].sum()) // UNIT_POINTS))
+    units = [_ReadUnit(change.folder, tuple(c.tolist()), int(points[c].sum())) for c in cuts if len(c)]
+    with change.stage("verify", int(points[rows].sum()), "points"):
+        change.run(_read_back, units)
+
+
+def publish(change: Change, new: list[str], named: set[str]) -> None:
+    """Give the new shards their place, then the new index its name, and delete what it does not name.
+
+    Killed before the index is renamed, the archive is the old one, and the shards it does not name are deleted by the
+    next run; killed after, it is the new one, and so are those that are not named any more.
+    """
+    shards = change.target / SHARD_FOLDER
+    moved = []
+    try:
+        for name in new:
+            os.rename(change.folder / SHARD_FOLDER / name, shards / name)
+            moved.append(shards / name)
+        sync_folder(shards)
+        (change.target / PREVIEW_NAME).unlink(missing_ok=True)  # of what it will not be any more
+        os.replace(change.folder / INDEX_NAME, change.target / INDEX_NAME)
+    except BaseException:
+        for path in moved:
+            with suppress(OSError):
+                path.unlink()
+        raise
+    sync_folder(change.target)
+    delete_orphans(change.target, named)

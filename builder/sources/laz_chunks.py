@@ -73,7 +73,8 @@ def check_chunks(
             )
         seen += count
         number += 1
-    if seen != points or number != chunks:
+    # Writers that end each chunk by hand leave an empty one behind the last.
+    if seen != points or not number <= chunks <= number + 1:
         raise _damaged(path, f"{seen} points in {number} chunks", f"{points} in {chunks} chunks")
     return laszip
 

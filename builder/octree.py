@@ -9,7 +9,7 @@ from ..schemas.voxel import CELL_BITS, VoxelData, top_shift
 from .balance import balance_cells, tree_limits
 from .cells import block_points, build_trees, join_rows, stored_cells, take_cells, take_rows
 from .config import BuildConfig
-from .kernels.octree import split_octree, voxel_codes
+from .kernels.octree import is_ascending, merge_order, split_octree, voxel_codes
 from .top import pack_top
 
 
@@ -27,14 +27,47 @@ class VoxelPoints(NamedTuple):
 
 
 def canonical(points: VoxelPoints) -> tuple[VoxelPoints, NDArray[np.uint64]]:
-    """Sort into Morton order, duplicates by their columns, so that any input order gives the same bytes."""
+    """Sort into Morton order, duplicates by their columns, so that any input order gives the same bytes.
+
+    Returns the points and their codes. What is in this order already stays where it is.
+    """
     codes = voxel_codes(points.local)
+    if is_ascending(codes):
+        return _with_ties_sorted(points, codes), codes
     columns = [c for c in (points.intensity, points.scan_index) if c is not None]
     order = np.lexsort((*columns, codes)) if columns else np.argsort(codes, kind="stable")
     return _taken(points, order), codes[order]
 
 
-def _taken(points: VoxelPoints, order: NDArray[np.int64]) -> VoxelPoints:
+def _with_ties_sorted(points: VoxelPoints, codes: NDArray[np.uint64]) -> VoxelPoints:
+    """Points in Morton order, those of equal codes sorted by their columns."""
+    columns = [c for c in (points.intensity, points.scan_index) if c is not None]
+    if not columns:
+        return points
+    same = np.append(codes[1:] == codes[:-1], False)
+    same[1:] |= same[:-1]
+    tied = np.flatnonzero(same)
+    order = np.arange(len(codes))
+    order[tied] = tied[np.lexsort((*(c[tied] for c in columns), codes[tied]))]
+    return _taken(points, order)
+
+
+def gather_voxel(parts: list[NDArray]) -> VoxelPoints:
+    """The points of rows of the spool, several sorted arrays of them, in Morton order."""
+    rows = np.concatenate(parts)
+    names = rows.dtype.names or ()
+    points = VoxelPoints(
+        np.ascontiguousarray(rows["local"]),
+        np.ascontiguousarray(rows["scan_index"]) if "scan_index" in names else None,
+        np.ascontiguousarray(rows["intensity"]) if "intensity" in names else None,
+    )
+    if len(parts) == 1:
+        return points
+    starts = np.cumsum([0, *map(len, parts)])
+    return _taken(points, merge_order(voxel_codes(points.local), starts))
+
+
+def _taken(points: VoxelPoints, order: NDArray[np.integer]) -> VoxelPoints:
     """The points in another order."""
     return VoxelPoints._make(None if column is None else column[order] for column in points)
 

@@ -14,7 +14,7 @@ from ..schemas.voxel import VoxelData
 from ..schemas.voxel_grid import Lattice
 from .classes import voxel_classes
 from .config import SHARD_POINTS, BuildConfig
-from .octree import VoxelPoints, build_voxel
+from .octree import build_voxel, gather_voxel
 from .spool import Spool
 
 
@@ -95,14 +95,3 @@ def build_shard(unit: ShardUnit) -> Shard:
     path = unit.folder / shard_name(unit.number, unit.generation)
     rows = write_shard(path, unit.number, unit.archive_id, voxels(), version=2 if with_classes else 1)
     return Shard(path.name, rows, path.stat().st_size, counts, capped)
-
-
-def gather_voxel(parts: list[NDArray]) -> VoxelPoints:
-    """All points of one voxel, from its rows in each run."""
-    rows = np.concatenate(parts)
-    names = rows.dtype.names or ()
-    return VoxelPoints(
-        np.ascontiguousarray(rows["local"]),
-        np.ascontiguousarray(rows["scan_index"]) if "scan_index" in names else None,
-        np.ascontiguousarray(rows["intensity"]) if "intensity" in names else None,
-    )

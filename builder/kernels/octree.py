@@ -62,3 +62,47 @@ def split_octree(codes, root_log2, largest_log2, capacity):
                 depth += 1
             end = begin
     return starts[:cells].copy(), sizes[:cells].copy()
+
+
+@nb.njit(nogil=True, cache=True)
+def is_ascending(codes):
+    """Whether codes (n,) uint64 ascend, equal ones admitted."""
+    falls = np.uint64(0)
+    for i in range(np.uint64(1), np.uint64(codes.shape[0])):
+        falls += np.uint64(codes[i] < codes[i - np.uint64(1)])
+    return falls == 0
+
+
+@nb.njit(nogil=True, cache=True)
+def merge_order(codes, starts):
+    """The order (n,) int32 in which codes (n,) uint64, n < 2^31, ascend, as each run of them does already.
+
+    starts: (k + 1,) int64, k >= 1, first of each run, and n. Of equal codes those of earlier runs come first. Runs are
+    merged in pairs; which of two comes next is taken without a branch, which would be guessed wrong every other time.
+    """
+    n, runs = codes.shape[0], starts.shape[0] - 1
+    ends = starts.copy()
+    values, spare_values = codes.copy(), np.empty(n, np.uint64)
+    order, spare = np.arange(n).astype(np.int32), np.empty(n, np.int32)
+    while runs > 1:
+        merged = 0
+        for run in range(0, runs, 2):
+            i, middle = ends[run], ends[run + 1]
+            j, end = middle, ends[min(run + 2, runs)]
+            to = i
+            while i < middle and j < end:
+                second = values[j] < values[i]
+                chosen = j if second else i
+                spare_values[to], spare[to] = values[chosen], order[chosen]
+                i += not second
+                j += second
+                to += 1
+            rest = i if i < middle else j
+            for left in range(end - to):
+                spare_values[to + left], spare[to + left] = values[rest + left], order[rest + left]
+            ends[merged + 1] = end
+            merged += 1
+        runs = merged
+        values, spare_values = spare_values, values
+        order, spare = spare, order
+    return order

@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 from scans import WITH_POINTS, make_steps
 from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.kernels.octree import split_octree, voxel_codes
-from solidcloud.builder.octree import VoxelPoints, build_voxel
+from solidcloud.builder.kernels.octree import is_ascending, merge_order, split_octree, voxel_codes
+from solidcloud.builder.octree import VoxelPoints, build_voxel, gather_voxel
+from solidcloud.builder.spool import canonical_columns, row_codes
+from solidcloud.schemas.codec import encode_voxel
 from solidcloud.schemas.voxel import CELL_BITS, VoxelData, check_voxel
 
 SIZES = [1000, 65536, 200_000, 1 << 21]
@@ -194,3 +196,36 @@ def test_columns_stay_with_their_points() -> None:
     found = runs_below(voxel, 1000)[0][0]
     assert np.array_equal(voxel.scan_index, found[:, 0])
     assert np.array_equal(voxel.intensity, (found @ [1, 1000, 1_000_000]).astype(np.float32))
+
+
+@pytest.mark.interpreted
+@pytest.mark.parametrize("sizes", [[5], [4, 4], [1, 30, 2], [0, 7, 7, 7, 3], [9, 1, 1, 1, 1, 1, 8]])
+def test_sorted_runs_are_merged_stably(sizes: list[int]) -> None:
+    rng = np.random.default_rng(3)
+    runs = [np.sort(rng.integers(0, 12, n)).astype(np.uint64) for n in sizes]
+    codes, starts = np.concatenate(runs), np.cumsum([0, *sizes])
+    before = codes.copy()
+    assert merge_order(codes, starts).tolist() == np.argsort(codes, kind="stable").tolist()
+    assert np.array_equal(codes, before)
+    assert is_ascending(np.sort(codes))
+    assert not is_ascending(np.append(np.sort(codes), np.uint64(0)))
+
+
+@pytest.mark.parametrize("columns", [(), ("scan_index",), ("scan_index", "intensity")])
+def test_a_voxel_gathered_from_runs_is_the_voxel(columns: tuple[str, ...]) -> None:
+    rng = np.random.default_rng(8)
+    kinds = {"scan_index": "<u2", "intensity": "<f4"}
+    rows = np.zeros(600, [("local", "<i4", (3,)), *((name, kinds[name]) for name in columns)])
+    rows["local"] = make_steps("duplicates", 1, 600, 1000)
+    for name in columns:
+        rows[name] = rng.integers(-2, 3, 600) + 2
+    if "intensity" in columns:
+        rows["intensity"][::3] = np.nan
+    order = [
+        np.lexsort((*canonical_columns(part), row_codes(part))) for part in np.split(rows, [7, 300, 420])
+    ]
+    parts = [part[by] for part, by in zip(np.split(rows, [7, 300, 420]), order, strict=True)]
+    plain = VoxelPoints(rows["local"], *(rows[name] for name in columns))
+    config = BuildConfig(cell_points=20, leaf=8)
+    a, b = build_voxel(9, plain, 1000, config), build_voxel(9, gather_voxel(parts), 1000, config)
+    assert encode_voxel(a, bytes(16)) == encode_voxel(b, bytes(16))

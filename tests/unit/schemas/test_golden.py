@@ -130,5 +130,7 @@ def test_a_build_today_gives_the_golden_points_and_cells(
         assert new.header.archive_id.hex() == expected["archive_id"]
         for row in range(len(golden.voxels)):
             a, b = new.read_voxel(row)[0], golden.read_voxel(row)[0]
-            for x, y in zip(a.cells, b.cells, strict=True):
-                assert np.array_equal(x, y)
+            # In what order cells stand below one node of the top hierarchy is free.
+            assert sorted(zip(*(c.tolist() for c in a.cells), strict=True)) == sorted(
+                zip(*(c.tolist() for c in b.cells), strict=True)
+            )

@@ -109,14 +109,14 @@ def workplace(target: Path, what: dict[str, Any], *, fresh: bool) -> Iterator[Wo
     folder = building_folder(target)
     journal = Journal(folder)
     if fresh:
-        shutil.rmtree(folder, ignore_errors=True)
+        remove_building(folder)
     begun = journal.recall(BEGUN)
     if begun is not None:
         check_same(folder, begun, json.loads(json.dumps(what)))
     place = Workplace(journal, folder / "archive")
     try:
         if begun is None:  # nothing, or killed before it could say what it was
-            shutil.rmtree(folder, ignore_errors=True)
+            remove_building(folder)
             folder.mkdir()
             journal.note(BEGUN, what)
         remove_temporaries(folder)
@@ -127,18 +127,27 @@ def workplace(target: Path, what: dict[str, Any], *, fresh: bool) -> Iterator[Wo
         if isinstance(error, BadRequestError | CorruptError) or (
             isinstance(error, ScanError) and not place.surveyed
         ):
-            shutil.rmtree(folder, ignore_errors=True)
+            remove_building(folder)
         elif folder.exists():
             remove_temporaries(folder)
         raise
-    shutil.rmtree(folder, ignore_errors=True)
+    remove_building(folder)
 
 
 def forget_finished(target: Path, what: dict[str, Any]) -> None:
     """Remove what a build left that was killed just after it had published `what`."""
     folder = building_folder(target)
-    if Journal(folder).recall(BEGUN) == json.loads(json.dumps(what)):
-        shutil.rmtree(folder, ignore_errors=True)
+    if Journal(folder).recall(BEGUN) in (None, json.loads(json.dumps(what))):
+        remove_building(folder)
+
+
+def remove_building(folder: Path) -> None:
+    """Remove the hidden folder of a build, the note of what it is last: killed here, it can still be told."""
+    if folder.is_dir():
+        for path in folder.iterdir():
+            if path.is_dir():
+                shutil.rmtree(path, ignore_errors=True)
+    shutil.rmtree(folder, ignore_errors=True)
 
 
 def recover(target: Path) -> None:

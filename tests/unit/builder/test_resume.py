@@ -1,0 +1,308 @@
+"""A build that was interrupted goes on: killed anywhere, it ends in the same bytes, and only as what it was."""
+
+import gc
+import json
+import os
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import solidcloud.builder.pipeline as pipeline
+import solidcloud.builder.shards as shards
+import solidcloud.builder.survey as survey
+from scans import make_scan, write_las, write_xyz
+from solidcloud.builder.config import BuildConfig
+from solidcloud.builder.pipeline import BuildSummary, build_archive
+from solidcloud.builder.resume import check_same, described
+from solidcloud.builder.workplace import building_folder
+from solidcloud.schemas.errors import BadRequestError, ScanError
+
+
+class Killed(BaseException):
+    """The process is gone."""
+
+
+# What a process does to a disk that matters, beside writing to files of no name.
+DEEDS = ("replace", "rename", "fsync", "unlink", "rmdir", "mkdir")
+
+
+class Reaper:
+    """Lets a process do so many deeds and ends it before the next; none is done by who is dead. done: how many were."""
+
+    def __init__(self, patch: pytest.MonkeyPatch, most: int) -> None:
+        self.most, self.done, self.dead = most, 0, False
+        for name in DEEDS:
+            patch.setattr(os, name, self._instead(getattr(os, name)))
+
+    def _instead(self, deed: Callable[..., Any]) -> Callable[..., Any]:
+        def watched(*arguments: Any, **options: Any) -> Any:
+            if self.dead or self.done == self.most:
+                self.dead = True
+                raise Killed
+            self.done += 1
+            return deed(*arguments, **options)
+
+        return watched
+
+
+def build(target: Path, scans: list[Path], **options: Any) -> BuildSummary:
+    """Build in this process."""
+    given = {"voxel": 0.9, "cell_points": 60, "leaf": 16, "degree": 4, "jobs": 1, "radius": 0.001, **options}
+    return build_archive(scans, target, BuildConfig(**given))
+
+
+def content(archive: Path) -> dict[str, bytes]:
+    """Every file of an archive."""
+    return {str(p.relative_to(archive)): p.read_bytes() for p in sorted(archive.rglob("*")) if p.is_file()}
+
+
+@pytest.fixture
+def scans(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Path]:
+    """Two scans, one of which is read in three ranges; two shards are made of them."""
+    monkeypatch.setattr(survey, "RANGE_POINTS", (100, 100))
+    monkeypatch.setattr(shards, "SHARD_POINTS", 250)
+    raw = np.random.default_rng(2).integers(-1500, 1500, (250, 3))
+    write_las(tmp_path / "a.las", raw)
+    write_xyz(tmp_path / "b.xyz", make_scan("plane", 3, 150))
+    return [tmp_path / "a.las", tmp_path / "b.xyz"]
+
+
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_a_build_killed_at_any_deed_goes_on_to_the_same_bytes(
+    overwrite: bool, scans: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # The power stays on in this test, and fsync takes nine tenths of its time.
+    monkeypatch.setattr(os, "fsync", lambda _: None)
+    old: dict[str, bytes] = {}
+
+    def killed(out: Path, most: int) -> int:
+        """A build that is killed after so many deeds, or ends before; returns how many there were."""
+        nonlocal old
+        out.mkdir()
+        if overwrite:
+            build(out / "hall", scans[1:])
+            old = content(out / "hall")
+        with monkeypatch.context() as patch:
+            reaper = Reaper(patch, most)
+            with suppress(Killed):
+                build(out / "hall", scans, overwrite=overwrite)
+        gc.collect()  # the lock goes with the file that holds it, and the file with the traceback
+        return reaper.done
+
+    deeds = killed(tmp_path / "judge", 10**9)
+    expected = content(tmp_path / "judge" / "hall")
+    assert len(expected) == 3
+    assert deeds > 90
+    # What is overwritten plays a part at the end alone.
+    for most in range(deeds - 40 if overwrite else 0, deeds):
+        out = tmp_path / f"{most}"
+        assert killed(out, most) == most
+        # Nothing but a whole archive is ever under the name asked for.
+        there = content(out / "hall") if (out / "hall").exists() else None
+        assert there in (None, expected, old)
+        build(out / "hall", scans, overwrite=overwrite and there != expected)
+        assert content(out / "hall") == expected, f"killed after {most} deeds"
+        assert [p.name for p in out.iterdir()] == ["hall"], f"killed after {most} deeds"
+
+
+def test_what_was_done_is_not_done_again(
+    scans: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls: list[str] = []
+
+    def counted(name: str) -> None:
+        function = getattr(pipeline, name)
+
+        def instead(unit: Any) -> Any:
+            calls.append(name)
+            return function(unit)
+
+        monkeypatch.setattr(pipeline, name, instead)
+
+    for name in ("survey_range", "hash_file", "spool_range", "build_shard"):
+        counted(name)
+    with monkeypatch.context() as patch:
+        patch.setattr(pipeline, "verify_archive", lambda *_, **__: (_ for _ in ()).throw(OSError(5, "lost")))
+        with pytest.raises(Exception, match="lost"):
+            build(tmp_path / "hall", scans)
+    everything = ["hash_file"] * 2 + ["survey_range"] * 4 + ["spool_range"] * 4 + ["build_shard"] * 2
+    assert calls == everything
+    calls.clear()
+    folder = building_folder(tmp_path / "hall")
+    # A run that is gone, and a shard that is not as long as it was: their notes are not believed.
+    next((folder / "spool").glob("000001-*.run")).unlink()
+    shard = folder / "archive" / "shards" / "0-000001.h5"
+    shard.write_bytes(shard.read_bytes()[:-1])
+    build(tmp_path / "hall", scans[::-1], jobs=1, memory_bytes=100 << 20)
+    lost = calls.count("spool_range")
+    assert 1 <= lost <= 3
+    assert calls == ["spool_range"] * lost + ["build_shard"]
+    build(tmp_path / "judge", scans)
+    assert content(tmp_path / "hall") == content(tmp_path / "judge")
+
+
+def interrupted(target: Path, scans: list[Path], monkeypatch: pytest.MonkeyPatch, **options: Any) -> None:
+    """A build that Ctrl-C stopped just before its shards."""
+    with monkeypatch.context() as patch:
+        patch.setattr(pipeline, "_build_shards", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            build(target, scans, **options)
+    assert (building_folder(target) / "build.json").exists()
+
+
+OTHER = {
+    "voxel": (4.0, "--voxel was 0.9, is 4.0: give --voxel 0.9 to go on, or --fresh to start over"),
+    "resolution": (0.01, "--resolution was not given, is 0.01: give no --resolution to go on"),
+    "strict": (True, "--strict was not given, is given: give no --strict to go on"),
+    "thin": (0.05, "--thin was not given, is 0.05"),
+    "models": (frozenset({"mean", "local"}), "--radius was not given, is mean,local"),
+}
+
+
+@pytest.mark.parametrize("name", OTHER)
+def test_other_options_are_refused_by_name(
+    name: str, scans: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    interrupted(tmp_path / "hall", scans, monkeypatch)
+    value, expected = OTHER[name]
+    before = content(building_folder(tmp_path / "hall"))
+    with pytest.raises(BadRequestError) as caught:
+        build(tmp_path / "hall", scans, **{name: value})
+    assert expected in str(caught.value)
+    assert content(building_folder(tmp_path / "hall")) == before
+    build(tmp_path / "hall", scans, **{name: value, "fresh": True, "resolution": 0.01})
+    assert not building_folder(tmp_path / "hall").exists()
+
+
+def test_an_option_that_was_given_is_asked_for_again(
+    scans: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    interrupted(tmp_path / "hall", scans, monkeypatch, strict=True, keep=frozenset({"scan"}))
+    with pytest.raises(BadRequestError) as caught:
+        build(tmp_path / "hall", scans)
+    assert "--keep was scan, is not given; --strict was given, is not given" in str(caught.value)
+    assert "give --keep scan; --strict to go on" in str(caught.value)
+
+
+def test_other_scans_are_refused_by_name(
+    scans: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    interrupted(tmp_path / "hall", scans, monkeypatch)
+    more = write_xyz(tmp_path / "c.xyz", make_scan("plane", 4, 20))
+    cases: list[tuple[list[Path], str]] = [
+        (scans[:1], "b.xyz is missing"),
+        ([*scans, more], "c.xyz was not there"),
+    ]
+    for paths, expected in cases:
+        with pytest.raises(BadRequestError, match=expected):
+            build(tmp_path / "hall", paths)
+    was = scans[1].stat()
+    os.utime(scans[1], ns=(was.st_atime_ns, was.st_mtime_ns + 1))
+    with pytest.raises(BadRequestError, match=r"b\.xyz has another time: give the same scans as they were"):
+        build(tmp_path / "hall", scans)
+    scans[1].write_text("1 2 3\n")
+    with pytest.raises(BadRequestError, match=rf"b\.xyz had {was.st_size} bytes, has 6"):
+        build(tmp_path / "hall", scans)
+
+
+def test_other_software_is_refused(
+    scans: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    interrupted(tmp_path / "hall", scans, monkeypatch)
+    monkeypatch.setattr("solidcloud.builder.resume.RESUME_VERSION", 999)
+    with pytest.raises(
+        BadRequestError, match=r"begun by resume 1 .*this is resume 999 .*--fresh to start over"
+    ):
+        build(tmp_path / "hall", scans)
+
+
+def test_many_differences_are_counted() -> None:
+    was = {"software": {}, "options": {}, "inputs": []}
+    now = {
+        "software": {},
+        "options": {},
+        "inputs": [
+            {"path": f"{i}.las", "scan": 0, "bytes": 1, "changed_ns": 1, "pose": []} for i in range(9)
+        ],
+    }
+    with pytest.raises(BadRequestError, match=r"4\.las was not there; and 4 more: give the same scans"):
+        check_same(Path("hall"), was, now)
+    check_same(Path("hall"), now, json.loads(json.dumps(now)))
+
+
+def test_a_pose_and_a_file_that_cannot_be_opened_are_part_of_what_is_built(scans: list[Path]) -> None:
+    from solidcloud.builder.resume import Input
+    from solidcloud.builder.survey import open_all
+
+    opened = [Input(path, *open_all(path, None)) for path in scans]
+    what = described(opened, BuildConfig())
+    opened[0].scans[0].pose = np.diag([-1.0, -1, 1, 1])
+    with pytest.raises(BadRequestError, match=r"a\.las has another pose"):
+        check_same(Path("hall"), what, described(opened, BuildConfig()))
+    gone = [Input(scans[0].with_name("gone.las"), [], "no such file"), opened[1]]
+    (entry, _) = described(gone, BuildConfig())["inputs"][::-1]
+    assert (Path(entry["path"]).name, entry["bytes"], entry["pose"]) == ("gone.las", -1, [])
+
+
+def test_the_same_command_after_success_does_nothing(
+    scans: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = build(tmp_path / "hall", scans)
+    before = content(tmp_path / "hall")
+    monkeypatch.setattr(pipeline, "_build", lambda *_: pytest.fail("built again"))
+    again = build(tmp_path / "hall", scans[::-1], jobs=2, memory_bytes=100 << 20)
+    assert (first.already, again.already) == (False, True)
+    shared = ("archive", "points", "voxels", "shards", "bytes", "radius", "moved_max", "skipped", "faults")
+    assert [getattr(again, name) for name in shared] == [getattr(first, name) for name in shared]
+    assert content(tmp_path / "hall") == before
+
+
+def test_an_archive_of_anything_else_is_in_the_way(scans: list[Path], tmp_path: Path) -> None:
+    build(tmp_path / "hall", scans)
+    with pytest.raises(BadRequestError, match="an archive is here already"):
+        build(tmp_path / "hall", scans, degree=5)
+    with pytest.raises(BadRequestError, match="an archive is here already"):
+        build(tmp_path / "hall", scans[:1])
+    raw = np.random.default_rng(3).integers(-1500, 1500, (250, 3))
+    write_las(scans[0], raw)  # the same name, other points
+    with pytest.raises(BadRequestError, match="an archive is here already"):
+        build(tmp_path / "hall", scans)
+    assert not building_folder(tmp_path / "hall").exists()
+
+
+def test_an_archive_that_a_stricter_build_would_refuse_is_not_what_it_asks_for(tmp_path: Path) -> None:
+    xyz = make_scan("plane", 3, 150)
+    xyz[3] = 2e9
+    path = write_xyz(tmp_path / "a.xyz", xyz)
+    build(tmp_path / "hall", [path])
+    assert build(tmp_path / "hall", [path]).already
+    with pytest.raises(BadRequestError, match="an archive is here already"):
+        build(tmp_path / "hall", [path], strict=True)
+    (tmp_path / "bad.las").write_bytes(b"no LAS")
+    build(tmp_path / "yard", [path, tmp_path / "bad.las"], skip_bad=True)
+    assert build(tmp_path / "yard", [path, tmp_path / "bad.las"], skip_bad=True).already
+    with pytest.raises(BadRequestError, match="an archive is here already"):
+        build(tmp_path / "yard", [path, tmp_path / "bad.las"])
+
+
+def test_a_bad_scan_found_in_the_survey_leaves_nothing_and_later_ones_do(
+    scans: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(_: Any) -> None:
+        raise ScanError("b.xyz: changed")
+
+    out = tmp_path / "out"
+    with monkeypatch.context() as patch:
+        patch.setattr(pipeline, "_check_surveys", lambda *_: fails(None))
+        with pytest.raises(ScanError):
+            build(out / "hall", scans)
+    assert not out.exists()
+    with monkeypatch.context() as patch:
+        patch.setattr(pipeline, "spool_range", fails)
+        with pytest.raises(ScanError):
+            build(out / "hall", scans)
+    assert sorted(p.name for p in (out / ".hall.building" / "survey").iterdir())
+    assert not list(out.glob(".hall.lock"))

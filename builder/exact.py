@@ -3,16 +3,17 @@
 Slow, and on purpose: no compiled code, no number of a fixed width, and of the archive's rules only what FORMAT.md says.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..schemas.voxel import Links, VoxelData
-from .radius import voxel_points
 
 # The same nodes of the same archive every time, so that a fault found once is found again.
 SAMPLE_SEED = 2012
+# Leaf nodes whose points are Python's integers at a time: a node may have all points of a voxel below it.
+_LEAVES = 1 << 10
 
 
 def sample_nodes(counts: NDArray[np.int64], sample: int | None) -> list[NDArray[np.int64]]:
@@ -35,12 +36,14 @@ def loose_nodes(voxel: VoxelData, links: Links, nodes: Iterable[int]) -> list[in
     A node's numbers are whole lattice steps, or whole multiples of the top unit (schemas/FORMAT.md), so that both
     tests are of integers: |p - c|^2 <= r^2, and least <= normal . (p - c) <= greatest.
     """
-    points = voxel_points(voxel, links)
-    return [int(node) for node in nodes if not _encloses(voxel, links, int(node), points)]
+    leaves = np.flatnonzero(links.is_leaf)
+    # By first point: a cell that is one leaf node stands among the roots, before the others' leaf nodes.
+    leaves = leaves[np.argsort(links.first[leaves], kind="stable")]
+    return [int(node) for node in nodes if not _encloses(voxel, links, int(node), leaves)]
 
 
-def _encloses(voxel: VoxelData, links: Links, node: int, points: NDArray[np.int64]) -> bool:
-    """Whether one node's bound holds; points: all of the voxel (p, 3) [steps], in stored order."""
+def _encloses(voxel: VoxelData, links: Links, node: int, leaves: NDArray[np.int64]) -> bool:
+    """Whether one node's bound holds; leaves: the leaf nodes in the order of their points."""
     cell = int(links.cell[node])
     low = [0, 0, 0] if cell < 0 else voxel.cells.low[cell].tolist()
     unit = 1 << voxel.top_shift if cell < 0 else 1
@@ -50,14 +53,27 @@ def _encloses(voxel: VoxelData, links: Links, node: int, points: NDArray[np.int6
     nx, ny, nz = voxel.nodes.normal[node].tolist()
     least, greatest = voxel.nodes.slab[node].tolist()
     has_slab = bool(nx or ny or nz)
-    begin, end = _run(voxel, links, node)
-    for x, y, z in points[begin:end].tolist():
+    for x, y, z in _points(voxel, links, leaves, *_run(voxel, links, node)):
         dx, dy, dz = x - cx, y - cy, z - cz
         if dx * dx + dy * dy + dz * dz > square:
             return False
         if has_slab and not least <= nx * dx + ny * dy + nz * dz <= greatest:
             return False
     return True
+
+
+def _points(
+    voxel: VoxelData, links: Links, leaves: NDArray[np.int64], begin: int, end: int
+) -> Iterator[list[int]]:
+    """The points of the leaf nodes from the one whose first is `begin` to the one that ends at `end` [voxel steps]."""
+    a, b = np.searchsorted(links.first[leaves], [begin, end]).tolist()
+    for at in range(a, b, _LEAVES):
+        some = leaves[at : min(at + _LEAVES, b)]
+        count = voxel.nodes.count[some].astype(np.int64)
+        low = voxel.cells.low[links.cell[some]].astype(np.int64) + voxel.nodes.block_low[some]
+        first = int(links.first[some[0]])
+        points = voxel.points[first : first + int(count.sum())].astype(np.int64)
+        yield from (points + np.repeat(low, count, axis=0)).tolist()
 
 
 def _run(voxel: VoxelData, links: Links, node: int) -> tuple[int, int]:

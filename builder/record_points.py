@@ -1,15 +1,20 @@
 """The points of an opened record a block at a time: all, those in a box, or a sample."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..schemas.codec import OpenRecord
+from ..schemas.index import Header
+from ..schemas.voxel import top_shift
+from .kernels.nearest import Spheres
 from .kernels.records import Leaves, take_points
 
 BLOCK_POINTS = 1 << 16
+# By the name that `--keep` calls them: the field of a record, and its type.
+_COLUMNS = {"scan": ("scan_index", np.dtype("<u2")), "intensity": ("intensity", np.dtype("<f4"))}
 # No coordinate of a lattice is beyond.
 _EVERYWHERE = np.array([[-(1 << 62)] * 3, [1 << 62] * 3], np.int64)
 
@@ -38,6 +43,33 @@ def leaves_of(record: OpenRecord) -> Leaves:
         cells.low,
         cells.log2_size,
     )
+
+
+def spheres_of(record: OpenRecord) -> Spheres:
+    """A record's bounds as kernels take them."""
+    return Spheres(record.nodes.center, record.nodes.radius, np.int64(1 << top_shift(record.voxel_steps)))
+
+
+def stored_columns(header: Header) -> dict[str, np.dtype]:
+    """The columns of points that go out of an archive, by the name that `--keep` calls them: those it stores."""
+    kept = {"scan": header.scan_index, "intensity": header.intensity}
+    return {name: kind for name, (_, kind) in _COLUMNS.items() if kept[name]}
+
+
+def record_columns(columns: Iterable[str]) -> list[str]:
+    """What a record calls these columns (schemas/codec.py OPTIONAL_COLUMNS)."""
+    return [_COLUMNS[name][0] for name in columns]
+
+
+def read_columns(record: OpenRecord, columns: Iterable[str], rows: NDArray[np.int64]) -> dict[str, NDArray]:
+    """Columns of some points of a record, which has them, by name; rows: (m,), see Taken."""
+    found = {}
+    for name in columns:
+        field, kind = _COLUMNS[name]
+        at = record.dtype.fields[field][1]  # type: ignore[index]  # its dtype has fields
+        raw = np.stack([record.planes[at + i][rows] for i in range(kind.itemsize)], axis=1)
+        found[name] = np.ascontiguousarray(raw).view(kind)[:, 0]
+    return found
 
 
 def hash_limit(share: float) -> np.uint64:

@@ -1,8 +1,8 @@
 """The mean closest-point distance of an archive: over a sample of its distinct points, across voxel borders.
 
 A voxel is opened once for its own points. What may have something closer in another voxel is asked there in rounds,
-all that concerns one voxel together: so each is opened twice in all, and one at a time, whatever they hold (11 bytes a
-point of it are held; builder/record_points.py).
+all that concerns one voxel together: so each is opened twice in all, and one at a time, whatever they hold: 12 bytes a
+point of it, 16 where there are intensities, for its frame, its bytes and its nodes.
 """
 
 from collections.abc import Callable, Iterator
@@ -13,16 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..schemas.archive import Archive
-from ..schemas.codec import OpenRecord
-from ..schemas.voxel import top_shift
 from .executor import Executor
 from .kernels.boxes import BoxTree, make_box_tree, near_boxes
-from .kernels.nearest import FAR, Spheres, closest_in_record
+from .kernels.nearest import FAR, closest_in_record
 from .kernels.records import first_of_each
 from .portions import jobs_of, portions, run_units
 from .progress import Progress, Silent
 from .radius import SUM_UNITS, MeanDistance, mean_of_squares
-from .record_points import hash_limit, leaves_of, taken
+from .record_points import hash_limit, leaves_of, spheres_of, taken
 
 # Voxels that a point is asked in at a time. A corner has 7 around it.
 _NEAR_VOXELS = 8
@@ -172,7 +170,7 @@ def own_best(archive: Archive, row: int, share: float) -> tuple[Open, NDArray[np
     """What the sampled distinct points of one voxel know of their closest other, from that voxel: those that may have
     something closer elsewhere, and the squared distances [steps] of the others."""
     base, steps = _corners(archive)[row], archive.header.lattice.voxel_steps
-    record = archive.open_voxel(row)
+    record = archive.open_voxel(row, columns=())
     parts = list(taken(record, base, limit=hash_limit(share)))
     nothing = np.empty(0, np.int64)
     if not parts:
@@ -194,19 +192,13 @@ def other_best(
     archive: Archive, row: int, lattice: NDArray[np.int64], best: NDArray[np.int64]
 ) -> NDArray[np.int64]:
     """What best (q,) [steps, squared] becomes when points (q, 3) are asked in another voxel."""
-    record, best = archive.open_voxel(row), best.copy()
+    record, best = archive.open_voxel(row, columns=()), best.copy()
     each = np.arange(len(best) + 1)
     home = np.full(len(best), -1, np.int32)
     closest_in_record(
         leaves_of(record), spheres_of(record), lattice - _corners(archive)[row], each, home, best
     )
     return best
-
-
-def spheres_of(record: OpenRecord) -> Spheres:
-    """A record's bounds as kernels take them."""
-    unit = np.int64(1 << top_shift(record.voxel_steps))
-    return Spheres(record.nodes.center, record.nodes.radius, unit)
 
 
 def _corners(archive: Archive) -> NDArray[np.int64]:

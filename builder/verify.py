@@ -4,21 +4,27 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ..schemas.archive import Archive
+from ..schemas.archive import SHARD_FOLDER, Archive
+from ..schemas.codec import OpenRecord
 from ..schemas.errors import BadRequestError, CorruptError
 from ..schemas.radius_model import RADIUS_CLASSES
-from ..schemas.voxel import Links, VoxelData
 from .exact import loose_nodes, sample_nodes
-from .kernels.enclosure import first_loose_node
+from .executor import Executor
+from .kernels.loose import last_loose_node
+from .kernels.records import measure_points
+from .portions import jobs_of, portions, run_units
+from .preview import preview_faults
 from .progress import Progress, Silent
-from .radius import search_tree
+from .record_points import leaves_of, spheres_of
 
 
 class VerifyReport(NamedTuple):
     """What was checked, and every fault found, one sentence each; none: all is well.
 
-    exact_nodes: bounds proved in Python's integers, of `nodes` there are.
+    exact_nodes: bounds proved in Python's integers, of `nodes` there are.  notes: what is no fault, but had better be
+    known: files that mean nothing, shards that no voxel is in any more.
     """
 
     voxels: int
@@ -26,6 +32,26 @@ class VerifyReport(NamedTuple):
     faults: tuple[str, ...]
     nodes: int = 0
     exact_nodes: int = 0
+    notes: tuple[str, ...] = ()
+
+
+class _Unit(NamedTuple):
+    """Voxels to be checked. asked: of each, the nodes to be proved; None: none of any."""
+
+    folder: Path
+    rows: range
+    deep: bool
+    asked: list[NDArray[np.int64]] | None
+    points: int
+
+
+class _Found(NamedTuple):
+    """What a unit came to. points: in voxels that could be read.  classes: (RADIUS_CLASSES,), of those points."""
+
+    faults: list[str]
+    points: int
+    classes: NDArray[np.int64]
+    proved: int
 
 
 def verify_archive(
@@ -35,51 +61,77 @@ def verify_archive(
     exact: bool = False,
     sample: int | None = None,
     progress: Progress | None = None,
+    executor: Executor | None = None,
 ) -> VerifyReport:
     """Read every record and check it; with `deep`, also that every bound encloses all points below it, exactly.
 
     exact: prove the bounds once more in Python's integers, without compiled code.  sample: only so many of them,
-    spread over the archive; None: all. Raises FormatError or CorruptError only when the index itself cannot be used,
-    BadRequestError for a sample that is none; a broken record is a fault.
+    spread over the archive; None: all.  executor: what runs the work; None: this process. A job holds one voxel, 12
+    bytes a point of it, 16 with intensities, and 40 where bounds are proved. Raises FormatError or CorruptError only
+    when the index itself cannot be used, BadRequestError for a sample that is none; a broken record is a fault.
     """
     if sample is not None and (not exact or sample < 1):
         raise BadRequestError(f"--sample {sample}: expected 1 or more, and --exact with it")
     progress = progress or Silent()
+    with Archive(folder) as archive:
+        header = archive.header
+        counts = archive.voxels["rows"].astype(np.int64)
+        notes = _strangers(archive)
+        faults, more = preview_faults(folder, header)
+    asked = sample_nodes(counts[:, 1], sample) if exact else None
+    units = [
+        _Unit(
+            folder,
+            rows,
+            deep,
+            asked[rows.start : rows.stop] if asked is not None else None,
+            int(counts[rows.start : rows.stop, 2].sum()),
+        )
+        for rows in portions(counts[:, 2], jobs_of(executor))
+    ]
+    progress.start("verify", header.points, "points")
+    results = list(run_units(executor, _verify_rows, units, progress, lambda unit: unit.points))
+    progress.finish()
+    found = [
+        result for _, result in sorted(zip(units, results, strict=True), key=lambda pair: pair[0].rows.start)
+    ]
+    faults += [fault for part in found for fault in part.faults]
+    points = sum(part.points for part in found)
+    classes = np.sum([part.classes for part in found], axis=0, dtype=np.int64)
+    if not faults and points != header.points:
+        faults.append(f"{folder}: {points} points in the records, {header.points} in the index: rebuild it")
+    if not faults and (classes != header.radius_counts).any():
+        faults.append(
+            f"{folder}: radius classes counted {classes.tolist()} in the records, "
+            f"{header.radius_counts.tolist()} in the index: rebuild it"
+        )
+    proved = sum(part.proved for part in found)
+    return VerifyReport(len(counts), points, tuple(faults), int(counts[:, 1].sum()), proved, (*notes, *more))
+
+
+def _verify_rows(unit: _Unit) -> _Found:
+    """Check a run of voxels; in any process."""
     faults: list[str] = []
     points = proved = 0
     classes = np.zeros(RADIUS_CLASSES, np.int64)
-    with Archive(folder) as archive:
-        header = archive.header
-        counts = archive.voxels["rows"][:, 1].astype(np.int64)
-        asked = sample_nodes(counts, sample) if exact else None
-        progress.start("verify", header.points, "points")
-        for row in range(len(archive.voxels)):
-            expected = int(archive.voxels["rows"][row, 2])
+    with Archive(unit.folder) as archive:
+        for i, row in enumerate(unit.rows):
             try:
-                voxel, links = archive.read_voxel(row)
-                faults += _voxel_faults(archive, row, voxel, links, deep)
-                if asked is not None:
-                    loose = loose_nodes(voxel, links, asked[row].tolist())
+                record = archive.open_voxel(row, columns=("radius_class",))
+                with archive.locating(row):
+                    faults += _voxel_faults(archive, row, record, unit.deep)
+                    counted = record.class_counts()
+                del record
+                if unit.asked is not None:
+                    loose = loose_nodes(*archive.read_voxel(row), unit.asked[i].tolist())
                     faults += [_loose(archive, row, node) for node in loose]
-                    proved += len(asked[row]) - len(loose)
+                    proved += len(unit.asked[i]) - len(loose)
             except (CorruptError, OSError) as error:
                 faults.append(str(error))
             else:
-                points += len(voxel.points)
-                if voxel.radius_class is not None:
-                    classes += np.bincount(voxel.radius_class, minlength=RADIUS_CLASSES)
-            progress.advance(expected)
-        progress.finish()
-        if not faults and points != header.points:
-            faults.append(
-                f"{folder}: {points} points in the records, {header.points} in the index: rebuild it"
-            )
-        if not faults and (classes != header.radius_counts).any():
-            faults.append(
-                f"{folder}: radius classes counted {classes.tolist()} in the records, "
-                f"{header.radius_counts.tolist()} in the index: rebuild it"
-            )
-        return VerifyReport(len(archive.voxels), points, tuple(faults), int(counts.sum()), proved)
+                points += int(archive.voxels["rows"][row, 2])
+                classes += counted
+    return _Found(faults, points, classes, proved)
 
 
 def _loose(archive: Archive, row: int, node: int) -> str:
@@ -87,20 +139,33 @@ def _loose(archive: Archive, row: int, node: int) -> str:
     return f"{archive.where(row)}: node {node} does not enclose its points: rebuild the archive"
 
 
-def _voxel_faults(archive: Archive, row: int, voxel: VoxelData, links: Links, deep: bool) -> list[str]:
-    """Faults of one voxel that `check_voxel` does not look for."""
+def _voxel_faults(archive: Archive, row: int, record: OpenRecord, deep: bool) -> list[str]:
+    """Faults of one voxel that opening it does not look for. CorruptError: a point outside its cell."""
     faults = []
-    tree = search_tree(voxel, links)
-    entry = archive.voxels[row]
-    if (tree.points.min(axis=0) != entry["low"]).any() or (tree.points.max(axis=0) != entry["high"]).any():
+    low, high = np.empty(3, np.int64), np.empty(3, np.int64)
+    leaves, entry = leaves_of(record), archive.voxels[row]
+    if not measure_points(leaves, np.int64(record.voxel_steps), low, high):
+        raise CorruptError(f"voxel {record.key:#x}: a point outside its cell")
+    if record.leaves != int(entry["leaves"]):
+        faults.append(
+            f"{archive.where(row)}: {record.leaves} leaf nodes, the index says {int(entry['leaves'])}: "
+            "rebuild the archive"
+        )
+    if (low != entry["low"]).any() or (high != entry["high"]).any():
         faults.append(f"{archive.where(row)}: points are not where the index says: rebuild the archive")
     if deep:
-        # Children stand behind their parents everywhere but for the cells' roots, which stand behind the top BSH.
-        order = np.arange(len(tree.first))[::-1].copy()
-        normal, slab = voxel.nodes.normal.astype(np.int64), voxel.nodes.slab.astype(np.int64)
-        node = first_loose_node(
-            tree.center, tree.radius, normal, slab, tree.first, tree.count, tree.is_leaf, order, tree.points
-        )
+        node = last_loose_node(leaves, spheres_of(record), record.nodes.normal, record.nodes.slab)
         if node >= 0:
             faults.append(_loose(archive, row, node))
     return faults
+
+
+def _strangers(archive: Archive) -> list[str]:
+    """Notes on shards that no voxel is in, and on files that the index does not name."""
+    shards = archive.folder / SHARD_FOLDER
+    used = set(np.unique(archive.voxels["shard"]).tolist())
+    named = [archive.shard_path(number) for number in range(archive.shard_count())]
+    dead = [path for number, path in enumerate(named) if number not in used]
+    notes = [f"{path}: a shard that no voxel is in any more" for path in dead]
+    strangers = sorted(set(shards.iterdir()) - set(named))
+    return notes + [f"{path}: not of this archive as it is: left by a build or by hand" for path in strangers]

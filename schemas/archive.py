@@ -71,7 +71,7 @@ def _temporary(path: Path) -> Path:
 
 
 @contextlib.contextmanager
-def _new_file(path: Path) -> Iterator[h5py.File]:
+def new_file(path: Path) -> Iterator[h5py.File]:
     """An HDF5 file under a temporary name. Given its own only once it is closed and synced."""
     temporary = _temporary(path)
     try:
@@ -134,7 +134,7 @@ def write_shard(
     version: of the format, as the index will say it. The file is verified by offsets before it is given its name.
     """
     rows = []
-    with _new_file(path) as file:
+    with new_file(path) as file:
         file.attrs["format"] = np.bytes_("solidcloud shard")
         file.attrs["format_version"] = np.uint32(version)
         file.attrs["archive_id"] = np.frombuffer(archive_id, np.uint8)
@@ -188,7 +188,7 @@ def write_index(folder: Path, header: Header, voxels: NDArray, shards: list[tupl
     """
     path = folder / INDEX_NAME
     columns = index_columns(header, voxels, shards)
-    with _new_file(path) as file:
+    with new_file(path) as file:
         file.attrs["format"] = np.bytes_("solidcloud")
         file.attrs["format_version"] = np.uint32(header.format_version)
         file.attrs["units"] = np.bytes_("m")

@@ -160,6 +160,15 @@ def point_hash(x, y, z):
 
 
 @nb.njit(nogil=True, cache=True)
+def point_hashes(lattice):
+    """The `point_hash` of each of lattice (n, 3) int64, (n,) uint64."""
+    hashes = np.empty(lattice.shape[0], np.uint64)
+    for i in range(lattice.shape[0]):
+        hashes[i] = point_hash(lattice[i, 0], lattice[i, 1], lattice[i, 2])
+    return hashes
+
+
+@nb.njit(nogil=True, cache=True)
 def first_of_each(xyz):
     """Whether each of xyz (n, 3) int32, coordinates in [0, 2^21), is the first of its place: (n,) bool."""
     n = xyz.shape[0]

@@ -13,8 +13,7 @@ from solidcloud.builder.kernels.nearest import (
     closest_other,
 )
 from solidcloud.builder.octree import VoxelPoints
-from solidcloud.builder.record_points import leaves_of
-from solidcloud.builder.spacing import spheres_of
+from solidcloud.builder.record_points import leaves_of, spheres_of
 from solidcloud.schemas.codec import OpenRecord
 
 pytestmark = pytest.mark.interpreted

@@ -159,9 +159,9 @@ def test_each_voxel_is_opened_twice_where_neighbours_are_near(
     opened: list[int] = []
     real = Archive.open_voxel
 
-    def counting(self: Archive, row: int, *rest: Any) -> Any:
+    def counting(self: Archive, row: int, **columns: Any) -> Any:
         opened.append(row)
-        return real(self, row, *rest)
+        return real(self, row, **columns)
 
     monkeypatch.setattr(Archive, "open_voxel", counting)
     archive_mean(tmp_path / "archive", 10**6)

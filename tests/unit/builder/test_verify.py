@@ -1,17 +1,23 @@
 """`verify_archive` finds nothing in a sound archive, and each fault put into one."""
 
 import shutil
-from collections.abc import Callable
+import tracemalloc
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from scans import WITH_POINTS, make_scan, write_xyz
+import solidcloud.builder.portions as portions
+from opened import open_scan
+from scans import WITH_POINTS, make_scan, write_ply, write_xyz
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.exact import loose_nodes, sample_nodes
+from solidcloud.builder.kernels.loose import last_loose_node
 from solidcloud.builder.pipeline import build_archive
+from solidcloud.builder.record_points import leaves_of, spheres_of
+from solidcloud.builder.spacing import archive_mean
 from solidcloud.builder.verify import verify_archive
 from solidcloud.schemas.archive import Archive, shard_name, write_index, write_shard
 from solidcloud.schemas.codec import encode_voxel
@@ -235,3 +241,131 @@ def test_counts_of_radius_classes_that_cannot_be_are_refused(tmp_path: Path, spo
     rewrite(tmp_path / "a", header_with=lambda header: replace(header, **spoilt))
     with pytest.raises(FormatError, match=r"radius_counts .* of 200 points"):
         verify_archive(tmp_path / "a")
+
+
+class Backwards:
+    """An executor of four jobs that are one, the last unit first; it counts what it is given."""
+
+    jobs = 4
+    given = 0
+
+    def map(
+        self, function: Callable[[Any], Any], units: Sequence[Any], progress: object, size: object
+    ) -> Iterator[Any]:
+        self.given = len(units)
+        return iter([function(unit) for unit in reversed(units)][::-1])
+
+
+@pytest.mark.parametrize("options", [{}, {"deep": True}, {"exact": True}, {"exact": True, "sample": 60}])
+def test_units_give_the_same_report(
+    copy: Path, options: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rewrite(copy, lambda v: v._replace(nodes=v.nodes._replace(radius=v.nodes.radius // 2)))
+    with Archive(copy) as archive:
+        entry, path = archive.voxels[4], archive.shard_path(0)
+    data = bytearray(path.read_bytes())
+    data[int(entry["frame_offset"][2]) + 20] ^= 0x10
+    path.write_bytes(data)
+    expected = verify_archive(copy, **options)
+    assert len(expected.faults) >= (2 if options else 1)
+    monkeypatch.setattr(portions, "_LEAST_POINTS", 1)
+    executor = Backwards()
+    assert verify_archive(copy, executor=executor, **options) == expected  # type: ignore[arg-type]
+    assert executor.given > 4
+
+
+def test_files_that_mean_nothing_are_notes(copy: Path) -> None:
+    shards = copy / "shards"
+    (shards / "1-000007.h5").write_bytes(b"")
+    (shards / "notes.txt").write_text("mine")
+    report = verify_archive(copy)
+    assert report.faults == () and [note.split(":")[0] for note in report.notes] == [
+        str(shards / "1-000007.h5"), str(shards / "notes.txt"),
+    ]  # fmt: skip
+    assert run(["validate", str(copy)]) == 0
+
+
+def test_a_shard_that_no_voxel_is_in_is_a_note(copy: Path) -> None:
+    with Archive(copy) as archive:
+        header, rows = archive.header, archive.voxels
+    dead = copy / "shards" / shard_name(1)
+    dead.write_bytes(b"once a shard")
+    shards = [(p.name, p.stat().st_size) for p in (copy / "shards" / shard_name(0), dead)]
+    write_index(copy, header, rows, shards)
+    report = verify_archive(copy)
+    assert report.faults == () and report.notes == (f"{dead}: a shard that no voxel is in any more",)
+
+
+def test_other_leaf_nodes_than_the_index_says_are_a_fault(copy: Path) -> None:
+    with Archive(copy) as archive:
+        header, rows, where = archive.header, archive.voxels.copy(), archive.where(2)
+    rows["leaves"][2] += 1
+    path = copy / "shards" / shard_name(0)
+    write_index(copy, header, rows, [(path.name, path.stat().st_size)])
+    (fault,) = verify_archive(copy).faults
+    assert fault.startswith(where) and "leaf nodes, the index says" in fault
+
+
+def test_a_point_outside_its_cell_is_a_fault(copy: Path) -> None:
+    def stretch(voxel: VoxelData) -> VoxelData:
+        points = voxel.points.copy()
+        points[-1] = 60_000
+        return voxel._replace(points=points)
+
+    rewrite(copy, stretch)
+    (fault,) = verify_archive(copy).faults
+    with Archive(copy) as archive:
+        assert fault.startswith(archive.where(1)) and "a point outside its cell: restore the shard" in fault
+
+
+@pytest.mark.interpreted
+@pytest.mark.parametrize("steps", [1000, 1 << 20])
+def test_loose_nodes_are_those_that_integers_prove_loose(steps: int) -> None:
+    """Every bound in turn a little smaller, and some at once: the last of them is told."""
+    record = open_scan("corner", 5, 120, steps)
+    voxel, links = record.decode()
+    leaves, spheres = leaves_of(record), spheres_of(record)
+    normal, slab = record.nodes.normal, record.nodes.slab
+    assert last_loose_node(leaves, spheres, normal, slab) == -1
+    rng = np.random.default_rng(6)
+    told = set()
+    for trial in range(len(links.first) + 40):
+        radius, spoilt = spheres.radius.copy(), slab.copy()
+        if trial < len(radius):
+            radius[trial] -= radius[trial] > 0
+        elif trial % 2:
+            radius[rng.integers(0, len(radius), 3)] //= 2
+        else:
+            spoilt[int(rng.integers(2)), rng.integers(0, len(radius), 2)] = 0
+        nodes = voxel.nodes._replace(radius=radius, slab=np.ascontiguousarray(spoilt.T))
+        expected = loose_nodes(voxel._replace(nodes=nodes), links, range(len(radius)))
+        found = last_loose_node(leaves, spheres._replace(radius=radius), normal, spoilt)
+        assert found == max(expected, default=-1)
+        told.add(found)
+    assert len(told) > 10
+
+
+def test_a_dense_voxel_is_held_at_16_bytes_a_point(tmp_path: Path) -> None:
+    """With intensities that do not compress; without columns, whose frame is smaller, at 12."""
+    count = 400_000
+    rng = np.random.default_rng(7)
+    xyz = rng.random((count, 3)) * np.array([8, 8, 0.01])
+    scan = write_ply(tmp_path / "a.ply", xyz, rng.random(count).astype(np.float32))
+    for kept, models, each in ((("scan", "intensity"), ("mean", "local"), 16), ((), ("mean",), 12)):
+        config = BuildConfig(
+            keep=frozenset(kept), models=frozenset(models), radius=0.01, jobs=1, overwrite=True
+        )
+        build_archive([scan], tmp_path / "a", config)
+        for work in (
+            lambda: verify_archive(tmp_path / "a", deep=True),
+            lambda: archive_mean(tmp_path / "a", 1000),
+        ):
+            work()  # what is compiled is not counted
+            tracemalloc.start()
+            try:
+                work()
+                peak = tracemalloc.get_traced_memory()[1]
+            finally:
+                tracemalloc.stop()
+            # Beside it the blocks that points are taken in.
+            assert count * 6 < peak < count * each + (1 << 21)

@@ -1,0 +1,127 @@
+"""A few of an archive's points as a file that ParaView opens: `preview.vtkhdf` in the archive's folder."""
+
+import math
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..schemas.archive import Archive, new_file, publish
+from ..schemas.errors import CorruptError
+from ..schemas.index import Header
+from ..schemas.vtkhdf import PREVIEW_NAME, VtkPoints, read_points
+from .executor import Executor
+from .kernels.records import first_of_each, point_hashes
+from .portions import jobs_of, portions, run_units
+from .progress import Progress, Silent
+from .record_points import hash_limit, read_columns, record_columns, stored_columns, taken
+
+# Points of a preview, at most: what a viewer turns without waiting, in 1.2 MB.
+MOST_POINTS = 200_000
+# And no more than this part of an archive's points, or a small archive would be the smaller part of its folder; but
+# up to so few points, all.
+_PART, _FEW = 8, 20_000
+# Coordinates are rounded to this [m]: they compress to 6 bytes a point, and as they are to 19.
+_ROUNDED = 2.0**-13
+
+
+class _Unit(NamedTuple):
+    """Voxels to choose points of."""
+
+    folder: Path
+    rows: range
+    share: float
+    points: int
+
+
+class _Chosen(NamedTuple):
+    """Points chosen. lattice: (n, 3) int64.  columns: (n,) by name."""
+
+    lattice: NDArray[np.int64]
+    columns: dict[str, NDArray]
+
+
+def write_preview(folder: Path, executor: Executor | None = None, progress: Progress | None = None) -> int:
+    """Write the preview of the archive in `folder`: some of its distinct points, rounded to 2^-13 m.
+
+    Which ones is decided by a hash of their lattice coordinates, so that one archive has one preview to the byte. Says
+    whose it is: archive_id and generation. It is given its name when it is whole. Returns how many points. Progress
+    advances by the points of the archive. Raises CorruptError, OSError.
+    """
+    with Archive(folder) as archive:
+        header, points = archive.header, archive.voxels["rows"][:, 2].astype(np.int64)
+    most = min(MOST_POINTS, max(_FEW, header.points // _PART))
+    # Five standard deviations fewer than may be, so that what is chosen by chance is hardly ever too much.
+    share = 1.0 if header.points <= most else (most - 5 * math.sqrt(most)) / header.points
+    units = [
+        _Unit(folder, rows, share, int(points[rows.start : rows.stop].sum()))
+        for rows in portions(points, jobs_of(executor))
+    ]
+    results = run_units(executor, _choose, units, progress or Silent(), lambda unit: unit.points)
+    found = sorted(zip(units, results, strict=True), key=lambda pair: pair[0].rows.start)
+    chosen = _trimmed(_joined([part for _, part in found]), most)
+    if not len(chosen.lattice):  # many points in few places, none of them chosen
+        chosen = _choose(_Unit(folder, range(1), 1.0, 1))
+        chosen = _Chosen(chosen.lattice[:1], {name: column[:1] for name, column in chosen.columns.items()})
+    path = folder / PREVIEW_NAME
+    with new_file(path) as file:
+        file.attrs["archive_id"] = np.frombuffer(header.archive_id, np.uint8)
+        file.attrs["generation"] = np.uint32(header.generation)
+        with VtkPoints(file, stored_columns(header), compressed=True) as out:
+            world = header.lattice.to_world(chosen.lattice)
+            out.append(np.rint(world / _ROUNDED) * _ROUNDED, chosen.columns)
+    publish(path)
+    return len(chosen.lattice)
+
+
+def preview_faults(folder: Path, header: Header) -> tuple[list[str], list[str]]:
+    """Faults of the preview in `folder`, and notes on it; none where there is no preview."""
+    path = folder / PREVIEW_NAME
+    if not path.exists():
+        return [], []
+    try:
+        found = read_points(path)
+        stamp = found.attributes["archive_id"].tobytes(), int(found.attributes["generation"])
+    except (CorruptError, OSError) as error:
+        return [str(error)], []
+    except KeyError:
+        return [f"{path}: does not say whose preview it is: delete it"], []
+    if stamp != (header.archive_id, header.generation):
+        return [], [f"{path}: of another archive or generation"]
+    low, high = header.lattice.to_world(np.stack([header.low, header.high]))
+    outside = (found.points < low - _ROUNDED) | (found.points > high + _ROUNDED)
+    if not 0 < len(found.points) <= MOST_POINTS or outside.any():
+        return [f"{path}: points that are not the archive's: delete it"], []
+    return [], []
+
+
+def _choose(unit: _Unit) -> _Chosen:
+    """The points chosen in a run of voxels, of each place one; in any process."""
+    parts = []
+    with Archive(unit.folder) as archive:
+        columns = stored_columns(archive.header)
+        base, limit = archive.coordinates * archive.header.lattice.voxel_steps, hash_limit(unit.share)
+        for row in unit.rows:
+            record = archive.open_voxel(row, columns=record_columns(columns))
+            some = list(taken(record, base[row], limit=limit))
+            if some:
+                xyz, rows = np.concatenate([t.xyz for t in some]), np.concatenate([t.rows for t in some])
+                first = first_of_each(xyz)
+                parts.append(_Chosen(xyz[first] + base[row], read_columns(record, columns, rows[first])))
+        nothing = {name: np.empty(0, kind) for name, kind in columns.items()}
+    return _joined([_Chosen(np.empty((0, 3), np.int64), nothing), *parts])
+
+
+def _joined(parts: list[_Chosen]) -> _Chosen:
+    """One behind the other."""
+    columns = {name: np.concatenate([p.columns[name] for p in parts]) for name in parts[0].columns}
+    return _Chosen(np.concatenate([p.lattice for p in parts]), columns)
+
+
+def _trimmed(chosen: _Chosen, most: int) -> _Chosen:
+    """No more than `most`: those with the least hashes."""
+    if len(chosen.lattice) <= most:
+        return chosen
+    kept = np.sort(np.argsort(point_hashes(chosen.lattice), kind="stable")[:most])
+    return _Chosen(chosen.lattice[kept], {name: column[kept] for name, column in chosen.columns.items()})

@@ -1,0 +1,143 @@
+"""Points as VTKHDF PolyData, vertices only: what ParaView and VTK open as *.vtkhdf. Beside archive.py a user of h5py.
+
+After the VTKHDF file format, version 2.0 of it (docs.vtk.org, "VTKHDF format specification"): a group `VTKHDF` with the
+attributes Version and Type, `NumberOfPoints` and `Points`, four groups of cells of which only `Vertices` has any, and
+`PointData`. One partition. Numbers are written a block at a time, in bounded memory, and without clocks.
+"""
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple, Self
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from .errors import CorruptError
+
+PREVIEW_NAME = "preview.vtkhdf"
+
+GROUP = "VTKHDF"
+_VERSION = (2, 0)
+_CELLS = ("Vertices", "Lines", "Polygons", "Strips")
+# Rows of a chunk: what is compressed and checked by itself.
+_CHUNK = 1 << 15
+# Numbers that count upwards, which shuffled compress to a hundredth.
+_SMALL: dict[str, Any] = {"shuffle": True, "compression": "gzip", "compression_opts": 1}
+# A chunk with a checksum, so that a flipped bit is found.
+_CHECKED: dict[str, Any] = {"shuffle": True, "compression": "gzip", "compression_opts": 6, "fletcher32": True}
+
+
+class VtkPoints:
+    """Points on their way into a file. A context manager: whole when left without an error."""
+
+    def __init__(self, file: h5py.File, columns: Mapping[str, np.dtype], *, compressed: bool) -> None:
+        """Begin `/VTKHDF`. columns: point data besides the coordinates, by name.
+
+        compressed: and with a checksum; else as they are, which is six times as fast.
+        """
+        self._options = _CHECKED if compressed else {}
+        self._root = file.create_group(GROUP, track_times=False)
+        self._root.attrs["Version"] = np.array(_VERSION, "<i8")
+        self._root.attrs["Type"] = np.bytes_("PolyData")  # of fixed length: VTK reads no other
+        self._points = self._make("Points", np.dtype("<f8"), (3,))
+        data = self._root.create_group("PointData", track_times=False)
+        self._columns = {
+            name: self._make(f"{data.name}/{name}", kind.newbyteorder("<"), ())
+            for name, kind in columns.items()
+        }
+
+    def __enter__(self) -> Self:
+        """Itself."""
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        """Write what is known only now."""
+        if kind is None:
+            self._finish()
+
+    def _make(self, name: str, kind: np.dtype, tail: tuple[int, ...]) -> h5py.Dataset:
+        """An empty dataset that can grow."""
+        return self._root.create_dataset(
+            name, (0, *tail), kind, maxshape=(None, *tail), chunks=(_CHUNK, *tail), **self._options
+        )
+
+    def append(self, points: NDArray[np.float64], columns: Mapping[str, NDArray]) -> None:
+        """Write so many more points (m, 3) [m], and the columns (m,) promised."""
+        for dataset, rows in [(self._points, points), *((d, columns[n]) for n, d in self._columns.items())]:
+            begin = len(dataset)
+            dataset.resize(begin + len(rows), axis=0)
+            dataset[begin:] = rows
+
+    def _finish(self) -> None:
+        """One vertex a point, and how many there are."""
+        count = len(self._points)
+        self._count(self._root, "NumberOfPoints", count)
+        for name in _CELLS:
+            group = self._root.create_group(name, track_times=False)
+            held = count if name == "Vertices" else 0
+            self._count(group, "NumberOfCells", held)
+            self._count(group, "NumberOfConnectivityIds", held)
+            for numbers, rows in (("Connectivity", held), ("Offsets", held + 1)):
+                chunks = {"chunks": (min(rows, _CHUNK),), **(self._options or _SMALL)} if rows else {}
+                dataset = group.create_dataset(numbers, (rows,), "<i8", **chunks)
+                for begin in range(0, rows, _CHUNK):
+                    end = min(begin + _CHUNK, rows)
+                    dataset[begin:end] = np.arange(begin, end)
+
+    @staticmethod
+    def _count(group: h5py.Group, name: str, count: int) -> None:
+        """A number of the one partition there is."""
+        group.create_dataset(name, data=np.array([count], "<i8"))
+
+
+@contextmanager
+def vtk_file(path: Path, columns: Mapping[str, np.dtype]) -> Iterator[VtkPoints]:
+    """A new file of points, uncompressed."""
+    with (
+        h5py.File(path, "w", libver=("v110", "v110")) as file,
+        VtkPoints(file, columns, compressed=False) as points,
+    ):
+        yield points
+
+
+class PointsRead(NamedTuple):
+    """What a file of points holds. points: (n, 3) [m].  columns: (n,) by name.  attributes: of the file's root."""
+
+    points: NDArray[np.float64]
+    columns: dict[str, NDArray]
+    attributes: dict[str, NDArray]
+
+
+def read_points(path: Path) -> PointsRead:
+    """What `VtkPoints` wrote, read whole. Raises CorruptError for anything else, OSError where no file is."""
+    with open(path, "rb"):
+        pass  # an OSError of HDF5's says nothing of why
+    try:
+        with h5py.File(path, "r") as file:
+            return _read(file)
+    except (OSError, KeyError, ValueError, TypeError, AttributeError, RuntimeError) as error:
+        raise CorruptError(f"{path}: not a whole file of points ({error}): write it anew") from error
+
+
+def _read(file: h5py.File) -> PointsRead:
+    """The same of an open file; ValueError and more for what is not what is written."""
+    root = file[GROUP]
+    if bytes(root.attrs["Type"]) != b"PolyData" or int(root.attrs["Version"][0]) != _VERSION[0]:
+        raise ValueError("no PolyData of version 2")
+    count = int(root["NumberOfPoints"][0])
+    points = root["Points"][()]
+    columns = {name: column[()] for name, column in root["PointData"].items()}
+    for name in _CELLS:
+        held = count if name == "Vertices" else 0
+        group = root[name]
+        if (
+            [int(group[n][0]) for n in ("NumberOfCells", "NumberOfConnectivityIds")] != [held, held]
+            or not np.array_equal(group["Connectivity"][()], np.arange(held))
+            or not np.array_equal(group["Offsets"][()], np.arange(held + 1))
+        ):
+            raise ValueError(f"{name} that are not one vertex a point")
+    if points.shape != (count, 3) or points.dtype != "<f8" or any(len(c) != count for c in columns.values()):
+        raise ValueError(f"{len(points)} points, expected {count}")
+    return PointsRead(points, columns, dict(file.attrs))

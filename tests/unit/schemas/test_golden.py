@@ -8,6 +8,7 @@ import naive_classes
 import numpy as np
 import pytest
 from solidcloud.builder.config import BuildConfig
+from solidcloud.builder.generation import add_scans, remove_scans
 from solidcloud.builder.pipeline import build_archive
 from solidcloud.builder.radius import voxel_points
 from solidcloud.builder.verify import verify_archive
@@ -18,7 +19,7 @@ GOLDEN = Path(__file__).resolve().parents[2] / "golden"
 
 
 # The archives of each format version, and how many of the scans went into them.
-SCANS = {"archive": 2, "archive-2": 3}
+SCANS = {"archive": 2, "archive-2": 3, "archive-3": 3}
 
 
 @pytest.fixture(params=SCANS)
@@ -42,6 +43,14 @@ def test_the_golden_archive_holds_what_is_written_beside_it(name: str, expected:
         assert list(header.models) == expected.get("models", ["mean"])
         assert header.radius_counts.tolist() == expected.get("radius_counts", [0] * RADIUS_CLASSES)
         assert header.radius_capped == expected.get("radius_capped", 0)
+        now = header.radius_now
+        assert header.generation == expected.get("generation", 0)
+        assert (
+            [now.radius.hex(), now.error.hex(), now.sample] == expected["radius_now"]
+            if now
+            else ("radius_now" not in expected)
+        )
+        assert [shard for shard, _ in archive.shards()] == expected.get("shards", ["0-000000.h5"])
         assert header.archive_id.hex() == expected["archive_id"]
         assert [value.hex() for value in header.lattice.origin] == expected["origin"]
         assert header.lattice.step.hex() == expected["step"]
@@ -93,22 +102,26 @@ def golden_classes(folder: Path) -> dict[tuple[int, ...], int]:
     return classes
 
 
-def test_the_golden_archive_holds_the_radius_classes_of_its_points() -> None:
-    classes = golden_classes(GOLDEN / "archive-2")
+@pytest.mark.parametrize("name", ["archive-2", "archive-3"])
+def test_the_golden_archive_holds_the_radius_classes_of_its_points(name: str) -> None:
+    classes = golden_classes(GOLDEN / name)
     judged = naive_classes.judge(np.array(list(classes)), "0.001")
     assert classes == {point: found.local + RIM_BIT * found.rim for point, found in judged.items()}
 
 
 def test_the_golden_archive_holds_the_points_of_its_scans(name: str, expected: dict[str, Any]) -> None:
-    tables = []
+    built = 2 if name == "archive-3" else SCANS[name]  # before any was added: they make the origin
+    tables, lows = [], []
     assert len(expected["sources"]) == SCANS[name]
-    for number, (path, *_) in enumerate(expected["sources"]):
+    for number, (path, *_, count) in enumerate(expected["sources"]):
         rows = np.loadtxt(GOLDEN / path, skiprows=1)
         # Millimetres from UTM 512345, 5612345 and -0.25 m: the numbers the scans were made of.
         steps = np.rint((rows[:, :3] - [512345, 5612345, -0.25]) * 1000)
-        tables.append(np.column_stack([steps, np.full(len(rows), number), rows[:, 3]]))
+        lows.append(steps.min(axis=0))
+        if count:  # not removed
+            tables.append(np.column_stack([steps, np.full(len(rows), number), rows[:, 3]]))
     table = np.concatenate(tables)
-    table[:, :3] -= table[:, :3].min(axis=0)
+    table[:, :3] -= np.min(lows[:built], axis=0)
     assert np.array_equal(golden_points(GOLDEN / name), table[np.lexsort(table.T)])
 
 
@@ -121,7 +134,12 @@ def test_a_build_today_gives_the_golden_points_and_cells(
         models=frozenset(expected.get("models", ["mean"])),
     )  # fmt: skip
     scans = [Path(f"scan-{number}.xyz") for number in range(SCANS[name])]
-    build_archive(scans[::-1], tmp_path / "a", config)
+    if name == "archive-3":
+        build_archive(scans[1::-1], tmp_path / "a", config)
+        add_scans(tmp_path / "a", scans[2:], jobs=1)
+        remove_scans(tmp_path / "a", ["scan-1.xyz"], jobs=1)
+    else:
+        build_archive(scans[::-1], tmp_path / "a", config)
     assert np.array_equal(golden_points(tmp_path / "a"), golden_points(GOLDEN / name))
     if name != "archive":
         assert golden_classes(tmp_path / "a") == golden_classes(GOLDEN / name)

@@ -1,0 +1,205 @@
+"""Builds killed at random moments, some several times in a row, then finished: the archive is the undisturbed one."""
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from contextlib import redirect_stderr, redirect_stdout
+from pathlib import Path
+
+from solidcloud.server.cli import run
+
+from .case import Case, Tally, arguments, content, make_small, write_scans
+from .child import Child, CountCalls, KillAt, build
+
+# Kills of one build before it is left to finish: one, and now and then more.
+ROW = (1, 1, 2, 4)
+SCRIPTS = Path(__file__).resolve().parent.parent
+
+
+class Ground:
+    """The scans, the archive that an undisturbed build makes of them, and how long that takes."""
+
+    def __init__(self, folder: Path) -> None:
+        """Build it, once here to load the kernels, once to see what it takes. Raises RuntimeError where that fails."""
+        make_small()
+        self.folder, self.scans = folder, folder / "scans"
+        write_scans(self.scans)
+        with open(folder / "warm.log", "w") as log, redirect_stdout(log), redirect_stderr(log):
+            code = run(arguments(self.scans, folder / "warm", 1))
+        if code != 0:
+            raise RuntimeError(f"a build here exited with {code}: {(folder / 'warm.log').read_text()}")
+        begin = time.perf_counter()
+        self.reference = content(self._undisturbed("reference"))
+        self.seconds = time.perf_counter() - begin
+        log = self._built("counted", CountCalls())
+        self.calls = int(log.rpartition("calls ")[2])
+        # What --overwrite replaces: of the same scans with other options.
+        self.old = self._undisturbed("old", "--voxel", "1.5")
+        self._cases = 0
+
+    def _undisturbed(self, name: str, *more: str) -> Path:
+        self._built(name, None, *more)
+        return self.folder / name / "hall"
+
+    def _built(self, name: str, before: CountCalls | None, *more: str) -> str:
+        (self.folder / name).mkdir()
+        target = self.folder / name / "hall"
+        child = build([*arguments(self.scans, target, 1), *more], self.folder / f"{name}.log", before)
+        if child.status != 0:
+            raise RuntimeError(f"an undisturbed build exited with {child.status}: {child.said()}")
+        return child.said()
+
+    def case(self, jobs: int = 1, overwrite: bool = False) -> Case:
+        """A new target."""
+        self._cases += 1
+        case = Case(self.folder / f"case-{self._cases}", self.scans, self.reference, jobs)
+        if overwrite:
+            case.put_old(self.old)
+        return case
+
+
+def check_finish(case: Case, tally: Tally, what: str, **how: object) -> None:
+    """Run the same command to its end; the archive must be the undisturbed one, byte for byte."""
+    child = build(case.arguments(), case.folder.with_suffix(".log"))
+    faults = case.finished()
+    if child.status != 0:
+        faults.append(f"the same command again exited with {child.status}: {child.said()[-2000:]}")
+    tally.add(what, faults, **how)
+
+
+def forked_kills(ground: Ground, kills: int, seed: int, tally: Tally) -> None:
+    """Kill builds of one process in forks, half of them at a random moment, half at a random call of CALLS."""
+    rng = random.Random(seed)
+    done = 0
+    while done < kills:
+        overwrite = rng.random() < 0.2
+        case = ground.case(overwrite=overwrite)
+        row = min(rng.choice(ROW), kills - done)
+        hows = []
+        for _ in range(row):
+            by_call = rng.random() < 0.5
+            if by_call:
+                trap = KillAt(rng.randint(1, ground.calls), rng.random() < 0.5)
+                child = Child(case.arguments(), case.folder.with_suffix(".log"), trap)
+                hows.append(f"call {trap.number}{' after' if trap.after else ''}")
+                child.go()
+                child.end()
+            else:
+                delay = rng.uniform(0, ground.seconds)
+                child = Child(case.arguments(), case.folder.with_suffix(".log"))
+                hows.append(f"{delay:.3f} s")
+                child.go()
+                if child.wait(delay) is None:
+                    child.signal(signal.SIGKILL)
+                child.end()
+            done += 1
+            _after_kill(
+                case, child.status, child.said(), tally, seed=seed, kills=list(hows), overwrite=overwrite
+            )
+        check_finish(case, tally, "finished after kills", seed=seed, kills=hows, overwrite=overwrite)
+
+
+def _after_kill(case: Case, status: int | None, said: str, tally: Tally, **how: object) -> None:
+    """What must hold when a build was just killed, or ended before it could be."""
+    faults = case.visible()
+    if status == 0:
+        tally.counts["ended before the kill"] += 1
+        if not case.whole():
+            faults.append("it said it was done, and the archive is not whole")
+    elif status != -signal.SIGKILL:
+        faults.append(f"it exited with {status} by itself: {said[-2000:]}")
+    tally.stages[case.stage()] += 1
+    tally.add("killed", faults, **how)
+
+
+def real_kills(ground: Ground, kills: int, seed: int, tally: Tally) -> None:
+    """Kill real commands, each a process group of its own, with one job and with two."""
+    rng = random.Random(seed)
+    spans = {jobs: _span(ground, jobs) for jobs in (1, 2)}
+    tally.counts["milliseconds of an undisturbed command, one job"] = round(spans[1] * 1e3)
+    tally.counts["milliseconds of an undisturbed command, two jobs"] = round(spans[2] * 1e3)
+    done = 0
+    while done < kills:
+        jobs, overwrite = rng.choice((1, 2)), rng.random() < 0.2
+        case = ground.case(jobs, overwrite)
+        hows = []
+        for _ in range(min(rng.choice(ROW), kills - done)):
+            delay = rng.uniform(0, spans[jobs])
+            hows.append(f"{delay:.3f} s")
+            with tempfile.TemporaryFile() as log:
+                process = _start(case, log)
+                time.sleep(delay)
+                # All of it at once, workers too. Whoever ended by itself is waited for below, and only then.
+                os.killpg(process.pid, signal.SIGKILL)
+                status = process.wait()
+                _wait_for_group(process.pid)
+                log.seek(0)
+                said = log.read().decode(errors="replace")
+            done += 1
+            _after_kill(
+                case, status, said, tally, seed=seed, kills=list(hows), jobs=jobs, overwrite=overwrite
+            )
+        case.jobs = rng.choice((1, 2))  # who finishes may have another number of jobs
+        check_finish(
+            case, tally, "finished after kills", seed=seed, kills=hows, jobs=jobs, overwrite=overwrite
+        )
+
+
+def _start(case: Case, log: object) -> "subprocess.Popen[bytes]":
+    """The command, in a process group of its own; returns when it is about to begin."""
+    ready, told = os.pipe()
+    code = f"import os; from kills.at_random import command; command({told}, {case.arguments()!r})"
+    process = subprocess.Popen(
+        [sys.executable, "-c", code],
+        env={
+            **os.environ,
+            "PYTHONPATH": os.pathsep.join(filter(None, (str(SCRIPTS), os.environ.get("PYTHONPATH")))),
+        },
+        stdin=subprocess.DEVNULL,
+        stdout=log,  # type: ignore[arg-type]
+        stderr=log,  # type: ignore[arg-type]
+        pass_fds=(told,),
+        start_new_session=True,
+    )
+    os.close(told)
+    os.read(ready, 1)
+    os.close(ready)
+    return process
+
+
+def command(told: int, words: list[str]) -> None:
+    """What a real command does: load everything, say so, run."""
+    make_small()
+    os.write(told, b"!")
+    os.close(told)
+    sys.exit(run(words))
+
+
+def _span(ground: Ground, jobs: int) -> float:
+    """How long a command takes undisturbed, from where it begins [s]."""
+    case = ground.case(jobs)
+    with tempfile.TemporaryFile() as log:
+        process = _start(case, log)
+        begin = time.perf_counter()
+        if process.wait() != 0:
+            log.seek(0)
+            raise RuntimeError(f"an undisturbed command failed: {log.read().decode(errors='replace')}")
+    if faults := case.finished():
+        raise RuntimeError(f"an undisturbed command with {jobs} jobs: {faults}")
+    return time.perf_counter() - begin
+
+
+def _wait_for_group(group: int) -> None:
+    """Until no process of the group is left: a worker dies a moment after its builder."""
+    deadline = time.monotonic() + 10
+    while time.monotonic() < deadline:
+        try:
+            os.killpg(group, 0)
+        except ProcessLookupError:
+            return
+        time.sleep(0.01)
+    raise RuntimeError(f"processes of group {group} outlived their kill")

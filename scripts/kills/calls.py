@@ -1,0 +1,155 @@
+"""Every system call by which a build writes, stopped in turn by strace: killed, no space left, input/output error."""
+
+import os
+import re
+import shutil
+import signal
+import subprocess
+import time
+from collections import Counter
+from pathlib import Path
+from typing import NamedTuple
+
+from .at_random import Ground, check_finish
+from .case import Case, Tally
+from .child import Child
+
+# By what a build makes, fills, syncs, names and removes files.
+CALLS = (
+    "write", "pwrite64", "fsync", "fdatasync", "ftruncate", "openat", "rename", "renameat", "renameat2", "mkdir",
+    "mkdirat", "unlink", "unlinkat", "rmdir",
+)  # fmt: skip
+# Only these fail for want of space; and only what is written, synced and named is told to fail by the disk.
+FULL = ("write", "pwrite64", "fsync", "fdatasync", "ftruncate", "openat", "rename", "mkdir")
+FAULTS = {"KILL": "signal=KILL", "ENOSPC": "error=ENOSPC", "EIO": "error=EIO"}
+SAID = {"ENOSPC": "No space left on device", "EIO": "Input/output error"}
+
+
+class Call(NamedTuple):
+    """One system call of a build. number: among all of its name, from 1.  text: as strace shows it."""
+
+    name: str
+    number: int
+    text: str
+
+
+def has_strace() -> bool:
+    """Whether strace is here and may trace: containers forbid it unless asked not to."""
+    program = shutil.which("strace")
+    return program is not None and subprocess.run(
+        [program, "-o", os.devnull, "true"], stderr=subprocess.DEVNULL, check=False
+    ).returncode == 0  # fmt: skip
+
+
+def calls_of(ground: Ground, overwrite: bool) -> list[Call]:
+    """The calls of an undisturbed build that write to its own files or name them."""
+    case = ground.case(overwrite=overwrite)
+    trace = case.folder.with_suffix(".trace")
+    child = _traced(case, trace, ["-y"])
+    if child.end() != 0 or case.finished():
+        raise RuntimeError(f"a traced build exited with {child.status}: {child.said()} {case.finished()}")
+    counts: Counter[str] = Counter()
+    found = []
+    for line in trace.read_text(errors="replace").splitlines():
+        match = re.match(r"\d+ +(\w+)\(", line)
+        if not match or match[1] not in CALLS:
+            continue
+        counts[match[1]] += 1
+        own = str(case.folder) + "/" in line or f"{case.folder}>" in line
+        if own and (match[1] != "openat" or re.search(r"O_WRONLY|O_RDWR|O_CREAT", line)):
+            found.append(Call(match[1], counts[match[1]], line.replace(str(case.folder), "")))
+    return found
+
+
+def inject(ground: Ground, call: Call, fault: str, overwrite: bool, tally: Tally) -> None:
+    """Stop a build at one call, check what is there, and let the same command finish it.
+
+    A disk that is full stays full until the build has ended; a read or write error happens once.
+    """
+    case = ground.case(overwrite=overwrite)
+    when = f"{call.number}+" if fault == "ENOSPC" else str(call.number)
+    trace = case.folder.with_suffix(".trace")
+    child = _traced(case, trace, ["-e", f"inject={call.name}:{FAULTS[fault]}:when={when}"])
+    status = child.end()
+    how = {
+        "call": f"{call.name} {call.number}",
+        "text": call.text[:200],
+        "fault": fault,
+        "overwrite": overwrite,
+    }
+    faults = case.visible()
+    said = child.said()
+    if status == 0:
+        # Only tidying up may fail without the build failing.
+        tally.counts[f"{fault}: done all the same"] += 1
+        faults += [] if fault == "KILL" else case.finished()[:1] if not case.whole() else []
+        if fault == "KILL":
+            faults.append("it was not killed: the calls are not those of the build before")
+    elif fault == "KILL":
+        if status != -signal.SIGKILL:
+            faults.append(f"exit code {status} after a kill: {said[-1000:]}")
+    else:
+        if status != 1:
+            faults.append(f"exit code {status}, expected 1")
+        if SAID[fault] not in said:
+            faults.append(f"the message does not say {SAID[fault]!r}")
+        if "Traceback" in said or "HDF5-DIAG" in said:
+            faults.append("a traceback")
+        if sum(line.startswith("error: ") for line in said.splitlines()) != 1:
+            faults.append("expected one line that begins with error:")
+        if faults:
+            faults.append(said[-3000:])
+    tally.stages[case.stage()] += 1
+    tally.add(fault, faults, **how)
+    check_finish(case, tally, "finished after an injection", **how)
+    shutil.rmtree(case.folder)
+
+
+def all_calls(ground: Ground, tally: Tally, every: int = 1, say: object = None) -> int:
+    """Each fault at each call, or each `every`-th, of a first build and of one that overwrites; returns the points."""
+    points = 0
+    for overwrite in (False, True):
+        calls = calls_of(ground, overwrite)
+        if overwrite:
+            # As the first build until the names are changed; only what follows is new.
+            calls = calls[-12:]
+        for index, call in enumerate(calls):
+            for fault in FAULTS:
+                if (fault == "ENOSPC" and call.name not in FULL) or (index % every):
+                    continue
+                points += 1
+                inject(ground, call, fault, overwrite, tally)
+            if callable(say) and index % 20 == 0:
+                say(
+                    f"{index + 1} of {len(calls)} calls{', --overwrite' if overwrite else ''}; {len(tally.bad)} bad"
+                )
+    return points
+
+
+def _traced(case: Case, trace: Path, options: list[str]) -> Child:
+    """A build under strace, going."""
+    child = Child(case.arguments(), case.folder.with_suffix(".log"))
+    command = [
+        "strace",
+        "-f",
+        "-qq",
+        "-o",
+        str(trace),
+        "-e",
+        f"trace={','.join(CALLS)}",
+        *options,
+        "-p",
+        str(child.pid),
+    ]
+    tracer = subprocess.Popen(command, stdin=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    status = Path(f"/proc/{child.pid}/status")
+    deadline = time.monotonic() + 10
+    while "TracerPid:\t0" in status.read_text():
+        if time.monotonic() > deadline or tracer.poll() is not None:
+            child.signal(signal.SIGKILL)
+            raise RuntimeError("strace does not attach: may it trace here?")
+        time.sleep(0.002)
+    child.go()
+    child.end()
+    tracer.wait()
+    return child

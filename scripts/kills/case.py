@@ -1,0 +1,184 @@
+"""A build that is small and writes many files, its undisturbed archive, and what must hold after it was stopped."""
+
+import hashlib
+import importlib
+import pkgutil
+import shutil
+import sys
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import laspy
+import numpy as np
+import solidcloud.builder
+from solidcloud.builder.verify import verify_archive
+
+# What cuts a build into units, made small: some 15 units of a few hundred points. What they hold does not depend on it.
+SMALL = {"SHARD_POINTS": 800, "SPOOL_RANGE": 1500, "LEAST_RUN_POINTS": 700}
+POINTS = 4000
+VOXEL = 1.0
+NAME = "hall"
+
+
+def make_small() -> list[str]:
+    """Set the constants of SMALL wherever the builder's modules hold them; returns where. Once in each process."""
+    for module in pkgutil.iter_modules(solidcloud.builder.__path__):
+        if module.name != "cluster":  # loads dask
+            importlib.import_module(f"solidcloud.builder.{module.name}")
+    found = []
+    for name, module in sorted(sys.modules.items()):
+        if name.startswith("solidcloud.builder."):
+            for constant in SMALL.keys() & vars(module).keys():
+                setattr(module, constant, SMALL[constant])
+                found.append(f"{name}.{constant}")
+    if not any(where.endswith(".SHARD_POINTS") for where in found):
+        raise RuntimeError("no SHARD_POINTS in the builder: what cuts a build into units now?")
+    return found
+
+
+def write_scans(folder: Path) -> None:
+    """Two scans of a room of 4 m, the one LAS, the other text, some of their points the same."""
+    rng = np.random.default_rng(5)
+    floor = np.column_stack([rng.uniform(0, 4, (POINTS // 2, 2)), rng.normal(0, 0.002, POINTS // 2)])
+    wall = np.column_stack(
+        [rng.uniform(0, 4, POINTS // 4), rng.normal(2, 0.002, POINTS // 4), rng.uniform(0, 2.5, POINTS // 4)]
+    )
+    points = np.round(np.concatenate([floor, wall]), 4)
+    folder.mkdir(parents=True)
+    header = laspy.LasHeader(point_format=0, version="1.2")
+    header.scales = np.full(3, 1e-4)
+    with laspy.open(folder / "a.las", "w", header=header) as file:
+        record = laspy.ScaleAwarePointRecord.zeros(len(points), header=header)
+        record.x, record.y, record.z = points.T
+        file.write_points(record)
+    more = np.concatenate([points[: POINTS // 8], np.round(rng.uniform(0, 3, (POINTS // 8, 3)), 4)])
+    np.savetxt(folder / "b.xyz", more, fmt="%.4f")
+
+
+def content(folder: Path) -> dict[str, str]:
+    """What a folder holds: path below it -> SHA-256."""
+    return {
+        path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+class Case:
+    """One target to build, and the archive it must become.
+
+    folder: empty but for what a build leaves.  target: in it.  old: content of an archive that stood there before, {}
+    for none.
+    """
+
+    def __init__(self, folder: Path, scans: Path, reference: dict[str, str], jobs: int = 1) -> None:
+        self.folder, self.scans, self.reference, self.jobs = folder, scans, reference, jobs
+        self.target = folder / NAME
+        self.old: dict[str, str] = {}
+        folder.mkdir(parents=True)
+
+    def put_old(self, archive: Path) -> None:
+        """Let another archive stand there, to be replaced."""
+        shutil.copytree(archive, self.target)
+        self.old = content(archive)
+
+    def arguments(self) -> list[str]:
+        """Of the command."""
+        more = ["--overwrite"] if self.old else []
+        return arguments(self.scans, self.target, self.jobs) + more
+
+    def visible(self) -> list[str]:
+        """What is wrong with what stands under the name asked for; the build may be anywhere."""
+        aside = self.folder / f".{NAME}.old"
+        if self.target.exists():
+            found = content(self.target)
+            if found not in (self.reference, self.old or self.reference):
+                return [
+                    f"{self.target}: neither the new archive nor the old: {difference(found, self.reference)}"
+                ]
+        elif self.old and not (aside.exists() and content(aside) == self.old):
+            return [f"{self.target}: the old archive is gone, and the new one is not there"]
+        return []
+
+    def whole(self) -> bool:
+        """Whether the archive is there, every byte of it."""
+        return self.target.exists() and content(self.target) == self.reference
+
+    def finished(self) -> list[str]:
+        """What is wrong after a build that said it was done."""
+        faults = []
+        if not self.whole():
+            found = content(self.target) if self.target.exists() else {}
+            faults.append(f"{self.target}: not byte-identical: {difference(found, self.reference)}")
+        elif report := verify_archive(self.target).faults:
+            faults.append(f"{self.target}: {report[0]}")
+        left = sorted(path.name for path in self.folder.iterdir() if path != self.target)
+        if left:
+            faults.append(f"{self.folder}: left behind: {', '.join(left)}")
+        return faults
+
+    def stage(self) -> str:
+        """How far a build came that was stopped, by the files it left."""
+        work = self.folder / f".{NAME}.building"
+        if (self.folder / f".{NAME}.old").exists():
+            return "between two renames"
+        if not work.exists():
+            return "published" if self.whole() else "nothing"
+        for name, pattern in (
+            ("index", "index.h5"),
+            ("shards", "shards/*.h5"),
+            ("spool", "spool/*"),
+            ("survey", "survey/*"),
+        ):
+            if any(work.glob(pattern)):
+                return name
+        return "started"
+
+
+def arguments(scans: Path, target: Path, jobs: int) -> list[str]:
+    """Of the command that builds the scans."""
+    return [
+        "build",
+        str(scans),
+        "-o",
+        str(target),
+        "--voxel",
+        str(VOXEL),
+        "--jobs",
+        str(jobs),
+        "--keep",
+        "scan",
+    ]
+
+
+def difference(found: dict[str, str], expected: dict[str, str]) -> str:
+    """Which files differ, in a few words."""
+    missing = sorted(expected.keys() - found.keys())
+    extra = sorted(found.keys() - expected.keys())
+    other = sorted(name for name in found.keys() & expected.keys() if found[name] != expected[name])
+    said = [
+        f"{what} {', '.join(names[:3])}"
+        for what, names in (("missing", missing), ("extra", extra), ("other", other))
+        if names
+    ]
+    return "; ".join(said) or "the same"
+
+
+class Tally:
+    """Counts what was done to builds and what was found; `bad` holds each fault with how to do it again."""
+
+    def __init__(self) -> None:
+        self.counts: Counter[str] = Counter()
+        self.stages: Counter[str] = Counter()
+        self.bad: list[dict[str, Any]] = []
+
+    def add(self, what: str, faults: list[str], **how: Any) -> None:
+        """One more of `what`; its faults, if any."""
+        self.counts[what] += 1
+        if faults:
+            self.bad.append({"what": what, **how, "faults": faults})
+
+    def summary(self) -> dict[str, Any]:
+        """All of it, for JSON."""
+        return {"counts": dict(self.counts), "stages": dict(self.stages), "bad": self.bad}

@@ -76,41 +76,40 @@ def forked_kills(ground: Ground, kills: int, seed: int, tally: Tally) -> None:
     rng = random.Random(seed)
     done = 0
     while done < kills:
-        overwrite = rng.random() < 0.2
-        case = ground.case(overwrite=overwrite)
-        row = min(rng.choice(ROW), kills - done)
-        hows = []
-        for _ in range(row):
-            by_call = rng.random() < 0.5
+        case = ground.case(overwrite=rng.random() < 0.2)
+        hows: list[str] = []
+        how = {"seed": seed, "kills": hows, "overwrite": bool(case.old)}
+        for turn in range(min(rng.choice(ROW), kills - done)):
+            # What was done is not done again: the later, the shorter.
+            by_call, span = rng.random() < 0.5, 1 / (turn + 1)
             if by_call:
-                trap = KillAt(rng.randint(1, ground.calls), rng.random() < 0.5)
-                child = Child(case.arguments(), case.folder.with_suffix(".log"), trap)
+                trap = KillAt(rng.randint(1, round(ground.calls * span)), rng.random() < 0.5)
                 hows.append(f"call {trap.number}{' after' if trap.after else ''}")
-                child.go()
-                child.end()
+                child = build(case.arguments(), case.folder.with_suffix(".log"), trap)
             else:
-                delay = rng.uniform(0, ground.seconds)
-                child = Child(case.arguments(), case.folder.with_suffix(".log"))
+                delay = rng.uniform(0, ground.seconds * span)
                 hows.append(f"{delay:.3f} s")
+                child = Child(case.arguments(), case.folder.with_suffix(".log"))
                 child.go()
                 if child.wait(delay) is None:
                     child.signal(signal.SIGKILL)
                 child.end()
+            _after_kill(case, child.status, child.said(), tally, **how)
+            if child.status == 0:
+                break
             done += 1
-            _after_kill(
-                case, child.status, child.said(), tally, seed=seed, kills=list(hows), overwrite=overwrite
-            )
-        check_finish(case, tally, "finished after kills", seed=seed, kills=hows, overwrite=overwrite)
+        check_finish(case, tally, "finished after kills", **how)
 
 
 def _after_kill(case: Case, status: int | None, said: str, tally: Tally, **how: object) -> None:
     """What must hold when a build was just killed, or ended before it could be."""
     faults = case.visible()
     if status == 0:
-        tally.counts["ended before the kill"] += 1
         if not case.whole():
             faults.append("it said it was done, and the archive is not whole")
-    elif status != -signal.SIGKILL:
+        tally.add("ended before the kill", faults, **how)
+        return
+    if status != -signal.SIGKILL:
         faults.append(f"it exited with {status} by itself: {said[-2000:]}")
     tally.stages[case.stage()] += 1
     tally.add("killed", faults, **how)
@@ -124,29 +123,28 @@ def real_kills(ground: Ground, kills: int, seed: int, tally: Tally) -> None:
     tally.counts["milliseconds of an undisturbed command, two jobs"] = round(spans[2] * 1e3)
     done = 0
     while done < kills:
-        jobs, overwrite = rng.choice((1, 2)), rng.random() < 0.2
-        case = ground.case(jobs, overwrite)
-        hows = []
-        for _ in range(min(rng.choice(ROW), kills - done)):
-            delay = rng.uniform(0, spans[jobs])
+        jobs = rng.choice((1, 2))
+        case = ground.case(jobs, rng.random() < 0.2)
+        hows: list[str] = []
+        how = {"seed": seed, "kills": hows, "jobs": jobs, "overwrite": bool(case.old)}
+        for turn in range(min(rng.choice(ROW), kills - done)):
+            delay = rng.uniform(0, spans[jobs] / (turn + 1))
             hows.append(f"{delay:.3f} s")
             with tempfile.TemporaryFile() as log:
                 process = _start(case, log)
                 time.sleep(delay)
-                # All of it at once, workers too. Whoever ended by itself is waited for below, and only then.
+                # All of it at once, workers too; of one that has ended by itself, nothing.
                 os.killpg(process.pid, signal.SIGKILL)
                 status = process.wait()
                 _wait_for_group(process.pid)
                 log.seek(0)
                 said = log.read().decode(errors="replace")
+            _after_kill(case, status, said, tally, **how)
+            if status == 0:
+                break
             done += 1
-            _after_kill(
-                case, status, said, tally, seed=seed, kills=list(hows), jobs=jobs, overwrite=overwrite
-            )
         case.jobs = rng.choice((1, 2))  # who finishes may have another number of jobs
-        check_finish(
-            case, tally, "finished after kills", seed=seed, kills=hows, jobs=jobs, overwrite=overwrite
-        )
+        check_finish(case, tally, "finished after kills", **how)
 
 
 def _start(case: Case, log: object) -> "subprocess.Popen[bytes]":

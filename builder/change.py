@@ -20,12 +20,14 @@ from numpy.typing import NDArray
 from ..schemas.archive import INDEX_NAME, SHARD_FOLDER, Archive, sync_folder
 from ..schemas.errors import BadRequestError, FormatError
 from ..schemas.index import Header
+from ..schemas.vtkhdf import PREVIEW_NAME
 from .config import BuildConfig
 from .executor import Executor, make_executor, worker_count
 from .pipeline import jobs_that_fit
+from .preview import write_preview
 from .progress import Progress, Silent
 from .spool import spool_dtype
-from .workplace import PREVIEW_NAME, locked
+from .workplace import locked
 
 # Points of a unit that reads stored voxels: a few records at a time, whatever the machine.
 UNIT_POINTS = 1 << 21
@@ -175,14 +177,14 @@ def publish(change: Change, new: list[str], named: set[str]) -> None:
     Killed before the index is renamed, the archive is the old one, and the shards it does not name are deleted by the
     next run; killed after, it is the new one, and so are those that are not named any more.
     """
-    shards = change.target / SHARD_FOLDER
-    moved = []
+    shards, preview = change.target / SHARD_FOLDER, change.target / PREVIEW_NAME
+    moved, had_preview = [], preview.exists()
     try:
         for name in new:
             os.rename(change.folder / SHARD_FOLDER / name, shards / name)
             moved.append(shards / name)
         sync_folder(shards)
-        (change.target / PREVIEW_NAME).unlink(missing_ok=True)  # of what it will not be any more
+        preview.unlink(missing_ok=True)  # of points that will not be there any more
         os.replace(change.folder / INDEX_NAME, change.target / INDEX_NAME)
     except BaseException:
         for path in moved:
@@ -191,3 +193,6 @@ def publish(change: Change, new: list[str], named: set[str]) -> None:
         raise
     sync_folder(change.target)
     delete_orphans(change.target, named)
+    if had_preview:
+        with change.stage("preview", change.archive.header.points, "points"):
+            write_preview(change.target, change.executor, change.progress)

@@ -89,7 +89,8 @@ def _info_facts(found: "SceneInfo") -> Iterator[tuple[str, str]]:
     (x0, y0, z0), (x1, y1, z1) = found.bounds
     step, moved = length_text(found.lattice_step), length_text(found.moved_max)
     radius, error = length_text(found.radius), length_text(found.radius_error)
-    yield "scene", f"{found.scene}, format {found.format_version}"
+    generation = f", generation {found.generation}" if found.generation else ""
+    yield "scene", f"{found.scene}, format {found.format_version}{generation}"
     yield "points", f"{found.points:,} in {found.voxels:,} voxels of {found.voxel_size:g} m"
     yield "bounds", f"{x0:.3f} {y0:.3f} {z0:.3f} .. {x1:.3f} {y1:.3f} {z1:.3f} m"
     yield "lattice", f"step {step} ({found.lattice_source}), points moved up to {moved} along an axis"
@@ -97,11 +98,19 @@ def _info_facts(found: "SceneInfo") -> Iterator[tuple[str, str]]:
         "radius",
         (f"{radius} ({found.radius_model}), standard error {error}, of {found.radius_sample:,} points"),
     )
+    if found.radius_now is not None:
+        change = 100 * (found.radius_now / found.radius - 1) if found.radius else 0.0
+        yield "radius now", f"{length_text(found.radius_now)} ({change:+.1f} %), if it were measured again"
     yield "hierarchy", f"degree {found.degree}, up to {found.leaf} points a leaf node"
     yield "size", f"{bytes_text(found.record_bytes)} of records, {bytes_text(found.resident_bytes)} decoded"
-    for source in found.sources:
+    for number, source in enumerate(found.sources):
+        if source.fault:
+            continue
         left_out = "".join(f", {count:,} {reason} left out" for reason, count in source.skipped.items())
-        yield "scan", f"{source.path} [{source.index}], {source.format}, {source.count:,} points{left_out}"
+        yield (
+            f"scan {number}",
+            f"{source.path} [{source.index}], {source.format}, {source.count:,} points{left_out}",
+        )
     for fault in found.skipped:
         yield "left out", fault
     for low, high in found.unknown:

@@ -14,7 +14,7 @@ from solidcloud.server.cli import run
 from solidcloud.server.verbs.options import parse_bytes
 from solidcloud.server.report.serving import free_port, served
 
-VERBS = ["build", "info", "validate", "serve", "query", "accuracy", "make"]
+VERBS = ["build", "info", "validate", "serve", "query", "accuracy", "add", "remove", "reload", "make"]
 RADIUS = 0.05
 
 

@@ -1,0 +1,129 @@
+"""The commands `add`, `remove` and `reload`: an archive that grows while a server serves it."""
+
+import json
+import threading
+from pathlib import Path
+
+import cases
+import naive
+import numpy as np
+import pytest
+import scans
+from solidcloud.builder.generation import add_scans, remove_scans
+from solidcloud.schemas.answers import Verdict
+from solidcloud.server.app import serving
+from solidcloud.server.cli import run
+from solidcloud.server.client import Client
+from solidcloud.server.config import ServerConfig
+from solidcloud.server.scene import Scene
+from test_reload import endpoint as endpoint  # the fixture
+
+BODY = np.array([[0.0, 0, 0], [0.1, 0, 0.1]])
+HALL = np.vstack([[[0.0, 0, 0], [2, 2, 2]], scans.make_scan("plane", 1, 400)]).round(3)
+CHAIR = scans.make_scan("pillar", 2, 200).round(3)
+
+
+@pytest.fixture
+def hall(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Path:
+    """An archive of one scan, beside it another scan."""
+    scans.write_ply(tmp_path / "hall.ply", HALL)
+    scans.write_ply(tmp_path / "chair.ply", CHAIR)
+    options = ["--voxel", "0.5", "--resolution", "0.001", "--keep", "scan", "--jobs", "1", "--radius", "0.02"]
+    assert run(["build", str(tmp_path / "hall.ply"), "-o", str(tmp_path / "hall"), *options]) == 0
+    capsys.readouterr()
+    return tmp_path / "hall"
+
+
+def told(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> dict:
+    """What a command says as JSON."""
+    assert run([*arguments, "--json"]) == 0
+    return json.loads(capsys.readouterr().out)
+
+
+def test_scans_are_added_and_removed(hall: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    chair = str(hall.parent / "chair.ply")
+    found = told(["add", str(hall), chair], capsys)
+    assert (found["generation"], found["points_before"], found["points"]) == (1, 402, 602)
+    assert run(["add", str(hall), chair]) == 2
+    assert "is in already" in capsys.readouterr().err
+    assert run(["add", str(hall), chair, "--again"]) == 0
+    assert "802, were 602" in capsys.readouterr().out
+    info = told(["info", str(hall)], capsys)
+    assert (info["format_version"], info["generation"], info["points"]) == (3, 2, 802)
+    assert run(["info", str(hall)]) == 0
+    assert "generation 2" in (shown := capsys.readouterr().out) and "scan 2" in shown
+    assert run(["validate", str(hall), "--deep"]) == 0
+    assert run(["remove", str(hall), chair]) == 0
+    assert "402, were 802" in capsys.readouterr().out
+    assert run(["remove", str(hall), "0"]) == 2
+    assert "nothing would be left" in capsys.readouterr().err
+    assert run(["add", str(hall), str(hall.parent / "none.ply")]) == 3
+    assert run(["add", str(hall.parent), chair]) == 3
+    assert "no archive here" in capsys.readouterr().err
+
+
+def test_the_stored_figure_stays_and_info_says_how_far_it_is_off(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scans.write_ply(tmp_path / "one.ply", HALL)
+    scans.write_ply(tmp_path / "two.ply", HALL + 0.011)
+    target = str(tmp_path / "x")
+    assert run(["build", str(tmp_path / "one.ply"), "-o", target, "--voxel", "0.5", "--jobs", "1"]) == 0
+    capsys.readouterr()
+    before = told(["info", target], capsys)
+    assert (before["generation"], before["radius_now"]) == (0, None)
+    added = told(["add", target, str(tmp_path / "two.ply")], capsys)
+    info = told(["info", target], capsys)
+    assert info["radius"] == before["radius"] == added["radius"]
+    assert info["radius_now"] == added["radius_now"] < info["radius"]
+    assert run(["info", target]) == 0
+    shown = capsys.readouterr().out
+    off = 100 * (info["radius_now"] / info["radius"] - 1)
+    assert "radius now" in shown and f"({off:+.1f} %)" in shown
+
+
+def test_an_archive_grows_and_shrinks_while_it_is_served(hall: Path, endpoint: str) -> None:
+    """Nothing is lost meanwhile, and what is answered is true of a generation that was there."""
+    rng = np.random.default_rng(6)
+    poses = cases.near_poses(rng, np.vstack([HALL, CHAIR]), BODY, 150, 0.1)
+    place = (np.zeros(3), 0.001, 0.02)
+    truths = [
+        naive.collide(points, *place, BODY, 0.01, poses).astype(np.uint8)
+        for points in (HALL, np.vstack([HALL, CHAIR]))
+    ]
+    assert (truths[0] != truths[1]).sum() > 20
+    stop, found = threading.Event(), []
+
+    def ask() -> None:
+        with Client(endpoint, scene="hall") as client:
+            client.add_avatar("al", BODY, 0.01)
+            while not stop.is_set():
+                found.append(client.collide("al", poses).verdict)
+
+    chair = hall.parent / "chair.ply"
+    with (
+        Scene.open(hall) as scene,
+        serving([scene], ServerConfig(listen=endpoint)),
+        Client(endpoint, scene="hall") as client,
+    ):
+        client.add_avatar("al", BODY, 0.01)
+        thread = threading.Thread(target=ask)
+        thread.start()
+        try:
+            for number in range(3):
+                add_scans(hall, [chair], jobs=1)
+                assert np.array_equal(client.collide("al", poses).verdict, truths[0]), "until it is told"
+                answer = client.reload()
+                assert (answer.generation_before, answer.generation_after) == (2 * number, 2 * number + 1)
+                assert np.array_equal(client.collide("al", poses).verdict, truths[1])
+                remove_scans(hall, [str(chair)], jobs=1)
+                assert np.array_equal(client.collide("al", poses).verdict, truths[1])
+                assert client.reload().points == len(HALL)
+                assert np.array_equal(client.collide("al", poses).verdict, truths[0])
+        finally:
+            stop.set()
+            thread.join(60.0)
+    assert len(found) > 20
+    for verdicts in found:
+        assert not (verdicts == Verdict.UNKNOWN).any()
+        assert any(np.array_equal(verdicts, truth) for truth in truths)

@@ -3,6 +3,7 @@
 import multiprocessing
 import os
 import signal
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -67,9 +68,18 @@ def make_executor(config: BuildConfig, jobs: int) -> Executor:
     return ClusterExecutor(address, config.memory_bytes)
 
 
-def _leave_interrupts() -> None:
-    """Ctrl-C is the builder's: it stops its workers, and they say nothing."""
+def _begin_worker() -> None:
+    """Ctrl-C is the builder's: it stops its workers, and they say nothing. If it is killed, they end with it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_builder, daemon=True).start()
+
+
+def _end_with_builder() -> None:
+    """Wait for the builder to end, and end: a worker would wait for its next unit for ever, holding its memory."""
+    builder = multiprocessing.parent_process()
+    if builder is not None:
+        builder.join()
+        os._exit(1)
 
 
 class ProcessExecutor:
@@ -81,7 +91,7 @@ class ProcessExecutor:
         # Spawned, not forked: a fork copies locks that other threads hold, such as a progress bar's.
         context = multiprocessing.get_context("spawn")
         self._pool = (
-            ProcessPoolExecutor(jobs, mp_context=context, initializer=_leave_interrupts) if jobs > 1 else None
+            ProcessPoolExecutor(jobs, mp_context=context, initializer=_begin_worker) if jobs > 1 else None
         )
 
     def __enter__(self) -> Self:
@@ -91,9 +101,14 @@ class ProcessExecutor:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Stop the processes; after a failure, without starting what still waits."""
-        if self._pool is not None:
-            self._pool.shutdown(wait=True, cancel_futures=kind is not None)
+        """Stop the processes; after a failure, without starting what still waits; when interrupted, at once."""
+        if self._pool is None:
+            return
+        if kind is not None and not issubclass(kind, Exception):
+            # What they were doing is done again: a unit may take a minute, and who pressed Ctrl-C waits.
+            for process in list((self._pool._processes or {}).values()):
+                process.terminate()
+        self._pool.shutdown(wait=True, cancel_futures=kind is not None)
 
     def map(
         self,

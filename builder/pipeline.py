@@ -34,10 +34,12 @@ from .partition import (
     run_points,
     spool_range,
 )
+from .preview import write_preview
 from .progress import Progress, Silent
-from .resume import Input, described, is_whole
+from .resume import described, is_whole
+from .scan_list import Input
+from .scan_list import inputs as scans_of
 from .shards import Shard, ShardUnit, build_shard, plan_shards
-from .sources import scan_files
 from .spacing import archive_mean
 from .spool import KEYS_SUFFIX, RUN_SUFFIX, Spool, spool_dtype
 from .survey import (
@@ -48,7 +50,6 @@ from .survey import (
     hash_file,
     joined,
     load_part,
-    open_all,
     ranges,
     survey_range,
     unopened,
@@ -185,18 +186,28 @@ def _build(
             surveys, faulty, filtered, lattice, lattice_source, identity, moved_max, shards, config
         )
         header = _measure_radius(header, shards, place.archive, executor, config, stages)
-        with stages.timed("verify"):
-            report = verify_archive(place.archive, progress=stages.progress)
-    if report.faults:
-        raise CorruptError(
-            f"{report.faults[0]}: what was written is not what reads back: check disk and memory"
-        )
+        _read_back(place.archive, executor, stages)
     return header, shards
 
 
+def _read_back(folder: Path, executor: Executor, stages: _Stages) -> None:
+    """Read what was written, for a preview and to the last record. Raises CorruptError where it is something else."""
+    fault = ""
+    try:
+        with stages.timed("preview"):
+            write_preview(folder, executor, stages.progress)
+        with stages.timed("verify"):
+            report = verify_archive(folder, progress=stages.progress, executor=executor)
+        fault = next(iter(report.faults), "")
+    except CorruptError as error:
+        fault = str(error)
+    if fault:
+        raise CorruptError(f"{fault}: what was written is not what reads back: check disk and memory")
+
+
 def open_inputs(paths: Sequence[Path], config: BuildConfig) -> list[Input]:
-    """The files that the paths stand for, opened: their headers are read."""
-    return [Input(path, *open_all(path, config.spacing)) for path in scan_files(paths)]
+    """The files that the paths stand for, files, folders or a list of scans, opened: their headers are read."""
+    return scans_of(paths, config.spacing)
 
 
 def _about(item: Input) -> int:
@@ -237,7 +248,7 @@ def _summary(
         points=header.points,
         voxels=voxels,
         shards=shards,
-        bytes=sum(f.stat().st_size for f in target.rglob("*.h5")),
+        bytes=sum(f.stat().st_size for f in target.rglob("*") if f.is_file()),
         seconds=time.perf_counter() - begin,
         stages=stages.seconds,
         lattice_step=header.lattice.step,
@@ -297,7 +308,7 @@ def _survey(
         count = len(ranges(scan, about))
         surveys.append(joined(scan, found[at : at + count], sha256[scan.path]))
         at += count
-    surveys += [unopened(item.path, item.fault) for item in inputs if not item.scans]
+    surveys += [unopened(item.path, item.fault, item.region) for item in inputs if not item.scans]
     good = sorted((s for s in surveys if not s.fault), key=_content_order)
     faulty = sorted((s for s in surveys if s.fault), key=_content_order)
     _check_surveys(good, faulty, inputs, config)

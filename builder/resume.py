@@ -3,12 +3,13 @@
 from collections.abc import Callable, Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from ..schemas.archive import Archive
 from ..schemas.errors import BadRequestError, FormatError
 from .config import BuildConfig
-from .sources import NOT_FINITE, Scan, sha256_of
+from .scan_list import Input
+from .sources import NOT_FINITE, sha256_of
 
 # To be raised when software of the same version may write other bytes than it did, or notes that mean other things.
 RESUME_VERSION = 1
@@ -17,14 +18,6 @@ NAMED = 5
 
 # Options that are not named as they are stored, or that the command line does not have.
 _OPTION_NAMES = {"models": "--radius", "cell_points": "cell_points", "with_slab": "with_slab"}
-
-
-class Input(NamedTuple):
-    """One file of scans, or why it cannot be opened."""
-
-    path: Path
-    scans: list[Scan]
-    fault: str = ""
 
 
 def described(inputs: Sequence[Input], config: BuildConfig) -> dict[str, Any]:

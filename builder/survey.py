@@ -16,7 +16,7 @@ from ..schemas.errors import ScanError
 from ..schemas.voxel_grid import MAX_COORDINATE, MAX_VOXEL_STEPS, MIN_STEP, Lattice, make_lattice
 from .config import DEFAULT_STEP, BuildConfig
 from .kernels.spool import usable_bounds
-from .sources import NOT_FINITE, Scan, header_bounds, open_scans, sha256_of
+from .sources import NOT_FINITE, Scan, sha256_of
 
 # A header's bounds are believed when no point lies farther outside [m]: they are rounded, but not by more.
 BOUNDS_WITHIN = 0.01
@@ -181,21 +181,16 @@ def survey_scan(scan: Scan) -> Survey:
     return joined(scan, parts, hash_file(scan.path))
 
 
-def open_all(path: Path, spacing: float | None) -> tuple[list[Scan], str]:
-    """The scans of one file, or the fault that keeps it from being opened."""
-    try:
-        return open_scans(path, spacing=spacing), ""
-    except ScanError as error:
-        return [], str(error)
+def unopened(path: Path, fault: str, region: NDArray[np.float64] | None = None) -> Survey:
+    """The survey of a file that cannot be opened, or, with no fault, that holds no scan at all.
 
-
-def unopened(path: Path, fault: str) -> Survey:
-    """The survey of a file that cannot be opened, or, with no fault, that holds no scan at all."""
+    region: (2, 3) world [m], where its points may have been; None: not known.
+    """
     none = np.zeros(3)
     if not fault:
         fault = f"{path}: holds no scan, expected at least one: leave it out"
         return Survey(None, path, "", 0, none, none, 0, fault, None, empty=True)
-    return Survey(None, path, "", 0, none, none, 0, fault, header_bounds(path))
+    return Survey(None, path, "", 0, none, none, 0, fault, region)
 
 
 def _region(scan: Scan, low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.float64] | None:

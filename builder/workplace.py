@@ -12,13 +12,12 @@ from typing import Any
 
 from ..schemas.archive import INDEX_NAME, SHARD_FOLDER, sync_folder
 from ..schemas.errors import BadRequestError, CorruptError, ScanError
+from ..schemas.vtkhdf import PREVIEW_NAME
 from .journal import Journal, remove_temporaries
 from .resume import check_same
 
 # The note of what is built, the first of all.
 BEGUN = "build"
-# What an archive's folder may hold beside its shards.
-PREVIEW_NAME = "preview.vtkhdf"
 
 
 def check_target(target: Path, overwrite: bool) -> None:

@@ -1,15 +1,24 @@
 """`solidcloud build`: scans to an archive."""
 
+import signal
 import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from .options import AsJson, parse_bytes, print_json
 
+if TYPE_CHECKING:
+    from ...builder.config import BuildConfig
+
 Scans = Annotated[
-    list[Path], typer.Argument(help="Scans or folders of scans: LAS LAZ E57 PLY XYZ PTS OBJ STL.")
+    list[Path],
+    typer.Argument(
+        help="Scans, folders of scans, or a scans.toml: LAS LAZ E57 PLY PTX PTS XYZ PCD OBJ STL GLB."
+    ),
 ]
 
 
@@ -27,7 +36,9 @@ def build(
         str, typer.Option(help="octree, or balanced: cells merged too, so that all trees have one height.")
     ] = "octree",
     jobs: Annotated[int, typer.Option(help="Worker processes; 0: one a core.")] = 0,
-    memory: Annotated[str, typer.Option(help="What the build may hold in memory.")] = "2GB",
+    memory: Annotated[
+        str, typer.Option(help="What the build may hold in memory, all processes together.")
+    ] = "2GB",
     spacing: Annotated[
         float | None, typer.Option(help="Sample meshes this far apart [m] instead of at vertices.")
     ] = None,
@@ -38,6 +49,21 @@ def build(
             help="Radius models to store, by comma: mean, local, border; fixed:METRES, or a number, in place of mean."
         ),
     ] = "mean",
+    thin: Annotated[float | None, typer.Option(help="Keep one point a cell of this size [m].")] = None,
+    outliers: Annotated[
+        str | None, typer.Option(help="METRES,COUNT: leave out points with fewer others than that so near.")
+    ] = None,
+    moving: Annotated[
+        str | None,
+        typer.Option(help="METRES,SCANS: leave out what fewer other scans saw so near than saw the place."),
+    ] = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(help="Address of a dask scheduler whose workers do the work: tcp://HOST:PORT."),
+    ] = None,
+    cluster: Annotated[
+        str | None, typer.Option(help="local:N: a dask cluster of N workers, started for this build.")
+    ] = None,
     strict: Annotated[bool, typer.Option("--strict", help="Fail on a point that is not finite.")] = False,
     skip_bad: Annotated[
         bool, typer.Option("--skip-bad", help="Leave out broken scans; their region is unknown.")
@@ -45,12 +71,19 @@ def build(
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace the archive once the new one is whole.")
     ] = False,
+    fresh: Annotated[
+        bool, typer.Option("--fresh", help="Start over, where a build that was interrupted could go on.")
+    ] = False,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Say what it would take: time, disk, memory; build nothing.")
+    ] = False,
+    log_json: Annotated[
+        bool, typer.Option("--log-json", help="Say how it goes as one JSON object a line, on standard error.")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Build one archive from scans."""
-    from ...builder.config import BuildConfig, parse_radius
-    from ...builder.pipeline import build_archive
-    from ..console import Bars, print_build
+    """Build one archive from scans; the same command again goes on where it was interrupted."""
+    from ...builder.config import BuildConfig, parse_radius, parse_rule
 
     fixed, models = parse_radius(radius)
     config = BuildConfig(
@@ -68,12 +101,74 @@ def build(
         strict=strict,
         skip_bad=skip_bad,
         overwrite=overwrite,
+        fresh=fresh,
+        thin=thin,
+        outliers=parse_rule(outliers, "--outliers"),
+        moving=parse_rule(moving, "--moving"),
+        scheduler=scheduler,
+        cluster=cluster,
     )
-    with Bars() as bars:
-        summary = build_archive(scans, output, config, bars)
+    if dry_run:
+        _estimate(scans, output, config, as_json)
+    else:
+        _build(scans, output, config, log_json, as_json)
+
+
+def _build(scans: list[Path], output: Path, config: "BuildConfig", log_json: bool, as_json: bool) -> None:
+    """Build, and say what was built."""
+    from ...builder.pipeline import build_archive
+    from ..console import print_build
+    from ..progress import progress_listener
+
+    with _interruptible(output), progress_listener(log_json) as listener:
+        summary = build_archive(scans, output, config, listener)
     if as_json:
         print_json({**summary._asdict(), "archive": str(summary.archive)})
     else:
         print_build(summary)
+    if summary.already:
+        print(
+            f"{output}: whole already, of these scans with these options: nothing was built", file=sys.stderr
+        )
     for fault in summary.faults:
         print(f"left out: {fault}", file=sys.stderr)
+
+
+@contextmanager
+def _interruptible(output: Path) -> Iterator[None]:
+    """Take SIGTERM for Ctrl-C, and say how to go on."""
+    before = signal.signal(signal.SIGTERM, _interrupt)
+    try:
+        yield
+    except KeyboardInterrupt:
+        from ...builder.workplace import building_folder
+
+        folder = building_folder(output)
+        if folder.exists():
+            print(
+                f"{output}: what is done is kept in {folder}: the same command goes on, --fresh starts over",
+                file=sys.stderr,
+            )
+        raise
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _interrupt(*_: object) -> None:
+    """What SIGTERM does."""
+    raise KeyboardInterrupt
+
+
+def _estimate(scans: Sequence[Path], output: Path, config: "BuildConfig", as_json: bool) -> None:
+    """Say what a build would take."""
+    from ...builder.plan import estimate, load_rates
+    from ...builder.sample import seen_scene
+    from ...builder.scan_list import inputs
+    from ..console import print_facts
+    from .plan import plan_facts
+
+    found = estimate(seen_scene(inputs(scans, config.spacing), config), config, load_rates(), output)
+    if as_json:
+        print_json(found.as_json())
+    else:
+        print_facts(plan_facts(found))

@@ -181,7 +181,7 @@ def test_an_archive_is_sound_and_summed_up(scans: list[Path], out: Path) -> None
         assert summary.voxels == len(archive.voxels)
         assert (summary.radius, summary.moved_max) == (header.radius, header.moved_max)
     assert summary.bytes == sum(map(len, content(out / "a").values()))
-    assert list(summary.stages) == ["survey", "spool", "build", "radius", "verify", "publish"]
+    assert list(summary.stages) == ["survey", "spool", "build", "radius", "preview", "verify", "publish"]
     assert (summary.skipped, summary.faults) == ({}, ())
 
 

@@ -8,7 +8,7 @@ import pytest
 import solidcloud.builder.survey as survey_module
 from scans import make_scan, write_las, write_xyz
 from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.sources import Block, Scan
+from solidcloud.builder.sources import Block, Scan, open_scans
 from solidcloud.builder.sources import Lattice as SourceLattice
 from solidcloud.builder.survey import (
     Survey,
@@ -17,7 +17,6 @@ from solidcloud.builder.survey import (
     hash_file,
     joined,
     load_part,
-    open_all,
     ranges,
     survey_range,
     survey_scan,
@@ -89,16 +88,9 @@ def test_a_scan_that_breaks_off_may_have_covered_header_and_points(tmp_path: Pat
     assert survey_scan(scan).region is None, "a point lies outside: the header's bounds are wrong"
 
 
-def test_a_file_that_cannot_be_opened_gives_its_fault(tmp_path: Path) -> None:
-    (tmp_path / "a.las").write_bytes(b"no LAS at all")
-    scans, fault = open_all(tmp_path / "a.las", None)
-    assert scans == []
-    assert "a.las" in fault
-
-
 def test_a_scan_that_seeks_is_surveyed_in_ranges(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     xyz = write_las(tmp_path / "a.las", np.random.default_rng(1).integers(-1000, 1000, (50, 3)))
-    (scan,), _ = open_all(tmp_path / "a.las", None)
+    (scan,) = open_scans(tmp_path / "a.las")
     assert [(unit.start, unit.stop, unit.points) for unit in ranges(scan, 50)] == [(0, 50, 50)]
     monkeypatch.setattr(survey_module, "RANGE_POINTS", (20, 30))
     assert [(unit.start, unit.stop, unit.points) for unit in ranges(scan, 0)] == [
@@ -197,8 +189,8 @@ def test_las_and_text_files_are_surveyed_alike(tmp_path: Path) -> None:
     xyz = write_las(tmp_path / "a.las", np.random.default_rng(1).integers(-1000, 1000, (50, 3)))
     write_xyz(tmp_path / "a.xyz", xyz)
     for name in ("a.las", "a.xyz"):
-        (scan,), fault = open_all(tmp_path / name, None)
+        (scan,) = open_scans(tmp_path / name)
         survey = survey_scan(scan)
-        assert (survey.count, survey.fault, fault) == (50, "", "")
+        assert (survey.count, survey.fault) == (50, "")
         assert np.array_equal([survey.low, survey.high], [xyz.min(axis=0), xyz.max(axis=0)])
         assert len(survey.sha256) == 64

@@ -320,6 +320,33 @@ def test_an_index_of_another_kind_is_refused(name: str, copy: Path) -> None:
         Archive(copy)
 
 
+def test_an_archive_that_changes_while_it_is_opened_is_read_once_more(
+    copy: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    index, shards = copy / "index.h5", copy / "shards"
+    checked = Archive._check_shards
+    done = []
+
+    def change(archive: Archive) -> None:
+        """What adds a scan does: shards of other names, the index replaced, the old ones deleted."""
+        checked(archive)
+        if not done:
+            done.append(True)
+            shutil.copytree(Path(__file__).resolve().parents[2] / "golden" / "archive-3", copy / "new")
+            for path in (copy / "new" / "shards").iterdir():
+                path.rename(shards / path.name)
+            (copy / "new" / "index.h5").replace(index)
+            (shards / "0-000000.h5").unlink()
+
+    monkeypatch.setattr(Archive, "_check_shards", change)
+    with Archive(copy) as archive:
+        assert archive.header.generation == 2
+        archive.read_voxel(0)
+    (shards / "1-000000.h5").unlink()
+    with pytest.raises(FormatError, match=r"1-000000\.h5: missing"):
+        Archive(copy)
+
+
 # --- broken shards ----------------------------------------------------------------------------------------
 
 

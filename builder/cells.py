@@ -99,11 +99,14 @@ def take_cells(trees: CellTrees, order: NDArray[np.int64]) -> CellTrees:
 def block_points(trees: CellTrees, leaf: int) -> NDArray[np.uint16]:
     """The points (n, 3) from the corners of their leaf nodes' boxes. leaf: most points of a leaf node."""
     points = np.empty((trees.xyz.shape[1], 3), np.uint16)
-    leaves = -(-np.diff(trees.starts) // leaf)  # full but one: pack_points
-    leaf_rows(
-        trees.xyz, trees.starts, trees.rows[1:] - leaves, trees.nodes.count, trees.nodes.block_low, points
-    )
+    first = trees.rows[1:] - _leaves(trees, leaf)
+    leaf_rows(trees.xyz, trees.starts, first, trees.nodes.count, trees.nodes.block_low, points)
     return points
+
+
+def _leaves(trees: CellTrees, leaf: int) -> NDArray[np.int64]:
+    """How many leaf nodes each cell has (c,): as few as hold its points (kernels/pack.py)."""
+    return np.asarray(-(-np.diff(trees.starts) // leaf))
 
 
 def stored_cells(trees: CellTrees) -> Cells:
@@ -124,3 +127,11 @@ def take_rows(nodes: Nodes, which: NDArray) -> Nodes:
 def join_rows(parts: list[Nodes]) -> Nodes:
     """Nodes, one part behind the other."""
     return Nodes(*map(np.concatenate, zip(*parts, strict=True)))
+
+
+def leaf_runs(trees: CellTrees, leaf: int) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """First point, number of points and sort axis of every leaf node. leaf: most points of one."""
+    leaves = _leaves(trees, leaf)
+    which = run_indices(trees.rows[1:] - leaves, leaves)
+    count = trees.nodes.count[which].astype(np.int64)
+    return np.cumsum(count) - count, count, trees.nodes.axis[which].astype(np.int64)

@@ -6,7 +6,7 @@ has them.
 """
 
 import math
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from fractions import Fraction
 from itertools import chain
 from typing import NamedTuple
@@ -27,6 +27,10 @@ REACH = 0.362
 LOCAL_SHARE = 13
 # Bits an axis of a Morton code.
 CODE_BITS = 21
+# Of all points of a voxel.
+ALL_CODES = range(1 << 63)
+# Points of a voxel around that are read at once.
+READ_POINTS = 1 << 18
 # Points that are not parted to save memory: what lies around fewer is not much less.
 LEAST_TOGETHER = 64
 
@@ -57,11 +61,17 @@ def class_limits(step: float) -> Limits:
 
 
 def voxel_classes(
-    key: int, local: NDArray[np.int32], models: Collection[str], spool: Spool, most_near: int
+    key: int,
+    local: NDArray[np.int32],
+    models: Collection[str],
+    spool: Spool,
+    most_near: int,
+    codes: range = ALL_CODES,
 ) -> Classes:
     """The class of each point of a voxel, local (n, 3) [voxel steps], n >= 1; equal points have the same.
 
-    most_near: points around those that are asked which may be held, as long as asking fewer helps.
+    most_near: points around those that are asked which may be held, as long as asking fewer helps.  codes: of a voxel
+    that is built in parts, the Morton codes of the part that is asked; `local` are all points that have them.
     """
     _, first, back = np.unique(voxel_codes(local), return_index=True, return_inverse=True)
     own = local[first]  # in Morton order: a part of them is a part of space
@@ -74,7 +84,7 @@ def voxel_classes(
         asked = own[begin:end]
         box = np.stack([asked.min(axis=0) - reach, asked.max(axis=0) + reach]).astype(np.int64)
         most = most_near if end - begin > LEAST_TOGETHER else None
-        near = _points_near(key, [own[:begin], own[end:]], box, spool, most)
+        near = _points_near(chain([own[:begin], own[end:]], _around(key, box, spool, codes)), box, most)
         if near is None:
             middle = (begin + end) // 2
             parts += [(begin, middle), (middle, end)]
@@ -85,16 +95,16 @@ def voxel_classes(
 
 
 def _points_near(
-    key: int, own: list[NDArray[np.int32]], box: NDArray[np.int64], spool: Spool, most: int | None
+    around: Iterable[NDArray[np.int32]], box: NDArray[np.int64], most: int | None
 ) -> NDArray[np.int32] | None:
-    """The distinct points (m, 3) in a box (2, 3) around a part of a voxel, frame and box the voxel's; None: too many.
+    """The points (m, 3) of several sets that lie in a box (2, 3); None: too many.
 
-    own: the voxel's other points.  most: how many are too many; None: any number is held.
+    most: how many are too many; None: any number is held.
     """
     held = 0
     found: list[NDArray[np.int32]] = []
-    for points in chain(own, _around(key, box, spool)):
-        inside = points[((points >= box[0]) & (points <= box[1])).all(axis=1)]
+    for points in around:
+        inside = _inside(points, box)
         held += len(inside)
         if most is not None and held > most:
             return None
@@ -102,8 +112,16 @@ def _points_near(
     return np.concatenate(found)
 
 
-def _around(key: int, box: NDArray[np.int64], spool: Spool) -> Iterator[NDArray[np.int32]]:
-    """The distinct points of each other voxel that a box reaches into, (m, 3) in this voxel's frame."""
+def _inside(points: NDArray[np.int32], box: NDArray[np.int64]) -> NDArray[np.int32]:
+    """Those of the points (n, 3) that lie in a box (2, 3), corners inclusive."""
+    return points[((points >= box[0]) & (points <= box[1])).all(axis=1)]
+
+
+def _around(key: int, box: NDArray[np.int64], spool: Spool, codes: range) -> Iterator[NDArray[np.int32]]:
+    """The distinct points in a box, frame and box the voxel's, of all voxels; of this one those of no code in `codes`.
+
+    Several sets (m, 3), with no point in two of them.
+    """
     steps = spool.lattice.voxel_steps
     home = voxel_coordinates(np.array([key], np.uint64))[0]
     low = np.maximum(home + box[0] // steps, -KEY_BIAS)
@@ -117,17 +135,43 @@ def _around(key: int, box: NDArray[np.int64], spool: Spool) -> Iterator[NDArray[
         voxels = voxel_coordinates(spool.keys)
         keys = spool.keys[((voxels >= low) & (voxels <= high)).all(axis=1)]
     for other in keys.tolist():
-        if other != key:
-            shift = (voxel_coordinates(np.array([other], np.uint64))[0] - home) * steps
-            inside = [
-                rows["local"][
-                    ((rows["local"] >= box[0] - shift) & (rows["local"] <= box[1] - shift)).all(axis=1)
-                ]
-                for rows in spool.rows(other)
-            ]
-            points = np.concatenate(inside)
-            distinct = np.unique(voxel_codes(points), return_index=True)[1]
+        if other == key and codes == ALL_CODES:
+            continue
+        shift = (voxel_coordinates(np.array([other], np.uint64))[0] - home) * steps
+        for points in _points_in(other, box - shift, spool):
+            found, distinct = np.unique(voxel_codes(points), return_index=True)
+            if other == key:
+                distinct = distinct[(found < codes.start) | (found >= codes.stop)]
             yield (points[distinct] + shift).astype(np.int32)
+
+
+def _points_in(key: int, box: NDArray[np.int64], spool: Spool) -> Iterator[NDArray[np.int32]]:
+    """The points of a voxel in a box, frame and box the voxel's, (m, 3) of one cube of its octree after the other.
+
+    Read are cubes of at most READ_POINTS, or of one lattice position.
+    """
+    root = int(spool.lattice.voxel_steps - 1).bit_length()
+    waiting = [(0, root, np.zeros(3, np.int64))]
+    while waiting:
+        code, log2, low = waiting.pop()
+        if (box[1] < low).any() or (box[0] >= low + (1 << log2)).any():
+            continue
+        whole = log2 == root
+        past = code + (1 << 3 * log2)
+        count = spool.count(key) if whole else spool.block_count(key, code, past)
+        if count > READ_POINTS and log2 > 0:
+            half = log2 - 1
+            waiting += [
+                (
+                    code + (octant << 3 * half),
+                    half,
+                    low + ((np.array([octant, octant >> 1, octant >> 2]) & 1) << half),
+                )
+                for octant in range(8)
+            ]
+        elif count:
+            parts = spool.rows(key) if whole else spool.block_rows(key, code, past)
+            yield np.concatenate([_inside(rows["local"], box) for rows in parts])
 
 
 def _classify(asked: NDArray[np.int32], near: NDArray[np.int32], limits: Limits) -> NDArray[np.uint8]:

@@ -1,6 +1,7 @@
 """The builder's work units: a run of voxels -> one shard file. Pure and idempotent; run in any process."""
 
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -8,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..schemas.archive import shard_name, write_shard
-from ..schemas.codec import Record, encode_voxel
+from ..schemas.codec import encode_voxel
 from ..schemas.radius_model import RADIUS_CLASSES
-from ..schemas.voxel import VoxelData
 from ..schemas.voxel_grid import Lattice
-from .classes import voxel_classes
+from .classes import ALL_CODES, voxel_classes
 from .config import SHARD_POINTS, BuildConfig
+from .dense import BuiltVoxel, build_dense, is_dense
 from .octree import build_voxel, gather_voxel
 from .spool import Spool
 
@@ -69,29 +70,47 @@ def plan_shards(keys: NDArray[np.uint64], counts: NDArray[np.int64]) -> list[tup
     return plans
 
 
+class _ClassCounts:
+    """Finds the radius classes of a unit's voxels and counts them. of: (32,) int64.  capped: too few neighbours."""
+
+    def __init__(self, unit: ShardUnit) -> None:
+        """Nothing counted yet."""
+        self.unit = unit
+        self.of, self.capped = np.zeros(RADIUS_CLASSES, np.int64), 0
+
+    def find(self, key: int, local: NDArray[np.int32], codes: range = ALL_CODES) -> NDArray[np.uint8]:
+        """The classes (n,) of points (n, 3) of a voxel, see `voxel_classes`."""
+        unit = self.unit
+        found = voxel_classes(key, local, unit.config.models, unit.spool, unit.most_near, codes)
+        self.of += np.bincount(found.of_point, minlength=RADIUS_CLASSES)
+        self.capped += found.few
+        return found.of_point
+
+
 def build_shard(unit: ShardUnit) -> Shard:
     """Gather, build, compress and write the voxels of one shard, one at a time."""
-    with_classes = unit.config.models != {"mean"}
-    counts, capped = np.zeros(RADIUS_CLASSES, np.int64), 0
-
-    def voxels() -> Iterator[tuple[VoxelData, Record, NDArray[np.int64], NDArray[np.int64]]]:
-        nonlocal counts, capped
-        for key in unit.keys:
-            points = gather_voxel(unit.spool.rows(key))
-            if with_classes:
-                classes = voxel_classes(key, points.local, unit.config.models, unit.spool, unit.most_near)
-                counts += np.bincount(classes.of_point, minlength=RADIUS_CLASSES)
-                capped += classes.few
-                points = points._replace(radius_class=classes.of_point)
-            voxel = build_voxel(key, points, unit.lattice.voxel_steps, unit.config)
-            record = encode_voxel(voxel, unit.archive_id)
-            yield (
-                voxel,
-                record,
-                points.local.min(axis=0).astype(np.int64),
-                points.local.max(axis=0).astype(np.int64),
-            )
-
+    classes = None if unit.config.models == {"mean"} else _ClassCounts(unit)
     path = unit.folder / shard_name(unit.number, unit.generation)
-    rows = write_shard(path, unit.number, unit.archive_id, voxels(), version=2 if with_classes else 1)
+    rows = write_shard(
+        path, unit.number, unit.archive_id, _voxels(unit, classes), version=1 if classes is None else 2
+    )
+    counts, capped = (
+        (np.zeros(RADIUS_CLASSES, np.int64), 0) if classes is None else (classes.of, classes.capped)
+    )
     return Shard(path.name, rows, path.stat().st_size, counts, capped)
+
+
+def _voxels(unit: ShardUnit, classes: _ClassCounts | None) -> Iterator[BuiltVoxel]:
+    """Each voxel of a unit built, its record, and the bounds of its points."""
+    for key in unit.keys:
+        if is_dense(unit.spool.count(key), unit.config):
+            classify = None if classes is None else partial(classes.find, key)
+            yield build_dense(key, unit.spool, unit.config, unit.archive_id, unit.folder, classify)
+            continue
+        points = gather_voxel(unit.spool.rows(key))
+        low, high = (edge(points.local, axis=0).astype(np.int64) for edge in (np.min, np.max))
+        if classes is not None:
+            points = points._replace(radius_class=classes.find(key, points.local))
+        voxel = build_voxel(key, points, unit.lattice.voxel_steps, unit.config)
+        del points
+        yield BuiltVoxel(voxel, encode_voxel(voxel, unit.archive_id), low, high)

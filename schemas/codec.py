@@ -5,15 +5,19 @@ shuffle filter followed by the registered zstd filter 32015, so that any HDF5 to
 FORMAT.md says the same in prose; change both together.
 """
 
+import mmap
+import os
+import tempfile
 import threading
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import zstandard
 from numpy.typing import NDArray
 
-from .errors import CorruptError
+from .errors import BadRequestError, CorruptError
 from .kernels.rows import delta_along, join_planes, lanes_to_points, leaf_bytes, leaf_column
 from .radius_model import RADIUS_CLASSES
 from .voxel import (
@@ -46,6 +50,11 @@ _PARAMETERS = zstandard.ZstdCompressionParameters(
 )
 
 _OF_THREAD = threading.local()
+
+# What is compressed at a time of a frame that is not held. The frame's bytes may depend on it.
+STREAM_BYTES = 1 << 20
+# The index says a frame's length in 32 bits (FORMAT.md).
+MAX_FRAME_BYTES = (1 << 32) - 1
 
 CELL_DTYPE = np.dtype(
     [
@@ -91,12 +100,16 @@ def voxel_point_dtype(voxel: VoxelData) -> np.dtype:
     return point_dtype(**{name: getattr(voxel, name) is not None for name in OPTIONAL_COLUMNS})
 
 
+# A zstd frame: held, or in a file that goes with the mapping.
+Frame = bytes | mmap.mmap
+
+
 class Record(NamedTuple):
     """The compressed bytes of one voxel: one zstd frame a dataset, the rows each holds, and its leaf nodes."""
 
-    cells: bytes
-    nodes: bytes
-    points: bytes
+    cells: Frame
+    nodes: Frame
+    points: Frame
     cell_rows: int
     node_rows: int
     point_rows: int
@@ -114,22 +127,95 @@ class RecordShape(NamedTuple):
 
 def encode_voxel(voxel: VoxelData, archive_id: bytes) -> Record:
     """Compress a voxel. archive_id: 16 bytes, repeated in every record. `decode_voxel` gives it back bit for bit."""
-    links = link_nodes(voxel)
-    cells = np.zeros(len(voxel.cells.nodes), CELL_DTYPE)
-    cells["archive"] = np.frombuffer(archive_id, "<u8")
-    cells["voxel"] = voxel.key
-    for name, column in zip(Cells._fields, voxel.cells, strict=True):
-        cells[name] = column
-    nodes = np.zeros(len(voxel.nodes.count), NODE_DTYPE)
-    for name, column in zip(Nodes._fields, voxel.nodes, strict=True):
-        nodes[name] = column
-    points = np.zeros(len(voxel.points), voxel_point_dtype(voxel))
-    first, count, axis = _leaf_runs(voxel, links)
-    points["xyz"] = delta_along(voxel.points, first, count, axis)
-    for name in OPTIONAL_COLUMNS:
-        if getattr(voxel, name) is not None:
-            points[name] = getattr(voxel, name)
-    return Record(_pack(cells), _pack(nodes), _pack(points), len(cells), len(nodes), len(points), len(first))
+    leaf_runs = _leaf_runs(voxel, link_nodes(voxel))
+    columns = {name: getattr(voxel, name) for name in OPTIONAL_COLUMNS}
+    cells = cell_rows(voxel.key, archive_id, voxel.cells)
+    nodes = node_rows(voxel.nodes)
+    points = point_rows(voxel.points, leaf_runs, columns)
+    leaves = len(leaf_runs[0])
+    return Record(_pack(cells), _pack(nodes), _pack(points), len(cells), len(nodes), len(points), leaves)
+
+
+def cell_rows(key: int, archive_id: bytes, cells: Cells) -> NDArray:
+    """The rows (c,) of the cells dataset."""
+    rows = np.zeros(len(cells.nodes), CELL_DTYPE)
+    rows["archive"] = np.frombuffer(archive_id, "<u8")
+    rows["voxel"] = key
+    for name, column in zip(Cells._fields, cells, strict=True):
+        rows[name] = column
+    return rows
+
+
+def node_rows(nodes: Nodes) -> NDArray:
+    """The rows (n,) of the nodes dataset."""
+    rows = np.zeros(len(nodes.count), NODE_DTYPE)
+    for name, column in zip(Nodes._fields, nodes, strict=True):
+        rows[name] = column
+    return rows
+
+
+def point_rows(
+    points: NDArray[np.uint16],
+    leaf_runs: tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]],
+    columns: Mapping[str, NDArray | None],
+) -> NDArray:
+    """The rows (p,) of the points dataset, or of a part of it that is whole leaf nodes.
+
+    points: (p, 3) as in VoxelData.  leaf_runs: first point, number of points and sort axis of every leaf node.
+    columns: by name, those of OPTIONAL_COLUMNS that there are.
+    """
+    kept = {name: columns.get(name) for name in OPTIONAL_COLUMNS}
+    rows = np.zeros(len(points), point_dtype(**{name: column is not None for name, column in kept.items()}))
+    rows["xyz"] = delta_along(points, *leaf_runs)
+    for name, column in kept.items():
+        if column is not None:
+            rows[name] = column
+    return rows
+
+
+class RowStream:
+    """A dataset of a record whose rows come in parts, in any order: their byte planes in a file, then one frame.
+
+    For voxels that are not to be held. The frame's bytes are a function of the rows, not of the parts; they are not
+    those that `encode_voxel` finds, which has all of them at once. Its files have no name and go with the process.
+    """
+
+    def __init__(self, scratch: Path, dtype: np.dtype, rows: int) -> None:
+        """Make room in the folder `scratch` for so many rows."""
+        self._scratch, self._dtype, self._rows = scratch, dtype, rows
+        self._planes = tempfile.TemporaryFile(dir=scratch, buffering=0)  # noqa: SIM115  `frame` closes it
+
+    def put(self, first: int, rows: NDArray) -> None:
+        """Take the rows from row `first` on."""
+        for number, plane in enumerate(_planes_of(rows.astype(self._dtype, copy=False))):
+            pwrite_all(self._planes.fileno(), plane, number * self._rows + first)
+
+    def frame(self) -> mmap.mmap:
+        """The frame, once all rows are there. Raises BadRequestError for one that the index could not name."""
+        with self._planes as planes, tempfile.TemporaryFile(dir=self._scratch, buffering=0) as file:
+            size = self._rows * self._dtype.itemsize
+            stream = zstandard.ZstdCompressor(compression_params=_PARAMETERS).compressobj(size=size)
+            written = 0
+            for at in range(0, size, STREAM_BYTES):
+                part = os.pread(planes.fileno(), min(STREAM_BYTES, size - at), at)
+                written += pwrite_all(file.fileno(), stream.compress(part), written)
+            written += pwrite_all(file.fileno(), stream.flush(), written)
+            if written > MAX_FRAME_BYTES:
+                raise BadRequestError(
+                    f"a voxel of {self._rows} rows takes {written} bytes, a record holds {MAX_FRAME_BYTES}: "
+                    "give a smaller --voxel"
+                )
+            return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+
+
+def pwrite_all(descriptor: int, data: bytes | NDArray, at: int) -> int:
+    """Write all of the data at an offset of a file; returns how many bytes."""
+    left = memoryview(data).cast("B")
+    size = len(left)
+    while left:
+        written = os.pwrite(descriptor, left, at)
+        at, left = at + written, left[written:]
+    return size
 
 
 class OpenRecord(NamedTuple):
@@ -270,8 +356,12 @@ def _leaf_runs(
 
 def _pack(rows: NDArray) -> bytes:
     """Byte planes (HDF5's shuffle) of a packed array, as one zstd frame with checksum and declared size."""
-    planes = np.ascontiguousarray(rows.view(np.uint8).reshape(len(rows), -1).T)
-    return zstandard.ZstdCompressor(compression_params=_PARAMETERS).compress(planes.data)
+    return zstandard.ZstdCompressor(compression_params=_PARAMETERS).compress(_planes_of(rows).data)
+
+
+def _planes_of(rows: NDArray) -> NDArray[np.uint8]:
+    """The byte planes (itemsize, n) of packed rows (n,)."""
+    return np.ascontiguousarray(rows.view(np.uint8).reshape(len(rows), rows.dtype.itemsize).T)
 
 
 def _unpack(

@@ -7,9 +7,9 @@ from pathlib import Path
 import naive_classes
 import numpy as np
 import pytest
-import solidcloud.builder.shards as shards
 from numpy.typing import NDArray
 from scans import make_scan, write_xyz
+from solidcloud.builder import classes, dense, shards
 from solidcloud.builder.classes import class_limits, voxel_classes
 from solidcloud.builder.config import BuildConfig, parse_radius
 from solidcloud.builder.kernels.classes import FEW, point_classes
@@ -306,3 +306,23 @@ def test_a_config_always_holds_the_mean() -> None:
         BuildConfig(models=frozenset({"local"}))
     with pytest.raises(BadRequestError, match="--radius colour,mean"):
         BuildConfig(models=frozenset({"mean", "colour"}))
+
+
+@pytest.mark.parametrize("kind", ["corner", "duplicates"])
+def test_a_dense_voxel_has_the_same_classes(
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Voxels built in parts, among points that are read cube by cube: of their own voxel, and of dense ones around."""
+    lattice = cloud(kind, 4)
+    for voxel in (8.0, 0.7):
+        expected = stored(build(tmp_path, lattice, voxel=voxel))
+        with monkeypatch.context() as patch:
+            patch.setattr(dense, "DENSE_POINTS", 60)
+            patch.setattr(classes, "READ_POINTS", 25)
+            folder = build(tmp_path, lattice, voxel=voxel)
+        points, found, header = stored(folder)
+        assert np.array_equal(points, expected[0])
+        assert np.array_equal(found, expected[1])
+        assert header.radius_counts.tolist() == expected[2].radius_counts.tolist()
+        assert header.radius_capped == expected[2].radius_capped
+        assert verify_archive(folder, deep=True).faults == ()

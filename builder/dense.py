@@ -1,0 +1,324 @@
+"""Voxels of more points than are held at once: built part by part, ordered and compressed from files.
+
+A cell of the octree is split by what is in it alone, and every cube of more than `cell_points` is split; so cubes that
+the spool says hold few enough points can be built one after the other, and give the cells that the whole voxel would.
+What they give is spilled in their order. Then the top hierarchy is packed over the cells, and they pass once more, in
+its order: bounding it, and becoming the record's rows. The voxel is the one that octree.py builds of the same points,
+row for row (tests/unit/builder/test_dense.py); only its frames are compressed as streams.
+
+Held are a part of DENSE_POINTS, and of each cell some 300 bytes at most. Not bounded are the points of one cell: those
+of one lattice position, where there are more of them, and those of `cell_points` where that is larger.
+"""
+
+import os
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..schemas.codec import (
+    CELL_DTYPE,
+    NODE_DTYPE,
+    OPTIONAL_COLUMNS,
+    Record,
+    RowStream,
+    cell_rows,
+    node_rows,
+    point_dtype,
+    point_rows,
+    pwrite_all,
+)
+from ..schemas.errors import CorruptError
+from ..schemas.voxel import CELL_BITS, Cells, Nodes, VoxelData, top_shift
+from .cells import CellTrees, block_points, build_trees, leaf_runs
+from .config import BuildConfig
+from .kernels.bounding_sphere import SPREAD
+from .kernels.octree import split_octree
+from .kernels.spill import by_axis, by_cell
+from .kernels.trees import EXTREMES
+from .octree import VoxelPoints, canonical, gather_voxel
+from .spool import Spool
+from .top import Top, pack_top
+
+# Voxels of more are built in parts of at most so many, always, so that no archive depends on the memory it was built
+# with. Work of a part takes some 60 bytes a point.
+DENSE_POINTS = 1 << 20
+# Points of cells that pass at once on the way into the record.
+WINDOW_POINTS = 1 << 17
+
+# The points of a part, all whose Morton codes are in a range, and the range -> the radius class of each.
+Classify = Callable[[NDArray[np.int32], range], NDArray[np.uint8]]
+
+
+class Cube(NamedTuple):
+    """A cube of the octree: the Morton codes of its points, from `code` on, its edge 2^log2 steps; how many points."""
+
+    code: int
+    log2: int
+    points: int
+
+    @property
+    def past(self) -> int:
+        """The first code behind it."""
+        return self.code + (1 << 3 * self.log2)
+
+
+class BuiltVoxel(NamedTuple):
+    """A voxel built, as `write_shard` takes it. voxel: at least its key and which columns it has.
+
+    low, high: (3,) int64, least and greatest coordinates of its points [voxel steps].
+    """
+
+    voxel: VoxelData
+    record: Record
+    low: NDArray[np.int64]
+    high: NDArray[np.int64]
+
+
+def is_dense(points: int, config: BuildConfig) -> bool:
+    """Whether a voxel of so many points is built in parts. Balanced cells, kept to compare, want the whole voxel."""
+    return points > DENSE_POINTS and config.cells == "octree"
+
+
+def plan_parts(spool: Spool, key: int, config: BuildConfig) -> Iterator[list[Cube]]:
+    """Cut a voxel into parts, in Morton order: cubes side by side that hold at most DENSE_POINTS together, or one cube
+    that cannot be cut."""
+    most = max(DENSE_POINTS, config.cell_points)
+    root = Cube(0, int(spool.lattice.voxel_steps - 1).bit_length(), spool.count(key))
+    waiting, part = [root], list[Cube]()
+    while waiting:
+        cube = waiting.pop()
+        if cube.points > most and cube.log2 > 0:
+            edge = 1 << 3 * (cube.log2 - 1)
+            children = [
+                Cube(code, cube.log2 - 1, spool.block_count(key, code, code + edge))
+                for code in range(cube.code, cube.past, edge)
+            ]
+            waiting += [child for child in reversed(children) if child.points]
+            continue
+        if part and sum(c.points for c in part) + cube.points > most:
+            yield part
+            part = []
+        part.append(cube)
+    yield part
+
+
+def build_dense(
+    key: int,
+    spool: Spool,
+    config: BuildConfig,
+    archive_id: bytes,
+    scratch: Path,
+    classify: Classify | None = None,
+) -> BuiltVoxel:
+    """Build a voxel and its record, as octree.py and codec.py do together, holding a part of it at a time.
+
+    scratch: a folder for files without names, of about 9 bytes a point and 12 more in turn.  classify: of a part; None:
+    no radius classes.
+    """
+    names = [name for name in OPTIONAL_COLUMNS[:2] if name in (spool.dtype.names or ())]
+    dtype = point_dtype(
+        scan_index="scan_index" in names, intensity="intensity" in names, radius_class=classify is not None
+    )
+    with _Spill(scratch, dtype) as spill:
+        for part in plan_parts(spool, key, config):
+            codes_of = range(part[0].code, part[-1].past)
+            points, codes = canonical(gather_voxel(spool.block_rows(key, codes_of.start, codes_of.stop)))
+            if classify is not None:
+                points = points._replace(radius_class=classify(points.local, codes_of))
+            spill.put(_build_part(points, codes, part, config), points)
+        return _Layout(key, spill, spool.lattice.voxel_steps, config, archive_id, scratch).write()
+
+
+def _build_part(
+    points: VoxelPoints, codes: NDArray[np.uint64], part: list[Cube], config: BuildConfig
+) -> CellTrees:
+    """The cells of cubes side by side, and their hierarchies."""
+    starts, sizes, at = [], [], 0
+    for cube in part:
+        found = split_octree(codes[at : at + cube.points], cube.log2, CELL_BITS, config.cell_points)
+        starts.append(at + found[0])
+        sizes.append(found[1])
+        at += cube.points
+    return build_trees(points.local, np.concatenate(starts), np.concatenate(sizes), config)
+
+
+class _Spill:
+    """The cells made so far, on disk in Morton order; in memory their corners, sizes and how much they hold."""
+
+    def __init__(self, scratch: Path, dtype: np.dtype) -> None:
+        """Spill into the folder `scratch` what is wanted for points of rows of `dtype`."""
+        self.names = [name for name in dtype.names or () if name != "xyz"]
+        self.dtype = dtype
+        self.columns = np.dtype([(name, dtype[name]) for name in self.names])
+        self._files = [tempfile.TemporaryFile(dir=scratch, buffering=0) for _ in range(4)]  # noqa: SIM115  __exit__
+        self._ends = [0] * 4
+        self._cells: list[tuple[NDArray[Any], ...]] = []
+
+    def __enter__(self) -> "_Spill":
+        """The spill itself."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close the files, and so lose them."""
+        for file in self._files:
+            file.close()
+
+    def put(self, trees: CellTrees, points: VoxelPoints) -> None:
+        """Take the cells of a part and the points that they were made of."""
+        columns = np.empty(len(trees.rank), self.columns)
+        for name in self.names:
+            columns[name] = getattr(points, name)[trees.rank]
+        stats = [trees.spreads.tobytes(), trees.extremes.tobytes()]
+        for i, data in enumerate(
+            [
+                by_cell(trees.xyz, trees.starts),
+                columns.view(np.uint8) if self.names else b"",
+                node_rows(trees.nodes).view(np.uint8),
+            ]
+        ):
+            self._ends[i] += pwrite_all(self._files[i].fileno(), data, self._ends[i])
+        self._ends[3] += pwrite_all(self._files[3].fileno(), b"".join(stats), self._ends[3])
+        self._cells.append(
+            (
+                trees.low.astype(np.int32),
+                trees.log2_size,
+                np.diff(trees.starts).astype(np.uint32),
+                np.diff(trees.rows).astype(np.uint32),
+            )
+        )
+
+    def cells(self) -> Cells:
+        """The cells as stored, in Morton order."""
+        low, log2_size, points, nodes = (np.concatenate(column) for column in zip(*self._cells, strict=True))
+        return Cells(low, log2_size, nodes, points)
+
+    def stats(self) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+        """The spreads and extremes of all cells, in Morton order."""
+        spreads, extremes, at = [], [], 0
+        for low, *_ in self._cells:
+            c = len(low)
+            raw = os.pread(self._files[3].fileno(), c * (8 * SPREAD + 12 * EXTREMES), at)
+            spreads.append(np.frombuffer(raw, np.float64, c * SPREAD).reshape(c, SPREAD))
+            extremes.append(np.frombuffer(raw, np.int32, offset=8 * c * SPREAD).reshape(c, EXTREMES, 3))
+            at += len(raw)
+        return np.concatenate(spreads), np.concatenate(extremes)
+
+    def take(self, which: int, starts: NDArray[np.int64], counts: NDArray[np.int64], size: int) -> NDArray:
+        """The bytes of some cells, one behind the other: their items of `size` bytes in file `which`."""
+        taken = np.empty(int(counts.sum()) * size, np.uint8)
+        view, at = memoryview(taken), 0
+        descriptor = self._files[which].fileno()
+        for start, count in zip((starts * size).tolist(), (counts * size).tolist(), strict=True):
+            got = os.preadv(descriptor, [view[at : at + count]], start)
+            if got != count:
+                raise CorruptError(f"a spill file ends {count - got} bytes too soon: check the disk")
+            at += count
+        return taken
+
+
+class _Layout:
+    """The cells of a spill, put into the order of the top hierarchy over them, and into the rows of a record."""
+
+    def __init__(
+        self, key: int, spill: _Spill, voxel_steps: int, config: BuildConfig, archive_id: bytes, scratch: Path
+    ) -> None:
+        """Pack the top hierarchy."""
+        self.key, self.spill, self.config = key, spill, config
+        self.archive_id, self.scratch, self.shift = archive_id, scratch, top_shift(voxel_steps)
+        cells = spill.cells()
+        spreads, extremes = spill.stats()
+        self.low = extremes.min(axis=(0, 1)).astype(np.int64)
+        self.high = extremes.max(axis=(0, 1)).astype(np.int64)
+        self.top: Top | None = None
+        order = np.zeros(1, np.int64)
+        if len(cells.nodes) > 1:
+            low = cells.low.astype(np.int64)
+            self.top = pack_top(low, cells.log2_size, spreads, extremes, voxel_steps, config)
+            order = self.top.order
+        points, nodes = (np.cumsum(np.append(0, c), dtype=np.int64) for c in (cells.points, cells.nodes))
+        self.first_point, self.first_node = points[order], nodes[order]
+        self.cells = Cells(*(column[order] for column in cells))
+
+    def write(self) -> BuiltVoxel:
+        """Let the cells pass, and compress their rows."""
+        spill, c = self.spill, len(self.cells.nodes)
+        counts = self.cells.points.astype(np.int64)
+        top_rows = 0 if self.top is None else len(self.top.count)
+        total, nodes_total = int(counts.sum()), top_rows + int(self.cells.nodes.sum(dtype=np.int64))
+        points = RowStream(self.scratch, spill.dtype, total)
+        nodes = RowStream(self.scratch, NODE_DTYPE, nodes_total)
+        at_point, at_node, leaves = 0, top_rows + c, 0
+        for first, past in _windows(counts):
+            trees, columns = self._read(first, past)
+            if self.top is not None:
+                self.top.grow(trees.xyz, trees.starts, trees.low, first)
+            runs = leaf_runs(trees, self.config.leaf)
+            kept = {name: columns[name] for name in spill.names}
+            rows = point_rows(block_points(trees, self.config.leaf), runs, kept)
+            points.put(at_point, rows)
+            at_point, leaves = at_point + len(rows), leaves + len(runs[0])
+            is_root = np.zeros(len(trees.nodes.count), bool)
+            is_root[trees.rows[:-1]] = True
+            rows = node_rows(trees.nodes)
+            nodes.put(top_rows + first, rows[is_root])
+            nodes.put(at_node, rows[~is_root])
+            at_node += len(rows) - (past - first)
+        if self.top is not None:
+            nodes.put(0, node_rows(self.top.rows()))
+        cells = RowStream(self.scratch, CELL_DTYPE, c)
+        cells.put(0, cell_rows(self.key, self.archive_id, self.cells))
+        record = Record(cells.frame(), nodes.frame(), points.frame(), c, nodes_total, total, leaves)
+        return BuiltVoxel(self._shell(), record, self.low, self.high)
+
+    def _read(self, first: int, past: int) -> tuple[CellTrees, NDArray]:
+        """Some cells of the top hierarchy's order, their points' columns behind."""
+        of = slice(first, past)
+        cells = Cells(*(column[of] for column in self.cells))
+        points, nodes = cells.points.astype(np.int64), cells.nodes.astype(np.int64)
+        starts, rows = (np.concatenate([[0], np.cumsum(held)]) for held in (points, nodes))
+        flat = self.spill.take(0, self.first_point[of], points, 6).view(np.uint16)
+        stored = self.spill.take(2, self.first_node[of], nodes, NODE_DTYPE.itemsize).view(NODE_DTYPE)
+        columns = np.empty(0, self.spill.columns)
+        if self.spill.names:
+            size = self.spill.columns.itemsize
+            columns = self.spill.take(1, self.first_point[of], points, size).view(self.spill.columns)
+        trees = CellTrees(
+            cells.low.astype(np.int64),
+            cells.log2_size,
+            starts,
+            rows,
+            Nodes(*(np.ascontiguousarray(stored[name]) for name in Nodes._fields)),
+            by_axis(flat, starts),
+            np.empty(0, np.int32),
+            np.empty((0, SPREAD)),
+            np.empty((0, EXTREMES, 3), np.int32),
+        )
+        return trees, columns
+
+    def _shell(self) -> VoxelData:
+        """The voxel without rows: its key, and which columns it has."""
+        none = np.empty((0, 3))
+        cells, nodes = cell_rows(0, bytes(16), Cells(*(c[:0] for c in self.cells))), np.empty(0, NODE_DTYPE)
+        return VoxelData(
+            self.key,
+            self.shift,
+            Cells(*(cells[name] for name in Cells._fields)),
+            Nodes(*(nodes[name] for name in Nodes._fields)),
+            none.astype(np.uint16),
+            **{name: np.empty(0, self.spill.dtype[name]) for name in self.spill.names},
+        )
+
+
+def _windows(counts: NDArray[np.int64]) -> Iterator[tuple[int, int]]:
+    """Cut cells of so many points (c,) into runs, first and past, of about WINDOW_POINTS, and at least one cell."""
+    ends = np.cumsum(counts)
+    first = 0
+    while first < len(counts):
+        before = int(ends[first - 1]) if first else 0
+        past = max(first + 1, int(np.searchsorted(ends, before + WINDOW_POINTS, side="right")))
+        yield first, past
+        first = past

@@ -1,0 +1,30 @@
+"""Points of cells, (3, n), and the same with each cell's x, y and z side by side, so that one read gets a cell."""
+
+import numba as nb
+import numpy as np
+
+
+@nb.njit(nogil=True, cache=True)
+def by_cell(xyz, starts):
+    """Points (3, n) uint16 of the cells that begin at starts (c + 1,) as (3 n,): x[], y[], z[] of each cell."""
+    flat = np.empty(3 * xyz.shape[1], np.uint16)
+    for cell in range(starts.shape[0] - 1):
+        lo, held = np.uint64(starts[cell]), np.uint64(starts[cell + 1] - starts[cell])
+        for k in range(np.uint64(3)):
+            to = np.uint64(3) * lo + k * held
+            for i in range(held):
+                flat[to + i] = xyz[k, lo + i]
+    return flat
+
+
+@nb.njit(nogil=True, cache=True)
+def by_axis(flat, starts):
+    """Undo `by_cell`."""
+    xyz = np.empty((3, flat.shape[0] // 3), np.uint16)
+    for cell in range(starts.shape[0] - 1):
+        lo, held = np.uint64(starts[cell]), np.uint64(starts[cell + 1] - starts[cell])
+        for k in range(np.uint64(3)):
+            at = np.uint64(3) * lo + k * held
+            for i in range(held):
+                xyz[k, lo + i] = flat[at + i]
+    return xyz

@@ -16,6 +16,9 @@ from .scan import NOT_FINITE, Block, Scan, reader_library, scan_error
 STEP_U = 0.7548776662466927
 STEP_V = 0.5698402909980532
 
+# A vertex that is damaged makes a surface of any size: more points than the largest archive has are no scan.
+MOST_SAMPLES = 1e12
+
 # trimesh holds a mesh whole: an OBJ takes about five times its file while it is read.
 LARGEST_MESH = 512 << 20
 
@@ -44,8 +47,17 @@ class SurfaceSamples(Scan):
         lost = int(np.count_nonzero(~np.isfinite(area)))
         if lost:
             self.dropped[NOT_FINITE] = lost
-        total = np.cumsum(np.where(np.isfinite(area), area, 0.0))
-        count = int(np.ceil(total[-1] / self._spacing**2)) if len(total) else 0
+        with np.errstate(over="ignore"):
+            total = np.cumsum(np.where(np.isfinite(area), area, 0.0))
+        wanted = total[-1] / self._spacing**2 if len(total) else 0.0
+        if not wanted <= MOST_SAMPLES:
+            raise scan_error(
+                self.path,
+                f"a surface of {total[-1]:.3g} square lengths, {wanted:.3g} points",
+                f"at most {MOST_SAMPLES:.0g}",
+                "check the mesh and its units, or give a larger --spacing",
+            )
+        count = int(np.ceil(wanted))
         for start in range(0, count, block_points):
             k = np.arange(start, min(start + block_points, count), dtype=np.float64)
             face = np.searchsorted(total, (k + 0.5) * (total[-1] / count), side="right")

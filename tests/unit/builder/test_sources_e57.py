@@ -132,3 +132,19 @@ def test_bounds_of_an_e57_are_unknown_where_one_scan_states_none(local: np.ndarr
     columns = cartesian(local)
     write_e57(path, [{"columns": columns, "bounds": [[-1, -2, -3], [4, 5, 6]]}, {"columns": columns}])
     assert header_bounds(path) is None
+
+
+def test_a_byte_changed_in_any_page_is_found_by_its_checksum(tmp_path: Path) -> None:
+    """Every page ends in a checksum; headers, XML, index and points lie in pages alike."""
+    rng = np.random.default_rng(4)
+    scans = [{"columns": cartesian(rng.uniform(-5, 5, (count, 3)))} for count in (100, 60)]
+    path = write_e57(tmp_path / "a.e57", scans)
+    whole = path.read_bytes()
+    pages = len(whole) // 1024
+    assert pages > 5 and len(read_all(path)) == 160
+    for page in range(pages):
+        data = bytearray(whole)
+        data[1024 * page + int(rng.integers(48, 1024))] ^= 1 << int(rng.integers(8))
+        path.write_bytes(data)
+        with pytest.raises(ScanError, match="checksum"):
+            read_all(path)

@@ -5,7 +5,7 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from types import TracebackType
 from typing import Protocol, Self, TypeVar
@@ -19,6 +19,8 @@ Result = TypeVar("Result")
 
 # Below this many points a second process costs more (1 to 2 s to start and to load the kernels) than it saves.
 POINTS_WORTH_A_PROCESS = 4_000_000
+# Units handed out and not done, and results that wait for those before them, a process.
+WAITING, AHEAD = 4, 64
 
 
 class Executor(Protocol):
@@ -46,7 +48,7 @@ class Executor(Protocol):
         progress: Progress,
         size: Callable[[Unit], int],
     ) -> Iterator[Result]:
-        """function(unit) for each unit, in order; progress advances by size(unit) as each result is taken."""
+        """function(unit) for each unit, in order; progress advances by size(unit) as units are done."""
         ...
 
 
@@ -117,29 +119,41 @@ class ProcessExecutor:
         progress: Progress,
         size: Callable[[Unit], int],
     ) -> Iterator[Result]:
-        """function(unit) for each unit, in order; progress advances by size(unit) as each result is taken.
+        """function(unit) for each unit, in order; progress advances by size(unit) as each is done.
 
-        At most four units a process are handed out ahead, so that results waiting their turn stay bounded.
+        Some units are handed out ahead, so that no process waits for another's long one; results that wait their turn
+        stay bounded by AHEAD a process. A unit that fails ends all when it does.
         """
         if self._pool is None:
             for unit in units:
                 yield function(unit)
                 progress.advance(size(unit))
             return
-        ahead = 4 * self.jobs
-        futures: list[Future[Result] | None] = [self._pool.submit(function, unit) for unit in units[:ahead]]
-        for i, unit in enumerate(units):
-            future = futures[i]
-            assert future is not None
-            try:
-                result = future.result()
-            except BrokenProcessPool:
-                raise SolidcloudError(
-                    "a worker process ended at once: out of memory? give fewer --jobs or a smaller --memory; the same "
-                    "command goes on where it was"
-                ) from None
-            futures[i] = future = None  # the result is held by nobody but who takes it
-            if i + ahead < len(units):
-                futures.append(self._pool.submit(function, units[i + ahead]))
-            yield result
-            progress.advance(size(unit))
+        running: dict[Future[Result], int] = {}
+        results: dict[int, Result] = {}
+        given = 0
+        for taken in range(len(units)):
+            while taken not in results:
+                while (
+                    given < len(units)
+                    and len(running) < WAITING * self.jobs
+                    and given - taken < AHEAD * self.jobs
+                ):
+                    running[self._pool.submit(function, units[given])] = given
+                    given += 1
+                for future in wait(running, return_when=FIRST_COMPLETED).done:
+                    number = running.pop(future)
+                    results[number] = _result(future)
+                    progress.advance(size(units[number]))
+            yield results.pop(taken)
+
+
+def _result(future: Future[Result]) -> Result:
+    """The result of a unit that is done, or what it raised."""
+    try:
+        return future.result()
+    except BrokenProcessPool:
+        raise SolidcloudError(
+            "a worker process ended at once: out of memory? give fewer --jobs or a smaller --memory; the same command "
+            "goes on where it was"
+        ) from None

@@ -1,7 +1,13 @@
 """Work units run in order, in this process or in others; a failure stops what waits."""
 
 import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
 from functools import partial
+from pathlib import Path
+from typing import Any
 
 import pytest
 import solidcloud.builder.executor as executor_module
@@ -52,6 +58,85 @@ def test_processes_give_the_same_in_the_same_order() -> None:
     assert results == [divmod(100, i) for i in range(1, 21)]
     assert os.getpid() not in processes
     assert progress.done == 20 + 1
+
+
+def slow_first(number: int, folder: str) -> str:
+    """Python text of a unit that says it ran; number 0 waits for all others."""
+    waits = f"while len(os.listdir({folder!r})) < 30: time.sleep(0.01)" if number == 0 else ""
+    says = f"open({folder!r} + '/{number}', 'w').close()"
+    return f"import os, time\n{waits}\n{says}"
+
+
+def test_a_long_unit_keeps_nobody_waiting(tmp_path: Path) -> None:
+    progress = Counted()
+    with ProcessExecutor(2) as executor:
+        results = executor.map(
+            exec, [slow_first(i, str(tmp_path)) for i in range(31)], progress, lambda unit: 1
+        )
+        assert list(results) == [None] * 31
+    assert progress.done == 31
+
+
+def test_results_that_wait_stay_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(executor_module, "AHEAD", 5)
+    with ProcessExecutor(2) as executor:
+        code = f"open({str(tmp_path)!r} + '/%d', 'w').close()"
+        results = executor.map(exec, [code % i for i in range(60)], Counted(), lambda unit: 1)
+        next(results)
+        assert len(list(tmp_path.iterdir())) <= 10
+        assert len(list(results)) == 59
+
+
+def test_an_interrupted_builder_does_not_wait_for_its_workers(tmp_path: Path) -> None:
+    begin = time.monotonic()
+    code = f"import time; open({str(tmp_path / 'runs')!r}, 'w').close(); time.sleep(600)"
+    with pytest.raises(KeyboardInterrupt), ProcessExecutor(2) as executor:
+        executor._pool.submit(exec, code)  # type: ignore[union-attr]
+        while not (tmp_path / "runs").exists():
+            time.sleep(0.01)
+        raise KeyboardInterrupt
+    assert time.monotonic() - begin < 300
+
+
+BUILDER = """
+import os, sys, time
+from solidcloud.builder.executor import ProcessExecutor
+if __name__ == "__main__":
+    with ProcessExecutor(2) as executor:
+        code = "import os, time; open(%r + '/' + str(os.getpid()), 'w').close(); time.sleep(600)" % sys.argv[1]
+        for _ in range(2):
+            executor._pool.submit(exec, code)
+        time.sleep(600)
+"""
+
+
+def test_workers_end_with_a_builder_that_is_killed(tmp_path: Path) -> None:
+    said = tmp_path / "said"
+    said.mkdir()
+    (tmp_path / "builder.py").write_text(BUILDER)
+    with subprocess.Popen([sys.executable, "-P", str(tmp_path / "builder.py"), str(said)]) as builder:
+        workers = until(
+            lambda: [int(p.name) for p in said.iterdir()] if len(list(said.iterdir())) == 2 else []
+        )
+        builder.kill()
+    assert until(lambda: not any(alive(worker) for worker in workers))
+
+
+def until(found: Callable[[], Any]) -> Any:
+    """What is found within a minute."""
+    deadline = time.monotonic() + 60
+    while not (result := found()):
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    return result
+
+
+def alive(process: int) -> bool:
+    """Whether a process runs; one that has ended and waits to be asked how does not."""
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
 
 
 def test_a_failure_here_stops_at_its_unit() -> None:

@@ -70,17 +70,108 @@ def _temporary(path: Path) -> Path:
     return path.with_name(f"{path.name}.{_PROCESS}-{os.getpid()}-{threading.get_ident()}.tmp")
 
 
-@contextlib.contextmanager
-def new_file(path: Path) -> Iterator[h5py.File]:
-    """An HDF5 file under a temporary name. Given its own only once it is closed and synced."""
-    temporary = _temporary(path)
-    try:
+class _Disk:
+    """A file that HDF5 writes, and whose errors it does not hear of: the first is kept in `error`.
+
+    With a full disk HDF5 2.0 crashed as it closed the file (SIGSEGV), or h5py printed what it ignored and went on. So
+    a write always succeeds; what comes after one that did not is kept in memory, for HDF5 to read back.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.error: OSError | None = None
+        self._path, self._position = path, 0
+        self._kept: list[tuple[int, bytes]] = []
+        self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o666)
+
+    def close(self) -> None:
+        os.close(self._descriptor)
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        if whence == os.SEEK_END:
+            ends = (at + len(data) for at, data in self._kept)
+            offset += max([os.fstat(self._descriptor).st_size, *ends])
+        elif whence == os.SEEK_CUR:
+            offset += self._position
+        self._position = offset
+        return offset
+
+    def tell(self) -> int:
+        return self._position
+
+    def write(self, data: memoryview) -> int:
+        data = memoryview(data).cast("B")
+        if self.error is None:
+            done = 0
+            try:
+                while done < len(data):
+                    done += os.pwrite(self._descriptor, data[done:], self._position + done)
+            except OSError as error:
+                self.error = OSError(error.errno, error.strerror, str(self._path))
+        if self.error is not None:
+            self._kept.append((self._position, bytes(data)))
+        self._position += len(data)
+        return len(data)
+
+    def read(self, size: int = -1) -> bytes:
+        raise NotImplementedError  # h5py asks whether it is there, and uses `readinto`
+
+    def readinto(self, buffer: memoryview) -> int:
+        view = memoryview(buffer).cast("B")
+        found = os.pread(self._descriptor, len(view), self._position)
+        view[:] = found + bytes(len(view) - len(found))
+        for at, data in self._kept:
+            low, high = max(at, self._position), min(at + len(data), self._position + len(view))
+            if low < high:
+                view[low - self._position : high - self._position] = data[low - at : high - at]
+        self._position += len(view)
+        return len(view)
+
+    def truncate(self, size: int) -> int:
+        try:
+            os.ftruncate(self._descriptor, size)
+        except OSError as error:
+            self.error = self.error or OSError(error.errno, error.strerror, str(self._path))
+        return size
+
+    def flush(self) -> None:
+        pass
+
+
+class NewFile(h5py.File):  # type: ignore[misc]
+    """An HDF5 file being written."""
+
+    def __init__(self, disk: _Disk) -> None:
+        """Write to `disk`."""
+        self._disk = disk
         # Metadata of format 1.10 and later is checksummed; in older ones 5 of 1,600 flips were silently wrong.
-        with h5py.File(temporary, "w", libver=("v110", "v110")) as file:
-            yield file
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
+        super().__init__(disk, "w", libver=("v110", "v110"))
+
+    def check(self) -> None:
+        """Raise the OSError of a write that failed: to be asked now and then while much is written."""
+        if self._disk.error is not None:
+            raise self._disk.error
+
+
+@contextlib.contextmanager
+def new_file(path: Path) -> Iterator[NewFile]:
+    """An HDF5 file under a temporary name. Given its own only once it is closed and synced.
+
+    A write that fails is an OSError that names the file; nothing is left then.
+    """
+    temporary = _temporary(path)
+    with contextlib.ExitStack() as stack:
+        disk = _Disk(temporary)
+        stack.callback(disk.close)
+        try:
+            with NewFile(disk) as file:
+                yield file
+            if disk.error is not None:
+                raise disk.error
+        except BaseException as error:
+            temporary.unlink(missing_ok=True)
+            if disk.error is not None and isinstance(error, Exception):
+                raise disk.error from None
+            raise
 
 
 def publish(path: Path) -> None:
@@ -158,6 +249,7 @@ def write_shard(
                 row["frame_offset"][i], row["frame_bytes"][i] = offset, size
                 row["frame_checksum"][i] = int.from_bytes(frames[i][-4:], "little")
             rows.append(row)
+            file.check()
     table = np.array(rows, VOXEL_DTYPE)
     temporary = _temporary(path)
     try:

@@ -25,6 +25,8 @@ from .config import RADIUS_SAMPLE, BuildConfig
 from .executor import Executor, make_executor, worker_count
 from .header import archive_id, make_header
 from .journal import Journal, Work, resumed
+from .memory import jobs_that_fit as jobs_that_fit
+from .memory import memory_share
 from .partition import (
     RunsHold,
     Spooled,
@@ -218,11 +220,6 @@ def _about(item: Input) -> int:
     return item.path.stat().st_size // BYTES_A_POINT
 
 
-def jobs_that_fit(jobs: int, config: BuildConfig) -> int:
-    """Processes that the memory bound allows, of so many that are wanted."""
-    return jobs
-
-
 def _is_whole(target: Path, inputs: Sequence[Input], config: BuildConfig, stages: _Stages) -> bool:
     """Whether the archive is there already."""
     if not target.is_dir():
@@ -386,7 +383,7 @@ def _spool(
 ) -> list[Spooled]:
     """Second pass: quantised points, sorted into voxels, on disk."""
     folder = place.folder / "spool"
-    most = run_points(config.memory_bytes // executor.jobs, dtype)
+    most = run_points(memory_share(executor.jobs, config), dtype)
     units = []
     for number, survey in enumerate(surveys):
         for part in survey.parts:
@@ -462,8 +459,8 @@ def _build_shards(
 ) -> list[Shard]:
     """Third pass: every voxel's octree and hierarchies, into shards; those with the most points first."""
     folder = place.archive / SHARD_FOLDER
-    # Beside the densest voxel, which may take all the memory while it is built and half of it before.
-    most_near = max(1 << 16, config.memory_bytes // (executor.jobs * 2 * VOXEL_BYTES_A_POINT))
+    # Beside the voxel itself, or a part of it.
+    most_near = max(1 << 16, memory_share(executor.jobs, config) // (2 * VOXEL_BYTES_A_POINT))
     plans = plan_shards(spool.keys, spool.counts)
     units = [
         (

@@ -1,0 +1,26 @@
+"""How `--memory` is shared: all processes of a build together, what they hold of the data and what they are made of."""
+
+from .config import BuildConfig
+
+# What a process takes before it holds a point, sum of PSS: Python, numpy, numba's compiled code, HDF5, a reader
+# (measured with two workers on LAS: the builder itself 75 MB, each worker 85 to 110).
+BUILDER_BYTES = 90 << 20
+WORKER_BYTES = 110 << 20
+# A build of one job is one process.
+ALONE_BYTES = 150 << 20
+# What a worker cannot do without: a part of a dense voxel (dense.py) and what is around it.
+LEAST_SHARE = 96 << 20
+# What a build may take over `--memory` rather than be refused: 64 MB is less than Python with numba.
+OVER_BYTES = 200 << 20
+
+
+def jobs_that_fit(jobs: int, config: BuildConfig) -> int:
+    """Processes that the memory bound allows, of so many that are wanted; at least one."""
+    room = config.memory_bytes + OVER_BYTES - BUILDER_BYTES
+    return max(1, min(jobs, room // (WORKER_BYTES + LEAST_SHARE)))
+
+
+def memory_share(jobs: int, config: BuildConfig) -> int:
+    """Bytes of data that each of `jobs` processes may hold."""
+    base = ALONE_BYTES if jobs == 1 else BUILDER_BYTES + jobs * WORKER_BYTES
+    return max(LEAST_SHARE, (config.memory_bytes - base) // jobs)

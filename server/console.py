@@ -32,9 +32,13 @@ def print_build(summary: "BuildSummary") -> None:
     print_facts(_build_facts(summary))
 
 
-def print_info(found: "SceneInfo", classes: "RadiusDistribution | None" = None) -> None:
-    """What an archive says of itself; classes: of its points, where they have any."""
-    print_facts((*_info_facts(found), *(_class_facts(classes, found.points) if classes else ())))
+def print_info(
+    found: "SceneInfo",
+    classes: "RadiusDistribution | None" = None,
+    more: Iterable[tuple[str, str]] = (),
+) -> None:
+    """What an archive says of itself; classes: of its points, where they have any.  more: names and values besides."""
+    print_facts((*_info_facts(found), *more, *(_class_facts(classes, found.points) if classes else ())))
 
 
 def bytes_text(count: float) -> str:

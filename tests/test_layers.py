@@ -17,7 +17,7 @@ DOORS = {
     "zstandard": ("schemas/codec.py",),
     "zenoh": ("server/transport.py", "server/client.py"),
     "numba": ("schemas/kernels/", "builder/kernels/", "server/kernels/", "server/report/kernels/"),
-    "laspy": ("builder/made/write.py",),
+    "laspy": ("builder/made/write.py", "builder/export_las.py"),
     "lazrs": ("builder/sources/las.py",),
     "pye57": ("builder/sources/e57.py", "builder/made/write.py"),
     "plyfile": ("builder/sources/ply.py",),

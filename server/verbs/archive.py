@@ -15,15 +15,17 @@ def info(archive: ArchivePath, as_json: AsJson = False) -> None:
     from ..console import print_info
     from ..scene import describe
     from ..store import Store
+    from .facts import archive_details, detail_facts
 
     store = Store(archive)
     found = describe(store, archive.resolve().name)
     classes = radius_distribution(store.archive.header)
+    details = archive_details(store)
     store.close()
     if as_json:
-        print_json({**msgspec.to_builtins(found), "radius_classes": msgspec.to_builtins(classes)})
+        print_json({**msgspec.to_builtins(found), "radius_classes": msgspec.to_builtins(classes), **details})
     else:
-        print_info(found, classes)
+        print_info(found, classes, detail_facts(details))
 
 
 def validate(
@@ -33,20 +35,27 @@ def validate(
     sample: Annotated[
         int | None, typer.Option(help="With --exact: only so many bounds, of all over it.")
     ] = None,
+    jobs: Annotated[int, typer.Option(min=0, help="Processes; 0: one a core, where it is worth one.")] = 0,
     as_json: AsJson = False,
 ) -> None:
     """Check every record; exit code 3 if one is broken."""
-    from ...builder.verify import verify_archive
+    from ...builder.executor import ProcessExecutor
+    from ...builder.verify import verify_archive, verify_jobs
     from ..progress import progress_listener
 
-    with progress_listener() as bars:
-        report = verify_archive(archive, deep=deep, exact=exact, sample=sample, progress=bars)
+    jobs = verify_jobs(archive, jobs, deep=deep, exact=exact)
+    with progress_listener() as bars, ProcessExecutor(jobs) as executor:
+        report = verify_archive(
+            archive, deep=deep, exact=exact, sample=sample, progress=bars, executor=executor
+        )
     if as_json:
         print_json(report._asdict())
     else:
         proved = f", {report.exact_nodes:,} of {report.nodes:,} bounds proved" if exact else ""
         counted = f"{report.voxels:,} voxels, {report.points:,} points{proved}"
         print(f"{archive}: {counted}, {len(report.faults)} faults")
+        for note in report.notes:
+            print(f"note: {note}")
     for fault in report.faults:
         complain(fault, 3)
     raise typer.Exit(3 if report.faults else 0)

@@ -1,0 +1,125 @@
+"""LAS and LAZ out of an archive, version 1.4, point format 6: coordinates as integers of the lattice's own step.
+
+A reader computes X * scale + offset. With the step for scale and the origin for offset that is how an archive's world
+coordinates are computed, to the last bit. Where 32 bits do not hold the lattice coordinates, the offset is moved along
+by whole steps: then a coordinate may be another in its last bits, and is still that of the same lattice point.
+"""
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import laspy
+import numpy as np
+from laspy.vlrs.known import WktCoordinateSystemVlr
+from numpy.typing import NDArray
+
+from ..schemas.errors import BadRequestError
+from ..schemas.index import Source
+from ..schemas.voxel_grid import Lattice
+from .export import Contents
+
+# The words that well-known texts begin with, in both of their versions [OGC 01-009, 18-010r7].
+_WKT = re.compile(
+    r"\s*(PROJ|GEOG|GEOC|GEOD|COMPD?|COMPOUND|BOUND|LOCAL|ENG|VERT|FITTED)\w*\s*[\[(]", re.IGNORECASE
+)
+# A record before the points is at most so long, a zero at its end included.
+_LONGEST_WKT = 65534
+# The field of intensities that 16 bits do not hold.
+EXACT_INTENSITY = "intensity_float"
+
+
+class LasOut:
+    """One LAS or LAZ file being written; a context manager. notes: what a reader should know of it."""
+
+    def __init__(
+        self, path: Path, lattice: Lattice, contents: Contents, crs: str, *, compressed: bool
+    ) -> None:
+        """crs: well-known text, or "". Raises BadRequestError where 32 bits cannot hold the coordinates."""
+        self.notes: list[str] = []
+        self._lattice, self._first = lattice, _first_steps(lattice, contents)
+        header = laspy.LasHeader(point_format=6, version="1.4")
+        header.scales = np.full(3, lattice.step)
+        header.offsets = lattice.to_world(self._first[None])[0]
+        header.generating_software = "solidcloud export"
+        header.system_identifier = "EXTRACTION"  # [LAS 1.4 R15, table 3]
+        header.global_encoding.wkt = True  # as formats from 6 on must say, text or none
+        if crs:
+            header.vlrs.append(WktCoordinateSystemVlr(crs))
+        self._float = "intensity" in contents.columns and not contents.whole_intensity
+        if self._float:
+            header.add_extra_dim(laspy.ExtraBytesParams(EXACT_INTENSITY, "float32"))
+            self.notes.append(
+                f"intensities are no whole numbers up to 65535: they are in the field {EXACT_INTENSITY}"
+            )
+        self._writer = laspy.open(
+            path.open("wb"), mode="w", header=header, do_compress=compressed, closefd=True
+        )
+
+    def __enter__(self) -> "LasOut":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._writer.close()
+
+    def append(
+        self, lattice: NDArray[np.int64], world: NDArray[np.float64], columns: dict[str, NDArray]
+    ) -> None:
+        """Write so many more points."""
+        record = laspy.ScaleAwarePointRecord.zeros(len(lattice), header=self._writer.header)
+        for name, column in zip("XYZ", (lattice - self._first).T, strict=True):
+            record[name] = column.astype(np.int32)
+        for name in ("return_number", "number_of_returns"):
+            record[name] = np.ones(len(lattice), np.uint8)
+        if "scan" in columns:
+            record["point_source_id"] = columns["scan"]
+        if self._float:
+            record[EXACT_INTENSITY] = columns["intensity"]
+        elif "intensity" in columns:
+            record["intensity"] = columns["intensity"].astype(np.uint16)
+        self._writer.write_points(record)
+
+
+def wkt_of(sources: Sequence[Source]) -> tuple[str, str]:
+    """The well-known text of the coordinate system that all scans of an archive are in, or ""; and a note, or "".
+
+    Only of scans in metres and z up: those of others were turned into what their text does not say.
+    """
+    held = [s for s in sources if s.count]
+    texts = {s.crs for s in held}
+    if texts <= {""}:
+        return "", ""
+    (text, *others) = sorted(texts)
+    if others:
+        return "", "the scans name several coordinate systems, or some none: none is in the file"
+    if not _WKT.match(text) or len(text.encode()) > _LONGEST_WKT:
+        return (
+            "",
+            f"the scans' coordinate system is not given as well-known text ({text[:60]}): it is not in the file",
+        )
+    if any((s.units, s.up) != ("m", "z") for s in held):
+        return "", "the scans' coordinate system is not that of metres with z up: it is not in the file"
+    return text, ""
+
+
+def _first_steps(lattice: Lattice, contents: Contents) -> NDArray[np.int64]:
+    """The lattice coordinates (3,) that the file's offset stands for: 0 where 32 bits hold the points' own."""
+    least, most = -(1 << 31), (1 << 31) - 1
+    far = (contents.low < least) | (contents.high > most)
+    middle = (contents.low + contents.high) // 2
+    first = np.where(far, middle, 0)
+    if (contents.high - contents.low > most - least).any():
+        extent = float((contents.high - contents.low).max()) * lattice.step
+        raise BadRequestError(
+            f"points {extent:g} m apart in steps of {lattice.step:g} m: more than the 32 bits of LAS hold: "
+            "export a smaller --box, or --format ply"
+        )
+    # The offset is rounded: lattice points must still be told apart, and come back as what they are.
+    ends = np.stack([contents.low, contents.high])
+    world = (ends - first) * lattice.step + lattice.to_world(first[None])[0]
+    if not np.array_equal(lattice.to_lattice(world), ends):
+        raise BadRequestError(
+            f"coordinates of {np.abs(world).max():g} m do not come back from LAS in steps of {lattice.step:g} m: "
+            "export --format ply"
+        )
+    return first

@@ -6,8 +6,8 @@ What they give is spilled in their order. Then the top hierarchy is packed over 
 its order: bounding it, and becoming the record's rows. The voxel is the one that octree.py builds of the same points,
 row for row (tests/unit/builder/test_dense.py); only its frames are compressed as streams.
 
-Held are a part of DENSE_POINTS, and of each cell some 300 bytes at most. Not bounded are the points of one cell: those
-of one lattice position, where there are more of them, and those of `cell_points` where that is larger.
+Held are a part of DENSE_POINTS, and of each cell some 300 bytes at most. Points of one lattice position are one cell,
+however many: of a heap of more than a part only the nodes are held, and the columns, where some are kept.
 """
 
 import os
@@ -32,11 +32,13 @@ from ..schemas.codec import (
     pwrite_all,
 )
 from ..schemas.errors import CorruptError
+from ..schemas.kernels.morton import morton_decode
 from ..schemas.voxel import CELL_BITS, Cells, Nodes, VoxelData, top_shift
 from .cells import CellTrees, block_points, build_trees, leaf_runs
 from .config import BuildConfig
 from .kernels.bounding_sphere import SPREAD
 from .kernels.octree import split_octree
+from .kernels.pack import heap_counts, most_nodes
 from .kernels.spill import by_axis, by_cell
 from .kernels.trees import EXTREMES
 from .octree import VoxelPoints, canonical, gather_voxel
@@ -126,6 +128,9 @@ def build_dense(
     with _Spill(scratch, dtype) as spill:
         for part in plan_parts(spool, key, config):
             codes_of = range(part[0].code, part[-1].past)
+            if part[0].points > DENSE_POINTS and part[0].log2 == 0:
+                _put_heap(spill, part[0], spool, key, config, classify)
+                continue
             points, codes = canonical(gather_voxel(spool.block_rows(key, codes_of.start, codes_of.stop)))
             if classify is not None:
                 points = points._replace(radius_class=classify(points.local, codes_of))
@@ -144,6 +149,41 @@ def _build_part(
         sizes.append(found[1])
         at += cube.points
     return build_trees(points.local, np.concatenate(starts), np.concatenate(sizes), config)
+
+
+def _put_heap(
+    spill: "_Spill", cube: Cube, spool: Spool, key: int, config: BuildConfig, classify: Classify | None
+) -> None:
+    """Spill the cell of a cube of one step, as `build_trees` makes it of its points, which need not be read for it."""
+    n = cube.points
+    place = morton_decode(np.array([cube.code], np.uint64)).astype(np.int32)
+    columns = np.zeros(0, spill.columns)
+    if spill.names:
+        columns = np.zeros(n, spill.columns)
+        if spill.names != ["radius_class"]:
+            points, _ = canonical(gather_voxel(spool.block_rows(key, cube.code, cube.past)))
+            for name in set(spill.names) - {"radius_class"}:
+                columns[name] = getattr(points, name)
+        if classify is not None:
+            for at in range(0, n, DENSE_POINTS):
+                some = columns["radius_class"][at : at + DENSE_POINTS]
+                some[:] = classify(np.repeat(place, len(some), axis=0), range(cube.code, cube.past))
+    one = build_trees(np.repeat(place, 3, axis=0), np.zeros(1, np.int64), np.zeros(1, np.uint8), config)
+    count = np.empty(most_nodes(n, config.leaf), np.uint8)
+    total = heap_counts(n, config.leaf, config.degree, count)
+    nodes = Nodes(*(np.repeat(column[:1], total, axis=0) for column in one.nodes))
+    spreads = one.spreads.copy()
+    spreads[0, 0] = n
+    spill.put_cells(
+        one._replace(
+            starts=np.array([0, n]),
+            rows=np.array([0, total]),
+            nodes=nodes._replace(count=count[:total]),
+            spreads=spreads,
+        ),
+        None,
+        columns,
+    )
 
 
 class _Spill:
@@ -169,13 +209,19 @@ class _Spill:
 
     def put(self, trees: CellTrees, points: VoxelPoints) -> None:
         """Take the cells of a part and the points that they were made of."""
-        columns = np.empty(len(trees.rank), self.columns)
+        columns = np.empty(len(trees.rank) if self.names else 0, self.columns)
         for name in self.names:
             columns[name] = getattr(points, name)[trees.rank]
+        self.put_cells(trees, by_cell(trees.xyz, trees.starts), columns)
+
+    def put_cells(self, trees: CellTrees, flat: NDArray[np.uint16] | None, columns: NDArray) -> None:
+        """Take cells, their points as `by_cell` gives them, and their columns; None: all points are on their corner."""
         stats = [trees.spreads.tobytes(), trees.extremes.tobytes()]
+        if flat is None:
+            self._ends[0] += 6 * int(trees.starts[-1])  # a hole, and nobody reads it
         for i, data in enumerate(
             [
-                by_cell(trees.xyz, trees.starts),
+                b"" if flat is None else flat,
                 columns.view(np.uint8) if self.names else b"",
                 node_rows(trees.nodes).view(np.uint8),
             ]
@@ -219,6 +265,12 @@ class _Spill:
             at += count
         return taken
 
+    def take_columns(self, starts: NDArray[np.int64], counts: NDArray[np.int64]) -> NDArray:
+        """The columns of some cells' points, one cell behind the other."""
+        if not self.names:
+            return np.empty(0, self.columns)
+        return self.take(1, starts, counts, self.columns.itemsize).view(self.columns)
+
 
 class _Layout:
     """The cells of a spill, put into the order of the top hierarchy over them, and into the rows of a record."""
@@ -251,53 +303,70 @@ class _Layout:
         total, nodes_total = int(counts.sum()), top_rows + int(self.cells.nodes.sum(dtype=np.int64))
         points = RowStream(self.scratch, spill.dtype, total)
         nodes = RowStream(self.scratch, NODE_DTYPE, nodes_total)
-        at_point, at_node, leaves = 0, top_rows + c, 0
+        at_point, at_node = 0, top_rows + c
         for first, past in _windows(counts):
-            trees, columns = self._read(first, past)
-            if self.top is not None:
-                self.top.grow(trees.xyz, trees.starts, trees.low, first)
-            runs = leaf_runs(trees, self.config.leaf)
-            kept = {name: columns[name] for name in spill.names}
-            rows = point_rows(block_points(trees, self.config.leaf), runs, kept)
-            points.put(at_point, rows)
-            at_point, leaves = at_point + len(rows), leaves + len(runs[0])
-            is_root = np.zeros(len(trees.nodes.count), bool)
-            is_root[trees.rows[:-1]] = True
-            rows = node_rows(trees.nodes)
-            nodes.put(top_rows + first, rows[is_root])
-            nodes.put(at_node, rows[~is_root])
-            at_node += len(rows) - (past - first)
+            stored, is_root = self._nodes(first, past)
+            nodes.put(top_rows + first, stored[is_root])
+            nodes.put(at_node, stored[~is_root])
+            at_node += len(stored) - (past - first)
+            is_heap = counts[first] > DENSE_POINTS and self.cells.log2_size[first] == 0
+            for rows in self._heap(first) if is_heap else self._points(first, past, stored):
+                points.put(at_point, rows)
+                at_point += len(rows)
         if self.top is not None:
             nodes.put(0, node_rows(self.top.rows()))
         cells = RowStream(self.scratch, CELL_DTYPE, c)
         cells.put(0, cell_rows(self.key, self.archive_id, self.cells))
+        leaves = int((-(-counts // self.config.leaf)).sum())
         record = Record(cells.frame(), nodes.frame(), points.frame(), c, nodes_total, total, leaves)
         return BuiltVoxel(self._shell(), record, self.low, self.high)
 
-    def _read(self, first: int, past: int) -> tuple[CellTrees, NDArray]:
-        """Some cells of the top hierarchy's order, their points' columns behind."""
+    def _nodes(self, first: int, past: int) -> tuple[NDArray, NDArray[np.bool_]]:
+        """The node rows of some cells of the top hierarchy's order, and which of them are roots."""
+        held = self.cells.nodes[first:past].astype(np.int64)
+        stored = self.spill.take(2, self.first_node[first:past], held, NODE_DTYPE.itemsize).view(NODE_DTYPE)
+        is_root = np.zeros(len(stored), bool)
+        is_root[np.cumsum(held) - held] = True
+        return stored, is_root
+
+    def _points(self, first: int, past: int, stored: NDArray) -> Iterator[NDArray]:
+        """The point rows of some cells, whose node rows are given; the top hierarchy grows around them."""
         of = slice(first, past)
         cells = Cells(*(column[of] for column in self.cells))
-        points, nodes = cells.points.astype(np.int64), cells.nodes.astype(np.int64)
-        starts, rows = (np.concatenate([[0], np.cumsum(held)]) for held in (points, nodes))
-        flat = self.spill.take(0, self.first_point[of], points, 6).view(np.uint16)
-        stored = self.spill.take(2, self.first_node[of], nodes, NODE_DTYPE.itemsize).view(NODE_DTYPE)
-        columns = np.empty(0, self.spill.columns)
-        if self.spill.names:
-            size = self.spill.columns.itemsize
-            columns = self.spill.take(1, self.first_point[of], points, size).view(self.spill.columns)
+        held = cells.points.astype(np.int64)
+        starts, rows = (
+            np.concatenate([[0], np.cumsum(count, dtype=np.int64)]) for count in (held, cells.nodes)
+        )
         trees = CellTrees(
             cells.low.astype(np.int64),
             cells.log2_size,
             starts,
             rows,
             Nodes(*(np.ascontiguousarray(stored[name]) for name in Nodes._fields)),
-            by_axis(flat, starts),
+            by_axis(self.spill.take(0, self.first_point[of], held, 6).view(np.uint16), starts),
             np.empty(0, np.int32),
             np.empty((0, SPREAD)),
             np.empty((0, EXTREMES, 3), np.int32),
         )
-        return trees, columns
+        if self.top is not None:
+            self.top.grow(trees.xyz, trees.starts, trees.low, first)
+        columns = self.spill.take_columns(self.first_point[of], held)
+        kept = {name: columns[name] for name in self.spill.names}
+        yield point_rows(block_points(trees, self.config.leaf), leaf_runs(trees, self.config.leaf), kept)
+
+    def _heap(self, cell: int) -> Iterator[NDArray]:
+        """The point rows of a cell whose points are all of one place: nothing but columns."""
+        if self.top is not None:
+            low = self.cells.low[cell : cell + 1].astype(np.int64)
+            self.top.grow(np.zeros((3, 1), np.uint16), np.array([0, 1]), low, cell)
+        n, first = int(self.cells.points[cell]), int(self.first_point[cell])
+        for at in range(0, n, WINDOW_POINTS):
+            held = min(WINDOW_POINTS, n - at)
+            rows = np.zeros(held, self.spill.dtype)
+            columns = self.spill.take_columns(np.array([first + at]), np.array([held]))
+            for name in self.spill.names:
+                rows[name] = columns[name]
+            yield rows
 
     def _shell(self) -> VoxelData:
         """The voxel without rows: its key, and which columns it has."""

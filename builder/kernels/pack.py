@@ -179,6 +179,47 @@ def pack_points(own, n, leaf, degree, space, begin, end, count, levels):
 
 
 @nb.njit(nogil=True, cache=True)
+def heap_counts(n, leaf, degree, count):
+    """Write what `pack_points` writes in count (>= t,) for n points, wherever they are. Returns t.
+
+    The numbers are the same for all points, as cuts go by numbers alone: those of points of one place need no points.
+    """
+    leaves = (n + leaf - 1) // leaf
+    capacity = np.int64(1)
+    while capacity < leaves:
+        capacity *= degree
+    stack, sizes = np.empty((degree + 1, 2), np.int64), np.empty(1, np.int64)
+    sizes[0] = n
+    total = 0
+    while capacity > 1:
+        capacity //= degree
+        below, found = np.empty(min(degree * sizes.shape[0], leaves), np.int64), 0
+        for size in sizes:
+            parts = ((size + leaf - 1) // leaf + capacity - 1) // capacity
+            count[total] = parts
+            total += 1
+            stack[0, 0], stack[0, 1] = size, parts
+            depth = 1
+            while depth > 0:
+                depth -= 1
+                held, k = stack[depth, 0], stack[depth, 1]
+                if k == 1:
+                    below[found] = held
+                    found += 1
+                    continue
+                left = k // 2
+                middle = ((held + leaf - 1) // leaf * left // k) * leaf
+                stack[depth, 0], stack[depth, 1] = held - middle, k - left
+                stack[depth + 1, 0], stack[depth + 1, 1] = middle, left
+                depth += 2
+        sizes = below[:found]
+    for size in sizes:
+        count[total] = size
+        total += 1
+    return total
+
+
+@nb.njit(nogil=True, cache=True)
 def sort_run(own, spare, lo, hi, axis):
     """Sort the points [lo, hi) of own along an axis, ties by rank: each goes where as many stand as are before it."""
     for j in range(lo, hi):

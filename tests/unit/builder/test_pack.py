@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scans import WITH_POINTS, make_steps
 from solidcloud.builder.hierarchy import Tree, build_hierarchy
-from solidcloud.builder.kernels.pack import most_nodes, pack_tree, sort_run
+from solidcloud.builder.kernels.pack import heap_counts, most_nodes, pack_tree, sort_run
 
 pytestmark = pytest.mark.interpreted
 
@@ -153,3 +153,12 @@ def test_the_border_of_a_cut_is_found_in_any_crowd(kind: str) -> None:
 def test_no_tree_has_more_nodes_than_are_made_room_for(degree: int) -> None:
     for n in [*range(1, 70), 129, 257, 513]:
         assert len(pack(np.zeros((n, 3)), 1, degree).begin) <= most_nodes(n, 1)
+
+
+@pytest.mark.parametrize(("leaf", "degree"), [*SHAPES, (7, 5), (1, 16)])
+def test_the_counts_of_a_tree_need_no_points(leaf: int, degree: int) -> None:
+    for n in [*range(1, 40), 64, 65, 130, 257]:
+        tree = pack(make_steps("noise", n, n, 1000), leaf, degree)
+        count = np.empty(most_nodes(n, leaf), np.uint8)
+        total = heap_counts(n, leaf, degree, count)
+        assert count[:total].tolist() == tree.count.tolist()

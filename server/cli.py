@@ -11,7 +11,7 @@ from typing import Any
 import typer
 
 from ..schemas.errors import BadRequestError, SolidcloudError
-from .verbs import accuracy, archive, build, export, generation, inspect, make, query, serve
+from .verbs import accuracy, archive, build, export, generation, inspect, make, plan, query, serve
 from .verbs.options import complain
 
 # Without rich's markup: importing it doubles the time --help takes, to over the 0.3 s it may.
@@ -27,9 +27,17 @@ makers.command("facade")(make.make_facade)
 makers.command("town")(make.make_town)
 makers.command("figure")(make.make_figure)
 makers.command("walk")(make.make_walk)
-for verb in (inspect.inspect, build.build, archive.info, archive.validate, serve.serve, accuracy.accuracy, query.query):
+for verb in (
+    inspect.inspect,
+    build.build,
+    archive.info,
+    archive.validate,
+    serve.serve,
+    accuracy.accuracy,
+    query.query,
+):
     app.command()(verb)
-for verb in (export.export, generation.add, generation.remove, generation.reload):
+for verb in (export.export, generation.add, generation.remove, generation.reload, plan.plan):
     app.command()(verb)
 
 

@@ -5,6 +5,6 @@ NOTES: dict[str, str] = {
     "memory": "sum of PSS over the command and all its workers, looked at 20 times a second; --memory and 200 MB",
     "linear": "seconds a point of the larger over those of the smaller façade, in one run; the start of the command, "
     "about 2 s, weighs on the smaller",
-    "bytes": "all files of the archive: octree, hierarchy and index included",
+    "bytes": "index and shards, octree and hierarchy included; the preview for ParaView, 1.2 MB at most, is not",
     "laz": "LAZ holds the points alone, in the order they were scanned: no hierarchy, and no way to find what is near",
 }

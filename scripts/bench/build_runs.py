@@ -20,13 +20,15 @@ REST = "start, rest"
 class Built:
     """One build. summary: what the command said of it.  watched: what it took, seen from outside.
 
-    step: of its lattice [m].
+    step: of its lattice [m].  stored, preview: bytes of index and shards, and of what is beside them.
     """
 
     points: int
     summary: dict[str, Any]
     watched: Watched
     step: float
+    stored: int
+    preview: int
 
     @property
     def seconds(self) -> float:
@@ -35,8 +37,8 @@ class Built:
 
     @property
     def bytes_a_point(self) -> float:
-        """Of the archive, everything in it."""
-        return float(self.summary["bytes"]) / self.points
+        """Of the archive: index and shards."""
+        return self.stored / self.points
 
     @property
     def stages(self) -> dict[str, float]:
@@ -84,7 +86,16 @@ def build(
     options += ["--resolution", f"{step:g}"] if step else []
     watched = _must([*COMMAND, "build", str(scan), "-o", str(target), *options])
     summary = last_json(watched.out)
-    return Built(int(summary["points"]), summary, watched, float(summary["lattice_step"]))
+    sizes = {path: path.stat().st_size for path in target.rglob("*") if path.is_file()}
+    stored = sum(size for path, size in sizes.items() if path.suffix == ".h5")
+    return Built(
+        int(summary["points"]),
+        summary,
+        watched,
+        float(summary["lattice_step"]),
+        stored,
+        sum(sizes.values()) - stored,
+    )
 
 
 def validate(target: Path) -> int:
@@ -147,7 +158,8 @@ def report(built: Built) -> dict[str, Any]:
         "others": built.watched.others,
         "looking": built.watched.looking,
         "stages": built.stages,
-        "bytes": built.summary["bytes"],
+        "bytes": built.stored,
+        "preview_bytes": built.preview,
         "voxels": built.summary["voxels"],
         "peak_pss": built.watched.peak,
         "peak_anonymous": built.watched.peak_anonymous,

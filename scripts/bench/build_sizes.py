@@ -23,8 +23,8 @@ def real_scans() -> list[Path]:
 
 
 def archive_bytes(folder: Path) -> int:
-    """Of all files of an archive."""
-    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+    """Of an archive's index and shards."""
+    return sum(path.stat().st_size for path in folder.rglob("*.h5"))
 
 
 def quantised(scans: Path, archive: Path) -> NDArray[np.int64]:

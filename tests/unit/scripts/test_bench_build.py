@@ -27,8 +27,10 @@ Swap:                  7 kB
 
 
 def built(points: int, seconds: float, stages: dict[str, float], samples: list[Sample]) -> build_runs.Built:
-    summary = {"stages": stages, "bytes": 3 * points, "points": points, "voxels": 2, "shards": 1}
-    return build_runs.Built(points, summary, Watched(seconds, 2 * seconds, 0.0, samples), 1e-4)
+    summary = {"stages": stages, "points": points, "voxels": 2, "shards": 1}
+    return build_runs.Built(
+        points, summary, Watched(seconds, 2 * seconds, 0.0, samples), 1e-4, 3 * points, points
+    )
 
 
 # --- watching -------------------------------------------------------------------------------------------

@@ -1,0 +1,353 @@
+"""What a build will take: bytes, memory, time by stage, voxels, and the limits that would stop it; before it is begun.
+
+Everything follows from a few figures of the scene (`Scene`: of scans that are there, found by `sample.py`, or of a
+number of points that are thought of) and from measured rates (`Rates`: rates.json, which `scripts/bench_build
+--write-rates` writes, or measured here). A stage takes a start, and so much a point; what of that is shared among
+workers was found by measuring with one and with two. Bytes a point follow the density of points on surfaces.
+An estimate holds within a factor of 1.5 where the scene is like a scanned building; it says what it assumed.
+"""
+
+import json
+import math
+import os
+import shutil
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
+from importlib import resources
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from ..schemas.errors import CorruptError
+from ..schemas.voxel_grid import KEY_BIAS, MAX_VOXEL_STEPS
+from .config import DEFAULT_STEP, SHARD_POINTS, BuildConfig
+from .executor import worker_count
+from .partition import run_points
+from .spool import spool_dtype
+
+RATES_NAME = "rates.json"
+VERSION = 1
+
+# Bytes of the index a voxel (schemas/FORMAT.md); of a shard's file beside the records, HDF5's own; and of a voxel in a
+# run's directory, read by every process.
+INDEX_BYTES = 100
+GROUP_BYTES = 1200
+DIRECTORY_BYTES = 40
+# Runs that a voxel is spread over, about: scans that overlap, and ranges of a scan that meet.
+RUNS_A_VOXEL = 8
+# A scan is spooled in ranges: about so many of a file, each of so many points (survey.py).
+RANGES, RANGE_POINTS = 32, (1 << 20, 1 << 24)
+# The preview beside the shards: 6 bytes a point of at least, at most, and one in so many (preview.py).
+PREVIEW, PREVIEW_BYTES = (20_000, 200_000, 8), 6
+# A frame's length is uint32 in the index; the column of scans is uint16 (schemas/FORMAT.md).
+MAX_FRAME = 1 << 32
+MAX_SCANS = 1 << 16
+# A folder of more files than this is slow to list on most file systems.
+MANY_FILES = 1_000_000
+# The densest voxel holds about so many times the mean (measured: 7 on a made façade in voxels of 8 m, 3 of 2 m).
+DENSEST = 8
+
+
+class Stage(NamedTuple):
+    """What a stage takes. start: whatever it holds [s].  serial: a point [s].  parallel: a point, of one core [s]."""
+
+    start: float
+    serial: float
+    parallel: float
+
+    def seconds(self, points: float, jobs: int) -> float:
+        """For so many points with so many workers."""
+        return self.start + points * (self.serial + self.parallel / jobs)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Rates:
+    """What builds were measured to take.
+
+    machine: its class.  cores: of it.  rests_on: what was measured.  stages: name -> Stage, a build's in their order.
+    workers: starting the processes of more than one job [s].  read: format -> seconds a point, reading alone, on one
+    core.  passes: how often a build reads its scans.  archive: (pitch, bytes a point), ascending: pitch is the square
+    root of the surface a point has, over the lattice step.  process, worker, point: memory [bytes] of the first
+    process, of each other, and of each point until --memory is reached.  disk: bytes/s that the disk writes.
+    density: points/m^2 of the made façade of 587,923 points.  crossed: voxels over area / voxel^2.
+    """
+
+    machine: str
+    cores: int
+    rests_on: str
+    stages: dict[str, Stage]
+    workers: float
+    read: dict[str, float]
+    passes: int
+    archive: list[tuple[float, float]]
+    process: float
+    worker: float
+    point: float
+    disk: float
+    density: float
+    crossed: float
+
+    def bytes_a_point(self, ratio: float) -> float:
+        """Of the archive, for a pitch of so many lattice steps: linear in its logarithm, as bits are."""
+        known = [(math.log2(at), size) for at, size in self.archive]
+        at = math.log2(max(ratio, 1e-3))
+        pairs = list(pairwise(known))
+        (x0, y0), (x1, y1) = next((p for p in pairs if at <= p[1][0]), pairs[-1])
+        # Never below one byte: nodes and cells alone take that.
+        return max(1.0, y0 + (y1 - y0) * (at - x0) / (x1 - x0))
+
+
+def load_rates(text: str | None = None) -> Rates:
+    """The rates that came with the package, or those of a text. Raises CorruptError for one that cannot be read."""
+    if text is None:
+        text = (resources.files(__package__) / RATES_NAME).read_text(encoding="utf-8")
+    try:
+        found = json.loads(text)
+        if found.pop("version") != VERSION:
+            raise ValueError("another version")
+        found["stages"] = {name: Stage(**stage) for name, stage in found["stages"].items()}
+        found["archive"] = [(float(at), float(size)) for at, size in found["archive"]]
+        rates = Rates(**found)
+        if len(rates.archive) < 2 or "las" not in rates.read:
+            raise ValueError("too few figures")
+        return rates
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        raise CorruptError(
+            f"{RATES_NAME}: {error}, expected what scripts/bench_build --write-rates writes: measure again"
+        ) from None
+
+
+def dump_rates(rates: Rates) -> str:
+    """Rates as the text of rates.json."""
+    stages = {name: stage._asdict() for name, stage in rates.stages.items()}
+    return json.dumps({"version": VERSION, **asdict(rates), "stages": stages}, indent=1) + "\n"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Scene:
+    """What is known of the points to be built.
+
+    points, scans: how many.  largest: points of the largest scan.  input_bytes: of files; None: not known.
+    formats: format -> points.  step: lattice step that all scans share [m], or None.  area: of the surfaces [m^2].
+    voxels: how many hold points, by a voxel's edge [m], found by a look; else they follow from the area.
+    extent: greatest length along an axis [m], or None.  assumed: sentences.
+    """
+
+    points: int
+    scans: int
+    largest: int
+    input_bytes: int | None
+    formats: Mapping[str, int]
+    step: float | None
+    area: float
+    voxels: tuple[float, float] | None = None
+    extent: float | None = None
+    assumed: tuple[str, ...] = ()
+
+
+def imagined(points: int, rates: Rates, density: float | None = None, scans: int | None = None) -> Scene:
+    """A scene of so many points that nobody has seen. density: points/m^2 of surface; None: as the façade's.
+
+    scans: None: of 1.4 million points each, as [Fig12] section 3: 700 scans, 10^9 points.
+    """
+    dense = density or rates.density
+    number = scans or max(1, round(points / 1.4e6))
+    like = "given" if density else "as in a façade of 587,923 points"
+    return Scene(
+        points=points,
+        scans=number,
+        largest=math.ceil(points / number),
+        input_bytes=None,
+        formats={"las": points},
+        step=None,
+        area=points / dense,
+        assumed=(
+            f"{dense:,.0f} points a square metre of surface ({like})",
+            f"{number:,} scans in LAS ({'given' if scans else '1.4 million points each, as in [Fig12] section 3'})",
+        ),
+    )
+
+
+class Limit(NamedTuple):
+    """Something that ends. found: what the build needs of it.  most: what there is.  advice: where it binds."""
+
+    what: str
+    found: float
+    most: float
+    unit: str
+    advice: str
+
+    @property
+    def binds(self) -> bool:
+        """Whether the build needs more than there is."""
+        return self.found > self.most
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Plan:
+    """What a build will take: bytes, seconds; see `estimate`. disk_bytes: at most at one time, beside the scans."""
+
+    points: int
+    scans: int
+    lattice_step: float
+    density: float
+    voxels: int
+    points_a_voxel: float
+    jobs: int
+    archive_bytes: int
+    bytes_a_point: float
+    index_bytes: int
+    spool_bytes: int
+    preview_bytes: int
+    disk_bytes: int
+    shards: int
+    runs: int
+    memory_bytes: int
+    stages: dict[str, float]
+    seconds: float
+    rests_on: tuple[str, ...]
+    assumed: tuple[str, ...]
+    limits: tuple[Limit, ...] = field(default=())
+
+    def as_json(self) -> dict[str, Any]:
+        """For JSON: each limit says whether it binds."""
+        limits = [{**limit._asdict(), "binds": limit.binds} for limit in self.limits]
+        return {**asdict(self), "limits": limits}
+
+
+def estimate(scene: Scene, config: BuildConfig, rates: Rates, target: Path | None = None) -> Plan:
+    """What building a scene will take. target: where the archive goes, for the room on its disk; None: not asked."""
+    step = config.resolution or scene.step or DEFAULT_STEP
+    pitch = math.sqrt(scene.area / scene.points)
+    voxels = _voxels(scene, config.voxel, rates)
+    jobs = worker_count(config.jobs, scene.points)
+    columns = sum({"scan": 0.2, "intensity": 2.0}[name] for name in config.keep) + (config.models != {"mean"})
+    each = rates.bytes_a_point(pitch / step) + columns
+    size = round(scene.points * each + voxels * (INDEX_BYTES + GROUP_BYTES))
+    spool = scene.points * spool_dtype(config).itemsize
+    runs = _runs(scene, config, jobs)
+    directories = min(runs * voxels, scene.points, RUNS_A_VOXEL * voxels + runs) * DIRECTORY_BYTES
+    stages = _seconds(scene, config, rates, jobs, size + spool)
+    plan = Plan(
+        points=scene.points,
+        scans=scene.scans,
+        lattice_step=step,
+        density=scene.points / scene.area,
+        voxels=voxels,
+        points_a_voxel=scene.points / voxels,
+        jobs=jobs,
+        archive_bytes=size,
+        bytes_a_point=size / scene.points,
+        index_bytes=voxels * INDEX_BYTES,
+        spool_bytes=spool,
+        preview_bytes=round(
+            PREVIEW_BYTES * min(PREVIEW[1], max(PREVIEW[0], scene.points / PREVIEW[2]), scene.points)
+        ),
+        disk_bytes=size + spool,
+        shards=max(1, math.ceil(scene.points / SHARD_POINTS)),
+        runs=runs,
+        memory_bytes=_memory(scene, config, rates, jobs, voxels * INDEX_BYTES + directories * jobs),
+        stages=stages,
+        seconds=sum(stages.values()),
+        rests_on=(f"{rates.rests_on}, on {rates.machine}, {rates.cores} cores",),
+        assumed=(*scene.assumed, *_assumed(config, rates, jobs)),
+    )
+    return replace(plan, limits=_limits(plan, scene, config, directories, target))
+
+
+def _voxels(scene: Scene, edge: float, rates: Rates) -> int:
+    """Voxels that hold points: counted in a sample for this edge, or by the area of the surfaces they are cut from."""
+    if scene.voxels is not None and scene.voxels[0] == edge:
+        return max(1, round(scene.voxels[1]))
+    return max(1, min(scene.points, round(rates.crossed * scene.area / edge**2)))
+
+
+def _runs(scene: Scene, config: BuildConfig, jobs: int) -> int:
+    """Runs of the spool, as survey.py cuts scans into ranges and partition.py ranges into runs."""
+    mean = scene.points / scene.scans
+    a_range = min(max(mean / RANGES, RANGE_POINTS[0]), RANGE_POINTS[1], mean)
+    a_run = min(a_range, run_points(config.memory_bytes // jobs, spool_dtype(config)))
+    return max(scene.scans, math.ceil(scene.scans * math.ceil(mean / a_range) * math.ceil(a_range / a_run)))
+
+
+def _seconds(scene: Scene, config: BuildConfig, rates: Rates, jobs: int, written: int) -> dict[str, float]:
+    """Seconds of each stage; reading other formats than LAS is added to the passes that read."""
+    working = min(jobs, os.cpu_count() or 1)
+    reading = sum(
+        points * max(0.0, rates.read.get(name, rates.read["las"]) - rates.read["las"])
+        for name, points in scene.formats.items()
+    )
+    # One scan that cannot seek is read by one worker.
+    reading /= min(working, scene.scans) if scene.scans > 1 or set(scene.formats) <= {"las", "laz"} else 1
+    found = {name: stage.seconds(scene.points, working) for name, stage in rates.stages.items()}
+    if jobs > 1:
+        found["workers"] = rates.workers
+    if config.radius is not None:
+        found.pop("radius", None)
+    for name in ("survey", "spool")[: rates.passes]:
+        found[name] = found.get(name, 0.0) + reading
+    least = written / rates.disk
+    total = sum(found.values())
+    if least > total:  # the disk is what is slow
+        found["waiting for the disk"] = least - total
+    return found
+
+
+def _memory(scene: Scene, config: BuildConfig, rates: Rates, jobs: int, tables: float) -> int:
+    """Of all processes together: what --memory bounds, and beside it what grows with voxels and not with points."""
+    base = rates.process + (jobs * rates.worker if jobs > 1 else 0)
+    return round(min(base + rates.point * scene.points, max(base, config.memory_bytes)) + tables)
+
+
+def _assumed(config: BuildConfig, rates: Rates, jobs: int) -> tuple[str, ...]:
+    """What an estimate takes for granted."""
+    said = [
+        f"{jobs} jobs on {os.cpu_count()} cores, each as fast as those measured, and nothing else running"
+    ]
+    said.append(
+        "scans come off the disk as fast as they are read: a slow disk or network adds to survey and spool"
+    )
+    if config.models != {"mean"}:
+        said.append("radius classes: their bytes are counted, their time (2.5 µs a point of one core) is not")
+    if config.thin is not None or config.outliers is not None or config.moving is not None:
+        said.append(
+            "no point is left out by filters, and their time (0.3 to 3 µs a point of one core) is not counted"
+        )
+    if config.cells != "octree":
+        said.append("cells as octree: balanced ones take longer")
+    return tuple(said)
+
+
+def _limits(
+    plan: Plan, scene: Scene, config: BuildConfig, directories: float, target: Path | None
+) -> tuple[Limit, ...]:
+    """What could stop the build, and what grows with it though --memory does not bound it."""
+    dense = plan.points_a_voxel * DENSEST * plan.bytes_a_point
+    found = [
+        Limit("voxels along an axis", (scene.extent or math.sqrt(scene.area)) / config.voxel, KEY_BIAS, "voxels",
+              "give a larger --voxel, or build in parts"),
+        Limit("lattice steps a voxel", config.voxel / plan.lattice_step, MAX_VOXEL_STEPS, "steps",
+              "give a smaller --voxel or a coarser --resolution"),
+        Limit("the densest voxel, compressed", dense, MAX_FRAME, "bytes", "give a smaller --voxel"),
+        Limit("index, held by build and server", plan.index_bytes, config.memory_bytes, "bytes",
+              "give a larger --voxel: the index takes 100 bytes a voxel"),
+        Limit("directories of runs, in each process", directories, config.memory_bytes / plan.jobs, "bytes",
+              "give a larger --voxel or --memory, or build in parts"),
+        Limit("files of the spool in one folder", 2 * plan.runs, MANY_FILES, "files", "build in parts"),
+    ]  # fmt: skip
+    if "scan" in config.keep or config.thin or config.outliers or config.moving:
+        found.append(
+            Limit(
+                "scans, as --keep scan and filters number them",
+                scene.scans,
+                MAX_SCANS,
+                "scans",
+                "build in parts",
+            )
+        )
+    if target is not None:
+        free = shutil.disk_usage(next(p for p in (target, *target.absolute().parents) if p.exists())).free
+        found.insert(
+            0, Limit("room on the disk", plan.disk_bytes, free, "bytes", "make room, or use another disk")
+        )
+    return tuple(found)

@@ -1,0 +1,206 @@
+"""A quick look at scans, for an estimate: how many points, over how much surface, in how many voxels.
+
+Headers say how many points there are, and where. Over how much surface they lie no header says: some points of each
+scan are looked at, a few seconds' worth. Scans that can seek are looked at in many places, others at their beginning.
+"""
+
+import time
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..schemas.errors import ScanError
+from ..schemas.voxel_grid import MAX_COORDINATE, MAX_VOXEL_STEPS, MIN_STEP
+from .config import BuildConfig
+from .plan import Plan, Rates, Scene, estimate, load_rates
+from .scan_list import Input, inputs
+from .sources import Scan
+
+# Surfaces are measured in cubes of the first of these edges [m] that is far more than the distance of points, so that
+# a cube has at least so many: far less than a room.
+CUBES = (0.25, 0.5, 1.0, 2.0)
+POINTS_A_CUBE = 8
+# Looks at all scans together, and points at a time; a chunk of LAZ, 50,000 points, is decoded for each.
+LOOKS, LOOK_POINTS = 512, 2048
+# Points looked at of a scan that cannot seek, and the time after which no more scans are looked at [s].
+FIRST_POINTS = 1 << 17
+SECONDS = 10.0
+# A file whose header says nothing of its points, text mostly, has one in so many bytes, or as its beginning shows.
+TEXT_BYTES = 30
+
+
+class _Look(NamedTuple):
+    """What was seen at one place. points: looked at.  held: edge [m] -> (k,) int64 keys of cubes that hold some."""
+
+    points: int
+    held: dict[float, NDArray[np.int64]]
+
+
+def _keys(xyz: NDArray[np.float64], edge: float) -> NDArray[np.int64]:
+    """Which cubes of an edge hold points (n, 3): a number each; a few that share one do not matter."""
+    at = np.floor(xyz / edge).astype(np.int64)
+    return np.unique(
+        at[:, 0] * 73_856_093 ^ at[:, 1] * 19_349_663 * 4_093 ^ at[:, 2] * 83_492_791 * 8_388_593
+    )
+
+
+class _Grid(NamedTuple):
+    """What is counted. edge: of voxels [m].  origin: (3,) [m] of cubes and voxels."""
+
+    edge: float
+    origin: NDArray[np.float64]
+
+    def look(self, xyz: NDArray[np.float64]) -> _Look:
+        """What points (n, 3) [m] are in."""
+        xyz = xyz[(np.abs(xyz) <= MAX_COORDINATE).all(axis=1)] - self.origin
+        return _Look(len(xyz), {edge: _keys(xyz, edge) for edge in {*CUBES, self.edge}})
+
+
+def unseen(looks: Sequence[NDArray[np.int64]]) -> float:
+    """How many different keys there are, of those seen in some looks (Chao 1987, incidence): at least, about.
+
+    Keys seen in one look alone, and in two, tell how many were seen in none.
+    """
+    seen = Counter(key for look in looks for key in look.tolist())
+    once = sum(count == 1 for count in seen.values())
+    twice = sum(count == 2 for count in seen.values())
+    share = (len(looks) - 1) / len(looks) if looks else 0.0
+    return len(seen) + share * once * (once - 1) / (2 * (twice + 1))
+
+
+class _Seen(NamedTuple):
+    """What was seen of one scan. count: of its points.  all_over: looks fell everywhere, not on its beginning alone."""
+
+    count: int
+    looks: list[_Look]
+    all_over: bool
+
+
+def _see(scan: Scan, looks: int, grid: _Grid) -> _Seen:
+    """Look at a scan: its header's number of points, and some of them."""
+    count = scan.declared_count
+    if scan.seekable and count:
+        if count <= looks * LOOK_POINTS:
+            found = [grid.look(block.xyz) for block in scan.blocks(LOOK_POINTS)]
+            return _Seen(count, found, True)
+        starts = np.linspace(0, count - LOOK_POINTS, looks).astype(np.int64).tolist()
+        found = [
+            grid.look(block.xyz)
+            for start in starts
+            for block in scan.blocks(LOOK_POINTS, start, start + LOOK_POINTS)
+        ]
+        return _Seen(count, found, True)
+    found, read, whole = [], 0, True
+    for block in scan.blocks(1 << 14):
+        found.append(grid.look(block.xyz))
+        read += len(block.xyz)
+        if read >= FIRST_POINTS:
+            whole = False
+            break
+    if count is None:
+        # Its file's length is all there is to go by.
+        count = read if whole else max(read, scan.path.stat().st_size // TEXT_BYTES)
+    return _Seen(count, found, whole)
+
+
+def seen_scene(inputs: Sequence[Input], config: BuildConfig) -> Scene:
+    """What a look at opened scans tells of a build of them.
+
+    Raises ScanError where no scan has a point, and for a broken one unless `skip_bad`.
+    """
+    faults = [each.fault for each in inputs if each.fault]
+    scans = [scan for each in inputs for scan in each.scans]
+    if faults and not config.skip_bad:
+        raise ScanError(f"{faults[0]} (--skip-bad leaves such scans out)")
+    bounds = _bounds(scans)
+    # Where headers say nothing the lattice's origin is not known, and voxels are cut elsewhere than they will be.
+    grid = _Grid(config.voxel, np.zeros(3) if bounds is None else bounds[0])
+    begin, seen, blind = time.perf_counter(), [], 0
+    for scan in scans:
+        if time.perf_counter() - begin > SECONDS and seen:
+            blind += 1
+            seen.append(_Seen(scan.declared_count or 0, [], False))
+            continue
+        try:
+            seen.append(_see(scan, max(4, LOOKS // len(scans)), grid))
+        except ScanError:
+            if not config.skip_bad:
+                raise
+            seen.append(_Seen(0, [], True))
+    points = sum(each.count for each in seen)
+    if not points:
+        raise ScanError("no scan holds a point, expected some: check the files")
+    voxels = _total(seen, config.voxel)
+    for edge in CUBES:
+        area = max(1.0, _total(seen, edge)) * edge**2
+        if area * POINTS_A_CUBE <= points * edge**2:
+            break
+    looked = sum(look.points for each in seen for look in each.looks)
+    formats: Counter[str] = Counter()
+    for scan, each in zip(scans, seen, strict=True):
+        formats[scan.format] += each.count
+    assumed = [f"surface and voxels as in {looked:,} points looked at of {points:,}"]
+    if blind:
+        assumed.append(f"{blind:,} scans not looked at are like the others")
+    if unsaid := sum(scan.declared_count is None for scan in scans):
+        assumed.append(
+            f"{unsaid:,} files do not say how many points they hold: a point in {TEXT_BYTES} bytes"
+        )
+    return Scene(
+        points=points,
+        scans=len(scans),
+        largest=max(each.count for each in seen),
+        input_bytes=sum(path.stat().st_size for path in {scan.path for scan in scans}),
+        formats=formats,
+        step=_shared_step(scans, config.voxel),
+        area=area,
+        voxels=(config.voxel, max(1.0, min(voxels, points))),
+        extent=None if bounds is None else float((bounds[1] - bounds[0]).max()),
+        assumed=tuple(assumed),
+    )
+
+
+def _total(seen: Sequence[_Seen], edge: float) -> float:
+    """Cubes of an edge that all scans together have points in, those that no look fell on included."""
+    through = [look for each in seen if each.all_over for look in each.looks]
+    if through and sum(look.points for look in through) >= sum(each.count for each in seen if each.all_over):
+        found = float(len(np.unique(np.concatenate([look.held[edge] for look in through]))))
+    else:
+        found = unseen([look.held[edge] for look in through])
+    for each in seen:
+        if each.looks and not each.all_over:
+            # Only its beginning was seen, the rest is taken to be as wide.
+            own = len(np.unique(np.concatenate([look.held[edge] for look in each.looks])))
+            found += own * each.count / max(1, sum(look.points for look in each.looks))
+    looked = sum(each.count for each in seen if each.looks)
+    return found * sum(each.count for each in seen) / max(1, looked)
+
+
+def _shared_step(scans: Sequence[Scan], voxel: float) -> float | None:
+    """The step of the lattice that all scans have, by their headers; about as survey.py chooses it."""
+    steps = {step for scan in scans for step in (scan.lattice.scale if scan.lattice else (None,))}
+    if len(steps) != 1:
+        return None
+    (step,) = steps
+    return step if step and max(MIN_STEP, voxel / MAX_VOXEL_STEPS) <= step <= voxel else None
+
+
+def _bounds(scans: Sequence[Scan]) -> NDArray[np.float64] | None:
+    """Low and high corner (2, 3) [m] of all scans by their headers; None where one says nothing."""
+    bounds = [scan.bounds for scan in scans if scan.bounds is not None]
+    if not bounds or len(bounds) < len(scans):
+        return None
+    return np.stack([np.min([b[0] for b in bounds], axis=0), np.max([b[1] for b in bounds], axis=0)])
+
+
+def planned(paths: Sequence[Path], config: BuildConfig, target: Path, rates: Rates | None = None) -> Plan:
+    """What building scans, folders of them or a list will take; reads headers and some points.
+
+    Raises ScanError and BadRequestError as a build would, as far as a look can tell.
+    """
+    scene = seen_scene(inputs(paths, config.spacing), config)
+    return estimate(scene, config, rates or load_rates(), target)

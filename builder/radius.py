@@ -5,18 +5,14 @@ taken over distinct points, across voxel borders; duplicates would make it zero 
 """
 
 import math
-from collections.abc import Callable
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..schemas.archive import Archive
 from ..schemas.voxel import Links, VoxelData
 from .hierarchy import Hierarchy, build_hierarchy
-from .kernels.nearest import FAR, SearchTree, box_distance2, closest_other
-from .kernels.octree import voxel_codes
+from .kernels.nearest import FAR, SearchTree, closest_other
 
 # Distances are added as integers of 2^-32 m: any order gives the same sum (NUMERICS.md N8), and 10^6 of
 # 2 km fit 63 bits.
@@ -90,22 +86,6 @@ def mean_closest_distance(local: LocalHierarchy) -> float:
     return math.fsum(np.sqrt(best.astype(np.float64)) * local.step) / len(queries)
 
 
-def search_tree(voxel: VoxelData, links: Links) -> SearchTree:
-    """A voxel's hierarchy and points in voxel steps, for `closest_other`."""
-    in_cell = links.cell >= 0
-    low = np.where(in_cell[:, None], voxel.cells.low[links.cell], 0).astype(np.int64)
-    unit = np.where(in_cell, 1, 1 << voxel.top_shift).astype(np.int64)
-    center = low + voxel.nodes.center.astype(np.int64) * unit[:, None]
-    return SearchTree(
-        center,
-        voxel.nodes.radius.astype(np.int64) * unit,
-        links.first,
-        voxel.nodes.count,
-        links.is_leaf,
-        voxel_points(voxel, links),
-    )
-
-
 def voxel_points(voxel: VoxelData, links: Links) -> NDArray[np.int64]:
     """The points of a voxel (p, 3) int64 [voxel steps], in stored order."""
     leaf = np.flatnonzero(links.is_leaf)
@@ -113,86 +93,3 @@ def voxel_points(voxel: VoxelData, links: Links) -> NDArray[np.int64]:
     leaf = leaf[np.argsort(links.first[leaf], kind="stable")]
     low = voxel.cells.low[links.cell[leaf]].astype(np.int64) + voxel.nodes.block_low[leaf]
     return np.repeat(low, voxel.nodes.count[leaf].astype(np.int64), axis=0) + voxel.points.astype(np.int64)
-
-
-def sample_mask(lattice: NDArray[np.int64], share: float) -> NDArray[np.bool_]:
-    """Which lattice points (n, 3) are asked: about `share` of them, chosen by their coordinates alone.
-
-    So a point is asked or not whatever the order of scans, the voxel size or the number of jobs. The
-    hash is the finaliser of MurmurHash3 (Appleby) over the three coordinates.
-    """
-    if share >= 1.0:
-        return np.ones(len(lattice), bool)
-    h = np.zeros(len(lattice), np.uint64)
-    for k in range(3):
-        h ^= lattice[:, k].astype(np.uint64)
-        h ^= h >> np.uint64(33)
-        h *= np.uint64(0xFF51AFD7ED558CCD)
-        h ^= h >> np.uint64(33)
-        h *= np.uint64(0xC4CEB9FE1A85EC53)
-        h ^= h >> np.uint64(33)
-    return h < np.uint64(int(share * 2.0**64))
-
-
-def archive_sums(
-    archive: Archive, rows: range, share: float, tick: Callable[[], None]
-) -> tuple[int, int, int]:
-    """Sums over the sampled distinct points of the voxels `rows`: distances, their squares, how many.
-
-    Distances in SUM_UNITS, as Python integers: no order changes them. A point alone in the dataset has no
-    closest other and is left out. Neighbouring voxels are opened only while one of them could hold something
-    closer; at most 16 are held at a time.
-    """
-    steps, scale = archive.header.lattice.voxel_steps, archive.header.lattice.step * SUM_UNITS
-    base = archive.coordinates * steps
-    low, high = base + archive.voxels["low"], base + archive.voxels["high"]
-
-    @lru_cache(maxsize=16)
-    def tree_of(row: int) -> SearchTree:
-        return search_tree(*archive.read_voxel(row))
-
-    total = squares = sample = 0
-    for row in rows:
-        own = tree_of(row)
-        queries = own.points[sample_mask(own.points + base[row], share)]
-        queries = queries[np.unique(voxel_codes(queries), return_index=True)[1]] + base[row]
-        best = np.full(len(queries), FAR)
-        if len(queries):
-            closest_other(own, queries - base[row], best)
-            _ask_neighbours(row, queries, best, low, high, base, tree_of)
-        best = best[best < FAR]
-        distances = np.rint(np.sqrt(best.astype(np.float64)) * scale).astype(np.int64)
-        total += int(distances.sum(dtype=np.int64))
-        squares += sum(int(d) ** 2 for d in distances.tolist())
-        sample += len(distances)
-        tick()
-    return total, squares, sample
-
-
-def _ask_neighbours(
-    row: int,
-    queries: NDArray[np.int64],
-    best: NDArray[np.int64],
-    low: NDArray[np.int64],
-    high: NDArray[np.int64],
-    base: NDArray[np.int64],
-    tree_of: Callable[[int], SearchTree],
-) -> None:
-    """Lower `best` by the points of other voxels, nearest box first, until none can hold anything closer."""
-    gap = np.maximum(np.maximum(low - high[row], low[row] - high), 0).astype(np.float64)
-    apart = (gap * gap).sum(axis=1)
-    to_box = np.empty(len(queries), np.int64)
-    # The box distance is a float64 sum of squares: a millionth less than it is surely a lower bound.
-    apart *= 1 - 1e-6
-    near_voxels = np.flatnonzero(apart < float(best.max()))
-    for other in near_voxels[np.argsort(apart[near_voxels], kind="stable")]:
-        if other == row:
-            continue
-        if apart[other] >= float(best.max()):
-            break
-        box_distance2(queries, low[other], high[other], to_box)
-        near = np.flatnonzero(to_box < best)
-        if len(near):
-            lowered = best[near]
-            closest_other(tree_of(int(other)), queries[near] - base[other], lowered)
-            best[near] = lowered

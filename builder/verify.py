@@ -12,7 +12,7 @@ from ..schemas.errors import BadRequestError, CorruptError
 from ..schemas.radius_model import RADIUS_CLASSES
 from .exact import loose_nodes, sample_nodes
 from .executor import Executor, worker_count
-from .kernels.loose import last_loose_node
+from .kernels.enclosure import last_loose_node
 from .kernels.records import measure_points
 from .portions import jobs_of, portions, run_units
 from .preview import preview_faults

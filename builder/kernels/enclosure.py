@@ -1,35 +1,47 @@
-"""Does every bound enclose the points below it? The check behind `solidcloud validate --deep`."""
+"""Does every bound of a record enclose the points below it? The check behind `solidcloud validate --deep`."""
 
 import numba as nb
 import numpy as np
 
+from .records import LANES, U, link_parents, read_leaf
+
 
 @nb.njit(nogil=True, cache=True)
-def first_loose_node(center, radius, normal, slab, first, count, is_leaf, order, points):
-    """The first node, in `order`, whose sphere or slab does not enclose all points below it; -1 when all do.
+def last_loose_node(leaves, spheres, normal, slab):
+    """The last node of a record whose sphere or slab does not enclose all points below it; -1 when all do.
 
-    center (n, 3), radius (n,), normal (n, 3), slab (n, 2): int64, one frame [steps].  order: (n,) int64, children
-    before parents.  points: (p, 3) int64. The points below a node are one run, as children are contiguous.
+    leaves, spheres: see records.py, nearest.py.  normal: (3, n) int8.  slab: (2, n) int32. Every point is held against
+    all nodes above it, in integers, while its leaf node is at hand.
     """
-    n = center.shape[0]
-    begin, end = np.empty(n, np.int64), np.empty(n, np.int64)
-    for at in range(n):
-        node = order[at]
-        a, held = np.int64(first[node]), np.int64(count[node])
-        if is_leaf[node]:
-            begin[node], end[node] = a, a + held
-        else:
-            begin[node], end[node] = begin[a], end[a + held - 1]
-        flat = normal[node, 0] == 0 and normal[node, 1] == 0 and normal[node, 2] == 0
-        for i in range(begin[node], end[node]):
-            dx, dy, dz = (
-                points[i, 0] - center[node, 0],
-                points[i, 1] - center[node, 1],
-                points[i, 2] - center[node, 2],
-            )
-            if dx * dx + dy * dy + dz * dz > radius[node] * radius[node]:
-                return node
-            along = normal[node, 0] * dx + normal[node, 1] * dy + normal[node, 2] * dz
-            if not flat and (along < slab[node, 0] or along > slab[node, 1]):
-                return node
-    return -1
+    center, radius, unit = spheres
+    parents = link_parents(leaves.first, leaves.count, leaves.is_leaf)
+    lanes = np.empty((3, LANES), np.int32)
+    loose = -1
+    for i in range(leaves.first.shape[0]):
+        if not leaves.is_leaf[i]:
+            continue
+        held, cell = read_leaf(leaves, U(i), lanes), leaves.cell[i]
+        node = np.int64(i)
+        while node >= 0:
+            at, scale = U(node), np.int64(1)
+            # From the points' block to the node's centre.
+            x = np.int64(leaves.block_low[U(0), U(i)]) - np.int64(center[U(0), at])
+            y = np.int64(leaves.block_low[U(1), U(i)]) - np.int64(center[U(1), at])
+            z = np.int64(leaves.block_low[U(2), U(i)]) - np.int64(center[U(2), at])
+            if leaves.cell[at] < 0:
+                scale = unit
+                x += np.int64(center[U(0), at]) * (1 - unit) + np.int64(leaves.cell_low[U(0), U(cell)])
+                y += np.int64(center[U(1), at]) * (1 - unit) + np.int64(leaves.cell_low[U(1), U(cell)])
+                z += np.int64(center[U(2), at]) * (1 - unit) + np.int64(leaves.cell_low[U(2), U(cell)])
+            square = (np.int64(radius[at]) * scale) ** 2
+            nx, ny, nz = np.int64(normal[U(0), at]), np.int64(normal[U(1), at]), np.int64(normal[U(2), at])
+            flat = nx == 0 and ny == 0 and nz == 0
+            least, most = np.int64(slab[U(0), at]), np.int64(slab[U(1), at])
+            for j in range(held):
+                dx, dy, dz = x + lanes[U(0), j], y + lanes[U(1), j], z + lanes[U(2), j]
+                along = nx * dx + ny * dy + nz * dz
+                if dx * dx + dy * dy + dz * dz > square or (not flat and (along < least or along > most)):
+                    loose = max(loose, node)
+                    break
+            node = np.int64(parents[at])
+    return loose

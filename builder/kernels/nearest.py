@@ -77,17 +77,6 @@ def closest_other(tree, queries, best):
         best[q] = found
 
 
-@nb.njit(nogil=True, cache=True)
-def box_distance2(queries, low, high, out):
-    """Write out (q,) int64: squared distance of queries (q, 3) int64 from the box [low, high] (3,)."""
-    for q in range(queries.shape[0]):
-        total = np.int64(0)
-        for k in range(3):
-            gap = max(low[k] - queries[q, k], queries[q, k] - high[k], 0)
-            total += gap * gap
-        out[q] = total
-
-
 class Spheres(NamedTuple):
     """The bounds of an opened record: center (3, n) uint16, radius (n,) uint16 (schemas/voxel.py Nodes).
 

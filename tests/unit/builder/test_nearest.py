@@ -8,7 +8,6 @@ from opened import open_points, open_scan, points_of
 from solidcloud.builder.kernels.nearest import (
     FAR,
     SearchTree,
-    box_distance2,
     closest_in_record,
     closest_other,
 )
@@ -101,15 +100,6 @@ def test_as_little_is_looked_at_as_ever(kind: str, centers: int, points: int) ->
         found.append(Counted.reads)
     assert best.tolist() == brute(cloud, cloud).tolist()
     assert found == [centers, points]
-
-
-def test_the_box_is_solid_and_its_corners_are_where_they_are() -> None:
-    rng = np.random.default_rng(6)
-    low, high = np.array([-7, 2, 30]), np.array([-2, 2, 41])
-    queries = rng.integers(-12, 50, (200, 3))
-    out = np.empty(200, np.int64)
-    box_distance2(queries, low, high, out)
-    assert out.tolist() == ((queries - np.clip(queries, low, high)) ** 2).sum(axis=1).tolist()
 
 
 def asked(

@@ -10,13 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 import solidcloud.builder.portions as portions
-from opened import open_scan
 from scans import WITH_POINTS, make_scan, write_ply, write_xyz
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.exact import loose_nodes, sample_nodes
-from solidcloud.builder.kernels.loose import last_loose_node
 from solidcloud.builder.pipeline import build_archive
-from solidcloud.builder.record_points import leaves_of, spheres_of
 from solidcloud.builder.spacing import archive_mean
 from solidcloud.builder.verify import verify_archive
 from solidcloud.schemas.archive import Archive, shard_name, write_index, write_shard
@@ -316,33 +313,6 @@ def test_a_point_outside_its_cell_is_a_fault(copy: Path) -> None:
     (fault,) = verify_archive(copy).faults
     with Archive(copy) as archive:
         assert fault.startswith(archive.where(1)) and "a point outside its cell: restore the shard" in fault
-
-
-@pytest.mark.interpreted
-@pytest.mark.parametrize("steps", [1000, 1 << 20])
-def test_loose_nodes_are_those_that_integers_prove_loose(steps: int) -> None:
-    """Every bound in turn a little smaller, and some at once: the last of them is told."""
-    record = open_scan("corner", 5, 120, steps)
-    voxel, links = record.decode()
-    leaves, spheres = leaves_of(record), spheres_of(record)
-    normal, slab = record.nodes.normal, record.nodes.slab
-    assert last_loose_node(leaves, spheres, normal, slab) == -1
-    rng = np.random.default_rng(6)
-    told = set()
-    for trial in range(len(links.first) + 40):
-        radius, spoilt = spheres.radius.copy(), slab.copy()
-        if trial < len(radius):
-            radius[trial] -= radius[trial] > 0
-        elif trial % 2:
-            radius[rng.integers(0, len(radius), 3)] //= 2
-        else:
-            spoilt[int(rng.integers(2)), rng.integers(0, len(radius), 2)] = 0
-        nodes = voxel.nodes._replace(radius=radius, slab=np.ascontiguousarray(spoilt.T))
-        expected = loose_nodes(voxel._replace(nodes=nodes), links, range(len(radius)))
-        found = last_loose_node(leaves, spheres._replace(radius=radius), normal, spoilt)
-        assert found == max(expected, default=-1)
-        told.add(found)
-    assert len(told) > 10
 
 
 def test_a_dense_voxel_is_held_at_16_bytes_a_point(tmp_path: Path) -> None:

@@ -27,6 +27,7 @@ class Child:
         self.pid = os.fork()
         if self.pid == 0:
             _build(arguments, log, gate, before)
+        os.setpgid(self.pid, self.pid)  # here as well as there: whoever comes first
         os.close(gate)
 
     status: int | None
@@ -79,7 +80,7 @@ def _build(arguments: list[str], log: Path, gate: int, before: Callable[[], None
     """In the child: run the command, exit as it says. Never returns."""
     code = 1
     try:
-        os.setsid()
+        os.setpgid(0, 0)
         output = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_APPEND, 0o644)
         os.dup2(output, 1)
         os.dup2(output, 2)
@@ -94,9 +95,12 @@ def _build(arguments: list[str], log: Path, gate: int, before: Callable[[], None
     except BaseException:
         traceback.print_exc()
     finally:
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(code)
+        # Whatever happens: above this are the callers of the process that forked, and their folders to be tidied.
+        try:
+            sys.stdout.flush()
+            sys.stderr.flush()
+        finally:
+            os._exit(code)
 
 
 class KillAt:

@@ -1,5 +1,6 @@
 """`solidcloud plan`: what a build will take, before it is begun."""
 
+import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -50,6 +51,8 @@ def plan(
         raise BadRequestError("expected scans to look at, or --points and a number, one of them")
     if points is None and (density is not None or number_of_scans is not None):
         raise BadRequestError("--density and --scans go with --points: scans say themselves")
+    if density is not None and not 0 < density < math.inf:
+        raise BadRequestError(f"--density {density}: expected a positive number of points a square metre")
     config = BuildConfig(
         voxel=voxel,
         resolution=resolution,

@@ -4,16 +4,16 @@ pye57's own read_scan() takes a scan at once, as the header sizes it; the reader
 any size as often as it is asked to.
 """
 
-import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
 from numpy.typing import NDArray
 
+from .e57_xml import check_e57, look_through, xml_of
 from .scan import (
     BOUNDS_MARGIN,
     Block,
@@ -30,10 +30,7 @@ CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 INVALID_STATE = "invalid state"
 SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
 
-# The XML of 700 scans, each with a pose and bounds, is about 4 MiB; more than this is not looked at.
-LONGEST_XML = 16 << 20
 LONGEST_CRS = 1 << 16  # longer than any real one, several times; more is cut
-PAGE_BYTES = 1024  # the last four are the page's checksum [ASTM E2807, 7]
 
 
 class Fields(NamedTuple):
@@ -123,6 +120,8 @@ def open_e57(path: Path) -> list[Scan]:
 
     Raises ScanError, also where a page's checksum does not fit.
     """
+    with library_errors(path):
+        check_e57(path)
     with library_errors(path), _image_file(path) as image:
         if not image.root().isDefined("data3D"):
             return []
@@ -173,7 +172,16 @@ def _open_scan(path: Path, index: int, node: Any) -> Scan:
     )
     numbers = {name: _number(node, *name.split("/")) for name in (*_POSE_NUMBERS, *_BOUNDS_NUMBERS)}
     pose = _pose(path, index, numbers)
-    return E57Scan(path, index, points.childCount(), pose, _bounds(numbers, pose), fields)
+    count = int(points.childCount())
+    # A record of constants takes no bit; no scan is of those alone, and a count of them could be anything.
+    if count > 8 * path.stat().st_size:
+        raise scan_error(
+            path,
+            f"scan {index} of {count} records",
+            f"at most the {8 * path.stat().st_size} bits of the file",
+            "fetch the file again, it is truncated or damaged",
+        )
+    return E57Scan(path, index, count, pose, _bounds(numbers, pose), fields)
 
 
 _QUATERNION = tuple(f"pose/rotation/{name}" for name in "wxyz")
@@ -228,7 +236,9 @@ def e57_bounds(path: Path) -> NDArray[np.float64] | None:
     Reads the XML by itself: libE57Format will not open a file with a broken page.
     """
     with path.open("rb") as file:
-        root = ElementTree.fromstring(_xml_of(file))
+        xml = xml_of(file)
+    look_through(xml)
+    root = ElementTree.fromstring(xml)
     tag = root.tag.rpartition("}")[0] + "}" if "}" in root.tag else ""
     boxes: list[NDArray[np.float64]] = []
     for scan in root.iterfind(f"{tag}data3D/{tag}vectorChild"):
@@ -254,16 +264,3 @@ def _xml_number(element: ElementTree.Element, names: list[str]) -> float | None:
     if found.get("type") == "ScaledInteger":
         number = number * float(found.get("scale", 1.0)) + float(found.get("offset", 0.0))
     return number
-
-
-def _xml_of(file: BinaryIO) -> bytes:
-    """The XML section, the checksum that ends each page taken out."""
-    signature, _, _, _, offset, length, page = struct.unpack("<8sIIQQQQ", file.read(48))
-    if signature != b"ASTM-E57" or page != PAGE_BYTES or length > LONGEST_XML:
-        raise ValueError("no E57 header")
-    at = offset % PAGE_BYTES
-    pages = (at + length) // (PAGE_BYTES - 4) + 1
-    file.seek(offset - at)
-    raw = file.read(pages * PAGE_BYTES)
-    section = b"".join(raw[start : start + PAGE_BYTES - 4] for start in range(0, len(raw), PAGE_BYTES))
-    return section[at : at + length]

@@ -1,9 +1,11 @@
 """E57: poses, invalid records, spherical coordinates, bounds in and of broken files."""
 
+import struct
 from pathlib import Path
 
 import numpy as np
 import pytest
+from broken_scans import with_checksums
 from formats import write_e57
 from solidcloud.builder.sources import header_bounds, open_scans
 from solidcloud.schemas.errors import ScanError
@@ -148,3 +150,89 @@ def test_a_byte_changed_in_any_page_is_found_by_its_checksum(tmp_path: Path) -> 
         path.write_bytes(data)
         with pytest.raises(ScanError, match="checksum"):
             read_all(path)
+
+
+NAMESPACE = "http://www.astm.org/COMMIT/E57/2010-e57-v1.0"
+
+
+def write_xml(path: Path, inner: str, before: str = "") -> None:
+    """An E57 file of XML alone, `inner` where its scans are, `before` in front of the root; checksums that fit."""
+    xml = (
+        f'<?xml version="1.0" encoding="UTF-8"?>{before}<e57Root type="Structure" xmlns="{NAMESPACE}">'
+        '<formatName type="String">ASTM E57 3D Imaging Data File</formatName><guid type="String">{1}</guid>'
+        '<versionMajor type="Integer">1</versionMajor><versionMinor type="Integer">0</versionMinor>'
+        f'<data3D type="Vector" allowHeterogeneousChildren="1">{inner}</data3D></e57Root>'
+    ).encode()
+    logical = bytes(48) + xml
+    pages = [logical[k : k + 1020].ljust(1020, b"\0") + bytes(4) for k in range(0, len(logical), 1020)]
+    raw = bytearray(b"".join(pages))
+    struct.pack_into("<8sIIQQQQ", raw, 0, b"ASTM-E57", 1, 0, len(raw), 48, len(xml), 1024)
+    path.write_bytes(with_checksums(bytes(raw)))
+
+
+def nested(depth: int) -> str:
+    return (
+        "<vectorChild type='Structure'>" + '<a type="Structure">' * depth + "</a>" * depth + "</vectorChild>"
+    )
+
+
+XML_LIES = {
+    "deep": (nested(1000), "", "over 64 in each other"),
+    "deep, and then broken": (nested(1000) + "<", "", "over 64 in each other"),
+    "many": ("<vectorChild type='Structure'/>" * (1 << 18), "", "over 262144 elements"),
+    "an entity": ("<a>&x;</a>", f'<!DOCTYPE e57Root [<!ENTITY x "{"y" * 9}">]>', "with a document type"),
+    "another file": (
+        "<a>&x;</a>",
+        '<!DOCTYPE e57Root [<!ENTITY x SYSTEM "/etc/hostname">]>',
+        "with a document type",
+    ),
+}
+
+
+@pytest.mark.parametrize("lie", XML_LIES)
+def test_xml_that_no_scan_needs_is_refused_before_the_library_sees_it(lie: str, tmp_path: Path) -> None:
+    inner, before, message = XML_LIES[lie]
+    path = tmp_path / "a.e57"
+    write_xml(path, "")
+    assert open_scans(path) == []
+    write_xml(path, inner, before)
+    with pytest.raises(ScanError, match=message):
+        open_scans(path)
+    assert header_bounds(path) is None
+
+
+@pytest.mark.parametrize(
+    ("at", "value", "message"),
+    [
+        (16, 4096, "4096 declared"),
+        (24, 1 << 40, "from byte 1099511627776 on"),
+        (32, 1 << 40, "1099511627776 of XML"),
+        (40, 512, "pages of 512 bytes"),
+    ],
+)
+def test_an_e57_header_that_lies_is_refused(at: int, value: int, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "a.e57"
+    write_xml(path, "")
+    data = bytearray(path.read_bytes())
+    struct.pack_into("<Q", data, at, value)
+    path.write_bytes(with_checksums(bytes(data)))
+    with pytest.raises(ScanError, match=message):
+        open_scans(path)
+
+
+def test_more_records_than_bits_are_refused(tmp_path: Path) -> None:
+    """A record of constants takes none: such a file may claim any number of them, and deliver it."""
+    path = tmp_path / "a.e57"
+    axes = "".join(
+        f'<cartesian{axis} type="Integer" minimum="5" maximum="5">5</cartesian{axis}>' for axis in "XYZ"
+    )
+    points = (
+        '<vectorChild type="Structure"><points type="CompressedVector" fileOffset="48" recordCount="{}">'
+        f'<prototype type="Structure">{axes}</prototype><codecs type="Vector" allowHeterogeneousChildren="1"/>'
+        "</points></vectorChild>"
+    )
+    write_xml(path, points.format(100))
+    assert open_scans(path)[0].declared_count == 100
+    write_xml(path, points.format(10**13))
+    with pytest.raises(ScanError, match=f"scan 0 of {10**13} records, expected at most the"):
+        open_scans(path)

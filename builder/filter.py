@@ -25,6 +25,7 @@ whole, however many points are there.
 """
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from fractions import Fraction
 from math import isqrt
 from pathlib import Path
@@ -58,11 +59,11 @@ Counts = dict[str, dict[int, int]]
 
 
 class Reach(NamedTuple):
-    """A distance and a count. squared: of the distance [steps^2].  steps: of it, whole.  count: see the rule."""
+    """A distance and a number. squared: of the distance [steps^2].  steps: of it, whole.  number: see the rule."""
 
     squared: int
     steps: int
-    count: int
+    number: int
 
 
 class Rules(NamedTuple):
@@ -112,7 +113,7 @@ def filter_passes(config: BuildConfig) -> int:
     return (config.moving is not None or config.outliers is not None) + (config.thin is not None)
 
 
-def _reach(option: str, metres: float, count: int, lattice: Lattice, wider: int = 1) -> Reach:
+def _reach(option: str, metres: float, number: int, lattice: Lattice, wider: int = 1) -> Reach:
     """`wider` times a distance. Raises BadRequestError where it is under a lattice step or over a voxel."""
     ratio = Fraction(repr(metres)) / Fraction(repr(lattice.step)) * wider
     squared = int(ratio * ratio)
@@ -126,7 +127,7 @@ def _reach(option: str, metres: float, count: int, lattice: Lattice, wider: int 
             f"{option} {metres:g}{around}: expected at most a voxel, {lattice.voxel_size:g} m: give a smaller distance "
             "or a larger --voxel"
         )
-    return Reach(squared, isqrt(squared), count)
+    return Reach(squared, isqrt(squared), number)
 
 
 def make_rules(config: BuildConfig, lattice: Lattice) -> Rules:
@@ -206,7 +207,8 @@ def _load(noted: dict[str, Any]) -> Filtered:
     return Filtered(noted["name"], noted["size"], counts)
 
 
-class _Holds(NamedTuple):
+@dataclass(frozen=True, slots=True)
+class _Holds:
     """Whether the run that a note speaks of is in the folder, as long as it was."""
 
     folder: Path
@@ -281,10 +283,10 @@ def _near(block: Block, reader: BlockReader, rules: Rules) -> NDArray[np.uint8]:
     if rules.moving is not None and rules.seen is not None:
         alone = (
             _scans_around(block, reader, rules.moving, np.ones(len(block.rows), np.bool_))
-            < rules.moving.count
+            < rules.moving.number
         )
         if alone.any():
-            seen = _scans_around(block, reader, rules.seen, alone) >= rules.seen.count
+            seen = _scans_around(block, reader, rules.seen, alone) >= rules.seen.number
             verdict[alone & seen] = 1 + REASONS.index(MOVING)
     return verdict
 
@@ -342,20 +344,20 @@ def _is_outlier(block: Block, reader: BlockReader, reach: Reach) -> NDArray[np.b
             grid.across,
             grid.deep,
             reach.squared,
-            reach.count,
+            reach.number,
             found,
         )
         counts[which] = found
-        left[which] = found < reach.count
-    return counts < reach.count
+        left[which] = found < reach.number
+    return counts < reach.number
 
 
 def _scans_around(
     block: Block, reader: BlockReader, reach: Reach, asked: NDArray[np.bool_]
 ) -> NDArray[np.int64]:
-    """How many other scans, up to `reach.count`, have a point within reach of each point; 0 where not asked."""
+    """How many other scans, up to `reach.number`, have a point within reach of each point; 0 where not asked."""
     counts = np.zeros(len(block.rows), np.int64)
-    found = np.full((len(block.rows), reach.count), -1, np.int64)
+    found = np.full((len(block.rows), reach.number), -1, np.int64)
     scans = block.rows["scan_index"].astype(np.int64)
     left = asked.copy()
     for piece, which, queries, grid in _pieces(block, reader, reach, left):
@@ -369,7 +371,7 @@ def _scans_around(
             np.append(starts, len(of)), cells[starts], of[starts], grid.across, grid.deep, reach.squared, rows, held,
         )  # fmt: skip
         found[which], counts[which] = rows, held
-        left[which] = held < reach.count
+        left[which] = held < reach.number
     return counts
 
 

@@ -73,9 +73,9 @@ def unseen(looks: Sequence[NDArray[np.int64]]) -> float:
 
 
 class _Seen(NamedTuple):
-    """What was seen of one scan. count: of its points.  all_over: looks fell everywhere, not on its beginning alone."""
+    """What was seen of one scan. points: that it has.  all_over: looks fell everywhere, not on its beginning alone."""
 
-    count: int
+    points: int
     looks: list[_Look]
     all_over: bool
 
@@ -119,7 +119,8 @@ def seen_scene(inputs: Sequence[Input], config: BuildConfig) -> Scene:
     bounds = _bounds(scans)
     # Where headers say nothing the lattice's origin is not known, and voxels are cut elsewhere than they will be.
     grid = _Grid(config.voxel, np.zeros(3) if bounds is None else bounds[0])
-    begin, seen, blind = time.perf_counter(), [], 0
+    begin, blind = time.perf_counter(), 0
+    seen: list[_Seen] = []
     for scan in scans:
         if time.perf_counter() - begin > SECONDS and seen:
             blind += 1
@@ -131,7 +132,7 @@ def seen_scene(inputs: Sequence[Input], config: BuildConfig) -> Scene:
             if not config.skip_bad:
                 raise
             seen.append(_Seen(0, [], True))
-    points = sum(each.count for each in seen)
+    points = sum(each.points for each in seen)
     if not points:
         raise ScanError("no scan holds a point, expected some: check the files")
     voxels = _total(seen, config.voxel)
@@ -142,7 +143,7 @@ def seen_scene(inputs: Sequence[Input], config: BuildConfig) -> Scene:
     looked = sum(look.points for each in seen for look in each.looks)
     formats: Counter[str] = Counter()
     for scan, each in zip(scans, seen, strict=True):
-        formats[scan.format] += each.count
+        formats[scan.format] += each.points
     assumed = [f"surface and voxels as in {looked:,} points looked at of {points:,}"]
     if blind:
         assumed.append(f"{blind:,} scans not looked at are like the others")
@@ -153,7 +154,7 @@ def seen_scene(inputs: Sequence[Input], config: BuildConfig) -> Scene:
     return Scene(
         points=points,
         scans=len(scans),
-        largest=max(each.count for each in seen),
+        largest=max(each.points for each in seen),
         input_bytes=sum(path.stat().st_size for path in {scan.path for scan in scans}),
         formats=formats,
         step=_shared_step(scans, config.voxel),
@@ -167,7 +168,7 @@ def seen_scene(inputs: Sequence[Input], config: BuildConfig) -> Scene:
 def _total(seen: Sequence[_Seen], edge: float) -> float:
     """Cubes of an edge that all scans together have points in, those that no look fell on included."""
     through = [look for each in seen if each.all_over for look in each.looks]
-    if through and sum(look.points for look in through) >= sum(each.count for each in seen if each.all_over):
+    if through and sum(look.points for look in through) >= sum(each.points for each in seen if each.all_over):
         found = float(len(np.unique(np.concatenate([look.held[edge] for look in through]))))
     else:
         found = unseen([look.held[edge] for look in through])
@@ -175,9 +176,9 @@ def _total(seen: Sequence[_Seen], edge: float) -> float:
         if each.looks and not each.all_over:
             # Only its beginning was seen, the rest is taken to be as wide.
             own = len(np.unique(np.concatenate([look.held[edge] for look in each.looks])))
-            found += own * each.count / max(1, sum(look.points for look in each.looks))
-    looked = sum(each.count for each in seen if each.looks)
-    return found * sum(each.count for each in seen) / max(1, looked)
+            found += own * each.points / max(1, sum(look.points for look in each.looks))
+    looked = sum(each.points for each in seen if each.looks)
+    return found * sum(each.points for each in seen) / max(1, looked)
 
 
 def _shared_step(scans: Sequence[Scan], voxel: float) -> float | None:

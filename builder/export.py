@@ -87,8 +87,8 @@ def export_archive(
     with Archive(folder) as archive:
         limits = lattice_box(archive.header.lattice, box)
         base = archive.coordinates * archive.header.lattice.voxel_steps
-        low, high = base + archive.voxels["low"], base + archive.voxels["high"]
-        rows = np.flatnonzero(((low <= limits[1]) & (high >= limits[0])).all(axis=1))
+        near = (base + archive.voxels["low"] <= limits[1]) & (base + archive.voxels["high"] >= limits[0])
+        rows = np.flatnonzero(near.all(axis=1))
         points = archive.voxels["rows"][rows, 2].astype(np.int64)
         progress.start("look", int(points.sum()), "points")
         contents = _look(archive, rows, base, limits, progress)
@@ -107,8 +107,8 @@ def export_archive(
         finally:
             temporary.unlink(missing_ok=True)
         bounds = archive.header.lattice.to_world(np.stack([contents.low, contents.high])).tolist()
-    low_high = bounds if contents.points else [None, None]
-    return Exported(output, form, contents.points, output.stat().st_size, *low_high, tuple(notes))
+    low, high = bounds if contents.points else (None, None)
+    return Exported(output, form, contents.points, output.stat().st_size, low, high, tuple(notes))
 
 
 def lattice_box(lattice: Lattice, box: tuple[float, ...] | None) -> NDArray[np.int64]:

@@ -14,7 +14,10 @@ from .kernels.records import Leaves, take_points
 
 BLOCK_POINTS = 1 << 16
 # By the name that `--keep` calls them: the field of a record, and its type.
-_COLUMNS = {"scan": ("scan_index", np.dtype("<u2")), "intensity": ("intensity", np.dtype("<f4"))}
+_COLUMNS: dict[str, tuple[str, np.dtype]] = {
+    "scan": ("scan_index", np.dtype("<u2")),
+    "intensity": ("intensity", np.dtype("<f4")),
+}
 # No coordinate of a lattice is beyond.
 _EVERYWHERE = np.array([[-(1 << 62)] * 3, [1 << 62] * 3], np.int64)
 

@@ -3,7 +3,8 @@
 import numba as nb
 import numpy as np
 
-from .records import LANES, U, link_parents, read_leaf
+from ...schemas.kernels.rows import LANES
+from .records import U, link_parents, read_leaf
 
 
 @nb.njit(nogil=True, cache=True)
@@ -41,7 +42,8 @@ def last_loose_node(leaves, spheres, normal, slab):
                 dx, dy, dz = x + lanes[U(0), j], y + lanes[U(1), j], z + lanes[U(2), j]
                 along = nx * dx + ny * dy + nz * dz
                 if dx * dx + dy * dy + dz * dz > square or (not flat and (along < least or along > most)):
-                    loose = max(loose, node)
+                    if node > loose:
+                        loose = node
                     break
             node = np.int64(parents[at])
     return loose

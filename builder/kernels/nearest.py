@@ -6,8 +6,9 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from ...schemas.kernels.rows import LANES
 from .bounding_sphere import ceil_sqrt
-from .records import LANES, U, read_leaf
+from .records import U, read_leaf
 
 FAR = np.int64(1) << np.int64(62)
 

@@ -38,8 +38,8 @@ def needs_extra(name: str) -> Iterator[None]:
 
 
 def complain(message: str, code: int) -> int:
-    """Print one line on standard error; returns the exit code."""
-    print(f"error: {' '.join(message.splitlines())}", file=sys.stderr)
+    """Print one line on standard error, and one more for each that is indented, as lists are; returns the exit code."""
+    print("error: " + re.sub(r"\s*\n(?!  )", " ", message.rstrip()), file=sys.stderr)
     return code
 
 

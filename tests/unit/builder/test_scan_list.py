@@ -13,6 +13,7 @@ from formats import glb_document, glb_vertices, ptx_scan, write_e57, write_glb
 from solidcloud.builder import scan_list
 from solidcloud.builder.scan_list import ScanEntry, inputs, inspect, read_scan_list, write_scan_list
 from solidcloud.builder.sources import sha256_of
+from solidcloud.schemas.archive import Archive
 from solidcloud.schemas.errors import BadRequestError, ScanError
 from solidcloud.server.cli import run
 
@@ -281,3 +282,34 @@ def test_the_crs_of_a_las_and_an_e57_is_in_the_list(folder: Path) -> None:
     columns = {f"cartesian{axis}": np.arange(3.0) for axis in "XYZ"}
     write_e57(folder / "p.e57", [{"columns": columns}], crs=wkt)
     assert inspect([folder / "p.e57"])[0].crs == wkt
+
+
+def test_a_build_names_every_broken_file_on_a_line_of_its_own(
+    folder: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(folder)
+    (folder / "e.las").write_bytes(b"LASF")
+    (folder / "deep" / "d.xyz").write_text("1 2 3\n4 5\n")  # broken behind what its header says
+    assert run(["build", ".", "-o", "archive", "--jobs", "1"]) == 3
+    lines = [line for line in capsys.readouterr().err.splitlines() if "expected" in line]
+    named = [next(name for name in ("c.e57", "d.xyz", "e.las") if name in line) for line in lines]
+    assert sorted(named) == ["c.e57", "d.xyz", "e.las"]
+    assert lines[0].startswith("error: ") and not (folder / "archive").exists()
+    assert not [path for path in folder.iterdir() if path.name.startswith(".")]
+
+
+def test_a_build_may_leave_broken_files_out(
+    folder: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(folder)
+    assert run(["inspect", "."]) == 3
+    edit(folder / "scans.toml", {"crs": "EPSG:2056", "up": "y"}, 0)
+    assert run(["build", "scans.toml", "-o", "archive", "--jobs", "1", "--skip-bad"]) == 0
+    assert "left out" in capsys.readouterr().err
+    with Archive(folder / "archive") as archive:
+        header = archive.header
+    assert header.points == 50 + 20 + 7 + 20 and header.unknown_everywhere
+    kept = {(Path(s.path).name, s.index): s for s in header.sources}
+    las, ptx, broken = kept["a.las", 0], kept["b.ptx", 0], kept["c.e57", 0]
+    assert (las.crs, las.up, las.units) == ("EPSG:2056", "y", "m") and (ptx.crs, ptx.up) == ("", "z")
+    assert np.array_equal(ptx.pose, POSE) and "checksum" in broken.fault

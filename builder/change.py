@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..schemas.archive import INDEX_NAME, SHARD_FOLDER, Archive, sync_folder
-from ..schemas.errors import BadRequestError, FormatError
+from ..schemas.errors import BadRequestError, FormatError, SolidcloudError
 from ..schemas.index import Header
 from ..schemas.vtkhdf import PREVIEW_NAME
 from .config import BuildConfig
@@ -52,6 +52,7 @@ class Change:
         self.dtype = spool_dtype(config)
         self.begin = time.perf_counter()
         self.seconds: dict[str, float] = {}
+        self.published = False  # whether the archive is the new one
 
     @property
     def share(self) -> int:
@@ -109,9 +110,23 @@ def changing(target: Path, jobs: int, memory_bytes: int, progress: Progress | No
         try:
             jobs = jobs_that_fit(worker_count(jobs, archive.header.points), config)
             with make_executor(config, jobs) as executor:
-                yield Change(target, folder, archive, config, executor, progress or Silent())
+                change = Change(target, folder, archive, config, executor, progress or Silent())
+                with _disk_errors(change):
+                    yield change
         finally:
             shutil.rmtree(folder, ignore_errors=True)
+
+
+@contextmanager
+def _disk_errors(change: Change) -> Iterator[None]:
+    """Say what the archive is where the disk failed, and what to do."""
+    try:
+        yield
+    except OSError as error:
+        state = "changed all the same" if change.published else "what it was"
+        raise SolidcloudError(
+            f"{change.target}: {error}: the archive is {state}: make room, or check the disk"
+        ) from error
 
 
 def config_of(header: Header, target: Path, jobs: int, memory_bytes: int) -> BuildConfig:
@@ -175,24 +190,27 @@ def publish(change: Change, new: list[str], named: set[str]) -> None:
     """Give the new shards their place, then the new index its name, and delete what it does not name.
 
     Killed before the index is renamed, the archive is the old one, and the shards it does not name are deleted by the
-    next run; killed after, it is the new one, and so are those that are not named any more.
+    next run; killed after, it is the new one, and so are those that are not named any more. A preview, where there is
+    one, is the old one for that moment, and says so: it names its generation.
     """
-    shards, preview = change.target / SHARD_FOLDER, change.target / PREVIEW_NAME
-    moved, had_preview = [], preview.exists()
+    shards, preview = change.target / SHARD_FOLDER, change.folder / PREVIEW_NAME
+    if (change.target / PREVIEW_NAME).exists():
+        with Archive(change.folder) as archive, change.stage("preview", archive.header.points, "points"):
+            write_preview(change.folder, change.executor, change.progress)
+    moved = []
     try:
         for name in new:
             os.rename(change.folder / SHARD_FOLDER / name, shards / name)
             moved.append(shards / name)
         sync_folder(shards)
-        preview.unlink(missing_ok=True)  # of points that will not be there any more
         os.replace(change.folder / INDEX_NAME, change.target / INDEX_NAME)
+        change.published = True
     except BaseException:
         for path in moved:
             with suppress(OSError):
                 path.unlink()
         raise
+    if preview.exists():
+        os.replace(preview, change.target / PREVIEW_NAME)
     sync_folder(change.target)
     delete_orphans(change.target, named)
-    if had_preview:
-        with change.stage("preview", change.archive.header.points, "points"):
-            write_preview(change.target, change.executor, change.progress)

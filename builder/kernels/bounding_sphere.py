@@ -181,7 +181,8 @@ def least_variance(spread, direction):
     """Write the direction (3,) float64 of least variance of a spread (SPREAD,), of unit length."""
     if _flat_direction(spread, direction):
         return
-    a, v = np.zeros((3, 3)), np.eye(3)
+    a, v = np.zeros((3, 3)), np.zeros((3, 3))
+    v[0, 0] = v[1, 1] = v[2, 2] = 1.0
     a[0, 0], a[0, 1], a[0, 2] = spread[4], spread[5], spread[6]
     a[1, 0], a[1, 1], a[1, 2] = spread[5], spread[7], spread[8]
     a[2, 0], a[2, 1], a[2, 2] = spread[6], spread[8], spread[9]

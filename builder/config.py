@@ -11,12 +11,23 @@ from ..schemas.voxel import MAX_DEGREE, MAX_LEAF, MIN_DEGREE
 # Closest-point distances are measured at about this many points; of fewer, at all.
 RADIUS_SAMPLE = 1_000_000
 
-# Points in a work unit, one shard: large enough that opening a file is noise, small enough that two
-# workers of the default memory bound hold one each, decoded, with room for the hierarchy being built.
+# Points in a work unit, one shard, see `shard_points`: large enough that opening a file is noise, small enough that a
+# worker that is killed loses a few seconds.
 SHARD_POINTS = 1 << 22
+# A server opens all shards of an archive, and a process may open 1,024 files on most systems.
+MOST_SHARDS = 512
 
 DEFAULT_STEP = 1e-4
 CELL_KINDS = ("octree", "balanced")
+
+
+def shard_points(points: int) -> int:
+    """Points in a shard of a dataset of so many: a function of nothing else, or bytes would depend on jobs.
+
+    A quarter of SHARD_POINTS for few, so that two workers have many each, and end at about the same time: 10^7 points
+    in 3 shards kept one of them idle for a quarter of the time.
+    """
+    return max(SHARD_POINTS // 4, min(SHARD_POINTS, points // 64), points // MOST_SHARDS)
 
 
 def parse_radius(text: str) -> tuple[float | None, frozenset[str]]:

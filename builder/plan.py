@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 from ..schemas.errors import CorruptError
 from ..schemas.voxel_grid import KEY_BIAS, MAX_VOXEL_STEPS
-from .config import DEFAULT_STEP, SHARD_POINTS, BuildConfig
+from .config import DEFAULT_STEP, BuildConfig, shard_points
 from .executor import worker_count
 from .partition import run_points
 from .spool import spool_dtype
@@ -244,7 +244,7 @@ def estimate(scene: Scene, config: BuildConfig, rates: Rates, target: Path | Non
             PREVIEW_BYTES * min(PREVIEW[1], max(PREVIEW[0], scene.points / PREVIEW[2]), scene.points)
         ),
         disk_bytes=size + spool,
-        shards=max(1, math.ceil(scene.points / SHARD_POINTS)),
+        shards=max(1, math.ceil(scene.points / shard_points(scene.points))),
         runs=runs,
         memory_bytes=_memory(scene, config, rates, jobs, voxels * INDEX_BYTES + directories * jobs),
         stages=stages,

@@ -13,7 +13,7 @@ from ..schemas.codec import encode_voxel
 from ..schemas.radius_model import RADIUS_CLASSES
 from ..schemas.voxel_grid import Lattice
 from .classes import ALL_CODES, voxel_classes
-from .config import SHARD_POINTS, BuildConfig
+from .config import BuildConfig, shard_points
 from .dense import BuiltVoxel, build_dense, is_dense
 from .octree import build_voxel, gather_voxel
 from .spool import Spool
@@ -52,15 +52,16 @@ class Shard(NamedTuple):
 
 
 def plan_shards(keys: NDArray[np.uint64], counts: NDArray[np.int64]) -> list[tuple[tuple[int, ...], int]]:
-    """Cut voxels (ascending keys, points of each) into runs of about SHARD_POINTS: (keys, points) each.
+    """Cut voxels (ascending keys, points of each) into runs of about `shard_points`: (keys, points) each.
 
     A function of the points alone, so that the archive does not depend on the number of jobs.
     """
+    most = shard_points(int(counts.sum()))
     plans: list[tuple[tuple[int, ...], int]] = []
     held: list[int] = []
     points = 0
     for key, count in zip(keys.tolist(), counts.tolist(), strict=True):
-        if held and points + count > SHARD_POINTS:
+        if held and points + count > most:
             plans.append((tuple(held), points))
             held, points = [], 0
         held.append(key)

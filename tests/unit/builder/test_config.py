@@ -1,7 +1,7 @@
 """Options of a build: what is refused by name, and which of them an archive's bytes depend on."""
 
 import pytest
-from solidcloud.builder.config import BuildConfig, parse_rule
+from solidcloud.builder.config import MOST_SHARDS, SHARD_POINTS, BuildConfig, parse_rule, shard_points
 from solidcloud.schemas.errors import BadRequestError
 
 WRONG = {
@@ -40,3 +40,12 @@ def test_an_archive_depends_on_filters_and_not_on_who_does_the_work() -> None:
     filters = BuildConfig(thin=0.01, outliers=(0.1, 5), moving=(0.25, 2)).identity()
     added = {name: value for name, value in filters.items() if name not in plain}
     assert added == {"thin": 0.01, "outliers": "0.1,5", "moving": "0.25,2"}
+
+
+@pytest.mark.parametrize("points", [1, 10**6, 10**7, 10**8, 10**9, 10**10, 10**12])
+def test_shards_are_many_enough_for_workers_and_few_enough_to_open(points: int) -> None:
+    each = shard_points(points)
+    assert each >= SHARD_POINTS // 4
+    assert points / each <= MOST_SHARDS + 1
+    assert each <= max(SHARD_POINTS, points // MOST_SHARDS)
+    assert points < 10**7 or points / each >= 9

@@ -12,9 +12,9 @@ import hdf5plugin  # noqa: F401  see test_two_jobs_write_the_bytes_of_one
 import laspy
 import numpy as np
 import pytest
+import solidcloud.builder.config as config
 import solidcloud.builder.partition as partition
 import solidcloud.builder.pipeline as pipeline
-import solidcloud.builder.shards as shards
 import solidcloud.builder.survey as survey
 from scans import WITH_POINTS, make_scan, write_las, write_ply, write_xyz
 from solidcloud.builder.config import BuildConfig
@@ -80,7 +80,7 @@ def test_the_bytes_do_not_depend_on_order_jobs_or_memory(
 ) -> None:
     # Several shards and several runs, though the dataset is small.
     keep = frozenset({"scan", "intensity"})
-    monkeypatch.setattr(shards, "SHARD_POINTS", 300)
+    monkeypatch.setattr(config, "SHARD_POINTS", 1200)
     first = build(scans, out / "a", keep=keep)
     assert first.shards > 1
     assert first.voxels > 8

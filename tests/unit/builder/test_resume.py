@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+import solidcloud.builder.config as config
 import solidcloud.builder.pipeline as pipeline
-import solidcloud.builder.shards as shards
 import solidcloud.builder.survey as survey
 from scans import make_scan, write_las, write_xyz
 from solidcloud.builder.config import BuildConfig
@@ -26,8 +26,8 @@ class Killed(BaseException):
     """The process is gone."""
 
 
-# What a process does to a disk that matters, beside writing to files of no name.
-DEEDS = ("replace", "rename", "fsync", "unlink", "rmdir", "mkdir")
+# What changes the names on a disk. All else is done to files that have none yet.
+DEEDS = ("replace", "rename", "unlink", "rmdir", "mkdir")
 
 
 class Reaper:
@@ -64,7 +64,7 @@ def content(archive: Path) -> dict[str, bytes]:
 def scans(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Path]:
     """Two scans, one of which is read in three ranges; two shards are made of them."""
     monkeypatch.setattr(survey, "RANGE_POINTS", (100, 100))
-    monkeypatch.setattr(shards, "SHARD_POINTS", 250)
+    monkeypatch.setattr(config, "SHARD_POINTS", 1000)
     raw = np.random.default_rng(2).integers(-1500, 1500, (250, 3))
     write_las(tmp_path / "a.las", raw)
     write_xyz(tmp_path / "b.xyz", make_scan("plane", 3, 150))
@@ -93,12 +93,13 @@ def test_a_build_killed_at_any_deed_goes_on_to_the_same_bytes(
         gc.collect()  # the lock goes with the file that holds it, and the file with the traceback
         return reaper.done
 
+    killed(tmp_path / "first", 10**9)  # numba keeps what it compiles, in files as well
     deeds = killed(tmp_path / "judge", 10**9)
     expected = content(tmp_path / "judge" / "hall")
     assert len(expected) == 4
-    assert deeds > 90
+    assert deeds > 40
     # What is overwritten plays a part at the end alone.
-    for most in range(deeds - 40 if overwrite else 0, deeds):
+    for most in range(deeds - 30 if overwrite else 0, deeds):
         out = tmp_path / f"{most}"
         assert killed(out, most) == most
         # Nothing but a whole archive is ever under the name asked for.

@@ -1,0 +1,166 @@
+"""A build on a cluster of two workers, one killed in mid-build: the archive is a single process's, to the byte."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("distributed")
+
+import solidcloud.builder.cluster as cluster_module
+import solidcloud.builder.config as config_module
+import solidcloud.builder.shards as shards_module
+from solidcloud.builder.config import BuildConfig
+from solidcloud.builder.pipeline import build_archive
+from solidcloud.builder.verify import verify_archive
+from solidcloud.server.cli import run
+
+VOXEL = 0.5
+
+
+@pytest.fixture(scope="module")
+def scans(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two scans of a floor and a wall, 20,000 points in some 90 voxels."""
+    folder = tmp_path_factory.mktemp("scans")
+    rng = np.random.default_rng(7)
+    for name, axis in (("floor", 2), ("wall", 1)):
+        points = rng.uniform(0, 3, (10_000, 3))
+        points[:, axis] = rng.normal(1, 0.002, len(points))
+        np.savetxt(folder / f"{name}.xyz", points, fmt="%.4f")
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def small_units(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Some 40 shards of a few voxels, so that there is a middle of the build."""
+    for module in (config_module, shards_module):
+        if hasattr(module, "SHARD_POINTS"):
+            monkeypatch.setattr(module, "SHARD_POINTS", 500)
+
+
+@pytest.fixture(scope="module")
+def alone(scans: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, bytes]]:
+    """What a single process makes of the scans."""
+    with pytest.MonkeyPatch.context() as patch:
+        for module in (config_module, shards_module):
+            if hasattr(module, "SHARD_POINTS"):
+                patch.setattr(module, "SHARD_POINTS", 500)
+        target = tmp_path_factory.mktemp("alone") / "hall"
+        build_archive([scans], target, BuildConfig(voxel=VOXEL, jobs=1))
+        yield content(target)
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()
+    }
+
+
+class Killer(threading.Thread):
+    """Kills one worker of the cluster as soon as the first shard is there."""
+
+    def __init__(self, target: Path) -> None:
+        super().__init__(daemon=True)
+        self.work = target.parent / f".{target.name}.building"
+        self.clusters: list[cluster_module.LocalCluster] = []
+        self.killed, self.shards = 0, 0
+
+    def run(self) -> None:
+        """Wait, and kill."""
+        deadline = time.monotonic() + 60
+        while time.monotonic() < deadline:
+            self.shards = len([*self.work.glob("**/0-*.h5")])
+            if self.shards and self.clusters:
+                self.killed = self.clusters[-1].workers[0].pid
+                os.kill(self.killed, signal.SIGKILL)
+                return
+            time.sleep(0.001)
+
+
+def test_a_worker_killed_in_mid_build_changes_no_byte(
+    scans: Path,
+    alone: dict[str, bytes],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    target = tmp_path / "hall"
+    killer = Killer(target)
+    start = cluster_module._start_local
+
+    def watched(number: int, memory: int, watch: cluster_module._Watch) -> cluster_module.LocalCluster:
+        killer.clusters.append(start(number, memory, watch))
+        return killer.clusters[-1]
+
+    monkeypatch.setattr(cluster_module, "_start_local", watched)
+    killer.start()
+    summary = build_archive([scans], target, BuildConfig(voxel=VOXEL, cluster="local:2"))
+    killer.join()
+
+    assert killer.killed and 0 < killer.shards < summary.shards
+    assert "died; its units are run again" in capsys.readouterr().err
+    assert content(target) == alone
+    assert not verify_archive(target).faults
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["hall"]
+
+
+def test_a_scheduler_that_runs_elsewhere_makes_the_same_archive(
+    scans: Path, alone: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Workers started by hand, in another folder than the builder's, whose paths are relative."""
+    code = (
+        "from distributed import LocalCluster; import sys\n"
+        "if __name__ == '__main__':\n"
+        "    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address='127.0.0.1:0') as cluster:\n"
+        "        print(cluster.scheduler_address, flush=True); sys.stdin.read()\n"
+    )
+    (tmp_path / "there").mkdir()
+    (tmp_path / "cluster.py").write_text(code)
+    scheduler = subprocess.Popen(
+        [sys.executable, "-P", tmp_path / "cluster.py"],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        cwd=tmp_path / "there",
+    )
+    assert scheduler.stdin and scheduler.stdout
+    try:
+        address = scheduler.stdout.readline().strip()
+        monkeypatch.chdir(scans)
+        archive = os.path.relpath(tmp_path / "hall")
+        config = BuildConfig(voxel=VOXEL, scheduler=address)
+        build_archive([Path(".")], Path(archive), config)
+        # The index names the scans as they were given: all else is the same.
+        found = content(tmp_path / "hall")
+        assert found.keys() == alone.keys()
+        assert {name for name in found if found[name] != alone[name]} <= {"index.h5"}
+    finally:
+        scheduler.stdin.close()
+        scheduler.wait(30)
+
+
+def test_what_is_wrong_on_the_cluster_is_said_as_here(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "bad.xyz").write_text("1 2 3\n4 5 six\n")
+    said = {}
+    for name, more in (("alone", ["--jobs", "1"]), ("cluster", ["--cluster", "local:2"])):
+        code = run(["build", str(tmp_path / "bad.xyz"), "-o", str(tmp_path / "hall"), *more])
+        lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
+        said[name] = (code, lines)
+    assert said["cluster"] == said["alone"]
+    assert said["alone"][0] == 3 and len(said["alone"][1]) == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["bad.xyz"]
+
+    monkeypatch.setattr(cluster_module, "REACH_SECONDS", 1)
+    np.savetxt(tmp_path / "good.xyz", np.eye(3))
+    more = ["--scheduler", "tcp://127.0.0.1:1"]
+    assert run(["build", str(tmp_path / "good.xyz"), "-o", str(tmp_path / "hall"), *more]) == 2
+    assert "tcp://127.0.0.1:1: no dask scheduler answers" in capsys.readouterr().err

@@ -6,6 +6,7 @@ import os
 import pickle
 import subprocess
 import sys
+import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -243,6 +244,28 @@ def test_a_truncated_file_is_an_error(case: Case, written: Path, truth: Truth, k
         for scan in open_scans(written):
             read(scan)
     assert str(caught.value).startswith(f"{written}: ")
+
+
+def test_memory_is_that_of_a_block_and_not_of_the_file(
+    case: Case, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of 30,000 points, 0.7 MB as float64, in blocks of 500; text in pieces of 16 kB."""
+    for module in ("rows", "counted"):
+        monkeypatch.setattr(f"solidcloud.builder.sources.{module}.CHUNK_BYTES", 1 << 14)
+    monkeypatch.setattr("solidcloud.builder.sources.lzf.PIECE_BYTES", 1 << 12)
+    rng = np.random.default_rng(3)
+    count = 30_016  # three points a triangle and one; whole columns of 8
+    many = Truth(rng.uniform(-50, 50, (count, 3)), rng.integers(0, 99, count).astype(np.float32))
+    path = tmp_path / case.name
+    monkeypatch.setattr(sys.modules[__name__], "COUNT", count)
+    case.write(path, many)
+    next(open_scans(path)[0].blocks(500))  # what is loaded or compiled on first use
+    tracemalloc.start()
+    seen = sum(len(block.xyz) for scan in open_scans(path) for block in scan.blocks(500))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert seen >= count
+    assert peak < 250_000
 
 
 def test_a_scan_can_be_sent_to_another_process(written: Path) -> None:

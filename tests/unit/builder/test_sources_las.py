@@ -6,6 +6,7 @@ from pathlib import Path
 import laspy
 import numpy as np
 import pytest
+from broken_scans import SEEDS
 from solidcloud.builder.sources import Lattice, header_bounds, open_scans
 from solidcloud.schemas.errors import ScanError
 
@@ -127,6 +128,37 @@ def test_a_range_of_a_laz_is_found_by_its_chunks(point_format: int, tmp_path: Pa
     for start, stop in ((0, 10), (49_999, 50_001), (50_000, 100_000), (77_777, 120_001), (120_000, None)):
         found = np.concatenate([block.xyz for block in scan.blocks(20_011, start, stop)])
         assert np.array_equal(found, xyz[start:stop])
+
+
+def test_a_range_of_chunks_that_differ_in_size_is_found(tmp_path: Path) -> None:
+    """As COPC has them; lazrs's own seek delivers other points there (0.8.2)."""
+    xyz = np.random.default_rng(3).uniform(-5, 5, (60, 3)).round(3)
+    SEEDS["variable.laz"](tmp_path / "a.laz", xyz)
+    (scan,) = open_scans(tmp_path / "a.laz")
+    whole = read_all(tmp_path / "a.laz")
+    assert np.abs(whole - xyz - [1000, 2000, 3]).max() < 1e-9
+    for start in range(60):
+        for stop in (start + 1, min(start + 9, 60), 60):
+            found = np.concatenate([block.xyz for block in scan.blocks(5, start, stop)])
+            assert np.array_equal(found, whole[start:stop])
+
+
+def test_layers_that_are_not_read_change_nothing(tmp_path: Path) -> None:
+    """Of a layered chunk only coordinates and intensities are decompressed."""
+    path = tmp_path / "a.laz"
+    header = laspy.LasHeader(version="1.4", point_format=7)
+    header.scales, header.offsets = [0.001] * 3, [0.0] * 3
+    las = laspy.LasData(header)
+    rng = np.random.default_rng(8)
+    las.X, las.Y, las.Z = rng.integers(-(2**31), 2**31, (3, 1000))
+    las.intensity, las.red = rng.integers(0, 65536, (2, 1000))
+    las.return_number, las.number_of_returns = rng.integers(1, 6, (2, 1000))
+    las.scanner_channel, las.gps_time = rng.integers(0, 4, 1000), rng.uniform(0, 1e9, 1000)
+    las.write(path, laz_backend=laspy.LazBackend.Lazrs)
+    (block,) = open_scans(path)[0].blocks()
+    judge = laspy.read(path)
+    assert np.array_equal(block.xyz, np.column_stack([judge.x, judge.y, judge.z]))
+    assert np.array_equal(block.intensity, judge.intensity)
 
 
 def test_a_laz_that_claims_more_points_than_its_chunks_hold_is_refused(tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ Exit codes: 0; 1 failed; 2 a request that cannot be understood; 3 bad data; 130 
 """
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import typer
@@ -27,6 +27,7 @@ makers.command("facade")(make.make_facade)
 makers.command("town")(make.make_town)
 makers.command("figure")(make.make_figure)
 makers.command("walk")(make.make_walk)
+verb: Callable[..., None]
 for verb in (
     inspect.inspect,
     build.build,

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import time
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -106,21 +107,34 @@ def inject(ground: Ground, call: Call, fault: str, overwrite: bool, tally: Tally
     shutil.rmtree(case.folder)
 
 
-def all_calls(ground: Ground, tally: Tally, every: int = 1, say: object = None) -> int:
-    """Each fault at each call, or each `every`-th, of a first build and of one that overwrites; returns the points."""
+def one_of_each(calls: list[Call]) -> list[Call]:
+    """The middle one of each name."""
+    names = dict.fromkeys(call.name for call in calls)
+    alike = [[call for call in calls if call.name == name] for name in names]
+    return [found[len(found) // 2] for found in alike]
+
+
+def all_calls(
+    ground: Ground, tally: Tally, every: int | None = 1, say: Callable[[str], None] | None = None
+) -> int:
+    """Each fault at each call, of a first build and of one that overwrites; returns how many that were.
+
+    every: at each so-many-th call alone; None: at one of each name.
+    """
     points = 0
     for overwrite in (False, True):
         calls = calls_of(ground, overwrite)
         if overwrite:
             # As the first build until the names are changed; only what follows is new.
             calls = calls[-12:]
+        calls = calls[::every] if every else one_of_each(calls)
         for index, call in enumerate(calls):
             for fault in FAULTS:
-                if (fault == "ENOSPC" and call.name not in FULL) or (index % every):
+                if fault == "ENOSPC" and call.name not in FULL:
                     continue
                 points += 1
                 inject(ground, call, fault, overwrite, tally)
-            if callable(say) and index % 20 == 0:
+            if say and index % 20 == 0:
                 say(
                     f"{index + 1} of {len(calls)} calls{', --overwrite' if overwrite else ''}; {len(tally.bad)} bad"
                 )

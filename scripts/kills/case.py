@@ -13,6 +13,7 @@ import laspy
 import numpy as np
 import solidcloud.builder
 from solidcloud.builder.verify import verify_archive
+from solidcloud.schemas.errors import SolidcloudError
 
 # What cuts a build into units, made small: some 15 units of a few hundred points. What they hold does not depend on it.
 SMALL = {"SHARD_POINTS": 800, "SPOOL_RANGE": 1500, "LEAST_RUN_POINTS": 700}
@@ -111,8 +112,11 @@ class Case:
         if not self.whole():
             found = content(self.target) if self.target.exists() else {}
             faults.append(f"{self.target}: not byte-identical: {difference(found, self.reference)}")
-        elif report := verify_archive(self.target).faults:
-            faults.append(f"{self.target}: {report[0]}")
+        else:
+            try:
+                faults += [f"{self.target}: {fault}" for fault in verify_archive(self.target).faults]
+            except SolidcloudError as error:
+                faults.append(str(error))
         left = sorted(path.name for path in self.folder.iterdir() if path != self.target)
         if left:
             faults.append(f"{self.folder}: left behind: {', '.join(left)}")

@@ -2,6 +2,7 @@
 
 import signal
 import sys
+import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -137,21 +138,20 @@ def _build(scans: list[Path], output: Path, config: "BuildConfig", log_json: boo
 @contextmanager
 def _interruptible(output: Path) -> Iterator[None]:
     """Take SIGTERM for Ctrl-C, and say how to go on."""
-    before = signal.signal(signal.SIGTERM, _interrupt)
+    main = threading.current_thread() is threading.main_thread()  # no other thread may say what a signal does
+    before = signal.signal(signal.SIGTERM, _interrupt) if main else None
     try:
         yield
     except KeyboardInterrupt:
         from ...builder.workplace import building_folder
 
         folder = building_folder(output)
-        if folder.exists():
-            print(
-                f"{output}: what is done is kept in {folder}: the same command goes on, --fresh starts over",
-                file=sys.stderr,
-            )
+        kept = f"what is done is kept in {folder}: the same command goes on, --fresh starts over"
+        print(f"interrupted: {kept if folder.exists() else 'nothing was done'}", file=sys.stderr)
         raise
     finally:
-        signal.signal(signal.SIGTERM, before)
+        if main:
+            signal.signal(signal.SIGTERM, before)
 
 
 def _interrupt(*_: object) -> None:

@@ -56,6 +56,7 @@ def spooled(
     return spool_range(unit), Spool(folder, dtype, lattice)
 
 
+@pytest.mark.interpreted
 @pytest.mark.parametrize("run_points", [1, 100, 10_000])
 @pytest.mark.parametrize("keep", [frozenset(), frozenset({"scan", "intensity"})])
 def test_every_point_is_spooled_once_whatever_the_runs(
@@ -142,6 +143,7 @@ def test_a_point_too_far_for_its_voxel_is_refused(tmp_path: Path) -> None:
         spooled(tmp_path / "s", Listed(xyz), 2, make_lattice((0, 0, 0), 0.001, 0.01))
 
 
+@pytest.mark.interpreted
 def test_only_usable_points_are_spooled(tmp_path: Path) -> None:
     xyz = make_scan("noise", 1, 60) + 1
     xyz[5, 1], xyz[6, 0], xyz[50, 2] = np.nan, np.inf, np.nextafter(MAX_COORDINATE, np.inf)
@@ -154,6 +156,7 @@ def test_only_usable_points_are_spooled(tmp_path: Path) -> None:
     assert result.count == 57
 
 
+@pytest.mark.interpreted
 def test_the_content_sum_names_the_points_and_not_their_order(tmp_path: Path) -> None:
     xyz = make_scan("noise", 2, 300)
     lattice = make_lattice((0, 0, 0), 0.001, 0.5)

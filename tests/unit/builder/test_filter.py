@@ -178,6 +178,7 @@ def test_one_point_a_cube_stays_the_nearest_to_its_middle(
         assert int(((kept - at) ** 2).sum(axis=1).min()) <= 3 * (steps - 1) ** 2 < 3 * steps**2
 
 
+@pytest.mark.interpreted
 def test_rules_together_are_moving_and_outliers_of_all_points_then_thin_of_the_rest(
     layout: tuple[int, int], rng: np.random.Generator, tmp_path: Path
 ) -> None:
@@ -196,6 +197,7 @@ def test_rules_together_are_moving_and_outliers_of_all_points_then_thin_of_the_r
     check(points, {MOVING: moving, OUTLIER: outlier, THINNED: thinned}, left, counts)
 
 
+@pytest.mark.interpreted
 def test_the_step_itself_merges_exact_duplicates(rng: np.random.Generator, tmp_path: Path) -> None:
     points = cloud(rng)
     config = BuildConfig(thin=STEP)

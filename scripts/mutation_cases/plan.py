@@ -62,6 +62,8 @@ TESTS: dict[str, tuple[str, ...]] = {
     "builder/kernels/content.py": (BUILDER + "test_content.py",),
     "builder/kernels/enclosure.py": (BUILDER + "test_enclosure.py",),
     "builder/kernels/nearest.py": (BUILDER + "test_nearest.py",),
+    "builder/kernels/records.py": (BUILDER + "test_records.py",),
+    "builder/kernels/boxes.py": (BUILDER + "test_boxes.py",),
     "builder/kernels/octree.py": (
         BUILDER + "test_octree.py::test_cells_are_runs_of_the_sorted_codes",
         BUILDER + "test_octree.py::test_a_cell_is_split_only_when_it_must_be",

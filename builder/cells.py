@@ -65,7 +65,7 @@ def build_trees(
     spreads, extremes = np.empty((c, SPREAD)), np.empty((c, EXTREMES, 3), np.int32)
     tree = (config.leaf, config.degree, config.with_slab, HIGHEST)
     total = build_cells(points, bounds, low, *tree, tuple(nodes), held, xyz, rank, spreads, extremes)
-    nodes = Nodes(*(column[:total].copy() for column in nodes))
+    nodes = Nodes._make(column[:total].copy() for column in nodes)
     rows = np.concatenate([[0], np.cumsum(held)])
     return CellTrees(low, log2_size, bounds, rows, nodes, xyz, rank, spreads, extremes)
 
@@ -88,7 +88,7 @@ def take_cells(trees: CellTrees, order: NDArray[np.int64]) -> CellTrees:
         trees.log2_size[order],
         np.concatenate([[0], np.cumsum(points)]),
         np.concatenate([[0], np.cumsum(held)]),
-        Nodes(*(column[of_nodes] for column in trees.nodes)),
+        take_rows(trees.nodes, of_nodes),
         xyz,
         rank[0],
         trees.spreads[order],
@@ -121,12 +121,12 @@ def stored_cells(trees: CellTrees) -> Cells:
 
 def take_rows(nodes: Nodes, which: NDArray) -> Nodes:
     """Some of the nodes."""
-    return Nodes(*(column[which] for column in nodes))
+    return Nodes._make(column[which] for column in nodes)
 
 
 def join_rows(parts: list[Nodes]) -> Nodes:
     """Nodes, one part behind the other."""
-    return Nodes(*map(np.concatenate, zip(*parts, strict=True)))
+    return Nodes._make(map(np.concatenate, zip(*parts, strict=True)))
 
 
 def leaf_runs(trees: CellTrees, leaf: int) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:

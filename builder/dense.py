@@ -171,7 +171,7 @@ def _put_heap(
     one = build_trees(np.repeat(place, 3, axis=0), np.zeros(1, np.int64), np.zeros(1, np.uint8), config)
     count = np.empty(most_nodes(n, config.leaf), np.uint8)
     total = heap_counts(n, config.leaf, config.degree, count)
-    nodes = Nodes(*(np.repeat(column[:1], total, axis=0) for column in one.nodes))
+    nodes = Nodes._make(np.repeat(column[:1], total, axis=0) for column in one.nodes)
     spreads = one.spreads.copy()
     spreads[0, 0] = n
     spill.put_cells(
@@ -256,7 +256,7 @@ class _Spill:
     def take(self, which: int, starts: NDArray[np.int64], counts: NDArray[np.int64], size: int) -> NDArray:
         """The bytes of some cells, one behind the other: their items of `size` bytes in file `which`."""
         taken = np.empty(int(counts.sum()) * size, np.uint8)
-        view, at = memoryview(taken), 0
+        view, at = taken.data, 0
         descriptor = self._files[which].fileno()
         for start, count in zip((starts * size).tolist(), (counts * size).tolist(), strict=True):
             got = os.preadv(descriptor, [view[at : at + count]], start)
@@ -293,7 +293,7 @@ class _Layout:
             order = self.top.order
         points, nodes = (np.cumsum(np.append(0, c), dtype=np.int64) for c in (cells.points, cells.nodes))
         self.first_point, self.first_node = points[order], nodes[order]
-        self.cells = Cells(*(column[order] for column in cells))
+        self.cells = Cells._make(column[order] for column in cells)
 
     def write(self) -> BuiltVoxel:
         """Let the cells pass, and compress their rows."""
@@ -332,7 +332,7 @@ class _Layout:
     def _points(self, first: int, past: int, stored: NDArray) -> Iterator[NDArray]:
         """The point rows of some cells, whose node rows are given; the top hierarchy grows around them."""
         of = slice(first, past)
-        cells = Cells(*(column[of] for column in self.cells))
+        cells = Cells._make(column[of] for column in self.cells)
         held = cells.points.astype(np.int64)
         starts, rows = (
             np.concatenate([[0], np.cumsum(count, dtype=np.int64)]) for count in (held, cells.nodes)
@@ -342,7 +342,7 @@ class _Layout:
             cells.log2_size,
             starts,
             rows,
-            Nodes(*(np.ascontiguousarray(stored[name]) for name in Nodes._fields)),
+            Nodes._make(np.ascontiguousarray(stored[name]) for name in Nodes._fields),
             by_axis(self.spill.take(0, self.first_point[of], held, 6).view(np.uint16), starts),
             np.empty(0, np.int32),
             np.empty((0, SPREAD)),
@@ -370,14 +370,13 @@ class _Layout:
 
     def _shell(self) -> VoxelData:
         """The voxel without rows: its key, and which columns it has."""
-        none = np.empty((0, 3))
-        cells, nodes = cell_rows(0, bytes(16), Cells(*(c[:0] for c in self.cells))), np.empty(0, NODE_DTYPE)
+        nodes = np.empty(0, NODE_DTYPE)
         return VoxelData(
             self.key,
             self.shift,
-            Cells(*(cells[name] for name in Cells._fields)),
-            Nodes(*(nodes[name] for name in Nodes._fields)),
-            none.astype(np.uint16),
+            Cells._make(column[:0] for column in self.cells),
+            Nodes._make(nodes[name] for name in Nodes._fields),
+            np.empty((0, 3), np.uint16),
             **{name: np.empty(0, self.spill.dtype[name]) for name in self.spill.names},
         )
 

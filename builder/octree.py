@@ -98,12 +98,11 @@ def build_voxel(key: int, points: VoxelPoints, voxel_steps: int, config: BuildCo
         *([] if top is None else [top.rows()]),
         *(take_rows(trees.nodes, of) for of in (of_roots, ~of_roots)),
     ]
-    columns = (None if column is None else column[trees.rank] for column in points[1:])
     return VoxelData(
         key,
         top_shift(voxel_steps),
         stored_cells(trees),
         join_rows(levels),
         block_points(trees, config.leaf),
-        *columns,
+        *_taken(points, trees.rank)[1:],
     )

@@ -24,6 +24,7 @@ from .codec import (
     CELL_DTYPE,
     NODE_DTYPE,
     OPTIONAL_COLUMNS,
+    Frame,
     OpenRecord,
     Record,
     RecordShape,
@@ -199,7 +200,7 @@ def _creation_properties() -> h5py.h5p.PropDCID:
     return h5py.h5d.open(h5py.h5f.open_file_image(image), b"x").get_create_plist()
 
 
-def _write_frame(group: h5py.Group, name: str, frame: bytes, rows: int, dtype: np.dtype) -> tuple[int, int]:
+def _write_frame(group: h5py.Group, name: str, frame: Frame, rows: int, dtype: np.dtype) -> tuple[int, int]:
     """Write one dataset of one chunk from its frame; returns the chunk's offset and size in the file."""
     properties = _creation_properties().copy()
     properties.set_chunk((rows,))

@@ -210,7 +210,7 @@ class RowStream:
 
 def pwrite_all(descriptor: int, data: bytes | NDArray, at: int) -> int:
     """Write all of the data at an offset of a file; returns how many bytes."""
-    left = memoryview(data).cast("B")
+    left = memoryview(data if isinstance(data, bytes) else data.data).cast("B")
     size = len(left)
     while left:
         written = os.pwrite(descriptor, left, at)

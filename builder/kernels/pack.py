@@ -28,7 +28,7 @@ def longest_edge(own, lo, hi):
         for i in range(lo, hi):
             least, most = min(least, own[k, i]), max(most, own[k, i])
         if np.int64(most) - np.int64(least) > widest:
-            axis, low, widest = k, np.int64(least), np.int64(most) - np.int64(least)
+            axis, low, widest = np.uint64(k), np.int64(least), np.int64(most) - np.int64(least)
     return axis, low, widest
 
 

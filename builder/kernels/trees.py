@@ -121,9 +121,9 @@ def extreme_points(own, n, low, extremes):
             key = (along << 32) + np.int64(i)
             least, most = min(least, key), max(most, key)
         for side in range(2):
-            i = np.uint64((least if side == 0 else most) & 0xFFFFFFFF)
+            chosen = np.uint64((least if side == 0 else most) & 0xFFFFFFFF)
             for k in range(np.uint64(3)):
-                extremes[2 * d + side, k] = low[k] + np.int64(own[k, i])
+                extremes[2 * d + side, k] = low[k] + np.int64(own[k, chosen])
 
 
 @nb.njit(nogil=True, cache=True)

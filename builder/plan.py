@@ -22,6 +22,7 @@ from ..schemas.errors import CorruptError
 from ..schemas.voxel_grid import KEY_BIAS, MAX_VOXEL_STEPS
 from .config import DEFAULT_STEP, BuildConfig, shard_points
 from .executor import worker_count
+from .memory import jobs_that_fit, memory_share
 from .partition import run_points
 from .spool import spool_dtype
 
@@ -220,7 +221,7 @@ def estimate(scene: Scene, config: BuildConfig, rates: Rates, target: Path | Non
     step = config.resolution or scene.step or DEFAULT_STEP
     pitch = math.sqrt(scene.area / scene.points)
     voxels = _voxels(scene, config.voxel, rates)
-    jobs = worker_count(config.jobs, scene.points)
+    jobs = jobs_that_fit(worker_count(config.jobs, scene.points), config)
     columns = sum({"scan": 0.2, "intensity": 2.0}[name] for name in config.keep) + (config.models != {"mean"})
     each = rates.bytes_a_point(pitch / step) + columns
     size = round(scene.points * each + voxels * (INDEX_BYTES + GROUP_BYTES))
@@ -266,7 +267,7 @@ def _runs(scene: Scene, config: BuildConfig, jobs: int) -> int:
     """Runs of the spool, as survey.py cuts scans into ranges and partition.py ranges into runs."""
     mean = scene.points / scene.scans
     a_range = min(max(mean / RANGES, RANGE_POINTS[0]), RANGE_POINTS[1], mean)
-    a_run = min(a_range, run_points(config.memory_bytes // jobs, spool_dtype(config)))
+    a_run = min(a_range, run_points(memory_share(jobs, config), spool_dtype(config)))
     return max(scene.scans, math.ceil(scene.scans * math.ceil(mean / a_range) * math.ceil(a_range / a_run)))
 
 

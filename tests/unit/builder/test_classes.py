@@ -134,10 +134,10 @@ def test_the_archive_is_the_same_for_any_order_of_files_jobs_and_memory(
     classes_of = shards.voxel_classes
 
     def short_of_memory(
-        key: int, local: NDArray[np.int32], models: frozenset[str], spool: Spool, _: int
+        key: int, local: NDArray[np.int32], models: frozenset[str], spool: Spool, _: int, codes: range
     ) -> object:
         asked.append(key)
-        return classes_of(key, local, models, spool, 20)
+        return classes_of(key, local, models, spool, 20, codes)
 
     monkeypatch.setattr(shards, "voxel_classes", short_of_memory)
     assert built("d", paths) == first

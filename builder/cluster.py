@@ -11,11 +11,12 @@ import hashlib
 import importlib.util
 import logging
 import os
+import pickle
 import platform
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any, TypeVar
@@ -30,15 +31,18 @@ from distributed import (
     SchedulerPlugin,
     Worker,
     get_worker,
+    wait,
 )
-from distributed.client import FutureCancelledError
+from distributed.client import FutureCancelledError, FuturesCancelledError
 from distributed.comm.core import connect
 
 from ..schemas.errors import BadRequestError, SolidcloudError
+from .executor import AHEAD, WAITING
 from .progress import Progress
 
 Unit = TypeVar("Unit")
 Result = TypeVar("Result")
+Answer = TypeVar("Answer")
 
 # For a scheduler to answer, and to show its first worker.
 REACH_SECONDS = 10
@@ -86,10 +90,8 @@ def software() -> dict[str, str]:
     }
 
 
-def _run_unit(
-    function: Callable[[Unit], Result], unit: Unit, expected: dict[str, str], folder: str
-) -> Result:
-    """Run one unit in a worker, which may have joined since the others were looked at."""
+def _run_unit(work: bytes, expected: dict[str, str], folder: str) -> Any:
+    """Run one unit, pickled with its function, in a worker, which may have joined since the others were looked at."""
     worker = get_worker()
     _check_worker(worker.address, software(), expected, worker.state.nthreads)
     try:
@@ -101,6 +103,7 @@ def _run_unit(
             f"worker {worker.address}: no folder {folder} ({error.strerror}), expected the builder's: all workers need "
             "the same files under the same paths"
         ) from None
+    function, unit = pickle.loads(work)
     return function(unit)
 
 
@@ -214,54 +217,72 @@ class ClusterExecutor:
         progress: Progress,
         size: Callable[[Unit], int],
     ) -> Iterator[Result]:
-        """function(unit) for each unit, in order; progress advances by size(unit) as each result is taken.
+        """function(unit) for each unit, in order; progress advances by size(unit) as each is done.
 
-        At most four units a worker are handed out ahead. What a unit raises is raised here, and what waits is
-        cancelled; SolidcloudError where the cluster is lost, or a unit's worker died each time it was tried.
+        Some units are handed out ahead, as in `executor.py`. What a unit raises is raised here when it does, and what
+        waits is cancelled; SolidcloudError where the cluster is lost, or a unit's worker died each time it was tried.
         """
-        ahead = 4 * self.jobs
-        futures: list[Future | None] = [self._submit(function, unit) for unit in units[:ahead]]
+        running: dict[Future, int] = {}
+        results: dict[int, Result] = {}
+        given = 0
         try:
-            for i, unit in enumerate(units):
-                future = futures[i]
-                assert future is not None
-                result: Result = self._result(future)
-                # The worker forgets the result when the last reference goes.
-                self._given.discard(future)
-                futures[i] = future = None
-                if i + ahead < len(units):
-                    futures.append(self._submit(function, units[i + ahead]))
-                yield result
-                progress.advance(size(unit))
+            for taken in range(len(units)):
+                while taken not in results:
+                    while (
+                        given < len(units)
+                        and len(running) < WAITING * self.jobs
+                        and given - taken < AHEAD * self.jobs
+                    ):
+                        running[self._submit(function, units[given])] = given
+                        given += 1
+                    for future in self._done(list(running)):
+                        number = running.pop(future)
+                        results[number] = self._result(future)
+                        self._given.discard(future)  # the worker forgets the result with the last reference
+                        progress.advance(size(units[number]))
+                yield results.pop(taken)
         finally:
             self._take_back()
 
     def _submit(self, function: Callable[[Unit], Result], unit: Unit) -> Future:
         """Hand out one unit. Not `pure` in dask's sense: the same unit asked for again is to be done again."""
-        future = self._client.submit(
-            _run_unit, function, unit, software(), os.getcwd(), pure=False, key=_key(function)
-        )
+        work = pickle.dumps((function, unit))  # dask would look into a unit for tasks, through all its keys
+        future = self._client.submit(_run_unit, work, software(), os.getcwd(), pure=False, key=_key(function))
         self._given.add(future)
         return future
 
+    def _done(self, futures: list[Future]) -> Iterable[Future]:
+        """Those of `futures` that are done, once one is."""
+        with self._client.as_current():
+            return self._patiently(
+                lambda: wait(futures, timeout=ASK_SECONDS, return_when="FIRST_COMPLETED").done
+            )
+
     def _result(self, future: Future) -> Any:
-        """Wait for a result, for as long as there is anybody to give it."""
+        """The result of a unit that is done, or what it raised."""
+        try:
+            # A worker that dies before its result is fetched has it made again.
+            return self._patiently(lambda: future.result(timeout=ASK_SECONDS), future)
+        except KilledWorker as error:
+            raise SolidcloudError(
+                f"a unit's worker died {error.allowed_failures + 1} times, at last {error.last_worker.address}: "
+                "out of memory? give a larger --memory or fewer workers, or look at its log"
+            ) from None
+
+    def _patiently(self, ask: Callable[[], Answer], future: Future | None = None) -> Answer:
+        """Ask again for as long as there is anybody to give an answer. future: what is asked, where it may raise."""
         alone_since: float | None = None
         while True:
             try:
-                return future.result(timeout=ASK_SECONDS)
-            except KilledWorker as error:
+                return ask()
+            except (FutureCancelledError, FuturesCancelledError):
                 raise SolidcloudError(
-                    f"a unit's worker died {error.allowed_failures + 1} times, at last {error.last_worker.address}: "
-                    "out of memory? give a larger --memory or fewer workers, or look at its log"
-                ) from None
-            except FutureCancelledError as error:
-                raise SolidcloudError(
-                    f"the cluster was lost ({error.reason}): the same command again goes on where it was"
+                    f"{self._address}: the scheduler was lost, expected it to last as long as the build: start it, then "
+                    "the same command again goes on where it was"
                 ) from None
             except TimeoutError:
-                # Of the function itself, or of waiting: only the one that is done has an answer.
-                if future.done():
+                # Of waiting; or of the function itself, which then has been heard.
+                if future is not None and future.status == "error":
                     raise
             if self._client.scheduler_info(n_workers=-1)["workers"]:
                 alone_since = None
@@ -269,8 +290,8 @@ class ClusterExecutor:
             alone_since = alone_since or time.monotonic()
             if time.monotonic() - alone_since > LONELY_SECONDS:
                 raise SolidcloudError(
-                    f"{self._address}: no worker left for {LONELY_SECONDS} s: start some, then the "
-                    "same command again goes on where it was"
+                    f"{self._address}: no worker left for {LONELY_SECONDS} s: start some, then the same command again "
+                    "goes on where it was"
                 )
 
 

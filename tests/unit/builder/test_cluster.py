@@ -5,6 +5,7 @@ import signal
 import time
 from collections.abc import Iterator
 from functools import partial
+from pathlib import Path
 
 import pytest
 
@@ -51,7 +52,7 @@ def test_results_come_in_the_order_of_the_units(executor: ClusterExecutor, said:
     progress = Counted()
     results = executor.map(partial(divmod, 100), range(1, 41), progress, lambda unit: unit)
     assert next(results) == (100, 0)
-    assert progress.done == 0  # advances when a result is taken
+    assert progress.done >= 1  # advances when a unit is done
     assert list(results) == [divmod(100, i) for i in range(2, 41)]
     assert progress.done == sum(range(1, 41))
     assert executor.jobs == 2
@@ -83,9 +84,25 @@ def test_what_a_unit_raises_is_raised_here(executor: ClusterExecutor) -> None:
 def test_only_a_few_units_are_handed_out_ahead(executor: ClusterExecutor) -> None:
     results = executor.map(partial(divmod, 100), range(1, 101), Silent(), lambda _: 1)
     next(results)
-    assert len(executor._given) <= 4 * executor.jobs
+    assert 0 < len(executor._given) <= cluster_module.WAITING * executor.jobs
     results.close()  # type: ignore[attr-defined]
     assert not executor._given
+
+
+def test_no_worker_waits_for_anothers_long_unit(executor: ClusterExecutor, tmp_path: Path) -> None:
+    executor._client.wait_for_workers(2, 30)
+    # The first unit ends when the last has begun: were units handed out in order of results, it never would.
+    flag, units = str(tmp_path / "last"), 3 * cluster_module.WAITING * executor.jobs
+    first = f"exec('import os, time\\nwhile not os.path.exists(\"{flag}\"): time.sleep(0.01)')"
+    assert len(mapped(executor, first, *["1"] * units, f"open({flag!r}, 'w').close()")) == units + 2
+
+
+def test_a_unit_that_fails_ends_all_at_once(executor: ClusterExecutor, tmp_path: Path) -> None:
+    executor._client.wait_for_workers(2, 30)
+    flag = tmp_path / "slow"
+    with pytest.raises(ScanError):
+        mapped(executor, f"(__import__('time').sleep(3), open({str(flag)!r}, 'w'))", FAIL)
+    assert not flag.exists()
 
 
 def test_a_unit_whose_worker_is_killed_is_run_again(
@@ -165,7 +182,7 @@ def test_a_cluster_that_is_not_as_needed_is_refused(monkeypatch: pytest.MonkeyPa
 
 def test_a_cluster_that_goes_away_ends_the_build() -> None:
     executor = ClusterExecutor("local:1", 1 << 30, lambda _: None)
-    with executor, pytest.raises(SolidcloudError, match=r"the cluster was lost.*goes on where it was"):
+    with executor, pytest.raises(SolidcloudError, match=r"the scheduler was lost.*goes on where it was"):
         results = executor.map(eval, ["1", "__import__('time').sleep(9)"], Silent(), lambda _: 1)
         assert next(results) == 1
         assert executor._cluster is not None

@@ -43,6 +43,8 @@ INDEX_NAME = "index.h5"
 SHARD_FOLDER = "shards"
 ZSTD_FILTER = 32015  # registered with the HDF Group
 DATASETS = ("cells", "nodes", "points")
+# What is read back at a time of a shard just written.
+READ_BYTES = 1 << 20
 
 # An HDF5 file of 463 bytes with one dataset, x, of one int8 in one chunk; made with a filter class registered as
 # "zstd" through ctypes. h5py leaves no other way to name a filter, and one without a name is written with what its
@@ -267,8 +269,12 @@ def _verify_frames(path: Path, table: NDArray) -> None:
     with open(path, "rb") as file:
         for row in table:
             for i, name in enumerate(DATASETS):
-                frame = os.pread(file.fileno(), int(row["frame_bytes"][i]), int(row["frame_offset"][i]))
-                if frame[-4:] != int(row["frame_checksum"][i]).to_bytes(4, "little"):
+                begin = int(row["frame_offset"][i])
+                end = begin + int(row["frame_bytes"][i])
+                for at in range(begin, end, READ_BYTES):  # a frame may be larger than what is to be held
+                    os.pread(file.fileno(), min(READ_BYTES, end - at), at)
+                checksum = os.pread(file.fileno(), 4, end - 4)
+                if checksum != int(row["frame_checksum"][i]).to_bytes(4, "little"):
                     raise CorruptError(
                         f"{path}: voxel {int(row['key']):#x}, {name}: not what was written: disk full?"
                     )

@@ -277,8 +277,8 @@ class ClusterExecutor:
                 return ask()
             except (FutureCancelledError, FuturesCancelledError):
                 raise SolidcloudError(
-                    f"{self._address}: the scheduler was lost, expected it to last as long as the build: start it, then "
-                    "the same command again goes on where it was"
+                    f"{self._address}: the scheduler was lost, expected it to last as long as the build: start it, "
+                    "then the same command again goes on where it was"
                 ) from None
             except TimeoutError:
                 # Of waiting; or of the function itself, which then has been heard.

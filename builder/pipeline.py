@@ -22,6 +22,7 @@ from ..schemas.errors import BadRequestError, CorruptError, ScanError, Solidclou
 from ..schemas.index import VOXEL_DTYPE, Header
 from ..schemas.voxel_grid import Lattice
 from .config import RADIUS_SAMPLE, BuildConfig
+from .dense import DENSE_POINTS
 from .executor import Executor, make_executor, worker_count
 from .header import archive_id, make_header
 from .journal import Journal, Work, resumed
@@ -75,6 +76,8 @@ VOXEL_BYTES_A_POINT = 160
 MAX_SCANS = 1 << 16
 # Bytes a point on disk at the end, at most (5 is the goal at 0.1 mm), to refuse a build that cannot finish.
 ARCHIVE_BYTES_A_POINT = 6
+# Bytes a point that a dense voxel takes besides while it is built (dense.py); one a job is.
+SCRATCH_BYTES_A_POINT = 21
 # A point of a file whose header says nothing of their number takes about so many bytes: text.
 BYTES_A_POINT = 30
 
@@ -172,8 +175,9 @@ def _build(
         place.surveyed = True
         lattice, lattice_source = choose_lattice(surveys, config)
         points = sum(s.count for s in surveys)
-        _check_space(target.parent, place.folder, points, config)
         dtype = _spool_rows(config)
+        final = points * (dtype.itemsize + ARCHIVE_BYTES_A_POINT)
+        _check_space(target.parent, place.folder, final)
         spooled = _spool(surveys, lattice, dtype, place, executor, config, stages)
         spool = Spool(place.folder / "spool", dtype, lattice)
         spool, left_out = _filter(spool, place, executor, config, stages)
@@ -181,6 +185,8 @@ def _build(
             {reason: of[number] for reason, of in left_out.items() if number in of}
             for number in range(len(surveys))
         ]
+        dense = np.sort(spool.counts[spool.counts > DENSE_POINTS])[-executor.jobs :]
+        _check_space(target.parent, place.folder, final + int(dense.sum()) * SCRATCH_BYTES_A_POINT)
         identity = archive_id(spooled, lattice, config)
         shards = _build_shards(spool, identity, place, executor, config, stages)
         moved_max = max(s.moved_max for s in spooled)
@@ -188,15 +194,15 @@ def _build(
             surveys, faulty, filtered, lattice, lattice_source, identity, moved_max, shards, config
         )
         header = _measure_radius(header, shards, place.archive, executor, config, stages)
-        _read_back(place.archive, executor, stages)
+        _read_back(place.archive, header.points, executor, stages)
     return header, shards
 
 
-def _read_back(folder: Path, executor: Executor, stages: _Stages) -> None:
+def _read_back(folder: Path, points: int, executor: Executor, stages: _Stages) -> None:
     """Read what was written, for a preview and to the last record. Raises CorruptError where it is something else."""
     fault = ""
     try:
-        with stages.timed("preview"):
+        with stages.stage("preview", points, "points"):
             write_preview(folder, executor, stages.progress)
         with stages.timed("verify"):
             report = verify_archive(folder, progress=stages.progress, executor=executor)
@@ -361,9 +367,8 @@ def _content_order(survey: Survey) -> tuple[str, int, str]:
     return survey.sha256, survey.scan.index if survey.scan else -1, str(survey.path)
 
 
-def _check_space(disk: Path, folder: Path, points: int, config: BuildConfig) -> None:
-    """Refuse a build whose spool and archive cannot fit on the disk, with what is there of them."""
-    needed = points * (spool_dtype(config).itemsize + ARCHIVE_BYTES_A_POINT)
+def _check_space(disk: Path, folder: Path, needed: int) -> None:
+    """Refuse a build whose files cannot all be on the disk, with what is there of them in `folder`."""
     there = sum(f.stat().st_size for f in folder.rglob("*") if f.is_file())
     free = shutil.disk_usage(disk).free
     if needed > free + there:

@@ -31,33 +31,33 @@ from .within import within
 MOST_MODELS = 64
 
 
-class _Parts:
-    """What an archive's questions read, in one place, so that all of it goes at once."""
-
-    def __init__(self, store: Store, budget_bytes: int) -> None:
-        self.data = make_scene_data(store.archive, Residency(store, budget_bytes))
-        self.radius_model = lru_cache(MOST_MODELS)(partial(with_radius_model, self.data, store.archive))
-
-
 class Opened:
     """An archive's store and resident voxels, held open by who reads them. Thread-safe.
 
+    data: what every question reads, spheres of the archive's one figure.  radius_model: the same under a radius model,
+    by its name; BadRequestError for one that is none, or not stored. Both are there for who has taken it.
     number: tells those of one scene apart.  ended: set once the last reader is gone and all is closed.
     """
+
+    data: SceneData
+    radius_model: Callable[[str | None], SceneData]
 
     def __init__(self, store: Store, budget_bytes: int, number: int = 0) -> None:
         """Hold `store` open for a first reader, the scene, which must `release` it."""
         self.store, self.number = store, number
         self.ended = threading.Event()
-        self._parts: _Parts | None = _Parts(store, budget_bytes)
+        self.data = make_scene_data(store.archive, Residency(store, budget_bytes))
+        self.radius_model = lru_cache(MOST_MODELS)(partial(with_radius_model, self.data, store.archive))
         self._lock = threading.Lock()
         self._readers = 1
 
     def take(self) -> bool:
         """Read it too, until `release`; False where the last reader is gone already."""
         with self._lock:
-            self._readers += self._readers > 0
-            return self._readers > 0
+            if self._readers:
+                self._readers += 1
+                return True
+        return False
 
     def release(self) -> None:
         """Read it no more. The last reader closes its files and gives its memory back."""
@@ -65,7 +65,7 @@ class Opened:
             self._readers -= 1
             if self._readers:
                 return
-            self._parts = None
+        del self.data, self.radius_model
         self.store.close()
         self.ended.set()
 
@@ -77,25 +77,10 @@ class Opened:
         """Let it go."""
         self.release()
 
-    def _held(self) -> _Parts:
-        parts = self._parts
-        if parts is None:
-            raise BadRequestError(f"{self.store.archive.folder}: this scene is closed: open it again")
-        return parts
-
-    @property
-    def data(self) -> SceneData:
-        """What every question reads, spheres of the archive's one figure. BadRequestError: closed."""
-        return self._held().data
-
-    def radius_model(self, text: str | None) -> SceneData:
-        """The same under a radius model; BadRequestError for one that is none, or not stored, and when closed."""
-        return self._held().radius_model(text)
-
     def taken(self) -> Self:
-        """Itself, taken once more. BadRequestError: closed."""
+        """Itself, taken once more. BadRequestError where the last reader is gone already."""
         if not self.take():
-            self._held()
+            raise BadRequestError(f"{self.store.archive.folder}: this scene is closed: open it again")
         return self
 
     def warm(self) -> None:

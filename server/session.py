@@ -19,9 +19,8 @@ from .request import SceneData, check_request, kernel_poses, refuse, to_units
 class Readable(Protocol):
     """An archive opened, as server/opened.py has it."""
 
-    @property
-    def number(self) -> int: ...
-    def radius_model(self, text: str | None) -> SceneData: ...
+    number: int
+    radius_model: Callable[[str | None], SceneData]
 
 
 class Walker:

@@ -117,6 +117,7 @@ def _inspect_file(path: Path, with_sha256: bool) -> list[ScanEntry]:
             1.0,
             scan.crs,
             digest,
+            fault=scan.fault,
         )
         for scan in scans
     ]

@@ -13,10 +13,12 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
+from ...schemas.errors import ScanError
 from .e57_xml import check_e57, look_through, xml_of
 from .scan import (
     BOUNDS_MARGIN,
     Block,
+    BrokenScan,
     Scan,
     apply_pose,
     checked_bounds,
@@ -118,7 +120,8 @@ def _cartesian(spherical: NDArray[np.float64]) -> NDArray[np.float64]:
 def open_e57(path: Path) -> list[Scan]:
     """The scans of an E57 file, in its order; none where it holds images only. Reads headers only.
 
-    Raises ScanError, also where a page's checksum does not fit.
+    One whose header is broken is a BrokenScan, where others are not. Raises ScanError, also where a page's checksum
+    does not fit.
     """
     with library_errors(path):
         check_e57(path)
@@ -126,7 +129,14 @@ def open_e57(path: Path) -> list[Scan]:
         if not image.root().isDefined("data3D"):
             return []
         data3d = image.root()["data3D"]
-        scans: list[Scan] = [_open_scan(path, index, data3d[index]) for index in range(len(data3d))]
+        scans: list[Scan] = []
+        for index in range(len(data3d)):
+            try:
+                scans.append(_open_scan(path, index, data3d[index]))
+            except ScanError as error:
+                scans.append(BrokenScan(path, "e57", index, str(error)))
+        if scans and all(scan.fault for scan in scans):
+            raise ScanError(scans[0].fault)
         if image.root().isDefined("coordinateMetadata"):
             for scan in scans:
                 scan.crs = str(image.root()["coordinateMetadata"].value())[:LONGEST_CRS]

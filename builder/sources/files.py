@@ -39,6 +39,26 @@ READERS: dict[str, Callable[[Path], list[Scan]]] = {
 }
 # Taken from a folder. Text of any name may be notes, which would stop a build: it is read when named.
 IN_FOLDERS = frozenset(READERS) - {".txt", ".csv"}
+# Scans that nothing here reads: in a folder they are no more left out in silence than broken ones are.
+UNREAD = frozenset(
+    [
+        ".fls",
+        ".fws",
+        ".gltf",
+        ".lsproj",
+        ".pod",
+        ".ptb",
+        ".ptg",
+        ".ptz",
+        ".rcp",
+        ".rcs",
+        ".rdbx",
+        ".rxp",
+        ".x3a",
+        ".zfs",
+        ".zlas",
+    ]
+)
 MESHES = frozenset({".obj", ".stl", ".ply", ".glb"})
 
 
@@ -73,7 +93,8 @@ def open_scans(path: Path, *, spacing: float | None = None) -> list[Scan]:
 
 
 def scan_files(paths: Iterable[Path]) -> list[Path]:
-    """The files that some paths stand for: files as they are, folders with all scans at any depth below.
+    """The files that some paths stand for: files as they are, folders with all scans at any depth below, those of
+    formats that open_scans() will refuse among them.
 
     A folder's files are sorted by path, so that the order does not depend on the file system; files given
     by name keep their place, whatever their suffix. Links to folders are not followed below a folder.
@@ -89,7 +110,7 @@ def scan_files(paths: Iterable[Path]) -> list[Path]:
             Path(folder, name)
             for folder, _, names in os.walk(path)
             for name in names
-            if Path(name).suffix.lower() in IN_FOLDERS
+            if Path(name).suffix.lower() in IN_FOLDERS | UNREAD
         )
         if not below:
             raise scan_error(

@@ -81,13 +81,14 @@ class Scan(ABC):
     seekable: blocks() can begin and end anywhere, at the cost of what it reads (`SeekableScan`).
     units: what one of its lengths is, a key of METRES (placed.py); up: its axis that is up, "z", "y" or "x"; as the
     format prescribes or, usual, nobody says. blocks() gives coordinates as they are.  crs: the coordinate reference
-    system's text, or "".
+    system's text, or "".  fault: what is wrong with it by its header, though others of its file can be read; or "".
     """
 
     seekable = False
     units = "m"
     up = "z"
     crs = ""
+    fault = ""
 
     def __init__(
         self,
@@ -154,6 +155,17 @@ class SeekableScan(Scan):
     @abstractmethod
     def _read_between(self, block_points: int, start: int, stop: int) -> Iterator[Block]:
         """Yield the blocks of points [start, stop), start < stop; may raise anything, blocks() converts it."""
+
+
+class BrokenScan(Scan):
+    """A scan that cannot be read, of a file in which others can: reading it raises its fault."""
+
+    def __init__(self, path: Path, format: str, index: int, fault: str) -> None:
+        super().__init__(path, format, index=index)
+        self.fault = fault
+
+    def _read(self, block_points: int) -> Iterator[Block]:
+        raise ScanError(self.fault)
 
 
 def read_records(

@@ -331,12 +331,14 @@ def test_suffixes_may_be_in_capitals(truth: Truth, tmp_path: Path) -> None:
 
 
 def test_a_folder_gives_its_scans_sorted_and_files_stay_as_given(tmp_path: Path) -> None:
-    for name in ("b/z.laz", "b/a.LAS", "a/deep/er/x.e57", "a/readme.md", "c.ply"):
+    for name in ("b/z.laz", "b/a.LAS", "a/deep/er/x.e57", "a/readme.md", "c.ply", "c.FLS"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).touch()
     odd = tmp_path / "a" / "readme.md"
-    below = [tmp_path / name for name in ("a/deep/er/x.e57", "b/a.LAS", "b/z.laz", "c.ply")]
+    below = [tmp_path / name for name in ("a/deep/er/x.e57", "b/a.LAS", "b/z.laz", "c.FLS", "c.ply")]
     assert scan_files([odd, tmp_path]) == [odd, *below]
+    with pytest.raises(ScanError, match=r"the suffix '\.fls', expected one of"):
+        open_scans(tmp_path / "c.FLS")
     (tmp_path / "none").mkdir()
     with pytest.raises(ScanError, match="a folder without scans"):
         scan_files([tmp_path / "none"])

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from broken_scans import with_checksums
 from formats import write_e57
+from solidcloud.builder.scan_list import inspect
 from solidcloud.builder.sources import header_bounds, open_scans
 from solidcloud.schemas.errors import ScanError
 
@@ -150,6 +151,27 @@ def test_a_byte_changed_in_any_page_is_found_by_its_checksum(tmp_path: Path) -> 
         path.write_bytes(data)
         with pytest.raises(ScanError, match="checksum"):
             read_all(path)
+
+
+def test_a_scan_whose_pose_is_none_does_not_keep_others_from_being_read(tmp_path: Path) -> None:
+    good, bad = np.arange(30.0).reshape(10, 3), {"rotation": np.array([1.0, 1, 0, 0])}
+    scans = [
+        {"columns": cartesian(good)},
+        {"columns": cartesian(good), **bad},
+        {"columns": cartesian(good + 1)},
+    ]
+    path = write_e57(tmp_path / "a.e57", scans)
+    first, broken, last = open_scans(path)
+    assert np.array_equal(
+        np.concatenate([b.xyz for s in (first, last) for b in s.blocks()]), [*good, *(good + 1)]
+    )
+    assert broken.index == 1 and "scan 1 with a rotation quaternion of length 1.41" in broken.fault
+    with pytest.raises(ScanError, match="quaternion of length"):
+        list(broken.blocks())
+    assert [entry.fault for entry in inspect([path])] == ["", broken.fault, ""]
+    write_e57(path, [{"columns": cartesian(good), **bad}] * 2)
+    with pytest.raises(ScanError, match="scan 0 with a rotation quaternion"):
+        open_scans(path)
 
 
 NAMESPACE = "http://www.astm.org/COMMIT/E57/2010-e57-v1.0"

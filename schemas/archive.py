@@ -73,16 +73,21 @@ def _temporary(path: Path) -> Path:
     return path.with_name(f"{path.name}.{_PROCESS}-{os.getpid()}-{threading.get_ident()}.tmp")
 
 
+# No piece of HDF5's own structures is longer [bytes]; the longest is a group's list of its links.
+_MOST_METADATA = 1 << 20
+
+
 class _Disk:
     """A file that HDF5 writes, and whose errors it does not hear of: the first is kept in `error`.
 
     With a full disk HDF5 2.0 crashed as it closed the file (SIGSEGV), or h5py printed what it ignored and went on. So
-    a write always succeeds; what comes after one that did not is kept in memory, for HDF5 to read back.
+    a write always succeeds; what comes after one that did not is kept in memory, for HDF5 to read back: its own
+    structures, and no record, which it does not read.
     """
 
     def __init__(self, path: Path) -> None:
         self.error: OSError | None = None
-        self._path, self._position = path, 0
+        self._path, self._position, self._end = path, 0, 0
         self._kept: list[tuple[int, bytes]] = []
         self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o666)
 
@@ -91,8 +96,7 @@ class _Disk:
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
         if whence == os.SEEK_END:
-            ends = (at + len(data) for at, data in self._kept)
-            offset += max([os.fstat(self._descriptor).st_size, *ends])
+            offset += self._end
         elif whence == os.SEEK_CUR:
             offset += self._position
         self._position = offset
@@ -110,9 +114,10 @@ class _Disk:
                     done += os.pwrite(self._descriptor, data[done:], self._position + done)
             except OSError as error:
                 self.error = OSError(error.errno, error.strerror, str(self._path))
-        if self.error is not None:
+        if self.error is not None and len(data) <= _MOST_METADATA:
             self._kept.append((self._position, bytes(data)))
         self._position += len(data)
+        self._end = max(self._end, self._position)
         return len(data)
 
     def read(self, size: int = -1) -> bytes:
@@ -134,6 +139,7 @@ class _Disk:
             os.ftruncate(self._descriptor, size)
         except OSError as error:
             self.error = self.error or OSError(error.errno, error.strerror, str(self._path))
+        self._end = size
         return size
 
     def flush(self) -> None:

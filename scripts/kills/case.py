@@ -15,8 +15,8 @@ import solidcloud.builder
 from solidcloud.builder.verify import verify_archive
 from solidcloud.schemas.errors import SolidcloudError
 
-# What cuts a build into units, made small: some 15 units of a few hundred points. What they hold does not depend on it.
-SMALL = {"SHARD_POINTS": 800, "SPOOL_RANGE": 1500, "LEAST_RUN_POINTS": 700}
+# What cuts a build into units, made small: some 10 units of a few hundred points, a shard a quarter of SHARD_POINTS.
+SMALL = {"SHARD_POINTS": 3200, "SPOOL_RANGE": 1500, "LEAST_RUN_POINTS": 700}
 POINTS = 4000
 VOXEL = 1.0
 NAME = "hall"

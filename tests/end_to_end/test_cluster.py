@@ -42,7 +42,7 @@ def small_units(monkeypatch: pytest.MonkeyPatch) -> None:
     """Some 40 shards of a few voxels, so that there is a middle of the build."""
     for module in (config_module, shards_module):
         if hasattr(module, "SHARD_POINTS"):
-            monkeypatch.setattr(module, "SHARD_POINTS", 500)
+            monkeypatch.setattr(module, "SHARD_POINTS", 2000)
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +51,7 @@ def alone(scans: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[dic
     with pytest.MonkeyPatch.context() as patch:
         for module in (config_module, shards_module):
             if hasattr(module, "SHARD_POINTS"):
-                patch.setattr(module, "SHARD_POINTS", 500)
+                patch.setattr(module, "SHARD_POINTS", 2000)
         target = tmp_path_factory.mktemp("alone") / "hall"
         build_archive([scans], target, BuildConfig(voxel=VOXEL, jobs=1))
         yield content(target)

@@ -110,12 +110,11 @@ class Scene:
         BusyError when the one before the old is still being read; the old one is served on.
         """
         begin = time.perf_counter()
-        with self._reloading:
+        with self._reloading, self._take() as old:
             if self._before is not None and not self._before.ended.wait(RELOAD_WAIT):
                 raise BusyError(
                     f"{self.name}: the generation before the one served is still asked, by a path perhaps: reload later"
                 )
-            old = self._opened
             store = Store(self._folder)
             try:
                 new = Opened(store, self._budget_bytes, old.number + 1)

@@ -158,7 +158,7 @@ def _look(
     box: NDArray[np.int64],
     progress: Progress,
 ) -> Contents:
-    """Go over the points to be written once: 10 ns each, and writing them takes ten times as long or more."""
+    """Go over the points to be written once: 10 ns each, where LAS takes 80 and LAZ 300."""
     columns = stored_columns(archive.header)
     looked = {name: kind for name, kind in columns.items() if name == "intensity"}
     points, whole = 0, True

@@ -23,7 +23,7 @@ from ..schemas.index import Header
 from ..schemas.vtkhdf import PREVIEW_NAME
 from .config import BuildConfig
 from .executor import Executor, make_executor, worker_count
-from .pipeline import jobs_that_fit
+from .memory import jobs_that_fit, memory_share
 from .preview import write_preview
 from .progress import Progress, Silent
 from .spool import spool_dtype
@@ -56,8 +56,8 @@ class Change:
 
     @property
     def share(self) -> int:
-        """The bytes that each job may hold."""
-        return self.config.memory_bytes // self.executor.jobs
+        """The bytes of data that each job may hold."""
+        return memory_share(self.executor.jobs, self.config)
 
     @property
     def with_classes(self) -> bool:

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ...builder.sources import open_scans, scan_files
+from ...builder.sources import open_scans, placed, scan_files
 from ...schemas.errors import ScanError, TooLargeError
 from ...schemas.messages import MAX_AVATAR_POINTS
 
@@ -38,7 +38,7 @@ def read_thinned(paths: Sequence[Path], points: int, at_most: int) -> NDArray[np
         block.xyz[::step]
         for path in scan_files(paths)
         for scan in open_scans(path)
-        for block in scan.blocks()
+        for block in placed(scan).blocks()
     ]
     thinned = np.concatenate([np.empty((0, 3)), *blocks])
     return thinned[np.isfinite(thinned).all(axis=1)]

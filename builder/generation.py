@@ -20,7 +20,8 @@ from .change import Change, changing, publish, show_kept, verify_new
 from .classes import class_limits
 from .config import RADIUS_SAMPLE
 from .partition import SpoolUnit, run_points, spool_range
-from .pipeline import MAX_SCANS, VOXEL_BYTES_A_POINT, open_inputs
+from .passes import MAX_SCANS, VOXEL_BYTES_A_POINT
+from .pipeline import open_inputs
 from .progress import Progress, Silent
 from .shards import Shard, ShardUnit, build_shard, plan_shards
 from .spacing import archive_mean

@@ -4,59 +4,37 @@ Everything is made in a hidden folder beside the target and renamed at the end: 
 name asked for. What is done stays there when a build is interrupted, and the same command goes on from it.
 """
 
-import base64
 import errno
 import shutil
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from ..schemas.archive import SHARD_FOLDER, Archive, write_index
-from ..schemas.errors import BadRequestError, CorruptError, ScanError, SolidcloudError
-from ..schemas.index import VOXEL_DTYPE, Header
-from ..schemas.voxel_grid import Lattice
+from ..schemas.archive import Archive, write_index
+from ..schemas.errors import BadRequestError, CorruptError, SolidcloudError
+from ..schemas.index import Header
 from .config import RADIUS_SAMPLE, BuildConfig
 from .dense import DENSE_POINTS
 from .executor import Executor, make_executor, worker_count
 from .header import archive_id, make_header
-from .journal import Journal, Work, resumed
-from .memory import jobs_that_fit as jobs_that_fit
-from .memory import memory_share
-from .partition import (
-    RunsHold,
-    Spooled,
-    SpoolUnit,
-    dump_spooled,
-    load_spooled,
-    run_points,
-    spool_range,
-)
+from .memory import jobs_that_fit
+from .passes import build_shards, filter_points, spool_rows, spool_scans, survey_scans
 from .preview import write_preview
 from .progress import Progress, Silent
 from .resume import described, is_whole
 from .scan_list import Input
 from .scan_list import inputs as scans_of
-from .shards import Shard, ShardUnit, build_shard, plan_shards
+from .shards import Shard
 from .spacing import archive_mean
-from .spool import KEYS_SUFFIX, RUN_SUFFIX, Spool, spool_dtype
-from .survey import (
-    RangeUnit,
-    Survey,
-    choose_lattice,
-    dump_part,
-    hash_file,
-    joined,
-    load_part,
-    ranges,
-    survey_range,
-    unopened,
-)
+from .spool import Spool
+from .stages import Stages
+from .survey import choose_lattice
 from .verify import verify_archive
 from .workplace import (
     Workplace,
@@ -70,10 +48,6 @@ from .workplace import (
     workplace,
 )
 
-# Bytes a point that building one voxel holds at its peak (measured with 10^7 points in one voxel: 128).
-VOXEL_BYTES_A_POINT = 160
-# The column of scan numbers is uint16 (schemas/FORMAT.md).
-MAX_SCANS = 1 << 16
 # Bytes a point on disk at the end, at most (5 is the goal at 0.1 mm), to refuse a build that cannot finish.
 ARCHIVE_BYTES_A_POINT = 6
 # Bytes a point that a dense voxel takes besides while it is built (dense.py); one a job is.
@@ -106,33 +80,6 @@ class BuildSummary(NamedTuple):
     already: bool = False
 
 
-class _Stages:
-    """Times the stages and passes them on to the listener."""
-
-    def __init__(self, progress: Progress) -> None:
-        self.progress = progress
-        self.seconds: dict[str, float] = {}
-
-    @contextmanager
-    def timed(self, name: str) -> Iterator[None]:
-        """A stage that says itself what it does."""
-        begin = time.perf_counter()
-        try:
-            yield
-        finally:
-            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - begin
-
-    @contextmanager
-    def stage(self, name: str, total: int, unit: str) -> Iterator[None]:
-        """A stage of so much work."""
-        with self.timed(name):
-            self.progress.start(name, total, unit)
-            try:
-                yield
-            finally:
-                self.progress.finish()
-
-
 def build_archive(
     paths: Sequence[Path], target: Path, config: BuildConfig, progress: Progress | None = None
 ) -> BuildSummary:
@@ -147,7 +94,7 @@ def build_archive(
     """
     begin = time.perf_counter()
     target = Path(target)
-    stages = _Stages(progress or Silent())
+    stages = Stages(progress or Silent())
     with made_parents(target), locked(target), _disk_errors(target):
         inputs = open_inputs(paths, config)
         what = described(inputs, config)
@@ -166,21 +113,21 @@ def build_archive(
 
 
 def _build(
-    inputs: Sequence[Input], place: Workplace, target: Path, config: BuildConfig, stages: _Stages
+    inputs: Sequence[Input], place: Workplace, target: Path, config: BuildConfig, stages: Stages
 ) -> tuple[Header, list[Shard]]:
     """All passes: what is in `place.archive` when this returns is an archive, and verified."""
     about = sum(_about(item) for item in inputs)
     with make_executor(config, jobs_that_fit(worker_count(config.jobs, about), config)) as executor:
-        surveys, faulty = _survey(inputs, about, place, executor, config, stages)
+        surveys, faulty = survey_scans(inputs, about, place, executor, config, stages)
         place.surveyed = True
         lattice, lattice_source = choose_lattice(surveys, config)
         points = sum(s.count for s in surveys)
-        dtype = _spool_rows(config)
+        dtype = spool_rows(config)
         final = points * (dtype.itemsize + ARCHIVE_BYTES_A_POINT)
         _check_space(target.parent, place.folder, final)
-        spooled = _spool(surveys, lattice, dtype, place, executor, config, stages)
+        spooled = spool_scans(surveys, lattice, dtype, place, executor, config, stages)
         spool = Spool(place.folder / "spool", dtype, lattice)
-        spool, left_out = _filter(spool, place, executor, config, stages)
+        spool, left_out = filter_points(spool, place, executor, config, stages)
         filtered = [
             {reason: of[number] for reason, of in left_out.items() if number in of}
             for number in range(len(surveys))
@@ -188,7 +135,7 @@ def _build(
         dense = np.sort(spool.counts[spool.counts > DENSE_POINTS])[-executor.jobs :]
         _check_space(target.parent, place.folder, final + int(dense.sum()) * SCRATCH_BYTES_A_POINT)
         identity = archive_id(spooled, lattice, config)
-        shards = _build_shards(spool, identity, place, executor, config, stages)
+        shards = build_shards(spool, identity, place, executor, config, stages)
         moved_max = max(s.moved_max for s in spooled)
         header = make_header(
             surveys, faulty, filtered, lattice, lattice_source, identity, moved_max, shards, config
@@ -198,7 +145,7 @@ def _build(
     return header, shards
 
 
-def _read_back(folder: Path, points: int, executor: Executor, stages: _Stages) -> None:
+def _read_back(folder: Path, points: int, executor: Executor, stages: Stages) -> None:
     """Read what was written, for a preview and to the last record. Raises CorruptError where it is something else."""
     fault = ""
     try:
@@ -226,7 +173,7 @@ def _about(item: Input) -> int:
     return item.path.stat().st_size // BYTES_A_POINT
 
 
-def _is_whole(target: Path, inputs: Sequence[Input], config: BuildConfig, stages: _Stages) -> bool:
+def _is_whole(target: Path, inputs: Sequence[Input], config: BuildConfig, stages: Stages) -> bool:
     """Whether the archive is there already."""
     if not target.is_dir():
         return False
@@ -241,7 +188,7 @@ def _summary(
     voxels: int,
     shards: int,
     begin: float,
-    stages: _Stages,
+    stages: Stages,
     *,
     already: bool = False,
 ) -> BuildSummary:
@@ -283,90 +230,6 @@ def _disk_errors(target: Path) -> Iterator[None]:
         ) from error
 
 
-def _survey(
-    inputs: Sequence[Input],
-    about: int,
-    place: Workplace,
-    executor: Executor,
-    config: BuildConfig,
-    stages: _Stages,
-) -> tuple[list[Survey], list[Survey]]:
-    """Read every scan once; returns the usable ones, in an order of their content, and the faulty ones."""
-    inputs = sorted(inputs, key=lambda item: str(item.path))  # the notes are named by this order
-    scans = [scan for item in inputs for scan in item.scans]
-    files = [item.path for item in inputs if item.scans]
-    units = [
-        (f"survey/{number:06d}-{unit.start:012d}", unit)
-        for number, scan in enumerate(scans)
-        for unit in ranges(scan, about)
-    ]
-    hashing = [(f"survey/sha256-{number:06d}", path) for number, path in enumerate(files)]
-    with stages.stage("survey", sum(unit.points for _, unit in units), "points"):
-        both: list[tuple[str, Path | RangeUnit]] = [*hashing, *units]
-        work: Work[Path | RangeUnit, Any] = Work(_hash_or_survey, _dump_either, _load_either)
-        found = resumed(place.journal, executor, work, both, stages.progress, _points_of)
-    sha256 = dict(zip(files, found, strict=False))
-    surveys, at = [], len(hashing)
-    for scan in scans:
-        count = len(ranges(scan, about))
-        surveys.append(joined(scan, found[at : at + count], sha256[scan.path]))
-        at += count
-    surveys += [unopened(item.path, item.fault, item.region) for item in inputs if not item.scans]
-    good = sorted((s for s in surveys if not s.fault), key=_content_order)
-    faulty = sorted((s for s in surveys if s.fault), key=_content_order)
-    _check_surveys(good, faulty, inputs, config)
-    return good, faulty
-
-
-def _hash_or_survey(unit: Path | RangeUnit) -> Any:
-    """A unit of the survey: a file to be hashed, or a range to be read."""
-    return survey_range(unit) if isinstance(unit, RangeUnit) else hash_file(unit)
-
-
-def _dump_either(result: Any) -> Any:
-    """A result of the survey, as its note says it."""
-    return list(result) if isinstance(result, tuple) else dump_part(result)
-
-
-def _load_either(noted: Any) -> Any:
-    """A result of the survey from its note."""
-    return tuple(noted) if isinstance(noted, list) else load_part(noted)
-
-
-def _points_of(unit: Path | RangeUnit) -> int:
-    """Points that a unit of the survey reads."""
-    return unit.points if isinstance(unit, RangeUnit) else 0
-
-
-def _check_surveys(
-    good: list[Survey], faulty: list[Survey], inputs: Sequence[Input], config: BuildConfig
-) -> None:
-    """Refuse scans that cannot be built as the options ask."""
-    if faulty and not config.skip_bad:
-        more = "" if len(faulty) == 1 else "".join(f"\n  {s.fault}" for s in faulty[1:])
-        raise ScanError(
-            f"{faulty[0].fault}{more} (--skip-bad leaves such scans out and marks their region unknown)"
-        )
-    if not good:
-        first = inputs[0].path if inputs else "nothing"
-        raise ScanError(f"{first}: no usable scan, expected at least one: check the files")
-    if ("scan" in config.keep or _is_filtered(config)) and len(good) > MAX_SCANS:
-        raise BadRequestError(
-            f"--keep scan, or a filter, with {len(good)} scans: expected at most {MAX_SCANS}: build in parts"
-        )
-    unclean = [s for s in good if s.unclean]
-    if unclean and config.strict:
-        wrong = sum(s.unclean for s in unclean)
-        raise ScanError(
-            f"{unclean[0].path}: {wrong} points that are not finite, expected none with --strict: clean the scan"
-        )
-
-
-def _content_order(survey: Survey) -> tuple[str, int, str]:
-    """Scans are numbered by their files' content, so that the order they are given in changes nothing."""
-    return survey.sha256, survey.scan.index if survey.scan else -1, str(survey.path)
-
-
 def _check_space(disk: Path, folder: Path, needed: int) -> None:
     """Refuse a build whose files cannot all be on the disk, with what is there of them in `folder`."""
     there = sum(f.stat().st_size for f in folder.rglob("*") if f.is_file())
@@ -377,147 +240,13 @@ def _check_space(disk: Path, folder: Path, needed: int) -> None:
         )
 
 
-def _spool(
-    surveys: list[Survey],
-    lattice: Lattice,
-    dtype: np.dtype,
-    place: Workplace,
-    executor: Executor,
-    config: BuildConfig,
-    stages: _Stages,
-) -> list[Spooled]:
-    """Second pass: quantised points, sorted into voxels, on disk."""
-    folder = place.folder / "spool"
-    most = run_points(memory_share(executor.jobs, config), dtype)
-    units = []
-    for number, survey in enumerate(surveys):
-        for part in survey.parts:
-            assert survey.scan is not None
-            name = f"{number:06d}-{part.start:012d}"
-            unit = SpoolUnit(
-                survey.scan,
-                number,
-                part.start,
-                part.stop,
-                part.count,
-                lattice,
-                config,
-                dtype,
-                folder,
-                name,
-                most,
-            )
-            units.append((f"spool/{name}", unit))
-    _sweep_spool(place.journal, folder)
-    work = Work(spool_range, dump_spooled, load_spooled, RunsHold(folder))
-    with stages.stage("spool", sum(s.count for s in surveys), "points"):
-        return resumed(place.journal, executor, work, units, stages.progress, lambda unit: unit.count)
-
-
-def _sweep_spool(journal: Journal, folder: Path) -> None:
-    """Delete the runs that no note vouches for: of a unit that was killed, whose runs may be cut otherwise now."""
-    noted = {
-        Path(name).stem
-        for note in folder.glob("*.json")
-        for name in (journal.recall(f"spool/{note.stem}") or {"runs": {}})["runs"]
-    }
-    for suffix in (RUN_SUFFIX, KEYS_SUFFIX):
-        for path in folder.glob(f"*{suffix}"):
-            if path.stem not in noted:
-                path.unlink()
-
-
-def _is_filtered(config: BuildConfig) -> bool:
-    """Whether points are to be left out; most builds have no use for builder/filter.py, and do not load it."""
-    return not (config.thin is None and config.outliers is None and config.moving is None)
-
-
-def _spool_rows(config: BuildConfig) -> np.dtype:
-    """A row of the spool: what the filters need besides what is kept, where there are any."""
-    if not _is_filtered(config):
-        return spool_dtype(config)
-    from .filter import filter_dtype
-
-    return filter_dtype(config)
-
-
-def _filter(
-    spool: Spool, place: Workplace, executor: Executor, config: BuildConfig, stages: _Stages
-) -> tuple[Spool, dict[str, dict[int, int]]]:
-    """The optional pass between: points are left out; also how many of each scan, by reason."""
-    if not _is_filtered(config):
-        return spool, {}
-    from .filter import filter_passes, filtered_spool
-
-    total = filter_passes(config) * int(spool.counts.sum())
-    with stages.stage("filter", total, "points"):
-        return filtered_spool(spool, config, place.folder, executor, stages.progress, place.journal)
-
-
-def _build_shards(
-    spool: Spool,
-    identity: bytes,
-    place: Workplace,
-    executor: Executor,
-    config: BuildConfig,
-    stages: _Stages,
-) -> list[Shard]:
-    """Third pass: every voxel's octree and hierarchies, into shards; those with the most points first."""
-    folder = place.archive / SHARD_FOLDER
-    # Beside the voxel itself, or a part of it.
-    most_near = max(1 << 16, memory_share(executor.jobs, config) // (2 * VOXEL_BYTES_A_POINT))
-    plans = plan_shards(spool.keys, spool.counts)
-    units = [
-        (
-            f"done/{number:06d}",
-            ShardUnit(number, 0, keys, points, spool, spool.lattice, config, most_near, identity, folder),
-        )
-        for number, (keys, points) in enumerate(plans)
-    ]
-    units.sort(key=lambda named: -named[1].points)
-    work = Work(build_shard, dump_shard, load_shard, ShardHolds(folder))
-    with stages.stage("build", sum(points for _, points in plans), "points"):
-        shards = resumed(place.journal, executor, work, units, stages.progress, lambda unit: unit.points)
-    named = {shard.name for shard in shards}
-    for path in folder.iterdir():
-        if path.name not in named:
-            path.unlink()
-    return [shard for _, shard in sorted(zip((unit.number for _, unit in units), shards, strict=True))]
-
-
-def dump_shard(shard: Shard) -> dict[str, Any]:
-    """A shard as its note says it."""
-    return {
-        **shard._asdict(),
-        "rows": base64.b85encode(shard.rows.tobytes()).decode(),
-        "radius_counts": shard.radius_counts.tolist(),
-    }
-
-
-def load_shard(noted: dict[str, Any]) -> Shard:
-    """A shard from its note."""
-    rows = np.frombuffer(base64.b85decode(noted["rows"]), VOXEL_DTYPE)
-    return Shard(**{**noted, "rows": rows, "radius_counts": np.array(noted["radius_counts"], np.int64)})
-
-
-@dataclass(frozen=True, slots=True)
-class ShardHolds:
-    """Whether the shard that a note speaks of is in `folder`, as long as it was."""
-
-    folder: Path
-
-    def __call__(self, shard: Shard) -> bool:
-        path = self.folder / shard.name
-        return path.is_file() and path.stat().st_size == shard.size
-
-
 def _measure_radius(
     header: Header,
     shards: list[Shard],
     folder: Path,
     executor: Executor,
     config: BuildConfig,
-    stages: _Stages,
+    stages: Stages,
 ) -> Header:
     """Fourth pass: the mean closest-point distance over what is stored; then the final index is written."""
     rows = np.concatenate([s.rows for s in shards])

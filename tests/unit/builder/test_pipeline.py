@@ -111,14 +111,14 @@ def test_a_small_memory_bound_gives_several_runs_and_the_same_bytes(
     raw = np.random.default_rng(5).integers(0, 4000, (600_000, 3)) * [1, 1, 0]
     write_las(tmp_path / "a.las", raw)
     runs: list[int] = []
-    spool = pipeline._spool
+    spool = pipeline.spool_scans
 
     def counted(*args: object) -> object:
         result = spool(*args)
         runs.append(sum(len(s.runs) for s in result))
         return result
 
-    monkeypatch.setattr(pipeline, "_spool", counted)
+    monkeypatch.setattr(pipeline, "spool_scans", counted)
     options = {"radius": 0.001, "leaf": 32, "degree": 8, "cell_points": 4096}
     build([tmp_path / "a.las"], out / "a", **options)
     # 64 MB, and 100,000 bytes a point claimed by the spool: runs of 2^18 points.
@@ -400,7 +400,7 @@ def test_what_no_note_vouches_for_is_removed(scans: list[Path], out: Path) -> No
 
 
 @pytest.mark.parametrize(
-    "stage", ["_spool", "_build_shards", "_measure_radius", "verify_archive", "publish_folder"]
+    "stage", ["spool_scans", "build_shards", "_measure_radius", "verify_archive", "publish_folder"]
 )
 def test_a_full_disk_is_named_and_the_same_command_goes_on(
     stage: str, scans: list[Path], out: Path, monkeypatch: pytest.MonkeyPatch

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import solidcloud.builder.config as config
+import solidcloud.builder.passes as passes
 import solidcloud.builder.pipeline as pipeline
 import solidcloud.builder.survey as survey
 from scans import make_scan, write_las, write_xyz
@@ -116,13 +117,13 @@ def test_what_was_done_is_not_done_again(
     calls: list[str] = []
 
     def counted(name: str) -> None:
-        function = getattr(pipeline, name)
+        function = getattr(passes, name)
 
         def instead(unit: Any) -> Any:
             calls.append(name)
             return function(unit)
 
-        monkeypatch.setattr(pipeline, name, instead)
+        monkeypatch.setattr(passes, name, instead)
 
     for name in ("survey_range", "hash_file", "spool_range", "build_shard"):
         counted(name)
@@ -149,7 +150,7 @@ def test_what_was_done_is_not_done_again(
 def interrupted(target: Path, scans: list[Path], monkeypatch: pytest.MonkeyPatch, **options: Any) -> None:
     """A build that Ctrl-C stopped just before its shards."""
     with monkeypatch.context() as patch:
-        patch.setattr(pipeline, "_build_shards", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        patch.setattr(pipeline, "build_shards", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
             build(target, scans, **options)
     assert (building_folder(target) / "build.json").exists()
@@ -295,12 +296,12 @@ def test_a_bad_scan_found_in_the_survey_leaves_nothing_and_later_ones_do(
 
     out = tmp_path / "out"
     with monkeypatch.context() as patch:
-        patch.setattr(pipeline, "_check_surveys", lambda *_: fails(None))
+        patch.setattr(passes, "_check_surveys", lambda *_: fails(None))
         with pytest.raises(ScanError):
             build(out / "hall", scans)
     assert not out.exists()
     with monkeypatch.context() as patch:
-        patch.setattr(pipeline, "spool_range", fails)
+        patch.setattr(passes, "spool_range", fails)
         with pytest.raises(ScanError):
             build(out / "hall", scans)
     assert sorted(p.name for p in (out / ".hall.building" / "survey").iterdir())

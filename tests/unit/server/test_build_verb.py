@@ -80,7 +80,7 @@ def test_who_interrupts_is_told_how_to_go_on(
     before = signal.getsignal(signal.SIGTERM)
     build = ["build", str(scan), "-o", str(tmp_path / "hall"), "--jobs", "1"]
     with monkeypatch.context() as patch:
-        patch.setattr(pipeline, "_build_shards", lambda *_: os.kill(os.getpid(), number))
+        patch.setattr(pipeline, "build_shards", lambda *_: os.kill(os.getpid(), number))
         with pytest.raises(SystemExit) as stopped:
             raise SystemExit(run(build))
     assert stopped.value.code == 130

@@ -1,0 +1,261 @@
+"""The passes of a build that are noted: survey, spool, filters, shards. What a note vouches for is not done again.
+
+Each takes the place of the build, an executor and the options, and gives what the next ones need.
+"""
+
+import base64
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..schemas.archive import SHARD_FOLDER
+from ..schemas.errors import BadRequestError, ScanError
+from ..schemas.index import VOXEL_DTYPE
+from ..schemas.voxel_grid import Lattice
+from .config import BuildConfig
+from .executor import Executor
+from .journal import Journal, Work, resumed
+from .memory import memory_share
+from .partition import RunsHold, Spooled, SpoolUnit, dump_spooled, load_spooled, run_points, spool_range
+from .scan_list import Input
+from .shards import Shard, ShardUnit, build_shard, plan_shards
+from .spool import KEYS_SUFFIX, RUN_SUFFIX, Spool, spool_dtype
+from .stages import Stages
+from .survey import (
+    RangeUnit,
+    Survey,
+    dump_part,
+    hash_file,
+    joined,
+    load_part,
+    ranges,
+    survey_range,
+    unopened,
+)
+from .workplace import Workplace
+
+# Bytes a point that building one voxel holds at its peak (measured with 10^7 points in one voxel: 128).
+VOXEL_BYTES_A_POINT = 160
+# The column of scan numbers is uint16 (schemas/FORMAT.md).
+MAX_SCANS = 1 << 16
+
+
+def survey_scans(
+    inputs: Sequence[Input],
+    about: int,
+    place: Workplace,
+    executor: Executor,
+    config: BuildConfig,
+    stages: Stages,
+) -> tuple[list[Survey], list[Survey]]:
+    """Read every scan once; returns the usable ones, in an order of their content, and the faulty ones."""
+    inputs = sorted(inputs, key=lambda item: str(item.path))  # the notes are named by this order
+    scans = [scan for item in inputs for scan in item.scans]
+    files = [item.path for item in inputs if item.scans]
+    units = [
+        (f"survey/{number:06d}-{unit.start:012d}", unit)
+        for number, scan in enumerate(scans)
+        for unit in ranges(scan, about)
+    ]
+    hashing = [(f"survey/sha256-{number:06d}", path) for number, path in enumerate(files)]
+    with stages.stage("survey", sum(unit.points for _, unit in units), "points"):
+        both: list[tuple[str, Path | RangeUnit]] = [*hashing, *units]
+        work: Work[Path | RangeUnit, Any] = Work(_hash_or_survey, _dump_either, _load_either)
+        found = resumed(place.journal, executor, work, both, stages.progress, _points_of)
+    sha256 = dict(zip(files, found, strict=False))
+    surveys, at = [], len(hashing)
+    for scan in scans:
+        count = len(ranges(scan, about))
+        surveys.append(joined(scan, found[at : at + count], sha256[scan.path]))
+        at += count
+    surveys += [unopened(item.path, item.fault, item.region) for item in inputs if not item.scans]
+    good = sorted((s for s in surveys if not s.fault), key=_content_order)
+    faulty = sorted((s for s in surveys if s.fault), key=_content_order)
+    _check_surveys(good, faulty, inputs, config)
+    return good, faulty
+
+
+def _hash_or_survey(unit: Path | RangeUnit) -> Any:
+    """A unit of the survey: a file to be hashed, or a range to be read."""
+    return survey_range(unit) if isinstance(unit, RangeUnit) else hash_file(unit)
+
+
+def _dump_either(result: Any) -> Any:
+    """A result of the survey, as its note says it."""
+    return list(result) if isinstance(result, tuple) else dump_part(result)
+
+
+def _load_either(noted: Any) -> Any:
+    """A result of the survey from its note."""
+    return tuple(noted) if isinstance(noted, list) else load_part(noted)
+
+
+def _points_of(unit: Path | RangeUnit) -> int:
+    """Points that a unit of the survey reads."""
+    return unit.points if isinstance(unit, RangeUnit) else 0
+
+
+def _check_surveys(
+    good: list[Survey], faulty: list[Survey], inputs: Sequence[Input], config: BuildConfig
+) -> None:
+    """Refuse scans that cannot be built as the options ask."""
+    if faulty and not config.skip_bad:
+        more = "" if len(faulty) == 1 else "".join(f"\n  {s.fault}" for s in faulty[1:])
+        raise ScanError(
+            f"{faulty[0].fault}{more} (--skip-bad leaves such scans out and marks their region unknown)"
+        )
+    if not good:
+        first = inputs[0].path if inputs else "nothing"
+        raise ScanError(f"{first}: no usable scan, expected at least one: check the files")
+    if ("scan" in config.keep or _is_filtered(config)) and len(good) > MAX_SCANS:
+        raise BadRequestError(
+            f"--keep scan, or a filter, with {len(good)} scans: expected at most {MAX_SCANS}: build in parts"
+        )
+    unclean = [s for s in good if s.unclean]
+    if unclean and config.strict:
+        wrong = sum(s.unclean for s in unclean)
+        raise ScanError(
+            f"{unclean[0].path}: {wrong} points that are not finite, expected none with --strict: clean the scan"
+        )
+
+
+def _content_order(survey: Survey) -> tuple[str, int, str]:
+    """Scans are numbered by their files' content, so that the order they are given in changes nothing."""
+    return survey.sha256, survey.scan.index if survey.scan else -1, str(survey.path)
+
+
+def spool_scans(
+    surveys: list[Survey],
+    lattice: Lattice,
+    dtype: np.dtype,
+    place: Workplace,
+    executor: Executor,
+    config: BuildConfig,
+    stages: Stages,
+) -> list[Spooled]:
+    """Second pass: quantised points, sorted into voxels, on disk."""
+    folder = place.folder / "spool"
+    most = run_points(memory_share(executor.jobs, config), dtype)
+    units = []
+    for number, survey in enumerate(surveys):
+        for part in survey.parts:
+            assert survey.scan is not None
+            name = f"{number:06d}-{part.start:012d}"
+            unit = SpoolUnit(
+                survey.scan,
+                number,
+                part.start,
+                part.stop,
+                part.count,
+                lattice,
+                config,
+                dtype,
+                folder,
+                name,
+                most,
+            )
+            units.append((f"spool/{name}", unit))
+    _sweep_spool(place.journal, folder)
+    work = Work(spool_range, dump_spooled, load_spooled, RunsHold(folder))
+    with stages.stage("spool", sum(s.count for s in surveys), "points"):
+        return resumed(place.journal, executor, work, units, stages.progress, lambda unit: unit.count)
+
+
+def _sweep_spool(journal: Journal, folder: Path) -> None:
+    """Delete the runs that no note vouches for: of a unit that was killed, whose runs may be cut otherwise now."""
+    noted = {
+        Path(name).stem
+        for note in folder.glob("*.json")
+        for name in (journal.recall(f"spool/{note.stem}") or {"runs": {}})["runs"]
+    }
+    for suffix in (RUN_SUFFIX, KEYS_SUFFIX):
+        for path in folder.glob(f"*{suffix}"):
+            if path.stem not in noted:
+                path.unlink()
+
+
+def _is_filtered(config: BuildConfig) -> bool:
+    """Whether points are to be left out; most builds have no use for builder/filter.py, and do not load it."""
+    return not (config.thin is None and config.outliers is None and config.moving is None)
+
+
+def spool_rows(config: BuildConfig) -> np.dtype:
+    """A row of the spool: what the filters need besides what is kept, where there are any."""
+    if not _is_filtered(config):
+        return spool_dtype(config)
+    from .filter import filter_dtype
+
+    return filter_dtype(config)
+
+
+def filter_points(
+    spool: Spool, place: Workplace, executor: Executor, config: BuildConfig, stages: Stages
+) -> tuple[Spool, dict[str, dict[int, int]]]:
+    """The optional pass between: points are left out; also how many of each scan, by reason."""
+    if not _is_filtered(config):
+        return spool, {}
+    from .filter import filter_passes, filtered_spool
+
+    total = filter_passes(config) * int(spool.counts.sum())
+    with stages.stage("filter", total, "points"):
+        return filtered_spool(spool, config, place.folder, executor, stages.progress, place.journal)
+
+
+def build_shards(
+    spool: Spool,
+    identity: bytes,
+    place: Workplace,
+    executor: Executor,
+    config: BuildConfig,
+    stages: Stages,
+) -> list[Shard]:
+    """Third pass: every voxel's octree and hierarchies, into shards; those with the most points first."""
+    folder = place.archive / SHARD_FOLDER
+    # Beside the voxel itself, or a part of it.
+    most_near = max(1 << 16, memory_share(executor.jobs, config) // (2 * VOXEL_BYTES_A_POINT))
+    plans = plan_shards(spool.keys, spool.counts)
+    units = [
+        (
+            f"done/{number:06d}",
+            ShardUnit(number, 0, keys, points, spool, spool.lattice, config, most_near, identity, folder),
+        )
+        for number, (keys, points) in enumerate(plans)
+    ]
+    units.sort(key=lambda named: -named[1].points)
+    work = Work(build_shard, dump_shard, load_shard, ShardHolds(folder))
+    with stages.stage("build", sum(points for _, points in plans), "points"):
+        shards = resumed(place.journal, executor, work, units, stages.progress, lambda unit: unit.points)
+    named = {shard.name for shard in shards}
+    for path in folder.iterdir():
+        if path.name not in named:
+            path.unlink()
+    return [shard for _, shard in sorted(zip((unit.number for _, unit in units), shards, strict=True))]
+
+
+def dump_shard(shard: Shard) -> dict[str, Any]:
+    """A shard as its note says it."""
+    return {
+        **shard._asdict(),
+        "rows": base64.b85encode(shard.rows.tobytes()).decode(),
+        "radius_counts": shard.radius_counts.tolist(),
+    }
+
+
+def load_shard(noted: dict[str, Any]) -> Shard:
+    """A shard from its note."""
+    rows = np.frombuffer(base64.b85decode(noted["rows"]), VOXEL_DTYPE)
+    return Shard(**{**noted, "rows": rows, "radius_counts": np.array(noted["radius_counts"], np.int64)})
+
+
+@dataclass(frozen=True, slots=True)
+class ShardHolds:
+    """Whether the shard that a note speaks of is in `folder`, as long as it was."""
+
+    folder: Path
+
+    def __call__(self, shard: Shard) -> bool:
+        path = self.folder / shard.name
+        return path.is_file() and path.stat().st_size == shard.size

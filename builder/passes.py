@@ -17,7 +17,7 @@ from ..schemas.index import VOXEL_DTYPE
 from ..schemas.voxel_grid import Lattice
 from .config import BuildConfig
 from .executor import Executor
-from .journal import Journal, Work, resumed
+from .journal import Work, resumed
 from .memory import memory_share
 from .partition import RunsHold, Spooled, SpoolUnit, dump_spooled, load_spooled, run_points, spool_range
 from .scan_list import Input
@@ -158,22 +158,22 @@ def spool_scans(
                 most,
             )
             units.append((f"spool/{name}", unit))
-    _sweep_spool(place.journal, folder)
+    notes = [place.journal.recall(f"spool/{note.stem}") for note in folder.glob("*.json")]
+    _sweep_spool(folder, {name for noted in notes if noted for name in noted["runs"]})
     work = Work(spool_range, dump_spooled, load_spooled, RunsHold(folder))
     with stages.stage("spool", sum(s.count for s in surveys), "points"):
-        return resumed(place.journal, executor, work, units, stages.progress, lambda unit: unit.count)
+        spooled = resumed(place.journal, executor, work, units, stages.progress, lambda unit: unit.count)
+    # A range that had lost a run was spooled again, into fewer runs, perhaps, than it was in.
+    _sweep_spool(folder, {name for found in spooled for name in found.runs})
+    return spooled
 
 
-def _sweep_spool(journal: Journal, folder: Path) -> None:
-    """Delete the runs that no note vouches for: of a unit that was killed, whose runs may be cut otherwise now."""
-    noted = {
-        Path(name).stem
-        for note in folder.glob("*.json")
-        for name in (journal.recall(f"spool/{note.stem}") or {"runs": {}})["runs"]
-    }
+def _sweep_spool(folder: Path, vouched: set[str]) -> None:
+    """Delete the runs that no note vouches for: a spool is all runs in its folder."""
+    stems = {Path(name).stem for name in vouched}
     for suffix in (RUN_SUFFIX, KEYS_SUFFIX):
         for path in folder.glob(f"*{suffix}"):
-            if path.stem not in noted:
+            if path.stem not in stems:
                 path.unlink()
 
 

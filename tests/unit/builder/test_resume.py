@@ -147,6 +147,22 @@ def test_what_was_done_is_not_done_again(
     assert content(tmp_path / "hall") == content(tmp_path / "judge")
 
 
+def test_a_range_spooled_again_leaves_no_run_of_before(
+    scans: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(passes, "run_points", lambda *_: 30)
+        interrupted(tmp_path / "hall", scans, monkeypatch)
+    folder = building_folder(tmp_path / "hall") / "spool"
+    runs = sorted(folder.glob("*.run"))
+    assert len(runs) == 4 + 4 + 2 + 5
+    runs[0].unlink()
+    (folder / "000000-000000000000-0009.run").write_bytes(b"half")
+    build(tmp_path / "hall", scans)
+    build(tmp_path / "judge", scans)
+    assert content(tmp_path / "hall") == content(tmp_path / "judge")
+
+
 def interrupted(target: Path, scans: list[Path], monkeypatch: pytest.MonkeyPatch, **options: Any) -> None:
     """A build that Ctrl-C stopped just before its shards."""
     with monkeypatch.context() as patch:

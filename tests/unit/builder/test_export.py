@@ -351,3 +351,21 @@ def test_vtk_reads_an_export(georeferenced: Path, tmp_path: Path) -> None:
     found = reader.GetOutputDataObject(0)
     arrays = [support.vtk_to_numpy(found.GetPointData().GetArray(name)) for name in ("scan", "intensity")]
     assert rows_of(support.vtk_to_numpy(found.GetPoints().GetData()), *arrays) == stored(georeferenced)
+
+
+def test_a_real_scan_comes_back_in_its_system(real_scans: Path, tmp_path: Path) -> None:
+    """Coordinates of the file's own, from its integers, and the text of its coordinate system."""
+    scan = real_scans / "lone_star.copc.laz"
+    build_archive([scan], tmp_path / "a", BuildConfig(voxel=8.0, radius=0.01, jobs=1))
+    done = export_archive(tmp_path / "a", tmp_path / "out.laz")
+    before, after = laspy.read(scan), laspy.read(tmp_path / "out.laz")
+    assert done.notes == () and len(after.points) == len(before.points) == 518_862
+    world = [
+        np.stack([las.X, las.Y, las.Z], axis=1) * las.header.scales + las.header.offsets
+        for las in (before, after)
+    ]
+    steps = [np.rint((xyz - before.header.offsets) / before.header.scales).astype(np.int64) for xyz in world]
+    first, second = (s[np.lexsort(s.T)] for s in steps)
+    assert np.array_equal(first, second)
+    texts = [[v.string for v in las.header.vlrs if v.record_id == 2112] for las in (before, after)]
+    assert texts[0] == texts[1] and texts[1][0].startswith("GEOCCS")

@@ -128,7 +128,7 @@ def build_dense(
     with _Spill(scratch, dtype) as spill:
         for part in plan_parts(spool, key, config):
             codes_of = range(part[0].code, part[-1].past)
-            if part[0].points > DENSE_POINTS and part[0].log2 == 0:
+            if len(part) == 1 and part[0].log2 == 0 and part[0].points > DENSE_POINTS:
                 _put_heap(spill, part[0], spool, key, config, classify)
                 continue
             points, codes = canonical(gather_voxel(spool.block_rows(key, codes_of.start, codes_of.stop)))

@@ -103,8 +103,10 @@ def test_a_voxel_built_in_parts_is_the_voxel(kind: str, steps: int, tmp_path: Pa
         (make_steps("plane", 1, 900, 1000), BuildConfig(cell_points=700)),
         (make_steps("plane", 1, 900, 1000), BuildConfig(cell_points=5000)),
         (make_steps("noise", 1, 900, 1000), BuildConfig(cell_points=1, leaf=1, degree=2)),
+        # 210 and 30 points of two places in one part, as the cube around them and 100 others is one too many.
+        (np.repeat([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [210, 30, 100], axis=0), BuildConfig(cell_points=250)),
     ],
-    ids=["one place", "a heap", "large cells", "one cell", "a cell a point"],
+    ids=["one place", "a heap", "large cells", "one cell", "a cell a point", "a heap in a part"],
 )  # fmt: skip
 def test_cells_of_more_points_than_a_part_are_one_part(
     points: NDArray[np.int32], config: BuildConfig, tmp_path: Path

@@ -14,6 +14,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from .archive import NewFile, new_file, publish
 from .errors import CorruptError
 
 PREVIEW_NAME = "preview.vtkhdf"
@@ -37,7 +38,7 @@ class VtkPoints:
 
         compressed: and with a checksum; else as they are, which is six times as fast.
         """
-        self._options = _CHECKED if compressed else {}
+        self._file, self._options = file, _CHECKED if compressed else {}
         self._root = file.create_group(GROUP, track_times=False)
         self._root.attrs["Version"] = np.array(_VERSION, "<i8")
         self._root.attrs["Type"] = np.bytes_("PolyData")  # of fixed length: VTK reads no other
@@ -64,11 +65,13 @@ class VtkPoints:
         )
 
     def append(self, points: NDArray[np.float64], columns: Mapping[str, NDArray]) -> None:
-        """Write so many more points (m, 3) [m], and the columns (m,) promised."""
+        """Write so many more points (m, 3) [m], and the columns (m,) promised. OSError: of a write that failed."""
         for dataset, rows in [(self._points, points), *((d, columns[n]) for n, d in self._columns.items())]:
             begin = len(dataset)
             dataset.resize(begin + len(rows), axis=0)
             dataset[begin:] = rows
+        if isinstance(self._file, NewFile):
+            self._file.check()  # what HDF5 was not told of, it would go on writing behind
 
     def _finish(self) -> None:
         """One vertex a point, and how many there are."""
@@ -94,12 +97,10 @@ class VtkPoints:
 
 @contextmanager
 def vtk_file(path: Path, columns: Mapping[str, np.dtype]) -> Iterator[VtkPoints]:
-    """A new file of points, uncompressed."""
-    with (
-        h5py.File(path, "w", libver=("v110", "v110")) as file,
-        VtkPoints(file, columns, compressed=False) as points,
-    ):
+    """A new file of points, uncompressed; it has its name when it is whole. OSError: the disk is full, for one."""
+    with new_file(path) as file, VtkPoints(file, columns, compressed=False) as points:
         yield points
+    publish(path)
 
 
 class PointsRead(NamedTuple):

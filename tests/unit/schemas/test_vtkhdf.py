@@ -1,10 +1,13 @@
 """A file of points is VTKHDF PolyData as its specification says, read by VTK itself where that is installed."""
 
+import errno
+import os
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
+import solidcloud.schemas.archive as archive
 from solidcloud.schemas.errors import CorruptError
 from solidcloud.schemas.vtkhdf import VtkPoints, read_points, vtk_file
 
@@ -85,6 +88,29 @@ def test_without_columns_there_are_none(tmp_path: Path) -> None:
     with vtk_file(tmp_path / "a", {}) as out:
         out.append(np.zeros((4, 3)), {})
     assert read_points(tmp_path / "a").columns == {}
+
+
+@pytest.mark.parametrize("room", [0, 3000, 200_000, 900_000])
+def test_a_full_disk_is_an_error_that_names_the_file(
+    room: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first write that ends behind `room` fails, and all that come later."""
+    real = os.pwrite
+
+    def pwrite(descriptor: int, data: memoryview, offset: int) -> int:
+        if offset + len(data) > room:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return real(descriptor, data, offset)
+
+    monkeypatch.setattr(archive.os, "pwrite", pwrite)
+    points, appended = np.random.default_rng(1).random((40_000, 3)), 0
+    path = tmp_path / "a.vtkhdf"
+    with pytest.raises(OSError, match=r"No space left on device: .*a\.vtkhdf"), vtk_file(path, {}) as out:
+        for _ in range(20):
+            out.append(points, {})
+            appended += 1
+    # HDF5 writes when 8 MB have come together.
+    assert appended < 15 and list(tmp_path.iterdir()) == []
 
 
 def test_flipped_bytes_of_a_compressed_file_are_refused_or_mean_nothing(tmp_path: Path) -> None:

@@ -4,7 +4,9 @@ import ast
 import re
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -17,9 +19,12 @@ from solidcloud.builder.radius import voxel_points
 from solidcloud.schemas.archive import DATASETS, Archive, shard_name, write_index, write_shard
 from solidcloud.schemas.codec import encode_voxel
 from solidcloud.schemas.errors import CorruptError, FormatError
+from solidcloud.schemas.index import RadiusNow
 from solidcloud.schemas.radius_model import LOCAL_RADII
 
 FORMAT = Path(archive_module.__file__).with_name("FORMAT.md")
+# Of version 3, with dead voxels in its shards.
+LATER = Path(__file__).resolve().parents[2] / "golden" / "archive-3"
 ORIGIN = np.array([512345.678901, 5612345.123456, -7.25])
 
 
@@ -141,6 +146,34 @@ def test_format_md_reads_and_names_an_archive_with_radius_classes(tmp_path: Path
             assert f"`{name}`" in text, name
     for radius in LOCAL_RADII:
         assert re.search(rf"\b{radius}\b", text), radius
+
+
+def test_format_md_reads_and_names_an_archive_of_several_generations() -> None:
+    names: dict[str, Callable] = {}
+    exec(compile(worked_example(), str(FORMAT), "exec"), names)
+    world, rows = names["read_archive"](LATER)
+    with Archive(LATER) as archive:
+        header = archive.header
+        expected = [
+            voxel_points(*archive.read_voxel(row)) + archive.coordinates[row] * header.lattice.voxel_steps
+            for row in range(len(archive.voxels))
+        ]
+        in_shards = 0
+        for number in range(archive.shard_count()):
+            with h5py.File(archive.shard_path(number)) as shard:
+                in_shards += len(shard["voxels"])
+                assert shard.attrs["format_version"] == 2
+        assert in_shards > len(archive.voxels), "some are dead"
+    assert np.array_equal(rows_of(world), rows_of(header.lattice.to_world(np.concatenate(expected))))
+    # Of the scan that was removed there is none.
+    assert sorted(np.unique(rows["scan_index"]).tolist()) == [
+        i for i, s in enumerate(header.sources) if s.count
+    ]
+    text = FORMAT.read_text()
+    with h5py.File(LATER / "index.h5") as index:
+        assert index.attrs["format_version"] == 3
+        for name in index:
+            assert f"`{name}`" in text, name
 
 
 def test_hdf5_says_what_a_shard_is(built: Path) -> None:
@@ -332,7 +365,7 @@ def test_an_archive_that_changes_while_it_is_opened_is_read_once_more(
         checked(archive)
         if not done:
             done.append(True)
-            shutil.copytree(Path(__file__).resolve().parents[2] / "golden" / "archive-3", copy / "new")
+            shutil.copytree(LATER, copy / "new")
             for path in (copy / "new" / "shards").iterdir():
                 path.rename(shards / path.name)
             (copy / "new" / "index.h5").replace(index)
@@ -372,6 +405,30 @@ def rewrite_index(folder: Path, change: Callable[[np.ndarray], None]) -> None:
         shards = [(p.name, p.stat().st_size) for p in map(archive.shard_path, range(archive.shard_count()))]
     change(voxels)
     write_index(folder, header, voxels, shards)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"generation": 1, "radius_now": RadiusNow(float("nan"), 0.0, 3)},
+        {"generation": 1, "radius_now": RadiusNow(-0.1, 0.0, 3)},
+        {"generation": 1, "radius_now": RadiusNow(0.1, float("inf"), 3)},
+        {"generation": 1, "radius_now": RadiusNow(0.1, 0.0, -3)},
+    ],
+)
+def test_a_generation_that_is_none_is_refused(change: dict[str, Any], copy: Path) -> None:
+    with Archive(copy) as archive:
+        header, shards = archive.header, archive.shards()
+        write_index(copy, replace(header, **change), archive.voxels, shards)
+    with pytest.raises(FormatError, match="generation 1, radius_now"):
+        Archive(copy)
+    good = RadiusNow(0.25, 0.125, 7)
+    write_index(copy, replace(header, generation=2**32 - 1, radius_now=good), archive.voxels, shards)
+    with Archive(copy) as archive:
+        assert (archive.header.generation, archive.header.radius_now) == (2**32 - 1, good)
+    write_index(copy, replace(header, generation=1), archive.voxels, shards)
+    with Archive(copy) as archive:
+        assert (archive.header.generation, archive.header.radius_now) == (1, None)
 
 
 def test_an_index_that_points_beyond_its_shard_is_refused(copy: Path) -> None:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from solidcloud.server.cli import run
 
-from .case import Case, Tally, arguments, content, make_small, write_scans
+from .case import Case, Change, Tally, arguments, content, make_small, write_scans
 from .child import Child, CountCalls, KillAt, build
 
 # Kills of one build before it is left to finish: one, and now and then more.
@@ -38,20 +38,34 @@ class Ground:
         log = self._built("counted", CountCalls())
         self.calls = int(log.rpartition("calls ")[2])
         # What --overwrite replaces: of the same scans with other options.
-        self.old = self._undisturbed("old", "--voxel", "1.5")
+        self.old = self._undisturbed("old", ".", "--voxel", "1.5")
         self._cases = 0
+        self._changed: dict[str, str] = {}
 
-    def _undisturbed(self, name: str, *more: str) -> Path:
-        self._built(name, None, *more)
+    def _undisturbed(self, name: str, scan: str = ".", *more: str) -> Path:
+        self._built(name, None, scan, *more)
         return self.folder / name / "hall"
 
-    def _built(self, name: str, before: CountCalls | None, *more: str) -> str:
+    def _built(self, name: str, before: CountCalls | None, scan: str = ".", *more: str) -> str:
         (self.folder / name).mkdir()
         target = self.folder / name / "hall"
-        child = build([*arguments(self.scans, target, 1), *more], self.folder / f"{name}.log", before)
+        words = [*arguments(self.scans / scan, target, 1), *more]
+        child = build(words, self.folder / f"{name}.log", before)
         if child.status != 0:
             raise RuntimeError(f"an undisturbed build exited with {child.status}: {child.said()}")
         return child.said()
+
+    def change(self) -> Change:
+        """An archive of the first scan, to which the second is to be added."""
+        if not self._changed:
+            self._first = self._undisturbed("first", "a.las")
+            undisturbed = Change(self.folder / "changed", self.scans / "b.xyz", self._first, {})
+            child = build(undisturbed.arguments(), self.folder / "changed.log")
+            if child.status != 0:
+                raise RuntimeError(f"an undisturbed add exited with {child.status}: {child.said()}")
+            self._changed = content(undisturbed.target)
+        self._cases += 1
+        return Change(self.folder / f"case-{self._cases}", self.scans / "b.xyz", self._first, self._changed)
 
     def case(self, jobs: int = 1, overwrite: bool = False) -> Case:
         """A new target."""
@@ -64,9 +78,10 @@ class Ground:
 
 def check_finish(case: Case, tally: Tally, what: str, **how: object) -> None:
     """Run the same command to its end; the archive must be the undisturbed one, byte for byte."""
+    done = case.whole()
     child = build(case.arguments(), case.folder.with_suffix(".log"))
     faults = case.finished()
-    if child.status != 0:
+    if child.status != 0 and not (done and isinstance(case, Change)):  # a scan is not added twice
         faults.append(f"the same command again exited with {child.status}: {child.said()[-2000:]}")
     tally.add(what, faults, **how)
 

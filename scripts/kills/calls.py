@@ -42,9 +42,8 @@ def has_strace() -> bool:
     ).returncode == 0  # fmt: skip
 
 
-def calls_of(ground: Ground, overwrite: bool) -> list[Call]:
-    """The calls of an undisturbed build that write to its own files or name them."""
-    case = ground.case(overwrite=overwrite)
+def calls_of(case: Case) -> list[Call]:
+    """The calls of an undisturbed command that write to its own files or name them."""
     trace = case.folder.with_suffix(".trace")
     child = _traced(case, trace, ["-y"])
     if child.end() != 0 or case.finished():
@@ -62,23 +61,17 @@ def calls_of(ground: Ground, overwrite: bool) -> list[Call]:
     return found
 
 
-def inject(ground: Ground, call: Call, fault: str, overwrite: bool, tally: Tally) -> None:
-    """Stop a build at one call, check what is there, and let the same command finish it.
+def inject(case: Case, call: Call, fault: str, tally: Tally, **how: object) -> None:
+    """Stop a command at one call, check what is there, and let the same command finish it.
 
     A disk that is full stays full until the build has ended, but for `write`, by which the error is said too; an
     input/output error happens once.
     """
-    case = ground.case(overwrite=overwrite)
     when = f"{call.number}+" if fault == "ENOSPC" and call.name != "write" else str(call.number)
     trace = case.folder.with_suffix(".trace")
     child = _traced(case, trace, ["-e", f"inject={call.name}:{FAULTS[fault]}:when={when}"])
     status = child.end()
-    how = {
-        "call": f"{call.name} {call.number}",
-        "text": call.text[:200],
-        "fault": fault,
-        "overwrite": overwrite,
-    }
+    how |= {"call": f"{call.name} {call.number}", "text": call.text[:200], "fault": fault}
     faults = case.visible()
     said = child.said()
     if status == 0:
@@ -117,14 +110,21 @@ def one_of_each(calls: list[Call]) -> list[Call]:
 def all_calls(
     ground: Ground, tally: Tally, every: int | None = 1, say: Callable[[str], None] | None = None
 ) -> int:
-    """Each fault at each call, of a first build and of one that overwrites; returns how many that were.
+    """Each fault at each call of a build, of one that overwrites and of `add`; returns how many that were.
 
-    every: at each so-many-th call alone; None: at one of each name.
+    every: at each so-many-th call alone; None: at one of each name of `build` and `add`.
     """
     points = 0
-    for overwrite in (False, True):
-        calls = calls_of(ground, overwrite)
-        if overwrite:
+    commands: dict[str, Callable[[], Case]] = {
+        "build": ground.case,
+        "build --overwrite": lambda: ground.case(overwrite=True),
+        "add": ground.change,
+    }
+    if not every:
+        del commands["build --overwrite"]
+    for name, make in commands.items():
+        calls = calls_of(make())
+        if name == "build --overwrite":
             # As the first build until the names are changed; only what follows is new.
             calls = calls[-12:]
         calls = calls[::every] if every else one_of_each(calls)
@@ -133,11 +133,9 @@ def all_calls(
                 if fault == "ENOSPC" and call.name not in FULL:
                     continue
                 points += 1
-                inject(ground, call, fault, overwrite, tally)
+                inject(make(), call, fault, tally, command=name)
             if say and index % 20 == 0:
-                say(
-                    f"{index + 1} of {len(calls)} calls{', --overwrite' if overwrite else ''}; {len(tally.bad)} bad"
-                )
+                say(f"{name}: {index + 1} of {len(calls)} calls; {len(tally.bad)} bad")
     return points
 
 

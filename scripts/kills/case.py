@@ -13,7 +13,9 @@ import laspy
 import numpy as np
 import solidcloud.builder
 from solidcloud.builder.verify import verify_archive
+from solidcloud.schemas.archive import INDEX_NAME
 from solidcloud.schemas.errors import SolidcloudError
+from solidcloud.schemas.vtkhdf import PREVIEW_NAME
 
 # What cuts a build into units, made small: some 10 units of a few hundred points, a shard a quarter of SHARD_POINTS.
 SMALL = {"SHARD_POINTS": 3200, "SPOOL_RANGE": 1500, "LEAST_RUN_POINTS": 700}
@@ -113,14 +115,18 @@ class Case:
             found = content(self.target) if self.target.exists() else {}
             faults.append(f"{self.target}: not byte-identical: {difference(found, self.reference)}")
         else:
-            try:
-                faults += [f"{self.target}: {fault}" for fault in verify_archive(self.target).faults]
-            except SolidcloudError as error:
-                faults.append(str(error))
+            faults += self._valid()
         left = sorted(path.name for path in self.folder.iterdir() if path != self.target)
         if left:
             faults.append(f"{self.folder}: left behind: {', '.join(left)}")
         return faults
+
+    def _valid(self) -> list[str]:
+        """What `validate` says of the archive."""
+        try:
+            return [f"{self.target}: {fault}" for fault in verify_archive(self.target).faults]
+        except SolidcloudError as error:
+            return [str(error)]
 
     def stage(self) -> str:
         """How far a build came that was stopped, by the files it left."""
@@ -138,6 +144,38 @@ class Case:
             if any(work.glob(pattern)):
                 return name
         return "started"
+
+
+class Change(Case):
+    """One archive that a scan is added to: it is the old one or the new, with or without files that it does not name.
+
+    scans: the one that is added.
+    """
+
+    def __init__(self, folder: Path, scan: Path, before: Path, reference: dict[str, str]) -> None:
+        super().__init__(folder, scan, reference)
+        self.put_old(before)
+
+    def arguments(self) -> list[str]:
+        """Of the command."""
+        return ["add", str(self.target), str(self.scans), "--jobs", "1"]
+
+    def visible(self) -> list[str]:
+        """What is wrong with the archive, whenever it is looked at."""
+        found = content(self.target)
+        for whole in (self.old, self.reference):
+            # The preview follows, and says of which archive it is.
+            if {name: whole[name] for name in whole if name != PREVIEW_NAME}.items() <= found.items():
+                return self._valid()
+        return [f"{self.target}: neither the new archive nor the old: {difference(found, self.reference)}"]
+
+    def whole(self) -> bool:
+        """Whether it is the new archive."""
+        return content(self.target).get(INDEX_NAME) == self.reference[INDEX_NAME]
+
+    def finished(self) -> list[str]:
+        """What is wrong after the scan was added, be it by a command that was stopped while it tidied up."""
+        return self.visible() if self.whole() else [f"{self.target}: the scan is not in it"]
 
 
 def arguments(scans: Path, target: Path, jobs: int) -> list[str]:

@@ -15,7 +15,7 @@ from solidcloud.schemas.answers import (
     SweepAnswers,
     WithinAnswers,
 )
-from solidcloud.schemas.errors import BadRequestError
+from solidcloud.schemas.errors import BadRequestError, FormatError
 from solidcloud.schemas.messages import (
     JSON,
     MSGPACK,
@@ -28,6 +28,7 @@ from solidcloud.schemas.messages import (
     ObjectsRequest,
     PathRequest,
     RaycastRequest,
+    ReloadAnswer,
     SceneInfo,
     ScenesAnswer,
     SweepRequest,
@@ -253,3 +254,34 @@ def test_two_scenes_of_one_name_are_refused():
 def test_a_scene_whose_name_no_key_can_hold_is_refused():
     with pytest.raises(BadRequestError, match="expected 1 to 64"):
         Service([FloorScene("a/b")], ServerConfig())
+
+
+@pytest.mark.parametrize("encoding", [MSGPACK, JSON])
+def test_a_reload_is_answered_in_one_part_when_it_is_taken(service, scene, encoding):
+    answers = service.answer(key("reload"), b"", encoding)
+    assert scene.reloaded == 0, "whoever sends the parts has it done"
+    (answer,) = list(answers)
+    assert answer.ok and scene.reloaded == 1
+    assert decode_answer(ReloadAnswer, answer.payload, encoding) == ReloadAnswer("floor", 0, 1, 4)
+
+
+def test_a_reload_that_fails_says_why(service, scene, caplog):
+    scene.refuses = FormatError("no archive here")
+    (answer,) = list(service.answer(key("reload"), b"", MSGPACK))
+    assert error(answer).code == "corrupt" and "no archive here" in error(answer).message
+    assert "floor is not reloaded, what was served is served on: no archive here" in caplog.text
+    scene.refuses = RuntimeError("a secret of the server's own")
+    (answer,) = list(service.answer(key("reload"), b"", MSGPACK))
+    assert error(answer).code == "internal" and "secret" not in error(answer).message
+
+
+def test_a_reload_takes_no_payload_and_a_scene_that_is_served(service):
+    assert "reload with a payload" in error(service.answer(key("reload"), b"x", MSGPACK)).message
+    assert error(service.answer(key("reload", scene="attic"), b"", MSGPACK)).code == "unknown_scene"
+
+
+def test_all_scenes_are_reloaded_where_one_cannot_be():
+    scenes = [FloorScene("cellar"), FloorScene("floor"), FloorScene("attic")]
+    scenes[1].refuses = FormatError("no archive here")
+    Service(scenes, ServerConfig()).reload()
+    assert [scene.reloaded for scene in scenes] == [1, 0, 1]

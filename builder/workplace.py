@@ -1,6 +1,5 @@
 """The folder that an archive is made in, and how it gets the name asked for: locked, hidden, renamed when whole."""
 
-import fcntl
 import json
 import os
 import shutil
@@ -14,6 +13,7 @@ from ..schemas.archive import INDEX_NAME, SHARD_FOLDER, sync_folder
 from ..schemas.errors import BadRequestError, CorruptError, ScanError
 from ..schemas.vtkhdf import PREVIEW_NAME
 from .journal import Journal, remove_temporaries
+from .lock import locked as locked
 from .resume import check_same
 
 # The note of what is built, the first of all.
@@ -49,30 +49,6 @@ def made_parents(target: Path) -> Iterator[None]:
             with suppress(OSError):  # somebody else uses it by now
                 folder.rmdir()
         raise
-
-
-@contextmanager
-def locked(target: Path) -> Iterator[None]:
-    """Keep a second builder off the same target."""
-    path = target.parent / f".{target.name}.lock"
-    while True:
-        file = open(path, "w")  # noqa: SIM115  held open as long as the lock
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            file.close()
-            raise BadRequestError(
-                f"{target}: another build is writing it: wait for it, or give another -o"
-            ) from None
-        # The holder before us may have removed the file we just locked: then lock the one that is there now.
-        if path.exists() and os.fstat(file.fileno()).st_ino == path.stat().st_ino:
-            break
-        file.close()
-    try:
-        yield
-    finally:
-        path.unlink(missing_ok=True)
-        file.close()
 
 
 def building_folder(target: Path) -> Path:

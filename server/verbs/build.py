@@ -84,6 +84,10 @@ def build(
     as_json: AsJson = False,
 ) -> None:
     """Build one archive from scans; the same command again goes on where it was interrupted."""
+    from ...builder.lock import check_free
+
+    if not dry_run:
+        check_free(output)  # before a second is spent on loading numba
     from ...builder.config import BuildConfig, parse_radius, parse_rule
 
     fixed, models = parse_radius(radius)

@@ -75,6 +75,7 @@ TESTS: dict[str, tuple[str, ...]] = {
     ),
     "builder/kernels/pack.py": (BUILDER + "test_pack.py",),
     "builder/kernels/spill.py": (BUILDER + "test_spill.py",),
+    "builder/kernels/spool.py": (BUILDER + "test_spool_kernels.py",),
     "builder/kernels/top.py": (BUILDER + "test_top.py",),
     "builder/kernels/trees.py": (BUILDER + "test_trees.py",),
     "server/kernels/placing.py": (SERVER + "test_pose_checks.py", SERVER + "test_placing.py"),

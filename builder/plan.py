@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 from ..schemas.errors import CorruptError
 from ..schemas.voxel_grid import KEY_BIAS, MAX_VOXEL_STEPS
-from .config import DEFAULT_STEP, BuildConfig, shard_points
+from .config import DEFAULT_STEP, RADIUS_SAMPLE, BuildConfig, shard_points
 from .executor import worker_count
 from .memory import jobs_that_fit, memory_share
 from .partition import run_points
@@ -50,15 +50,21 @@ DENSEST = 8
 
 
 class Stage(NamedTuple):
-    """What a stage takes. start: whatever it holds [s].  serial: a point [s].  parallel: a point, of one core [s]."""
+    """What a stage takes. start: whatever it holds [s].  serial: a point [s].  parallel: a point, of one core [s].
+
+    first: each of the first RADIUS_SAMPLE points besides, of one core [s]: no more than those have their closest
+    points looked for, and a part of other stages is like that.
+    """
 
     start: float
+    first: float
     serial: float
     parallel: float
 
     def seconds(self, points: float, jobs: int) -> float:
         """For so many points with so many workers."""
-        return self.start + points * (self.serial + self.parallel / jobs)
+        first = min(points, RADIUS_SAMPLE) * self.first
+        return self.start + points * self.serial + (first + points * self.parallel) / jobs
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -23,7 +23,8 @@ from solidcloud.schemas.errors import BadRequestError, CorruptError, ScanError
 RATES = Rates(
     machine="m", cores=2, rests_on="r", workers=1.0, passes=2, process=1e8, worker=5e7, point=10.0, disk=1e8,
     density=400.0, crossed=0.5,
-    stages={"survey": Stage(0.5, 1e-8, 2e-8), "spool": Stage(0.0, 0.0, 1e-7), "radius": Stage(1.0, 0.0, 0.0)},
+    stages={"survey": Stage(0.5, 0.0, 1e-8, 2e-8), "spool": Stage(0.0, 0.0, 0.0, 1e-7),
+            "radius": Stage(0.2, 8e-7, 0.0, 0.0)},
     read={"las": 1e-8, "laz": 3e-7, "text": 1e-6},
     archive=[(10.0, 2.0), (1000.0, 4.0)],
 )  # fmt: skip
@@ -36,8 +37,10 @@ def write_las(path: Path, xyz: np.ndarray) -> None:
 
 
 def test_a_stage_is_its_start_and_so_much_a_point_shared_among_jobs() -> None:
-    assert Stage(1.0, 0.25, 0.5).seconds(4, 1) == 4.0
-    assert Stage(1.0, 0.25, 0.5).seconds(4, 2) == 3.0
+    assert Stage(1.0, 0.0, 0.25, 0.5).seconds(4, 1) == 4.0
+    assert Stage(1.0, 0.0, 0.25, 0.5).seconds(4, 2) == 3.0
+    assert Stage(1.0, 2e-6, 0.0, 0.0).seconds(5e5, 1) == 2.0
+    assert Stage(1.0, 2e-6, 0.0, 0.0).seconds(1e9, 2) == 2.0
 
 
 def test_bytes_a_point_are_linear_in_bits_of_the_pitch() -> None:

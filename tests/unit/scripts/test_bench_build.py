@@ -1,5 +1,6 @@
 """The helpers of scripts/bench_build: what its report says of memory, stages and limits. Nothing is timed."""
 
+import dataclasses
 import hashlib
 import sys
 from pathlib import Path
@@ -8,11 +9,12 @@ import numpy as np
 import pytest
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import build_archive
+from solidcloud.builder.plan import Stage
 
 # Appended, so that nothing of scripts/ hides a module of the tests.
 sys.path.append(str(Path(__file__).parents[3] / "scripts"))
 
-from bench import build_limits, build_picture, build_runs, build_sizes, build_watch
+from bench import build_limits, build_picture, build_rates, build_runs, build_sizes, build_watch
 from bench.build_watch import Sample, Watched
 from bench.results import Part
 
@@ -97,6 +99,37 @@ def test_linearity_is_time_a_point_over_that_of_the_size_before() -> None:
 def test_a_failed_build_says_why(tmp_path: Path) -> None:
     with pytest.raises(build_runs.BuildError, match=r"exit code 3.*no\.las"):
         build_runs.build(tmp_path / "no.las", tmp_path / "archive", memory="1GB", jobs=1)
+
+
+# --- rates ----------------------------------------------------------------------------------------------
+
+
+def test_a_stage_is_found_again_in_the_times_it_would_take() -> None:
+    stage = Stage(0.3, 5e-7, 1e-8, 2e-7)
+    found = build_rates.fit_stage({(n, jobs): stage.seconds(n, jobs) for n, jobs in build_rates.SIZES})
+    assert found == pytest.approx(stage, rel=0.05)
+
+
+def rate_builds(others: float, slower: float) -> dict[tuple[int, int], list[build_runs.Built]]:
+    """Builds of one stage: 1 s and 1 µs a point, shared among jobs; processor time as if nothing else ran."""
+    found = {}
+    for n, jobs in build_rates.SIZES:
+        alone = 1.0 + 1e-6 * n / jobs
+        run = built(n, slower * alone, {"build": slower * alone}, [])
+        seen = Watched(slower * alone, jobs * alone, others, [Sample(0.0, (100 + 20 * jobs) << 20, 0, 1)])
+        found[n, jobs] = [dataclasses.replace(run, watched=seen)]
+    return found
+
+
+@pytest.mark.parametrize(("others", "slower"), [(0.0, 1.0), (1.5, 3.0)])
+def test_other_work_does_not_make_rates_slow(others: float, slower: float) -> None:
+    builds = rate_builds(others, slower)
+    assert build_rates.is_busy(builds) is (others > 1)
+    stages = build_rates.fit_stages(builds)
+    assert stages["build"] == pytest.approx(Stage(1.0, 0.0, 0.0, 1e-6), abs=1e-9)
+    assert set(stages) == {"build", "start, end"}
+    assert build_rates.fit_memory(builds) == pytest.approx((120 << 20, 10 << 20, 0.0))
+    assert build_rates.fit_workers(builds, stages) == (0.0 if others < 1 else build_rates.USUAL_WORKERS)
 
 
 # --- limits and sizes -----------------------------------------------------------------------------------

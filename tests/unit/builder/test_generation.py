@@ -180,6 +180,23 @@ def test_what_is_left_is_as_if_built_without(
     assert np.array_equal(all_points(target), sort_points(A, C))
 
 
+def test_neighbours_count_across_several_voxels(built: Build, files: Files, tmp_path: Path) -> None:
+    """Where a voxel is smaller than the reach of a neighbour, voxels change in which nothing was added."""
+    options = {"models": frozenset({"mean", "local", "border"}), "keep": frozenset({"scan"}), "voxel": 0.3}
+    target = built(tmp_path / "x", "a", **options)
+    with Archive(built(tmp_path / "ab", "ab", **options)) as both, Archive(target) as archive:
+        voxels, steps = len(both.voxels), both.header.lattice.voxel_steps
+        assert 0 < archive.header.radius_capped != both.header.radius_capped
+    summary = add_scans(target, [files.b], jobs=1)
+    of_b = {tuple(voxel) for voxel in (np.rint(B / 1e-3).astype(int) // steps).tolist()}
+    assert len(of_b) < summary.built < voxels, "some were, some were not"
+    same_scene(target, tmp_path / "ab")
+    remove_scans(target, [str(files.a)], jobs=1)
+    with Archive(target) as archive:
+        assert archive.header.points == len(B)
+    assert not verify_archive(target, deep=True).faults
+
+
 def test_added_and_removed_again_is_as_before(built: Build, files: Files, tmp_path: Path) -> None:
     target = built(tmp_path / "x", "a", keep=EVERYTHING)
     before = content(target)

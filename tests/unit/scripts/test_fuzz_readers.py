@@ -44,7 +44,8 @@ def test_damaged_scans_are_read_or_refused_by_name() -> None:
 FAULTS = {
     "crash by signal 9": lambda path: os.kill(os.getpid(), signal.SIGKILL),
     "crash by exit 7": lambda path: os._exit(7),
-    "over 0.5 s": lambda path: time.sleep(60),
+    "over 1 s": lambda path: sum(iter(int, 1)),
+    "over 7 s": lambda path: time.sleep(60),
     "another error": lambda path: {}[path],
     "over 20 MB": lambda path: np.ones(30 << 20, np.uint8),
     "an error that does not say where or what was expected": lambda path: (_ for _ in ()).throw(
@@ -61,7 +62,8 @@ def test_each_kind_of_fault_is_found(
     path.write_bytes(b"no scan")
     room = 1 << 40
     assert fuzz.read_mutant(3, "a.las", path, room).outcome == "refused"
-    monkeypatch.setattr(fuzz, "MOST_SECONDS", 0.5 if outcome.endswith(" s") else 20.0)
+    monkeypatch.setattr(fuzz, "MOST_SECONDS", 1 if outcome == "over 1 s" else 7)
+    monkeypatch.setattr(fuzz, "LONGEST_WAIT", 0.5 if outcome == "over 7 s" else 60.0)
     if outcome.endswith("MB"):
         monkeypatch.setattr(fuzz, "MOST_BYTES", 20 << 20)
     monkeypatch.setattr(fuzz, "read_all", FAULTS[outcome])

@@ -1,4 +1,4 @@
-"""The bounding sphere hierarchy (BSH) of a set of points: a leaf cell's, a voxel's cells', an avatar's.
+"""The bounding sphere hierarchy (BSH) of one set of points, such as an avatar's; cells.py makes those of many cells.
 
 [Fig12] section 5: an R-tree-like tree of spheres of degree m, all leaf nodes on one level, each point in
 one node. Two differences: nodes are packed from the top, not by insertion, and each sphere is cut by a

@@ -191,13 +191,21 @@ class RowStream:
             pwrite_all(self._planes.fileno(), plane, number * self._rows + first)
 
     def frame(self) -> mmap.mmap:
-        """The frame, once all rows are there. Raises BadRequestError for one that the index could not name."""
+        """The frame, once all rows are there.
+
+        Raises BadRequestError for one that the index could not name, CorruptError where rows are missing at the end.
+        """
         with self._planes as planes, tempfile.TemporaryFile(dir=self._scratch, buffering=0) as file:
             size = self._rows * self._dtype.itemsize
             stream = zstandard.ZstdCompressor(compression_params=_PARAMETERS).compressobj(size=size)
             written = 0
             for at in range(0, size, STREAM_BYTES):
-                part = os.pread(planes.fileno(), min(STREAM_BYTES, size - at), at)
+                wanted = min(STREAM_BYTES, size - at)
+                part = os.pread(planes.fileno(), wanted, at)
+                if len(part) != wanted:
+                    raise CorruptError(
+                        f"the planes of {self._rows} rows end at byte {at + len(part)}, expected {size}: check the disk"
+                    )
                 written += pwrite_all(file.fileno(), stream.compress(part), written)
             written += pwrite_all(file.fileno(), stream.flush(), written)
             if written > MAX_FRAME_BYTES:

@@ -17,7 +17,7 @@ def last_loose_node(leaves, spheres, normal, slab):
     center, radius, unit = spheres
     parents = link_parents(leaves.first, leaves.count, leaves.is_leaf)
     lanes = np.empty((3, LANES), np.int32)
-    loose = -1
+    loose = np.int64(-1)
     for i in range(leaves.first.shape[0]):
         if not leaves.is_leaf[i]:
             continue

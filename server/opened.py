@@ -6,12 +6,13 @@ when the answer is there; files and memory of one that was swapped out go with i
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Generator, Iterator
 from functools import lru_cache, partial
 from typing import Self
 
 import numpy as np
 
+from ..schemas.answers import Part
 from ..schemas.errors import BadRequestError
 from .avatar import make_avatar
 from .collide import collide
@@ -126,3 +127,28 @@ class Opened:
                 return
             with residency.hold([row]):
                 pass
+
+
+class HeldParts(Iterator[Part]):
+    """The parts of a path, holding the generation they are of until the last was taken or nobody wants more."""
+
+    def __init__(self, parts: Generator[Part, None, None], opened: Opened) -> None:
+        self._parts = parts
+        self._opened: Opened | None = opened
+
+    def __next__(self) -> Part:
+        try:
+            return next(self._parts)
+        except BaseException:  # the end, too
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Take no more."""
+        opened, self._opened = self._opened, None
+        if opened is not None:
+            self._parts.close()
+            opened.release()
+
+    def __del__(self) -> None:
+        self.close()

@@ -3,7 +3,7 @@
 import os
 import threading
 import time
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, Unpack
@@ -23,15 +23,16 @@ from ..schemas.answers import (
     WithinAnswers,
 )
 from ..schemas.errors import BadRequestError, BusyError, UnknownAvatarError
-from ..schemas.messages import WIRE_VERSION, AvatarInfo, ReloadAnswer, SceneInfo, SourceInfo
+from ..schemas.messages import AvatarInfo, ReloadAnswer, SceneInfo
 from ..schemas.requests import QuestionOptions, make_objects, make_poses
 from .avatar import AvatarModel, make_avatar
 from .collide import collide
 from .contacts import contacts
+from .describe import describe
 from .distance import distance
 from .effort import Effort, make_effort
 from .objects import objects as ask_objects
-from .opened import Opened
+from .opened import HeldParts, Opened
 from .path import PATH_THREADS, largest_part, path_parts, path_question
 from .rays import raycast
 from .request import SceneData
@@ -357,7 +358,7 @@ class Scene:
 
             most = largest_part(op, parameters)
             ahead = (self._pool_of_threads(), 2 * threads) if threads > 1 else (None, 1)
-            return _Held(path_parts(ask_held, total, most, *ahead), opened)
+            return HeldParts(path_parts(ask_held, total, most, *ahead), opened)
         except BaseException:
             opened.release()
             raise
@@ -367,68 +368,3 @@ class Scene:
         with self._lock:
             for key in [key for key in self._avatars if key[0] == client]:
                 del self._avatars[key]
-
-
-class _Held(Iterator[Part]):
-    """The parts of a path, holding the generation they are of until the last was taken or nobody wants more."""
-
-    def __init__(self, parts: Generator[Part, None, None], opened: Opened) -> None:
-        self._parts = parts
-        self._opened: Opened | None = opened
-
-    def __next__(self) -> Part:
-        try:
-            return next(self._parts)
-        except BaseException:  # the end, too
-            self.close()
-            raise
-
-    def close(self) -> None:
-        """Take no more."""
-        opened, self._opened = self._opened, None
-        if opened is not None:
-            self._parts.close()
-            opened.release()
-
-    def __del__(self) -> None:
-        self.close()
-
-
-def describe(store: Store, name: str) -> SceneInfo:
-    """What the archive of `store` holds: counts, bounds, lattice, radius, sources. Reads no voxel."""
-    header = store.archive.header
-    lattice, now = header.lattice, header.radius_now
-    # Those of a point's scan_index are rows of this: what was left out stays in its place where others stand behind.
-    listed = max((number for number, s in enumerate(header.sources, 1) if not s.fault), default=0)
-    return SceneInfo(
-        scene=name,
-        format_version=header.format_version,
-        wire_version=WIRE_VERSION,
-        points=header.points,
-        voxels=len(store.sizes),
-        bounds=lattice.to_world(np.stack([header.low, header.high])).tolist(),
-        origin=list(lattice.origin),
-        lattice_step=lattice.step,
-        lattice_source=header.lattice_source,
-        voxel_size=lattice.voxel_size,
-        radius=header.radius,
-        radius_model=header.radius_model,
-        radius_models=list(header.models),
-        radius_error=header.radius_error,
-        radius_sample=header.radius_sample,
-        moved_max=header.moved_max,
-        degree=header.degree,
-        leaf=header.leaf,
-        sources=[
-            SourceInfo(s.path, s.index, s.sha256, s.count, s.format, s.pose.tolist(), s.skipped, s.fault)
-            for s in header.sources[:listed]
-        ],
-        skipped=[s.fault for s in header.sources if s.fault],
-        record_bytes=int(store.archive.voxels["frame_bytes"].sum(dtype=np.int64)),
-        resident_bytes=int(store.sizes.sum()),
-        unknown=[lattice.to_world(box).tolist() for box in header.unknown],
-        unknown_everywhere=header.unknown_everywhere,
-        generation=header.generation,
-        radius_now=now.radius if now else None,
-        radius_now_error=now.error if now else None,
-    )

@@ -14,10 +14,10 @@ from solidcloud.builder.pipeline import build_archive
 from solidcloud.schemas.answers import ContactsAnswers, Verdict
 from solidcloud.server.avatar import AvatarModel, make_avatar
 from solidcloud.server.contacts import contacts
+from solidcloud.server.describe import describe
 from solidcloud.server.effort import EXACT, Effort
 from solidcloud.server.request import SceneData, make_scene_data, with_radius_model
 from solidcloud.server.residency import Residency
-from solidcloud.server.scene import describe
 from solidcloud.server.store import Store
 
 

@@ -13,7 +13,7 @@ def info(archive: ArchivePath, as_json: AsJson = False) -> None:
 
     from ...schemas.index import radius_distribution
     from ..console import print_info
-    from ..scene import describe
+    from ..describe import describe
     from ..store import Store
     from .facts import archive_details, detail_facts
 

@@ -20,10 +20,10 @@ from solidcloud.schemas.requests import MAX_CONTACTS
 from solidcloud.server import contacts as contacts_module
 from solidcloud.server.avatar import make_avatar
 from solidcloud.server.contacts import contacts
+from solidcloud.server.describe import describe
 from solidcloud.server.effort import Effort, make_effort
 from solidcloud.server.request import make_scene_data
 from solidcloud.server.residency import Residency
-from solidcloud.server.scene import describe
 from solidcloud.server.store import Store
 
 CLEAR, CONTACT, UNKNOWN = Verdict

@@ -1,0 +1,46 @@
+"""What an archive holds, as `info` says it."""
+
+import numpy as np
+
+from ..schemas.messages import WIRE_VERSION, SceneInfo, SourceInfo
+from .store import Store
+
+
+def describe(store: Store, name: str) -> SceneInfo:
+    """What the archive of `store` holds: counts, bounds, lattice, radius, sources. Reads no voxel."""
+    header = store.archive.header
+    lattice, now = header.lattice, header.radius_now
+    # Those of a point's scan_index are rows of this: what was left out stays in its place where others stand behind.
+    listed = max((number for number, s in enumerate(header.sources, 1) if not s.fault), default=0)
+    return SceneInfo(
+        scene=name,
+        format_version=header.format_version,
+        wire_version=WIRE_VERSION,
+        points=header.points,
+        voxels=len(store.sizes),
+        bounds=lattice.to_world(np.stack([header.low, header.high])).tolist(),
+        origin=list(lattice.origin),
+        lattice_step=lattice.step,
+        lattice_source=header.lattice_source,
+        voxel_size=lattice.voxel_size,
+        radius=header.radius,
+        radius_model=header.radius_model,
+        radius_models=list(header.models),
+        radius_error=header.radius_error,
+        radius_sample=header.radius_sample,
+        moved_max=header.moved_max,
+        degree=header.degree,
+        leaf=header.leaf,
+        sources=[
+            SourceInfo(s.path, s.index, s.sha256, s.count, s.format, s.pose.tolist(), s.skipped, s.fault)
+            for s in header.sources[:listed]
+        ],
+        skipped=[s.fault for s in header.sources if s.fault],
+        record_bytes=int(store.archive.voxels["frame_bytes"].sum(dtype=np.int64)),
+        resident_bytes=int(store.sizes.sum()),
+        unknown=[lattice.to_world(box).tolist() for box in header.unknown],
+        unknown_everywhere=header.unknown_everywhere,
+        generation=header.generation,
+        radius_now=now.radius if now else None,
+        radius_now_error=now.error if now else None,
+    )

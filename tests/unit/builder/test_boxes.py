@@ -22,7 +22,7 @@ def found_for(
     while True:
         rows, distances = np.empty((1, most), np.int64), np.empty((1, most), np.int64)
         near_boxes(tree, query[None], np.array([own]), np.array([best]), after, rows, distances)
-        held = rows[0][rows[0] >= 0].tolist()
+        held = rows[0][rows[0] != -1].tolist()
         if not held:
             return goes
         goes.append(held)

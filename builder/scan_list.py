@@ -181,9 +181,9 @@ def read_scan_list(path: Path) -> list[ScanEntry]:
         found = f"unknown {unknown[0]}" if unknown else f"version {document.get('version')}"
         raise BadRequestError(f"{path}: {found}, expected version = {VERSION} and a [[scan]] for each scan")
     entries = [_entry(path, number, table) for number, table in enumerate(document["scan"], 1)]
-    seen: dict[tuple[Path, int], int] = {}
+    seen: dict[tuple[str, int], int] = {}
     for number, entry in enumerate(entries, 1):
-        first = seen.setdefault((entry.path, entry.index), number)
+        first = seen.setdefault((os.path.realpath(entry.path), entry.index), number)
         if first != number:
             raise BadRequestError(
                 f"{path}: scan {number} ({entry.path}, index {entry.index}): the same as scan {first}, "

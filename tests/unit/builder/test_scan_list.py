@@ -212,6 +212,7 @@ def test_a_wrong_edit_is_refused_by_file_scan_and_field(
             '[[scan]]\npath = "a"\n[[scan]]\npath = "b"\n[[scan]]\npath = "a"\n',
             r"scan 3 \(.*\): the same as scan 1",
         ),
+        ('[[scan]]\npath = "a"\n[[scan]]\npath = "b/../a"\n', r"scan 2 \(.*\): the same as scan 1"),
         ('[[scan]]\npath = "a.las"\nuse = false\n', "no scan to use"),
         ("\udcff", "expected a list of scans"),
     ],

@@ -27,6 +27,7 @@ from .shards import Shard, ShardUnit, build_shard, plan_shards
 from .spacing import archive_mean
 from .spool import Spool
 from .stored_points import (
+    RECORD_BYTES_A_POINT,
     RUN_BYTES_A_POINT,
     FewUnit,
     FindUnit,
@@ -345,7 +346,8 @@ def _gather(
     """Spool the stored points that are needed. Returns what the voxels to be rebuilt had of `radius_counts` and of
     `radius_capped`."""
     config, folder = change.config, change.folder
-    most = max(1 << 16, change.share // RUN_BYTES_A_POINT)
+    densest = int(change.archive.voxels["rows"][read, 2].max(initial=0))
+    most = max(1 << 16, (change.share - RECORD_BYTES_A_POINT * densest) // RUN_BYTES_A_POINT)
     before = folder / "before" if change.with_classes else None
     groups = [
         (rows, group) for rows in (rebuilt, np.setdiff1d(read, rebuilt)) for group in change.units_of(rows)

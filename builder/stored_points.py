@@ -26,6 +26,8 @@ from .spool import RUN_SUFFIX, Spool, canonical_columns, spool_dtype, write_dire
 
 # Bytes a point that is held while a run is written: code and columns, and of a voxel order, sorted copies and rows.
 RUN_BYTES_A_POINT = 60
+# Beside them: the record that they are read of, all its columns and trees.
+RECORD_BYTES_A_POINT = 14
 
 _FROM_CORNER = np.zeros(3, np.int64)
 

@@ -21,24 +21,29 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any, TypeVar
 
-import dask
-from distributed import (
-    Client,
-    Future,
-    KilledWorker,
-    LocalCluster,
-    Scheduler,
-    SchedulerPlugin,
-    Worker,
-    get_worker,
-    wait,
-)
-from distributed.client import FutureCancelledError, FuturesCancelledError
-from distributed.comm.core import connect
-
 from ..schemas.errors import BadRequestError, SolidcloudError
 from .executor import AHEAD, WAITING
 from .progress import Progress
+
+try:
+    import dask
+    from distributed import (
+        Client,
+        Future,
+        KilledWorker,
+        LocalCluster,
+        Scheduler,
+        SchedulerPlugin,
+        Worker,
+        get_worker,
+        wait,
+    )
+    from distributed.client import FutureCancelledError, FuturesCancelledError
+    from distributed.comm.core import connect
+except ModuleNotFoundError as missing:
+    raise SolidcloudError(
+        f"--scheduler and --cluster: the library {missing.name!r} is not installed: pip install 'solidcloud[cluster]'"
+    ) from None
 
 Unit = TypeVar("Unit")
 Result = TypeVar("Result")
@@ -178,7 +183,7 @@ class ClusterExecutor:
             ) from None
         for worker, (found, threads) in looks.items():
             _check_worker(worker, found, software(), threads)
-        return len(looks)
+        return max(1, len(looks))  # those that were seen may be gone
 
     def _say_dashboard(self) -> None:
         """Where to watch the cluster; one started here has nothing to show without bokeh."""

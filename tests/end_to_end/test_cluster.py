@@ -164,3 +164,14 @@ def test_what_is_wrong_on_the_cluster_is_said_as_here(
     more = ["--scheduler", "tcp://127.0.0.1:1"]
     assert run(["build", str(tmp_path / "good.xyz"), "-o", str(tmp_path / "hall"), *more]) == 2
     assert "tcp://127.0.0.1:1: no dask scheduler answers" in capsys.readouterr().err
+
+
+def test_without_dask_it_is_said_what_to_install(tmp_path: Path) -> None:
+    np.savetxt(tmp_path / "good.xyz", np.eye(3))
+    words = ["build", str(tmp_path / "good.xyz"), "-o", str(tmp_path / "hall"), "--cluster", "local:2"]
+    hidden = "import sys; sys.modules['distributed'] = None; from solidcloud.server.cli import run"
+    code = f"{hidden}; sys.exit(run({words!r}))"
+    done = subprocess.run([sys.executable, "-P", "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert "'distributed' is not installed: pip install 'solidcloud[cluster]'" in done.stderr
+    assert "Traceback" not in done.stderr

@@ -48,7 +48,7 @@ from .top import Top, pack_top
 # Voxels of more are built in parts of at most so many, always, so that no archive depends on the memory it was built
 # with. Work of a part takes some 60 bytes a point.
 DENSE_POINTS = 1 << 20
-# Points of cells that pass at once on the way into the record.
+# Points of cells that pass at once on the way into the record: fewer than DENSE_POINTS, so that a heap passes alone.
 WINDOW_POINTS = 1 << 17
 
 # The points of a part, all whose Morton codes are in a range, and the range -> the radius class of each.
@@ -169,9 +169,11 @@ def _put_heap(
                 some = columns["radius_class"][at : at + DENSE_POINTS]
                 some[:] = classify(np.repeat(place, len(some), axis=0), range(cube.code, cube.past))
     one = build_trees(np.repeat(place, 3, axis=0), np.zeros(1, np.int64), np.zeros(1, np.uint8), config)
-    count = np.empty(most_nodes(n, config.leaf), np.uint8)
-    total = heap_counts(n, config.leaf, config.degree, count)
+    most = most_nodes(n, config.leaf)
+    count, held = np.empty(most, np.uint8), np.empty(most, np.int64)
+    total = heap_counts(n, config.leaf, config.degree, count, held)
     nodes = Nodes._make(np.repeat(column[:1], total, axis=0) for column in one.nodes)
+    nodes.normal[held[:total] < 3] = 0  # as `stored_direction` has it
     spreads = one.spreads.copy()
     spreads[0, 0] = n
     spill.put_cells(

@@ -194,10 +194,11 @@ def pack_points(own, n, leaf, degree, space, begin, end, count, levels):
 
 
 @nb.njit(nogil=True, cache=True)
-def heap_counts(n, leaf, degree, count):
-    """Write what `pack_points` writes in count (>= t,) for n points, wherever they are. Returns t.
+def heap_counts(n, leaf, degree, count, held):
+    """Write what `pack_points` writes in count (>= t,) for n points, wherever they are, and how many each node holds.
 
     The numbers are the same for all points, as cuts go by numbers alone: those of points of one place need no points.
+    Returns t; held: (>= t,) int64.
     """
     leaves = (n + leaf - 1) // leaf
     capacity = np.int64(1)
@@ -211,25 +212,25 @@ def heap_counts(n, leaf, degree, count):
         below, found = np.empty(min(degree * sizes.shape[0], leaves), np.int64), 0
         for size in sizes:
             parts = ((size + leaf - 1) // leaf + capacity - 1) // capacity
-            count[total] = parts
+            count[total], held[total] = parts, size
             total += 1
             stack[0, 0], stack[0, 1] = size, parts
             depth = 1
             while depth > 0:
                 depth -= 1
-                held, k = stack[depth, 0], stack[depth, 1]
+                rest, k = stack[depth, 0], stack[depth, 1]
                 if k == 1:
-                    below[found] = held
+                    below[found] = rest
                     found += 1
                     continue
                 left = k // 2
-                middle = ((held + leaf - 1) // leaf * left // k) * leaf
-                stack[depth, 0], stack[depth, 1] = held - middle, k - left
+                middle = ((rest + leaf - 1) // leaf * left // k) * leaf
+                stack[depth, 0], stack[depth, 1] = rest - middle, k - left
                 stack[depth + 1, 0], stack[depth + 1, 1] = middle, left
                 depth += 2
         sizes = below[:found]
     for size in sizes:
-        count[total] = size
+        count[total] = held[total] = size
         total += 1
     return total
 

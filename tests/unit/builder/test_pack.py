@@ -159,6 +159,7 @@ def test_no_tree_has_more_nodes_than_are_made_room_for(degree: int) -> None:
 def test_the_counts_of_a_tree_need_no_points(leaf: int, degree: int) -> None:
     for n in [*range(1, 40), 64, 65, 130, 257]:
         tree = pack(make_steps("noise", n, n, 1000), leaf, degree)
-        count = np.empty(most_nodes(n, leaf), np.uint8)
-        total = heap_counts(n, leaf, degree, count)
+        count, held = (np.empty(most_nodes(n, leaf), kind) for kind in (np.uint8, np.int64))
+        total = heap_counts(n, leaf, degree, count, held)
         assert count[:total].tolist() == tree.count.tolist()
+        assert held[:total].tolist() == (tree.end - tree.begin).tolist()

@@ -38,10 +38,11 @@ def draw(
     axes = left.subplots(2, 1, height_ratios=heights[0])
     _stages(axes[0], builds, limits)
     _memory(axes[1], builds, bound)
-    axes = right.subplots(2, 1, height_ratios=heights[1]) if cases else [right.subplots()]
-    goals_table(axes[0], rows, heights[1][0] if cases else height)
+    # Each in a figure of its own: beside the long names of the lower the upper would be squeezed.
+    parts_right = right.subfigures(2, 1, height_ratios=heights[1]) if cases else [right]
+    goals_table(parts_right[0].subplots(), rows, heights[1][0] if cases else height)
     if cases:
-        _sizes(axes[1], sizes, cases)
+        _sizes(parts_right[1].subplots(), sizes, cases)
     title = f"solidcloud build: LAS in, validated archive out, one run  ({machine})"
     warning = busy(parts)
     if warning:
@@ -63,7 +64,7 @@ def _stages(axes: Any, builds: list[Built], limits: dict[int, dict[str, float]])
         for name in names:
             width = built.stages.get(name, 0.0) / built.points * 1e9
             axes.barh(row, width, left=at, height=0.8, color=colours[name], label=name if k == 0 else None)
-            if width > 0.06 * longest:
+            if width > 0.08 * longest:
                 text = f"{width:.0f}, {width * built.points / built.seconds / 1e9:.0%}"
                 colour = INK if name == REST else "white"
                 axes.text(at + width / 2, row, text, ha="center", va="center", fontsize=8, color=colour)

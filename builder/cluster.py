@@ -51,8 +51,9 @@ Answer = TypeVar("Answer")
 
 # For a scheduler to answer, and to show its first worker.
 REACH_SECONDS = 10
-# A cluster without any worker for so long is given up: a batch system may take a while to start others in their place.
-LONELY_SECONDS = 300
+# A cluster without any worker for so long is given up: a batch system may take a while to start others in their place,
+# dask a second. One that is killed while it starts dask does not always start anew.
+LONELY_SECONDS, LONELY_LOCAL_SECONDS = 300, 60
 # How often a unit that is waited for is asked about; a result that comes is taken at once.
 ASK_SECONDS = 5
 # Beside its share of --memory a worker of the local cluster has what Python, numba, HDF5, the readers and dask itself
@@ -293,10 +294,11 @@ class ClusterExecutor:
                 alone_since = None
                 continue
             alone_since = alone_since or time.monotonic()
-            if time.monotonic() - alone_since > LONELY_SECONDS:
+            patience = LONELY_SECONDS if self._cluster is None else LONELY_LOCAL_SECONDS
+            if time.monotonic() - alone_since > patience:
                 raise SolidcloudError(
-                    f"{self._address}: no worker left for {LONELY_SECONDS} s: start some, then the same command again "
-                    "goes on where it was"
+                    f"{self._address}: no worker left for {patience} s: start some, then the same command again goes "
+                    "on where it was"
                 )
 
 

@@ -81,7 +81,8 @@ def build(
     Raises BuildError with what the command said.
     """
     shutil.rmtree(target, ignore_errors=True)
-    options = ["--memory", memory, "--jobs", str(jobs), "--json", *extra]
+    # A benchmark that was stopped may have left a build half done: going on with it would take less time.
+    options = ["--memory", memory, "--jobs", str(jobs), "--json", "--fresh", *extra]
     options += ["--voxel", f"{voxel:g}"] if voxel else []
     options += ["--resolution", f"{step:g}"] if step else []
     watched = _must([*COMMAND, "build", str(scan), "-o", str(target), *options])

@@ -7,8 +7,6 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from .progress import Bars as Bars
-
 if TYPE_CHECKING:
     # Numba and HDF5 come with these; a table needs neither.
     from ..builder.pipeline import BuildSummary

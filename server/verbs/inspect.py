@@ -30,11 +30,11 @@ def inspect(
     from ...builder.scan_list import inspect as inspect_scans
     from ...builder.scan_list import write_scan_list
     from ...schemas.errors import BadRequestError
-    from ..console import Bars
+    from ..progress import progress_listener
 
     if output and output.exists() and not overwrite:
         raise BadRequestError(f"{output}: exists, expected no such file: give another -o, or --overwrite")
-    with Bars() as bars:
+    with progress_listener() as bars:
         entries = inspect_scans(scans, with_sha256=with_sha256, progress=bars)
     if as_json:
         print_json([_plain(entry) for entry in entries])

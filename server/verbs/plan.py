@@ -45,7 +45,8 @@ def plan(
     from ...builder.config import BuildConfig
     from ...builder.plan import estimate, imagined, load_rates
     from ...schemas.errors import BadRequestError
-    from ..console import Bars, print_facts
+    from ..console import print_facts
+    from ..progress import progress_listener
 
     if bool(scans) == (points is not None):
         raise BadRequestError("expected scans to look at, or --points and a number, one of them")
@@ -65,7 +66,7 @@ def plan(
     if measure:
         from ...builder.measure import measured
 
-        with Bars() as bars:
+        with progress_listener() as bars:
             rates = measured(rates, bars)
     if points is not None:
         found = estimate(imagined(_number(points), rates, density, number_of_scans), config, rates, output)

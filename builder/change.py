@@ -197,18 +197,20 @@ def publish(change: Change, new: list[str], named: set[str]) -> None:
     if (change.target / PREVIEW_NAME).exists():
         with Archive(change.folder) as archive, change.stage("preview", archive.header.points, "points"):
             write_preview(change.folder, change.executor, change.progress)
-    moved = []
     try:
         for name in new:
             os.rename(change.folder / SHARD_FOLDER / name, shards / name)
-            moved.append(shards / name)
         sync_folder(shards)
         os.replace(change.folder / INDEX_NAME, change.target / INDEX_NAME)
         change.published = True
     except BaseException:
-        for path in moved:
-            with suppress(OSError):
-                path.unlink()
+        # The disk says whether the index was renamed: an interruption is told once the call is done, and a call that
+        # a file server did may still fail. Renamed, it names these shards.
+        change.published = not (change.folder / INDEX_NAME).exists()
+        if not change.published:
+            for name in new:
+                with suppress(OSError):
+                    (shards / name).unlink()
         raise
     if preview.exists():
         os.replace(preview, change.target / PREVIEW_NAME)

@@ -534,6 +534,32 @@ def test_a_failure_leaves_the_old_archive_and_nothing_else(
     assert add_scans(target, [files.b], jobs=1).generation == 1
 
 
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(5, "Input/output error")])
+def test_an_error_told_once_the_index_is_renamed_leaves_the_new_archive(
+    built: Build, files: Files, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException
+) -> None:
+    """As an interruption during the call is told after it, and some file servers tell an error of what they did."""
+    target = built(tmp_path / "x", "a")
+    rename = os.replace
+
+    def renamed_and_broken(source: Path, to: Path) -> None:
+        rename(source, to)
+        if Path(to) == target / INDEX_NAME:
+            raise error
+
+    told = "Input/output.*: the archive is changed all the same" if isinstance(error, OSError) else None
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "replace", renamed_and_broken)
+        expected = SolidcloudError if told else KeyboardInterrupt
+        with pytest.raises(expected, match=told):
+            add_scans(target, [files.b], jobs=1)
+    report = verify_archive(target)
+    assert not report.faults and report.points == len(A) + len(B)
+    with Archive(target) as archive:
+        assert archive.header.generation == 1
+    assert add_scans(target, [files.c], jobs=1).generation == 2
+
+
 def test_shards_that_no_voxel_refers_to_are_deleted(built: Build, files: Files, tmp_path: Path) -> None:
     target = built(tmp_path / "x", "ab", keep=EVERYTHING)
     keep = target / SHARD_FOLDER / "notes.txt"

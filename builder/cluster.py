@@ -99,13 +99,16 @@ def software() -> dict[str, str]:
 def _run_unit(work: bytes, expected: dict[str, str], folder: str) -> Any:
     """Run one unit, pickled with its function, in a worker, which may have joined since the others were looked at."""
     worker = get_worker()
-    _check_worker(worker.address, software(), expected, worker.state.nthreads)
+    try:
+        _check_worker(worker.address, software(), expected, worker.state.nthreads)
+    except BadRequestError as error:
+        raise SolidcloudError(str(error)) from None  # what was asked for was possible when the build began
     try:
         # Relative paths mean what they mean to the builder. A worker runs one unit at a time, so nobody else is moved.
         if os.getcwd() != folder:
             os.chdir(folder)
     except OSError as error:
-        raise BadRequestError(
+        raise SolidcloudError(
             f"worker {worker.address}: no folder {folder} ({error.strerror}), expected the builder's: all workers need "
             "the same files under the same paths"
         ) from None

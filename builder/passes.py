@@ -191,6 +191,14 @@ def spool_rows(config: BuildConfig) -> np.dtype:
     return filter_dtype(config)
 
 
+def check_filters(config: BuildConfig, lattice: Lattice) -> None:
+    """Raise BadRequestError for filters that cannot be done on this lattice."""
+    if _is_filtered(config):
+        from .filter import make_rules
+
+        make_rules(config, lattice)
+
+
 def filter_points(
     spool: Spool, place: Workplace, executor: Executor, config: BuildConfig, stages: Stages
 ) -> tuple[Spool, dict[str, dict[int, int]]]:

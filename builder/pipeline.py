@@ -19,12 +19,13 @@ import numpy as np
 from ..schemas.archive import Archive, write_index
 from ..schemas.errors import BadRequestError, CorruptError, SolidcloudError
 from ..schemas.index import Header
+from ..schemas.voxel_grid import Lattice
 from .config import RADIUS_SAMPLE, BuildConfig
 from .dense import DENSE_POINTS
 from .executor import Executor, make_executor, worker_count
 from .header import archive_id, make_header
 from .memory import jobs_that_fit
-from .passes import build_shards, filter_points, spool_rows, spool_scans, survey_scans
+from .passes import build_shards, check_filters, filter_points, spool_rows, spool_scans, survey_scans
 from .preview import write_preview
 from .progress import Progress, Silent
 from .resume import described, is_whole
@@ -34,7 +35,7 @@ from .shards import Shard
 from .spacing import archive_mean
 from .spool import Spool
 from .stages import Stages
-from .survey import choose_lattice
+from .survey import Survey, choose_lattice
 from .verify import verify_archive
 from .workplace import (
     Workplace,
@@ -54,6 +55,8 @@ ARCHIVE_BYTES_A_POINT = 6
 SCRATCH_BYTES_A_POINT = 21
 # A point of a file whose header says nothing of their number takes about so many bytes: text.
 BYTES_A_POINT = 30
+# Points that quantising made one may be found out late, others are at once.
+ONE_POINT = "a single distinct point has no closest point: give --radius"
 
 
 class BuildSummary(NamedTuple):
@@ -89,8 +92,8 @@ def build_archive(
     options in `config.identity()`; not on the order of paths, the number of jobs, the memory bound, or how often the
     build was interrupted. An archive that is there already, of the same scans and options, is left as it is.
     Raises ScanError naming every scan that cannot be used (with `skip_bad` they are left out and their region is
-    unknown) and BadRequestError for impossible options, and leaves nothing behind then; SolidcloudError where the disk
-    or a process failed, and keeps what is done.
+    unknown) and BadRequestError for impossible options, and leaves nothing behind where the survey of a build that
+    began here tells; SolidcloudError where the disk or a process failed. What is done is kept then.
     """
     begin = time.perf_counter()
     target = Path(target)
@@ -119,8 +122,9 @@ def _build(
     about = sum(_about(item) for item in inputs)
     with make_executor(config, jobs_that_fit(worker_count(config.jobs, about), config)) as executor:
         surveys, faulty = survey_scans(inputs, about, place, executor, config, stages)
-        place.surveyed = True
         lattice, lattice_source = choose_lattice(surveys, config)
+        _check_request(surveys, lattice, config)
+        place.surveyed = True
         points = sum(s.count for s in surveys)
         dtype = spool_rows(config)
         final = points * (dtype.itemsize + ARCHIVE_BYTES_A_POINT)
@@ -143,6 +147,14 @@ def _build(
         header = _measure_radius(header, shards, place.archive, executor, config, stages)
         _read_back(place.archive, header.points, executor, stages)
     return header, shards
+
+
+def _check_request(surveys: Sequence[Survey], lattice: Lattice, config: BuildConfig) -> None:
+    """Refuse, while nothing is lost by it, what is known from the survey to be impossible."""
+    check_filters(config, lattice)
+    low, high = np.min([s.low for s in surveys], axis=0), np.max([s.high for s in surveys], axis=0)
+    if config.radius is None and (low == high).all():
+        raise BadRequestError(ONE_POINT)
 
 
 def _read_back(folder: Path, points: int, executor: Executor, stages: Stages) -> None:
@@ -259,7 +271,7 @@ def _measure_radius(
     with stages.stage("radius", header.points, "points"):
         found = archive_mean(folder, RADIUS_SAMPLE, executor, stages.progress)
     if found.sample == 0:
-        raise BadRequestError("a single distinct point has no closest point: give --radius")
+        raise BadRequestError(ONE_POINT)
     header = replace(header, radius=found.mean / 2, radius_error=found.error / 2, radius_sample=found.sample)
     write_index(folder, header, rows, names)
     return header

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ..schemas.archive import INDEX_NAME, SHARD_FOLDER, sync_folder
-from ..schemas.errors import BadRequestError, CorruptError, ScanError
+from ..schemas.errors import BadRequestError, ScanError
 from ..schemas.vtkhdf import PREVIEW_NAME
 from .journal import Journal, remove_temporaries
 from .lock import locked as locked
@@ -60,7 +60,7 @@ def building_folder(target: Path) -> Path:
 class Workplace:
     """The hidden folder of a build. journal: what is done.  archive: what will be renamed to the target.
 
-    surveyed: all scans were read to their end once, so that a scan at fault is no reason to forget what was done.
+    surveyed: all scans were read to their end once and can be built as asked: what is found later removes nothing.
     """
 
     journal: Journal
@@ -77,9 +77,9 @@ class Workplace:
 def workplace(target: Path, what: dict[str, Any], *, fresh: bool) -> Iterator[Workplace]:
     """Go on with a build of `what` that was interrupted, or begin one; see resume.py `described`.
 
-    What is done stays when the build is interrupted, killed, or fails by the disk. A request that cannot be done, a
-    scan at fault in the survey, and what was written but does not read back leave nothing. Raises BadRequestError for a
-    build that was begun of something else, which it leaves as it is.
+    What is done stays, whatever happens: hours of work are worth more than a clean disk. Only a request that cannot be
+    done, and a scan at fault, found in the survey of a build that began here, leave nothing. Raises BadRequestError for
+    a build that was begun of something else, which it leaves as it is.
     """
     folder = building_folder(target)
     journal = Journal(folder)
@@ -99,9 +99,7 @@ def workplace(target: Path, what: dict[str, Any], *, fresh: bool) -> Iterator[Wo
             (folder / name).mkdir(exist_ok=True)
         yield place
     except BaseException as error:
-        if isinstance(error, BadRequestError | CorruptError) or (
-            isinstance(error, ScanError) and not place.surveyed
-        ):
+        if begun is None and not place.surveyed and isinstance(error, BadRequestError | ScanError):
             remove_building(folder)
         elif folder.exists():
             remove_temporaries(folder)

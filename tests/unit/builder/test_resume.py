@@ -172,6 +172,21 @@ def interrupted(target: Path, scans: list[Path], monkeypatch: pytest.MonkeyPatch
     assert (building_folder(target) / "build.json").exists()
 
 
+def test_a_cluster_that_cannot_be_reached_costs_no_work(
+    scans: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def unreachable(*_: Any) -> Any:
+        raise BadRequestError("no dask scheduler answers")
+
+    interrupted(tmp_path / "hall", scans, monkeypatch)
+    before = content(building_folder(tmp_path / "hall"))
+    with monkeypatch.context() as patch:
+        patch.setattr(pipeline, "make_executor", unreachable)
+        with pytest.raises(BadRequestError, match="answers"):
+            build(tmp_path / "hall", scans, scheduler="tcp://127.0.0.1:1")
+    assert content(building_folder(tmp_path / "hall")) == before
+
+
 OTHER = {
     "voxel": (4.0, "--voxel was 0.9, is 4.0: give --voxel 0.9 to go on, or --fresh to start over"),
     "resolution": (0.01, "--resolution was not given, is 0.01: give no --resolution to go on"),

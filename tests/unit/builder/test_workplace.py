@@ -37,17 +37,21 @@ def test_what_is_done_outlives_an_interruption(error: BaseException, surveyed: b
     assert not failed(tmp_path / "hall", error, surveyed=surveyed, fresh=True)
 
 
-@pytest.mark.parametrize("error", [BadRequestError("too far"), CorruptError("not what was written")])
-def test_what_cannot_be_leaves_nothing(error: BaseException, tmp_path: Path) -> None:
-    for surveyed in (False, True):
-        assert not failed(tmp_path / "hall", error, surveyed=surveyed)
-        assert not list(tmp_path.iterdir())
+FAULTS = [BadRequestError("too far"), ScanError("bad"), CorruptError("not what was written")]
 
 
-def test_a_bad_scan_leaves_nothing_until_all_were_read_to_their_end(tmp_path: Path) -> None:
-    failed(tmp_path / "hall", ScanError("bad"), surveyed=False)
+@pytest.mark.parametrize("error", FAULTS[:2])
+def test_what_the_survey_of_a_new_build_refuses_leaves_nothing(error: BaseException, tmp_path: Path) -> None:
+    assert not failed(tmp_path / "hall", error, surveyed=False)
     assert not list(tmp_path.iterdir())
-    failed(tmp_path / "hall", ScanError("changed"), surveyed=True)
+
+
+@pytest.mark.parametrize("error", FAULTS)
+def test_what_is_found_later_or_by_a_later_command_removes_nothing(
+    error: BaseException, tmp_path: Path
+) -> None:
+    failed(tmp_path / "hall", error, surveyed=True)
+    assert failed(tmp_path / "hall", error, surveyed=False)
     assert failed(tmp_path / "hall", KeyboardInterrupt(), surveyed=True)
 
 

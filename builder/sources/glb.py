@@ -18,6 +18,9 @@ from .scan import BLOCK_BYTES, Block, Scan, apply_pose, library_errors, quaterni
 
 # The words of a scene of ten thousand parts take about 4 MiB; parsed they take thirty times that.
 LONGEST_JSON = 8 << 20
+# Nodes may share a mesh, so that parts take no words of the document: as many are three times what it has words for
+# of meshes of their own. Told where they are they take 15 us and half a kilobyte each.
+MOST_PARTS = 1 << 16
 # Corners of a triangle take 72 bytes while a mesh is sampled, which holds all of them: 1.2 GB for these.
 MOST_TRIANGLES = 1 << 24
 
@@ -34,6 +37,14 @@ class Column(NamedTuple):
     rows: int
     type: str
     width: int
+
+
+class _Primitive(NamedTuple):
+    """A primitive of a mesh, wherever it is. indices: of the corners; None: in order."""
+
+    vertices: Column
+    mode: int
+    indices: Column | None
 
 
 class Part(NamedTuple):
@@ -158,7 +169,10 @@ class _Document:
         self.path, self.document, self.start, self.size = path, document, start, size
 
     def parts(self) -> list[Part]:
-        """Every primitive where the scene's nodes put it; the tree is walked once, a node at a time."""
+        """Every primitive where the scene's nodes put it; the tree is walked once, a node at a time.
+
+        ScanError for more than MOST_PARTS nodes or primitives at nodes.
+        """
         nodes = self.document.get("nodes", [])
         scenes = self.document.get("scenes", [])
         if scenes:
@@ -167,6 +181,8 @@ class _Document:
             children = {child for node in nodes for child in node.get("children", [])}
             roots = [k for k in range(len(nodes)) if k not in children]
         found: list[Part] = []
+        meshes: dict[int, list[_Primitive]] = {}
+        parts = 0
         waiting = [(root, np.eye(4)) for root in roots]
         seen: set[int] = set()
         while waiting:
@@ -174,15 +190,28 @@ class _Document:
             if number in seen:
                 raise _damaged(self.path, f"node {number} twice in its scene", "a tree of nodes")
             seen.add(number)
+            self._check_parts(len(seen), "nodes")
             node = self._at("nodes", number)
             pose = outer @ self._pose(number, node)
             if "mesh" in node:
-                mesh = self._at("meshes", node["mesh"])
-                found += [
-                    part for primitive in mesh["primitives"] for part in self._primitive(primitive, pose)
-                ]
+                parts += len(self._at("meshes", node["mesh"])["primitives"])
+                self._check_parts(parts, "primitives at nodes")
+                if node["mesh"] not in meshes:
+                    meshes[node["mesh"]] = self._mesh(node["mesh"])
+                found += [Part(p.vertices, pose, p.mode, p.indices) for p in meshes[node["mesh"]]]
             waiting += [(child, pose) for child in reversed(node.get("children", []))]
         return found
+
+    def _check_parts(self, parts: int, what: str) -> None:
+        if parts > MOST_PARTS:
+            raise scan_error(
+                self.path, f"over {MOST_PARTS} {what}", "at most that many", "join meshes, or split the scene"
+            )
+
+    def _mesh(self, number: int) -> list["_Primitive"]:
+        """The primitives of a mesh that have positions."""
+        primitives = [self._primitive(primitive) for primitive in self._at("meshes", number)["primitives"]]
+        return [primitive for primitive in primitives if primitive is not None]
 
     def _pose(self, number: int, node: dict[str, Any]) -> NDArray[np.float64]:
         """Where a node is in its parent, (4, 4): a matrix by columns, or scale, then rotation, then translation."""
@@ -198,19 +227,19 @@ class _Document:
             )
         return pose
 
-    def _primitive(self, primitive: dict[str, Any], pose: NDArray[np.float64]) -> Iterator[Part]:
-        """A primitive as a part; none where it has no positions."""
+    def _primitive(self, primitive: dict[str, Any]) -> "_Primitive | None":
+        """A primitive's accessors; None where it has no positions."""
         if primitive.get("extensions", {}).get("KHR_draco_mesh_compression") is not None:
             raise _damaged(
                 self.path, "a mesh compressed by Draco", "plain vertices (write it without compression)"
             )
         if "POSITION" not in primitive["attributes"]:
-            return
+            return None
         vertices = self._column(primitive["attributes"]["POSITION"], "VEC3", {FLOAT: "<f4"})
         indices = None
         if "indices" in primitive:
             indices = self._column(primitive["indices"], "SCALAR", INDEX_TYPES)
-        yield Part(vertices, pose, int(primitive.get("mode", TRIANGLES)), indices)
+        return _Primitive(vertices, int(primitive.get("mode", TRIANGLES)), indices)
 
     def _column(self, number: int, shape: str, types: dict[int, str]) -> Column:
         """An accessor, held against its buffer view and that against the binary chunk."""

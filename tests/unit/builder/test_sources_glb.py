@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from formats import glb_document, glb_vertices, write_glb
-from solidcloud.builder.sources import open_scans
+from solidcloud.builder.sources import glb, open_scans
 from solidcloud.schemas.errors import ScanError
 
 SQUARE = np.array([[0.0, 0, 1], [2, 0, 1], [2, 2, 1], [0, 2, 1]])
@@ -93,6 +93,38 @@ def test_a_document_that_lies_is_refused(lie: str, tmp_path: Path) -> None:
     path = write_square(tmp_path / "a.glb", change)
     with pytest.raises(ScanError, match=message):
         open_scans(path)
+
+
+def test_parts_of_shared_meshes_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A few words are parts without end, a hundred thousand nodes of a mesh of as many primitives."""
+
+    def scene(nodes: int, primitives: int, meshless: int = 0) -> Callable[[dict], object]:
+        def change(document: dict) -> None:
+            document["nodes"] = [{"mesh": 0}] * nodes + [{}] * meshless
+            document["scenes"] = [{"nodes": list(range(nodes + meshless))}]
+            document["meshes"][0]["primitives"] *= primitives
+
+        return change
+
+    parsed = []
+    whole = glb._Document._primitive
+
+    def counted(document: glb._Document, primitive: dict) -> object:
+        parsed.append(primitive)
+        return whole(document, primitive)
+
+    monkeypatch.setattr(glb._Document, "_primitive", counted)
+    with pytest.raises(ScanError, match="over 65536 primitives at nodes, expected at most that many"):
+        open_scans(write_square(tmp_path / "a.glb", scene(2, 40_000)))
+    assert len(parsed) == 40_000, "the second node's are not taken up, nor a mesh parsed anew"
+    parsed.clear()
+    with pytest.raises(ScanError, match="over 65536 primitives"):
+        open_scans(write_square(tmp_path / "b.glb", scene(1, 70_000)))
+    assert not parsed
+    monkeypatch.setattr(glb, "MOST_PARTS", 6)
+    with pytest.raises(ScanError, match="over 6 nodes"):
+        open_scans(write_square(tmp_path / "c.glb", scene(1, 1, meshless=6)))
+    assert open_scans(write_square(tmp_path / "d.glb", scene(3, 2, meshless=3)))[0].declared_count == 4
 
 
 def test_a_triangle_of_no_vertex_is_refused(tmp_path: Path) -> None:

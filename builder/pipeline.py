@@ -8,16 +8,16 @@ import errno
 import shutil
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..schemas.archive import Archive, write_index
-from ..schemas.errors import BadRequestError, CorruptError, SolidcloudError
+from ..schemas.errors import BadRequestError, CorruptError, ScanError, SolidcloudError
 from ..schemas.index import Header
 from ..schemas.voxel_grid import Lattice
 from .config import RADIUS_SAMPLE, BuildConfig
@@ -28,7 +28,7 @@ from .memory import jobs_that_fit
 from .passes import build_shards, check_filters, filter_points, spool_rows, spool_scans, survey_scans
 from .preview import write_preview
 from .progress import Progress, Silent
-from .resume import described, is_whole
+from .resume import changed_inputs, described, is_whole
 from .scan_list import Input
 from .scan_list import inputs as scans_of
 from .shards import Shard
@@ -109,14 +109,20 @@ def build_archive(
             return _summary(target, header, voxels, shards, begin, stages, already=True)
         check_target(target, config.overwrite)
         with workplace(target, what, fresh=config.fresh) as place:
-            header, built = _build(inputs, place, target, config, stages)
+            header, built = _build(inputs, what, place, target, config, stages)
+            _check_unchanged(inputs, what, place, config)
             with stages.timed("publish"):
                 publish_folder(place.archive, target, config.overwrite)
     return _summary(target, header, sum(len(s.rows) for s in built), len(built), begin, stages)
 
 
 def _build(
-    inputs: Sequence[Input], place: Workplace, target: Path, config: BuildConfig, stages: Stages
+    inputs: Sequence[Input],
+    what: Mapping[str, Any],
+    place: Workplace,
+    target: Path,
+    config: BuildConfig,
+    stages: Stages,
 ) -> tuple[Header, list[Shard]]:
     """All passes: what is in `place.archive` when this returns is an archive, and verified."""
     about = sum(_about(item) for item in inputs)
@@ -129,7 +135,12 @@ def _build(
         dtype = spool_rows(config)
         final = points * (dtype.itemsize + ARCHIVE_BYTES_A_POINT)
         _check_space(target.parent, place.folder, final)
-        spooled = spool_scans(surveys, lattice, dtype, place, executor, config, stages)
+        try:
+            spooled = spool_scans(surveys, lattice, dtype, place, executor, config, stages)
+        except ScanError:
+            _check_unchanged(inputs, what, place, config)
+            raise
+        _check_unchanged(inputs, what, place, config)
         spool = Spool(place.folder / "spool", dtype, lattice)
         spool, left_out = filter_points(spool, place, executor, config, stages)
         filtered = [
@@ -155,6 +166,22 @@ def _check_request(surveys: Sequence[Survey], lattice: Lattice, config: BuildCon
     low, high = np.min([s.low for s in surveys], axis=0), np.max([s.high for s in surveys], axis=0)
     if config.radius is None and (low == high).all():
         raise BadRequestError(ONE_POINT)
+
+
+def _check_unchanged(
+    inputs: Sequence[Input], what: Mapping[str, Any], place: Workplace, config: BuildConfig
+) -> None:
+    """Raise ScanError where a file is not as it was before it was read, and start over: what was read of it first,
+    its hash above all, need not go with what was read last.
+
+    Asked as soon as all is read, and once more before an archive has its name: what is written through a memory map,
+    or on another host, may be seen late.
+    """
+    if changed := changed_inputs(inputs, config, what):
+        place.start_over()
+        raise ScanError(
+            f"{changed}: changed while it was read, expected files that stay as they are: build again"
+        )
 
 
 def _read_back(folder: Path, points: int, executor: Executor, stages: Stages) -> None:

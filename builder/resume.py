@@ -66,6 +66,11 @@ def check_same(folder: Path, was: Mapping[str, Any], now: Mapping[str, Any]) -> 
     )
 
 
+def changed_inputs(inputs: Sequence[Input], config: BuildConfig, what: Mapping[str, Any]) -> str:
+    """Which of the inputs are not as `what` described them before they were read, for a reader; "" where all are."""
+    return _listed(_input_differences(what["inputs"], described(inputs, config)["inputs"]))
+
+
 def _software(noted: Mapping[str, Any]) -> str:
     """Versions for a reader."""
     return " ".join(f"{name} {version}" for name, version in sorted(noted.items())) or "other software"

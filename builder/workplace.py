@@ -67,6 +67,10 @@ class Workplace:
     archive: Path
     surveyed: bool = False
 
+    def start_over(self) -> None:
+        """Forget all that is done: the files it was read from are not what they were."""
+        remove_building(self.folder)
+
     @property
     def folder(self) -> Path:
         """The hidden folder itself."""

@@ -187,6 +187,28 @@ def test_a_cluster_that_cannot_be_reached_costs_no_work(
     assert content(building_folder(tmp_path / "hall")) == before
 
 
+@pytest.mark.parametrize("stage", ["spool_scans", "spool_range", "build_shards"])
+def test_a_scan_that_changes_while_it_is_read_is_no_archive(
+    stage: str, scans: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    where = passes if stage == "spool_range" else pipeline
+    function, raw = getattr(where, stage), np.random.default_rng(3).integers(-1500, 1500, (250, 3))
+
+    def changed_first(*arguments: Any) -> Any:
+        # As many points as before; or fewer, found out by whoever counts them.
+        write_las(scans[0], raw[: 200 if stage == "spool_range" else 250])
+        return function(*arguments)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(where, stage, changed_first)
+        with pytest.raises(ScanError, match=r"a\.las ha[sd] .*: changed while it was read.*: build again"):
+            build(tmp_path / "hall", scans)
+    assert not (tmp_path / "hall").exists()
+    build(tmp_path / "hall", scans)  # as the message says
+    build(tmp_path / "judge", scans)
+    assert content(tmp_path / "hall") == content(tmp_path / "judge")
+
+
 OTHER = {
     "voxel": (4.0, "--voxel was 0.9, is 4.0: give --voxel 0.9 to go on, or --fresh to start over"),
     "resolution": (0.01, "--resolution was not given, is 0.01: give no --resolution to go on"),

@@ -34,7 +34,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..schemas.errors import BadRequestError
+from ..schemas.errors import BadRequestError, CorruptError
 from ..schemas.voxel_grid import Lattice
 from .blocks import Block, BlockReader, Box, Grid, NearPoints
 from .config import BuildConfig
@@ -42,7 +42,7 @@ from .executor import Executor
 from .journal import Journal, Work, new_file, resumed
 from .kernels.filter import best_of_cells, count_others, other_scans
 from .progress import Progress
-from .spool import RUN_SUFFIX, Spool, canonical_columns, row_codes, spool_dtype, write_directory
+from .spool import RUN_SUFFIX, Spool, canonical_columns, places_sum, row_codes, spool_dtype, write_directory
 
 # Why a point was left out, as `info` says it.
 MOVING, OUTLIER, THINNED = "moving", "outliers", "thinned"
@@ -87,11 +87,16 @@ class FilterUnit(NamedTuple):
 
 
 class Filtered(NamedTuple):
-    """What one unit left. name: of its run.  size: of it [bytes]; 0: nothing was left, and there is no run."""
+    """What one unit left. name: of its run.  size: of it [bytes]; 0: nothing was left, and there is no run.
+
+    places_before, places: the `places_sum` of what it read and of what it left.
+    """
 
     name: str
     size: int
     left_out: Counts
+    places_before: int
+    places: int
 
 
 def is_filtered(config: BuildConfig) -> bool:
@@ -176,7 +181,12 @@ def filtered_spool(
         results = resumed(journal, executor, work, named, progress, lambda unit: unit.points)
         for result in results:
             _add(left_out, result.left_out)
-        spool = Spool(target, dtype, spool.lattice)
+        if spool.places not in (None, sum(r.places_before for r in results) % (1 << 64)):
+            raise CorruptError(
+                f"{spool.folder}: points that are not those of the scans: check disk and memory"
+            )
+        runs, places = [r.name for r in results if r.size], sum(r.places for r in results) % (1 << 64)
+        spool = Spool(target, dtype, spool.lattice, runs, places)
         if not len(spool.keys):
             raise BadRequestError(
                 "no point is left: expected some: give --thin, --outliers or --moving other figures"
@@ -204,7 +214,7 @@ def _dump(result: Filtered) -> dict[str, Any]:
 def _load(noted: dict[str, Any]) -> Filtered:
     """A result from what JSON made of it: its scans became text."""
     counts = {reason: {int(scan): n for scan, n in of.items()} for reason, of in noted["left_out"].items()}
-    return Filtered(noted["name"], noted["size"], counts)
+    return Filtered(**{**noted, "left_out": counts})
 
 
 @dataclass(frozen=True, slots=True)
@@ -232,6 +242,7 @@ def filter_voxels(unit: FilterUnit) -> Filtered:
     reader = BlockReader(unit.spool)
     keys: list[int] = []
     starts = [0]
+    before = after = 0
     with new_file(unit.path) as file:
         for key in unit.keys:
             kept = 0
@@ -240,6 +251,8 @@ def filter_voxels(unit: FilterUnit) -> Filtered:
                 verdict = _thinned(block, reader, thin) if thin else _near(block, reader, unit.rules)
                 _add(left_out, _counted(block.rows, verdict))
                 rows = _narrowed(block.rows[verdict == KEPT], unit.dtype)
+                before += places_sum(key, block.rows["local"], unit.spool.lattice)
+                after += places_sum(key, rows["local"], unit.spool.lattice)
                 file.write(rows[np.lexsort((*canonical_columns(rows), row_codes(rows)))].tobytes())
                 kept += len(rows)
             if kept:
@@ -247,9 +260,9 @@ def filter_voxels(unit: FilterUnit) -> Filtered:
                 starts.append(starts[-1] + kept)
     if not keys:
         unit.path.unlink()
-        return Filtered(unit.path.name, 0, left_out)
+        return Filtered(unit.path.name, 0, left_out, before, after)
     write_directory(unit.path, np.array(keys, np.uint64), np.array(starts, np.int64))
-    return Filtered(unit.path.name, unit.path.stat().st_size, left_out)
+    return Filtered(unit.path.name, unit.path.stat().st_size, left_out, before, after)
 
 
 # Verdicts of a point; REASONS[v - 1] for the others.

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from ..schemas.errors import ScanError
 from ..schemas.voxel_grid import KEY_BIAS, MAX_COORDINATE, Lattice, voxel_keys
 from .config import BuildConfig
+from .kernels.content import SEEDS
 from .kernels.spool import FREE, fill_local, order_ties, place_points, rehash, scatter, usable_bounds
 from .sources import Block, Scan
 from .spool import KEYS_SUFFIX, RUN_SUFFIX, new_run, write_directory
@@ -30,8 +31,6 @@ SPOOL_BYTES = 48 << 20
 LEAST_RUN_POINTS = 1 << 16
 # Rows made at a time when a run is written.
 WRITTEN_ROWS = 1 << 18
-
-_SEEDS = np.array([0x9E3779B97F4A7C15, 0xD1B54A32D192ED03], np.uint64)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,13 +58,15 @@ class SpoolUnit:
 class Spooled:
     """What the second pass made of a range. runs: name of each -> bytes of its two files.
 
-    content: sums that identify the points, see `content_sum`.  moved_max: farthest along an axis that quantising
+    content: sums that identify the points, see `content_sum`.  places: the same of their lattice coordinates alone, see
+    `places_sum`.  moved_max: farthest along an axis that quantising
     moved a point [m].
     """
 
     runs: dict[str, list[int]]
     count: int
     content: list[int]
+    places: int
     moved_max: float
 
 
@@ -114,7 +115,9 @@ def spool_range(unit: SpoolUnit) -> Spooled:
     runs: dict[str, list[int]] = {}
 
     def flush() -> None:
-        path = unit.folder / f"{unit.name}-{len(runs):04d}{RUN_SUFFIX}"
+        # Named by how the range is cut, too: a worker that was given up, of a session that cut it otherwise, may still
+        # write, and must not put its run in the place of one that is in use.
+        path = unit.folder / f"{unit.name}-{unit.run_points}-{len(runs):04d}{RUN_SUFFIX}"
         held.write(path)
         sizes = run_bytes(path)
         assert sizes is not None
@@ -136,7 +139,8 @@ def spool_range(unit: SpoolUnit) -> Spooled:
         )
     if held.size:
         flush()
-    return Spooled(runs, kept, [int(held.sums[0]), int(held.sums[1])], held.moved_max)
+    *content, places = (int(total) for total in held.sums)
+    return Spooled(runs, kept, content, places, held.moved_max)
 
 
 def usable(block: Block) -> Block:
@@ -160,7 +164,7 @@ class _Held:
         # A point is identified by what the archive keeps of it.
         self.scan_named = "scan" in unit.config.keep
         self.bits = np.empty(capacity, np.uint32) if "intensity" in names else None
-        self.sums, self.moved_max = np.zeros(2, np.uint64), 0.0
+        self.sums, self.moved_max = np.zeros(3, np.uint64), 0.0
         self._room(1 << 14)
 
     @property
@@ -197,7 +201,7 @@ class _Held:
             self.lattice.voxel_steps,
             KEY_BIAS,
             more,
-            _SEEDS,
+            SEEDS,
             (self.table, self.number_of, self.keys, self.known),
             self.numbers[to],
             self.codes[to],

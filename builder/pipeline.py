@@ -141,7 +141,9 @@ def _build(
             _check_unchanged(inputs, what, place, config)
             raise
         _check_unchanged(inputs, what, place, config)
-        spool = Spool(place.folder / "spool", dtype, lattice)
+        runs = [name for s in spooled for name in s.runs]
+        places = sum(s.places for s in spooled) % (1 << 64)
+        spool = Spool(place.folder / "spool", dtype, lattice, runs, places)
         spool, left_out = filter_points(spool, place, executor, config, stages)
         filtered = [
             {reason: of[number] for reason, of in left_out.items() if number in of}
@@ -156,7 +158,7 @@ def _build(
             surveys, faulty, filtered, lattice, lattice_source, identity, moved_max, shards, config
         )
         header = _measure_radius(header, shards, place.archive, executor, config, stages)
-        _read_back(place.archive, header.points, executor, stages)
+        _read_back(place.archive, header.points, spool, executor, stages)
     return header, shards
 
 
@@ -184,14 +186,17 @@ def _check_unchanged(
         )
 
 
-def _read_back(folder: Path, points: int, executor: Executor, stages: Stages) -> None:
-    """Read what was written, for a preview and to the last record. Raises CorruptError where it is something else."""
+def _read_back(folder: Path, points: int, spool: Spool, executor: Executor, stages: Stages) -> None:
+    """Read what was written, for a preview and to the last record. Raises CorruptError where it is something else.
+
+    The points of the records must be those of the scans: runs have no checksums, and outlive many a command.
+    """
     fault = ""
     try:
         with stages.stage("preview", points, "points"):
             write_preview(folder, executor, stages.progress)
         with stages.timed("verify"):
-            report = verify_archive(folder, progress=stages.progress, executor=executor)
+            report = verify_archive(folder, progress=stages.progress, executor=executor, places=spool.places)
         fault = next(iter(report.faults), "")
     except CorruptError as error:
         fault = str(error)

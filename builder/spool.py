@@ -10,6 +10,7 @@ A `Spool` is a folder of runs. It holds no rows: a voxel's are read from the few
 """
 
 import os
+from collections.abc import Collection
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
@@ -18,9 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..schemas.errors import CorruptError
-from ..schemas.voxel_grid import Lattice
+from ..schemas.voxel_grid import Lattice, voxel_coordinates
 from .config import BuildConfig
 from .journal import new_file
+from .kernels.content import SEEDS, content_sum
 from .kernels.octree import voxel_codes
 
 RUN_SUFFIX = ".run"
@@ -49,6 +51,12 @@ def canonical_columns(rows: NDArray) -> tuple[NDArray, ...]:
 def row_codes(rows: NDArray) -> NDArray[np.uint64]:
     """The Morton codes (n,) of rows in their voxel."""
     return np.asarray(voxel_codes(np.ascontiguousarray(rows["local"])), np.uint64)
+
+
+def places_sum(key: int, local: NDArray[np.int32], lattice: Lattice) -> int:
+    """Sum modulo 2^64 of a hash of the lattice coordinates of each point, local (n, 3), of a voxel."""
+    corner = voxel_coordinates(np.array([key], np.uint64))[0] * lattice.voxel_steps
+    return int(content_sum(np.ascontiguousarray((local + corner).T).view(np.uint64), SEEDS[0]))
 
 
 def write_run(path: Path, keys: NDArray[np.uint64], rows: NDArray) -> None:
@@ -102,11 +110,23 @@ class Spool:
     """A folder of sorted runs. Picklable, and cheap to send: what it knows of the runs is read on first use.
 
     Safe in any process, and from one thread at a time. Opened when all runs are written: later ones are not seen.
+    places: what `places_sum` of all its rows must be; None: not known.
     """
 
-    def __init__(self, folder: Path, dtype: np.dtype, lattice: Lattice) -> None:
-        """Take the runs in `folder`, rows of `dtype`, voxels of `lattice`; nothing is read yet."""
+    def __init__(
+        self,
+        folder: Path,
+        dtype: np.dtype,
+        lattice: Lattice,
+        runs: Collection[str] | None = None,
+        places: int | None = None,
+    ) -> None:
+        """Take the runs in `folder`, rows of `dtype`, voxels of `lattice`; nothing is read yet.
+
+        runs: names of those that count; None: all that are there.
+        """
         self.folder, self.dtype, self.lattice = Path(folder), np.dtype(dtype), lattice
+        self.runs, self.places = None if runs is None else tuple(sorted(runs)), places
         self._directory: _Directory | None = None
         self._sampled: tuple[int, list[NDArray[np.uint64]]] | None = None
 
@@ -146,7 +166,10 @@ class Spool:
     def _merged(self) -> _Directory:
         """All directories, sorted by key, then by the name of the run."""
         if self._directory is None:
-            paths = sorted(self.folder.glob(f"*{RUN_SUFFIX}"))
+            names = self.runs
+            if names is None:
+                names = tuple(sorted(path.name for path in self.folder.glob(f"*{RUN_SUFFIX}")))
+            paths = [self.folder / name for name in names]
             read = [read_directory(path) for path in paths]
             none = [np.empty(0, np.uint64)]
             keys = np.concatenate(none + [k for k, _ in read])

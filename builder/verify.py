@@ -12,8 +12,9 @@ from ..schemas.errors import BadRequestError, CorruptError
 from ..schemas.radius_model import RADIUS_CLASSES
 from .exact import loose_nodes, sample_nodes
 from .executor import Executor, worker_count
+from .kernels.content import SEEDS
 from .kernels.enclosure import last_loose_node
-from .kernels.records import measure_points
+from .kernels.records import measure_points, sum_places
 from .portions import jobs_of, portions, run_units
 from .preview import preview_faults
 from .progress import Progress, Silent
@@ -40,22 +41,28 @@ _WORK, _DEEP_WORK, _EXACT_WORK = 1 / 60, 1 / 10, 10
 
 
 class _Unit(NamedTuple):
-    """Voxels to be checked. asked: of each, the nodes to be proved; None: none of any."""
+    """Voxels to be checked. asked: of each, the nodes to be proved; None: none of any.  summed: whether their points'
+    places are."""
 
     folder: Path
     rows: range
     deep: bool
     asked: list[NDArray[np.int64]] | None
+    summed: bool
     points: int
 
 
 class _Found(NamedTuple):
-    """What a unit came to. points: in voxels that could be read.  classes: (RADIUS_CLASSES,), of those points."""
+    """What a unit came to. points: in voxels that could be read.  classes: (RADIUS_CLASSES,), of those points.
+
+    places: sum of where they are, see `places_sum`; 0 where it is not asked for.
+    """
 
     faults: list[str]
     points: int
     classes: NDArray[np.int64]
     proved: int
+    places: int
 
 
 def verify_archive(
@@ -66,11 +73,13 @@ def verify_archive(
     sample: int | None = None,
     progress: Progress | None = None,
     executor: Executor | None = None,
+    places: int | None = None,
 ) -> VerifyReport:
     """Read every record and check it; with `deep`, also that every bound encloses all points below it, exactly.
 
     exact: prove the bounds once more in Python's integers, without compiled code.  sample: only so many of them,
-    spread over the archive; None: all.  executor: what runs the work; None: this process. A job holds one voxel, 12
+    spread over the archive; None: all.  executor: what runs the work; None: this process.  places: what
+    the `places_sum` of all points must be (spool.py); None: not known. A job holds one voxel, 12
     bytes a point of it, 16 with intensities, and 40 where bounds are proved. Raises FormatError or CorruptError only
     when the index itself cannot be used, BadRequestError for a sample that is none; a broken record is a fault.
     """
@@ -89,6 +98,7 @@ def verify_archive(
             rows,
             deep,
             asked[rows.start : rows.stop] if asked is not None else None,
+            places is not None,
             int(counts[rows.start : rows.stop, 2].sum()),
         )
         for rows in portions(counts[:, 2], jobs_of(executor))
@@ -109,6 +119,8 @@ def verify_archive(
             f"{folder}: radius classes counted {classes.tolist()} in the records, "
             f"{header.radius_counts.tolist()} in the index: rebuild it"
         )
+    if not faults and places is not None and sum(part.places for part in found) % (1 << 64) != places:
+        faults.append(f"{folder}: the points in the records are not those of the scans: rebuild it")
     proved = sum(part.proved for part in found)
     return VerifyReport(len(counts), points, tuple(faults), int(counts[:, 1].sum()), proved, (*notes, *more))
 
@@ -123,7 +135,7 @@ def verify_jobs(folder: Path, jobs: int, *, deep: bool, exact: bool) -> int:
 def _verify_rows(unit: _Unit) -> _Found:
     """Check a run of voxels; in any process."""
     faults: list[str] = []
-    points = proved = 0
+    points = proved = places = 0
     classes = np.zeros(RADIUS_CLASSES, np.int64)
     with Archive(unit.folder) as archive:
         for i, row in enumerate(unit.rows):
@@ -132,6 +144,9 @@ def _verify_rows(unit: _Unit) -> _Found:
                 with archive.locating(row):
                     faults += _voxel_faults(archive, row, record, unit.deep)
                     counted = record.class_counts()
+                if unit.summed:
+                    corner = archive.coordinates[row] * record.voxel_steps
+                    places += int(sum_places(leaves_of(record), corner, SEEDS[0]))
                 del record
                 if unit.asked is not None:
                     loose = loose_nodes(*archive.read_voxel(row), unit.asked[i].tolist())
@@ -142,7 +157,7 @@ def _verify_rows(unit: _Unit) -> _Found:
             else:
                 points += int(archive.voxels["rows"][row, 2])
                 classes += counted
-    return _Found(faults, points, classes, proved)
+    return _Found(faults, points, classes, proved, places)
 
 
 def _loose(archive: Archive, row: int, node: int) -> str:

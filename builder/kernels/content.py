@@ -8,8 +8,13 @@ import numpy as np
 CHUNK = 512
 
 
+# What two sums of the same points are told apart by. The first one's, over lattice coordinates alone, also says whether
+# the points of the records are those of the scans.
+SEEDS = np.array([0x9E3779B97F4A7C15, 0xD1B54A32D192ED03], np.uint64)
+
+
 @nb.njit(nogil=True, cache=True)
-def _mix(value):
+def mix(value):
     """The finaliser of MurmurHash3 for 64 bits (Appleby)."""
     value ^= value >> np.uint64(33)
     value *= np.uint64(0xFF51AFD7ED558CCD)
@@ -22,7 +27,7 @@ def _mix(value):
 def mix_column(hashed, column, seed):
     """Take one more column (n,) into the hashes (n,) so far."""
     for i in range(column.shape[0]):
-        hashed[i] = _mix(hashed[i] ^ column[i]) + seed
+        hashed[i] = mix(hashed[i] ^ column[i]) + seed
 
 
 @nb.njit(nogil=True, cache=True)
@@ -30,7 +35,7 @@ def mixed_sum(hashed):
     """Sum modulo 2^64 of the finished hashes."""
     total = np.uint64(0)
     for i in range(hashed.shape[0]):
-        total += _mix(hashed[i])
+        total += mix(hashed[i])
     return total
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas.kernels.rows import LANES
+from .content import mix
 
 U = np.uint64
 
@@ -88,6 +89,29 @@ def measure_points(leaves, voxel_steps, low, high):
             low[k] = min(low[k], corner + block + least)
             high[k] = max(high[k], corner + block + most)
     return True
+
+
+@nb.njit(nogil=True, cache=True)
+def sum_places(leaves, base, seed):
+    """The `content_sum` (content.py) of seed uint64 over the lattice coordinates of all points: modulo 2^64.
+
+    base: (3,) int64, lattice coordinates of the voxel's corner.
+    """
+    lanes, hashed = np.empty((3, LANES), np.int32), np.empty(LANES, np.uint64)
+    total = U(0)
+    for i in range(U(leaves.first.shape[0])):
+        if not leaves.is_leaf[i]:
+            continue
+        held, cell = read_leaf(leaves, i, lanes), U(leaves.cell[i])
+        hashed[:] = seed
+        for k in range(U(3)):
+            corner = base[k] + np.int64(leaves.cell_low[k, cell]) + np.int64(leaves.block_low[k, i])
+            out = lanes[k]
+            for j in range(held):
+                hashed[j] = mix(hashed[j] ^ U(corner + np.int64(out[j]))) + seed
+        for j in range(held):
+            total += mix(hashed[j])
+    return total
 
 
 @nb.njit(nogil=True, cache=True)

@@ -117,7 +117,8 @@ def place_points(xyz, origin, step, voxel_steps, bias, more, seeds, voxels, numb
     xyz: (n, 3) float64 world [m], usable.  origin (3,) [m], step [m], voxel_steps [steps]: the lattice.
     bias: KEY_BIAS.  more: (m, n) uint64, further columns that the points are identified by.  seeds: (2,) uint64.
     voxels: (table, number_of, known, count), see `_number_voxels`; count (1,) int64 is kept up.
-    Writes numbers (n,) int32 of voxels and codes (n,) uint64 in them, adds to sums (2,) uint64.
+    Writes numbers (n,) int32 of voxels and codes (n,) uint64 in them, adds to sums (3,) uint64: one a seed over all
+    columns, and one of the first seed over lattice coordinates alone.
     Returns (points done, farthest that quantising moved one along an axis [m], lowest and highest voxel coordinate).
     When the coordinates returned are out of [-bias, bias), what was written is of no use.
     """
@@ -143,6 +144,8 @@ def place_points(xyz, origin, step, voxel_steps, bias, more, seeds, voxels, numb
             hashed[:] = seeds[k]
             for c in range(columns.shape[0]):
                 mix_column(hashed[:size], columns[c][:size], seeds[k])
+                if k == 0 and c == 2:
+                    sums[2] += mixed_sum(hashed[:size])
             sums[k] += mixed_sum(hashed[:size])
         _to_codes(voxel[0], voxel[1], voxel[2], bias, keys[:size])
         _to_codes(local[0], local[1], local[2], 0, codes[done:end])

@@ -8,6 +8,7 @@ import pytest
 import solidcloud.builder.partition as partition
 from scans import make_scan
 from solidcloud.builder.config import BuildConfig
+from solidcloud.builder.kernels.content import SEEDS, content_sum
 from solidcloud.builder.partition import (
     RunsHold,
     Spooled,
@@ -21,7 +22,7 @@ from solidcloud.builder.partition import (
     usable,
 )
 from solidcloud.builder.sources import Block, Scan
-from solidcloud.builder.spool import Spool, row_codes, spool_dtype, write_run
+from solidcloud.builder.spool import Spool, places_sum, row_codes, spool_dtype, write_run
 from solidcloud.schemas.errors import BadRequestError, ScanError
 from solidcloud.schemas.voxel_grid import MAX_COORDINATE, Lattice, make_lattice, voxel_keys
 
@@ -184,6 +185,18 @@ def test_a_point_is_named_by_what_is_kept_of_it(tmp_path: Path) -> None:
     (rows,) = Spool(tmp_path / "s", dtype, lattice).rows(int(voxel_keys(np.zeros((1, 3), np.int64))[0]))[-1:]
     assert (rows["scan_index"] == 3).all()
     assert (np.diff(row_codes(rows).astype(np.int64)) >= 0).all()
+
+
+@pytest.mark.parametrize("keep", [frozenset(), frozenset({"scan", "intensity"})])
+def test_the_places_of_what_is_spooled_are_summed_whatever_is_kept(
+    keep: frozenset[str], tmp_path: Path
+) -> None:
+    xyz = make_scan("noise", 2, 300)
+    lattice = make_lattice((-0.3, 0.1, 0), 0.001, 0.5)
+    result, spool = spooled(tmp_path / "s", Listed(xyz), 300, lattice, 70, keep)
+    expected = int(content_sum(np.ascontiguousarray(lattice.to_lattice(xyz).T).view(np.uint64), SEEDS[0]))
+    rows = [places_sum(k, part["local"], lattice) for k in spool.keys.tolist() for part in spool.rows(k)]
+    assert result.places == sum(rows) % (1 << 64) == expected
 
 
 @pytest.mark.parametrize("count", [299, 301])

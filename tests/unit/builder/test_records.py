@@ -3,7 +3,14 @@
 import numpy as np
 import pytest
 from opened import open_points, open_scan, points_of
-from solidcloud.builder.kernels.records import first_of_each, link_parents, measure_points, point_hash
+from solidcloud.builder.kernels.content import SEEDS, content_sum
+from solidcloud.builder.kernels.records import (
+    first_of_each,
+    link_parents,
+    measure_points,
+    point_hash,
+    sum_places,
+)
 from solidcloud.builder.octree import VoxelPoints
 from solidcloud.builder.record_points import Taken, hash_limit, leaves_of, taken
 from solidcloud.schemas.codec import OpenRecord
@@ -101,6 +108,14 @@ def test_points_are_measured(kind: str, steps: int) -> None:
     assert measure_points(leaves_of(record), np.int64(steps), low, high)
     points, _ = points_of(record)
     assert (low.tolist(), high.tolist()) == (points.min(axis=0).tolist(), points.max(axis=0).tolist())
+
+
+@pytest.mark.parametrize("kind", ["plane", "duplicates"])
+def test_the_places_of_a_record_are_summed(kind: str) -> None:
+    record = open_scan(kind, 7, 150, 70_000)
+    points, _ = points_of(record)
+    columns = np.ascontiguousarray((points + BASE).T).view(np.uint64)
+    assert int(sum_places(leaves_of(record), BASE, SEEDS[1])) == int(content_sum(columns, SEEDS[1]))
 
 
 def spoilt(record: OpenRecord, plane: int, row: int, value: int) -> OpenRecord:

@@ -5,6 +5,7 @@ import json
 import os
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +17,12 @@ import solidcloud.builder.pipeline as pipeline
 import solidcloud.builder.survey as survey
 from scans import make_scan, write_las, write_xyz
 from solidcloud.builder.config import BuildConfig
+from solidcloud.builder.partition import SpoolUnit
 from solidcloud.builder.pipeline import BuildSummary, build_archive
 from solidcloud.builder.resume import check_same, described
 from solidcloud.builder.scan_list import Input, inputs
 from solidcloud.builder.workplace import building_folder
-from solidcloud.schemas.errors import BadRequestError, ScanError
+from solidcloud.schemas.errors import BadRequestError, CorruptError, ScanError
 
 
 class Killed(BaseException):
@@ -163,6 +165,43 @@ def test_a_range_spooled_again_leaves_no_run_of_before(
     assert content(tmp_path / "hall") == content(tmp_path / "judge")
 
 
+@pytest.mark.parametrize("options", [{}, {"thin": 0.01}, {"keep": frozenset({"scan", "intensity"})}])
+def test_a_run_that_changed_where_it_lay_is_found(
+    options: dict[str, Any], scans: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(pipeline, "filter_points", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            build(tmp_path / "hall", scans, **options)
+    run = next((building_folder(tmp_path / "hall") / "spool").glob("000000-*.run"))
+    data = bytearray(run.read_bytes())
+    data[0] ^= 1
+    run.write_bytes(data)
+    with pytest.raises(CorruptError, match="not those of the scans"):
+        build(tmp_path / "hall", scans, **options)
+    assert not (tmp_path / "hall").exists()
+
+
+def test_a_unit_of_an_earlier_session_that_ends_late_changes_nothing(
+    scans: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    units: list[SpoolUnit] = []
+    spool, after = passes.spool_range, pipeline.filter_points
+    monkeypatch.setattr(passes, "spool_range", lambda unit: units.append(unit) or spool(unit))
+
+    def late(*arguments: Any) -> Any:
+        # It was cut otherwise, as the session had more memory, or less.
+        for run_points in (30, 70):
+            spool(replace(units[0], run_points=run_points))
+        return after(*arguments)
+
+    monkeypatch.setattr(pipeline, "filter_points", late)
+    build(tmp_path / "hall", scans)
+    monkeypatch.setattr(pipeline, "filter_points", after)
+    build(tmp_path / "judge", scans)
+    assert content(tmp_path / "hall") == content(tmp_path / "judge")
+
+
 def interrupted(target: Path, scans: list[Path], monkeypatch: pytest.MonkeyPatch, **options: Any) -> None:
     """A build that Ctrl-C stopped just before its shards."""
     with monkeypatch.context() as patch:
@@ -270,7 +309,7 @@ def test_other_software_is_refused(
     interrupted(tmp_path / "hall", scans, monkeypatch)
     monkeypatch.setattr("solidcloud.builder.resume.RESUME_VERSION", 999)
     with pytest.raises(
-        BadRequestError, match=r"begun by resume 1 .*this is resume 999 .*--fresh to start over"
+        BadRequestError, match=r"begun by resume 2 .*this is resume 999 .*--fresh to start over"
     ):
         build(tmp_path / "hall", scans)
 

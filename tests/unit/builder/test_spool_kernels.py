@@ -35,7 +35,7 @@ def table(room: int) -> tuple[Any, ...]:
 def placed(xyz: np.ndarray, lattice: Lattice, voxels: tuple[Any, ...], more: np.ndarray) -> tuple[Any, ...]:
     """`place_points` and what it wrote."""
     numbers, codes = np.full(len(xyz), -1, np.int32), np.zeros(len(xyz), np.uint64)
-    sums = np.array([5, 7], np.uint64)
+    sums = np.array([5, 7, 9], np.uint64)
     origin = np.array(lattice.origin)
     told = place_points(
         xyz, origin, lattice.step, lattice.voxel_steps, KEY_BIAS, more, SEEDS, voxels, numbers, codes, sums
@@ -82,6 +82,7 @@ def test_points_are_placed_as_the_lattice_says(steps: int) -> None:
     columns = np.concatenate([expected.T.astype(np.uint64), more])
     for k, seed in enumerate(SEEDS):
         assert int(sums[k]) == (int(content_sum(columns, seed)) + (5, 7)[k]) % (1 << 64)
+    assert int(sums[2]) == (int(content_sum(columns[:3], SEEDS[0])) + 9) % (1 << 64)
 
 
 def test_no_more_points_are_taken_than_the_table_has_room_for() -> None:

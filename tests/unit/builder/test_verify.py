@@ -10,11 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 import solidcloud.builder.portions as portions
+from opened import points_of
 from scans import WITH_POINTS, make_scan, write_ply, write_xyz
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.exact import loose_nodes, sample_nodes
 from solidcloud.builder.pipeline import build_archive
 from solidcloud.builder.spacing import archive_mean
+from solidcloud.builder.spool import places_sum
 from solidcloud.builder.verify import verify_archive
 from solidcloud.schemas.archive import Archive, shard_name, write_index, write_shard
 from solidcloud.schemas.codec import encode_voxel
@@ -185,6 +187,17 @@ def test_points_that_are_not_where_the_index_says_are_found(copy: Path) -> None:
     rewrite(copy, move)
     (fault,) = verify_archive(copy).faults
     assert "points are not where the index says" in fault
+
+
+def test_points_that_are_not_those_expected_are_a_fault(copy: Path) -> None:
+    with Archive(copy) as archive:
+        lattice = archive.header.lattice
+        places = sum(
+            places_sum(int(archive.voxels["key"][row]), points_of(archive.open_voxel(row))[0], lattice)
+            for row in range(len(archive.voxels))
+        ) % (1 << 64)
+    assert verify_archive(copy, places=places).faults == ()
+    assert "not those of the scans" in verify_archive(copy, places=places ^ 1).faults[0]
 
 
 def test_a_wrong_count_in_the_index_is_found(copy: Path) -> None:

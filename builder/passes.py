@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ..schemas.archive import SHARD_FOLDER
+from ..schemas.archive import SHARD_FOLDER, file_checksum
 from ..schemas.errors import BadRequestError, ScanError
 from ..schemas.index import VOXEL_DTYPE
 from ..schemas.voxel_grid import Lattice
@@ -260,10 +260,10 @@ def load_shard(noted: dict[str, Any]) -> Shard:
 
 @dataclass(frozen=True, slots=True)
 class ShardHolds:
-    """Whether the shard that a note speaks of is in `folder`, as long as it was."""
+    """Whether the shard that a note speaks of is in `folder`, byte for byte: it is read once, as no pass will."""
 
     folder: Path
 
     def __call__(self, shard: Shard) -> bool:
         path = self.folder / shard.name
-        return path.is_file() and path.stat().st_size == shard.size
+        return path.is_file() and path.stat().st_size == shard.size and file_checksum(path) == shard.checksum

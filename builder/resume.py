@@ -12,7 +12,7 @@ from .scan_list import Input
 from .sources import NOT_FINITE, sha256_of
 
 # To be raised when software of the same version may write other bytes than it did, or notes that mean other things.
-RESUME_VERSION = 2
+RESUME_VERSION = 3
 # Differences named in a message, at most.
 NAMED = 5
 

@@ -39,7 +39,7 @@ class ShardUnit(NamedTuple):
 
 
 class Shard(NamedTuple):
-    """A shard written. rows: of the index.  size: of the file [bytes].
+    """A shard written. rows: of the index.  size: of the file [bytes].  checksum: of all its bytes, `file_checksum`.
 
     radius_counts: (32,) int64, points of each radius class; radius_capped: see schemas/index.py Header.
     """
@@ -47,6 +47,7 @@ class Shard(NamedTuple):
     name: str
     rows: NDArray
     size: int
+    checksum: int
     radius_counts: NDArray[np.int64]
     radius_capped: int
 
@@ -92,13 +93,13 @@ def build_shard(unit: ShardUnit) -> Shard:
     """Gather, build, compress and write the voxels of one shard, one at a time."""
     classes = None if unit.config.models == {"mean"} else _ClassCounts(unit)
     path = unit.folder / shard_name(unit.number, unit.generation)
-    rows = write_shard(
+    rows, checksum = write_shard(
         path, unit.number, unit.archive_id, _voxels(unit, classes), version=1 if classes is None else 2
     )
     counts, capped = (
         (np.zeros(RADIUS_CLASSES, np.int64), 0) if classes is None else (classes.of, classes.capped)
     )
-    return Shard(path.name, rows, path.stat().st_size, counts, capped)
+    return Shard(path.name, rows, path.stat().st_size, checksum, counts, capped)
 
 
 def _voxels(unit: ShardUnit, classes: _ClassCounts | None) -> Iterator[BuiltVoxel]:

@@ -227,8 +227,8 @@ def write_shard(
     voxels: Iterable[tuple[VoxelData, Record, NDArray[np.int64], NDArray[np.int64]]],
     *,
     version: int = 1,
-) -> NDArray:
-    """Write one shard; returns its rows of the index, VOXEL_DTYPE.
+) -> tuple[NDArray, int]:
+    """Write one shard; returns its rows of the index, VOXEL_DTYPE, and the `file_checksum` of the whole file.
 
     voxels: per voxel its data, record, and the bounds low, high (3,) of its points [voxel steps, inclusive].
     version: of the format, as the index will say it. The file is verified by offsets before it is given its name.
@@ -262,28 +262,35 @@ def write_shard(
     table = np.array(rows, VOXEL_DTYPE)
     temporary = _temporary(path)
     try:
-        _verify_frames(temporary, table)
+        checksum = _verify_frames(temporary, table)
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
     publish(path)
-    return table
+    return table, checksum
 
 
-def _verify_frames(path: Path, table: NDArray) -> None:
-    """Read back every frame of a shard by its offset; a full disk can lie until here."""
+def file_checksum(path: Path) -> int:
+    """The CRC-32 of a file's bytes, HDF5's structures among them, of which a record's checksum says nothing."""
+    checksum, buffer = 0, memoryview(bytearray(READ_BYTES))
+    with open(path, "rb", buffering=0) as file:
+        while got := file.readinto(buffer):
+            checksum = zlib.crc32(buffer[:got], checksum)
+    return checksum
+
+
+def _verify_frames(path: Path, table: NDArray) -> int:
+    """Check the end of every frame of a shard by its offset, a full disk can lie until here; its `file_checksum`."""
     with open(path, "rb") as file:
         for row in table:
             for i, name in enumerate(DATASETS):
-                begin = int(row["frame_offset"][i])
-                end = begin + int(row["frame_bytes"][i])
-                for at in range(begin, end, READ_BYTES):  # a frame may be larger than what is to be held
-                    os.pread(file.fileno(), min(READ_BYTES, end - at), at)
+                end = int(row["frame_offset"][i]) + int(row["frame_bytes"][i])
                 checksum = os.pread(file.fileno(), 4, end - 4)
                 if checksum != int(row["frame_checksum"][i]).to_bytes(4, "little"):
                     raise CorruptError(
                         f"{path}: voxel {int(row['key']):#x}, {name}: not what was written: disk full?"
                     )
+    return file_checksum(path)
 
 
 def write_index(folder: Path, header: Header, voxels: NDArray, shards: list[tuple[str, int]]) -> None:

@@ -57,7 +57,7 @@ def rewrite(
         for v, r in zip(voxels, rows, strict=True)
     ]
     path = folder / "shards" / shard_name(0)
-    table = write_shard(path, 0, header.archive_id, records, version=header.format_version)
+    table, _ = write_shard(path, 0, header.archive_id, records, version=header.format_version)
     write_index(folder, header_with(header), table, [(path.name, path.stat().st_size)])
 
 

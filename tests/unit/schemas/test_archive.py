@@ -3,6 +3,7 @@
 import ast
 import re
 import shutil
+import zlib
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +17,7 @@ from scans import WITH_POINTS, make_scan, write_xyz
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import build_archive
 from solidcloud.builder.radius import voxel_points
-from solidcloud.schemas.archive import DATASETS, Archive, shard_name, write_index, write_shard
+from solidcloud.schemas.archive import DATASETS, Archive, file_checksum, shard_name, write_index, write_shard
 from solidcloud.schemas.codec import encode_voxel
 from solidcloud.schemas.errors import CorruptError, FormatError
 from solidcloud.schemas.index import RadiusNow
@@ -486,7 +487,8 @@ def test_another_archives_record_is_refused(copy: Path) -> None:
     bounds = zip(rows["low"].astype(np.int64), rows["high"].astype(np.int64), strict=True)
     records = [(v, encode_voxel(v, bytes(16)), *b) for v, b in zip(voxels, bounds, strict=True)]
     path = copy / "shards" / shard_name(0)
-    table = write_shard(path, 0, bytes(16), records)
+    table, checksum = write_shard(path, 0, bytes(16), records)
+    assert checksum == file_checksum(path) == zlib.crc32(path.read_bytes())
     write_index(copy, header, table, [(path.name, path.stat().st_size)])
     with Archive(copy) as archive, pytest.raises(CorruptError, match="another archive's"):
         archive.read_voxel(0)

@@ -183,7 +183,8 @@ def filtered_spool(
             _add(left_out, result.left_out)
         if spool.places not in (None, sum(r.places_before for r in results) % (1 << 64)):
             raise CorruptError(
-                f"{spool.folder}: points that are not those of the scans: check disk and memory"
+                f"{spool.folder}: points that are not those of the scans: check disk and memory",
+                (spool.folder,),
             )
         runs, places = [r.name for r in results if r.size], sum(r.places for r in results) % (1 << 64)
         spool = Spool(target, dtype, spool.lattice, runs, places)

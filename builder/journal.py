@@ -73,6 +73,16 @@ class Journal:
         """Remove a note: what it vouched for is not there."""
         self.path(name).unlink(missing_ok=True)
 
+    def forget_file(self, path: Path) -> None:
+        """Remove every note that vouches for a file, by its name."""
+        for note in self.folder.rglob("*.json"):
+            name = note.relative_to(self.folder).with_suffix("").as_posix()
+            what = self.recall(name)
+            if isinstance(what, dict) and (
+                path.name == what.get("name") or path.name in what.get("runs", ())
+            ):
+                self.forget(name)
+
     def path(self, name: str) -> Path:
         """The file of a note."""
         return self.folder / f"{name}.json"

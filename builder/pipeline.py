@@ -192,16 +192,23 @@ def _read_back(folder: Path, points: int, spool: Spool, executor: Executor, stag
     The points of the records must be those of the scans: runs have no checksums, and outlive many a command.
     """
     fault = ""
+    paths: tuple[Path, ...] = ()
     try:
         with stages.stage("preview", points, "points"):
             write_preview(folder, executor, stages.progress)
-        with stages.timed("verify"):
-            report = verify_archive(folder, progress=stages.progress, executor=executor, places=spool.places)
-        fault = next(iter(report.faults), "")
     except CorruptError as error:
-        fault = str(error)
+        fault, paths = str(error), error.paths
+    with stages.timed("verify"):
+        report = verify_archive(folder, progress=stages.progress, executor=executor, places=spool.places)
+    if report.faults:
+        fault = report.faults[0]
+        paths = (*report.damaged, *((spool.folder,) if report.others else ()))
     if fault:
-        raise CorruptError(f"{fault}: what was written is not what reads back: check disk and memory")
+        raise CorruptError(
+            f"{fault}: what was written is not what reads back: check disk and memory; the same command makes anew "
+            "what is damaged",
+            paths,
+        )
 
 
 def open_inputs(paths: Sequence[Path], config: BuildConfig) -> list[Input]:

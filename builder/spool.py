@@ -199,7 +199,8 @@ class Spool:
         rows = np.fromfile(path, self.dtype, part.size, offset=part.start * self.dtype.itemsize)
         if len(rows) != part.size:
             raise CorruptError(
-                f"{path}: ends before row {part.start + part.size}: check the disk, and build again with --fresh"
+                f"{path}: ends before row {part.start + part.size}: check the disk, and give the same command again",
+                (path,),
             )
         return rows
 

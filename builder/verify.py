@@ -25,7 +25,8 @@ class VerifyReport(NamedTuple):
     """What was checked, and every fault found, one sentence each; none: all is well.
 
     exact_nodes: bounds proved in Python's integers, of `nodes` there are.  notes: what is no fault, but had better be
-    known: files that mean nothing, shards that no voxel is in any more.
+    known: files that mean nothing, shards that no voxel is in any more.  damaged: the shards with faults.  others:
+    whether each record is sound, but the points are not those expected.
     """
 
     voxels: int
@@ -34,6 +35,8 @@ class VerifyReport(NamedTuple):
     nodes: int = 0
     exact_nodes: int = 0
     notes: tuple[str, ...] = ()
+    damaged: tuple[Path, ...] = ()
+    others: bool = False
 
 
 # What a point takes beside building it, which worker_count knows of: measured, 10, 60 and 6,000 ns of 600.
@@ -55,7 +58,7 @@ class _Unit(NamedTuple):
 class _Found(NamedTuple):
     """What a unit came to. points: in voxels that could be read.  classes: (RADIUS_CLASSES,), of those points.
 
-    places: sum of where they are, see `places_sum`; 0 where it is not asked for.
+    places: sum of where they are, see `places_sum`; 0 where it is not asked for.  damaged: shards with faults.
     """
 
     faults: list[str]
@@ -63,6 +66,7 @@ class _Found(NamedTuple):
     classes: NDArray[np.int64]
     proved: int
     places: int
+    damaged: set[Path]
 
 
 def verify_archive(
@@ -111,8 +115,10 @@ def verify_archive(
     ]
     faults += [fault for part in found for fault in part.faults]
     points = sum(part.points for part in found)
+    others = False
     classes = np.sum([part.classes for part in found], axis=0, dtype=np.int64)
     if not faults and points != header.points:
+        others = True
         faults.append(f"{folder}: {points} points in the records, {header.points} in the index: rebuild it")
     if not faults and (classes != header.radius_counts).any():
         faults.append(
@@ -120,9 +126,20 @@ def verify_archive(
             f"{header.radius_counts.tolist()} in the index: rebuild it"
         )
     if not faults and places is not None and sum(part.places for part in found) % (1 << 64) != places:
+        others = True
         faults.append(f"{folder}: the points in the records are not those of the scans: rebuild it")
     proved = sum(part.proved for part in found)
-    return VerifyReport(len(counts), points, tuple(faults), int(counts[:, 1].sum()), proved, (*notes, *more))
+    damaged = tuple(sorted(set().union(*(part.damaged for part in found))))
+    return VerifyReport(
+        len(counts),
+        points,
+        tuple(faults),
+        int(counts[:, 1].sum()),
+        proved,
+        (*notes, *more),
+        damaged,
+        others,
+    )
 
 
 def verify_jobs(folder: Path, jobs: int, *, deep: bool, exact: bool) -> int:
@@ -136,9 +153,11 @@ def _verify_rows(unit: _Unit) -> _Found:
     """Check a run of voxels; in any process."""
     faults: list[str] = []
     points = proved = places = 0
+    damaged: set[Path] = set()
     classes = np.zeros(RADIUS_CLASSES, np.int64)
     with Archive(unit.folder) as archive:
         for i, row in enumerate(unit.rows):
+            known = len(faults)
             try:
                 record = archive.open_voxel(row, columns=("radius_class",))
                 with archive.locating(row):
@@ -157,7 +176,9 @@ def _verify_rows(unit: _Unit) -> _Found:
             else:
                 points += int(archive.voxels["rows"][row, 2])
                 classes += counted
-    return _Found(faults, points, classes, proved, places)
+            if len(faults) > known:
+                damaged.add(archive.shard_path(int(archive.voxels["shard"][row])))
+    return _Found(faults, points, classes, proved, places, damaged)
 
 
 def _loose(archive: Archive, row: int, node: int) -> str:

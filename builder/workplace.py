@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ..schemas.archive import INDEX_NAME, SHARD_FOLDER, sync_folder
-from ..schemas.errors import BadRequestError, ScanError
+from ..schemas.errors import BadRequestError, CorruptError, ScanError
 from ..schemas.vtkhdf import PREVIEW_NAME
 from .journal import Journal, remove_temporaries
 from .lock import locked as locked
@@ -71,6 +71,14 @@ class Workplace:
         """Forget all that is done: the files it was read from are not what they were."""
         remove_building(self.folder)
 
+    def distrust(self, path: Path) -> None:
+        """Forget what was found not to be what was written: a run or a shard, or, by their folder, all points."""
+        if not path.is_dir():
+            self.journal.forget_file(path)
+            return
+        for name in ("done", "archive", "spool", *(p.name for p in self.folder.glob("filter-*"))):
+            shutil.rmtree(self.folder / name, ignore_errors=True)
+
     @property
     def folder(self) -> Path:
         """The hidden folder itself."""
@@ -82,7 +90,8 @@ def workplace(target: Path, what: dict[str, Any], *, fresh: bool) -> Iterator[Wo
     """Go on with a build of `what` that was interrupted, or begin one; see resume.py `described`.
 
     What is done stays, whatever happens: hours of work are worth more than a clean disk. Only a request that cannot be
-    done, and a scan at fault, found in the survey of a build that began here, leave nothing. Raises BadRequestError for
+    done, and a scan at fault, found in the survey of a build that began here, leave nothing; of what is found not to be
+    what was written, that is forgotten and no more. Raises BadRequestError for
     a build that was begun of something else, which it leaves as it is.
     """
     folder = building_folder(target)
@@ -106,6 +115,8 @@ def workplace(target: Path, what: dict[str, Any], *, fresh: bool) -> Iterator[Wo
         if begun is None and not place.surveyed and isinstance(error, BadRequestError | ScanError):
             remove_building(folder)
         elif folder.exists():
+            for path in error.paths if isinstance(error, CorruptError) else ():
+                place.distrust(path)
             remove_temporaries(folder)
         raise
     remove_building(folder)

@@ -499,7 +499,8 @@ class Archive:
             frame = os.pread(self._descriptors[int(entry["shard"])], size, offset)
             if len(frame) != size or frame[-4:] != int(entry["frame_checksum"][i]).to_bytes(4, "little"):
                 raise CorruptError(
-                    f"{self.where(row)}, {name}: {len(frame)} bytes that are not the record's, expected {size}"
+                    f"{self.where(row)}, {name}: {len(frame)} bytes that are not the record's, expected {size}",
+                    (self.shard_path(int(entry["shard"])),),
                 )
             frames.append(frame)
         return frames[0], frames[1], frames[2]
@@ -517,7 +518,8 @@ class Archive:
             yield
         except CorruptError as error:
             raise CorruptError(
-                f"{self.where(row)}: {error}: restore the shard or rebuild the archive"
+                f"{self.where(row)}: {error}: restore the shard or rebuild the archive",
+                (self.shard_path(int(self.voxels["shard"][row])),),
             ) from error
 
     def open_voxel(

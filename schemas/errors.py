@@ -5,6 +5,7 @@ the wire receives beside that sentence (WIRE.md, "Errors"); `exit_code` is what 
 """
 
 from enum import StrEnum
+from pathlib import Path
 
 
 class ErrorCode(StrEnum):
@@ -100,7 +101,12 @@ class FormatError(BadDataError):
 
 
 class CorruptError(FormatError):
-    """A record whose bytes are not those that were written."""
+    """A record whose bytes are not those that were written. paths: the files, or folders, where they lie, if known."""
+
+    def __init__(self, message: str = "", paths: tuple[Path, ...] = ()) -> None:
+        """Say `message`, which names the files for a reader."""
+        super().__init__(message)
+        self.paths = paths
 
 
 _BY_CODE: dict[ErrorCode, type[SolidcloudError]] = {

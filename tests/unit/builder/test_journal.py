@@ -10,6 +10,18 @@ from solidcloud.builder.journal import Journal, Work, new_file, remove_temporari
 from solidcloud.builder.progress import Silent
 
 
+def test_a_file_is_forgotten_by_its_name(tmp_path: Path) -> None:
+    journal = Journal(tmp_path)
+    journal.note("spool/1", {"runs": {"a.run": [1, 2], "b.run": [3, 4]}})
+    journal.note("done/1", {"name": "0-1.h5"})
+    journal.note("done/2", {"name": "0-2.h5"})
+    journal.note("survey/1", ["a.run"])
+    journal.forget_file(tmp_path / "spool" / "b.run")
+    journal.forget_file(tmp_path / "archive" / "0-2.h5")
+    left = ["spool/1", "done/1", "done/2", "survey/1"]
+    assert [name for name in left if journal.recall(name)] == ["done/1", "survey/1"]
+
+
 def test_a_note_is_recalled_as_it_was(tmp_path: Path) -> None:
     journal = Journal(tmp_path)
     what = {"low": [float("inf"), 0.1, -1e300], "text": "Größe", "nested": {"a": [1, None]}}

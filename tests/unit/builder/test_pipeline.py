@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import solidcloud.builder.config as config
 import solidcloud.builder.partition as partition
+import solidcloud.builder.passes as passes
 import solidcloud.builder.pipeline as pipeline
 import solidcloud.builder.survey as survey
 from scans import WITH_POINTS, make_scan, write_las, write_ply, write_xyz
@@ -423,9 +424,10 @@ def test_a_full_disk_is_named_and_the_same_command_goes_on(
     assert sorted(p.name for p in out.iterdir()) == ["a", "b"]
 
 
-def test_a_record_that_does_not_read_back_fails_the_build(
+def test_a_record_that_does_not_read_back_fails_the_build_and_is_made_again(
     scans: list[Path], out: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(config, "SHARD_POINTS", 1000)
     measure = pipeline._measure_radius
 
     def damage(header: object, built: object, folder: Path, *rest: object) -> object:
@@ -443,6 +445,15 @@ def test_a_record_that_does_not_read_back_fails_the_build(
         with pytest.raises(CorruptError, match="not what reads back: check disk and memory"):
             build(scans, out / "a")
     assert not (out / "a").exists()
+    # Of several shards only the one that is damaged is made again.
+    made: list[object] = []
+    build_shard = passes.build_shard
+    monkeypatch.setattr(passes, "build_shard", lambda unit: made.append(unit) or build_shard(unit))
+    monkeypatch.setattr(passes, "spool_range", lambda _: pytest.fail("spooled again"))
+    build(scans, out / "a")
+    assert len(made) == 1
+    assert len(list((out / "a" / "shards").iterdir())) > 1
+    assert verify_archive(out / "a", deep=True).faults == ()
 
 
 def test_a_build_that_cannot_fit_the_disk_is_refused(

@@ -182,6 +182,30 @@ def test_a_run_that_changed_where_it_lay_is_found(
     with pytest.raises(CorruptError, match="not those of the scans"):
         build(tmp_path / "hall", scans, **options)
     assert not (tmp_path / "hall").exists()
+    # Nobody knows which it was; the survey is believed, and all else made again.
+    monkeypatch.setattr(passes, "survey_range", lambda _: pytest.fail("surveyed again"))
+    build(tmp_path / "hall", scans, **options)
+    assert not building_folder(tmp_path / "hall").exists()
+
+
+def test_a_run_that_ends_too_soon_is_made_again(
+    scans: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def cut(spool: Any, *rest: Any) -> Any:
+        run = next(spool.folder.glob("000000-*.run"))
+        run.write_bytes(run.read_bytes()[:-1])
+        return after(spool, *rest)
+
+    after = pipeline.filter_points
+    with monkeypatch.context() as patch:
+        patch.setattr(pipeline, "filter_points", cut)
+        with pytest.raises(CorruptError, match="give the same command again"):
+            build(tmp_path / "hall", scans)
+    calls: list[Any] = []
+    spool = passes.spool_range
+    monkeypatch.setattr(passes, "spool_range", lambda unit: calls.append(unit) or spool(unit))
+    build(tmp_path / "hall", scans)
+    assert len(calls) == 1
 
 
 def test_a_unit_of_an_earlier_session_that_ends_late_changes_nothing(

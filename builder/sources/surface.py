@@ -16,8 +16,10 @@ from .scan import NOT_FINITE, Block, Scan, reader_library, scan_error
 STEP_U = 0.7548776662466927
 STEP_V = 0.5698402909980532
 
-# A vertex that is damaged makes a surface of any size: more points than the largest archive has are no scan.
-MOST_SAMPLES = 1e12
+# A vertex that is damaged makes a surface of any size: few triangles that come to more points than these are taken for
+# that. A triangle of a binary STL, the longest there is, may have 800; and a hall of a dozen ten millions.
+SAMPLES_A_BYTE = 16
+SAMPLES_ANYWAY = 10**7
 
 # trimesh holds a mesh whole: an OBJ takes about five times its file while it is read.
 LARGEST_MESH = 512 << 20
@@ -50,12 +52,14 @@ class SurfaceSamples(Scan):
         with np.errstate(over="ignore"):
             total = np.cumsum(np.where(np.isfinite(area), area, 0.0))
         wanted = total[-1] / self._spacing**2 if len(total) else 0.0
-        if not wanted <= MOST_SAMPLES:
+        size = self.path.stat().st_size
+        most = SAMPLES_ANYWAY + SAMPLES_A_BYTE * size
+        if not wanted <= most:
             raise scan_error(
                 self.path,
                 f"a surface of {total[-1]:.3g} square lengths, {wanted:.3g} points",
-                f"at most {MOST_SAMPLES:.0g}",
-                "check the mesh and its units, or give a larger --spacing",
+                f"at most {most} of a file of {size} bytes",
+                "check the mesh and its units, or give a larger --spacing, or cut its triangles up",
             )
         count = int(np.ceil(wanted))
         for start in range(0, count, block_points):

@@ -85,6 +85,21 @@ def test_spacing_samples_a_ply_with_faces_and_leaves_scans_alone(tmp_path: Path)
     assert read_all(scan, spacing=0.1).tolist() == [[1, 2, 3]]
 
 
+def test_a_surface_too_large_for_its_file_is_refused(tmp_path: Path) -> None:
+    """As one of a damaged vertex; up to ten million points, and sixteen a byte, it may be of any size."""
+    path = tmp_path / "a.obj"
+    write_square(path, 100_000.0)
+    size = path.stat().st_size
+    most = 10**7 + 16 * size
+    expected = rf"a surface of 1e\+10 square lengths, 1e\+10 points, expected at most {most} of a file of {size} bytes"
+    with pytest.raises(ScanError, match=expected):
+        read_all(path, spacing=1.0)
+    (scan,) = open_scans(path, spacing=1e5 / (most - 1) ** 0.5)
+    assert len(next(scan.blocks(1000)).xyz) == 1000
+    with pytest.raises(ScanError, match="square lengths"):
+        next(open_scans(path, spacing=1e5 / (most + 1) ** 0.5)[0].blocks(1000))
+
+
 def test_a_mesh_without_faces_cannot_be_sampled(tmp_path: Path) -> None:
     path = tmp_path / "a.obj"
     path.write_text("v 1 2 3\nv 4 5 6\nv 7 8 8\n")

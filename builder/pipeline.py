@@ -202,7 +202,7 @@ def _read_back(folder: Path, points: int, spool: Spool, executor: Executor, stag
         report = verify_archive(folder, progress=stages.progress, executor=executor, places=spool.places)
     if report.faults:
         fault = report.faults[0]
-        paths = (*report.damaged, *((spool.folder,) if report.others else ()))
+        paths = (*map(Path, report.damaged), *((spool.folder,) if report.others else ()))
     if fault:
         raise CorruptError(
             f"{fault}: what was written is not what reads back: check disk and memory; the same command makes anew "

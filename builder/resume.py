@@ -7,14 +7,18 @@ from typing import Any
 
 from ..schemas.archive import Archive
 from ..schemas.errors import BadRequestError, FormatError
+from ..schemas.index import Source
 from .config import BuildConfig
 from .scan_list import Input
-from .sources import NOT_FINITE, sha256_of
+from .sources import NOT_FINITE, Scan, sha256_of
 
 # To be raised when software of the same version may write other bytes than it did, or notes that mean other things.
 RESUME_VERSION = 3
 # Differences named in a message, at most.
 NAMED = 5
+
+# What says where a scan stands: field of its note -> for a reader.
+_PLACED = {"pose": "pose", "crs": "coordinate system", "units": "unit", "up": "direction up"}
 
 # Options that are not named as they are stored, or that the command line does not have.
 _OPTION_NAMES = {"models": "--radius", "cell_points": "cell_points", "with_slab": "with_slab"}
@@ -44,8 +48,13 @@ def _entries(item: Input) -> list[dict[str, Any]]:
     except OSError:
         file = {"path": str(item.path), "bytes": -1, "changed_ns": -1}
     if not item.scans:
-        return [{**file, "scan": 0, "pose": []}]
-    return [{**file, "scan": scan.index, "pose": scan.pose.tolist()} for scan in item.scans]
+        return [{**file, "scan": 0, **dict.fromkeys(_PLACED, "")}]
+    return [{**file, "scan": scan.index, **_placed(scan)} for scan in item.scans]
+
+
+def _placed(scan: Scan | Source) -> dict[str, Any]:
+    """Where a scan, or a source of an archive, stands in the world."""
+    return {"pose": scan.pose.tolist(), "crs": scan.crs, "units": scan.units, "up": scan.up}
 
 
 def check_same(folder: Path, was: Mapping[str, Any], now: Mapping[str, Any]) -> None:
@@ -110,8 +119,9 @@ def _input_differences(was: list[dict[str, Any]], now: list[dict[str, Any]]) -> 
         elif before[key]["bytes"] != after[key]["bytes"]:
             differ.append(f"{name} had {before[key]['bytes']} bytes, has {after[key]['bytes']}")
         elif before[key] != after[key]:
-            what = "time" if before[key]["changed_ns"] != after[key]["changed_ns"] else "pose"
-            differ.append(f"{name} has another {what}")
+            names = {"changed_ns": "time", **_PLACED}
+            what = [text for field, text in names.items() if before[key].get(field) != after[key].get(field)]
+            differ.append(f"{name} has another {' and '.join(what)}")
     return differ
 
 
@@ -147,7 +157,7 @@ def is_whole(
         return False
     for s in sources:
         scan = asked[s.path, s.index]
-        if (scan is None) != (not s.format) or (scan and not s.fault and (scan.pose != s.pose).any()):
+        if (scan is None) != (not s.format) or (scan and not s.fault and _placed(scan) != _placed(s)):
             return False
     hashes: dict[str, str] = {}
     for s in sources:

@@ -35,7 +35,7 @@ class VerifyReport(NamedTuple):
     nodes: int = 0
     exact_nodes: int = 0
     notes: tuple[str, ...] = ()
-    damaged: tuple[Path, ...] = ()
+    damaged: tuple[str, ...] = ()
     others: bool = False
 
 
@@ -129,7 +129,7 @@ def verify_archive(
         others = True
         faults.append(f"{folder}: the points in the records are not those of the scans: rebuild it")
     proved = sum(part.proved for part in found)
-    damaged = tuple(sorted(set().union(*(part.damaged for part in found))))
+    damaged = tuple(sorted({str(path) for part in found for path in part.damaged}))
     return VerifyReport(
         len(counts),
         points,

@@ -20,7 +20,7 @@ from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.partition import SpoolUnit
 from solidcloud.builder.pipeline import BuildSummary, build_archive
 from solidcloud.builder.resume import check_same, described
-from solidcloud.builder.scan_list import Input, inputs
+from solidcloud.builder.scan_list import Input, inputs, inspect, write_scan_list
 from solidcloud.builder.workplace import building_folder
 from solidcloud.schemas.errors import BadRequestError, CorruptError, ScanError
 
@@ -360,9 +360,12 @@ def test_a_pose_and_a_file_that_cannot_be_opened_are_part_of_what_is_built(scans
     opened[0].scans[0].pose = np.diag([-1.0, -1, 1, 1])
     with pytest.raises(BadRequestError, match=r"a\.las has another pose"):
         check_same(Path("hall"), what, described(opened, BuildConfig()))
+    opened[0].scans[0].pose, opened[0].scans[0].crs, opened[0].scans[0].up = np.eye(4), "EPSG:25832", "y"
+    with pytest.raises(BadRequestError, match=r"a\.las has another coordinate system and direction up"):
+        check_same(Path("hall"), what, described(opened, BuildConfig()))
     gone = [Input(scans[0].with_name("gone.las"), [], "no such file"), opened[1]]
     (entry, _) = described(gone, BuildConfig())["inputs"][::-1]
-    assert (Path(entry["path"]).name, entry["bytes"], entry["pose"]) == ("gone.las", -1, [])
+    assert (Path(entry["path"]).name, entry["bytes"], entry["pose"]) == ("gone.las", -1, "")
 
 
 def test_the_same_command_after_success_does_nothing(
@@ -389,6 +392,19 @@ def test_an_archive_of_anything_else_is_in_the_way(scans: list[Path], tmp_path: 
     with pytest.raises(BadRequestError, match="an archive is here already"):
         build(tmp_path / "hall", scans)
     assert not building_folder(tmp_path / "hall").exists()
+
+
+@pytest.mark.parametrize("elsewhere", [{"crs": "EPSG:25832"}, {"units": "ft"}, {"up": "y"}])
+def test_an_archive_of_scans_that_stand_elsewhere_is_in_the_way(
+    elsewhere: dict[str, str], scans: list[Path], tmp_path: Path
+) -> None:
+    entries = inspect([scans[1]])
+    write_scan_list(tmp_path / "scans.toml", entries)
+    build(tmp_path / "hall", [tmp_path / "scans.toml"])
+    assert build(tmp_path / "hall", [tmp_path / "scans.toml"]).already
+    write_scan_list(tmp_path / "scans.toml", [replace(entry, **elsewhere) for entry in entries])
+    with pytest.raises(BadRequestError, match="an archive is here already"):
+        build(tmp_path / "hall", [tmp_path / "scans.toml"])
 
 
 def test_an_archive_that_a_stricter_build_would_refuse_is_not_what_it_asks_for(tmp_path: Path) -> None:

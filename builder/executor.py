@@ -7,6 +7,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from types import TracebackType
 from typing import Protocol, Self, TypeVar
 
@@ -139,21 +140,24 @@ class ProcessExecutor:
                     and len(running) < WAITING * self.jobs
                     and given - taken < AHEAD * self.jobs
                 ):
-                    running[self._pool.submit(function, units[given])] = given
+                    with _worker_deaths():
+                        running[self._pool.submit(function, units[given])] = given
                     given += 1
                 for future in wait(running, return_when=FIRST_COMPLETED).done:
                     number = running.pop(future)
-                    results[number] = _result(future)
+                    with _worker_deaths():
+                        results[number] = future.result()
                     progress.advance(size(units[number]))
             yield results.pop(taken)
 
 
-def _result(future: Future[Result]) -> Result:
-    """The result of a unit that is done, or what it raised."""
+@contextmanager
+def _worker_deaths() -> Iterator[None]:
+    """Say what it may be where a worker ended, whether it is noticed as a unit is handed out or as it should be done."""
     try:
-        return future.result()
+        yield
     except BrokenProcessPool:
         raise SolidcloudError(
-            "a worker process ended at once: out of memory? give fewer --jobs or a smaller --memory; the same command "
-            "goes on where it was"
+            "a worker process ended at once: out of memory, or an error that cannot be sent here? give fewer --jobs or a "
+            "smaller --memory; the same command goes on where it was"
         ) from None

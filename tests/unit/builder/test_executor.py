@@ -1,6 +1,7 @@
 """Work units run in order, in this process or in others; a failure stops what waits."""
 
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -13,6 +14,7 @@ import pytest
 import solidcloud.builder.executor as executor_module
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.executor import POINTS_WORTH_A_PROCESS, ProcessExecutor, make_executor, worker_count
+from solidcloud.schemas.errors import SolidcloudError
 
 
 class Counted:
@@ -96,6 +98,14 @@ def test_an_interrupted_builder_does_not_wait_for_its_workers(tmp_path: Path) ->
             time.sleep(0.01)
         raise KeyboardInterrupt
     assert time.monotonic() - begin < 300
+
+
+def test_a_worker_that_died_while_it_had_nothing_to_do_is_said(tmp_path: Path) -> None:
+    with ProcessExecutor(2) as executor, pytest.raises(SolidcloudError, match="ended at once: out of memory"):
+        for worker in set(executor.map(eval, ["__import__('os').getpid()"] * 4, Counted(), lambda unit: 0)):
+            os.kill(worker, signal.SIGKILL)
+        until(lambda: executor._pool._broken)  # type: ignore[union-attr]
+        list(executor.map(eval, ["1"], Counted(), lambda unit: 0))
 
 
 BUILDER = """

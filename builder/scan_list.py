@@ -81,9 +81,10 @@ def inspect(
     """The scans of files and folders by their headers, in the order of `scan_files`.
 
     A file that cannot be read is an entry with a fault, a file that holds no scan (E57 may) one too. Raises ScanError
-    for a path that does not exist and a folder without scans.
+    for a path that does not exist and a folder without scans, BadRequestError for a file that is named twice.
     """
     files = scan_files(paths)
+    _check_once((path, 0) for path in files)
     progress = progress or Silent()
     progress.start("inspect", len(files), "files")
     entries: list[ScanEntry] = []
@@ -275,7 +276,8 @@ def inputs(paths: Sequence[Path], spacing: float | None = None) -> list[Input]:
     """What a build reads: files and folders, and lists of scans (.toml), opened and placed in metres with z up.
 
     spacing: of sampled meshes [m].  A file that cannot be opened is kept with its fault, for all of them to be named.
-    Raises ScanError for a path that does not exist and a folder without scans, BadRequestError for a broken list.
+    Raises ScanError for a path that does not exist and a folder without scans, BadRequestError for a broken list and
+    for a scan that is named twice.
     """
     found: list[Input] = []
     for path in map(Path, paths):
@@ -289,7 +291,20 @@ def inputs(paths: Sequence[Path], spacing: float | None = None) -> list[Input]:
         for entry in used:
             files.setdefault(entry.path, []).append(entry)
         found += [_opened(file, entries, spacing) for file, entries in files.items()]
+    _check_once((item.path, scan.index if scan else 0) for item in found for scan in item.scans or [None])
     return found
+
+
+def _check_once(scans: Iterable[tuple[Path, int]]) -> None:
+    """Raise BadRequestError for a scan, a file and which of its scans, that is there twice, by one path or another."""
+    seen: dict[tuple[str, int], Path] = {}
+    for path, index in scans:
+        key = os.path.realpath(path), index
+        if key in seen:
+            raise BadRequestError(
+                f"{path}: scan {index} is named twice, as that of {seen[key]} too, expected each once: leave one out"
+            )
+        seen[key] = path
 
 
 def _opened(path: Path, entries: list[ScanEntry] | None, spacing: float | None) -> Input:

@@ -149,6 +149,22 @@ def test_a_header_says_where_a_broken_scan_was_unless_the_list_puts_it_elsewhere
     assert inputs([folder / "scans.toml"])[0].region is None
 
 
+def test_a_scan_that_is_named_twice_is_refused(folder: Path, tmp_path: Path) -> None:
+    """By its file and its folder, a link, or a list beside them; its points would count twice in silence."""
+    las, link = folder / "a.las", tmp_path / "link.las"
+    link.symlink_to(las)
+    for twice in ([folder, las], [las, folder / "deep" / ".." / "a.las"], [las, link], [folder / "deep"] * 2):
+        with pytest.raises(BadRequestError, match=r"scan 0 is named twice, as that of .*: leave one out"):
+            inputs(twice)
+        with pytest.raises(BadRequestError, match="is named twice"):
+            inspect(twice)
+    path = tmp_path / "scans.toml"
+    write_scan_list(path, [ScanEntry(folder / "b.ptx", index) for index in (0, 1)])
+    assert [len(item.scans) for item in inputs([path, las])] == [2, 1]
+    with pytest.raises(BadRequestError, match=r"b\.ptx: scan 0 is named twice"):
+        inputs([path, folder / "b.ptx"])
+
+
 def test_a_missing_file_of_a_list_is_a_fault_and_of_the_command_an_error(folder: Path) -> None:
     write_scan_list(folder / "scans.toml", inspect([folder]))
     (folder / "a.las").unlink()

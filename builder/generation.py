@@ -22,8 +22,9 @@ from .config import RADIUS_SAMPLE
 from .partition import SpoolUnit, run_points, spool_range
 from .passes import MAX_SCANS, VOXEL_BYTES_A_POINT
 from .pipeline import open_inputs
-from .progress import Progress, Silent
+from .progress import Progress
 from .shards import Shard, ShardUnit, build_shard, plan_shards
+from .sources import Scan
 from .spacing import archive_mean
 from .spool import Spool
 from .stored_points import (
@@ -38,6 +39,9 @@ from .stored_points import (
     gather,
 )
 from .survey import Survey, hash_file, joined, ranges, survey_range, unopened
+
+# Scans that an error names.
+MOST_NAMED = 10
 
 # What removing a scan leaves in its place, so that the numbers of the others stay.
 REMOVED = "removed"
@@ -73,19 +77,20 @@ def add_scans(
     paths: Sequence[Path],
     *,
     again: bool = False,
+    new_only: bool = False,
     jobs: int = 0,
     memory_bytes: int = 2 << 30,
     progress: Progress | None = None,
 ) -> ChangeSummary:
     """Add scans to the archive in `target`: on its lattice, with its options, `radius` as it is stored.
 
-    again: also scans that are in already. The records are those that a build of all scans would have, on the same
-    lattice and but for the numbers of scans, which go on from those there are. ScanError for a scan that cannot be
-    used, BadRequestError for one that is in already, FormatError and CorruptError for an archive that cannot be read;
-    the archive is then what it was.
+    again: also scans that are in already; new_only: leave those out instead. The records are those that a build of all
+    scans would have, on the same lattice and but for the numbers of scans, which go on from those there are. ScanError
+    for a scan that cannot be used, BadRequestError for one that is in already, FormatError and CorruptError for an
+    archive that cannot be read; the archive is then what it was.
     """
     with changing(Path(target), jobs, memory_bytes, progress) as change:
-        surveys = _survey_added(change, paths, again)
+        surveys = _survey_added(change, paths, again, new_only)
         moved = _spool_added(change, surveys)
         header = change.archive.header
         new = Spool(change.folder / "spool", change.dtype, header.lattice)
@@ -133,38 +138,60 @@ def remove_scans(
 # --- what is added --------------------------------------------------------------------------------------
 
 
-def _survey_added(change: Change, paths: Sequence[Path], again: bool) -> list[Survey]:
-    """The scans of `paths`, all usable, none in already."""
+def _survey_added(change: Change, paths: Sequence[Path], again: bool, new_only: bool) -> list[Survey]:
+    """The scans of `paths` that are to be added, all usable. What is in already is told before points are read."""
     inputs = open_inputs(paths, change.config)
+    if faults := [unopened(item.path, item.fault).fault for item in inputs if not item.scans]:
+        raise ScanError("\n  ".join(faults))
     scans = [scan for item in inputs for scan in item.scans]
+    files = list(dict.fromkeys(scan.path for scan in scans))
+    with change.stage("hash", len(files), "files"):
+        hashes = dict(
+            zip(files, change.executor.map(hash_file, files, change.progress, lambda _: 1), strict=True)
+        )
+    if not again:
+        scans = _not_in(change, scans, {path: digest for path, (digest, _) in hashes.items()}, new_only)
+    count = len(change.archive.header.sources) + len(scans)
+    if change.archive.header.scan_index and count > MAX_SCANS:
+        raise BadRequestError(
+            f"{change.target}: {count} scans with those removed, --keep scan holds {MAX_SCANS}: build again"
+        )
     about = sum(scan.declared_count or 0 for scan in scans)
     cut = [ranges(scan, about) for scan in scans]
-    files = list(dict.fromkeys(scan.path for scan in scans))
     with change.stage("survey", about, "points"):
-        hashes = dict(zip(files, change.executor.map(hash_file, files, Silent(), lambda _: 0), strict=True))
         parts = iter(change.run(survey_range, [unit for units in cut for unit in units]))
         surveys = [
             joined(scan, [next(parts) for _ in units], hashes[scan.path])
             for scan, units in zip(scans, cut, strict=True)
         ]
-    surveys += [unopened(item.path, item.fault) for item in inputs if not item.scans]
     if faults := [survey.fault for survey in surveys if survey.fault]:
         raise ScanError("\n  ".join(faults))
-    known = {(s.sha256, s.index): _named(s) for s in change.archive.header.sources if not s.fault}
-    for survey in surveys:
-        index = survey.scan.index if survey.scan else 0
-        if not again and (survey.sha256, index) in known:
-            raise BadRequestError(
-                f"{survey.path}: scan {index} is in already, as {known[survey.sha256, index]}: leave it out, or give "
-                "--again to have its points twice"
-            )
-        known[survey.sha256, index] = f"{survey.path}[{index}]"
-    count = len(change.archive.header.sources) + len(surveys)
-    if change.archive.header.scan_index and count > MAX_SCANS:
-        raise BadRequestError(
-            f"{change.target}: {count} scans with those removed, --keep scan holds {MAX_SCANS}: build again"
-        )
     return surveys
+
+
+def _not_in(change: Change, scans: list[Scan], hashes: Mapping[Path, str], new_only: bool) -> list[Scan]:
+    """The scans that are not in yet, by what is in their files. BadRequestError names those that are in, and refuses
+    them unless only new ones are wanted, and then to add none."""
+    known = {(s.sha256, s.index): _named(s) for s in change.archive.header.sources if not s.fault}
+    new, there = [], []
+    for scan in scans:
+        key, name = (hashes[scan.path], scan.index), f"{scan.path}[{scan.index}]"
+        if key in known and key[0]:
+            there.append(f"{name} is in already, as {known[key]}")
+            continue
+        known[key] = name
+        new.append(scan)
+    if there and not (new and new_only):
+        more = [f"and {len(there) - MOST_NAMED} more"] if len(there) > MOST_NAMED else []
+        advice = (
+            "nothing is new"
+            if new_only
+            else "leave out what is in, or give --new, or --again to have it twice"
+        )
+        raise BadRequestError(
+            "\n  ".join([f"{len(there)} of {len(scans)} scans: {advice}", *there[:MOST_NAMED], *more])
+        )
+    return new
 
 
 def _spool_added(change: Change, surveys: list[Survey]) -> float:

@@ -20,6 +20,10 @@ def add(
         list[Path], typer.Argument(help="Scans or folders of scans, or scans.toml, as build takes them.")
     ],
     again: Annotated[bool, typer.Option("--again", help="Also scans that are in already.")] = False,
+    new_only: Annotated[
+        bool,
+        typer.Option("--new", help="Leave out scans that are in already, as of a folder that has grown."),
+    ] = False,
     jobs: Jobs = 0,
     memory: Memory = "2GB",
     as_json: AsJson = False,
@@ -36,6 +40,7 @@ def add(
             archive,
             scans,
             again=again,
+            new_only=new_only,
             jobs=jobs,
             memory_bytes=parse_bytes(memory, "--memory"),
             progress=bars,

@@ -331,11 +331,40 @@ def test_a_scan_that_is_in_is_refused_unless_again(built: Build, files: Files, t
             r"is in already, as .*b\.ply\[0\]",
             lambda p=path: add_scans(target, [p], jobs=1),
         )
-    refused(target, BadRequestError, "is in already", lambda: add_scans(target, [files.c, files.c], jobs=1))
+    other = Path(shutil.copy(files.c, tmp_path / "other.ply"))
+    refused(target, BadRequestError, "is in already", lambda: add_scans(target, [files.c, other], jobs=1))
+    refused(target, BadRequestError, "named twice", lambda: add_scans(target, [files.c, files.c], jobs=1))
     add_scans(target, [files.b], again=True, jobs=1)
     assert np.array_equal(all_points(target), sort_points(A, B, B))
     remove_scans(target, ["2"], jobs=1)
     same_scene(target, built(tmp_path / "ab", "ab", keep=EVERYTHING))
+
+
+def test_scans_that_are_in_are_named_or_left_out_before_points_are_read(
+    built: Build, files: Files, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    target = built(tmp_path / "x", "ab", keep=EVERYTHING)
+    surveyed: list[str] = []
+    survey = generation_module.survey_range
+
+    def noted(unit: Any) -> Any:
+        surveyed.append(unit.scan.path.name)
+        return survey(unit)
+
+    monkeypatch.setattr(generation_module, "survey_range", noted)
+    everything = files.a.parent
+    named = r"2 of 3 scans: .*--new.*\n  .*a\.ply\[0\] is in already, as .*a\.ply\[0\]\n  .*b\.ply\[0\] is in already"
+    refused(target, BadRequestError, named, lambda: add_scans(target, [everything], jobs=1))
+    assert not surveyed
+    added = add_scans(target, [everything], new_only=True, jobs=1)
+    assert [Path(name).name for name in added.scans] == ["c.ply[0]"] and set(surveyed) == {"c.ply"}
+    same_scene(target, built(tmp_path / "abc", "abc", keep=EVERYTHING))
+    refused(
+        target,
+        BadRequestError,
+        "nothing is new",
+        lambda: add_scans(target, [everything], new_only=True, jobs=1),
+    )
 
 
 def test_scans_that_cannot_be_used_are_refused(built: Build, files: Files, tmp_path: Path) -> None:

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 from solidcloud.server.cli import run
-from solidcloud.server.verbs.options import parse_bytes
 from solidcloud.server.report.serving import free_port, served
+from solidcloud.server.verbs.options import parse_bytes
 
 VERBS = ["build", "info", "validate", "serve", "query", "accuracy", "add", "remove", "reload", "make"]
 RADIUS = 0.05

@@ -43,6 +43,9 @@ from .survey import Survey, hash_file, joined, ranges, survey_range, unopened
 # Scans that an error names.
 MOST_NAMED = 10
 
+# A block of a grid and those around it.
+AROUND = np.stack(np.meshgrid(*[np.arange(-1, 2)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+
 # What removing a scan leaves in its place, so that the numbers of the others stay.
 REMOVED = "removed"
 
@@ -356,14 +359,44 @@ def _touched(
 
 
 def within_reach(held: NDArray[np.int64], boxes: NDArray[np.int64], reach2: int) -> NDArray[np.bool_]:
-    """Which boxes (v, 2, 3) lie within a squared distance of some of the others (b, 2, 3), corners inclusive."""
+    """Which boxes (v, 2, 3) lie within a squared distance of some of the others (b, 2, 3), corners inclusive.
+
+    Both are put into blocks of a grid, and only boxes of neighbouring blocks held against each other: a block is as
+    long as the longest of them and the reach, so that no other is near.
+    """
     found = np.zeros(len(held), bool)
+    if not len(held) or not len(boxes):
+        return found
     farther = int(reach2**0.5) + 1  # no gap counts for more, so that squares stay small
-    for low, high in boxes:
-        left = np.flatnonzero(~found)
-        gap = np.maximum(np.maximum(held[left, 0] - high, low - held[left, 1]), 0)
-        gap = np.minimum(gap, farther + 1)
-        found[left[(gap * gap).sum(axis=1) <= reach2]] = True
+    block = farther + 1 + max(int((each[:, 1] - each[:, 0]).max()) + 1 for each in (held, boxes))
+    corners = np.concatenate([held[:, 0], boxes[:, 0]])
+    block = max(
+        block, int((corners.max(axis=0) - corners.min(axis=0)).max()) >> 20
+    )  # their numbers fit 64 bits
+    of_held, of_boxes = held[:, 0] // block, boxes[:, 0] // block
+    least = np.minimum(of_held.min(axis=0), of_boxes.min(axis=0)) - 1
+    _, size_y, size_z = (int(n) for n in np.maximum(of_held.max(axis=0), of_boxes.max(axis=0)) - least + 2)
+
+    def numbered(blocks: NDArray[np.int64]) -> NDArray[np.int64]:
+        x, y, z = (blocks - least).T
+        return (x * size_y + y) * size_z + z
+
+    place = numbered(of_held)
+    order = np.argsort(place, kind="stable")
+    place = place[order]
+    by_block = np.argsort(numbered(of_boxes), kind="stable")
+    starts = np.flatnonzero(np.diff(numbered(of_boxes)[by_block], prepend=-1))
+    for here in np.split(by_block, starts[1:]):
+        around = numbered(of_boxes[here[0]] + AROUND)
+        first, past = np.searchsorted(place, around), np.searchsorted(place, around, side="right")
+        left = np.concatenate([order[a:b] for a, b in zip(first.tolist(), past.tolist(), strict=True)])
+        for low, high in boxes[here]:
+            left = left[~found[left]]
+            if not len(left):
+                break
+            gap = np.maximum(np.maximum(held[left, 0] - high, low - held[left, 1]), 0)
+            gap = np.minimum(gap, farther + 1)
+            found[left[(gap * gap).sum(axis=1) <= reach2]] = True
     return found
 
 

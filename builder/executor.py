@@ -153,11 +153,11 @@ class ProcessExecutor:
 
 @contextmanager
 def _worker_deaths() -> Iterator[None]:
-    """Say what it may be where a worker ended, whether it is noticed as a unit is handed out or as it should be done."""
+    """Say what it may be that ended a worker, noticed when a unit is handed out or when it should be done."""
     try:
         yield
     except BrokenProcessPool:
         raise SolidcloudError(
-            "a worker process ended at once: out of memory, or an error that cannot be sent here? give fewer --jobs or a "
-            "smaller --memory; the same command goes on where it was"
+            "a worker process ended at once: out of memory, or an error that cannot be sent here? give fewer --jobs or "
+            "a smaller --memory; the same command goes on where it was"
         ) from None

@@ -1,6 +1,7 @@
 """Sorted runs: every row once, in canonical order, found by voxel and by block of a voxel."""
 
 import pickle
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -64,6 +65,50 @@ def test_a_voxels_rows_are_found_once_and_in_order(keep: frozenset[str], tmp_pat
         assert sorted(judged(np.concatenate(parts))) == sorted(judged(expected))
         assert count == spool.count(key) == len(expected)
     assert (spool.rows(4), spool.count(4), spool.block_rows(4, 0, 1 << 63)) == ([], 0, [])
+
+
+@pytest.mark.parametrize("entries", [1, 7, 1 << 18])
+def test_directories_are_merged_a_part_at_a_time(
+    entries: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(spool_module, "MERGED_ENTRIES", entries)
+    rng, dtype = np.random.default_rng(4), spool_dtype(BuildConfig())
+    expected: dict[int, list[int]] = {}
+    for number in range(9):
+        keys = rng.choice(np.array([*range(12), 1 << 62], np.uint64), 20)
+        write_run(tmp_path / f"{number}.run", keys, np.zeros(20, dtype))
+        for key, count in zip(*(part.tolist() for part in np.unique(keys, return_counts=True)), strict=True):
+            expected.setdefault(key, []).append(count)
+    spool = Spool(tmp_path, dtype, LATTICE)
+    for held in (spool, pickle.loads(pickle.dumps(spool))):
+        assert held.keys.tolist() == sorted(expected)
+        assert held.counts.tolist() == [sum(expected[key]) for key in sorted(expected)]
+        assert {key: [len(rows) for rows in held.rows(key)] for key in expected} == expected
+    assert len(list(tmp_path.glob("*.tmp"))) == 1
+
+
+def test_a_worker_holds_the_directories_of_what_it_asks_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(spool_module, "MERGED_ENTRIES", 1 << 12)
+    runs, voxels = 100, 1000
+    keys = np.arange(voxels, dtype=np.uint64)
+    for number in range(runs):
+        spool_module.write_directory(tmp_path / f"{number}.run", keys, np.arange(voxels + 1))
+        (tmp_path / f"{number}.run").touch()
+    tracemalloc.start()
+    try:
+        spool = Spool(tmp_path, spool_dtype(BuildConfig()), LATTICE)
+        assert spool.counts.tolist() == [runs] * voxels
+        assert tracemalloc.get_traced_memory()[1] < 2 << 20  # 94 bytes a voxel of a run were 9 MB
+        sent = pickle.dumps(spool)
+        assert len(sent) < 10_000
+        tracemalloc.reset_peak()
+        before = tracemalloc.get_traced_memory()[0]
+        assert pickle.loads(sent).count(77) == runs
+        assert tracemalloc.get_traced_memory()[1] - before < 1 << 18
+    finally:
+        tracemalloc.stop()
 
 
 @pytest.mark.parametrize("stride", [1, 3, 64, 4096])

@@ -4,7 +4,7 @@ How the new archive takes the old one's place is change.py's.
 """
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -23,6 +23,8 @@ from .partition import SpoolUnit, run_points, spool_range
 from .passes import MAX_SCANS, VOXEL_BYTES_A_POINT
 from .pipeline import open_inputs
 from .progress import Progress
+from .resume import changed_inputs, described
+from .scan_list import Input
 from .shards import Shard, ShardUnit, build_shard, plan_shards
 from .sources import Scan
 from .spacing import archive_mean
@@ -93,15 +95,30 @@ def add_scans(
     archive that cannot be read; the archive is then what it was.
     """
     with changing(Path(target), jobs, memory_bytes, progress) as change:
-        surveys = _survey_added(change, paths, again, new_only)
-        moved = _spool_added(change, surveys)
+        inputs = open_inputs(paths, change.config)
+        what = described(inputs, change.config)
+
+        def check_unchanged() -> None:
+            """A scan's hash need not go with the points that were read of it later."""
+            if changed := changed_inputs(inputs, change.config, what):
+                raise ScanError(
+                    f"{changed}: changed while it was read, expected files that stay as they are: add it again"
+                )
+
+        surveys = _survey_added(change, inputs, again, new_only)
+        try:
+            moved = _spool_added(change, surveys)
+        except ScanError:
+            check_unchanged()
+            raise
+        check_unchanged()
         header = change.archive.header
         new = Spool(change.folder / "spool", change.dtype, header.lattice)
         boxes = {key: _box_of(key, new.rows(key), header.lattice) for key in new.keys.tolist()}
         sources = (*header.sources, *(_source(survey) for survey in surveys))
         names = tuple(_named(source) for source in sources[len(header.sources) :])
         header = replace(header, sources=sources, moved_max=max(header.moved_max, moved))
-        return _finish(change, header, boxes, frozenset(), names)
+        return _finish(change, header, boxes, frozenset(), names, check_unchanged)
 
 
 def remove_scans(
@@ -141,9 +158,8 @@ def remove_scans(
 # --- what is added --------------------------------------------------------------------------------------
 
 
-def _survey_added(change: Change, paths: Sequence[Path], again: bool, new_only: bool) -> list[Survey]:
-    """The scans of `paths` that are to be added, all usable. What is in already is told before points are read."""
-    inputs = open_inputs(paths, change.config)
+def _survey_added(change: Change, inputs: Sequence[Input], again: bool, new_only: bool) -> list[Survey]:
+    """The scans of `inputs` that are to be added, all usable. What is in already is told before points are read."""
     if faults := [unopened(item.path, item.fault).fault for item in inputs if not item.scans]:
         raise ScanError("\n  ".join(faults))
     scans = [scan for item in inputs for scan in item.scans]
@@ -286,10 +302,11 @@ def _finish(
     boxes: Mapping[int, NDArray[np.int64]],
     dropped: frozenset[int],
     names: tuple[str, ...],
+    check: Callable[[], None] = lambda: None,
 ) -> ChangeSummary:
     """Build what the change touches, and publish it. boxes: key -> box (2, 3) of the points that change, lattice.
 
-    header: with its sources as they are to be.  dropped: scans whose points go.
+    header: with its sources as they are to be.  dropped: scans whose points go.  check: called before it is published.
     """
     before = change.archive.header
     header = replace(header, generation=before.generation + 1, radius_now=None)
@@ -310,6 +327,7 @@ def _finish(
     header = _measure(change, header)
     write_index(change.folder, header, table, files)
     verify_new(change, {s.name for s in shards})
+    check()
     publish(change, [s.name for s in shards], {name for name, _ in files})
     return ChangeSummary(
         archive=change.target,

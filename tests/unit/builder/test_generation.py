@@ -375,6 +375,30 @@ def test_scans_that_cannot_be_used_are_refused(built: Build, files: Files, tmp_p
     refused(target, ScanError, r"none\.ply", lambda: add_scans(target, [tmp_path / "none.ply"], jobs=1))
 
 
+@pytest.mark.parametrize("stage", ["_spool_added", "verify_new"])
+def test_a_scan_that_is_written_anew_meanwhile_is_refused(
+    built: Build, files: Files, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stage: str
+) -> None:
+    """Other points would be in under the hash of those that it had, as many as they are."""
+    target = built(tmp_path / "there" / "x", "a")
+    path = Path(shutil.copy(files.b, tmp_path / "other.ply"))
+    work = getattr(generation_module, stage)
+
+    def written_before(change: Any, given: Any) -> Any:
+        scans.write_ply(path, B[::-1].copy(), np.zeros(len(B), np.float32))
+        return work(change, given)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(generation_module, stage, written_before)
+        refused(
+            target,
+            ScanError,
+            r"other\.ply .*: changed while it was read.*: add it again",
+            lambda: add_scans(target, [path], jobs=1),
+        )
+    assert add_scans(target, [path], jobs=1).generation == 1
+
+
 def test_a_scan_too_far_away_is_refused(built: Build, tmp_path: Path) -> None:
     target = built(tmp_path / "x", "a")
     far = scans.write_ply(tmp_path / "far.ply", np.array([[9e8, 0.0, 0]]))

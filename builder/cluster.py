@@ -7,23 +7,20 @@ Results come in the order of the units, as from `executor.py`.
 
 import asyncio
 import functools
-import hashlib
 import importlib.util
 import logging
 import os
 import pickle
-import platform
 import signal
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from importlib import metadata
-from pathlib import Path
 from typing import Any, TypeVar
 
 from ..schemas.errors import BadRequestError, SolidcloudError
 from .executor import AHEAD, WAITING
 from .progress import Progress
+from .software import software
 
 try:
     import dask
@@ -59,8 +56,6 @@ ASK_SECONDS = 5
 # Beside its share of --memory a worker of the local cluster has what Python, numba, HDF5, the readers and dask itself
 # take, and some air: dask kills what is over, it does not ask.
 WORKER_BASE_BYTES = 384 << 20
-# What the bytes of an archive may depend on, beside the software itself.
-LIBRARIES = ("numpy", "numba", "llvmlite", "h5py", "zstandard")
 
 LOCAL = "local:"
 _START_WORKERS = "start its workers as `dask worker tcp://HOST:PORT --nthreads 1 --nworkers N`"
@@ -79,21 +74,6 @@ def local_workers(address: str) -> int | None:
             f"--scheduler {address}: expected the address of a dask scheduler, tcp://HOST:PORT"
         )
     return None
-
-
-@functools.cache
-def software() -> dict[str, str]:
-    """What a unit's bytes may depend on, name -> version; solidcloud's own with a hash of its sources."""
-    root = Path(__file__).resolve().parent.parent
-    sources = hashlib.sha256()
-    for package in ("schemas", "builder"):
-        for path in sorted((root / package).rglob("*.py")):
-            sources.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
-    return {
-        "solidcloud": f"{metadata.version('solidcloud')} ({sources.hexdigest()[:12]})",
-        "Python": platform.python_version(),
-        **{name: metadata.version(name) for name in LIBRARIES},
-    }
 
 
 def _run_unit(work: bytes, expected: dict[str, str], folder: str) -> Any:

@@ -1,7 +1,6 @@
 """What is being built, as a note says it: so that a build goes on only where it is the same, and says what is not."""
 
 from collections.abc import Callable, Mapping, Sequence
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +9,9 @@ from ..schemas.errors import BadRequestError, FormatError
 from ..schemas.index import Source
 from .config import BuildConfig
 from .scan_list import Input
+from .software import software
 from .sources import NOT_FINITE, Scan, sha256_of
 
-# To be raised when software of the same version may write other bytes than it did, or notes that mean other things.
-RESUME_VERSION = 3
 # Differences named in a message, at most.
 NAMED = 5
 
@@ -27,12 +25,7 @@ _OPTION_NAMES = {"models": "--radius", "cell_points": "cell_points", "with_slab"
 def described(inputs: Sequence[Input], config: BuildConfig) -> dict[str, Any]:
     """What is to be built: software, options and inputs, as JSON holds them. Memory and jobs are no part of it."""
     return {
-        "software": {
-            "solidcloud": metadata.version("solidcloud"),
-            "resume": RESUME_VERSION,
-            # Its frames may differ from version to version.
-            "zstandard": metadata.version("zstandard"),
-        },
+        "software": software(),
         "options": {**config.identity(), "strict": config.strict, "skip_bad": config.skip_bad},
         "inputs": [
             entry for item in sorted(inputs, key=lambda item: str(item.path)) for entry in _entries(item)
@@ -60,9 +53,12 @@ def _placed(scan: Scan | Source) -> dict[str, Any]:
 def check_same(folder: Path, was: Mapping[str, Any], now: Mapping[str, Any]) -> None:
     """Raise BadRequestError unless a build begun in `folder` is the one asked for, naming what differs."""
     if was.get("software") != now["software"]:
-        found, here = _software(was.get("software", {})), _software(now["software"])
+        found, here = was.get("software", {}), now["software"]
+        names = sorted(name for name in {*found, *here} if found.get(name) != here.get(name))
+        differ = [f"{name} {found.get(name, 'none')}, now {here.get(name, 'none')}" for name in names]
         raise BadRequestError(
-            f"{folder}: a build was begun by {found}, this is {here}: use that, or give --fresh to start over"
+            f"{folder}: a build was begun by other software: {_listed(differ)}: use what it was, or give --fresh to "
+            "start over"
         )
     options, remedies = _option_differences(was["options"], now["options"])
     inputs = _input_differences(was["inputs"], now["inputs"])
@@ -78,11 +74,6 @@ def check_same(folder: Path, was: Mapping[str, Any], now: Mapping[str, Any]) -> 
 def changed_inputs(inputs: Sequence[Input], config: BuildConfig, what: Mapping[str, Any]) -> str:
     """Which of the inputs are not as `what` described them before they were read, for a reader; "" where all are."""
     return _listed(_input_differences(what["inputs"], described(inputs, config)["inputs"]))
-
-
-def _software(noted: Mapping[str, Any]) -> str:
-    """Versions for a reader."""
-    return " ".join(f"{name} {version}" for name, version in sorted(noted.items())) or "other software"
 
 
 def _option_differences(was: Mapping[str, Any], now: Mapping[str, Any]) -> tuple[list[str], list[str]]:

@@ -13,8 +13,9 @@ pytest.importorskip("distributed")
 
 import solidcloud.builder.cluster as cluster_module
 from distributed import LocalCluster
-from solidcloud.builder.cluster import ClusterExecutor, local_workers, software
+from solidcloud.builder.cluster import ClusterExecutor, local_workers
 from solidcloud.builder.progress import Silent
+from solidcloud.builder.software import software
 from solidcloud.schemas.errors import BadRequestError, ScanError, SolidcloudError
 
 # Units are text for `eval`, because workers cannot import a test module by its name.

@@ -21,8 +21,11 @@ from solidcloud.builder.partition import SpoolUnit
 from solidcloud.builder.pipeline import BuildSummary, build_archive
 from solidcloud.builder.resume import check_same, described
 from solidcloud.builder.scan_list import Input, inputs, inspect, write_scan_list
+from solidcloud.builder.software import software
+from solidcloud.builder.sources import Scan
+from solidcloud.builder.sources.scan import library_errors
 from solidcloud.builder.workplace import building_folder
-from solidcloud.schemas.errors import BadRequestError, CorruptError, ScanError
+from solidcloud.schemas.errors import BadRequestError, CorruptError, ScanError, SolidcloudError
 
 
 class Killed(BaseException):
@@ -274,6 +277,22 @@ def test_a_scan_that_changes_while_it_is_read_is_no_archive(
     assert content(tmp_path / "hall") == content(tmp_path / "judge")
 
 
+def test_a_disk_that_fails_for_a_moment_leaves_no_scan_out(
+    scans: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(scan: Scan, *_: Any) -> Any:
+        with library_errors(scan.path):
+            raise OSError(5, "Input/output error")
+        yield
+
+    with monkeypatch.context() as patch:
+        patch.setattr(type(inputs(scans)[1].scans[0]), "_read", fails)
+        with pytest.raises(SolidcloudError, match=r"Input/output error: '.*b\.xyz'.*same command again"):
+            build(tmp_path / "hall", scans, skip_bad=True)
+    summary = build(tmp_path / "hall", scans, skip_bad=True)
+    assert (summary.points, summary.faults) == (400, ())
+
+
 OTHER = {
     "voxel": (4.0, "--voxel was 0.9, is 4.0: give --voxel 0.9 to go on, or --fresh to start over"),
     "resolution": (0.01, "--resolution was not given, is 0.01: give no --resolution to go on"),
@@ -333,10 +352,10 @@ def test_other_software_is_refused(
     scans: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     interrupted(tmp_path / "hall", scans, monkeypatch)
-    monkeypatch.setattr("solidcloud.builder.resume.RESUME_VERSION", 999)
-    with pytest.raises(
-        BadRequestError, match=r"begun by resume 3 .*this is resume 999 .*--fresh to start over"
-    ):
+    other = {**software(), "h5py": "0.1"}
+    monkeypatch.setattr("solidcloud.builder.resume.software", lambda: other)
+    expected = rf"begun by other software: h5py {software()['h5py']}, now 0\.1: use .*--fresh to start over"
+    with pytest.raises(BadRequestError, match=expected):
         build(tmp_path / "hall", scans)
 
 

@@ -1,0 +1,24 @@
+"""What the bytes of an archive may depend on beside scans and options: versions, and our own sources."""
+
+import functools
+import hashlib
+import platform
+from importlib import metadata
+from pathlib import Path
+
+LIBRARIES = ("numpy", "numba", "llvmlite", "h5py", "zstandard")
+
+
+@functools.cache
+def software() -> dict[str, str]:
+    """What a unit's bytes may depend on, name -> version; solidcloud's own with a hash of its sources."""
+    root = Path(__file__).resolve().parent.parent
+    sources = hashlib.sha256()
+    for package in ("schemas", "builder"):
+        for path in sorted((root / package).rglob("*.py")):
+            sources.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
+    return {
+        "solidcloud": f"{metadata.version('solidcloud')} ({sources.hexdigest()[:12]})",
+        "Python": platform.python_version(),
+        **{name: metadata.version(name) for name in LIBRARIES},
+    }

@@ -3,6 +3,7 @@
 A scan that can seek is surveyed in ranges of its points, in any process, and its file's SHA-256 in another.
 """
 
+import errno
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -62,6 +63,13 @@ class Survey:
         return self.dropped.get(NOT_FINITE, 0)
 
 
+# Errors of a disk, a network or a machine with too much to do: a scan that is left out for one is left out for good.
+PASSING = frozenset(
+    {errno.EIO, errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.ENODEV, errno.ENXIO, errno.ESTALE, errno.ETIMEDOUT,
+     errno.ENOTCONN, errno.EHOSTDOWN, errno.EHOSTUNREACH, errno.EREMOTEIO}
+)  # fmt: skip
+
+
 @dataclass(frozen=True, slots=True)
 class Part:
     """What was found in a range of a scan. dropped: reason -> points the reader left out.
@@ -111,6 +119,7 @@ def survey_range(unit: RangeUnit) -> Part:
             count += usable_bounds(block.xyz, MAX_COORDINATE, low, high)
             seen += len(block.xyz)
     except ScanError as error:
+        _raise_passing(error, unit.scan.path)
         fault = str(error)
     return Part(
         unit.start,
@@ -139,7 +148,15 @@ def hash_file(path: Path) -> tuple[str, str]:
     try:
         return sha256_of(path), ""
     except ScanError as error:
+        _raise_passing(error, path)
         return "", str(error)
+
+
+def _raise_passing(error: ScanError, path: Path) -> None:
+    """Raise OSError where a file could not be read for a reason that may pass, and that is no fault of the scan."""
+    cause = error.__cause__
+    if isinstance(cause, OSError) and cause.errno in PASSING:
+        raise OSError(cause.errno, cause.strerror, str(path)) from None
 
 
 def joined(scan: Scan, parts: Sequence[Part], sha256: tuple[str, str]) -> Survey:

@@ -152,7 +152,7 @@ def _interruptible(output: Path) -> Iterator[None]:
         folder = building_folder(output)
         kept = f"what is done is kept in {folder}: the same command goes on, --fresh starts over"
         print(f"interrupted: {kept if folder.exists() else 'nothing was done'}", file=sys.stderr)
-        raise
+        raise typer.Exit(130) from None  # all is said
     finally:
         if main:
             signal.signal(signal.SIGTERM, before)

@@ -86,6 +86,7 @@ def test_who_interrupts_is_told_how_to_go_on(
     assert stopped.value.code == 130
     said = capsys.readouterr().err
     assert f"interrupted: what is done is kept in {tmp_path}/.hall.building: the same command goes on" in said
+    assert said.count("interrupted") == 1
     assert signal.getsignal(signal.SIGTERM) == before
     assert run(build) == 0
     assert not (tmp_path / ".hall.building").exists()

@@ -3,6 +3,7 @@
 How the new archive takes the old one's place is change.py's.
 """
 
+import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -117,6 +118,8 @@ def add_scans(
         boxes = {key: _box_of(key, new.rows(key), header.lattice) for key in new.keys.tolist()}
         sources = (*header.sources, *(_source(survey) for survey in surveys))
         names = tuple(_named(source) for source in sources[len(header.sources) :])
+        header = _no_longer_unknown(header, surveys)
+        sources = (*header.sources, *sources[len(header.sources) :])
         header = replace(header, sources=sources, moved_max=max(header.moved_max, moved))
         return _finish(change, header, boxes, frozenset(), names, check_unchanged)
 
@@ -239,6 +242,32 @@ def _source(survey: Survey) -> Source:
         str(survey.path), scan.index, scan.format, survey.sha256, survey.count, scan.pose, survey.dropped,
         crs=scan.crs, units=scan.units, up=scan.up,
     )  # fmt: skip
+
+
+def _no_longer_unknown(header: Header, surveys: Sequence[Survey]) -> Header:
+    """The header without the regions of scans that a build left out and that are added now, by their paths."""
+    added = {(os.path.realpath(s.path), s.scan.index) for s in surveys if s.scan is not None}
+    files = {path for path, _ in added}
+    sources, gone = [], set()
+    for source in header.sources:
+        path = os.path.realpath(source.path)
+        # A file that could not be opened stands for all scans in it.
+        here = (path, source.index) in added or (not source.format and path in files)
+        if source.unknown is not None and here:
+            gone.add(source.unknown)
+            fault = f"{_named(source)}: left out at first, added in generation {header.generation + 1}"
+            source = replace(source, fault=fault, unknown=None)
+        sources.append(source)
+    if not gone:
+        return header
+    kept = [row for row in range(len(header.unknown)) if row not in gone]
+    number = {-1: -1, None: None, **{row: place for place, row in enumerate(kept)}}
+    return replace(
+        header,
+        sources=tuple(replace(source, unknown=number[source.unknown]) for source in sources),
+        unknown=header.unknown[kept],
+        unknown_everywhere=any(source.unknown == -1 for source in sources),
+    )
 
 
 def _box_of(key: int, parts: list[NDArray], lattice: Lattice) -> NDArray[np.int64]:

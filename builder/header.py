@@ -3,6 +3,7 @@
 import hashlib
 import json
 from collections.abc import Sequence
+from itertools import count
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,7 +72,7 @@ def make_header(
         options=config.identity(),
         sources=(
             *(_good_source(s, f) for s, f in zip(surveys, filtered, strict=True) if s.scan is not None),
-            *(_bad_source(s) for s in faulty),
+            *map(_bad_source, faulty, _unknown_rows(faulty)),
         ),
         unknown=np.array(boxes, np.int64).reshape(-1, 2, 3),
         unknown_everywhere=any(s.region is None for s in lost),
@@ -96,8 +97,14 @@ def _good_source(survey: Survey, filtered: dict[str, int]) -> Source:
     )  # fmt: skip
 
 
-def _bad_source(survey: Survey) -> Source:
-    """What is said of a scan that was left out."""
+def _unknown_rows(faulty: Sequence[Survey]) -> list[int | None]:
+    """Of each scan that was left out, the box where it may have had points; -1: not known; None: it had none."""
+    boxes = count()
+    return [None if s.empty else -1 if s.region is None else next(boxes) for s in faulty]
+
+
+def _bad_source(survey: Survey, unknown: int | None) -> Source:
+    """What is said of a scan that was left out. unknown: see `Source`."""
     scan: Scan | None = survey.scan
     return Source(
         str(survey.path),
@@ -108,4 +115,5 @@ def _bad_source(survey: Survey) -> Source:
         np.eye(4),
         {},
         survey.fault,
+        unknown=unknown,
     )

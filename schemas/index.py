@@ -40,7 +40,8 @@ class Source:
     index: of the scan inside its file.  sha256: of the file.  pose: (4, 4) float64, scan to world.
     count: points stored.  skipped: reason -> points left out.  fault: why the whole scan was left out, or "".
     crs: the text of the coordinate reference system that the file names, or "".  units, up: what a length of the file
-    was taken for, and which of its axes for up; `pose` has both in it.
+    was taken for, and which of its axes for up; `pose` has both in it.  unknown: the row of the header's `unknown`
+    where a scan that was left out may have had points, -1 where that is not known; None: nothing was lost with it.
     """
 
     path: str
@@ -54,10 +55,11 @@ class Source:
     crs: str = ""
     units: str = "m"
     up: str = "z"
+    unknown: int | None = None
 
 
 # Fields of a source that texts name only where they are not the default: without, an archive stays what it was.
-_OPTIONAL = {"crs": "", "units": "m", "up": "z"}
+_OPTIONAL = {"crs": "", "units": "m", "up": "z", "unknown": None}
 
 
 @dataclass(frozen=True, slots=True)
@@ -243,6 +245,13 @@ def _check_counts(counts: NDArray, capped: int, points: int) -> None:
         )
 
 
+def _unknown_row(row: Any, boxes: int) -> int | None:
+    """Which of the boxes is of a source. Raises ValueError for none of them."""
+    if row is None or (type(row) is int and -1 <= row < boxes):
+        return row
+    raise ValueError(f"a source with box {row!r} of {boxes}: expected one of them, or -1")
+
+
 def read_header(archive_id: bytes, columns: dict[str, NDArray]) -> Header:
     """The header from the index's datasets; the digest has vouched for them. Raises ValueError, KeyError for what is
     no index."""
@@ -258,7 +267,8 @@ def read_header(archive_id: bytes, columns: dict[str, NDArray]) -> Header:
             poses[i],
             s["skipped"],
             s["fault"],
-            **{name: str(s[name]) for name in _OPTIONAL if name in s},
+            **{name: str(s[name]) for name in ("crs", "units", "up") if name in s},
+            unknown=_unknown_row(s.get("unknown"), len(columns["unknown"])),
         )
         for i, s in enumerate(texts["sources"])
     )

@@ -375,6 +375,42 @@ def test_scans_that_cannot_be_used_are_refused(built: Build, files: Files, tmp_p
     refused(target, ScanError, r"none\.ply", lambda: add_scans(target, [tmp_path / "none.ply"], jobs=1))
 
 
+def test_a_scan_that_was_left_out_and_is_added_is_unknown_no_more(files: Files, tmp_path: Path) -> None:
+    """Where it may have been is known again; the others' regions stay theirs."""
+    rng = np.random.default_rng(4)
+    whole = {name: tmp_path / f"{name}.las" for name in "mno"}
+    for place, path in enumerate(whole.values()):
+        scans.write_las(path, rng.integers(0, 1000, (90, 3)) + 2000 * place)
+    bytes_of = {name: path.read_bytes() for name, path in whole.items()}
+    (lost := tmp_path / "p.ply").write_bytes(b"no scan")
+    for path in whole.values():
+        path.write_bytes(path.read_bytes()[:-40])
+    target = tmp_path / "x"
+    build_archive([files.a, *whole.values(), lost], target, BuildConfig(**OPTIONS, skip_bad=True))
+
+    def unknown() -> tuple[dict[str, list[Any]], bool]:
+        with Archive(target) as archive:
+            header = archive.header
+        held = {Path(s.path).name: s.unknown for s in header.sources if s.unknown is not None}
+        assert sorted(row for row in held.values() if row >= 0) == list(range(len(header.unknown)))
+        boxes = {name: header.unknown[row].tolist() if row >= 0 else [] for name, row in held.items()}
+        return boxes, header.unknown_everywhere
+
+    before, everywhere = unknown()
+    assert everywhere and set(before) == {"m.las", "n.las", "o.las", "p.ply"}
+    assert all(low[0] < high[0] for low, high in (before[f"{name}.las"] for name in "mno"))
+    whole["n"].write_bytes(bytes_of["n"])
+    add_scans(target, [whole["n"]], jobs=1)
+    assert unknown() == ({name: box for name, box in before.items() if name != "n.las"}, True)
+    shutil.copy(files.b, lost)
+    add_scans(target, [lost, files.c], jobs=1)
+    assert unknown() == ({name: before[name] for name in ("m.las", "o.las")}, False)
+    for name in "mo":
+        whole[name].write_bytes(bytes_of[name])
+    add_scans(target, [whole["m"], whole["o"]], jobs=1)
+    assert unknown() == ({}, False) and not verify_archive(target).faults
+
+
 @pytest.mark.parametrize("stage", ["_spool_added", "verify_new"])
 def test_a_scan_that_is_written_anew_meanwhile_is_refused(
     built: Build, files: Files, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stage: str

@@ -91,6 +91,7 @@ class ProcessExecutor:
     def __init__(self, jobs: int) -> None:
         """Use `jobs` processes."""
         self.jobs = jobs
+        self.at_once = jobs
         # Spawned, not forked: a fork copies locks that other threads hold, such as a progress bar's.
         context = multiprocessing.get_context("spawn")
         self._pool = (
@@ -123,23 +124,21 @@ class ProcessExecutor:
         """function(unit) for each unit, in order; progress advances by size(unit) as each is done.
 
         Some units are handed out ahead, so that no process waits for another's long one; results that wait their turn
-        stay bounded by AHEAD a process. A unit that fails ends all when it does.
+        stay bounded by AHEAD a process. A unit that fails ends all when it does. With `at_once` fewer than `jobs`, so
+        many run at a time.
         """
         if self._pool is None:
             for unit in units:
                 yield function(unit)
                 progress.advance(size(unit))
             return
+        most = WAITING * self.jobs if self.at_once == self.jobs else self.at_once
         running: dict[Future[Result], int] = {}
         results: dict[int, Result] = {}
         given = 0
         for taken in range(len(units)):
             while taken not in results:
-                while (
-                    given < len(units)
-                    and len(running) < WAITING * self.jobs
-                    and given - taken < AHEAD * self.jobs
-                ):
+                while given < len(units) and len(running) < most and given - taken < AHEAD * self.jobs:
                     with _worker_deaths():
                         running[self._pool.submit(function, units[given])] = given
                     given += 1

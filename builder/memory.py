@@ -1,5 +1,9 @@
 """How `--memory` is shared: all processes of a build together, what they hold of the data and what they are made of."""
 
+import numpy as np
+from numpy.typing import NDArray
+
+from ..schemas.errors import SolidcloudError
 from .config import BuildConfig
 
 # What a process takes before it holds a point, sum of PSS: Python, numpy, numba's compiled code, HDF5, a reader
@@ -12,6 +16,10 @@ ALONE_BYTES = 150 << 20
 LEAST_SHARE = 96 << 20
 # What a build may take over `--memory` rather than be refused: 64 MB is less than Python with numba.
 OVER_BYTES = 200 << 20
+# Bytes a point of a record that radius, preview and verify hold: its frame, its planes, and its nodes.
+RECORD_BYTES_A_POINT = 18
+# Of all other things they hold.
+RECORD_BYTES = 16 << 20
 
 
 def jobs_that_fit(jobs: int, config: BuildConfig) -> int:
@@ -24,3 +32,22 @@ def memory_share(jobs: int, config: BuildConfig) -> int:
     """Bytes of data that each of `jobs` processes may hold."""
     base = ALONE_BYTES if jobs == 1 else BUILDER_BYTES + jobs * WORKER_BYTES
     return max(LEAST_SHARE, (config.memory_bytes - base) // jobs)
+
+
+def readers_that_fit(counts: NDArray[np.int64], jobs: int, config: BuildConfig) -> int:
+    """How many of `jobs` processes may each hold the record of a voxel at a time, whichever of `counts` (v,) points.
+
+    Raises SolidcloudError where not even one may hold the largest.
+    """
+    largest = np.sort(counts)[::-1][:jobs]
+    base = ALONE_BYTES if jobs == 1 else BUILDER_BYTES + jobs * WORKER_BYTES
+    room = max(config.memory_bytes + OVER_BYTES - base, LEAST_SHARE)
+    needed = np.cumsum(largest * RECORD_BYTES_A_POINT + RECORD_BYTES)
+    fits = int(np.searchsorted(needed, room, "right"))
+    if not fits and len(largest):
+        raise SolidcloudError(
+            f"a voxel of {config.voxel:g} m holds {int(largest[0])} points, and to read its record back takes "
+            f"{int(needed[0]) >> 20} MB: give a smaller --voxel, fewer --jobs, or --memory "
+            f"{(config.memory_bytes + int(needed[0]) - room + (1 << 20) - 1) >> 20}MB"
+        )
+    return jobs if fits == len(largest) else fits

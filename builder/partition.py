@@ -22,9 +22,9 @@ from .sources import Block, Scan
 from .spool import KEYS_SUFFIX, RUN_SUFFIX, new_run, write_directory
 
 # Bytes a point that a spooling worker holds: voxel number, code, and the code once more in order; with intensity its
-# bits, them once more, and a voxel's order.
+# bits, them once more, and, of a run in one voxel, order, sorted codes and ranks.
 SPOOL_BYTES_A_POINT = 20
-SPOOL_BYTES_A_POINT_WITH_INTENSITY = 36
+SPOOL_BYTES_A_POINT_WITH_INTENSITY = 52
 # Beside that: a block as it is read, and one as it is written.
 SPOOL_BYTES = 48 << 20
 # A run is not smaller than this, whatever the memory: many small ones are slow to gather a voxel from.

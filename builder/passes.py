@@ -174,7 +174,7 @@ def _sweep_spool(folder: Path, vouched: set[str]) -> None:
     for suffix in (RUN_SUFFIX, KEYS_SUFFIX):
         for path in folder.glob(f"*{suffix}"):
             if path.stem not in stems:
-                path.unlink()
+                path.unlink(missing_ok=True)  # a worker that was given up may have had it removed itself
 
 
 def _is_filtered(config: BuildConfig) -> bool:
@@ -239,7 +239,7 @@ def build_shards(
     named = {shard.name for shard in shards}
     for path in folder.iterdir():
         if path.name not in named:
-            path.unlink()
+            path.unlink(missing_ok=True)
     return [shard for _, shard in sorted(zip((unit.number for _, unit in units), shards, strict=True))]
 
 

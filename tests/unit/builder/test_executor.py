@@ -79,6 +79,16 @@ def test_a_long_unit_keeps_nobody_waiting(tmp_path: Path) -> None:
     assert progress.done == 31
 
 
+def test_fewer_units_than_processes_run_at_once_where_that_is_asked_for(tmp_path: Path) -> None:
+    code = (
+        f"import os, time; name = {str(tmp_path)!r} + '/%d'; open(name, 'x').close(); "
+        f"time.sleep(0.05); assert len(os.listdir({str(tmp_path)!r})) == 1; os.unlink(name)"
+    )
+    with ProcessExecutor(2) as executor:
+        executor.at_once = 1
+        assert list(executor.map(exec, [code % i for i in range(6)], Counted(), lambda unit: 1)) == [None] * 6
+
+
 def test_results_that_wait_stay_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(executor_module, "AHEAD", 5)
     with ProcessExecutor(2) as executor:

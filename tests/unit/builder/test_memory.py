@@ -1,5 +1,6 @@
 """Memory is shared among processes, their own included."""
 
+import numpy as np
 import pytest
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.memory import (
@@ -7,10 +8,14 @@ from solidcloud.builder.memory import (
     BUILDER_BYTES,
     LEAST_SHARE,
     OVER_BYTES,
+    RECORD_BYTES,
+    RECORD_BYTES_A_POINT,
     WORKER_BYTES,
     jobs_that_fit,
     memory_share,
+    readers_that_fit,
 )
+from solidcloud.schemas.errors import SolidcloudError
 
 
 @pytest.mark.parametrize("memory", [64 << 20, 256 << 20, 1 << 30, 4 << 30, 100 << 30])
@@ -30,3 +35,33 @@ def test_a_gigabyte_is_enough_for_two_and_some() -> None:
     config = BuildConfig(memory_bytes=1 << 30)
     assert jobs_that_fit(2, config) == 2
     assert memory_share(2, config) > 3 * LEAST_SHARE
+
+
+@pytest.mark.parametrize("jobs", [1, 2, 5])
+@pytest.mark.parametrize("memory", [64 << 20, 1 << 30, 2 << 30])
+def test_no_more_processes_read_than_hold_the_largest_voxels(jobs: int, memory: int) -> None:
+    config = BuildConfig(memory_bytes=memory)
+    base = ALONE_BYTES if jobs == 1 else BUILDER_BYTES + jobs * WORKER_BYTES
+    room = max(memory + OVER_BYTES - base, LEAST_SHARE)
+    for points in (1, 10**6, 5 * 10**6, 4 * 10**7, 10**9):
+        counts = np.array([7, points, points // 2, points, 3])
+        each = sorted((n * RECORD_BYTES_A_POINT + RECORD_BYTES for n in counts.tolist()), reverse=True)
+        if each[0] > room:
+            with pytest.raises(
+                SolidcloudError, match=f"{points} points.*smaller --voxel, fewer --jobs, or --memory"
+            ):
+                readers_that_fit(counts, jobs, config)
+            continue
+        readers = readers_that_fit(counts, jobs, config)
+        assert sum(each[:readers]) <= room
+        assert readers == jobs or sum(each[: readers + 1]) > room
+    assert readers_that_fit(np.empty(0, np.int64), jobs, config) == jobs
+    assert readers_that_fit(np.array([5]), 64, BuildConfig(memory_bytes=100 << 30)) == 64
+
+
+def test_the_memory_named_for_a_large_voxel_is_enough() -> None:
+    counts = np.array([10**9])
+    with pytest.raises(SolidcloudError) as caught:
+        readers_that_fit(counts, 1, BuildConfig())
+    named = int(str(caught.value).rpartition(" ")[2].removesuffix("MB"))
+    assert readers_that_fit(counts, 1, BuildConfig(memory_bytes=named << 20)) == 1

@@ -7,6 +7,8 @@ text of PTX and PTS files, in which the second scan can only be found by reading
 
 import math
 import os
+import re
+import sys
 import tomllib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -18,12 +20,16 @@ import numpy as np
 import tomli_w
 from numpy.typing import NDArray
 
+from ..schemas.archive import sync_folder
 from ..schemas.errors import BadRequestError, ScanError
 from .progress import Progress, Silent
 from .sources import METRES, TURNS, Scan, header_bounds, open_scans, placed, scan_files, sha256_of
 
 SUFFIX = ".toml"
 VERSION = 1
+
+# What stands for the bytes of a file's name that are no UTF-8.
+_BROKEN_NAME = re.compile("[\ud800-\udfff]")
 
 HEAD = """\
 # Scans for `solidcloud build`, as their headers describe them. Edit by hand:
@@ -125,12 +131,32 @@ def _inspect_file(path: Path, with_sha256: bool) -> list[ScanEntry]:
 
 
 def write_scan_list(path: Path, entries: Sequence[ScanEntry]) -> None:
-    """Write a list of scans as TOML, their paths relative to it. Replaces a file of that name."""
+    """Write a list of scans as TOML, their paths relative to it. Replaces a file of that name, once all is written.
+
+    Raises BadRequestError for a name that is no UTF-8, which TOML cannot hold.
+    """
     folder = Path(path).parent
     tables = [_table(entry, folder) for entry in entries]
     head = HEAD.format(units=", ".join(METRES))
     text = head + "\n" + tomli_w.dumps({"version": VERSION, "scan": tables})
-    Path(path).write_text(text, encoding="utf-8")
+    for entry in entries:
+        if _BROKEN_NAME.search(str(entry.path)):
+            raise BadRequestError(
+                f"{str(entry.path)!r}: a name that is no UTF-8, which a list cannot hold: give it another, or build "
+                "without a list"
+            )
+    # What else a header says is for the record.
+    data = _BROKEN_NAME.sub("\ufffd", text).encode()
+    temporary = Path(path).with_name(f".{Path(path).name}.{os.getpid()}.tmp")
+    try:
+        with temporary.open("wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+        sync_folder(Path(path).parent)
+    finally:
+        temporary.unlink(missing_ok=True)
 
 
 def _table(entry: ScanEntry, folder: Path) -> dict[str, Any]:
@@ -201,7 +227,9 @@ class _Field(NamedTuple):
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+    if isinstance(value, int):  # of any length, in TOML
+        return not isinstance(value, bool) and abs(value) <= sys.float_info.max
+    return isinstance(value, float) and math.isfinite(value)
 
 
 def _is_numbers(value: Any, length: int) -> bool:

@@ -1,6 +1,7 @@
 """The list of scans: what headers say, written and read back, edited by hand, wrong edits; what a build opens."""
 
 import json
+import os
 import struct
 from pathlib import Path
 from typing import Any
@@ -163,6 +164,36 @@ def test_a_scan_that_is_named_twice_is_refused(folder: Path, tmp_path: Path) -> 
     assert [len(item.scans) for item in inputs([path, las])] == [2, 1]
     with pytest.raises(BadRequestError, match=r"b\.ptx: scan 0 is named twice"):
         inputs([path, folder / "b.ptx"])
+
+
+def test_a_list_that_cannot_be_written_leaves_the_one_there_was(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "lists" / "scans.toml"
+    path.parent.mkdir()
+    write_scan_list(path, inspect([folder]))
+    before = path.read_bytes()
+    odd = folder / os.fsdecode(b"odd\xff.xyz")
+    odd.write_text("1 2 3\n")
+    with pytest.raises(BadRequestError, match=r"odd\\udcff\.xyz'.* no UTF-8"):
+        write_scan_list(path, inspect([folder]))
+    assert [p.read_bytes() for p in path.parent.iterdir()] == [before]
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", full)
+        with pytest.raises(OSError, match="No space"):
+            write_scan_list(path, [])
+    assert [p.read_bytes() for p in path.parent.iterdir()] == [before]
+
+
+def test_a_number_that_no_float_holds_is_refused(folder: Path) -> None:
+    path = folder / "scans.toml"
+    path.write_text(f"[[scan]]\npath = 'a.las'\nscale = 1{'0' * 400}\n")
+    with pytest.raises(BadRequestError, match=r"scale is '1000.*, expected a number above 0"):
+        read_scan_list(path)
 
 
 def test_a_missing_file_of_a_list_is_a_fault_and_of_the_command_an_error(folder: Path) -> None:

@@ -21,6 +21,7 @@ from ..schemas.voxel_grid import MAX_COORDINATE, Lattice
 from ..schemas.vtkhdf import vtk_file
 from .progress import Progress, Silent
 from .record_points import Taken, read_columns, record_columns, stored_columns, taken
+from .unchanged import unchanged
 
 FORMATS = ("laz", "las", "ply", "vtkhdf")
 
@@ -76,12 +77,16 @@ def export_archive(
 
     box: half open; None: all points.  form: one of FORMATS; None: by the suffix of `output`. A file of no points is
     whole, too. Raises BadRequestError for a box, format or output that cannot be, and where the format cannot hold the
-    points; CorruptError, FormatError, OSError.
+    points; SolidcloudError where the archive is changed meanwhile; CorruptError, FormatError, OSError.
     """
     output, progress = Path(output), progress or Silent()
     form = _format_of(output, form)
     if output.is_dir() or (output.exists() and not overwrite):
         raise BadRequestError(f"{output}: is there already: give another name, or --overwrite")
+    if Path(folder).resolve() in output.resolve().parents:
+        raise BadRequestError(
+            f"{output}: within the archive itself, expected a place outside: give another name"
+        )
     if not output.parent.is_dir():
         raise BadRequestError(f"{output.parent}: no such folder: make it first")
     with Archive(folder) as archive:
@@ -91,13 +96,17 @@ def export_archive(
         rows = np.flatnonzero(near.all(axis=1))
         points = archive.voxels["rows"][rows, 2].astype(np.int64)
         progress.start("look", int(points.sum()), "points")
-        contents = _look(archive, rows, base, limits, progress)
+        with unchanged(folder, archive.header):
+            contents = _look(archive, rows, base, limits, progress)
         progress.finish()
         notes = [] if contents.points else ["no point is in the box"]
         temporary = output.with_name(f".{output.name}.{os.getpid()}.tmp")
         try:
             progress.start("export", contents.points, "points")
-            with _writer(form, temporary, archive.header, contents, notes) as writer:
+            with (
+                unchanged(folder, archive.header),
+                _writer(form, temporary, archive.header, contents, notes) as writer,
+            ):
                 _write(archive, rows, base, limits, contents, writer, progress)
             progress.finish()
             with open(temporary, "rb") as file:

@@ -19,6 +19,7 @@ from .portions import jobs_of, portions, run_units
 from .preview import preview_faults
 from .progress import Progress, Silent
 from .record_points import leaves_of, spheres_of
+from .unchanged import unchanged
 
 
 class VerifyReport(NamedTuple):
@@ -85,7 +86,8 @@ def verify_archive(
     spread over the archive; None: all.  executor: what runs the work; None: this process.  places: what
     the `places_sum` of all points must be (spool.py); None: not known. A job holds one voxel, 12
     bytes a point of it, 16 with intensities, and 40 where bounds are proved. Raises FormatError or CorruptError only
-    when the index itself cannot be used, BadRequestError for a sample that is none; a broken record is a fault.
+    when the index itself cannot be used, BadRequestError for a sample that is none, SolidcloudError where the archive
+    is changed meanwhile; a broken record is a fault.
     """
     if sample is not None and (not exact or sample < 1):
         raise BadRequestError(f"--sample {sample}: expected 1 or more, and --exact with it")
@@ -108,7 +110,8 @@ def verify_archive(
         for rows in portions(counts[:, 2], jobs_of(executor))
     ]
     progress.start("verify", header.points, "points")
-    results = list(run_units(executor, _verify_rows, units, progress, lambda unit: unit.points))
+    with unchanged(folder, header):  # each unit opens it anew
+        results = list(run_units(executor, _verify_rows, units, progress, lambda unit: unit.points))
     progress.finish()
     found = [
         result for _, result in sorted(zip(units, results, strict=True), key=lambda pair: pair[0].rows.start)

@@ -1,0 +1,96 @@
+"""An archive that is changed while it is read: checked or exported, it is of one generation or of none."""
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import scans
+from solidcloud.builder import export as export_module
+from solidcloud.builder import verify as verify_module
+from solidcloud.builder.config import BuildConfig
+from solidcloud.builder.export import export_archive
+from solidcloud.builder.generation import add_scans
+from solidcloud.builder.pipeline import build_archive
+from solidcloud.builder.unchanged import unchanged
+from solidcloud.builder.verify import verify_archive
+from solidcloud.schemas.archive import Archive
+from solidcloud.schemas.errors import BadRequestError, CorruptError, SolidcloudError
+
+
+@pytest.fixture
+def archive(tmp_path: Path) -> Path:
+    """A small one."""
+    path = tmp_path / "a.xyz"
+    scans.write_xyz(path, np.random.default_rng(1).uniform(0, 2, (300, 3)).round(3))
+    build_archive([path], tmp_path / "hall", BuildConfig(voxel=1.0, resolution=1e-3, jobs=1))
+    return tmp_path / "hall"
+
+
+@pytest.fixture
+def add(tmp_path: Path, archive: Path) -> Callable[[], None]:
+    """Adds points to it that touch every voxel."""
+    path = tmp_path / "b.xyz"
+    scans.write_xyz(path, np.random.default_rng(2).uniform(0, 2, (300, 3)).round(3))
+    return lambda: print(add_scans(archive, [path], jobs=1))
+
+
+@pytest.mark.parametrize(
+    ("module", "name"), [(verify_module, "_verify_rows"), (export_module, "_look"), (export_module, "_write")]
+)
+def test_what_is_read_of_two_generations_is_an_error(
+    archive: Path,
+    add: Callable[[], None],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    module: Any,
+    name: str,
+) -> None:
+    work = getattr(module, name)
+
+    def added_before(*given: Any) -> Any:
+        add()
+        return work(*given)
+
+    out = tmp_path / "out.ply"
+    read = {
+        verify_module: lambda: verify_archive(archive),
+        export_module: lambda: export_archive(archive, out),
+    }[module]
+    with monkeypatch.context() as patch:
+        patch.setattr(module, name, added_before)
+        with pytest.raises(SolidcloudError, match="changed while it was read, generation 0 and then 1: give"):
+            read()
+    assert not list(tmp_path.glob("*out*"))
+    assert read().points == 600
+
+
+def test_an_archive_of_another_build_is_another(archive: Path, tmp_path: Path) -> None:
+    with Archive(archive) as held:
+        header = held.header
+    scans.write_xyz(tmp_path / "c.xyz", np.eye(3))
+    with (
+        pytest.raises(SolidcloudError, match="then 0 of another build: give the command again"),
+        unchanged(archive, header),
+    ):
+        build_archive([tmp_path / "c.xyz"], archive, BuildConfig(voxel=1.0, jobs=1, overwrite=True))
+
+
+def test_errors_of_one_archive_are_what_they_are(archive: Path) -> None:
+    with Archive(archive) as held:
+        header = held.header
+    with pytest.raises(CorruptError, match=r"^a voxel$"), unchanged(archive, header):
+        raise CorruptError("a voxel")
+    shutil.rmtree(archive)
+    with pytest.raises(CorruptError, match=r"^a voxel$"), unchanged(archive, header):
+        raise CorruptError("a voxel")
+
+
+def test_an_export_into_the_archive_itself_is_refused(archive: Path, tmp_path: Path) -> None:
+    (tmp_path / "link").symlink_to(archive)
+    for output in (archive / "index.h5", tmp_path / "link" / "shards" / "0-000000.h5", archive / "new.ply"):
+        with pytest.raises(BadRequestError, match="within the archive itself"):
+            export_archive(archive, output, form="ply", overwrite=True)
+    assert not verify_archive(archive).faults

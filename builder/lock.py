@@ -16,7 +16,9 @@ def lock_path(target: Path) -> Path:
 
 def _taken(target: Path) -> BadRequestError:
     """What a second builder is told."""
-    return BadRequestError(f"{target}: another build is writing it: wait for it, or give another -o")
+    return BadRequestError(
+        f"{target}: another build is writing it, or add or remove: wait for it (a build may be given another -o)"
+    )
 
 
 def check_free(target: Path) -> None:

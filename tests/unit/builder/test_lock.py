@@ -48,4 +48,5 @@ def test_a_second_builder_loads_no_numpy(tmp_path: Path) -> None:
             check=False,
         )
     assert done.returncode == 2, done.stderr
-    assert "hall: another build is writing it: wait for it, or give another -o" in done.stderr
+    expected = "another build is writing it, or add or remove: wait for it (a build may be given another -o)"
+    assert f"hall: {expected}" in done.stderr

@@ -79,6 +79,15 @@ class Change:
         """function(unit) of each unit, which has `points`, in order; progress goes by them."""
         return list(self.executor.map(function, units, self.progress, lambda unit: unit.points))
 
+    def check_room(self, needed: int) -> None:
+        """Refuse, while nothing is lost by it, to write about so many bytes more than are free."""
+        free = shutil.disk_usage(self.target.parent).free
+        if needed > free:
+            raise SolidcloudError(
+                f"{self.target.parent}: {free} bytes free, the change needs about {needed}: make room; the archive is "
+                "what it was"
+            )
+
     def units_of(self, rows: NDArray[np.int64]) -> list[tuple[tuple[int, ...], int]]:
         """Rows of the index in runs of about UNIT_POINTS: (rows, points) each."""
         points = self.archive.voxels["rows"][rows, 2].astype(np.int64)

@@ -22,7 +22,7 @@ from .classes import class_limits
 from .config import RADIUS_SAMPLE
 from .partition import SpoolUnit, run_points, spool_range
 from .passes import MAX_SCANS, VOXEL_BYTES_A_POINT
-from .pipeline import open_inputs
+from .pipeline import ARCHIVE_BYTES_A_POINT, open_inputs
 from .progress import Progress
 from .resume import changed_inputs, described
 from .scan_list import Input
@@ -143,7 +143,8 @@ def remove_scans(
         header = change.archive.header
         if not header.scan_index:
             raise BadRequestError(
-                f"{target}: built without --keep scan, so no point says which scan it is of: build again without it"
+                f"{target}: built without --keep scan, so no point says which scan it is of: build again with "
+                "it, or of the scans that are to stay"
             )
         rows = _rows_of(header.sources, scans, target)
         found = _find_removed(change, rows)
@@ -220,6 +221,7 @@ def _spool_added(change: Change, surveys: list[Survey]) -> float:
     """Spool the new scans; returns the farthest that quantising moved a point [m]."""
     header, dtype, folder = change.archive.header, change.dtype, change.folder / "spool"
     most, first = run_points(change.share, dtype), len(change.archive.header.sources)
+    change.check_room(sum(survey.count for survey in surveys) * (dtype.itemsize + ARCHIVE_BYTES_A_POINT))
     units = [
         SpoolUnit(
             survey.scan, number, part.start, part.stop, part.count, header.lattice, change.config, dtype, folder,
@@ -340,6 +342,7 @@ def _finish(
     before = change.archive.header
     header = replace(header, generation=before.generation + 1, radius_now=None)
     rebuilt, read = _touched(change.archive, boxes)
+    change.check_room(_room(change, header, rebuilt, read))
     gathered, few = _gather(change, rebuilt, read, dropped)
     spool = Spool(change.folder / "spool", change.dtype, header.lattice)
     wanted = set(boxes) | set(change.archive.voxels["key"][rebuilt].tolist())
@@ -374,6 +377,17 @@ def _finish(
         radius=header.radius,
         radius_now=header.radius_now,
     )
+
+
+def _room(change: Change, header: Header, rebuilt: NDArray[np.int64], read: NDArray[np.int64]) -> int:
+    """Bytes, about, that are yet to be written: runs of what is read, and the records of what is built."""
+    archive, before = change.archive, change.archive.header
+    # With radius classes what is read is spooled once more, as it was before.
+    a_point = change.dtype.itemsize * (2 if change.with_classes else 1)
+    runs = int(archive.voxels["rows"][read, 2].sum(dtype=np.int64)) * a_point
+    added = sum(source.count for source in header.sources[len(before.sources) :])
+    records = int(archive.voxels["frame_bytes"][rebuilt].sum(dtype=np.int64)) + added * ARCHIVE_BYTES_A_POINT
+    return runs + records
 
 
 def _dead_bytes(archive: Archive, rebuilt: NDArray[np.int64], files: list[tuple[str, int]]) -> int:

@@ -649,6 +649,41 @@ def test_an_error_told_once_the_index_is_renamed_leaves_the_new_archive(
     assert add_scans(target, [files.c], jobs=1).generation == 2
 
 
+@pytest.mark.parametrize("keep", [frozenset({"scan"}), frozenset()])
+def test_a_disk_without_room_is_told_before_it_is_full(
+    built: Build, files: Files, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, keep: frozenset[str]
+) -> None:
+    """First for the new points, then with those that are read again and built."""
+    target = built(tmp_path / "there" / "x", "ac", keep=keep)
+    row = 12 + 2 * ("scan" in keep)
+    with Archive(target) as archive:
+        held = archive.header.points
+    free = 0
+
+    def usage(_: Path) -> Any:
+        return shutil._ntuple_diskusage(1 << 40, 0, free)
+
+    def too_little(bytes_: int, change: Callable[[], ChangeSummary]) -> int:
+        nonlocal free
+        free = bytes_
+        with pytest.raises(SolidcloudError, match=f"{free} bytes free, the change needs about") as told:
+            refused(target, SolidcloudError, "make room; the archive is what it was", change)
+            change()
+        return int(str(told.value).split("about ")[1].split(":")[0])
+
+    monkeypatch.setattr(shutil, "disk_usage", usage)
+    needed = too_little(len(B) * row, lambda: add_scans(target, [files.b], jobs=1))
+    assert len(B) * row < needed < len(B) * (row + 20)
+    needed = too_little(needed, lambda: add_scans(target, [files.b], jobs=1))
+    assert needed > 100 * row
+    free = needed
+    assert add_scans(target, [files.b], jobs=1).points == held + len(B)
+    if keep:
+        needed = too_little(0, lambda: remove_scans(target, [str(files.b)], jobs=1))
+        free = needed
+        assert remove_scans(target, [str(files.b)], jobs=1).points == held
+
+
 def test_shards_that_no_voxel_refers_to_are_deleted(built: Build, files: Files, tmp_path: Path) -> None:
     target = built(tmp_path / "x", "ab", keep=EVERYTHING)
     keep = target / SHARD_FOLDER / "notes.txt"

@@ -24,6 +24,9 @@ MOST_PARTS = 1 << 16
 # Corners of a triangle take 72 bytes while a mesh is sampled, which holds all of them: 1.2 GB for these.
 MOST_TRIANGLES = 1 << 24
 
+# Extensions that say nothing of where vertices are. Others that a file requires may: instances, compression.
+HARMLESS = ("KHR_lights_", "KHR_materials_", "KHR_texture_", "EXT_texture_", "MSFT_texture_")
+
 FLOAT = 5126
 INDEX_TYPES = {5121: "<u1", 5123: "<u2", 5125: "<u4"}
 TRIANGLES, STRIP, FAN = 4, 5, 6
@@ -173,6 +176,14 @@ class _Document:
 
         ScanError for more than MOST_PARTS nodes or primitives at nodes.
         """
+        required = [str(name) for name in self.document.get("extensionsRequired", [])]
+        if others := [name for name in required if not name.startswith(HARMLESS)]:
+            raise scan_error(
+                self.path,
+                f"a file that requires the extension {others[0]}",
+                "plain meshes, wherever nodes put them",
+                "write it without compression and instancing",
+            )
         nodes = self.document.get("nodes", [])
         scenes = self.document.get("scenes", [])
         if scenes:

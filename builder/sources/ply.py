@@ -6,14 +6,13 @@ vertices into one array of the size the header claims.
 
 import io
 from collections.abc import Iterator
-from itertools import islice
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .rows import number_rows
+from .rows import LONGEST_LINE, number_rows
 from .scan import (
     INTENSITY_NAMES,
     Block,
@@ -58,6 +57,12 @@ class BinaryPly(SeekableScan):
                 yield _block(record, header.intensity)
 
 
+def _skip_lines(file: BinaryIO, lines: int) -> None:
+    """Read past lines, of any length, in bounded memory; to the end where there are fewer."""
+    while lines and (piece := file.readline(LONGEST_LINE)):
+        lines -= piece.endswith(b"\n")
+
+
 class AsciiPly(Scan):
     """The vertices of one PLY file in text."""
 
@@ -75,8 +80,7 @@ class AsciiPly(Scan):
         seen = 0
         with self.path.open("rb") as file:
             file.seek(header.start)
-            for _ in islice(file, header.skip):
-                pass
+            _skip_lines(file, header.skip)
             for rows in number_rows(
                 file,
                 self.path,

@@ -80,6 +80,10 @@ LIES: dict[str, tuple[Callable[[dict], object], str]] = {
         lambda d: d["meshes"][0]["primitives"][0].update(extensions={"KHR_draco_mesh_compression": {}}),
         "compressed by Draco",
     ),
+    "instances": (
+        lambda d: d.update(extensionsRequired=["KHR_materials_unlit", "EXT_mesh_gpu_instancing"]),
+        "requires the extension EXT_mesh_gpu_instancing, expected plain meshes",
+    ),
     "sparse": (lambda d: d["accessors"][0].update(sparse={"count": 1}), "not sparse"),
     "a matrix that projects": (lambda d: d["nodes"][0].update(matrix=[1.0] * 16), "node 0 with the matrix"),
     "a turn that stretches": (lambda d: d["nodes"][0].update(rotation=[0, 0, 1, 1]), "quaternion of length"),
@@ -125,6 +129,11 @@ def test_parts_of_shared_meshes_are_bounded(tmp_path: Path, monkeypatch: pytest.
     with pytest.raises(ScanError, match="over 6 nodes"):
         open_scans(write_square(tmp_path / "c.glb", scene(1, 1, meshless=6)))
     assert open_scans(write_square(tmp_path / "d.glb", scene(3, 2, meshless=3)))[0].declared_count == 4
+
+
+def test_extensions_of_materials_change_nothing(tmp_path: Path) -> None:
+    path = write_square(tmp_path / "a.glb", lambda d: d.update(extensionsRequired=["KHR_texture_transform"]))
+    assert np.array_equal(read_all(path), SQUARE)
 
 
 def test_a_triangle_of_no_vertex_is_refused(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """PLY: the order of elements, odd line ends, and headers that cannot be true."""
 
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -69,3 +70,24 @@ def test_a_ply_may_have_blanks_and_crlf_at_its_line_ends_and_no_vertices(tmp_pat
     assert read_all(path).tolist() == [[1, 2, 3], [4, 5, 6]]
     path.write_text(PLY.format(0) + "end_header\n")
     assert read_all(path).shape == (0, 3)
+
+
+def test_lines_before_the_vertices_may_be_of_any_length(tmp_path: Path) -> None:
+    """They are not held."""
+    path = tmp_path / "a.ply"
+    camera = "ply\nformat ascii 1.0\nelement camera 2\nproperty double a\n"
+    head = camera + PLY.format(1).split("1.0\n")[1] + "end_header\n"
+    with path.open("w") as file:
+        file.write(head)
+        for _ in range(24):
+            file.write(" " * (1 << 20))
+        file.write("1\n2\n3 4 5\n")
+    tracemalloc.start()
+    try:
+        assert read_all(path).tolist() == [[3, 4, 5]]
+        assert tracemalloc.get_traced_memory()[1] < 8 << 20
+    finally:
+        tracemalloc.stop()
+    path.write_text(head + "1\n")
+    with pytest.raises(ScanError):
+        read_all(path)

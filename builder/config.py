@@ -27,7 +27,8 @@ def shard_points(points: int) -> int:
     A quarter of SHARD_POINTS for few, so that two workers have many each, and end at about the same time: 10^7 points
     in 3 shards kept one of them idle for a quarter of the time.
     """
-    return max(SHARD_POINTS // 4, min(SHARD_POINTS, points // 64), points // MOST_SHARDS)
+    # Voxels are not cut, so a shard may stay half empty; two that follow each other hold more than this together.
+    return max(SHARD_POINTS // 4, min(SHARD_POINTS, points // 64), 2 * points // MOST_SHARDS)
 
 
 def parse_radius(text: str) -> tuple[float | None, frozenset[str]]:

@@ -55,6 +55,8 @@ ARCHIVE_BYTES_A_POINT = 6
 SCRATCH_BYTES_A_POINT = 21
 # A point of a file whose header says nothing of their number takes about so many bytes: text.
 BYTES_A_POINT = 30
+# A record's points are numbered by int32 (schemas/voxel.py Links).
+MOST_POINTS = (1 << 31) - 1
 # Points that quantising made one may be found out late, others are at once.
 ONE_POINT = "a single distinct point has no closest point: give --radius"
 
@@ -151,6 +153,7 @@ def _build(
         ]
         dense = np.sort(spool.counts[spool.counts > DENSE_POINTS])[-executor.jobs :]
         _check_space(target.parent, place.folder, final + int(dense.sum()) * SCRATCH_BYTES_A_POINT)
+        _check_voxels(spool, config)
         readers = executor.jobs if config.scheduler else readers_that_fit(spool.counts, executor.jobs, config)
         identity = archive_id(spooled, lattice, config)
         shards = build_shards(spool, identity, place, executor, config, stages)
@@ -171,6 +174,16 @@ def _check_request(surveys: Sequence[Survey], lattice: Lattice, config: BuildCon
     low, high = np.min([s.low for s in surveys], axis=0), np.max([s.high for s in surveys], axis=0)
     if config.radius is None and (low == high).all():
         raise BadRequestError(ONE_POINT)
+
+
+def _check_voxels(spool: Spool, config: BuildConfig) -> None:
+    """Refuse a voxel of more points than a record can hold, before hours go into it."""
+    most = int(spool.counts.max())
+    if most > MOST_POINTS:
+        raise SolidcloudError(
+            f"a voxel of {config.voxel:g} m holds {most} points, expected at most {MOST_POINTS}: give a smaller "
+            "--voxel and --fresh"
+        )
 
 
 def _check_unchanged(

@@ -466,6 +466,17 @@ def test_a_build_that_cannot_fit_the_disk_is_refused(
     assert not list(out.rglob("*.run"))
 
 
+def test_a_voxel_of_more_points_than_a_record_holds_is_refused_before_it_is_built(
+    scans: list[Path], out: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pipeline, "MOST_POINTS", 9)
+    monkeypatch.setattr(pipeline, "build_shards", lambda *_: pytest.fail("built"))
+    with pytest.raises(
+        SolidcloudError, match=r"holds \d+ points, expected at most 9: give a smaller --voxel"
+    ):
+        build(scans, out / "a")
+
+
 BAD_OPTIONS = [
     {"degree": 1}, {"degree": 17}, {"leaf": 0}, {"leaf": 33}, {"cell_points": 0}, {"voxel": 0.0},
     {"voxel": float("nan")}, {"resolution": 0.0}, {"resolution": -1.0}, {"spacing": 0.0}, {"radius": -0.1},

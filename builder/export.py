@@ -21,7 +21,6 @@ from ..schemas.voxel_grid import MAX_COORDINATE, Lattice
 from ..schemas.vtkhdf import vtk_file
 from .progress import Progress, Silent
 from .record_points import Taken, read_columns, record_columns, stored_columns, taken
-from .unchanged import unchanged
 
 FORMATS = ("laz", "las", "ply", "vtkhdf")
 
@@ -77,7 +76,7 @@ def export_archive(
 
     box: half open; None: all points.  form: one of FORMATS; None: by the suffix of `output`. A file of no points is
     whole, too. Raises BadRequestError for a box, format or output that cannot be, and where the format cannot hold the
-    points; SolidcloudError where the archive is changed meanwhile; CorruptError, FormatError, OSError.
+    points; CorruptError, FormatError, OSError. An archive that is changed meanwhile is written as it was at first.
     """
     output, progress = Path(output), progress or Silent()
     form = _format_of(output, form)
@@ -96,17 +95,13 @@ def export_archive(
         rows = np.flatnonzero(near.all(axis=1))
         points = archive.voxels["rows"][rows, 2].astype(np.int64)
         progress.start("look", int(points.sum()), "points")
-        with unchanged(folder, archive.header):
-            contents = _look(archive, rows, base, limits, progress)
+        contents = _look(archive, rows, base, limits, progress)
         progress.finish()
         notes = [] if contents.points else ["no point is in the box"]
         temporary = output.with_name(f".{output.name}.{os.getpid()}.tmp")
         try:
             progress.start("export", contents.points, "points")
-            with (
-                unchanged(folder, archive.header),
-                _writer(form, temporary, archive.header, contents, notes) as writer,
-            ):
+            with _writer(form, temporary, archive.header, contents, notes) as writer:
                 _write(archive, rows, base, limits, contents, writer, progress)
             progress.finish()
             with open(temporary, "rb") as file:

@@ -1,4 +1,4 @@
-"""An archive that is changed while it is read: checked or exported, it is of one generation or of none."""
+"""An archive that is changed while it is checked or exported: what is told is of one generation, or an error."""
 
 import shutil
 from collections.abc import Callable
@@ -37,34 +37,39 @@ def add(tmp_path: Path, archive: Path) -> Callable[[], None]:
     return lambda: print(add_scans(archive, [path], jobs=1))
 
 
-@pytest.mark.parametrize(
-    ("module", "name"), [(verify_module, "_verify_rows"), (export_module, "_look"), (export_module, "_write")]
-)
-def test_what_is_read_of_two_generations_is_an_error(
-    archive: Path,
-    add: Callable[[], None],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    module: Any,
-    name: str,
-) -> None:
+def during(monkeypatch: pytest.MonkeyPatch, module: Any, name: str, what: Callable[[], None]) -> None:
+    """Have something done just before a function of a module."""
     work = getattr(module, name)
 
-    def added_before(*given: Any) -> Any:
-        add()
+    def after(*given: Any) -> Any:
+        what()
         return work(*given)
 
-    out = tmp_path / "out.ply"
-    read = {
-        verify_module: lambda: verify_archive(archive),
-        export_module: lambda: export_archive(archive, out),
-    }[module]
+    monkeypatch.setattr(module, name, after)
+
+
+def test_what_is_checked_of_two_generations_is_an_error(
+    archive: Path, add: Callable[[], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
     with monkeypatch.context() as patch:
-        patch.setattr(module, name, added_before)
+        during(patch, verify_module, "_verify_rows", add)
         with pytest.raises(SolidcloudError, match="changed while it was read, generation 0 and then 1: give"):
-            read()
-    assert not list(tmp_path.glob("*out*"))
-    assert read().points == 600
+            verify_archive(archive)
+    report = verify_archive(archive)
+    assert not report.faults and report.points == 600
+
+
+@pytest.mark.parametrize("name", ["_look", "_write"])
+def test_an_export_is_of_the_generation_it_began_with(
+    archive: Path, add: Callable[[], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    """Its files are open from the first on, and stay readable when they are deleted."""
+    export_archive(archive, tmp_path / "before.ply")
+    with monkeypatch.context() as patch:
+        during(patch, export_module, name, add)
+        assert export_archive(archive, tmp_path / "while.ply").points == 300
+    assert (tmp_path / "while.ply").read_bytes() == (tmp_path / "before.ply").read_bytes()
+    assert export_archive(archive, tmp_path / "after.ply").points == 600
 
 
 def test_an_archive_of_another_build_is_another(archive: Path, tmp_path: Path) -> None:

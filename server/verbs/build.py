@@ -1,15 +1,13 @@
 """`solidcloud build`: scans to an archive."""
 
-import signal
 import sys
-import threading
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from .interrupt import interruptible
 from .options import AsJson, parse_bytes, print_json
 
 if TYPE_CHECKING:
@@ -125,7 +123,7 @@ def _build(scans: list[Path], output: Path, config: "BuildConfig", log_json: boo
     from ..console import print_build
     from ..progress import progress_listener
 
-    with _interruptible(output), progress_listener(log_json) as listener:
+    with interruptible(lambda: _kept(output)), progress_listener(log_json) as listener:
         summary = build_archive(scans, output, config, listener)
     if as_json:
         print_json({**summary._asdict(), "archive": str(summary.archive)})
@@ -139,28 +137,13 @@ def _build(scans: list[Path], output: Path, config: "BuildConfig", log_json: boo
         print(f"left out: {fault}", file=sys.stderr)
 
 
-@contextmanager
-def _interruptible(output: Path) -> Iterator[None]:
-    """Take SIGTERM for Ctrl-C, and say how to go on."""
-    main = threading.current_thread() is threading.main_thread()  # no other thread may say what a signal does
-    before = signal.signal(signal.SIGTERM, _interrupt) if main else None
-    try:
-        yield
-    except KeyboardInterrupt:
-        from ...builder.workplace import building_folder
+def _kept(output: Path) -> str:
+    """What is left of a build that was interrupted."""
+    from ...builder.workplace import building_folder
 
-        folder = building_folder(output)
-        kept = f"what is done is kept in {folder}: the same command goes on, --fresh starts over"
-        print(f"interrupted: {kept if folder.exists() else 'nothing was done'}", file=sys.stderr)
-        raise typer.Exit(130) from None  # all is said
-    finally:
-        if main:
-            signal.signal(signal.SIGTERM, before)
-
-
-def _interrupt(*_: object) -> None:
-    """What SIGTERM does."""
-    raise KeyboardInterrupt
+    folder = building_folder(output)
+    kept = f"what is done is kept in {folder}: the same command goes on, --fresh starts over"
+    return kept if folder.exists() else "nothing was done"
 
 
 def _estimate(scans: Sequence[Path], output: Path, config: "BuildConfig", as_json: bool) -> None:

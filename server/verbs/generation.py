@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from .interrupt import interruptible
 from .options import ArchivePath, AsJson, parse_bytes, print_json
 
 if TYPE_CHECKING:
@@ -35,7 +36,7 @@ def add(
     from ...builder.generation import add_scans
     from ..progress import progress_listener
 
-    with progress_listener() as bars:
+    with interruptible(lambda: _as_it_is(archive)), progress_listener() as bars:
         summary = add_scans(
             archive,
             scans,
@@ -64,11 +65,23 @@ def remove(
     from ...builder.generation import remove_scans
     from ..progress import progress_listener
 
-    with progress_listener() as bars:
+    with interruptible(lambda: _as_it_is(archive)), progress_listener() as bars:
         summary = remove_scans(
             archive, scans, jobs=jobs, memory_bytes=parse_bytes(memory, "--memory"), progress=bars
         )
     _print(summary, "removed", as_json)
+
+
+def _as_it_is(archive: Path) -> str:
+    """What an archive is after a change of it was interrupted."""
+    from ...schemas.archive import Archive
+    from ...schemas.errors import FormatError
+
+    try:
+        with Archive(archive) as held:
+            return f"{archive} is whole, of generation {held.header.generation}"
+    except FormatError as error:
+        return str(error)
 
 
 def _print(summary: "ChangeSummary", what: str, as_json: bool) -> None:

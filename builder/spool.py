@@ -241,7 +241,7 @@ class Spool:
             if self._file is None:
                 names = self.runs
                 if names is None:
-                    names = sorted(path.name for path in self.folder.glob(f"*{RUN_SUFFIX}"))
+                    names = tuple(sorted(path.name for path in self.folder.glob(f"*{RUN_SUFFIX}")))
                 # Of use to this session alone, and so removed with what is temporary by the next.
                 path = self.folder / f"{uuid.uuid4().hex}{MERGED_SUFFIX}"
                 _merge_directories([self.folder / name for name in names], path)

@@ -11,9 +11,10 @@ import contextlib
 import functools
 import os
 import re
+import stat
 import threading
 import zlib
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from pathlib import Path
 
 import h5py
@@ -34,6 +35,7 @@ from .codec import (
 )
 from .errors import CorruptError, FormatError
 from .index import VOXEL_DTYPE, Header, index_columns, index_digest, read_header
+from .interrupts import kept_back
 from .voxel import Links, VoxelData
 from .voxel_grid import voxel_coordinates
 
@@ -149,14 +151,15 @@ class _Disk:
 class NewFile(h5py.File):  # type: ignore[misc]
     """An HDF5 file being written."""
 
-    def __init__(self, disk: _Disk) -> None:
-        """Write to `disk`."""
-        self._disk = disk
+    def __init__(self, disk: _Disk, deliver: Callable[[], None]) -> None:
+        """Write to `disk`. deliver: hands on an interrupt that was kept back."""
+        self._disk, self._deliver = disk, deliver
         # Metadata of format 1.10 and later is checksummed; in older ones 5 of 1,600 flips were silently wrong.
         super().__init__(disk, "w", libver=("v110", "v110"))
 
     def check(self) -> None:
-        """Raise the OSError of a write that failed: to be asked now and then while much is written."""
+        """Raise the OSError of a write that failed, or an interrupt: to be asked now and then in long writing."""
+        self._deliver()
         if self._disk.error is not None:
             raise self._disk.error
 
@@ -165,15 +168,17 @@ class NewFile(h5py.File):  # type: ignore[misc]
 def new_file(path: Path) -> Iterator[NewFile]:
     """An HDF5 file under a temporary name. Given its own only once it is closed and synced.
 
-    A write that fails is an OSError that names the file; nothing is left then.
+    A write that fails is an OSError that names the file; nothing is left then. Interrupts wait until the file is
+    closed, or for `check`.
     """
     temporary = _temporary(path)
-    with contextlib.ExitStack() as stack:
+    with kept_back() as deliver, contextlib.ExitStack() as stack:
         disk = _Disk(temporary)
         stack.callback(disk.close)
         try:
-            with NewFile(disk) as file:
+            with NewFile(disk, deliver) as file:
                 yield file
+            deliver()
             if disk.error is not None:
                 raise disk.error
         except BaseException as error:
@@ -436,11 +441,15 @@ class Archive:
                 raise FormatError(
                     f"{self.folder}: shard name {name!r} in the index: not written by solidcloud"
                 )
-            if not path.is_file():
+            try:
+                held = path.stat()
+            except OSError:
+                held = None
+            if held is None or not stat.S_ISREG(held.st_mode):
                 raise FormatError(f"{path}: missing: restore it or rebuild the archive")
-            if path.stat().st_size != size:
+            if held.st_size != size:
                 raise FormatError(
-                    f"{path}: {path.stat().st_size} bytes, expected {size}: truncated? restore or rebuild it"
+                    f"{path}: {held.st_size} bytes, expected {size}: truncated? restore or rebuild it"
                 )
         sizes = np.array([size for _, size in self._shards], np.uint64)
         if len(self.voxels) and (

@@ -561,3 +561,22 @@ def test_an_archive_that_is_replaced_stays_the_one_opened(copy: Path) -> None:
     with Archive(copy) as archive:
         shutil.rmtree(copy)
         assert len(archive.read_voxel(0)[0].points) > 0
+
+
+def test_a_shard_that_is_deleted_while_it_is_looked_at_is_missing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As by a change that ends just then: whoever opens the archive may take the new index, and no bare OSError."""
+    shutil.copytree(LATER, tmp_path / "hall")
+    look = Path.stat
+
+    def looked(path: Path, **more: Any) -> Any:
+        held = look(path, **more)
+        if path.suffix == ".h5" and path.name != "index.h5":
+            path.unlink()
+        return held
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "stat", looked)
+        with pytest.raises(FormatError, match=r"\.h5: "):
+            Archive(tmp_path / "hall")

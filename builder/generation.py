@@ -263,7 +263,8 @@ def _no_longer_unknown(header: Header, surveys: Sequence[Survey]) -> Header:
     if not gone:
         return header
     kept = [row for row in range(len(header.unknown)) if row not in gone]
-    number = {-1: -1, None: None, **{row: place for place, row in enumerate(kept)}}
+    number: dict[int | None, int | None] = {row: place for place, row in enumerate(kept)}
+    number |= {-1: -1, None: None}
     return replace(
         header,
         sources=tuple(replace(source, unknown=number[source.unknown]) for source in sources),

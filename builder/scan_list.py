@@ -319,7 +319,7 @@ def inputs(paths: Sequence[Path], spacing: float | None = None) -> list[Input]:
         for entry in used:
             files.setdefault(entry.path, []).append(entry)
         found += [_opened(file, entries, spacing) for file, entries in files.items()]
-    _check_once((item.path, scan.index if scan else 0) for item in found for scan in item.scans or [None])
+    _check_once((item.path, index) for item in found for index in [s.index for s in item.scans] or [0])
     return found
 
 

@@ -1,4 +1,4 @@
-"""Every system call by which a build writes, stopped in turn by strace: killed, no space left, input/output error."""
+"""Every system call by which a build writes, stopped in turn by strace: killed, interrupted, no space, I/O error."""
 
 import os
 import re
@@ -22,8 +22,9 @@ CALLS = (
 )  # fmt: skip
 # Only these fail for want of space; and only what is written, synced and named is told to fail by the disk.
 FULL = ("write", "pwrite64", "fsync", "fdatasync", "ftruncate", "openat", "rename", "mkdir")
-FAULTS = {"KILL": "signal=KILL", "ENOSPC": "error=ENOSPC", "EIO": "error=EIO"}
-SAID = {"ENOSPC": "no space left", "EIO": "input/output error"}
+FAULTS = {"KILL": "signal=KILL", "INT": "signal=INT", "ENOSPC": "error=ENOSPC", "EIO": "error=EIO"}
+SAID = {"INT": "interrupted", "ENOSPC": "no space left", "EIO": "input/output error"}
+EXITS = {"INT": 130, "ENOSPC": 1, "EIO": 1}
 
 
 class Call(NamedTuple):
@@ -84,14 +85,15 @@ def inject(case: Case, call: Call, fault: str, tally: Tally, **how: object) -> N
         if status != -signal.SIGKILL:
             faults.append(f"exit code {status} after a kill: {said[-1000:]}")
     else:
-        if status != 1:
-            faults.append(f"exit code {status}, expected 1")
+        if status != EXITS[fault]:
+            faults.append(f"exit code {status}, expected {EXITS[fault]}")
         if SAID[fault] not in said.lower():
             faults.append(f"the message does not say {SAID[fault]!r}")
         if "Traceback" in said or "HDF5-DIAG" in said:
             faults.append("a traceback")
-        if sum(line.startswith("error: ") for line in said.splitlines()) != 1:
-            faults.append("expected one line that begins with error:")
+        opening = "interrupted" if fault == "INT" else "error: "
+        if sum(line.startswith(opening) for line in said.splitlines()) != 1:
+            faults.append(f"expected one line that begins with {opening!r}")
         if faults:
             faults.append(said[-3000:])
     tally.stages[case.stage()] += 1

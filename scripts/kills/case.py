@@ -18,7 +18,7 @@ from solidcloud.schemas.errors import SolidcloudError
 from solidcloud.schemas.vtkhdf import PREVIEW_NAME
 
 # What cuts a build into units, made small: some 10 units of a few hundred points, a shard a quarter of SHARD_POINTS.
-SMALL = {"SHARD_POINTS": 3200, "SPOOL_RANGE": 1500, "LEAST_RUN_POINTS": 700}
+SMALL: dict[str, Any] = {"SHARD_POINTS": 3200, "RANGE_POINTS": (1500, 1500), "LEAST_RUN_POINTS": 700}
 POINTS = 4000
 VOXEL = 1.0
 NAME = "hall"
@@ -35,8 +35,9 @@ def make_small() -> list[str]:
             for constant in SMALL.keys() & vars(module).keys():
                 setattr(module, constant, SMALL[constant])
                 found.append(f"{name}.{constant}")
-    if not any(where.endswith(".SHARD_POINTS") for where in found):
-        raise RuntimeError("no SHARD_POINTS in the builder: what cuts a build into units now?")
+    missing = SMALL.keys() - {where.rpartition(".")[2] for where in found}
+    if missing:
+        raise RuntimeError(f"no {', '.join(missing)} in the builder: what cuts a build into units now?")
     return found
 
 

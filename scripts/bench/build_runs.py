@@ -131,12 +131,20 @@ def stage_peaks(stages: dict[str, float], samples: list[Sample], seconds: float)
 
 def linearity(built: dict[int, list[Built]]) -> dict[tuple[int, int], float]:
     """Seconds a point of each size over those of the size before it, medians: (smaller, larger) -> ratio."""
-    found = {}
-    for small, large in itertools.pairwise(sorted(built)):
-        found[small, large] = (_median_seconds(built[large]) / large) / (
-            _median_seconds(built[small]) / small
-        )
-    return found
+    spent = {points: _median_seconds(runs) / points for points, runs in sorted(built.items())}
+    return {(small, large): spent[large] / spent[small] for small, large in itertools.pairwise(spent)}
+
+
+def marginal(built: dict[int, list[Built]]) -> dict[tuple[int, int], float]:
+    """Seconds that each further point takes from one size to the next, medians: (smaller, larger) -> seconds.
+
+    What does not grow with the scan, the command's start above all, is in none of them.
+    """
+    spent = {points: _median_seconds(runs) for points, runs in sorted(built.items())}
+    return {
+        (small, large): (spent[large] - spent[small]) / (large - small)
+        for small, large in itertools.pairwise(spent)
+    }
 
 
 def _median_seconds(runs: list[Built]) -> float:

@@ -14,9 +14,10 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ..schemas.archive import Archive, sync_folder
+from ..schemas.archive import Archive
 from ..schemas.errors import BadRequestError
 from ..schemas.index import Header
+from ..schemas.new_file import sync_folder
 from ..schemas.voxel_grid import MAX_COORDINATE, Lattice
 from ..schemas.vtkhdf import vtk_file
 from .progress import Progress, Silent

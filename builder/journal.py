@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, Generic, TypeVar
 
-from ..schemas.archive import sync_folder
+from ..schemas.new_file import sync_folder
 from .executor import Executor
 from .progress import Progress
 

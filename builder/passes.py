@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from ..schemas.archive import SHARD_FOLDER, file_checksum
 from ..schemas.errors import BadRequestError, ScanError
 from ..schemas.index import VOXEL_DTYPE
+from ..schemas.shard import SHARD_FOLDER, file_checksum
 from ..schemas.voxel_grid import Lattice
 from .config import BuildConfig
 from .executor import Executor

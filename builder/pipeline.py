@@ -16,9 +16,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..schemas.archive import Archive, write_index
+from ..schemas.archive import Archive
 from ..schemas.errors import BadRequestError, CorruptError, ScanError, SolidcloudError
 from ..schemas.index import Header
+from ..schemas.index_file import write_index
 from ..schemas.voxel_grid import Lattice
 from .config import RADIUS_SAMPLE, BuildConfig
 from .dense import DENSE_POINTS
@@ -64,7 +65,7 @@ ONE_POINT = "a single distinct point has no closest point: give --radius"
 class BuildSummary(NamedTuple):
     """What was built. bytes: of the archive.  stages: seconds of each.  skipped: reason -> points left out.
 
-    lattice_step, moved_max, radius, radius_error: [m], see schemas/archive.py Header.  faults: scans left out.
+    lattice_step, moved_max, radius, radius_error: [m], see schemas/index.py Header.  faults: scans left out.
     already: nothing was built, for the archive was there, of the same scans with the same options.
     """
 
@@ -129,6 +130,7 @@ def _build(
     """All passes: what is in `place.archive` when this returns is an archive, and verified."""
     about = sum(_about(item) for item in inputs)
     with make_executor(config, jobs_that_fit(worker_count(config.jobs, about), config)) as executor:
+        place.staffed = True
         surveys, faulty = survey_scans(inputs, about, place, executor, config, stages)
         lattice, lattice_source = choose_lattice(surveys, config)
         _check_request(surveys, lattice, config)

@@ -7,9 +7,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..schemas.archive import Archive, new_file, publish
+from ..schemas.archive import Archive
 from ..schemas.errors import CorruptError
 from ..schemas.index import Header
+from ..schemas.new_file import new_file, publish
 from ..schemas.vtkhdf import PREVIEW_NAME, VtkPoints, read_points
 from .executor import Executor
 from .kernels.records import first_of_each, point_hashes

@@ -20,8 +20,8 @@ import numpy as np
 import tomli_w
 from numpy.typing import NDArray
 
-from ..schemas.archive import sync_folder
 from ..schemas.errors import BadRequestError, ScanError
+from ..schemas.new_file import sync_folder
 from .progress import Progress, Silent
 from .sources import METRES, TURNS, Scan, header_bounds, open_scans, placed, scan_files, sha256_of
 

@@ -8,9 +8,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..schemas.archive import shard_name, write_shard
 from ..schemas.codec import encode_voxel
 from ..schemas.radius_model import RADIUS_CLASSES
+from ..schemas.shard import shard_name, write_shard
 from ..schemas.voxel_grid import Lattice
 from .classes import ALL_CODES, voxel_classes
 from .config import BuildConfig, shard_points

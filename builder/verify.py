@@ -6,10 +6,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..schemas.archive import SHARD_FOLDER, Archive
+from ..schemas.archive import Archive
 from ..schemas.codec import OpenRecord
 from ..schemas.errors import BadRequestError, CorruptError
 from ..schemas.radius_model import RADIUS_CLASSES
+from ..schemas.shard import SHARD_FOLDER
 from .exact import loose_nodes, sample_nodes
 from .executor import Executor, worker_count
 from .kernels.content import SEEDS

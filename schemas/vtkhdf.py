@@ -1,4 +1,4 @@
-"""Points as VTKHDF PolyData, vertices only: what ParaView and VTK open as *.vtkhdf. Beside archive.py a user of h5py.
+"""Points as VTKHDF PolyData, vertices only: what ParaView and VTK open as *.vtkhdf. Beside archives' a user of h5py.
 
 After the VTKHDF file format, version 2.0 of it (docs.vtk.org, "VTKHDF format specification"): a group `VTKHDF` with the
 attributes Version and Type, `NumberOfPoints` and `Points`, four groups of cells of which only `Vertices` has any, and
@@ -14,8 +14,8 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from .archive import NewFile, new_file, publish
 from .errors import CorruptError
+from .new_file import NewFile, new_file, publish
 
 PREVIEW_NAME = "preview.vtkhdf"
 

@@ -8,8 +8,9 @@ import h5py
 import numpy as np
 import pytest
 import scans
-from solidcloud.schemas.archive import INDEX_NAME, Archive
+from solidcloud.schemas.archive import Archive
 from solidcloud.schemas.errors import BadRequestError, BadTransformError
+from solidcloud.schemas.index_file import INDEX_NAME
 from solidcloud.schemas.messages import JSON, MSGPACK, SceneInfo, decode_answer, encode
 from solidcloud.server.pose_file import read_poses
 from solidcloud.server.scene import Scene

@@ -15,9 +15,10 @@ from scans import make_scan, write_las, write_ply
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.export import export_archive, lattice_box
 from solidcloud.builder.pipeline import build_archive
-from solidcloud.schemas.archive import Archive, write_index
+from solidcloud.schemas.archive import Archive
 from solidcloud.schemas.errors import BadRequestError
 from solidcloud.schemas.index import Header
+from solidcloud.schemas.index_file import write_index
 from solidcloud.schemas.voxel_grid import Lattice
 from solidcloud.schemas.vtkhdf import read_points
 from solidcloud.server.cli import run

@@ -21,8 +21,10 @@ from solidcloud.builder.preview import write_preview
 from solidcloud.builder.radius import voxel_points
 from solidcloud.builder.verify import verify_archive
 from solidcloud.builder.workplace import locked
-from solidcloud.schemas.archive import INDEX_NAME, SHARD_FOLDER, Archive
+from solidcloud.schemas.archive import Archive
 from solidcloud.schemas.errors import BadRequestError, CorruptError, FormatError, ScanError, SolidcloudError
+from solidcloud.schemas.index_file import INDEX_NAME
+from solidcloud.schemas.shard import SHARD_FOLDER
 from solidcloud.schemas.vtkhdf import PREVIEW_NAME
 from solidcloud.server.scene import Scene
 

@@ -21,8 +21,9 @@ from scans import WITH_POINTS, make_scan, write_las, write_ply, write_xyz
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import BuildSummary, build_archive
 from solidcloud.builder.verify import verify_archive
-from solidcloud.schemas.archive import ZSTD_FILTER, Archive
+from solidcloud.schemas.archive import Archive
 from solidcloud.schemas.errors import BadRequestError, CorruptError, ScanError, SolidcloudError
+from solidcloud.schemas.shard import ZSTD_FILTER
 from solidcloud.server.scene import Scene
 
 

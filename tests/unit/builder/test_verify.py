@@ -18,11 +18,13 @@ from solidcloud.builder.pipeline import build_archive
 from solidcloud.builder.spacing import archive_mean
 from solidcloud.builder.spool import places_sum
 from solidcloud.builder.verify import verify_archive
-from solidcloud.schemas.archive import Archive, shard_name, write_index, write_shard
+from solidcloud.schemas.archive import Archive
 from solidcloud.schemas.codec import encode_voxel
 from solidcloud.schemas.errors import BadRequestError, FormatError
 from solidcloud.schemas.index import Header
+from solidcloud.schemas.index_file import write_index
 from solidcloud.schemas.radius_model import RADIUS_CLASSES
+from solidcloud.schemas.shard import shard_name, write_shard
 from solidcloud.schemas.voxel import VoxelData
 from solidcloud.server.cli import run
 

@@ -12,18 +12,20 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-import solidcloud.schemas.archive as archive_module
+import solidcloud.schemas.index as index_module
 from scans import WITH_POINTS, make_scan, write_xyz
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import build_archive
 from solidcloud.builder.radius import voxel_points
-from solidcloud.schemas.archive import DATASETS, Archive, file_checksum, shard_name, write_index, write_shard
+from solidcloud.schemas.archive import Archive
 from solidcloud.schemas.codec import encode_voxel
 from solidcloud.schemas.errors import CorruptError, FormatError
 from solidcloud.schemas.index import RadiusNow
+from solidcloud.schemas.index_file import write_index
 from solidcloud.schemas.radius_model import LOCAL_RADII
+from solidcloud.schemas.shard import DATASETS, file_checksum, shard_name, write_shard
 
-FORMAT = Path(archive_module.__file__).with_name("FORMAT.md")
+FORMAT = Path(index_module.__file__).with_name("FORMAT.md")
 # Of version 3, with dead voxels in its shards.
 LATER = Path(__file__).resolve().parents[2] / "golden" / "archive-3"
 ORIGIN = np.array([512345.678901, 5612345.123456, -7.25])
@@ -121,7 +123,7 @@ def test_format_md_names_every_dataset_and_field(built: Path) -> None:
         assert f"`{name}`" in text, name
     assert f"c >= 1 rows of {sizes[0]} bytes" in text
     assert f"n >= 1 rows of {sizes[1]} bytes" in text
-    assert f"packed, {archive_module.VOXEL_DTYPE.itemsize} bytes" in text
+    assert f"packed, {index_module.VOXEL_DTYPE.itemsize} bytes" in text
 
 
 def test_format_md_reads_and_names_an_archive_with_radius_classes(tmp_path: Path) -> None:

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from solidcloud.schemas.archive import new_file
 from solidcloud.schemas.interrupts import kept_back
+from solidcloud.schemas.new_file import new_file
 
 
 @pytest.fixture(autouse=True)

@@ -9,7 +9,8 @@ import pytest
 from scans import make_scan, write_xyz
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import build_archive
-from solidcloud.schemas.archive import Archive, write_index
+from solidcloud.schemas.archive import Archive
+from solidcloud.schemas.index_file import write_index
 from solidcloud.server.cli import run
 from solidcloud.server.store import Store
 

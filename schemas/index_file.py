@@ -1,0 +1,93 @@
+"""The file `index.h5`, writer and reader side by side: the columns of schemas/index.py as plain HDF5 datasets.
+
+FORMAT.md says the same in prose; change both together. It is the last file of an archive to be written.
+"""
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from .errors import CorruptError, FormatError
+from .index import Header, index_columns, index_digest
+from .new_file import new_file, publish
+
+# What this software reads, and writes: the first version that holds what is to be said (schemas/index.py Header).
+FORMAT_VERSIONS = (1, 2, 3)
+INDEX_NAME = "index.h5"
+
+
+def write_index(folder: Path, header: Header, voxels: NDArray, shards: list[tuple[str, int]]) -> None:
+    """Write index.h5, the last file of an archive: with it the archive is whole.
+
+    voxels: VOXEL_DTYPE rows sorted by key.  shards: name and bytes of each, in the order of their numbers.
+    """
+    path = folder / INDEX_NAME
+    columns = index_columns(header, voxels, shards)
+    with new_file(path) as file:
+        file.attrs["format"] = np.bytes_("solidcloud")
+        file.attrs["format_version"] = np.uint32(header.format_version)
+        file.attrs["units"] = np.bytes_("m")
+        file.attrs["archive_id"] = np.frombuffer(header.archive_id, np.uint8)
+        file.attrs["sha256"] = np.frombuffer(index_digest(header.archive_id, columns), np.uint8)
+        for name, column in columns.items():
+            file.create_dataset(name, data=column)
+    publish(path)
+
+
+def _text_attribute(file: h5py.File, name: str) -> str:
+    """A text attribute of fixed length, "" where there is none.
+
+    Text of variable length lies in HDF5's global heap, which has no checksum: with one byte flipped there, HDF5
+    2.0 never came back. So it is neither written nor read.
+    """
+    if name not in file.attrs or file.attrs.get_id(name).dtype.kind != "S":
+        return ""
+    return bytes(file.attrs[name]).decode("ascii", "replace")
+
+
+def read_columns(path: Path) -> tuple[bytes, dict[str, NDArray]]:
+    """The archive's id and every dataset of an index, none of which leads elsewhere or claims more than the file holds.
+
+    Raises FormatError or CorruptError naming the file; of HDF5 what it raises for a file that is damaged.
+    """
+    size = path.stat().st_size
+    with h5py.File(path, "r") as file:
+        if _text_attribute(file, "format") != "solidcloud":
+            raise FormatError(
+                f"{path}: not a solidcloud index: give the folder that `solidcloud build` wrote"
+            )
+        version = int(file.attrs["format_version"])
+        if version not in FORMAT_VERSIONS:
+            known = ", ".join(map(str, FORMAT_VERSIONS))
+            raise FormatError(
+                f"{path}: format version {version}, this software reads {known}: use the one that wrote it"
+            )
+        units = _text_attribute(file, "units")
+        if units != "m":
+            raise FormatError(f"{path}: units {units!r}, expected 'm': rebuild the archive")
+        columns = {}
+        for name in file:
+            link = file.get(name, getlink=True)
+            dataset = file.get(name) if isinstance(link, h5py.HardLink) else None
+            if (
+                not isinstance(dataset, h5py.Dataset)
+                or dataset.external
+                or dataset.is_virtual
+                or dataset.chunks
+            ):
+                raise FormatError(
+                    f"{path}: {name} is no plain dataset: not written by solidcloud, do not use it"
+                )
+            if dataset.dtype.hasobject or dataset.size * dataset.dtype.itemsize > size:
+                raise FormatError(
+                    f"{path}: {name} claims more than the file holds: damaged, restore or rebuild it"
+                )
+            columns[name] = dataset[()]
+        archive_id = file.attrs["archive_id"].tobytes()
+        if index_digest(archive_id, columns) != file.attrs["sha256"].tobytes():
+            raise CorruptError(
+                f"{path}: checksum differs from the one stored: damaged, restore or rebuild it"
+            )
+    return archive_id, columns

@@ -24,15 +24,14 @@ from ..schemas.codec import (
     NODE_DTYPE,
     OPTIONAL_COLUMNS,
     Record,
-    RowStream,
     cell_rows,
     node_rows,
     point_dtype,
     point_rows,
-    pwrite_all,
 )
 from ..schemas.errors import CorruptError
 from ..schemas.kernels.morton import morton_decode
+from ..schemas.row_stream import RowStream, pwrite_all
 from ..schemas.voxel import CELL_BITS, Cells, Nodes, VoxelData, top_shift
 from .cells import CellTrees, block_points, build_trees, leaf_runs
 from .config import BuildConfig

@@ -16,8 +16,9 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from .codec import CELL_DTYPE, NODE_DTYPE, Frame, Record, voxel_point_dtype
+from .codec import CELL_DTYPE, NODE_DTYPE, Record, voxel_point_dtype
 from .errors import CorruptError
+from .frames import Frame
 from .index import VOXEL_DTYPE
 from .new_file import new_file, publish, temporary_path
 from .voxel import VoxelData

@@ -5,11 +5,68 @@ from numpy.typing import NDArray
 from scans import make_steps
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.octree import VoxelPoints, build_voxel
-from solidcloud.schemas.codec import OpenRecord, RecordShape, encode_voxel, open_record, voxel_point_dtype
+from solidcloud.schemas.codec import (
+    OPTIONAL_COLUMNS,
+    OpenRecord,
+    Record,
+    RecordShape,
+    decode_voxel,
+    encode_voxel,
+    open_record,
+    voxel_point_dtype,
+)
+from solidcloud.schemas.radius_model import RADIUS_CLASSES
 from solidcloud.schemas.voxel import Links, VoxelData
 
 ARCHIVE_ID = bytes(range(16))
 KEY = 0x1234567
+
+
+def shape_of(voxel: VoxelData) -> RecordShape:
+    """What an index would say of this voxel's record."""
+    counts = len(voxel.cells.nodes), len(voxel.nodes.count), len(voxel.points)
+    return RecordShape(*counts, voxel_point_dtype(voxel))
+
+
+def decode(record: Record, voxel: VoxelData, steps: int, **other: object) -> tuple[VoxelData, Links]:
+    """`decode_voxel` of a record as it should be, but for what `other` says."""
+    arguments = {
+        "cells": record.cells,
+        "nodes": record.nodes,
+        "points": record.points,
+        "shape": shape_of(voxel),
+        "key": voxel.key,
+        "archive_id": ARCHIVE_ID,
+        "voxel_steps": steps,
+        **other,
+    }
+    return decode_voxel(**arguments)
+
+
+def assert_same_bits(found: VoxelData, expected: VoxelData) -> None:
+    """Every column of the same type, shape and bytes."""
+    assert found.key == expected.key
+    assert found.top_shift == expected.top_shift
+    columns = [
+        *zip(found.cells, expected.cells, strict=True),
+        *zip(found.nodes, expected.nodes, strict=True),
+        *((getattr(found, f), getattr(expected, f)) for f in ("points", *OPTIONAL_COLUMNS)),
+    ]
+    for a, b in columns:
+        assert (a is None) == (b is None)
+        if a is not None:
+            assert (a.dtype, a.shape, a.tobytes()) == (b.dtype, b.shape, b.tobytes())
+
+
+def kept(n: int, seed: int) -> dict[str, np.ndarray]:
+    """Optional columns of any bits, NaN among them."""
+    rng = np.random.default_rng(seed)
+    bits = rng.integers(0, 2**32, n, np.uint32)
+    return {
+        "scan_index": rng.integers(0, 2**16, n).astype(np.uint16),
+        "intensity": bits.view(np.float32),
+        "radius_class": rng.integers(0, RADIUS_CLASSES, n).astype(np.uint8),
+    }
 
 
 def open_points(points: VoxelPoints, steps: int, **options: object) -> OpenRecord:
@@ -17,8 +74,7 @@ def open_points(points: VoxelPoints, steps: int, **options: object) -> OpenRecor
     config = BuildConfig(**{"cell_points": 40, "leaf": 8, "degree": 3, **options})
     voxel = build_voxel(KEY, points, steps, config)
     record = encode_voxel(voxel, ARCHIVE_ID)
-    shape = RecordShape(record.cell_rows, record.node_rows, record.point_rows, voxel_point_dtype(voxel))
-    return open_record(record.cells, record.nodes, record.points, shape, KEY, ARCHIVE_ID, steps)
+    return open_record(*record[:3], shape_of(voxel), KEY, ARCHIVE_ID, steps)
 
 
 def open_scan(kind: str, seed: int, count: int, steps: int, **options: object) -> OpenRecord:

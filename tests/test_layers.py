@@ -14,7 +14,7 @@ PACKAGES = ("schemas", "builder", "server")
 # Library: the files, or the folders with a slash behind, that may import it.
 DOORS = {
     "h5py": ("schemas/new_file.py", "schemas/shard.py", "schemas/index_file.py", "schemas/vtkhdf.py"),
-    "zstandard": ("schemas/codec.py",),
+    "zstandard": ("schemas/frames.py",),
     "zenoh": ("server/transport.py", "server/client.py"),
     "numba": ("schemas/kernels/", "builder/kernels/", "server/kernels/", "server/report/kernels/"),
     "laspy": ("builder/made/write.py", "builder/export_las.py"),

@@ -1,0 +1,70 @@
+"""A dataset of a record whose rows come in parts: for voxels that are not to be held."""
+
+import mmap
+import os
+import tempfile
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .errors import BadRequestError, CorruptError
+from .frames import new_compressor, planes_of
+
+# What is compressed at a time of a frame that is not held. The frame's bytes may depend on it.
+STREAM_BYTES = 1 << 20
+# The index says a frame's length in 32 bits (FORMAT.md).
+MAX_FRAME_BYTES = (1 << 32) - 1
+
+
+class RowStream:
+    """A dataset of a record whose rows come in parts, in any order: their byte planes in a file, then one frame.
+
+    For voxels that are not to be held. The frame's bytes are a function of the rows, not of the parts; they are not
+    those that `encode_voxel` finds, which has all of them at once. Its files have no name and go with the process.
+    """
+
+    def __init__(self, scratch: Path, dtype: np.dtype, rows: int) -> None:
+        """Make room in the folder `scratch` for so many rows."""
+        self._scratch, self._dtype, self._rows = scratch, dtype, rows
+        self._planes = tempfile.TemporaryFile(dir=scratch, buffering=0)  # noqa: SIM115  `frame` closes it
+
+    def put(self, first: int, rows: NDArray) -> None:
+        """Take the rows from row `first` on."""
+        for number, plane in enumerate(planes_of(rows.astype(self._dtype, copy=False))):
+            pwrite_all(self._planes.fileno(), plane, number * self._rows + first)
+
+    def frame(self) -> mmap.mmap:
+        """The frame, once all rows are there.
+
+        Raises BadRequestError for one that the index could not name, CorruptError where rows are missing at the end.
+        """
+        with self._planes as planes, tempfile.TemporaryFile(dir=self._scratch, buffering=0) as file:
+            size = self._rows * self._dtype.itemsize
+            stream = new_compressor().compressobj(size=size)
+            written = 0
+            for at in range(0, size, STREAM_BYTES):
+                wanted = min(STREAM_BYTES, size - at)
+                part = os.pread(planes.fileno(), wanted, at)
+                if len(part) != wanted:
+                    raise CorruptError(
+                        f"the planes of {self._rows} rows end at byte {at + len(part)}, expected {size}: check the disk"
+                    )
+                written += pwrite_all(file.fileno(), stream.compress(part), written)
+            written += pwrite_all(file.fileno(), stream.flush(), written)
+            if written > MAX_FRAME_BYTES:
+                raise BadRequestError(
+                    f"a voxel of {self._rows} rows takes {written} bytes, a record holds {MAX_FRAME_BYTES}: "
+                    "give a smaller --voxel"
+                )
+            return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+
+
+def pwrite_all(descriptor: int, data: bytes | NDArray, at: int) -> int:
+    """Write all of the data at an offset of a file; returns how many bytes."""
+    left = memoryview(data if isinstance(data, bytes) else data.data).cast("B")
+    size = len(left)
+    while left:
+        written = os.pwrite(descriptor, left, at)
+        at, left = at + written, left[written:]
+    return size

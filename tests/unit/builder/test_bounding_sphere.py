@@ -9,6 +9,7 @@ from scans import WITH_POINTS, make_steps
 from solidcloud.builder.hierarchy import Bounds, build_hierarchy
 from solidcloud.builder.kernels.bounding_sphere import (
     SPREAD,
+    _flat_direction,
     ceil_sqrt,
     join_spread,
     leaf_spread,
@@ -208,3 +209,26 @@ def test_the_direction_of_least_variance_is_an_eigenvector() -> None:
         assert np.linalg.norm(direction) == pytest.approx(1, abs=1e-9)
         # Its variance is the least there is, to rounding.
         assert direction @ matrix @ direction <= min(lengths) ** 2 + 1e-9 * max(lengths) ** 2
+
+
+@pytest.mark.interpreted
+@pytest.mark.parametrize("scale", [0.02, 1.0, 1e6])
+@pytest.mark.parametrize(
+    ("lengths", "found"),
+    [
+        # Whichever axis is the thinnest: each pair of rows of the matrix gives the direction of one.
+        ([9, 5, 1], True), ([1, 9, 5], True), ([5, 1, 9], True), ([9, 8, 0], True), ([0, 9, 8], True),
+        ([9, 1, 1], False), ([1, 1, 1], False), ([3, 0, 0], False), ([0, 0, 0], False),
+    ],
+)  # fmt: skip
+def test_a_direction_is_found_at_once_where_one_variance_is_the_least(
+    scale: float, lengths: list[float], found: bool
+) -> None:
+    """Along the axes and turned, of variances of any size."""
+    rng = np.random.default_rng(8)
+    for turn in (np.eye(3), np.linalg.qr(rng.normal(size=(3, 3)))[0]):
+        matrix = turn @ np.diag(np.square(np.array(lengths) * scale)) @ turn.T
+        spread, direction = np.array([9, 0, 0, 0, *matrix[np.triu_indices(3)]], float), np.empty(3)
+        assert _flat_direction(spread, direction) == found
+        if found:
+            assert abs(direction @ turn[:, np.argmin(lengths)]) == pytest.approx(1, abs=1e-9)

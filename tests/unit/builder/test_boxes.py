@@ -45,6 +45,16 @@ def test_near_boxes_are_those_of_brute_force(count: int, most: int) -> None:
         assert all(len(go) == most for go in goes[:-1])
 
 
+@pytest.mark.parametrize("most", [1, 2, 3, 5, 30])
+def test_of_boxes_as_near_as_each_other_the_first_come_first(most: int) -> None:
+    rng = np.random.default_rng(most)
+    low = rng.integers(-2, 3, (30, 3)) * 10
+    for own in range(0, 30, 7):
+        order = sorted((d, i) for i, d in enumerate(box_distances(low, low, np.zeros(3))) if i != own)
+        goes = found_for(low, low, np.zeros(3, np.int64), own, 10**6, most)
+        assert [i for go in goes for i in go] == [i for _, i in order]
+
+
 def test_where_nothing_is_known_one_box_is_found_at_a_time() -> None:
     low = np.array([[10, 0, 0], [0, 0, 0], [30, 0, 0], [20, 0, 0]])
     assert found_for(low, low + 1, np.array([0, 0, 0]), 1, int(FAR), 8) == [[0], [3], [2]]
@@ -52,8 +62,9 @@ def test_where_nothing_is_known_one_box_is_found_at_a_time() -> None:
 
 def test_boxes_too_far_for_their_squares_are_none() -> None:
     near, far = (1 << 31) - 1, 1 << 31
-    low = np.array(
-        [[0, 0, 0], [near, 0, 0], [0, far, 0], [0, 0, 1 << 50], [near, near, near], [-near, near, 0]]
-    )
+    none = [[0, far, 0], [0, 0, 1 << 50], [near, near, near], [-near, near, 0]]
+    # Three squares that int64 does not hold, two of them not a tenth above FAR.
+    none += [[near, near, 1 << 17], [near, 1 << 17, near], [1 << 17, near, near]]
+    low = np.array([[0, 0, 0], [near, 0, 0], *none])
     assert found_for(low, low, np.zeros(3, np.int64), 0, int(FAR), 4) == [[1]]
     assert found_for(low, low, np.zeros(3, np.int64), 0, int(FAR) - 1, 4) == [[1]]

@@ -1,8 +1,10 @@
 """The sum that names an archive's points, against the published hash in Python's integers: old archives keep theirs."""
 
+from decimal import Decimal, localcontext
+
 import numpy as np
 import pytest
-from solidcloud.builder.kernels.content import content_sum
+from solidcloud.builder.kernels.content import CHUNK, SEEDS, content_sum
 
 pytestmark = pytest.mark.interpreted
 
@@ -30,3 +32,19 @@ def test_the_sum_is_that_of_the_hash(rng: np.random.Generator, seed: int, column
     assert int(content_sum(values, np.uint64(seed))) == total & WRAP
     assert content_sum(values[:, ::-1], np.uint64(seed)) == content_sum(values, np.uint64(seed))
     assert content_sum(values[:, :0], np.uint64(seed)) == 0
+
+
+def test_many_points_are_summed_chunk_by_chunk() -> None:
+    values = np.random.default_rng(1).integers(0, 1 << 64, (1, 2 * CHUNK + 3), np.uint64)
+    total = sum(finalised((finalised(7 ^ value) + 7) & WRAP) for value in values[0].tolist())
+    assert int(content_sum(values, np.uint64(7))) == total & WRAP
+
+
+def test_the_seeds_are_those_of_the_archives_there_are() -> None:
+    """2^64 through the real roots of x^2 = x + 1 and x^4 = x + 1, made odd."""
+    with localcontext(prec=50):
+        golden = (1 + Decimal(5).sqrt()) / 2
+        fourth = Decimal(1)
+        for _ in range(200):
+            fourth = (1 + fourth).sqrt().sqrt()
+        assert SEEDS.tolist() == [int(2**64 / root) | 1 for root in (golden, fourth)]

@@ -9,6 +9,7 @@ from solidcloud.builder.kernels.records import (
     link_parents,
     measure_points,
     point_hash,
+    point_hashes,
     sum_places,
 )
 from solidcloud.builder.octree import VoxelPoints
@@ -17,7 +18,7 @@ from solidcloud.schemas.codec import OpenRecord
 
 pytestmark = pytest.mark.interpreted
 
-BASE = np.array([-(1 << 40), 7, 1 << 35])
+BASE = np.array([-(1 << 40) + 3, 7, (1 << 35) + 5])
 
 
 def joined(parts: list[Taken]) -> Taken:
@@ -75,6 +76,7 @@ def test_a_share_is_chosen_by_the_hash_of_lattice_coordinates(share: float) -> N
     assert abs(sum(chosen) / 300 - share) < 0.1
     found = joined(list(taken(record, BASE, limit=hash_limit(share), block=40)))
     assert sorted(found.rows.tolist()) == np.flatnonzero(chosen).tolist()
+    assert point_hashes(points + BASE).tolist() == hashes
     assert hash_limit(1.0) == hash_limit(7.0) == 0 < hash_limit(1e-30)
 
 
@@ -88,6 +90,34 @@ def test_of_equal_points_in_a_leaf_node_a_share_has_the_first() -> None:
     assert len(expected) >= 5 + 2
     first = first_of_each(parts.xyz)
     assert sorted(parts.xyz[first].tolist()) == sorted(np.unique(points, axis=0).tolist())
+
+
+@pytest.mark.parametrize("width", [1, 2, 3])
+def test_equal_points_are_told_from_those_beside_them(width: int) -> None:
+    """Leaf nodes in which points differ by a step, and equal ones are followed by others."""
+    points = (
+        np.random.default_rng(width).integers(0, 1 + np.arange(width, width + 3), (60, 3)).astype(np.int32)
+    )
+    record = open_points(VoxelPoints(points), 1000)
+    stored, nodes = points_of(record)
+    found = joined(list(taken(record, BASE, limit=np.uint64((1 << 64) - 1))))
+    rows = [
+        min(np.flatnonzero((nodes == node) & (stored == point).all(axis=1)).tolist())
+        for node, point in {(int(n), tuple(p)) for n, p in zip(nodes, stored.tolist(), strict=True)}
+    ]
+    assert len(rows) < 60 and sorted(found.rows.tolist()) == sorted(rows)
+
+
+def test_places_that_differ_by_a_bit_are_told_apart() -> None:
+    """Of coordinates whose bits meet where the three are packed into one number; few, so that slots collide."""
+    rng = np.random.default_rng(7)
+    for _ in range(150):
+        xyz = rng.choice([0, 1, 2, 1 << 20, (1 << 21) - 1], (8, 3)).astype(np.int32)
+        xyz[4:] = xyz[:4]
+        xyz[4:, rng.integers(0, 3)] = rng.choice([0, 1, 1 << 20], 4)
+        expected = np.zeros(8, bool)
+        expected[np.unique(xyz, axis=0, return_index=True)[1]] = True
+        assert first_of_each(xyz).tolist() == expected.tolist()
 
 
 def test_the_first_of_each_place_is_told() -> None:

@@ -130,6 +130,14 @@ def test_equal_codes_are_ordered_by_rank(many: int) -> None:
     assert sorted(order.tolist()) == list(range(len(codes)))
 
 
+@pytest.mark.parametrize("many", [1, 2, 32, 33])
+def test_codes_that_are_all_equal_are_one_stretch(many: int) -> None:
+    ranks = np.random.default_rng(many).permutation(many).astype(np.uint32)
+    order = np.arange(many)
+    order_ties(np.full(many, 4, np.uint64), order, ranks)
+    assert ranks[order].tolist() == list(range(many))
+
+
 def test_coordinates_come_back_from_their_codes() -> None:
     local = np.random.default_rng(2).integers(0, 1 << 21, (30, 3))
     found = np.zeros((40, 3), np.int32)

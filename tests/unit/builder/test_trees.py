@@ -1,5 +1,7 @@
 """The hierarchies of many cells made in one call are those of each cell."""
 
+import itertools
+
 import numpy as np
 import pytest
 from scans import make_steps
@@ -57,6 +59,13 @@ def test_extremes_and_spreads_are_those_of_the_points() -> None:
         off = there - there.mean(axis=0)
         expected = [len(own), *there.mean(axis=0), *(off.T @ off)[np.triu_indices(3)]]
         assert np.allclose(trees.spreads[cell], expected, rtol=1e-9, atol=1e-6)
+
+
+def test_extremes_are_along_the_axes_and_the_diagonals_of_a_cube() -> None:
+    """Each line once, whichever way it points."""
+    lines = [line for line in itertools.product((-1, 0, 1), repeat=3) if sum(map(abs, line)) in (1, 3)]
+    both_ways = [tuple(way * v for v in line) for line in DIRECTIONS.tolist() for way in (-1, 1)]
+    assert sorted(both_ways) == sorted(lines)
 
 
 def test_cells_are_taken_in_another_order() -> None:

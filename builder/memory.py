@@ -40,14 +40,22 @@ def readers_that_fit(counts: NDArray[np.int64], jobs: int, config: BuildConfig) 
     Raises SolidcloudError where not even one may hold the largest.
     """
     largest = np.sort(counts)[::-1][:jobs]
-    base = ALONE_BYTES if jobs == 1 else BUILDER_BYTES + jobs * WORKER_BYTES
-    room = max(config.memory_bytes + OVER_BYTES - base, LEAST_SHARE)
     needed = np.cumsum(largest * RECORD_BYTES_A_POINT + RECORD_BYTES)
-    fits = int(np.searchsorted(needed, room, "right"))
+    fits = int(np.searchsorted(needed, _room(jobs, config), "right"))
     if not fits and len(largest):
+        most = int(needed[0])
+        memory = config.memory_bytes + most - _room(jobs, config)
+        fewer = next((n for n in range(jobs - 1, 0, -1) if most <= _room(n, config)), 0)
+        jobs_too = f"--jobs {fewer} or " if fewer else ""
         raise SolidcloudError(
             f"a voxel of {config.voxel:g} m holds {int(largest[0])} points, and to read its record back takes "
-            f"{int(needed[0]) >> 20} MB: give a smaller --voxel, fewer --jobs, or --memory "
-            f"{(config.memory_bytes + int(needed[0]) - room + (1 << 20) - 1) >> 20}MB"
+            f"{most >> 20} MB: give {jobs_too}--memory {(memory + (1 << 20) - 1) >> 20}MB to go on from what is done, "
+            "or a smaller --voxel and --fresh"
         )
     return jobs if fits == len(largest) else fits
+
+
+def _room(jobs: int, config: BuildConfig) -> int:
+    """Bytes that all of `jobs` processes may hold together of records that are read back."""
+    base = ALONE_BYTES if jobs == 1 else BUILDER_BYTES + jobs * WORKER_BYTES
+    return max(config.memory_bytes + OVER_BYTES - base, LEAST_SHARE)

@@ -3,21 +3,24 @@
 import json
 import os
 import shutil
+import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..schemas.archive import INDEX_NAME, SHARD_FOLDER, sync_folder
 from ..schemas.errors import BadRequestError, CorruptError, ScanError
+from ..schemas.index_file import INDEX_NAME
+from ..schemas.new_file import sync_folder
+from ..schemas.shard import SHARD_FOLDER
 from ..schemas.vtkhdf import PREVIEW_NAME
 from .journal import Journal, remove_temporaries
 from .lock import locked as locked
 from .resume import check_same
 
-# The note of what is built, the first of all.
-BEGUN = "build"
+# The note of what is built, the first of all; and what in it names the folder that holds what is done.
+BEGUN, WORD = "build", "word"
 
 
 def check_target(target: Path, overwrite: bool) -> None:
@@ -58,31 +61,56 @@ def building_folder(target: Path) -> Path:
 
 @dataclass
 class Workplace:
-    """The hidden folder of a build. journal: what is done.  archive: what will be renamed to the target.
+    """The hidden folder of a build, and the folder in it that holds what is done.
 
+    That one has a name that is nobody else's, which the note in the hidden folder tells: a unit of an earlier build
+    that a worker of a cluster still runs finds no folder to write to. hidden: the hidden folder.  begun: its note.
     surveyed: all scans were read to their end once and can be built as asked: what is found later removes nothing.
+    staffed: there is somebody to do the work: what is refused from then on is what was asked for.
     """
 
-    journal: Journal
-    archive: Path
+    hidden: Path
+    begun: dict[str, Any]
     surveyed: bool = False
+    staffed: bool = False
 
     def start_over(self) -> None:
         """Forget all that is done: the files it was read from are not what they were."""
-        remove_building(self.folder)
+        remove_building(self.hidden)
 
     def distrust(self, path: Path) -> None:
-        """Forget what was found not to be what was written: a run or a shard, or, by their folder, all points."""
+        """Forget what was found not to be what was written: a run or a shard, or, by their folder, all points.
+
+        All points are made again under another name: who still reads the old ones has nowhere to write what comes of
+        it.
+        """
         if not path.is_dir():
             self.journal.forget_file(path)
             return
-        for name in ("done", "archive", "spool", *(p.name for p in self.folder.glob("filter-*"))):
-            shutil.rmtree(self.folder / name, ignore_errors=True)
+        old = self.folder
+        begun = {**self.begun, WORD: uuid.uuid4().hex}
+        folder = self.hidden / begun[WORD]
+        folder.mkdir()
+        with suppress(FileNotFoundError):
+            os.rename(old / "survey", folder / "survey")
+        Journal(self.hidden).note(BEGUN, begun)
+        self.begun = begun
+        _remove(old)
 
     @property
     def folder(self) -> Path:
-        """The hidden folder itself."""
-        return self.journal.folder
+        """Where all is that is done."""
+        return self.hidden / str(self.begun[WORD])
+
+    @property
+    def journal(self) -> Journal:
+        """What is done."""
+        return Journal(self.folder)
+
+    @property
+    def archive(self) -> Path:
+        """What will be renamed to the target."""
+        return self.folder / "archive"
 
 
 @contextmanager
@@ -94,38 +122,51 @@ def workplace(target: Path, what: dict[str, Any], *, fresh: bool) -> Iterator[Wo
     what was written, that is forgotten and no more. Raises BadRequestError for
     a build that was begun of something else, which it leaves as it is.
     """
-    folder = building_folder(target)
-    journal = Journal(folder)
+    hidden = building_folder(target)
     if fresh:
-        remove_building(folder)
-    begun = journal.recall(BEGUN)
+        remove_building(hidden)
+    begun = Journal(hidden).recall(BEGUN)
     if begun is not None:
-        check_same(folder, begun, json.loads(json.dumps(what)))
-    place = Workplace(journal, folder / "archive")
+        check_same(hidden, begun, json.loads(json.dumps(what)))
+    place = Workplace(hidden, begun or {**what, WORD: uuid.uuid4().hex})
     try:
         if begun is None:  # nothing, or killed before it could say what it was
-            remove_building(folder)
-            folder.mkdir()
-            journal.note(BEGUN, what)
-        remove_temporaries(folder)
-        for name in ("spool", "archive", f"archive/{SHARD_FOLDER}"):
-            (folder / name).mkdir(exist_ok=True)
+            remove_building(hidden)
+            hidden.mkdir(exist_ok=True)
+            Journal(hidden).note(BEGUN, place.begun)
+        _prepare(place)
         yield place
     except BaseException as error:
-        if begun is None and not place.surveyed and isinstance(error, BadRequestError | ScanError):
-            remove_building(folder)
-        elif folder.exists():
+        refused = isinstance(error, BadRequestError | ScanError)
+        if begun is None and not place.surveyed and refused:
+            remove_building(hidden)
+        elif hidden.exists():
             for path in error.paths if isinstance(error, CorruptError) else ():
                 place.distrust(path)
-            remove_temporaries(folder)
+            remove_temporaries(hidden)
+            if refused and place.staffed:
+                raise type(error)(
+                    f"{error}; what is done is kept in {hidden}: with other options or other scans give --fresh"
+                ) from error
         raise
-    remove_building(folder)
+    remove_building(hidden)
+
+
+def _prepare(place: Workplace) -> None:
+    """Make the folders of a build, and remove what is not of it."""
+    for path in place.hidden.iterdir():
+        if path.is_dir() and path != place.folder:
+            _remove(path)
+    remove_temporaries(place.hidden)
+    for folder in (place.folder, place.folder / "spool", place.archive, place.archive / SHARD_FOLDER):
+        folder.mkdir(exist_ok=True)
 
 
 def forget_finished(target: Path, what: dict[str, Any]) -> None:
     """Remove what a build left that was killed just after it had published `what`."""
     folder = building_folder(target)
-    if Journal(folder).recall(BEGUN) in (None, json.loads(json.dumps(what))):
+    begun = Journal(folder).recall(BEGUN)
+    if begun is None or {**begun, WORD: ""} == {**json.loads(json.dumps(what)), WORD: ""}:
         remove_building(folder)
 
 
@@ -134,7 +175,15 @@ def remove_building(folder: Path) -> None:
     if folder.is_dir():
         for path in folder.iterdir():
             if path.is_dir():
-                shutil.rmtree(path, ignore_errors=True)
+                _remove(path)
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+def _remove(folder: Path) -> None:
+    """Remove a folder, first of all from where a unit that still runs would write into it while it is emptied."""
+    with suppress(OSError):
+        os.rename(folder, gone := folder.with_name(uuid.uuid4().hex))
+        folder = gone
     shutil.rmtree(folder, ignore_errors=True)
 
 
@@ -160,4 +209,6 @@ def publish_folder(folder: Path, target: Path, overwrite: bool) -> None:
         shutil.rmtree(old)
     else:
         os.rename(folder, target)  # replaces an empty folder
+    # Of a unit that was given up and still runs: from now on it can name no other.
+    remove_temporaries(target)
     sync_folder(target.parent)

@@ -13,8 +13,8 @@ import laspy
 import numpy as np
 import solidcloud.builder
 from solidcloud.builder.verify import verify_archive
-from solidcloud.schemas.archive import INDEX_NAME
 from solidcloud.schemas.errors import SolidcloudError
+from solidcloud.schemas.index_file import INDEX_NAME
 from solidcloud.schemas.vtkhdf import PREVIEW_NAME
 
 # What cuts a build into units, made small: some 10 units of a few hundred points, a shard a quarter of SHARD_POINTS.
@@ -137,10 +137,10 @@ class Case:
         if not work.exists():
             return "published" if self.whole() else "nothing"
         for name, pattern in (
-            ("index", "index.h5"),
-            ("shards", "shards/*.h5"),
-            ("spool", "spool/*"),
-            ("survey", "survey/*"),
+            ("index", "*/archive/index.h5"),
+            ("shards", "*/archive/shards/*.h5"),
+            ("spool", "*/spool/*"),
+            ("survey", "*/survey/*"),
         ):
             if any(work.glob(pattern)):
                 return name

@@ -1,5 +1,7 @@
 """Memory is shared among processes, their own included."""
 
+import re
+
 import numpy as np
 import pytest
 from solidcloud.builder.config import BuildConfig
@@ -48,7 +50,7 @@ def test_no_more_processes_read_than_hold_the_largest_voxels(jobs: int, memory: 
         each = sorted((n * RECORD_BYTES_A_POINT + RECORD_BYTES for n in counts.tolist()), reverse=True)
         if each[0] > room:
             with pytest.raises(
-                SolidcloudError, match=f"{points} points.*smaller --voxel, fewer --jobs, or --memory"
+                SolidcloudError, match=rf"{points} points.*give .*--memory \d+MB.*smaller --voxel and --fresh"
             ):
                 readers_that_fit(counts, jobs, config)
             continue
@@ -59,9 +61,28 @@ def test_no_more_processes_read_than_hold_the_largest_voxels(jobs: int, memory: 
     assert readers_that_fit(np.array([5]), 64, BuildConfig(memory_bytes=100 << 30)) == 64
 
 
-def test_the_memory_named_for_a_large_voxel_is_enough() -> None:
-    counts = np.array([10**9])
-    with pytest.raises(SolidcloudError) as caught:
-        readers_that_fit(counts, 1, BuildConfig())
-    named = int(str(caught.value).rpartition(" ")[2].removesuffix("MB"))
-    assert readers_that_fit(counts, 1, BuildConfig(memory_bytes=named << 20)) == 1
+@pytest.mark.parametrize("jobs", [1, 2, 7])
+@pytest.mark.parametrize("points", [7 * 10**6, 4 * 10**7, 10**8, 10**9])
+def test_the_memory_and_the_jobs_named_for_a_large_voxel_are_enough(points: int, jobs: int) -> None:
+    counts, config = np.array([points]), BuildConfig(memory_bytes=1 << 30)
+    try:
+        assert 1 <= readers_that_fit(counts, jobs, config) <= jobs
+        return
+    except SolidcloudError as error:
+        said = str(error)
+    named = re.search(r"give (?:--jobs (\d+) or )?--memory (\d+)MB to go on", said)
+    assert named
+    assert readers_that_fit(counts, jobs, BuildConfig(memory_bytes=int(named[2]) << 20)) >= 1
+    with pytest.raises(SolidcloudError):  # and no more than that
+        readers_that_fit(counts, jobs, BuildConfig(memory_bytes=(int(named[2]) - 1) << 20))
+    if named[1]:
+        assert readers_that_fit(counts, int(named[1]), config) >= 1
+    for fewer in range(int(named[1] or 0) + 1, jobs):
+        with pytest.raises(SolidcloudError):
+            readers_that_fit(counts, fewer, config)
+
+
+def test_fewer_jobs_are_named_where_they_are_enough() -> None:
+    counts, config = np.array([4 * 10**7]), BuildConfig(memory_bytes=1 << 30)
+    with pytest.raises(SolidcloudError, match="give --jobs 3 or --memory"):
+        readers_that_fit(counts, 7, config)

@@ -7,17 +7,21 @@ import shutil
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import solidcloud.builder.config as config
+import solidcloud.builder.memory as memory
 import solidcloud.builder.passes as passes
 import solidcloud.builder.pipeline as pipeline
 import solidcloud.builder.survey as survey
 from scans import make_scan, write_las, write_xyz
 from solidcloud.builder.config import BuildConfig
+from solidcloud.builder.executor import ProcessExecutor
+from solidcloud.builder.journal import _Noting
 from solidcloud.builder.partition import SpoolUnit
 from solidcloud.builder.pipeline import BuildSummary, build_archive
 from solidcloud.builder.resume import check_same, described
@@ -27,6 +31,7 @@ from solidcloud.builder.sources import Scan
 from solidcloud.builder.sources.scan import library_errors
 from solidcloud.builder.workplace import building_folder
 from solidcloud.schemas.errors import BadRequestError, CorruptError, ScanError, SolidcloudError
+from solidcloud.server.cli import run
 
 
 class Killed(BaseException):
@@ -65,6 +70,12 @@ def build(target: Path, scans: list[Path], **options: Any) -> BuildSummary:
 def content(archive: Path) -> dict[str, bytes]:
     """Every file of an archive."""
     return {str(p.relative_to(archive)): p.read_bytes() for p in sorted(archive.rglob("*")) if p.is_file()}
+
+
+def done_folder(target: Path) -> Path:
+    """Where all is that a build has done that was interrupted."""
+    (folder,) = (path for path in building_folder(target).iterdir() if path.is_dir())
+    return folder
 
 
 @pytest.fixture
@@ -148,7 +159,7 @@ def test_what_was_done_is_not_done_again(
     everything = ["hash_file"] * 2 + ["survey_range"] * 4 + ["spool_range"] * 4 + ["build_shard"] * 2
     assert calls == everything
     calls.clear()
-    folder = building_folder(tmp_path / "hall")
+    folder = done_folder(tmp_path / "hall")
     # A run that is gone, and a shard that is not what it was, in a byte that no record has: notes are not believed.
     next((folder / "spool").glob("000001-*.run")).unlink()
     shard = folder / "archive" / "shards" / "0-000001.h5"
@@ -169,7 +180,7 @@ def test_a_range_spooled_again_leaves_no_run_of_before(
     with monkeypatch.context() as patch:
         patch.setattr(passes, "run_points", lambda *_: 30)
         interrupted(tmp_path / "hall", scans, monkeypatch)
-    folder = building_folder(tmp_path / "hall") / "spool"
+    folder = done_folder(tmp_path / "hall") / "spool"
     runs = sorted(folder.glob("*.run"))
     assert len(runs) == 4 + 4 + 2 + 5
     runs[0].unlink()
@@ -187,7 +198,7 @@ def test_a_run_that_changed_where_it_lay_is_found(
         patch.setattr(pipeline, "filter_points", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
             build(tmp_path / "hall", scans, **options)
-    run = next((building_folder(tmp_path / "hall") / "spool").glob("000000-*.run"))
+    run = next((done_folder(tmp_path / "hall") / "spool").glob("000000-*.run"))
     data = bytearray(run.read_bytes())
     data[0] ^= 1
     run.write_bytes(data)
@@ -238,6 +249,83 @@ def test_a_unit_of_an_earlier_session_that_ends_late_changes_nothing(
     monkeypatch.setattr(pipeline, "filter_points", after)
     build(tmp_path / "judge", scans)
     assert content(tmp_path / "hall") == content(tmp_path / "judge")
+
+
+class HandedOut:
+    """Records what a build hands out: calling it does it once more, as a worker that was taken for dead may."""
+
+    def __init__(self, patch: pytest.MonkeyPatch) -> None:
+        self.work: list[Callable[[], Any]] = []
+        run = ProcessExecutor.map
+
+        def recorded(executor: ProcessExecutor, function: Any, units: Any, *more: Any) -> Any:
+            if isinstance(function, _Noting):
+                self.work += [partial(function, unit) for unit in units]
+            return run(executor, function, units, *more)
+
+        patch.setattr(ProcessExecutor, "map", recorded)
+
+    def late(self) -> list[type[Exception] | None]:
+        """Does all of it, and says how each ended."""
+        ends: list[type[Exception] | None] = []
+        for unit in self.work:
+            try:
+                unit()
+                ends.append(None)
+            except Exception as error:
+                ends.append(type(error))
+        return ends
+
+
+def late_in(patch: pytest.MonkeyPatch, stage: str, work: HandedOut, ends: list[Any], folder: Path) -> None:
+    """Let all of `work` be done once more when a build comes to a stage; it may change no file in `folder`."""
+    function = getattr(pipeline, stage)
+
+    def after(*arguments: Any) -> Any:
+        before = content(folder)
+        ends.append(work.late())
+        assert content(folder) == before
+        return function(*arguments)
+
+    patch.setattr(pipeline, stage, after)
+
+
+@pytest.mark.parametrize("stage", ["spool_scans", "build_shards", "_read_back"])
+def test_late_units_of_a_build_that_was_given_up_find_no_folder(
+    stage: str, scans: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    target, ends = tmp_path / "hall", []
+    with monkeypatch.context() as patch:
+        work = HandedOut(patch)
+        patch.setattr(pipeline, "_read_back", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            build(target, scans, thin=0.01, resolution=0.002)
+    with monkeypatch.context() as patch:
+        late_in(patch, stage, work, ends, building_folder(target))
+        build(target, scans, thin=0.02, fresh=True)
+    assert len(work.work) > 12
+    assert ends == [[FileNotFoundError] * len(work.work)]
+    build(tmp_path / "judge", scans, thin=0.02)
+    assert content(target) == content(tmp_path / "judge")
+    assert not building_folder(target).exists()
+
+
+def test_late_units_of_the_same_build_write_the_same_bytes(
+    scans: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    target, ends = tmp_path / "hall", []
+    with monkeypatch.context() as patch:
+        work = HandedOut(patch)
+        patch.setattr(pipeline, "_read_back", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            build(target, scans, thin=0.02)
+    with monkeypatch.context() as patch:
+        for stage in ("spool_scans", "build_shards", "_read_back"):
+            late_in(patch, stage, work, ends, building_folder(target))
+        build(target, scans, thin=0.02)
+    assert ends == [[None] * len(work.work)] * 3
+    build(tmp_path / "judge", scans, thin=0.02)
+    assert content(target) == content(tmp_path / "judge")
 
 
 def interrupted(target: Path, scans: list[Path], monkeypatch: pytest.MonkeyPatch, **options: Any) -> None:
@@ -466,5 +554,71 @@ def test_a_bad_scan_found_in_the_survey_leaves_nothing_and_later_ones_do(
         patch.setattr(passes, "spool_range", fails)
         with pytest.raises(ScanError):
             build(out / "hall", scans)
-    assert sorted(p.name for p in (out / ".hall.building" / "survey").iterdir())
+    assert sorted(p.name for p in (done_folder(out / "hall") / "survey").iterdir())
     assert not list(out.glob(".hall.lock"))
+
+
+def command(capsys: pytest.CaptureFixture[str], scan: Path, target: Path, *options: str) -> tuple[int, str]:
+    """`solidcloud build`: its exit code, and its error."""
+    words = ["build", str(scan), "-o", str(target), "--voxel", "0.9", "--jobs", "1", *options]
+    code = run(words)
+    errors = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
+    return code, "".join(errors)
+
+
+# Options and points of a request that is refused when all is read, and what its error says to give.
+LATE_REFUSALS: dict[str, tuple[list[str], np.ndarray, str, list[str]]] = {
+    "one point": ([], np.array([[0, 0, 0], [1e-6, 0, 0]]), "give --radius", ["--radius", "0.01"]),
+    "no point": (
+        ["--outliers", "0.001,5"],
+        make_scan("noise", 3, 100),
+        "give --thin, --outliers or --moving other figures",
+        ["--outliers", "0.8,1"],
+    ),
+}
+
+
+@pytest.mark.parametrize("name", LATE_REFUSALS)
+def test_a_request_that_is_refused_late_says_what_will_be_done(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options, points, advice, instead = LATE_REFUSALS[name]
+    scan = write_xyz(tmp_path / "a.xyz", points)
+    for _ in range(2):
+        code, said = command(capsys, scan, tmp_path / "hall", *options)
+        assert code == 2
+        assert advice in said
+        kept = building_folder(tmp_path / "hall")
+        assert f"; what is done is kept in {kept}: with other options or other scans give --fresh" in said
+        assert list((done_folder(tmp_path / "hall") / "survey").iterdir())
+    assert command(capsys, scan, tmp_path / "hall", *instead)[0] == 2
+    assert command(capsys, scan, tmp_path / "hall", *instead, "--fresh") == (0, "")
+    assert not kept.exists()
+
+
+def test_a_bad_scan_found_by_a_later_command_says_what_will_be_done(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "scans"
+    folder.mkdir()
+    write_xyz(folder / "a.xyz", make_scan("plane", 3, 100))
+    (folder / "b.xyz").write_text("1 2 3\nbroken\n")
+    with monkeypatch.context() as patch:
+        patch.setattr(passes, "_check_surveys", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        assert command(capsys, folder, tmp_path / "hall")[0] == 130
+    code, said = command(capsys, folder, tmp_path / "hall")
+    assert code == 3
+    assert "--skip-bad leaves such scans out" in said and "other scans give --fresh" in said
+    assert command(capsys, folder, tmp_path / "hall", "--skip-bad", "--fresh")[0] == 0
+
+
+def test_a_voxel_that_does_not_fit_is_built_as_the_error_says(
+    scans: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(memory, "RECORD_BYTES_A_POINT", 200 << 20)
+    folder = scans[0].parent
+    said = command(capsys, folder, tmp_path / "hall", "--memory", "1GB")[1]
+    assert "to read its record back takes" in said and "a smaller --voxel and --fresh" in said
+    named = said.partition("--memory ")[2].partition(" ")[0]
+    monkeypatch.setattr(passes, "spool_range", lambda _: pytest.fail("spooled again"))
+    assert command(capsys, folder, tmp_path / "hall", "--memory", named) == (0, "")

@@ -1,12 +1,16 @@
 """The hidden folder of a build: what stays in it after which failure, and what it becomes."""
 
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import pytest
+from solidcloud.builder.journal import Journal, new_file
 from solidcloud.builder.workplace import (
+    Workplace,
     building_folder,
     forget_finished,
+    publish_folder,
     remove_building,
     workplace,
 )
@@ -74,8 +78,9 @@ def test_a_folder_that_does_not_say_what_it_is_is_not_believed(tmp_path: Path) -
 
 def test_the_folder_goes_when_all_is_done(tmp_path: Path) -> None:
     with workplace(tmp_path / "hall", WHAT, fresh=False) as place:
-        assert place.folder == building_folder(tmp_path / "hall")
-        assert {p.name for p in place.folder.iterdir()} == {"build.json", "spool", "archive"}
+        assert place.hidden == building_folder(tmp_path / "hall")
+        assert {p.name for p in place.hidden.iterdir()} == {"build.json", place.folder.name}
+        assert {p.name for p in place.folder.iterdir()} == {"spool", "archive"}
     assert not list(tmp_path.iterdir())
 
 
@@ -93,10 +98,72 @@ def test_what_a_finished_build_left_is_forgotten_and_what_another_left_is_not(tm
 def test_the_note_of_what_it_is_is_removed_last(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     failed(tmp_path / "hall", KeyboardInterrupt(), surveyed=True)
     folder = building_folder(tmp_path / "hall")
+    late = Journal(next(path for path in folder.iterdir() if path.is_dir()))
     seen: list[bool] = []
-    monkeypatch.setattr(
-        "solidcloud.builder.workplace.shutil.rmtree",
-        lambda path, **_: seen.append((folder / "build.json").exists() and path != folder),
-    )
+
+    def watched(path: Path, **_: Any) -> None:
+        with pytest.raises(FileNotFoundError):  # where it was, nobody can write any more
+            late.note("survey/2", {})
+        seen.append((folder / "build.json").exists() and path != folder)
+
+    monkeypatch.setattr("solidcloud.builder.workplace.shutil.rmtree", watched)
     remove_building(folder)
-    assert seen == [True] * 3 + [False]
+    assert seen == [True, False]
+
+
+def began(target: Path, *, fresh: bool = False) -> Workplace:
+    """What a build begins with that is interrupted at once."""
+    with suppress(KeyboardInterrupt), workplace(target, WHAT, fresh=fresh) as place:
+        raise KeyboardInterrupt
+    return place
+
+
+def test_only_the_same_build_has_the_folder_of_before(tmp_path: Path) -> None:
+    first, second = began(tmp_path / "hall"), began(tmp_path / "hall")
+    assert first.folder == second.folder
+    third = began(tmp_path / "hall", fresh=True)
+    assert third.folder.name != first.folder.name
+    assert [p for p in third.hidden.iterdir() if p.is_dir()] == [third.folder]
+    with pytest.raises(FileNotFoundError):
+        first.journal.note("survey/1", {})
+
+
+@pytest.mark.parametrize("parted", [False, True])
+def test_what_comes_of_points_that_are_not_believed_finds_no_folder(parted: bool, tmp_path: Path) -> None:
+    place = began(tmp_path / "hall")
+    late = place.journal
+    late.note("survey/1", {"count": 7})
+    late.note("spool/1", {"runs": {}})
+    late.note("done/1", {"name": "0-1.h5"})
+    place.distrust(place.folder / "spool")
+    for name in ("survey/2", "spool/2", "done/2"):
+        with pytest.raises(FileNotFoundError):
+            late.note(name, {})
+    if parted:  # killed before it could remove what was there
+        late.folder.mkdir()
+    again = began(tmp_path / "hall")
+    assert again.folder == place.folder != late.folder
+    assert [p for p in again.hidden.iterdir() if p.is_dir()] == [again.folder]
+    assert again.journal.recall("survey/1") == {"count": 7}
+    assert again.journal.recall("spool/1") is again.journal.recall("done/1") is None
+
+
+def test_nobody_writes_to_what_is_started_over(tmp_path: Path) -> None:
+    with suppress(KeyboardInterrupt), workplace(tmp_path / "hall", WHAT, fresh=False) as place:
+        late = place.journal
+        place.start_over()
+        with pytest.raises(FileNotFoundError):
+            late.note("survey/1", {})
+        raise KeyboardInterrupt
+    assert not list(tmp_path.iterdir())
+    assert began(tmp_path / "hall").folder != late.folder
+
+
+def test_a_file_that_is_still_written_is_not_published(tmp_path: Path) -> None:
+    with workplace(tmp_path / "hall", WHAT, fresh=False) as place:
+        (place.archive / "index.h5").write_bytes(b"whole")
+        with pytest.raises(FileNotFoundError), new_file(place.archive / "shards" / "0-000000.h5") as file:
+            publish_folder(place.archive, tmp_path / "hall", overwrite=False)
+            file.write(b"late")
+    assert sorted(p.name for p in (tmp_path / "hall").rglob("*")) == ["index.h5", "shards"]
+    assert [p.name for p in tmp_path.iterdir()] == ["hall"]

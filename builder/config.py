@@ -98,7 +98,7 @@ class BuildConfig:
     fresh: forget what a build of the same name that was interrupted has done.
     thin: keep one point a cell of this size [m]; None: all.
     outliers: leave out points with fewer than the second number of others within the first [m]; None: none.
-    moving: leave out points that other scans saw through, see builder/filter.py: (distance [m], scans); None: none.
+    moving: leave out points that other scans saw through (builder/filter_rules.py): (distance [m], scans); None: none.
     scheduler: the address of a dask scheduler whose workers do the work; cluster: "local:N", one that is started for
     the build. Both None: processes of this one.
     """

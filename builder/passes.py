@@ -17,6 +17,7 @@ from ..schemas.shard import SHARD_FOLDER, file_checksum
 from ..schemas.voxel_grid import Lattice
 from .config import BuildConfig
 from .executor import Executor
+from .filter_rules import filter_dtype, filter_passes, is_filtered, make_rules
 from .journal import Work, resumed
 from .memory import memory_share
 from .partition import RunsHold, Spooled, SpoolUnit, dump_spooled, load_spooled, run_points, spool_range
@@ -110,7 +111,7 @@ def _check_surveys(
     if not good:
         first = inputs[0].path if inputs else "nothing"
         raise ScanError(f"{first}: no usable scan, expected at least one: check the files")
-    if ("scan" in config.keep or _is_filtered(config)) and len(good) > MAX_SCANS:
+    if ("scan" in config.keep or is_filtered(config)) and len(good) > MAX_SCANS:
         raise BadRequestError(
             f"--keep scan, or a filter, with {len(good)} scans: expected at most {MAX_SCANS}: build in parts"
         )
@@ -177,25 +178,16 @@ def _sweep_spool(folder: Path, vouched: set[str]) -> None:
                 path.unlink(missing_ok=True)  # a worker that was given up may have had it removed itself
 
 
-def _is_filtered(config: BuildConfig) -> bool:
-    """Whether points are to be left out; most builds have no use for builder/filter.py, and do not load it."""
-    return not (config.thin is None and config.outliers is None and config.moving is None)
-
-
 def spool_rows(config: BuildConfig) -> np.dtype:
     """A row of the spool: what the filters need besides what is kept, where there are any."""
-    if not _is_filtered(config):
+    if not is_filtered(config):
         return spool_dtype(config)
-    from .filter import filter_dtype
-
     return filter_dtype(config)
 
 
 def check_filters(config: BuildConfig, lattice: Lattice) -> None:
     """Raise BadRequestError for filters that cannot be done on this lattice."""
-    if _is_filtered(config):
-        from .filter import make_rules
-
+    if is_filtered(config):
         make_rules(config, lattice)
 
 
@@ -203,9 +195,9 @@ def filter_points(
     spool: Spool, place: Workplace, executor: Executor, config: BuildConfig, stages: Stages
 ) -> tuple[Spool, dict[str, dict[int, int]]]:
     """The optional pass between: points are left out; also how many of each scan, by reason."""
-    if not _is_filtered(config):
+    if not is_filtered(config):
         return spool, {}
-    from .filter import filter_passes, filtered_spool
+    from .filter import filtered_spool  # most builds have no use for its kernels, and do not load them
 
     total = filter_passes(config) * int(spool.counts.sum())
     with stages.stage("filter", total, "points"):

@@ -8,6 +8,8 @@ so that all that is near a point is in its own cell and the 26 around it: nine r
 import numba as nb
 import numpy as np
 
+from .bisection import first_at_least
+
 
 @nb.njit(nogil=True, cache=True)
 def cell_numbers(positions, edge, across, deep):
@@ -27,21 +29,22 @@ def cell_numbers(positions, edge, across, deep):
 
 
 @nb.njit(nogil=True, cache=True)
-def _first_at_least(values, value):
-    """The first index of sorted values that is not below value; their number when there is none."""
-    lo, hi = 0, values.shape[0]
-    while lo < hi:
-        mid = (lo + hi) // 2
-        if values[mid] < value:
-            lo = mid + 1
-        else:
-            hi = mid
-    return lo
+def _no_runs():
+    """Room for what `_runs_around` finds: of which cell, begins, ends. No cell has the number 0."""
+    return np.zeros(1, np.uint64), np.empty(9, np.int64), np.empty(9, np.int64)
 
 
 @nb.njit(nogil=True, cache=True)
-def _runs_around(cells, cell, across, deep, begins, ends):
-    """Where the cells around a cell lie in sorted `cells`: nine runs, the middle first. Writes begins, ends (9,)."""
+def _runs_around(cells, cell, across, deep, runs):
+    """Where the cells around a cell lie in sorted `cells`: nine runs, the middle first. Writes runs (`_no_runs`).
+
+    Nothing is looked for where they are those of this cell already: queries come cell by cell.
+    """
+    known, begins, ends = runs
+    if known[0] == cell:
+        return
+    known[0] = cell
+    n = cells.shape[0]
     k = 0
     for turn in range(2):
         for dx in range(-1, 2):
@@ -51,8 +54,8 @@ def _runs_around(cells, cell, across, deep, begins, ends):
                     # dx and dy may be negative: sums modulo 2^64 are what they should be.
                     shift = np.uint64(np.int64(dx) * np.int64(across * deep) + np.int64(dy) * np.int64(deep))
                     at = cell + shift
-                    begins[k] = _first_at_least(cells, at - np.uint64(1))
-                    ends[k] = _first_at_least(cells, at + np.uint64(2))
+                    begins[k] = first_at_least(cells, 0, n, at - np.uint64(1))
+                    ends[k] = first_at_least(cells, 0, n, at + np.uint64(2))
                     k += 1
 
 
@@ -64,15 +67,12 @@ def count_others(queries, query_cells, points, cells, across, deep, reach2, most
     uint64, ascending.  reach2: the square of the reach [steps^2], inclusive.  counts: (q,) int64, added to; where it is
     `most` already, nothing is looked for.
     """
-    begins, ends = np.empty(9, np.int64), np.empty(9, np.int64)
-    known = False
-    last = np.uint64(0)
+    runs = _no_runs()
+    begins, ends = runs[1], runs[2]
     for i in range(queries.shape[0]):
         if counts[i] >= most:
             continue
-        if not known or query_cells[i] != last:
-            _runs_around(cells, query_cells[i], across, deep, begins, ends)
-            last, known = query_cells[i], True
+        _runs_around(cells, query_cells[i], across, deep, runs)
         x, y, z = np.int64(queries[i, 0]), np.int64(queries[i, 1]), np.int64(queries[i, 2])
         found = counts[i]
         for k in range(9):
@@ -141,15 +141,12 @@ def other_scans(
             for j in range(groups[g], groups[g + 1]):
                 low[g, axis] = min(low[g, axis], points[j, axis])
                 high[g, axis] = max(high[g, axis], points[j, axis])
-    begins, ends = np.empty(9, np.int64), np.empty(9, np.int64)
-    known = False
-    last = np.uint64(0)
+    runs = _no_runs()
+    begins, ends = runs[1], runs[2]
     for i in range(queries.shape[0]):
         if counts[i] >= most:
             continue
-        if not known or query_cells[i] != last:
-            _runs_around(group_cells, query_cells[i], across, deep, begins, ends)
-            last, known = query_cells[i], True
+        _runs_around(group_cells, query_cells[i], across, deep, runs)
         x, y, z = np.int64(queries[i, 0]), np.int64(queries[i, 1]), np.int64(queries[i, 2])
         for k in range(9):
             for g in range(begins[k], ends[k]):

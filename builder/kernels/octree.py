@@ -4,6 +4,7 @@ import numba as nb
 import numpy as np
 
 from ...schemas.kernels.morton import morton_code
+from .bisection import first_at_least
 
 
 @nb.njit(nogil=True, cache=True)
@@ -14,18 +15,6 @@ def voxel_codes(points):
     for i in range(n):
         codes[i] = morton_code(np.uint64(points[i, 0]), np.uint64(points[i, 1]), np.uint64(points[i, 2]))
     return codes
-
-
-@nb.njit(nogil=True, cache=True)
-def _first_at_least(codes, lo, hi, value):
-    """First index in [lo, hi) of sorted codes that is not below value; hi when there is none."""
-    while lo < hi:
-        mid = (lo + hi) // 2
-        if codes[mid] < value:
-            lo = mid + 1
-        else:
-            hi = mid
-    return lo
 
 
 @nb.njit(nogil=True, cache=True)
@@ -56,7 +45,7 @@ def split_octree(codes, root_log2, largest_log2, capacity):
         base = (codes[lo] >> (shift + np.uint64(3))) << np.uint64(3)
         end = hi
         for child in range(7, -1, -1):  # pushed last to first, so that they come out in Morton order
-            begin = _first_at_least(codes, lo, end, (base | np.uint64(child)) << shift)
+            begin = first_at_least(codes, lo, end, (base | np.uint64(child)) << shift)
             if begin < end:
                 stack[depth, 0], stack[depth, 1], stack[depth, 2] = begin, end, log2 - 1
                 depth += 1

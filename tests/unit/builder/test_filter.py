@@ -9,7 +9,8 @@ from solidcloud.builder import blocks
 from solidcloud.builder import filter as filters
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.executor import make_executor
-from solidcloud.builder.filter import MOVING, OUTLIER, THINNED, filter_dtype, filtered_spool
+from solidcloud.builder.filter import filtered_spool
+from solidcloud.builder.filter_rules import MOVING, OUTLIER, THINNED, filter_dtype, filter_passes, is_filtered
 from solidcloud.builder.journal import Journal
 from solidcloud.builder.progress import Silent
 from solidcloud.builder.spool import Spool, row_codes, spool_dtype, write_run
@@ -299,5 +300,5 @@ def test_the_filters_need_the_scan_and_nothing_else() -> None:
         {"outliers": (0.1, 2)},
         {"outliers": (0.1, 2), "moving": (0.1, 2), "thin": 0.1},
     ]
-    assert [filters.filter_passes(BuildConfig(**options)) for options in passes] == [0, 1, 1, 2]
-    assert [filters.is_filtered(BuildConfig(**options)) for options in passes] == [False, True, True, True]
+    assert [filter_passes(BuildConfig(**options)) for options in passes] == [0, 1, 1, 2]
+    assert [is_filtered(BuildConfig(**options)) for options in passes] == [False, True, True, True]

@@ -21,6 +21,7 @@ from ..schemas.errors import BadRequestError, CorruptError, ScanError, Solidclou
 from ..schemas.index import Header
 from ..schemas.index_file import write_index
 from ..schemas.voxel_grid import Lattice
+from ..schemas.vtkhdf import PREVIEW_NAME
 from .config import RADIUS_SAMPLE, BuildConfig
 from .dense import DENSE_POINTS
 from .executor import Executor, ProcessExecutor, make_executor, worker_count
@@ -63,8 +64,9 @@ ONE_POINT = "a single distinct point has no closest point: give --radius"
 
 
 class BuildSummary(NamedTuple):
-    """What was built. bytes: of the archive.  stages: seconds of each.  skipped: reason -> points left out.
+    """What was built. bytes: of index and shards.  preview_bytes: of the file for ParaView, 0 where it is gone.
 
+    stages: seconds of each.  skipped: reason -> points left out.
     lattice_step, moved_max, radius, radius_error: [m], see schemas/index.py Header.  faults: scans left out.
     already: nothing was built, for the archive was there, of the same scans with the same options.
     """
@@ -74,6 +76,7 @@ class BuildSummary(NamedTuple):
     voxels: int
     shards: int
     bytes: int
+    preview_bytes: int
     seconds: float
     stages: dict[str, float]
     lattice_step: float
@@ -262,12 +265,14 @@ def _summary(
     already: bool = False,
 ) -> BuildSummary:
     """What is said of an archive that is there."""
+    sizes = {f.relative_to(target).as_posix(): f.stat().st_size for f in target.rglob("*") if f.is_file()}
     return BuildSummary(
         archive=target,
         points=header.points,
         voxels=voxels,
         shards=shards,
-        bytes=sum(f.stat().st_size for f in target.rglob("*") if f.is_file()),
+        bytes=sum(size for name, size in sizes.items() if name != PREVIEW_NAME),
+        preview_bytes=sizes.get(PREVIEW_NAME, 0),
         seconds=time.perf_counter() - begin,
         stages=stages.seconds,
         lattice_step=header.lattice.step,

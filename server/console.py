@@ -58,6 +58,8 @@ def _build_facts(summary: "BuildSummary") -> Iterator[tuple[str, str]]:
     rate = summary.points / max(summary.seconds, 1e-9)
     stages = ", ".join(f"{stage} {seconds:.1f}" for stage, seconds in summary.stages.items())
     yield "archive", f"{summary.archive}, {bytes_text(summary.bytes)}, {each:.2f} bytes a point"
+    if summary.preview_bytes:
+        yield "preview", f"preview.vtkhdf for ParaView, {bytes_text(summary.preview_bytes)}"
     yield "points", f"{summary.points:,} in {summary.voxels:,} voxels, {summary.shards} shards"
     yield (
         "lattice",

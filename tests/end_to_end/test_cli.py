@@ -135,13 +135,17 @@ def test_build_says_what_it_made(scan: Path, tmp_path: Path, capsys: pytest.Capt
     assert run(["build", str(scan), "-o", str(target), "--voxel", "2", "--jobs", "1", "--json"]) == 0
     made = json.loads(capsys.readouterr().out)
     assert made["points"] == len(floor()) and made["archive"] == str(target)
-    assert made["bytes"] == sum(path.stat().st_size for path in target.rglob("*") if path.is_file())
+    preview = target / "preview.vtkhdf"
+    stored = [path for path in target.rglob("*") if path.is_file() and path != preview]
+    assert made["bytes"] == sum(path.stat().st_size for path in stored)
+    assert made["preview_bytes"] == preview.stat().st_size
     assert made["radius"] == pytest.approx(0.05, rel=1e-9)
     assert run(["build", str(scan), "-o", str(target)]) == 2
     assert "--overwrite" in errors(capsys)[0]
     assert run(["build", str(scan), "-o", str(target), "--overwrite", "--jobs", "1"]) == 0
     shown = capsys.readouterr()
     assert "points/s" in shown.out and "bytes a point" in shown.out
+    assert re.search(r"preview +preview\.vtkhdf for ParaView, \d", shown.out)
 
 
 def test_broken_scan_stops_the_build_unless_it_is_skipped(

@@ -182,7 +182,9 @@ def test_an_archive_is_sound_and_summed_up(scans: list[Path], out: Path) -> None
         assert summary.points == header.points == 5 * 150 + 1
         assert summary.voxels == len(archive.voxels)
         assert (summary.radius, summary.moved_max) == (header.radius, header.moved_max)
-    assert summary.bytes == sum(map(len, content(out / "a").values()))
+    files = {name: len(data) for name, data in content(out / "a").items()}
+    assert summary.preview_bytes == files.pop("preview.vtkhdf") > 0
+    assert summary.bytes == sum(files.values())
     assert list(summary.stages) == ["survey", "spool", "build", "radius", "preview", "verify", "publish"]
     assert (summary.skipped, summary.faults) == ({}, ())
 

@@ -1,0 +1,239 @@
+"""Which resident voxel goes first: the orders of eviction, behind one interface.
+
+No threads, no clock, no bytes of its own: the residency calls it under its lock, and scripts/simulate_cache replays
+traces with the same objects. What a policy is not told of, pins and predictions, whoever evicts looks at: `victims`
+names every resident row, and those in use are passed over.
+"""
+
+from collections import OrderedDict
+from collections.abc import Callable, Iterator, Sequence
+from itertools import islice
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..schemas.errors import BadRequestError
+
+POLICIES = ("lru", "lru+prefetch", "distance", "s3fifo")
+
+# Of the budget, what scans may fill while others want room: sweeps along a path, and what is asked right after a
+# teleport. With all of it, one sweep through the archive washes out what every user stands in.
+SCAN_SHARE = 0.1
+# S3-FIFO's small queue, of the budget, and the uses counted: two bits ([Yang23]).
+SMALL_SHARE = 0.1
+MOST_USES = 3
+
+Nearness = Callable[[Sequence[int]], NDArray[np.float64]]
+
+
+class Policy(Protocol):
+    """An order of eviction. Rows are index rows of voxels; each is added once, until it is removed."""
+
+    name: str
+
+    def added(self, row: int, size: int, *, scan: bool) -> None:
+        """Room of `size` bytes was given to a row, for a demand (of a scan, or not) or to prefetch it (no scan)."""
+
+    def used(self, row: int, *, scan: bool) -> None:
+        """A row was demanded that is resident or being loaded."""
+
+    def removed(self, row: int, *, evicted: bool) -> None:
+        """A row gave its room back: evicted, or it was never loaded."""
+
+    def victims(self) -> Iterator[int]:
+        """Every row that has room, once, first to go first. Found as they are taken, and void after any other call."""
+
+
+def prefetches(name: str) -> bool:
+    """Whether voxels are loaded before they are asked for under this policy: all but [Fig12]'s."""
+    return name != "lru"
+
+
+def make_policy(name: str, budget_bytes: int, nearness: Nearness | None = None) -> Policy:
+    """The policy of this name, empty. nearness: what `distance` goes by, see `Distance`.
+
+    Raises BadRequestError for another name, ValueError for `distance` without nearness.
+    """
+    if name in ("lru", "lru+prefetch"):
+        return Lru(budget_bytes, name)
+    if name == "s3fifo":
+        return S3Fifo(budget_bytes)
+    if name != "distance":
+        raise BadRequestError(f"policy {name!r}: expected one of {', '.join(POLICIES)}")
+    if nearness is None:
+        raise ValueError("policy distance: needs to know how near rows are to users")
+    return Distance(nearness)
+
+
+class Lru:
+    """Least recently used first; of scans, no more than their share.
+
+    What a scan added stands in a queue of its own until somebody else uses it. While that queue holds more than
+    SCAN_SHARE of the budget, its oldest go before anything else; within its share it is as good as the rest.
+    """
+
+    def __init__(self, budget_bytes: int, name: str = "lru") -> None:
+        """Empty."""
+        self.name = name
+        self._order: OrderedDict[int, int] = (
+            OrderedDict()
+        )  # row -> bytes, all of them; least recently used first
+        self._scans: OrderedDict[int, int] = OrderedDict()  # those that only scans wanted
+        self._scan_bytes = 0
+        self._scan_most = int(budget_bytes * SCAN_SHARE)
+
+    def added(self, row: int, size: int, *, scan: bool) -> None:
+        """See `Policy`."""
+        self._order[row] = size
+        if scan:
+            self._scans[row] = size
+            self._scan_bytes += size
+
+    def used(self, row: int, *, scan: bool) -> None:
+        """See `Policy`."""
+        self._order.move_to_end(row)
+        if row in self._scans:
+            if scan:
+                self._scans.move_to_end(row)
+            else:
+                self._scan_bytes -= self._scans.pop(row)
+
+    def removed(self, row: int, *, evicted: bool) -> None:
+        """See `Policy`."""
+        del self._order[row]
+        self._scan_bytes -= self._scans.pop(row, 0)
+
+    def victims(self) -> Iterator[int]:
+        """See `Policy`."""
+        over = self._scan_bytes - self._scan_most
+        named: set[int] = set()
+        if over > 0:
+            for row, size in self._scans.items():
+                named.add(row)
+                yield row
+                over -= size
+                if over <= 0:
+                    break
+        for row in self._order:
+            if row not in named:
+                yield row
+
+
+class Distance:
+    """Farthest from every user's predicted way first; of those as far, least recently used first.
+
+    What a scan added needs no share: far from users it goes first as it is.
+    """
+
+    name = "distance"
+
+    def __init__(self, nearness: Nearness) -> None:
+        """nearness: rows -> (n,) float64, least distance of each to any user's predicted way [m], inf: no users."""
+        self._nearness = nearness
+        self._order: OrderedDict[int, None] = OrderedDict()
+
+    def added(self, row: int, size: int, *, scan: bool) -> None:
+        """See `Policy`."""
+        self._order[row] = None
+
+    def used(self, row: int, *, scan: bool) -> None:
+        """See `Policy`."""
+        self._order.move_to_end(row)
+
+    def removed(self, row: int, *, evicted: bool) -> None:
+        """See `Policy`."""
+        del self._order[row]
+
+    def victims(self) -> Iterator[int]:
+        """See `Policy`."""
+        rows = list(self._order)
+        if not rows:
+            return
+        far = self._nearness(rows)
+        first = int(np.argmax(far))  # of equals the first, as a stable sort has it
+        yield rows[first]
+        for at in np.argsort(-far, kind="stable").tolist():
+            if at != first:
+                yield rows[at]
+
+
+class S3Fifo:
+    """S3-FIFO, in bytes: a small queue for what is new, a main queue for what was used, a ghost for what was new once.
+
+    After [Yang23] J. Yang, Y. Zhang, Z. Qiu, Y. Yue, K. V. Rashmi, "FIFO queues are all you need for cache eviction",
+    SOSP 2023, algorithm 1. New rows enter the small queue, or the main one where the ghost still knows them. What
+    leaves the small queue used more than once moves to the main one; what leaves the main queue used at all goes
+    round again, its count one less. Uses by scans are not counted, nor does a scan find anything in the ghost.
+    """
+
+    name = "s3fifo"
+
+    def __init__(self, budget_bytes: int) -> None:
+        """Empty."""
+        self._small: OrderedDict[int, int] = OrderedDict()  # row -> bytes; oldest first
+        self._main: OrderedDict[int, int] = OrderedDict()
+        self._ghost: OrderedDict[int, int] = OrderedDict()
+        self._uses: dict[int, int] = {}
+        self._small_bytes = self._ghost_bytes = 0
+        self._small_most = int(budget_bytes * SMALL_SHARE)
+        self._ghost_most = budget_bytes - self._small_most  # as much as the main queue holds
+
+    def added(self, row: int, size: int, *, scan: bool) -> None:
+        """See `Policy`."""
+        self._uses[row] = 0
+        if row in self._ghost and not scan:
+            self._ghost_bytes -= self._ghost.pop(row)
+            self._main[row] = size
+        else:
+            self._small[row] = size
+            self._small_bytes += size
+
+    def used(self, row: int, *, scan: bool) -> None:
+        """See `Policy`."""
+        if not scan and self._uses[row] < MOST_USES:
+            self._uses[row] += 1
+
+    def removed(self, row: int, *, evicted: bool) -> None:
+        """See `Policy`."""
+        del self._uses[row]
+        if row in self._main:
+            del self._main[row]
+            return
+        size = self._small.pop(row)
+        self._small_bytes -= size
+        if not evicted:
+            return
+        self._ghost_bytes += size - self._ghost.pop(row, 0)
+        self._ghost[row] = size
+        while self._ghost_bytes > self._ghost_most:
+            self._ghost_bytes -= self._ghost.popitem(last=False)[1]
+
+    def victims(self) -> Iterator[int]:
+        """See `Policy`. Rows change queues as the walk comes to them, as they would by evictions.
+
+        Rows that were named and not taken stay at the front of their queue; the walk goes on as if they had gone.
+        """
+        named_small = named_main = named_bytes = 0
+        while True:
+            small_left = len(self._small) - named_small
+            main_left = len(self._main) - named_main
+            if small_left and (self._small_bytes - named_bytes >= self._small_most or not main_left):
+                row = next(islice(self._small, named_small, None))
+                if self._uses[row] > 1:
+                    self._small_bytes -= self._small[row]
+                    self._main[row] = self._small.pop(row)
+                    self._uses[row] = 0
+                    continue
+                named_small, named_bytes = named_small + 1, named_bytes + self._small[row]
+                yield row
+            elif main_left:
+                row = next(islice(self._main, named_main, None))
+                if self._uses[row]:
+                    self._uses[row] -= 1
+                    self._main.move_to_end(row)
+                    continue
+                named_main += 1
+                yield row
+            else:
+                return

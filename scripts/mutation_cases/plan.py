@@ -38,6 +38,7 @@ TESTS: dict[str, tuple[str, ...]] = {
     "schemas/kernels/links.py": (SCHEMAS + "test_links.py",),
     "schemas/kernels/morton.py": (SCHEMAS + "test_morton.py",),
     "schemas/kernels/rows.py": (SCHEMAS + "test_rows.py",),
+    "builder/kernels/bisection.py": (BUILDER + "test_bisection.py",),
     "builder/kernels/bounding_sphere.py": (
         BUILDER + "test_bounding_sphere.py::test_a_bound_is_as_tight_as_its_guess",
         BUILDER + "test_bounding_sphere.py::test_a_guess_whose_radius_does_not_fit_is_given_up_for_the_box",
@@ -51,6 +52,7 @@ TESTS: dict[str, tuple[str, ...]] = {
         BUILDER
         + "test_bounding_sphere.py::test_a_direction_is_found_at_once_where_one_variance_is_the_least",
     ),
+    "builder/kernels/filter.py": (BUILDER + "test_filter_kernels.py",),
     "builder/kernels/classes.py": (
         BUILDER + "test_classes.py::test_the_kernel_and_the_judge_agree_at_the_edge_of_each_rule",
         BUILDER + "test_classes.py::test_the_twelfth_neighbour_decides_and_at_the_limit_is_within",

@@ -66,6 +66,7 @@ def test_steps_give_the_bytes_they_mean_whatever_they_end_in(before: bytes) -> N
     for past in range(len(source) + 1):
         whole = max(k for k in range(len(ends)) if ends[k] <= past)
         assert ask(source, before, room, 0, past) == (ends[whole], outs[whole], True), f"past {past}"
+        assert ask(source[:past], before, room) == (ends[whole], outs[whole], True), f"{past} bytes"
     # From within, after the steps before.
     for k in range(len(steps)):
         assert ask(source, outs[k], room, ends[k]) == (ends[-1], outs[-1], True)

@@ -55,8 +55,11 @@ def test_usable_points_are_counted_and_bounded() -> None:
     assert usable_bounds(xyz, 8.0, low, high) == 2
     assert low.tolist() == [0.5, -2, 2]
     assert high.tolist() == [3, 4, 8]
-    assert usable_bounds(xyz[:0], 8.0, low, high) == 0
-    assert low.tolist() == [0.5, -2, 2]
+    # What is known before stays where nothing lies beyond it.
+    for known in (xyz[:0], np.zeros((1, 3)), xyz[1:4]):
+        low, high = np.array([-1.0, -2, -3]), np.array([4.0, 5, 6])
+        assert usable_bounds(known, 8.0, low, high) == (len(known) == 1)
+        assert (low.tolist(), high.tolist()) == ([-1, -2, -3], [4, 5, 6])
 
 
 @pytest.mark.parametrize("steps", [1, 3, 7, 80, 2**21])
@@ -108,6 +111,15 @@ def test_coordinates_beyond_the_keys_are_told() -> None:
         done, _, lowest, highest, *_ = placed(np.array([[0.0, x, 0]]), lattice, table(2 * CHUNK), none)
         assert (lowest, highest) == (min(x, 0), max(x, 0))
         assert done == fits
+
+
+@pytest.mark.parametrize("x", [-9.0, 9.0])
+def test_the_coordinates_told_are_those_of_the_points_alone(x: float) -> None:
+    """Where all lie on one side of the origin, which is not among them."""
+    lattice = make_lattice((0, 0, 0), 1.0, 1.0)
+    none = np.empty((0, 2), np.uint64)
+    _, _, lowest, highest, *_ = placed(np.array([[x, x, x], [x + 1, x, x]]), lattice, table(2 * CHUNK), none)
+    assert (lowest, highest) == (x, x + 1)
 
 
 def test_values_come_into_the_order_of_their_voxels() -> None:

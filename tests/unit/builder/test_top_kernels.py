@@ -4,7 +4,7 @@ import itertools
 
 import numpy as np
 import pytest
-from solidcloud.builder.kernels.top import _join_extremes, grow_bounds, leaf_rows, take_runs
+from solidcloud.builder.kernels.top import _join_extremes, _stored_center, grow_bounds, leaf_rows, take_runs
 from solidcloud.builder.kernels.trees import DIRECTIONS, EXTREMES
 
 pytestmark = pytest.mark.interpreted
@@ -85,6 +85,17 @@ def test_each_levels_node_above_a_cell_grows() -> None:
     for node in range(3):
         own = bounds(place[(above == node).any(axis=0)], center[node], normal[node])
         assert (reach2[node], *slab[node]) == (own[0], min(own[1], 0), max(own[2], 0))
+
+
+def test_a_stored_centre_is_the_nearest_there_is() -> None:
+    center = np.empty(3, np.int64)
+    for guess, unit, expected in (
+        ([0.0, 0.4, 0.6], 1, [0, 0, 1]),
+        ([-3.0, 99.7, 1000.0], 1, [0, 100, 100]),
+        ([5.9, 6.1, 404.0], 4, [1, 2, 100]),
+    ):
+        _stored_center(np.array(guess), unit, 100, center)
+        assert center.tolist() == expected
 
 
 @pytest.mark.parametrize(("first", "count"), [(0, 1), (2, 1), (1, 4), (0, 6)])

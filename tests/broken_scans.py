@@ -6,11 +6,11 @@ import struct
 from collections.abc import Callable
 from pathlib import Path
 
-import laspy
 import lazrs
 import numpy as np
 import plyfile
 from formats import (
+    cartesian,
     glb_document,
     glb_vertices,
     ptx_scan,
@@ -20,6 +20,7 @@ from formats import (
     write_pcd,
     write_pts,
 )
+from scans import write_las
 
 COUNT = 60
 POSE = np.array([[0.0, -1, 0, 10], [1, 0, 0, 20], [0, 0, 1, 30], [0, 0, 0, 1]])
@@ -27,12 +28,9 @@ PAGE = 1024
 
 
 def _las(path: Path, xyz: np.ndarray, point_format: int) -> None:
-    header = laspy.LasHeader(version="1.4" if point_format > 5 else "1.2", point_format=point_format)
-    header.scales, header.offsets = [0.001] * 3, [1000.0, 2000.0, 3.0]
-    las = laspy.LasData(header)
-    las.x, las.y, las.z = (xyz + np.array(header.offsets)).T
-    las.intensity = np.arange(len(xyz))
-    las.write(path, laz_backend=laspy.LazBackend.Lazrs)
+    light = np.arange(len(xyz), dtype=np.uint16)
+    offset = (1000.0, 2000.0, 3.0)
+    write_las(path, np.rint(xyz * 1000), offset=offset, intensity=light, point_format=point_format)
 
 
 def _variable_laz(path: Path, xyz: np.ndarray) -> None:
@@ -58,18 +56,12 @@ def _variable_laz(path: Path, xyz: np.ndarray) -> None:
         writer.done()
 
 
-def _cartesian(xyz: np.ndarray) -> dict[str, np.ndarray]:
-    return {
-        f"cartesian{axis}": np.ascontiguousarray(column) for axis, column in zip("XYZ", xyz.T, strict=True)
-    }
-
-
 def _e57(path: Path, xyz: np.ndarray) -> None:
     light, state = np.arange(COUNT) / COUNT, (np.arange(COUNT) % 7 == 0).astype(np.int8)
     scaled = {f"cartesian{axis}": (0.001, 0.5) for axis in "XYZ"}
-    first = {"columns": {**_cartesian(xyz), "intensity": light, "cartesianInvalidState": state}}
+    first = {"columns": {**cartesian(xyz), "intensity": light, "cartesianInvalidState": state}}
     first |= {"translation": [1.0, 2, 3], "rotation": [0.5, 0.5, -0.5, 0.5], "bounds": [[-5] * 3, [5] * 3]}
-    second = {"columns": _cartesian((xyz * 1000).round() / 1000 + 0.5), "scaled": scaled}
+    second = {"columns": cartesian((xyz * 1000).round() / 1000 + 0.5), "scaled": scaled}
     write_e57(path, [first, second], crs="a system")
 
 

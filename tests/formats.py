@@ -142,6 +142,11 @@ def glb_vertices(xyz: Rows) -> bytes:
     return rows.tobytes()
 
 
+def cartesian(xyz: NDArray, real: type = np.float64) -> dict[str, NDArray]:
+    """The columns x, y, z of an E57 scan."""
+    return {f"cartesian{axis}": xyz[:, k].astype(real) for k, axis in enumerate("XYZ")}
+
+
 def write_e57(path: Path, scans: list[dict], crs: str = "") -> Path:
     """E57 of scans with the keys columns (name -> array), and perhaps rotation, translation, bounds (2, 3), scaled.
 

@@ -70,13 +70,14 @@ def write_las(
     scale: float = 0.001,
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0),
     intensity: NDArray[np.uint16] | None = None,
+    point_format: int = 6,
 ) -> NDArray[np.float64]:
-    """Write a LAS of raw integers (n, 3). Returns the world points (n, 3) [m] that it stands for."""
-    header = laspy.LasHeader(version="1.4", point_format=6)
+    """Write a LAS, or LAZ, of raw integers (n, 3). Returns the world points (n, 3) [m] that it stands for."""
+    header = laspy.LasHeader(version="1.4" if point_format > 5 else "1.2", point_format=point_format)
     header.scales, header.offsets = [scale] * 3, list(offset)
     las = laspy.LasData(header)
     las.X, las.Y, las.Z = raw.astype(np.int32).T
     if intensity is not None:
         las.intensity = intensity
-    las.write(path)
+    las.write(path, laz_backend=laspy.LazBackend.Lazrs)
     return np.asarray(raw, np.float64) * scale + np.array(offset)

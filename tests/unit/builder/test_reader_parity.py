@@ -9,11 +9,11 @@ from pathlib import Path
 
 import h5py
 import hdf5plugin  # noqa: F401  the index's chunks are compressed by what it registers
-import laspy
 import numpy as np
 import plyfile
 import pytest
 from formats import (
+    cartesian,
     glb_document,
     glb_vertices,
     ptx_scan,
@@ -23,6 +23,7 @@ from formats import (
     write_pcd,
     write_pts,
 )
+from scans import write_las
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import build_archive
 from solidcloud.schemas.archive import Archive
@@ -41,18 +42,13 @@ def made(step: float) -> tuple[np.ndarray, np.ndarray]:
     return raw * step, rng.integers(0, 256, 1000).astype(np.float64)
 
 
-def write_las(path: Path, xyz: np.ndarray, light: np.ndarray, step: float = STEP, new: bool = True) -> None:
-    header = laspy.LasHeader(version="1.4" if new else "1.2", point_format=7 if new else 3)
-    header.scales, header.offsets = [step] * 3, [0.0] * 3
-    las = laspy.LasData(header)
-    las.X, las.Y, las.Z = np.rint(xyz / step).astype(np.int32).T
-    las.intensity = light.astype(np.uint16)
-    las.write(path, laz_backend=laspy.LazBackend.Lazrs)
+def as_las(path: Path, xyz: np.ndarray, light: np.ndarray, step: float = STEP, point_format: int = 7) -> None:
+    raw, intensity = np.rint(xyz / step), light.astype(np.uint16)
+    write_las(path, raw, scale=step, intensity=intensity, point_format=point_format)
 
 
 def columns(xyz: np.ndarray, light: np.ndarray, real: type = np.float64) -> dict[str, np.ndarray]:
-    named = {f"cartesian{axis}": xyz[:, k].astype(real) for k, axis in enumerate("XYZ")}
-    return {**named, "intensity": light}
+    return {**cartesian(xyz, real), "intensity": light}
 
 
 def scaled(step: float) -> dict[str, tuple[float, float]]:
@@ -99,10 +95,10 @@ def write_quarter_turned(path: Path, xyz: np.ndarray, light: np.ndarray) -> None
 
 
 WRITERS: dict[str, Callable[[Path, np.ndarray, np.ndarray], object]] = {
-    "plain.las": lambda p, xyz, light: write_las(p, xyz, light),
-    "old.las": lambda p, xyz, light: write_las(p, xyz, light, new=False),
-    "layered.laz": lambda p, xyz, light: write_las(p, xyz, light),
-    "old.laz": lambda p, xyz, light: write_las(p, xyz, light, new=False),
+    "plain.las": as_las,
+    "old.las": lambda p, xyz, light: as_las(p, xyz, light, point_format=3),
+    "layered.laz": as_las,
+    "old.laz": lambda p, xyz, light: as_las(p, xyz, light, point_format=3),
     "double.e57": lambda p, xyz, light: write_e57(p, [{"columns": columns(xyz, light)}]),
     "single.e57": lambda p, xyz, light: write_e57(p, [{"columns": columns(xyz, light, np.float32)}]),
     "scaled.e57": lambda p, xyz, light: write_e57(
@@ -125,7 +121,7 @@ WRITERS: dict[str, Callable[[Path, np.ndarray, np.ndarray], object]] = {
 }
 # Formats without intensities. glTF has y up: its x, y, z are the world's x, z, -y.
 BARE: dict[str, Callable[[Path, np.ndarray], object]] = {
-    "plain.las": lambda p, xyz: write_las(p, xyz, np.zeros(1000)),
+    "plain.las": lambda p, xyz: as_las(p, xyz, np.zeros(1000)),
     "mesh.obj": lambda p, xyz: p.write_text("".join(f"v {x!r} {y!r} {z!r}\n" for x, y, z in xyz.tolist())),
     "mesh.glb": lambda p, xyz: write_glb(
         p, glb_document(1000), glb_vertices(np.column_stack([xyz[:, 0], xyz[:, 2], -xyz[:, 1]]))
@@ -158,7 +154,7 @@ def apart_from_sources(archive: Path) -> tuple[dict[str, bytes], dict[str, bytes
 def judge(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, bytes], dict[str, bytes]]:
     """What all must be: of the points as LAS."""
     folder = tmp_path_factory.mktemp("judge")
-    write_las(folder / "a.las", *made(STEP))
+    as_las(folder / "a.las", *made(STEP))
     return apart_from_sources(build(folder / "a.las", folder / "a"))
 
 
@@ -199,7 +195,7 @@ def test_at_millimetres_the_lattice_takes_the_formats_rounding_away(tmp_path: Pa
     xyz, light = made(0.001)
     text = "".join(f"{x:.3f} {y:.3f} {z:.3f} {i:.0f}\n" for (x, y, z), i in zip(xyz, light, strict=True))
     (tmp_path / "a.csv").write_text("x y z intensity\n" + text)
-    write_las(tmp_path / "b.las", xyz, light, 0.001)
+    as_las(tmp_path / "b.las", xyz, light, 0.001)
     write_e57(tmp_path / "c.e57", [{"columns": columns(xyz, light), "scaled": scaled(0.001)}])
     write_ply(tmp_path / "d.ply", xyz, light, "f4", False, "<")
     write_quarter_turned(tmp_path / "e.e57", xyz, light)

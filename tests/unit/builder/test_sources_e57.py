@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from broken_scans import with_checksums
-from formats import write_e57
+from formats import cartesian, write_e57
 from solidcloud.builder.scan_list import inspect
 from solidcloud.builder.sources import header_bounds, open_scans
 from solidcloud.schemas.errors import ScanError
@@ -20,12 +20,6 @@ def read_all(path: Path, spacing: float | None = None, block_points: int = 1 << 
 
 TURN = np.array([0.5, 0.5, -0.5, 0.5])  # w, x, y, z: a third of a turn about a diagonal, exact in float64
 TURNED = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
-
-
-def cartesian(xyz: np.ndarray) -> dict[str, np.ndarray]:
-    return {
-        f"cartesian{axis}": np.ascontiguousarray(column) for axis, column in zip("XYZ", xyz.T, strict=True)
-    }
 
 
 @pytest.fixture

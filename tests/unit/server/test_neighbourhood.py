@@ -1,0 +1,275 @@
+"""What users will need: straight on, turning, stopping, with jitter, after a teleport; and who is forgotten when."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from solidcloud.schemas.voxel_grid import voxel_keys
+from solidcloud.server.kernels.reach import SceneIndex
+from solidcloud.server.neighbourhood import AHEAD, EXPIRY, STALE, Neighbourhood, Wanted, merge
+
+pytestmark = pytest.mark.interpreted
+
+STEP, VOXEL_STEPS = 0.01, 200
+EDGE = STEP * VOXEL_STEPS
+ORIGIN = np.array([1000.0, -500.0, 20.0])
+ME, YOU = ("client", "me"), ("client", "you")
+REACH = 0.5
+NO_RING = AHEAD._replace(ring=0.0)
+
+
+def floor(side: int = 20) -> tuple[SceneIndex, NDArray[np.int64]]:
+    """A floor of 2 m voxels, side by side, each full of points; and their coordinates (v, 3)."""
+    x, y = np.meshgrid(np.arange(-side, side), np.arange(-side, side))
+    coordinates = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size, np.int64)])
+    keys = voxel_keys(coordinates)
+    coordinates = coordinates[np.argsort(keys)]
+    low = coordinates * VOXEL_STEPS
+    high = low + VOXEL_STEPS - 1
+    return SceneIndex(np.sort(keys), low, high, low.min(axis=0), high.max(axis=0)), coordinates
+
+
+INDEX, COORDINATES = floor()
+
+
+def make(ahead: object = AHEAD) -> Neighbourhood:
+    """Nobody there yet."""
+    return Neighbourhood(INDEX, VOXEL_STEPS, ORIGIN, STEP, ahead)  # type: ignore[arg-type]
+
+
+def at(x: float, y: float) -> tuple[float, float, float]:
+    """A place above the floor, from the lattice's origin [m]."""
+    return (ORIGIN[0] + x, ORIGIN[1] + y, ORIGIN[2] + 1.0)
+
+
+def cells(rows: NDArray[np.int64]) -> set[tuple[int, int]]:
+    """Which voxels rows are."""
+    return {(int(x), int(y)) for x, y, _ in COORDINATES[rows]}
+
+
+def touched(x: float, y: float, reach: float) -> set[tuple[int, int]]:
+    """Brute force: the voxels a ball at a place of the floor touches."""
+    center = np.array([x, y, 1.0]) / STEP
+    gap = np.maximum(np.maximum(INDEX.low - center, center - INDEX.high), 0)
+    return cells(np.flatnonzero(np.sqrt((gap**2).sum(axis=1)) <= reach / STEP))
+
+
+def walk(
+    around: Neighbourhood, places: NDArray[np.float64], start: float = 0.0, user: tuple[str, str] = ME
+) -> float:
+    """See a user at places (k, 2), 30 a second. Returns the time of the last."""
+    for number, (x, y) in enumerate(places):
+        assert not around.saw(user, start + number / 30, at(x, y), REACH)
+    return start + (len(places) - 1) / 30
+
+
+def straight(speed: float, poses: int = 30) -> NDArray[np.float64]:
+    """Along x from (1, 1), in the middle of a voxel."""
+    return np.column_stack([1.0 + speed * np.arange(poses) / 30, np.ones(poses)])
+
+
+def test_straight_on_the_next_voxels_come_in_their_order_and_time() -> None:
+    around = make(NO_RING)
+    now = walk(around, straight(3.0))
+    wanted = around.plan(now, 0.25)[ME]
+    x = straight(3.0)[-1, 0]  # 3.9 m; the reach ends 0.5 m ahead, voxels at 2, 4, 6, ...
+    assert NO_RING.horizon(0.25) == 2.0
+    assert [cell for cell in cells(wanted.rows) if cell[1] != 0] == []
+    order = [int(c[0]) for c in COORDINATES[wanted.rows]]
+    assert order == sorted(order) and order[-1] in (4, 5), "6 m ahead and half a metre"
+    for column, need in zip(order, wanted.need.tolist(), strict=True):
+        assert need == pytest.approx(max(0.0, (column * EDGE - REACH - x) / 3.0), abs=0.1)
+    assert wanted.need[0] == 0.0
+
+
+def test_the_horizon_follows_the_time_of_loading() -> None:
+    assert AHEAD.horizon(0.0) == AHEAD.least and AHEAD.horizon(99.0) == AHEAD.most
+    around = make(NO_RING)
+    now = walk(around, straight(3.0))
+    counts = [len(around.plan(now, seconds)[ME].rows) for seconds in (0.0, 0.25, 99.0)]
+    assert counts[0] < counts[1] < counts[2]
+
+
+def test_who_stands_wants_what_is_around_and_what_it_touches_first() -> None:
+    around = make()
+    now = walk(around, np.tile([1.9, 1.0], (20, 1)))
+    wanted = around.plan(now, 0.25)[ME]
+    assert cells(wanted.rows) == touched(1.9, 1.0, REACH + AHEAD.ring)
+    here = touched(1.9, 1.0, REACH)
+    assert cells(wanted.rows[: len(here)]) == here and (wanted.need[: len(here)] == 0).all()
+    assert (wanted.need[len(here) :] > AHEAD.horizon(0.25)).all() and (np.diff(wanted.need) >= 0).all()
+
+
+def test_what_is_ahead_comes_before_what_is_around() -> None:
+    around = make()
+    now = walk(around, straight(3.0))
+    wanted = around.plan(now, 0.25)[ME]
+    ahead = wanted.need <= AHEAD.horizon(0.25)
+    assert cells(wanted.rows[ahead]) == cells(make_plan(NO_RING, straight(3.0)).rows)
+    assert ahead.any() and not ahead.all() and np.array_equal(ahead, np.sort(ahead)[::-1])
+    assert len(set(wanted.rows.tolist())) == len(wanted.rows)
+
+
+def make_plan(ahead: object, places: NDArray[np.float64]) -> Wanted:
+    """What a user who went along places wants."""
+    around = make(ahead)
+    return around.plan(walk(around, places), 0.25)[ME]
+
+
+def test_who_turns_wants_what_is_round_the_corner() -> None:
+    """A quarter of a circle of 2 m at 3 m/s, from along x to along y."""
+    angle = np.linspace(0.0, np.pi / 2, 32)
+    places = np.column_stack([1.0 + 2.0 * np.sin(angle), 1.0 + 2.0 * (1 - np.cos(angle))])
+    wanted = cells(make_plan(NO_RING, places).rows)
+    assert (1, 2) in wanted and (0, 2) in wanted, "it goes on turning left"
+    assert not any(x >= 3 for x, _ in wanted), "where it was heading a moment ago is wanted no more"
+
+
+def test_who_stops_wants_nothing_ahead_any_more() -> None:
+    around = make(NO_RING)
+    now = walk(around, np.concatenate([straight(3.0), np.tile(straight(3.0)[-1], (20, 1))]))
+    assert cells(around.plan(now, 0.5)[ME].rows) == touched(*straight(3.0)[-1], REACH)
+
+
+def test_who_is_not_heard_of_is_taken_to_stand() -> None:
+    around = make(NO_RING)
+    now = walk(around, straight(3.0))
+    moving, standing = around.plan(now + STALE - 0.01, 0.25)[ME], around.plan(now + STALE + 0.01, 0.25)[ME]
+    assert cells(standing.rows) == touched(*straight(3.0)[-1], REACH)
+    assert len(moving.rows) > len(standing.rows)
+    assert (moving.need >= 0).all()
+
+
+def test_what_is_late_is_reckoned_from_now() -> None:
+    around = make(NO_RING)
+    now = walk(around, straight(3.0))
+    before, after = around.plan(now, 0.25)[ME], around.plan(now + 0.2, 0.25)[ME]
+    needs = dict(zip(after.rows.tolist(), after.need.tolist(), strict=True))
+    for row, need in zip(before.rows.tolist(), before.need.tolist(), strict=True):
+        assert needs[row] == pytest.approx(max(0.0, need - 0.2), abs=0.02)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_jitter_changes_little(seed: int) -> None:
+    """A centimetre of place, ten milliseconds of clock: what will be touched in a second is wanted all the same."""
+    rng = np.random.default_rng(seed)
+    around = make()
+    places = straight(1.5, 60) + rng.normal(0, 0.01, (60, 2))
+    times = np.maximum.accumulate(np.arange(60) / 30 + rng.uniform(0, 0.01, 60))
+    for now, (x, y) in zip(times.tolist(), places.tolist(), strict=True):
+        assert not around.saw(ME, now, at(x, y), REACH)
+    wanted = around.plan(float(times[-1]), 0.25)[ME]
+    soon = wanted.rows[wanted.need <= 2.0]
+    end = straight(1.5, 60)[-1, 0]
+    for ahead in np.linspace(0.0, 1.0, 20):
+        assert touched(end + 1.5 * ahead, 1.0, REACH - 0.3) <= cells(soon)
+
+
+def test_a_teleport_is_said_and_what_was_before_is_dropped() -> None:
+    around = make(NO_RING)
+    now = walk(around, straight(5.0))
+    assert around.saw(ME, now + 1 / 30, at(-30.0, -30.0), REACH)
+    wanted = around.plan(now + 1 / 30, 0.5)[ME]
+    assert cells(wanted.rows) == touched(-30.0, -30.0, REACH) and (wanted.need == 0).all()
+    assert cells(around.kept(now + 1 / 30)) == touched(-30.0, -30.0, REACH)
+    assert not around.saw(ME, now + 2 / 30, at(-29.9, -30.0), REACH)
+
+
+@pytest.mark.parametrize(
+    ("passed", "metres", "teleport"),
+    [
+        (1 / 30, 1.4, False),
+        (1 / 30, 1.6, True),
+        (0.0, 0.9, False),
+        (0.0, 1.1, True),
+        (60.0, 15.9, False),
+        (60.0, 17, True),
+    ],
+)
+def test_how_far_is_too_far(passed: float, metres: float, teleport: bool) -> None:
+    around = make()
+    assert not around.saw(ME, 7.0, at(0, 0), REACH), "the first pose is none"
+    assert around.saw(ME, 7.0 + passed, at(metres, 0), REACH) is teleport
+
+
+def test_poses_out_of_order_are_passed_over() -> None:
+    around = make(NO_RING)
+    now = walk(around, straight(3.0))
+    before = around.plan(now, 0.25)[ME]
+    assert not around.saw(ME, now - 0.01, at(-20, -20), REACH)
+    after = around.plan(now, 0.25)[ME]
+    assert after.rows.tolist() == before.rows.tolist() and after.need.tolist() == before.need.tolist()
+
+
+def test_a_clock_that_starts_again_starts_afresh() -> None:
+    around = make(NO_RING)
+    walk(around, straight(3.0), start=1e6)
+    assert not around.saw(ME, 0.0, at(-20, -20), REACH)
+    assert cells(around.plan(0.0, 0.25)[ME].rows) == touched(-20, -20, REACH)
+
+
+def test_poses_asked_as_fast_as_they_are_answered_span_the_history_all_the_same() -> None:
+    """10,000 a second: the direction is seen as well as at 30 a second."""
+    around = make(NO_RING)
+    for number in range(5000):
+        around.saw(ME, number * 1e-4, at(1.0 + 3.0 * number * 1e-4, 1.0), REACH)
+    wanted = around.plan(0.5, 0.25)[ME]
+    assert max(x for x, _ in cells(wanted.rows)) == int((1.0 + 1.5 + 6.0 + REACH) // EDGE)
+
+
+def test_a_user_wants_no_more_than_so_many_and_the_soonest() -> None:
+    few = make_plan(AHEAD._replace(most_wanted=4), straight(3.0))
+    many = make_plan(AHEAD, straight(3.0))
+    assert len(few.rows) == 4 < len(many.rows)
+    assert few.rows.tolist() == many.rows[:4].tolist()
+
+
+def test_who_leaves_is_forgotten() -> None:
+    around = make()
+    other = ("other", "me")
+    for user in (ME, YOU, other):
+        walk(around, straight(1.0), user=user)
+    assert set(around.plan(1.0, 0.1)) == {ME, YOU, other}
+    around.leave(YOU)
+    around.leave(YOU)
+    assert set(around.plan(1.0, 0.1)) == {ME, other}
+    around.leave_client("client")
+    assert set(around.plan(1.0, 0.1)) == {other}
+    around.expire(29 / 30 + 10.0, 10.0)
+    assert set(around.plan(11.0, 0.1)) == {other}
+    around.expire(11.0, 10.0)
+    assert around.plan(11.0, 0.1) == {} and around.kept(11.0).tolist() == []
+
+
+def test_what_users_can_touch_is_kept_each_once() -> None:
+    around = make()
+    around.saw(ME, 0.0, at(2.0, 2.0), REACH)
+    around.saw(YOU, 5.0, at(4.0, 2.0), 1.0)
+    kept = around.kept(5.0)
+    assert cells(kept) == touched(2.0, 2.0, REACH) | touched(4.0, 2.0, 1.0)
+    assert len(set(kept.tolist())) == len(kept)
+    assert cells(around.kept(EXPIRY + 1.0)) == touched(4.0, 2.0, 1.0), "not what is not heard of any more"
+
+
+def test_nearness_is_the_distance_to_the_nearest_way() -> None:
+    around = make()
+    rows = np.arange(len(COORDINATES))
+    assert np.isinf(around.nearness(rows)).all()
+    now = walk(around, straight(3.0))
+    walk(around, np.tile([-31.0, -31.0], (3, 1)), start=now, user=YOU)
+    around.plan(now, 0.25)
+    near = around.nearness(rows)
+    assert cells(rows[near == 0]) >= {(1, 0), (2, 0), (3, 0), (-16, -16)}
+    at_end = {tuple(c[:2]): float(d) for c, d in zip(COORDINATES.tolist(), near, strict=True)}
+    assert at_end[(15, 0)] == pytest.approx(30.0 - straight(3.0)[-1, 0] - 6.0, abs=0.3)
+    assert at_end[(-16, -10)] == pytest.approx(31.0 - 20.0, abs=0.01)
+    around.leave_client("client")
+    around.plan(now, 0.25)
+    assert np.isinf(around.nearness(rows)).all()
+
+
+def test_what_several_want_is_wanted_once_and_when_the_first_needs_it() -> None:
+    one = Wanted(np.array([5, 3, 9]), np.array([0.0, 1.0, 2.0]))
+    two = Wanted(np.array([9, 7, 5]), np.array([0.5, 0.6, 3.0]))
+    both = merge([one, two])
+    assert both.rows.tolist() == [5, 9, 7, 3] and both.need.tolist() == [0.0, 0.5, 0.6, 1.0]
+    assert merge([one]).rows.tolist() == [5, 3, 9] and merge([]).rows.tolist() == []

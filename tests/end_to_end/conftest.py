@@ -1,0 +1,28 @@
+"""The made floor of fake_server.py, and a server and a client of it, where a test has no scene of its own."""
+
+import socket
+
+import pytest
+from fake_server import FloorScene
+from solidcloud.server.app import serving
+from solidcloud.server.client import Client
+from solidcloud.server.config import ServerConfig
+
+
+@pytest.fixture
+def endpoint():
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    return f"tcp/127.0.0.1:{port}"
+
+
+@pytest.fixture
+def scene():
+    return FloorScene()
+
+
+@pytest.fixture
+def client(scene, endpoint):
+    with serving([scene], ServerConfig(listen=endpoint)), Client(endpoint, scene="floor") as client:
+        yield client

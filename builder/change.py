@@ -17,15 +17,21 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..schemas.archive import INDEX_NAME, SHARD_FOLDER, Archive, sync_folder
-from ..schemas.errors import BadRequestError, FormatError, SolidcloudError
-from ..schemas.index import Header
+from ..schemas.archive import Archive
+from ..schemas.errors import BadRequestError, CorruptError, FormatError, SolidcloudError
+from ..schemas.index import Header, Source
+from ..schemas.index_file import INDEX_NAME
+from ..schemas.new_file import sync_folder
+from ..schemas.shard import SHARD_FOLDER
 from ..schemas.vtkhdf import PREVIEW_NAME
 from .config import BuildConfig
 from .executor import Executor, make_executor, worker_count
+from .kernels.content import SEEDS
+from .kernels.records import sum_places
 from .memory import jobs_that_fit, memory_share
 from .preview import write_preview
 from .progress import Progress, Silent
+from .record_points import leaves_of
 from .spool import spool_dtype
 from .workplace import locked
 
@@ -114,9 +120,9 @@ def changing(target: Path, jobs: int, memory_bytes: int, progress: Progress | No
         folder = target.parent / f".{target.name}.changing"
         shutil.rmtree(folder, ignore_errors=True)
         delete_orphans(target, {name for name, _ in archive.shards()})
-        for name in ("spool", "before", SHARD_FOLDER):
-            (folder / name).mkdir(parents=True)
         try:
+            for name in ("spool", "before", SHARD_FOLDER):
+                (folder / name).mkdir(parents=True)
             jobs = jobs_that_fit(worker_count(jobs, archive.header.points), config)
             with make_executor(config, jobs) as executor:
                 change = Change(target, folder, archive, config, executor, progress or Silent())
@@ -159,11 +165,31 @@ def delete_orphans(target: Path, named: set[str]) -> None:
             path.unlink()
 
 
+def scan_name(source: Source) -> str:
+    """A scan as messages name it."""
+    return f"{source.path}[{source.index}]"
+
+
 def show_kept(change: Change, files: list[tuple[str, int]], new: set[str]) -> None:
     """Show the shards that stay in the hidden folder too, so that it is read as an archive."""
     for name, _ in files:
         if name not in new:
             (change.folder / SHARD_FOLDER / name).symlink_to(change.target / SHARD_FOLDER / name)
+
+
+@contextmanager
+def reading_back(change: Change, new: set[str]) -> Iterator[None]:
+    """Say of a CorruptError whether it is of what was written just now, or of what stays; new: names of shards."""
+    try:
+        yield
+    except CorruptError as error:
+        if not {path.name for path in error.paths} & new:
+            # It was read by a link in the hidden folder, which is gone when this is read.
+            raise CorruptError(str(error).replace(str(change.folder), str(change.target))) from error
+        raise CorruptError(
+            f"{error}: what was written is not what reads back: check disk and memory, and give the command again; "
+            "the archive is what it was"
+        ) from error
 
 
 class _ReadUnit(NamedTuple):
@@ -174,25 +200,38 @@ class _ReadUnit(NamedTuple):
     points: int
 
 
-def _read_back(unit: _ReadUnit) -> None:
-    """Read voxels as a server does. Raises CorruptError."""
+def _read_back(unit: _ReadUnit) -> int:
+    """Read voxels as a server does; returns the `places_sum` of their points (spool.py). Raises CorruptError."""
+    places = 0
     with Archive(unit.folder) as archive:
         for row in unit.rows:
-            archive.read_voxel(row)
+            record = archive.open_voxel(row)
+            with archive.locating(row):
+                record.decode()
+                corner = archive.coordinates[row] * record.voxel_steps
+                places += int(sum_places(leaves_of(record), corner, SEEDS[0]))
+    return places
 
 
-def verify_new(change: Change, new: set[str]) -> None:
-    """Read back every voxel that was built; those that were not touched stand where they stood."""
+def verify_new(change: Change, new: set[str], places: int) -> None:
+    """Read back every voxel that was built; those that were not touched stand where they stood.
+
+    places: what the `places_sum` of their points must be (spool.py). Raises CorruptError where records are broken, or
+    sound and of other points: runs have no checksums.
+    """
     with Archive(change.folder) as archive:
         fresh = np.array([name in new for name, _ in archive.shards()], bool)
         rows = np.flatnonzero(fresh[archive.voxels["shard"]])
         points = archive.voxels["rows"][:, 2].astype(np.int64)
-    if not len(rows):
-        return
     cuts = np.array_split(rows, max(1, int(points[rows].sum()) // UNIT_POINTS))
     units = [_ReadUnit(change.folder, tuple(c.tolist()), int(points[c].sum())) for c in cuts if len(c)]
     with change.stage("verify", int(points[rows].sum()), "points"):
-        change.run(_read_back, units)
+        found = sum(change.run(_read_back, units))
+    if (found - places) % (1 << 64):
+        raise CorruptError(
+            f"{change.target}: the points built anew are not those that were stored and read: what was written is not "
+            "what reads back: check disk and memory, and give the command again; the archive is what it was"
+        )
 
 
 def publish(change: Change, new: list[str], named: set[str]) -> None:

@@ -13,16 +13,19 @@ from numpy.typing import NDArray
 
 from ..schemas.archive import Archive
 from ..schemas.codec import OpenRecord
+from ..schemas.kernels.morton import morton_decode
 from ..schemas.radius_model import LOCAL_CLASSES, RADIUS_CLASSES, RIM_BIT
 from .classes import voxel_classes
 from .config import BuildConfig
 from .dense import is_dense, plan_parts
 from .journal import new_file
+from .kernels.content import SEEDS
 from .kernels.octree import voxel_codes
+from .kernels.records import sum_places
 from .kernels.spool import fill_local
 from .octree import gather_voxel
-from .record_points import taken
-from .spool import RUN_SUFFIX, Spool, canonical_columns, spool_dtype, write_directory
+from .record_points import leaves_of, taken
+from .spool import RUN_SUFFIX, Spool, canonical_columns, places_sum, spool_dtype, write_directory
 
 # Bytes a point that is held while a run is written: code and columns, and of a voxel order, sorted copies and rows.
 RUN_BYTES_A_POINT = 60
@@ -52,10 +55,11 @@ class GatherUnit(NamedTuple):
 
 class Gathered(NamedTuple):
     """radius_counts: (32,) int64, points of each radius class as stored.  perhaps_few: keys of the voxels that may have
-    points with too few neighbours for a class."""
+    points with too few neighbours for a class.  places: `places_sum` of the points that are not left out (spool.py)."""
 
     radius_counts: NDArray[np.int64]
     perhaps_few: tuple[int, ...]
+    places: int
 
 
 class FindUnit(NamedTuple):
@@ -176,16 +180,24 @@ def gather(unit: GatherUnit) -> Gathered:
     runs = _Runs(unit.spool, unit.name, dtype, unit.run_points)
     before = _Runs(unit.before, unit.name, dtype, unit.run_points) if unit.before else None
     dropped = np.array(sorted(unit.dropped), np.int64)
-    counts, perhaps_few = np.zeros(RADIUS_CLASSES, np.int64), []
+    counts, perhaps_few, places = np.zeros(RADIUS_CLASSES, np.int64), [], 0
     wanted = {name for name in dtype.names or () if name != "local"} | {"radius_class"}
     with Archive(unit.archive) as archive:
         for row in unit.rows:
             record, key = archive.open_voxel(row, columns=wanted), int(archive.voxels["key"][row])
+            places += int(
+                sum_places(leaves_of(record), archive.coordinates[row] * record.voxel_steps, SEEDS[0])
+            )
             with archive.locating(row):
                 for points in record_points(record, dtype):
                     if before:
                         before.take(key, points)
-                    runs.take(key, _without(points, dropped) if len(dropped) else points)
+                    if len(dropped):
+                        points, gone = _without(points, dropped)
+                        places -= places_sum(
+                            key, morton_decode(gone).astype(np.int32), archive.header.lattice
+                        )
+                    runs.take(key, points)
             if archive.header.radius_class:
                 each = record.class_counts()
                 counts += each
@@ -194,13 +206,14 @@ def gather(unit: GatherUnit) -> Gathered:
     for written in (runs, before):
         if written:
             written.write()
-    return Gathered(counts, tuple(perhaps_few))
+    return Gathered(counts, tuple(perhaps_few), places)
 
 
-def _without(points: _Points, scans: NDArray[np.int64]) -> _Points:
-    """Points but those of some scans."""
+def _without(points: _Points, scans: NDArray[np.int64]) -> tuple[_Points, NDArray[np.uint64]]:
+    """Points but those of some scans, and the codes of those."""
     kept = ~np.isin(points.columns["scan_index"], scans)
-    return _Points(points.codes[kept], {name: column[kept] for name, column in points.columns.items()})
+    columns = {name: column[kept] for name, column in points.columns.items()}
+    return _Points(points.codes[kept], columns), points.codes[~kept]
 
 
 def few_are_possible(counts: NDArray[np.int64], models: tuple[str, ...]) -> bool:

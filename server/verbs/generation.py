@@ -9,7 +9,7 @@ from .interrupt import interruptible
 from .options import ArchivePath, AsJson, parse_bytes, print_json
 
 if TYPE_CHECKING:
-    from ...builder.generation import ChangeSummary
+    from ...builder.rebuild import ChangeSummary
 
 Jobs = Annotated[int, typer.Option(help="Worker processes; 0: one a core where it pays.")]
 Memory = Annotated[str, typer.Option(help="Bound on what the passes hold.")]
@@ -25,6 +25,7 @@ def add(
         bool,
         typer.Option("--new", help="Leave out scans that are in already, as of a folder that has grown."),
     ] = False,
+    strict: Annotated[bool, typer.Option("--strict", help="Fail on a point that is not finite.")] = False,
     jobs: Jobs = 0,
     memory: Memory = "2GB",
     as_json: AsJson = False,
@@ -42,6 +43,7 @@ def add(
             scans,
             again=again,
             new_only=new_only,
+            strict=strict,
             jobs=jobs,
             memory_bytes=parse_bytes(memory, "--memory"),
             progress=bars,
@@ -113,6 +115,7 @@ def _print(summary: "ChangeSummary", what: str, as_json: bool) -> None:
             ("voxels", f"{summary.built:,} of {summary.voxels:,} built, {summary.gone:,} emptied"),
             ("written", f"{bytes_text(summary.bytes)} in new shards{dead}"),
             ("radius", radius),
+            *(("left out", f"{count:,} points: {reason}") for reason, count in summary.skipped.items()),
             ("time", f"{summary.seconds:.1f} s ({stages})"),
         )
     )

@@ -1,7 +1,10 @@
 """The commands `add`, `remove` and `reload`: an archive that grows while a server serves it."""
 
 import json
+import subprocess
+import sys
 import threading
+import time
 from pathlib import Path
 
 import cases
@@ -36,6 +39,7 @@ def hall(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Path:
 
 def told(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> dict:
     """What a command says as JSON."""
+    capsys.readouterr()
     assert run([*arguments, "--json"]) == 0
     return json.loads(capsys.readouterr().out)
 
@@ -60,6 +64,72 @@ def test_scans_are_added_and_removed(hall: Path, capsys: pytest.CaptureFixture[s
     assert run(["add", str(hall), str(hall.parent / "none.ply")]) == 3
     assert run(["add", str(hall.parent), chair]) == 3
     assert "no archive here" in capsys.readouterr().err
+
+
+def test_points_that_are_left_out_are_said_or_refused(hall: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    points = CHAIR.copy()
+    points[[3, 5, 8]] = np.nan
+    holes = str(scans.write_ply(hall.parent / "holes.ply", points))
+    assert run(["add", str(hall), holes, "--strict"]) == 3
+    assert "holes.ply: 3 points that are not finite, expected none with --strict" in capsys.readouterr().err
+    assert told(["add", str(hall), holes], capsys)["skipped"] == {"not finite": 3}
+    assert run(["add", str(hall), holes, "--again", "--new"]) == 2
+    assert "--new and --again together" in capsys.readouterr().err
+    assert run(["add", str(hall), holes, "--again"]) == 0
+    assert "3 points: not finite" in capsys.readouterr().out
+    assert told(["remove", str(hall), holes], capsys)["skipped"] == {}
+
+
+def start_adding(hall: Path) -> subprocess.Popen[str]:
+    """`solidcloud add` with workers, in a process of its own that has begun."""
+    command = ["add", str(hall), str(hall.parent / "chair.ply"), "--jobs", "2"]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "solidcloud.server.cli", *command], stderr=subprocess.PIPE, text=True
+    )
+    deadline = time.monotonic() + 120
+    while not (hall.parent / ".hall.changing" / "spool").exists():
+        assert process.poll() is None and time.monotonic() < deadline, "it did not begin"
+        time.sleep(0.001)
+    return process
+
+
+def test_nothing_is_left_of_a_change_that_is_told_to_end(hall: Path) -> None:
+    before = sorted(hall.parent.iterdir())
+    with start_adding(hall) as process:
+        process.terminate()
+        _, said = process.communicate(timeout=120)
+    assert process.returncode == 130 and f"interrupted: {hall} is whole, of generation 0" in said
+    assert sorted(hall.parent.iterdir()) == before
+    assert run(["validate", str(hall), "--deep"]) == 0
+
+
+@pytest.mark.parametrize("following", ["add", "remove", "build"])
+def test_a_change_that_was_killed_keeps_nobody_off(
+    hall: Path, following: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scan, chair = (str(hall.parent / name) for name in ("hall.ply", "chair.ply"))
+    if following == "remove":
+        assert run(["add", str(hall), chair]) == 0
+        (hall.parent / "chair.ply").rename(hall.parent / "old.ply")
+        scans.write_ply(hall.parent / "chair.ply", CHAIR[:100])
+    with start_adding(hall) as process:
+        process.kill()
+    assert (hall.parent / ".hall.changing").is_dir(), "nobody could tidy up"
+    capsys.readouterr()
+    assert run(["validate", str(hall), "--deep"]) == 0
+    if following == "build":
+        options = ["--voxel", "0.5", "--resolution", "0.001", "--keep", "scan", "--radius", "0.02"]
+        found = told(["build", scan, "-o", str(hall), "--jobs", "1", "--overwrite", *options], capsys)
+        assert found["points"] == len(HALL)
+    elif following == "add":
+        assert told(["add", str(hall), chair], capsys)["points"] == len(HALL) + len(CHAIR)
+    else:
+        assert told(["remove", str(hall), "1"], capsys)["points"] == len(HALL)
+    assert run(["validate", str(hall), "--deep"]) == 0
+    if following != "build":  # which leaves that alone: the next change removes it
+        assert not (hall.parent / ".hall.changing").exists()
+    assert told(["add", str(hall), chair, "--again"], capsys)["generation"] >= 1
+    assert not list(hall.parent.glob(".hall*"))
 
 
 def test_the_stored_figure_stays_and_info_says_how_far_it_is_off(

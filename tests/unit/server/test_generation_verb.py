@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scans
-from solidcloud.builder import generation
+from solidcloud.builder import rebuild
 from solidcloud.server.cli import run
 
 
@@ -30,7 +30,7 @@ def test_who_interrupts_a_change_is_told_what_the_archive_is(
     before = signal.getsignal(signal.SIGTERM)
     capsys.readouterr()
     with monkeypatch.context() as patch:
-        patch.setattr(generation, stage, lambda *_: os.kill(os.getpid(), number))
+        patch.setattr(rebuild, stage, lambda *_: os.kill(os.getpid(), number))
         assert run(["add", hall, str(tmp_path / "b.xyz"), "--jobs", "1"]) == 130
     said = capsys.readouterr().err
     assert f"interrupted: {hall} is whole, of generation {now}" in said and said.count("interrupted") == 1

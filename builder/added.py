@@ -1,0 +1,159 @@
+"""What is added to an archive: new scans surveyed, held against those that are in, and spooled on its lattice."""
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..schemas.errors import BadRequestError, ScanError
+from ..schemas.index import Header, Source
+from ..schemas.voxel_grid import Lattice, voxel_coordinates
+from .change import Change, scan_name
+from .partition import SpoolUnit, run_points, spool_range
+from .passes import MAX_SCANS
+from .pipeline import ARCHIVE_BYTES_A_POINT
+from .scan_list import Input
+from .sources import Scan
+from .survey import Survey, hash_file, joined, ranges, survey_range, unopened
+
+# Scans that an error names.
+MOST_NAMED = 10
+
+
+class Wanted(NamedTuple):
+    """Which scans are added. again: those too that are in already.  new_only: those that are in are left out.
+
+    strict: a scan with points that are not finite is refused.
+    """
+
+    again: bool = False
+    new_only: bool = False
+    strict: bool = False
+
+
+def survey_added(change: Change, inputs: Sequence[Input], wanted: Wanted) -> list[Survey]:
+    """The scans of `inputs` that are to be added, all usable. What is in already is told before points are read."""
+    if faults := [unopened(item.path, item.fault).fault for item in inputs if not item.scans]:
+        raise ScanError("\n  ".join(faults))
+    scans = [scan for item in inputs for scan in item.scans]
+    files = list(dict.fromkeys(scan.path for scan in scans))
+    with change.stage("hash", len(files), "files"):
+        hashes = dict(
+            zip(files, change.executor.map(hash_file, files, change.progress, lambda _: 1), strict=True)
+        )
+    if not wanted.again:
+        scans = _not_in(
+            change, scans, {path: digest for path, (digest, _) in hashes.items()}, wanted.new_only
+        )
+    count = len(change.archive.header.sources) + len(scans)
+    if change.archive.header.scan_index and count > MAX_SCANS:
+        raise BadRequestError(
+            f"{change.target}: {count} scans with those removed, --keep scan holds {MAX_SCANS}: build again"
+        )
+    about = sum(scan.declared_count or 0 for scan in scans)
+    cut = [ranges(scan, about) for scan in scans]
+    with change.stage("survey", about, "points"):
+        parts = iter(change.run(survey_range, [unit for units in cut for unit in units]))
+        surveys = [
+            joined(scan, [next(parts) for _ in units], hashes[scan.path])
+            for scan, units in zip(scans, cut, strict=True)
+        ]
+    if faults := [survey.fault for survey in surveys if survey.fault]:
+        raise ScanError("\n  ".join(faults))
+    if wanted.strict and (unclean := [survey for survey in surveys if survey.unclean]):
+        found = (f"{survey.path}: {survey.unclean} points that are not finite" for survey in unclean)
+        raise ScanError("\n  ".join(found) + ", expected none with --strict: clean the scan")
+    return surveys
+
+
+def _not_in(change: Change, scans: list[Scan], hashes: Mapping[Path, str], new_only: bool) -> list[Scan]:
+    """The scans that are not in yet, by what is in their files. BadRequestError names those that are in, and refuses
+    them unless only new ones are wanted, and then to add none."""
+    known = {(s.sha256, s.index): scan_name(s) for s in change.archive.header.sources if not s.fault}
+    new, there = [], []
+    for scan in scans:
+        key, name = (hashes[scan.path], scan.index), f"{scan.path}[{scan.index}]"
+        if key in known and key[0]:
+            there.append(f"{name} is in already, as {known[key]}")
+            continue
+        known[key] = name
+        new.append(scan)
+    if there and not (new and new_only):
+        more = [f"and {len(there) - MOST_NAMED} more"] if len(there) > MOST_NAMED else []
+        advice = (
+            "nothing is new"
+            if new_only
+            else "leave out what is in, or give --new, or --again to have it twice"
+        )
+        raise BadRequestError(
+            "\n  ".join([f"{len(there)} of {len(scans)} scans: {advice}", *there[:MOST_NAMED], *more])
+        )
+    return new
+
+
+def spool_added(change: Change, surveys: list[Survey]) -> tuple[float, int]:
+    """Spool the new scans; returns the farthest that quantising moved a point [m], and the `places_sum` (spool.py)."""
+    header, dtype, folder = change.archive.header, change.dtype, change.folder / "spool"
+    most, first = run_points(change.share, dtype), len(change.archive.header.sources)
+    change.check_room(sum(survey.count for survey in surveys) * (dtype.itemsize + ARCHIVE_BYTES_A_POINT))
+    units = [
+        SpoolUnit(
+            survey.scan, number, part.start, part.stop, part.count, header.lattice, change.config, dtype, folder,
+            f"new-{number:06d}-{part.start:012d}", most,
+        )
+        for number, survey in enumerate(surveys, first)
+        for part in survey.parts
+        if survey.scan is not None
+    ]  # fmt: skip
+    with change.stage("spool", sum(unit.count for unit in units), "points"):
+        spooled = list(change.executor.map(spool_range, units, change.progress, lambda unit: unit.count))
+    return max(found.moved_max for found in spooled), sum(found.places for found in spooled)
+
+
+def source_of(survey: Survey) -> Source:
+    """What the index says of a scan that was added."""
+    scan = survey.scan
+    assert scan is not None
+    return Source(
+        str(survey.path), scan.index, scan.format, survey.sha256, survey.count, scan.pose, survey.dropped,
+        crs=scan.crs, units=scan.units, up=scan.up,
+    )  # fmt: skip
+
+
+def no_longer_unknown(header: Header, surveys: Sequence[Survey]) -> Header:
+    """The header without the regions of scans that a build left out and that are added now, by their paths."""
+    added = {(os.path.realpath(s.path), s.scan.index) for s in surveys if s.scan is not None}
+    files = {path for path, _ in added}
+    sources, gone = [], set()
+    for source in header.sources:
+        path = os.path.realpath(source.path)
+        # A file that could not be opened stands for all scans in it.
+        here = (path, source.index) in added or (not source.format and path in files)
+        if source.unknown is not None and here:
+            gone.add(source.unknown)
+            fault = f"{scan_name(source)}: left out at first, added in generation {header.generation + 1}"
+            source = replace(source, fault=fault, unknown=None)
+        sources.append(source)
+    if not gone:
+        return header
+    kept = [row for row in range(len(header.unknown)) if row not in gone]
+    number: dict[int | None, int | None] = {row: place for place, row in enumerate(kept)}
+    number |= {-1: -1, None: None}
+    return replace(
+        header,
+        sources=tuple(replace(source, unknown=number[source.unknown]) for source in sources),
+        unknown=header.unknown[kept],
+        unknown_everywhere=any(source.unknown == -1 for source in sources),
+    )
+
+
+def box_of(key: int, parts: list[NDArray], lattice: Lattice) -> NDArray[np.int64]:
+    """The box (2, 3) of a voxel's rows, lattice coordinates."""
+    low = np.min([rows["local"].min(axis=0) for rows in parts], axis=0)
+    high = np.max([rows["local"].max(axis=0) for rows in parts], axis=0)
+    corner = voxel_coordinates(np.array([key], np.uint64))[0] * lattice.voxel_steps
+    return np.stack([low, high]).astype(np.int64) + corner

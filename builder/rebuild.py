@@ -1,0 +1,254 @@
+"""What a change touches built anew, beside what stays: the new records, the new index, and both published."""
+
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..schemas.archive import Archive
+from ..schemas.errors import CorruptError
+from ..schemas.index import Header, RadiusNow, Source
+from ..schemas.index_file import write_index
+from ..schemas.shard import SHARD_FOLDER
+from ..schemas.voxel_grid import voxel_coordinates
+from .change import Change, publish, reading_back, show_kept, verify_new
+from .config import RADIUS_SAMPLE
+from .passes import VOXEL_BYTES_A_POINT
+from .pipeline import ARCHIVE_BYTES_A_POINT
+from .shards import Shard, ShardUnit, build_shard, plan_shards
+from .spacing import archive_mean
+from .spool import Spool
+from .stored_points import (
+    RECORD_BYTES_A_POINT,
+    RUN_BYTES_A_POINT,
+    FewUnit,
+    GatherUnit,
+    count_few,
+    gather,
+)
+from .touched import touched
+
+
+class ChangeSummary(NamedTuple):
+    """What a change did. generation: of the archive now.  points_before, points: in it.  voxels: in it; built: of them,
+    anew; gone: that hold nothing any more.
+
+    bytes: of the new shards.  dead_bytes: of records that were replaced, but stay on disk in shards that are in use.
+    radius: the stored figure; radius_now: what it would be now, None where it was given [m].
+    scans: those added or removed, as the index names them.  skipped: reason -> points of those added left out.
+    """
+
+    archive: Path
+    generation: int
+    scans: tuple[str, ...]
+    points_before: int
+    points: int
+    voxels: int
+    built: int
+    gone: int
+    bytes: int
+    dead_bytes: int
+    seconds: float
+    stages: dict[str, float]
+    radius: float
+    radius_now: RadiusNow | None
+    skipped: dict[str, int]
+
+
+class Difference(NamedTuple):
+    """What is to be different. header: with its sources as they are to be.  scans: those added or removed, by name.
+
+    boxes: key -> box (2, 3) of the points that change, lattice.  dropped: scans whose points go.  places: `places_sum`
+    of the points that are spooled already (spool.py).
+    """
+
+    header: Header
+    scans: tuple[str, ...]
+    boxes: Mapping[int, NDArray[np.int64]]
+    dropped: frozenset[int] = frozenset()
+    places: int = 0
+
+
+def rebuild(
+    change: Change, difference: Difference, check: Callable[[], None] = lambda: None
+) -> ChangeSummary:
+    """Build what a difference touches, and publish it. check: called before it is published.
+
+    Raises CorruptError where what was written is not what is read back; the archive is then what it was.
+    """
+    before = change.archive.header
+    header = replace(difference.header, generation=before.generation + 1, radius_now=None)
+    rebuilt, read = touched(change.archive, difference.boxes)
+    change.check_room(_room(change, header, rebuilt, read))
+    gathered = _gather(change, rebuilt, read, difference.dropped)
+    spool = Spool(change.folder / "spool", change.dtype, header.lattice)
+    wanted = set(difference.boxes) | set(change.archive.voxels["key"][rebuilt].tolist())
+    shards = _build(change, header, spool, wanted)
+    header, table, files = _new_index(change, header, rebuilt, shards)
+    header = replace(
+        header,
+        radius_counts=before.radius_counts - gathered.radius_counts + sum(s.radius_counts for s in shards),
+        radius_capped=before.radius_capped - gathered.few + sum(s.radius_capped for s in shards),
+    )
+    _check_counts(change, header)
+    new = {s.name for s in shards}
+    show_kept(change, files, new)
+    write_index(change.folder, header, table, files)
+    with reading_back(change, new):
+        header = _measure(change, header)
+        write_index(change.folder, header, table, files)
+        verify_new(change, new, difference.places + gathered.places)
+        check()
+        publish(change, sorted(new), {name for name, _ in files})
+    return ChangeSummary(
+        archive=change.target,
+        generation=header.generation,
+        scans=difference.scans,
+        points_before=before.points,
+        points=header.points,
+        voxels=len(table),
+        built=sum(len(s.rows) for s in shards),
+        gone=len(change.archive.voxels) - int(np.isin(change.archive.voxels["key"], table["key"]).sum()),
+        bytes=sum(s.size for s in shards),
+        dead_bytes=_dead_bytes(change.archive, rebuilt, files),
+        seconds=time.perf_counter() - change.begin,
+        stages=change.seconds,
+        radius=header.radius,
+        radius_now=header.radius_now,
+        skipped=_left_out(header.sources[len(before.sources) :]),
+    )
+
+
+def _left_out(sources: Sequence[Source]) -> dict[str, int]:
+    """Reason -> points of some scans left out."""
+    return dict(sum((Counter(source.skipped) for source in sources), Counter[str]()))
+
+
+def _room(change: Change, header: Header, rebuilt: NDArray[np.int64], read: NDArray[np.int64]) -> int:
+    """Bytes, about, that are yet to be written: runs of what is read, and the records of what is built."""
+    archive, before = change.archive, change.archive.header
+    # With radius classes what is read is spooled once more, as it was before.
+    a_point = change.dtype.itemsize * (2 if change.with_classes else 1)
+    runs = int(archive.voxels["rows"][read, 2].sum(dtype=np.int64)) * a_point
+    added = sum(source.count for source in header.sources[len(before.sources) :])
+    records = int(archive.voxels["frame_bytes"][rebuilt].sum(dtype=np.int64)) + added * ARCHIVE_BYTES_A_POINT
+    return runs + records
+
+
+def _dead_bytes(archive: Archive, rebuilt: NDArray[np.int64], files: list[tuple[str, int]]) -> int:
+    """Bytes of the records that were replaced, but stand in shards that stay."""
+    named = {name for name, _ in files}
+    stays = np.array([name in named for name, _ in archive.shards()], bool)
+    rows = archive.voxels[rebuilt]
+    return int(rows["frame_bytes"][stays[rows["shard"]]].sum(dtype=np.int64))
+
+
+class _Before(NamedTuple):
+    """What the voxels to be rebuilt had, as they are stored. radius_counts, few: of `radius_counts` and of
+    `radius_capped`.  places: `places_sum` of their points that stay (spool.py)."""
+
+    radius_counts: NDArray[np.int64]
+    few: int
+    places: int
+
+
+def _gather(
+    change: Change, rebuilt: NDArray[np.int64], read: NDArray[np.int64], dropped: frozenset[int]
+) -> _Before:
+    """Spool the stored points that are needed."""
+    config, folder = change.config, change.folder
+    densest = int(change.archive.voxels["rows"][read, 2].max(initial=0))
+    most = max(1 << 16, (change.share - RECORD_BYTES_A_POINT * densest) // RUN_BYTES_A_POINT)
+    before = folder / "before" if change.with_classes else None
+    groups = [
+        (rows, group) for rows in (rebuilt, np.setdiff1d(read, rebuilt)) for group in change.units_of(rows)
+    ]
+    units = [
+        GatherUnit(
+            change.target, rows, points, folder / "spool", f"old-{number:06d}", dropped, before, config, most
+        )
+        for number, (_, (rows, points)) in enumerate(groups)
+    ]
+    with change.stage("gather", sum(unit.points for unit in units), "points"):
+        parts = [
+            part for (rows, _), part in zip(groups, change.run(gather, units), strict=True) if rows is rebuilt
+        ]
+    counts = sum((part.radius_counts for part in parts), np.zeros(32, np.int64))
+    places = sum(part.places for part in parts)
+    keys = [part.perhaps_few for part in parts if part.perhaps_few]
+    if not keys or before is None:
+        return _Before(counts, 0, places)
+    spool = Spool(before, change.dtype, change.archive.header.lattice)
+    few = [FewUnit(held, sum(map(spool.count, held)), spool, config, _most_near(change)) for held in keys]
+    with change.stage("neighbours", sum(unit.points for unit in few), "points"):
+        return _Before(counts, sum(change.run(count_few, few)), places)
+
+
+def _most_near(change: Change) -> int:
+    """Points around a voxel that a job may hold beside it."""
+    return max(1 << 16, change.share // (2 * VOXEL_BYTES_A_POINT))
+
+
+def _build(change: Change, header: Header, spool: Spool, wanted: set[int]) -> list[Shard]:
+    """Build the voxels of `wanted` that hold points, into new shards in the hidden folder."""
+    which = np.isin(spool.keys, np.array(sorted(wanted), np.uint64))
+    units = [
+        ShardUnit(
+            number, header.generation, keys, points, spool, header.lattice, change.config, _most_near(change),
+            header.archive_id, change.folder / SHARD_FOLDER,
+        )
+        for number, (keys, points) in enumerate(plan_shards(spool.keys[which], spool.counts[which]))
+    ]  # fmt: skip
+    with change.stage("build", sum(unit.points for unit in units), "points"):
+        return change.run(build_shard, units)
+
+
+def _new_index(
+    change: Change, header: Header, rebuilt: NDArray[np.int64], shards: list[Shard]
+) -> tuple[Header, NDArray, list[tuple[str, int]]]:
+    """The rows of the new index, ascending, the shards it names, and the header with counts and bounds of both."""
+    kept = np.delete(change.archive.voxels, rebuilt)
+    used, where = np.unique(kept["shard"], return_inverse=True)
+    kept["shard"] = where
+    files = [change.archive.shards()[number] for number in used.tolist()]
+    tables = [kept]
+    for number, shard in enumerate(shards, len(files)):
+        rows = shard.rows.copy()
+        rows["shard"] = number
+        tables.append(rows)
+    files += [(shard.name, shard.size) for shard in shards]
+    table = np.concatenate(tables)
+    table = table[np.argsort(table["key"], kind="stable")]
+    base = voxel_coordinates(table["key"]) * header.lattice.voxel_steps
+    header = replace(
+        header,
+        points=int(table["rows"][:, 2].sum(dtype=np.int64)),
+        low=(base + table["low"]).min(axis=0),
+        high=(base + table["high"]).max(axis=0),
+    )
+    return header, table, files
+
+
+def _check_counts(change: Change, header: Header) -> None:
+    """What is built must be what the scans had."""
+    expected = sum(s.count for s in header.sources)
+    if header.points != expected:
+        raise CorruptError(
+            f"{change.target}: {header.points} points after the change, expected {expected}: see solidcloud validate"
+        )
+
+
+def _measure(change: Change, header: Header) -> Header:
+    """Measure the mean closest-point distance of what there is now; not where the radius was given."""
+    if header.radius_model != "mean":
+        return header
+    with change.stage("radius", header.points, "points"):
+        found = archive_mean(change.folder, RADIUS_SAMPLE, change.executor, change.progress)
+    if not found.sample:
+        return header
+    return replace(header, radius_now=RadiusNow(found.mean / 2, found.error / 2, found.sample))

@@ -54,11 +54,14 @@ TESTS: dict[str, tuple[str, ...]] = {
     ),
     "builder/kernels/filter.py": (BUILDER + "test_filter_kernels.py",),
     "builder/kernels/classes.py": (
+        BUILDER + "test_classes_kernels.py",
         BUILDER + "test_classes.py::test_the_kernel_and_the_judge_agree_at_the_edge_of_each_rule",
         BUILDER + "test_classes.py::test_the_twelfth_neighbour_decides_and_at_the_limit_is_within",
         BUILDER + "test_classes.py::test_a_mean_at_the_limit_is_no_rim",
     ),
     "builder/kernels/neighbours.py": (
+        BUILDER + "test_neighbours.py::test_what_is_inserted_is_among_the_first_in_order",
+        BUILDER + "test_neighbours.py::test_the_distance_of_a_box_is_that_of_its_nearest_place",
         BUILDER + "test_neighbours.py::test_the_closest_equal_brute_force",
         BUILDER + "test_neighbours.py::test_ties_go_to_lesser_coordinates",
         BUILDER + "test_neighbours.py::test_a_distance_at_the_limit_counts",

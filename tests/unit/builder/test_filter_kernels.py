@@ -75,16 +75,16 @@ def test_others_are_counted_as_every_pair_says(reach2: int, most: int) -> None:
     assert ((d2 == reach2) | (d2 == reach2 + 1)).any()
 
 
-def test_points_are_looked_for_in_all_cells_around_and_none_beyond() -> None:
-    """One point in each of the 125 cells around, the query in the middle one: what is beyond reach2 counts nothing."""
+@pytest.mark.parametrize("reach2", [EDGE**2, 3 * EDGE**2, 1 << 40])
+def test_points_are_looked_for_in_all_cells_around_and_none_beyond(reach2: int) -> None:
+    """One point in each of 125 cells, and a query there: what is not in a cell around counts nothing, however near."""
     points = np.array(list(itertools.product(range(5), repeat=3)), np.int32) * EDGE
-    query = np.array([[2, 2, 2]], np.int32) * EDGE
-    grid = grid_of(points)
-    for reach2, expected in ((EDGE**2, 6), (3 * EDGE**2, 26), (2**40, 26)):
-        counts = np.zeros(1, np.int64)
-        cells = numbers_of(points, grid)
-        count_others(query, numbers_of(query, grid), points, cells, *grid, reach2, 99, counts)
-        assert counts.tolist() == [expected]
+    grid, counts = grid_of(points), np.zeros(125, np.int64)
+    cells = numbers_of(points, grid)
+    count_others(points, cells, points, cells, *grid, reach2, 99, counts)
+    d2 = squares(points, points)
+    around = (np.abs(points[:, None] - points).max(axis=2) <= EDGE) & (d2 > 0)
+    assert counts.tolist() == (around & (d2 <= reach2)).sum(axis=1).tolist()
 
 
 @pytest.mark.parametrize("reach2", REACHES)

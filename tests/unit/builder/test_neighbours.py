@@ -8,6 +8,8 @@ from solidcloud.builder.kernels.neighbours import (
     BLOCK,
     FAN,
     STACK,
+    _insert,
+    _outside,
     bound_boxes,
     box_starts,
     closest_distinct,
@@ -82,6 +84,32 @@ def test_a_distance_at_the_limit_counts() -> None:
     points = np.array([[0, 0, 0], [3, 4, 0]], np.int32)
     assert found(points, 0, 2, 25) == [[25, 3, 4, 0]]
     assert found(points, 0, 2, 24) == []
+
+
+@pytest.mark.interpreted
+@pytest.mark.parametrize("k", [1, 2, 5])
+def test_what_is_inserted_is_among_the_first_in_order(k: int) -> None:
+    """Of few values, so that many tie in one, two or three of the four."""
+    rng = np.random.default_rng(k)
+    for _ in range(30):
+        rows = rng.integers(-1, 2, (8, 4))
+        closest, held = np.full((k, 4), -9, np.int64), 0
+        for count, row in enumerate(rows, 1):
+            held = _insert(closest, held, *row)
+            expected = sorted(rows[:count].tolist())[:k]
+            assert held == len(expected) and closest[:held].tolist() == expected
+
+
+@pytest.mark.interpreted
+def test_the_distance_of_a_box_is_that_of_its_nearest_place() -> None:
+    rng = np.random.default_rng(4)
+    for wide in (3, 1 << 21):
+        for _ in range(100):
+            edges = np.sort(rng.integers(-wide, wide, (2, 3)), axis=0)
+            at = rng.integers(-2 * wide, 2 * wide, 3)
+            nearest = np.clip(at, edges[0], edges[1])
+            boxes = edges.reshape(1, 6).astype(np.int32)
+            assert _outside(boxes, 0, *at) == ((at - nearest) ** 2).sum()
 
 
 def test_a_far_cluster_is_dense_and_one_point_alone() -> None:

@@ -7,7 +7,7 @@ its order: bounding it, and becoming the record's rows. The voxel is the one tha
 row for row (tests/unit/builder/test_dense.py); only its frames are compressed as streams.
 
 Held are a part of DENSE_POINTS, and of each cell some 300 bytes at most. Points of one lattice position are one cell,
-however many: of a heap of more than a part only the nodes are held, and the columns, where some are kept.
+however many: of a heap of more than a part only the nodes are held (heap.py).
 """
 
 import os
@@ -30,14 +30,13 @@ from ..schemas.codec import (
     point_rows,
 )
 from ..schemas.errors import CorruptError
-from ..schemas.kernels.morton import morton_decode
 from ..schemas.row_stream import RowStream, pwrite_all
 from ..schemas.voxel import CELL_BITS, Cells, Nodes, VoxelData, top_shift
 from .cells import CellTrees, block_points, build_trees, leaf_runs
 from .config import BuildConfig
+from .heap import heap_points, heap_trees, merge_runs
 from .kernels.bounding_sphere import SPREAD
 from .kernels.octree import split_octree
-from .kernels.pack import heap_counts, most_nodes
 from .kernels.spill import by_axis, by_cell
 from .kernels.trees import EXTREMES
 from .octree import VoxelPoints, canonical, gather_voxel
@@ -127,7 +126,7 @@ def build_dense(
     with _Spill(scratch, dtype) as spill:
         for part in plan_parts(spool, key, config):
             codes_of = range(part[0].code, part[-1].past)
-            if len(part) == 1 and part[0].log2 == 0 and part[0].points > DENSE_POINTS:
+            if is_heap(part):
                 _put_heap(spill, part[0], spool, key, config, classify)
                 continue
             points, codes = canonical(gather_voxel(spool.block_rows(key, codes_of.start, codes_of.stop)))
@@ -150,41 +149,29 @@ def _build_part(
     return build_trees(points.local, np.concatenate(starts), np.concatenate(sizes), config)
 
 
+def is_heap(part: list[Cube]) -> bool:
+    """Whether a part is one lattice position of more points than are held at once."""
+    return len(part) == 1 and part[0].log2 == 0 and part[0].points > DENSE_POINTS
+
+
 def _put_heap(
     spill: "_Spill", cube: Cube, spool: Spool, key: int, config: BuildConfig, classify: Classify | None
 ) -> None:
-    """Spill the cell of a cube of one step, as `build_trees` makes it of its points, which need not be read for it."""
-    n = cube.points
-    place = morton_decode(np.array([cube.code], np.uint64)).astype(np.int32)
-    columns = np.zeros(0, spill.columns)
+    """Spill the cell of a cube of one step, as `build_trees` makes it of its points, which are never held at once."""
+    codes, kind = range(cube.code, cube.past), np.uint8(0)
+    if classify is not None:
+        # All have one class. Each is classified for the counts of those that do.
+        for points in heap_points(cube.code, cube.points, DENSE_POINTS):
+            kind = classify(points, codes)[0]
     if spill.names:
-        columns = np.zeros(n, spill.columns)
-        if spill.names != ["radius_class"]:
-            points, _ = canonical(gather_voxel(spool.block_rows(key, cube.code, cube.past)))
-            for name in set(spill.names) - {"radius_class"}:
-                columns[name] = getattr(points, name)
-        if classify is not None:
-            for at in range(0, n, DENSE_POINTS):
-                some = columns["radius_class"][at : at + DENSE_POINTS]
-                some[:] = classify(np.repeat(place, len(some), axis=0), range(cube.code, cube.past))
-    one = build_trees(np.repeat(place, 3, axis=0), np.zeros(1, np.int64), np.zeros(1, np.uint8), config)
-    most = most_nodes(n, config.leaf)
-    count, held = np.empty(most, np.uint8), np.empty(most, np.int64)
-    total = heap_counts(n, config.leaf, config.degree, count, held)
-    nodes = Nodes._make(np.repeat(column[:1], total, axis=0) for column in one.nodes)
-    nodes.normal[held[:total] < 3] = 0  # as `stored_direction` has it
-    spreads = one.spreads.copy()
-    spreads[0, 0] = n
-    spill.put_cells(
-        one._replace(
-            starts=np.array([0, n]),
-            rows=np.array([0, total]),
-            nodes=nodes._replace(count=count[:total]),
-            spreads=spreads,
-        ),
-        None,
-        columns,
-    )
+        # Two windows of each run are held, and what is merged of them, sorted.
+        windows = spool.block_windows(key, codes.start, codes.stop, DENSE_POINTS // 4)
+        for rows in merge_runs(windows):
+            columns = np.empty(len(rows), spill.columns)
+            for name in spill.names:
+                columns[name] = kind if name == "radius_class" else rows[name]
+            spill.put_columns(columns)
+    spill.put_cells(heap_trees(cube.code, cube.points, config), None, np.empty(0, spill.columns))
 
 
 class _Spill:
@@ -215,8 +202,15 @@ class _Spill:
             columns[name] = getattr(points, name)[trees.rank]
         self.put_cells(trees, by_cell(trees.xyz, trees.starts), columns)
 
+    def put_columns(self, columns: NDArray) -> None:
+        """Take columns of the cells that are put next, before them."""
+        self._ends[1] += pwrite_all(self._files[1].fileno(), columns.view(np.uint8), self._ends[1])
+
     def put_cells(self, trees: CellTrees, flat: NDArray[np.uint16] | None, columns: NDArray) -> None:
-        """Take cells, their points as `by_cell` gives them, and their columns; None: all points are on their corner."""
+        """Take cells, their points as `by_cell` gives them, and their columns; None: all points are on their corner.
+
+        columns: of those points of which `put_columns` has not had them.
+        """
         stats = [trees.spreads.tobytes(), trees.extremes.tobytes()]
         if flat is None:
             self._ends[0] += 6 * int(trees.starts[-1])  # a hole, and nobody reads it

@@ -12,7 +12,7 @@ A `Spool` is a folder of runs. It holds no rows: a voxel's are read from the few
 import json
 import os
 import uuid
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import AbstractContextManager
 from itertools import pairwise
 from pathlib import Path
@@ -234,6 +234,17 @@ class Spool:
     def block_rows(self, key: int, code_lo: int, code_hi: int) -> list[NDArray]:
         """The rows of a voxel whose Morton code is in [code_lo, code_hi), one array a run that holds some."""
         return [self._read(part) for part in self._block(key, code_lo, code_hi)]
+
+    def block_windows(self, key: int, code_lo: int, code_hi: int, points: int) -> list[Iterator[NDArray]]:
+        """The same a few rows at a time: an iterator a run, such that a window of each is about `points` together."""
+        parts = self._block(key, code_lo, code_hi)
+        most = max(1, points // max(1, len(parts)))
+        return [self._windows(part, most) for part in parts]
+
+    def _windows(self, part: _Part, most: int) -> Iterator[NDArray]:
+        """The rows of a part, at most so many at a time."""
+        for at in range(0, part.size, most):
+            yield self._read(_Part(part.run, part.start + at, min(most, part.size - at)))
 
     def _merged(self) -> _Directory:
         """All directories, sorted by key, then by the name of the run: merged once, by whom it is asked first."""

@@ -17,7 +17,8 @@ from ..schemas.kernels.morton import morton_decode
 from ..schemas.radius_model import LOCAL_CLASSES, RADIUS_CLASSES, RIM_BIT
 from .classes import voxel_classes
 from .config import BuildConfig
-from .dense import is_dense, plan_parts
+from .dense import DENSE_POINTS, is_dense, is_heap, plan_parts
+from .heap import heap_points
 from .journal import new_file
 from .kernels.content import SEEDS
 from .kernels.octree import voxel_codes
@@ -271,6 +272,9 @@ def _few_of(key: int, unit: FewUnit) -> int:
     few = 0
     for part in plan_parts(spool, key, unit.config):
         codes = range(part[0].code, part[-1].past)
-        local = gather_voxel(spool.block_rows(key, codes.start, codes.stop)).local
-        few += voxel_classes(key, local, models, spool, unit.most_near, codes).few
+        if is_heap(part):
+            held = heap_points(codes.start, part[0].points, DENSE_POINTS)
+        else:
+            held = iter([gather_voxel(spool.block_rows(key, codes.start, codes.stop)).local])
+        few += sum(voxel_classes(key, local, models, spool, unit.most_near, codes).few for local in held)
     return few

@@ -6,22 +6,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from dense_voxels import COLUMNS, KEY, assert_same, decoded, hashed, rows_of, spooled
 from numpy.typing import NDArray
 from scans import make_steps
 from solidcloud.builder import dense
 from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.dense import BuiltVoxel, build_dense, is_dense, plan_parts
+from solidcloud.builder.dense import build_dense, is_dense, plan_parts
 from solidcloud.builder.kernels.octree import voxel_codes
 from solidcloud.builder.octree import VoxelPoints, build_voxel
-from solidcloud.builder.spool import Spool, write_run
-from solidcloud.schemas.codec import RecordShape, decode_voxel, voxel_point_dtype
 from solidcloud.schemas.errors import BadRequestError, CorruptError
-from solidcloud.schemas.voxel import VoxelData
-from solidcloud.schemas.voxel_grid import Lattice
 
-KEY = 0x1C0000000000000  # voxel (0, 0, 0)
 PART = 200
-COLUMNS = {"scan_index": "<u2", "intensity": "<f4"}
 
 
 @pytest.fixture(autouse=True)
@@ -29,48 +24,6 @@ def small_parts(monkeypatch: pytest.MonkeyPatch) -> None:
     """Parts of a few hundred points, passed on in windows of a few cells."""
     monkeypatch.setattr(dense, "DENSE_POINTS", PART)
     monkeypatch.setattr(dense, "WINDOW_POINTS", 70)
-
-
-def spooled(folder: Path, rows: NDArray, steps: int, cuts: list[int]) -> Spool:
-    """A spool of one voxel in runs of the rows between the cuts."""
-    folder.mkdir()
-    for number, part in enumerate(np.split(rows, cuts)):
-        if len(part):
-            write_run(folder / f"{number:06d}.run", np.full(len(part), KEY, np.uint64), part)
-    return Spool(folder, rows.dtype, Lattice((0.0, 0.0, 0.0), 0.001, steps))
-
-
-def rows_of(points: NDArray[np.int32], *names: str) -> NDArray:
-    """Rows of the spool with some of the columns, of few values each."""
-    rng = np.random.default_rng(5)
-    rows = np.zeros(len(points), [("local", "<i4", (3,)), *((name, COLUMNS[name]) for name in names)])
-    rows["local"] = points
-    for name in names:
-        rows[name] = rng.integers(0, 3, len(points))
-    return rows
-
-
-def hashed(local: NDArray[np.int32], _: range) -> NDArray[np.uint8]:
-    """A radius class of each place."""
-    return (local.astype(np.int64) @ np.array([7919, 104729, 1299709]) % 32).astype(np.uint8)
-
-
-def decoded(built: BuiltVoxel, steps: int) -> VoxelData:
-    """The voxel of a record, through all checks of a reader."""
-    record = built.record
-    shape = RecordShape(record.cell_rows, record.node_rows, record.point_rows, voxel_point_dtype(built.voxel))
-    frames = (bytes(record.cells), bytes(record.nodes), bytes(record.points))
-    voxel, links = decode_voxel(*frames, shape, KEY, bytes(16), steps)
-    assert record.leaf_rows == links.is_leaf.sum()
-    return voxel
-
-
-def assert_same(a: VoxelData, b: VoxelData) -> None:
-    """Two voxels, row for row."""
-    assert a.top_shift == b.top_shift
-    for x, y in zip((*a.cells, *a.nodes, *a[4:]), (*b.cells, *b.nodes, *b[4:]), strict=True):
-        assert (x is None) == (y is None)
-        assert x is None or np.array_equal(x, y)
 
 
 @pytest.mark.parametrize("kind", ["plane", "corner", "pillar", "noise", "duplicates"])

@@ -1,0 +1,104 @@
+"""A heap: more points of one lattice position than are held at once, one cell, whose points differ in columns alone.
+
+Its columns are a multiset in canonical order: the runs, each in that order, merged a few rows of each at a time.
+"""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..schemas.kernels.morton import morton_decode
+from ..schemas.voxel import Nodes
+from .cells import CellTrees, build_trees
+from .config import BuildConfig
+from .kernels.pack import heap_counts, most_nodes
+from .partition import ranks
+
+# Behind all keys, which have 48 bits.
+_END = np.uint64(0xFFFFFFFFFFFFFFFF)
+
+
+def heap_points(code: int, points: int, most: int) -> Iterator[NDArray[np.int32]]:
+    """The points of the Morton code `code`, at most `most` of them at a time (m, 3) [voxel steps]."""
+    place = morton_decode(np.array([code], np.uint64)).astype(np.int32)
+    for at in range(0, points, most):
+        yield np.repeat(place, min(most, points - at), axis=0)
+
+
+def heap_trees(code: int, points: int, config: BuildConfig) -> CellTrees:
+    """The cell as `build_trees` makes it of so many points of one Morton code, which need not be there for it.
+
+    Without `xyz` and `rank`. Held are its nodes.
+    """
+    place = morton_decode(np.array([code], np.uint64)).astype(np.int32)
+    one = build_trees(np.repeat(place, 3, axis=0), np.zeros(1, np.int64), np.zeros(1, np.uint8), config)
+    most = most_nodes(points, config.leaf)
+    count, held = np.empty(most, np.uint8), np.empty(most, np.int64)
+    total = heap_counts(points, config.leaf, config.degree, count, held)
+    nodes = Nodes._make(np.repeat(column[:1], total, axis=0) for column in one.nodes)
+    nodes.normal[held[:total] < 3] = 0  # as `stored_direction` has it
+    spreads = one.spreads.copy()
+    spreads[0, 0] = points
+    return one._replace(
+        starts=np.array([0, points]),
+        rows=np.array([0, total]),
+        nodes=nodes._replace(count=count[:total]),
+        spreads=spreads,
+        xyz=np.empty((3, 0), np.uint16),
+        rank=np.empty(0, np.int32),
+    )
+
+
+class _Run:
+    """A run on its way through the merge. rows: of it that are held, in order; none when it is at its end.
+    keys: (n,) uint64, see `_order_keys`."""
+
+    def __init__(self, windows: Iterator[NDArray]) -> None:
+        """Hold the first window."""
+        self._windows = windows
+        self._read()
+
+    def _read(self) -> None:
+        rows = next(self._windows, None)
+        self.rows = rows
+        self.keys = np.array([_END]) if rows is None else _order_keys(rows)
+
+    def take(self, bound: np.uint64) -> tuple[NDArray, NDArray[np.uint64]]:
+        """The rows held whose key is at most `bound`, and their keys; then those behind them are held."""
+        assert self.rows is not None
+        cut = int(np.searchsorted(self.keys, bound, "right"))
+        taken = self.rows[:cut], self.keys[:cut]
+        if cut == len(self.keys):
+            self._read()
+        else:
+            self.rows, self.keys = self.rows[cut:], self.keys[cut:]
+        return taken
+
+
+def merge_runs(runs: Sequence[Iterator[NDArray]]) -> Iterator[NDArray]:
+    """Rows of the spool of one lattice position in canonical order, some at a time.
+
+    runs: each the rows of one run in order, a window at a time. Held are two windows of each at most.
+    """
+    held = [_Run(windows) for windows in runs]
+    first, last = (np.array([run.keys[at] for run in held], np.uint64) for at in (0, -1))
+    # No row that is not held yet comes before the least of the last ones that are.
+    while (bound := last.min()) != _END:
+        parts = []
+        for i in np.flatnonzero(first <= bound).tolist():
+            parts.append(held[i].take(bound))
+            first[i], last[i] = held[i].keys[0], held[i].keys[-1]
+        keys = np.concatenate([keys for _, keys in parts])
+        # Rows of equal keys cannot be told apart.
+        yield np.concatenate([rows for rows, _ in parts])[np.argsort(keys, kind="stable")]
+
+
+def _order_keys(rows: NDArray) -> NDArray[np.uint64]:
+    """Integers (n,) in the order that rows of one lattice position have (spool.py `canonical_columns`)."""
+    keys = np.zeros(len(rows), np.uint64)
+    if "scan_index" in (rows.dtype.names or ()):
+        keys |= rows["scan_index"].astype(np.uint64) << np.uint64(32)
+    if "intensity" in (rows.dtype.names or ()):
+        keys |= ranks(np.ascontiguousarray(rows["intensity"]).view(np.uint32)).astype(np.uint64)
+    return keys

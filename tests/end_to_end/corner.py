@@ -1,0 +1,162 @@
+"""A scanned corner, what is asked of it, and its scene, server and clients."""
+
+from contextlib import contextmanager
+from functools import partial
+
+import cases
+import classes
+import numpy as np
+import scans
+from msgspec import structs
+from solidcloud.schemas.answers import (
+    CollideAnswers,
+    ContactsAnswers,
+    DistanceAnswers,
+    ObjectsAnswers,
+    RaycastAnswers,
+    SweepAnswers,
+    WithinAnswers,
+)
+from solidcloud.schemas.arrays import array_fields
+from solidcloud.schemas.messages import (
+    CollideRequest,
+    ContactsRequest,
+    DistanceRequest,
+    ObjectsRequest,
+    RaycastRequest,
+    SweepRequest,
+    WithinRequest,
+)
+from solidcloud.schemas.requests import make_objects
+from solidcloud.server.app import serving
+from solidcloud.server.client import Client
+from solidcloud.server.config import ServerConfig
+from solidcloud.server.report.serving import free_port
+from solidcloud.server.scene import Scene
+
+BODY = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.0, 0.2, 0], [0.05, 0.05, 0.3]])
+POINTS = scans.make_scan("corner", 4, 300)
+RNG = np.random.default_rng(11)
+POSES = cases.near_poses(RNG, POINTS, BODY, 40, 0.1)
+ENDS = cases.near_poses(RNG, POINTS, BODY, 40, 0.1)
+RAYS = POINTS[:30] + RNG.normal(0, 0.5, (30, 3))
+TOWARDS = np.where(np.arange(30)[:, None] % 2, POINTS[:30] - RAYS, RNG.normal(size=(30, 3)))
+OBJECTS = [("al", POSES[0]), ("bo", POSES[0], 2), ("al", POSES[1], 4, 1), ("bo", POSES[2], 1, 0xFFFFFFFE)]
+ITEMS, PLACES = make_objects(OBJECTS)
+
+# What is asked of a scene and a client, the same as a request, the type of the answer, and how many.
+QUESTIONS = {
+    "collide": (
+        lambda scene: scene.collide("al", POSES, 0.02),
+        CollideRequest("al", POSES, 0.02),
+        CollideAnswers,
+        40,
+    ),
+    "collide-bounded": (
+        lambda scene: scene.collide("al", POSES, tolerance=0.01, budget_visits=30),
+        CollideRequest("al", POSES, tolerance=0.01, budget_visits=30),
+        CollideAnswers,
+        40,
+    ),
+    "distance": (
+        lambda scene: scene.distance("al", POSES, 0.05),
+        DistanceRequest("al", POSES, 0.05),
+        DistanceAnswers,
+        40,
+    ),
+    "contacts": (
+        lambda scene: scene.contacts("al", POSES, 3, 0.05, 0.1),
+        ContactsRequest("al", POSES, 3, 0.05, 0.1),
+        ContactsAnswers,
+        40,
+    ),
+    "sweep": (
+        lambda scene: scene.sweep("al", POSES, ENDS, 0.01, tolerance=1e-4),
+        SweepRequest(avatar="al", pose_from=POSES, pose_to=ENDS, margin=0.01, tolerance=1e-4),
+        SweepAnswers,
+        40,
+    ),
+    "raycast": (
+        lambda scene: scene.raycast(RAYS, TOWARDS, 1.5),
+        RaycastRequest(RAYS, TOWARDS, 1.5),
+        RaycastAnswers,
+        30,
+    ),
+    "within": (lambda scene: scene.within(RAYS, 0.5), WithinRequest(RAYS, 0.5), WithinAnswers, 30),
+    "objects": (
+        lambda scene: scene.objects(OBJECTS, 0.01),
+        ObjectsRequest(ITEMS, PLACES, 0.01),
+        ObjectsAnswers,
+        4,
+    ),
+}
+
+# The same with spheres of several sizes.
+MODELS = {
+    "collide": "border:2",
+    "distance": "local:0.1",
+    "contacts": "local+border:0.2",
+    "sweep": "border:2",
+    "raycast": "fixed:0.04",
+    "objects": "local:0.1",
+}
+QUESTIONS |= {
+    f"{op}-{model}": (
+        lambda scene, ask=QUESTIONS[op][0], model=model: ask(_WithModel(scene, model)),
+        structs.replace(QUESTIONS[op][1], radius_model=model),
+        *QUESTIONS[op][2:],
+    )
+    for op, model in MODELS.items()
+}
+
+
+class _WithModel:
+    """A scene or client all of whose questions are asked with one radius model."""
+
+    def __init__(self, scene, model):
+        self._scene, self._model = scene, model
+
+    def __getattr__(self, name):
+        return partial(getattr(self._scene, name), radius_model=self._model)
+
+
+def add_avatars(scene, **client):
+    """Two avatars, "al" and "bo", of a scene or client. client: whose they are."""
+    scene.add_avatar("al", BODY, 0.01, **client)
+    scene.add_avatar("bo", BODY[:2] + 0.01, 0.02, **client)
+
+
+def same(one, other):
+    """Whether two answers are one, what they cost in time and loads apart."""
+    assert type(one) is type(other)
+    for name in array_fields(type(one)):
+        a, b = getattr(one, name), getattr(other, name)
+        assert (a.dtype, a.shape) == (b.dtype, b.shape), name
+        assert a.tobytes() == b.tobytes(), name
+
+
+@contextmanager
+def opened(folder):
+    """The corner as a scene, built below `folder`, with avatars of its own and of the client "plain"."""
+    with classes.any_classes():
+        case = cases.build(folder, POINTS, models=classes.STORED)
+    with Scene.open(case.archive, "hall") as scene:
+        add_avatars(scene)
+        add_avatars(scene, client="plain")
+        yield scene
+
+
+@contextmanager
+def served(scene):
+    """A server of the scene; its endpoint."""
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    with serving([scene], ServerConfig(listen=endpoint)):
+        yield endpoint
+
+
+@contextmanager
+def client_of(endpoint):
+    """A client of the corner, with its avatars."""
+    with Client(endpoint, scene="hall", timeout=30.0) as client:
+        add_avatars(client)
+        yield client

@@ -1,0 +1,166 @@
+"""Every question along a path: its parts are the answers to it, bit for bit, here and over zenoh."""
+
+import numpy as np
+import pytest
+import zenoh
+from corner import POSES, client_of, opened, same, served
+from solidcloud.schemas import keys
+from solidcloud.schemas.answers import (
+    PARTS,
+    PATH_ANSWERS,
+    Verdict,
+)
+from solidcloud.schemas.columns import join, without_part
+from solidcloud.schemas.errors import BadRequestError, BadTransformError
+from solidcloud.schemas.messages import (
+    JSON,
+    MSGPACK,
+    PathRequest,
+    decode_answer,
+    encode,
+)
+from solidcloud.server import path as path_module
+from solidcloud.server.transport import session_config
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    with opened(tmp_path_factory.mktemp("corner")) as scene:
+        yield scene
+
+
+@pytest.fixture(scope="module")
+def endpoint(scene):
+    with served(scene) as endpoint:
+        yield endpoint
+
+
+@pytest.fixture
+def client(endpoint):
+    with client_of(endpoint) as client:
+        yield client
+
+
+@pytest.mark.parametrize(
+    "op, parameters",
+    [
+        ("collide", {}),
+        ("collide", {"margin": 0.02, "tolerance": 0.01, "budget_visits": 30}),
+        ("distance", {"reach": 0.05}),
+        ("contacts", {"limit": 3, "margin": 0.05, "cluster_distance": 0.1}),
+        ("sweep", {"margin": 0.01, "tolerance": 1e-4}),
+        ("collide", {"radius_model": "border:2"}),
+        ("sweep", {"radius_model": "local:0.1"}),
+    ],
+)
+def test_a_path_is_its_question_in_parts(scene, client, op, parameters, monkeypatch):
+    monkeypatch.setattr(path_module, "FIRST_PART", 3)
+    monkeypatch.setattr(path_module, "LARGEST_PART", 9)
+    if op == "sweep":
+        expected = scene.sweep("al", POSES[:-1], POSES[1:], **parameters)
+    else:
+        expected = getattr(scene, op)("al", POSES, **parameters)
+    for parts in (
+        list(scene.path("al", POSES, op, threads=1, **parameters)),
+        list(scene.path("al", POSES, op, **parameters)),
+        list(client.path("al", POSES, op, **parameters)),
+    ):
+        assert len(parts) > 3
+        stops = np.cumsum([len(part) for part in parts]).tolist()
+        assert [part.first for part in parts] == [0, *stops[:-1]]
+        assert {part.total for part in parts} == {stops[-1]} == {len(expected)}
+        same(join([without_part(type(expected), part) for part in parts]), expected)
+
+
+@pytest.mark.parametrize("encoding", [MSGPACK, JSON])
+@pytest.mark.parametrize("op, parameters", [("distance", {"reach": 0.05}), ("contacts", {}), ("sweep", {})])
+def test_plain_zenoh_gets_the_parts_of_a_path(scene, endpoint, op, parameters, encoding, monkeypatch):
+    monkeypatch.setattr(path_module, "FIRST_PART", 3)
+    monkeypatch.setattr(path_module, "LARGEST_PART", 9)
+    expected = list(scene.path("al", POSES, op, **parameters))
+    key = keys.question_key("hall", "plain", "path")
+    payload = encode(PathRequest("al", POSES, op, **parameters), encoding)
+    with zenoh.open(session_config(connect=endpoint)) as session:
+        every = {"consolidation": zenoh.ConsolidationMode.NONE, "encoding": encoding}
+        replies = [reply.ok.payload.to_bytes() for reply in session.get(key, payload=payload, **every)]
+    assert len(replies) > 3
+    kind = PATH_ANSWERS[op]
+    parts = [decode_answer(PARTS[kind], reply, encoding) for reply in replies]
+    same(
+        join([without_part(kind, part) for part in parts]),
+        join([without_part(kind, part) for part in expected]),
+    )
+
+
+@pytest.mark.parametrize(
+    "op, poses, total", [("collide", 0, 0), ("sweep", 0, 0), ("sweep", 1, 0), ("collide", 1, 1)]
+)
+def test_the_shortest_paths_have_one_part(scene, client, op, poses, total):
+    for one in (scene, client):
+        (part,) = one.path("al", POSES[:poses], op)
+        assert (part.first, part.total, len(part)) == (0, total, total)
+
+
+def test_a_bad_pose_far_along_a_path_is_named_before_any_part(scene, client, monkeypatch):
+    monkeypatch.setattr(path_module, "FIRST_PART", 3)
+    poses = POSES.copy()
+    poses[33, 3, 0] = 1.0
+    for one in (scene, client):
+        with pytest.raises(BadTransformError, match="pose 33 "):
+            next(iter(one.path("al", poses)))
+
+
+@pytest.mark.parametrize(
+    "op, parameters, said",
+    [
+        ("raycast", {}, "expected one of collide, distance, contacts, sweep"),
+        ("collide", {"reach": 1.0}, "reach is no parameter of collide"),
+        ("distance", {}, "needs reach"),
+        ("distance", {"reach": 1.0, "limit": 3}, "limit is no parameter of distance"),
+        ("sweep", {"margin": -1.0}, "margin"),
+        ("collide", {"tolerance": np.inf}, "tolerance"),
+        ("contacts", {"limit": -1}, "limit"),
+    ],
+)
+def test_parameters_that_do_not_fit_are_refused_by_both(scene, client, op, parameters, said):
+    for one in (scene, client):
+        with pytest.raises(BadRequestError, match=said):
+            list(one.path("al", POSES, op, **parameters))
+
+
+def test_a_spent_budget_is_unknown_all_along_the_path(scene, client):
+    for one in (scene, client):
+        parts = list(one.path("al", POSES, budget_visits=0))
+        verdicts = np.concatenate([part.verdict for part in parts])
+        assert len(verdicts) == len(POSES) and Verdict.CLEAR not in verdicts[~clear_at_once(parts)]
+
+
+@pytest.mark.parametrize(
+    "op, parameters", [("collide", {}), ("distance", {"reach": 0.1}), ("contacts", {}), ("sweep", {})]
+)
+def test_what_the_time_did_not_suffice_for_is_unknown(scene, client, op, parameters):
+    for one in (scene, client):
+        parts = list(one.path("al", POSES, op, budget_ms=0.0, **parameters))
+        verdicts = np.concatenate([part.verdict for part in parts])
+        assert verdicts.tolist() == [Verdict.UNKNOWN] * (len(POSES) - (op == "sweep"))
+        parts = list(one.path("al", POSES, op, budget_ms=60_000.0, **parameters))
+        assert Verdict.UNKNOWN not in np.concatenate([part.verdict for part in parts])
+
+
+def test_nothing_is_asked_once_the_time_is_up(scene, monkeypatch):
+    def question(*_, **__):
+        raise AssertionError("asked")
+
+    for op in ("collide", "contacts", "sweep"):
+        monkeypatch.setattr(path_module, op, question)
+        assert {len(part) for part in scene.path("al", POSES, op, budget_ms=0.0)} <= {
+            len(POSES),
+            len(POSES) - 1,
+        }
+
+
+def clear_at_once(parts):
+    """Which poses were clear without a visit: out of reach of every voxel."""
+    visits = np.concatenate([part.node_visits for part in parts])
+    bounds = np.concatenate([part.lower for part in parts])
+    return (visits == 0) & (bounds > 0)

@@ -18,7 +18,8 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, TypeVar
 
 from ..schemas.errors import BadRequestError, SolidcloudError
-from .executor import AHEAD, WAITING
+from .executor import Result, Unit, results_in_order
+from .memory import CLUSTER_WORKER_KILLED, cluster_worker_limit
 from .progress import Progress
 from .software import software
 
@@ -42,8 +43,6 @@ except ModuleNotFoundError as missing:
         f"--scheduler and --cluster: the library {missing.name!r} is not installed: pip install 'solidcloud[cluster]'"
     ) from None
 
-Unit = TypeVar("Unit")
-Result = TypeVar("Result")
 Answer = TypeVar("Answer")
 
 # For a scheduler to answer, and to show its first worker.
@@ -53,9 +52,6 @@ REACH_SECONDS = 10
 LONELY_SECONDS, LONELY_LOCAL_SECONDS = 300, 60
 # How often a unit that is waited for is asked about; a result that comes is taken at once.
 ASK_SECONDS = 5
-# Beside its share of --memory a worker of the local cluster has what Python, numba, HDF5, the readers and dask itself
-# take, and some air: dask kills what is over, it does not ask.
-WORKER_BASE_BYTES = 384 << 20
 
 LOCAL = "local:"
 _START_WORKERS = "start its workers as `dask worker tcp://HOST:PORT --nthreads 1 --nworkers N`"
@@ -118,7 +114,7 @@ def _check_worker(address: str, found: dict[str, str], expected: dict[str, str],
 class ClusterExecutor:
     """Maps a picklable function over work units on dask workers. A context manager, like `executor.Executor`.
 
-    jobs: workers, as they were when this was made; others may come and go.
+    jobs: workers, as they were when this was made; others may come and go.  at_once: see `Executor`.
     """
 
     def __init__(
@@ -143,7 +139,7 @@ class ClusterExecutor:
                 self._cluster.close()
             raise
         try:
-            self.jobs = self._check_workers(number)
+            self.jobs = self.at_once = self._check_workers(number)
             self._say_dashboard()
         except BaseException:
             self._close()
@@ -206,57 +202,41 @@ class ClusterExecutor:
         progress: Progress,
         size: Callable[[Unit], int],
     ) -> Iterator[Result]:
-        """function(unit) for each unit, in order; progress advances by size(unit) as each is done.
+        """See `Executor`, and `results_in_order` in executor.py; what waits is cancelled in the end, however that is.
 
-        Some units are handed out ahead, as in `executor.py`. What a unit raises is raised here when it does, and what
-        waits is cancelled; SolidcloudError where the cluster is lost, or a unit's worker died each time it was tried.
+        SolidcloudError where the cluster is lost, or a unit's worker died each time it was tried.
         """
-        running: dict[Future, int] = {}
-        results: dict[int, Result] = {}
-        given = 0
         try:
-            for taken in range(len(units)):
-                while taken not in results:
-                    while (
-                        given < len(units)
-                        and len(running) < WAITING * self.jobs
-                        and given - taken < AHEAD * self.jobs
-                    ):
-                        running[self._submit(function, units[given])] = given
-                        given += 1
-                    for future in self._done(list(running)):
-                        number = running.pop(future)
-                        results[number] = self._result(future)
-                        self._given.discard(future)  # the worker forgets the result with the last reference
-                        progress.advance(size(units[number]))
-                yield results.pop(taken)
+            yield from results_in_order(self, function, units, progress, size)
         finally:
             self._take_back()
 
-    def _submit(self, function: Callable[[Unit], Result], unit: Unit) -> Future:
-        """Hand out one unit. Not `pure` in dask's sense: the same unit asked for again is to be done again."""
+    def hand_out(self, function: Callable[[Unit], Result], unit: Unit) -> Future:
+        """See `Hands`. Not `pure` in dask's sense: the same unit asked for again is to be done again."""
         work = pickle.dumps((function, unit))  # dask would look into a unit for tasks, through all its keys
         future = self._client.submit(_run_unit, work, software(), os.getcwd(), pure=False, key=_key(function))
         self._given.add(future)
         return future
 
-    def _done(self, futures: list[Future]) -> Iterable[Future]:
-        """Those of `futures` that are done, once one is."""
+    def done(self, tickets: Sequence[Future]) -> Iterable[Future]:
+        """See `Hands`."""
         with self._client.as_current():
             return self._patiently(
-                lambda: wait(futures, timeout=ASK_SECONDS, return_when="FIRST_COMPLETED").done
+                lambda: wait(list(tickets), timeout=ASK_SECONDS, return_when="FIRST_COMPLETED").done
             )
 
-    def _result(self, future: Future) -> Any:
-        """The result of a unit that is done, or what it raised."""
+    def result(self, ticket: Future) -> Any:
+        """See `Hands`."""
         try:
             # A worker that dies before its result is fetched has it made again.
-            return self._patiently(lambda: future.result(timeout=ASK_SECONDS), future)
+            result = self._patiently(lambda: ticket.result(timeout=ASK_SECONDS), ticket)
         except KilledWorker as error:
             raise SolidcloudError(
                 f"a unit's worker died {error.allowed_failures + 1} times, at last {error.last_worker.address}: "
                 "out of memory? give a larger --memory or fewer workers, or look at its log"
             ) from None
+        self._given.discard(ticket)  # the worker forgets the result with the last reference
+        return result
 
     def _patiently(self, ask: Callable[[], Answer], future: Future | None = None) -> Answer:
         """Ask again for as long as there is anybody to give an answer. future: what is asked, where it may raise."""
@@ -322,6 +302,7 @@ def _start_local(number: int, memory_bytes: int, watch: _Watch) -> LocalCluster:
             "distributed.worker.memory.target": False,
             "distributed.worker.memory.spill": False,
             "distributed.worker.memory.pause": False,
+            "distributed.worker.memory.terminate": CLUSTER_WORKER_KILLED,
         }
     ):
         return LocalCluster(
@@ -330,7 +311,7 @@ def _start_local(number: int, memory_bytes: int, watch: _Watch) -> LocalCluster:
             processes=True,
             host="127.0.0.1",
             dashboard_address="127.0.0.1:0",
-            memory_limit=memory_bytes // number + WORKER_BASE_BYTES,
+            memory_limit=cluster_worker_limit(number, memory_bytes),
             preload=[__name__],
             scheduler_kwargs={"plugins": [watch]},
             # A unit that fails is reported here, by one line; dask would show its call stack besides.

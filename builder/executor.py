@@ -4,12 +4,12 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from types import TracebackType
-from typing import Protocol, Self, TypeVar
+from typing import Any, Protocol, Self, TypeVar
 
 from ..schemas.errors import SolidcloudError
 from .config import BuildConfig
@@ -17,6 +17,7 @@ from .progress import Progress
 
 Unit = TypeVar("Unit")
 Result = TypeVar("Result")
+Ticket = TypeVar("Ticket")
 
 # Below this many points a second process costs more (1 to 2 s to start and to load the kernels) than it saves.
 POINTS_WORTH_A_PROCESS = 4_000_000
@@ -27,10 +28,11 @@ WAITING, AHEAD = 4, 64
 class Executor(Protocol):
     """Maps a picklable function over work units. A context manager.
 
-    jobs: units that run at a time.
+    jobs: units that run at a time.  at_once: so many that do, where that is fewer, for want of memory.
     """
 
     jobs: int
+    at_once: int
 
     def __enter__(self) -> Self:
         """The executor itself."""
@@ -49,8 +51,62 @@ class Executor(Protocol):
         progress: Progress,
         size: Callable[[Unit], int],
     ) -> Iterator[Result]:
-        """function(unit) for each unit, in order; progress advances by size(unit) as units are done."""
+        """function(unit) for each unit, in order; progress advances by size(unit) as units are done.
+
+        What a unit raises is raised here, and ends all.
+        """
         ...
+
+
+class Hands(Protocol[Ticket]):
+    """Who does units somewhere else. A ticket stands for a unit that was handed out.
+
+    jobs, at_once: as of `Executor`.
+    """
+
+    jobs: int
+    at_once: int
+
+    def hand_out(self, function: Callable[[Any], Any], unit: Any) -> Ticket:
+        """Have function(unit) done."""
+        ...
+
+    def done(self, tickets: Sequence[Ticket]) -> Iterable[Ticket]:
+        """Those of the tickets whose units are done, once one is."""
+        ...
+
+    def result(self, ticket: Ticket) -> Any:
+        """The result of a unit that is done; raises what it raised."""
+        ...
+
+
+def results_in_order(
+    hands: Hands[Ticket],
+    function: Callable[[Unit], Result],
+    units: Sequence[Unit],
+    progress: Progress,
+    size: Callable[[Unit], int],
+) -> Iterator[Result]:
+    """function(unit) for each unit, in order, done by others; progress advances by size(unit) as each is done.
+
+    Some units are handed out ahead, so that no process waits for another's long one; results that wait their turn
+    stay bounded by AHEAD a process. A unit that fails ends all when it does. With `at_once` fewer than `jobs`, so
+    many are handed out at a time.
+    """
+    most = WAITING * hands.jobs if hands.at_once >= hands.jobs else hands.at_once
+    running: dict[Ticket, int] = {}
+    results: dict[int, Result] = {}
+    given = 0
+    for taken in range(len(units)):
+        while taken not in results:
+            while given < len(units) and len(running) < most and given - taken < AHEAD * hands.jobs:
+                running[hands.hand_out(function, units[given])] = given
+                given += 1
+            for ticket in hands.done(list(running)):
+                number = running.pop(ticket)
+                results[number] = hands.result(ticket)
+                progress.advance(size(units[number]))
+        yield results.pop(taken)
 
 
 def worker_count(jobs: int, points: int) -> int:
@@ -121,33 +177,28 @@ class ProcessExecutor:
         progress: Progress,
         size: Callable[[Unit], int],
     ) -> Iterator[Result]:
-        """function(unit) for each unit, in order; progress advances by size(unit) as each is done.
-
-        Some units are handed out ahead, so that no process waits for another's long one; results that wait their turn
-        stay bounded by AHEAD a process. A unit that fails ends all when it does. With `at_once` fewer than `jobs`, so
-        many run at a time.
-        """
+        """See `Executor`, and `results_in_order`."""
         if self._pool is None:
             for unit in units:
                 yield function(unit)
                 progress.advance(size(unit))
             return
-        most = WAITING * self.jobs if self.at_once == self.jobs else self.at_once
-        running: dict[Future[Result], int] = {}
-        results: dict[int, Result] = {}
-        given = 0
-        for taken in range(len(units)):
-            while taken not in results:
-                while given < len(units) and len(running) < most and given - taken < AHEAD * self.jobs:
-                    with _worker_deaths():
-                        running[self._pool.submit(function, units[given])] = given
-                    given += 1
-                for future in wait(running, return_when=FIRST_COMPLETED).done:
-                    number = running.pop(future)
-                    with _worker_deaths():
-                        results[number] = future.result()
-                    progress.advance(size(units[number]))
-            yield results.pop(taken)
+        yield from results_in_order(self, function, units, progress, size)
+
+    def hand_out(self, function: Callable[[Unit], Result], unit: Unit) -> Future[Result]:
+        """See `Hands`."""
+        assert self._pool is not None
+        with _worker_deaths():
+            return self._pool.submit(function, unit)
+
+    def done(self, tickets: Sequence[Future[Any]]) -> Iterable[Future[Any]]:
+        """See `Hands`."""
+        return wait(tickets, return_when=FIRST_COMPLETED).done
+
+    def result(self, ticket: Future[Any]) -> Any:
+        """See `Hands`."""
+        with _worker_deaths():
+            return ticket.result()
 
 
 @contextmanager

@@ -1,8 +1,11 @@
 """How `--memory` is shared: all processes of a build together, what they hold of the data and what they are made of."""
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
+from ..schemas.codec import point_dtype
 from ..schemas.errors import SolidcloudError
 from .config import BuildConfig
 
@@ -16,10 +19,19 @@ ALONE_BYTES = 150 << 20
 LEAST_SHARE = 96 << 20
 # What a build may take over `--memory` rather than be refused: 64 MB is less than Python with numba.
 OVER_BYTES = 200 << 20
-# Bytes a point of a record that radius, preview and verify hold: its frame, its planes, and its nodes.
-RECORD_BYTES_A_POINT = 18
+# What radius, preview and verify hold of a record: its frame, at most as long as its rows, and the rows' planes; and of
+# each of its nodes, of which there are 1.2 to 1.4 times as many as leaf nodes would be if all were full.
+RECORD_BYTES_A_NODE = 72
+NODES_A_FULL_LEAF = 1.5
 # Of all other things they hold.
 RECORD_BYTES = 16 << 20
+
+# Beside its share of --memory a worker of the local cluster has what Python, numba, HDF5, the readers and dask itself
+# take, and some air: dask kills what holds more than this part of both, it does not ask.
+CLUSTER_WORKER_AIR_BYTES = 384 << 20
+CLUSTER_WORKER_KILLED = 0.95
+# What such a worker is made of as dask counts it, shared libraries whole (measured: 205 MB when it has read records).
+CLUSTER_WORKER_BYTES = 240 << 20
 
 
 def jobs_that_fit(jobs: int, config: BuildConfig) -> int:
@@ -34,28 +46,63 @@ def memory_share(jobs: int, config: BuildConfig) -> int:
     return max(LEAST_SHARE, (config.memory_bytes - base) // jobs)
 
 
+def cluster_worker_limit(jobs: int, memory_bytes: int) -> int:
+    """Bytes at which dask calls each of `jobs` workers that it started here full."""
+    return memory_bytes // jobs + CLUSTER_WORKER_AIR_BYTES
+
+
+def record_bytes_a_point(config: BuildConfig) -> int:
+    """Bytes a point that is held of a record while it is read back."""
+    row = point_dtype(
+        scan_index="scan" in config.keep,
+        intensity="intensity" in config.keep,
+        radius_class=config.models != {"mean"},
+    )
+    return 2 * row.itemsize + math.ceil(NODES_A_FULL_LEAF * RECORD_BYTES_A_NODE / config.leaf)
+
+
 def readers_that_fit(counts: NDArray[np.int64], jobs: int, config: BuildConfig) -> int:
     """How many of `jobs` processes may each hold the record of a voxel at a time, whichever of `counts` (v,) points.
 
-    Raises SolidcloudError where not even one may hold the largest.
+    `jobs` for workers of a scheduler that is elsewhere: their memory is not known here. Raises SolidcloudError where
+    not even one may hold the largest.
     """
+    if config.scheduler or not len(counts):
+        return jobs
     largest = np.sort(counts)[::-1][:jobs]
-    needed = np.cumsum(largest * RECORD_BYTES_A_POINT + RECORD_BYTES)
-    fits = int(np.searchsorted(needed, _room(jobs, config), "right"))
-    if not fits and len(largest):
-        most = int(needed[0])
-        memory = config.memory_bytes + most - _room(jobs, config)
-        fewer = next((n for n in range(jobs - 1, 0, -1) if most <= _room(n, config)), 0)
-        jobs_too = f"--jobs {fewer} or " if fewer else ""
+    needed = np.cumsum(largest * record_bytes_a_point(config) + RECORD_BYTES)
+    most = int(needed[0])
+    if most > _room_of_one(jobs, config):
+        option = "--cluster local:" if config.cluster else "--jobs "
+        fewer = next((n for n in range(jobs - 1, 0, -1) if most <= _room_of_one(n, config)), 0)
+        fewer_too = f"{option}{fewer} or " if fewer else ""
         raise SolidcloudError(
             f"a voxel of {config.voxel:g} m holds {int(largest[0])} points, and to read its record back takes "
-            f"{most >> 20} MB: give {jobs_too}--memory {(memory + (1 << 20) - 1) >> 20}MB to go on from what is done, "
-            "or a smaller --voxel and --fresh"
+            f"{most >> 20} MB: give {fewer_too}--memory {_memory_for(most, jobs, config) >> 20}MB to go on from what "
+            "is done, or a smaller --voxel and --fresh"
         )
+    fits = int(np.searchsorted(needed, _room(jobs, config), "right"))
     return jobs if fits == len(largest) else fits
 
 
 def _room(jobs: int, config: BuildConfig) -> int:
     """Bytes that all of `jobs` processes may hold together of records that are read back."""
-    base = ALONE_BYTES if jobs == 1 else BUILDER_BYTES + jobs * WORKER_BYTES
+    base = ALONE_BYTES if jobs == 1 and not config.cluster else BUILDER_BYTES + jobs * WORKER_BYTES
     return max(config.memory_bytes + OVER_BYTES - base, LEAST_SHARE)
+
+
+def _room_of_one(jobs: int, config: BuildConfig) -> int:
+    """Bytes that one of `jobs` processes may hold of them: all, but dask kills a worker for what it holds itself."""
+    if not config.cluster:
+        return _room(jobs, config)
+    limit = cluster_worker_limit(jobs, config.memory_bytes)
+    return min(_room(jobs, config), int(limit * CLUSTER_WORKER_KILLED) - CLUSTER_WORKER_BYTES)
+
+
+def _memory_for(needed: int, jobs: int, config: BuildConfig) -> int:
+    """The `--memory` [bytes, whole MB] with which one of `jobs` processes may hold so many bytes."""
+    memory = config.memory_bytes + needed - _room(jobs, config)
+    if config.cluster:
+        limit = (needed + CLUSTER_WORKER_BYTES + 1) / CLUSTER_WORKER_KILLED
+        memory = max(memory, int(limit - CLUSTER_WORKER_AIR_BYTES + 1) * jobs)
+    return -(-memory >> 20) << 20

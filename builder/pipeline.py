@@ -24,7 +24,7 @@ from ..schemas.voxel_grid import Lattice
 from ..schemas.vtkhdf import PREVIEW_NAME
 from .config import RADIUS_SAMPLE, BuildConfig
 from .dense import DENSE_POINTS
-from .executor import Executor, ProcessExecutor, make_executor, worker_count
+from .executor import Executor, make_executor, worker_count
 from .header import archive_id, make_header
 from .memory import jobs_that_fit, readers_that_fit
 from .passes import build_shards, check_filters, filter_points, spool_rows, spool_scans, survey_scans
@@ -159,15 +159,14 @@ def _build(
         dense = np.sort(spool.counts[spool.counts > DENSE_POINTS])[-executor.jobs :]
         _check_space(target.parent, place.folder, final + int(dense.sum()) * SCRATCH_BYTES_A_POINT)
         _check_voxels(spool, config)
-        readers = executor.jobs if config.scheduler else readers_that_fit(spool.counts, executor.jobs, config)
+        readers = readers_that_fit(spool.counts, executor.jobs, config)
         identity = archive_id(spooled, lattice, config)
         shards = build_shards(spool, identity, place, executor, config, stages)
         moved_max = max(s.moved_max for s in spooled)
         header = make_header(
             surveys, faulty, filtered, lattice, lattice_source, identity, moved_max, shards, config
         )
-        if isinstance(executor, ProcessExecutor):
-            executor.at_once = readers  # dask's workers have bounds of their own
+        executor.at_once = readers
         header = _measure_radius(header, shards, place.archive, executor, config, stages)
         _read_back(place.archive, header.points, spool, executor, stages)
     return header, shards

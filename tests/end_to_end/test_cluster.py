@@ -16,6 +16,8 @@ pytest.importorskip("distributed")
 
 import solidcloud.builder.cluster as cluster_module
 import solidcloud.builder.config as config_module
+import solidcloud.builder.pipeline as pipeline_module
+import solidcloud.builder.portions as portions_module
 import solidcloud.builder.shards as shards_module
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import build_archive
@@ -109,6 +111,29 @@ def test_a_worker_killed_in_mid_build_changes_no_byte(
     assert content(target) == alone
     assert not verify_archive(target).faults
     assert sorted(path.name for path in tmp_path.iterdir()) == ["hall"]
+
+
+def test_no_more_workers_read_records_back_than_may_hold_them(
+    scans: Path, alone: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    handed_out: list[int] = []
+    hand_out, radius = cluster_module.ClusterExecutor.hand_out, pipeline_module._measure_radius
+
+    def watched(executor: cluster_module.ClusterExecutor, function: object, unit: object) -> object:
+        ticket = hand_out(executor, function, unit)
+        handed_out.append(len(executor._given))
+        return ticket
+
+    def from_here_on(*arguments: object) -> object:
+        monkeypatch.setattr(cluster_module.ClusterExecutor, "hand_out", watched)
+        return radius(*arguments)
+
+    monkeypatch.setattr(pipeline_module, "_measure_radius", from_here_on)
+    monkeypatch.setattr(pipeline_module, "readers_that_fit", lambda *_: 1)
+    monkeypatch.setattr(portions_module, "_LEAST_POINTS", 1)
+    build_archive([scans], tmp_path / "hall", BuildConfig(voxel=VOXEL, cluster="local:2"))
+    assert len(handed_out) > 20 and set(handed_out) == {1}
+    assert content(tmp_path / "hall") == alone
 
 
 def test_a_scheduler_that_runs_elsewhere_makes_the_same_archive(

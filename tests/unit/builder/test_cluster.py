@@ -14,6 +14,7 @@ pytest.importorskip("distributed")
 import solidcloud.builder.cluster as cluster_module
 from distributed import LocalCluster
 from solidcloud.builder.cluster import ClusterExecutor, local_workers
+from solidcloud.builder.executor import WAITING
 from solidcloud.builder.progress import Silent
 from solidcloud.builder.software import software
 from solidcloud.schemas.errors import BadRequestError, ScanError, SolidcloudError
@@ -85,15 +86,28 @@ def test_what_a_unit_raises_is_raised_here(executor: ClusterExecutor) -> None:
 def test_only_a_few_units_are_handed_out_ahead(executor: ClusterExecutor) -> None:
     results = executor.map(partial(divmod, 100), range(1, 101), Silent(), lambda _: 1)
     next(results)
-    assert 0 < len(executor._given) <= cluster_module.WAITING * executor.jobs
+    assert 0 < len(executor._given) <= WAITING * executor.jobs
     results.close()  # type: ignore[attr-defined]
     assert not executor._given
+
+
+def test_fewer_units_than_workers_run_at_once_where_that_is_asked_for(
+    executor: ClusterExecutor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    executor._client.wait_for_workers(2, 30)
+    code = (
+        f"import os, time; name = {str(tmp_path)!r} + '/%d'; open(name, 'x').close(); "
+        f"time.sleep(0.05); assert len(os.listdir({str(tmp_path)!r})) == 1; os.unlink(name)"
+    )
+    units = [f"exec({code % i!r})" for i in range(6)]
+    monkeypatch.setattr(executor, "at_once", 1)
+    assert mapped(executor, *units) == [None] * 6
 
 
 def test_no_worker_waits_for_anothers_long_unit(executor: ClusterExecutor, tmp_path: Path) -> None:
     executor._client.wait_for_workers(2, 30)
     # The first unit ends when the last has begun: were units handed out in order of results, it never would.
-    flag, units = str(tmp_path / "last"), 3 * cluster_module.WAITING * executor.jobs
+    flag, units = str(tmp_path / "last"), 3 * WAITING * executor.jobs
     first = f"exec('import os, time\\nwhile not os.path.exists(\"{flag}\"): time.sleep(0.01)')"
     assert len(mapped(executor, first, *["1"] * units, f"open({flag!r}, 'w').close()")) == units + 2
 

@@ -50,16 +50,17 @@ def divmod_by_7(value: int) -> tuple[int, int]:
 
 
 def test_processes_give_the_same_in_the_same_order() -> None:
-    progress = Counted()
+    progress, failing = Counted(), Counted()
     # A builtin, because spawned processes cannot import a test module by its name.
     with ProcessExecutor(2) as executor:
         results = list(executor.map(partial(divmod, 100), range(1, 21), progress, lambda unit: 1))
         processes = set(executor.map(eval, ["__import__('os').getpid()"] * 8, progress, lambda unit: 0))
-        with pytest.raises(ZeroDivisionError):
-            list(executor.map(partial(divmod, 1), [1, 0, 1], progress, lambda unit: 1))
+        with pytest.raises(ZeroDivisionError):  # the unit after it may have been done before
+            list(executor.map(partial(divmod, 1), [1, 0, 1], failing, lambda unit: 1))
     assert results == [divmod(100, i) for i in range(1, 21)]
     assert os.getpid() not in processes
-    assert progress.done == 20 + 1
+    assert progress.done == 20
+    assert 0 <= failing.done <= 2
 
 
 def slow_first(number: int, folder: str) -> str:

@@ -8,14 +8,17 @@ from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.memory import (
     ALONE_BYTES,
     BUILDER_BYTES,
+    CLUSTER_WORKER_BYTES,
+    CLUSTER_WORKER_KILLED,
     LEAST_SHARE,
     OVER_BYTES,
     RECORD_BYTES,
-    RECORD_BYTES_A_POINT,
     WORKER_BYTES,
+    cluster_worker_limit,
     jobs_that_fit,
     memory_share,
     readers_that_fit,
+    record_bytes_a_point,
 )
 from solidcloud.schemas.errors import SolidcloudError
 
@@ -47,7 +50,9 @@ def test_no_more_processes_read_than_hold_the_largest_voxels(jobs: int, memory: 
     room = max(memory + OVER_BYTES - base, LEAST_SHARE)
     for points in (1, 10**6, 5 * 10**6, 4 * 10**7, 10**9):
         counts = np.array([7, points, points // 2, points, 3])
-        each = sorted((n * RECORD_BYTES_A_POINT + RECORD_BYTES for n in counts.tolist()), reverse=True)
+        each = sorted(
+            (n * record_bytes_a_point(config) + RECORD_BYTES for n in counts.tolist()), reverse=True
+        )
         if each[0] > room:
             with pytest.raises(
                 SolidcloudError, match=rf"{points} points.*give .*--memory \d+MB.*smaller --voxel and --fresh"
@@ -61,28 +66,53 @@ def test_no_more_processes_read_than_hold_the_largest_voxels(jobs: int, memory: 
     assert readers_that_fit(np.array([5]), 64, BuildConfig(memory_bytes=100 << 30)) == 64
 
 
+@pytest.mark.parametrize("cluster", [False, True])
 @pytest.mark.parametrize("jobs", [1, 2, 7])
 @pytest.mark.parametrize("points", [7 * 10**6, 4 * 10**7, 10**8, 10**9])
-def test_the_memory_and_the_jobs_named_for_a_large_voxel_are_enough(points: int, jobs: int) -> None:
-    counts, config = np.array([points]), BuildConfig(memory_bytes=1 << 30)
+def test_the_memory_and_the_jobs_named_for_a_large_voxel_are_enough(
+    points: int, jobs: int, cluster: bool
+) -> None:
+    counts = np.array([points])
+
+    def given(memory: int, number: int) -> BuildConfig:
+        return BuildConfig(memory_bytes=memory, cluster=f"local:{number}" if cluster else None)
+
+    config = given(1 << 30, jobs)
     try:
         assert 1 <= readers_that_fit(counts, jobs, config) <= jobs
         return
     except SolidcloudError as error:
         said = str(error)
-    named = re.search(r"give (?:--jobs (\d+) or )?--memory (\d+)MB to go on", said)
+    named = re.search(r"give (?:--(?:jobs |cluster local:)(\d+) or )?--memory (\d+)MB to go on", said)
     assert named
-    assert readers_that_fit(counts, jobs, BuildConfig(memory_bytes=int(named[2]) << 20)) >= 1
+    assert readers_that_fit(counts, jobs, given(int(named[2]) << 20, jobs)) >= 1
     with pytest.raises(SolidcloudError):  # and no more than that
-        readers_that_fit(counts, jobs, BuildConfig(memory_bytes=(int(named[2]) - 1) << 20))
+        readers_that_fit(counts, jobs, given((int(named[2]) - 2) << 20, jobs))
     if named[1]:
-        assert readers_that_fit(counts, int(named[1]), config) >= 1
+        assert readers_that_fit(counts, int(named[1]), given(1 << 30, int(named[1]))) >= 1
     for fewer in range(int(named[1] or 0) + 1, jobs):
         with pytest.raises(SolidcloudError):
-            readers_that_fit(counts, fewer, config)
+            readers_that_fit(counts, fewer, given(1 << 30, fewer))
+
+
+def test_a_worker_of_a_local_cluster_holds_what_dask_leaves_it() -> None:
+    """Dask kills it at its own limit, whatever the others hold."""
+    memory, jobs = 2 << 30, 4
+    limit = cluster_worker_limit(jobs, memory)
+    local = BuildConfig(memory_bytes=memory, cluster="local:4")
+    most = (int(limit * CLUSTER_WORKER_KILLED) - CLUSTER_WORKER_BYTES - RECORD_BYTES) // record_bytes_a_point(
+        local
+    )
+    assert 1 <= readers_that_fit(np.array([most] * jobs), jobs, local) < jobs
+    with pytest.raises(SolidcloudError, match="give --cluster local:3 or --memory"):
+        readers_that_fit(np.array([most + 1]), jobs, local)
+    assert readers_that_fit(np.array([most + 1]), jobs, BuildConfig(memory_bytes=memory)) == jobs
+    # What workers elsewhere may hold is known there.
+    elsewhere = BuildConfig(memory_bytes=memory, scheduler="tcp://127.0.0.1:1")
+    assert readers_that_fit(np.array([1 << 40]), jobs, elsewhere) == jobs
 
 
 def test_fewer_jobs_are_named_where_they_are_enough() -> None:
     counts, config = np.array([4 * 10**7]), BuildConfig(memory_bytes=1 << 30)
-    with pytest.raises(SolidcloudError, match="give --jobs 3 or --memory"):
+    with pytest.raises(SolidcloudError, match="give --jobs 4 or --memory"):
         readers_that_fit(counts, 7, config)

@@ -615,7 +615,7 @@ def test_a_bad_scan_found_by_a_later_command_says_what_will_be_done(
 def test_a_voxel_that_does_not_fit_is_built_as_the_error_says(
     scans: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(memory, "RECORD_BYTES_A_POINT", 200 << 20)
+    monkeypatch.setattr(memory, "RECORD_BYTES", 20 << 30)
     folder = scans[0].parent
     said = command(capsys, folder, tmp_path / "hall", "--memory", "1GB")[1]
     assert "to read its record back takes" in said and "a smaller --voxel and --fresh" in said

@@ -1,6 +1,6 @@
 """What is said on the wire: requests and answers as types, and their JSON Schemas.
 
-WIRE.md is this file, requests.py, answers.py and encoding.py in prose. No zenoh here.
+WIRE.md is this file, requests.py, answers.py, stats.py and encoding.py in prose. No zenoh here.
 """
 
 import inspect
@@ -50,6 +50,7 @@ from .requests import (
     make_poses,
     make_positions,
 )
+from .stats import StatsAnswer, StatsRequest, UserStats
 
 # What a reader of messages needs, wherever it is defined.
 __all__ = [
@@ -75,7 +76,10 @@ __all__ = [
     "SceneInfo",
     "ScenesAnswer",
     "SourceInfo",
+    "StatsAnswer",
+    "StatsRequest",
     "SweepRequest",
+    "UserStats",
     "WithinRequest",
     "check_answers",
     "decode_answer",
@@ -220,6 +224,8 @@ MESSAGES: tuple[type, ...] = (
     ContactsPart,
     SweepPart,
     ReloadAnswer,
+    StatsRequest,
+    StatsAnswer,
     ErrorReply,
 )
 

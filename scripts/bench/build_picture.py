@@ -6,8 +6,8 @@ from typing import Any
 from solidcloud.server.report.spheres import load_pyplot
 
 from .build_runs import REST, Built
-from .picture import FAINT, INK, VERDICTS, goals_table
-from .results import MISSED, Part, busy, goal_rows, number
+from .picture import FAINT, INK, goals_table, write_picture
+from .results import Part, goal_rows, number
 
 STAGES = ("#1b6ca8", "#74b3df", "#d98b2b", "#7a4fa3", "#2e8b57", "#c9a227", "#b79bd1", "#4d4d4d")
 REST_COLOUR = "#c8ccd0"
@@ -44,12 +44,7 @@ def draw(
     if cases:
         _sizes(parts_right[1].subplots(), sizes, cases)
     title = f"solidcloud build: LAS in, validated archive out, one run  ({machine})"
-    warning = busy(parts)
-    if warning:
-        title += f"\n{warning}: not figures to quote"
-    figure.suptitle(title, fontsize=13, color=VERDICTS[MISSED] if warning else INK)
-    figure.savefig(target)
-    pyplot.close(figure)
+    write_picture(figure, title, parts, target)
 
 
 def _stages(axes: Any, builds: list[Built], limits: dict[int, dict[str, float]]) -> None:

@@ -47,13 +47,19 @@ def draw(parts: list[Part], notes: dict[str, str], machine: str, target: Path) -
         for axes, (draw_it, _) in zip(panels[:, 0], left, strict=True):
             draw_it(axes)
     goals_table(columns[1].subplots(), rows, height)
-    title = f"solidcloud: the engine's goals and its peers, one run  ({machine})"
+    write_picture(
+        figure, f"solidcloud: the engine's goals and its peers, one run  ({machine})", parts, target
+    )
+
+
+def write_picture(figure: Any, title: str, parts: list[Part], target: Path) -> None:
+    """Write the figure as PNG, and let it go. Its title says so where the machine was busy in one of the parts."""
     warning = busy(parts)
     if warning:
         title += f"\n{warning}: not figures to quote"
     figure.suptitle(title, fontsize=13, color=VERDICTS[MISSED] if warning else INK)
     figure.savefig(target)
-    pyplot.close(figure)
+    load_pyplot().close(figure)
 
 
 def _colour(side: str, ours: list[str]) -> str:

@@ -34,6 +34,30 @@ SWEEPS = tuple(
     )
 )
 
+# Of the tests of voxels ahead, those that take less than two seconds.
+AHEAD = tuple(
+    SERVER + f"test_ahead.py::test_{name}"
+    for name in (
+        "straight_and_even_is_seen_as_such",
+        "acceleration_is_seen",
+        "few_poses_and_equal_times_say_little",
+        "what_is_older_than_the_history_says_nothing",
+        "jitter_of_clock_and_place_moves_a_prediction_little",
+        "turning_is_followed",
+        "no_way_is_longer_than_people_go",
+        "of_no_time_ahead_the_user_stands",
+        "distance_to_ways_is_the_least_of_all",
+        "a_ball_that_passes_by_touches_where_it_is_nearest",
+        "of_more_than_there_is_room_for_the_first_pieces_come_first",
+        "far_outside_the_scene_nothing_is_wanted",
+        "what_balls_touch_is_what_brute_force_finds",
+        "what_is_wanted_is_what_brute_force_finds[2-20-15-0.0]",
+        "what_is_wanted_is_what_brute_force_finds[2-20-15-60.0]",
+        "what_is_wanted_is_what_brute_force_finds[3-300-0-60.0]",
+        "what_is_wanted_is_what_brute_force_finds[6-700-40-60.0]",
+    )
+)
+
 TESTS: dict[str, tuple[str, ...]] = {
     "schemas/kernels/links.py": (SCHEMAS + "test_links.py",),
     "schemas/kernels/morton.py": (SCHEMAS + "test_morton.py",),
@@ -93,6 +117,7 @@ TESTS: dict[str, tuple[str, ...]] = {
     ),
     "server/kernels/pairs.py": (SERVER + "test_pairs.py",),
     "server/kernels/motion.py": (SERVER + "test_motion.py", *work("sweep")),
+    "server/kernels/ahead.py": AHEAD,
     "server/kernels/advance.py": (*work("sweep", "sweep bounded"), *SWEEPS),
     "server/kernels/closer.py": (SERVER + "test_closer.py", *work("distance")),
     "server/kernels/closest.py": work("distance", "distance deep", "distance bounded"),

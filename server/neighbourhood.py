@@ -108,6 +108,7 @@ class Neighbourhood:
     ) -> None:
         """No users yet. voxel_steps: edge of a voxel [steps].  origin (3,), step: of the lattice [m]."""
         self.ahead = ahead
+        self._history = ahead.motion.history
         self._index, self._voxel_steps = index, voxel_steps
         self._origin, self._step = np.asarray(origin, np.float64), step
         self._lock = threading.Lock()
@@ -139,6 +140,8 @@ class Neighbourhood:
                     poses.clear()
                 elif len(poses) > 1 and now - poses[-2][0] < LEAST_GAP:
                     poses.pop()
+                while poses and now - poses[0][0] > self._history:
+                    poses.popleft()
             poses.append((now, x, y, z))
             walk.reach = reach
             return teleport

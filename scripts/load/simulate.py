@@ -1,0 +1,293 @@
+"""Replays traces against the policies and the prediction that serve, offline: no clock, no threads, no bytes read.
+
+What is modelled is loading: one loader, so many seconds a load and a byte, demands first and in their order; a load
+that has begun is finished. A demand whose voxel is absent, or not there yet, is a miss, and waits until it is there.
+The trace goes on meanwhile, as the users of an open loop do. Fragments of the arena are not modelled.
+"""
+
+import math
+from collections import deque
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from solidcloud.schemas.archive import Archive
+from solidcloud.server.kernels.reach import SceneIndex
+from solidcloud.server.neighbourhood import AHEAD, Ahead, Neighbourhood, merge
+from solidcloud.server.policies import Policy, make_policy
+
+from .traces import Centers
+
+# Of the times that loads take, the share that is shorter than what predictions reckon with.
+USUAL = 0.9
+
+
+class Town(NamedTuple):
+    """What a simulation reads of an archive.
+
+    index: its voxels, in lattice steps.  voxel_steps: edge of a voxel.  origin (3,), step: of the lattice [m].
+    sizes: (v,) int64, bytes of each voxel once decoded.  radius: of its largest sphere [m].
+    """
+
+    index: SceneIndex
+    voxel_steps: int
+    origin: NDArray[np.float64]
+    step: float
+    sizes: NDArray[np.int64]
+    radius: float
+
+    def neighbourhood(self, ahead: Ahead = AHEAD) -> Neighbourhood:
+        """The prediction of users here, nobody seen yet."""
+        return Neighbourhood(self.index, self.voxel_steps, self.origin, self.step, ahead)
+
+
+def town_of(archive: Archive, sizes: NDArray[np.int64]) -> Town:
+    """What a simulation reads of an archive whose voxels take `sizes` (v,) bytes."""
+    lattice, voxels = archive.header.lattice, archive.voxels
+    base = archive.coordinates * lattice.voxel_steps
+    index = SceneIndex(
+        voxels["key"].astype(np.uint64), base + voxels["low"], base + voxels["high"], archive.header.low,
+        archive.header.high,
+    )  # fmt: skip
+    origin = np.array(lattice.origin)
+    return Town(index, lattice.voxel_steps, origin, lattice.step, sizes, archive.header.radius)
+
+
+class Requests(NamedTuple):
+    """n requests and the voxels each needs. asked: who, when, where.  rows: (n,) lists.  flat: all of them, in order.
+
+    request: the number of the request each of `flat` belongs to.  first: (n,) bool, in the user's first second.
+    """
+
+    asked: Centers
+    rows: list[list[int]]
+    flat: NDArray[np.int64]
+    request: NDArray[np.int64]
+    first: NDArray[np.bool_]
+
+
+def requests_of(town: Town, asked: Centers) -> Requests:
+    """What each request of a trace needs: one kernel call for all of them."""
+    starts, flat = town.neighbourhood().rows_in_reach(asked.center, asked.reach)
+    every, bounds = flat.tolist(), starts.tolist()
+    rows = [every[a:b] for a, b in pairwise(bounds)]
+    began = np.full(int(asked.user.max(initial=-1)) + 1, np.inf)
+    np.minimum.at(began, asked.user, asked.time)
+    return Requests(
+        asked, rows, flat, np.repeat(np.arange(len(rows)), np.diff(starts)), asked.time < began[asked.user] + 1.0
+    )  # fmt: skip
+
+
+class Loading(NamedTuple):
+    """How long one load takes: per_load + per_byte * bytes [s]. plan_seconds: how often what is wanted is found out."""
+
+    per_load: float = 1e-3
+    per_byte: float = 5e-9
+    plan_seconds: float = 0.05
+
+
+LOADING = Loading()
+
+
+@dataclass
+class Outcome:
+    """What became of a trace.
+
+    misses: references to voxels not resident, each load counted once; `misses_later` those after the users' first
+    second.  late: of misses, those whose load had begun ahead of time.  frames_missed, frames_missed_later: requests
+    that waited.  waits: of each request [s].  prefetched, vain: loads ahead of time, and of those the ones evicted or
+    left at the end without a demand; the same in bytes.  evictions: all.
+    """
+
+    requests: int = 0
+    references: int = 0
+    misses: int = 0
+    misses_later: int = 0
+    late: int = 0
+    frames_missed: int = 0
+    frames_missed_later: int = 0
+    prefetched: int = 0
+    prefetched_bytes: int = 0
+    vain: int = 0
+    vain_bytes: int = 0
+    evictions: int = 0
+    waits: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
+
+    def row(self) -> dict[str, float]:
+        """The figures, for tables: waits as percentiles [ms], over the frames that waited and over all."""
+        figures = {name: value for name, value in vars(self).items() if name != "waits"}
+        missed = self.waits[self.waits > 0] * 1e3
+        figures["wait_p50_ms"] = float(np.percentile(missed, 50)) if len(missed) else 0.0
+        figures["wait_p99_ms"] = float(np.percentile(missed, 99)) if len(missed) else 0.0
+        figures["frame_p99_ms"] = float(np.percentile(self.waits, 99) * 1e3) if len(self.waits) else 0.0
+        figures["vain_share"] = self.vain_bytes / self.prefetched_bytes if self.prefetched_bytes else 0.0
+        return figures
+
+
+class Replay:
+    """One run of one policy. Demands hold what they need; users' places are kept where there is prefetching."""
+
+    def __init__(
+        self,
+        town: Town,
+        budget_bytes: int,
+        name: str,
+        *,
+        prefetch: bool,
+        loading: Loading = LOADING,
+        ahead: Ahead = AHEAD,
+    ) -> None:
+        """name: of the policy."""
+        self.budget_bytes, self.prefetch, self.loading = budget_bytes, prefetch, loading
+        self.neighbourhood = town.neighbourhood(ahead)
+        self.policy: Policy = make_policy(name, budget_bytes, self.neighbourhood.nearness)
+        self.sizes = town.sizes.tolist()
+        self.costs = (loading.per_load + town.sizes * loading.per_byte).tolist()
+        self.usual = float(np.quantile(self.costs, USUAL)) if self.costs else 0.0
+        self.sees = prefetch or name == "distance"
+        self.resident: set[int] = set()  # loaded, or being loaded: what has room
+        self.bytes = 0
+        self.ready: dict[int, float] = {}  # of what is being loaded: when it is there
+        self.unused: set[int] = set()  # loaded ahead, and not demanded yet
+        self.kept: frozenset[int] = frozenset()
+        self.need: dict[int, float] = {}
+        self.queue: deque[tuple[int, float]] = deque()
+        self.free = self.planned = -math.inf
+        self.found = Outcome()
+
+    def run(self, requests: Requests) -> Outcome:
+        """Replay all of it, from an empty cache. ValueError: one request alone does not fit the budget."""
+        asked, found = requests.asked, self.found
+        most = max((sum(self.sizes[row] for row in rows) for rows in requests.rows), default=0)
+        if most > self.budget_bytes:
+            raise ValueError(f"a request needs {most} bytes, the budget is {self.budget_bytes}: give more")
+        waits = np.zeros(len(requests.rows))
+        centers = asked.center.tolist() if self.sees else requests.rows
+        each = zip(
+            requests.rows, asked.user.tolist(), asked.time.tolist(), asked.reach.tolist(), asked.scan.tolist(),
+            requests.first.tolist(), centers, strict=True,
+        )  # fmt: skip
+        resident, ready, used = self.resident, self.ready, self.policy.used
+        for number, (rows, user, time, reach, scan, first, center) in enumerate(each):
+            if self.sees:
+                scan = self.neighbourhood.saw(("", str(user)), time, center, reach) or scan
+                self.run_until(time)
+            if not ready and resident.issuperset(rows):
+                for row in rows:
+                    used(row, scan=scan)
+                if self.unused:
+                    self.unused.difference_update(rows)
+                continue
+            missed = found.misses
+            wait = self.demand(rows, time, scan)
+            waits[number] = wait
+            found.frames_missed += wait > 0
+            if not first:
+                found.misses_later += found.misses - missed
+                found.frames_missed_later += wait > 0
+        found.requests, found.references, found.waits = len(requests.rows), len(requests.flat), waits
+        for row in self.unused:
+            found.vain += 1
+            found.vain_bytes += self.sizes[row]
+        return found
+
+    def demand(self, rows: list[int], now: float, scan: bool) -> float:
+        """Make rows resident; returns how long their request waits [s]."""
+        self.settle(now)
+        until = now
+        absent = []
+        for row in rows:
+            if row not in self.resident:
+                absent.append(row)
+                continue
+            self.policy.used(row, scan=scan)
+            if row in self.ready:
+                until = max(until, self.ready[row])
+                self.found.late += row in self.unused
+                self.found.misses += row in self.unused
+        self.unused.difference_update(rows)
+        for row in absent:
+            self.make_room(row, rows)
+            until = max(until, self.load(row, now, scan))
+            self.found.misses += 1
+        return until - now
+
+    def settle(self, now: float) -> None:
+        """Forget about loads that have ended."""
+        for row in [row for row, there in self.ready.items() if there <= now]:
+            del self.ready[row]
+
+    def load(self, row: int, now: float, scan: bool) -> float:
+        """Begin a load that has room, when the loader is free; returns when it ends."""
+        self.free = self.ready[row] = max(self.free, now) + self.costs[row]
+        self.resident.add(row)
+        self.bytes += self.sizes[row]
+        self.policy.added(row, self.sizes[row], scan=scan)
+        return self.free
+
+    def make_room(self, row: int, own: list[int]) -> None:
+        """Room for a demand: of what nobody stands in, else of anything but the request's own."""
+        while self.bytes + self.sizes[row] > self.budget_bytes:
+            spare = None
+            for victim in self.policy.victims():
+                if victim in own:
+                    continue
+                if victim not in self.kept and victim not in self.ready:
+                    spare = victim
+                    break
+                spare = victim if spare is None else spare
+            assert spare is not None, "run() has seen that every request fits"
+            self.evict(spare)
+
+    def evict(self, row: int) -> None:
+        """Give the room of a row back."""
+        self.policy.removed(row, evicted=True)
+        self.resident.remove(row)
+        self.ready.pop(row, None)
+        self.bytes -= self.sizes[row]
+        self.found.evictions += 1
+        if row in self.unused:
+            self.unused.remove(row)
+            self.found.vain += 1
+            self.found.vain_bytes += self.sizes[row]
+
+    def run_until(self, now: float) -> None:
+        """Let the loader do what is wanted until now, then find out anew what is."""
+        if self.ready:
+            self.settle(now)
+        while self.queue and self.free <= now:
+            row, at = self.queue.popleft()
+            if row not in self.resident and not self.load_ahead(row, at):
+                self.queue.clear()  # what is wanted later would have no room either
+        if now >= self.planned + self.loading.plan_seconds:
+            self.planned = now
+            self.neighbourhood.expire(now)
+            wanted = merge(self.neighbourhood.plan(now, self.usual).values())
+            self.kept = frozenset(self.neighbourhood.kept(now).tolist())
+            if self.prefetch:
+                self.need = dict(zip(wanted.rows.tolist(), wanted.need.tolist(), strict=True))
+                self.queue = deque((row, at) for row, at in self.need.items() if row not in self.resident)
+
+    def load_ahead(self, row: int, at: float) -> bool:
+        """Begin a load ahead of time; False: no room, but for what is stood in, or wanted as soon."""
+        short = self.bytes + self.sizes[row] - self.budget_bytes
+        if short > 0:
+            given: list[int] = []
+            for victim in self.policy.victims():
+                if victim in self.kept or victim in self.ready or self.need.get(victim, math.inf) <= at:
+                    continue
+                given.append(victim)
+                short -= self.sizes[victim]
+                if short <= 0:
+                    break
+            if short > 0:
+                return False
+            for victim in given:
+                self.evict(victim)
+        self.load(row, max(self.free, self.planned), scan=False)
+        self.unused.add(row)
+        self.found.prefetched += 1
+        self.found.prefetched_bytes += self.sizes[row]
+        return True

@@ -79,6 +79,8 @@ def join(parts: Sequence[_A]) -> _A:
         resident=answered[-1].resident,
         resident_bytes=answered[-1].resident_bytes,
         faults=tuple(dict.fromkeys(fault for part in parts for fault in part.faults)),
+        wait_seconds=sum(part.wait_seconds for part in parts),
+        late=tuple(dict.fromkeys(key for part in parts for key in part.late)),
     )
 
 
@@ -107,7 +109,7 @@ def in_pieces(answers: ContactsAnswers, most_bytes: int) -> Iterator[ContactsAns
             else:
                 piece[name] = column[start:stop]
         yield ContactsAnswers(**(rest | piece))
-        rest |= {"engine_seconds": 0.0, "hits": 0, "misses": 0}
+        rest |= {"engine_seconds": 0.0, "wait_seconds": 0.0, "hits": 0, "misses": 0}
         start = max(stop, 1)
 
 

@@ -21,7 +21,7 @@ from ..schemas.answers import (
 from ..schemas.arrays import array_fields
 
 _NAMES = {int(verdict): verdict.name.lower() for verdict in Verdict}
-_TOTALS = ("engine_seconds", "hits", "misses", "resident", "resident_bytes", "faults")
+_TOTALS = ("engine_seconds", "hits", "misses", "resident", "resident_bytes", "faults", "wait_seconds", "late")
 _OBJECTS = ("pairs_tested", "pairs_filtered", "pair_visits", "pair_tests")
 _WORDS = {SweepAnswers: "motions", RaycastAnswers: "rays", WithinAnswers: "points", ObjectsAnswers: "objects"}
 

@@ -44,6 +44,15 @@ class ArenaBuffer:
                 return offset
         return None
 
+    def take(self, offset: int, size: int) -> None:
+        """Take a run of `size` bytes from `offset` on, all of which is free."""
+        size = self.rounded(size)
+        i = bisect.bisect_right(self._free, (offset, self.total_bytes)) - 1
+        start, free = self._free[i]
+        before, behind = offset - start, start + free - offset - size
+        left = [(start, before)] if before else []
+        self._free[i : i + 1] = [*left, (offset + size, behind)] if behind else left
+
     def release(self, offset: int, size: int) -> None:
         """Give back a run that `allocate` gave out, joining it to its free neighbours."""
         size = self.rounded(size)

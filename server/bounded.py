@@ -21,6 +21,7 @@ from .kernels.priority import OPEN, Goal, Known, end_search, go_on, make_search,
 from .kernels.reach import Reach
 from .request import SceneData, as_held, check_request, in_unknown, kernel_poses, pieces, to_units
 from .signed import distance_columns, signed_bound, signed_from_square, unknown_gaps
+from .spent import Spent
 
 # Pairs the heap holds before the search turns depth first: half a megabyte a request.
 HEAP_PAIRS = 1 << 14
@@ -98,19 +99,16 @@ def _gather(
     data: SceneData, avatar: AvatarModel, array: NDArray[np.float64], reach: Reach, goal: Goal, effort: Effort
 ) -> _Gathered:
     """Search for all poses, piece by piece."""
-    begin = time.perf_counter()
     k = len(array)
     known = Known(
         np.full(k, -1, np.int64), np.zeros((k, 6), np.int64), np.zeros(k, np.int64), np.full(k, math.inf),
         np.full(k, math.inf), np.full(k, math.inf), np.zeros(k, bool),
     )  # fmt: skip
     counts = np.zeros((3, k), np.uint32)
-    residency = data.residency
-    hits = misses = 0
-    faults: dict[str, None] = {}
+    residency, spent = data.residency, Spent(time.perf_counter())
     for which, rows, part in pieces(reach, residency) if len(avatar.points) else ():
         heap = max(HEAP_PAIRS, int(np.diff(part.starts).max(initial=0)))
-        with residency.hold(rows, effort.loads_until()) as held:
+        with residency.hold(rows, effort.loads_until(), scan=effort.scan) as held:
             seen = as_held(data, held)
             if effort.deadline < math.inf:
                 _search_until(seen, avatar, array, part, which, heap, goal, effort.deadline, known, counts)
@@ -118,13 +116,8 @@ def _gather(
                 search_poses(
                     array, avatar.arrays, seen.arrays, data.broad, part, which, heap, goal, known, counts
                 )
-        hits, misses = hits + held.hits, misses + held.misses
-        faults.update(dict.fromkeys(held.faults))
-    cost = Cost(
-        engine_seconds=time.perf_counter() - begin, hits=hits, misses=misses, resident=residency.resident,
-        resident_bytes=residency.resident_bytes, faults=tuple(faults),
-    )  # fmt: skip
-    return _Gathered(known, counts, cost)
+        spent.add(held)
+    return _Gathered(known, counts, Cost(**spent.cost(data)))
 
 
 def _fields(cost: Cost) -> dict[str, Any]:

@@ -9,9 +9,11 @@ from ..schemas.answers import CollideAnswers
 from ..schemas.voxel_grid import UNITS_PER_METRE
 from .avatar import AvatarModel
 from .bounded import collide_bounded
+from .coarse import settle
 from .effort import EXACT, Effort
 from .kernels.overlap import CLEAR, CONTACT, UNKNOWN, answer_resident, overlap_poses
 from .request import SceneData, check_request, in_unknown, kernel_poses, pieces, refuse, to_units
+from .spent import Spent
 
 # An avatar up to this size is answered under the residency's lock when a request holds one pose: 20 µs for the
 # 3,617 points of the walk. A larger one could keep others waiting, and gains little.
@@ -76,23 +78,21 @@ def collide(
         if answers is not None:
             return answers
     reach = check_request(data, avatar, array, other_units)
+    if data.coarse is not None and len(avatar.points):
+        reach, _ = settle(data.arrays, data.coarse.arrays, avatar.arrays, array, reach)
     verdict, counts = np.zeros(k, np.uint8), np.zeros((3, k), np.uint32)
-    residency = data.residency
-    hits = misses = 0
-    faults: dict[str, None] = {}
+    residency, spent = data.residency, Spent(begin)
     # An empty avatar is clear, whatever is unknown here.
     for which, rows, part in pieces(reach, residency) if len(avatar.points) else ():
-        with residency.hold(rows) as held:
+        with residency.hold(rows, scan=effort.scan) as held:
             overlap_poses(array, avatar.arrays, data.arrays, part, which, verdict, counts)
-        hits, misses = hits + held.hits, misses + held.misses
-        faults.update(dict.fromkeys(held.faults))
+        spent.add(held)
     if unseen and len(avatar.points):
         lost = in_unknown(reach.boxes, data.unknown, data.unknown_everywhere)
         verdict[lost & (verdict == CLEAR)] = UNKNOWN
     return CollideAnswers(
-        verdict, reach.outside, counts[0], counts[1], counts[2], engine_seconds=time.perf_counter() - begin,
-        hits=hits, misses=misses, resident=residency.resident, resident_bytes=residency.resident_bytes,
-        faults=tuple(faults), **_bounds(verdict, reach.units - margin_units, margin, margin_units, effort),
+        verdict, reach.outside, counts[0], counts[1], counts[2], **spent.cost(data),
+        **_bounds(verdict, reach.units - margin_units, margin, margin_units, effort),
     )  # fmt: skip
 
 

@@ -41,6 +41,7 @@ from .kernels.contacts import Asked, Tally, gather_contacts
 from .kernels.overlap import STACK
 from .kernels.reach import Reach
 from .request import SceneData, as_held, check_request, in_unknown, kernel_poses, pieces, to_units
+from .spent import Spent
 
 # Pairs and clusters that one request may list, all poses together [bytes]; some three times as much is needed for a
 # moment, to make columns of them. The wire's largest message holds an eighth of it.
@@ -87,8 +88,7 @@ def contacts(
         np.zeros((3, k), np.int64), np.zeros(k, np.int64), np.zeros(k, bool), np.zeros((k, 4), np.int64)
     )
     memory = _empty_memory(limit)
-    hits = misses = 0
-    faults: dict[str, None] = {}
+    spent = Spent(begin)
     if len(avatar.points):
         edges = _edges(reach, edge_units, data.arrays.units_per_step)
         asked = Asked(avatar.rows, edges, data.keeps_scan, limit, effort.visits)
@@ -101,17 +101,12 @@ def contacts(
             if effort.spent:
                 memory = _gather(data, avatar, array, part, which, asked, closes, effort, memory, tally)
                 continue
-            with data.residency.hold(rows, effort.loads_until()) as held:
+            with data.residency.hold(rows, effort.loads_until(), scan=effort.scan) as held:
                 seen = as_held(data, held)
                 memory = _gather(seen, avatar, array, part, which, asked, closes, effort, memory, tally)
-            hits, misses = hits + held.hits, misses + held.misses
-            faults.update(dict.fromkeys(held.faults))
-    residency = data.residency
+            spent.add(held)
     columns = _columns(data, reach, margin_units, tally, memory, len(avatar.points) > 0)
-    return ContactsAnswers(
-        **columns, engine_seconds=time.perf_counter() - begin, hits=hits, misses=misses,
-        resident=residency.resident, resident_bytes=residency.resident_bytes, faults=tuple(faults),
-    )  # fmt: skip
+    return ContactsAnswers(**columns, **spent.cost(data))
 
 
 def _checked_limit(limit: int) -> int:

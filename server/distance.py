@@ -14,6 +14,7 @@ from .kernels.closest import Nearest
 from .kernels.nearest import nearest_poses
 from .request import SceneData, check_request, kernel_poses, pieces, to_units
 from .signed import distance_columns, signed_from_square, unknown_gaps
+from .spent import Spent
 
 __all__ = ["distance", "signed_from_square"]
 
@@ -39,24 +40,16 @@ def distance(
         np.full(k, -1, np.int64), np.zeros((k, 6), np.int64), np.zeros(k, np.int64), np.full(k, math.inf)
     )
     counts = np.zeros((3, k), np.uint32)
-    residency = data.residency
-    hits = misses = 0
-    faults: dict[str, None] = {}
+    residency, spent = data.residency, Spent(begin)
     if len(avatar.points):
         for which, rows, part in pieces(around, residency):
-            with residency.hold(rows) as held:
+            with residency.hold(rows, scan=effort.scan) as held:
                 nearest_poses(
                     array, avatar.arrays, data.arrays, data.broad, part, reach_units, which, nearest, counts
                 )
-            hits, misses = hits + held.hits, misses + held.misses
-            faults.update(dict.fromkeys(held.faults))
+            spent.add(held)
         np.minimum(nearest.gap, unknown_gaps(data, around), out=nearest.gap)
     return DistanceAnswers(
         **distance_columns(data, around, float(reach), reach_units, nearest, counts),
-        engine_seconds=time.perf_counter() - begin,
-        hits=hits,
-        misses=misses,
-        resident=residency.resident,
-        resident_bytes=residency.resident_bytes,
-        faults=tuple(faults),
+        **spent.cost(data),
     )

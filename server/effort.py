@@ -22,11 +22,13 @@ class Effort(NamedTuple):
     tolerance: how early contact may be called, and how far bounds may lie apart [m]; 0, the default: exact, for no
     search that may stop early is as fast (`solidcloud accuracy`).
     visits: node visits a pose (ray, point, motion).  deadline: on time.perf_counter()'s clock [s], inf: none.
+    scan: what is looked at is passed by, as on a sweep along a path: it is not to wash the cache (policies.py).
     """
 
     tolerance: float = 0.0
     visits: int = NO_LIMIT
     deadline: float = math.inf
+    scan: bool = False
 
     @property
     def limited(self) -> bool:

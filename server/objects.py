@@ -19,6 +19,7 @@ from .effort import EXACT, Effort
 from .kernels.pairs import CLEAR, UNKNOWN, bound_objects, sweep_and_prune, touch_pairs
 from .kernels.placing import MAX_REACH_UNITS, check_poses
 from .request import SceneData, kernel_poses, refuse, to_units
+from .spent import Spent
 
 # The scene's own group: an object whose mask lacks this bit is not tested against the scene.
 SCENE_GROUP = 1 << 31
@@ -77,8 +78,7 @@ def objects(
     placing = _check(data, avatars, poses, groups, masks, margin)
     n = len(placing.poses)
     verdict, outside, counts = np.zeros(n, np.uint8), np.zeros(n, bool), np.zeros((3, n), np.uint32)
-    hits = misses = 0
-    faults: dict[str, None] = {}
+    spent = Spent(begin)
     for number, model in enumerate(placing.models):
         rows = np.flatnonzero((placing.model_of == number) & ((placing.masks & SCENE_GROUP) > 0))
         if not len(rows):
@@ -89,13 +89,10 @@ def objects(
         found = collide(data, model, placing.poses[rows], margin, effort._replace(tolerance=0.0))
         verdict[rows], outside[rows] = found.verdict, found.outside
         counts[:, rows] = found.voxels_missing, found.node_visits, found.point_tests
-        hits, misses = hits + found.hits, misses + found.misses
-        faults.update(dict.fromkeys(found.faults))
+        spent.add_cost(found, data)
     met = _meet(placing, data.arrays.origin, effort)
     return ObjectsAnswers(
-        verdict, outside, counts[0], counts[1], counts[2], *met,
-        engine_seconds=time.perf_counter() - begin, hits=hits, misses=misses, resident=data.residency.resident,
-        resident_bytes=data.residency.resident_bytes, faults=tuple(faults),
+        verdict, outside, counts[0], counts[1], counts[2], *met, **spent.cost(data)
     )  # fmt: skip
 
 

@@ -4,30 +4,42 @@ A scene swaps one for another while it is asked (`Scene.reload`). Who reads take
 when the answer is there; files and memory of one that was swapped out go with its last reader.
 """
 
+import math
 import threading
 import time
 from collections.abc import Callable, Generator, Iterator
+from contextlib import suppress
 from functools import lru_cache, partial
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 
 from ..schemas.answers import Part
-from ..schemas.errors import BadRequestError
-from .avatar import make_avatar
+from ..schemas.errors import BadRequestError, CorruptError
+from ..schemas.voxel_grid import UNITS_PER_METRE
+from .arena import ArenaBuffer
+from .avatar import AvatarModel, make_avatar
+from .coarse import Coarse, settle
 from .collide import collide
 from .contacts import contacts
 from .distance import distance
 from .effort import EXACT, Effort
+from .neighbourhood import Neighbourhood, User
 from .objects import objects as ask_objects
+from .policies import make_policy, prefetches
+from .prefetch import Prefetcher
 from .rays import raycast
-from .request import SceneData, make_scene_data, with_radius_model
+from .request import SceneData, check_request, make_scene_data, make_scene_index, with_radius_model
 from .residency import Residency
 from .session import Walker
 from .store import Store
 from .sweep import sweep
 from .within import within
 
+# A user is where the last of so many poses is; more are looked over, not walked.
+MOST_SEEN = 8
+# Of the budget, what coarse tops may take: 6 KB each.
+COARSE_SHARE = 1 / 16
 # Radius models whose tables are remembered; asked for by name, and by clients, so there may be any number.
 MOST_MODELS = 64
 
@@ -43,11 +55,34 @@ class Opened:
     data: SceneData
     radius_model: Callable[[str | None], SceneData]
 
-    def __init__(self, store: Store, budget_bytes: int, number: int = 0) -> None:
-        """Hold `store` open for a first reader, the scene, which must `release` it."""
+    def __init__(
+        self,
+        store: Store,
+        budget_bytes: int,
+        policy: str = "lru",
+        number: int = 0,
+        took: Callable[[float], None] | None = None,
+    ) -> None:
+        """Hold `store` open for a first reader, the scene, which must `release` it.
+
+        policy: see policies.py.  took: told the seconds that each load took.
+        """
         self.store, self.number = store, number
         self.ended = threading.Event()
-        self.data = make_scene_data(store.archive, Residency(store, budget_bytes))
+        index, lattice = make_scene_index(store.archive), store.archive.header.lattice
+        around = Neighbourhood(index, lattice.voxel_steps, lattice.origin, lattice.step)
+        ahead = prefetches(policy)
+        coarse = _make_coarse(store, budget_bytes) if ahead else None
+        if coarse is not None:
+            budget_bytes -= coarse.bytes
+        residency = Residency(store, budget_bytes, make_policy(policy, budget_bytes, around.nearness))
+        residency.took = took
+        if coarse is not None:
+            arena, remember = residency.buffer.arena, coarse.remember
+            residency.loaded = lambda row, where: remember(row, arena, where)
+        fill = None if coarse is None else Filling(coarse, store)
+        self.prefetcher = Prefetcher(residency, around, ahead=ahead, idle=fill)
+        self.data = make_scene_data(store.archive, residency, index, coarse)
         self.radius_model = lru_cache(MOST_MODELS)(partial(with_radius_model, self.data, store.archive))
         self._lock = threading.Lock()
         self._readers = 1
@@ -66,7 +101,8 @@ class Opened:
             self._readers -= 1
             if self._readers:
                 return
-        del self.data, self.radius_model
+        self.prefetcher.stop()
+        del self.data, self.radius_model, self.prefetcher
         self.store.close()
         self.ended.set()
 
@@ -84,6 +120,30 @@ class Opened:
             raise BadRequestError(f"{self.store.archive.folder}: this scene is closed: open it again")
         return self
 
+    def saw(self, user: User, avatar: AvatarModel, poses: Any, other: float) -> bool:
+        """A user asks about an avatar under some poses, the last of which is where it is, if they are few.
+
+        other: what is added to the avatar's spheres and the scan's, margin or reach [m]. Returns whether what is in
+        reach is not stayed with: there are many poses, or it came there by no motion.
+        """
+        # What is not so will be refused, or is none to look ahead for.
+        if not isinstance(poses, np.ndarray) or poses.dtype != np.float64 or poses.shape[1:] != (4, 4):
+            return False
+        if not len(poses) or not len(avatar.points):
+            return False
+        if not isinstance(other, float | int):  # it will be refused, as what is not finite below
+            return False
+        if len(poses) > MOST_SEEN:
+            return True
+        pose = poses[-1].tolist()
+        x, y, z = avatar.arrays.center[0].tolist()
+        center = [a * x + b * y + c * z + d for a, b, c, d in pose[:3]]
+        scale = math.hypot(pose[0][0], pose[1][0], pose[2][0])
+        reach = avatar.bounding_radius * scale + self.data.radius_units / UNITS_PER_METRE + other
+        if not math.isfinite(sum(center) + reach):
+            return False
+        return self.prefetcher.saw(user, (center[0], center[1], center[2]), reach)
+
     def warm(self) -> None:
         """Ask one of everything, a load included, so that nobody waits for compilers after."""
         data, archive = self.data, self.store.archive
@@ -92,7 +152,13 @@ class Opened:
         pose = np.eye(4)[None]
         pose[0, :3, 3] = archive.header.lattice.to_world(corner)
         place = pose[:, :3, 3].copy()
+        x, y, z = place[0].tolist()
+        self.prefetcher.warm((x, y, z))
         avatar = make_avatar([[0.0, 0, 0], [0.1, 0, 0]])
+        if data.coarse is not None:
+            reach = check_request(data, avatar, pose, data.radius_units)
+            nowhere = data.arrays._replace(where=np.full_like(data.arrays.where, -1))
+            settle(nowhere, data.coarse.arrays, avatar.arrays, pose, reach)
         both = np.full(2, 0xFFFFFFFF, np.uint32)
         # Budgets that are hardly ever spent: what is bounded has kernels of its own, and so have deadlines.
         later = time.perf_counter() + 3600.0
@@ -127,6 +193,32 @@ class Opened:
                 return
             with residency.hold([row]):
                 pass
+
+
+def _make_coarse(store: Store, budget_bytes: int) -> Coarse | None:
+    """Room for the coarse tops of all voxels, or of as many as COARSE_SHARE of the budget holds; None where the budget
+    is too small for any beside the largest voxel."""
+    voxels, largest = len(store.sizes), int(store.sizes.max(initial=0))
+    most = min(int(budget_bytes * COARSE_SHARE), budget_bytes - ArenaBuffer.rounded(largest))
+    coarse = Coarse(voxels, most)
+    return coarse if len(coarse.arrays.count) else None
+
+
+class Filling:
+    """Coarse tops of voxels that were never loaded, one at a call, until all have one or there is no room."""
+
+    def __init__(self, coarse: Coarse, store: Store) -> None:
+        self._coarse, self._store, self._left = coarse, store, coarse.missing()
+
+    def __call__(self) -> bool:
+        """Make one; False where nothing is left to be made."""
+        row = next(self._left, None)
+        if row is None:
+            return False
+        # Not read, it has none: whoever asks for the voxel is told why.
+        with suppress(CorruptError, OSError):
+            self._coarse.fill(self._store, row)
+        return True
 
 
 class HeldParts(Iterator[Part]):

@@ -15,6 +15,7 @@ from .kernels.rays import Nearest, Rays, follow_rays
 from .kernels.voxel_tree import Lists
 from .request import SceneData, to_units
 from .rounds import finish, look, make_origins
+from .spent import Spent
 
 # Differences within this reach are exact in float64: 2^53 units are 134,000 km.
 MAX_RAY_REACH = 1e6
@@ -46,7 +47,7 @@ def raycast(
     not within the budget. Where that might hide a nearer hit, `exact` is false and `lower` says how near; with a
     tolerance `lower` may be below `upper` by as much. Raises BadRequestError.
     """
-    begin = time.perf_counter()
+    spent = Spent(time.perf_counter())
     world, units = make_origins(data, origins, "origins")
     unit = make_directions(directions)
     if len(world) != len(unit):
@@ -69,18 +70,17 @@ def raycast(
         rays = Rays(units[first:last], unit[first:last], reach_units, data.radius_units)
         follow_rays(rays, lists, cursor, held, data.arrays, tolerance, effort.visits, best)
 
-    found = look(data, units, unit, reach_units, data.radius_units, effort, kernel)
-    verdict, lower, upper, exact = finish(found.best.value, found.best.unseen, reach_units)
-    hit, cloud, normal = _where(data, world, units, unit, found.best)
+    best = look(data, units, unit, reach_units, data.radius_units, effort, kernel, spent)
+    verdict, lower, upper, exact = finish(best.value, best.unseen, reach_units)
+    hit, cloud, normal = _where(data, world, units, unit, best)
     ends = np.stack([units.astype(np.float64), units + float(reach_units) * unit])
     low, high = (
         np.rint(b * data.arrays.units_per_step) for b in (data.broad.scene_low, data.broad.scene_high)
     )
     return RaycastAnswers(
         verdict, upper, lower, upper.copy(), exact, hit, cloud, normal,
-        ((ends < low) | (ends > high)).any(axis=(0, 2)), *found.best.counts,
-        engine_seconds=time.perf_counter() - begin, hits=found.hits, misses=found.misses,
-        resident=data.residency.resident, resident_bytes=data.residency.resident_bytes, faults=found.faults,
+        ((ends < low) | (ends > high)).any(axis=(0, 2)), *best.counts,
+        **spent.cost(data),
     )  # fmt: skip
 
 

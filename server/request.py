@@ -12,6 +12,7 @@ from ..schemas.radius_model import class_radii
 from ..schemas.requests import make_poses
 from ..schemas.voxel_grid import MAX_COORDINATE, UNITS_PER_METRE
 from .avatar import AvatarModel
+from .coarse import Coarse
 from .kernels import placing
 from .kernels.layout import SceneArrays, block_words
 from .kernels.reach import Reach, SceneIndex, find_reach
@@ -47,7 +48,8 @@ class SceneData(NamedTuple):
 
     arrays: what the kernels read.  broad: what the broad phase reads.  radius_units: of the largest sphere of a scan
     point, exact units.  unknown: (u, 2, 3) int64, lattice boxes of scans left out; unknown_everywhere: also elsewhere.
-    keeps_scan: whether the arena holds the scan each point came from.
+    keeps_scan: whether the arena holds the scan each point came from.  coarse: what is known of voxels that are not in
+    memory; None: nothing is.
     """
 
     residency: Residency
@@ -57,6 +59,7 @@ class SceneData(NamedTuple):
     unknown: NDArray[np.int64]
     unknown_everywhere: bool
     keeps_scan: bool
+    coarse: Coarse | None = None
 
 
 def kernel_poses(poses: ArrayLike) -> NDArray[np.float64]:
@@ -72,11 +75,28 @@ def to_units(metres: float, what: str) -> int:
     return round(metres * UNITS_PER_METRE)  # half to even
 
 
-def make_scene_data(archive: Archive, residency: Residency) -> SceneData:
-    """What the questions read of an archive whose voxels `residency` holds; radii are the archive's one figure."""
+def make_scene_index(archive: Archive) -> SceneIndex:
+    """What the broad phase reads of an archive."""
+    header = archive.header
+    base = archive.coordinates * header.lattice.voxel_steps
+    return SceneIndex(
+        archive.voxels["key"].astype(np.uint64),
+        base + archive.voxels["low"],
+        base + archive.voxels["high"],
+        header.low,
+        header.high,
+    )
+
+
+def make_scene_data(
+    archive: Archive, residency: Residency, index: SceneIndex | None = None, coarse: Coarse | None = None
+) -> SceneData:
+    """What the questions read of an archive whose voxels `residency` holds; radii are the archive's one figure.
+
+    index: `make_scene_index` of it, where somebody else has use for it too.
+    """
     header = archive.header
     lattice = header.lattice
-    base = archive.coordinates * lattice.voxel_steps
     arrays = SceneArrays(
         *residency.buffer.arena,
         residency.where,
@@ -91,17 +111,12 @@ def make_scene_data(archive: Archive, residency: Residency) -> SceneData:
     return SceneData(
         residency,
         arrays,
-        SceneIndex(
-            archive.voxels["key"].astype(np.uint64),
-            base + archive.voxels["low"],
-            base + archive.voxels["high"],
-            header.low,
-            header.high,
-        ),
+        make_scene_index(archive) if index is None else index,
         to_units(header.radius, "radius of the archive"),
         header.unknown,
         header.unknown_everywhere,
         header.scan_index,
+        coarse,
     )
 
 

@@ -1,7 +1,9 @@
-"""Resident voxels: decoded, least recently used first to go, never more than `budget_bytes`.
+"""Resident voxels: decoded, never more than `budget_bytes`; who holds them, and who loads them.
 
 [Fig12] section 4: "neighbour voxels to a user's position loaded and uncompressed into a LRU queue". One load
-for a voxel however many wait for it; what a request uses is pinned until it is answered.
+for a voxel however many wait for it; what a request uses is pinned until it is answered. Which voxel goes first is the
+policy's (policies.py), which bytes it has the room's (room.py), and what is loaded before anybody asks for it the
+prefetcher's (prefetch.py).
 
 A request takes all its voxels or none: it never waits for room while holding pins, so two requests that each
 hold half of what the other needs cannot wait for each other for ever.
@@ -10,43 +12,63 @@ hold half of what the other needs cannot wait for each other for ever.
 import math
 import threading
 import time
-from collections import OrderedDict
-from collections.abc import Sequence
+from collections import OrderedDict, deque
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
+from enum import Enum
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..schemas.errors import BadRequestError, CorruptError
 from .arena import ArenaBuffer
+from .policies import Policy, make_policy
+from .room import Room
 from .store import Store
+
+# A voxel that is asked for again so soon after it went for another had better stayed [s].
+TOO_SOON = 10.0
+# Loads whose times are remembered.
+TIMES = 256
+# Voxels that are looked at to find room for one that nobody waits for.
+MOST_CANDIDATES = 256
 
 
 class Held(NamedTuple):
     """What a hold found. hits, misses: voxels resident before, and not.  faults: one sentence an unreadable voxel.
 
     late: rows that were not resident by the deadline. They may become so while held: read `where` without them
-    (`request.as_held`).
+    (`request.as_held`).  waited: for loads, its own and others', and for room [s].
     """
 
     hits: int
     misses: int
     faults: tuple[str, ...]
     late: tuple[int, ...] = ()
+    waited: float = 0.0
+
+
+class Ahead(Enum):
+    """What became of a load that nobody waited for."""
+
+    THERE = "it is resident, or was"
+    NO_ROOM = "nothing may go for it"
+    FAILED = "it cannot be read"
 
 
 class Hold:
     """A hold on voxels, for a `with`; a class and not a generator, which costs a request twice as much."""
 
-    __slots__ = ("_deadline", "_residency", "_rows")
+    __slots__ = ("_deadline", "_residency", "_rows", "_scan")
 
-    def __init__(self, residency: "Residency", rows: Sequence[int], deadline: float) -> None:
+    def __init__(self, residency: "Residency", rows: Sequence[int], deadline: float, scan: bool) -> None:
         """Use `Residency.hold`."""
-        self._residency, self._rows, self._deadline = residency, rows, deadline
+        self._residency, self._rows, self._deadline, self._scan = residency, rows, deadline, scan
 
     def __enter__(self) -> Held:
         """Wait until all that can be read is resident, or the deadline."""
-        return self._residency.acquire(self._rows, self._deadline)
+        return self._residency.acquire(self._rows, self._deadline, scan=self._scan)
 
     def __exit__(self, *_: object) -> None:
         """Let the voxels go."""
@@ -60,14 +82,44 @@ def _seconds_to(deadline: float) -> float | None:
     return min(max(0.0, deadline - time.perf_counter()), threading.TIMEOUT_MAX)
 
 
+class Counters(NamedTuple):
+    """What a residency has done so far; voxels but where bytes are said.
+
+    hits: asked for and there, or being loaded; waits: of them being loaded.  misses: asked for and not there.
+    late: asked for and not there in time.  prefetched: loaded before anybody asked; used: of them asked for since;
+    wasted: of them gone again without.  evicted: gone for others; too_soon: of them asked for again within TOO_SOON.
+    moved_bytes: of voxels moved to join free room.  failed: loads that failed.
+    """
+
+    hits: int = 0
+    waits: int = 0
+    misses: int = 0
+    late: int = 0
+    prefetched: int = 0
+    prefetched_bytes: int = 0
+    used: int = 0
+    wasted: int = 0
+    wasted_bytes: int = 0
+    evicted: int = 0
+    too_soon: int = 0
+    moved_bytes: int = 0
+    failed: int = 0
+
+
 class Residency:
     """The resident voxels of one scene. Thread-safe.
 
     where: (v, 3) int64, a voxel's runs in the arena, -1 when not resident; the kernels read it directly.
+    kept: rows that users stand in: they go only when a request would not fit otherwise.  owed: called when a load is
+    owed to somebody who could not wait for it, see `take_owed`.  loaded: called with the row and where it is of each
+    voxel that was loaded, by the thread that did, before others know of it; took: then, with the seconds it took.
     """
 
-    def __init__(self, store: Store, budget_bytes: int) -> None:
-        """Reserve budget_bytes for the voxels of `store`. Raises BadRequestError when one voxel alone is larger."""
+    def __init__(self, store: Store, budget_bytes: int, policy: Policy | None = None) -> None:
+        """Reserve budget_bytes for the voxels of `store`. policy: least recently used where left out.
+
+        Raises BadRequestError when one voxel alone is larger.
+        """
         largest = ArenaBuffer.rounded(int(store.sizes.max(initial=0)))
         if budget_bytes < largest:
             raise BadRequestError(
@@ -77,11 +129,16 @@ class Residency:
         self.budget_bytes = budget_bytes
         self.buffer = ArenaBuffer(budget_bytes)
         self.where = np.full((len(store.sizes), 3), -1, np.int64)
+        self.kept: frozenset[int] = frozenset()
+        self.owed: Callable[[], None] | None = None
+        self.loaded: Callable[[int, NDArray[np.int64]], None] | None = None
+        self.took: Callable[[float], None] | None = None
         self._store = store
         self._sizes = [ArenaBuffer.rounded(int(size)) for size in store.sizes]
+        self.policy = policy or make_policy("lru", budget_bytes)
+        self._room = Room(self.buffer, self._sizes, self.where, self.policy)
         self._lock = threading.RLock()
         self._changed = threading.Condition(self._lock)
-        self._offsets: OrderedDict[int, int] = OrderedDict()  # row -> offset; least recently used first
         self._pins: dict[int, int] = {}
         self._loading: set[int] = set()
         self._faults: dict[int, str] = {}  # of corrupt records, which reading again would not mend
@@ -90,48 +147,91 @@ class Residency:
         self._passing: dict[int, str] = {}
         # Of those in `_loading`: reserved by one whose deadline came before the load began. Who waits takes it over.
         self._left: set[int] = set()
-        self.resident_bytes = 0
-        self.hits = 0
-        self.misses = 0
-        self.evictions = 0
+        self._owed: OrderedDict[int, None] = OrderedDict()
+        self._demands = 0  # requests that wait
+        self._fresh: set[int] = set()  # prefetched, and not asked for yet
+        self._went: dict[int, float] = {}  # when a voxel was evicted
+        self._times: deque[float] = deque(maxlen=TIMES)
+        self.hits = self.waits = self.misses = self.lates = 0
+        self.prefetched = self.prefetched_bytes = self.used = self.wasted = self.wasted_bytes = 0
+        self.too_soon = self.failed = 0
 
     @property
     def resident(self) -> int:
         """The number of voxels resident or being loaded."""
-        return len(self._offsets)
+        return len(self._room.offsets)
+
+    @property
+    def resident_bytes(self) -> int:
+        """Their bytes."""
+        return self._room.used_bytes
+
+    @property
+    def evictions(self) -> int:
+        """Voxels that went for others."""
+        return self._room.evictions
+
+    def counters(self) -> Counters:
+        """What was done so far."""
+        with self._lock:
+            return Counters(
+                self.hits, self.waits, self.misses, self.lates, self.prefetched, self.prefetched_bytes, self.used,
+                self.wasted, self.wasted_bytes, self.evictions, self.too_soon, self._room.moved_bytes, self.failed,
+            )  # fmt: skip
+
+    def load_times(self) -> list[float]:
+        """The seconds that the last loads took, in no order."""
+        with self._lock:
+            return list(self._times)
 
     def recent(self) -> list[int]:
-        """The index rows of the resident voxels, those used last at the end."""
+        """The index rows of the resident voxels, those that would stay longest at the end."""
         with self._lock:
-            return [row for row in self._offsets if row not in self._loading]
+            return [row for row in self.policy.victims() if row not in self._loading]
+
+    def is_resident(self, row: int) -> bool:
+        """Whether a voxel is resident or being loaded."""
+        return row in self._room.offsets
 
     def bytes_of(self, rows: Sequence[int]) -> int:
         """Bytes these voxels take when resident."""
         return sum(self._sizes[row] for row in rows)
 
-    def hold(self, rows: Sequence[int], deadline: float = math.inf) -> "Hold":
+    # --- what a request does ------------------------------------------------------------------------------
+
+    def hold(self, rows: Sequence[int], deadline: float = math.inf, *, scan: bool = False) -> "Hold":
         """Make the voxels of distinct index rows resident and keep them so inside a `with`, which gives a `Held`.
 
         Together they must fit the budget. Voxels that cannot be read stay at -1 in `where` and are named in
         the result's faults; everything else is resident. deadline: on time.perf_counter()'s clock [s]; what is not
-        resident by then is `late`. No load is begun after it, one that has begun is finished.
+        resident by then is `late`. No load is begun after it, one that has begun is finished.  scan: these are passed
+        by, not stayed with: they had better not take the place of what others stay with (policies.py).
         """
-        return Hold(self, rows, deadline)
+        return Hold(self, rows, deadline, scan)
 
     def still(self) -> AbstractContextManager[bool]:
         """For a `with` inside which what is resident stays so, and nobody else goes on: for tens of microseconds."""
         return self._lock
 
-    def use(self, rows: Sequence[int]) -> None:
+    def use(self, rows: Sequence[int], *, scan: bool = False) -> None:
         """Count resident voxels as used just now; inside `still`."""
         for row in rows:
-            self._offsets.move_to_end(row)
+            self.policy.used(row, scan=scan)
         self.hits += len(rows)
+        if self._fresh:
+            self._count_used(rows)
 
-    def acquire(self, rows: Sequence[int], deadline: float = math.inf) -> Held:
+    def _count_used(self, rows: Sequence[int]) -> None:
+        """Of what was prefetched, these were asked for."""
+        found = self._fresh.intersection(rows)
+        self._fresh -= found
+        self.used += len(found)
+
+    def acquire(self, rows: Sequence[int], deadline: float = math.inf, *, scan: bool = False) -> Held:
         """Begin a hold; `release` must follow, unless this raises."""
-        mine, hits, roomy = self._reserve(rows, deadline)
-        if roomy and not mine and not self._loading and not self._faults and not self._passing:
+        begin = time.perf_counter()
+        mine, hits, settled = self._reserve(rows, deadline, scan)
+        if settled:
             return Held(len(rows), 0, ())  # all resident and pinned: nothing can change that
         try:
             wanted = mine
@@ -143,16 +243,28 @@ class Residency:
                     if not wanted:
                         faults = tuple(fault for row in rows if (fault := self._fault(row)))
                         late = tuple(row for row in rows if not self._fault(row) and not self._there(row))
+                        self._demands -= 1
+                        self._owe(late)
+                        self._changed.notify_all()
                         break
                     self._left.difference_update(wanted)
         except BaseException:
+            with self._changed:
+                self._demands -= 1
             self.release(rows)
             raise
-        return Held(hits, len(mine), faults, late)
+        return Held(hits, len(mine), faults, late, time.perf_counter() - begin)
+
+    def _owe(self, rows: Sequence[int]) -> None:
+        """Voxels that somebody could not wait for: their loads are to go on."""
+        self.lates += len(rows)
+        if rows and self.owed is not None:
+            self._owed.update(dict.fromkeys(rows))
+            self.owed()
 
     def _there(self, row: int) -> bool:
         """Whether a voxel is resident and whole."""
-        return row in self._offsets and row not in self._loading
+        return row in self._room.offsets and row not in self._loading
 
     def _settled(self, rows: Sequence[int]) -> bool:
         """Whether nobody loads any of these, or one was left to be loaded."""
@@ -165,73 +277,103 @@ class Residency:
             self._unpin(rows)
             self._changed.notify_all()
 
-    def _reserve(self, rows: Sequence[int], deadline: float) -> tuple[list[int], int, bool]:
-        """Pin all rows and allocate for those to be loaded by this caller.
+    def _reserve(self, rows: Sequence[int], deadline: float, scan: bool) -> tuple[list[int], int, bool]:
+        """Pin all rows and make room for those to be loaded by this caller; none where there is no room in time.
 
         Returns these, how many of the others are resident or being loaded (a voxel with a fault is neither), and
-        whether there was room before the deadline: without it nothing is to be loaded.
+        whether all is there; where not, `_demands` counts this request until it is.
         """
         if self.bytes_of(rows) > self.buffer.total_bytes:
             raise ValueError(
                 f"{len(rows)} voxels take {self.bytes_of(rows)} bytes, over the budget: ask in pieces"
             )
+        offsets = self._room.offsets
         with self._changed:
-            while True:
-                for row in rows:
-                    self._pins[row] = self._pins.get(row, 0) + 1
-                mine = [row for row in rows if row not in self._offsets and not self._fault(row)]
-                if self._allocate_all(mine):
-                    roomy = True
-                    break
-                self._unpin(rows)
-                if not self._pins:
-                    # Nobody else holds anything, and yet the room is in pieces between our own voxels.
-                    for row in list(self._offsets):
-                        self._evict(row)
-                    continue
-                if not self._changed.wait(_seconds_to(deadline)):
-                    for row in rows:
-                        self._pins[row] = self._pins.get(row, 0) + 1
-                    roomy, mine = False, []
-                    break
+            self._pin(rows)
+            mine = [row for row in rows if row not in offsets and not self._fault(row)]
+            settled = not mine and self._all_there(rows)
+            if not settled:
+                self._demands += 1
+                try:
+                    mine = self._make_room(rows, mine, deadline, scan)
+                except BaseException:
+                    self._demands -= 1
+                    raise
             self._loading.update(mine)
             for row in rows:
-                if row in self._offsets:
-                    self._offsets.move_to_end(row)
-            hits = sum(row in self._offsets for row in rows) - len(mine)
+                if row in offsets:
+                    self.policy.used(row, scan=scan)
+            hits = sum(row in offsets for row in rows) - len(mine)
             self.hits += hits
             self.misses += len(mine)
-            return mine, hits, roomy
+            if self._fresh:
+                self._count_used(rows)
+            if not settled:
+                self._count_misses(rows, mine)
+            return mine, hits, settled
 
-    def _allocate_all(self, rows: list[int]) -> bool:
-        """Allocate for every row, evicting what is neither pinned nor loading; all or nothing."""
-        done: list[int] = []
+    def _all_there(self, rows: Sequence[int]) -> bool:
+        """Whether none of these, all of which have room or a fault, has a fault or is being loaded."""
+        if self._loading and not self._loading.isdisjoint(rows):
+            return False
+        return not (self._faults or self._passing) or not any(map(self._fault, rows))
+
+    def _count_misses(self, rows: Sequence[int], mine: list[int]) -> None:
+        """Count what has to be waited for."""
+        self.waits += sum(row in self._loading for row in rows) - len(mine)
+        now = time.perf_counter()
+        self.too_soon += sum(now - self._went.get(row, -math.inf) < TOO_SOON for row in mine)
+
+    def _make_room(self, rows: Sequence[int], mine: list[int], deadline: float, scan: bool) -> list[int]:
+        """Room for `mine`, of `rows` that are pinned by this caller; returns those it is to load. It may wait.
+
+        None of them where the deadline comes before there is room. The rows are not pinned where this raises.
+        """
+        while not self._allocate_all(mine, scan):
+            self._unpin(rows)
+            if self._pins or self._loading:
+                roomy = self._changed.wait(_seconds_to(deadline))
+            else:
+                # Nobody else holds anything, and yet the room is in pieces between our own voxels.
+                self._room.leave_only(set(rows), self._gone)
+                roomy = True
+            self._pin(rows)
+            mine = [row for row in rows if row not in self._room.offsets and not self._fault(row)]
+            if not roomy:
+                return []
+        return mine
+
+    def _pin(self, rows: Sequence[int]) -> None:
         for row in rows:
-            offset = self.buffer.allocate(self._sizes[row])
-            while offset is None and (victim := self._victim()) is not None:
-                self._evict(victim)
-                offset = self.buffer.allocate(self._sizes[row])
-            if offset is None:
-                for other in done:
-                    self._forget(other)
+            self._pins[row] = self._pins.get(row, 0) + 1
+
+    def _allocate_all(self, rows: list[int], scan: bool) -> bool:
+        """Make room for every row; all or nothing. What users stand in goes last."""
+        for number, row in enumerate(rows):
+            for may_go in (self._idle, self._free):
+                if self._room.make(row, may_go, self._free, self._gone, scan=scan):
+                    break
+            else:
+                for other in rows[:number]:
+                    self._room.forget(other)
                 return False
-            self._offsets[row] = offset
-            self.resident_bytes += self._sizes[row]
-            done.append(row)
         return True
 
-    def _victim(self) -> int | None:
-        """The least recently used voxel that nobody uses."""
-        return next((row for row in self._offsets if row not in self._pins), None)
+    def _free(self, row: int) -> bool:
+        """Whether nobody uses or loads a voxel."""
+        return row not in self._pins and row not in self._loading
 
-    def _evict(self, row: int) -> None:
-        self.evictions += 1
-        self._forget(row)
+    def _idle(self, row: int) -> bool:
+        """Whether also no user stands in it."""
+        return row not in self._pins and row not in self._loading and row not in self.kept
 
-    def _forget(self, row: int) -> None:
-        self.where[row] = -1
-        self.buffer.release(self._offsets.pop(row), self._sizes[row])
-        self.resident_bytes -= self._sizes[row]
+    def _gone(self, row: int) -> None:
+        """A voxel was evicted."""
+        self._went[row] = time.perf_counter()
+        if row in self._fresh:
+            self._fresh.discard(row)
+            self.wasted += 1
+            self.wasted_bytes += self._sizes[row]
 
     def _unpin(self, rows: Sequence[int]) -> None:
         for row in rows:
@@ -246,7 +388,7 @@ class Residency:
         """Give back the room of a voxel whose load never began."""
         self._left.discard(row)
         self._loading.discard(row)
-        self._forget(row)
+        self._room.forget(row)
 
     def _leave(self, rows: list[int]) -> None:
         """Leave loads that have not begun to whoever else holds these rows."""
@@ -261,54 +403,110 @@ class Residency:
         """Why a voxel cannot be read, or ""."""
         return self._faults.get(row, "") or self._passing.get(row, "")
 
+    # --- loads --------------------------------------------------------------------------------------------
+
     def _load(self, rows: list[int], deadline: float) -> None:
         """Load what this caller reserved; every row leaves `_loading`, loaded or with a fault, or is left to others."""
         for number, row in enumerate(rows):
             if _seconds_to(deadline) == 0:
                 self._leave(rows[number:])
                 return
-            where = None
-            faults, fault = self._passing, ""
             try:
-                where = self._store.load(row, self.buffer.arena, self._offsets[row])
-            except CorruptError as error:
-                faults, fault = self._faults, str(error)
-            except OSError as error:
-                fault = f"{self._store.archive.where(row)}: cannot be read ({error}): check the disk"
+                self._load_one(row)
             except BaseException as error:
                 with self._changed:
-                    for left in rows[number:]:
-                        self._passing[left] = (
-                            f"{self._store.archive.where(left)}: not loaded ({error!r}): ask again"
-                        )
-                        self._forget(left)
-                        self._loading.discard(left)
+                    for left in rows[number + 1 :]:
+                        self._fail(left, f"not loaded ({error!r}): ask again")
                     self._changed.notify_all()
                 raise
+
+    def _load_one(self, row: int) -> bool:
+        """Load a voxel that room was made for; whether it is there then."""
+        begin, where, fault, corrupt = time.perf_counter(), None, "", False
+        try:
+            where = self._store.load(row, self.buffer.arena, self._room.offsets[row])
+            if self.loaded is not None:
+                self.loaded(row, where)  # now, for it may go as soon as others know of it
+        except CorruptError as error:
+            fault, corrupt = str(error), True
+        except OSError as error:
+            fault = f"cannot be read ({error}): check the disk"
+        except BaseException as error:
             with self._changed:
-                if where is None:
-                    faults[row] = fault
-                    self._forget(row)
-                else:
-                    self.where[row] = where
-                self._loading.discard(row)
+                self._fail(row, f"not loaded ({error!r}): ask again")
                 self._changed.notify_all()
+            raise
+        with self._changed:
+            if where is None:
+                self._fail(row, fault, corrupt=corrupt)
+            else:
+                self.where[row] = where
+                self._loading.discard(row)
+                self._times.append(seconds := time.perf_counter() - begin)
+            self._changed.notify_all()
+        if where is not None and self.took is not None:
+            self.took(seconds)
+        return where is not None
+
+    def _fail(self, row: int, fault: str, *, corrupt: bool = False) -> None:
+        """A load ended without a voxel. Who holds it is told; nobody else, unless it will always be so."""
+        self.failed += 1
+        if row in self._fresh:
+            self._fresh.discard(row)
+            self.prefetched -= 1
+            self.prefetched_bytes -= self._sizes[row]
+        self._room.forget(row)
+        self._loading.discard(row)
+        if corrupt:
+            self._faults[row] = fault
+        elif row in self._pins:
+            self._passing[row] = f"{self._store.archive.where(row)}: {fault}"
+
+    def take_owed(self) -> int | None:
+        """A voxel whose load is owed, the longest first; None where none is."""
+        with self._lock:
+            while self._owed:
+                row = self._owed.popitem(last=False)[0]
+                if row not in self._room.offsets and not self._fault(row):
+                    return row
+        return None
+
+    def wait_for_nobody(self) -> None:
+        """Wait until no request waits for anything."""
+        with self._changed:
+            while self._demands:
+                self._changed.wait()
+
+    def load_ahead(self, row: int, may_go: Callable[[int], bool], *, owed: bool = False) -> Ahead:
+        """Load a voxel that nobody waits for, once no request waits for anything.
+
+        may_go: whether a resident voxel may go for it, besides that nobody uses it or stands in it.  owed: somebody has
+        asked for it. Raises what a load raises that is no fault of the record.
+        """
+        with self._changed:
+            self.wait_for_nobody()
+            if row in self._room.offsets or self._fault(row):
+                return Ahead.THERE if row in self._room.offsets else Ahead.FAILED
+            if not self._room.make(
+                row, lambda other: self._idle(other) and may_go(other), self._free, self._gone, scan=False,
+                most=MOST_CANDIDATES,
+            ):  # fmt: skip
+                return Ahead.NO_ROOM
+            self._loading.add(row)
+            if not owed:
+                self._fresh.add(row)
+                self.prefetched += 1
+                self.prefetched_bytes += self._sizes[row]
+        return Ahead.THERE if self._load_one(row) else Ahead.FAILED
 
     def check(self) -> None:
         """Assert what must always hold: bytes add up, runs neither overlap nor leave the buffer."""
         with self._changed:
-            held = sum(self._sizes[row] for row in self._offsets)
-            runs = sorted(
-                [(offset, self._sizes[row]) for row, offset in self._offsets.items()]
-                + self.buffer.free_runs()
-            )
-            assert held == self.resident_bytes <= self.buffer.total_bytes, (held, self.resident_bytes)
-            at = 0
-            for offset, size in runs:
-                assert offset == at, (offset, at)
-                at += size
-            assert at == self.buffer.total_bytes
+            self._room.check()
+            offsets = set(self._room.offsets)
             resident = {int(row) for row in np.flatnonzero(self.where[:, 0] >= 0)}
-            assert resident == set(self._offsets) - self._loading
-            assert self._left <= self._loading <= set(self._offsets) and self._left <= set(self._pins)
+            assert resident == offsets - self._loading
+            assert self._left <= self._loading <= offsets and self._left <= set(self._pins)
             assert all(count > 0 for count in self._pins.values())
+            assert self._fresh <= offsets and self._demands >= 0
+            assert self.used + self.wasted + len(self._fresh) == self.prefetched

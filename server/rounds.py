@@ -7,7 +7,7 @@ hit in the first voxel loads no second one. What is held at a time stays within 
 
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -21,6 +21,7 @@ from .kernels.rays import Nearest
 from .kernels.voxel_tree import Lists, VoxelTree, list_voxels, make_voxel_tree
 from .request import SceneData
 from .residency import Residency
+from .spent import Spent
 
 # Rays or points whose lists are in memory together.
 BATCH = 1 << 14
@@ -28,15 +29,6 @@ BATCH = 1 << 14
 TIMED_BATCH = 1 << 11
 
 _trees: WeakKeyDictionary[Residency, VoxelTree] = WeakKeyDictionary()
-
-
-class Found(NamedTuple):
-    """All of a request's answers, and what it took. best: of k rays or points.  hits, misses, faults: as in `Cost`."""
-
-    best: Nearest
-    hits: int
-    misses: int
-    faults: tuple[str, ...]
 
 
 def voxel_tree(data: SceneData) -> VoxelTree:
@@ -89,17 +81,16 @@ def look(
     radius_units: int,
     effort: Effort,
     kernel: Callable[..., Any],
-) -> Found:
+    spent: Spent,
+) -> Nearest:
     """Answer k rays (direction (k, 3)) or loose points (None) by rounds.
 
     radius_units: of the scan's largest sphere, 0 where radii do not count: what the index alone can tell of a voxel.
     kernel(begin, end, lists, cursor, held, best) looks as far as it may; see `kernels.rays.follow_rays`.
-    What a deadline left undone is in best.unseen.
+    What a deadline left undone is in `unseen` of what is returned. What it took is added to `spent`.
     """
     k = len(at_units)
     best = make_best(k)
-    hits = misses = 0
-    faults: dict[str, None] = {}
     capacity = 64
     batch = BATCH if effort.deadline == math.inf else TIMED_BATCH
     for begin in range(0, k, batch):
@@ -135,15 +126,13 @@ def look(
             rows = _next_rows(data, lists, cursor, open_)
             held = np.zeros(len(looked), bool)
             held[rows] = True
-            with data.residency.hold(rows.tolist(), effort.deadline) as found:
+            with data.residency.hold(rows.tolist(), effort.deadline, scan=effort.scan) as found:
                 held[list(found.late)] = False  # they may be written to just now
                 kernel(begin, end, lists, cursor, held, part)
-            hits += max(0, found.hits - int(looked[rows].sum()))
-            misses += found.misses
-            faults.update(dict.fromkeys(found.faults))
+            spent.add(found, int(looked[rows].sum()))
             looked |= held
         best.counts[:, begin:end] = part.counts
-    return Found(best, hits, misses, tuple(faults))
+    return best
 
 
 def _next_rows(

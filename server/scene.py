@@ -3,10 +3,11 @@
 import os
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
-from typing import Any, Unpack
+from typing import Any, TypeVar, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,14 +24,15 @@ from ..schemas.answers import (
     WithinAnswers,
 )
 from ..schemas.errors import BadRequestError, BusyError, UnknownAvatarError
-from ..schemas.messages import AvatarInfo, ReloadAnswer, SceneInfo
+from ..schemas.messages import AvatarInfo, ReloadAnswer, SceneInfo, StatsAnswer
 from ..schemas.requests import QuestionOptions, make_objects, make_poses
 from .avatar import AvatarModel, make_avatar
 from .collide import collide
 from .contacts import contacts
-from .describe import describe
+from .describe import describe, make_stats
 from .distance import distance
 from .effort import Effort, make_effort
+from .metrics import Metrics
 from .objects import objects as ask_objects
 from .opened import HeldParts, Opened
 from .path import PATH_THREADS, largest_part, path_parts, path_question
@@ -41,6 +43,8 @@ from .session import Walker
 from .store import Store
 from .sweep import sweep
 from .within import within
+
+_A = TypeVar("_A", bound=Cost)
 
 DEFAULT_BUDGET = 512 << 20
 # How long a reload waits for the last reader of the generation before the one that is current [s]: with a third one
@@ -55,11 +59,12 @@ class Scene:
     stays what is asked, whatever becomes of the folder, until `reload`.
     """
 
-    def __init__(self, store: Store, name: str, budget_bytes: int) -> None:
+    def __init__(self, store: Store, name: str, budget_bytes: int, policy: str) -> None:
         """Serve the voxels of `store`; use `Scene.open`."""
         self.name = name
-        self._folder, self._budget_bytes = store.archive.folder, budget_bytes
-        self._opened = Opened(store, budget_bytes)
+        self._folder, self._budget_bytes, self._policy = store.archive.folder, budget_bytes, policy
+        self._metrics = Metrics()
+        self._opened = Opened(store, budget_bytes, policy, took=self._metrics.loaded)
         self._before: Opened | None = None  # swapped out; perhaps not ended yet
         self._info = describe(store, name)
         self._avatars: dict[tuple[str, str], AvatarModel] = {}
@@ -70,15 +75,21 @@ class Scene:
 
     @classmethod
     def open(
-        cls, folder: str | Path, name: str | None = None, *, budget_bytes: int = DEFAULT_BUDGET
+        cls,
+        folder: str | Path,
+        name: str | None = None,
+        *,
+        budget_bytes: int = DEFAULT_BUDGET,
+        policy: str = "lru",
     ) -> "Scene":
         """Open the archive in `folder`, keeping at most budget_bytes of decoded voxels in memory.
 
+        policy: which of them go first, and whether others are loaded before they are asked for, see policies.py.
         Raises FormatError or CorruptError when it is no whole archive, BadRequestError for too small a budget.
         """
         store = Store(folder)
         try:
-            return cls(store, name or Path(folder).resolve().name, budget_bytes)
+            return cls(store, name or Path(folder).resolve().name, budget_bytes, policy)
         except BaseException:
             store.close()
             raise
@@ -118,7 +129,7 @@ class Scene:
                 )
             store = Store(self._folder)
             try:
-                new = Opened(store, self._budget_bytes, old.number + 1)
+                new = Opened(store, self._budget_bytes, self._policy, old.number + 1, self._metrics.loaded)
             except BaseException:
                 store.close()
                 raise
@@ -182,6 +193,19 @@ class Scene:
         """What is served: counts, bounds, lattice, radius, sources."""
         return self._info
 
+    def stats(self, keys: bool = False) -> StatsAnswer:
+        """What is in memory, what was asked, and what had to be waited for. keys: name the resident voxels, too."""
+        with self._take() as opened:
+            coarse = opened.data.coarse
+            return make_stats(
+                opened.store,
+                self.name,
+                opened.data.residency,
+                self._metrics,
+                coarse_bytes=0 if coarse is None else coarse.bytes,
+                keys=keys,
+            )
+
     def add_avatar(
         self, name: str, points: ArrayLike, radius: float | None = None, *, client: str = ""
     ) -> AvatarInfo:
@@ -214,6 +238,29 @@ class Scene:
         effort = make_effort(tolerance, budget_ms, budget_visits)
         return opened.data if radius_model is None else opened.radius_model(radius_model), effort
 
+    def _ask(
+        self,
+        question: Callable[..., _A],
+        name: str,
+        client: str,
+        poses: ArrayLike,
+        what: tuple[Any, ...],
+        around: float,
+        options: QuestionOptions,
+    ) -> _A:
+        """Ask about an avatar under some poses; the last one says where its user is.
+
+        question: takes scene, avatar, `what`, and `effort`.  around: margin or reach [m].
+        """
+        with self._take() as opened:
+            data, effort = self._terms(opened, **options)
+            avatar = self._avatar(name, client)
+            if opened.saw((client, name), avatar, poses, around):
+                effort = effort._replace(scan=True)
+            answers = question(data, avatar, *what, effort=effort)
+        self._metrics.answered(client, name, answers)
+        return answers
+
     def collide(
         self,
         name: str,
@@ -229,15 +276,13 @@ class Scene:
         server/effort.py; radius_model: how large the scan's spheres are, see schemas/radius_model.py, None: the
         archive's one figure.
         """
-        with self._take() as opened:
-            data, effort = self._terms(opened, **options)
-            return collide(data, self._avatar(name, client), poses, margin, effort)
+        return self._ask(collide, name, client, poses, (poses, margin), margin, options)
 
     def walker(
         self, name: str, margin: float = 0.0, *, radius_model: str | None = None, client: str = ""
     ) -> Walker:
         """A session of avatar `name`: its `collide` remembers the last pose; see server/session.py."""
-        return Walker(self._take, self._avatar(name, client), margin, radius_model)
+        return Walker(self._take, self._avatar(name, client), margin, radius_model, (client, name))
 
     def distance(
         self,
@@ -249,9 +294,7 @@ class Scene:
         **options: Unpack[QuestionOptions],
     ) -> DistanceAnswers:
         """How far avatar `name` is from the scene under each pose, up to `reach` [m]; see server/distance.py."""
-        with self._take() as opened:
-            data, effort = self._terms(opened, **options)
-            return distance(data, self._avatar(name, client), poses, reach, effort)
+        return self._ask(distance, name, client, poses, (poses, reach), reach, options)
 
     def contacts(
         self,
@@ -265,10 +308,8 @@ class Scene:
         **options: Unpack[QuestionOptions],
     ) -> ContactsAnswers:
         """Which pairs of points are in contact under each of the poses, deepest first; see server/contacts.py."""
-        with self._take() as opened:
-            data, effort = self._terms(opened, **options)
-            avatar = self._avatar(name, client)
-            return contacts(data, avatar, poses, limit, margin, cluster_distance, effort)
+        what = (poses, limit, margin, cluster_distance)
+        return self._ask(contacts, name, client, poses, what, margin, options)
 
     def sweep(
         self,
@@ -282,10 +323,8 @@ class Scene:
     ) -> SweepAnswers:
         """When avatar `name` first touches the scene on its way between poses; see server/sweep.py."""
         options.setdefault("tolerance", 1e-6)
-        with self._take() as opened:
-            data, effort = self._terms(opened, **options)
-            avatar = self._avatar(name, client)
-            return sweep(data, avatar, pose_from, pose_to, margin, effort.tolerance, effort)
+        what = (pose_from, pose_to, margin, options["tolerance"])
+        return self._ask(sweep, name, client, pose_to, what, margin, options)
 
     def raycast(
         self,
@@ -297,7 +336,9 @@ class Scene:
         """Which scan point's sphere rays (k, 3), (k, 3) hit first, up to `reach` [m]; see server/rays.py."""
         with self._take() as opened:
             data, effort = self._terms(opened, **options)
-            return raycast(data, origins, directions, reach, effort)
+            answers = raycast(data, origins, directions, reach, effort)
+        self._metrics.answered("", "", answers)
+        return answers
 
     def within(
         self,
@@ -308,7 +349,9 @@ class Scene:
         """Which scan point is nearest to each loose point (k, 3), up to `reach` [m]; see server/within.py."""
         with self._take() as opened:
             data, effort = self._terms(opened, **options)
-            return within(data, points, reach, effort)
+            answers = within(data, points, reach, effort)
+        self._metrics.answered("", "", answers)
+        return answers
 
     def objects(
         self,
@@ -328,7 +371,9 @@ class Scene:
             avatars = [self._avatar(item.avatar, client) for item in items]
             groups = np.array([item.group for item in items], np.uint32)
             masks = np.array([item.mask for item in items], np.uint32)
-            return ask_objects(data, avatars, poses, groups, masks, margin, effort)
+            answers = ask_objects(data, avatars, poses, groups, masks, margin, effort)
+        self._metrics.answered(client, "", answers)
+        return answers
 
     def path(
         self,
@@ -354,7 +399,9 @@ class Scene:
 
             def ask_held(start: int, stop: int) -> Cost:
                 with opened.taken():  # whoever wanted the parts may be gone, and their hold with them
-                    return ask(start, stop)
+                    part = ask(start, stop)
+                self._metrics.answered(client, name, part)
+                return part
 
             most = largest_part(op, parameters)
             ahead = (self._pool_of_threads(), 2 * threads) if threads > 1 else (None, 1)
@@ -368,3 +415,6 @@ class Scene:
         with self._lock:
             for key in [key for key in self._avatars if key[0] == client]:
                 del self._avatars[key]
+        with suppress(BadRequestError), self._take() as opened:  # closed, it keeps nothing for anybody
+            opened.prefetcher.leave_client(client)
+        self._metrics.drop_client(client)

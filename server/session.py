@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,7 +13,9 @@ from .avatar import AvatarModel
 from .collide import collide
 from .kernels.memory import KNOWN, make_memory
 from .kernels.walking import walk_poses, walk_resident
+from .neighbourhood import User
 from .request import SceneData, check_request, kernel_poses, refuse, to_units
+from .spent import Spent
 
 
 class Readable(Protocol):
@@ -21,6 +23,8 @@ class Readable(Protocol):
 
     number: int
     radius_model: Callable[[str | None], SceneData]
+
+    def saw(self, user: User, avatar: AvatarModel, poses: Any, other: float) -> bool: ...
 
 
 class Walker:
@@ -38,10 +42,13 @@ class Walker:
         avatar: AvatarModel,
         margin: float = 0.0,
         radius_model: str | None = None,
+        user: User | None = None,
     ) -> None:
         """take: the archive that is current, held for a `with`.  margin: distance below or at which two spheres are
-        called in contact [m]. Raises BadRequestError, also for a radius model that the archive does not hold."""
+        called in contact [m].  user: around whom voxels are loaded before they are asked for; None: nobody. Raises
+        BadRequestError, also for a radius model that the archive does not hold."""
         self._take, self._avatar, self._margin, self._model = take, avatar, margin, radius_model
+        self._user = user
         self._margin_units = to_units(margin, "margin")
         front = avatar.arrays.front.shape[1]
         leaves = avatar.arrays.first[avatar.arrays.front_first :]
@@ -65,6 +72,8 @@ class Walker:
             if opened.number != self._number:
                 self.forget()
                 self._number = opened.number
+            if self._user is not None:
+                opened.saw(self._user, self._avatar, array, self._margin)
             return self._collide(opened.radius_model(self._model), array, begin)
 
     def _collide(self, data: SceneData, poses: NDArray[np.float64], begin: float) -> CollideAnswers:
@@ -86,10 +95,9 @@ class Walker:
                 walk_poses(poses, self._avatar.arrays, data.arrays, reach, verdict, counts, self._memory)
         if held.faults:
             return self._collide_afresh(data, poses)
-        return CollideAnswers(
-            verdict, reach.outside, counts[0], counts[1], counts[2], engine_seconds=time.perf_counter() - begin,
-            hits=held.hits, misses=held.misses, resident=residency.resident, resident_bytes=residency.resident_bytes,
-        )  # fmt: skip
+        spent = Spent(begin)
+        spent.add(held)
+        return CollideAnswers(verdict, reach.outside, counts[0], counts[1], counts[2], **spent.cost(data))
 
     def _collide_at_once(
         self, data: SceneData, poses: NDArray[np.float64], begin: float

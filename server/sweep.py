@@ -15,6 +15,7 @@ from .kernels.advance import Progress, look_around, plan_segments, sweep_segment
 from .kernels.placing import SIMILARITY_TOLERANCE, check_poses
 from .kernels.reach import Reach
 from .request import SceneData, as_held, kernel_poses, pieces, refuse, to_units
+from .spent import Spent
 
 # Motions of one kernel call where there is a deadline: it is looked at between calls.
 _PER_CALL = 64
@@ -127,9 +128,7 @@ def sweep(
     proved = np.ones(k)
     if not len(avatar.points) or not k:
         return _answers(progress, proved, counts, outside, tolerance)
-    residency = data.residency
-    hits = misses = 0
-    faults: dict[str, None] = {}
+    residency, spent = data.residency, Spent(begin)
     starts, rows = np.zeros(k + 1, np.int64), np.empty(16 * k + 64, np.int64)
     which = np.arange(k)
     while len(which):
@@ -143,7 +142,7 @@ def sweep(
         boxes = np.empty((k, 2, 3))  # of no use here
         for part, held_rows, reach in pieces(Reach(scales, units, starts, rows, boxes, outside), residency):
             chunk = len(part) if effort.deadline == np.inf else _PER_CALL
-            with residency.hold(held_rows, effort.loads_until()) as held:
+            with residency.hold(held_rows, effort.loads_until(), scan=effort.scan) as held:
                 seen = as_held(data, held)
                 for at in range(0, len(part), chunk):
                     if effort.spent:
@@ -152,8 +151,7 @@ def sweep(
                         first, last, avatar.arrays, avatar.radius, other_units, scales, units, loose, seen.arrays,
                         data.broad, reach.starts, reach.rows, part[at : at + chunk], tolerance, progress, counts,
                     )  # fmt: skip
-            hits, misses = hits + held.hits, misses + held.misses
-            faults.update(dict.fromkeys(held.faults))
+            spent.add(held)
         which = _next_round(which, progress, proved)
     until = np.minimum(progress.upper, 1.0)
     lost = np.empty(k)
@@ -168,10 +166,7 @@ def sweep(
     progress.witness[:, 0] = np.rint(progress.witness[:, 0] * UNITS_PER_METRE) / UNITS_PER_METRE
     progress.witness[:] += origin
     answers = _answers(progress, proved, counts, outside, tolerance)
-    return msgspec.structs.replace(
-        answers, engine_seconds=time.perf_counter() - begin, hits=hits, misses=misses,
-        resident=residency.resident, resident_bytes=residency.resident_bytes, faults=tuple(faults),
-    )  # fmt: skip
+    return msgspec.structs.replace(answers, **spent.cost(data))
 
 
 def _next_round(

@@ -15,6 +15,7 @@ from .kernels.voxel_tree import Lists
 from .kernels.within import search_points
 from .request import SceneData, to_units
 from .rounds import finish, look, make_origins
+from .spent import Spent
 
 
 def within(data: SceneData, points: ArrayLike, reach: float, effort: Effort = EXACT) -> WithinAnswers:
@@ -24,7 +25,7 @@ def within(data: SceneData, points: ArrayLike, reach: float, effort: Effort = EX
     point is `outside` when its reach, a cube of exact units, leaves the box of all scan points.
     Verdicts, bounds and effort as in `raycast`. Raises BadRequestError.
     """
-    begin = time.perf_counter()
+    spent = Spent(time.perf_counter())
     _, units = make_origins(data, points, "points")
     reach_units = to_units(reach, "reach")
     if reach_units > MAX_REACH_UNITS:
@@ -43,8 +44,7 @@ def within(data: SceneData, points: ArrayLike, reach: float, effort: Effort = EX
             units[first:last], reach_units, lists, cursor, held, data.arrays, tolerance, effort.visits, best
         )
 
-    found = look(data, units, None, reach_units, 0, effort, kernel)
-    best = found.best
+    best = look(data, units, None, reach_units, 0, effort, kernel, spent)
     near = np.where(best.square >= 0, np.sqrt(np.maximum(best.square, 0).astype(np.float64)), np.inf)
     verdict, lower, upper, exact = finish(near, best.unseen, reach_units)
     cloud: NDArray[np.float64] = np.full((len(units), 3), np.nan)
@@ -57,6 +57,5 @@ def within(data: SceneData, points: ArrayLike, reach: float, effort: Effort = EX
     outside = ((units - reach_units < low) | (units + reach_units > high)).any(axis=1)
     return WithinAnswers(
         verdict, upper, lower, upper.copy(), exact, cloud, outside, *best.counts,
-        engine_seconds=time.perf_counter() - begin, hits=found.hits, misses=found.misses,
-        resident=data.residency.resident, resident_bytes=data.residency.resident_bytes, faults=found.faults,
+        **spent.cost(data),
     )  # fmt: skip

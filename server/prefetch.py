@@ -1,0 +1,178 @@
+"""Loads voxels before anybody asks for them, and those that somebody could not wait for: one thread a scene.
+
+What users will need the neighbourhood says (neighbourhood.py), soonest first; the thread loads it while no request
+waits for anything, and finds out what is wanted anew each time users have moved. So what a user has turned from is not
+loaded any more; a load that has begun is finished. A voxel goes for another only if it is wanted later than that one.
+"""
+
+import logging
+import math
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import Self
+
+from .neighbourhood import Neighbourhood, User, merge
+from .residency import Ahead, Residency
+
+log = logging.getLogger(__name__)
+
+# What is wanted is found out at most so often [s]: at 5 m/s a user moves a quarter of a metre meanwhile.
+PLAN_SECONDS = 0.05
+# How long nothing may be heard of a user whose voxels are kept [s].
+SILENCE = 10.0
+# Of the times that loads took, this share is shorter than what is reckoned with.
+USUAL = 0.9
+
+
+def _wanted_later(need: dict[int, float], than: float) -> Callable[[int], bool]:
+    """Whether a voxel is needed later than that, or by nobody."""
+    return lambda row: need.get(row, math.inf) > than
+
+
+class Prefetcher:
+    """The thread of one residency, started when the first user is seen. A context manager. Thread-safe."""
+
+    def __init__(
+        self,
+        residency: Residency,
+        neighbourhood: Neighbourhood,
+        *,
+        ahead: bool = True,
+        idle: Callable[[], bool] | None = None,
+        clock: Callable[[], float] = time.perf_counter,
+    ) -> None:
+        """ahead: load what will be needed; without, only what is owed, and users' voxels are kept.  idle: called again
+        and again when there is nothing to be loaded, until it returns False; some milliseconds of work each time."""
+        self._residency, self._neighbourhood, self._clock, self._ahead = (
+            residency,
+            neighbourhood,
+            clock,
+            ahead,
+        )
+        self._work = threading.Event()
+        self._lock = threading.Lock()  # of starting and stopping
+        self._thread: threading.Thread | None = None
+        self._stopped = self._seen = False
+        self._idle = idle
+        self._failed: dict[int, float] = {}  # when; whoever asks for these tries again
+        residency.owed = self._wake
+
+    def __enter__(self) -> Self:
+        """The prefetcher itself."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Stop: a load that has begun is finished."""
+        self.stop()
+
+    def stop(self) -> None:
+        """Load nothing more, and wait for the thread."""
+        with self._lock:
+            self._stopped, thread = True, self._thread
+        self._residency.owed = None
+        self._work.set()
+        if thread is not None and thread is not threading.current_thread():
+            thread.join()
+        self._residency.kept = frozenset()
+
+    def saw(self, user: User, center: tuple[float, float, float], reach: float) -> bool:
+        """A user's avatar is around `center` [m], as far as `reach` [m]; whether it came there by no motion."""
+        jumped = self._neighbourhood.saw(user, self._clock(), center, reach)
+        self._seen = True
+        self._wake()
+        return jumped
+
+    def warm(self, center: tuple[float, float, float]) -> None:
+        """Look ahead for nobody, so that compilers are done; before anybody is seen."""
+        user = ("", "")
+        self._neighbourhood.saw(user, self._clock(), center, 1.0)
+        self._neighbourhood.plan(self._clock(), 0.0)
+        self._neighbourhood.kept(self._clock())
+        self._neighbourhood.nearness([0])
+        self._neighbourhood.leave(user)
+        self._neighbourhood.plan(self._clock(), 0.0)
+
+    def leave_client(self, client: str) -> None:
+        """Keep and load nothing more for a client's avatars."""
+        self._neighbourhood.leave_client(client)
+        self._seen = True
+        self._wake()
+
+    def _wake(self) -> None:
+        """There is work."""
+        if self._thread is None:
+            self._start()
+        if not self._work.is_set():
+            self._work.set()
+
+    def _start(self) -> None:
+        with self._lock:
+            if self._thread is None and not self._stopped:
+                self._thread = threading.Thread(target=self._run, name="solidcloud-prefetch", daemon=True)
+                self._thread.start()
+
+    def _run(self) -> None:
+        """The thread's work."""
+        queue: deque[tuple[int, float]] = deque()
+        need: dict[int, float] = {}
+        planned = -SILENCE
+        while True:
+            now = self._clock()
+            left = planned + PLAN_SECONDS - now
+            if self._seen and left <= 0:
+                self._seen, planned = False, now
+                need = self._plan(now)
+                queue = deque(need.items() if self._ahead else ())
+            if self._stopped:
+                return
+            if self._step(queue, need):
+                continue
+            if self._idle is not None:
+                self._residency.wait_for_nobody()
+                if not self._idle():
+                    self._idle = None
+                continue
+            if self._seen:
+                time.sleep(
+                    max(0.0, min(left, PLAN_SECONDS))
+                )  # until they may have moved far enough to look again
+                continue
+            # Nobody is seen any more: what they stood in is let go when their time is up.
+            if not self._work.wait(SILENCE if self._residency.kept else None):
+                self._seen = True
+            self._work.clear()
+
+    def _step(self, queue: deque[tuple[int, float]], need: dict[int, float]) -> bool:
+        """Load one voxel; False where there is none to be loaded."""
+        residency, row = self._residency, -1
+        try:
+            owed = residency.take_owed()
+            if owed is not None:
+                residency.load_ahead(owed, lambda _: True, owed=True)
+                return True
+            while queue:
+                row, at = queue.popleft()
+                if residency.is_resident(row) or self._clock() < self._failed.get(row, -math.inf) + SILENCE:
+                    continue
+                found = residency.load_ahead(row, _wanted_later(need, at))
+                if found is Ahead.NO_ROOM:
+                    queue.clear()  # what is wanted later would have none either
+                elif found is Ahead.FAILED:
+                    self._failed[row] = self._clock()
+                return True
+        except Exception:  # out of memory, say: who asks for the voxel will be told
+            log.exception("a voxel is not loaded ahead")
+            self._failed[row] = self._clock()
+            return True
+        return False
+
+    def _plan(self, now: float) -> dict[int, float]:
+        """What all users will need, soonest first: row -> seconds until then; what they stand in is kept."""
+        times = sorted(self._residency.load_times())
+        usual = times[int(USUAL * (len(times) - 1))] if times else 0.0
+        self._neighbourhood.expire(now, SILENCE)
+        wanted = merge(self._neighbourhood.plan(now, usual).values())
+        self._residency.kept = frozenset(self._neighbourhood.kept(now, SILENCE).tolist())
+        return dict(zip(wanted.rows.tolist(), wanted.need.tolist(), strict=True))

@@ -1,0 +1,165 @@
+"""Which voxel has which bytes of the arena, and which one goes for another.
+
+Not thread-safe: the residency calls it under its lock.
+"""
+
+from collections.abc import Callable, Collection
+from itertools import islice
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .arena import ArenaBuffer
+from .policies import Policy
+
+Which = Callable[[int], bool]
+
+
+class Room:
+    """The runs of the resident voxels, and of those being loaded.
+
+    offsets: row -> byte offset.  where: (v, 3) int64, see Residency.  used_bytes: of all runs.  evictions: voxels that
+    went for others; moved_bytes: of voxels that were moved to join free runs.
+    """
+
+    def __init__(
+        self, buffer: ArenaBuffer, sizes: list[int], where: NDArray[np.int64], policy: Policy
+    ) -> None:
+        """Nothing in `buffer` yet. sizes: of each row, rounded as the buffer does."""
+        self.buffer, self.sizes, self.where, self.policy = buffer, sizes, where, policy
+        self.offsets: dict[int, int] = {}
+        self.used_bytes = self.evictions = self.moved_bytes = 0
+        self._bytes = buffer.arena.halves.view(np.uint8)
+
+    def make(
+        self,
+        row: int,
+        may_go: Which,
+        may_move: Which,
+        gone: Callable[[int], None],
+        *,
+        scan: bool,
+        most: int | None = None,
+    ) -> bool:
+        """Room for a voxel that has none, at the cost of voxels that may go, in the policy's order.
+
+        may_go, may_move: of a row.  gone: told each row that went.  most: rows looked at to find those; None: all.
+        Where what may go is too little, nothing goes.
+        """
+        size = self.sizes[row]
+        offset = self.buffer.allocate(size)
+        if offset is None:
+            victims = self._enough(size, may_go, most)
+            if victims is None:
+                return False
+            for victim in victims:
+                self._evict(victim, gone)
+            offset = self._whole_run(size, may_move)
+            while offset is None:  # what is pinned lies in between
+                victim = next(filter(may_go, islice(self.policy.victims(), most)), -1)
+                if victim < 0:
+                    return False
+                self._evict(victim, gone)
+                offset = self._whole_run(size, may_move)
+        self.offsets[row] = offset
+        self.used_bytes += size
+        self.policy.added(row, size, scan=scan)
+        return True
+
+    def _enough(self, size: int, may_go: Which, most: int | None) -> list[int] | None:
+        """The voxels to go for a run of `size` bytes, in order; None where all that may are too little."""
+        free, found = self.buffer.total_bytes - self.used_bytes, list[int]()
+        candidates = filter(may_go, islice(self.policy.victims(), most))
+        while free < size:
+            row = next(candidates, -1)
+            if row < 0:
+                return None
+            found.append(row)
+            free += self.sizes[row]
+        return found
+
+    def _whole_run(self, size: int, may_move: Which) -> int | None:
+        """Move voxels together so that a run of `size` bytes becomes free, and take it; None where pins prevent it.
+
+        Of the stretches that hold so much free room and nothing that stays, the one with the least to be moved.
+        """
+        if self.buffer.total_bytes - self.used_bytes < size:
+            return None
+        runs = sorted((offset, row) for row, offset in self.offsets.items())
+        best, moves = None, 0
+        begin, at, free, held = 0, 0, 0, 0  # a stretch from run `begin` on; free and held bytes in it
+        first = 0
+        for number, (offset, row) in enumerate([*runs, (self.buffer.total_bytes, -1)]):
+            free += offset - at
+            while free >= size:
+                if best is None or held < moves:
+                    best, moves = (first, begin, number), held
+                # Shorten the stretch from its beginning.
+                if begin == number:
+                    break
+                start, gone = runs[begin]
+                free -= start - first
+                held -= self.sizes[gone]
+                first, begin = start + self.sizes[gone], begin + 1
+            if row < 0:
+                break
+            at = offset + self.sizes[row]
+            if may_move(row):
+                held += self.sizes[row]
+            else:
+                begin, first, free, held = number + 1, at, 0, 0
+        if best is None:
+            return None
+        to, begin, end = best
+        for offset, row in runs[begin:end]:
+            self._move(row, offset, to)
+            to += self.sizes[row]
+        return self.buffer.allocate(size)
+
+    def _move(self, row: int, offset: int, to: int) -> None:
+        """Move a voxel down; its runs are numbered from the arena's start, in words, words and halfwords."""
+        size = self.sizes[row]
+        if to == offset:
+            return
+        self._bytes[to : to + size] = self._bytes[offset : offset + size].copy()
+        self.buffer.release(offset, size)
+        self.buffer.take(to, size)
+        self.offsets[row] = to
+        shift = offset - to
+        self.where[row] -= (shift // 4, shift // 4, shift // 2)
+        self.moved_bytes += size
+
+    def _evict(self, row: int, gone: Callable[[int], None]) -> None:
+        self.evictions += 1
+        self.forget(row, evicted=True)
+        gone(row)
+
+    def leave_only(self, rows: Collection[int], gone: Callable[[int], None]) -> None:
+        """Let go of every voxel but these, and move them together; nobody may use or load any."""
+        for row in [row for row in self.offsets if row not in rows]:
+            self._evict(row, gone)
+        to = 0
+        for offset, row in sorted((offset, row) for row, offset in self.offsets.items()):
+            self._move(row, offset, to)
+            to += self.sizes[row]
+
+    def forget(self, row: int, *, evicted: bool = False) -> None:
+        """Give back a voxel's room."""
+        self.where[row] = -1
+        self.buffer.release(self.offsets.pop(row), self.sizes[row])
+        self.used_bytes -= self.sizes[row]
+        self.policy.removed(row, evicted=evicted)
+
+    def check(self) -> None:
+        """Assert that runs tile the buffer and the bytes add up."""
+        held = sum(self.sizes[row] for row in self.offsets)
+        runs = sorted(
+            [(offset, self.sizes[row]) for row, offset in self.offsets.items()] + self.buffer.free_runs()
+        )
+        assert held == self.used_bytes <= self.buffer.total_bytes, (held, self.used_bytes)
+        at = 0
+        for offset, size in runs:
+            assert offset == at, (offset, at)
+            at += size
+        assert at == self.buffer.total_bytes
+        assert sorted(self.policy.victims()) == sorted(self.offsets)

@@ -1,14 +1,17 @@
-"""Residency against a model: whatever is held in whatever order, what is promised is there and nothing is over."""
+"""Residency against a model: whatever is held or loaded ahead in whatever order, what is promised is there and nothing
+is over."""
 
 from contextlib import AbstractContextManager
 from typing import NamedTuple
 
+import numpy as np
 import pytest
 from fake_store import BLOCK, FakeStore
 from hypothesis import settings
 from hypothesis import strategies as st
-from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
-from solidcloud.server.residency import Held, Residency
+from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
+from solidcloud.server.policies import POLICIES, make_policy
+from solidcloud.server.residency import Ahead, Held, Residency
 
 SIZES = [1, 1, 2, 3, 1, 4, 2, 1, 5, 2]  # cache lines
 BUDGET = 9
@@ -40,7 +43,14 @@ class ResidencyMachine(RuleBasedStateMachine):
     def __init__(self) -> None:
         super().__init__()
         self.store = FakeStore(SIZES)
-        self.residency = Residency(self.store, BUDGET * BLOCK)
+        self.begin("lru")
+
+    @initialize(policy=st.sampled_from(POLICIES))
+    def begin(self, policy: str) -> None:
+        """An empty residency under a policy; to `distance`, greater rows are farther."""
+        order = make_policy(policy, BUDGET * BLOCK, lambda rows: np.array(rows, np.float64))
+        self.residency = Residency(self.store, BUDGET * BLOCK, order)
+        self.residency.owed = lambda: None
         self.residency._changed.wait = _refuse  # type: ignore[method-assign,assignment]
         self.open: list[Holding] = []
         self.corrupt: set[int] = set()
@@ -83,6 +93,38 @@ class ResidencyMachine(RuleBasedStateMachine):
         assert len(held.faults) == len(bad)
         assert all(f"voxel {row}" in fault for row, fault in zip(bad, held.faults, strict=True))
         self.open.append(Holding(context, rows, set(rows) - set(bad)))
+
+    @rule(rows=ROWS)
+    def stand(self, rows: list[int]) -> None:
+        """Users stand in these now."""
+        self.residency.kept = frozenset(rows)
+
+    @rule(row=st.integers(0, len(SIZES) - 1), sooner=ROWS, owed=st.booleans())
+    def load_ahead(self, row: int, sooner: list[int], owed: bool) -> None:
+        """Load a voxel that nobody waits for, others being wanted sooner: none of those goes, nor what is stood in."""
+        before = {other for other in range(len(SIZES)) if self.residency.where[other, 0] >= 0}
+        loads = self.store.loads[row]
+        found = self.residency.load_ahead(row, lambda other: other not in sooner, owed=owed)
+        after = {other for other in range(len(SIZES)) if self.residency.where[other, 0] >= 0}
+        stays = before & (set(sooner) | self.residency.kept | self._held())
+        assert stays <= after <= before | {row}
+        fault = self.store.faults.get(row)
+        bad = row in self.corrupt | (self.failed & self._held())
+        assert self.store.loads[row] - loads == (found is not Ahead.NO_ROOM and not bad and row not in before)
+        assert (found is Ahead.THERE) == (row in after)
+        if self.store.loads[row] > loads and fault == "corrupt":
+            self.corrupt.add(row)
+        elif self.store.loads[row] > loads and fault and row in self._held():
+            self.failed.add(row)
+        if found is Ahead.NO_ROOM:
+            free = BUDGET - sum(SIZES[other] for other in stays)
+            assert free < SIZES[row] or self._held() or stays, "there was room"
+
+    @rule()
+    def pay(self) -> None:
+        """What is owed is asked for by somebody once, and not there."""
+        row = self.residency.take_owed()
+        assert row is None or self.residency.where[row, 0] == -1
 
     @precondition(lambda self: self.open)
     @rule(data=st.data())

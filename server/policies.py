@@ -7,7 +7,6 @@ names every resident row, and those in use are passed over.
 
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
-from itertools import islice
 from typing import Protocol
 
 import numpy as np
@@ -158,6 +157,52 @@ class Distance:
                 yield rows[at]
 
 
+class _Queues:
+    """The queues of S3-FIFO that hold. small, main: row -> bytes, oldest first.  uses: row -> 0 to MOST_USES."""
+
+    def __init__(self, small_most: int) -> None:
+        self.small: OrderedDict[int, int] = OrderedDict()
+        self.main: OrderedDict[int, int] = OrderedDict()
+        self.uses: dict[int, int] = {}
+        self.small_bytes, self.small_most = 0, small_most
+
+    def copy(self) -> "_Queues":
+        """The same, on its own."""
+        other = _Queues(self.small_most)
+        other.small, other.main, other.uses = self.small.copy(), self.main.copy(), self.uses.copy()
+        other.small_bytes = self.small_bytes
+        return other
+
+    def remove(self, row: int) -> int | None:
+        """Take a row out. Returns its bytes if it was in the small queue, else None."""
+        del self.uses[row]
+        if row in self.main:
+            del self.main[row]
+            return None
+        size = self.small.pop(row)
+        self.small_bytes -= size
+        return size
+
+    def victim(self) -> int | None:
+        """Who goes next, None: nobody is there. What was used changes its place, as algorithm 1 has it."""
+        while self.small or self.main:
+            if self.small and (self.small_bytes >= self.small_most or not self.main):
+                row = next(iter(self.small))
+                if self.uses[row] <= 1:
+                    return row
+                size = self.small.pop(row)
+                self.small_bytes -= size
+                self.main[row] = size
+                self.uses[row] = 0
+            else:
+                row = next(iter(self.main))
+                if not self.uses[row]:
+                    return row
+                self.uses[row] -= 1
+                self.main.move_to_end(row)
+        return None
+
+
 class S3Fifo:
     """S3-FIFO, in bytes: a small queue for what is new, a main queue for what was used, a ghost for what was new once.
 
@@ -171,38 +216,34 @@ class S3Fifo:
 
     def __init__(self, budget_bytes: int) -> None:
         """Empty."""
-        self._small: OrderedDict[int, int] = OrderedDict()  # row -> bytes; oldest first
-        self._main: OrderedDict[int, int] = OrderedDict()
-        self._ghost: OrderedDict[int, int] = OrderedDict()
-        self._uses: dict[int, int] = {}
-        self._small_bytes = self._ghost_bytes = 0
-        self._small_most = int(budget_bytes * SMALL_SHARE)
-        self._ghost_most = budget_bytes - self._small_most  # as much as the main queue holds
+        small_most = int(budget_bytes * SMALL_SHARE)
+        self._queues = _Queues(small_most)
+        self._ghost: OrderedDict[int, int] = (
+            OrderedDict()
+        )  # row -> bytes, of what left the small queue unused
+        self._ghost_bytes, self._ghost_most = 0, budget_bytes - small_most  # as much as the main queue holds
 
     def added(self, row: int, size: int, *, scan: bool) -> None:
         """See `Policy`."""
-        self._uses[row] = 0
+        queues = self._queues
+        queues.uses[row] = 0
         if row in self._ghost and not scan:
             self._ghost_bytes -= self._ghost.pop(row)
-            self._main[row] = size
+            queues.main[row] = size
         else:
-            self._small[row] = size
-            self._small_bytes += size
+            queues.small[row] = size
+            queues.small_bytes += size
 
     def used(self, row: int, *, scan: bool) -> None:
         """See `Policy`."""
-        if not scan and self._uses[row] < MOST_USES:
-            self._uses[row] += 1
+        uses = self._queues.uses
+        if not scan and uses[row] < MOST_USES:
+            uses[row] += 1
 
     def removed(self, row: int, *, evicted: bool) -> None:
         """See `Policy`."""
-        del self._uses[row]
-        if row in self._main:
-            del self._main[row]
-            return
-        size = self._small.pop(row)
-        self._small_bytes -= size
-        if not evicted:
+        size = self._queues.remove(row)
+        if size is None or not evicted:
             return
         self._ghost_bytes += size - self._ghost.pop(row, 0)
         self._ghost[row] = size
@@ -210,30 +251,18 @@ class S3Fifo:
             self._ghost_bytes -= self._ghost.popitem(last=False)[1]
 
     def victims(self) -> Iterator[int]:
-        """See `Policy`. Rows change queues as the walk comes to them, as they would by evictions.
+        """See `Policy`. To find the first, rows change places as algorithm 1 has it; those behind are only looked up.
 
-        Rows that were named and not taken stay at the front of their queue; the walk goes on as if they had gone.
+        So whoever looks at all of them leaves the counts as they are, but for one eviction's. What comes after the
+        first takes a copy of the queues.
         """
-        named_small = named_main = named_bytes = 0
-        while True:
-            small_left = len(self._small) - named_small
-            main_left = len(self._main) - named_main
-            if small_left and (self._small_bytes - named_bytes >= self._small_most or not main_left):
-                row = next(islice(self._small, named_small, None))
-                if self._uses[row] > 1:
-                    self._small_bytes -= self._small[row]
-                    self._main[row] = self._small.pop(row)
-                    self._uses[row] = 0
-                    continue
-                named_small, named_bytes = named_small + 1, named_bytes + self._small[row]
+        row = self._queues.victim()
+        if row is None:
+            return
+        yield row
+        queues = self._queues.copy()
+        while row is not None:
+            queues.remove(row)
+            row = queues.victim()
+            if row is not None:
                 yield row
-            elif main_left:
-                row = next(islice(self._main, named_main, None))
-                if self._uses[row]:
-                    self._uses[row] -= 1
-                    self._main.move_to_end(row)
-                    continue
-                named_main += 1
-                yield row
-            else:
-                return

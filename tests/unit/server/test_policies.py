@@ -92,21 +92,32 @@ class NaiveS3Fifo:
         self.main = [entry for entry in self.main if entry[0] != row]
 
     def next_after(self, named: list[int]) -> int | None:
-        while True:
-            small = [entry for entry in self.small if entry[0] not in named]
-            main = [entry for entry in self.main if entry[0] not in named]
-            if not small and not main:
-                return None
-            if small and (sum(entry[1] for entry in small) >= BUDGET // 10 or not main):
-                if small[0][2] <= 1:
-                    return small[0][0]
-                self.small.remove(small[0])
-                self.main.append([*small[0][:2], 0])
+        if not named:
+            return self.evict_next()
+        looked_up = NaiveS3Fifo()
+        looked_up.small = [list(entry) for entry in self.small]
+        looked_up.main = [list(entry) for entry in self.main]
+        for row in named:
+            assert looked_up.evict_next() == row
+            looked_up.removed(row, False)
+        return looked_up.evict_next()
+
+    def evict_next(self) -> int | None:
+        """Who goes next; others move on the way."""
+        while self.small or self.main:
+            if self.small and (sum(size for _, size, _ in self.small) >= BUDGET // 10 or not self.main):
+                row, size, uses = self.small[0]
+                if uses <= 1:
+                    return row
+                self.small.pop(0)
+                self.main.append([row, size, 0])
             else:
-                if main[0][2] == 0:
-                    return main[0][0]
-                self.main.remove(main[0])
-                self.main.append([*main[0][:2], main[0][2] - 1])
+                row, size, uses = self.main[0]
+                if uses == 0:
+                    return row
+                self.main.pop(0)
+                self.main.append([row, size, uses - 1])
+        return None
 
 
 Naive = NaiveLru | NaiveDistance | NaiveS3Fifo
@@ -225,6 +236,26 @@ def test_what_was_used_twice_outlives_what_was_new_once() -> None:
     policy.added(3, 100, scan=True)
     policy.added(4, 100, scan=False)
     assert list(policy.victims()) == [3, 4, 1, 2]
+
+
+@pytest.mark.parametrize("name", POLICIES)
+def test_to_look_at_all_victims_changes_nothing(name: str) -> None:
+    """Whoever checks, or asks what is resident, walks all of them."""
+    rng = np.random.default_rng(4)
+    looked_at, left_alone = make_policy(name, BUDGET, near), make_policy(name, BUDGET, near)
+    for policy in (looked_at, left_alone):
+        for row in range(20):
+            policy.added(row, 40, scan=False)
+    for row in rng.integers(0, 20, 60).tolist():
+        looked_at.used(row, scan=False)
+        left_alone.used(row, scan=False)
+    first = next(looked_at.victims())
+    assert next(left_alone.victims()) == first
+    order = list(looked_at.victims())
+    assert list(looked_at.victims()) == order == list(left_alone.victims()) and order[0] == first
+    for victim in order:
+        assert next(left_alone.victims()) == victim
+        left_alone.removed(victim, evicted=True)
 
 
 def test_without_users_distance_is_lru() -> None:

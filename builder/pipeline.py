@@ -104,7 +104,7 @@ def build_archive(
     begin = time.perf_counter()
     target = Path(target)
     stages = Stages(progress or Silent())
-    with made_parents(target), locked(target), _disk_errors(target):
+    with made_parents(target), locked(target), _machine_errors(target):
         inputs = open_inputs(paths, config)
         what = described(inputs, config)
         recover(target)
@@ -286,12 +286,17 @@ def _summary(
 
 
 @contextmanager
-def _disk_errors(target: Path) -> Iterator[None]:
-    """Name the disk, and what to do, where it has failed; what is done stays in the hidden folder."""
+def _machine_errors(target: Path) -> Iterator[None]:
+    """Name the disk or the memory, and what to do, where it has failed; what is done stays in the hidden folder."""
+    folder = building_folder(target)
     try:
         yield
+    except MemoryError as error:
+        raise SolidcloudError(
+            f"{target}: out of memory ({error or 'no more is said'}): give fewer --jobs or a smaller --memory, or stop "
+            f"other programs, then give the same command again: it goes on from what is done, in {folder}"
+        ) from error
     except OSError as error:
-        folder = building_folder(target)
         # HDF5 puts the number into its text alone.
         full = error.errno in (errno.ENOSPC, errno.EDQUOT) or f"errno = {errno.ENOSPC}" in str(error)
         found = "no space left on the disk" if full else str(error)

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from ..schemas.errors import BadRequestError, ScanError
 from ..schemas.new_file import sync_folder
+from .passing import raise_passing
 from .progress import Progress, Silent
 from .sources import METRES, TURNS, Scan, header_bounds, open_scans, placed, scan_files, sha256_of
 
@@ -196,16 +197,18 @@ def read_scan_list(path: Path) -> list[ScanEntry]:
     Raises BadRequestError that names the file, the scan and the field, what was found and what was expected.
     """
     path = Path(path)
+    text = ""
     try:
-        with path.open("rb") as file:
-            document = tomllib.load(file)
+        text = path.read_bytes().decode()
+        document = tomllib.loads(text)
     except (OSError, ValueError) as error:
+        found = _long_number(text) or error
         raise BadRequestError(
-            f"{path}: {error}, expected a list of scans: correct it, or write it with `solidcloud inspect`"
+            f"{path}: {found}, expected a list of scans: correct it, or write it with `solidcloud inspect`"
         ) from error
     unknown = sorted(set(document) - {"version", "scan"})
     if unknown or document.get("version", VERSION) != VERSION or not isinstance(document.get("scan"), list):
-        found = f"unknown {unknown[0]}" if unknown else f"version {document.get('version')}"
+        found = f"unknown {unknown[0]}" if unknown else f"version {_shown(document.get('version'))}"
         raise BadRequestError(f"{path}: {found}, expected version = {VERSION} and a [[scan]] for each scan")
     entries = [_entry(path, number, table) for number, table in enumerate(document["scan"], 1)]
     seen: dict[tuple[str, int], int] = {}
@@ -217,6 +220,24 @@ def read_scan_list(path: Path) -> list[ScanEntry]:
                 "expected each scan once: remove one"
             )
     return entries
+
+
+def _long_number(text: str) -> str:
+    """Where a number has more digits than Python reads, of which its own error does not say the line; or ""."""
+    most = sys.get_int_max_str_digits()
+    found = re.search(rf"[0-9_]{{{most + 1},}}", text) if most else None
+    if found is None:
+        return ""
+    line = text.count("\n", 0, found.start()) + 1
+    return f"a number of {len(found[0])} digits (at line {line})"
+
+
+def _shown(value: Any) -> str:
+    """A value for a reader, its beginning."""
+    try:
+        return str(value)[:80]
+    except ValueError:  # a hexadecimal number may have any length; as a decimal one it may not
+        return "a number of very many digits"
 
 
 class _Field(NamedTuple):
@@ -242,7 +263,7 @@ def _is_pose(value: Any) -> bool:
 
 
 def _is_whole(value: Any) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and value >= 0
+    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 1 << 63
 
 
 _TEXT = _Field("text in quotes", lambda value: isinstance(value, str))
@@ -250,14 +271,14 @@ _FIELDS = {
     "path": _Field(
         "the path of a file, seen from the list", lambda v: isinstance(v, str) and v and "\0" not in v
     ),
-    "index": _Field("a whole number, 0 or more", _is_whole),
+    "index": _Field("a whole number, 0 or more, of 63 bits", _is_whole),
     "use": _Field("true or false", lambda value: isinstance(value, bool)),
     "units": _Field(" or ".join(METRES), lambda value: isinstance(value, str) and value in METRES),
     "scale": _Field("a number above 0", lambda value: _is_number(value) and value > 0),
     "up": _Field(" or ".join(TURNS), lambda value: isinstance(value, str) and value in TURNS),
     "pose": _Field("four rows of four numbers that move points, the last 0 0 0 1", _is_pose),
     "format": _TEXT,
-    "count": _Field("a whole number, 0 or more", _is_whole),
+    "count": _Field("a whole number, 0 or more, of 63 bits", _is_whole),
     "low": _Field("three numbers", lambda value: _is_numbers(value, 3)),
     "high": _Field("three numbers", lambda value: _is_numbers(value, 3)),
     "crs": _TEXT,
@@ -279,7 +300,7 @@ def _entry(path: Path, number: int, table: Any) -> ScanEntry:
             )
         if not _FIELDS[field].good(value):
             raise BadRequestError(
-                f"{where}: {field} is {str(value)[:80]!r}, expected {_FIELDS[field].expected}: correct it"
+                f"{where}: {field} is {_shown(value)!r}, expected {_FIELDS[field].expected}: correct it"
             )
     if ("low" in table) != ("high" in table):
         raise BadRequestError(f"{where}: low or high alone, expected both or none: remove it")
@@ -305,7 +326,7 @@ def inputs(paths: Sequence[Path], spacing: float | None = None) -> list[Input]:
 
     spacing: of sampled meshes [m].  A file that cannot be opened is kept with its fault, for all of them to be named.
     Raises ScanError for a path that does not exist and a folder without scans, BadRequestError for a broken list and
-    for a scan that is named twice.
+    for a scan that is named twice, OSError where a file cannot be opened now (passing.py).
     """
     found: list[Input] = []
     for path in map(Path, paths):
@@ -360,6 +381,7 @@ def _opened(path: Path, entries: list[ScanEntry] | None, spacing: float | None) 
             scans.append(scan)
         return Input(path, scans)
     except ScanError as error:
+        raise_passing(error, path)
         region = header_bounds(path)
         moved = entries is not None and any(
             (entry.units, entry.up, entry.scale) != ("m", "z", 1.0) or entry.pose is not None

@@ -3,7 +3,6 @@
 A scan that can seek is surveyed in ranges of its points, in any process, and its file's SHA-256 in another.
 """
 
-import errno
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -17,6 +16,7 @@ from ..schemas.errors import ScanError
 from ..schemas.voxel_grid import MAX_COORDINATE, MAX_VOXEL_STEPS, MIN_STEP, Lattice, make_lattice
 from .config import DEFAULT_STEP, BuildConfig
 from .kernels.spool import usable_bounds
+from .passing import raise_passing
 from .sources import NOT_FINITE, Scan, sha256_of
 
 # A header's bounds are believed when no point lies farther outside [m]: they are rounded, but not by more.
@@ -61,13 +61,6 @@ class Survey:
     def unclean(self) -> int:
         """Points, or triangles of a sampled mesh, that were left out because they are not finite."""
         return self.dropped.get(NOT_FINITE, 0)
-
-
-# Errors of a disk, a network or a machine with too much to do: a scan that is left out for one is left out for good.
-PASSING = frozenset(
-    {errno.EIO, errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.ENODEV, errno.ENXIO, errno.ESTALE, errno.ETIMEDOUT,
-     errno.ENOTCONN, errno.EHOSTDOWN, errno.EHOSTUNREACH, errno.EREMOTEIO}
-)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,7 +112,7 @@ def survey_range(unit: RangeUnit) -> Part:
             count += usable_bounds(block.xyz, MAX_COORDINATE, low, high)
             seen += len(block.xyz)
     except ScanError as error:
-        _raise_passing(error, unit.scan.path)
+        raise_passing(error, unit.scan.path)
         fault = str(error)
     return Part(
         unit.start,
@@ -148,15 +141,8 @@ def hash_file(path: Path) -> tuple[str, str]:
     try:
         return sha256_of(path), ""
     except ScanError as error:
-        _raise_passing(error, path)
+        raise_passing(error, path)
         return "", str(error)
-
-
-def _raise_passing(error: ScanError, path: Path) -> None:
-    """Raise OSError where a file could not be read for a reason that may pass, and that is no fault of the scan."""
-    cause = error.__cause__
-    if isinstance(cause, OSError) and cause.errno in PASSING:
-        raise OSError(cause.errno, cause.strerror, str(path)) from None
 
 
 def joined(scan: Scan, parts: Sequence[Part], sha256: tuple[str, str]) -> Survey:

@@ -4,6 +4,7 @@ A reader is a subclass of Scan that implements `_read`. It holds no open file, o
 so that scans can be listed by the thousand and sent to other processes.
 """
 
+import errno
 import hashlib
 import importlib
 from abc import ABC, abstractmethod
@@ -17,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...schemas.errors import ScanError
+from ...schemas.errors import ScanError, SolidcloudError
 
 # A block of 2^18 points is 6 MiB of float64: large enough that the cost of a Python loop round is lost in
 # it, small enough that a few of them count as nothing beside any --memory.
@@ -201,12 +202,17 @@ def scan_error(path: Path, found: str, expected: str, what_to_do: str) -> ScanEr
 
 @contextmanager
 def library_errors(path: Path) -> Iterator[None]:
-    """Turn whatever a format's library or the file system raises into a ScanError."""
+    """Turn whatever a format's library or the file system raises into a ScanError; that memory ran out is none."""
     try:
         yield
-    except ScanError:
+    except SolidcloudError:
         raise
     except BaseException as error:
+        if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM):
+            raise SolidcloudError(
+                f"{path}: out of memory while it was read, expected a few blocks of points to fit: give fewer --jobs "
+                "or stop other programs, then the same command again; where that does not help, leave it out"
+            ) from error
         # A panic inside lazrs (Rust) is a BaseException of its own and not an Exception.
         if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
             raise

@@ -374,20 +374,43 @@ def test_a_scan_that_changes_while_it_is_read_is_no_archive(
     assert content(tmp_path / "hall") == content(tmp_path / "judge")
 
 
-def test_a_disk_that_fails_for_a_moment_leaves_no_scan_out(
-    scans: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("failure", "said"),
+    [
+        (OSError(5, "Input/output error"), r"Input/output error: '.*b\.xyz'.*same command again"),
+        (MemoryError(), r"b\.xyz: out of memory.*fewer --jobs.*same command again"),
+    ],
+)
+def test_a_machine_that_fails_for_a_moment_leaves_no_scan_out(
+    failure: Exception, said: str, scans: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fails(scan: Scan, *_: Any) -> Any:
         with library_errors(scan.path):
-            raise OSError(5, "Input/output error")
+            raise failure
         yield
 
     with monkeypatch.context() as patch:
         patch.setattr(type(inputs(scans)[1].scans[0]), "_read", fails)
-        with pytest.raises(SolidcloudError, match=r"Input/output error: '.*b\.xyz'.*same command again"):
+        with pytest.raises(SolidcloudError, match=said):
             build(tmp_path / "hall", scans, skip_bad=True)
     summary = build(tmp_path / "hall", scans, skip_bad=True)
     assert (summary.points, summary.faults) == (400, ())
+
+
+@pytest.mark.parametrize("stage", ["survey_scans", "build_shards"])
+def test_that_memory_ran_out_is_said_and_the_same_command_goes_on(
+    stage: str, scans: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(
+            pipeline, stage, lambda *_: (_ for _ in ()).throw(MemoryError("Unable to allocate 9 GiB"))
+        )
+        with pytest.raises(
+            SolidcloudError, match=r"hall: out of memory \(Unable to.*give fewer --jobs.*goes on"
+        ):
+            build(tmp_path / "hall", scans)
+    assert building_folder(tmp_path / "hall").exists()
+    assert build(tmp_path / "hall", scans).points == 400
 
 
 OTHER = {

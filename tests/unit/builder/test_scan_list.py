@@ -14,8 +14,9 @@ from formats import glb_document, glb_vertices, ptx_scan, write_e57, write_glb
 from solidcloud.builder import scan_list
 from solidcloud.builder.scan_list import ScanEntry, inputs, inspect, read_scan_list, write_scan_list
 from solidcloud.builder.sources import sha256_of
+from solidcloud.builder.sources.scan import library_errors
 from solidcloud.schemas.archive import Archive
-from solidcloud.schemas.errors import BadRequestError, ScanError
+from solidcloud.schemas.errors import BadRequestError, ScanError, SolidcloudError
 from solidcloud.server.cli import run
 
 POSE = np.array([[0.0, -1, 0, 10], [1, 0, 0, 20], [0, 0, 1, 30], [0, 0, 0, 1]])
@@ -194,6 +195,47 @@ def test_a_number_that_no_float_holds_is_refused(folder: Path) -> None:
     path.write_text(f"[[scan]]\npath = 'a.las'\nscale = 1{'0' * 400}\n")
     with pytest.raises(BadRequestError, match=r"scale is '1000.*, expected a number above 0"):
         read_scan_list(path)
+
+
+LONG = {
+    "decimal": ("scale = " + "9" * 5000, r"a number of 5000 digits \(at line 4\), expected a list of scans"),
+    "hexadecimal": (
+        "scale = 0x" + "f" * 5000,
+        "scan 1 .*: scale is 'a number of very many digits', expected a num",
+    ),
+    "in a list": (
+        f"low = [0x{'f' * 5000}, 0, 0]",
+        "low is 'a number of very many digits', expected three num",
+    ),
+    "index": ("index = " + "9" * 400, r"index is '9{80}', expected a whole number, 0 or more, of 63 bits"),
+    "count": ("count = 0x" + "f" * 5000, "count is 'a number of very many digits', expected a whole number"),
+}
+
+
+@pytest.mark.parametrize("name", LONG)
+def test_a_number_without_end_is_refused_by_its_place(name: str, tmp_path: Path) -> None:
+    line, message = LONG[name]
+    path = tmp_path / "scans.toml"
+    path.write_text(f"version = 1\n[[scan]]\npath = 'a.las'\n{line}\n")
+    with pytest.raises(BadRequestError, match=message):
+        read_scan_list(path)
+    path.write_text(f"version = 0x{'f' * 5000}\n")
+    with pytest.raises(BadRequestError, match=r"version a number of very many digits, expected version = 1"):
+        read_scan_list(path)
+
+
+@pytest.mark.parametrize("error", [OSError(5, "Input/output error"), MemoryError()])
+def test_a_file_that_cannot_be_opened_just_now_is_not_left_out(
+    error: Exception, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(path: Path, **_: Any) -> Any:
+        with library_errors(path):
+            raise error
+
+    monkeypatch.setattr(scan_list, "open_scans", fails)
+    with pytest.raises((OSError, SolidcloudError), match=r"Input/output error|out of memory") as caught:
+        inputs([folder / "a.las"])
+    assert not isinstance(caught.value, ScanError)
 
 
 def test_a_missing_file_of_a_list_is_a_fault_and_of_the_command_an_error(folder: Path) -> None:

@@ -21,7 +21,7 @@ from solidcloud.builder.survey import (
     survey_range,
     survey_scan,
 )
-from solidcloud.schemas.errors import BadRequestError, ScanError
+from solidcloud.schemas.errors import BadRequestError, ScanError, SolidcloudError
 from solidcloud.schemas.voxel_grid import MAX_COORDINATE
 
 
@@ -126,6 +126,23 @@ def test_what_the_reader_leaves_out_is_counted_with_what_is_not_finite(tmp_path:
     assert survey.dropped == {"not finite": 3, "invalid": 5}
     assert survey.unclean == 3
     assert survey_scan(listed(tmp_path, xyz[1:])).dropped == {}
+
+
+@pytest.mark.parametrize("error", [MemoryError("std::bad_alloc"), OSError(12, "no")])
+@pytest.mark.parametrize("where", ["survey_range", "hash_file"])
+def test_that_memory_ran_out_is_no_fault_of_the_scan(
+    where: str, error: Exception, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Starved(Listed):
+        def _read(self, block_points: int) -> Iterator[Block]:
+            yield from super()._read(block_points)
+            raise error
+
+    scan = Starved(listed(tmp_path, np.ones((4, 3))).path, np.ones((4, 3)), 50)
+    monkeypatch.setattr("hashlib.file_digest", lambda *_: (_ for _ in ()).throw(error))
+    with pytest.raises(SolidcloudError, match=r"listed\.xyz: out of memory.*give fewer --jobs") as caught:
+        survey_range(ranges(scan, 4)[0]) if where == "survey_range" else hash_file(scan.path)
+    assert not isinstance(caught.value, ScanError)
 
 
 def test_a_file_that_cannot_be_hashed_is_at_fault(tmp_path: Path) -> None:

@@ -9,7 +9,10 @@ import numpy as np
 import pytest
 import scans
 from fake_store import BLOCK, FakeStore
+from solidcloud.schemas.answers import Verdict
 from solidcloud.schemas.errors import BadRequestError
+from solidcloud.schemas.requests import QuestionOptions
+from solidcloud.server.policies import POLICIES
 from solidcloud.server.residency import Held, Residency
 from solidcloud.server.scene import Scene
 
@@ -197,7 +200,10 @@ def test_check_finds_what_is_broken(broken: str) -> None:
         residency.check()
 
 
-def test_eight_threads_and_a_tiny_budget_change_no_answer(tmp_path: Path, rng: np.random.Generator) -> None:
+@pytest.mark.parametrize("policy", POLICIES)
+def test_eight_threads_and_a_tiny_budget_change_no_answer(
+    tmp_path: Path, rng: np.random.Generator, policy: str
+) -> None:
     case = cases.build(tmp_path, scans.make_scan("noise", 9, 1500), voxel=0.4, leaf=8)
     avatar = rng.uniform(-0.2, 0.2, (40, 3))
     poses = cases.near_poses(rng, case.points, avatar, 160, 0.04)
@@ -207,18 +213,31 @@ def test_eight_threads_and_a_tiny_budget_change_no_answer(tmp_path: Path, rng: n
     parts = [np.sort(part) for part in np.array_split(rng.permutation(len(poses)), 110)] * 3
     with Scene.open(case.archive) as scene:
         everything = scene.info().resident_bytes
-    with Scene.open(case.archive, budget_bytes=everything // 6) as scene:
-        scene.add_avatar("avatar", avatar, 0.005)
-        over = []
+    with Scene.open(case.archive, budget_bytes=everything // 6, policy=policy) as scene:
+        over, unknown = [], []
 
-        def ask(part: np.ndarray) -> np.ndarray:
-            verdict = scene.collide("avatar", poses[part]).verdict
-            over.append(scene.residency.resident_bytes > everything // 6)
-            return verdict
+        def ask(number: int) -> list[int]:
+            """A request of a user of its own thread; every third one does not wait."""
+            part, client = parts[number], str(threading.get_ident())
+            scene.add_avatar("avatar", avatar, 0.005, client=client)
+            options: QuestionOptions = {"budget_ms": 0.0} if number % 3 == 0 else {}
+            answers = scene.collide("avatar", poses[part], client=client, **options)
+            over.append(scene.stats().resident_bytes + scene.stats().coarse_bytes > everything // 6)
+            late = answers.verdict == Verdict.UNKNOWN
+            unknown.append(int(late.sum()))
+            assert not late.any() or options
+            assert answers.late or not late.any() or not answers.misses
+            return np.where(late, expected[part], answers.verdict).tolist()
 
         with ThreadPoolExecutor(8) as pool:
-            verdicts = list(pool.map(ask, parts))
+            verdicts = list(pool.map(ask, range(len(parts))))
         scene.residency.check()
-        assert scene.residency.evictions > 0 and not any(over)
+        stats = scene.stats()
+        assert scene.residency.evictions > 0 and not any(over) and sum(unknown) > 0
+        assert stats.requests == len(parts) and stats.unknown == sum(unknown)
+        assert sum(user.requests for user in stats.users) == stats.requests
+        assert sum(user.misses for user in stats.users) <= stats.misses
+        assert stats.prefetched == stats.used + stats.wasted + len(scene.residency._fresh)
+        assert (stats.prefetched > 0) == (policy != "lru")
     for part, verdict in zip(parts, verdicts, strict=True):
-        assert verdict.tolist() == expected[part].tolist()
+        assert verdict == expected[part].tolist()

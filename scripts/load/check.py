@@ -1,0 +1,45 @@
+"""Whether what the server said under load is right: held against a scene in this process with everything resident."""
+
+from pathlib import Path
+
+import numpy as np
+from solidcloud.builder.made.figure import figure_points
+from solidcloud.schemas.answers import Verdict
+from solidcloud.server.report.walkthrough import open_whole
+from solidcloud.server.scene import Scene
+
+from .frames import ANSWERED, Frames
+from .traces import Trace
+from .users import AVATAR
+
+
+class Judge:
+    """The undisturbed scene. Opened with the first question, closed by `close`."""
+
+    def __init__(self, archive: Path, points: int) -> None:
+        """points: of the avatar."""
+        self._archive, self._points = archive, points
+        self._scene: Scene | None = None
+
+    def verdicts(self, trace: Trace) -> np.ndarray:
+        """What is true of each pose (n,), asked in one call for each user."""
+        if self._scene is None:
+            self._scene = open_whole(self._archive)
+            self._scene.add_avatar(AVATAR, figure_points(self._points))
+        found = np.full(len(trace.user), -1)
+        for user in np.unique(trace.user):
+            own = trace.user == user
+            found[own] = self._scene.collide(AVATAR, trace.pose[own]).verdict
+        return found
+
+    def close(self) -> None:
+        """Close the scene, if it was opened."""
+        scene, self._scene = self._scene, None
+        if scene is not None:
+            scene.close()
+
+
+def wrong(frames: Frames, truth: np.ndarray) -> np.ndarray:
+    """Frames whose verdict is neither `UNKNOWN` nor the true one: their numbers. What was not answered says nothing."""
+    said = (frames.status == ANSWERED) & (frames.verdict != Verdict.UNKNOWN)
+    return np.flatnonzero(said & (frames.verdict != truth))

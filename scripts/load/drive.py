@@ -1,0 +1,204 @@
+"""One run: a real server, N users in processes of their own, and what became of every frame; beside it a bare echo."""
+
+import os
+import subprocess
+import threading
+import time
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+from solidcloud.builder.made.figure import figure_points
+from solidcloud.schemas.messages import CollideRequest, encode
+from solidcloud.server.client import Client
+
+from . import frames as results
+from . import server, traces
+from .frames import Frames
+from .server import Memory
+from .traces import Trace
+from .users import AVATAR, LAST_ANSWERS, Job
+
+LEAD = 0.5  # from the time users are told to start until the first frame is due [s]
+STRIP = 12  # pictures of what is resident, evenly over a run
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What all runs have in common. work: a folder for logs and what processes exchange.  points: of the avatar.
+
+    processes: of users, at most.  budget_ms: of each question; None: an answer waits for its voxels.
+    """
+
+    archive: Path
+    work: Path
+    points: int = 3617
+    processes: int = 2
+    budget_ms: float | None = None
+
+
+@dataclass
+class Outcome:
+    """One run. trace: what was asked in the end.  start: when the first frame could be due, time.monotonic() [s].
+
+    empty: RSS of the server when it was warm and its cache empty [bytes].  memory: of the server from then on.
+    strip: pictures of what was resident: seconds since the start, keys.  stats: what the server said of its cache in
+    the end (`StatsAnswer`); None: nothing.  faults: what went wrong in its words, some of them.
+    """
+
+    trace: Trace
+    frames: Frames
+    start: float
+    ready_seconds: float = 0.0
+    empty: int = 0
+    memory: Memory = field(default_factory=Memory)
+    strip: list[tuple[float, NDArray[np.uint64]]] = field(default_factory=list)
+    stats: Any = None
+    faults: list[str] = field(default_factory=list)
+
+
+def run(setup: Setup, trace: Trace, budget: int, policy: str | None, adversary: bool = False) -> Outcome:
+    """Serve the archive with a cache of `budget` bytes and drive the users of a trace.
+
+    adversary: the trace says who asks when; what, the adversaries do. ServerError: something did not start.
+    """
+    log = setup.work / "server.log"
+    with server.serving(setup.archive, budget, policy, log) as served, ExitStack() as stack:
+        watcher = server.Watcher(served.process)
+        watcher.look(True)
+        empty = watcher.memory.rss[-1]
+        watcher.start()
+        job = Job(served.endpoint, "", "", server.SCENE, setup.points, setup.budget_ms)
+        if adversary:
+            job = msgspec.structs.replace(job, archive=str(setup.archive), budget=budget)
+        # Adversaries of one process share what they know: in several none would know what is evicted.
+        users = Users(stack, setup, trace, job, 1 if adversary else setup.processes)
+        strip = stack.enter_context(Strip(served.endpoint, float(trace.time[-1])))
+        start = users.go()
+        strip.begin(start)
+        found = users.results()
+        stats = strip.end()
+        memory = watcher.stop()
+    pose = np.concatenate([more["pose"] for _, more in found])
+    user = np.concatenate([frames.user for frames, _ in found])
+    due = np.concatenate([frames.due for frames, _ in found])
+    frames = results.merged([frames for frames, _ in found])
+    asked = Trace(frames.user, trace.time, pose[np.lexsort((user, due))])
+    faults = [str(text) for _, more in found for text in more["faults"]]
+    return Outcome(asked, frames, start, served.seconds, empty, memory, strip.pictures, stats, faults)
+
+
+def run_echo(setup: Setup, trace: Trace, request_bytes: int, reply_bytes: int) -> Outcome:
+    """The same load on a bare echo: as many sessions, as many questions at the same times, as many bytes."""
+    with server.echoing(reply_bytes, setup.work / "echo.log") as endpoint, ExitStack() as stack:
+        job = Job(endpoint, "", "", request_bytes=request_bytes)
+        users = Users(stack, setup, trace, job, setup.processes)
+        start = users.go()
+        found = users.results()
+    faults = [str(text) for _, more in found for text in more["faults"]]
+    return Outcome(trace, results.merged([frames for frames, _ in found]), start, faults=faults)
+
+
+def message_sizes(setup: Setup, trace: Trace, budget: int) -> tuple[int, int]:
+    """Bytes of a question and of its answer, as they are sent."""
+    pose = trace.pose[:1]
+    request = CollideRequest(AVATAR, pose, 0.0, budget_ms=setup.budget_ms)
+    with (
+        server.serving(setup.archive, budget, None, setup.work / "server.log") as served,
+        Client(served.endpoint, scene=server.SCENE) as client,
+    ):
+        client.add_avatar(AVATAR, figure_points(setup.points))
+        return len(encode(request)), len(encode(client.collide(AVATAR, pose)))
+
+
+class Users:
+    """The processes of users, whose sessions are open once this is made."""
+
+    def __init__(self, stack: ExitStack, setup: Setup, trace: Trace, job: Job, processes: int) -> None:
+        """stack: ends the processes."""
+        names = np.unique(trace.user)
+        count = max(1, min(processes, len(names)))
+        self._length, self._processes, self._outs = float(trace.time[-1]), [], []
+        commands = []
+        for number in range(count):
+            paths = {what: str(setup.work / f"users-{number}.{what}.npz") for what in ("trace", "out")}
+            traces.save(Path(paths["trace"]), traces.of_users(trace, names[number::count]))
+            Path(paths["out"]).unlink(missing_ok=True)
+            path = setup.work / f"users-{number}.json"
+            path.write_bytes(msgspec.json.encode(msgspec.structs.replace(job, **paths)))
+            commands.append((server.script("users", str(path)), setup.work / f"users-{number}.log"))
+            self._outs.append(Path(paths["out"]))
+        for command, log in commands:
+            self._processes.append(stack.enter_context(server.running(command, log, "ready")))
+
+    def go(self) -> float:
+        """Tell all when to start; returns it."""
+        start = time.monotonic() + LEAD
+        for process in self._processes:
+            process.stdin.write(f"{start!r}\n")
+            process.stdin.flush()
+        return start
+
+    def results(self) -> list[tuple[Frames, dict[str, NDArray]]]:
+        """Wait until all are done. ServerError: one of them failed."""
+        deadline = time.monotonic() + LEAD + self._length + 2 * LAST_ANSWERS + 30.0
+        for process, out in zip(self._processes, self._outs, strict=True):
+            try:
+                code: Any = process.wait(max(1.0, deadline - time.monotonic()))
+            except subprocess.TimeoutExpired:
+                code = "none: still at work"
+            if code != 0:
+                said = out.with_name(out.name.replace(".out.npz", ".log")).read_text(errors="replace")
+                raise server.ServerError(f"a process of users ended with exit code {code}: {said[-2000:]}")
+        return [results.load(out) for out in self._outs]
+
+
+class Strip:
+    """Pictures of what is resident, taken from a server that says so; none of another."""
+
+    def __init__(self, endpoint: str, length: float) -> None:
+        """length: of the run [s]."""
+        self.pictures: list[tuple[float, NDArray[np.uint64]]] = []
+        self._length = length
+        self._done = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._client = Client(endpoint, scene=server.SCENE)
+
+    def __enter__(self) -> "Strip":
+        self._client.__enter__()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._done.set()
+        if self._thread is not None:
+            self._thread.join()
+        self._client.close()
+
+    def begin(self, start: float) -> None:
+        """Take them from `start` on, in a thread."""
+        self._thread = threading.Thread(target=self._take, args=(start,), daemon=True)
+        self._thread.start()
+
+    def _take(self, start: float) -> None:
+        for number in range(STRIP):
+            at = (number + 0.5) / STRIP * self._length
+            if self._done.wait(max(0.0, start + at - time.monotonic())):
+                return
+            stats = server.ask_stats(self._client)
+            if stats is None:
+                return
+            self.pictures.append((at, np.array(stats.keys, np.uint64)))
+
+    def end(self) -> Any:
+        """Take no more; what the server says in the end, None: nothing."""
+        self._done.set()
+        return server.ask_stats(self._client)
+
+
+def cores() -> int:
+    """How many this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

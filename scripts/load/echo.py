@@ -1,0 +1,25 @@
+"""A process with nothing but zenoh, that answers whatever is asked below `echo/` with as many bytes as it was told.
+
+Arguments: the endpoint to listen on, and the bytes of a reply. It prints `ready`, and ends when its input does.
+"""
+
+import json
+import sys
+
+import zenoh
+
+
+def main() -> None:
+    """Answer until the standard input ends."""
+    config = zenoh.Config()
+    config.insert_json5("listen/endpoints", json.dumps([sys.argv[1]]))
+    config.insert_json5("scouting/multicast/enabled", "false")
+    reply = bytes(int(sys.argv[2]))
+
+    def echo(query: zenoh.Query) -> None:
+        with query:
+            query.reply(query.key_expr, reply)
+
+    with zenoh.open(config) as session, session.declare_queryable("echo/*", echo):
+        print("ready", flush=True)
+        sys.stdin.read()

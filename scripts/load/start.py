@@ -1,0 +1,40 @@
+"""How long a server takes from its command to its first right answer, its archive's files cached or not."""
+
+import time
+from contextlib import ExitStack
+
+import numpy as np
+from bench.build_limits import forget
+from numpy.typing import NDArray
+from solidcloud.builder.made.figure import figure_points
+from solidcloud.server.client import Client
+
+from . import server
+from .drive import Setup
+from .users import AVATAR
+
+MOST_SECONDS = 900.0
+
+
+def first_answer(
+    setup: Setup, budget: int, pose: NDArray[np.float64], verdict: int, cold: bool
+) -> float | None:
+    """Seconds from the command until a client that was there before it has the right answer about `pose` (4, 4).
+
+    verdict: the right one, CLEAR or CONTACT.  cold: the archive's files are dropped from the system's cache before;
+    None: the system cannot. ServerError: no right answer came.
+    """
+    if cold and not all([forget(path) for path in setup.archive.rglob("*") if path.is_file()]):
+        return None
+    endpoint = server.free_endpoint()
+    command = server.serve_command(setup.archive, endpoint, budget, None)
+    with ExitStack() as stack:
+        client = stack.enter_context(Client(endpoint, scene=server.SCENE, timeout=0.5))
+        client.add_avatar(AVATAR, figure_points(setup.points))
+        begin = time.monotonic()
+        process = stack.enter_context(server.started(command, setup.work / "server.log"))
+        while time.monotonic() - begin < MOST_SECONDS and process.poll() is None:
+            if int(client.collide(AVATAR, pose[None]).verdict[0]) == verdict:
+                return time.monotonic() - begin
+            time.sleep(0.005)
+        raise server.ServerError(f"no right answer within {time.monotonic() - begin:.0f} s")

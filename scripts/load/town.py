@@ -1,0 +1,50 @@
+"""The archive a load test serves: one that is given, or a made town that stays in a folder once it was built."""
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+from bench.build_runs import COMMAND
+from bench.machine import say
+
+
+def find(
+    archive: Path | None, truth: Path | None, points: int, voxel: float, work: Path
+) -> tuple[Path, Path]:
+    """The archive and its truth: as given, else of a made town of so many points, made where `work` has none.
+
+    SystemExit: a truth that is not there.
+    """
+    if archive is None:
+        archive, beside = made_town(work, points, voxel)
+    else:
+        beside = archive.with_name(f"{archive.stem}.truth.json")
+    truth = truth or beside
+    if not truth.exists():
+        raise SystemExit(
+            f"{truth}: not there: name the truth that was written beside the scan of the town with --truth"
+        )
+    return archive, truth
+
+
+def made_town(work: Path, points: int, voxel: float) -> tuple[Path, Path]:
+    """The archive of a town of so many points and its truth; made where the folder has none. The scan is not kept."""
+    name = f"town-{points}-{voxel:g}"
+    archive, truth = work / name, work / f"{name}.truth.json"
+    if (archive / "index.h5").exists() and truth.exists():
+        return archive, truth
+    work.mkdir(parents=True, exist_ok=True)
+    scan = work / f"{name}.las"
+    say(f"making a town of {points:,} points, once")
+    try:
+        for step in (
+            ["make", "town", "-o", str(scan), "--points", str(points)],
+            ["build", str(scan), "-o", str(archive), "--voxel", f"{voxel:g}", "--overwrite"],
+        ):
+            # Not on the standard output: that is for the figures.
+            subprocess.run([*COMMAND, *step], check=True, stdout=sys.stderr)
+    finally:
+        scan.unlink(missing_ok=True)
+    shutil.rmtree(work / f".{name}.building", ignore_errors=True)
+    return archive, truth

@@ -1,0 +1,180 @@
+"""One process of simulated users, each with a zenoh session of its own; started by drive.py.
+
+It reads a job, opens the sessions, prints `ready`, waits for the time to start on its standard input, asks every frame
+when it is due, and writes what became of them. An answer is timed once it is decoded, in the thread that received it.
+"""
+
+import gc
+import json
+import sys
+import threading
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any, Protocol
+
+import msgspec
+import numpy as np
+import zenoh
+from solidcloud.builder.made.figure import figure_points
+from solidcloud.schemas.answers import CollideAnswers
+from solidcloud.schemas.messages import MSGPACK, CollideRequest, decode_answer, encode
+from solidcloud.server.avatar import make_avatar
+from solidcloud.server.client import Client
+
+from . import frames as results
+from . import traces
+from .adversary import Adversary, make_adversary
+from .frames import ANSWERED, REFUSED, Frames
+from .pace import pace
+
+AVATAR = "avatar"
+LAST_ANSWERS = 6.0  # how long the last answers are waited for [s], a second more than a query lives
+FAULTS = 5  # of so many refusals what was said is kept
+
+
+class Job(msgspec.Struct, frozen=True):
+    """What a process is to do. trace, out: paths.  scene: "": a bare echo is asked, whose request has request_bytes.
+
+    archive, budget: of the server, for adversaries; "": the poses are the trace's.  points: of the avatar.
+    """
+
+    endpoint: str
+    trace: str
+    out: str
+    scene: str = ""
+    points: int = 3617
+    budget_ms: float | None = None
+    request_bytes: int = 0
+    archive: str = ""
+    budget: int = 0
+
+
+Came = Callable[[Any], None]
+
+
+class Asker(Protocol):
+    """One user's session."""
+
+    def send(self, payload: bytes, came: Came) -> None:
+        """Ask; `came` is called with zenoh's reply, in another thread."""
+
+
+class SceneUser(Client):
+    """A client that does not wait for its answers."""
+
+    def send(self, payload: bytes, came: Came) -> None:
+        # Called in the thread that receives: the default starts a thread for each question.
+        handler = zenoh.handlers.Callback(came, indirect=False)
+        self._querier("collide").get(handler, payload=payload, encoding=zenoh.Encoding(MSGPACK))
+
+
+class EchoUser:
+    """Asks a bare echo (echo.py), as zenoh's examples do."""
+
+    def __init__(self, endpoint: str, user: int) -> None:
+        config = zenoh.Config()
+        config.insert_json5("connect/endpoints", json.dumps([endpoint]))
+        config.insert_json5("scouting/multicast/enabled", "false")
+        self._config, self._key = config, f"echo/{user}"
+
+    def __enter__(self) -> "EchoUser":
+        with ExitStack() as stack:
+            session = stack.enter_context(zenoh.open(self._config))
+            self._querier = stack.enter_context(session.declare_querier(self._key))
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+
+    def send(self, payload: bytes, came: Came) -> None:
+        self._querier.get(zenoh.handlers.Callback(came, indirect=False), payload=payload)
+
+
+class Run:
+    """Frames on their way: what is sent, and what came."""
+
+    def __init__(self, job: Job, trace: traces.Trace, start: float) -> None:
+        self.job, self.trace = job, trace
+        self.frames: Frames = results.empty(trace.user, start + trace.time)
+        self.faults: list[str] = []
+        self._open = len(trace.user)
+        self._all = threading.Event()
+        self._lock = threading.Lock()
+        self._echo = bytes(job.request_bytes)
+        self._adversary: Adversary | None = None
+        if job.archive:
+            avatar = make_avatar(figure_points(job.points))
+            self._adversary = make_adversary(Path(job.archive), job.budget, avatar)
+
+    def ask(self, askers: dict[int, Asker], number: int) -> None:
+        """Send one frame."""
+        user = int(self.trace.user[number])
+        if self._adversary is not None:
+            self.trace.pose[number] = self._adversary.pose(recent=user % 2 == 0)
+        payload = self._echo if not self.job.scene else encode(
+            CollideRequest(AVATAR, self.trace.pose[number : number + 1], 0.0, budget_ms=self.job.budget_ms)
+        )  # fmt: skip
+        self.frames.sent[number] = time.monotonic()
+        askers[user].send(payload, lambda reply: self._came(number, reply))
+
+    def _came(self, number: int, reply: Any) -> None:
+        """Note one reply; a thread of zenoh's."""
+        frames = self.frames
+        try:
+            if reply.ok is None:
+                self._refused(number, reply.err.payload.to_bytes()[:300].decode(errors="replace"))
+            elif not self.job.scene:
+                reply.ok.payload.to_bytes()
+                frames.done[number], frames.status[number] = time.monotonic(), ANSWERED
+            else:
+                answer = decode_answer(CollideAnswers, reply.ok.payload.to_bytes())
+                frames.done[number] = time.monotonic()
+                frames.verdict[number] = answer.verdict[0]
+                frames.hits[number], frames.misses[number] = answer.hits, answer.misses
+                frames.engine[number] = answer.engine_seconds
+                frames.resident_bytes[number] = answer.resident_bytes
+                frames.status[number] = ANSWERED
+                if answer.faults:
+                    self.faults.extend(answer.faults[: FAULTS - len(self.faults)])
+        except Exception as error:
+            self._refused(number, repr(error))
+        with self._lock:
+            self._open -= 1
+            if not self._open:
+                self._all.set()
+
+    def _refused(self, number: int, text: str) -> None:
+        self.frames.status[number] = REFUSED
+        if len(self.faults) < FAULTS:
+            self.faults.append(text)
+
+    def wait(self) -> None:
+        """Until all is answered, or no longer will be."""
+        self._all.wait(LAST_ANSWERS)
+
+
+def main() -> None:
+    """The process; the job's path is its one argument."""
+    job = msgspec.json.decode(Path(sys.argv[1]).read_bytes(), type=Job)
+    trace = traces.load(Path(job.trace))
+    sys.setswitchinterval(0.0005)
+    with ExitStack() as stack:
+        askers: dict[int, Asker] = {}
+        for user in np.unique(trace.user).tolist():
+            if job.scene:
+                client = stack.enter_context(SceneUser(job.endpoint, scene=job.scene))
+                client.add_avatar(AVATAR, figure_points(job.points))
+                askers[user] = client
+            else:
+                askers[user] = stack.enter_context(EchoUser(job.endpoint, user))
+        run = Run(job, trace, 0.0)
+        gc.freeze()  # no collection of what is here already while frames are paced
+        print("ready", flush=True)
+        start = float(sys.stdin.readline())
+        run.frames.due[:] += start
+        pace(run.frames.due.tolist(), lambda number: run.ask(askers, number))
+        run.wait()
+    results.save(Path(job.out), run.frames, pose=trace.pose, faults=np.array(run.faults, np.str_))

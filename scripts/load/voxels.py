@@ -1,0 +1,48 @@
+"""The voxels of an archive as a load test needs them: their keys, where their points are, their bytes decoded."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from solidcloud.server.arena import ArenaBuffer
+from solidcloud.server.store import Store
+
+
+class Voxels(NamedTuple):
+    """By index row. keys: (v,) uint64, ascending.  boxes: (v, 2, 3) of each one's points, world [m].
+
+    sizes: (v,) int64, bytes each takes in a cache.  radius: of the scan's points [m].
+    """
+
+    keys: NDArray[np.uint64]
+    boxes: NDArray[np.float64]
+    sizes: NDArray[np.int64]
+    radius: float
+
+    @property
+    def decoded(self) -> int:
+        """Bytes of all of them."""
+        return int(self.sizes.sum())
+
+    def rows(self, keys: NDArray[np.uint64]) -> NDArray[np.int64]:
+        """Rows of the voxels of these keys; a key that is none of them is left out."""
+        at = np.searchsorted(self.keys, keys)
+        known = at < len(self.keys)
+        known[known] = self.keys[at[known]] == keys[known]
+        return at[known]
+
+
+def read_voxels(archive: Path) -> Voxels:
+    """The voxels of the archive in this folder."""
+    store = Store(archive)
+    try:
+        found, header = store.archive, store.archive.header
+        lattice = header.lattice
+        base = found.coordinates * lattice.voxel_steps
+        corners = np.stack([base + found.voxels["low"], base + found.voxels["high"]], axis=1)
+        boxes = corners * lattice.step + np.array(lattice.origin)
+        sizes = np.array([ArenaBuffer.rounded(int(size)) for size in store.sizes], np.int64)
+        return Voxels(found.voxels["key"].astype(np.uint64), boxes, sizes, float(header.radius))
+    finally:
+        store.close()

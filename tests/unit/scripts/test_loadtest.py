@@ -1,0 +1,352 @@
+"""The helpers of scripts/loadtest: pacing, figures, adversaries, goals and the page. Nothing is timed."""
+
+import os
+import re
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from solidcloud.schemas.answers import Verdict
+
+# Appended, so that nothing of scripts/ hides a module of the tests.
+sys.path.append(str(Path(__file__).parents[3] / "scripts"))
+
+from bench.results import MET, MISSED, Part, goal_rows
+from load import cases, check, frames, pace, page, pictures, server, town
+from load.adversary import Adversary, LruModel
+from load.cases import ECHO, Case, Ran
+from load.frames import ANSWERED, NOTHING, REFUSED, Frames
+from load.server import Memory
+from load.traces import Trace
+from load.voxels import Voxels
+
+CLEAR, CONTACT, UNKNOWN = (int(v) for v in (Verdict.CLEAR, Verdict.CONTACT, Verdict.UNKNOWN))
+
+
+# --- pacing ---------------------------------------------------------------------------------------------
+
+
+class Clock:
+    """A clock that goes on while one sleeps, and while an act is said to take. early: by so much a sleep is short."""
+
+    def __init__(self, early: float = 0.0) -> None:
+        self.now, self.early = 0.0, early
+        self.acted: list[tuple[int, float]] = []
+
+    def sleep(self, seconds: float) -> None:
+        assert seconds > 0
+        self.now += max(seconds - self.early, 1e-6)
+
+    def act(self, takes: Callable[[int], float]) -> Callable[[int], None]:
+        def act(number: int) -> None:
+            self.acted.append((number, self.now))
+            self.now += takes(number)
+
+        return act
+
+    def run(self, due: list[float], takes: Callable[[int], float]) -> list[tuple[int, float]]:
+        pace.pace(due, self.act(takes), lambda: self.now, self.sleep)
+        return self.acted
+
+
+def test_each_frame_is_asked_when_it_is_due() -> None:
+    due = [0.5, 1.0, 1.25, 7.0]
+    assert Clock().run(due, lambda _: 0.0) == list(enumerate(due))
+
+
+def test_a_late_frame_delays_no_other_but_those_due_meanwhile() -> None:
+    due = [0.0, 1.0, 2.0, 3.0, 4.0]
+    # The second takes until 3.5: two follow at once, the last is on time again.
+    acted = Clock().run(due, lambda number: 2.5 if number == 1 else 0.0)
+    assert acted == [(0, 0.0), (1, 1.0), (2, 3.5), (3, 3.5), (4, 4.0)]
+
+
+def test_no_frame_is_asked_before_its_time_though_sleep_ends_early() -> None:
+    acted = Clock(early=0.01).run([0.1, 0.2], lambda _: 0.0)
+    assert [number for number, _ in acted] == [0, 1]
+    assert all(0 <= at - due < 0.01 for (_, at), due in zip(acted, (0.1, 0.2), strict=True))
+
+
+def test_a_frame_stalls_when_its_answer_is_later_than_the_next_frame_or_never() -> None:
+    due = np.array([1.0, 2.0, 3.0, 4.0])
+    done = np.array([1.033, 2.034, np.nan, 4.0])
+    assert pace.stalled(due, done).tolist() == [False, True, True, False]
+    assert pace.stalled(due, done, 0.1).tolist() == [False, False, True, False]
+
+
+def test_the_first_second_is_that_of_each_user() -> None:
+    user = np.array([0, 2, 0, 2, 0])
+    due = np.array([5.0, 5.5, 5.9, 6.4, 6.0])
+    assert pace.after_first(user, due).tolist() == [False, False, False, False, True]
+    assert pace.after_first(user, due, 0.9).tolist() == [False, False, True, True, True]
+    assert pace.after_first(user[:0], due[:0]).tolist() == []
+
+
+# --- figures --------------------------------------------------------------------------------------------
+
+
+def some_frames(**columns: list) -> Frames:
+    """Frames of one user at one a second, each answered 10 ms after it was sent, 5 ms late, unless said otherwise."""
+    n = len(next(iter(columns.values())))
+    due = np.arange(n, dtype=np.float64)
+    made = Frames(
+        np.zeros(n, np.int64), due, due + 0.005, due + 0.015, np.full(n, ANSWERED), np.full(n, CLEAR),
+        np.ones(n, np.int64), np.zeros(n, np.int64), np.full(n, 1e-4), np.arange(n) * 100,
+    )  # fmt: skip
+    return made._replace(**{name: np.array(values) for name, values in columns.items()})
+
+
+def test_figures_leave_the_first_second_out_but_not_its_faults() -> None:
+    made = some_frames(
+        verdict=[UNKNOWN, CLEAR, CONTACT, CLEAR, -1],
+        status=[ANSWERED, ANSWERED, ANSWERED, REFUSED, NOTHING],
+        misses=[7, 0, 1, 0, 0],
+        hits=[0, 4, 3, 0, 0],
+        done=[0.5, 1.015, 2.05, np.nan, np.nan],
+    )
+    f = frames.figures(made)
+    assert (f.frames, f.stalled, f.unknown, f.refused, f.unanswered) == (4, 3, 1, 1, 1)
+    assert f.misses == 1 and f.hit_rate == 7 / 8 and f.without_miss == 0.5
+    assert f.delays == pytest.approx([0.05] * 4)  # of 15 and 50 ms
+    assert f.round_trips[-1] == pytest.approx(0.045) and f.late == pytest.approx(0.005)
+    assert frames.figures(made, warm_up=0.0).misses == 8
+
+
+def test_a_run_without_answers_has_no_rates() -> None:
+    f = frames.figures(some_frames(status=[NOTHING] * 3, done=[np.nan] * 3, sent=[np.nan] * 3))
+    assert (f.stalled, f.unanswered, f.misses) == (2, 3, 0)
+    assert np.isnan([f.hit_rate, f.without_miss, *f.delays, f.late]).all()
+
+
+def test_percentiles_are_values_that_were_measured() -> None:
+    values = np.array([4.0, 1.0, np.nan, 2.0, 3.0])
+    assert frames.percentiles(values, (50.0, 99.0, 100.0)).tolist() == [3.0, 4.0, 4.0]
+    assert np.isnan(frames.percentiles(np.array([np.nan]))).all()
+
+
+def test_a_wait_is_what_the_engine_took_beyond_a_calm_frame() -> None:
+    made = some_frames(engine=[1e-4, 1e-4, 3e-4, 9e-3, 8e-3, np.nan], misses=[0, 0, 0, 2, 0, 0])
+    waits = frames.added_wait(made._replace(status=np.array([1, 1, 1, 1, 1, 0])))
+    # Calm are the first three and the fifth, which waited for a load that the fourth began.
+    assert waits[:5] == pytest.approx([0.0, 0.0, 1e-4, 8.8e-3, 7.8e-3]) and np.isnan(waits[5])
+
+
+def test_frames_of_processes_become_those_of_one_in_order(tmp_path: Path) -> None:
+    first = some_frames(user=[0, 0, 0])
+    second = some_frames(user=[1, 1, 1])._replace(due=np.array([0.5, 1.0, 9.0]))
+    frames.save(tmp_path / "a.npz", first, pose=np.zeros((3, 4, 4)))
+    back, more = frames.load(tmp_path / "a.npz")
+    assert more["pose"].shape == (3, 4, 4)
+    both = frames.merged([second, back])
+    assert both.due.tolist() == [0.0, 0.5, 1.0, 1.0, 2.0, 9.0] and both.user.tolist() == [0, 1, 0, 1, 0, 1]
+
+
+def test_bytes_over_time_are_the_most_of_each_piece() -> None:
+    made = some_frames(resident_bytes=[5, 9, 7, 1], done=[0.0, 1.0, 3.0, 4.0])
+    at, most = frames.bytes_over_time(made, 2)
+    assert at.tolist() == [1.0, 3.0] and most.tolist() == [9.0, 7.0]
+    assert len(frames.bytes_over_time(made._replace(status=np.zeros(4, int)))[0]) == 0
+
+
+def test_wrong_is_what_is_said_and_not_true() -> None:
+    made = some_frames(verdict=[CLEAR, CONTACT, UNKNOWN, CLEAR, CONTACT], status=[ANSWERED] * 4 + [REFUSED])
+    assert check.wrong(made, np.array([CLEAR, CLEAR, CONTACT, CONTACT, CLEAR])).tolist() == [1, 3]
+
+
+# --- adversaries ----------------------------------------------------------------------------------------
+
+
+def test_the_model_evicts_as_a_list_does() -> None:
+    rng = np.random.default_rng(1)
+    sizes = rng.integers(1, 40, 30)
+    model, order, gone = LruModel(sizes, 150), list[int](), list[int]()
+    for _ in range(400):
+        wanted = sorted(set(rng.integers(0, 30, 3).tolist()))
+        model.use(wanted)
+        gone = [row for row in gone if row not in wanted]
+        order = [row for row in order if row not in wanted] + wanted
+        while sizes[order].sum() > 150 and len(order) > len(wanted):
+            gone.append(order.pop(0))
+        assert list(model.resident) == order and list(model.evicted) == gone
+        assert model.bytes == sizes[order].sum()
+
+
+def row_of_boxes(count: int) -> NDArray[np.float64]:
+    """Boxes of 1 m with gaps of 9 m, along x."""
+    low = np.column_stack([np.arange(count) * 10.0, np.zeros(count), np.zeros(count)])
+    return np.stack([low, low + 1.0], axis=1)
+
+
+@pytest.mark.parametrize(
+    ("recent", "asked"),
+    [(True, [0, 1, 2, 3, 4, 5, 2, 3, 4, 5, 2]), (False, [0, 1, 2, 3, 4, 5, 0, 1, 2, 3, 4])],
+)
+def test_an_adversary_asks_for_what_was_evicted(recent: bool, asked: list[int]) -> None:
+    # The cache holds three: all six are asked for once, until three were evicted; from then on each is missed.
+    model = LruModel(np.full(7, 10), 30)
+    found = Adversary(row_of_boxes(7), model, np.array([0.0, 0.0, 0.9]), 1.0)
+    for number, row in enumerate(asked):
+        resident = set(model.resident)
+        pose = found.pose(recent)
+        assert np.allclose(pose[:3, :3], np.eye(3))
+        assert np.allclose(pose[:3, 3], (10.0 * row + 0.5, 0.5, -0.4)), number
+        assert row not in resident
+
+
+def test_an_adversary_of_a_cache_that_holds_all_goes_round() -> None:
+    found = Adversary(row_of_boxes(3), LruModel(np.full(3, 10), 100), np.zeros(3), 1.0)
+    assert [round(found.pose(True)[0, 3] - 0.5) for _ in range(7)] == [0, 10, 20, 0, 10, 20, 0]
+
+
+def test_an_adversary_knows_what_else_its_pose_needs() -> None:
+    found = Adversary(row_of_boxes(4), LruModel(np.full(4, 10), 30), np.zeros(3), 10.0)
+    assert found.needed(0) == [0, 1] and found.needed(2) == [1, 2, 3]
+
+
+# --- the server's process -------------------------------------------------------------------------------
+
+
+def test_an_option_is_found_by_its_whole_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        server, "serve_help", lambda: "| --cache  TEXT  Decoded [default: 512MB] | --policy-file  |"
+    )
+    assert server.takes("--cache") and not server.takes("--policy") and not server.takes("--cach")
+
+
+def test_a_policy_is_named_only_where_one_is_given() -> None:
+    command = server.serve_command(Path("a.scd"), "tcp/127.0.0.1:1", 1000, None)
+    assert command[-2:] == ["--cache", "1000"] and "--policy" not in command
+    assert server.serve_command(Path("a"), "e", 1000, "lru")[-2:] == ["--policy", "lru"]
+
+
+@pytest.mark.skipif(not Path("/proc/self/smaps_rollup").exists(), reason="the system does not say")
+def test_memory_of_a_process_is_seen() -> None:
+    watcher = server.Watcher(os.getpid())
+    watcher.look(True)
+    held = np.ones(1 << 25, np.uint8)
+    watcher.look(False)
+    memory = watcher.stop()
+    assert len(memory.rss) == 3 and len(memory.pss) == 2
+    assert memory.peak() >= max(memory.rss) >= held.nbytes and 0 < memory.pss[-1] <= memory.peak()
+
+
+def test_the_most_memory_is_read_from_a_status() -> None:
+    assert server.parse_high("VmPeak:\t 9 kB\nVmHWM:\t    21 kB\nVmRSS: 1 kB\n") == 21 * 1024
+    assert server.parse_high("VmRSS: 1 kB\n") == 0
+
+
+def test_a_process_that_ends_before_it_is_ready_says_why(tmp_path: Path) -> None:
+    code = "import sys; print('no room', file=sys.stderr); sys.exit(3)"
+    with (
+        pytest.raises(server.ServerError, match="no room"),
+        server.running([sys.executable, "-c", code], tmp_path / "log", "ready"),
+    ):
+        pass
+
+
+def test_a_truth_that_is_not_there_is_named(tmp_path: Path) -> None:
+    with pytest.raises(SystemExit, match=re.escape("town.truth.json")):
+        town.find(tmp_path / "town.scd", None, 1, 8.0, tmp_path)
+    (tmp_path / "town.truth.json").write_text("{}")
+    assert town.find(tmp_path / "town.scd", None, 1, 8.0, tmp_path)[1] == tmp_path / "town.truth.json"
+
+
+# --- cases, goals, pictures -----------------------------------------------------------------------------
+
+
+def ran(case: Case, made: Frames, **more: object) -> Ran:
+    rss = (np.array([0.0, 1.0]), np.array([1e8, 2e8]))
+    plain: dict = {"budget": 50 << 20, "wrong": 0, "speed": 1.5, "empty": 100 << 20, "peak": 250 << 20}
+    plain |= {"memory": Memory(), "resident": frames.bytes_over_time(made), "rss": rss, **more}
+    return Ran(case, figures=frames.figures(made), **plain)
+
+
+STEADY = Case("kinds", "stroll", 8, 0.1, None)
+CALM = some_frames(user=[0] * 9)
+
+
+def verdicts(runs: list[Ran]) -> dict[str, str]:
+    part = Part("kinds")
+    cases.add_goals(part, runs)
+    return {row["key"]: row["verdict"] for row in goal_rows([part], cases.NOTES)}
+
+
+def test_goals_are_met_by_a_calm_run_and_missed_by_what_breaks_them() -> None:
+    assert verdicts([ran(STEADY, CALM)]) == {"stalled": MET, "wait": MET, "misses": MET, "right": MET}
+    late = CALM._replace(done=CALM.done + np.array([0] * 8 + [0.1]))
+    slow = CALM._replace(engine=np.array([1e-4] * 8 + [5e-3]))
+    missed = CALM._replace(misses=np.array([0] * 8 + [1]))
+    assert verdicts([ran(STEADY, late)])["stalled"] == MISSED
+    assert verdicts([ran(STEADY, slow)])["wait"] == MISSED
+    assert verdicts([ran(STEADY, missed)])["misses"] == MISSED
+    assert verdicts([ran(STEADY, CALM, wrong=1)])["right"] == MISSED
+
+
+def test_memory_is_that_beyond_the_empty_process_and_the_budget() -> None:
+    hard = Case("kinds", "teleport", 8, 0.1, None)
+    assert verdicts([ran(hard, CALM)])["memory"] == MET  # 250 - 100 - 50
+    assert verdicts([ran(hard, CALM, peak=301 << 20)])["memory"] == MISSED
+
+
+def test_round_trips_of_the_crowd_are_held_against_the_echo_of_as_many() -> None:
+    own, echo = Case("users", "stroll", 64, 1.1, None), Case("users", "stroll", 64, 1.1, ECHO)
+    few = Case("users", "stroll", 8, 1.1, None)
+    slower = CALM._replace(done=CALM.due + 0.025)
+    assert verdicts([ran(own, CALM), ran(echo, CALM), ran(few, slower)])["echo"] == MET
+    assert verdicts([ran(own, slower), ran(echo, CALM)])["echo"] == MISSED
+    assert "echo" not in verdicts([ran(own, CALM)])
+
+
+def test_the_knee_is_the_fewest_users_for_whom_frames_stall() -> None:
+    runs = [ran(Case("users", "stroll", n, 1.1, None), CALM) for n in (8, 16)]
+    assert cases.knee(runs) == {cases.AS_SERVED: None}
+    late = CALM._replace(done=CALM.done + 1.0)
+    runs += [ran(Case("users", "stroll", n, 1.1, None), late) for n in (64, 32)]
+    assert cases.knee(runs) == {cases.AS_SERVED: 32}
+
+
+def test_the_speed_of_users_is_over_the_floor_and_of_no_one_who_jumps() -> None:
+    pose = np.tile(np.eye(4), (91, 1, 1))
+    pose[:, 0, 3] = np.arange(91) * 0.1
+    walked = Trace(np.zeros(91, np.int64), np.arange(91) / 30, pose)
+    assert cases.mean_speed(walked) == pytest.approx(3.0)
+    pose[45:, 0, 3] += 100.0
+    assert np.isnan(cases.mean_speed(walked))
+
+
+def test_rows_are_found_by_key_and_strangers_left_out() -> None:
+    voxels = Voxels(np.array([3, 8, 9], np.uint64), row_of_boxes(3), np.full(3, 10), 0.01)
+    assert voxels.rows(np.array([9, 4, 3, 77], np.uint64)).tolist() == [2, 0] and voxels.decoded == 30
+
+
+def test_the_page_holds_goals_figures_and_pictures_and_needs_no_other_file(tmp_path: Path) -> None:
+    keys = np.array([3, 8, 9], np.uint64)
+    voxels = Voxels(keys, row_of_boxes(3), np.full(3, 10), 0.01)
+    shown = ran(STEADY, CALM, strip=[(0.5, keys[:1]), (1.5, keys[1:])])
+    runs = [shown, ran(Case("kinds", "run", 8, 0.1, None), CALM, speed=5.0)]
+    crowd = [ran(Case("users", "stroll", n, 1.1, side), CALM) for n in (8, 64) for side in (None, ECHO)]
+    part = Part("kinds")
+    for one in runs:
+        cases.add_figures(part, one)
+    cases.add_goals(part, runs)
+    made = [
+        ("hits", pictures.hit_rate(runs)), ("stalls", pictures.stalls(runs)), ("trips", pictures.round_trips(crowd)),
+        ("bytes", pictures.bytes_over_time(runs)), ("strip", pictures.film_strip(shown, voxels)),
+    ]  # fmt: skip
+    assert all(picture.startswith(b"\x89PNG") for _, picture in made)
+    target = tmp_path / "out" / "load.html"
+    page.write_page([part], cases.NOTES, made, "a <town>", target)
+    text = target.read_text()
+    assert text.count("data:image/png;base64,") == 5 and "a &lt;town&gt;" in text
+    assert "stroll, 8 users" in text and "frames stalled" in text and 'src="http' not in text
+
+
+def test_a_run_that_is_wrong_is_said() -> None:
+    part = Part("kinds")
+    cases.add_figures(part, ran(STEADY, CALM, wrong=2, faults=["busy", "busy"]))
+    assert (
+        len(part.wrong) == 1 and "2 verdicts" in part.wrong[0] and sum("busy" in r for r in part.remarks) == 1
+    )

@@ -12,7 +12,15 @@ from pathlib import Path
 
 import numpy as np
 
-from .codec import OPTIONAL_COLUMNS, OpenRecord, RecordShape, open_record, point_dtype
+from .codec import (
+    OPTIONAL_COLUMNS,
+    OpenRecord,
+    OpenTree,
+    RecordShape,
+    open_record,
+    open_tree,
+    point_dtype,
+)
 from .errors import CorruptError, FormatError
 from .index import VOXEL_DTYPE, read_header
 from .index_file import INDEX_NAME, read_columns
@@ -147,20 +155,21 @@ class Archive:
 
         Raises CorruptError, naming file, voxel and dataset, when a frame is not the one the index means.
         """
+        return self._read_frame(row, 0), self._read_frame(row, 1), self._read_frame(row, 2)
+
+    def _read_frame(self, row: int, i: int) -> bytes:
+        """The frame of dataset `i` of a voxel, as `read_frames` gives it."""
         if not self._descriptors:
             raise ValueError(f"{self.folder}: the archive is closed")
         entry = self.voxels[row]
-        frames = []
-        for i, name in enumerate(DATASETS):
-            size, offset = int(entry["frame_bytes"][i]), int(entry["frame_offset"][i])
-            frame = os.pread(self._descriptors[int(entry["shard"])], size, offset)
-            if len(frame) != size or frame[-4:] != int(entry["frame_checksum"][i]).to_bytes(4, "little"):
-                raise CorruptError(
-                    f"{self.where(row)}, {name}: {len(frame)} bytes that are not the record's, expected {size}",
-                    (self.shard_path(int(entry["shard"])),),
-                )
-            frames.append(frame)
-        return frames[0], frames[1], frames[2]
+        size, offset = int(entry["frame_bytes"][i]), int(entry["frame_offset"][i])
+        frame = os.pread(self._descriptors[int(entry["shard"])], size, offset)
+        if len(frame) != size or frame[-4:] != int(entry["frame_checksum"][i]).to_bytes(4, "little"):
+            raise CorruptError(
+                f"{self.where(row)}, {DATASETS[i]}: {len(frame)} bytes that are not the record's, expected {size}",
+                (self.shard_path(int(entry["shard"])),),
+            )
+        return frame
 
     def where(self, row: int) -> str:
         """Where the record of index row `row` lies, for messages."""
@@ -191,18 +200,36 @@ class Archive:
         Raises CorruptError saying where.
         """
         frames = frames or self.read_frames(row)
-        entry = self.voxels[row]
-        cells, nodes, points = (int(n) for n in entry["rows"])
-        shape = RecordShape(cells, nodes, points, self._shape_dtype)
         with self.locating(row):
             return open_record(
                 *frames,
-                shape,
-                int(entry["key"]),
+                self._shape(row),
+                int(self.voxels["key"][row]),
                 self.header.archive_id,
                 self.header.lattice.voxel_steps,
                 columns,
             )
+
+    def open_tree(self, row: int) -> OpenTree:
+        """The hierarchy of the voxel in index row `row`; of its points nothing is read.
+
+        Raises CorruptError saying where.
+        """
+        cells, nodes = self._read_frame(row, 0), self._read_frame(row, 1)
+        with self.locating(row):
+            return open_tree(
+                cells,
+                nodes,
+                self._shape(row),
+                int(self.voxels["key"][row]),
+                self.header.archive_id,
+                self.header.lattice.voxel_steps,
+            )
+
+    def _shape(self, row: int) -> RecordShape:
+        """What the index says of the record of index row `row`."""
+        cells, nodes, points = (int(n) for n in self.voxels["rows"][row])
+        return RecordShape(cells, nodes, points, self._shape_dtype)
 
     def read_voxel(self, row: int) -> tuple[VoxelData, Links]:
         """Read, decompress and check the voxel in index row `row`. Raises CorruptError saying where."""

@@ -141,6 +141,15 @@ def point_rows(
     return rows
 
 
+class OpenTree(NamedTuple):
+    """What a record holds beside its points, decompressed and checked. Fields as of OpenRecord."""
+
+    cells: Cells
+    nodes: Nodes
+    links: Links
+    leaves: int
+
+
 class OpenRecord(NamedTuple):
     """A record decompressed, its tree checked; its points still as the frame has them, to be read once, in place.
 
@@ -235,12 +244,20 @@ def open_record(
     Raises CorruptError when a frame is damaged, of another size than `shape`, of another voxel or archive, or
     holds what `check_voxel` refuses.
     """
+    names = [n for n in shape.point_dtype.names or () if n == "xyz" or n in columns]
+    kept = np.dtype([(n, shape.point_dtype[n]) for n in names])
+    planes = unpack(points, shape.point_dtype, shape.point_rows, f"voxel {key:#x}, points", kept)
+    tree = open_tree(cells, nodes, shape, key, archive_id, voxel_steps)
+    return OpenRecord(key, voxel_steps, *tree, planes, kept)
+
+
+def open_tree(
+    cells: bytes, nodes: bytes, shape: RecordShape, key: int, archive_id: bytes, voxel_steps: int
+) -> OpenTree:
+    """`open_record` without the points: they need not have been read."""
     name = f"voxel {key:#x}"
     cell_planes = unpack(cells, CELL_DTYPE, shape.cell_rows, f"{name}, cells")
     node_planes = unpack(nodes, NODE_DTYPE, shape.node_rows, f"{name}, nodes")
-    names = [n for n in shape.point_dtype.names or () if n == "xyz" or n in columns]
-    kept = np.dtype([(n, shape.point_dtype[n]) for n in names])
-    point_planes = unpack(points, shape.point_dtype, shape.point_rows, f"{name}, points", kept)
     identity = np.frombuffer(archive_id + key.to_bytes(8, "little"), np.uint8)
     if (cell_planes[: len(identity)] != identity[:, None]).any():  # archive and voxel come first in a row
         raise CorruptError(f"{name}: the record found is another voxel's or another archive's")
@@ -248,8 +265,7 @@ def open_record(
     node_columns = Nodes(*(column_of(node_planes, NODE_DTYPE, field) for field in Nodes._fields))
     links = link_tree(name, cell_columns, node_columns.count)
     check_tree(name, cell_columns, node_columns, links, shape.point_rows, voxel_steps)
-    leaves = int(np.count_nonzero(links.is_leaf))
-    return OpenRecord(key, voxel_steps, cell_columns, node_columns, links, leaves, point_planes, kept)
+    return OpenTree(cell_columns, node_columns, links, int(np.count_nonzero(links.is_leaf)))
 
 
 def decode_voxel(

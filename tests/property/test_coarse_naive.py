@@ -1,0 +1,151 @@
+"""What coarse tops settle is clear by the definition, whatever the scan, avatar, pose, tree and radii."""
+
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import cases
+import classes
+import numpy as np
+import pytest
+import scans
+from clouds import KINDS, TREES, cloud
+from coarse_tops import Made, least_margin, open_made
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from solidcloud.builder.radius import voxel_points
+from solidcloud.schemas.radius_model import class_radii
+from solidcloud.server.avatar import AvatarModel, make_avatar
+
+MOST_UNITS = 1 << 30  # of a pair's reach
+
+
+def spheres(made: Made, model: str | None) -> list[tuple[NDArray[np.int64], NDArray[np.int64]]]:
+    """Points (p, 3) [voxel steps] and radii (p,) [exact units] of every voxel, as stored."""
+    archive, found = made.store.archive, []
+    table = class_radii(model, archive.header.radius, archive.header.models)
+    for row in range(made.voxels):
+        voxel, links = archive.read_voxel(row)
+        chosen = np.zeros(len(voxel.points), np.int64) if len(table) == 1 else voxel.radius_class
+        found.append((voxel_points(voxel, links).astype(np.int64), table[chosen]))
+    return found
+
+
+def judge(
+    made: Made, model: str | None, avatar: AvatarModel, poses: NDArray[np.float64], rng: np.random.Generator
+) -> tuple[int, int]:
+    """Ask about each pose at margins where its pair with some voxel begins to be in contact, just before, and half.
+
+    Returns, of the pairs that are clear by half their distance or more, how many were settled, and how many there are.
+    """
+    points = spheres(made, model)
+    for row in range(made.voxels):
+        made.remember(row) if row % 2 else made.coarse.fill(made.store, row)
+    settled = clear = 0
+    for pose in poses:
+        if np.abs(pose[:3, 3]).max() > 1e9:
+            continue
+        least = [least_margin(made, row, *points[row], avatar, pose) for row in range(made.voxels)]
+        own = int(made.reach(avatar, pose[None]).units[0])
+        begun = least[int(rng.integers(made.voxels))]
+        resident = np.flatnonzero(rng.uniform(size=made.voxels) < 0.2).tolist()
+        for margin in (begun - 1, begun, min(least), min(least) - 1, begun // 2):
+            if not 0 <= margin <= MOST_UNITS - own:
+                continue
+            reach, gone = made.settled(avatar, pose[None], margin)
+            assert all(margin < least[row] for row in gone[0]), (pose.tolist(), margin, gone, least)
+            some = made.resident(*resident).settled(avatar, pose[None], margin)
+            assert some == (reach, [[row for row in gone[0] if row not in resident]])
+            far = {row for row in reach[0] if 2 * margin <= least[row]}
+            settled, clear = settled + len(far & set(gone[0])), clear + len(far)
+    return settled, clear
+
+
+@settings(max_examples=40, deadline=None, derandomize=True)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    kind=st.sampled_from(KINDS),
+    count=st.sampled_from([1, 2, 33, 300]),
+    body=st.sampled_from(KINDS),
+    step=st.sampled_from([1e-6, cases.BINARY_STEP, 1e-4, 1e-2, 0.3]),
+    voxel_steps=st.sampled_from([7, 1000, 70_000, 1 << 21]),
+    far=st.sampled_from([0.0, 5e5, 6.4e6, 1e8]),
+    scale=st.sampled_from([1.0, 1.0, 1e-3, 0.3, 999.0]),
+    off=st.sampled_from([0.0, 0.0, 1e3, 1e5]),
+    tree=TREES,
+)
+def test_nothing_in_contact_is_settled(
+    seed: int,
+    kind: str,
+    count: int,
+    body: str,
+    step: float,
+    voxel_steps: int,
+    far: float,
+    scale: float,
+    off: float,
+    tree: dict[str, Any],
+) -> None:
+    rng = np.random.default_rng(seed)
+    extent = step * min(voxel_steps * rng.uniform(0.1, 3), 1 << 21)
+    if step <= far * 1e-14:  # float64 holds no such lattice there
+        far = 0.0
+    points = cloud(rng, kind, count) * extent + far * rng.uniform(-1, 1, 3)
+    place = off * rng.uniform(-1, 1, 3)
+    avatar = make_avatar(
+        cloud(rng, body, 20) * (extent / scale * rng.uniform(0.01, 0.5)) + place,
+        float(step / scale * rng.choice([0, 0.7, 9])),
+    )
+    radius = float(step * rng.choice([0, 0.5, 9]))
+    with TemporaryDirectory() as folder:
+        case = cases.build(
+            Path(folder), points, voxel=step * voxel_steps, resolution=step, radius=radius, **tree
+        )
+        poses = cases.near_poses(rng, points, avatar.points, 8, extent, scale)
+        judge(open_made(case.archive), None, avatar, poses, rng)
+
+
+@settings(max_examples=30, deadline=None, derandomize=True)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    kind=st.sampled_from(KINDS),
+    count=st.sampled_from([2, 33, 300]),
+    body=st.sampled_from(KINDS),
+    model=st.sampled_from(classes.MODELS),
+    voxel=st.sampled_from([0.5, 4.0]),
+    scale=st.sampled_from([1.0, 0.3]),
+    tree=TREES,
+)
+def test_nothing_in_contact_is_settled_whatever_the_radii(
+    seed: int,
+    kind: str,
+    count: int,
+    body: str,
+    model: str | None,
+    voxel: float,
+    scale: float,
+    tree: dict[str, Any],
+) -> None:
+    rng = np.random.default_rng(seed)
+    points, avatar = cloud(rng, kind, count), make_avatar(cloud(rng, body, 20) * 0.3, 0.01)
+    with TemporaryDirectory() as folder, classes.any_classes():
+        case = cases.build(Path(folder), points, voxel=voxel, models=classes.STORED, **tree)
+        poses = cases.near_poses(rng, points, avatar.points, 8, 0.3, scale)
+        judge(open_made(case.archive, model), model, avatar, poses, rng)
+
+
+@pytest.mark.interpreted
+@pytest.mark.parametrize("model", [None, "local+border:0.3"])
+@pytest.mark.parametrize("kind", scans.WITH_POINTS)
+def test_of_every_kind_of_scan_clear_pairs_are_settled(
+    tmp_path: Path, rng: np.random.Generator, kind: str, model: str | None
+) -> None:
+    with classes.any_classes():
+        case = cases.build(
+            tmp_path, scans.make_scan(kind, 11, 60), voxel=1.0, leaf=4, degree=3, models=classes.STORED
+        )
+    avatar = make_avatar(rng.uniform(-0.2, 0.2, (9, 3)), 0.01)
+    poses = cases.near_poses(rng, case.points, avatar.points, 10, 0.5)
+    settled, clear = judge(open_made(case.archive, model), model, avatar, poses, rng)
+    assert 3 * settled > clear > 0

@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 from solidcloud.builder.kernels.filter import (
     _group_in_reach,
+    _no_runs,
+    _runs_around,
     best_of_cells,
     cell_numbers,
     count_others,
@@ -55,6 +57,22 @@ def test_cells_are_numbered_so_that_all_have_neighbours(edge: int) -> None:
         for shift in np.array(list(itertools.product((-1, 0, 1), repeat=3)))
     }
     assert len(set(around.values())) == len(around) and min(around.values()) >= 0
+
+
+def test_the_runs_around_a_cell_are_of_three_cells_each_its_own_first() -> None:
+    rng = np.random.default_rng(1)
+    at = cloud(rng, 90)
+    grid = grid_of(at)
+    cells = np.sort(numbers_of(at, grid))
+    runs = _no_runs()
+    for cell in rng.permuted(cells):
+        _runs_around(cells, cell, *grid, runs)
+        middles = [int(cell) + (dx * grid[0] + dy) * grid[1] for dx in (-1, 0, 1) for dy in (-1, 0, 1)]
+        expected = [
+            [int(np.searchsorted(cells, np.uint64(middle + by))) for by in (-1, 2)] for middle in middles
+        ]
+        found = np.column_stack(runs[1:]).tolist()
+        assert runs[0][0] == cell and found[0] == expected[4] and sorted(found) == sorted(expected)
 
 
 @pytest.mark.parametrize("reach2", REACHES)

@@ -10,7 +10,7 @@ from .errors import BadRequestError
 ROOT = "solidcloud/1"
 OPERATIONS = (
     "info", "add_avatar", "collide", "distance", "contacts", "sweep", "raycast", "within", "objects", "path",
-    "reload",
+    "reload", "stats",
 )  # fmt: skip
 
 _NAME = re.compile(r"[A-Za-z0-9._-]{1,64}")

@@ -46,6 +46,8 @@ from ..schemas.messages import (
     ReloadAnswer,
     SceneInfo,
     ScenesAnswer,
+    StatsAnswer,
+    StatsRequest,
     SweepRequest,
     WithinRequest,
     decode_request,
@@ -81,6 +83,7 @@ class SceneLike(Protocol):
     def path(self, *what: Any, **parameters: Any) -> Iterator[Part]: ...
     def drop_client(self, client: str) -> None: ...
     def reload(self) -> ReloadAnswer: ...
+    def stats(self, keys: bool = False) -> StatsAnswer: ...
     def warm(self) -> None: ...
     def close(self) -> None: ...
 
@@ -229,6 +232,9 @@ class Service:
             raise UnknownSceneError(f"scene {route.scene!r} is not served here; served: {served}")
         operation = _OPERATIONS.get(route.operation)
         if operation is None:
+            if route.operation == "stats":
+                asked = decode_request(StatsRequest, payload, encoding) if payload else StatsRequest()
+                return scene.stats(asked.keys)
             if payload:
                 raise BadRequestError(
                     f"{route.operation} with a payload of {len(payload)} bytes: expected none"
@@ -300,6 +306,7 @@ def serve(scenes: Sequence[SceneLike], config: ServerConfig) -> None:
         log.warning("--insecure: whoever reaches %s may ask anything, unauthenticated", config.listen)
     with (
         _signalled(signal.SIGTERM, signal.SIGINT, signal.SIGHUP) as signals,
+        _metrics(scenes, config),
         serving(scenes, config) as service,
         _reloader(service) as wanted,
     ):
@@ -307,6 +314,19 @@ def serve(scenes: Sequence[SceneLike], config: ServerConfig) -> None:
         print(f"serving {names} at {config.listen}", flush=True)
         while signals.recv(1)[0] == signal.SIGHUP:
             wanted.set()
+
+
+@contextmanager
+def _metrics(scenes: Sequence[SceneLike], config: ServerConfig) -> Iterator[None]:
+    """Serve the metrics of scenes where the configuration says so; from the start, so that a fault is early."""
+    if not config.metrics_port:
+        yield
+        return
+    from .prometheus import metrics_served  # its library is an extra
+
+    with metrics_served(scenes, config.metrics_host, config.metrics_port) as where:
+        log.info("metrics at %s", where)
+        yield
 
 
 @contextmanager

@@ -25,6 +25,7 @@ class ServerConfig:
     more is answered `busy`.
     max_poses, max_avatar_points: of one request; more is answered `too_large`.
     stop_seconds: how long a stop waits for accepted requests to be answered.
+    metrics_port: where Prometheus' text is served over HTTP, on loopback unless `insecure`; 0: nowhere.
     """
 
     listen: str = DEFAULT_ENDPOINT
@@ -36,6 +37,7 @@ class ServerConfig:
     max_poses: int = MAX_POSES
     max_avatar_points: int = MAX_AVATAR_POINTS
     stop_seconds: float = 10.0
+    metrics_port: int = 0
 
     def __post_init__(self) -> None:
         if not _ENDPOINT.fullmatch(self.listen):
@@ -51,6 +53,13 @@ class ServerConfig:
         for name in ("workers", "max_in_flight", "max_in_flight_bytes", "max_paths"):
             if getattr(self, name) < 1:
                 raise BadRequestError(f"{name} is {getattr(self, name)}: expected at least 1")
+        if not 0 <= self.metrics_port < 1 << 16:
+            raise BadRequestError(f"--metrics-port {self.metrics_port}: expected 1 to 65535, or 0 for none")
+
+    @property
+    def metrics_host(self) -> str:
+        """The address that metrics are served at."""
+        return "0.0.0.0" if self.insecure else "127.0.0.1"
 
 
 def is_loopback(endpoint: str) -> bool:

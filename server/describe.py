@@ -1,8 +1,10 @@
-"""What an archive holds, as `info` says it."""
+"""What a scene says of itself: what its archive holds, as `info`, and what it keeps in memory, as `stats`."""
 
 import numpy as np
 
-from ..schemas.messages import WIRE_VERSION, SceneInfo, SourceInfo
+from ..schemas.messages import WIRE_VERSION, SceneInfo, SourceInfo, StatsAnswer
+from .metrics import Metrics, times_of
+from .residency import Residency
 from .store import Store
 
 
@@ -43,4 +45,46 @@ def describe(store: Store, name: str) -> SceneInfo:
         generation=header.generation,
         radius_now=now.radius if now else None,
         radius_now_error=now.error if now else None,
+    )
+
+
+def make_stats(
+    store: Store,
+    name: str,
+    residency: Residency,
+    metrics: Metrics,
+    *,
+    coarse_bytes: int = 0,
+    keys: bool = False,
+) -> StatsAnswer:
+    """What a scene keeps in memory of the archive of `store`, and how it did so far.
+
+    coarse_bytes: of coarse tops, beside the residency's budget.  keys: name the resident voxels, too.
+    """
+    total, users = metrics.snapshot()
+    counts = total.counts
+    resident = None
+    if keys:
+        rows = np.flatnonzero(residency.where[:, 0] >= 0)
+        resident = np.sort(store.archive.voxels["key"][rows]).tolist()
+    return StatsAnswer(
+        scene=name,
+        generation=store.archive.header.generation,
+        policy=residency.policy.name,
+        budget_bytes=residency.budget_bytes + coarse_bytes,
+        resident_bytes=residency.resident_bytes,
+        coarse_bytes=coarse_bytes,
+        voxels=len(store.sizes),
+        resident=residency.resident,
+        kept=len(residency.kept),
+        requests=counts.requests,
+        answers=counts.answers,
+        unknown=counts.unknown,
+        waited=counts.waited,
+        load_seconds=times_of(residency.load_times(), total.loads.times()),
+        stall_seconds=counts.stalls.times(),
+        engine_seconds=total.engine.times(),
+        users=users,
+        keys=resident,
+        **residency.counters()._asdict(),
     )

@@ -24,12 +24,13 @@ DOORS = {
     "tomli_w": ("builder/scan_list.py",),
     "trimesh": ("builder/sources/surface.py", "builder/made/"),
     "embreex": ("builder/made/scanner.py",),
+    "prometheus_client": ("server/prometheus.py",),
     "distributed": ("builder/cluster.py",),
     "dask": ("builder/cluster.py",),
     "matplotlib": ("server/report/",),
     "PIL": ("server/report/",),
     "typer": ("server/cli.py", "server/verbs/"),
-    "rich": ("server/console.py", "server/progress.py", "server/report/"),
+    "rich": ("server/console.py", "server/progress.py", "server/top.py", "server/report/"),
 }
 # Needed everywhere; numpy and msgspec are the language that arrays and messages are written in.
 FREE = frozenset({"numpy", "msgspec"}) | sys.stdlib_module_names

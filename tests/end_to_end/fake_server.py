@@ -20,7 +20,14 @@ from solidcloud.schemas.answers import (
 )
 from solidcloud.schemas.columns import as_part, unknown
 from solidcloud.schemas.errors import BadRequestError, BadTransformError, UnknownAvatarError
-from solidcloud.schemas.messages import WIRE_VERSION, AvatarInfo, ReloadAnswer, SceneInfo, SourceInfo
+from solidcloud.schemas.messages import (
+    WIRE_VERSION,
+    AvatarInfo,
+    ReloadAnswer,
+    SceneInfo,
+    SourceInfo,
+    StatsAnswer,
+)
 from solidcloud.server.app import serve
 from solidcloud.server.config import ServerConfig
 
@@ -80,6 +87,9 @@ class FloorScene:
             raise self.refuses
         self.reloaded += 1
         return ReloadAnswer(self.name, self.reloaded - 1, self.reloaded, 4)
+
+    def stats(self, keys=False):
+        return StatsAnswer(scene=self.name, hits=len(self.asked), keys=[3, 5] if keys else None)
 
     def add_avatar(self, name, points, radius=None, *, client=""):
         known = self.avatars.get((client, name))

@@ -12,7 +12,7 @@ hold half of what the other needs cannot wait for each other for ever.
 import math
 import threading
 import time
-from collections import OrderedDict, deque
+from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from enum import Enum
@@ -22,15 +22,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..schemas.errors import BadRequestError, CorruptError
+from .accounts import Accounts, Counters
 from .arena import ArenaBuffer
 from .policies import Policy, make_policy
 from .room import Room
 from .store import Store
 
-# A voxel that is asked for again so soon after it went for another had better stayed [s].
-TOO_SOON = 10.0
-# Loads whose times are remembered.
-TIMES = 256
 # Voxels that are looked at to find room for one that nobody waits for.
 MOST_CANDIDATES = 256
 
@@ -82,30 +79,6 @@ def _seconds_to(deadline: float) -> float | None:
     return min(max(0.0, deadline - time.perf_counter()), threading.TIMEOUT_MAX)
 
 
-class Counters(NamedTuple):
-    """What a residency has done so far; voxels but where bytes are said.
-
-    hits: asked for and there, or being loaded; waits: of them being loaded.  misses: asked for and not there.
-    late: asked for and not there in time.  prefetched: loaded before anybody asked; used: of them asked for since;
-    wasted: of them gone again without.  evicted: gone for others; too_soon: of them asked for again within TOO_SOON.
-    moved_bytes: of voxels moved to join free room.  failed: loads that failed.
-    """
-
-    hits: int = 0
-    waits: int = 0
-    misses: int = 0
-    late: int = 0
-    prefetched: int = 0
-    prefetched_bytes: int = 0
-    used: int = 0
-    wasted: int = 0
-    wasted_bytes: int = 0
-    evicted: int = 0
-    too_soon: int = 0
-    moved_bytes: int = 0
-    failed: int = 0
-
-
 class Residency:
     """The resident voxels of one scene. Thread-safe.
 
@@ -149,12 +122,7 @@ class Residency:
         self._left: set[int] = set()
         self._owed: OrderedDict[int, None] = OrderedDict()
         self._demands = 0  # requests that wait
-        self._fresh: set[int] = set()  # prefetched, and not asked for yet
-        self._went: dict[int, float] = {}  # when a voxel was evicted
-        self._times: deque[float] = deque(maxlen=TIMES)
-        self.hits = self.waits = self.misses = self.lates = 0
-        self.prefetched = self.prefetched_bytes = self.used = self.wasted = self.wasted_bytes = 0
-        self.too_soon = self.failed = 0
+        self._accounts = Accounts(self._sizes)
 
     @property
     def resident(self) -> int:
@@ -167,6 +135,16 @@ class Residency:
         return self._room.used_bytes
 
     @property
+    def hits(self) -> int:
+        """Voxels asked for and there, or being loaded."""
+        return self._accounts.hits
+
+    @property
+    def misses(self) -> int:
+        """Voxels asked for and not there."""
+        return self._accounts.misses
+
+    @property
     def evictions(self) -> int:
         """Voxels that went for others."""
         return self._room.evictions
@@ -174,15 +152,12 @@ class Residency:
     def counters(self) -> Counters:
         """What was done so far."""
         with self._lock:
-            return Counters(
-                self.hits, self.waits, self.misses, self.lates, self.prefetched, self.prefetched_bytes, self.used,
-                self.wasted, self.wasted_bytes, self.evictions, self.too_soon, self._room.moved_bytes, self.failed,
-            )  # fmt: skip
+            return self._accounts.counters(self._room.evictions, self._room.moved_bytes)
 
     def load_times(self) -> list[float]:
         """The seconds that the last loads took, in no order."""
         with self._lock:
-            return list(self._times)
+            return list(self._accounts.times)
 
     def recent(self) -> list[int]:
         """The index rows of the resident voxels, those that would stay longest at the end."""
@@ -217,15 +192,7 @@ class Residency:
         """Count resident voxels as used just now; inside `still`."""
         for row in rows:
             self.policy.used(row, scan=scan)
-        self.hits += len(rows)
-        if self._fresh:
-            self._count_used(rows)
-
-    def _count_used(self, rows: Sequence[int]) -> None:
-        """Of what was prefetched, these were asked for."""
-        found = self._fresh.intersection(rows)
-        self._fresh -= found
-        self.used += len(found)
+        self._accounts.found(rows)
 
     def acquire(self, rows: Sequence[int], deadline: float = math.inf, *, scan: bool = False) -> Held:
         """Begin a hold; `release` must follow, unless this raises."""
@@ -244,7 +211,9 @@ class Residency:
                         faults = tuple(fault for row in rows if (fault := self._fault(row)))
                         late = tuple(row for row in rows if not self._fault(row) and not self._there(row))
                         self._demands -= 1
-                        self._owe(late)
+                        self._accounts.late += len(late)
+                        if self.owed is not None:
+                            self._owed.update(dict.fromkeys(late))
                         self._changed.notify_all()
                         break
                     self._left.difference_update(wanted)
@@ -253,14 +222,9 @@ class Residency:
                 self._demands -= 1
             self.release(rows)
             raise
+        if late and (owed := self.owed) is not None:
+            owed()
         return Held(hits, len(mine), faults, late, time.perf_counter() - begin)
-
-    def _owe(self, rows: Sequence[int]) -> None:
-        """Voxels that somebody could not wait for: their loads are to go on."""
-        self.lates += len(rows)
-        if rows and self.owed is not None:
-            self._owed.update(dict.fromkeys(rows))
-            self.owed()
 
     def _there(self, row: int) -> bool:
         """Whether a voxel is resident and whole."""
@@ -299,30 +263,24 @@ class Residency:
                 except BaseException:
                     self._demands -= 1
                     raise
-            self._loading.update(mine)
             for row in rows:
                 if row in offsets:
                     self.policy.used(row, scan=scan)
-            hits = sum(row in offsets for row in rows) - len(mine)
-            self.hits += hits
-            self.misses += len(mine)
-            if self._fresh:
-                self._count_used(rows)
-            if not settled:
-                self._count_misses(rows, mine)
-            return mine, hits, settled
+            if settled:
+                self._accounts.found(rows)
+                return [], len(rows), True
+            there = [row for row in rows if row in offsets and row not in mine]
+            self._accounts.found(there)
+            self._accounts.missed(mine)
+            self._accounts.waited(there, self._loading)
+            self._loading.update(mine)
+            return mine, len(there), False
 
     def _all_there(self, rows: Sequence[int]) -> bool:
         """Whether none of these, all of which have room or a fault, has a fault or is being loaded."""
         if self._loading and not self._loading.isdisjoint(rows):
             return False
         return not (self._faults or self._passing) or not any(map(self._fault, rows))
-
-    def _count_misses(self, rows: Sequence[int], mine: list[int]) -> None:
-        """Count what has to be waited for."""
-        self.waits += sum(row in self._loading for row in rows) - len(mine)
-        now = time.perf_counter()
-        self.too_soon += sum(now - self._went.get(row, -math.inf) < TOO_SOON for row in mine)
 
     def _make_room(self, rows: Sequence[int], mine: list[int], deadline: float, scan: bool) -> list[int]:
         """Room for `mine`, of `rows` that are pinned by this caller; returns those it is to load. It may wait.
@@ -335,7 +293,7 @@ class Residency:
                 roomy = self._changed.wait(_seconds_to(deadline))
             else:
                 # Nobody else holds anything, and yet the room is in pieces between our own voxels.
-                self._room.leave_only(set(rows), self._gone)
+                self._room.leave_only(set(rows), self._accounts.evicted)
                 roomy = True
             self._pin(rows)
             mine = [row for row in rows if row not in self._room.offsets and not self._fault(row)]
@@ -351,7 +309,7 @@ class Residency:
         """Make room for every row; all or nothing. What users stand in goes last."""
         for number, row in enumerate(rows):
             for may_go in (self._idle, self._free):
-                if self._room.make(row, may_go, self._free, self._gone, scan=scan):
+                if self._room.make(row, may_go, self._free, self._accounts.evicted, scan=scan):
                     break
             else:
                 for other in rows[:number]:
@@ -366,14 +324,6 @@ class Residency:
     def _idle(self, row: int) -> bool:
         """Whether also no user stands in it."""
         return row not in self._pins and row not in self._loading and row not in self.kept
-
-    def _gone(self, row: int) -> None:
-        """A voxel was evicted."""
-        self._went[row] = time.perf_counter()
-        if row in self._fresh:
-            self._fresh.discard(row)
-            self.wasted += 1
-            self.wasted_bytes += self._sizes[row]
 
     def _unpin(self, rows: Sequence[int]) -> None:
         for row in rows:
@@ -442,7 +392,7 @@ class Residency:
             else:
                 self.where[row] = where
                 self._loading.discard(row)
-                self._times.append(seconds := time.perf_counter() - begin)
+                self._accounts.times.append(seconds := time.perf_counter() - begin)
             self._changed.notify_all()
         if where is not None and self.took is not None:
             self.took(seconds)
@@ -450,11 +400,7 @@ class Residency:
 
     def _fail(self, row: int, fault: str, *, corrupt: bool = False) -> None:
         """A load ended without a voxel. Who holds it is told; nobody else, unless it will always be so."""
-        self.failed += 1
-        if row in self._fresh:
-            self._fresh.discard(row)
-            self.prefetched -= 1
-            self.prefetched_bytes -= self._sizes[row]
+        self._accounts.lost(row)
         self._room.forget(row)
         self._loading.discard(row)
         if corrupt:
@@ -488,15 +434,13 @@ class Residency:
             if row in self._room.offsets or self._fault(row):
                 return Ahead.THERE if row in self._room.offsets else Ahead.FAILED
             if not self._room.make(
-                row, lambda other: self._idle(other) and may_go(other), self._free, self._gone, scan=False,
+                row, lambda other: self._idle(other) and may_go(other), self._free, self._accounts.evicted, scan=False,
                 most=MOST_CANDIDATES,
             ):  # fmt: skip
                 return Ahead.NO_ROOM
             self._loading.add(row)
             if not owed:
-                self._fresh.add(row)
-                self.prefetched += 1
-                self.prefetched_bytes += self._sizes[row]
+                self._accounts.begun_ahead(row)
         return Ahead.THERE if self._load_one(row) else Ahead.FAILED
 
     def check(self) -> None:
@@ -508,5 +452,5 @@ class Residency:
             assert resident == offsets - self._loading
             assert self._left <= self._loading <= offsets and self._left <= set(self._pins)
             assert all(count > 0 for count in self._pins.values())
-            assert self._fresh <= offsets and self._demands >= 0
-            assert self.used + self.wasted + len(self._fresh) == self.prefetched
+            assert self._accounts.fresh <= offsets and self._demands >= 0
+            self._accounts.check()

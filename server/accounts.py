@@ -1,0 +1,104 @@
+"""What a residency has done so far: voxels asked for, loaded, loaded in vain, gone too soon. Kept under its lock."""
+
+import math
+import time
+from collections import deque
+from collections.abc import Collection, Sequence
+from typing import NamedTuple
+
+# A voxel that is asked for again so soon after it went for another had better stayed [s].
+TOO_SOON = 10.0
+# Loads whose times are remembered.
+TIMES = 256
+
+
+class Counters(NamedTuple):
+    """What a residency has done so far; voxels but where bytes are said.
+
+    hits: asked for and there, or being loaded; waits: of them being loaded.  misses: asked for and not there.
+    late: asked for and not there in time.  prefetched: loaded before anybody asked; used: of them asked for since;
+    wasted: of them gone again without.  evicted: gone for others; too_soon: of them asked for again within TOO_SOON.
+    moved_bytes: of voxels moved to join free room.  failed: loads that failed.
+    """
+
+    hits: int = 0
+    waits: int = 0
+    misses: int = 0
+    late: int = 0
+    prefetched: int = 0
+    prefetched_bytes: int = 0
+    used: int = 0
+    wasted: int = 0
+    wasted_bytes: int = 0
+    evicted: int = 0
+    too_soon: int = 0
+    moved_bytes: int = 0
+    failed: int = 0
+
+
+class Accounts:
+    """Counts as `Counters` has them. Not thread-safe.
+
+    fresh: rows prefetched, or just being so, that nobody has asked for yet.  times: seconds of the last loads.
+    """
+
+    def __init__(self, sizes: Sequence[int]) -> None:
+        """Nothing done yet. sizes: bytes of each row."""
+        self._sizes = sizes
+        self.hits = self.waits = self.misses = self.late = self.failed = self.too_soon = 0
+        self.prefetched = self.prefetched_bytes = self.used = self.wasted = self.wasted_bytes = 0
+        self.fresh: set[int] = set()
+        self.times: deque[float] = deque(maxlen=TIMES)
+        self._went: dict[int, float] = {}  # when each voxel that was evicted went last
+
+    def found(self, rows: Sequence[int]) -> None:
+        """These were asked for and are there, or being loaded."""
+        self.hits += len(rows)
+        if self.fresh:
+            known = self.fresh.intersection(rows)
+            self.fresh -= known
+            self.used += len(known)
+
+    def missed(self, rows: Sequence[int]) -> None:
+        """These were asked for, and who asked loads them."""
+        self.misses += len(rows)
+        now = time.perf_counter()
+        self.too_soon += sum(now - self._went.get(row, -math.inf) < TOO_SOON for row in rows)
+
+    def waited(self, rows: Sequence[int], loading: Collection[int]) -> None:
+        """Of these, which were asked for, others load some."""
+        self.waits += sum(row in loading for row in rows)
+
+    def evicted(self, row: int) -> None:
+        """A voxel went for another."""
+        self._went[row] = time.perf_counter()
+        if row in self.fresh:
+            self.fresh.discard(row)
+            self.wasted += 1
+            self.wasted_bytes += self._sizes[row]
+
+    def begun_ahead(self, row: int) -> None:
+        """A voxel is being loaded that nobody asked for."""
+        self.fresh.add(row)
+        self.prefetched += 1
+        self.prefetched_bytes += self._sizes[row]
+
+    def lost(self, row: int) -> None:
+        """A load failed."""
+        self.failed += 1
+        if row in self.fresh:
+            self.fresh.discard(row)
+            self.prefetched -= 1
+            self.prefetched_bytes -= self._sizes[row]
+
+    def counters(self, evicted: int, moved_bytes: int) -> Counters:
+        """All of them."""
+        return Counters(
+            self.hits, self.waits, self.misses, self.late, self.prefetched, self.prefetched_bytes, self.used,
+            self.wasted, self.wasted_bytes, evicted, self.too_soon, moved_bytes, self.failed,
+        )  # fmt: skip
+
+    def check(self) -> None:
+        """Assert that they add up."""
+        assert self.used + self.wasted + len(self.fresh) == self.prefetched
+        assert self.waits <= self.hits and self.too_soon <= self.misses

@@ -30,8 +30,8 @@ class Cost(msgspec.Struct, frozen=True, eq=False, kw_only=True):
     hits, misses: voxels in reach that were resident, and that had to be loaded, of this request.
     resident, resident_bytes: voxels decoded in memory after this request, and their bytes.
     faults: one sentence for each voxel that could not be read, where and why; empty when all is well.
-    wait_seconds: of engine_seconds, those that voxels were waited for [s].  late: keys of the voxels that were not there
-    in time, which a budget does not wait for: what depends on them is `UNKNOWN`, and they are being loaded.
+    wait_seconds: of engine_seconds, those that voxels were waited for [s].  late: keys of the voxels that were not
+    there in time, which a budget does not wait for: what depends on them is `UNKNOWN`, and they are being loaded.
     """
 
     engine_seconds: float = 0.0

@@ -123,8 +123,7 @@ TESTS: dict[str, tuple[str, ...]] = {
     "server/kernels/closest.py": work("distance", "distance deep", "distance bounded"),
     "server/kernels/coarse.py": (
         SERVER + "test_coarse.py::test_the_nodes_of_a_top_enclose_all_points",
-        SERVER + "test_coarse.py::test_a_pose_between_walls_is_settled_and_one_at_a_wall_is_not",
-        SERVER + "test_coarse.py::test_feet_above_a_floor_are_settled_by_their_points",
+        SERVER + "test_coarse.py::test_filled_and_remembered_are_the_same_rows",
     ),
     "server/kernels/contacts.py": (*work("contacts", "contacts deep"), *tangent("contacts")),
     "server/kernels/front.py": work("collide", "distance"),

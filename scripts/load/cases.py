@@ -18,6 +18,7 @@ Floats = NDArray[np.float64]
 
 AS_SERVED = "as served"  # where the server takes no --policy
 ECHO = "echo"
+DEFAULT = "lru+prefetch"
 # The goals. Users of the first three: 8; of the last: 64.
 STEADY = ("stroll", "run")
 STALLED, WAIT_MS, WITHOUT_MISS = 0.0, 2.0, 0.999
@@ -105,14 +106,21 @@ def add_figures(part: Part, ran: Ran) -> None:
     case, side, f = ran.case.name, ran.case.side, ran.figures
 
     def add(what: str, value: float, unit: str) -> None:
-        part.add(case, side, what, value, unit, f.frames)
+        if np.isfinite(value):
+            part.add(case, side, what, value, unit, f.frames)
 
     add("users' speed", ran.speed, "m/s")
     add("frames stalled", f.stalled, "")
-    add("frames without a miss", 100 * f.without_miss, "%")
-    add("hit rate of voxels", 100 * f.hit_rate, "%")
-    add("voxels missed", f.misses, "")
-    for name, values in (("due to answer", f.delays), ("round trip", f.round_trips), ("added wait", f.waits)):
+    if side != ECHO:
+        add("frames without a miss", 100 * f.without_miss, "%")
+        add("frames that waited", 100 * f.waited, "%")
+        add("hit rate of voxels", 100 * f.hit_rate, "%")
+        add("voxels missed", f.misses, "")
+    for name, values in (
+        ("due to answer", f.delays),
+        ("round trip", f.round_trips),
+        ("wait for voxels", f.waits),
+    ):
         for share, value in zip(PERCENTILES, values, strict=True):
             add(f"{name}, p{share:g}", 1e3 * value, "ms")
     add("users behind, p99", 1e3 * f.late, "ms")
@@ -146,16 +154,18 @@ def _add_stats(part: Part, ran: Ran) -> None:
 
 
 def add_goals(part: Part, runs: list[Ran]) -> None:
-    """The goals of a section's runs; a case under several policies has them for each."""
+    """The goals of a section's runs: those of steady users for the default policy alone, where it was run by name."""
+    sides = {ran.case.side for ran in runs}
+    held = {DEFAULT} if DEFAULT in sides else sides
     for ran in runs:
         case, f = ran.case, ran.figures
         if case.side == ECHO or case.section not in ("kinds", "users"):
             continue
         name = f"{case.name}, {case.side}"
-        if case.section == "kinds" and case.kind in STEADY:
+        if case.section == "kinds" and case.kind in STEADY and case.side in held:
             stalled = f.stalled if f.frames else None
             part.goal("stalled", f"{name}: frames stalled", stalled, STALLED, "")
-            part.goal("wait", f"{name}: added wait, p99", _number(1e3 * f.waits[1]), WAIT_MS, "ms")
+            part.goal("wait", f"{name}: wait for voxels, p99", _number(1e3 * f.waits[1]), WAIT_MS, "ms")
             part.goal(
                 "misses",
                 f"{name}: frames without a miss",
@@ -206,7 +216,7 @@ def _number(value: float) -> float | None:
 
 NOTES: dict[str, str] = {
     "stalled": "frames with no answer 33 ms after they were due, after the first second; of the users' own delay too",
-    "wait": "in the engine, beyond the median of the frames that missed nothing: waits for loads that others began too",
+    "wait": "in the engine, for voxels that were not there, whoever had them loaded",
     "misses": "voxels that had to be loaded while a frame waited; those being loaded already are not counted by it",
     "vain": "evicted before anybody asked for them, of all that were prefetched; those still there count as neither",
     "memory": "RSS at its highest, less that of the warm process with an empty cache, less --cache",
@@ -219,12 +229,13 @@ NOTES: dict[str, str] = {
 def summary(ran: Ran) -> dict[str, object]:
     """A run for JSON: the case, its figures, memory and bytes over time."""
     f = ran.figures._asdict()
-    plain = {k: (v.tolist() if isinstance(v, np.ndarray) else v) for k, v in f.items()}
+    plain = {name: [_number(v) for v in np.atleast_1d(value)] for name, value in f.items()}
+    plain = {name: values[0] if np.ndim(f[name]) == 0 else values for name, values in plain.items()}
     case = {
         name: getattr(ran.case, name) for name in ("section", "kind", "users", "share", "policy", "speed")
     }
     return {
-        **case, "budget": ran.budget, "figures": plain, "wrong": ran.wrong, "mean_speed": ran.speed,
+        **case, "budget": ran.budget, "figures": plain, "wrong": ran.wrong, "mean_speed": _number(ran.speed),
         "stats": None if ran.stats is None else msgspec.to_builtins(msgspec.structs.replace(ran.stats, keys=None)),
         "empty_rss": ran.empty, "peak_rss": ran.peak, "pss": ran.memory.pss,
         "resident": [column.tolist() for column in ran.resident], "rss": [column.tolist() for column in ran.rss],

@@ -22,7 +22,8 @@ class Frames(NamedTuple):
 
     user: (n,) int64.  due, sent, done: when it should be asked, was asked, and its answer was decoded; NaN: never.
     status: (n,) of the three above.  verdict: (n,) int64, -1 without an answer.  hits, misses: of the answer, voxels.
-    engine: time in the server's engine, loads included [s].  resident_bytes: in the server, after the request.
+    engine, wait: time in the server's engine, and what of it was waiting for voxels, whoever had them loaded [s].
+    resident_bytes: in the server, after the request.
     """
 
     user: Ints
@@ -34,13 +35,15 @@ class Frames(NamedTuple):
     hits: Ints
     misses: Ints
     engine: Floats
+    wait: Floats
     resident_bytes: Ints
 
 
 class Figures(NamedTuple):
     """A run in figures; times [s], of frames after the first second of each user, all but the counts of faults.
 
-    delays, waits: percentiles (PERCENTILES) of due to done, and of the added wait.  round_trips: of sent to done.
+    without_miss, waited: shares of the answered frames.  hit_rate: of voxels.
+    delays, waits: percentiles (PERCENTILES) of due to done, and of the wait for voxels.  round_trips: of sent to done.
     late: 99th percentile of due to sent: what the users themselves were behind.  rate: answers a second.
     """
 
@@ -52,6 +55,7 @@ class Figures(NamedTuple):
     delays: Floats
     round_trips: Floats
     waits: Floats
+    waited: float
     late: float
     rate: float
     unknown: int
@@ -64,7 +68,7 @@ def empty(user: Ints, due: Floats) -> Frames:
     n = len(user)
     return Frames(
         user, due, np.full(n, np.nan), np.full(n, np.nan), np.full(n, NOTHING), np.full(n, -1),
-        np.zeros(n, np.int64), np.zeros(n, np.int64), np.full(n, np.nan), np.zeros(n, np.int64),
+        np.zeros(n, np.int64), np.zeros(n, np.int64), np.full(n, np.nan), np.full(n, np.nan), np.zeros(n, np.int64),
     )  # fmt: skip
 
 
@@ -85,17 +89,6 @@ def load(path: Path) -> tuple[Frames, dict[str, NDArray]]:
     with np.load(path, allow_pickle=False) as file:
         columns = {name: file[name] for name in file.files}
     return Frames(*(columns.pop(name) for name in Frames._fields)), columns
-
-
-def added_wait(frames: Frames) -> Floats:
-    """What each answered frame waited in the engine beyond the median of those that missed nothing (n,) [s].
-
-    A frame that waits for a load which another began counts no miss, but its wait; one whose pose is harder than most
-    counts the difference. NaN where there was no answer.
-    """
-    calm = frames.engine[(frames.status == ANSWERED) & (frames.misses == 0)]
-    usual = float(np.median(calm)) if len(calm) else 0.0
-    return np.maximum(frames.engine - usual, 0.0)
 
 
 def percentiles(values: Floats, shares: tuple[float, ...] = PERCENTILES) -> Floats:
@@ -121,7 +114,8 @@ def figures(frames: Frames, warm_up: float = 1.0) -> Figures:
         misses=misses,
         delays=percentiles((frames.done - frames.due)[kept]),
         round_trips=percentiles((frames.done - frames.sent)[kept]),
-        waits=percentiles(added_wait(frames)[kept]),
+        waits=percentiles(frames.wait[kept]),
+        waited=float((frames.wait[answered] > 0).mean()) if answered.any() else np.nan,
         late=float(late[0]),
         rate=float(answered.sum()) / spent if spent else np.nan,
         unknown=int((frames.verdict == Verdict.UNKNOWN).sum()),

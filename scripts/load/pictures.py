@@ -37,6 +37,30 @@ def _axes(title: str, width: float = 9.0, height: float = 4.6) -> tuple[Any, Any
     return figure, axes
 
 
+def _frame(axes: Any) -> None:
+    """The line above which a frame stalls."""
+    axes.axhline(1e3 * FRAME, color=LIMIT, lw=1.1, ls="--")
+    across = axes.get_yaxis_transform()
+    axes.text(0.01, 1e3 * FRAME, "a frame: 33 ms", color=LIMIT, fontsize=8, va="bottom", transform=across)
+
+
+def _plain_ticks(axis: Any) -> None:
+    """Numbers as people write them on a logarithmic axis, at 1, 2 and 5."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def _ticks_at(axes: Any, values: list[float]) -> None:
+    """Ticks of a logarithmic x axis where something was measured, and nowhere else."""
+    from matplotlib.ticker import NullLocator
+
+    axes.xaxis.set_minor_locator(NullLocator())
+    axes.set_xticks(values, [f"{value:g}" for value in values])
+
+
 def _sides(runs: list[Ran]) -> dict[str, list[Ran]]:
     """Runs by kind and policy, in order of their first."""
     found: dict[str, list[Ran]] = {}
@@ -53,6 +77,7 @@ def hit_rate(runs: list[Ran]) -> bytes:
         shares, rates = [r.case.share for r in own], [100 * r.figures.hit_rate for r in own]
         axes.plot(shares, rates, MARKS[k % 8] + "-", color=COLOURS[k % 8], label=name, lw=1.6)
     axes.set(xlabel="budget, share of the scene's decoded bytes", xscale="log")
+    _ticks_at(axes, sorted({r.case.share for r in runs}))
     axes.legend(fontsize=8, frameon=False)
     return png(figure)
 
@@ -68,9 +93,9 @@ def stalls(runs: list[Ran]) -> bytes:
             axes.plot(
                 [r.speed for r in own], 1e3 * values, style + MARKS[k % 8], color=COLOURS[k % 8], label=label
             )
-    axes.axhline(1e3 * FRAME, color=LIMIT, lw=1.1, ls="--")
-    axes.text(0, 1e3 * FRAME, " a frame: 33 ms", color=LIMIT, fontsize=8, va="bottom")
+    _frame(axes)
     axes.set(xlabel="mean speed of the users, m/s", yscale="log")
+    _plain_ticks(axes.yaxis)
     axes.legend(fontsize=7, frameon=False, ncols=2)
     return png(figure)
 
@@ -87,10 +112,10 @@ def round_trips(runs: list[Ran]) -> bytes:
             axes.plot(
                 [r.case.users for r in own], values, style + MARKS[k % 8], color=colour, label=label, lw=1.6
             )
-    axes.axhline(1e3 * FRAME, color=LIMIT, lw=1.1, ls="--")
+    _frame(axes)
     axes.set(xlabel="users, 30 frames a second each", xscale="log", yscale="log")
-    users = sorted({r.case.users for r in runs})
-    axes.set_xticks(users, [str(n) for n in users])
+    _plain_ticks(axes.yaxis)
+    _ticks_at(axes, sorted({r.case.users for r in runs}))
     axes.legend(fontsize=8, frameon=False)
     return png(figure)
 
@@ -110,7 +135,6 @@ def bytes_over_time(runs: list[Ran]) -> bytes:
         beyond = (ran.rss[1] - ran.empty) / 2**20
         axes.plot(ran.rss[0], beyond, color=COLOURS[1], lw=1.1, label="RSS beyond warm, empty")
         axes.axhline(ran.budget / 2**20, color=LIMIT, ls="--", lw=1.1, label="budget")
-        axes.axhline(ran.budget / 2**20 + 150, color=LIMIT, ls=":", lw=1.1, label="goal: 150 MB more")
         axes.set_title(f"{ran.case.name}, {ran.case.side}", loc="left", fontsize=8.5)
         axes.set(xlabel="s", ylabel="MB", xlim=(0, None), ylim=(0, None))
         axes.spines[["top", "right"]].set_visible(False)

@@ -134,7 +134,7 @@ class Run:
                 frames.done[number] = time.monotonic()
                 frames.verdict[number] = answer.verdict[0]
                 frames.hits[number], frames.misses[number] = answer.hits, answer.misses
-                frames.engine[number] = answer.engine_seconds
+                frames.engine[number], frames.wait[number] = answer.engine_seconds, answer.wait_seconds
                 frames.resident_bytes[number] = answer.resident_bytes
                 frames.status[number] = ANSWERED
                 if answer.faults:

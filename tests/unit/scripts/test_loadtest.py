@@ -1,15 +1,18 @@
 """The helpers of scripts/loadtest: pacing, figures, adversaries, goals and the page. Nothing is timed."""
 
+import json
 import os
 import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from solidcloud.schemas.answers import Verdict
+from solidcloud.schemas.stats import StatsAnswer
 
 # Appended, so that nothing of scripts/ hides a module of the tests.
 sys.path.append(str(Path(__file__).parents[3] / "scripts"))
@@ -94,7 +97,7 @@ def some_frames(**columns: list) -> Frames:
     due = np.arange(n, dtype=np.float64)
     made = Frames(
         np.zeros(n, np.int64), due, due + 0.005, due + 0.015, np.full(n, ANSWERED), np.full(n, CLEAR),
-        np.ones(n, np.int64), np.zeros(n, np.int64), np.full(n, 1e-4), np.arange(n) * 100,
+        np.ones(n, np.int64), np.zeros(n, np.int64), np.full(n, 1e-4), np.zeros(n), np.arange(n) * 100,
     )  # fmt: skip
     return made._replace(**{name: np.array(values) for name, values in columns.items()})
 
@@ -127,11 +130,12 @@ def test_percentiles_are_values_that_were_measured() -> None:
     assert np.isnan(frames.percentiles(np.array([np.nan]))).all()
 
 
-def test_a_wait_is_what_the_engine_took_beyond_a_calm_frame() -> None:
-    made = some_frames(engine=[1e-4, 1e-4, 3e-4, 9e-3, 8e-3, np.nan], misses=[0, 0, 0, 2, 0, 0])
-    waits = frames.added_wait(made._replace(status=np.array([1, 1, 1, 1, 1, 0])))
-    # Calm are the first three and the fifth, which waited for a load that the fourth began.
-    assert waits[:5] == pytest.approx([0.0, 0.0, 1e-4, 8.8e-3, 7.8e-3]) and np.isnan(waits[5])
+def test_a_frame_may_wait_for_what_another_had_loaded() -> None:
+    made = some_frames(
+        wait=[0.5, 0.0, 8e-3, 9e-3, np.nan], misses=[0, 0, 0, 2, 0], status=[ANSWERED] * 4 + [REFUSED]
+    )
+    f = frames.figures(made)
+    assert f.waits[1:].tolist() == [9e-3] * 3 and f.waited == 2 / 3 and f.without_miss == 2 / 3
 
 
 def test_frames_of_processes_become_those_of_one_in_order(tmp_path: Path) -> None:
@@ -277,12 +281,43 @@ def verdicts(runs: list[Ran]) -> dict[str, str]:
 def test_goals_are_met_by_a_calm_run_and_missed_by_what_breaks_them() -> None:
     assert verdicts([ran(STEADY, CALM)]) == {"stalled": MET, "wait": MET, "misses": MET, "right": MET}
     late = CALM._replace(done=CALM.done + np.array([0] * 8 + [0.1]))
-    slow = CALM._replace(engine=np.array([1e-4] * 8 + [5e-3]))
+    slow = CALM._replace(wait=np.array([0.0] * 8 + [5e-3]))
     missed = CALM._replace(misses=np.array([0] * 8 + [1]))
     assert verdicts([ran(STEADY, late)])["stalled"] == MISSED
     assert verdicts([ran(STEADY, slow)])["wait"] == MISSED
     assert verdicts([ran(STEADY, missed)])["misses"] == MISSED
     assert verdicts([ran(STEADY, CALM, wrong=1)])["right"] == MISSED
+
+
+def test_goals_of_steady_users_are_those_of_the_default_policy() -> None:
+    late = CALM._replace(done=CALM.done + 0.1)
+    named = [ran(Case("kinds", "stroll", 8, 0.1, policy), late if policy == "lru" else CALM)
+             for policy in ("lru", "lru+prefetch")]  # fmt: skip
+    assert verdicts(named)["stalled"] == MET
+    assert verdicts(named[:1])["stalled"] == MISSED
+
+
+def test_what_the_server_says_it_loaded_in_vain_is_a_goal() -> None:
+    stats = StatsAnswer(scene="load", prefetched_bytes=100, wasted_bytes=30, prefetched=4, wasted=1)
+    assert verdicts([ran(STEADY, CALM, stats=stats)])["vain"] == MET
+    worse = msgspec.structs.replace(stats, wasted_bytes=31)
+    assert verdicts([ran(STEADY, CALM, stats=worse)])["vain"] == MISSED
+    none = msgspec.structs.replace(stats, prefetched_bytes=0, wasted_bytes=0)
+    assert "vain" not in verdicts([ran(STEADY, CALM, stats=none)])
+
+
+def test_a_report_holds_no_figure_that_is_no_number() -> None:
+    nothing = CALM._replace(status=np.zeros(9, int), done=CALM.done * np.nan, wait=CALM.wait * np.nan)
+    stats = StatsAnswer(scene="load", keys=[1, 2])
+    part, made = Part("kinds"), ran(STEADY, nothing, speed=np.nan, stats=stats)
+    cases.add_figures(part, made)
+    cases.add_goals(part, [made])
+    assert all(np.isfinite(f.value) for f in part.figures)
+    text = json.dumps(cases.summary(made), allow_nan=False)
+    assert json.loads(text)["figures"]["unanswered"] == 9 and json.loads(text)["stats"]["keys"] is None
+    assert {row["verdict"] for row in goal_rows([part], cases.NOTES) if row["key"] == "misses"} == {
+        "not measured"
+    }
 
 
 def test_memory_is_that_beyond_the_empty_process_and_the_budget() -> None:

@@ -11,7 +11,7 @@ from typing import Any
 import typer
 
 from ..schemas.errors import BadRequestError, SolidcloudError
-from .verbs import accuracy, archive, build, export, generation, inspect, make, plan, query, serve
+from .verbs import accuracy, archive, build, export, generation, inspect, make, plan, query, serve, top
 from .verbs.options import complain
 
 # Without rich's markup: importing it doubles the time --help takes, to over the 0.3 s it may.
@@ -38,7 +38,7 @@ for verb in (
     query.query,
 ):
     app.command()(verb)
-for verb in (export.export, generation.add, generation.remove, generation.reload, plan.plan):
+for verb in (export.export, generation.add, generation.remove, generation.reload, plan.plan, top.top):
     app.command()(verb)
 
 

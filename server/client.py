@@ -7,6 +7,7 @@ there, a server died or a message was dropped (WIRE.md, "Empty replies").
 import logging
 import queue
 import threading
+import time
 import uuid
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
@@ -41,6 +42,8 @@ from ..schemas.messages import (
     ReloadAnswer,
     SceneInfo,
     ScenesAnswer,
+    StatsAnswer,
+    StatsRequest,
     decode_answer,
     encode,
 )
@@ -59,6 +62,9 @@ log = logging.getLogger(__name__)
 # How long some queries are kept open [s]. Of a path; how long a part of it may take is the client's timeout. A reload
 # opens an archive and fills a cache, at some 100 MB/s.
 _SECONDS = {"path": 3600.0, "reload": 600.0}
+
+# Of that time, how much must have passed for a silence to be a server's that is slow: clocks differ by a little.
+_NEARLY = 0.9
 
 _ENCODING = zenoh.Encoding(MSGPACK)
 
@@ -94,12 +100,7 @@ class Client(Questions):
 
     def __enter__(self) -> Self:
         with ExitStack() as stack:
-            try:
-                self._session = stack.enter_context(zenoh.open(session_config(connect=self._endpoint)))
-            except zenoh.ZError as error:
-                raise BadRequestError(
-                    f"endpoint {self._endpoint!r}: {error}: expected one such as {DEFAULT_ENDPOINT}"
-                ) from None
+            self._session = stack.enter_context(_session(self._endpoint))
             # Gone with this process, however it ends: then the server forgets our avatars.
             token = keys.client_alive_key(self.name, self._id)
             stack.enter_context(self._session.liveliness().declare_token(token))
@@ -140,17 +141,37 @@ class Client(Questions):
         BusyError: nobody answered, or the server still answers of the generation before the one served. FormatError
         and others: what is there cannot be served; the server serves on what it did.
         """
-        return decode_answer(ReloadAnswer, self._answered("reload", _SECONDS["reload"]))
+        return decode_answer(ReloadAnswer, self._answered("reload", max(self._timeout, _SECONDS["reload"])))
 
-    def _answered(self, operation: str, seconds: float) -> bytes:
-        """The answer to a question without payload; BusyError: nobody answered."""
-        payload = self._ask(operation, b"")
+    def stats(self, keys: bool = False) -> StatsAnswer:
+        """What the server keeps of the scene in memory, and how it did. keys: name the resident voxels, too.
+
+        BusyError: nobody answered.
+        """
+        return decode_answer(StatsAnswer, self._answered("stats", self._timeout, encode(StatsRequest(keys))))
+
+    def _answered(self, operation: str, seconds: float, request: bytes = b"") -> bytes:
+        """The answer to a question about the scene itself; BusyError: nobody answered."""
+        begin = time.monotonic()
+        payload = self._ask(operation, request)
         if payload is None:
-            raise BusyError(
-                f"no server of scene {self.name!r} answered at {self._endpoint} within {seconds:g} s: "
-                f"start one with: solidcloud serve ARCHIVE --name {self.name} --listen {self._endpoint}"
-            )
+            raise BusyError(self._silence(operation, seconds, time.monotonic() - begin))
         return payload
+
+    def _silence(self, operation: str, seconds: float, waited: float) -> str:
+        """Why a question may have had no answer, and what to do. seconds: for which one was waited for at most."""
+        where = f"scene {self.name!r} at {self._endpoint}"
+        # A question that no server gets ends at once, one whose server is gone as soon as that is seen.
+        if self._seen and waited > _NEARLY * seconds:
+            then = ", and its log says when it is done" if operation == "reload" else ""
+            return (
+                f"the server of {where} has not answered {operation!r} within {seconds:g} s: it may still be at work"
+                f"{then}: ask again, or start it anew"
+            )
+        start = f"solidcloud serve ARCHIVE --name {self.name} --listen {self._endpoint}"
+        if self._seen:
+            return f"the server of {where} is gone, expected its answer to {operation!r}: start one with: {start}"
+        return f"no server of {where}, expected one that answers {operation!r}: start one with: {start}"
 
     def add_avatar(self, name: str, points: Any, radius: float | None = None) -> AvatarInfo:
         """Give this client an avatar: (n, 3) float64, its own frame [m]; radius [m], see AddAvatarRequest.
@@ -297,21 +318,7 @@ class Client(Questions):
 
     def _check_served(self) -> None:
         """UnknownSceneError if servers answer and none of them serves this scene."""
-        served: set[str] = set()
-        versions: set[int] = set()
-        replies = self._session.get(
-            keys.scenes_key(),
-            # Several servers answer under the one key, and all of them count.
-            target=zenoh.QueryTarget.ALL,
-            consolidation=zenoh.ConsolidationMode.NONE,
-            timeout=self._timeout,
-            encoding=_ENCODING,
-        )
-        for reply in replies:
-            if reply.ok is not None:
-                answer = decode_answer(ScenesAnswer, reply.ok.payload.to_bytes())
-                served.update(answer.scenes)
-                versions.add(answer.wire_version)
+        served, versions = _ask_scenes(self._session, self._timeout)
         if versions - {WIRE_VERSION}:
             raise InternalError(
                 f"a server at {self._endpoint} speaks wire version {max(versions)}, this client "
@@ -322,6 +329,48 @@ class Client(Questions):
         elif versions:
             names = ", ".join(sorted(served)) or "none"
             raise UnknownSceneError(f"scene {self.name!r} is not served at {self._endpoint}; served: {names}")
+
+
+def scenes_at(endpoint: str = DEFAULT_ENDPOINT, timeout: float = 5.0) -> list[str]:
+    """The names of the scenes that are served at an endpoint, in order. BusyError: nobody answered."""
+    with _session(endpoint) as session:
+        served, versions = _ask_scenes(session, timeout)
+    if not versions:
+        raise BusyError(
+            f"no server answered at {endpoint} within {timeout:g} s: "
+            f"start one with: solidcloud serve ARCHIVE --listen {endpoint}"
+        )
+    return sorted(served)
+
+
+def _session(endpoint: str) -> zenoh.Session:
+    """A session connected to an endpoint; BadRequestError for one that is none."""
+    try:
+        return zenoh.open(session_config(connect=endpoint))
+    except zenoh.ZError as error:
+        raise BadRequestError(
+            f"endpoint {endpoint!r}: {error}: expected one such as {DEFAULT_ENDPOINT}"
+        ) from None
+
+
+def _ask_scenes(session: zenoh.Session, timeout: float) -> tuple[set[str], set[int]]:
+    """The scenes that are served, and the wire versions of the servers that answered."""
+    served: set[str] = set()
+    versions: set[int] = set()
+    replies = session.get(
+        keys.scenes_key(),
+        # Several servers answer under the one key, and all of them count.
+        target=zenoh.QueryTarget.ALL,
+        consolidation=zenoh.ConsolidationMode.NONE,
+        timeout=timeout,
+        encoding=_ENCODING,
+    )
+    for reply in replies:
+        if reply.ok is not None:
+            answer = decode_answer(ScenesAnswer, reply.ok.payload.to_bytes())
+            served.update(answer.scenes)
+            versions.add(answer.wire_version)
+    return served, versions
 
 
 def _add_request(name: str, avatar: _Avatar) -> bytes:

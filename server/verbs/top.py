@@ -1,0 +1,38 @@
+"""`solidcloud top`: what a server keeps in memory and how its users fare, live."""
+
+from contextlib import ExitStack
+from typing import Annotated
+
+import typer
+
+from .options import AsJson, print_json
+
+
+def top(
+    scene: Annotated[
+        str | None, typer.Option(help="Name of the scene; left out: all that are served.")
+    ] = None,
+    connect: Annotated[str, typer.Option(help="zenoh endpoint of the server.")] = "tcp/127.0.0.1:7447",
+    interval: Annotated[float, typer.Option(help="Seconds between two looks.")] = 1.0,
+    once: Annotated[bool, typer.Option("--once", help="Print one table and end.")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Show what a server keeps in memory, and how its users fare, until Ctrl-C."""
+    import msgspec
+
+    from ...schemas.errors import BadRequestError
+    from ..client import Client, scenes_at
+    from ..top import watch
+
+    if not 0.1 <= interval <= 3600:
+        raise BadRequestError(f"--interval {interval}: expected 0.1 to 3600 seconds")
+    with ExitStack() as stack:
+        names = [scene] if scene is not None else scenes_at(connect)
+        clients = [stack.enter_context(Client(connect, scene=name)) for name in names]
+        if as_json:
+            print_json([msgspec.to_builtins(client.stats()) for client in clients])
+            return
+        try:
+            watch(clients, interval, once=once)
+        except KeyboardInterrupt:
+            return  # how it is ended

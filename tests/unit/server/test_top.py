@@ -1,0 +1,163 @@
+"""The tables of `top`: rates between two looks, a bar for bytes, names that somebody else chose."""
+
+import io
+from collections.abc import Sequence
+from typing import Any
+
+import pytest
+from rich.console import Console
+from solidcloud.schemas.errors import BusyError
+from solidcloud.schemas.stats import StatsAnswer, Times, UserStats
+from solidcloud.server import top
+from solidcloud.server.top import MOST_ROWS, Look, budget_line, plain, rate, rate_text, seconds_text, watch
+
+
+class Told:
+    """A scene that says one thing after the other, then that nobody is there."""
+
+    def __init__(self, *said: StatsAnswer) -> None:
+        self.said = list(said)
+
+    def stats(self) -> StatsAnswer:
+        if not self.said:
+            raise BusyError("no server of scene 'hall' answered")
+        return self.said.pop(0)
+
+
+class Clock:
+    """A clock that moves when somebody sleeps."""
+
+    now = 50.0
+
+    def __call__(self) -> float:
+        return self.now
+
+    def sleep(self, seconds: float) -> None:
+        assert 0 < seconds <= top.NAP_SECONDS
+        self.now += seconds
+
+
+def hall(**fields: Any) -> StatsAnswer:
+    return StatsAnswer(scene="hall", **fields)
+
+
+def shown(said: Sequence[StatsAnswer], width: int = 80, terminal: bool = False, **more: Any) -> str:
+    """What is printed of these, until nobody answers."""
+    out, clock = io.StringIO(), Clock()
+    console = Console(file=out, width=width, height=60, force_terminal=terminal)
+    watching: dict[str, Any] = {"console": console, "clock": clock, "sleep": clock.sleep, **more}
+    if more.get("once"):
+        watch([Told(*said)], 1.0, **watching)
+    else:
+        with pytest.raises(BusyError, match="no server"):
+            watch([Told(*said)], 1.0, **watching)
+    return out.getvalue()
+
+
+def line(text: str, name: str, which: int = -1) -> list[str]:
+    """The words after a name in a line that begins with it and a number; of several, one of them."""
+    found = [each.removeprefix(name).split() for each in text.splitlines() if each.startswith(name)]
+    return [words for words in found if words[0][0].isdigit()][which]
+
+
+def test_a_rate_is_what_a_count_rose_a_second() -> None:
+    before, now = Look(10.0, hall(hits=100)), Look(12.0, hall(hits=150))
+    assert rate(before, now, "hits") == 25.0
+    assert rate(before, now, "misses") == 0.0
+    assert rate(None, now, "hits") is None
+    assert rate(now, Look(14.0, hall(hits=3)), "hits") is None, "another generation"
+    assert rate(now, now, "hits") is None
+
+
+def test_one_look_has_no_rates() -> None:
+    text = shown([hall(requests=1234, policy="lru", generation=2)], once=True)
+    assert "hall, generation 2, policy lru" in text
+    assert line(text, "requests ", 0)[:2] == ["1,234", "prefetched"]
+
+
+def test_rates_come_with_the_second_look() -> None:
+    text = shown([hall(requests=1000, misses=7), hall(requests=1450, misses=8)])
+    assert line(text, "requests ", 0)[:2] == ["1,000", "prefetched"]
+    assert line(text, "requests ", 1)[:2] == ["1,450", "450"]
+    assert line(text, "misses ", 1)[:2] == ["8", "1"]
+
+
+def test_on_a_terminal_one_table_is_drawn_over_and_the_cursor_comes_back() -> None:
+    text = shown([hall(requests=1000), hall(requests=1450)], terminal=True)
+    hide, show = "\x1b[?25l", "\x1b[?25h"
+    assert text.count(hide) == 1 and text.index(hide) < text.index("1,000") < text.index("1,450")
+    assert text.rindex(show) > text.index("1,450")
+
+
+def test_every_count_is_shown() -> None:
+    counted = {
+        name: 1001 + number
+        for number, name in enumerate(StatsAnswer.__struct_fields__)
+        if StatsAnswer.__annotations__[name] is int and "bytes" not in name and name != "generation"
+    }
+    text = shown([hall(**counted)], once=True)
+    assert [name for name, value in counted.items() if f"{value:,}" not in text] == []
+
+
+@pytest.mark.parametrize("width", [80, 100, 200])
+def test_it_fits_a_terminal_without_losing_a_number(width: int) -> None:
+    user = UserStats("c" * 32, "a" * 64, 123456, 1, 1, 12345, 1234, 123, 123, 0.1, 0.123, 1.25, 1000.0)
+    times = Times(9, 1.0, 0.00012, 0.0123, 0.123, 120.0)
+    counts = {"requests": 123_456_789, "answers": 123_456_789, "hits": 123_456_789}
+    said = hall(users=[user], load_seconds=times, stall_seconds=times, prefetched_bytes=123 << 30, **counts)
+    text = shown([said], width, once=True)
+    assert "…" not in text and max(map(len, text.splitlines())) <= width
+    numbers = ["123,456", "12,345", "1,234", "123", "123"]
+    assert line(text, "cccccc aaaaaaaaaa") == [*numbers, "123", "ms", "1.2", "s", "1000", "s"]
+    assert "120 µs" in text and "12 ms" in text and "123 ms" in text and "123.0 GB" in text
+
+
+def test_users_have_rates_of_their_own_and_the_last_are_counted() -> None:
+    many = [UserStats(f"{number:06}", "al", requests=100 + number) for number in range(MOST_ROWS + 3)]
+    later = [UserStats("000001", "al", requests=161), UserStats("new", "al", requests=5)]
+    text = shown([hall(users=many), hall(users=later)], 120)
+    assert "and 3 more" in text and f"{MOST_ROWS - 1:06} al" in text and f"{MOST_ROWS:06} al" not in text
+    assert line(text, "000001 al")[:2] == ["161", "60"]
+    assert line(text, "new al")[:2] == ["5", "0"], "no rate yet: the next is the misses"
+
+
+def test_a_bar_is_of_the_budget() -> None:
+    assert budget_line(hall(budget_bytes=1000, resident_bytes=400, coarse_bytes=100)).startswith(
+        "█" * 15 + "░" * 15 + " 50%  500 bytes of 1000 bytes, 100 bytes coarse"
+    )
+    assert budget_line(hall(budget_bytes=1000, resident_bytes=1000)).startswith("█" * 30 + " 100%")
+    assert budget_line(hall()).startswith("░" * 30 + " 0%  0 bytes of 0 bytes")
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [
+        (0.0, "0"),
+        (5e-7, "0"),
+        (1e-6, "1 µs"),
+        (0.000123, "123 µs"),
+        (0.00123, "1.2 ms"),
+        (0.0996, "100 ms"),
+        (0.25, "250 ms"),
+        (1.25, "1.2 s"),
+        (300.0, "300 s"),
+    ],
+)
+def test_times_for_a_reader(seconds: float, text: str) -> None:
+    assert seconds_text(seconds) == text
+
+
+def test_rates_for_a_reader() -> None:
+    assert [rate_text(value) for value in (None, 0.0, 0.25, 9.5, 12.4, 45000.0)] == [
+        "", "0", "0.25", "9.5", "12", "45,000",
+    ]  # fmt: skip
+
+
+def test_names_cannot_move_the_cursor() -> None:
+    assert plain("al\x1b[2J\r\n\u202e\x07b") == "al?[2J????b"
+    text = shown([hall(users=[UserStats("c\x1b[2J", "[red]x\x1b")])], once=True)
+    assert "\x1b" not in text and "c?[2J [red]x?" in text
+
+
+def test_a_scene_without_users_or_budget_is_shown_too() -> None:
+    assert "policy ?" in shown([hall()], once=True)

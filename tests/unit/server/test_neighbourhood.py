@@ -91,7 +91,7 @@ def test_the_horizon_follows_the_time_of_loading() -> None:
 
 def test_who_stands_wants_what_is_around_and_what_it_touches_first() -> None:
     around = make()
-    now = walk(around, np.tile([1.9, 1.0], (20, 1)))
+    now = walk(around, np.tile([1.9, 1.0], (70, 1)))
     wanted = around.plan(now, 0.25)[ME]
     assert cells(wanted.rows) == touched(1.9, 1.0, REACH + AHEAD.ring)
     here = touched(1.9, 1.0, REACH)
@@ -99,12 +99,25 @@ def test_who_stands_wants_what_is_around_and_what_it_touches_first() -> None:
     assert (wanted.need[len(here) :] > AHEAD.horizon(0.25)).all() and (np.diff(wanted.need) >= 0).all()
 
 
+def test_who_has_just_come_wants_nothing_around_yet() -> None:
+    """Nor who teleports every second: what is around would be loaded in vain each time."""
+    around = make()
+    here, around_here = touched(1.9, 1.0, REACH), touched(1.9, 1.0, REACH + AHEAD.ring)
+    for now, teleports in ((0.0, False), (10.0, True)):
+        if teleports:
+            around.saw(ME, now - 0.1, at(-30.0, -30.0), REACH)
+        assert around.saw(ME, now, at(1.9, 1.0), REACH) is teleports
+        for later, wanted in ((0.0, here), (AHEAD.settled - 0.1, here), (AHEAD.settled + 0.1, around_here)):
+            assert not around.saw(ME, now + later, at(1.9, 1.0), REACH)
+            assert cells(around.plan(now + later, 0.25)[ME].rows) == wanted
+
+
 def test_what_is_ahead_comes_before_what_is_around() -> None:
     around = make()
-    now = walk(around, straight(3.0))
+    now = walk(around, straight(3.0, 70))
     wanted = around.plan(now, 0.25)[ME]
     ahead = wanted.need <= AHEAD.horizon(0.25)
-    assert cells(wanted.rows[ahead]) == cells(make_plan(NO_RING, straight(3.0)).rows)
+    assert cells(wanted.rows[ahead]) == cells(make_plan(NO_RING, straight(3.0, 70)).rows)
     assert ahead.any() and not ahead.all() and np.array_equal(ahead, np.sort(ahead)[::-1])
     assert len(set(wanted.rows.tolist())) == len(wanted.rows)
 
@@ -217,8 +230,8 @@ def test_poses_asked_as_fast_as_they_are_answered_span_the_history_all_the_same(
 
 
 def test_a_user_wants_no_more_than_so_many_and_the_soonest() -> None:
-    few = make_plan(AHEAD._replace(most_wanted=4), straight(3.0))
-    many = make_plan(AHEAD, straight(3.0))
+    few = make_plan(AHEAD._replace(most_wanted=4), straight(3.0, 70))
+    many = make_plan(AHEAD, straight(3.0, 70))
     assert len(few.rows) == 4 < len(many.rows)
     assert few.rows.tolist() == many.rows[:4].tolist()
 

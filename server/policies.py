@@ -17,7 +17,9 @@ from ..schemas.errors import BadRequestError
 POLICIES = ("lru", "lru+prefetch", "distance", "s3fifo")
 
 # Of the budget, what scans may fill while others want room: sweeps along a path, and what is asked right after a
-# teleport. With all of it, one sweep through the archive washes out what every user stands in.
+# teleport. With all of it, one sweep through the archive washes out what every user stands in. As much as S3-FIFO gives
+# to what is new. Ten sweeps in five minutes beside eight strollers, `scripts/simulate_cache --sweeps 10 --kinds stroll`
+# in a town of 4e7 points: the strollers miss 362 voxels, and 440 where the sweeps are not told; 326 without sweeps.
 SCAN_SHARE = 0.1
 # S3-FIFO's small queue, of the budget, and the uses counted: two bits ([Yang23]).
 SMALL_SHARE = 0.1

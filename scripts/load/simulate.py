@@ -22,6 +22,8 @@ from .traces import Centers
 
 # Of the times that loads take, the share that is shorter than what predictions reckon with.
 USUAL = 0.9
+# Who sweeps: no user, so that it is nowhere; and how long one sweep through all voxels takes [s].
+NOBODY, SWEEP_SECONDS = -1, 10.0
 
 
 class Town(NamedTuple):
@@ -73,11 +75,27 @@ def requests_of(town: Town, asked: Centers) -> Requests:
     starts, flat = town.neighbourhood().rows_in_reach(asked.center, asked.reach)
     every, bounds = flat.tolist(), starts.tolist()
     rows = [every[a:b] for a, b in pairwise(bounds)]
-    began = np.full(int(asked.user.max(initial=-1)) + 1, np.inf)
-    np.minimum.at(began, asked.user, asked.time)
+    users, who = np.unique(asked.user, return_inverse=True)
+    began = np.full(len(users), np.inf)
+    np.minimum.at(began, who, asked.time)
     return Requests(
-        asked, rows, flat, np.repeat(np.arange(len(rows)), np.diff(starts)), asked.time < began[asked.user] + 1.0
+        asked, rows, flat, np.repeat(np.arange(len(rows)), np.diff(starts)), asked.time < began[who] + 1.0
     )  # fmt: skip
+
+
+def with_sweeps(town: Town, asked: Centers, sweeps: int) -> Centers:
+    """A trace and, evenly over its time, sweeps through all voxels in the order of their rows: scans, by NOBODY."""
+    voxels, seconds = len(town.sizes), float(asked.time[-1] - asked.time[0])
+    middle = (town.index.low + town.index.high) / 2 * town.step + town.origin
+    begin = asked.time[0] + seconds * (np.arange(sweeps) + 1) / (sweeps + 1)
+    time = (begin[:, None] + np.arange(voxels) * SWEEP_SECONDS / voxels).ravel()
+    swept = Centers(
+        np.full(len(time), NOBODY), time, np.tile(middle, (sweeps, 1)), np.zeros(len(time)),
+        np.ones(len(time), bool),
+    )  # fmt: skip
+    both = [np.concatenate(columns) for columns in zip(asked, swept, strict=True)]
+    order = np.argsort(both[1], kind="stable")
+    return Centers(*(column[order] for column in both))
 
 
 class Loading(NamedTuple):
@@ -98,7 +116,8 @@ class Outcome:
     misses: references to voxels not resident, each load counted once; `misses_later` those after the users' first
     second.  late: of misses, those whose load had begun ahead of time.  frames_missed, frames_missed_later: requests
     that waited.  waits: of each request [s].  prefetched, vain: loads ahead of time, and of those the ones evicted or
-    left at the end without a demand; the same in bytes.  evictions: all.
+    left at the end without a demand; the same in bytes.  evictions: all.  misses_swept: of sweeps, in `misses` too;
+    their waits and frames are nobody's, and what was loaded ahead was not for them.
     """
 
     requests: int = 0
@@ -113,6 +132,7 @@ class Outcome:
     vain: int = 0
     vain_bytes: int = 0
     evictions: int = 0
+    misses_swept: int = 0
     waits: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
 
     def row(self) -> dict[str, float]:
@@ -171,23 +191,29 @@ class Replay:
         )  # fmt: skip
         resident, ready, used = self.resident, self.ready, self.policy.used
         for number, (rows, user, time, reach, scan, first, center) in enumerate(each):
-            if self.sees:
+            if self.sees and user != NOBODY:
                 scan = self.neighbourhood.saw(("", str(user)), time, center, reach) or scan
+            if self.sees:
                 self.run_until(time)
             if not ready and resident.issuperset(rows):
                 for row in rows:
                     used(row, scan=scan)
-                if self.unused:
+                if self.unused and user != NOBODY:
                     self.unused.difference_update(rows)
                 continue
             missed = found.misses
             wait = self.demand(rows, time, scan)
+            if user == NOBODY:
+                found.misses_swept += found.misses - missed
+                continue
+            self.unused.difference_update(rows)
             waits[number] = wait
             found.frames_missed += wait > 0
             if not first:
                 found.misses_later += found.misses - missed
                 found.frames_missed_later += wait > 0
-        found.requests, found.references, found.waits = len(requests.rows), len(requests.flat), waits
+        found.requests, found.references = len(requests.rows), len(requests.flat)
+        found.waits = waits[asked.user != NOBODY]
         for row in self.unused:
             found.vain += 1
             found.vain_bytes += self.sizes[row]
@@ -207,7 +233,6 @@ class Replay:
                 until = max(until, self.ready[row])
                 self.found.late += row in self.unused
                 self.found.misses += row in self.unused
-        self.unused.difference_update(rows)
         for row in absent:
             self.make_room(row, rows)
             until = max(until, self.load(row, now, scan))

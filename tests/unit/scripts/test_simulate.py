@@ -22,7 +22,17 @@ from solidcloud.server.policies import POLICIES
 # Appended, so that nothing of scripts/ hides a module of the tests.
 sys.path.append(str(Path(__file__).parents[3] / "scripts"))
 
-from load.simulate import Loading, Outcome, Replay, Requests, Town, requests_of
+from load.simulate import (
+    NOBODY,
+    SWEEP_SECONDS,
+    Loading,
+    Outcome,
+    Replay,
+    Requests,
+    Town,
+    requests_of,
+    with_sweeps,
+)
 from load.traces import Centers, Trace, save
 
 SCRIPTS = Path(__file__).parents[3] / "scripts"
@@ -204,6 +214,48 @@ def test_loading_ahead_takes_nothing_that_somebody_stands_in() -> None:
     assert (found.waits[stands][30:] == 0).all() and found.evictions > 10
 
 
+def test_sweeps_come_evenly_and_ask_for_every_voxel() -> None:
+    asked = walks([along(1.0, 60.0), along(1.0, 60.0, y=5.0)])
+    both = with_sweeps(TOWN, asked, 2)
+    swept = both.user == NOBODY
+    assert (np.diff(both.time) >= 0).all() and both.scan[swept].all() and not both.scan[~swept].any()
+    for ours, theirs in zip(both, asked, strict=True):
+        assert np.array_equal(ours[~swept], theirs)
+    rows = [rows for rows, scan in zip(requests_of(TOWN, both).rows, swept, strict=True) if scan]
+    voxels = len(TOWN.sizes)
+    assert rows == [[row] for row in range(voxels)] * 2
+    begin = both.time[swept][[0, voxels]]
+    assert np.allclose(begin, asked.time[0] + np.ptp(asked.time) * np.array([1, 2]) / 3)
+    assert np.ptp(both.time[swept][:voxels]) == pytest.approx(SWEEP_SECONDS, rel=0.01)
+
+
+@pytest.mark.parametrize("name", ["lru", "lru+prefetch"])
+def test_sweeps_that_are_told_hurt_less_and_are_counted_apart(name: str) -> None:
+    """Users who go to and fro, with room for little more than where they go."""
+    x = 6.0 + 5.0 * np.sin(np.arange(1800) / 30)
+    asked = walks([np.column_stack([x, np.full(1800, y)]) for y in (1.0, 5.0)])
+    swept = with_sweeps(TOWN, asked, 4)
+    plain = replay(name, asked, budget=3000)[1]
+    told = replay(name, swept, budget=3000)[1]
+    _, hidden = replay(name, swept._replace(scan=np.zeros(len(swept.user), bool)), budget=3000)
+    for found in (told, hidden):
+        assert found.misses_swept > 600 and len(found.waits) == len(asked.user)
+        assert found.misses_later <= found.misses - found.misses_swept
+
+    def loads(found: Outcome) -> int:
+        return found.misses - found.misses_swept + found.prefetched
+
+    assert loads(plain) <= loads(told) < loads(hidden)
+
+
+def test_what_a_sweep_asks_for_was_not_loaded_ahead_for_it() -> None:
+    asked = walks([along(0.0, 30.0, y=4.0)])
+    options = {"ahead": AHEAD._replace(ring=3.0)}
+    _, plain = replay("lru+prefetch", asked, **options)
+    _, swept = replay("lru+prefetch", with_sweeps(TOWN, asked, 1), **options)
+    assert swept.prefetched == plain.prefetched == plain.vain == swept.vain > 0
+
+
 def test_a_budget_below_one_request_is_refused() -> None:
     with pytest.raises(ValueError, match="a request needs"):
         replay("lru", walks([along(1.0, 1.0)]), budget=60)
@@ -259,8 +311,14 @@ def test_goals_are_of_voxels_and_after_the_first_second(script: ModuleType) -> N
 def test_ahead_is_read_by_name(script: ModuleType) -> None:
     read = script.read_ahead("ring=1.5,most_wanted=32")
     assert read == AHEAD._replace(ring=1.5, most_wanted=32) and type(read.most_wanted) is int
+    assert script.changed(read) == "ring 1.5, most_wanted 32"
+    moved = script.read_ahead("history=0.25")
+    assert moved == AHEAD._replace(motion=AHEAD.motion._replace(history=0.25))
+    assert script.changed(moved) == "history 0.25" and script.changed(AHEAD) == ""
     for text in ("width=3", "ring=x", "ring", "motion=1"):
-        with pytest.raises(argparse.ArgumentTypeError, match="expected NAME=NUMBER, of loads, least"):
+        with pytest.raises(
+            argparse.ArgumentTypeError, match="expected NAME=NUMBER, of loads, least, most, ring, settled"
+        ):
             script.read_ahead(text)
 
 

@@ -218,8 +218,13 @@ class Metrics:
         """What it came to in all, and for each user that is remembered, those heard of last first."""
         with self._lock:
             total = Total(self._gone.copy(), self._engine.copy(), self._loads.copy())
-            users = [(key, user.copy()) for key, user in reversed(self._users.items())]
-            now = self._clock()
+            known = list(reversed(self._users.items()))
+        users = []
+        # One by one, for requests wait meanwhile. One that is forgotten now is counted all the same: it was not before.
+        for key, user in known:
+            with self._lock:
+                users.append((key, user.copy()))
+        now = self._clock()
         for _, user in users:
             total.counts.merge(user)
         return total, [_user_stats(key, max(0.0, now - user.seen), user) for key, user in users]

@@ -18,7 +18,7 @@ from solidcloud.schemas.stats import StatsAnswer
 sys.path.append(str(Path(__file__).parents[3] / "scripts"))
 
 from bench.results import MET, MISSED, Part, goal_rows
-from load import cases, check, frames, pace, page, pictures, server, town
+from load import cases, check, drive, frames, pace, page, pictures, server, town
 from load.adversary import Adversary, LruModel
 from load.cases import ECHO, Case, Ran
 from load.frames import ANSWERED, NOTHING, REFUSED, Frames
@@ -256,6 +256,17 @@ def test_a_truth_that_is_not_there_is_named(tmp_path: Path) -> None:
         town.find(tmp_path / "town.scd", None, 1, 8.0, tmp_path)
     (tmp_path / "town.truth.json").write_text("{}")
     assert town.find(tmp_path / "town.scd", None, 1, 8.0, tmp_path)[1] == tmp_path / "town.truth.json"
+
+
+def test_users_in_processes_ask_every_frame_of_a_trace_and_hear_of_each(tmp_path: Path) -> None:
+    user = np.array([0, 1, 2] * 10)
+    asked = Trace(user, np.arange(30) / 90, np.tile(np.eye(4), (30, 1, 1)))
+    setup = drive.Setup(tmp_path / "none", tmp_path, processes=2)
+    found = drive.run_echo(setup, asked, request_bytes=226, reply_bytes=180)
+    made = found.frames
+    assert made.user.tolist() == user.tolist() and (made.status == ANSWERED).all() and not found.faults
+    assert np.allclose(made.due - made.due[0], asked.time) and (made.due <= made.sent).all()
+    assert (made.sent <= made.done).all() and (np.diff(made.due) >= 0).all()
 
 
 # --- cases, goals, pictures -----------------------------------------------------------------------------

@@ -20,7 +20,9 @@ from numpy.typing import NDArray
 from solidcloud.schemas.answers import Verdict
 from solidcloud.schemas.errors import BusyError, FormatError, UnknownSceneError
 from solidcloud.schemas.messages import ReloadAnswer
+from solidcloud.server import client as client_module
 from solidcloud.server.app import serving
+from solidcloud.server.cli import run
 from solidcloud.server.client import Client
 from solidcloud.server.config import ServerConfig
 from solidcloud.server.scene import Scene
@@ -184,9 +186,14 @@ def test_what_cannot_be_opened_is_said_and_the_old_one_served_on(
         assert which(generations, client.collide("al", generations.poses).verdict) == {0}
 
 
-def test_a_reload_that_nobody_answers_says_so(endpoint: str) -> None:
-    with Client(endpoint, scene="floor") as client, pytest.raises(BusyError, match="no server of scene"):
+def test_a_reload_that_nobody_answers_says_so(endpoint: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with Client(endpoint, scene="floor") as client, pytest.raises(BusyError) as told:
         client.reload()
+    advice = f"start one with: solidcloud serve ARCHIVE --name floor --listen {endpoint}"
+    absent = f"no server of scene 'floor' at {endpoint}, expected one that answers 'reload': {advice}"
+    assert str(told.value) == absent, "nobody waits for 600 s where there is nobody"
+    assert run(["reload", "--scene", "floor", "--connect", endpoint]) == 1
+    assert absent in capsys.readouterr().err
     with (
         serving([FloorScene()], ServerConfig(listen=endpoint)),
         pytest.raises(UnknownSceneError),
@@ -215,6 +222,35 @@ def server(generations: Generations, endpoint: str, tmp_path: Path) -> Iterator[
             yield process
         finally:
             process.kill()
+
+
+def test_a_server_that_is_slow_is_told_from_one_that_is_gone(
+    endpoint: str, server: subprocess.Popen[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(client_module._SECONDS, "reload", 1.5)
+    with Client(endpoint, scene="hall", timeout=1.5) as client:
+        client.reload()
+        os.kill(server.pid, signal.SIGSTOP)
+        with pytest.raises(BusyError) as told:
+            client.reload()
+        assert str(told.value) == (
+            f"the server of scene 'hall' at {endpoint} has not answered 'reload' within 1.5 s: it may still be at "
+            "work, and its log says when it is done: ask again, or start it anew"
+        )
+    monkeypatch.setitem(client_module._SECONDS, "reload", DEADLINE)
+    os.kill(server.pid, signal.SIGCONT)
+    with Client(endpoint, scene="hall") as client:
+        client.reload()
+        os.kill(server.pid, signal.SIGSTOP)
+        killer = threading.Timer(0.3, server.kill)  # while it is asked, and before: it is gone all the same
+        killer.start()
+        with pytest.raises(BusyError) as told:
+            client.reload()
+        killer.join()
+    assert str(told.value) == (
+        f"the server of scene 'hall' at {endpoint} is gone, expected its answer to 'reload': start one with: "
+        f"solidcloud serve ARCHIVE --name hall --listen {endpoint}"
+    )
 
 
 def test_the_command_and_the_signal_reload(

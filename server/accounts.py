@@ -16,8 +16,8 @@ class Counters(NamedTuple):
     """What a residency has done so far; voxels but where bytes are said.
 
     hits: asked for and there, or being loaded; waits: of them being loaded.  misses: asked for and not there.
-    late: asked for and not there in time.  prefetched: loaded before anybody asked; used: of them asked for since;
-    wasted: of them gone again without.  evicted: gone for others; too_soon: of them asked for again within TOO_SOON.
+    late: asked for and not there in time.  prefetched: loads begun before anybody asked; used: of them asked for since;
+    wasted: of them failed, or gone again without.  evicted: gone for others; too_soon: of them asked for again within TOO_SOON.
     moved_bytes: of voxels moved to join free room.  failed: loads that failed.
     """
 
@@ -72,10 +72,7 @@ class Accounts:
     def evicted(self, row: int) -> None:
         """A voxel went for another."""
         self._went[row] = time.perf_counter()
-        if row in self.fresh:
-            self.fresh.discard(row)
-            self.wasted += 1
-            self.wasted_bytes += self._sizes[row]
+        self._in_vain(row)
 
     def begun_ahead(self, row: int) -> None:
         """A voxel is being loaded that nobody asked for."""
@@ -86,10 +83,14 @@ class Accounts:
     def lost(self, row: int) -> None:
         """A load failed."""
         self.failed += 1
+        self._in_vain(row)
+
+    def _in_vain(self, row: int) -> None:
+        """A voxel is gone; if it was prefetched and nobody asked for it, that was for nothing."""
         if row in self.fresh:
             self.fresh.discard(row)
-            self.prefetched -= 1
-            self.prefetched_bytes -= self._sizes[row]
+            self.wasted += 1
+            self.wasted_bytes += self._sizes[row]
 
     def counters(self, evicted: int, moved_bytes: int) -> Counters:
         """All of them."""

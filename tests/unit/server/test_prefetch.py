@@ -168,7 +168,7 @@ def test_a_load_that_fails_leaves_nothing_and_the_next_goes_on(fault: str) -> No
         assert until(lambda: table.resident() == [1])
         table.wishes.wanted = {}
         counters = table.residency.counters()
-        assert counters.prefetched == 1 and counters.failed >= 1
+        assert counters.prefetched == 1 + counters.failed and counters.wasted == counters.failed >= 1
         table.store.faults.clear()
         with table.residency.hold([0]) as held:
             assert bool(held.faults) == (fault == "corrupt")

@@ -119,7 +119,8 @@ class Coarse:
         except BaseException:
             self._give_back(row, number)
             raise
-        # The lock is a barrier: no processor writes what is inside before what is above.
+        # Between what is written above and below the interpreter's lock was let go and this one is taken: who sees the
+        # slot's number, which is where its rows are found, sees the rows.
         with self._lock:
             self.arrays.count[number] = count
             self.arrays.slot[row] = number

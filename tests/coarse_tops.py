@@ -4,8 +4,10 @@ import math
 from pathlib import Path
 from typing import NamedTuple
 
+import cases
 import naive
 import numpy as np
+import scans
 from numpy.typing import NDArray
 from solidcloud.schemas.radius_model import class_radii
 from solidcloud.server.arena import ArenaBuffer
@@ -130,6 +132,12 @@ def open_made(folder: Path, model: str | None = None, budget_bytes: int = ROOM) 
     )
     coarse = Coarse(len(sizes), budget_bytes)
     return Made(store, buffer.arena, loaded, arrays, broad, int(radii.max()), coarse)
+
+
+def scattered(folder: Path) -> Made:
+    """Eight voxels with hierarchies of a few levels, some of fewer leaf nodes than a slot holds."""
+    points = scans.make_scan("noise", 3, 2500) ** 2 / scans.SIZE
+    return open_made(cases.build(folder, points, voxel=1.0, leaf=2, degree=3, cell_points=50).archive)
 
 
 def least_margin(

@@ -1,6 +1,7 @@
 """`collide`: does an avatar touch the scene, one verdict a pose? One request -> one result."""
 
 import time
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -98,7 +99,7 @@ def collide(
 
 def _bounds(
     verdict: NDArray[np.uint8], radii: NDArray[np.int64], margin: float, margin_units: int, effort: Effort
-) -> dict[str, NDArray]:
+) -> dict[str, Any]:
     """The bounds of `CollideAnswers` that verdicts alone give; none where no tolerance asks for them.
 
     radii: (k,) of avatar's and scan's largest spheres together, exact units: no pair is deeper.  margin: [m];

@@ -184,7 +184,7 @@ def _by_pose(rows: NDArray[np.int64], runs: NDArray[np.int64]) -> tuple[NDArray[
 
 def _columns(
     data: SceneData, reach: Reach, margin_units: int, tally: Tally, memory: Memory, has_points: bool
-) -> dict[str, NDArray[Any]]:
+) -> dict[str, Any]:
     """The fields of `ContactsAnswers` but the cost of the request."""
     exact = ~tally.cut & (tally.counts[0] == 0)
     if has_points:  # an empty avatar is clear, whatever is unknown here

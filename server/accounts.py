@@ -17,7 +17,8 @@ class Counters(NamedTuple):
 
     hits: asked for and there, or being loaded; waits: of them being loaded.  misses: asked for and not there.
     late: asked for and not there in time.  prefetched: loads begun before anybody asked; used: of them asked for since;
-    wasted: of them failed, or gone again without.  evicted: gone for others; too_soon: of them asked for again within TOO_SOON.
+    wasted: of them failed, or gone again without.  evicted: gone for others; too_soon: of them asked for again within
+    TOO_SOON.
     moved_bytes: of voxels moved to join free room.  failed: loads that failed.
     """
 

@@ -59,6 +59,8 @@ def calls_of(case: Case) -> list[Call]:
         own = str(case.folder) + "/" in line or f"{case.folder}>" in line
         if own and (match[1] != "openat" or re.search(r"O_WRONLY|O_RDWR|O_CREAT", line)):
             found.append(Call(match[1], counts[match[1]], line.replace(str(case.folder), "")))
+    if not found:
+        raise RuntimeError(f"a traced command touches nothing in {case.folder}: is that how it names it?")
     return found
 
 

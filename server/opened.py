@@ -155,15 +155,15 @@ class Opened:
         x, y, z = place[0].tolist()
         self.prefetcher.warm((x, y, z))
         avatar = make_avatar([[0.0, 0, 0], [0.1, 0, 0]])
-        if data.coarse is not None:
-            reach = check_request(data, avatar, pose, data.radius_units)
-            nowhere = data.arrays._replace(where=np.full_like(data.arrays.where, -1))
-            settle(nowhere, data.coarse.arrays, avatar.arrays, pose, reach)
         both = np.full(2, 0xFFFFFFFF, np.uint32)
         # Budgets that are hardly ever spent: what is bounded has kernels of its own, and so have deadlines.
         later = time.perf_counter() + 3600.0
         for poses in (pose, np.concatenate([pose, pose])):
             Walker(self.taken, avatar).collide(poses)
+        if data.coarse is not None:  # of the voxel that was just loaded, as if it were not
+            reach = check_request(data, avatar, pose, data.radius_units)
+            nowhere = data.arrays._replace(where=np.full_like(data.arrays.where, -1))
+            settle(nowhere, data.coarse.arrays, avatar.arrays, pose, reach)
         for effort in (EXACT, Effort(tolerance=1e-3, visits=1 << 20), Effort(deadline=later)):
             for poses in (pose, np.concatenate([pose, pose])):
                 collide(data, avatar, poses, 0.0, effort)

@@ -161,7 +161,7 @@ def film_strip(ran: Ran, voxels: Voxels) -> bytes:
         for own, colour, alpha in ((~held, "#d5dae0", 0.6), (held, COLOURS[0], 0.5)):
             _plan(axes, boxes[own], colour, alpha)
         axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
-        axes.set_title(f"{at:.0f} s, {int(held.sum())} voxels", fontsize=8)
+        axes.set_title(f"{at:.1f} s, {int(held.sum())} voxels", fontsize=8)
     figure.suptitle(f"resident from above: {ran.case.name}, {ran.case.side}", fontsize=10)
     return png(figure)
 

@@ -65,6 +65,7 @@ class SceneUser(Client):
     """A client that does not wait for its answers."""
 
     def send(self, payload: bytes, came: Came) -> None:
+        """Ask `collide`; see `Asker`."""
         # Called in the thread that receives: the default starts a thread for each question.
         handler = zenoh.handlers.Callback(came, indirect=False)
         self._querier("collide").get(handler, payload=payload, encoding=zenoh.Encoding(MSGPACK))
@@ -90,6 +91,7 @@ class EchoUser:
         self._stack.close()
 
     def send(self, payload: bytes, came: Came) -> None:
+        """Ask the echo; see `Asker`."""
         self._querier.get(zenoh.handlers.Callback(came, indirect=False), payload=payload)
 
 

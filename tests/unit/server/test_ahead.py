@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 from solidcloud.schemas.kernels.morton import morton_encode
 from solidcloud.schemas.voxel_grid import KEY_BIAS
 from solidcloud.server.kernels.ahead import (
+    MOST_CELLS,
     Motion,
     distance_to_ways,
     first_touch,
@@ -61,7 +62,9 @@ def test_what_is_wanted_is_what_brute_force_finds(side: int, count: int, reach: 
         rows, need = np.full(1000, -1), np.full(1000, np.nan)
         found = rows_ahead(way, reach, ring, index, VOXEL_STEPS, rows, need)
         rows, need = rows[:found], need[:found]
-        assert len(set(rows.tolist())) == found and (np.diff(need) >= 0).all()
+        assert len(set(rows.tolist())) == found
+        each = list(zip(need.tolist(), rows.tolist(), strict=True))
+        assert each == sorted(each), "soonest first, of equals by row"
         along = np.linspace(0, 8, 401)
         centers = np.column_stack([np.interp(along, np.arange(9), way[:, k]) for k in range(3)])
         apart = gaps(index, centers)
@@ -113,6 +116,19 @@ def test_far_outside_the_scene_nothing_is_wanted() -> None:
         assert rows_ahead(np.full((3, 3), place), 50.0, 50.0, index, VOXEL_STEPS, rows, need) == 0
     empty = SceneIndex(index.keys[:0], index.low[:0], index.high[:0], index.scene_low, index.scene_high)
     assert rows_ahead(np.zeros((3, 3)), 50.0, 50.0, empty, VOXEL_STEPS, rows, need) == 0
+
+
+@pytest.mark.parametrize(("beyond", "found"), [(-1, 1), (0, 0)])
+def test_no_more_cells_are_looked_at_than_are_said(beyond: int, found: int) -> None:
+    """A row of voxels that a ball comes down to at its end, which is looked at last."""
+    count = MOST_CELLS + 1 + beyond
+    coordinates = np.column_stack([np.arange(count), np.zeros((count, 2), np.int64)])
+    base = coordinates * VOXEL_STEPS
+    keys = morton_encode((coordinates + KEY_BIAS).astype(np.uint64))
+    index = SceneIndex(keys, base, base, base[0], base[-1] + [0, 300, 0])
+    way = np.array([base[0] + [0, 200, 0], base[-1]], np.float64)
+    rows, need = np.empty(9, np.int64), np.empty(9)
+    assert rows_ahead(way, 1e-3, 0.0, index, VOXEL_STEPS, rows, need) == found
 
 
 def test_a_ball_that_passes_by_touches_where_it_is_nearest(rng: np.random.Generator) -> None:
@@ -215,6 +231,28 @@ def test_turning_is_followed() -> None:
     straight = poses[-1, 1:] + 0.75 * np.array([-np.sin(angle[-1]), np.cos(angle[-1]), 0])
     assert np.linalg.norm(way[-1] - truth) < np.linalg.norm(straight - truth) * 0.6
     assert np.array_equal(way[0], poses[-1, 1:])
+
+
+@pytest.mark.parametrize("power", [1, 2, 3])
+def test_no_motion_is_beyond_its_bounds(power: int) -> None:
+    t = np.arange(16)[:, None] / 30
+    velocity, acceleration = fit_motion(walked(1e3 * t**power * [1.0, -1.0, 0.5]), MOTION)
+    assert np.linalg.norm(velocity) == pytest.approx(MOTION.speed)
+    assert np.linalg.norm(acceleration) <= MOTION.acceleration * (1 + 1e-9)
+    if power > 1:
+        assert np.linalg.norm(acceleration) == pytest.approx(MOTION.acceleration)
+
+
+def test_acceleration_fades_so_that_what_is_far_ahead_goes_straight() -> None:
+    """At 1 m/s, gaining 2 m/s a second: after half a second some 60 % of a second's worth, then hardly more."""
+    t = np.arange(16)[:, None] / 30
+    way = np.empty((17, 3))
+    predict_way(walked((0.5 * t + t**2) * [1.0, 0.0, 0.0]), MOTION, 4.0, way)
+    velocity, gained = 1.5, 2.0 * MOTION.fade
+    expected = velocity * 4.0 + gained * (4.0 - MOTION.fade * (1 - np.exp(-4.0 / MOTION.fade)))
+    assert way[-1, 0] - way[0, 0] == pytest.approx(expected, rel=0.05)
+    speeds = np.diff(way[:, 0]) / 0.25
+    assert speeds[1] > speeds[0] + 0.1 and speeds[-1] - speeds[-2] < 0.01
 
 
 @pytest.mark.parametrize("power", [1, 2, 3])

@@ -96,7 +96,14 @@ def test_who_stands_wants_what_is_around_and_what_it_touches_first() -> None:
     assert cells(wanted.rows) == touched(1.9, 1.0, REACH + AHEAD.ring)
     here = touched(1.9, 1.0, REACH)
     assert cells(wanted.rows[: len(here)]) == here and (wanted.need[: len(here)] == 0).all()
-    assert (wanted.need[len(here) :] > AHEAD.horizon(0.25)).all() and (np.diff(wanted.need) >= 0).all()
+    low, high = INDEX.low[wanted.rows] * STEP, INDEX.high[wanted.rows] * STEP
+    gap = np.maximum(np.maximum(low - [1.9, 1.0, 1.0], [1.9, 1.0, 1.0] - high), 0)
+    beyond = (np.sqrt((gap**2).sum(axis=1)) - REACH) / AHEAD.ring
+    expected = AHEAD.horizon(0.25) * (1 + beyond[len(here) :])
+    for later in (0.0, STALE + 0.1):  # not heard of for a while: the same
+        need = around.plan(now + later, 0.25)[ME].need
+        assert np.allclose(need[len(here) :], expected, rtol=0.02) and (np.diff(need) >= 0).all()
+    assert len(expected) > 1
 
 
 def test_who_has_just_come_wants_nothing_around_yet() -> None:
@@ -256,11 +263,16 @@ def test_who_leaves_is_forgotten() -> None:
 def test_what_users_can_touch_is_kept_each_once() -> None:
     around = make()
     around.saw(ME, 0.0, at(2.0, 2.0), REACH)
-    around.saw(YOU, 5.0, at(4.0, 2.0), 1.0)
+    around.saw(YOU, 5.0, at(3.0, 3.0), 1.2)
     kept = around.kept(5.0)
-    assert cells(kept) == touched(2.0, 2.0, REACH) | touched(4.0, 2.0, 1.0)
+    assert cells(kept) == touched(2.0, 2.0, REACH) | touched(3.0, 3.0, 1.2)
     assert len(set(kept.tolist())) == len(kept)
-    assert cells(around.kept(EXPIRY + 1.0)) == touched(4.0, 2.0, 1.0), "not what is not heard of any more"
+    around.saw(YOU, 5.1, at(3.0, 3.0), REACH)
+    assert cells(around.kept(5.1)) == touched(2.0, 2.0, REACH) | touched(3.0, 3.0, REACH), (
+        "its reach is the last one's"
+    )
+    around.saw(YOU, 5.2, at(3.0, 3.0), 1.2)
+    assert cells(around.kept(EXPIRY + 1.0)) == touched(3.0, 3.0, 1.2), "not what is not heard of any more"
 
 
 def test_nearness_is_the_distance_to_the_nearest_way() -> None:

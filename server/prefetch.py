@@ -22,6 +22,9 @@ log = logging.getLogger(__name__)
 PLAN_SECONDS = 0.05
 # How long nothing may be heard of a user whose voxels are kept [s].
 SILENCE = 10.0
+# What is done when there is nothing to be loaded rests so many times as long as it works: it is Python in good part, and
+# who answers waits for the interpreter meanwhile.
+IDLE_REST = 4.0
 # Of the times that loads took, this share is shorter than what is reckoned with.
 USUAL = 0.9
 
@@ -131,8 +134,10 @@ class Prefetcher:
                 continue
             if self._idle is not None:
                 self._residency.wait_for_nobody()
+                begin = self._clock()
                 if not self._idle():
                     self._idle = None
+                time.sleep(min(IDLE_REST * (self._clock() - begin), PLAN_SECONDS))
                 continue
             if self._seen:
                 time.sleep(

@@ -18,12 +18,13 @@ from .residency import Ahead, Residency
 
 log = logging.getLogger(__name__)
 
-# What is wanted is found out at most so often [s]: at 5 m/s a user moves a quarter of a metre meanwhile.
-PLAN_SECONDS = 0.05
+# What is wanted is found out at most so often [s]: at 5 m/s a user moves a quarter of a metre meanwhile. And with many
+# users so seldom that it rests so many times as long as it takes: 64 of them take some 10 ms.
+PLAN_SECONDS, PLAN_REST = 0.05, 10.0
 # How long nothing may be heard of a user whose voxels are kept [s].
 SILENCE = 10.0
-# What is done when there is nothing to be loaded rests so many times as long as it works: it is Python in good part, and
-# who answers waits for the interpreter meanwhile.
+# What is done when there is nothing to be loaded rests so many times as long as it works: it is Python in good part,
+# and who answers waits for the interpreter meanwhile.
 IDLE_REST = 4.0
 # Of the times that loads took, this share is shorter than what is reckoned with.
 USUAL = 0.9
@@ -120,13 +121,13 @@ class Prefetcher:
         """The thread's work."""
         queue: deque[tuple[int, float]] = deque()
         need: dict[int, float] = {}
-        planned = -SILENCE
+        due = -math.inf
         while True:
             now = self._clock()
-            left = planned + PLAN_SECONDS - now
-            if self._seen and left <= 0:
-                self._seen, planned = False, now
+            if self._seen and now >= due:
+                self._seen = False
                 need = self._plan(now)
+                due = now + max(PLAN_SECONDS, PLAN_REST * (self._clock() - now))
                 queue = deque(need.items() if self._ahead else ())
             if self._stopped:
                 return
@@ -140,9 +141,8 @@ class Prefetcher:
                 time.sleep(min(IDLE_REST * (self._clock() - begin), PLAN_SECONDS))
                 continue
             if self._seen:
-                time.sleep(
-                    max(0.0, min(left, PLAN_SECONDS))
-                )  # until they may have moved far enough to look again
+                # Until they may have moved far enough to look again; a stop need not wait for it.
+                time.sleep(max(0.0, min(due - now, PLAN_SECONDS)))
                 continue
             # Nobody is seen any more: what they stood in is let go when their time is up.
             if not self._work.wait(SILENCE if self._residency.kept else None):

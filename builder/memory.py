@@ -1,6 +1,8 @@
 """How `--memory` is shared: all processes of a build together, what they hold of the data and what they are made of."""
 
 import math
+import os
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +35,9 @@ CLUSTER_WORKER_KILLED = 0.95
 # What such a worker is made of as dask counts it, shared libraries whole (measured: 205 MB when it has read records).
 CLUSTER_WORKER_BYTES = 240 << 20
 
+# How the advice for a voxel that is too large goes on where a build is refused: what it has done is kept.
+OTHERWISE = " to go on from what is done, or a smaller --voxel and --fresh"
+
 
 def jobs_that_fit(jobs: int, config: BuildConfig) -> int:
     """Processes that the memory bound allows, of so many that are wanted; at least one."""
@@ -61,11 +66,13 @@ def record_bytes_a_point(config: BuildConfig) -> int:
     return 2 * row.itemsize + math.ceil(NODES_A_FULL_LEAF * RECORD_BYTES_A_NODE / config.leaf)
 
 
-def readers_that_fit(counts: NDArray[np.int64], jobs: int, config: BuildConfig) -> int:
+def readers_that_fit(
+    counts: NDArray[np.int64], jobs: int, config: BuildConfig, otherwise: str = OTHERWISE
+) -> int:
     """How many of `jobs` processes may each hold the record of a voxel at a time, whichever of `counts` (v,) points.
 
     `jobs` for workers of a scheduler that is elsewhere: their memory is not known here. Raises SolidcloudError where
-    not even one may hold the largest.
+    not even one may hold the largest; otherwise: what its advice ends with, after the memory to be given.
     """
     if config.scheduler or not len(counts):
         return jobs
@@ -78,17 +85,33 @@ def readers_that_fit(counts: NDArray[np.int64], jobs: int, config: BuildConfig) 
         fewer_too = f"{option}{fewer} or " if fewer else ""
         raise SolidcloudError(
             f"a voxel of {config.voxel:g} m holds {int(largest[0])} points, and to read its record back takes "
-            f"{most >> 20} MB: give {fewer_too}--memory {_memory_for(most, jobs, config) >> 20}MB to go on from what "
-            "is done, or a smaller --voxel and --fresh"
+            f"{most >> 20} MB: give {fewer_too}--memory {_memory_for(most, jobs, config) >> 20}MB{otherwise}"
         )
     fits = int(np.searchsorted(needed, _room(jobs, config), "right"))
     return jobs if fits == len(largest) else fits
 
 
+def bytes_beside_records(counts: NDArray[np.int64], readers: int, jobs: int, config: BuildConfig) -> int:
+    """What each of `readers` processes, as `readers_that_fit` says, may hold beside the record of a voxel [bytes].
+
+    No more than its share of `--memory`, which alone is what workers elsewhere go by.
+    """
+    share = memory_share(jobs, config)
+    if config.scheduler or not len(counts):
+        return share
+    largest = np.sort(counts)[::-1][:readers] * record_bytes_a_point(config) + RECORD_BYTES
+    left = (_room(jobs, config) - int(largest.sum())) // readers
+    return max(0, min(share, left, _room_of_one(jobs, config) - int(largest[0])))
+
+
+def _base(jobs: int, config: BuildConfig) -> int:
+    """Bytes that `jobs` processes are made of."""
+    return ALONE_BYTES if jobs == 1 and not config.cluster else BUILDER_BYTES + jobs * WORKER_BYTES
+
+
 def _room(jobs: int, config: BuildConfig) -> int:
     """Bytes that all of `jobs` processes may hold together of records that are read back."""
-    base = ALONE_BYTES if jobs == 1 and not config.cluster else BUILDER_BYTES + jobs * WORKER_BYTES
-    return max(config.memory_bytes + OVER_BYTES - base, LEAST_SHARE)
+    return max(config.memory_bytes + OVER_BYTES - _base(jobs, config), LEAST_SHARE)
 
 
 def _room_of_one(jobs: int, config: BuildConfig) -> int:
@@ -100,9 +123,22 @@ def _room_of_one(jobs: int, config: BuildConfig) -> int:
 
 
 def _memory_for(needed: int, jobs: int, config: BuildConfig) -> int:
-    """The `--memory` [bytes, whole MB] with which one of `jobs` processes may hold so many bytes."""
-    memory = config.memory_bytes + needed - _room(jobs, config)
+    """The `--memory` [bytes, whole MB] with which one of `jobs` processes may hold so many bytes, more than it may now.
+
+    With more memory there are more processes, up to those that are wanted, and each takes of it.
+    """
     if config.cluster:
         limit = (needed + CLUSTER_WORKER_BYTES + 1) / CLUSTER_WORKER_KILLED
-        memory = max(memory, int(limit - CLUSTER_WORKER_AIR_BYTES + 1) * jobs)
-    return -(-memory >> 20) << 20
+        of_one = int(limit - CLUSTER_WORKER_AIR_BYTES + 1) * jobs
+        return _whole_mb(max(needed + _base(jobs, config) - OVER_BYTES, of_one))
+    wanted = max(jobs, config.jobs or os.cpu_count() or 1)
+    for number in range(jobs, wanted):
+        memory = _whole_mb(needed + _base(number, config) - OVER_BYTES)
+        if jobs_that_fit(wanted, replace(config, memory_bytes=memory)) <= number:
+            return memory
+    return _whole_mb(needed + _base(wanted, config) - OVER_BYTES)
+
+
+def _whole_mb(size: int) -> int:
+    """So many bytes, rounded up to whole MB."""
+    return -(-size >> 20) << 20

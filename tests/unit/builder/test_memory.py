@@ -14,6 +14,7 @@ from solidcloud.builder.memory import (
     OVER_BYTES,
     RECORD_BYTES,
     WORKER_BYTES,
+    bytes_beside_records,
     cluster_worker_limit,
     jobs_that_fit,
     memory_share,
@@ -67,32 +68,72 @@ def test_no_more_processes_read_than_hold_the_largest_voxels(jobs: int, memory: 
 
 
 @pytest.mark.parametrize("cluster", [False, True])
-@pytest.mark.parametrize("jobs", [1, 2, 7])
-@pytest.mark.parametrize("points", [7 * 10**6, 4 * 10**7, 10**8, 10**9])
+@pytest.mark.parametrize("wanted", [1, 2, 3, 4, 7, 8, 16, 32])
+@pytest.mark.parametrize("memory", [64, 128, 256, 512, 1024, 2048])
 def test_the_memory_and_the_jobs_named_for_a_large_voxel_are_enough(
-    points: int, jobs: int, cluster: bool
+    wanted: int, memory: int, cluster: bool
 ) -> None:
-    counts = np.array([points])
+    """More memory lets more processes start, and each takes of it."""
 
-    def given(memory: int, number: int) -> BuildConfig:
-        return BuildConfig(memory_bytes=memory, cluster=f"local:{number}" if cluster else None)
+    def read(points: int, memory: int, number: int) -> int:
+        config = BuildConfig(
+            memory_bytes=memory << 20, jobs=number, cluster=f"local:{number}" if cluster else None
+        )
+        jobs = number if cluster else jobs_that_fit(number, config)
+        readers = readers_that_fit(np.array([points, 1000]), jobs, config)
+        assert 1 <= readers <= jobs
+        return readers
 
-    config = given(1 << 30, jobs)
-    try:
-        assert 1 <= readers_that_fit(counts, jobs, config) <= jobs
-        return
-    except SolidcloudError as error:
-        said = str(error)
-    named = re.search(r"give (?:--(?:jobs |cluster local:)(\d+) or )?--memory (\d+)MB to go on", said)
-    assert named
-    assert readers_that_fit(counts, jobs, given(int(named[2]) << 20, jobs)) >= 1
-    with pytest.raises(SolidcloudError):  # and no more than that
-        readers_that_fit(counts, jobs, given((int(named[2]) - 2) << 20, jobs))
-    if named[1]:
-        assert readers_that_fit(counts, int(named[1]), given(1 << 30, int(named[1]))) >= 1
-    for fewer in range(int(named[1] or 0) + 1, jobs):
+    refused = 0
+    for points in (10**6, 5 * 10**6, 7 * 10**6, 10**7, 3 * 10**7, 4 * 10**7, 10**8, 10**9):
+        try:
+            read(points, memory, wanted)
+            continue
+        except SolidcloudError as error:
+            said = str(error)
+        refused += 1
+        named = re.search(r"give (?:--(?:jobs |cluster local:)(\d+) or )?--memory (\d+)MB to go on", said)
+        assert named, said
+        read(points, int(named[2]), wanted)
+        with pytest.raises(SolidcloudError):  # and no more than that
+            read(points, int(named[2]) - 2, wanted)
+        if named[1]:
+            read(points, memory, int(named[1]))
+    assert refused
+
+
+@pytest.mark.parametrize("cluster", [False, True])
+def test_no_more_jobs_would_be_enough_than_are_named(cluster: bool) -> None:
+    counts = np.array([4 * 10**7])
+
+    def given(number: int) -> BuildConfig:
+        return BuildConfig(memory_bytes=1 << 30, jobs=number, cluster=f"local:{number}" if cluster else None)
+
+    with pytest.raises(SolidcloudError) as error:
+        readers_that_fit(counts, 7, given(7))
+    named = re.search(r"give --(?:jobs |cluster local:)(\d+) or", str(error.value))
+    assert named and readers_that_fit(counts, int(named[1]), given(int(named[1]))) >= 1
+    for fewer in range(int(named[1]) + 1, 7):
         with pytest.raises(SolidcloudError):
-            readers_that_fit(counts, fewer, given(1 << 30, fewer))
+            readers_that_fit(counts, fewer, given(fewer))
+
+
+@pytest.mark.parametrize("jobs", [1, 2, 5])
+@pytest.mark.parametrize("memory", [64 << 20, 1 << 30, 2 << 30])
+def test_what_is_held_beside_records_fits_beside_them(jobs: int, memory: int) -> None:
+    config = BuildConfig(memory_bytes=memory)
+    base = ALONE_BYTES if jobs == 1 else BUILDER_BYTES + jobs * WORKER_BYTES
+    room = max(memory + OVER_BYTES - base, LEAST_SHARE)
+    for points in (1, 10**6, 3 * 10**6, 5 * 10**6):
+        counts = np.array([7, points, points // 2, points, 3])
+        readers = readers_that_fit(counts, jobs, config)
+        each = sorted((counts * record_bytes_a_point(config) + RECORD_BYTES).tolist())[-readers:]
+        beside = bytes_beside_records(counts, readers, jobs, config)
+        assert 0 <= beside <= memory_share(jobs, config)
+        assert sum(each) + readers * beside <= room
+    # What workers elsewhere may hold is known there.
+    elsewhere = BuildConfig(memory_bytes=memory, scheduler="tcp://127.0.0.1:1")
+    assert bytes_beside_records(np.array([1 << 40]), jobs, jobs, elsewhere) == memory_share(jobs, elsewhere)
 
 
 def test_a_worker_of_a_local_cluster_holds_what_dask_leaves_it() -> None:

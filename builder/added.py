@@ -1,8 +1,9 @@
 """What is added to an archive: new scans surveyed, held against those that are in, and spooled on its lattice."""
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,17 +12,21 @@ from numpy.typing import NDArray
 
 from ..schemas.errors import BadRequestError, ScanError
 from ..schemas.index import Header, Source
-from ..schemas.voxel_grid import Lattice, voxel_coordinates
+from ..schemas.voxel_grid import voxel_coordinates
 from .change import Change, scan_name
+from .classes import ALL_CODES
 from .partition import SpoolUnit, run_points, spool_range
 from .passes import MAX_SCANS
 from .pipeline import ARCHIVE_BYTES_A_POINT
 from .scan_list import Input
 from .sources import Scan
+from .spool import Spool
 from .survey import Survey, hash_file, joined, ranges, survey_range, unopened
 
 # Scans that an error names.
 MOST_NAMED = 10
+# Rows of a voxel that are held at once while its box is found.
+BOX_POINTS = 1 << 18
 
 
 class Wanted(NamedTuple):
@@ -151,9 +156,14 @@ def no_longer_unknown(header: Header, surveys: Sequence[Survey]) -> Header:
     )
 
 
-def box_of(key: int, parts: list[NDArray], lattice: Lattice) -> NDArray[np.int64]:
-    """The box (2, 3) of a voxel's rows, lattice coordinates."""
-    low = np.min([rows["local"].min(axis=0) for rows in parts], axis=0)
-    high = np.max([rows["local"].max(axis=0) for rows in parts], axis=0)
-    corner = voxel_coordinates(np.array([key], np.uint64))[0] * lattice.voxel_steps
+def box_of(key: int, spool: Spool) -> NDArray[np.int64]:
+    """The box (2, 3) of a voxel's rows, lattice coordinates. Of a large voxel a few rows are held at a time."""
+    if spool.count(key) <= BOX_POINTS:
+        parts: Iterable[NDArray] = spool.rows(key)
+    else:
+        parts = chain.from_iterable(spool.block_windows(key, ALL_CODES.start, ALL_CODES.stop, BOX_POINTS))
+    low, high = np.full(3, spool.lattice.voxel_steps), np.full(3, -1)
+    for rows in parts:
+        low, high = np.minimum(low, rows["local"].min(axis=0)), np.maximum(high, rows["local"].max(axis=0))
+    corner = voxel_coordinates(np.array([key], np.uint64))[0] * spool.lattice.voxel_steps
     return np.stack([low, high]).astype(np.int64) + corner

@@ -28,15 +28,18 @@ from .config import BuildConfig
 from .executor import Executor, make_executor, worker_count
 from .kernels.content import SEEDS
 from .kernels.records import sum_places
-from .memory import jobs_that_fit, memory_share
+from .memory import bytes_beside_records, jobs_that_fit, memory_share, readers_that_fit
 from .preview import write_preview
 from .progress import Progress, Silent
 from .record_points import leaves_of
 from .spool import spool_dtype
+from .verify import voxel_faults
 from .workplace import locked
 
 # Points of a unit that reads stored voxels: a few records at a time, whatever the machine.
 UNIT_POINTS = 1 << 21
+# How the advice for a voxel that is too large to be read back ends: nothing is kept of a change.
+OTHERWISE = ", or build again with a smaller --voxel; the archive is what it was"
 
 _OURS = re.compile(r"[0-9]{1,9}-[0-9]{1,9}\.h5(\..*\.?tmp|\.tmp)?")
 
@@ -70,6 +73,33 @@ class Change:
         """Whether points have radius classes."""
         return self.archive.header.radius_class
 
+    @property
+    def points(self) -> NDArray[np.int64]:
+        """(v,) the points of each voxel of the archive as it is."""
+        return self.archive.voxels["rows"][:, 2].astype(np.int64)
+
+    @property
+    def reads_all(self) -> bool:
+        """Whether in the end every record is read: for the figure of now, or for a preview."""
+        return self.archive.header.radius_model == "mean" or (self.target / PREVIEW_NAME).exists()
+
+    def readers(self, counts: NDArray[np.int64]) -> int:
+        """How many jobs may read back voxels of so many points at a time; SolidcloudError where one has no room."""
+        return readers_that_fit(counts, self.executor.jobs, self.config, OTHERWISE)
+
+    @contextmanager
+    def reading(self, counts: NDArray[np.int64]) -> Iterator[int]:
+        """Meanwhile no more jobs are at work than may read back voxels of so many points.
+
+        Gives the bytes that each may hold beside the record of a voxel. Raises as `readers`.
+        """
+        readers = self.readers(counts)
+        self.executor.at_once = readers
+        try:
+            yield bytes_beside_records(counts, readers, self.executor.jobs, self.config)
+        finally:
+            self.executor.at_once = self.executor.jobs
+
     @contextmanager
     def stage(self, name: str, total: int, unit: str) -> Iterator[None]:
         """Time a stage, and tell who listens."""
@@ -96,7 +126,7 @@ class Change:
 
     def units_of(self, rows: NDArray[np.int64]) -> list[tuple[tuple[int, ...], int]]:
         """Rows of the index in runs of about UNIT_POINTS: (rows, points) each."""
-        points = self.archive.voxels["rows"][rows, 2].astype(np.int64)
+        points = self.points[rows]
         if not len(rows):
             return []
         cuts = np.flatnonzero(np.diff((np.cumsum(points) - points) // UNIT_POINTS, prepend=-1))
@@ -126,22 +156,24 @@ def changing(target: Path, jobs: int, memory_bytes: int, progress: Progress | No
             jobs = jobs_that_fit(worker_count(jobs, archive.header.points), config)
             with make_executor(config, jobs) as executor:
                 change = Change(target, folder, archive, config, executor, progress or Silent())
-                with _disk_errors(change):
+                with _machine_errors(change):
                     yield change
         finally:
             shutil.rmtree(folder, ignore_errors=True)
 
 
 @contextmanager
-def _disk_errors(change: Change) -> Iterator[None]:
-    """Say what the archive is where the disk failed, and what to do."""
+def _machine_errors(change: Change) -> Iterator[None]:
+    """Say what the archive is where the disk or the memory failed, and what to do."""
     try:
         yield
-    except OSError as error:
+    except (MemoryError, OSError) as error:
         state = "changed all the same" if change.published else "what it was"
-        raise SolidcloudError(
-            f"{change.target}: {error}: the archive is {state}: make room, or check the disk"
-        ) from error
+        found, advice = str(error), "make room, or check the disk"
+        if isinstance(error, MemoryError):
+            found = f"out of memory ({error or 'no more is said'})"
+            advice = "give fewer --jobs or a smaller --memory, or stop other programs"
+        raise SolidcloudError(f"{change.target}: {found}: the archive is {state}: {advice}") from error
 
 
 def config_of(header: Header, target: Path, jobs: int, memory_bytes: int) -> BuildConfig:
@@ -201,15 +233,22 @@ class _ReadUnit(NamedTuple):
 
 
 def _read_back(unit: _ReadUnit) -> int:
-    """Read voxels as a server does; returns the `places_sum` of their points (spool.py). Raises CorruptError."""
+    """Check voxels as verify.py does, all their columns read; returns the `places_sum` of their points (spool.py).
+
+    Raises CorruptError.
+    """
     places = 0
     with Archive(unit.folder) as archive:
         for row in unit.rows:
             record = archive.open_voxel(row)
             with archive.locating(row):
-                record.decode()
+                faults = voxel_faults(archive, row, record, deep=False)
+                record.class_counts()
                 corner = archive.coordinates[row] * record.voxel_steps
                 places += int(sum_places(leaves_of(record), corner, SEEDS[0]))
+            if faults:
+                raise CorruptError(faults[0], (archive.shard_path(int(archive.voxels["shard"][row])),))
+            del record  # before the next is read
     return places
 
 

@@ -56,6 +56,8 @@ def add_scans(
                     f"{changed}: changed while it was read, expected files that stay as they are: add it again"
                 )
 
+        if change.reads_all:
+            change.readers(change.points)  # voxels that are too large now do not get smaller
         surveys = survey_added(change, inputs, Wanted(again, new_only, strict))
         try:
             moved, places = spool_added(change, surveys)
@@ -67,9 +69,10 @@ def add_scans(
         header = no_longer_unknown(change.archive.header, surveys)
         header = replace(header, sources=(*header.sources, *added), moved_max=max(header.moved_max, moved))
         new = Spool(change.folder / "spool", change.dtype, header.lattice)
-        boxes = {key: box_of(key, new.rows(key), header.lattice) for key in new.keys.tolist()}
+        counts = dict(zip(new.keys.tolist(), new.counts.tolist(), strict=True))
+        boxes = {key: box_of(key, new) for key in counts}
         names = tuple(scan_name(source) for source in added)
-        return rebuild(change, Difference(header, names, boxes, places=places), check_unchanged)
+        return rebuild(change, Difference(header, names, boxes, places=places, added=counts), check_unchanged)
 
 
 def remove_scans(

@@ -110,6 +110,7 @@ def _choose(unit: _Unit) -> _Chosen:
                 xyz, rows = np.concatenate([t.xyz for t in some]), np.concatenate([t.rows for t in some])
                 first = first_of_each(xyz)
                 parts.append(_Chosen(xyz[first] + base[row], read_columns(record, columns, rows[first])))
+            del record  # before the next is read
         nothing = {name: np.empty(0, kind) for name, kind in columns.items()}
     return _joined([_Chosen(np.empty((0, 3), np.int64), nothing), *parts])
 

@@ -18,13 +18,14 @@ from ..schemas.shard import SHARD_FOLDER
 from ..schemas.voxel_grid import voxel_coordinates
 from .change import Change, publish, reading_back, show_kept, verify_new
 from .config import RADIUS_SAMPLE
+from .dense import DENSE_POINTS
+from .partition import LEAST_RUN_POINTS
 from .passes import VOXEL_BYTES_A_POINT
-from .pipeline import ARCHIVE_BYTES_A_POINT
+from .pipeline import ARCHIVE_BYTES_A_POINT, SCRATCH_BYTES_A_POINT
 from .shards import Shard, ShardUnit, build_shard, plan_shards
 from .spacing import archive_mean
 from .spool import Spool
 from .stored_points import (
-    RECORD_BYTES_A_POINT,
     RUN_BYTES_A_POINT,
     FewUnit,
     GatherUnit,
@@ -64,7 +65,7 @@ class Difference(NamedTuple):
     """What is to be different. header: with its sources as they are to be.  scans: those added or removed, by name.
 
     boxes: key -> box (2, 3) of the points that change, lattice.  dropped: scans whose points go.  places: `places_sum`
-    of the points that are spooled already (spool.py).
+    of the points that are spooled already (spool.py).  added: key -> how many those are.
     """
 
     header: Header
@@ -72,6 +73,7 @@ class Difference(NamedTuple):
     boxes: Mapping[int, NDArray[np.int64]]
     dropped: frozenset[int] = frozenset()
     places: int = 0
+    added: Mapping[int, int] = {}
 
 
 def rebuild(
@@ -79,12 +81,16 @@ def rebuild(
 ) -> ChangeSummary:
     """Build what a difference touches, and publish it. check: called before it is published.
 
-    Raises CorruptError where what was written is not what is read back; the archive is then what it was.
+    Raises CorruptError where what was written is not what is read back, and SolidcloudError where there is no room on
+    the disk, or for a voxel in memory; the archive is then what it was.
     """
     before = change.archive.header
     header = replace(difference.header, generation=before.generation + 1, radius_now=None)
     rebuilt, read = touched(change.archive, difference.boxes)
-    change.check_room(_room(change, header, rebuilt, read))
+    built, there = _points_after(change, rebuilt, difference.added)
+    for counts in (change.points[read], there if change.reads_all else built):
+        change.readers(counts)
+    change.check_room(_room(change, header, rebuilt, read, built))
     gathered = _gather(change, rebuilt, read, difference.dropped)
     spool = Spool(change.folder / "spool", change.dtype, header.lattice)
     wanted = set(difference.boxes) | set(change.archive.voxels["key"][rebuilt].tolist())
@@ -99,7 +105,8 @@ def rebuild(
     new = {s.name for s in shards}
     show_kept(change, files, new)
     write_index(change.folder, header, table, files)
-    with reading_back(change, new):
+    to_read = table if change.reads_all else np.concatenate([table[:0], *(s.rows for s in shards)])
+    with reading_back(change, new), change.reading(to_read["rows"][:, 2].astype(np.int64)):
         header = _measure(change, header)
         write_index(change.folder, header, table, files)
         verify_new(change, new, difference.places + gathered.places)
@@ -129,15 +136,36 @@ def _left_out(sources: Sequence[Source]) -> dict[str, int]:
     return dict(sum((Counter(source.skipped) for source in sources), Counter[str]()))
 
 
-def _room(change: Change, header: Header, rebuilt: NDArray[np.int64], read: NDArray[np.int64]) -> int:
-    """Bytes, about, that are yet to be written: runs of what is read, and the records of what is built."""
+def _points_after(
+    change: Change, rebuilt: NDArray[np.int64], added: Mapping[int, int]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The points, at most, of each voxel to be built anew, and of each that there is then."""
+    keys, points = change.archive.voxels["key"], change.points
+    new, counts = np.array(list(added), np.uint64), np.array(list(added.values()), np.int64)
+    at = np.minimum(np.searchsorted(keys, new), len(keys) - 1)
+    known = keys[at] == new
+    points[at[known]] += counts[known]
+    more = counts[~known]
+    return np.concatenate([points[rebuilt], more]), np.concatenate([points, more])
+
+
+def _room(
+    change: Change,
+    header: Header,
+    rebuilt: NDArray[np.int64],
+    read: NDArray[np.int64],
+    built: NDArray[np.int64],
+) -> int:
+    """Bytes, about, that are yet to be written: runs of what is read, the records of what is built, of so many points
+    a voxel at most (b,), and what dense ones take meanwhile, one a job."""
     archive, before = change.archive, change.archive.header
     # With radius classes what is read is spooled once more, as it was before.
     a_point = change.dtype.itemsize * (2 if change.with_classes else 1)
     runs = int(archive.voxels["rows"][read, 2].sum(dtype=np.int64)) * a_point
     added = sum(source.count for source in header.sources[len(before.sources) :])
     records = int(archive.voxels["frame_bytes"][rebuilt].sum(dtype=np.int64)) + added * ARCHIVE_BYTES_A_POINT
-    return runs + records
+    dense = np.sort(built[built > DENSE_POINTS])[-change.executor.jobs :]
+    return runs + records + int(dense.sum()) * SCRATCH_BYTES_A_POINT
 
 
 def _dead_bytes(archive: Archive, rebuilt: NDArray[np.int64], files: list[tuple[str, int]]) -> int:
@@ -162,22 +190,33 @@ def _gather(
 ) -> _Before:
     """Spool the stored points that are needed."""
     config, folder = change.config, change.folder
-    densest = int(change.archive.voxels["rows"][read, 2].max(initial=0))
-    most = max(1 << 16, (change.share - RECORD_BYTES_A_POINT * densest) // RUN_BYTES_A_POINT)
     before = folder / "before" if change.with_classes else None
     groups = [
         (rows, group) for rows in (rebuilt, np.setdiff1d(read, rebuilt)) for group in change.units_of(rows)
     ]
-    units = [
-        GatherUnit(
-            change.target, rows, points, folder / "spool", f"old-{number:06d}", dropped, before, config, most
-        )
-        for number, (_, (rows, points)) in enumerate(groups)
-    ]
-    with change.stage("gather", sum(unit.points for unit in units), "points"):
-        parts = [
-            part for (rows, _), part in zip(groups, change.run(gather, units), strict=True) if rows is rebuilt
+    with change.reading(change.points[read]) as beside:
+        # With radius classes two runs are filled at a time.
+        most = max(LEAST_RUN_POINTS, beside // (RUN_BYTES_A_POINT * (2 if before else 1)))
+        units = [
+            GatherUnit(
+                change.target,
+                rows,
+                points,
+                folder / "spool",
+                f"old-{number:06d}",
+                dropped,
+                before,
+                config,
+                most,
+            )
+            for number, (_, (rows, points)) in enumerate(groups)
         ]
+        with change.stage("gather", sum(unit.points for unit in units), "points"):
+            parts = [
+                part
+                for (rows, _), part in zip(groups, change.run(gather, units), strict=True)
+                if rows is rebuilt
+            ]
     counts = sum((part.radius_counts for part in parts), np.zeros(32, np.int64))
     places = sum(part.places for part in parts)
     keys = [part.perhaps_few for part in parts if part.perhaps_few]

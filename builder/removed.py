@@ -36,7 +36,7 @@ def find_removed(change: Change, scans: frozenset[int]) -> list[Found]:
     archive = change.archive
     rows = np.arange(len(archive.voxels))
     units = [FindUnit(change.target, held, points, scans) for held, points in change.units_of(rows)]
-    with change.stage("find", archive.header.points, "points"):
+    with change.reading(change.points), change.stage("find", archive.header.points, "points"):
         found: list[Found] = [voxel for part in change.run(find_scans, units) for voxel in part]
     for scan in sorted(scans):
         count, stored = sum(f.counts.get(scan, 0) for f in found), archive.header.sources[scan].count

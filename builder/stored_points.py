@@ -17,7 +17,7 @@ from ..schemas.kernels.morton import morton_decode
 from ..schemas.radius_model import LOCAL_CLASSES, RADIUS_CLASSES, RIM_BIT
 from .classes import voxel_classes
 from .config import BuildConfig
-from .dense import DENSE_POINTS, is_dense, is_heap, plan_parts
+from .dense import is_dense, is_heap, plan_parts
 from .heap import heap_points
 from .journal import new_file
 from .kernels.content import SEEDS
@@ -29,9 +29,10 @@ from .record_points import leaves_of, taken
 from .spool import RUN_SUFFIX, Spool, canonical_columns, places_sum, spool_dtype, write_directory
 
 # Bytes a point that is held while a run is written: code and columns, and of a voxel order, sorted copies and rows.
+# Beside the record that they are read of (memory.py).
 RUN_BYTES_A_POINT = 60
-# Beside them: the record that they are read of, all its columns and trees.
-RECORD_BYTES_A_POINT = 14
+# Points of which scan a record's are that are looked at together.
+LOOKED_AT = 1 << 16
 
 _FROM_CORNER = np.zeros(3, np.int64)
 
@@ -204,6 +205,7 @@ def gather(unit: GatherUnit) -> Gathered:
                 counts += each
                 if few_are_possible(each, archive.header.models):
                     perhaps_few.append(key)
+            del record  # before the next is read
     for written in (runs, before):
         if written:
             written.write()
@@ -234,28 +236,33 @@ def find_scans(unit: FindUnit) -> list[Found]:
     with Archive(unit.archive) as archive:
         for row in unit.rows:
             record = archive.open_voxel(row, columns={"scan_index"})
-            low, high = np.full(3, 1 << 31, np.int64), np.full(3, -1, np.int64)
-            counts: dict[int, int] = {}
-            column = _whole_column(record, "scan_index")
-            if not np.isin(column, scans).any():
+            if not _holds_scans(record, scans):
+                del record  # before the next is read
                 continue
-            for scan in scans.tolist():
-                if here := int(np.count_nonzero(column == scan)):
-                    counts[scan] = here
+            low, high = np.full(3, 1 << 31, np.int64), np.full(3, -1, np.int64)
+            counts = np.zeros(len(scans), np.int64)
             with archive.locating(row):
                 for block in taken(record, _FROM_CORNER):
-                    xyz = block.xyz[np.isin(column[block.rows], scans)]
-                    if len(xyz):
+                    of = stored_column(record, "scan_index", block.rows)
+                    if len(xyz := block.xyz[np.isin(of, scans)]):
                         low, high = np.minimum(low, xyz.min(axis=0)), np.maximum(high, xyz.max(axis=0))
+                    counts += [np.count_nonzero(of == scan) for scan in scans]
+            del record
             corner = archive.coordinates[row] * archive.header.lattice.voxel_steps
-            found.append(Found(row, np.stack([low, high]) + corner, counts))
+            each = dict(zip(scans.tolist(), counts.tolist(), strict=True))
+            found.append(Found(row, np.stack([low, high]) + corner, {s: n for s, n in each.items() if n}))
     return found
 
 
-def _whole_column(record: OpenRecord, name: str) -> NDArray:
-    """A column of all points of a record."""
-    kind, at = record.dtype.fields[name][:2]  # type: ignore[index]  # its dtype has fields
-    return np.ascontiguousarray(record.planes[at : at + kind.itemsize].T).view(kind).reshape(-1)
+def _holds_scans(record: OpenRecord, scans: NDArray[np.int64]) -> bool:
+    """Whether a record has points of some scans, by the column alone."""
+    kind, at = record.dtype.fields["scan_index"][:2]  # type: ignore[index]  # its dtype has fields
+    planes = record.planes[at : at + kind.itemsize]
+    for begin in range(0, planes.shape[1], LOOKED_AT):
+        of = np.ascontiguousarray(planes[:, begin : begin + LOOKED_AT].T).view(kind).reshape(-1)
+        if np.isin(of, scans).any():
+            return True
+    return False
 
 
 def count_few(unit: FewUnit) -> int:
@@ -271,10 +278,10 @@ def _few_of(key: int, unit: FewUnit) -> int:
         return voxel_classes(key, local, models, spool, unit.most_near).few
     few = 0
     for part in plan_parts(spool, key, unit.config):
-        codes = range(part[0].code, part[-1].past)
-        if is_heap(part):
-            held = heap_points(codes.start, part[0].points, DENSE_POINTS)
+        codes, times = range(part[0].code, part[-1].past), 1
+        if is_heap(part):  # all have the class of one
+            local, times = next(heap_points(codes.start, 1, 1)), part[0].points
         else:
-            held = iter([gather_voxel(spool.block_rows(key, codes.start, codes.stop)).local])
-        few += sum(voxel_classes(key, local, models, spool, unit.most_near, codes).few for local in held)
+            local = gather_voxel(spool.block_rows(key, codes.start, codes.stop)).local
+        few += times * voxel_classes(key, local, models, spool, unit.most_near, codes).few
     return few

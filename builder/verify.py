@@ -165,7 +165,7 @@ def _verify_rows(unit: _Unit) -> _Found:
             try:
                 record = archive.open_voxel(row, columns=("radius_class",))
                 with archive.locating(row):
-                    faults += _voxel_faults(archive, row, record, unit.deep)
+                    faults += voxel_faults(archive, row, record, unit.deep)
                     counted = record.class_counts()
                 if unit.summed:
                     corner = archive.coordinates[row] * record.voxel_steps
@@ -190,7 +190,7 @@ def _loose(archive: Archive, row: int, node: int) -> str:
     return f"{archive.where(row)}: node {node} does not enclose its points: rebuild the archive"
 
 
-def _voxel_faults(archive: Archive, row: int, record: OpenRecord, deep: bool) -> list[str]:
+def voxel_faults(archive: Archive, row: int, record: OpenRecord, deep: bool) -> list[str]:
     """Faults of one voxel that opening it does not look for. CorruptError: a point outside its cell."""
     faults = []
     low, high = np.empty(3, np.int64), np.empty(3, np.int64)

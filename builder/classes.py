@@ -138,17 +138,18 @@ def _around(key: int, box: NDArray[np.int64], spool: Spool, codes: range) -> Ite
         if other == key and codes == ALL_CODES:
             continue
         shift = (voxel_coordinates(np.array([other], np.uint64))[0] - home) * steps
-        for points in _points_in(other, box - shift, spool):
+        without = codes if other == key else range(0)
+        for points in _points_in(other, box - shift, spool, without):
             found, distinct = np.unique(voxel_codes(points), return_index=True)
-            if other == key:
-                distinct = distinct[(found < codes.start) | (found >= codes.stop)]
+            distinct = distinct[(found < without.start) | (found >= without.stop)]
             yield (points[distinct] + shift).astype(np.int32)
 
 
-def _points_in(key: int, box: NDArray[np.int64], spool: Spool) -> Iterator[NDArray[np.int32]]:
+def _points_in(key: int, box: NDArray[np.int64], spool: Spool, without: range) -> Iterator[NDArray[np.int32]]:
     """The points of a voxel in a box, frame and box the voxel's, (m, 3) of one cube of its octree after the other.
 
-    Read are cubes of at most READ_POINTS, or of one lattice position.
+    Read are cubes of at most READ_POINTS; of a lattice position of more one point is given, and none is read: distinct
+    ones are wanted. Cubes whose codes are all in `without` are left out; points of these codes may be among others.
     """
     root = int(spool.lattice.voxel_steps - 1).bit_length()
     waiting = [(0, root, np.zeros(3, np.int64))]
@@ -156,10 +157,14 @@ def _points_in(key: int, box: NDArray[np.int64], spool: Spool) -> Iterator[NDArr
         code, log2, low = waiting.pop()
         if (box[1] < low).any() or (box[0] >= low + (1 << log2)).any():
             continue
-        whole = log2 == root
         past = code + (1 << 3 * log2)
+        if without.start <= code and past <= without.stop:
+            continue
+        whole = log2 == root
         count = spool.count(key) if whole else spool.block_count(key, code, past)
-        if count > READ_POINTS and log2 > 0:
+        if count > READ_POINTS and log2 == 0:
+            yield low[None].astype(np.int32)
+        elif count > READ_POINTS:
             half = log2 - 1
             waiting += [
                 (

@@ -34,7 +34,7 @@ from ..schemas.row_stream import RowStream, pwrite_all
 from ..schemas.voxel import CELL_BITS, Cells, Nodes, VoxelData, top_shift
 from .cells import CellTrees, block_points, build_trees, leaf_runs
 from .config import BuildConfig
-from .heap import heap_points, heap_trees, merge_runs
+from .heap import heap_place, heap_trees, merge_runs
 from .kernels.bounding_sphere import SPREAD
 from .kernels.octree import split_octree
 from .kernels.spill import by_axis, by_cell
@@ -49,8 +49,9 @@ DENSE_POINTS = 1 << 20
 # Points of cells that pass at once on the way into the record: fewer than DENSE_POINTS, so that a heap passes alone.
 WINDOW_POINTS = 1 << 17
 
-# The points of a part, all whose Morton codes are in a range, and the range -> the radius class of each.
-Classify = Callable[[NDArray[np.int32], range], NDArray[np.uint8]]
+# All points (n, 3) of a voxel whose Morton codes are in a range, the range, and how many times each is there, as a heap
+# is asked by one point -> the radius class of each, (n,).
+Classify = Callable[[NDArray[np.int32], range, int], NDArray[np.uint8]]
 
 
 class Cube(NamedTuple):
@@ -131,7 +132,7 @@ def build_dense(
                 continue
             points, codes = canonical(gather_voxel(spool.block_rows(key, codes_of.start, codes_of.stop)))
             if classify is not None:
-                points = points._replace(radius_class=classify(points.local, codes_of))
+                points = points._replace(radius_class=classify(points.local, codes_of, 1))
             spill.put(_build_part(points, codes, part, config), points)
         return _Layout(key, spill, spool.lattice.voxel_steps, config, archive_id, scratch).write()
 
@@ -160,9 +161,7 @@ def _put_heap(
     """Spill the cell of a cube of one step, as `build_trees` makes it of its points, which are never held at once."""
     codes, kind = range(cube.code, cube.past), np.uint8(0)
     if classify is not None:
-        # All have one class. Each is classified for the counts of those that do.
-        for points in heap_points(cube.code, cube.points, DENSE_POINTS):
-            kind = classify(points, codes)[0]
+        kind = classify(heap_place(cube.code), codes, cube.points)[0]
     if spill.names:
         # Two windows of each run are held, and what is merged of them, sorted.
         windows = spool.block_windows(key, codes.start, codes.stop, DENSE_POINTS // 4)

@@ -19,9 +19,14 @@ from .partition import ranks
 _END = np.uint64(0xFFFFFFFFFFFFFFFF)
 
 
+def heap_place(code: int) -> NDArray[np.int32]:
+    """Where all points of the Morton code `code` are, (1, 3) [voxel steps]."""
+    return morton_decode(np.array([code], np.uint64)).astype(np.int32)
+
+
 def heap_points(code: int, points: int, most: int) -> Iterator[NDArray[np.int32]]:
     """The points of the Morton code `code`, at most `most` of them at a time (m, 3) [voxel steps]."""
-    place = morton_decode(np.array([code], np.uint64)).astype(np.int32)
+    place = heap_place(code)
     for at in range(0, points, most):
         yield np.repeat(place, min(most, points - at), axis=0)
 
@@ -31,8 +36,9 @@ def heap_trees(code: int, points: int, config: BuildConfig) -> CellTrees:
 
     Without `xyz` and `rank`. Held are its nodes.
     """
-    place = morton_decode(np.array([code], np.uint64)).astype(np.int32)
-    one = build_trees(np.repeat(place, 3, axis=0), np.zeros(1, np.int64), np.zeros(1, np.uint8), config)
+    one = build_trees(
+        np.repeat(heap_place(code), 3, axis=0), np.zeros(1, np.int64), np.zeros(1, np.uint8), config
+    )
     most = most_nodes(points, config.leaf)
     count, held = np.empty(most, np.uint8), np.empty(most, np.int64)
     total = heap_counts(points, config.leaf, config.degree, count, held)

@@ -80,12 +80,14 @@ class _ClassCounts:
         self.unit = unit
         self.of, self.capped = np.zeros(RADIUS_CLASSES, np.int64), 0
 
-    def find(self, key: int, local: NDArray[np.int32], codes: range = ALL_CODES) -> NDArray[np.uint8]:
-        """The classes (n,) of points (n, 3) of a voxel, see `voxel_classes`."""
+    def find(
+        self, key: int, local: NDArray[np.int32], codes: range = ALL_CODES, times: int = 1
+    ) -> NDArray[np.uint8]:
+        """The classes (n,) of points (n, 3) of a voxel, see `voxel_classes`. times: each is there, and so counted."""
         unit = self.unit
         found = voxel_classes(key, local, unit.config.models, unit.spool, unit.most_near, codes)
-        self.of += np.bincount(found.of_point, minlength=RADIUS_CLASSES)
-        self.capped += found.few
+        self.of += times * np.bincount(found.of_point, minlength=RADIUS_CLASSES)
+        self.capped += times * found.few
         return found.of_point
 
 

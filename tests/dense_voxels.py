@@ -33,7 +33,7 @@ def rows_of(points: NDArray[np.int32], *names: str) -> NDArray:
     return rows
 
 
-def hashed(local: NDArray[np.int32], _: range) -> NDArray[np.uint8]:
+def hashed(local: NDArray[np.int32], _: range, times: int = 1) -> NDArray[np.uint8]:
     """A radius class of each place."""
     return (local.astype(np.int64) @ np.array([7919, 104729, 1299709]) % 32).astype(np.uint8)
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import naive_classes
 import numpy as np
 import pytest
+from dense_voxels import KEY, rows_of, spooled
 from numpy.typing import NDArray
 from scans import make_scan, write_xyz
 from solidcloud.builder import classes, dense, shards
@@ -14,6 +15,7 @@ from solidcloud.builder.classes import class_limits, voxel_classes
 from solidcloud.builder.config import BuildConfig, parse_radius
 from solidcloud.builder.kernels.classes import FEW, point_classes
 from solidcloud.builder.kernels.neighbours import bound_boxes, box_starts
+from solidcloud.builder.kernels.octree import voxel_codes
 from solidcloud.builder.pipeline import build_archive
 from solidcloud.builder.radius import voxel_points
 from solidcloud.builder.spool import Spool, write_run
@@ -326,3 +328,56 @@ def test_a_dense_voxel_has_the_same_classes(
         assert header.radius_counts.tolist() == expected[2].radius_counts.tolist()
         assert header.radius_capped == expected[2].radius_capped
         assert verify_archive(folder, deep=True).faults == ()
+
+
+def heaps(seed: int) -> NDArray[np.int64]:
+    """Lattice points (n, 3) among which are places of 300 points: in a corner, side by side, and alone."""
+    steps = cloud("corner", seed, 300)
+    places = np.array([[0, 0, 0], [700, 699, 3], [699, 699, 3], [700, 700, 3], [1400, 20, 900]])
+    return np.concatenate([steps, np.repeat(places, 300, axis=0)])
+
+
+@pytest.mark.parametrize("voxel", [8.0, 0.7])
+def test_heaps_have_the_classes_that_they_have_when_all_is_read(
+    voxel: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lattice = heaps(4)
+    expected, few = judge(np.array(sorted(lattice.tolist())))
+    monkeypatch.setattr(dense, "DENSE_POINTS", 60)
+    monkeypatch.setattr(dense, "WINDOW_POINTS", 50)
+    monkeypatch.setattr(classes, "READ_POINTS", 25)
+    points, found, header = stored(build(tmp_path, lattice, voxel=voxel))
+    assert points.tolist() == sorted(lattice.tolist())
+    assert np.array_equal(found, expected)
+    assert header.radius_counts.tolist() == np.bincount(expected, minlength=32).tolist()
+    assert header.radius_capped == few
+
+
+def test_of_a_heap_and_of_the_part_that_is_asked_nothing_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(dense, "DENSE_POINTS", 60)
+    monkeypatch.setattr(classes, "READ_POINTS", 25)
+    local = heaps(5).astype(np.int32)
+    spool = spooled(tmp_path / "spool", rows_of(local), 4000, [500, 900])
+    read: list[NDArray[np.int32]] = []
+    block_rows, rows = Spool.block_rows, Spool.rows
+
+    def noted(found: list[NDArray]) -> list[NDArray]:
+        read.append(np.concatenate([part["local"] for part in found]))
+        return found
+
+    monkeypatch.setattr(Spool, "block_rows", lambda *asked: noted(block_rows(*asked)))
+    monkeypatch.setattr(Spool, "rows", lambda *asked: noted(rows(*asked)))
+    config = BuildConfig(cell_points=40)
+    for part in dense.plan_parts(spool, KEY, config):
+        codes = range(part[0].code, part[-1].past)
+        of_part = voxel_codes(local)
+        asked = local[(of_part >= codes.start) & (of_part < codes.stop)]
+        read.clear()
+        voxel_classes(KEY, asked, ALL, spool, 1 << 16, codes)
+        assert read and max(map(len, read)) <= 25
+        # Cubes are parted no farther than they must: some hold points of the part beside others, none those alone.
+        for points in read:
+            among = voxel_codes(points)
+            assert not ((among >= codes.start) & (among < codes.stop)).all()

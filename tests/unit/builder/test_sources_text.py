@@ -1,11 +1,17 @@
 """Text scans: the rules for columns, headers and counts, and lines that are broken."""
 
+import io
+import tracemalloc
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+from solidcloud.builder.config import BuildConfig
+from solidcloud.builder.pipeline import build_archive
+from solidcloud.builder.scan_list import inspect
 from solidcloud.builder.sources import open_scans
-from solidcloud.builder.sources.rows import LONGEST_LINE
+from solidcloud.builder.sources.rows import LONGEST_LINE, number_rows
 from solidcloud.schemas.errors import ScanError
 
 
@@ -96,3 +102,46 @@ def test_text_is_read_right_across_chunks(tmp_path: Path, monkeypatch: pytest.Mo
     path.write_text("\n".join(lines))
     with pytest.raises(ScanError, match="line 223 is '1 2'"):
         read_all(path)
+
+
+def ply_of(count: int) -> str:
+    """The header of a PLY of so many vertices in text."""
+    axes = "".join(f"property float {axis}\n" for axis in "xyz")
+    return f"ply\nformat ascii 1.0\nelement vertex {count}\n{axes}end_header\n"
+
+
+def pcd_of(count: int) -> str:
+    """The header of a PCD of so many points in text."""
+    return f"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH {count}\nHEIGHT 1\nDATA ascii\n"
+
+
+@pytest.mark.parametrize(("name", "head"), [("a.ply", ply_of), ("a.pcd", pcd_of)])
+def test_a_row_that_makes_the_declared_points_too_many_to_hold_is_a_fault_of_the_file(
+    name: str, head: Callable[[int], str], tmp_path: Path
+) -> None:
+    """800 GB for 250,000 rows like the first, in a file of 2.3 MB: others of the same build are no worse for it."""
+    path = tmp_path / name
+    path.write_text(head(250_000) + "1 " * 400_000 + "\n" * 1_500_000)
+    with pytest.raises(ScanError, match=r"line \d+ is '1 1 1 .*, expected 3 numbers like the first row"):
+        read_all(path)
+    good = tmp_path / "b.xyz"
+    good.write_text("1 2 3\n4 5 6\n")
+    inspected = {entry.path: entry.fault for entry in inspect([path, good])}
+    assert inspected[good] == ""
+    config = BuildConfig(jobs=1, skip_bad=True, resolution=0.001)
+    summary = build_archive([path, good], tmp_path / "hall", config)
+    assert summary.points == 2
+    assert [name in fault for fault in summary.faults] == [True]
+
+
+def test_no_more_rows_are_made_room_for_than_the_bytes_hold(tmp_path: Path) -> None:
+    """Of 1,000 rows of 20,000 numbers, 160 MB, one is there, and blank lines."""
+    data = io.BytesIO(b"1 " * 20_000 + b"\n" * 1_000_000)
+    tracemalloc.start()
+    try:
+        (rows,) = number_rows(data, tmp_path, columns=20_000, delimiter=None, first_line=1, limit=1000)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert rows.shape == (1, 20_000)
+    assert peak < 40 << 20

@@ -24,13 +24,6 @@ def heap_place(code: int) -> NDArray[np.int32]:
     return morton_decode(np.array([code], np.uint64)).astype(np.int32)
 
 
-def heap_points(code: int, points: int, most: int) -> Iterator[NDArray[np.int32]]:
-    """The points of the Morton code `code`, at most `most` of them at a time (m, 3) [voxel steps]."""
-    place = heap_place(code)
-    for at in range(0, points, most):
-        yield np.repeat(place, min(most, points - at), axis=0)
-
-
 def heap_trees(code: int, points: int, config: BuildConfig) -> CellTrees:
     """The cell as `build_trees` makes it of so many points of one Morton code, which need not be there for it.
 

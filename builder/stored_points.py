@@ -18,7 +18,7 @@ from ..schemas.radius_model import LOCAL_CLASSES, RADIUS_CLASSES, RIM_BIT
 from .classes import voxel_classes
 from .config import BuildConfig
 from .dense import is_dense, is_heap, plan_parts
-from .heap import heap_points
+from .heap import heap_place
 from .journal import new_file
 from .kernels.content import SEEDS
 from .kernels.octree import voxel_codes
@@ -280,7 +280,7 @@ def _few_of(key: int, unit: FewUnit) -> int:
     for part in plan_parts(spool, key, unit.config):
         codes, times = range(part[0].code, part[-1].past), 1
         if is_heap(part):  # all have the class of one
-            local, times = next(heap_points(codes.start, 1, 1)), part[0].points
+            local, times = heap_place(codes.start), part[0].points
         else:
             local = gather_voxel(spool.block_rows(key, codes.start, codes.stop)).local
         few += times * voxel_classes(key, local, models, spool, unit.most_near, codes).few

@@ -57,6 +57,11 @@ def check_chunks(
         raise _damaged(path, f"{chunks} chunks of {chunk_points} points", "at least one of each")
     if chunk_points != VARIABLE and points > chunks * chunk_points:
         raise _damaged(path, f"{points} points in {chunks} chunks of {chunk_points}", "as many as they hold")
+    # lazrs makes room for the whole table. A chunk begins with a point, raw; an empty one may be behind the last.
+    if (chunks - 1) * record_bytes > table - start - 8:
+        raise _damaged(
+            path, f"{chunks} chunks in {table - start - 8} bytes", f"a point of {record_bytes} bytes in each"
+        )
     if compressor != LAYERED:
         return laszip
     layers = sum(LAYERS.get(kind, length if kind == EXTRA_BYTES else 0) for kind, length in items)

@@ -12,7 +12,7 @@ from solidcloud.builder import dense
 from solidcloud.builder.cells import build_trees
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.dense import build_dense
-from solidcloud.builder.heap import heap_points, heap_trees, merge_runs
+from solidcloud.builder.heap import heap_place, heap_trees, merge_runs
 from solidcloud.builder.octree import VoxelPoints, build_voxel
 from solidcloud.builder.spool import Spool, canonical_columns
 from solidcloud.schemas.kernels.morton import morton_code
@@ -81,8 +81,8 @@ def test_what_comes_in_turn_is_read_in_turn() -> None:
     "config", [BuildConfig(), BuildConfig(leaf=3, degree=2), BuildConfig(leaf=1, degree=3)]
 )
 def test_the_cell_is_that_of_its_points(count: int, config: BuildConfig) -> None:
-    points = np.concatenate(list(heap_points(CODE, count, 999)))
-    assert points.tolist() == [list(PLACE)] * count
+    assert heap_place(CODE).tolist() == [list(PLACE)]
+    points = np.repeat(heap_place(CODE), count, axis=0)
     expected = build_trees(points, np.zeros(1, np.int64), np.zeros(1, np.uint8), config)
     found = heap_trees(CODE, count, config)
     for name in set(found._fields) - {"xyz", "rank", "nodes"}:

@@ -171,6 +171,26 @@ def test_a_laz_that_claims_more_points_than_its_chunks_hold_is_refused(tmp_path:
         open_scans(path)
 
 
+def test_a_laz_of_more_chunks_than_its_bytes_hold_is_refused(tmp_path: Path) -> None:
+    """Room is made for all that the table claims."""
+    header = laspy.LasHeader(version="1.2", point_format=0)
+    las = laspy.LasData(header)
+    las.X = las.Y = las.Z = np.arange(300) * 7919 % 50_000
+    path = tmp_path / "a.laz"
+    las.write(path, laz_backend=laspy.LazBackend.Lazrs)
+    data = bytearray(path.read_bytes())
+    start = struct.unpack_from("<I", data, 96)[0]
+    table = struct.unpack_from("<q", data, start)[0]
+    held = (table - start - 8) // 20
+    assert struct.unpack_from("<I", data, table + 4) == (1,) and held > 2
+    struct.pack_into("<I", data, table + 4, held + 2)
+    path.write_bytes(data)
+    with pytest.raises(
+        ScanError, match=rf"{held + 2} chunks in .* bytes, expected a point of 20 bytes in each"
+    ):
+        open_scans(path)
+
+
 def test_a_laz_chunk_that_claims_gigabytes_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.laz"
     write_laz(path, 100, 6)

@@ -111,6 +111,8 @@ class Archive:
         if len(self.voxels) and (
             self.voxels["shard"].max() >= len(sizes)
             or (self.voxels["key"][1:] <= self.voxels["key"][:-1]).any()
+            # Three coordinates of 21 bits: with one bit more two keys would be one voxel.
+            or self.voxels["key"][-1] >= 1 << 63
         ):
             raise FormatError(f"{self.folder}: the index does not add up: restore or rebuild it")
         # The broad phase searches ascending keys and prunes by these bounds: it would call clear what they hide.

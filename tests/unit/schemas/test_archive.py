@@ -112,6 +112,16 @@ def test_an_index_that_names_a_voxel_twice_is_refused(copy: Path) -> None:
         Archive(copy)
 
 
+def test_a_key_of_more_than_three_coordinates_is_refused(copy: Path) -> None:
+    # Its coordinates are those of the key without the bit: two voxels in one place.
+    def widen(rows: np.ndarray) -> None:
+        rows["key"][-1] |= np.uint64(1 << 63)
+
+    rewrite_index(copy, widen)
+    with pytest.raises(FormatError, match="does not add up"):
+        Archive(copy)
+
+
 def test_a_shard_name_that_leads_elsewhere_is_refused(copy: Path) -> None:
     with Archive(copy) as archive:
         write_index(copy, archive.header, archive.voxels, [("../../secret.h5", 10)])

@@ -131,7 +131,9 @@ def _build(scans: list[Path], output: Path, config: "BuildConfig", log_json: boo
         print_build(summary)
     if summary.already:
         print(
-            f"{output}: whole already, of these scans with these options: nothing was built", file=sys.stderr
+            f"{output}: whole already, of these scans with these options: nothing was built. Its index says so: its "
+            "records were not read, which `solidcloud validate` does; --overwrite builds it anew",
+            file=sys.stderr,
         )
     for fault in summary.faults:
         print(f"left out: {fault}", file=sys.stderr)

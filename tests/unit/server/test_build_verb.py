@@ -95,6 +95,7 @@ def test_who_interrupts_is_told_how_to_go_on(
     told = capsys.readouterr()
     assert json.loads(told.out)["already"] is True
     assert "whole already, of these scans with these options: nothing was built" in told.err
+    assert "Its index says so: its records were not read, which `solidcloud validate` does" in told.err
 
 
 def test_progress_is_json_where_asked_for(

@@ -5,7 +5,6 @@ is taken in cubes by Morton range, and what lies around one is read piece by pie
 whole, however many points are there.
 """
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,9 +17,21 @@ from .config import BuildConfig
 from .executor import Executor
 from .filter_rules import Rules, make_rules
 from .filter_verdicts import KEPT, REASONS, near_verdicts, thin_verdicts
-from .journal import Journal, Work, new_file, resumed
+from .journal import Journal, Work, resumed
+from .partition import RunsHold
 from .progress import Progress
-from .spool import RUN_SUFFIX, Spool, canonical_columns, places_sum, row_codes, spool_dtype, write_directory
+from .spool import (
+    RUN_FOLDERS,
+    RUN_SUFFIX,
+    RunSums,
+    Spool,
+    canonical_columns,
+    new_run,
+    places_sum,
+    row_codes,
+    spool_dtype,
+    write_directory,
+)
 
 # Points in a work unit.
 UNIT_POINTS = 1 << 21
@@ -41,13 +52,12 @@ class FilterUnit(NamedTuple):
 
 
 class Filtered(NamedTuple):
-    """What one unit left. name: of its run.  size: of it [bytes]; 0: nothing was left, and there is no run.
+    """What one unit left. runs: name of its run -> what was written of it; none where nothing was left.
 
     places_before, places: the `places_sum` of what it read and of what it left.
     """
 
-    name: str
-    size: int
+    runs: dict[str, RunSums]
     left_out: Counts
     places_before: int
     places: int
@@ -64,16 +74,16 @@ def filtered_spool(
     rules = make_rules(config, spool.lattice)
     passes = []
     if rules.moving or rules.outliers:
-        passes.append(("filter-near", rules._replace(thin=None)))
+        passes.append((RUN_FOLDERS[1], rules._replace(thin=None)))
     if rules.thin:
-        passes.append(("filter-thin", Rules(None, None, None, rules.thin)))
+        passes.append((RUN_FOLDERS[2], Rules(None, None, None, rules.thin)))
     left_out: Counts = {}
     for i, (name, rule) in enumerate(passes):
         target = folder / name
         target.mkdir(parents=True, exist_ok=True)
         dtype = spool_dtype(config) if i == len(passes) - 1 else spool.dtype
         units = _units(spool, rule, dtype, target)
-        work = Work(filter_voxels, _dump, _load, _Holds(target))
+        work = Work(filter_voxels, _dump, _load, RunsHold(target))
         named = [(f"{name}/{unit.path.stem}", unit) for unit in units]
         results = resumed(journal, executor, work, named, progress, lambda unit: unit.points)
         for result in results:
@@ -83,7 +93,7 @@ def filtered_spool(
                 f"{spool.folder}: points that are not those of the scans: check disk and memory",
                 (spool.folder,),
             )
-        runs, places = [r.name for r in results if r.size], sum(r.places for r in results) % (1 << 64)
+        runs, places = [name for r in results for name in r.runs], sum(r.places for r in results) % (1 << 64)
         spool = Spool(target, dtype, spool.lattice, runs, places)
         if not len(spool.keys):
             raise BadRequestError(
@@ -115,17 +125,6 @@ def _load(noted: dict[str, Any]) -> Filtered:
     return Filtered(**{**noted, "left_out": counts})
 
 
-@dataclass(frozen=True, slots=True)
-class _Holds:
-    """Whether the run that a note speaks of is in the folder, as long as it was."""
-
-    folder: Path
-
-    def __call__(self, result: Filtered) -> bool:
-        path = self.folder / result.name
-        return (path.stat().st_size if path.exists() else 0) == result.size
-
-
 def _add(total: Counts, more: Counts) -> None:
     """Add up what was left out."""
     for reason, scans in more.items():
@@ -141,7 +140,7 @@ def filter_voxels(unit: FilterUnit) -> Filtered:
     keys: list[int] = []
     starts = [0]
     before = after = 0
-    with new_file(unit.path) as file:
+    with new_run(unit.path) as file:
         for key in unit.keys:
             kept = 0
             for block in reader.blocks(key):
@@ -159,10 +158,10 @@ def filter_voxels(unit: FilterUnit) -> Filtered:
                 keys.append(key)
                 starts.append(starts[-1] + kept)
     if not keys:
-        unit.path.unlink()
-        return Filtered(unit.path.name, 0, left_out, before, after)
-    write_directory(unit.path, np.array(keys, np.uint64), np.array(starts, np.int64))
-    return Filtered(unit.path.name, unit.path.stat().st_size, left_out, before, after)
+        unit.path.unlink(missing_ok=True)  # the same unit, given up and still running, may be before us
+        return Filtered({}, left_out, before, after)
+    directory = write_directory(unit.path, np.array(keys, np.uint64), np.array(starts, np.int64))
+    return Filtered({unit.path.name: [*file.sums, *directory]}, left_out, before, after)
 
 
 def _counted(rows: NDArray, verdict: NDArray[np.uint8]) -> Counts:

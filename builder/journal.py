@@ -7,6 +7,7 @@ work of which it was not yet written is done again.
 
 import json
 import os
+import re
 import uuid
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -22,6 +23,7 @@ Unit = TypeVar("Unit")
 Result = TypeVar("Result")
 
 TEMPORARY_SUFFIX = ".tmp"
+_TEMPORARY = re.compile(r".+\.([0-9a-f]{32}|[0-9a-f]{12}-\d+-\d+|directory)\.tmp")
 
 
 @contextmanager
@@ -41,6 +43,11 @@ def new_file(path: Path) -> Iterator[BinaryIO]:
         temporary.unlink(missing_ok=True)
         raise
     sync_folder(path.parent)
+
+
+def is_temporary(path: Path) -> bool:
+    """Whether a name is that of a file that has none yet, given here or by schemas/new_file.py."""
+    return _TEMPORARY.fullmatch(path.name) is not None
 
 
 def remove_temporaries(folder: Path) -> None:

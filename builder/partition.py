@@ -8,7 +8,7 @@ writes them as one run (builder/spool.py).
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,7 @@ from .config import BuildConfig
 from .kernels.content import SEEDS
 from .kernels.spool import FREE, fill_local, order_ties, place_points, rehash, scatter, usable_bounds
 from .sources import Block, Scan
-from .spool import KEYS_SUFFIX, RUN_SUFFIX, new_run, write_directory
+from .spool import RUN_SUFFIX, RunSums, new_run, run_sizes, write_directory
 
 # Bytes a point that a spooling worker holds: voxel number, code, and the code once more in order; with intensity its
 # bits, them once more, and, of a run in one voxel, order, sorted codes and ranks.
@@ -56,14 +56,14 @@ class SpoolUnit:
 
 @dataclass(frozen=True, slots=True)
 class Spooled:
-    """What the second pass made of a range. runs: name of each -> bytes of its two files.
+    """What the second pass made of a range. runs: name of each -> what was written of it.
 
     content: sums that identify the points, see `content_sum`.  places: the same of their lattice coordinates alone, see
     `places_sum`.  moved_max: farthest along an axis that quantising
     moved a point [m].
     """
 
-    runs: dict[str, list[int]]
+    runs: dict[str, RunSums]
     count: int
     content: list[int]
     places: int
@@ -80,22 +80,22 @@ def load_spooled(noted: dict[str, Any]) -> Spooled:
     return Spooled(**noted)
 
 
+class HasRuns(Protocol):
+    """What speaks of runs. runs: name of each -> what was written of it."""
+
+    @property
+    def runs(self) -> dict[str, RunSums]:
+        """The runs."""
+
+
 @dataclass(frozen=True, slots=True)
 class RunsHold:
-    """Whether the runs that a note speaks of are in `folder`, as long as they were."""
+    """Whether the runs that a note speaks of are in `folder`, as long as they were; their bytes: believed.py."""
 
     folder: Path
 
-    def __call__(self, spooled: Spooled) -> bool:
-        return all(run_bytes(self.folder / name) == sizes for name, sizes in spooled.runs.items())
-
-
-def run_bytes(path: Path) -> list[int] | None:
-    """The bytes of a run's two files; None where one is missing."""
-    try:
-        return [path.stat().st_size, path.with_suffix(KEYS_SUFFIX).stat().st_size]
-    except FileNotFoundError:
-        return None
+    def __call__(self, noted: HasRuns) -> bool:
+        return all(run_sizes(self.folder / name) == tuple(sums[::2]) for name, sums in noted.runs.items())
 
 
 def run_points(memory_bytes: int, dtype: np.dtype) -> int:
@@ -112,16 +112,13 @@ def spool_range(unit: SpoolUnit) -> Spooled:
     """
     held = _Held(unit, min(unit.count, unit.run_points))
     kept = 0
-    runs: dict[str, list[int]] = {}
+    runs: dict[str, RunSums] = {}
 
     def flush() -> None:
         # Named by how the range is cut, too: a worker that was given up, of a session that cut it otherwise, may still
         # write, and must not put its run in the place of one that is in use.
         path = unit.folder / f"{unit.name}-{unit.run_points}-{len(runs):04d}{RUN_SUFFIX}"
-        held.write(path)
-        sizes = run_bytes(path)
-        assert sizes is not None
-        runs[path.name] = sizes
+        runs[path.name] = held.write(path)
 
     for block in unit.scan.blocks(start=unit.start, stop=unit.stop):
         block = usable(block)
@@ -215,8 +212,8 @@ class _Held:
         self.moved_max = max(self.moved_max, moved)
         return done
 
-    def write(self, path: Path) -> None:
-        """Sort what is held and write it as the run `path`; then hold nothing."""
+    def write(self, path: Path) -> RunSums:
+        """Sort what is held and write it as the run `path`; then hold nothing. Returns what was written."""
         size, voxels = self.size, int(self.known[0])
         numbers = self.numbers[:size]
         order = np.argsort(self.keys[:voxels])
@@ -235,9 +232,10 @@ class _Held:
         with new_run(path) as file:
             for rows in self._rows(codes, bits):
                 file.write(rows.view(np.uint8).data)
-        write_directory(path, self.keys[:voxels][order], starts)
+        directory = write_directory(path, self.keys[:voxels][order], starts)
         self.size = 0
         self._room(len(self.keys))
+        return [*file.sums, *directory]
 
     def _rows(self, codes: NDArray[np.uint64], bits: NDArray[np.uint32] | None) -> Iterator[NDArray]:
         """The rows of sorted codes, WRITTEN_ROWS at a time, overwritten by the next."""

@@ -15,6 +15,7 @@ from ..schemas.errors import BadRequestError, ScanError
 from ..schemas.index import VOXEL_DTYPE
 from ..schemas.shard import SHARD_FOLDER, file_checksum
 from ..schemas.voxel_grid import Lattice
+from .believed import check_runs
 from .config import BuildConfig
 from .executor import Executor
 from .filter_rules import filter_dtype, filter_passes, is_filtered, make_rules
@@ -138,6 +139,7 @@ def spool_scans(
     stages: Stages,
 ) -> list[Spooled]:
     """Second pass: quantised points, sorted into voxels, on disk."""
+    check_runs(place, stages)
     folder = place.folder / "spool"
     most = run_points(memory_share(executor.jobs, config), dtype)
     units = []

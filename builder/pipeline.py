@@ -25,6 +25,7 @@ from ..schemas.vtkhdf import PREVIEW_NAME
 from .config import RADIUS_SAMPLE, BuildConfig
 from .dense import DENSE_POINTS
 from .executor import Executor, make_executor, worker_count
+from .filter_rules import filter_dtype, filter_passes
 from .header import archive_id, make_header
 from .memory import jobs_that_fit, readers_that_fit
 from .passes import build_shards, check_filters, filter_points, spool_rows, spool_scans, survey_scans
@@ -35,7 +36,7 @@ from .scan_list import Input
 from .scan_list import inputs as scans_of
 from .shards import Shard
 from .spacing import archive_mean
-from .spool import Spool
+from .spool import Spool, spool_dtype
 from .stages import Stages
 from .survey import Survey, choose_lattice
 from .verify import verify_archive
@@ -140,7 +141,7 @@ def _build(
         place.surveyed = True
         points = sum(s.count for s in surveys)
         dtype = spool_rows(config)
-        final = points * (dtype.itemsize + ARCHIVE_BYTES_A_POINT)
+        final = points * (_run_bytes_a_point(config) + ARCHIVE_BYTES_A_POINT)
         _check_space(target.parent, place.folder, final)
         try:
             spooled = spool_scans(surveys, lattice, dtype, place, executor, config, stages)
@@ -156,6 +157,7 @@ def _build(
             {reason: of[number] for reason, of in left_out.items() if number in of}
             for number in range(len(surveys))
         ]
+        final -= (points - int(spool.counts.sum())) * (spool.dtype.itemsize + ARCHIVE_BYTES_A_POINT)
         dense = np.sort(spool.counts[spool.counts > DENSE_POINTS])[-executor.jobs :]
         _check_space(target.parent, place.folder, final + int(dense.sum()) * SCRATCH_BYTES_A_POINT)
         _check_voxels(spool, config)
@@ -209,7 +211,7 @@ def _check_unchanged(
 def _read_back(folder: Path, points: int, spool: Spool, executor: Executor, stages: Stages) -> None:
     """Read what was written, for a preview and to the last record. Raises CorruptError where it is something else.
 
-    The points of the records must be those of the scans: runs have no checksums, and outlive many a command.
+    The points of the records must be those of the scans: what is on disk may change while it is in use.
     """
     fault = ""
     paths: tuple[Path, ...] = ()
@@ -306,6 +308,11 @@ def _machine_errors(target: Path) -> Iterator[None]:
             f"{target.parent}: {found}{where}: {what}, then give the same command again: it goes on from what is done, "
             f"in {folder}"
         ) from error
+
+
+def _run_bytes_a_point(config: BuildConfig) -> int:
+    """Bytes a point of all runs together: the scans', and those of each pass of the filters, which may leave it in."""
+    return filter_passes(config) * filter_dtype(config).itemsize + spool_dtype(config).itemsize
 
 
 def _check_space(disk: Path, folder: Path, needed: int) -> None:

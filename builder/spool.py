@@ -6,14 +6,16 @@ A run is two files that say nothing of each other but their name:
 - `NAME.keys`: its directory, uint64 words: the keys of its voxels ascending, then the row each begins at, then how many
   rows there are. `s` voxels are `2 s + 1` words.
 
-A `Spool` is a folder of runs. It holds no rows: a voxel's are read from the few runs that have some of it, each time.
+Nothing in them says whether they are what was written: notes do, by sizes and checksums (`RunSums`). A `Spool` is a
+folder of runs. It holds no rows: a voxel's are read from the few runs that have some of it, each time.
 """
 
 import json
 import os
 import uuid
+import zlib
 from collections.abc import Collection, Iterator, Sequence
-from contextlib import AbstractContextManager
+from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
@@ -22,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..schemas.errors import CorruptError
+from ..schemas.shard import file_checksum
 from ..schemas.voxel_grid import Lattice, voxel_coordinates
 from .config import BuildConfig
 from .journal import TEMPORARY_SUFFIX, new_file
@@ -30,6 +33,8 @@ from .kernels.octree import voxel_codes
 
 RUN_SUFFIX = ".run"
 KEYS_SUFFIX = ".keys"
+# Folders of runs, each made of those before it.
+RUN_FOLDERS = ("spool", "filter-near", "filter-thin")
 # Of the file of all directories merged.
 MERGED_SUFFIX = f".directory{TEMPORARY_SUFFIX}"
 # Voxels of runs that are merged at a time. 1,400 runs of 1,500 voxels each took 200 MB in each process, all merged at
@@ -39,6 +44,11 @@ MERGED_ENTRIES = 1 << 18
 # Every so many rows of a voxel in a run, one Morton code is read to find a block: then a block's end is found with
 # one more read of so many rows, 48 kB, and 10^8 rows are known by 24,000 codes.
 CODE_STRIDE = 4096
+# A voxel key has three coordinates of 21 bits.
+KEY_BITS = 63
+
+# What was written of a run, as JSON holds it: bytes and `file_checksum` of NAME.run, then those of NAME.keys.
+RunSums = list[int]
 
 
 def spool_dtype(config: BuildConfig) -> np.dtype:
@@ -77,22 +87,76 @@ def write_run(path: Path, keys: NDArray[np.uint64], rows: NDArray) -> None:
     write_directory(path, found, np.append(starts, len(keys)).astype(np.int64))
 
 
-def new_run(path: Path) -> AbstractContextManager[BinaryIO]:
+class SummedFile:
+    """A file that is being written, and the sums of what was. sums: bytes, and their `file_checksum`."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        """Nothing written yet."""
+        self._file, self.sums = file, [0, 0]
+
+    def write(self, data: bytes | memoryview) -> None:
+        """Write more, in bytes."""
+        self._file.write(data)
+        # Summed here and not from the disk: what a disk reads back is what is in question.
+        self.sums = [self.sums[0] + len(data), zlib.crc32(data, self.sums[1])]
+
+
+@contextmanager
+def new_run(path: Path) -> Iterator[SummedFile]:
     """The file of a run, to be written in order; it has its name when it is whole and on disk for good."""
-    return new_file(path)
+    with new_file(path) as file:
+        yield SummedFile(file)
 
 
-def write_directory(path: Path, keys: NDArray[np.uint64], starts: NDArray[np.int64]) -> None:
-    """Write the directory of the run `path`: keys (s,) ascending, starts (s + 1,)."""
-    with new_file(path.with_suffix(KEYS_SUFFIX)) as file:
+def write_directory(path: Path, keys: NDArray[np.uint64], starts: NDArray[np.int64]) -> list[int]:
+    """Write the directory of the run `path`: keys (s,) ascending, starts (s + 1,) ascending; returns its sums."""
+    with new_run(path.with_suffix(KEYS_SUFFIX)) as file:
         file.write(np.concatenate([keys.astype("<u8"), starts.astype("<u8")]).tobytes())
+    return file.sums
 
 
-def read_directory(path: Path) -> tuple[NDArray[np.uint64], NDArray[np.int64]]:
-    """keys (s,) and starts (s + 1,) of the run `path`."""
+def run_sizes(path: Path) -> tuple[int | None, int | None]:
+    """The bytes of a run's two files; None for one that is missing."""
+    files = (path, path.with_suffix(KEYS_SUFFIX))
+    first, second = (file.stat().st_size if file.is_file() else None for file in files)
+    return first, second
+
+
+def is_other_run(path: Path, sums: RunSums) -> bool:
+    """Whether what there is of a run is not what was written, of which nothing can be made; both files are read.
+
+    A file that is missing is no other: what was made of the run while it was there is as it should be.
+    """
+    written = zip((path, path.with_suffix(KEYS_SUFFIX)), sums[::2], sums[1::2], strict=True)
+    return any(
+        file.is_file() and (file.stat().st_size != size or file_checksum(file) != checksum)
+        for file, size, checksum in written
+    )
+
+
+def read_directory(path: Path, row_bytes: int) -> tuple[NDArray[np.uint64], NDArray[np.int64]]:
+    """keys (s,) and starts (s + 1,) of the run `path`, of rows of so many bytes.
+
+    Raises CorruptError for words that can be no directory of this run. One that can be, and is not what was written,
+    is told by its checksum alone.
+    """
     words = np.fromfile(path.with_suffix(KEYS_SUFFIX), "<u8")
     voxels = len(words) // 2
-    return words[:voxels], words[voxels:].astype(np.int64)
+    keys, starts = words[:voxels], words[voxels:]
+    if (
+        path.with_suffix(KEYS_SUFFIX).stat().st_size != 8 * (2 * voxels + 1)
+        or (keys[1:] <= keys[:-1]).any()
+        or (keys >> np.uint64(KEY_BITS)).any()
+        or starts[0] != 0
+        or (starts[1:] <= starts[:-1]).any()
+        or int(starts[-1]) * row_bytes != path.stat().st_size
+    ):
+        raise CorruptError(
+            f"{path.with_suffix(KEYS_SUFFIX)}: not the directory of {path.name}, {path.stat().st_size} bytes: "
+            "check the disk, and give the same command again",
+            (path,),
+        )
+    return keys, starts.astype(np.int64)
 
 
 class _Part(NamedTuple):
@@ -116,16 +180,16 @@ class _Directory(NamedTuple):
     entries: NDArray[np.int64]
 
 
-def _merge_directories(paths: Sequence[Path], path: Path) -> None:
-    """Write the directories of runs, merged, as the file `path`.
+def _merge_directories(paths: Sequence[Path], row_bytes: int, path: Path) -> None:
+    """Write the directories of runs, of rows of so many bytes, merged, as the file `path`.
 
     uint64 words: how many voxels, entries, and bytes of names there are; keys, first, entries and counts as in
     `_Directory`; then the runs' names as JSON. Memory: 24 bytes a voxel, and 100 an entry of MERGED_ENTRIES.
     """
-    keys = _all_keys(paths)
+    keys = _all_keys(paths, row_bytes)
     pairs = np.zeros(len(keys) + 1, np.int64)
     for run in paths:
-        pairs[1 + np.searchsorted(keys, read_directory(run)[0])] += 1
+        pairs[1 + np.searchsorted(keys, read_directory(run, row_bytes)[0])] += 1
     first = np.cumsum(pairs)
     counts = np.empty(len(keys), np.int64)
     names = json.dumps([run.name for run in paths]).encode()
@@ -136,29 +200,29 @@ def _merge_directories(paths: Sequence[Path], path: Path) -> None:
         while begin < len(keys):
             most = int(first[begin]) + MERGED_ENTRIES
             end = max(begin + 1, int(np.searchsorted(first, most, "right")) - 1)
-            table = _entries_of(paths, keys[begin], keys[end - 1])
+            table = _entries_of(paths, row_bytes, keys[begin], keys[end - 1])
             counts[begin:end] = np.add.reduceat(table[:, 2], first[begin:end] - first[begin])
             file.write(table.astype("<i8").tobytes())
             begin = end
         file.write(counts.astype("<i8").tobytes() + names)
 
 
-def _all_keys(paths: Sequence[Path]) -> NDArray[np.uint64]:
+def _all_keys(paths: Sequence[Path], row_bytes: int) -> NDArray[np.uint64]:
     """The keys of all voxels in some runs, ascending."""
     keys, waiting, held = np.empty(0, np.uint64), [np.empty(0, np.uint64)], 0
     for run in paths:
-        waiting.append(read_directory(run)[0])
+        waiting.append(read_directory(run, row_bytes)[0])
         held += len(waiting[-1])
         if held > MERGED_ENTRIES:
             keys, waiting, held = np.unique(np.concatenate([keys, *waiting])), [], 0
     return np.unique(np.concatenate([keys, *waiting]))
 
 
-def _entries_of(paths: Sequence[Path], low: np.uint64, high: np.uint64) -> NDArray[np.int64]:
+def _entries_of(paths: Sequence[Path], row_bytes: int, low: np.uint64, high: np.uint64) -> NDArray[np.int64]:
     """Run, start and size (e, 3) of the voxels from key `low` to `high`, by key, then by run."""
     keys, tables = [], []
     for number, run in enumerate(paths):
-        found, starts = read_directory(run)
+        found, starts = read_directory(run, row_bytes)
         which = slice(int(np.searchsorted(found, low)), int(np.searchsorted(found, high, "right")))
         begin, end = starts[:-1][which], starts[1:][which]
         keys.append(found[which].copy())
@@ -255,7 +319,7 @@ class Spool:
                     names = tuple(sorted(path.name for path in self.folder.glob(f"*{RUN_SUFFIX}")))
                 # Of use to this session alone, and so removed with what is temporary by the next.
                 path = self.folder / f"{uuid.uuid4().hex}{MERGED_SUFFIX}"
-                _merge_directories([self.folder / name for name in names], path)
+                _merge_directories([self.folder / name for name in names], self.dtype.itemsize, path)
                 self._file = path
             self._directory = _open_directories(self._file)
         return self._directory

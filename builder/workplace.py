@@ -4,20 +4,21 @@ import json
 import os
 import shutil
 import uuid
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..schemas.errors import BadRequestError, CorruptError, ScanError
+from ..schemas.errors import BadRequestError, CorruptError, ScanError, SolidcloudError
 from ..schemas.index_file import INDEX_NAME
 from ..schemas.new_file import sync_folder
 from ..schemas.shard import SHARD_FOLDER
 from ..schemas.vtkhdf import PREVIEW_NAME
-from .journal import Journal, remove_temporaries
+from .journal import TEMPORARY_SUFFIX, Journal, is_temporary, remove_temporaries
 from .lock import locked as locked
 from .resume import check_same
+from .spool import RUN_FOLDERS
 
 # The note of what is built, the first of all; and what in it names the folder that holds what is done.
 BEGUN, WORD = "build", "word"
@@ -33,7 +34,8 @@ def check_target(target: Path, overwrite: bool) -> None:
         raise BadRequestError(f"{target}: an archive is here already: give another -o, or --overwrite")
     shards = list((target / SHARD_FOLDER).iterdir()) if (target / SHARD_FOLDER).is_dir() else []
     strangers = [p for p in target.iterdir() if p.name not in (INDEX_NAME, SHARD_FOLDER, PREVIEW_NAME)]
-    strangers += [p for p in shards if p.suffix != ".h5" or not p.is_file()]
+    # A unit that was given up may have left a file without a name, of a build killed before it could remove it.
+    strangers += [p for p in shards if not p.is_file() or (p.suffix != ".h5" and not is_temporary(p))]
     if strangers:
         raise BadRequestError(
             f"{strangers[0]}: not part of an archive, and --overwrite would delete it: move it, or give another -o"
@@ -81,21 +83,39 @@ class Workplace:
     def distrust(self, path: Path) -> None:
         """Forget what was found not to be what was written: a run or a shard, or, by their folder, all points.
 
-        All points are made again under another name: who still reads the old ones has nowhere to write what comes of
-        it.
+        What was made of a run is forgotten with it.
         """
-        if not path.is_dir():
-            self.journal.forget_file(path)
+        if path.is_dir():
+            self._keep(("survey",))
             return
+        if path.parent.name in RUN_FOLDERS:
+            self.distrust_made_of(path.parent.name)
+        self.journal.forget_file(path)
+
+    def distrust_made_of(self, folder: str) -> None:
+        """Forget what was made of the runs in a folder of RUN_FOLDERS: what filters left of them, and shards."""
+        self._keep(("survey", *RUN_FOLDERS[: RUN_FOLDERS.index(folder) + 1]))
+
+    def _keep(self, names: Sequence[str]) -> None:
+        """Keep these folders of what is done, under another name: who still works on the rest of it, and of what is not
+        believed, has nowhere to write what comes of it.
+        """
         old = self.folder
         begun = {**self.begun, WORD: uuid.uuid4().hex}
         folder = self.hidden / begun[WORD]
         folder.mkdir()
-        with suppress(FileNotFoundError):
-            os.rename(old / "survey", folder / "survey")
+        for name in names:
+            with suppress(FileNotFoundError):
+                os.rename(old / name, folder / name)
         Journal(self.hidden).note(BEGUN, begun)
         self.begun = begun
         _remove(old)
+        self.make_folders()
+
+    def make_folders(self) -> None:
+        """Make the folders that passes write to."""
+        for folder in (self.folder, self.folder / "spool", self.archive, self.archive / SHARD_FOLDER):
+            folder.mkdir(exist_ok=True)
 
     @property
     def folder(self) -> Path:
@@ -125,6 +145,11 @@ def workplace(target: Path, what: dict[str, Any], *, fresh: bool) -> Iterator[Wo
     hidden = building_folder(target)
     if fresh:
         remove_building(hidden)
+        if (note := Journal(hidden).path(BEGUN)).exists():
+            raise SolidcloudError(
+                f"{note}: cannot be removed, as --fresh asks, and the build would go on from it: remove {hidden} by "
+                "hand, then give the same command again"
+            )
     begun = Journal(hidden).recall(BEGUN)
     if begun is not None:
         check_same(hidden, begun, json.loads(json.dumps(what)))
@@ -158,8 +183,7 @@ def _prepare(place: Workplace) -> None:
         if path.is_dir() and path != place.folder:
             _remove(path)
     remove_temporaries(place.hidden)
-    for folder in (place.folder, place.folder / "spool", place.archive, place.archive / SHARD_FOLDER):
-        folder.mkdir(exist_ok=True)
+    place.make_folders()
 
 
 def forget_finished(target: Path, what: dict[str, Any]) -> None:
@@ -167,6 +191,10 @@ def forget_finished(target: Path, what: dict[str, Any]) -> None:
     folder = building_folder(target)
     begun = Journal(folder).recall(BEGUN)
     if begun is None or {**begun, WORD: ""} == {**json.loads(json.dumps(what)), WORD: ""}:
+        # What units that were given up left in it after its rename; anything else there is somebody's own.
+        left = (target / SHARD_FOLDER).glob(f"*{TEMPORARY_SUFFIX}") if folder.is_dir() else ()
+        for path in filter(is_temporary, left):
+            path.unlink(missing_ok=True)
         remove_building(folder)
 
 

@@ -248,6 +248,28 @@ def test_processes_give_the_same_run_and_a_second_call_does_nothing_again(
     assert contents(again).rows() == contents(two).rows()
 
 
+def test_a_run_of_nothing_may_be_removed_by_the_same_unit_elsewhere(
+    rng: np.random.Generator, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A worker that was given up runs to its end."""
+    spool = spool_of(cloud(rng), tmp_path / "a", 64, 1, rng)
+    config = BuildConfig(outliers=(0.001, 2000))
+    (tmp_path / "near").mkdir()
+    rules = filters.make_rules(config, spool.lattice)
+    keys = tuple(spool.keys.tolist())
+    unit = filters.FilterUnit(keys, 400, spool, rules, spool.dtype, tmp_path / "near" / "000000.run")
+    unlink = Path.unlink
+
+    def twice(path: Path, missing_ok: bool = False) -> None:
+        unlink(path)
+        unlink(path, missing_ok)
+
+    monkeypatch.setattr(Path, "unlink", twice)
+    left = filters.filter_voxels(unit)
+    assert left.runs == {} and sum(sum(of.values()) for of in left.left_out.values()) == 400
+    assert not list((tmp_path / "near").iterdir())
+
+
 def test_a_place_with_more_duplicates_than_are_held_is_one_block(
     rng: np.random.Generator, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -1,15 +1,27 @@
 """Sorted runs: every row once, in canonical order, found by voxel and by block of a voxel."""
 
+import os
 import pickle
 import tracemalloc
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 import solidcloud.builder.spool as spool_module
 from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.spool import KEYS_SUFFIX, Spool, read_directory, spool_dtype, write_run
+from solidcloud.builder.spool import (
+    KEYS_SUFFIX,
+    Spool,
+    is_other_run,
+    new_run,
+    read_directory,
+    spool_dtype,
+    write_directory,
+    write_run,
+)
 from solidcloud.schemas.errors import CorruptError
+from solidcloud.schemas.shard import file_checksum
 from solidcloud.schemas.voxel_grid import make_lattice
 
 LATTICE = make_lattice((0, 0, 0), 0.001, 0.1)
@@ -93,12 +105,14 @@ def test_a_worker_holds_the_directories_of_what_it_asks_for(
     monkeypatch.setattr(spool_module, "MERGED_ENTRIES", 1 << 12)
     runs, voxels = 100, 1000
     keys = np.arange(voxels, dtype=np.uint64)
+    dtype = spool_dtype(BuildConfig())
     for number in range(runs):
         spool_module.write_directory(tmp_path / f"{number}.run", keys, np.arange(voxels + 1))
         (tmp_path / f"{number}.run").touch()
+        os.truncate(tmp_path / f"{number}.run", voxels * dtype.itemsize)
     tracemalloc.start()
     try:
-        spool = Spool(tmp_path, spool_dtype(BuildConfig()), LATTICE)
+        spool = Spool(tmp_path, dtype, LATTICE)
         assert spool.counts.tolist() == [runs] * voxels
         assert tracemalloc.get_traced_memory()[1] < 2 << 20  # 94 bytes a voxel of a run were 9 MB
         sent = pickle.dumps(spool)
@@ -138,8 +152,9 @@ def test_a_folder_without_runs_holds_nothing(tmp_path: Path) -> None:
 def test_a_run_that_lost_its_end_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.run"
     write_run(path, *made(1, 50, frozenset()))
-    path.write_bytes(path.read_bytes()[:-1])
     spool = Spool(tmp_path, spool_dtype(BuildConfig()), LATTICE)
+    assert len(spool.keys) == 3
+    path.write_bytes(path.read_bytes()[:-1])
     spool.rows(int(spool.keys[0]))
     with pytest.raises(CorruptError, match=r"a\.run: ends before row 50"):
         spool.rows(int(spool.keys[-1]))
@@ -152,5 +167,69 @@ def test_the_directory_is_as_its_description_says(tmp_path: Path) -> None:
     assert words[:3] == KEYS.tolist()
     assert np.diff(words[3:]).tolist() == [int((keys == key).sum()) for key in KEYS]
     assert words[3] == 0
-    found, starts = read_directory(tmp_path / "a.run")
+    found, starts = read_directory(tmp_path / "a.run", rows.dtype.itemsize)
     assert (found.tolist(), starts.tolist()) == (words[:3], words[3:])
+
+
+NO_DIRECTORIES: dict[str, Callable[[list[int]], list[int]]] = {
+    "nothing": lambda words: [],
+    "an even number of words": lambda words: words[:-1],
+    "two words more": lambda words: [*words, words[-1] + 1, words[-1] + 2],
+    "a voxel twice": lambda words: [words[1], *words[1:]],
+    "voxels that descend": lambda words: [words[1], words[0], *words[2:]],
+    "a key of 64 bits": lambda words: [*words[:2], words[2] | 1 << 63, *words[3:]],
+    "a first row left out": lambda words: [*words[:3], 1, *words[4:]],
+    "a voxel without rows": lambda words: [*words[:4], words[5], *words[5:]],
+    "rows that descend": lambda words: [*words[:4], words[5] + 1, *words[5:]],
+    "a start of 64 bits": lambda words: [*words[:4], words[4] | 1 << 63, *words[5:]],
+    "a row too many": lambda words: [*words[:-1], words[-1] + 1],
+    "a row too few": lambda words: [*words[:-1], words[-1] - 1],
+    "rows that overflow": lambda words: [*words[:-1], words[-1] + (1 << 62)],
+}
+
+
+@pytest.mark.parametrize("fault", [*NO_DIRECTORIES, "half a word"])
+def test_what_can_be_no_directory_of_a_run_is_refused_and_the_run_named(fault: str, tmp_path: Path) -> None:
+    run, dtype = tmp_path / "b.run", spool_dtype(BuildConfig())
+    for path in (tmp_path / "a.run", run):
+        write_run(path, *made(2, 60, frozenset()))
+    file = run.with_suffix(KEYS_SUFFIX)
+    words = np.fromfile(file, "<u8").tolist()
+    assert Spool(tmp_path, dtype, LATTICE).counts.sum() == 120
+    if fault in NO_DIRECTORIES:
+        np.array(NO_DIRECTORIES[fault](words), "<u8").tofile(file)
+    else:
+        file.write_bytes(file.read_bytes() + b"half")
+    with pytest.raises(CorruptError, match=r"b\.keys: not the directory of b\.run.*same command") as found:
+        print(Spool(tmp_path, dtype, LATTICE).counts)
+    assert found.value.paths == (run,)
+
+
+def test_what_was_written_of_a_run_is_told_from_all_else(tmp_path: Path) -> None:
+    run, (keys, rows) = tmp_path / "a.run", made(2, 20, frozenset({"scan", "intensity"}))
+    order = np.argsort(keys, kind="stable")
+    found, starts = np.unique(keys[order], return_index=True)
+    with new_run(run) as file:
+        for part in np.array_split(rows[order], 3):
+            file.write(part.tobytes())
+    sums = [*file.sums, *write_directory(run, found, np.append(starts, 20).astype(np.int64))]
+    files = (run, run.with_suffix(KEYS_SUFFIX))
+    assert sums == [of(path) for path in files for of in (lambda p: p.stat().st_size, file_checksum)]
+    assert not is_other_run(run, sums)
+    for path in files:
+        data = path.read_bytes()
+        for at in range(0, 8 * len(data), 7):  # each bit of a byte is among them
+            path.write_bytes(flipped(data, at))
+            assert is_other_run(run, sums)
+        path.write_bytes(data + b"more")
+        assert is_other_run(run, sums)
+        path.unlink()
+        assert not is_other_run(run, sums)  # nobody makes anything of it
+        path.write_bytes(data)
+
+
+def flipped(data: bytes, bit: int) -> bytes:
+    """The same but for one bit."""
+    changed = bytearray(data)
+    changed[bit // 8] ^= 1 << bit % 8
+    return bytes(changed)

@@ -9,6 +9,7 @@ from solidcloud.builder.journal import Journal, new_file
 from solidcloud.builder.workplace import (
     Workplace,
     building_folder,
+    check_target,
     forget_finished,
     publish_folder,
     remove_building,
@@ -93,6 +94,66 @@ def test_what_a_finished_build_left_is_forgotten_and_what_another_left_is_not(tm
     building_folder(tmp_path / "hall").mkdir()  # killed between its last two deeds
     forget_finished(tmp_path / "hall", WHAT)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_build_that_cannot_be_forgotten_is_not_gone_on_with(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    failed(tmp_path / "hall", KeyboardInterrupt(), surveyed=True)
+    with monkeypatch.context() as patch:
+        patch.setattr("solidcloud.builder.workplace.shutil.rmtree", lambda *_, **__: None)
+        with (
+            pytest.raises(
+                SolidcloudError, match=r"build\.json: cannot be removed, as --fresh asks.* by hand"
+            ),
+            workplace(tmp_path / "hall", WHAT, fresh=True),
+        ):
+            pytest.fail("went on")
+    assert not failed(tmp_path / "hall", KeyboardInterrupt(), surveyed=True, fresh=True)
+
+
+LATE = (f"0-000000.h5.{'0f' * 6}-12-345.tmp", f"0-000000.h5.{'0f' * 16}.tmp")
+
+
+def test_what_was_written_late_into_a_published_archive_is_removed(tmp_path: Path) -> None:
+    """By the same command, of a build that was killed just after its rename; what is somebody's own is not."""
+    failed(tmp_path / "hall", KeyboardInterrupt(), surveyed=True)
+    shards = tmp_path / "hall" / "shards"
+    shards.mkdir(parents=True)
+    for name in (*LATE, "own.tmp", "0-000000.h5"):
+        (shards / name).write_bytes(b"")
+    forget_finished(tmp_path / "hall", WHAT)
+    assert sorted(path.name for path in shards.iterdir()) == ["0-000000.h5", "own.tmp"]
+    (shards / LATE[0]).write_bytes(b"")
+    forget_finished(tmp_path / "hall", WHAT)  # no build was killed
+    assert (shards / LATE[0]).exists()
+
+
+@pytest.mark.parametrize("name", [*LATE, "own.tmp", "0-000000.h5.12.tmp"])
+def test_what_was_written_late_is_part_of_an_archive_to_overwrite(name: str, tmp_path: Path) -> None:
+    (tmp_path / "shards").mkdir()
+    for path in ("index.h5", "shards/0-000000.h5", f"shards/{name}"):
+        (tmp_path / path).write_bytes(b"")
+    if name in LATE:
+        check_target(tmp_path, overwrite=True)
+    else:
+        with pytest.raises(BadRequestError, match=f"{name}: not part of an archive"):
+            check_target(tmp_path, overwrite=True)
+
+
+def test_what_was_made_of_a_run_is_forgotten_with_it(tmp_path: Path) -> None:
+    place = began(tmp_path / "hall")
+    late = place.journal
+    for name in ("survey/1", "spool/1", "filter-near/1", "filter-thin/1", "done/1"):
+        late.note(name, {"runs": {f"{name[-6:-2]}.run": []}})
+    place.distrust(place.folder / "filter-near" / "near.run")
+    noted = ("survey/1", "spool/1", "filter-near/1", "filter-thin/1", "done/1")
+    assert [name for name in noted if place.journal.recall(name)] == ["survey/1", "spool/1"]
+    with pytest.raises(FileNotFoundError):  # a shard of what was not believed
+        late.note("done/2", {})
+    again = began(tmp_path / "hall")
+    assert again.folder == place.folder != late.folder
+    assert [p for p in again.hidden.iterdir() if p.is_dir()] == [again.folder]
 
 
 def test_the_note_of_what_it_is_is_removed_last(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

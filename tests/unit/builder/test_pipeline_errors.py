@@ -5,6 +5,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import laspy
 import numpy as np
@@ -256,6 +257,36 @@ def test_a_build_that_cannot_fit_the_disk_is_refused(
     with pytest.raises(SolidcloudError, match="1000 bytes free, the build needs about"):
         build(scans, out / "a")
     assert not list(out.rglob("*.run"))
+
+
+@pytest.mark.parametrize(
+    ("options", "bytes_a_point"),
+    [
+        ({}, 12),
+        ({"keep": frozenset({"scan", "intensity"})}, 18),
+        ({"thin": 0.05}, 14 + 12),
+        ({"outliers": (0.1, 2), "keep": frozenset({"intensity"})}, 18 + 16),
+        ({"outliers": (0.1, 2), "thin": 0.05}, 14 + 14 + 12),
+    ],
+)
+def test_the_runs_of_the_filters_take_room_too(
+    options: dict[str, Any], bytes_a_point: int, scans: list[Path], out: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked, runs = [], []
+
+    def noted(disk: Path, folder: Path, needed: int) -> None:
+        asked.append(needed)
+        runs.append(sum(path.stat().st_size for path in folder.rglob("*.run")))
+
+    monkeypatch.setattr(pipeline, "_check_space", noted)
+    left = build(scans, out / "a", **options).points
+    with_all = build(scans, out / "b").points
+    assert asked[0] == with_all * (bytes_a_point + 6)
+    # What filters took out is known after them, and is neither in their last runs nor in the archive.
+    last = 12 + 2 * ("scan" in options.get("keep", ())) + 4 * ("intensity" in options.get("keep", ()))
+    assert asked[1] == asked[0] - (with_all - left) * (last + 6)
+    assert runs[1] <= asked[1] - 6 * left
+    assert left < with_all or not options.keys() & {"thin", "outliers"}
 
 
 def test_a_voxel_of_more_points_than_a_record_holds_is_refused_before_it_is_built(

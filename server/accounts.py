@@ -8,6 +8,8 @@ from typing import NamedTuple
 
 # A voxel that is asked for again so soon after it went for another had better stayed [s].
 TOO_SOON = 10.0
+# Voxels of which it is remembered for longer when they went.
+MOST_WENT = 4096
 # Loads whose times are remembered.
 TIMES = 256
 
@@ -72,7 +74,11 @@ class Accounts:
 
     def evicted(self, row: int) -> None:
         """A voxel went for another."""
-        self._went[row] = time.perf_counter()
+        now = time.perf_counter()
+        self._went.pop(row, None)
+        self._went[row] = now  # in order of time
+        while len(self._went) > MOST_WENT and now - next(iter(self._went.values())) > TOO_SOON:
+            del self._went[next(iter(self._went))]
         self._in_vain(row)
 
     def begun_ahead(self, row: int) -> None:

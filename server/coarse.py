@@ -55,6 +55,11 @@ class Coarse:
             return self._begun - len(self._back) - len(self._making)
 
     @property
+    def holds_all(self) -> bool:
+        """Whether there is a slot for every voxel."""
+        return len(self.arrays.count) >= len(self.arrays.slot) > 0
+
+    @property
     def _room(self) -> bool:
         return self._begun - len(self._back) < len(self.arrays.count)
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from ..schemas.answers import Part
 from ..schemas.errors import BadRequestError, CorruptError
-from ..schemas.voxel_grid import UNITS_PER_METRE
+from ..schemas.voxel_grid import MAX_COORDINATE, UNITS_PER_METRE
 from .arena import ArenaBuffer
 from .avatar import AvatarModel, make_avatar
 from .coarse import Coarse, settle
@@ -38,6 +38,10 @@ from .within import within
 
 # A user is where the last of so many poses is; more are looked over, not walked.
 MOST_SEEN = 8
+# Margins and reaches that are asked for [m], and scales of avatars; others will be refused (kernels/placing.py).
+MOST_AROUND, LEAST_SCALE = 16.0, 1e-3
+# A user is taken to need what is so near to it, however far it asks [m].
+NEAR = 1.0
 # Of the budget, what coarse tops may take: 6 KB each.
 COARSE_SHARE = 1 / 16
 # Radius models whose tables are remembered; asked for by name, and by clients, so there may be any number.
@@ -80,7 +84,8 @@ class Opened:
         if coarse is not None:
             arena, remember = residency.buffer.arena, coarse.remember
             residency.loaded = lambda row, where: remember(row, arena, where)
-        fill = None if coarse is None else Filling(coarse, store)
+        # Where there is not room for all, it is for those that somebody came near.
+        fill = Filling(coarse, store) if coarse is not None and coarse.holds_all else None
         self.prefetcher = Prefetcher(residency, around, ahead=ahead, idle=fill)
         self.data = make_scene_data(store.archive, residency, index, coarse)
         self.radius_model = lru_cache(MOST_MODELS)(partial(with_radius_model, self.data, store.archive))
@@ -101,6 +106,14 @@ class Opened:
             self._readers -= 1
             if self._readers:
                 return
+        if self.prefetcher.running:
+            # Its thread is waited for, which nobody may do who is collecting garbage, and so may hold any lock.
+            threading.Thread(target=self._end, name="solidcloud-end", daemon=True).start()
+        else:
+            self._end()
+
+    def _end(self) -> None:
+        """Stop loading, close all."""
         self.prefetcher.stop()
         del self.data, self.radius_model, self.prefetcher
         self.store.close()
@@ -131,7 +144,7 @@ class Opened:
             return False
         if not len(poses) or not len(avatar.points):
             return False
-        if not isinstance(other, float | int):  # it will be refused, as what is not finite below
+        if not isinstance(other, float | int) or not 0 <= other <= MOST_AROUND:
             return False
         if len(poses) > MOST_SEEN:
             return True
@@ -139,9 +152,10 @@ class Opened:
         x, y, z = avatar.arrays.center[0].tolist()
         center = [a * x + b * y + c * z + d for a, b, c, d in pose[:3]]
         scale = math.hypot(pose[0][0], pose[1][0], pose[2][0])
-        reach = avatar.bounding_radius * scale + self.data.radius_units / UNITS_PER_METRE + other
-        if not math.isfinite(sum(center) + reach):
+        if not (LEAST_SCALE <= scale <= 1 / LEAST_SCALE and all(abs(c) <= MAX_COORDINATE for c in center)):
             return False
+        # Who asks how far away things are will not stand in all of them.
+        reach = avatar.bounding_radius * scale + self.data.radius_units / UNITS_PER_METRE + min(other, NEAR)
         return self.prefetcher.saw(user, (center[0], center[1], center[2]), reach)
 
     def warm(self) -> None:

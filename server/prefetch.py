@@ -23,9 +23,12 @@ log = logging.getLogger(__name__)
 PLAN_SECONDS, PLAN_REST = 0.05, 10.0
 # How long nothing may be heard of a user whose voxels are kept [s].
 SILENCE = 10.0
+MOST_REST = 0.25
 # What is done when there is nothing to be loaded rests so many times as long as it works: it is Python in good part,
 # and who answers waits for the interpreter meanwhile.
 IDLE_REST = 4.0
+# Of the budget, what is kept for who stands in it; the rest is there for whoever asks.
+KEPT_SHARE = 0.5
 # Of the times that loads took, this share is shorter than what is reckoned with.
 USUAL = 0.9
 
@@ -56,12 +59,13 @@ class Prefetcher:
             ahead,
         )
         self._work = threading.Event()
+        self._urgent = threading.Event()  # ends a rest
         self._lock = threading.Lock()  # of starting and stopping
         self._thread: threading.Thread | None = None
         self._stopped = self._seen = False
         self._idle = idle
         self._failed: dict[int, float] = {}  # when; whoever asks for these tries again
-        residency.owed = self._wake
+        residency.owed = self._owed
 
     def __enter__(self) -> Self:
         """The prefetcher itself."""
@@ -77,6 +81,7 @@ class Prefetcher:
             self._stopped, thread = True, self._thread
         self._residency.owed = None
         self._work.set()
+        self._urgent.set()
         if thread is not None and thread is not threading.current_thread():
             thread.join()
         self._residency.kept = frozenset()
@@ -104,6 +109,16 @@ class Prefetcher:
         self._seen = True
         self._wake()
 
+    @property
+    def running(self) -> bool:
+        """Whether there is a thread to be waited for."""
+        return self._thread is not None
+
+    def _owed(self) -> None:
+        """A load is owed: it does not wait until a rest is over."""
+        self._urgent.set()
+        self._wake()
+
     def _wake(self) -> None:
         """There is work."""
         if self._thread is None:
@@ -126,28 +141,50 @@ class Prefetcher:
             now = self._clock()
             if self._seen and now >= due:
                 self._seen = False
-                need = self._plan(now)
-                due = now + max(PLAN_SECONDS, PLAN_REST * (self._clock() - now))
+                need, due = self._planned(now)
                 queue = deque(need.items() if self._ahead else ())
             if self._stopped:
                 return
             if self._step(queue, need):
                 continue
             if self._idle is not None:
-                self._residency.wait_for_nobody()
-                begin = self._clock()
-                if not self._idle():
-                    self._idle = None
-                time.sleep(min(IDLE_REST * (self._clock() - begin), PLAN_SECONDS))
+                self._rest(self._use_idle_time(self._idle))
                 continue
             if self._seen:
-                # Until they may have moved far enough to look again; a stop need not wait for it.
-                time.sleep(max(0.0, min(due - now, PLAN_SECONDS)))
+                self._rest(due - now)  # until they may have moved far enough to look again
                 continue
             # Nobody is seen any more: what they stood in is let go when their time is up.
             if not self._work.wait(SILENCE if self._residency.kept else None):
                 self._seen = True
             self._work.clear()
+
+    def _rest(self, seconds: float) -> None:
+        """Wait, but not while something is owed or all is to stop."""
+        self._urgent.wait(min(max(0.0, seconds), MOST_REST))
+        self._urgent.clear()
+
+    def _planned(self, now: float) -> tuple[dict[int, float], float]:
+        """What is wanted, see `_plan`, and when to look again."""
+        begin = time.thread_time()
+        try:
+            need = self._plan(now)
+        except Exception:  # out of memory, say: what is asked for is loaded all the same
+            log.exception("what users will need is not known")
+            return {}, now + MOST_REST
+        return need, now + min(max(PLAN_SECONDS, PLAN_REST * (time.thread_time() - begin)), MOST_REST)
+
+    def _use_idle_time(self, idle: Callable[[], bool]) -> float:
+        """Do some of what is done when there is nothing else; how long to rest then [s]."""
+        self._residency.wait_for_nobody()
+        begin = time.thread_time()
+        try:
+            left = idle()
+        except Exception:
+            log.exception("given up")
+            left = False
+        if not left:
+            self._idle = None
+        return IDLE_REST * (time.thread_time() - begin)
 
     def _step(self, queue: deque[tuple[int, float]], need: dict[int, float]) -> bool:
         """Load one voxel; False where there is none to be loaded."""
@@ -179,5 +216,19 @@ class Prefetcher:
         usual = times[int(USUAL * (len(times) - 1))] if times else 0.0
         self._neighbourhood.expire(now, SILENCE)
         wanted = merge(self._neighbourhood.plan(now, usual).values())
-        self._residency.kept = frozenset(self._neighbourhood.kept(now, SILENCE).tolist())
-        return dict(zip(wanted.rows.tolist(), wanted.need.tolist(), strict=True))
+        need = dict(zip(wanted.rows.tolist(), wanted.need.tolist(), strict=True))
+        self._residency.kept = self._within_share(self._neighbourhood.kept(now, SILENCE).tolist(), need)
+        return need
+
+    def _within_share(self, rows: list[int], need: dict[int, float]) -> frozenset[int]:
+        """Of voxels that users stand in, those that may be kept: what is needed soonest, KEPT_SHARE of the budget."""
+        left = int(KEPT_SHARE * self._residency.budget_bytes)
+        if self._residency.bytes_of(rows) <= left:
+            return frozenset(rows)
+        kept = []
+        for row in sorted(rows, key=lambda row: need.get(row, math.inf)):
+            left -= self._residency.bytes_of([row])
+            if left < 0:
+                break
+            kept.append(row)
+        return frozenset(kept)

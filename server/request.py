@@ -167,8 +167,12 @@ def check_request(
             return reach
 
 
-def pieces(reach: Reach, residency: Residency) -> Iterator[tuple[NDArray[np.int64], list[int], Reach]]:
+def pieces(
+    reach: Reach, residency: Residency, *, scan: bool = False
+) -> Iterator[tuple[NDArray[np.int64], list[int], Reach]]:
     """Cut a request into pieces whose voxels fit the budget: (pose numbers, voxel rows, reach) each.
+
+    scan: half of it, so that what users stand in, at most the other half (prefetch.py), can stay.
 
     Nearly always one piece. A pose that alone reaches more than the budget is looked at voxel by voxel run
     (NUMERICS.md case 23), and so appears in several pieces.
@@ -177,7 +181,7 @@ def pieces(reach: Reach, residency: Residency) -> Iterator[tuple[NDArray[np.int6
     everything = reach.rows[: reach.starts[k]].tolist()
     if k > 1:
         everything = np.unique(everything).tolist()
-    budget = residency.buffer.total_bytes
+    budget = residency.buffer.total_bytes // (2 if scan else 1)
     if residency.bytes_of(everything) <= budget:
         yield np.arange(k), everything, reach
         return
@@ -197,7 +201,7 @@ def pieces(reach: Reach, residency: Residency) -> Iterator[tuple[NDArray[np.int6
             continue
         part: list[int] = []
         for row in [*own, -1]:
-            if row < 0 or residency.bytes_of([*part, row]) > budget:
+            if part and (row < 0 or residency.bytes_of([*part, row]) > budget):
                 yield np.array([pose]), part, _only(reach, pose, part)
                 part = []
             part.append(row)

@@ -197,7 +197,7 @@ class Residency:
     def acquire(self, rows: Sequence[int], deadline: float = math.inf, *, scan: bool = False) -> Held:
         """Begin a hold; `release` must follow, unless this raises."""
         begin = time.perf_counter()
-        mine, hits, settled = self._reserve(rows, deadline, scan)
+        mine, hits, waits, settled = self._reserve(rows, deadline, scan)
         if settled:
             return Held(len(rows), 0, ())  # all resident and pinned: nothing can change that
         try:
@@ -224,7 +224,9 @@ class Residency:
             raise
         if late and (owed := self.owed) is not None:
             owed()
-        return Held(hits, len(mine), faults, late, time.perf_counter() - begin)
+        # Where all that is not there has long been known not to be readable, nothing was waited for.
+        waited = time.perf_counter() - begin if mine or waits or late else 0.0
+        return Held(hits, len(mine), faults, late, waited)
 
     def _there(self, row: int) -> bool:
         """Whether a voxel is resident and whole."""
@@ -241,11 +243,12 @@ class Residency:
             self._unpin(rows)
             self._changed.notify_all()
 
-    def _reserve(self, rows: Sequence[int], deadline: float, scan: bool) -> tuple[list[int], int, bool]:
+    def _reserve(self, rows: Sequence[int], deadline: float, scan: bool) -> tuple[list[int], int, bool, bool]:
         """Pin all rows and make room for those to be loaded by this caller; none where there is no room in time.
 
-        Returns these, how many of the others are resident or being loaded (a voxel with a fault is neither), and
-        whether all is there; where not, `_demands` counts this request until it is.
+        Returns these, how many of the others are resident or being loaded (a voxel with a fault is neither), whether
+        some of them are being loaded, and whether all is there; where not, `_demands` counts this request until it is.
+        Nothing is pinned where this raises.
         """
         if self.bytes_of(rows) > self.buffer.total_bytes:
             raise ValueError(
@@ -262,19 +265,20 @@ class Residency:
                     mine = self._make_room(rows, mine, deadline, scan)
                 except BaseException:
                     self._demands -= 1
+                    self._changed.notify_all()
                     raise
-            for row in rows:
-                if row in offsets:
-                    self.policy.used(row, scan=scan)
-            if settled:
-                self._accounts.found(rows)
-                return [], len(rows), True
-            there = [row for row in rows if row in offsets and row not in mine]
+            new = set(mine)
+            there = [row for row in rows if row in offsets and row not in new] if not settled else rows
+            for row in there:
+                self.policy.used(row, scan=scan)
             self._accounts.found(there)
+            if settled:
+                return [], len(rows), False, True
             self._accounts.missed(mine)
             self._accounts.waited(there, self._loading)
+            waits = not self._loading.isdisjoint(there)
             self._loading.update(mine)
-            return mine, len(there), False
+            return mine, len(there), waits, False
 
     def _all_there(self, rows: Sequence[int]) -> bool:
         """Whether none of these, all of which have room or a fault, has a fault or is being loaded."""
@@ -287,7 +291,13 @@ class Residency:
 
         None of them where the deadline comes before there is room. The rows are not pinned where this raises.
         """
-        while not self._allocate_all(mine, scan):
+        while True:
+            try:
+                if self._allocate_all(mine, scan):
+                    return mine
+            except BaseException:
+                self._unpin(rows)
+                raise
             self._unpin(rows)
             if self._pins or self._loading:
                 roomy = self._changed.wait(_seconds_to(deadline))
@@ -299,7 +309,6 @@ class Residency:
             mine = [row for row in rows if row not in self._room.offsets and not self._fault(row)]
             if not roomy:
                 return []
-        return mine
 
     def _pin(self, rows: Sequence[int]) -> None:
         for row in rows:
@@ -307,15 +316,25 @@ class Residency:
 
     def _allocate_all(self, rows: list[int], scan: bool) -> bool:
         """Make room for every row; all or nothing. What users stand in goes last."""
-        for number, row in enumerate(rows):
-            for may_go in (self._idle, self._free):
-                if self._room.make(row, may_go, self._free, self._accounts.evicted, scan=scan):
+        done = 0
+        try:
+            for row in rows:
+                if not self._make_one(row, scan):
                     break
-            else:
-                for other in rows[:number]:
-                    self._room.forget(other)
-                return False
-        return True
+                done += 1
+        finally:
+            if done < len(rows):
+                for row in rows[:done]:
+                    self._room.forget(row)
+        return done == len(rows)
+
+    def _make_one(self, row: int, scan: bool) -> bool:
+        """Make room for a row that is asked for."""
+        evicted = self._accounts.evicted
+        return any(
+            self._room.make(row, may_go, self._free, evicted, scan=scan)
+            for may_go in (self._idle, self._free)
+        )
 
     def _free(self, row: int) -> bool:
         """Whether nobody uses or loads a voxel."""
@@ -339,6 +358,8 @@ class Residency:
         self._left.discard(row)
         self._loading.discard(row)
         self._room.forget(row)
+        if row in self._owed and self.owed is not None:
+            self.owed()
 
     def _leave(self, rows: list[int]) -> None:
         """Leave loads that have not begun to whoever else holds these rows."""
@@ -411,8 +432,10 @@ class Residency:
     def take_owed(self) -> int | None:
         """A voxel whose load is owed, the longest first; None where none is."""
         with self._lock:
-            while self._owed:
-                row = self._owed.popitem(last=False)[0]
+            for row in list(self._owed):
+                if row in self._left:  # whoever still waits for it may load it; dropped, it is owed again
+                    continue
+                del self._owed[row]
                 if row not in self._room.offsets and not self._fault(row):
                     return row
         return None
@@ -424,13 +447,14 @@ class Residency:
                 self._changed.wait()
 
     def load_ahead(self, row: int, may_go: Callable[[int], bool], *, owed: bool = False) -> Ahead:
-        """Load a voxel that nobody waits for, once no request waits for anything.
+        """Load a voxel that nobody waits for, once no request waits for anything; one that is owed at once.
 
         may_go: whether a resident voxel may go for it, besides that nobody uses it or stands in it.  owed: somebody has
         asked for it. Raises what a load raises that is no fault of the record.
         """
         with self._changed:
-            self.wait_for_nobody()
+            if not owed:
+                self.wait_for_nobody()
             if row in self._room.offsets or self._fault(row):
                 return Ahead.THERE if row in self._room.offsets else Ahead.FAILED
             if not self._room.make(

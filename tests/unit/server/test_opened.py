@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import time
 import weakref
 from collections.abc import Callable
 from pathlib import Path
@@ -116,6 +117,10 @@ def test_the_old_one_goes_with_its_last_reader(place: Path, replace: Replace) ->
         rest = list(path)
         verdicts = np.concatenate([part.verdict for part in (first, *rest)])
         assert len(verdicts) == 3000 and not verdicts.any(), "one answer, of one generation"
+        # Who loads ahead for the walker is waited for by a thread of its own.
+        until = time.monotonic() + 20.0
+        while (memory() is not None or files_open() != before) and time.monotonic() < until:
+            time.sleep(0.001)
         assert memory() is None and files_open() == before, "an idle walker holds nothing"
         assert walker.collide(AT_ALONE).verdict.tolist() == [1]
 

@@ -1,5 +1,6 @@
 """A walk through a scene larger than its cache: voxels come before the walker does, and every answer is the same."""
 
+import time
 from pathlib import Path
 
 import cases
@@ -7,6 +8,7 @@ import numpy as np
 import pytest
 import scans
 from solidcloud.schemas.answers import Verdict
+from solidcloud.schemas.errors import BadRequestError, BadTransformError
 from solidcloud.server.coarse import SLOT_BYTES
 from solidcloud.server.policies import POLICIES
 from solidcloud.server.scene import Scene
@@ -64,8 +66,29 @@ def test_a_path_washes_out_no_more_than_its_share(tmp_path: Path, rng: np.random
     with Scene.open(case.archive, budget_bytes=needed(case.archive, avatar, sweep) // 2) as scene:
         scene.add_avatar("al", avatar, 0.005)
         assert scene.collide("al", here).misses > 0
+        until = time.monotonic() + 20.0
+        while not scene.residency.kept and time.monotonic() < until:
+            time.sleep(0.001)
+        assert scene.residency.kept
         for part in scene.path("al", sweep, threads=1):
             assert not (part.verdict == Verdict.UNKNOWN).any()
         assert scene.stats().evicted > 0
         again = scene.collide("al", here)
         assert (again.misses, again.wait_seconds) == (0, 0.0) and again.hits > 0
+
+
+def test_questions_that_are_refused_or_wide_keep_nothing_for_themselves(
+    tmp_path: Path, rng: np.random.Generator
+) -> None:
+    """A margin that no question takes, a scale that no pose has: nobody stands in the whole scene for it."""
+    case = cases.build(tmp_path, SCAN, voxel=0.2)
+    avatar = rng.uniform(-0.05, 0.05, (20, 3))
+    here = walk(case.points, 3)[1:2]
+    with Scene.open(case.archive, policy="lru+prefetch") as scene:
+        scene.add_avatar("al", avatar, 0.005)
+        large = here.copy()
+        large[0, :3, :3] *= 1e6
+        for poses, margin in ((here, 1e6), (here, 10**400), (here, float("nan")), (here, -1.0), (large, 0.0)):
+            with pytest.raises((BadRequestError, BadTransformError)):
+                scene.collide("al", poses, margin)
+        assert not scene._opened.prefetcher.running and not scene.residency.kept

@@ -241,3 +241,53 @@ def test_eight_threads_and_a_tiny_budget_change_no_answer(
         assert policy != "lru" or stats.prefetched == 0
     for part, verdict in zip(parts, verdicts, strict=True):
         assert verdict == expected[part].tolist()
+
+
+def test_an_error_while_room_is_made_leaves_nothing_pinned(monkeypatch: pytest.MonkeyPatch) -> None:
+    store = FakeStore([1, 1, 1, 1, 2, 2])
+    residency = Residency(store, 4 * BLOCK)
+    take(residency, [0, 1, 2, 3])
+    made = residency._room.make
+
+    def make(row: int, *what: object, **more: object) -> bool:
+        """Room for the first, and no memory for the second."""
+        if row == 5:
+            raise MemoryError("no room to look for room")
+        return made(row, *what, **more)  # type: ignore[arg-type]
+
+    with monkeypatch.context() as patched:
+        patched.setattr(residency._room, "make", make)
+        with pytest.raises(MemoryError), residency.hold([4, 5]):
+            pass
+    assert not residency._pins and not residency._loading and residency._demands == 0
+    residency.check()
+    assert take(residency, [4, 5]) == Held(0, 2, ()) and store.loads[4] == 1
+
+
+def test_a_voxel_known_to_be_corrupt_is_not_waited_for() -> None:
+    store = FakeStore([1, 1])
+    store.faults[0] = "corrupt"
+    residency = Residency(store, 2 * BLOCK)
+    take(residency, [0, 1])
+    with residency.hold([0, 1]) as held:
+        assert held.faults and (held.hits, held.misses, held.waited) == (1, 0, 0.0)
+
+
+def test_a_load_that_two_could_not_wait_for_is_owed_until_it_is_done() -> None:
+    """One leaves it to the other, who leaves too: it is still to be loaded."""
+    store = FakeStore([1, 1])
+    residency = Residency(store, 2 * BLOCK)
+    told: list[None] = []
+    residency.owed = lambda: told.append(None)
+    residency._reserve(
+        [1], float("inf"), False
+    )  # reserved by one whose deadline comes before the load begins
+    residency._pin([1])  # another waits for it
+    residency._leave([1])
+    residency._owed[1] = None
+    assert residency.take_owed() is None, "who waits may load it"
+    residency.release([1])
+    residency.release([1])
+    residency._demands -= 1
+    assert told and residency.take_owed() == 1
+    residency.check()

@@ -106,7 +106,7 @@ def _gather(
     )  # fmt: skip
     counts = np.zeros((3, k), np.uint32)
     residency, spent = data.residency, Spent(time.perf_counter())
-    for which, rows, part in pieces(reach, residency, scan=effort.scan) if len(avatar.points) else ():
+    for which, rows, part in pieces(reach, residency, effort.share) if len(avatar.points) else ():
         heap = max(HEAP_PAIRS, int(np.diff(part.starts).max(initial=0)))
         with residency.hold(rows, effort.loads_until(), scan=effort.scan) as held:
             seen = as_held(data, held)

@@ -84,7 +84,7 @@ def collide(
     verdict, counts = np.zeros(k, np.uint8), np.zeros((3, k), np.uint32)
     residency, spent = data.residency, Spent(begin)
     # An empty avatar is clear, whatever is unknown here.
-    for which, rows, part in pieces(reach, residency, scan=effort.scan) if len(avatar.points) else ():
+    for which, rows, part in pieces(reach, residency, effort.share) if len(avatar.points) else ():
         with residency.hold(rows, scan=effort.scan) as held:
             overlap_poses(array, avatar.arrays, data.arrays, part, which, verdict, counts)
         spent.add(held)

@@ -92,7 +92,7 @@ def contacts(
     if len(avatar.points):
         edges = _edges(reach, edge_units, data.arrays.units_per_step)
         asked = Asked(avatar.rows, edges, data.keeps_scan, limit, effort.visits)
-        parts = list(pieces(reach, data.residency, scan=effort.scan))
+        parts = list(pieces(reach, data.residency, effort.share))
         for number, (which, rows, part) in enumerate(parts):
             # A pose in several pieces is alone in each of them, and they follow one another.
             closes = (

@@ -42,7 +42,7 @@ def distance(
     counts = np.zeros((3, k), np.uint32)
     residency, spent = data.residency, Spent(begin)
     if len(avatar.points):
-        for which, rows, part in pieces(around, residency, scan=effort.scan):
+        for which, rows, part in pieces(around, residency, effort.share):
             with residency.hold(rows, scan=effort.scan) as held:
                 nearest_poses(
                     array, avatar.arrays, data.arrays, data.broad, part, reach_units, which, nearest, counts

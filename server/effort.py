@@ -23,12 +23,14 @@ class Effort(NamedTuple):
     search that may stop early is as fast (`solidcloud accuracy`).
     visits: node visits a pose (ray, point, motion).  deadline: on time.perf_counter()'s clock [s], inf: none.
     scan: what is looked at is passed by, as on a sweep along a path: it is not to wash the cache (policies.py).
+    share: of the cache, what may be held at a time. Counts of work depend on it, where not all fits; no verdict does.
     """
 
     tolerance: float = 0.0
     visits: int = NO_LIMIT
     deadline: float = math.inf
     scan: bool = False
+    share: float = 1.0
 
     @property
     def limited(self) -> bool:

@@ -53,7 +53,8 @@ def path_question(
     check_path_parameters(op, given)
     budgets = {name: given.pop(name) for name in ("budget_ms", "budget_visits") if name in given}
     tolerance = given.pop("tolerance", 1e-6 if op == "sweep" else 0.0)
-    effort = make_effort(tolerance, **budgets)._replace(scan=True)  # nobody stays along a path
+    # Nobody stays along a path; what users stand in, at most half of the cache (prefetch.py), can stay beside it.
+    effort = make_effort(tolerance, **budgets)._replace(scan=True, share=0.5)
     poses = kernel_poses(poses)  # copied once if at all, or every part would copy its own
     other = (
         to_units(given["reach"], "reach")

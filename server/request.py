@@ -168,11 +168,11 @@ def check_request(
 
 
 def pieces(
-    reach: Reach, residency: Residency, *, scan: bool = False
+    reach: Reach, residency: Residency, share: float = 1.0
 ) -> Iterator[tuple[NDArray[np.int64], list[int], Reach]]:
     """Cut a request into pieces whose voxels fit the budget: (pose numbers, voxel rows, reach) each.
 
-    scan: half of it, so that what users stand in, at most the other half (prefetch.py), can stay.
+    share: of the budget, what a piece may take, but for a voxel that alone takes more.
 
     Nearly always one piece. A pose that alone reaches more than the budget is looked at voxel by voxel run
     (NUMERICS.md case 23), and so appears in several pieces.
@@ -181,7 +181,7 @@ def pieces(
     everything = reach.rows[: reach.starts[k]].tolist()
     if k > 1:
         everything = np.unique(everything).tolist()
-    budget = residency.buffer.total_bytes // (2 if scan else 1)
+    budget = int(residency.buffer.total_bytes * share)
     if residency.bytes_of(everything) <= budget:
         yield np.arange(k), everything, reach
         return

@@ -141,7 +141,7 @@ def sweep(
         progress.lower[which] = progress.end[which]
         boxes = np.empty((k, 2, 3))  # of no use here
         around = Reach(scales, units, starts, rows, boxes, outside)
-        for part, held_rows, reach in pieces(around, residency, scan=effort.scan):
+        for part, held_rows, reach in pieces(around, residency, effort.share):
             chunk = len(part) if effort.deadline == np.inf else _PER_CALL
             with residency.hold(held_rows, effort.loads_until(), scan=effort.scan) as held:
                 seen = as_held(data, held)

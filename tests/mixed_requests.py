@@ -55,7 +55,14 @@ ANSWERS = {
     "objects": ObjectsAnswers,
 }
 # What depends on the clock and on what is resident: times and counters of the cache.
-COSTS = {"engine_seconds": 0.0, "wait_seconds": 0.0, "hits": 0, "misses": 0, "resident": 0, "resident_bytes": 0}
+COSTS = {
+    "engine_seconds": 0.0,
+    "wait_seconds": 0.0,
+    "hits": 0,
+    "misses": 0,
+    "resident": 0,
+    "resident_bytes": 0,
+}
 
 
 def question(

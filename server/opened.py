@@ -91,6 +91,7 @@ class Opened:
         self.radius_model = lru_cache(MOST_MODELS)(partial(with_radius_model, self.data, store.archive))
         self._lock = threading.Lock()
         self._readers = 1
+        self._ending: threading.Thread | None = None
 
     def take(self) -> bool:
         """Read it too, until `release`; False where the last reader is gone already."""
@@ -108,9 +109,15 @@ class Opened:
                 return
         if self.prefetcher.running:
             # Its thread is waited for, which nobody may do who is collecting garbage, and so may hold any lock.
-            threading.Thread(target=self._end, name="solidcloud-end", daemon=True).start()
+            self._ending = threading.Thread(target=self._end, name="solidcloud-end", daemon=True)
+            self._ending.start()
         else:
             self._end()
+
+    def join(self) -> None:
+        """Wait until all is closed, where the last reader is gone; not while garbage is collected."""
+        if self._ending is not None:
+            self._ending.join()
 
     def _end(self) -> None:
         """Stop loading, close all."""

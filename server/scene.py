@@ -112,6 +112,7 @@ class Scene:
         if not closed:
             with self._reloading:
                 self._opened.release()
+                self._opened.join()
 
     def reload(self) -> ReloadAnswer:
         """Serve what is in the archive's folder now, opened and warmed beside what is served, then swapped for it.

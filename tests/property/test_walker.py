@@ -166,7 +166,7 @@ def test_voxels_may_come_and_go(tmp_path: Path, rng: np.random.Generator) -> Non
     with Scene.open(case.archive) as whole:
         sizes = np.sort(whole._opened.store.sizes)
         whole.add_avatar("avatar", avatar, 0.005)
-        with Scene.open(case.archive, budget_bytes=int(sizes[-14:].sum())) as scene:
+        with Scene.open(case.archive, budget_bytes=int(sizes[-11:].sum())) as scene:
             scene.add_avatar("avatar", avatar, 0.005)
             walker = scene.walker("avatar")
             for kind in ("smooth", "sliding", "jumps", "smooth"):

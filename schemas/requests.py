@@ -282,6 +282,12 @@ def make_poses(poses: Any, what: str = "poses") -> Poses:
     return array  # type: ignore[return-value]
 
 
+def check_one_pose(what: str, poses: Poses) -> None:
+    """BadRequestError unless there is one pose."""
+    if poses.shape != (1, 4, 4):
+        raise BadRequestError(f"{what} of shape {poses.shape}: expected (1, 4, 4), avatar to world")
+
+
 def make_objects(objects: Sequence[Sequence[Any]]) -> tuple[list[ObjectItem], Poses]:
     """Objects (name, pose, group = 1, mask = all groups), poses (4, 4) float64, as the wire has them.
 

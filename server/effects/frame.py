@@ -1,0 +1,106 @@
+"""One frame of one user on its way through the effects: what was wished, and what came of it so far."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...schemas.answers import Verdict
+from ..avatar import AvatarModel
+from ..effort import EXACT, Effort
+
+Vec = NDArray[np.float64]  # (3,) [m]
+Pose = NDArray[np.float64]  # (4, 4) float64, avatar to world, rigid
+
+
+class Hit(NamedTuple):
+    """What ended a motion. fraction: of the motion, gone.  verdict: CONTACT or UNKNOWN.
+
+    avatar, cloud: (3,) centres of the two spheres that touch, world [m]; None where UNKNOWN.  what: "" the scene, else
+    the object or user.  archive: which of the scene's archives; -1: none of them.
+    """
+
+    fraction: float
+    verdict: Verdict
+    avatar: Vec | None
+    cloud: Vec | None
+    what: str = ""
+    archive: int = -1
+
+
+class Obstacle(Protocol):
+    """Something that moves and blocks: another user, a dynamic object. See bodies.py."""
+
+    name: str
+
+    def sweep(self, avatar: AvatarModel, pose_from: Pose, pose_to: Pose, tolerance: float) -> Hit | None:
+        """What ends the motion against it; None: nothing does."""
+
+    def touches(self, avatar: AvatarModel, pose: Pose) -> Hit | None:
+        """Whether it is touched by an avatar there."""
+
+
+@dataclass(slots=True)
+class Body:
+    """What is remembered of a user between frames. avatar: its model.  pose: where it is.
+
+    fall_speed: [m/s], 0 on the ground.  on_ground: whether the last frame left it standing.  clear: whether `pose` was
+    found clear.  kept: what an effect keeps for itself, by its name.
+    """
+
+    name: str
+    avatar: AvatarModel
+    pose: Pose
+    fall_speed: float = 0.0
+    on_ground: bool = False
+    clear: bool = False
+    kept: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(slots=True)
+class Frame:
+    """One user's one frame. body: as the frame before left it; written once, when the frame is done (pipeline.py).
+
+    wish: where to.  seconds: since the frame before.  world: what is asked (world.py).  pose, verdict: so far.
+    left: (3,) of the translation wished, not gone yet [m].  hits: what ended motions, in order.  obstacles: what else
+    blocks.  go: as far as nothing is touched; `stop` puts it there.  reports: fields of `Moved`.
+    """
+
+    body: Body
+    wish: Pose
+    seconds: float
+    world: Any
+    effort: Effort = EXACT
+    pose: Pose = field(default_factory=lambda: np.eye(4))
+    verdict: Verdict = Verdict.CLEAR
+    left: Vec = field(default_factory=lambda: np.zeros(3))
+    hits: list[Hit] = field(default_factory=list)
+    obstacles: list[Obstacle] = field(default_factory=list)
+    go: "Go | None" = None
+    fall_speed: float = 0.0
+    on_ground: bool = False
+    simulated: list[str] = field(default_factory=list)
+    skipped: list[str] = field(default_factory=list)
+    reports: dict[str, Any] = field(default_factory=dict)
+
+
+# Go towards a pose from `frame.pose`, as far as nothing is touched; sets frame.pose, returns what ended it.
+Go = Callable[[Frame, Pose], Hit | None]
+
+
+class Runner(Protocol):
+    """One effect of one scene. It keeps nothing of a user but in `Body`."""
+
+    name: str
+
+    def run(self, frame: Frame) -> None:
+        """Its part of one frame."""
+
+
+def moved_by(pose: Pose, way: Vec) -> Pose:
+    """A pose carried along."""
+    there = pose.copy()
+    there[:3, 3] += way
+    return there

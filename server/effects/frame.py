@@ -31,15 +31,23 @@ class Hit(NamedTuple):
 
 
 class Obstacle(Protocol):
-    """Something that moves and blocks: another user, a dynamic object. See bodies.py."""
+    """What moves and blocks: the other users, the dynamic objects. See bodies.py.
+
+    One obstacle may stand for many bodies: `Hit.what` names the one. What was touched when the frame began blocks only
+    what goes deeper into it, so that an avatar gets free: then neither question says that it is touched.
+    """
 
     name: str
 
     def sweep(self, avatar: AvatarModel, pose_from: Pose, pose_to: Pose, tolerance: float) -> Hit | None:
-        """What ends the motion against it; None: nothing does."""
+        """What ends the motion against it; None: nothing does. Nothing is touched before the hit's fraction."""
 
     def touches(self, avatar: AvatarModel, pose: Pose) -> Hit | None:
         """Whether it is touched by an avatar there."""
+
+    def give_way(self, frame: "Frame", hit: Hit, to: Pose) -> bool:
+        """Asked of what ended a motion, the avatar at frame.pose and on its way to `to`: it may be pushed on, and then
+        says that it was and that the way is worth going on."""
 
 
 @dataclass(slots=True)

@@ -37,27 +37,32 @@ class Sheet(NamedTuple):
     places: WallPlaces
 
 
-def make_sheet(path: Path, *, spacing: float = 0.03, places: int = 2000, seed: int = 2012) -> Sheet:
+def make_sheet(
+    path: Path, *, spacing: float = 0.03, places: int = 2000, seed: int = 2012, door: float = DOOR
+) -> Sheet:
     """Write the points of a sheet as OBJ or ASCII PLY; `spacing`: 1 over the root of the points per square metre [m].
 
-    The same arguments give the same coordinates. BadRequestError: a spacing outside 0.5 to 20 cm.
+    door: its clear width [m]. The same arguments give the same coordinates. BadRequestError: a spacing outside 0.5 to
+    20 cm, a door as wide as the sheet.
     """
+    if not 0.0 < door < HALF_WIDTH:
+        raise BadRequestError(f"door of {door} m: expected more than 0 and less than {HALF_WIDTH} m")
     if not THINNEST <= spacing <= WIDEST:
         raise BadRequestError(
             f"spacing {spacing} m: expected {THINNEST} to {WIDEST} m: choose a spacing between"
         )
     rng = np.random.default_rng([seed, 0x5EE7])
     flat = np.concatenate([_grid(spacing * wider, aspect, rng) for wider, aspect in GRIDS])
-    flat = flat[np.abs(flat[:, 0]) > DOOR / 2]
+    flat = flat[np.abs(flat[:, 0]) > door / 2]
     points = np.column_stack([flat[:, 0], rng.normal(0.0, NOISE, len(flat)), flat[:, 1]])
     write_figure(path, np.rint(points / LATTICE) * LATTICE)
-    half = DOOR / 2
+    half = door / 2
     walls = tuple(
         WallTruth(name, "y", 0.0, -1, low, high, 0.0, HEIGHT)
         for name, low, high in (("left", -HALF_WIDTH, -half), ("right", half, HALF_WIDTH))
     )
-    door = DoorTruth("main", -half, half, 0.0, 0.0, 0.0, HEIGHT, HEIGHT)
-    truth = FacadeTruth(seed, (0.0, 0.0, 0.0), 0.0, (door,), (), (), walls)
+    opening = DoorTruth("main", -half, half, 0.0, 0.0, 0.0, HEIGHT, HEIGHT)
+    truth = FacadeTruth(seed, (0.0, 0.0, 0.0), 0.0, (opening,), (), (), walls)
     side = np.where(rng.uniform(size=places) < 0.5, -1.0, 1.0)
     at = np.zeros((places, 3))
     at[:, 0] = side * rng.uniform(half + MARGIN, HALF_WIDTH - MARGIN, places)

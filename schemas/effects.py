@@ -1,15 +1,18 @@
 """The effects a scene may call for, and what each is told: types of the scene file. A tagged union, tag `effect`.
 
-What an effect does is said in server/effects/, one file each; what each default is for, here.
+What an effect does is said in server/effects/, one file each; what each default is for, in SCENE.md. Bounds catch what
+was meant in other units: a step of 200, a skin of 2.
 """
 
 from typing import Annotated, ClassVar
 
 import msgspec
 
-Positive = Annotated[float, msgspec.Meta(gt=0)]
-Length = Annotated[float, msgspec.Meta(ge=0)]
-Share = Annotated[float, msgspec.Meta(gt=0, le=1)]
+# A pair reaches 16 m at most, radii and margin or reach together (WIRE.md): what is asked for leaves room for radii.
+MOST_REACH = 10.0
+
+Length = Annotated[float, msgspec.Meta(ge=0, le=MOST_REACH)]
+Near = Annotated[float, msgspec.Meta(gt=0, le=1)]
 Degrees = Annotated[float, msgspec.Meta(ge=0, lt=90)]
 Vector = tuple[float, float, float]
 BoxName = Annotated[str, msgspec.Meta(min_length=1, max_length=64)]
@@ -27,7 +30,7 @@ class Stop(Effect, frozen=True, tag="stop"):
     skin: how far from what stopped it, along its way, it stays [m].
     """
 
-    skin: Length = 0.002
+    skin: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.002
 
 
 class Sweep(Effect, frozen=True, tag="sweep"):
@@ -37,7 +40,7 @@ class Sweep(Effect, frozen=True, tag="sweep"):
     """
 
     needs: ClassVar[tuple[str, ...]] = ("stop",)
-    tolerance: Positive = 1e-5
+    tolerance: Annotated[float, msgspec.Meta(gt=0, le=0.1)] = 1e-5
 
 
 class Slide(Effect, frozen=True, tag="slide"):
@@ -49,11 +52,14 @@ class Slide(Effect, frozen=True, tag="slide"):
 
     needs: ClassVar[tuple[str, ...]] = ("stop",)
     surfaces: Annotated[int, msgspec.Meta(ge=1, le=8)] = 4
-    normal_reach: Positive = 0.08
+    normal_reach: Near = 0.08
 
 
 class Step(Effect, frozen=True, tag="step"):
-    """What is no higher is climbed, and descended without a fall. height: [m]."""
+    """What is no higher is climbed, and descended without a fall.
+
+    height: of the highest step [m].
+    """
 
     needs: ClassVar[tuple[str, ...]] = ("stop", "slide", "ground")
     height: Annotated[float, msgspec.Meta(gt=0, le=2)] = 0.2
@@ -68,19 +74,26 @@ class Ground(Effect, frozen=True, tag="ground"):
 
     needs: ClassVar[tuple[str, ...]] = ("stop",)
     slope: Degrees = 45.0
-    clearance: Positive = 0.03
-    gravity: Positive = 9.81
-    fall_speed: Positive = 50.0
+    clearance: Near = 0.03
+    gravity: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 9.81
+    fall_speed: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 50.0
 
 
 class Proximity(Effect, frozen=True, tag="proximity"):
-    """Each frame says how near the nearest point is, where, and the way out. reach: farthest worth saying [m]."""
+    """Each frame says how near the nearest point is, where, and the way out.
 
-    reach: Positive = 0.5
+    reach: farthest worth saying [m].
+    """
+
+    reach: Annotated[float, msgspec.Meta(gt=0, le=MOST_REACH)] = 0.5
 
 
 class Contacts(Effect, frozen=True, tag="contacts"):
-    """Each frame lists what is touched, or within `margin` [m], in clusters, deepest first: at most `limit`."""
+    """Each frame lists what is touched, or nearly, in clusters, deepest first.
+
+    margin: what is so near counts as touched [m].  limit: clusters listed, at most.  cluster_distance: scan points so
+    far apart at most are of one cluster [m]; left out: twice the reach of a contact.
+    """
 
     margin: Length = 0.01
     limit: Annotated[int, msgspec.Meta(ge=1, le=1000)] = 16
@@ -92,7 +105,10 @@ class Objects(Effect, frozen=True, tag="objects"):
 
 
 class Crowd(Effect, frozen=True, tag="crowd"):
-    """Users do not walk through one another. margin: they stay so far apart [m]."""
+    """Users do not walk through one another.
+
+    margin: they stay so far apart [m].
+    """
 
     needs: ClassVar[tuple[str, ...]] = ("stop",)
     margin: Length = 0.0
@@ -107,7 +123,10 @@ class ThroughBox(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Through(Effect, frozen=True, tag="through"):
-    """Named boxes are passed: a door known to open, a portal."""
+    """Named boxes are passed: a door known to open, a portal.
+
+    boxes: scan points in them are left out.
+    """
 
     boxes: Annotated[list[ThroughBox], msgspec.Meta(min_length=1)]
 
@@ -119,8 +138,8 @@ class Uncertainty(Effect, frozen=True, tag="uncertainty"):
     that does not keep the scan of each point (`build --keep scan`) has one sigma.
     """
 
-    sigma: Positive = 0.005
-    scans: dict[str, Positive] = {}
+    sigma: Near = 0.005
+    scans: dict[str, Near] = {}
 
 
 AnyEffect = (

@@ -3,19 +3,35 @@
 Read by `solidcloud serve` and `solidcloud scene check`; SCENE.md says it in prose. Paths are relative to the file.
 """
 
+import inspect
 import math
-from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
+from msgspec import structs
 
 from .effects import AnyEffect, Stop, Through, Vector
 from .errors import BadRequestError
+from .keys import check_name
 from .radius_model import parse_radius_model
+from .toml_faults import decode, fault, nearest, shown
+from .voxel_grid import MAX_COORDINATE
+
+SUFFIX = ".toml"
+FORMAT = 1
+# A pose may be written with seven digits: one that is so near to a rigid one is made rigid (NUMERICS.md case 4).
+_ALMOST_RIGID = 1e-6
+# A pose that is rigid to its last digits stays as it is; the server asks for 1e-9 (NUMERICS.md N6).
+_RIGID = 1e-12
 
 Matrix = Annotated[list[Annotated[list[float], msgspec.Meta(min_length=4, max_length=4)]], msgspec.Meta(min_length=4, max_length=4)]  # fmt: skip  # noqa: E501
-SceneName = Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z0-9._-]{1,64}$")]
+SceneName = Annotated[
+    str,
+    msgspec.Meta(pattern=r"^[A-Za-z0-9._-]{1,64}$", description="1 to 64 of A-Z, a-z, 0-9, '.', '_' and '-'"),
+]
+PathText = Annotated[str, msgspec.Meta(min_length=1)]
 ItemName = Annotated[str, msgspec.Meta(min_length=1, max_length=64)]
 
 
@@ -31,7 +47,7 @@ class _Part(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 class ArchiveItem(_Part, frozen=True):
     """An archive. path: its folder.  pose: archive to world, rigid, row-major."""
 
-    path: str
+    path: PathText
     pose: Matrix = msgspec.field(default_factory=identity)
 
 
@@ -40,8 +56,8 @@ class AvatarItem(_Part, frozen=True):
     the mean closest-point distance."""
 
     name: ItemName
-    file: str
-    radius: Annotated[float, msgspec.Meta(ge=0)] | None = None
+    file: PathText
+    radius: Annotated[float, msgspec.Meta(ge=0, le=8)] | None = None
 
 
 class ObjectItem(_Part, frozen=True):
@@ -67,8 +83,8 @@ class Limits(_Part, frozen=True):
     """
 
     users: Annotated[int, msgspec.Meta(ge=1, le=1024)] = 64
-    frame_ms: Annotated[float, msgspec.Meta(gt=0)] | None = None
-    frame_visits: Annotated[int, msgspec.Meta(gt=0)] | None = None
+    frame_ms: Annotated[float, msgspec.Meta(gt=0, le=10_000)] | None = None
+    frame_visits: Annotated[int, msgspec.Meta(gt=0, le=1 << 62)] | None = None
     longest_move: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 100.0
 
 
@@ -98,6 +114,23 @@ def effect_name(effect: AnyEffect) -> str:
     return str(type(effect).__struct_config__.tag)
 
 
+def up_of(scene: SceneFile) -> Vector:
+    """Unit vector against gravity."""
+    length = math.hypot(*scene.up)
+    x, y, z = (value / length for value in scene.up)
+    return x, y, z
+
+
+def scene_name(scene: SceneFile, path: Path) -> str:
+    """What clients call the scene of a file: its `name`, else the file's, without suffix. BadRequestError."""
+    if scene.name is not None:
+        return scene.name
+    try:
+        return check_name(path.stem, "the file's name")
+    except BadRequestError as error:
+        raise BadRequestError(f"{path}: {error}: give the scene a `name`") from None
+
+
 def read_scene(path: Path) -> SceneFile:
     """The scene of a file, all that can be said without opening an archive checked. BadRequestError: what is wrong,
     with file, place and what is allowed."""
@@ -111,65 +144,163 @@ def read_scene(path: Path) -> SceneFile:
 
 
 def parse_scene(text: bytes, where: str) -> SceneFile:
-    """The scene of a file's bytes; where: its name, for errors."""
-    try:
-        scene = msgspec.toml.decode(text, type=SceneFile)
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
-        raise BadRequestError(f"{where}: {error}") from None
-    check_scene(scene, where)
-    return scene
+    """The scene of a file's bytes, its poses made rigid to the last digits; where: its name, for errors."""
+    scene = decode(text, SceneFile, where)
+    for place, said in _faults(scene):
+        raise fault(where, place, said, text)
+    return structs.replace(scene, archives=_rigid(scene.archives), objects=_rigid(scene.objects))
 
 
 def check_scene(scene: SceneFile, where: str) -> None:
-    """BadRequestError for what no type says: names that are there twice or not at all, effects that miss another."""
+    """BadRequestError for what no type says: names that are there twice or not at all, effects that miss another, poses
+    that are not rigid."""
+    for place, said in _faults(scene):
+        raise fault(where, place, said)
+
+
+def json_schema() -> str:
+    """The JSON Schema of a scene file: what `json/Scene.json` holds, for editors of TOML."""
+    schema = msgspec.json.schema(SceneFile)
+    for definition in schema["$defs"].values():
+        # Python 3.13 strips a docstring's indentation, earlier ones do not: the same text from all.
+        definition["description"] = inspect.cleandoc(definition["description"])
+    text = msgspec.json.format(msgspec.json.encode(schema, order="sorted"), indent=2)
+    return text.decode() + "\n"
+
+
+def _faults(scene: SceneFile) -> Iterator[tuple[str, str]]:
+    """What is wrong: the place, and found and expected."""
+    if scene.name is not None:
+        try:
+            check_name(scene.name, "name")
+        except BadRequestError as error:
+            yield "$.name", str(error)
     names = [effect_name(effect) for effect in scene.effects]
+    yield from _twice(names, "effects", "effect")
     for number, effect in enumerate(scene.effects):
-        for needed in effect.needs:
-            if needed not in names:
-                raise BadRequestError(
-                    f"{where}: `{names[number]}` means nothing without `{needed}` - at `$.effects[{number}]`: "
-                    f'add [[effects]] effect = "{needed}", or leave it out'
-                )
-        if isinstance(effect, Through):
-            _check_boxes(effect, number, where)
-    _check_once(names, "effects", where)
-    _check_once([item.name for item in scene.avatars], "avatars", where)
-    _check_once([item.name for item in scene.objects], "objects", where)
-    known = {item.name for item in scene.avatars}
-    for number, item in enumerate(scene.objects):
-        if item.avatar not in known:
-            raise BadRequestError(
-                f"{where}: avatar {item.avatar!r} is none of {', '.join(sorted(known)) or 'no avatars'} - at "
-                f"`$.objects[{number}].avatar`"
+        missing = [needed for needed in effect.needs if needed not in names]
+        if missing:
+            add = " and ".join(f'[[effects]] effect = "{needed}"' for needed in missing)
+            less = " and ".join(f"`{needed}`" for needed in missing)
+            yield (
+                f"$.effects[{number}]",
+                f"`{names[number]}` means nothing without {less}: add {add}, or leave it out",
             )
-    if scene.objects and "objects" not in names:
-        raise BadRequestError(
-            f'{where}: objects without the effect: add [[effects]] effect = "objects" - at `$.objects`'
-        )
-    if not 0 < math.hypot(*scene.up) < math.inf:
-        raise BadRequestError(f"{where}: {list(scene.up)}: expected a direction - at `$.up`")
+        if isinstance(effect, Through):
+            yield from _boxes(effect, f"$.effects[{number}].boxes")
+    yield from _twice([item.name for item in scene.avatars], "avatars", "name")
+    yield from _twice([item.name for item in scene.objects], "objects", "name")
+    yield from _objects(scene, names)
+    for what, items in (("archives", scene.archives), ("objects", scene.objects)):
+        for number, item in enumerate(items):
+            yield from _pose(item.pose, f"$.{what}[{number}].pose")
+    if not 1e-100 < math.hypot(*scene.up) < 1e100:  # whose squares are neither
+        yield "$.up", f"found {list(scene.up)}: expected a direction, of any length but zero"
+    if scene.spawn is not None:
+        yield from _position(scene.spawn.position, "$.spawn.position")
     if scene.radius_model is not None:
         try:
             parse_radius_model(scene.radius_model)
         except BadRequestError as error:
-            raise BadRequestError(f"{where}: {error} - at `$.radius_model`") from None
+            yield "$.radius_model", str(error)
 
 
-def _check_once(names: list[str], what: str, where: str) -> None:
-    """BadRequestError for a name that is there twice."""
-    for name, count in Counter(names).items():
-        if count > 1:
-            at = len(names) - 1 - names[::-1].index(name)
-            raise BadRequestError(
-                f"{where}: {name!r} is there {count} times, expected once - at `$.{what}[{at}]`"
+def _objects(scene: SceneFile, effects: list[str]) -> Iterator[tuple[str, str]]:
+    """Objects of no known shape, or without the effect."""
+    known = [item.name for item in scene.avatars]
+    for number, item in enumerate(scene.objects):
+        if item.avatar not in known:
+            listed = f"one of {', '.join(map(shown, known))}" if known else "it in [[avatars]]"
+            close = nearest(item.avatar, known)
+            yield (
+                f"$.objects[{number}].avatar",
+                f"{shown(item.avatar)} is no avatar of the scene: expected {listed}{close}",
             )
+    if scene.objects and "objects" not in effects:
+        yield (
+            "$.objects",
+            f'{len(scene.objects)} without the effect: add [[effects]] effect = "objects", or leave them out',
+        )
 
 
-def _check_boxes(effect: Through, number: int, where: str) -> None:
-    """BadRequestError for a box that holds nothing."""
-    for at, box in enumerate(effect.boxes):
+def _twice(names: list[str], what: str, field: str) -> Iterator[tuple[str, str]]:
+    """Names that are there before."""
+    for number, name in enumerate(names):
+        if name in names[:number]:
+            first = f"$.{what}[{names.index(name)}]"
+            yield f"$.{what}[{number}].{field}", f"{shown(name)} again: expected once, as in {first}"
+
+
+def _boxes(effect: Through, place: str) -> Iterator[tuple[str, str]]:
+    """Boxes that hold nothing, or have the name of another."""
+    for number, box in enumerate(effect.boxes):
+        yield from _position(box.low, f"{place}[{number}].low")
+        yield from _position(box.high, f"{place}[{number}].high")
         if not all(low <= high for low, high in zip(box.low, box.high, strict=True)):
-            raise BadRequestError(
-                f"{where}: box {box.name!r} from {list(box.low)} to {list(box.high)}: expected low <= high - at "
-                f"`$.effects[{number}].boxes[{at}]`"
+            yield (
+                f"{place}[{number}]",
+                f"box {shown(box.name)} from {list(box.low)} to {list(box.high)}: expected low <= high along each axis",
             )
+    yield from _twice([box.name for box in effect.boxes], place[2:], "name")
+
+
+def _position(position: Vector, place: str) -> Iterator[tuple[str, str]]:
+    """A position that no archive's lattice reaches."""
+    if not all(abs(value) <= MAX_COORDINATE for value in position):
+        yield place, f"found {list(position)}: expected coordinates within {MAX_COORDINATE:g} m"
+
+
+def _pose(pose: list[list[float]], place: str) -> Iterator[tuple[str, str]]:
+    """A pose that is not rigid, or shifts too far."""
+    if pose[3] != [0.0, 0.0, 0.0, 1.0]:
+        yield (
+            f"{place}[3]",
+            f"found {pose[3]}: expected the last row 0 0 0 1: a pose is 4 rows of 4, row-major",
+        )
+        return
+    gram = _gram(pose)
+    off = max(abs(gram[row][column] - (row == column)) for row in range(3) for column in range(3))
+    if not off <= _ALMOST_RIGID:  # not so for NaN either
+        yield (
+            place,
+            f"scales or shears, by {off:.2g}: expected a rotation and a shift, within {_ALMOST_RIGID:g}",
+        )
+    elif _determinant(pose) < 0:
+        yield place, "mirrors: expected a rotation and a shift"
+    else:
+        yield from _position((pose[0][3], pose[1][3], pose[2][3]), place)
+
+
+def _gram(pose: list[list[float]]) -> list[list[float]]:
+    """Dot products of the rows of a pose's rotation: those of unit vectors at right angles, were it exact."""
+    return [
+        [sum(a * b for a, b in zip(one[:3], other[:3], strict=True)) for other in pose[:3]]
+        for one in pose[:3]
+    ]
+
+
+def _determinant(pose: list[list[float]]) -> float:
+    """Of a pose's rotation."""
+    (a, b, c, _), (d, e, f, _), (g, h, i, _) = pose[:3]
+    return a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
+
+
+def _rigid(items: list[Any]) -> list[Any]:
+    """Archives or objects with poses whose rotations are rotations to the last digits.
+
+    (3 R - R R' R) / 2 squares the distance of R from the nearest rotation: from 1e-6, twice is enough.
+    """
+    made = []
+    for item in items:
+        pose = item.pose
+        for _ in range(2):
+            gram = _gram(pose)
+            if all(abs(gram[i][j] - (i == j)) <= _RIGID for i in range(3) for j in range(3)):
+                break
+            pose = [
+                [1.5 * pose[i][j] - 0.5 * sum(gram[i][k] * pose[k][j] for k in range(3)) for j in range(3)]
+                + [pose[i][3]]
+                for i in range(3)
+            ] + [pose[3]]
+        made.append(item if pose is item.pose else structs.replace(item, pose=pose))
+    return made

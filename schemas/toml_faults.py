@@ -1,0 +1,285 @@
+"""What is wrong with a TOML file that is to be of some type, in one sentence: where, found, expected.
+
+msgspec says where (`$.effects[0].skin`) and of what type; here is added what was found there, all that is allowed, the
+nearest name to one that is none, and the line.
+"""
+
+import difflib
+import json
+import math
+import re
+import tomllib
+from collections.abc import Iterator
+from typing import Any, TypeVar
+
+import msgspec
+from msgspec import inspect
+
+from .errors import BadRequestError
+
+_T = TypeVar("_T")
+
+# A scene of a thousand objects with poses takes 300 KB.
+MOST_BYTES = 4 << 20
+
+_PLACE = re.compile(r" - at `(?:key in )?(\$[^`]*)`$")
+_TOKEN = re.compile(r"\.([^.\[]+)|\[(\d+|\.\.\.)\]")
+_FIELD = re.compile(r"^Object (contains unknown|missing required) field `([^`]*)`")
+_LONGEST_SHOWN = 60
+
+
+def decode(text: bytes, kind: type[_T], where: str) -> _T:
+    """A TOML file's bytes as a type of msgspec's. where: its name.
+
+    BadRequestError: in one sentence, what is wrong with it.
+    """
+    data = load(text, where)
+    for place, value in _numbers(data, "$"):
+        if not math.isfinite(value):
+            raise fault(where, place, f"found {shown(value)}: expected a finite number", text)
+    try:
+        return msgspec.convert(data, kind)
+    except msgspec.ValidationError as error:
+        place, said = _explained(str(error), data, kind)
+        raise fault(where, place, said, text) from None
+
+
+def load(text: bytes, where: str) -> dict[str, Any]:
+    """The tables of a TOML file; BadRequestError says line and column."""
+    if len(text) > MOST_BYTES:
+        raise BadRequestError(f"{where}: {len(text):,} bytes, expected at most {MOST_BYTES:,}")
+    try:
+        return tomllib.loads(text.decode("utf-8"))
+    except UnicodeDecodeError as error:
+        line = text.count(b"\n", 0, error.start) + 1
+        raise BadRequestError(f"{where}: line {line}: bytes that are no UTF-8: save it as UTF-8") from None
+    except tomllib.TOMLDecodeError as error:
+        raise BadRequestError(f"{where}: no TOML: {error}") from None
+    except RecursionError:
+        raise BadRequestError(f"{where}: nested too deeply") from None
+
+
+def fault(where: str, place: str, said: str, text: bytes | None = None) -> BadRequestError:
+    """What is wrong at a place of a file; text: its bytes, for the line."""
+    line = None if text is None else line_of(text.decode("utf-8"), place)
+    at = f"line {line}: " if line else ""
+    return BadRequestError(f"{where}: {at}{place}: {said}")
+
+
+def shown(value: Any) -> str:
+    """A value as the file has it, shortened."""
+    text = json.dumps(value, ensure_ascii=False, default=str)
+    return text if len(text) <= _LONGEST_SHOWN else text[: _LONGEST_SHOWN - 1] + "…"
+
+
+def nearest(name: Any, names: list[str]) -> str:
+    """Which name was perhaps meant, to be put behind a sentence."""
+    close = difflib.get_close_matches(str(name), names, 1)
+    return f": did you mean {shown(close[0])}?" if close else ""
+
+
+def line_of(text: str, place: str) -> int | None:
+    """The line, from 1, where the statement begins that makes a place of a TOML file; None for the whole of it, and
+    for what is not in it.
+
+    A prefix of lines that can be parsed ends with a whole statement, so the last of them without the place ends right
+    before it. Once there, it is there in every longer prefix: that is bisected.
+    """
+    tokens = _tokens(place)
+    if not tokens or not _has(tomllib.loads(text), tokens):
+        return None
+    lines = text.split("\n")
+
+    def holds(count: int) -> tuple[int, bool]:
+        """The least prefix of so many lines or more that can be parsed, and whether it has the place."""
+        for longer in range(count, len(lines)):
+            try:
+                data = tomllib.loads("\n".join(lines[:longer]) + "\n")
+            except tomllib.TOMLDecodeError:
+                continue
+            return longer, _has(data, tokens)
+        return len(lines), True
+
+    # Without the place; the least known to lead to a prefix with it.
+    without, has = 0, len(lines)
+    while has - without > 1:
+        middle = (without + has) // 2
+        longer, there = holds(middle)
+        if there:
+            has = middle
+        else:
+            without = longer
+    return without + 1
+
+
+def _tokens(place: str) -> list[str | int]:
+    """The steps of a place; a table's values, of which msgspec does not say which, are none."""
+    steps: list[str | int] = []
+    for name, number in _TOKEN.findall(place):
+        if number == "...":
+            break
+        steps.append(name or int(number))
+    return steps
+
+
+def _has(data: Any, tokens: list[str | int]) -> bool:
+    """Whether there is such a place."""
+    for token in tokens:
+        try:
+            data = data[token]
+        except (KeyError, IndexError, TypeError):
+            return False
+    return True
+
+
+def _numbers(value: Any, place: str) -> Iterator[tuple[str, float]]:
+    """All numbers, and where."""
+    if isinstance(value, float):
+        yield place, value
+    elif isinstance(value, dict):
+        for name, inner in value.items():
+            yield from _numbers(inner, f"{place}.{name}")
+    elif isinstance(value, list):
+        for number, inner in enumerate(value):
+            yield from _numbers(inner, f"{place}[{number}]")
+
+
+def _explained(message: str, data: Any, kind: Any) -> tuple[str, str]:
+    """The place that a message of msgspec's is about, and what is wrong there."""
+    found = _PLACE.search(message)
+    place = found[1] if found else "$"
+    root = inspect.type_info(kind)
+    node, value = _resolve(root, data, _tokens(place))
+    field = _FIELD.match(message)
+    if not field or not isinstance(node, inspect.StructType):
+        return _of_value(place, node, value)
+    names = [each.encode_name for each in node.fields]
+    if node.tag_field:
+        names.insert(0, node.tag_field)
+    what = "the file" if place == "$" else f"{_name(node)}" if node.tag_field else "this table"
+    if field[1] == "missing required":
+        needed = [each.encode_name for each in node.fields if each.required]
+        return place, f"has no `{field[2]}`: expected {', '.join(f'`{name}`' for name in needed)}"
+    hint = nearest(field[2], names)
+    of_file = [each.encode_name for each in root.fields] if isinstance(root, inspect.StructType) else []
+    if not hint and place != "$" and field[2] in of_file:
+        # What stands behind the header of a table is a field of it; who wrote it meant one of the file.
+        hint = f": `{field[2]}` of the file itself stands above its first [table]"
+    return f"{place}.{field[2]}", f"{what} has no field `{field[2]}`: expected {', '.join(names)}{hint}"
+
+
+def _of_value(place: str, node: Any, value: Any) -> tuple[str, str]:
+    """What is wrong with a value."""
+    if isinstance(node, inspect.UnionType):
+        tags = {
+            str(_struct(each).tag): each
+            for each in node.types
+            if isinstance(_struct(each), inspect.StructType)
+        }
+        if tags:
+            field = str(_struct(next(iter(tags.values()))).tag_field)
+            return _of_tag(place, field, list(tags), value)
+    return place, f"found {shown(value)}: expected {_expected(node)}"
+
+
+def _of_tag(place: str, field: str, tags: list[str], value: Any) -> tuple[str, str]:
+    """What is wrong with a table that may be of several kinds."""
+    listed = ", ".join(tags)
+    if not isinstance(value, dict):
+        hint = f": write [[{place.partition('[')[0][2:]}]] {field} = {shown(value)}" if value in tags else ""
+        return place, f"found {shown(value)}: expected a table with `{field}`, one of {listed}{hint}"
+    place = place.removesuffix(f".{field}")
+    if field not in value:
+        return place, f"has no `{field}`: expected one of {listed}"
+    tag = value[field]
+    return f"{place}.{field}", f"{shown(tag)} is no {field}: expected one of {listed}{nearest(tag, tags)}"
+
+
+def _resolve(node: Any, value: Any, tokens: list[str | int]) -> tuple[Any, Any]:
+    """The type and the value at a place: of a table that may be of several kinds, the kind its tag says; what is wrong
+    with the tag itself is wrong with the table."""
+    node = _narrowed(node, value)
+    for token in tokens:
+        node = _struct(node)
+        if isinstance(node, inspect.UnionType):
+            return node, value
+        value = value[token]
+        if isinstance(node, inspect.StructType):
+            node = next((each.type for each in node.fields if each.encode_name == token), node)
+        elif isinstance(node, inspect.TupleType):
+            node = node.item_types[int(token)]
+        else:
+            node = node.item_type
+        node = _narrowed(node, value)
+    return node, value
+
+
+def _struct(node: Any) -> Any:
+    """A type without what is said of it."""
+    return _struct(node.type) if isinstance(node, inspect.Metadata) else node
+
+
+def _narrowed(node: Any, value: Any) -> Any:
+    """A union without null, which TOML does not have; of structs, that of the value's tag, if any's."""
+    if not isinstance(node, inspect.UnionType):
+        return node
+    kinds = [each for each in node.types if not isinstance(each, inspect.NoneType)]
+    if len(kinds) == 1:
+        return kinds[0]
+    if isinstance(value, dict):
+        for each in kinds:
+            inner = _struct(each)
+            if isinstance(inner, inspect.StructType) and value.get(inner.tag_field) == inner.tag:
+                return inner
+    return inspect.UnionType(tuple(kinds))
+
+
+def _name(node: inspect.StructType) -> str:
+    """What a table of several kinds is called."""
+    return f"{node.tag_field} {shown(node.tag)}"
+
+
+def _expected(node: Any) -> str:
+    """What a type allows, in words."""
+    if isinstance(node, inspect.Metadata):
+        said = (node.extra_json_schema or {}).get("description")
+        return said or _expected(node.type)
+    if isinstance(node, inspect.FloatType | inspect.IntType):
+        kind = "an integer" if isinstance(node, inspect.IntType) else "a number"
+        return kind + _bounds(node)
+    if isinstance(node, inspect.StrType):
+        return f"a string{_lengths(node, 'characters')}"
+    if isinstance(node, inspect.LiteralType):
+        return " or ".join(shown(value) for value in sorted(node.values))
+    if isinstance(node, inspect.TupleType):
+        return f"a list of {len(node.item_types)}, each {_expected(node.item_types[0])}"
+    if isinstance(node, inspect.ListType):
+        return f"a list{_lengths(node, 'items')}, each {_expected(node.item_type)}"
+    if isinstance(node, inspect.DictType):
+        return f"a table whose values are each {_expected(node.value_type)}"
+    if isinstance(node, inspect.StructType):
+        return f"a table of {', '.join(each.encode_name for each in node.fields)}"
+    if isinstance(node, inspect.UnionType):
+        if tag_field := getattr(_struct(node.types[0]), "tag_field", None):
+            return f"a table with `{tag_field}`"
+        return " or ".join(dict.fromkeys(_expected(each) for each in node.types))
+    return type(node).__name__.removesuffix("Type").lower()
+
+
+def _bounds(node: inspect.FloatType | inspect.IntType) -> str:
+    """What a number is bounded by."""
+    signs = {"gt": "above", "ge": "from", "lt": "below", "le": "up to"}
+    said = [
+        f"{word} {bound:,.10g}" for name, word in signs.items() if (bound := getattr(node, name)) is not None
+    ]
+    return " " + " ".join(said) if said else ""
+
+
+def _lengths(node: Any, what: str) -> str:
+    """What a length is bounded by."""
+    low, high = node.min_length, node.max_length
+    if low is None and high is None:
+        return ""
+    if low == high:
+        return f" of {low} {what}"
+    return f" of at least {low or 0} {what}" if high is None else f" of {low or 0} to {high} {what}"

@@ -1,0 +1,75 @@
+"""`distance` of one pose in one kernel call, where all voxels in its reach are resident: see `near.py`.
+
+What the nearest pair comes to in metres is worked out here as well: `signed.py` has the formulas, in the same order of
+operations, so that the bits are the same. In columns of one element they took four times as long as the search.
+"""
+
+import math
+
+import numba as nb
+import numpy as np
+
+from ...schemas.voxel_grid import UNITS_PER_METRE
+from .closest import Nearest
+from .compiled import borrowing
+from .nearest import nearest_poses
+from .placing import GOOD, lattice_to_units
+from .reach import Reach, find_reach
+
+# Columns of what is written.
+SIGNED, LOWER, NORMAL, AVATAR, CLOUD, COLUMNS = 0, 1, 2, 5, 8, 11
+
+
+@borrowing
+def _say(square, pair, drop, radii, reach, scene, said):
+    """Write what one pair found comes to, or that there is none (square -1); see `nearest_resident`."""
+    if square < 0:
+        said[SIGNED], said[LOWER] = np.inf, reach
+        for at in range(NORMAL, COLUMNS):
+            said[at] = np.nan
+        return
+    own = radii - drop
+    above = np.float64(square - own * own)
+    root = math.sqrt(np.float64(square))
+    both = root + np.float64(own)
+    signed = above / both / UNITS_PER_METRE if both > 0.0 else 0.0
+    said[SIGNED], said[LOWER] = signed, min(signed, reach)
+    for r in range(3):
+        apart = np.float64(pair[3 + r] - lattice_to_units(pair[r], scene.units_per_step))
+        said[NORMAL + r] = apart / root if root > 0.0 else 0.0
+        said[AVATAR + r] = np.float64(pair[3 + r]) / UNITS_PER_METRE + scene.origin[r]
+        said[CLOUD + r] = np.float64(pair[r]) * scene.step + scene.origin[r]
+
+
+@nb.njit(nogil=True, cache=True)
+def nearest_resident(poses, avatar, radius, radius_units, reach_units, reach, scene, index, rows, said):
+    """`find_reach`, then `nearest_poses`, then the figures of the pair, for one pose.
+
+    poses: (1, 4, 4) float64, any.  radius: of the avatar's points [m].  radius_units: of the largest sphere of the
+    scan, reach_units: of the reach, exact units; reach: the same [m].
+    Writes rows (capacity,) int64, the voxels in reach, and said (COLUMNS,) float64: signed distance and what it is at
+    least [m], normal, witness of the avatar, of the cloud, world [m]; inf and NaN where no pair is within reach.
+    Returns (fault, pose, figure found) as `check_poses` does, how many rows, -1: not answered, for something has to be
+    loaded or the rows do not fit; outside, node visits, point tests.
+    """
+    outside = np.zeros(1, np.bool_)
+    scales, units = np.empty(1), np.empty(1, np.int64)
+    around = Reach(scales, units, np.zeros(2, np.int64), rows, np.empty((1, 2, 3)), outside)
+    fault, pose, found, needed = find_reach(
+        poses, avatar, radius, radius_units + reach_units, scene, index, around
+    )
+    if fault != GOOD or needed > rows.shape[0]:
+        return fault, pose, found, -1, False, 0, 0
+    for at in range(needed):
+        if scene.where[rows[at], 0] < 0:
+            return fault, pose, found, -1, False, 0, 0
+    nearest = Nearest(
+        np.full(1, -1, np.int64), np.zeros((1, 6), np.int64), np.zeros(1, np.int64), np.full(1, np.inf)
+    )
+    counts = np.zeros((3, 1), np.uint32)
+    if needed > 0:
+        nearest_poses(
+            poses, avatar, scene, index, around, reach_units, np.zeros(1, np.int64), nearest, counts
+        )
+    _say(nearest.square[0], nearest.pair[0], nearest.drop[0], units[0] - reach_units, reach, scene, said)
+    return fault, pose, found, needed, outside[0], np.int64(counts[1, 0]), np.int64(counts[2, 0])

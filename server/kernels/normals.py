@@ -1,0 +1,141 @@
+"""The normal at a scan point of a resident voxel: its neighbours gathered from the voxel's tree.
+
+The definition is in schemas/kernels/normals.py. Spheres prune, in whole numbers that float64 holds exactly; points are
+decided by integers.
+"""
+
+import numba as nb
+import numpy as np
+
+from ...schemas.kernels.morton import morton_code
+from ...schemas.kernels.normals import NONE, normal_code
+from ...schemas.voxel_grid import KEY_BIAS
+from .compiled import borrowing
+from .layout import COUNT, COUNTED, FIRST, LANES, ROW_WORDS
+from .rays import STACK
+from .reach import find_key
+
+# What no normal has as its code: both bytes of one are 1 at least.
+UNASKED = np.uint16(1)
+SUMS = 10
+
+
+@nb.njit(nogil=True, cache=True)
+def find_voxel(keys, voxel_steps, x, y, z):
+    """The index row of the voxel that a lattice point is in, -1 where none holds points.
+
+    keys: (v,) uint64, sorted.
+    """
+    ix, iy, iz = x // voxel_steps + KEY_BIAS, y // voxel_steps + KEY_BIAS, z // voxel_steps + KEY_BIAS
+    if min(ix, iy, iz) < 0 or max(ix, iy, iz) >= 2 * KEY_BIAS:
+        return -1
+    return find_key(keys, morton_code(np.uint64(ix), np.uint64(iy), np.uint64(iz)))
+
+
+@borrowing
+def _find_point(scene, voxel, x, y, z, rows):
+    """The lane of a resident voxel, LANES a block, where a point (int64, from the voxel's low corner) is; -1: none.
+
+    rows: (STACK,) int64, scratch. Of points in one place any is named. Also returns the nodes visited.
+    """
+    words, ints, halves = scene.words, scene.ints, scene.halves
+    base, visits = scene.where[voxel, 0], 0
+    rows[0], depth = base, 1
+    while depth > 0:
+        depth -= 1
+        row = rows[depth]
+        visits += 1
+        dx, dy, dz = x - words[row], y - words[row + 1], z - words[row + 2]
+        radius = np.float64(words[row + 3])
+        if dx * dx + dy * dy + dz * dz > radius * radius:
+            continue
+        first = np.int64(ints[row + FIRST])
+        count = np.int64(ints[row + COUNT] & COUNTED)
+        if first >= 0:
+            for child in range(first, first + count):
+                rows[depth] = base + child * ROW_WORDS
+                depth += 1
+            continue
+        block = ~first
+        block_at = scene.where[voxel, 1] + block * scene.block_words
+        lane_at = scene.where[voxel, 2] + block * 3 * LANES
+        ox, oy, oz = x - ints[block_at], y - ints[block_at + 1], z - ints[block_at + 2]
+        for j in range(count):
+            if (
+                ox == np.int64(halves[lane_at + j])
+                and oy == np.int64(halves[lane_at + LANES + j])
+                and oz == np.int64(halves[lane_at + 2 * LANES + j])
+            ):
+                return block * LANES + j, visits
+    return np.int64(-1), visits
+
+
+@borrowing
+def _add_near(scene, voxel, x, y, z, square, rows, sums):
+    """Add up, of a resident voxel's points within a square [steps] of a point, what `normal_code` is told.
+
+    Arguments as of `_find_point`; sums: (SUMS,) int64, zeros. Returns the nodes visited.
+    """
+    words, ints, halves = scene.words, scene.ints, scene.halves
+    # Rounded up: 2^-50 is more than a root and a sum of whole numbers below 2^31 lose.
+    reach = np.sqrt(np.float64(square)) * (1.0 + 2.0**-50)
+    base, visits = scene.where[voxel, 0], 0
+    rows[0], depth = base, 1
+    while depth > 0:
+        depth -= 1
+        row = rows[depth]
+        visits += 1
+        dx, dy, dz = x - words[row], y - words[row + 1], z - words[row + 2]
+        both = (reach + words[row + 3]) * (1.0 + 2.0**-50)
+        if dx * dx + dy * dy + dz * dz > both * both * (1.0 + 2.0**-50):
+            continue
+        first = np.int64(ints[row + FIRST])
+        count = np.int64(ints[row + COUNT] & COUNTED)
+        if first >= 0:
+            for child in range(first, first + count):
+                rows[depth] = base + child * ROW_WORDS
+                depth += 1
+            continue
+        block = ~first
+        block_at = scene.where[voxel, 1] + block * scene.block_words
+        lane_at = scene.where[voxel, 2] + block * 3 * LANES
+        ox, oy, oz = ints[block_at] - x, ints[block_at + 1] - y, ints[block_at + 2] - z
+        for j in range(count):
+            px = ox + np.int64(halves[lane_at + j])
+            py = oy + np.int64(halves[lane_at + LANES + j])
+            pz = oz + np.int64(halves[lane_at + 2 * LANES + j])
+            if px * px + py * py + pz * pz > square:
+                continue
+            sums[0] += 1
+            sums[1] += px
+            sums[2] += py
+            sums[3] += pz
+            sums[4] += px * px
+            sums[5] += py * py
+            sums[6] += pz * pz
+            sums[7] += py * pz
+            sums[8] += pz * px
+            sums[9] += px * py
+    return visits
+
+
+@nb.njit(nogil=True, cache=True)
+def code_at(scene, voxel, x, y, z, square, codes):
+    """The code of the normal at a lattice point of a resident voxel, looked up in `codes`, else estimated and kept.
+
+    scene: SceneArrays.  x, y, z: int64.  square: of the reach [steps^2], with `normals.normal_reach` found to fit.
+    codes: (blocks * LANES,) uint16, UNASKED where not estimated yet; written.
+    Returns (code, nodes visited, whether it was estimated): NONE where no point of the voxel is there.
+    """
+    rows, sums = np.empty(STACK, np.int64), np.zeros(SUMS, np.int64)
+    x -= scene.coordinates[voxel, 0] * scene.voxel_steps
+    y -= scene.coordinates[voxel, 1] * scene.voxel_steps
+    z -= scene.coordinates[voxel, 2] * scene.voxel_steps
+    lane, visits = _find_point(scene, voxel, x, y, z, rows)
+    if lane < 0:
+        return NONE, visits, False
+    fresh = codes[lane] == UNASKED
+    if fresh:
+        visits += _add_near(scene, voxel, x, y, z, square, rows, sums)
+        codes[lane] = normal_code(sums)
+    return codes[lane], visits, fresh

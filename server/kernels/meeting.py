@@ -1,0 +1,376 @@
+"""When does an avatar on its way first touch one that stands? Two trees of avatars, one of them moving.
+
+The motion is that of kernels/motion.py, contact that of kernels/pairs.py: both bodies placed from the dataset's origin,
+in float64, each rounded once to exact units. The proof is that of kernels/sweep.py, whose scan point is here a point of
+the standing avatar, as rounded: over [t0, t1] every moving point is taken along its chord, within
+`band` = sqrt(3) / 2 + B (t1 - t0)^2 / 8 + 2 slip of where it is, and what may be early is halved and quartered until
+a sagitta no longer counts beside rounding. A translation has none: it takes one descent.
+
+What is answered is only how far nothing touches: beyond is a contact, or a graze within 1.2 units, 18 nm, of one.
+All is float64: avatars are some thousand points, and few of them are near one another.
+"""
+
+import math
+from typing import NamedTuple
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+
+from ...schemas.voxel_grid import UNITS_PER_METRE
+from .compiled import borrowing
+from .layout import LANES
+from .moments import INFINITE, pair_times
+from .motion import Motion, make_motion, pose_at
+from .pairs import STACK, STRETCH
+from .placing import Avatar, largest_term, place, to_units
+
+# As in sweep.py, advance.py: what is not worth halving; of a first chord; advances that settled nothing.
+_LEAST_SAGITTA = 0.25
+_CHORD_BEND = 1.0 / 16.0
+_MOST_REFUSED = 512
+
+
+class Scratch(NamedTuple):
+    """Scratch of one thread, by `make_scratch`.
+
+    nodes: (STACK, 2) int64, at: (STACK, 9) float64: pairs to be looked at, where the moving one's centre begins, its
+    way, and the other's centre.  lanes: (3, LANES) of a standing block.  ends: (2, 4, 4), shifts: (3, 3): the poses of
+    a chord's ends, their translations and the standing one's.  gap, way: (3,).  first: (2,) when anything could
+    touch, and when something must.  pair: (4,) int64 block, lane of either.  counters: (2,) node visits, point tests.
+    """
+
+    nodes: NDArray[np.int64]
+    at: NDArray[np.float64]
+    lanes: NDArray[np.float64]
+    ends: NDArray[np.float64]
+    shifts: NDArray[np.float64]
+    gap: NDArray[np.float64]
+    way: NDArray[np.float64]
+    first: NDArray[np.float64]
+    pair: NDArray[np.int64]
+    counters: NDArray[np.int64]
+
+
+def make_scratch() -> Scratch:
+    """Scratch for `sweep_bodies`."""
+    return Scratch(
+        np.empty((STACK, 2), np.int64), np.empty((STACK, 9)), np.empty((3, LANES)), np.empty((2, 4, 4)),
+        np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(2), np.zeros(4, np.int64), np.zeros(2, np.int64),
+    )  # fmt: skip
+
+
+class _Meeting(NamedTuple):
+    """One motion against one body. motion: Motion of avatar a.  pose: (4, 4) of b.  units: of both radii and margin.
+    error: of a distance of two placed centres, and of what rounds to units [m]."""
+
+    motion: Motion
+    a: Avatar
+    b: Avatar
+    pose: NDArray[np.float64]
+    units: np.int64
+    error: float
+    scratch: Scratch
+
+
+class _Chord(NamedTuple):
+    """One interval from t0 on. inner, outer: U - band, U + band, exact units.  room: outer with the error [m].
+    final: not worth halving."""
+
+    t0: float
+    inner: float
+    outer: float
+    room: float
+    final: bool
+
+
+@nb.njit(nogil=True, cache=True)
+def bound_body(box, pose, origin, more, bounds):
+    """Write bounds (2, 3), from the origin [m], of a body's box (2, 3), avatar frame, placed; `more` on all sides."""
+    for r in range(3):
+        middle, half, size = pose[r, 3] - origin[r], 0.0, abs(pose[r, 3]) + abs(origin[r])
+        for c in range(3):
+            middle += pose[r, c] * (0.5 * (box[0, c] + box[1, c]))
+            half += abs(pose[r, c]) * (0.5 * (box[1, c] - box[0, c]))
+            size += abs(pose[r, c]) * (abs(box[0, c]) + abs(box[1, c]))
+        half += more + 2.0 / UNITS_PER_METRE + size * 2.0**-48
+        bounds[0, r], bounds[1, r] = middle - half, middle + half
+
+
+@nb.njit(nogil=True, cache=True)
+def find_near(box, first, last, more, bounds, kinds, wanted, skip, rows):
+    """Bodies whose bounds meet those of a motion, ascending into rows (n,) int64; returns how many.
+
+    box: (2, 3) of the moving avatar.  first, last: (4, 4), translations from the origin.  more: its radius and the
+    margin [m].  bounds: (n, 2, 3), see `bound_body`.  kinds: (n,) uint8, one bit each; wanted: bits.  skip: a row.
+    """
+    origin = np.zeros(3)
+    begin, end = np.empty((2, 3)), np.empty((2, 3))
+    stray = make_motion(first, last, box, origin).bend / 8.0
+    bound_body(box, first, origin, more + stray, begin)
+    bound_body(box, last, origin, more + stray, end)
+    count = 0
+    for i in range(bounds.shape[0]):
+        if i == skip or not kinds[i] & wanted:
+            continue
+        apart = False
+        for r in range(3):
+            apart |= min(begin[0, r], end[0, r]) > bounds[i, 1, r]
+            apart |= max(begin[1, r], end[1, r]) < bounds[i, 0, r]
+        if not apart:
+            rows[count] = i
+            count += 1
+    return count
+
+
+@borrowing
+def _least_square(gx, gy, gz, wx, wy, wz, latest):
+    """The least square of a length that goes from g to g + latest w."""
+    square = wx * wx + wy * wy + wz * wz
+    t = 0.0
+    if square > 1e-200:
+        t = min(max(-(gx * wx + gy * wy + gz * wz) / square, 0.0), latest)
+    ex, ey, ez = gx + t * wx, gy + t * wy, gz + t * wz
+    return ex * ex + ey * ey + ez * ez
+
+
+@borrowing
+def _latest(scratch):
+    """The fraction of a chord that still matters, rounded up."""
+    return min(scratch.first[0] * (1.0 + 1e-9) + 1e-30, 1.0)
+
+
+@borrowing
+def _goes_away(meeting, chord, x, y, z, lane_b):
+    """Whether a pair that is within the band where the motion begins, (x, y, z) and a lane, does not touch there and
+    comes no nearer."""
+    scratch = meeting.scratch
+    gap, way = scratch.gap, scratch.way
+    if chord.t0 > 0.0 or not chord.final:
+        return False
+    if gap[0] * way[0] + gap[1] * way[1] + gap[2] * way[2] < 0.0:
+        return False
+    square = np.int64(0)
+    for r in range(3):
+        begin = to_units(place(scratch.ends[0], scratch.shifts[0], r, x, y, z))
+        difference = begin - to_units(scratch.lanes[r, lane_b])
+        square += difference * difference
+    return square > meeting.units * meeting.units
+
+
+@borrowing
+def _try_pair(meeting, chord, block_a, lane_a, block_b, lane_b):
+    """Take one pair of points into account; lanes are those of block_b."""
+    scratch, points = meeting.scratch, meeting.a.points
+    gap, way, ends, first = scratch.gap, scratch.way, scratch.ends, scratch.first
+    x, y, z = points[block_a, 0, lane_a], points[block_a, 1, lane_a], points[block_a, 2, lane_a]
+    for r in range(3):
+        begin = place(ends[0], scratch.shifts[0], r, x, y, z) * UNITS_PER_METRE
+        end = place(ends[1], scratch.shifts[1], r, x, y, z) * UNITS_PER_METRE
+        gap[r] = begin - np.float64(to_units(scratch.lanes[r, lane_b]))
+        way[r] = end - begin
+    enters, certain, _ = pair_times(gap, way, chord.inner, chord.outer)
+    if enters == 0.0 and certain > 0.0 and _goes_away(meeting, chord, x, y, z, lane_b):
+        return
+    if enters < first[0]:
+        first[0] = enters
+        pair = scratch.pair
+        pair[0], pair[1], pair[2], pair[3] = block_a, lane_a, block_b, lane_b
+    first[1] = min(first[1], certain)
+
+
+@borrowing
+def _leaves(meeting, chord, i, j, bx, by, bz, radius_b):
+    """Take all pairs of two leaf nodes into account; (bx, by, bz) with radius_b is the standing one's sphere."""
+    scratch = meeting.scratch
+    lanes, ends, shifts = scratch.lanes, scratch.ends, scratch.shifts
+    block_a, block_b = ~meeting.a.first[i], ~meeting.b.first[j]
+    points, others = meeting.a.points, meeting.b.points
+    for r in range(3):
+        for k in range(LANES):
+            x, y, z = others[block_b, 0, k], others[block_b, 1, k], others[block_b, 2, k]
+            lanes[r, k] = place(meeting.pose, shifts[2], r, x, y, z)
+    far, span = chord.room * chord.room * (1.0 + 1e-12), (radius_b + chord.room) * (1.0 + 1e-12)
+    for lane in range(meeting.a.count[i]):
+        x, y, z = points[block_a, 0, lane], points[block_a, 1, lane], points[block_a, 2, lane]
+        px, py, pz = (
+            place(ends[0], shifts[0], 0, x, y, z),
+            place(ends[0], shifts[0], 1, x, y, z),
+            place(ends[0], shifts[0], 2, x, y, z),
+        )
+        wx = place(ends[1], shifts[1], 0, x, y, z) - px
+        wy = place(ends[1], shifts[1], 1, x, y, z) - py
+        wz = place(ends[1], shifts[1], 2, x, y, z) - pz
+        latest = _latest(scratch)
+        if _least_square(px - bx, py - by, pz - bz, wx, wy, wz, latest) > span * span:
+            continue
+        scratch.counters[1] += LANES
+        for k in range(meeting.b.count[j]):
+            if _least_square(px - lanes[0, k], py - lanes[1, k], pz - lanes[2, k], wx, wy, wz, latest) <= far:
+                _try_pair(meeting, chord, block_a, lane, block_b, k)
+
+
+@borrowing
+def _place_chord(meeting, node, at, depth):
+    """Where a moving node's centre begins, and its way, into at[depth, :6]."""
+    scratch, center = meeting.scratch, meeting.a.center
+    x, y, z = center[node, 0], center[node, 1], center[node, 2]
+    for r in range(3):
+        begin = place(scratch.ends[0], scratch.shifts[0], r, x, y, z)
+        at[depth, r] = begin
+        at[depth, 3 + r] = place(scratch.ends[1], scratch.shifts[1], r, x, y, z) - begin
+
+
+@borrowing
+def _place_standing(meeting, node, at, depth):
+    """Where a standing node's centre is, into at[depth, 6:]."""
+    center = meeting.b.center
+    x, y, z = center[node, 0], center[node, 1], center[node, 2]
+    for r in range(3):
+        at[depth, 6 + r] = place(meeting.pose, meeting.scratch.shifts[2], r, x, y, z)
+
+
+@borrowing
+def _descend(meeting, chord):
+    """One descent of both trees for one chord, the larger inner node opened, a leaf never; fills scratch.first."""
+    scratch, a, b = meeting.scratch, meeting.a, meeting.b
+    nodes, at, counters = scratch.nodes, scratch.at, scratch.counters
+    scratch.first[0], scratch.first[1] = INFINITE, INFINITE
+    nodes[0, 0], nodes[0, 1] = 0, 0
+    _place_chord(meeting, 0, at, 0)
+    _place_standing(meeting, 0, at, 0)
+    counters[0] += 1
+    depth = 1
+    while depth > 0:
+        depth -= 1
+        i, j = nodes[depth, 0], nodes[depth, 1]
+        px, py, pz, wx, wy, wz = (
+            at[depth, 0],
+            at[depth, 1],
+            at[depth, 2],
+            at[depth, 3],
+            at[depth, 4],
+            at[depth, 5],
+        )
+        bx, by, bz = at[depth, 6], at[depth, 7], at[depth, 8]
+        radius_a, radius_b = a.radius[i] * STRETCH, b.radius[j] * STRETCH
+        both = (radius_a + radius_b + chord.room) * (1.0 + 1e-12)
+        if _least_square(px - bx, py - by, pz - bz, wx, wy, wz, _latest(scratch)) > both * both:
+            continue
+        first_a, first_b = a.first[i], b.first[j]
+        if first_a < 0 and first_b < 0:
+            _leaves(meeting, chord, i, j, bx, by, bz, radius_b)
+            if scratch.first[0] <= 0.0:
+                return
+        elif first_b < 0 or (first_a >= 0 and radius_a > radius_b):
+            counters[0] += a.count[i]
+            for child in range(first_a, first_a + a.count[i]):
+                nodes[depth, 0], nodes[depth, 1] = child, j
+                _place_chord(meeting, child, at, depth)
+                at[depth, 6], at[depth, 7], at[depth, 8] = bx, by, bz
+                depth += 1
+        else:
+            counters[0] += b.count[j]
+            for child in range(first_b, first_b + b.count[j]):
+                nodes[depth, 0], nodes[depth, 1] = i, child
+                at[depth, 0], at[depth, 1], at[depth, 2] = px, py, pz
+                at[depth, 3], at[depth, 4], at[depth, 5] = wx, wy, wz
+                _place_standing(meeting, child, at, depth)
+                depth += 1
+
+
+@borrowing
+def _search(meeting, t0, t1):
+    """One descent over [t0, t1]. Fills scratch.first and pair; returns whether halving is of no use."""
+    motion, scratch = meeting.motion, meeting.scratch
+    ends, shifts = scratch.ends, scratch.shifts
+    pose_at(motion, t0, ends[0])
+    pose_at(motion, t1, ends[1])
+    for r in range(3):
+        shifts[0, r], shifts[1, r] = ends[0, r, 3], ends[1, r, 3]
+    sagitta = motion.bend * (t1 - t0) * (t1 - t0) / 8.0 * UNITS_PER_METRE
+    # The standing point is a whole number but where float64 has none left for it: `error` holds that.
+    loose = (2.0 * motion.slip + meeting.error) * UNITS_PER_METRE
+    band = (0.8661 + sagitta + loose) * (1.0 + 1e-9)
+    outer = np.float64(meeting.units) + band
+    final = sagitta <= _LEAST_SAGITTA
+    room = outer / UNITS_PER_METRE + 2.0 / UNITS_PER_METRE + 8.0 * meeting.error
+    _descend(meeting, _Chord(t0, np.float64(meeting.units) - band, outer, room, final))
+    return final
+
+
+@borrowing
+def _advance(meeting, size, until, tolerance):
+    """How far nothing touches, where that is before `until`; else inf. scratch.pair is then what comes first."""
+    motion, first = meeting.motion, meeting.scratch.first
+    longest = 1.0
+    if motion.bend > 8.0 * _CHORD_BEND * size:
+        longest = math.sqrt(8.0 * _CHORD_BEND * size / motion.bend)
+    t, length, refused = 0.0, longest, 0
+    while True:
+        after = until if t + length >= until else t + length
+        final = _search(meeting, t, after)
+        if first[0] == INFINITE:
+            if after >= until:
+                return INFINITE
+            t, length = after, min(2.0 * length, longest)
+            continue
+        since = max(t, t + first[0] * (after - t) - 2.0**-52)
+        sure = t + first[1] * (after - t) if first[1] <= 1.0 else INFINITE
+        refused += 1
+        if final or refused > _MOST_REFUSED or motion.speed * (sure - since) <= tolerance:
+            return since
+        length = max(min(sure - since, 0.25 * (after - t)), 2.0**-52)
+        t = since
+
+
+@nb.njit(nogil=True, cache=True)
+def sweep_bodies(
+    a, box, units_a, first, last, b, poses, units_b, rows, origin, margin_units, tolerance, until, witness, scratch
+):  # fmt: skip
+    """Which of some bodies that stand, all of avatar b, ends a motion of avatar a first; neither avatar empty.
+
+    box: (2, 3) of a.  first, last: (4, 4), checked, rigid, translations from the origin.  poses: (n, 4, 4), checked,
+    rigid, world.  units_a, units_b, margin_units: radii and margin, exact units.  rows: (m,) int64, of poses.
+    until: what comes no sooner is of no interest; inf: all.  Returns (row, fraction): nothing of these touches before,
+    and the row's body does, or all but, at most `tolerance` [m] of the fastest point's way later; (-1, until) if none
+    does. Writes witness (2, 3): the centres of the two spheres there, world [m]. Adds to scratch.counters.
+    """
+    motion = make_motion(first, last, box, np.zeros(3))
+    shift, shifts = np.empty(3), scratch.shifts
+    pose = np.empty((4, 4))
+    size = 1e-6
+    for r in range(3):
+        shift[r] = 0.0
+        size += abs(box[1, r] - box[0, r])
+    largest_a = a.radius[0]
+    for end in (first, last):
+        for r in range(3):
+            shift[r] = end[r, 3]
+        term = largest_term(end, shift, a.center[0, 0], a.center[0, 1], a.center[0, 2])
+        largest_a = max(largest_a, term + a.radius[0])
+    best, found = -1, until
+    for at in range(rows.shape[0]):
+        row = rows[at]
+        for r in range(3):
+            shifts[2, r] = poses[row, r, 3] - origin[r]
+        largest = largest_term(poses[row], shifts[2], b.center[0, 0], b.center[0, 1], b.center[0, 2])
+        error = max(largest_a, largest + b.radius[0]) * 2.0**-49
+        units = np.int64(units_a + units_b + margin_units)
+        meeting = _Meeting(motion, a, b, poses[row], units, error, scratch)
+        stop = min(found, 1.0)
+        since = _advance(meeting, size, stop, tolerance)
+        if since >= found or since == INFINITE:
+            continue
+        best, found = row, since
+        pair = scratch.pair
+        pose_at(motion, since, pose)
+        for r in range(3):
+            shift[r] = pose[r, 3]
+        for r in range(3):
+            p, q = a.points, b.points
+            x, y, z = p[pair[0], 0, pair[1]], p[pair[0], 1, pair[1]], p[pair[0], 2, pair[1]]
+            witness[0, r] = place(pose, shift, r, x, y, z) + origin[r]
+            x, y, z = q[pair[2], 0, pair[3]], q[pair[2], 1, pair[3]], q[pair[2], 2, pair[3]]
+            witness[1, r] = place(poses[row], shifts[2], r, x, y, z) + origin[r]
+    return best, found

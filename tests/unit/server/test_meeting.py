@@ -1,0 +1,206 @@
+"""A moving avatar against one that stands, by the kernel alone: the judge steps along and asks every pair of points."""
+
+import os
+from typing import NamedTuple
+
+import cases
+import naive
+import naive_sweep
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from solidcloud.server.avatar import AvatarModel, make_avatar
+from solidcloud.server.kernels import meeting as kernel
+from swept import turned
+
+pytestmark = pytest.mark.interpreted
+INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
+
+ORIGIN = np.array([3.0, -20.0, 500.0])
+TOLERANCE = 1e-6
+
+
+class Asked(NamedTuple):
+    """What the kernel said. row: of the body, -1: none.  fraction: nothing touches before.  witness: (2, 3)."""
+
+    row: int
+    fraction: float
+    witness: NDArray[np.float64]
+
+
+def box_of(model: AvatarModel) -> NDArray[np.float64]:
+    return np.array([model.points.min(axis=0), model.points.max(axis=0)])
+
+
+def units_of(model: AvatarModel) -> int:
+    return int(np.rint(model.radius * naive.UNITS))
+
+
+def ask(
+    a: AvatarModel, first: NDArray[np.float64], last: NDArray[np.float64],
+    b: AvatarModel, poses: NDArray[np.float64], margin: float = 0.0, until: float = np.inf,
+) -> Asked:  # fmt: skip
+    """Ask for all bodies at once."""
+    ends = [pose.copy() for pose in (first, last)]
+    for end in ends:
+        end[:3, 3] -= ORIGIN
+    witness = np.full((2, 3), np.nan)
+    row, fraction = kernel.sweep_bodies(
+        a.arrays, box_of(a), units_of(a), *ends, b.arrays, poses, units_of(b), np.arange(len(poses)), ORIGIN,
+        int(np.rint(margin * naive.UNITS)), TOLERANCE, until, witness, kernel.make_scratch(),
+    )  # fmt: skip
+    return Asked(int(row), float(fraction), witness)
+
+
+def touching(
+    a: AvatarModel, first: NDArray[np.float64], last: NDArray[np.float64],
+    b: AvatarModel, pose: NDArray[np.float64], fractions: NDArray[np.float64], more_units: int = 0,
+) -> NDArray[np.bool_]:  # fmt: skip
+    """Whether a touches b at each of the fractions, by the definition; more_units: of reach."""
+    ends = [end.copy() for end in (first, last)]
+    for end in ends:
+        end[:3, 3] -= ORIGIN
+    standing = naive.placed_units(b.points, pose, ORIGIN)
+    reach = units_of(a) + units_of(b) + more_units
+    return np.array(
+        [
+            naive.touches(
+                naive.placed_units(a.points, naive_sweep.pose_at(*ends, float(t)), np.zeros(3)), standing, reach
+            )
+            for t in fractions
+        ]
+    )  # fmt: skip
+
+
+def at(x: float) -> NDArray[np.float64]:
+    """The pose that only moves, from the origin."""
+    return cases.pose_of(np.eye(3), ORIGIN + np.array([x, 0.0, 0.0]))
+
+
+def random_motion(
+    rng: np.random.Generator, way: float, turn: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    first = cases.pose_of(cases.random_rotation(rng), ORIGIN + rng.normal(size=3) * 0.5)
+    last = first.copy()
+    last[:3, :3] = turned(rng, first[:3, :3], turn)
+    last[:3, 3] += rng.normal(size=3) * way
+    return first, last
+
+
+@pytest.mark.parametrize(("way", "turn"), [(1.0, 0.0), (30.0, 0.0), (0.5, 0.7), (0.0, 3.1), (5.0, 2.0)])
+def test_nothing_touches_before_what_is_said_and_something_does_soon_after(way: float, turn: float) -> None:
+    rng = np.random.default_rng(round(way * 10 + turn * 100))
+    a = make_avatar(rng.normal(size=(40, 3)) * 0.2, 0.02)
+    b = make_avatar(rng.normal(size=(90, 3)) * np.array([0.3, 0.02, 0.3]), 0.015)
+    met = clear = 0
+    for _ in range(12 if INTERPRETED else 40):
+        first, last = random_motion(rng, way, turn)
+        pose = cases.pose_of(cases.random_rotation(rng), ORIGIN + rng.normal(size=3) * 0.5)
+        found = ask(a, first, last, b, pose[None])
+        said = (first.tolist(), last.tolist(), pose.tolist(), found)
+        before = np.linspace(0, 1, 40)
+        if found.row < 0:
+            clear += 1
+            assert found.fraction == np.inf
+            assert not touching(a, first, last, b, pose, before).any(), said
+            continue
+        far = found.fraction
+        close = far - far * np.geomspace(1e-14, 1e-2, 10)
+        before = np.concatenate(
+            [before[before < far], close[close < far], [np.nextafter(far, 0)] if far else []]
+        )
+        assert not touching(a, first, last, b, pose, before).any(), said
+        # Soon: some point goes no more than the tolerance, or it is a graze: within 1.2 units of a contact there.
+        after = np.linspace(far, min(1.0, far + 4 * TOLERANCE / max(way + turn, 1e-3)), 9)
+        grazes = touching(a, first, last, b, pose, np.array([far]), more_units=3)
+        assert touching(a, first, last, b, pose, after).any() or grazes.any(), said
+        apart = np.linalg.norm(found.witness[0] - found.witness[1])
+        assert apart <= a.radius + b.radius + 2 * TOLERANCE, said
+        met += 1
+    assert met and (clear or way == 0)
+
+
+def test_a_leaf_of_two_centimetres_is_met_at_fifty_metres_a_step() -> None:
+    """A door leaf: two sheets of points, 2 cm thick with its spheres."""
+    side = np.arange(-0.4, 0.41, 0.05 if INTERPRETED else 0.02)
+    y, z = (grid.ravel() for grid in np.meshgrid(side, side))
+    leaf = make_avatar(np.stack([np.zeros_like(y), y, z], axis=1), 0.025 if INTERPRETED else 0.01)
+    rng = np.random.default_rng(1)
+    ball = rng.normal(size=(50, 3))
+    ball = make_avatar(0.2 * ball / np.linalg.norm(ball, axis=1)[:, None], 0.02)
+    pose = cases.pose_of(np.eye(3), ORIGIN)
+    for way in (0.5, 5.0, 50.0, 500.0):
+        for _ in range(2 if INTERPRETED else 20):
+            start = np.array([-way * rng.uniform(0.3, 0.7) - 0.3, rng.uniform(-0.2, 0.2), 0.0])
+            first = cases.pose_of(cases.random_rotation(rng), ORIGIN + start)
+            last = first.copy()
+            last[:3, 3] += [way + 0.6, 0, 0]
+            found = ask(ball, first, last, leaf, pose[None])
+            assert found.row == 0
+            there = first[0, 3] + found.fraction * (last - first)[0, 3] - ORIGIN[0]
+            assert -0.2 - 0.02 - leaf.radius - 1e-6 <= there < 0
+            assert abs(found.witness[1, 0] - ORIGIN[0]) < 1e-7
+
+
+def test_the_first_of_several_is_named_and_what_comes_later_than_asked_is_not() -> None:
+    one = make_avatar(np.zeros((1, 3)), 0.5)
+    poses = np.array([at(x) for x in (7.0, 3.0, 5.0, 3.0)])
+    first, last = (at(x) for x in (0.0, 10.0))
+    found = ask(one, first, last, one, poses)
+    assert found.row == 1  # the first of two that are met at the same moment
+    assert abs(found.fraction - 0.2) < 1e-8
+    assert np.allclose(found.witness - ORIGIN, [[2, 0, 0], [3, 0, 0]], atol=1e-7)
+    assert abs(ask(one, first, last, one, poses, margin=0.5).fraction - 0.15) < 1e-8
+    later = ask(one, first, last, one, poses, until=0.2 - 1e-6)
+    assert later.row == -1 and later.fraction == 0.2 - 1e-6
+
+
+def test_what_all_but_touches_can_be_left_and_not_gone_into() -> None:
+    """Spheres 0.6 units apart, one as they are rounded: below what a sweep can tell from a contact."""
+    unit = 2.0**-26
+    one = make_avatar(np.zeros((1, 3)), 0.5)
+    pose = at(1 + unit)
+    first = at(0.4 * unit)
+    for way, ends in (((-1, 0, 0), False), ((0, 1, 0), False), ((0, 0, 0), False), ((1, 0, 0), True)):
+        last = first.copy()
+        last[:3, 3] += way
+        found = ask(one, first, last, one, pose[None])
+        assert (found.row == 0) == ends, way
+        assert found.fraction == (0 if ends else np.inf)
+    last = at(-1)
+    assert ask(one, at(0), last, one, at(1)[None]).fraction == 0
+
+
+@pytest.mark.parametrize("turn", [0.0, 1.5, 3.1])
+def test_bodies_whose_bounds_a_motion_does_not_meet_are_not_touched(turn: float) -> None:
+    rng = np.random.default_rng(5)
+    a = make_avatar(rng.normal(size=(20, 3)) * 0.3 + [0.5, 0, 0], 0.05)
+    b = make_avatar(rng.normal(size=(20, 3)) * 0.2, 0.05)
+    n, near = 20, 0
+    kinds = np.array([1, 2, 4, 4] * 5, np.uint8)
+    for _ in range(2 if INTERPRETED else 10):
+        first, last = random_motion(rng, 1.0, turn)
+        poses = np.array(
+            [cases.pose_of(cases.random_rotation(rng), ORIGIN + rng.normal(size=3) * 2) for _ in range(n)]
+        )
+        bounds = np.empty((n, 2, 3))
+        for pose, bound in zip(poses, bounds, strict=True):
+            kernel.bound_body(box_of(b), pose, ORIGIN, b.radius, bound)
+            placed = (pose[:3, :3] @ b.points.T).T + pose[:3, 3] - ORIGIN
+            assert (bound[0] <= placed.min(axis=0) - b.radius).all()
+            assert (bound[1] >= placed.max(axis=0) + b.radius).all()
+        ends = [pose.copy() for pose in (first, last)]
+        for end in ends:
+            end[:3, 3] -= ORIGIN
+        rows = np.empty(n, np.int64)
+        for wanted, skip in ((7, -1), (4, 2)):
+            count = kernel.find_near(box_of(a), *ends, a.radius, bounds, kinds, wanted, skip, rows)
+            named = rows[:count].tolist()
+            assert named == sorted(named) and skip not in named
+            assert all(kinds[row] & wanted for row in named)
+            near += count
+            for row in range(n):
+                if row in named or row == skip or not kinds[row] & wanted:
+                    continue
+                assert ask(a, first, last, b, poses[row : row + 1]).row < 0, (row, poses[row].tolist())
+    assert 0 < near < (20 if INTERPRETED else 200)

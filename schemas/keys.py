@@ -10,7 +10,7 @@ from .errors import BadRequestError
 ROOT = "solidcloud/1"
 OPERATIONS = (
     "info", "add_avatar", "collide", "distance", "contacts", "sweep", "raycast", "within", "objects", "path",
-    "reload", "stats",
+    "move", "reload", "stats",
 )  # fmt: skip
 
 _NAME = re.compile(r"[A-Za-z0-9._-]{1,64}")
@@ -22,6 +22,13 @@ class Route(NamedTuple):
     scene: str
     client: str
     operation: str
+
+
+class User(NamedTuple):
+    """One avatar of one client, in one scene: who wishes, and whom a state is of."""
+
+    client: str
+    avatar: str
 
 
 def check_name(name: str, what: str) -> str:
@@ -78,3 +85,41 @@ def client_alive_key(scene: str, client: str) -> str:
 def clients_alive_key(scene: str) -> str:
     """What a server listens to: the tokens of all clients of its scene."""
     return f"{ROOT}/client/{check_name(scene, 'scene')}/*"
+
+
+def wish_key(scene: str, user: User) -> str:
+    """Where a client publishes what its avatar wishes; deleted, the avatar leaves the scene."""
+    return _user_key("wish", scene, user)
+
+
+def wishes_key(scene: str) -> str:
+    """What a server listens to: the wishes of all users of its scene."""
+    return f"{ROOT}/wish/{check_name(scene, 'scene')}/*/*"
+
+
+def parse_wish(key: str) -> User:
+    """Whose wish comes under this key; BadRequestError where it is none, wildcards included."""
+    prefix = f"{ROOT}/wish/"
+    parts = key.removeprefix(prefix).split("/")
+    if not key.startswith(prefix) or len(parts) != 3:
+        raise BadRequestError(f"key {key!r}: expected {prefix}SCENE/CLIENT/AVATAR")
+    wish_key(parts[0], user := User(parts[1], parts[2]))
+    return user
+
+
+def state_key(scene: str, user: User) -> str:
+    """Where a server publishes what came of a user's wishes."""
+    return _user_key("state", scene, user)
+
+
+def refused_key(scene: str, user: User) -> str:
+    """Where a server says why a wish has no state."""
+    return _user_key("refused", scene, user)
+
+
+def _user_key(what: str, scene: str, user: User) -> str:
+    """A key of one user."""
+    check_name(scene, "scene")
+    check_name(user.client, "client")
+    check_name(user.avatar, "avatar of a session")
+    return f"{ROOT}/{what}/{scene}/{user.client}/{user.avatar}"

@@ -1,6 +1,6 @@
 """What is said on the wire: requests and answers as types, and their JSON Schemas.
 
-WIRE.md is this file, requests.py, answers.py, stats.py and encoding.py in prose. No zenoh here.
+WIRE.md is this file, requests.py, answers.py, moves.py, stats.py and encoding.py in prose. No zenoh here.
 """
 
 import inspect
@@ -34,6 +34,7 @@ from .encoding import (
     wire_encoding,
 )
 from .errors import ErrorCode
+from .moves import Moved, MoveRequest, State, Wish
 from .requests import (
     MAX_AVATAR_POINTS,
     MAX_POSES,
@@ -67,6 +68,9 @@ __all__ = [
     "ContactsRequest",
     "DistanceRequest",
     "ErrorReply",
+    "MoveRequest",
+    "Moved",
+    "ObjectInfo",
     "ObjectsRequest",
     "PathRequest",
     "Poses",
@@ -76,10 +80,13 @@ __all__ = [
     "SceneInfo",
     "ScenesAnswer",
     "SourceInfo",
+    "SpawnInfo",
+    "State",
     "StatsAnswer",
     "StatsRequest",
     "SweepRequest",
     "UserStats",
+    "Wish",
     "WithinRequest",
     "check_answers",
     "decode_answer",
@@ -133,6 +140,25 @@ class SourceInfo(msgspec.Struct, frozen=True):
     fault: str = ""
 
 
+class SpawnInfo(msgspec.Struct, frozen=True):
+    """Where users of a scene begin. position: of the avatar's origin, world [m].  heading: about `up` [degrees]."""
+
+    position: tuple[float, float, float]
+    heading: float = 0.0
+
+
+class ObjectInfo(msgspec.Struct, frozen=True):
+    """A dynamic object of a scene. avatar: its shape, of the scene's avatars.  pose: 4x4 row-major, where it begins.
+
+    kind: `kinematic`: where it is told to be; `pushed`: users push it. A reader takes others for kinematic.
+    """
+
+    name: str
+    avatar: str
+    pose: list[list[float]]
+    kind: str = "kinematic"
+
+
 class SceneInfo(msgspec.Struct, frozen=True):
     """What a scene is: counts, bounds, lattice, radius, and what went into it.
 
@@ -141,11 +167,14 @@ class SceneInfo(msgspec.Struct, frozen=True):
     lattice_source: "sources", "given" or "default".  moved_max: farthest a point moved onto the lattice [m].
     radius_sample: points the mean closest-point distance was taken of.  degree, leaf: of the hierarchies.
     skipped: scans left out with `--skip-bad`.  record_bytes: of all records on disk.
-    resident_bytes: of the whole archive, decoded.  effects: names a request may use; none in version 1.
+    resident_bytes: of the whole archive, decoded.  effects: what its frames simulate; what is not there is not.
     unknown: boxes like `bounds` of scans left out, where nothing is called clear; unknown_everywhere: of one of
     them not even the bounds are known.  radius_models: stored, so that a question may ask for them.
     generation: how often scans were added or removed since the build.  radius_now: what `radius` would be, were it
     measured of the points of this generation; radius_now_error: its standard error [m]; null: not known.
+    avatars: the scene's own, which every client may ask about by their names.  up: unit vector against gravity.
+    spawn: where users begin; null: where they say.  objects: that move, and where they begin.  default_radius_model:
+    what a question that names none is asked under; null: `radius`.
     """
 
     scene: str
@@ -176,6 +205,11 @@ class SceneInfo(msgspec.Struct, frozen=True):
     generation: int = 0
     radius_now: float | None = None
     radius_now_error: float | None = None
+    avatars: list[AvatarInfo] = []
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    spawn: SpawnInfo | None = None
+    objects: list[ObjectInfo] = []
+    default_radius_model: str | None = None
 
 
 class ReloadAnswer(msgspec.Struct, frozen=True):
@@ -223,6 +257,10 @@ MESSAGES: tuple[type, ...] = (
     DistancePart,
     ContactsPart,
     SweepPart,
+    MoveRequest,
+    Moved,
+    Wish,
+    State,
     ReloadAnswer,
     StatsRequest,
     StatsAnswer,

@@ -3,7 +3,8 @@
 What an effect says is a field of `Moved` that is left out where the scene does not call for the effect.
 """
 
-from typing import Annotated
+import math
+from collections.abc import Iterable
 
 import msgspec
 import numpy as np
@@ -14,8 +15,8 @@ from .errors import BadRequestError
 from .requests import Count, Length, Name, Request, check_one_pose
 
 Vector = tuple[float, float, float]
-Seconds = Annotated[float, msgspec.Meta(ge=0, le=10)]
 
+LONGEST_SECONDS = 10.0
 # Of one frame, 30 of which make a second, for whoever does not say [s].
 FRAME_SECONDS = 1 / 30
 
@@ -24,18 +25,20 @@ class MoveRequest(Request, frozen=True, kw_only=True):
     """Ask where an avatar gets that goes from one pose towards another, and what it meets; nothing is remembered.
 
     avatar: the name it was added under.  pose_from, pose_to: (1, 4, 4) float64, avatar to world, rigid.
-    seconds: the frame lasts, which gravity asks for [s].
+    seconds: the frame lasts, which gravity asks for, at most 10 [s].
     """
 
     avatar: Name
     pose_from: Poses
     pose_to: Poses
-    seconds: Seconds = FRAME_SECONDS
+    seconds: Length = FRAME_SECONDS
 
     def __post_init__(self) -> None:
         Request.__post_init__(self)
         check_one_pose("pose_from", self.pose_from)
         check_one_pose("pose_to", self.pose_to)
+        if self.seconds > LONGEST_SECONDS:
+            raise BadRequestError(f"seconds is {self.seconds}: expected {LONGEST_SECONDS:g} at most")
 
 
 class Wish(Request, frozen=True, kw_only=True):
@@ -60,6 +63,19 @@ class Wish(Request, frozen=True, kw_only=True):
             raise BadRequestError("a wish has pose or velocity: expected one of them")
         if len(self.pose):
             check_one_pose("pose", self.pose)
+        _check_finite("velocity", self.velocity or ())
+        _check_finite("turn", [self.turn])
+        for name, rows in self.objects.items():
+            if [len(row) for row in rows] != [4, 4, 4, 4]:
+                raise BadRequestError(f"object {name!r}: expected a pose of 4 rows of 4 numbers")
+            _check_finite(f"pose of object {name!r}", [number for row in rows for number in row])
+
+
+def _check_finite(what: str, numbers: Iterable[float]) -> None:
+    """BadRequestError for a number no answer exists for (NUMERICS.md N7)."""
+    for number in numbers:
+        if not math.isfinite(number):
+            raise BadRequestError(f"{what} holds {number}: expected finite numbers")
 
 
 class Touched(msgspec.Struct, frozen=True, omit_defaults=True):

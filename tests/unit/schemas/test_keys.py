@@ -13,6 +13,11 @@ def test_keys_look_as_in_the_document():
     assert keys.server_alive_key("hall", "ab12") == "solidcloud/1/alive/hall/ab12"
     assert keys.client_alive_key("hall", "c-1") == "solidcloud/1/client/hall/c-1"
     assert keys.clients_alive_key("hall") == "solidcloud/1/client/hall/*"
+    user = keys.User("c-1", "al")
+    assert keys.wish_key("hall", user) == "solidcloud/1/wish/hall/c-1/al"
+    assert keys.wishes_key("hall") == "solidcloud/1/wish/hall/*/*"
+    assert keys.state_key("hall", user) == "solidcloud/1/state/hall/c-1/al"
+    assert keys.refused_key("hall", user) == "solidcloud/1/refused/hall/c-1/al"
     assert f"solidcloud/{WIRE_VERSION}" == keys.ROOT
 
 
@@ -20,6 +25,25 @@ def test_a_question_is_read_as_it_was_written():
     for operation in keys.OPERATIONS:
         route = keys.parse_question(keys.question_key("St.Peter_2", "a", operation))
         assert route == keys.Route("St.Peter_2", "a", operation)
+
+
+def test_a_wish_is_read_as_it_was_written():
+    user = keys.User("c-1", "al.2")
+    assert keys.parse_wish(keys.wish_key("hall", user)) == user
+
+
+@pytest.mark.parametrize(
+    "key",
+    [
+        "solidcloud/1/wish/hall/c",
+        "solidcloud/1/wish/hall/c/al/x",
+        "solidcloud/1/wish/hall/*/al",
+        "solidcloud/1/state/hall/c/al",
+    ],
+)
+def test_keys_that_are_no_wish_are_refused(key):
+    with pytest.raises(BadRequestError):
+        keys.parse_wish(key)
 
 
 @pytest.mark.parametrize("name", ["", "a" * 65, "a/b", "*", "**", "a b", "häll", "a\n", "$*", "a?b", "#"])
@@ -30,6 +54,9 @@ def test_bad_names_are_refused(name):
         lambda: keys.questions_key(name),
         lambda: keys.client_alive_key("hall", name),
         lambda: keys.server_alive_key(name, "s"),
+        lambda: keys.wish_key("hall", keys.User("c", name)),
+        lambda: keys.state_key("hall", keys.User(name, "al")),
+        lambda: keys.wishes_key(name),
     ):
         with pytest.raises(BadRequestError, match="expected 1 to 64"):
             make()

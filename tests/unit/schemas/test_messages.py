@@ -27,6 +27,8 @@ from solidcloud.schemas.messages import (
     make_positions,
     wire_encoding,
 )
+from solidcloud.schemas.requests import Request
+from solidcloud.schemas.scene import json_schema
 
 SCHEMAS = Path(messages.__file__).parent
 
@@ -270,7 +272,7 @@ def test_poses_of_the_wrong_shape_are_refused_before_they_are_sent(poses):
 
 
 def test_schemas_on_disk_are_current():
-    expected = messages.json_schemas()
+    expected = {**messages.json_schemas(), "Scene": json_schema()}
     found = {path.stem: path.read_text() for path in (SCHEMAS / "json").glob("*.json")}
     assert found == expected, "run scripts/make_schemas"
 
@@ -296,7 +298,7 @@ def test_there_are_worked_examples():
 @pytest.mark.parametrize("name, text, digits", worked_examples())
 def test_worked_example(name, text, digits):
     kind = getattr(messages, name)
-    decode = decode_request if name.endswith("Request") else decode_answer
+    decode = decode_request if issubclass(kind, Request) else decode_answer
     bits = bytes.fromhex(digits)
     for message in (decode(kind, text.encode(), JSON), decode(kind, bits, MSGPACK)):
         assert encode(message, JSON).decode() == text

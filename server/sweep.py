@@ -11,7 +11,7 @@ from ..schemas.errors import BadRequestError, BadTransformError
 from ..schemas.voxel_grid import MAX_COORDINATE, UNITS_PER_METRE
 from .avatar import AvatarModel
 from .effort import EXACT, Effort
-from .kernels.advance import Progress, look_around, plan_segments, sweep_segments
+from .kernels.advance import Progress, avatar_box, look_around, plan_segments, sweep_segments
 from .kernels.placing import SIMILARITY_TOLERANCE, check_poses
 from .kernels.reach import Reach
 from .request import SceneData, as_held, kernel_poses, pieces, refuse, to_units
@@ -128,12 +128,23 @@ def sweep(
     proved = np.ones(k)
     if not len(avatar.points) or not k:
         return _answers(progress, proved, counts, outside, tolerance)
-    residency, spent = data.residency, Spent(begin)
+    residency, spent, box = data.residency, Spent(begin), avatar_box(avatar.arrays)
     starts, rows = np.zeros(k + 1, np.int64), np.empty(16 * k + 64, np.int64)
     which = np.arange(k)
     while len(which):
         needed = plan_segments(
-            first, last, avatar.arrays, scales, units, data.arrays, data.broad, which, progress, starts, rows
+            box,
+            first,
+            last,
+            avatar.arrays,
+            scales,
+            units,
+            data.arrays,
+            data.broad,
+            which,
+            progress,
+            starts,
+            rows,
         )
         if needed > len(rows):
             rows = np.empty(2 * needed, np.int64)
@@ -149,15 +160,27 @@ def sweep(
                     if effort.spent:
                         progress.visits[part[at:]] = -1
                     sweep_segments(
-                        first, last, avatar.arrays, avatar.radius, other_units, scales, units, loose, seen.arrays,
-                        data.broad, reach.starts, reach.rows, part[at : at + chunk], tolerance, progress, counts,
+                        box, first, last, avatar.arrays, avatar.radius, other_units, scales, units, loose,
+                        seen.arrays, data.broad, reach.starts, reach.rows, part[at : at + chunk], tolerance, progress,
+                        counts,
                     )  # fmt: skip
             spent.add(held)
         which = _next_round(which, progress, proved)
     until = np.minimum(progress.upper, 1.0)
     lost = np.empty(k)
     look_around(
-        first, last, avatar.arrays, scales, units, data.arrays, data.broad, data.unknown, until, outside, lost
+        box,
+        first,
+        last,
+        avatar.arrays,
+        scales,
+        units,
+        data.arrays,
+        data.broad,
+        data.unknown,
+        until,
+        outside,
+        lost,
     )
     if data.unknown_everywhere:
         lost[:] = 0.0

@@ -19,7 +19,8 @@ class Hit(NamedTuple):
     """What ended a motion. fraction: of the motion, gone.  verdict: CONTACT or UNKNOWN.
 
     avatar, cloud: (3,) centres of the two spheres that touch, world [m]; None where UNKNOWN.  what: "" the scene, else
-    the object or user.  archive: which of the scene's archives; -1: none of them.
+    the object or user.  archive: which of the scene's archives; -1: none of them.  normal: (3,) unit, of the surface
+    touched, towards the avatar; None where nobody estimated it.
     """
 
     fraction: float
@@ -28,6 +29,7 @@ class Hit(NamedTuple):
     cloud: Vec | None
     what: str = ""
     archive: int = -1
+    normal: Vec | None = None
 
 
 class Obstacle(Protocol):
@@ -52,10 +54,10 @@ class Obstacle(Protocol):
 
 @dataclass(slots=True)
 class Body:
-    """What is remembered of a user between frames. avatar: its model.  pose: where it is.
+    """What is remembered of a user between frames. name: client/avatar.  avatar: its model.  pose: where it is.
 
     fall_speed: [m/s], 0 on the ground.  on_ground: whether the last frame left it standing.  clear: whether `pose` was
-    found clear.  kept: what an effect keeps for itself, by its name.
+    found clear, of the archives `generations` (World.generations).  kept: what an effect keeps for itself, by its name.
     """
 
     name: str
@@ -64,6 +66,7 @@ class Body:
     fall_speed: float = 0.0
     on_ground: bool = False
     clear: bool = False
+    generations: tuple[int, ...] = ()
     kept: dict[str, Any] = field(default_factory=dict)
 
 
@@ -72,8 +75,10 @@ class Frame:
     """One user's one frame. body: as the frame before left it; written once, when the frame is done (pipeline.py).
 
     wish: where to.  seconds: since the frame before.  world: what is asked (world.py).  pose, verdict: so far.
-    left: (3,) of the translation wished, not gone yet [m].  hits: what ended motions, in order.  obstacles: what else
-    blocks.  go: as far as nothing is touched; `stop` puts it there.  reports: fields of `Moved`.
+    clear: whether nothing is touched at `pose`, which is asked once: `go` keeps it so.
+    left: (3,) of the translation wished, not gone yet [m].  hits: what ended motions, in order.  blocked: what ended
+    the wish, or what was gone of it last; None: nothing did.  obstacles: what else blocks.  go: as far as nothing is
+    touched; `stop` or `sweep` puts it there.  reports: fields of `Moved`.
     """
 
     body: Body
@@ -83,8 +88,10 @@ class Frame:
     effort: Effort = EXACT
     pose: Pose = field(default_factory=lambda: np.eye(4))
     verdict: Verdict = Verdict.CLEAR
+    clear: bool = False
     left: Vec = field(default_factory=lambda: np.zeros(3))
     hits: list[Hit] = field(default_factory=list)
+    blocked: Hit | None = None
     obstacles: list[Obstacle] = field(default_factory=list)
     go: "Go | None" = None
     fall_speed: float = 0.0
@@ -99,7 +106,11 @@ Go = Callable[[Frame, Pose], Hit | None]
 
 
 class Runner(Protocol):
-    """One effect of one scene. It keeps nothing of a user but in `Body`."""
+    """One effect of one scene. It keeps nothing of a user but in `Body`.
+
+    A module of effects makes one: `make(effect, world)`. One with a method `begin(frame)`, too, is called before any
+    effect runs: it may change the wish.
+    """
 
     name: str
 

@@ -177,16 +177,15 @@ def _list_rows(begin, end, span, still, scene, index, rows, count):
 
 
 @nb.njit(nogil=True, cache=True)
-def plan_segments(first, last, avatar, scales, units, scene, index, which, progress, starts, rows):
+def plan_segments(box, first, last, avatar, scales, units, scene, index, which, progress, starts, rows):
     """The next segment of each motion numbered in `which` that reaches any voxel, and those voxels.
 
-    first, last: (k, 4, 4), checked.  scales, units: (k,), the larger of either end's.  Reads progress.at and moves
-    it on to where the segment begins, all before being out of reach of everything; writes end and speed; `at` is 1 for
-    a motion with nothing left in reach, which gets no rows. Fills starts (k + 1,) and rows (capacity,) int64, with no
-    rows for motions not in `which` (ascending). Returns how many rows there are; those beyond the capacity are not
-    written, and progress.at is then as it was.
+    box: `avatar_box`.  first, last: (k, 4, 4), checked.  scales, units: (k,), the larger of either end's.  Reads
+    progress.at and moves it on to where the segment begins, all before being out of reach of everything; writes end and
+    speed; `at` is 1 for a motion with nothing left in reach, which gets no rows. Fills starts (k + 1,) and rows
+    (capacity,) int64, with no rows for motions not in `which` (ascending). Returns how many rows there are; those
+    beyond the capacity are not written, and progress.at is then as it was.
     """
-    box = avatar_box(avatar)
     pose, shift, begin, end = np.empty((4, 4)), np.empty(3), np.empty(3), np.empty(3)
     moved = np.empty(which.shape[0])
     count, next_start = 0, 0
@@ -226,17 +225,16 @@ def plan_segments(first, last, avatar, scales, units, scene, index, which, progr
 
 @nb.njit(nogil=True, cache=True)
 def sweep_segments(
-    first, last, avatar, radius, other_units, scales, units, loose, scene, index, starts, rows, which, tolerance,
+    box, first, last, avatar, radius, other_units, scales, units, loose, scene, index, starts, rows, which, tolerance,
     progress, counts,
 ):  # fmt: skip
     """Advance the motions numbered in `which` along their segments: one call for all of a piece.
 
-    first, last, scales, units: as in `plan_segments`.  loose: (k,) what units may differ by on the way.  starts, rows:
-    the voxels of each motion's segment that this piece holds.  tolerance: [m].  Lowers progress.lower and upper, names
-    a witness with upper, and adds to counts (4, k): voxels missing, node visits, point tests, advances.
+    box, first, last, scales, units: as in `plan_segments`.  loose: (k,) what units may differ by on the way.  starts,
+    rows: the voxels of each motion's segment that this piece holds.  tolerance: [m].  Lowers progress.lower and upper,
+    names a witness with upper, and adds to counts (4, k): voxels missing, node visits, point tests, advances.
     A voxel that is not resident is unknown from where the root sphere's cube reaches it.
     """
-    box = avatar_box(avatar)
     moving = make_moving(avatar, scene.drop)
     begin, end = np.empty(3), np.empty(3)
     for number in range(which.shape[0]):
@@ -360,13 +358,12 @@ def _name_witness(job, t, witness):
 
 
 @nb.njit(nogil=True, cache=True)
-def look_around(first, last, avatar, scales, units, scene, index, unknown, until, outside, lost):
+def look_around(box, first, last, avatar, scales, units, scene, index, unknown, until, outside, lost):
     """What lies around the motions, for each over [0, until]: outside (k,) bool, the reach leaves the scene's bounds;
     lost (k,) float64, when it first meets one of the boxes unknown (u, 2, 3) int64 [steps], inf: never.
 
     The reach is the cube around the avatar's root sphere, as `collide` has it, along chords; neither depends on voxels.
     """
-    box = avatar_box(avatar)
     pose, shift, begin, end = np.empty((4, 4)), np.empty(3), np.empty(3), np.empty(3)
     for i in range(first.shape[0]):
         motion = make_motion(first[i], last[i], box, scene.origin)

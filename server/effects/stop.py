@@ -1,0 +1,88 @@
+"""`stop`: what is touched blocks; the avatar stays at the last clear pose.
+
+Alone it is discrete: the wish is taken where nothing is touched there, and else the avatar stays where it is. With
+`sweep` it goes as far as it can.
+
+An avatar that touches something before it goes (it was put there, or what it stands in is served anew) gets free first:
+by its wish, or by the shortest of a few ways, out of the deepest contact and up, of at most MOST_FREE, whose end is
+clear. What lies between is not asked: an avatar in a wall has no clear side to keep to. Where none is clear it stays,
+and the verdict says so.
+"""
+
+from ...schemas.answers import Verdict
+from ...schemas.effects import Stop, Sweep
+from ..world import World
+from .frame import Frame, Hit, Pose, Vec, moved_by
+from .going import is_clear, note, set_out, touched_at
+
+# How far an avatar gets free by itself [m], and the ways it tries.
+MOST_FREE = 0.5
+_WAYS = (0.005, 0.01, 0.02, 0.04, 0.08, 0.16, 0.32, MOST_FREE)
+
+
+class Stopping:
+    """The effect of one scene."""
+
+    name = "stop"
+
+    def __init__(self, continuous: bool) -> None:
+        """continuous: `sweep` goes for the wish."""
+        self._continuous = continuous
+
+    def run(self, frame: Frame) -> None:
+        """Begin clear; without `sweep`, go for the wish."""
+        frame.go = go
+        body, generations = frame.body, frame.world.generations()
+        frame.clear = body.clear and body.generations == generations
+        if not frame.clear:
+            get_free(frame)
+        if not self._continuous:
+            set_out(frame)
+
+
+def go(frame: Frame, to: Pose) -> Hit | None:
+    """Be at a pose, where nothing is touched there."""
+    if frame.pose.tobytes() == to.tobytes():
+        return None
+    hit = touched_at(frame, to)
+    if hit is None:
+        frame.pose, frame.clear = to, True
+        if frame.verdict == Verdict.CONTACT:
+            frame.verdict = Verdict.CLEAR
+        return None
+    note(frame, hit)
+    return hit
+
+
+def get_free(frame: Frame) -> None:
+    """Leave what is touched at frame.pose, if anything is, and a clear pose is near."""
+    hit = touched_at(frame, frame.pose)
+    frame.clear = hit is None
+    if hit is None:
+        return
+    for way in _ways(frame, hit):
+        pose = moved_by(frame.pose, way)
+        if is_clear(frame, pose):
+            frame.pose, frame.clear = pose, True
+            return
+    frame.verdict = hit.verdict
+
+
+def _ways(frame: Frame, hit: Hit) -> list[Vec]:
+    """The ways to get free, shortest first."""
+    directions: list[Vec] = [frame.world.up]
+    if hit.avatar is not None and hit.cloud is not None:
+        out = hit.avatar - hit.cloud
+        size = float((out @ out) ** 0.5)
+        if size > 0.0:
+            directions.insert(0, out / size)
+    wished = frame.wish[:3, 3] - frame.pose[:3, 3]
+    ways = [way * direction for way in _WAYS for direction in directions]
+    if 0.0 < float(wished @ wished) <= MOST_FREE**2:
+        ways.insert(0, wished)
+    return ways
+
+
+def make(effect: Stop, world: World) -> Stopping:
+    """The effect of a scene."""
+    return Stopping(any(isinstance(each, Sweep) for each in world.file.effects))

@@ -1,0 +1,131 @@
+"""One motion in one call, as server/sweep.py answers it, where all that is in its reach is resident.
+
+What a motion costs is then its search: between Python and a kernel each array handed over takes a tenth of a
+microsecond, and each question about it another call.
+"""
+
+import numba as nb
+import numpy as np
+
+from ...schemas.answers import Verdict
+from ...schemas.voxel_grid import UNITS_PER_METRE
+from .advance import Progress, avatar_box, look_around, plan_segments, sweep_segments
+from .layout import SceneArrays
+from .motion import make_motion, pose_at
+from .placing import GOOD, SIMILARITY_TOLERANCE, check_poses
+
+_CLEAR, _CONTACT, _UNKNOWN = int(Verdict.CLEAR), int(Verdict.CONTACT), int(Verdict.UNKNOWN)
+
+# Columns of what is said of a motion: fractions, how far any point goes at most [m], the witness's centres, world [m].
+LOWER, UPPER, SPEED, AVATAR, CLOUD, COLUMNS = 0, 1, 2, 3, 6, 9
+# Node visits of a motion that is answered so, while nobody else can use the residency: a few milliseconds at most.
+MOST_VISITS = 1 << 16
+
+
+@nb.njit(nogil=True, cache=True)
+def box_of(avatar):
+    """`avatar_box` of an avatar, not empty."""
+    return avatar_box(avatar)
+
+
+@nb.njit(nogil=True, cache=True)
+def _rigid(pose):
+    """Whether a pose is well within what server/sweep.py takes to be of scale 1."""
+    square = 0.0
+    for r in range(3):
+        for c in range(3):
+            square += pose[r, c] * pose[r, c]
+    return abs(square / 3.0 - 1.0) <= 0.5 * SIMILARITY_TOLERANCE
+
+
+@nb.njit(nogil=True, cache=True)
+def sweep_resident(
+    pose_from, pose_to, avatar, radius, other_units, box, scene, index, unknown, unknown_everywhere, tolerance, rows,
+    said,
+):  # fmt: skip
+    """Sweep one motion, where it is short, of scale 1, and all voxels in its reach are resident.
+
+    pose_from, pose_to: (4, 4) world, as given.  avatar: not empty.  box: `box_of` it.  radius, other_units, tolerance:
+    as in kernels/advance.py.  scene: with the dataset's origin, which the motion is taken from as server/sweep.py does.
+    unknown: (u, 2, 3) int64 boxes [steps] of scans left out. Writes rows (capacity,) int64, the voxels in reach, and
+    said (COLUMNS,) float64; the witness is written where the verdict is CONTACT.
+    Returns (how many rows or -1: not answered, also for poses that are none, verdict, node visits, point tests,
+    advances).
+    """
+    origin, zero = scene.origin, np.zeros(3)
+    first, last = np.empty((1, 4, 4)), np.empty((1, 4, 4))
+    first[0], last[0] = pose_from, pose_to
+    scales, units, others = np.empty(1), np.empty(1, np.int64), np.empty(1, np.int64)
+    for poses, found_units in ((first, others), (last, units)):
+        fault, _, _ = check_poses(poses, avatar.radius, radius, other_units, scene, scales, found_units)
+        if fault != GOOD or not _rigid(poses[0]):
+            return -1, _UNKNOWN, 0, 0, 0
+    units[0] = max(units[0], others[0])
+    for r in range(3):
+        first[0, r, 3] -= origin[r]
+        last[0, r, 3] -= origin[r]
+    from_zero = SceneArrays(
+        scene.words, scene.ints, scene.halves, scene.where, scene.coordinates, zero, scene.step, scene.units_per_step,
+        scene.voxel_steps, scene.block_words, scene.drop,
+    )  # fmt: skip
+    progress = Progress(
+        np.zeros(1), np.ones(1), np.ones(1), np.full(1, np.inf), np.zeros(1), np.full((1, 2, 3), np.nan),
+        np.full(1, MOST_VISITS, np.int64),
+    )  # fmt: skip
+    counts, outside, lost = np.zeros((4, 1), np.uint32), np.zeros(1, np.bool_), np.empty(1)
+    starts, which = np.zeros(2, np.int64), np.zeros(1, np.int64)
+    needed = plan_segments(
+        box, first, last, avatar, scales, units, from_zero, index, which, progress, starts, rows
+    )
+    if needed > rows.shape[0] or (needed > 0 and progress.end[0] < 1.0):
+        return -1, _UNKNOWN, 0, 0, 0
+    for at in range(needed):
+        if scene.where[rows[at], 0] < 0:
+            return -1, _UNKNOWN, 0, 0, 0
+    proved = 1.0
+    if needed > 0:
+        progress.lower[0] = progress.end[0]
+        sweep_segments(
+            box, first, last, avatar, radius, other_units, scales, units, np.zeros(1), from_zero, index, starts, rows,
+            which, tolerance, progress, counts,
+        )  # fmt: skip
+        if progress.visits[0] < 0:
+            return -1, _UNKNOWN, 0, 0, 0
+        proved = progress.lower[0]
+    upper = progress.upper[0]
+    if unknown_everywhere:
+        proved = 0.0
+    elif unknown.shape[0] > 0:
+        until = np.full(1, min(upper, 1.0))
+        look_around(box, first, last, avatar, scales, units, from_zero, index, unknown, until, outside, lost)
+        if lost[0] <= until[0]:
+            proved = min(proved, lost[0])
+    said[LOWER], said[UPPER], said[SPEED] = proved, upper, progress.speed[0]
+    verdict = _CLEAR if proved >= 1.0 else _UNKNOWN
+    if upper < np.inf:
+        verdict = _CONTACT
+        for r in range(3):
+            own = np.rint(progress.witness[0, 0, r] * UNITS_PER_METRE) / UNITS_PER_METRE
+            said[AVATAR + r], said[CLOUD + r] = own + origin[r], progress.witness[0, 1, r] + origin[r]
+    return needed, verdict, np.int64(counts[1, 0]), np.int64(counts[2, 0]), np.int64(counts[3, 0])
+
+
+@nb.njit(nogil=True, cache=True)
+def pose_between(pose_from, pose_to, fraction, box, origin, pose):
+    """Write the pose at a fraction of a motion, as `sweep_resident` takes it, into pose (4, 4), world.
+
+    Returns whether it is that pose bit for bit, once the origin is taken off again: then what was proved of the motion
+    holds for it.
+    """
+    poses = np.empty((2, 4, 4))
+    poses[0], poses[1] = pose_from, pose_to
+    for r in range(3):
+        poses[0, r, 3] -= origin[r]
+        poses[1, r, 3] -= origin[r]
+    pose_at(make_motion(poses[0], poses[1], box, np.zeros(3)), fraction, pose)
+    same = True
+    for r in range(3):
+        there = pose[r, 3]
+        pose[r, 3] = there + origin[r]
+        same &= pose[r, 3] - origin[r] == there
+    return same

@@ -1,0 +1,127 @@
+"""One avatar asked about frame after frame: one motion or one pose a question, one kernel call where all is resident.
+
+The answers are those of server/sweep.py and server/collide.py, bit for bit; where something has to be loaded, or a
+question is none for a quick look, these give them.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..schemas.answers import Verdict
+from .avatar import AvatarModel
+from .collide import QUICK_POINTS, collide
+from .effort import Effort
+from .kernels.overlap import answer_resident
+from .kernels.probing import AVATAR, CLOUD, COLUMNS, box_of, pose_between, sweep_resident
+from .request import SceneData, refuse
+from .sweep import sweep
+
+Vec = NDArray[np.float64]
+Pose = NDArray[np.float64]
+
+# By value; making one of a number takes as long as a question's share of Python otherwise.
+_VERDICTS = tuple(Verdict(value) for value in range(3))
+_CLEAR = int(Verdict.CLEAR)
+# Voxels in reach of a quick question.
+_ROWS = 64
+
+
+class Swept(NamedTuple):
+    """When an avatar first touches on its way. Fields as of one motion in `SweepAnswers`.
+
+    avatar, cloud: (3,) the witness's centres, world [m]; None where the verdict is not CONTACT.  archive: which of a
+    scene's archives is touched.  exact: nothing else may be touched before: no point goes farther than the tolerance
+    between `lower` and `upper`.  visits: node visits.
+    """
+
+    verdict: Verdict
+    lower: float
+    upper: float
+    avatar: Vec | None = None
+    cloud: Vec | None = None
+    archive: int = 0
+    exact: bool = True
+    visits: int = 0
+
+
+class Probe:
+    """One avatar's questions. Not thread-safe: it has arrays that are written again and again.
+
+    avatar: the model asked about.
+    """
+
+    __slots__ = ("_box", "_counts", "_outside", "_poses", "_rows", "_said", "_verdict", "avatar", "quick")
+
+    def __init__(self, avatar: AvatarModel) -> None:
+        self.avatar = avatar
+        self.quick = 0 < len(avatar.points) <= QUICK_POINTS
+        self._box = box_of(avatar.arrays) if len(avatar.points) else np.zeros((2, 3))
+        self._poses = np.empty((1, 4, 4))
+        self._rows, self._said = np.empty(_ROWS, np.int64), np.empty(COLUMNS)
+        self._verdict, self._outside = np.zeros(1, np.uint8), np.zeros(1, bool)
+        self._counts = np.zeros((3, 1), np.uint32)
+
+    def sweep(
+        self, data: SceneData, pose_from: Pose, pose_to: Pose, tolerance: float, effort: Effort
+    ) -> Swept:
+        """When the avatar first touches between two poses (4, 4); see server/sweep.py, which says what is refused."""
+        if self.quick and not effort.limited:
+            avatar, residency, rows, said = self.avatar, data.residency, self._rows, self._said
+            with residency.still():
+                needed, verdict, visits, _, _ = sweep_resident(
+                    pose_from, pose_to, avatar.arrays, avatar.radius, data.radius_units, self._box, data.arrays,
+                    data.broad, data.unknown, data.unknown_everywhere, max(tolerance, effort.tolerance), rows, said,
+                )  # fmt: skip
+                if needed > 0:
+                    residency.use(rows[:needed].tolist())
+            if needed >= 0:
+                lower, upper, speed = said[:AVATAR].tolist()
+                if verdict != Verdict.CONTACT:
+                    return Swept(_VERDICTS[verdict], lower, upper, None, None, 0, verdict == _CLEAR, visits)
+                own, cloud = said[AVATAR:CLOUD].copy(), said[CLOUD:].copy()
+                exact = upper == lower or speed * (upper - lower) <= max(tolerance, effort.tolerance)
+                return Swept(Verdict.CONTACT, lower, upper, own, cloud, 0, exact, visits)
+        answers = sweep(data, self.avatar, pose_from[None], pose_to[None], tolerance=tolerance, effort=effort)
+        touches = answers.verdict[0] == Verdict.CONTACT
+        return Swept(
+            _VERDICTS[answers.verdict[0]],
+            float(answers.lower[0]),
+            float(answers.upper[0]),
+            answers.witness_avatar[0] if touches else None,
+            answers.witness_cloud[0] if touches else None,
+            0,
+            bool(answers.exact[0]),
+            int(answers.node_visits[0]),
+        )
+
+    def collide(self, data: SceneData, pose: Pose, effort: Effort) -> tuple[Verdict, int]:
+        """Whether the avatar touches at a pose (4, 4), and the node visits; see server/collide.py."""
+        if self.quick and not effort.limited and not data.unknown_everywhere and not len(data.unknown):
+            avatar, residency, rows = self.avatar, data.residency, self._rows
+            poses, verdict, counts = self._poses, self._verdict, self._counts
+            poses[0] = pose
+            verdict[0] = _CLEAR
+            counts[:] = 0
+            with residency.still():
+                fault, at, found, needed = answer_resident(
+                    poses, avatar.arrays, avatar.radius, data.radius_units, data.arrays, data.broad, rows,
+                    self._outside, verdict, counts,
+                )  # fmt: skip
+                if needed > 0:
+                    residency.use(rows[:needed].tolist())
+            refuse(fault, at, found)
+            if needed >= 0:
+                return _VERDICTS[verdict[0]], int(counts[1, 0])
+        answers = collide(data, self.avatar, pose[None], effort=effort)
+        return _VERDICTS[answers.verdict[0]], int(answers.node_visits[0])
+
+    def between(self, origin: Vec, pose_from: Pose, pose_to: Pose, fraction: float) -> tuple[Pose, bool]:
+        """The pose at a fraction of a motion, and whether what a sweep proved of the motion there holds for it.
+
+        origin: (3,) of the dataset, world [m].
+        """
+        pose = np.empty((4, 4))
+        same = pose_between(pose_from, pose_to, fraction, self._box, origin, pose)
+        return pose, bool(same)

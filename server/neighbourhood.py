@@ -8,36 +8,36 @@ Safe to call from several threads. One lock guards the poses, held for microseco
 callers hold, and nothing is taken inside it. `nearness` takes none.
 """
 
-import math
 import threading
-from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .kernels.ahead import Motion, distance_to_ways, predict_way, rows_ahead, rows_in_reach
+from .kernels.ahead import Motion, distance_to_ways, rows_in_reach
 from .kernels.reach import SceneIndex
+from .kernels.walks import (
+    COUNT,
+    LAST,
+    MOST_SPEED,
+    PIECES,
+    WALK,
+    WIDER,
+    Look,
+    note_pose,
+    note_poses,
+    plan_walks,
+    rows_kept,
+)
 
 User = tuple[str, str]
 
-# Farther than this since the last pose is no motion but a teleport: a speed nobody walks, runs or is driven at indoors
-# [m/s], over the time passed but no longer than a second, and some slack for poses that come late and all at once [m].
-MOST_SPEED, MOST_PAUSE, SLACK = 15.0, 1.0, 1.0
-# Without a pose for this long a user is taken to stand where the last one was [s].
-STALE = 0.5
-# And after this long it is taken to be gone [s].
+# After this long without a pose a user is taken to be gone [s].
 EXPIRY = 10.0
-# The least time between two poses that are remembered [s], and how many are: at 90 poses a second, more than half a
-# second. Of poses asked as fast as they are answered, most are passed over.
-LEAST_GAP, MOST_POSES = 0.005, 64
-# A reach is widened by this share of itself, and a step: by more than the rounding of what is done with it.
-WIDER = 1e-6
-# Straight pieces of a predicted way.
-PIECES = 16
-# Rows found before the soonest are taken, as a multiple of those: a piece's rows are found in an order of place.
-SPARE = 4
+# Users remembered at first, twice as many each time there is no room, and at most: 2 KB each. A new one takes the place
+# of the one not heard of for longest.
+FEW_USERS, MOST_USERS = 16, 4096
 
 
 class Ahead(NamedTuple):
@@ -76,7 +76,7 @@ AHEAD = Ahead()
 
 
 class Wanted(NamedTuple):
-    """What a user will need.
+    """What users will need.
 
     rows: (n,) int64, each once, soonest first.  need: (n,) float64, seconds from now until the avatar could touch
     it, 0: it does now. Of rows around, which the predicted way does not touch, beyond the horizon, nearest first.
@@ -84,31 +84,6 @@ class Wanted(NamedTuple):
 
     rows: NDArray[np.int64]
     need: NDArray[np.float64]
-
-
-class _Walk:
-    """What is remembered of one user. poses: time [s] and place [m], in order of time.  reach: of the last [m].
-
-    since: when it came, or last teleported [s].
-    """
-
-    __slots__ = ("poses", "reach", "since")
-
-    def __init__(self, since: float) -> None:
-        self.poses: deque[tuple[float, float, float, float]] = deque(maxlen=MOST_POSES)
-        self.reach, self.since = 0.0, since
-
-
-def merge(plans: Iterable[Wanted]) -> Wanted:
-    """What several users want as one list: each row once, when the first of them needs it."""
-    every = list(plans)
-    if len(every) == 1:
-        return every[0]
-    rows = np.concatenate([np.empty(0, np.int64), *(plan.rows for plan in every)])
-    need = np.concatenate([np.empty(0), *(plan.need for plan in every)])
-    order = np.argsort(need, kind="stable")
-    first = np.sort(np.unique(rows[order], return_index=True)[1])
-    return Wanted(rows[order][first], need[order][first])
 
 
 class Neighbourhood:
@@ -124,12 +99,20 @@ class Neighbourhood:
     ) -> None:
         """No users yet. voxel_steps: edge of a voxel [steps].  origin (3,), step: of the lattice [m]."""
         self.ahead = ahead
-        self._history = ahead.motion.history
-        self._index, self._voxel_steps = index, voxel_steps
-        self._origin, self._step = np.asarray(origin, np.float64), step
+        self._index, self._step = index, step
+        self._look = Look(
+            0.0, ahead.ring, ahead.settled, ahead.most_wanted, np.array(origin, np.float64), step, voxel_steps,
+            ahead.motion,
+        )  # fmt: skip
         self._lock = threading.Lock()
-        self._walks: dict[User, _Walk] = {}
+        self._users: dict[User, int] = {}  # the row of each in `_walks`, in their order
+        self._walks = np.zeros((FEW_USERS, WALK))
         self._ways = np.empty((0, PIECES + 1, 3))  # of the last plan [steps]; replaced, never written
+
+    @property
+    def users(self) -> list[User]:
+        """Who is known, those first who came first."""
+        return list(self._users)
 
     def saw(self, user: User, now: float, center: tuple[float, float, float], reach: float) -> bool:
         """Remember a pose. center: of the avatar's root sphere [m].  reach: its radius with spheres and margin [m].
@@ -139,119 +122,97 @@ class Neighbourhood:
         """
         x, y, z = center
         with self._lock:
-            walk = self._walks.get(user)
-            if walk is None:
-                walk = self._walks[user] = _Walk(now)
-            poses = walk.poses
-            teleport = False
-            if poses:
-                then, x0, y0, z0 = poses[-1]
-                passed = now - then
-                if passed < 0.0:
-                    if passed > -MOST_PAUSE:
-                        return False
-                    poses.clear()
-                    walk.since = now
-                elif math.dist((x, y, z), (x0, y0, z0)) > MOST_SPEED * min(passed, MOST_PAUSE) + SLACK:
-                    teleport = True
-                    poses.clear()
-                    walk.since = now
-                elif len(poses) > 1 and now - poses[-2][0] < LEAST_GAP:
-                    poses.pop()
-                while poses and now - poses[0][0] > self._history:
-                    poses.popleft()
-            poses.append((now, x, y, z))
-            walk.reach = reach
-            return teleport
+            row = self._users.get(user)
+            if row is None:
+                row = self._add(user)
+            return bool(note_pose(self._walks, row, now, x, y, z, reach))
+
+    def saw_each(
+        self,
+        users: Sequence[User],
+        times: NDArray[np.float64],
+        centers: NDArray[np.float64],
+        reaches: NDArray[np.float64],
+    ) -> NDArray[np.bool_]:
+        """`saw` of n poses, one after another, of MOST_USERS at most: whether each is a teleport (n,)."""
+        teleports = np.empty(len(users), np.bool_)
+        with self._lock:
+            known = self._users
+            rows = [known[user] if user in known else self._add(user) for user in users]
+            note_poses(self._walks, np.array(rows, np.int64), times, centers, reaches, teleports)
+        return teleports
+
+    def _add(self, user: User) -> int:
+        """A row for a user not seen before."""
+        count = len(self._users)
+        if count == MOST_USERS:
+            silent = int(np.argmin(self._walks[:count, LAST]))
+            self._drop(lambda row: row == silent)
+            count -= 1
+        if count == len(self._walks):
+            grown = np.zeros((2 * count, WALK))
+            grown[:count] = self._walks
+            self._walks = grown
+        self._walks[count, COUNT] = 0
+        self._users[user] = count
+        return count
+
+    def _drop(self, gone: Callable[[int], bool]) -> None:
+        """Forget the users of rows that are gone; the others move up, in their order."""
+        left = [(user, row) for user, row in self._users.items() if not gone(row)]
+        if len(left) < len(self._users):
+            self._walks[: len(left)] = self._walks[[row for _, row in left]]
+            self._users = {user: row for row, (user, _) in enumerate(left)}
 
     def leave(self, user: User) -> None:
         """Forget a user, if it is known."""
         with self._lock:
-            self._walks.pop(user, None)
+            row = self._users.get(user)
+            self._drop(lambda other: other == row)
 
     def leave_client(self, client: str) -> None:
         """Forget all users of a client."""
         with self._lock:
-            for user in [user for user in self._walks if user[0] == client]:
-                del self._walks[user]
+            rows = {row for user, row in self._users.items() if user[0] == client}
+            self._drop(rows.__contains__)
 
     def expire(self, now: float, after: float = EXPIRY) -> None:
         """Forget users whose last pose is more than `after` seconds old."""
         with self._lock:
-            for user in [user for user, walk in self._walks.items() if now - walk.poses[-1][0] > after]:
-                del self._walks[user]
+            silent = now - self._walks[: len(self._users), LAST] > after
+            if silent.any():
+                self._drop(lambda row: bool(silent[row]))
 
-    def plan(self, now: float, load_seconds: float) -> dict[User, Wanted]:
-        """What every user will need.
+    def _snapshot(self) -> NDArray[np.float64]:
+        """The walks as they are: kernels read them without the lock."""
+        with self._lock:
+            return self._walks[: len(self._users)].copy()
+
+    def plan(self, now: float, load_seconds: float) -> Wanted:
+        """What users will need: each row once, when the first of them needs it; of equals, first who came first.
 
         load_seconds: what loading one voxel takes now, queueing included: an upper percentile of what was measured.
         """
-        with self._lock:
-            walks = [(user, list(walk.poses), walk.reach, walk.since) for user, walk in self._walks.items()]
-        ahead = self.ahead
-        horizon = ahead.horizon(load_seconds)
-        ways = np.empty((len(walks), PIECES + 1, 3))
-        plans = {}
-        for (user, poses, reach, since), way in zip(walks, ways, strict=True):
-            ring = ahead.ring if now - since >= ahead.settled else 0.0
-            plans[user] = self._look_ahead(np.array(poses), reach, ring, now, horizon, way)
-        self._ways = ways
-        return plans
-
-    def _look_ahead(
-        self,
-        poses: NDArray[np.float64],
-        reach: float,
-        ring: float,
-        now: float,
-        horizon: float,
-        way: NDArray[np.float64],
-    ) -> Wanted:
-        """What a user of poses (h, 4) needs, around by `ring` [m]; and its way [steps] into `way`."""
-        ahead = self.ahead
-        late = max(now - poses[-1, 0], 0.0)
-        seconds = late + horizon if late <= STALE else 0.0
-        predict_way(poses, ahead.motion, seconds, way)
-        way -= self._origin
-        way /= self._step
-        rows = np.empty(SPARE * ahead.most_wanted, np.int64)
-        need = np.empty(SPARE * ahead.most_wanted)
-        found = rows_ahead(
-            way, self._span(reach), ring / self._step, self._index, self._voxel_steps, rows, need
-        )
-        found = min(found, ahead.most_wanted)
-        pieces = need[:found]
-        # Around: beyond the horizon, by as much again for what is as far as the ring goes.
-        around = pieces > PIECES
-        times = np.maximum(pieces * (seconds / PIECES) - late, 0.0)
-        times[around] = horizon * (pieces[around] - PIECES)
-        return Wanted(rows[:found].copy(), times)
-
-    def _span(self, reach: float) -> float:
-        """A reach in steps, widened by more than the rounding of what is done with it."""
-        return reach / self._step * (1.0 + WIDER) + 1.0
+        look = self._look._replace(horizon=self.ahead.horizon(load_seconds))
+        rows, need, self._ways = plan_walks(self._snapshot(), now, look, self._index)
+        return Wanted(rows, need)
 
     def kept(self, now: float, after: float = EXPIRY) -> NDArray[np.int64]:
         """The rows (n,), each once, that users can touch where they stand: by poses at most `after` seconds old."""
-        with self._lock:
-            last = [
-                (*walk.poses[-1][1:], walk.reach)
-                for walk in self._walks.values()
-                if now - walk.poses[-1][0] <= after
-            ]
-        balls = np.array(last, np.float64).reshape(-1, 4)
-        return np.unique(self.rows_in_reach(balls[:, :3], balls[:, 3])[1])
+        rows: NDArray[np.int64] = rows_kept(self._snapshot(), now, after, self._look, self._index)
+        return rows
 
     def rows_in_reach(
         self, centers: NDArray[np.float64], reaches: NDArray[np.float64]
     ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Starts (k + 1,) and rows: what each of k balls, centers (k, 3) and reaches (k,) [m], can touch."""
-        steps = np.ascontiguousarray((centers - self._origin) / self._step)
-        spans = np.ascontiguousarray(reaches / self._step * (1.0 + WIDER) + 1.0)
+        look = self._look
+        steps = np.ascontiguousarray((centers - look.origin) / look.step)
+        spans = np.ascontiguousarray(reaches / look.step * (1.0 + WIDER) + 1.0)
         starts, needed = np.zeros(len(steps) + 1, np.int64), 8 * len(steps) + 8
         while True:
             rows = np.empty(needed, np.int64)
-            needed = rows_in_reach(steps, spans, self._index, self._voxel_steps, starts, rows)
+            needed = rows_in_reach(steps, spans, self._index, look.voxel_steps, starts, rows)
             if needed <= len(rows):
                 return starts, rows[:needed]
 

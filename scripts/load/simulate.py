@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from solidcloud.schemas.archive import Archive
 from solidcloud.server.kernels.reach import SceneIndex
-from solidcloud.server.neighbourhood import AHEAD, Ahead, Neighbourhood, merge
+from solidcloud.server.neighbourhood import AHEAD, Ahead, Neighbourhood
 from solidcloud.server.policies import Policy, make_policy
 
 from .traces import Centers
@@ -289,7 +289,7 @@ class Replay:
         if now >= self.planned + self.loading.plan_seconds:
             self.planned = now
             self.neighbourhood.expire(now)
-            wanted = merge(self.neighbourhood.plan(now, self.usual).values())
+            wanted = self.neighbourhood.plan(now, self.usual)
             self.kept = frozenset(self.neighbourhood.kept(now).tolist())
             if self.prefetch:
                 self.need = dict(zip(wanted.rows.tolist(), wanted.need.tolist(), strict=True))

@@ -5,7 +5,8 @@ import pytest
 from numpy.typing import NDArray
 from solidcloud.schemas.voxel_grid import voxel_keys
 from solidcloud.server.kernels.reach import SceneIndex
-from solidcloud.server.neighbourhood import AHEAD, EXPIRY, STALE, Neighbourhood, Wanted, merge
+from solidcloud.server.kernels.walks import MOST_POSES, STALE, merge_wanted
+from solidcloud.server.neighbourhood import AHEAD, EXPIRY, FEW_USERS, MOST_USERS, Neighbourhood, Wanted
 
 pytestmark = pytest.mark.interpreted
 
@@ -70,7 +71,7 @@ def straight(speed: float, poses: int = 30) -> NDArray[np.float64]:
 def test_straight_on_the_next_voxels_come_in_their_order_and_time() -> None:
     around = make(NO_RING)
     now = walk(around, straight(3.0))
-    wanted = around.plan(now, 0.25)[ME]
+    wanted = around.plan(now, 0.25)
     x = straight(3.0)[-1, 0]  # 3.9 m; the reach ends 0.5 m ahead, voxels at 2, 4, 6, ...
     assert NO_RING.horizon(0.25) == 2.0
     assert [cell for cell in cells(wanted.rows) if cell[1] != 0] == []
@@ -85,14 +86,14 @@ def test_the_horizon_follows_the_time_of_loading() -> None:
     assert AHEAD.horizon(0.0) == AHEAD.least and AHEAD.horizon(99.0) == AHEAD.most
     around = make(NO_RING)
     now = walk(around, straight(3.0))
-    counts = [len(around.plan(now, seconds)[ME].rows) for seconds in (0.0, 0.25, 99.0)]
+    counts = [len(around.plan(now, seconds).rows) for seconds in (0.0, 0.25, 99.0)]
     assert counts[0] < counts[1] < counts[2]
 
 
 def test_who_stands_wants_what_is_around_and_what_it_touches_first() -> None:
     around = make()
     now = walk(around, np.tile([1.9, 1.0], (70, 1)))
-    wanted = around.plan(now, 0.25)[ME]
+    wanted = around.plan(now, 0.25)
     assert cells(wanted.rows) == touched(1.9, 1.0, REACH + AHEAD.ring)
     here = touched(1.9, 1.0, REACH)
     assert cells(wanted.rows[: len(here)]) == here and (wanted.need[: len(here)] == 0).all()
@@ -101,7 +102,7 @@ def test_who_stands_wants_what_is_around_and_what_it_touches_first() -> None:
     beyond = (np.sqrt((gap**2).sum(axis=1)) - REACH) / AHEAD.ring
     expected = AHEAD.horizon(0.25) * (1 + beyond[len(here) :])
     for later in (0.0, STALE + 0.1):  # not heard of for a while: the same
-        need = around.plan(now + later, 0.25)[ME].need
+        need = around.plan(now + later, 0.25).need
         assert np.allclose(need[len(here) :], expected, rtol=0.02) and (np.diff(need) >= 0).all()
     assert len(expected) > 1
 
@@ -116,13 +117,13 @@ def test_who_has_just_come_wants_nothing_around_yet() -> None:
         assert around.saw(ME, now, at(1.9, 1.0), REACH) is teleports
         for later, wanted in ((0.0, here), (AHEAD.settled - 0.1, here), (AHEAD.settled + 0.1, around_here)):
             assert not around.saw(ME, now + later, at(1.9, 1.0), REACH)
-            assert cells(around.plan(now + later, 0.25)[ME].rows) == wanted
+            assert cells(around.plan(now + later, 0.25).rows) == wanted
 
 
 def test_what_is_ahead_comes_before_what_is_around() -> None:
     around = make()
     now = walk(around, straight(3.0, 70))
-    wanted = around.plan(now, 0.25)[ME]
+    wanted = around.plan(now, 0.25)
     ahead = wanted.need <= AHEAD.horizon(0.25)
     assert cells(wanted.rows[ahead]) == cells(make_plan(NO_RING, straight(3.0, 70)).rows)
     assert ahead.any() and not ahead.all() and np.array_equal(ahead, np.sort(ahead)[::-1])
@@ -132,7 +133,7 @@ def test_what_is_ahead_comes_before_what_is_around() -> None:
 def make_plan(ahead: object, places: NDArray[np.float64]) -> Wanted:
     """What a user who went along places wants."""
     around = make(ahead)
-    return around.plan(walk(around, places), 0.25)[ME]
+    return around.plan(walk(around, places), 0.25)
 
 
 def test_who_turns_wants_what_is_round_the_corner() -> None:
@@ -147,13 +148,13 @@ def test_who_turns_wants_what_is_round_the_corner() -> None:
 def test_who_stops_wants_nothing_ahead_any_more() -> None:
     around = make(NO_RING)
     now = walk(around, np.concatenate([straight(3.0), np.tile(straight(3.0)[-1], (20, 1))]))
-    assert cells(around.plan(now, 0.5)[ME].rows) == touched(*straight(3.0)[-1], REACH)
+    assert cells(around.plan(now, 0.5).rows) == touched(*straight(3.0)[-1], REACH)
 
 
 def test_who_is_not_heard_of_is_taken_to_stand() -> None:
     around = make(NO_RING)
     now = walk(around, straight(3.0))
-    moving, standing = around.plan(now + STALE - 0.01, 0.25)[ME], around.plan(now + STALE + 0.01, 0.25)[ME]
+    moving, standing = around.plan(now + STALE - 0.01, 0.25), around.plan(now + STALE + 0.01, 0.25)
     assert cells(standing.rows) == touched(*straight(3.0)[-1], REACH)
     assert len(moving.rows) > len(standing.rows)
     assert (moving.need >= 0).all()
@@ -162,7 +163,7 @@ def test_who_is_not_heard_of_is_taken_to_stand() -> None:
 def test_what_is_late_is_reckoned_from_now() -> None:
     around = make(NO_RING)
     now = walk(around, straight(3.0))
-    before, after = around.plan(now, 0.25)[ME], around.plan(now + 0.2, 0.25)[ME]
+    before, after = around.plan(now, 0.25), around.plan(now + 0.2, 0.25)
     needs = dict(zip(after.rows.tolist(), after.need.tolist(), strict=True))
     for row, need in zip(before.rows.tolist(), before.need.tolist(), strict=True):
         assert needs[row] == pytest.approx(max(0.0, need - 0.2), abs=0.02)
@@ -177,7 +178,7 @@ def test_jitter_changes_little(seed: int) -> None:
     times = np.maximum.accumulate(np.arange(60) / 30 + rng.uniform(0, 0.01, 60))
     for now, (x, y) in zip(times.tolist(), places.tolist(), strict=True):
         assert not around.saw(ME, now, at(x, y), REACH)
-    wanted = around.plan(float(times[-1]), 0.25)[ME]
+    wanted = around.plan(float(times[-1]), 0.25)
     soon = wanted.rows[wanted.need <= 2.0]
     end = straight(1.5, 60)[-1, 0]
     for ahead in np.linspace(0.0, 1.0, 20):
@@ -188,7 +189,7 @@ def test_a_teleport_is_said_and_what_was_before_is_dropped() -> None:
     around = make(NO_RING)
     now = walk(around, straight(5.0))
     assert around.saw(ME, now + 1 / 30, at(-30.0, -30.0), REACH)
-    wanted = around.plan(now + 1 / 30, 0.5)[ME]
+    wanted = around.plan(now + 1 / 30, 0.5)
     assert cells(wanted.rows) == touched(-30.0, -30.0, REACH) and (wanted.need == 0).all()
     assert cells(around.kept(now + 1 / 30)) == touched(-30.0, -30.0, REACH)
     assert not around.saw(ME, now + 2 / 30, at(-29.9, -30.0), REACH)
@@ -214,9 +215,9 @@ def test_how_far_is_too_far(passed: float, metres: float, teleport: bool) -> Non
 def test_poses_out_of_order_are_passed_over() -> None:
     around = make(NO_RING)
     now = walk(around, straight(3.0))
-    before = around.plan(now, 0.25)[ME]
+    before = around.plan(now, 0.25)
     assert not around.saw(ME, now - 0.01, at(-20, -20), REACH)
-    after = around.plan(now, 0.25)[ME]
+    after = around.plan(now, 0.25)
     assert after.rows.tolist() == before.rows.tolist() and after.need.tolist() == before.need.tolist()
 
 
@@ -224,7 +225,7 @@ def test_a_clock_that_starts_again_starts_afresh() -> None:
     around = make(NO_RING)
     walk(around, straight(3.0), start=1e6)
     assert not around.saw(ME, 0.0, at(-20, -20), REACH)
-    assert cells(around.plan(0.0, 0.25)[ME].rows) == touched(-20, -20, REACH)
+    assert cells(around.plan(0.0, 0.25).rows) == touched(-20, -20, REACH)
 
 
 def test_poses_asked_as_fast_as_they_are_answered_span_the_history_all_the_same() -> None:
@@ -232,7 +233,7 @@ def test_poses_asked_as_fast_as_they_are_answered_span_the_history_all_the_same(
     around = make(NO_RING)
     for number in range(5000):
         around.saw(ME, number * 1e-4, at(1.0 + 3.0 * number * 1e-4, 1.0), REACH)
-    wanted = around.plan(0.5, 0.25)[ME]
+    wanted = around.plan(0.5, 0.25)
     assert max(x for x, _ in cells(wanted.rows)) == int((1.0 + 1.5 + 6.0 + REACH) // EDGE)
 
 
@@ -248,16 +249,16 @@ def test_who_leaves_is_forgotten() -> None:
     other = ("other", "me")
     for user in (ME, YOU, other):
         walk(around, straight(1.0), user=user)
-    assert set(around.plan(1.0, 0.1)) == {ME, YOU, other}
+    assert around.users == [ME, YOU, other]
     around.leave(YOU)
     around.leave(YOU)
-    assert set(around.plan(1.0, 0.1)) == {ME, other}
+    assert around.users == [ME, other]
     around.leave_client("client")
-    assert set(around.plan(1.0, 0.1)) == {other}
+    assert around.users == [other] and len(around.plan(1.0, 0.1).rows)
     around.expire(29 / 30 + 10.0, 10.0)
-    assert set(around.plan(11.0, 0.1)) == {other}
+    assert around.users == [other]
     around.expire(11.0, 10.0)
-    assert around.plan(11.0, 0.1) == {} and around.kept(11.0).tolist() == []
+    assert around.users == [] and len(around.plan(11.0, 0.1).rows) == 0 and around.kept(11.0).tolist() == []
 
 
 def test_what_users_can_touch_is_kept_each_once() -> None:
@@ -292,9 +293,89 @@ def test_nearness_is_the_distance_to_the_nearest_way() -> None:
     assert np.isinf(around.nearness(rows)).all()
 
 
-def test_what_several_want_is_wanted_once_and_when_the_first_needs_it() -> None:
-    one = Wanted(np.array([5, 3, 9]), np.array([0.0, 1.0, 2.0]))
-    two = Wanted(np.array([9, 7, 5]), np.array([0.5, 0.6, 3.0]))
-    both = merge([one, two])
-    assert both.rows.tolist() == [5, 9, 7, 3] and both.need.tolist() == [0.0, 0.5, 0.6, 1.0]
-    assert merge([one]).rows.tolist() == [5, 3, 9] and merge([]).rows.tolist() == []
+def test_who_stays_is_known_as_before_when_others_leave() -> None:
+    around, alone = make(), make()
+    for number in range(5):
+        walk(around, straight(1.0 + number) + 3.0 * number, user=("client", str(number)))
+    now = walk(alone, straight(3.0) + 6.0, user=("client", "2"))
+    for number in (0, 4, 1, 3):
+        around.leave(("client", str(number)))
+    assert around.users == alone.users == [("client", "2")]
+    after, before = around.plan(now, 0.25), alone.plan(now, 0.25)
+    assert after.rows.tolist() == before.rows.tolist() and after.need.tolist() == before.need.tolist()
+    again = ("client", "0")
+    assert not around.saw(again, now, at(-30.0, -30.0), REACH), "what it was before is forgotten"
+
+
+def test_there_is_room_for_more_users_than_at_first() -> None:
+    around = make(NO_RING)
+    users = [("client", str(number)) for number in range(3 * FEW_USERS)]
+    places = np.random.default_rng(5).uniform(-35, 35, (len(users), 2))
+    for user, (x, y) in zip(users, places.tolist(), strict=True):
+        around.saw(user, 1.0, at(x, y), REACH)
+    least, most = (
+        set().union(*(touched(x, y, reach) for x, y in places.tolist())) for reach in (REACH, 0.52)
+    )
+    assert around.users == users and least <= cells(around.kept(1.0)) <= most
+    assert cells(around.plan(1.0, 0.25).rows) == cells(around.kept(1.0))
+
+
+def test_of_too_many_users_the_one_not_heard_of_for_longest_is_forgotten(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    assert MOST_USERS >= FEW_USERS
+    monkeypatch.setattr("solidcloud.server.neighbourhood.MOST_USERS", 3)
+    around = make()
+    users = [("client", str(number)) for number in range(5)]
+    for when, number in enumerate((0, 1, 2, 0, 3, 4)):
+        around.saw(users[number], float(when), at(2.0 * number, 0.0), REACH)
+    assert around.users == [users[0], users[3], users[4]]
+    assert cells(around.kept(5.0)) == set().union(*(touched(x, 0.0, REACH) for x in (0.0, 6.0, 8.0)))
+
+
+def test_many_poses_at_once_are_as_many_one_by_one() -> None:
+    rng = np.random.default_rng(11)
+    one, many = make(), make()
+    users = [("client", str(number)) for number in rng.integers(0, 5, 400).tolist()]
+    times = np.cumsum(rng.uniform(0, 0.02, 400)) - (rng.random(400) < 0.05) * 0.05
+    places = ORIGIN + np.cumsum(rng.normal(0, 0.3, (400, 3)), axis=0)
+    reaches = rng.choice([0.4, 1.0], 400)
+    jumped = [
+        one.saw(user, time, (x, y, z), reach)
+        for user, time, (x, y, z), reach in zip(
+            users, times.tolist(), places.tolist(), reaches.tolist(), strict=True
+        )
+    ]
+    assert many.saw_each(users, times, places, reaches).tolist() == jumped and 0 < sum(jumped) < 400
+    assert many.users == one.users
+    now = float(times[-1])
+    before, after = one.plan(now, 0.25), many.plan(now, 0.25)
+    assert after.rows.tolist() == before.rows.tolist() and after.need.tolist() == before.need.tolist()
+
+
+def test_of_more_poses_than_are_remembered_the_last_are() -> None:
+    """At 150 a second half a second is more than that: round the ring several times, back and then on."""
+    around = make(NO_RING)
+    turn = 3 * MOST_POSES
+    places = 1.0 + 3.0 / 150 * np.concatenate([np.arange(turn)[::-1], np.arange(MOST_POSES)])
+    for number, x in enumerate(places.tolist()):
+        assert not around.saw(ME, number / 150, at(x, 1.0), REACH)
+    wanted = around.plan((len(places) - 1) / 150, 0.25)
+    assert max(x for x, _ in cells(wanted.rows)) == int((places[-1] + 6.0 + REACH) // EDGE)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_what_several_want_is_wanted_once_and_when_the_first_needs_it(seed: int) -> None:
+    """Against a dict."""
+    rng = np.random.default_rng(seed)
+    for count in (0, 1, 7, 300):
+        rows = rng.integers(0, rng.choice([5, 100, 1 << 31]), count)
+        need = rng.integers(0, 20, count) / 4
+        first: dict[int, float] = {}
+        for row, when in zip(rows.tolist(), need.tolist(), strict=True):
+            first[row] = min(first.get(row, when), when)
+        found_rows, found_need = merge_wanted(rows, need)
+        found = list(zip(found_rows.tolist(), found_need.tolist(), strict=True))
+        assert dict(found) == first and len(found) == len(first)
+        places = {row: int(np.flatnonzero((rows == row) & (need == when))[0]) for row, when in found}
+        assert found == sorted(found, key=lambda each: (each[1], places[each[0]])), "equals as they came"

@@ -36,12 +36,12 @@ class Wishes:
     def expire(self, now: float, after: float) -> None:
         """Nobody is."""
 
-    def plan(self, now: float, load_seconds: float) -> dict[User, Wanted]:
+    def plan(self, now: float, load_seconds: float) -> Wanted:
         """What is wanted, soonest first."""
         self.plans += 1
         rows = sorted(self.wanted, key=lambda row: self.wanted[row])
         need = np.array([self.wanted[row] for row in rows])
-        return {ANNA: Wanted(np.array(rows, np.int64), need)}
+        return Wanted(np.array(rows, np.int64), need)
 
     def kept(self, now: float, after: float) -> np.ndarray:
         """What users stand in."""

@@ -1,0 +1,189 @@
+"""Blocking: what one mover meets of the bodies of a scene, as an `Obstacle` of one frame.
+
+First the bounds of all bodies against those of the motion, in one kernel call of some microseconds; mostly nobody is
+near. Then, exactly, those that are (kernels/meeting.py, kernels/pairs.py).
+
+What is overlapped when the frame begins blocks only a motion that goes against `Bodies.way_out`; a motion along it,
+across it or about the mover's own axis is let, and so is one up or down. So bodies that came to be in one place, by
+where they began or by an object that was told to be there, get apart, and none is ever held.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...schemas.answers import Verdict
+from ...schemas.voxel_grid import UNITS_PER_METRE
+from ..avatar import AvatarModel, make_avatar
+from ..kernels.meeting import find_near, sweep_bodies
+from .bodies import USER, Bodies, Shape
+from .frame import Body, Frame, Hit, Pose, Vec
+
+# Of a way that is across what is overlapped: rounding is not going deeper.
+_ACROSS = 1e-9
+
+
+class Blocking:
+    """The bodies of some kinds, for one mover and one frame."""
+
+    def __init__(
+        self, name: str, bodies: Bodies, wanted: int, mover: str, model: AvatarModel, start: Pose,
+        *, user: bool = True, margin_units: int = 0, skip: str = "",
+    ) -> None:  # fmt: skip
+        """name: of the effect.  wanted: kinds, bits.  mover: its name; user: whether it is one, or an object.
+
+        start: where it is when the frame begins.  margin_units: apart, exact units.  skip: a user that does not block.
+        """
+        self.name = name
+        self._bodies, self._wanted, self._margin_units = bodies, wanted, margin_units
+        self._mover, self._user, self._skip = mover, user, skip
+        self._model, self._start = model, start.copy()
+        self._layout = bodies.layout
+        self._overlapped: dict[int, bool] = {}
+        self._hits: list[Hit] = []
+
+    def sweep(self, avatar: AvatarModel, pose_from: Pose, pose_to: Pose, tolerance: float) -> Hit | None:
+        """What ends the motion first; see `Obstacle`. Of equal fractions the lowest row's."""
+        hit = self._sweep(avatar, pose_from, pose_to, tolerance)
+        if hit is not None:
+            self._hits.append(hit)
+        return hit
+
+    def touches(self, avatar: AvatarModel, pose: Pose) -> Hit | None:
+        """What is touched there, the lowest row; avatar and cloud of the hit are the two bodies' centres, level."""
+        hit = self._touches(avatar, pose)
+        if hit is not None:
+            self._hits.append(hit)
+        return hit
+
+    def is_own(self, hit: Hit) -> bool:
+        """Whether this said so."""
+        return any(hit is own for own in self._hits)
+
+    def _sweep(self, avatar: AvatarModel, pose_from: Pose, pose_to: Pose, tolerance: float) -> Hit | None:
+        """`sweep`."""
+        bodies = self._bodies
+        with bodies.lock:
+            shape = bodies.shape_of(avatar)
+            ends = self._from_origin(pose_from), self._from_origin(pose_to)
+            rows = self._near(shape, *ends)
+            while len(rows):
+                row, fraction, witness = self._first(shape, ends, rows, tolerance)
+                if row < 0:
+                    break
+                if fraction > 0.0 or not self._is_overlapped(row):
+                    hit = Hit(fraction, Verdict.CONTACT, witness[0], witness[1], bodies.names[row])
+                    return self._goes_deeper(shape, pose_from, pose_to) or hit
+                rows = rows[rows != row]
+            return self._goes_deeper(shape, pose_from, pose_to)
+
+    def _touches(self, avatar: AvatarModel, pose: Pose) -> Hit | None:
+        """`touches`."""
+        bodies = self._bodies
+        with bodies.lock:
+            shape = bodies.shape_of(avatar)
+            there = self._from_origin(pose)
+            rows = self._near(shape, there, there)
+            if not len(rows):
+                return None
+            touching = bodies.touching(shape, pose, rows, self._margin_units)
+            for row in rows[touching].tolist():
+                if not self._is_overlapped(row):
+                    return self._hit(shape, pose, row)
+            return self._goes_deeper(shape, self._start, pose)
+
+    def give_way(self, frame: Frame, hit: Hit, to: Pose) -> bool:
+        """Nothing here does."""
+        return False
+
+    def _near(self, shape: Shape, first: Pose, last: Pose) -> NDArray[np.int64]:
+        """Rows that a motion, from the origin, could meet, but for those overlapped when the frame began."""
+        bodies = self._bodies
+        rows = np.empty(len(bodies.names), np.int64)
+        if not len(rows) or not len(shape.model.points):
+            return rows[:0]
+        if self._layout != bodies.layout:
+            self._layout, self._overlapped = bodies.layout, {}
+        own = bodies.row_of(self._mover, user=self._user)
+        more = shape.model.radius + self._margin_units / UNITS_PER_METRE
+        count = find_near(shape.box, first, last, more, bodies.bounds, bodies.kinds, self._wanted, own, rows)
+        found = rows[:count]
+        left_out = [row for row, overlapped in self._overlapped.items() if overlapped]
+        if self._skip:
+            left_out.append(bodies.row_of(self._skip, user=True))
+        return found[~np.isin(found, left_out)] if count and left_out else found
+
+    def _from_origin(self, pose: Pose) -> Pose:
+        """A pose with its translation from the bodies' origin."""
+        there = np.array(pose, np.float64, order="C")
+        there[:3, 3] -= self._bodies.origin
+        return there
+
+    def _first(
+        self, shape: Shape, ends: tuple[Pose, Pose], rows: NDArray[np.int64], tolerance: float
+    ) -> tuple[int, float, NDArray[np.float64]]:
+        """Of these rows, what ends the motion first: (row, fraction, witness (2, 3)); row -1: nothing does."""
+        bodies = self._bodies
+        numbers = bodies.numbers[rows]
+        best, until, witness = -1, np.inf, np.empty((2, 3))
+        while len(rows):
+            same = numbers == numbers[0]
+            other = bodies.shapes[int(rows[0])]
+            if len(other.model.points):
+                place = np.empty((2, 3))
+                row, fraction = sweep_bodies(
+                    shape.model.arrays, shape.box, shape.units, *ends, other.model.arrays, bodies.poses,
+                    other.units, rows[same], bodies.origin, self._margin_units, tolerance, until, place,
+                    bodies.scratch,
+                )  # fmt: skip
+                if row >= 0:
+                    best, until, witness = row, fraction, place
+            rows, numbers = rows[~same], numbers[~same]
+        return best, until, witness
+
+    def _is_overlapped(self, row: int) -> bool:
+        """Whether a body was touched where the mover was when the frame began."""
+        found = self._overlapped.get(row)
+        if found is None:
+            bodies = self._bodies
+            shape = bodies.shape_of(self._model)
+            touching = bodies.touching(shape, self._start, np.array([row]), self._margin_units)
+            found = self._overlapped[row] = bool(touching[0])
+        return found
+
+    def _goes_deeper(self, shape: Shape, pose_from: Pose, pose_to: Pose) -> Hit | None:
+        """What of that overlapped when the frame began a motion goes against the way out of."""
+        center = None
+        for row in sorted(row for row, overlapped in self._overlapped.items() if overlapped):
+            if center is None:
+                center = shape.center(pose_from)
+                way = shape.center(pose_to) - center
+            out = self._out(row)
+            if way @ out < -_ACROSS * np.linalg.norm(out) * np.linalg.norm(way):
+                return Hit(0.0, Verdict.CONTACT, center, center - out, self._bodies.names[row])
+        return None
+
+    def _out(self, row: int) -> Vec:
+        """The way out of what the mover overlapped when the frame began."""
+        bodies = self._bodies
+        center = bodies.shape_of(self._model).center(self._start)
+        return bodies.way_out(row, self._mover if self._user else "", center)
+
+    def _hit(self, shape: Shape, pose: Pose, row: int) -> Hit:
+        """A body touched at a pose: nothing is known of when, so that its centre says where."""
+        bodies, center = self._bodies, shape.center(pose)
+        out = center - bodies.shapes[row].center(bodies.poses[row])
+        level = out - (out @ bodies.up) * bodies.up
+        return Hit(0.0, Verdict.CONTACT, center, center - level, bodies.names[row])
+
+
+def warm() -> None:
+    """Have the kernels compiled, before anybody waits for them."""
+    model = make_avatar([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]], 0.05)
+    bodies = Bodies(np.zeros(3), np.array([0.0, 0.0, 1.0]))
+    poses = [np.eye(4), np.eye(4)]
+    poses[1][0, 3] = 1.0
+    for name, pose in zip("ab", poses, strict=True):
+        bodies[name] = Body(name, model, pose)
+    blocking = Blocking("", bodies, USER, "a", model, poses[0])
+    blocking.sweep(model, poses[0], poses[1], 1e-6)
+    blocking.touches(model, poses[1])

@@ -1,0 +1,274 @@
+"""Bodies: all that moves in one scene, users and objects, and where they are now. One of a simulation.
+
+A simulation keeps it up to date as it would a dict of its users (`bodies[user] = body` after each frame, `pop`), and
+tells it where wishes put objects (`tell`). Effects ask it through `Blocking` (blocking.py).
+"""
+
+import threading
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...schemas.errors import BadRequestError, BadTransformError
+from ..avatar import AvatarModel
+from ..kernels.meeting import bound_body, make_scratch
+from ..kernels.pairs import CONTACT, touch_pairs
+from ..kernels.placing import MAX_REACH_UNITS, SIMILARITY_TOLERANCE
+from ..request import kernel_poses, to_units
+from .frame import Body, Pose, Vec
+
+USER, TOLD, PUSHED = 1, 2, 4  # kinds, one bit each
+_EVER = 1 << 62  # node visits: no budget
+# Shapes kept of avatars that are of no body, before they are forgotten.
+_MOST_LOOSE = 64
+
+
+class Shape(NamedTuple):
+    """An avatar's model with what a broad phase asks. box: (2, 3) of its points [m], zeros where it has none.
+    units: its radius, exact units.  number: of it among its `Bodies`."""
+
+    model: AvatarModel
+    box: NDArray[np.float64]
+    units: int
+    number: int
+
+    def center(self, pose: Pose) -> Vec:
+        """The middle of its box, placed."""
+        placed: Vec = pose[:3, :3] @ (0.5 * (self.box[0] + self.box[1])) + pose[:3, 3]
+        return placed
+
+
+class Bodies:
+    """Bodies by row: users in the order they came, after the objects that were there first.
+
+    origin: (3,) from which bodies are placed, as the scene is [m].  up: (3,) unit.  lock: held while asked or changed:
+    a move of which nothing is remembered may be asked beside a frame.  Rows: names; kinds (n,) uint8; poses (n, 4, 4),
+    world; bounds (n, 2, 3), from the origin, radius included; shapes; numbers (n,) of shapes; changed: when last moved.
+    clock: counts moves.  layout: counts bodies that came and went, after which rows are others.
+    """
+
+    def __init__(self, origin: Vec, up: Vec, begin: "Callable[[Bodies], None] | None" = None) -> None:
+        """begin: adds what is there first, when somebody first asks: avatars come after effects."""
+        self._begin = begin
+        self.origin, self.up = np.array(origin, np.float64), np.array(up, np.float64)
+        self.lock = threading.RLock()
+        self.scratch = make_scratch()
+        self.names: list[str] = []
+        self.kinds = np.empty(0, np.uint8)
+        self.poses = np.empty((0, 4, 4))
+        self.bounds = np.empty((0, 2, 3))
+        self.numbers = np.empty(0, np.int64)
+        self.shapes: list[Shape] = []
+        self.changed: list[int] = []
+        self.clock = self.layout = 0
+        self._rows: dict[tuple[bool, str], int] = {}
+        self._users: dict[Hashable, Body] = {}
+        self._known: dict[int, Shape] = {}
+        self._numbered = 0
+        self._clear: dict[
+            tuple[str, str], Vec
+        ] = {}  # user, object: the user's centre when last clear, object's frame
+
+    # --- shapes -------------------------------------------------------------------------------------------
+
+    def shape_of(self, model: AvatarModel) -> Shape:
+        """The shape of a model, kept."""
+        shape = self._known.get(id(model.points))
+        if shape is not None and shape.model.arrays is model.arrays and shape.model.radius == model.radius:
+            return shape
+        if len(self._known) > _MOST_LOOSE + len(self.names):
+            self._known = {id(kept.model.points): kept for kept in self.shapes}
+        box = np.zeros((2, 3))
+        if len(model.points):
+            box = np.array([model.points.min(axis=0), model.points.max(axis=0)])
+        units = to_units(model.radius, "radius")
+        if units > MAX_REACH_UNITS // 4:
+            raise BadRequestError(f"avatar radius {model.radius:g} m: expected at most 4 m where bodies meet")
+        shape = self._known[id(model.points)] = Shape(model, box, units, self._numbered)
+        self._numbered += 1
+        return shape
+
+    # --- who is there -------------------------------------------------------------------------------------
+
+    def begin(self) -> None:
+        """What is there first is there."""
+        with self.lock:
+            begin, self._begin = self._begin, None
+            if begin is not None:
+                begin(self)
+
+    def __setitem__(self, user: Hashable, body: Body) -> None:
+        """A user is there, where its body is now."""
+        with self.lock:
+            self.begin()
+            self._users[user] = body
+            row = self._rows.get((True, body.name))
+            if row is None:
+                self._add(body.name, USER, body.avatar, body.pose)
+                return
+            if self.shapes[row].model is not body.avatar:
+                self.shapes[row] = self.shape_of(body.avatar)
+                self.numbers[row] = self.shapes[row].number
+            self._put(row, body.pose)
+
+    def pop(self, user: Hashable, default: Body | None = None) -> Body | None:
+        """A user is gone."""
+        with self.lock:
+            body = self._users.pop(user, default)
+            if body is not None and (True, body.name) in self._rows:
+                self._remove(self._rows[True, body.name])
+            return body
+
+    def remembers(self, body: Body) -> bool:
+        """Whether this is a body of a user that is there, and not one of which nothing is remembered."""
+        return any(body is known for known in self._users.values())
+
+    def add_object(self, name: str, model: AvatarModel, pose: Pose, *, pushed: bool) -> None:
+        """An object, where it begins. BadTransformError for a pose that is not rigid."""
+        with self.lock:
+            self._add(name, PUSHED if pushed else TOLD, model, _checked(name, pose))
+
+    def row_of(self, name: str, *, user: bool) -> int:
+        """The row of a user or an object; -1: there is none."""
+        return self._rows.get((user, name), -1)
+
+    def _add(self, name: str, kind: int, model: AvatarModel, pose: Pose) -> None:
+        """A row more."""
+        row = len(self.names)
+        shape = self.shape_of(model)
+        self.names.append(name)
+        self.shapes.append(shape)
+        self.changed.append(0)
+        self.kinds = np.append(self.kinds, np.uint8(kind))
+        self.numbers = np.append(self.numbers, shape.number)
+        self.poses = np.concatenate([self.poses, np.eye(4)[None]])
+        self.bounds = np.concatenate([self.bounds, np.zeros((1, 2, 3))])
+        self._rows[kind == USER, name] = row
+        self.layout += 1
+        self._put(row, pose, begun=True)
+
+    def _remove(self, row: int) -> None:
+        """A row less: later ones move up."""
+        name = self.names[row]
+        for rows in (self.names, self.shapes, self.changed):
+            del rows[row]  # type: ignore[attr-defined]
+        self.kinds, self.numbers = np.delete(self.kinds, row), np.delete(self.numbers, row)
+        self.poses, self.bounds = np.delete(self.poses, row, axis=0), np.delete(self.bounds, row, axis=0)
+        self._rows = {(bool(self.kinds[at] == USER), each): at for at, each in enumerate(self.names)}
+        self._came_from = {key: way for key, way in self._came_from.items() if key[0] != name}
+        self.layout += 1
+
+    # --- where they are -----------------------------------------------------------------------------------
+
+    def put(self, row: int, pose: Pose) -> None:
+        """A body is somewhere else now."""
+        with self.lock:
+            self._put(row, pose)
+
+    def _put(self, row: int, pose: Pose, begun: bool = False) -> None:
+        """`put`; begun: it is there at all."""
+        if not begun and (self.poses[row] == pose).all():
+            return
+        self.poses[row] = pose
+        shape = self.shapes[row]
+        if len(shape.model.points):
+            bound_body(shape.box, self.poses[row], self.origin, shape.model.radius, self.bounds[row])
+        else:
+            self.bounds[row, 0], self.bounds[row, 1] = np.inf, -np.inf
+        if not begun:
+            self.clock += 1
+            self.changed[row] = self.clock
+
+    def tell(self, poses: Mapping[str, Sequence[Sequence[float]]]) -> None:
+        """Objects are where a wish puts them, whatever is there: a user that is, starts its next frame in contact.
+
+        poses: (4, 4) row-major by name. All are checked before any is put: BadRequestError, BadTransformError.
+        """
+        with self.lock:
+            self.begin()
+            checked = [(self._told(name), _checked(name, poses[name])) for name in sorted(poses)]
+            for row, pose in checked:
+                before = self.poses[row].copy()
+                self._put(row, pose)
+                self._remember_way(row, before)
+
+    def _told(self, name: str) -> int:
+        """The row of an object that wishes may move; BadRequestError for others."""
+        row = self.row_of(name, user=False)
+        told = [each for each, kind in zip(self.names, self.kinds, strict=True) if kind == TOLD]
+        if row < 0 or self.kinds[row] != TOLD:
+            found = "is none of this scene" if row < 0 else "is pushed, and not told where to be"
+            raise BadRequestError(
+                f"object {name!r} {found}: expected one of {', '.join(told) or 'none: no object is kinematic'}"
+            )
+        return row
+
+    def _remember_way(self, thing: int, before: Pose) -> None:
+        """Where from, in its own frame, an object that was told to move has come into users; `way_out` asks."""
+        bounds, now = self.bounds, self.poses[thing]
+        apart = (bounds[:, 0] > bounds[thing, 1]) | (bounds[:, 1] < bounds[thing, 0])
+        near = np.flatnonzero((self.kinds == USER) & ~apart.any(axis=1))
+        if not len(near):
+            return
+        touching = self.touching(self.shapes[thing], now, near, 0)
+        touching &= ~self.touching(self.shapes[thing], before, near, 0)
+        for row in near[touching].tolist():
+            center = self.shapes[row].center(self.poses[row])
+            own = [pose[:3, :3].T @ (center - pose[:3, 3]) for pose in (before, now)]
+            self._came_from[self.names[row], self.names[thing]] = own[0] - own[1]
+
+    def way_out(self, row: int, user: str, center: Vec) -> Vec:
+        """Level, which way a mover whose centre is there gets free of what it overlaps; zeros: any way.
+
+        Away from the other's centre; of an object that was moved into a user, the way the object came: not through it.
+        user: the mover's name, "" where it is none.
+        """
+        came_from = self._came_from.get((user, self.names[row])) if self.kinds[row] != USER else None
+        pose = self.poses[row]
+        way = center - self.shapes[row].center(pose) if came_from is None else pose[:3, :3] @ came_from
+        level: Vec = way - (way @ self.up) * self.up
+        return level
+
+    def touching(
+        self, shape: Shape, pose: Pose, rows: NDArray[np.int64], margin_units: int
+    ) -> NDArray[np.bool_]:
+        """Whether an avatar at a pose touches the bodies of each of rows (m,), by the definition."""
+        found = np.zeros(len(rows), bool)
+        if not len(shape.model.points):
+            return found
+        poses = np.concatenate([pose[None], self.poses[rows]])
+        scales = np.ones(len(poses))
+        units = np.array([shape.units, *(self.shapes[row].units for row in rows.tolist())], np.int64)
+        numbers = self.numbers[rows]
+        for number in np.unique(numbers).tolist():
+            at = np.flatnonzero(numbers == number)
+            model = self.shapes[int(rows[at[0]])].model
+            if not len(model.points):
+                continue
+            pairs = np.stack([np.zeros(len(at), np.int64), at + 1], axis=1)
+            verdict = np.empty(len(at), np.uint8)
+            touch_pairs(
+                shape.model.arrays, model.arrays, poses, scales, units, pairs, margin_units, self.origin, _EVER,
+                verdict, self.scratch.counters,
+            )  # fmt: skip
+            found[at] = verdict == CONTACT
+        return found
+
+
+def _checked(name: str, pose: Sequence[Sequence[float]] | Pose) -> Pose:
+    """The pose (4, 4) of an object; BadRequestError, BadTransformError unless it is rigid."""
+    array = np.array(pose, np.float64)
+    if array.shape != (4, 4):
+        raise BadRequestError(f"object {name!r}: pose of shape {array.shape}: expected 4 rows of 4 numbers")
+    array = kernel_poses(array[None])[0]
+    if not np.isfinite(array).all() or np.abs(array[:3, 3]).max() > 1e9:
+        raise BadRequestError(f"object {name!r}: expected finite numbers, and a place within 1e9 m")
+    off = float(np.abs(array[:3, :3] @ array[:3, :3].T - np.eye(3)).max())
+    if array[3].tolist() != [0, 0, 0, 1] or off > SIMILARITY_TOLERANCE or np.linalg.det(array[:3, :3]) < 0:
+        raise BadTransformError(
+            f"object {name!r}: its pose is not rigid (off by {off:g}): expected a row-major 4x4 pose, a rotation and a "
+            "translation, within 1e-9"
+        )
+    return array

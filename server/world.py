@@ -24,6 +24,7 @@ from .posed import inverse_of, moved, turned, under
 from .probe import Probe, Swept
 from .request import SceneData
 from .scene import Scene
+from .served import EVERYBODY
 
 # Avatars a thread has probes of at a time: users of one scene, and its objects.
 _PROBES = 256
@@ -65,7 +66,7 @@ class World:
 
     def __init__(self, served: Any, file: SceneFile) -> None:
         """served: a `Scene`, or several with their poses (`archives`)."""
-        self.file = file
+        self.file, self._served = file, served
         self.up: Vec = np.array(file.up, np.float64) / np.linalg.norm(file.up)
         placed = getattr(served, "archives", None)
         self.scenes = [
@@ -101,6 +102,11 @@ class World:
             seen, held.seen = held.seen, []
             for each in seen:
                 each.opened.release()
+
+    def avatar(self, name: str) -> AvatarModel:
+        """One of the scene's own avatars, once they have been added; UnknownAvatarError."""
+        model: AvatarModel = self._served.avatar(name, EVERYBODY)
+        return model
 
     @property
     def visits(self) -> int:

@@ -48,13 +48,19 @@ class Usual:
 class Pipeline:
     """The effects of one scene in their order. Thread-safe, but for one body at a time.
 
-    runners: the effects.  usual: what each takes, by name.
+    runners: the effects.  usual: what each takes, by name.  bodies: see bodies.py; None where no effect asks for it.
     """
 
     def __init__(self, file: SceneFile, world: World, runners: list[Runner]) -> None:
         """Use `make_pipeline`."""
         self.file, self.world, self.runners = file, world, runners
         self.usual = {runner.name: Usual() for runner in runners}
+        # Where users and objects are: one for all effects that ask, kept up to date by the simulation. None: none asks.
+        self.bodies: Any = None
+        for runner in runners:
+            if hasattr(runner, "bodies"):
+                self.bodies = self.bodies or runner.bodies
+                runner.bodies = self.bodies
         self._beginners: list[Any] = [runner for runner in runners if hasattr(runner, "begin")]
         self._stops = any(runner.name == "stop" for runner in runners)
         limits = file.limits

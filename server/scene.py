@@ -40,7 +40,7 @@ from .rays import raycast
 from .request import SceneData
 from .residency import Residency
 from .session import Walker
-from .store import Store
+from .store import OpenStore, Store
 from .sweep import sweep
 from .within import within
 
@@ -59,10 +59,12 @@ class Scene:
     stays what is asked, whatever becomes of the folder, until `reload`.
     """
 
-    def __init__(self, store: Store, name: str, budget_bytes: int, policy: str) -> None:
+    def __init__(
+        self, store: Store, name: str, budget_bytes: int, policy: str, open_store: OpenStore
+    ) -> None:
         """Serve the voxels of `store`; use `Scene.open`."""
-        self.name = name
-        self._folder, self._budget_bytes, self._policy = store.archive.folder, budget_bytes, policy
+        self.name, self._folder, self._open_store = name, store.archive.folder, open_store
+        self._budget_bytes, self._policy = budget_bytes, policy
         self._metrics = Metrics()
         self._opened = Opened(store, budget_bytes, policy, took=self._metrics.loaded)
         self._before: Opened | None = None  # swapped out; perhaps not ended yet
@@ -81,15 +83,17 @@ class Scene:
         *,
         budget_bytes: int = DEFAULT_BUDGET,
         policy: str = "lru",
+        open_store: OpenStore = Store,
     ) -> "Scene":
         """Open the archive in `folder`, keeping at most budget_bytes of decoded voxels in memory.
 
         policy: which of them go first, and whether others are loaded before they are asked for, see policies.py.
+        open_store: opens the folder, now and at each reload (effects/through.py).
         Raises FormatError or CorruptError when it is no whole archive, BadRequestError for too small a budget.
         """
-        store = Store(folder)
+        store = open_store(folder)
         try:
-            return cls(store, name or Path(folder).resolve().name, budget_bytes, policy)
+            return cls(store, name or Path(folder).resolve().name, budget_bytes, policy, open_store)
         except BaseException:
             store.close()
             raise
@@ -128,7 +132,7 @@ class Scene:
                 raise BusyError(
                     f"{self.name}: the generation before the one served is still asked, by a path perhaps: reload later"
                 )
-            store = Store(self._folder)
+            store = self._open_store(self._folder)
             try:
                 new = Opened(store, self._budget_bytes, self._policy, old.number + 1, self._metrics.loaded)
             except BaseException:

@@ -1,5 +1,6 @@
 """Index row -> decoded voxel, written into the arena. Safe to call from several threads."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -26,9 +27,9 @@ class Store:
     archive: see schemas/archive.py.  sizes: (v,) int64, bytes of each voxel once decoded.
     """
 
-    def __init__(self, folder: str | Path) -> None:
-        """Open the archive in `folder`. Raises FormatError or CorruptError."""
-        self.archive = Archive(folder)
+    def __init__(self, folder: str | Path, open_archive: Callable[[str | Path], Archive] = Archive) -> None:
+        """Open the archive in `folder`; open_archive: how. Raises FormatError or CorruptError."""
+        self.archive = open_archive(folder)
         rows, header = self.archive.voxels, self.archive.header
         self.sizes = resident_bytes(
             rows["rows"][:, 1].astype(np.int64),
@@ -80,3 +81,7 @@ class Store:
     def close(self) -> None:
         """Close the archive's files."""
         self.archive.close()
+
+
+# Opens the archive in a folder.
+OpenStore = Callable[[str | Path], Store]

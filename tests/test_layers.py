@@ -35,8 +35,9 @@ DOORS = {
 # Needed everywhere; numpy and msgspec are the language that arrays and messages are written in.
 FREE = frozenset({"numpy", "msgspec"}) | sys.stdlib_module_names
 
-# An avatar's tree is built by the code that builds a voxel's; nothing else crosses from builder to server.
-CROSSING = ("builder/hierarchy", "builder/radius")
+# An avatar's tree is built by the code that builds a voxel's, and so is a voxel that a scene leaves points of out of;
+# nothing else crosses from builder to server.
+CROSSING = ("builder/hierarchy", "builder/radius", "builder/without")
 # Above both sides: the command line, and the reports.
 ABOVE = ("server/cli.py", "server/console.py", "server/report/", "server/verbs/")
 
@@ -131,7 +132,7 @@ def stray_inside(where: str, file: str, top: str, target: str) -> str | None:
         return f"{where}: {top} imports {target}; imports point down, server to builder to schemas"
     above = file.startswith(ABOVE)
     if top == "server" and aim == "builder" and not above and not target.startswith(CROSSING):
-        return f"{where}: imports {target}; the server uses {' and '.join(CROSSING)} alone"
+        return f"{where}: imports {target}; the server uses {', '.join(CROSSING)} alone"
     if target.startswith(ABOVE[2:]) and not above:
         return f"{where}: imports {target}; only the command line and the reports stand that high"
     return None

@@ -55,7 +55,7 @@ class AvatarItem(_Part, frozen=True):
     """An avatar that every user finds there. file: a scan or mesh of it.  radius: of its points [m]; left out: half
     the mean closest-point distance."""
 
-    name: ItemName
+    name: SceneName
     file: PathText
     radius: Annotated[float, msgspec.Meta(ge=0, le=8)] | None = None
 

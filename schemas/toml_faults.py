@@ -247,6 +247,8 @@ def _expected(node: Any) -> str:
     if isinstance(node, inspect.FloatType | inspect.IntType):
         kind = "an integer" if isinstance(node, inspect.IntType) else "a number"
         return kind + _bounds(node)
+    if isinstance(node, inspect.BoolType):
+        return "true or false"
     if isinstance(node, inspect.StrType):
         return f"a string{_lengths(node, 'characters')}"
     if isinstance(node, inspect.LiteralType):

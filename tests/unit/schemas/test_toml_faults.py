@@ -1,0 +1,106 @@
+"""What is wrong with a TOML file: where a statement begins, what is no TOML, what a type allows."""
+
+import random
+
+import msgspec
+import pytest
+from solidcloud.schemas.errors import BadRequestError
+from solidcloud.schemas.scene import parse_scene
+from solidcloud.schemas.toml_faults import decode, line_of, nearest, shown
+
+TOP = 'format = 1\n[[archives]]\npath = "hall"\n'
+
+
+def refused(text: str) -> str:
+    with pytest.raises(BadRequestError) as found:
+        parse_scene(text.encode(), "hall.toml")
+    return str(found.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (
+            b"format = 1\n[[archives]\n",
+            "hall.toml: no TOML: Expected ']]' at the end of an array declaration (at l",
+        ),
+        (b"format = 1\nname =\n", "(at line 2, column 7)"),
+        (b"format = 1\nformat = 1\n", "Cannot overwrite a value (at line 2"),
+        (b"format = 1\n# \xff\n", "hall.toml: line 2: bytes that are no UTF-8: save it as UTF-8"),
+        (b"a = " + b"[" * 100_000, "hall.toml: nested too deeply"),
+        (b"#" * ((4 << 20) + 1), "hall.toml: 4,194,305 bytes, expected at most 4,194,304"),
+    ],
+)
+def test_what_is_no_toml_says_where(text: bytes, said: str) -> None:
+    with pytest.raises(BadRequestError) as found:
+        parse_scene(text, "hall.toml")
+    assert said in str(found.value)
+
+
+def test_the_line_is_that_where_a_statement_begins_whatever_stands_around_it() -> None:
+    before = '# [[effects]]\nname = "hall" # effect = "x"\n\n' + TOP[11:] + "pose = [ # rows\n" + "  # more\n"
+    rows = "  [1, 0, 0, 0],\n  [0, 1, 0, 0],\n  [0, 0, 1, 0],\n  [0, 0, 0, 1],\n]\n"
+    text = "format = 1\n" + before + rows + '[[effects]]\n"effect" = "stop"\n\n[[effects]]\neffect = "slyde"'
+    assert "line 18: $.effects[1].effect" in refused(text)
+    crlf = text.replace("\n", "\r\n")
+    assert "line 18: $.effects[1].effect" in refused(crlf)
+
+
+def test_the_line_of_every_place_of_a_file_is_found() -> None:
+    rng = random.Random(5)
+    for _ in range(20):
+        lines: list[str] = []
+        expected: dict[str, int] = {}
+        for number in range(rng.randint(1, 6)):
+            lines += rng.choice([[], ["# a = 1"], ["", "#"]])
+            expected[f"$.item[{number}]"] = len(lines) + 1
+            lines.append("[[item]]")
+            for name in rng.sample("abcdef", rng.randint(0, 4)):
+                lines += rng.choice([[], [""], ['# "x"']])
+                expected[f"$.item[{number}].{name}"] = len(lines) + 1
+                value = (
+                    [f"{name} = [", " # [[item]]", " 1,", "]"],
+                    [f"{name} = 3"],
+                    [f'{name} = """', "[[item]]", '"""'],
+                )
+                lines += rng.choice(value)
+        text = "\n".join(lines)
+        assert {place: line_of(text, place) for place in expected} == expected
+        assert line_of(text, "$") is None and line_of(text, "$.other") is None
+
+
+def test_a_long_value_is_shortened_and_a_name_like_none_is_not_guessed() -> None:
+    assert shown("é" * 3) == '"ééé"' and shown(True) == "true"
+    assert len(shown(list(range(100)))) == 60 and shown(list(range(100))).endswith("…")
+    assert nearest("slid", ["stop", "slide"]) == ': did you mean "slide"?'
+    assert nearest("xyz", ["stop", "slide"]) == ""
+
+
+class _Inner(msgspec.Struct, forbid_unknown_fields=True):
+    size: int | float = 1
+    flag: bool = True
+
+
+class _Outer(msgspec.Struct):
+    inner: _Inner
+    names: dict[str, str] = {}
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("inner = 3", "line 1: $.inner: found 3: expected a table of size, flag"),
+        ('inner = {size = "x"}', 'line 1: $.inner.size: found "x": expected an integer or a number'),
+        ("inner = {flag = 1}", "line 1: $.inner.flag: found 1: expected true or false"),
+        ("inner = {sise = 1}", "$.inner.sise: this table has no field `sise`: expected size, flag"),
+        ("names = {}", "$: has no `inner`: expected `inner`"),
+        (
+            "names = [1]\ninner = {}",
+            "line 1: $.names: found [1]: expected a table whose values are each a string",
+        ),
+    ],
+)
+def test_other_types_are_told_as_well(text: str, said: str) -> None:
+    with pytest.raises(BadRequestError) as found:
+        decode(text.encode(), _Outer, "x.toml")
+    assert str(found.value).startswith("x.toml: ") and said in str(found.value)

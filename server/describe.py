@@ -1,8 +1,20 @@
 """What a scene says of itself: what its archive holds, as `info`, and what it keeps in memory, as `stats`."""
 
-import numpy as np
+from collections.abc import Sequence
 
-from ..schemas.messages import WIRE_VERSION, SceneInfo, SourceInfo, StatsAnswer
+import numpy as np
+from msgspec import structs
+
+from ..schemas.messages import (
+    WIRE_VERSION,
+    AvatarInfo,
+    ObjectInfo,
+    SceneInfo,
+    SourceInfo,
+    SpawnInfo,
+    StatsAnswer,
+)
+from ..schemas.scene import SceneFile, effect_name, up_of
 from .metrics import Metrics, times_of
 from .residency import Residency
 from .store import Store
@@ -46,6 +58,30 @@ def describe(store: Store, name: str) -> SceneInfo:
         radius_now=now.radius if now else None,
         radius_now_error=now.error if now else None,
     )
+
+
+def describe_scene(info: SceneInfo, file: SceneFile, avatars: Sequence[AvatarInfo] = ()) -> SceneInfo:
+    """What is said of a scene besides its archives: what its file calls for. avatars: the scene's own."""
+    spawn = file.spawn
+    return structs.replace(
+        info,
+        effects=run_order(file),
+        avatars=list(avatars),
+        up=up_of(file),
+        spawn=None if spawn is None else SpawnInfo(spawn.position, spawn.heading),
+        objects=[ObjectInfo(item.name, item.avatar, item.pose, item.kind) for item in file.objects],
+        default_radius_model=file.radius_model,
+    )
+
+
+def run_order(file: SceneFile) -> list[str]:
+    """The names of a scene's effects as they run: what is left out of the scene is when it is opened, before all."""
+    declared = {effect_name(effect) for effect in file.effects}
+    if len(declared) < 2:
+        return list(declared)
+    from .effects import ORDER  # an archive without a file has one effect: nothing of them is imported for it
+
+    return [name for name in ("through", *ORDER) if name in declared]
 
 
 def make_stats(

@@ -7,8 +7,9 @@ The trace goes on meanwhile, as the users of an open loop do. Fragments of the a
 
 import math
 from collections import deque
+from collections.abc import Iterator
 from dataclasses import dataclass, field
-from itertools import pairwise
+from itertools import islice, pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -146,6 +147,21 @@ class Outcome:
         return figures
 
 
+# One request: its number, the rows it needs, whose it is, when [s], and whether in the user's first second.
+Each = tuple[int, list[int], int, float, bool]
+
+
+def plan_turns(times: list[float], seconds: float) -> list[int]:
+    """At which requests what is wanted is found out: at the first, then whenever so long has passed."""
+    turns: list[int] = []
+    due = -math.inf
+    for number, time in enumerate(times):
+        if time >= due:
+            turns.append(number)
+            due = time + seconds
+    return turns
+
+
 class Replay:
     """One run of one policy. Demands hold what they need; users' places are kept where there is prefetching."""
 
@@ -179,45 +195,89 @@ class Replay:
 
     def run(self, requests: Requests) -> Outcome:
         """Replay all of it, from an empty cache. ValueError: one request alone does not fit the budget."""
-        asked, found = requests.asked, self.found
+        found, asked = self.found, requests.asked
         most = max((sum(self.sizes[row] for row in rows) for rows in requests.rows), default=0)
         if most > self.budget_bytes:
             raise ValueError(f"a request needs {most} bytes, the budget is {self.budget_bytes}: give more")
         waits = np.zeros(len(requests.rows))
-        centers = asked.center.tolist() if self.sees else requests.rows
         each = zip(
-            requests.rows, asked.user.tolist(), asked.time.tolist(), asked.reach.tolist(), asked.scan.tolist(),
-            requests.first.tolist(), centers, strict=True,
+            range(len(waits)), requests.rows, asked.user.tolist(), asked.time.tolist(), requests.first.tolist(),
+            strict=True,
         )  # fmt: skip
-        resident, ready, used = self.resident, self.ready, self.policy.used
-        for number, (rows, user, time, reach, scan, first, center) in enumerate(each):
-            if self.sees and user != NOBODY:
-                scan = self.neighbourhood.saw(("", str(user)), time, center, reach) or scan
-            if self.sees:
-                self.run_until(time)
-            if not ready and resident.issuperset(rows):
-                for row in rows:
-                    used(row, scan=scan)
-                if self.unused and user != NOBODY:
-                    self.unused.difference_update(rows)
-                continue
-            missed = found.misses
-            wait = self.demand(rows, time, scan)
-            if user == NOBODY:
-                found.misses_swept += found.misses - missed
-                continue
-            self.unused.difference_update(rows)
-            waits[number] = wait
-            found.frames_missed += wait > 0
-            if not first:
-                found.misses_later += found.misses - missed
-                found.frames_missed_later += wait > 0
+        if self.sees:
+            self.run_planned(requests, each, waits)
+        else:
+            self.run_some(each, asked.scan.tolist(), waits, -1)
         found.requests, found.references = len(requests.rows), len(requests.flat)
         found.waits = waits[asked.user != NOBODY]
         for row in self.unused:
             found.vain += 1
             found.vain_bytes += self.sizes[row]
         return found
+
+    def run_planned(self, requests: Requests, each: Iterator[Each], waits: NDArray[np.float64]) -> None:
+        """The same where users are seen: from one plan to the next.
+
+        What is wanted is found out at a request, when its pose is known. All poses until the next time are seen at
+        once: nobody looks at them before.
+        """
+        asked = requests.asked
+        somebody = np.flatnonzero(asked.user != NOBODY)
+        users = [("", str(user)) for user in asked.user[somebody].tolist()]
+        times, centers, reaches = asked.time[somebody], asked.center[somebody], asked.reach[somebody]
+        scans, every = asked.scan.copy(), asked.time.tolist()
+        plans = plan_turns(every, self.loading.plan_seconds)
+        seen = 0
+        for begin, end in pairwise([-1, *plans, len(every)]):
+            if begin >= 0:
+                now = every[begin]
+                self.run_until(now)
+                self.plan(now)
+            upto = int(np.searchsorted(somebody, end, side="right"))
+            some = slice(seen, upto)
+            scans[somebody[some]] |= self.neighbourhood.saw_each(
+                users[some], times[some], centers[some], reaches[some]
+            )
+            seen = upto
+            if begin >= 0:
+                self.run_some(islice(each, end - begin), scans[begin:end].tolist(), waits, begin)
+
+    def run_some(
+        self, each: Iterator[Each], scans: list[bool], waits: NDArray[np.float64], planned: int
+    ) -> None:
+        """Answer requests, one after another, and load meanwhile what is wanted; fills their waits.
+
+        planned: the request at which a plan was made: what is wanted since is loaded from the next on.
+        """
+        resident, ready, unused, queue = self.resident, self.ready, self.unused, self.queue
+        used = self.policy.used
+        for scan, (number, rows, user, time, first) in zip(scans, each, strict=True):
+            if (ready or queue) and number != planned:
+                self.run_until(time)
+            if not ready and resident.issuperset(rows):
+                for row in rows:
+                    used(row, scan=scan)
+                if unused and user != NOBODY:
+                    unused.difference_update(rows)
+                continue
+            self.answer(number, rows, user, time, first, scan, waits)
+
+    def answer(
+        self, number: int, rows: list[int], user: int, time: float, first: bool, scan: bool, waits: NDArray[np.float64]
+    ) -> None:  # fmt: skip
+        """Answer one request that may have to wait, and count it."""
+        found = self.found
+        missed = found.misses
+        wait = self.demand(rows, time, scan)
+        if user == NOBODY:
+            found.misses_swept += found.misses - missed
+            return
+        self.unused.difference_update(rows)
+        waits[number] = wait
+        found.frames_missed += wait > 0
+        if not first:
+            found.misses_later += found.misses - missed
+            found.frames_missed_later += wait > 0
 
     def demand(self, rows: list[int], now: float, scan: bool) -> float:
         """Make rows resident; returns how long their request waits [s]."""
@@ -279,21 +339,25 @@ class Replay:
             self.found.vain_bytes += self.sizes[row]
 
     def run_until(self, now: float) -> None:
-        """Let the loader do what is wanted until now, then find out anew what is."""
+        """Let the loader do what is wanted until now."""
         if self.ready:
             self.settle(now)
         while self.queue and self.free <= now:
             row, at = self.queue.popleft()
             if row not in self.resident and not self.load_ahead(row, at):
                 self.queue.clear()  # what is wanted later would have no room either
-        if now >= self.planned + self.loading.plan_seconds:
-            self.planned = now
-            self.neighbourhood.expire(now)
-            wanted = self.neighbourhood.plan(now, self.usual)
-            self.kept = frozenset(self.neighbourhood.kept(now).tolist())
-            if self.prefetch:
-                self.need = dict(zip(wanted.rows.tolist(), wanted.need.tolist(), strict=True))
-                self.queue = deque((row, at) for row, at in self.need.items() if row not in self.resident)
+
+    def plan(self, now: float) -> None:
+        """Find out anew what is wanted, and who stands where."""
+        self.planned = now
+        self.neighbourhood.expire(now)
+        wanted = self.neighbourhood.plan(now, self.usual)
+        self.kept = frozenset(self.neighbourhood.kept(now).tolist())
+        if self.prefetch:
+            self.need = dict(zip(wanted.rows.tolist(), wanted.need.tolist(), strict=True))
+            resident = self.resident
+            self.queue.clear()
+            self.queue.extend(each for each in self.need.items() if each[0] not in resident)
 
     def load_ahead(self, row: int, at: float) -> bool:
         """Begin a load ahead of time; False: no room, but for what is stood in, or wanted as soon."""

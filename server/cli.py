@@ -11,7 +11,7 @@ from typing import Any
 import typer
 
 from ..schemas.errors import BadRequestError, SolidcloudError
-from .verbs import accuracy, archive, build, export, generation, inspect, make, plan, query, serve, top
+from .verbs import accuracy, archive, build, export, generation, inspect, make, plan, query, scene, serve, top
 from .verbs.options import complain
 
 # Without rich's markup: importing it doubles the time --help takes, to over the 0.3 s it may.
@@ -27,6 +27,10 @@ makers.command("facade")(make.make_facade)
 makers.command("town")(make.make_town)
 makers.command("figure")(make.make_figure)
 makers.command("walk")(make.make_walk)
+scenes = typer.Typer(help="Begin a scene file, or check one.", rich_markup_mode=None)
+app.add_typer(scenes, name="scene")
+scenes.command("new")(scene.new)
+scenes.command("check")(scene.check)
 verb: Callable[..., None]
 for verb in (
     inspect.inspect,

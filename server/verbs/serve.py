@@ -1,15 +1,20 @@
-"""`solidcloud serve`: archives over zenoh."""
+"""`solidcloud serve`: an archive or a scene over zenoh."""
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from .options import ArchivePath, parse_bytes
+from .options import parse_bytes
 
 
 def serve(
-    archive: ArchivePath,
-    name: Annotated[str | None, typer.Option(help="Scene name for clients; left out: the folder's.")] = None,
+    what: Annotated[
+        Path, typer.Argument(metavar="ARCHIVE|SCENE.toml", help="Folder of an archive, or a scene file.")
+    ],
+    name: Annotated[
+        str | None, typer.Option(help="Scene name for clients; left out: the scene file's, or the folder's.")
+    ] = None,
     listen: Annotated[str, typer.Option(help="zenoh endpoint.")] = "tcp/127.0.0.1:7447",
     cache: Annotated[str, typer.Option(help="Decoded voxels kept in memory, at most.")] = "512MB",
     policy: Annotated[
@@ -25,14 +30,16 @@ def serve(
         bool, typer.Option("--insecure", help="Allow an endpoint that other hosts reach.")
     ] = False,
 ) -> None:
-    """Serve an archive over zenoh until told to stop."""
+    """Serve an archive, which stops who touches it, or a scene over zenoh until told to stop."""
     import logging
 
     from ..app import serve as serve_scenes
     from ..config import ServerConfig
-    from ..scene import Scene
+    from ..report.points import read_avatar
+    from ..scene_file import open_scene
 
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(message)s")
     config = ServerConfig(listen=listen, insecure=insecure, metrics_port=metrics_port)
-    with Scene.open(archive, name, budget_bytes=parse_bytes(cache, "--cache"), policy=policy) as scene:
+    budget = parse_bytes(cache, "--cache")
+    with open_scene(what, read_points=read_avatar, name=name, budget_bytes=budget, policy=policy) as scene:
         serve_scenes([scene], config)

@@ -1,0 +1,152 @@
+"""What `solidcloud scene check` says of a scene file: what it names, found whole, which effects run in which order."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+import numpy as np
+
+from ..schemas.effects import Objects, Through, Uncertainty
+from ..schemas.scene import SceneFile, effect_name, identity, read_scene, scene_name, up_of
+from .describe import run_order
+from .posed import moved_boxes
+from .scene_file import Found, FoundAvatar, ReadPoints, at_place, find_archives, read_avatars, store_opener
+
+
+class Checked(NamedTuple):
+    """A scene file in which nothing is wrong. left_out: points that are passed through.
+
+    notes: what is no fault, and perhaps not meant.
+    """
+
+    path: Path
+    name: str
+    file: SceneFile
+    archives: list[Found]
+    avatars: list[FoundAvatar]
+    left_out: int
+    notes: list[str]
+
+
+def check_scene_file(path: Path, read_points: ReadPoints) -> Checked:
+    """Read a scene file and all that it names. Raises as `open_scene` does, but for budgets."""
+    file = read_scene(path)
+    name = scene_name(file, path)
+    archives = find_archives(file, path)
+    avatars = read_avatars(file, path, read_points)
+    left_out = _left_out(file, path, archives)
+    return Checked(path, name, file, archives, avatars, left_out, list(_notes(file, archives, left_out)))
+
+
+def scene_facts(checked: Checked) -> Iterator[tuple[str, str]]:
+    """Names and values for a table."""
+    file = checked.file
+    yield "scene", f"{checked.name}, {checked.path}"
+    for item, found in zip(file.archives, checked.archives, strict=True):
+        info = found.info
+        posed = "" if item.pose == identity() else ", posed"
+        models = ", ".join(info.radius_models)
+        yield (
+            "archive",
+            f"{found.folder}: {info.points:,} points in {info.voxels:,} voxels, radii {models}{posed}",
+        )
+    yield "up", _numbers(up_of(file))
+    yield "radius model", file.radius_model or "each archive's one figure"
+    for item, avatar in zip(file.avatars, checked.avatars, strict=True):
+        made = avatar.info
+        yield f"avatar {item.name}", f"{avatar.file}: {made.points:,} points of {made.radius:.4g} m radius"
+    for thing in file.objects:
+        x, y, z = (row[3] for row in thing.pose[:3])
+        yield f"object {thing.name}", f"{thing.kind}, avatar {thing.avatar}, at {_numbers((x, y, z))} m"
+    if file.spawn:
+        yield "spawn", f"{_numbers(file.spawn.position)} m, heading {file.spawn.heading:g} degrees"
+    yield "limits", _options(file.limits)
+    by_name = {effect_name(effect): effect for effect in file.effects}
+    steps = run_order(file)
+    for number, name in enumerate(steps, 1):
+        effect = by_name[name]
+        if isinstance(effect, Through):
+            boxes = ", ".join(box.name for box in effect.boxes)
+            yield "once, at the start", f"through: {boxes}; {checked.left_out:,} points left out"
+        else:
+            options = _options(effect)
+            yield f"effect {number - ('through' in steps)}", f"{name}{': ' if options else ''}{options}"
+    if not steps:
+        yield "effects", "none: nothing stops anybody"
+    for note in checked.notes:
+        yield "note", note
+
+
+def scene_json(checked: Checked) -> dict[str, Any]:
+    """The same for a program; JSON's own types alone. scene: the file as read, with its defaults."""
+    return {
+        "file": str(checked.path),
+        "name": checked.name,
+        "scene": msgspec.to_builtins(checked.file),
+        "archives": [
+            {"folder": str(found.folder), "points": found.info.points, "voxels": found.info.voxels}
+            for found in checked.archives
+        ],
+        "avatars": [{"file": str(a.file), **msgspec.to_builtins(a.info)} for a in checked.avatars],
+        "order": run_order(checked.file),
+        "left_out": checked.left_out,
+        "notes": checked.notes,
+    }
+
+
+def _left_out(file: SceneFile, path: Path, archives: list[Found]) -> int:
+    """How many points are passed through."""
+    if not any(isinstance(effect, Through) for effect in file.effects):
+        return 0
+    left_out = 0
+    for number, found in enumerate(archives):
+        with at_place(path, f"$.archives[{number}]"):
+            store = store_opener(file, number)(found.folder)
+        left_out += found.info.points - int(store.archive.voxels["rows"][:, 2].sum(dtype=np.int64))
+        store.close()
+    return left_out
+
+
+def _notes(file: SceneFile, archives: list[Found], left_out: int) -> Iterator[str]:
+    """What is no fault, and perhaps not meant."""
+    for effect in file.effects:
+        if isinstance(effect, Objects) and not file.objects:
+            yield "the effect `objects` without any in [[objects]]: it has nothing to do"
+        if isinstance(effect, Through) and not left_out:
+            yield "no scan point lies in a box of `through`: are the boxes in world coordinates, in metres?"
+        if isinstance(effect, Uncertainty) and effect.scans:
+            for found in archives:
+                if not found.keeps_scan:
+                    yield f"{found.folder} keeps no scan of its points (build --keep scan): one sigma holds for all"
+    names = {effect_name(effect) for effect in file.effects}
+    if "stop" in names and "sweep" not in names:
+        yield "`stop` without `sweep`: what is thinner than a frame's motion may be passed through between two frames"
+    if file.spawn is not None:
+        low, high = _bounds(file, archives)
+        if not all(a <= x <= b for a, x, b in zip(low, file.spawn.position, high, strict=True)):
+            yield f"spawn lies outside what is scanned, {_numbers(low)} .. {_numbers(high)} m"
+
+
+def _bounds(file: SceneFile, archives: list[Found]) -> tuple[list[float], list[float]]:
+    """A box around all archives, world [m]."""
+    lows, highs = [], []
+    for item, found in zip(file.archives, archives, strict=True):
+        low, high = np.array(found.info.bounds)[:, None]
+        if item.pose != identity():
+            low, high = moved_boxes(np.array(item.pose), low, high)
+        lows.append(low[0])
+        highs.append(high[0])
+    return np.min(lows, axis=0).tolist(), np.max(highs, axis=0).tolist()
+
+
+def _numbers(values: Any) -> str:
+    """Numbers for a reader."""
+    return " ".join(f"{value:.6g}" for value in values)
+
+
+def _options(part: Any) -> str:
+    """The fields of a part of the file that are set, as they are written there."""
+    fields = msgspec.to_builtins(part)
+    fields.pop("effect", None)
+    return ", ".join(f"{name} {value}" for name, value in fields.items() if value not in (None, {}))

@@ -1,0 +1,203 @@
+"""What is served, opened: an archive, or what a scene file says. Every fault is told with the file and the place in it.
+
+What a scene does not call for is not imported: several archives, what points are left out of.
+"""
+
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from msgspec import structs
+from numpy.typing import NDArray
+
+from ..schemas.effects import Through, Uncertainty
+from ..schemas.errors import BadRequestError, SolidcloudError
+from ..schemas.messages import AvatarInfo, SceneInfo
+from ..schemas.radius_model import class_radii
+from ..schemas.scene import SUFFIX, SceneFile, identity, read_scene, scene_name
+from .arena import ArenaBuffer
+from .avatar import make_avatar
+from .describe import describe
+from .scene import DEFAULT_BUDGET, Scene
+from .served import SceneLike
+from .simulated import simulate
+from .store import OpenStore, Store
+
+ReadPoints = Callable[[Path], NDArray[np.float64]]
+
+
+class Found(NamedTuple):
+    """One archive of a scene. info: what it says of itself.  sizes: (v,) int64, bytes of each voxel once decoded.
+
+    keeps_scan: whether it knows the scan of each point.
+    """
+
+    folder: Path
+    info: SceneInfo
+    sizes: NDArray[np.int64]
+    keeps_scan: bool
+
+
+class FoundAvatar(NamedTuple):
+    """One avatar of a scene: the file's points (n, 3) [m], and what is made of them."""
+
+    file: Path
+    points: NDArray[np.float64]
+    info: AvatarInfo
+
+
+def is_scene_file(path: Path) -> bool:
+    """Whether a path is that of a scene file, there or not; else it is that of an archive, which is a folder."""
+    return path.suffix == SUFFIX and not path.is_dir()
+
+
+@contextmanager
+def open_scene(
+    path: str | Path,
+    *,
+    read_points: ReadPoints,
+    name: str | None = None,
+    budget_bytes: int = DEFAULT_BUDGET,
+    policy: str = "lru",
+) -> Iterator[SceneLike]:
+    """What is served of an archive's folder or a scene file; closed at the end.
+
+    read_points: the points (n, 3) of a file [m].  name: what clients call it; None: as the file says, else the file's
+    or the folder's name.  budget_bytes: of decoded voxels, all archives together.  policy: see policies.py.
+    Raises BadRequestError for a file that is wrong, FormatError, CorruptError or ScanError for what it names.
+    """
+    path = Path(path)
+    if not is_scene_file(path):
+        with Scene.open(path, name, budget_bytes=budget_bytes, policy=policy) as scene:
+            yield scene
+        return
+    file = read_scene(path)
+    name = name or scene_name(file, path)
+    found = find_archives(file, path)
+    avatars = read_avatars(file, path, read_points)
+    own = {item.name: (a.points, a.info.radius) for item, a in zip(file.avatars, avatars, strict=True)}
+    with ExitStack() as stack:
+        served = _open_archives(file, path, name, found, budget_bytes, policy, stack)
+        yield stack.enter_context(simulate(served, file, own))
+
+
+def find_archives(file: SceneFile, path: Path) -> list[Found]:
+    """The archives that a scene file names, found whole by their indexes, and holding what the file asks of them.
+
+    path: the file's, for errors and for paths relative to it. Raises FormatError, CorruptError, BadRequestError.
+    """
+    found = []
+    for number, item in enumerate(file.archives):
+        with at_place(path, f"$.archives[{number}].path"):
+            store = Store((path.parent / item.path).resolve())
+        try:
+            header = store.archive.header
+            if file.radius_model is not None:
+                with at_place(path, f"$.radius_model: {store.archive.folder}"):
+                    class_radii(file.radius_model, header.radius, header.models)
+            info = describe(store, store.archive.folder.name)
+            found.append(Found(store.archive.folder, info, store.sizes, header.scan_index))
+        finally:
+            store.close()
+    _check_noise(file, path, found)
+    return found
+
+
+def read_avatars(file: SceneFile, path: Path, read_points: ReadPoints) -> list[FoundAvatar]:
+    """The avatars that a scene file names. Raises what `read_points` does, and BadRequestError."""
+    found = []
+    for number, item in enumerate(file.avatars):
+        avatar_file = (path.parent / item.file).resolve()
+        with at_place(path, f"$.avatars[{number}].file"):
+            points = read_points(avatar_file)
+        with at_place(path, f"$.avatars[{number}]"):
+            model = make_avatar(points, item.radius)
+        info = AvatarInfo(item.name, len(points), model.radius, model.bounding_radius)
+        found.append(FoundAvatar(avatar_file, points, info))
+    return found
+
+
+def store_opener(file: SceneFile, number: int) -> OpenStore:
+    """What opens the folder of archive `number`: as it is, or without the points that are passed through."""
+    for effect in file.effects:
+        if isinstance(effect, Through):
+            from .effects.through import store_without
+
+            return store_without(effect, file.archives[number].pose)
+    return Store
+
+
+def share_budget(budget_bytes: int, sizes: list[NDArray[np.int64]]) -> list[int]:
+    """What of a budget each archive gets: room for its largest voxel, the rest after what they take whole.
+
+    sizes: (v,) of each, bytes of its voxels. BadRequestError where the largest voxels alone take more.
+    """
+    if len(sizes) == 1:
+        return [budget_bytes]  # `Residency` says what it misses
+    least = [ArenaBuffer.rounded(int(each.max(initial=0))) for each in sizes]
+    rest = budget_bytes - sum(least)
+    if rest < 0:
+        raise BadRequestError(
+            f"cache of {budget_bytes} bytes: the largest voxels of {len(sizes)} archives take {sum(least)}: give a "
+            "larger --cache, or build with a smaller --voxel"
+        )
+    whole = [int(each.sum()) for each in sizes]
+    return [low + rest * size // max(sum(whole), 1) for low, size in zip(least, whole, strict=True)]
+
+
+def _open_archives(
+    file: SceneFile,
+    path: Path,
+    name: str,
+    found: list[Found],
+    budget_bytes: int,
+    policy: str,
+    stack: ExitStack,
+) -> SceneLike:
+    """The archives as one scene; stack: closes them where that fails, else whoever has it does."""
+    with at_place(path, "$.archives"):
+        budgets = share_budget(budget_bytes, [each.sizes for each in found])
+    scenes = []
+    for number, (each, budget) in enumerate(zip(found, budgets, strict=True)):
+        with at_place(path, f"$.archives[{number}]"):
+            scene = Scene.open(
+                each.folder,
+                name,
+                budget_bytes=budget,
+                policy=policy,
+                open_store=store_opener(file, number),
+                radius_model=file.radius_model,
+            )
+        scenes.append(stack.enter_context(scene))
+    poses = [None if item.pose == identity() else np.array(item.pose) for item in file.archives]
+    if len(scenes) == 1 and poses[0] is None:
+        return scenes[0]
+    from .several import SeveralScenes
+
+    with at_place(path, "$.archives"):
+        return SeveralScenes(list(zip(scenes, poses, strict=True)), name)
+
+
+def _check_noise(file: SceneFile, path: Path, found: list[Found]) -> None:
+    """BadRequestError for the noise of a scan that is none."""
+    for number, effect in enumerate(file.effects):
+        if isinstance(effect, Uncertainty):
+            from .effects.uncertainty import check
+
+            sources = [source for each in found for source in each.info.sources]
+            with at_place(path, f"$.effects[{number}]"):
+                check(effect, structs.replace(found[0].info, sources=sources))
+
+
+@contextmanager
+def at_place(path: Path, place: str) -> Iterator[None]:
+    """Errors raised inside say the file and the place in front."""
+    try:
+        yield
+    except SolidcloudError as error:
+        error.args = (f"{path}: {place}: {error}",)
+        raise
+    except OSError as error:
+        raise BadRequestError(f"{path}: {place}: {error}") from None

@@ -179,7 +179,7 @@ def _machine_errors(change: Change) -> Iterator[None]:
 def config_of(header: Header, target: Path, jobs: int, memory_bytes: int) -> BuildConfig:
     """The options an archive was built with. BadRequestError for those under which a scan cannot be added later."""
     stored = dict(header.options)
-    known = set(BuildConfig().identity()) | {"cells", "models"}
+    known = set(BuildConfig().identity()) | {"cells", "models", "normal_reach"}
     if others := sorted(set(stored) - known):
         raise BadRequestError(
             f"{target}: built with {', '.join(others)}, which look at all scans at once: build again"

@@ -5,6 +5,7 @@ import re
 from dataclasses import dataclass, field
 
 from ..schemas.errors import BadRequestError
+from ..schemas.normals import DEFAULT_REACH, MAX_REACH
 from ..schemas.radius_model import MAX_RADIUS, STORED_MODELS
 from ..schemas.voxel import MAX_DEGREE, MAX_LEAF, MIN_DEGREE
 
@@ -92,7 +93,8 @@ class BuildConfig:
     spacing: meshes are sampled about this far apart [m]; None: their vertices are taken.
     with_slab: cut each sphere by a slab; False is the paper's structure, for comparison, five times as slow.
     jobs: worker processes; 0: one a core.  memory_bytes: bound on what the passes hold.
-    keep: extra columns, among "scan" and "intensity".  strict: a non-finite point fails the build.
+    keep: extra columns, among "scan", "intensity" and "normal".  normal_reach: how near the points are that a normal
+    is estimated of [m] (schemas/kernels/normals.py), where it is kept.  strict: a non-finite point fails the build.
     skip_bad: leave out scans that cannot be read and mark their region as unknown.
     overwrite: replace an archive of the same name, once the new one is whole.
     fresh: forget what a build of the same name that was interrupted has done.
@@ -116,6 +118,7 @@ class BuildConfig:
     jobs: int = 0
     memory_bytes: int = 2 << 30
     keep: frozenset[str] = field(default_factory=frozenset)
+    normal_reach: float = DEFAULT_REACH
     strict: bool = False
     skip_bad: bool = False
     overwrite: bool = False
@@ -161,9 +164,14 @@ class BuildConfig:
             (self.jobs >= 0, f"--jobs {self.jobs}", "0 (all cores) or more"),
             (self.memory_bytes >= 64 << 20, f"--memory {self.memory_bytes} bytes", "at least 64MB"),
             (
-                self.keep <= {"scan", "intensity"},
+                self.keep <= {"scan", "intensity", "normal"},
                 f"--keep {','.join(sorted(self.keep))}",
-                "scan, intensity or both",
+                "scan, intensity, normal, by comma",
+            ),
+            (
+                0 < self.normal_reach <= MAX_REACH,
+                f"--normal-reach {self.normal_reach}",
+                f"a length above 0, at most {MAX_REACH:g} m",
             ),
             (self.thin is None or 0 < self.thin < math.inf, f"--thin {self.thin}", "a positive distance"),
             (
@@ -206,6 +214,7 @@ class BuildConfig:
             # Named only where it is not the default: archives without it stay what they were, byte for byte.
             **({} if self.cells == "octree" else {"cells": self.cells}),
             **({} if self.models == {"mean"} else {"models": ",".join(self.stored_models())}),
+            **({"normal_reach": self.normal_reach} if "normal" in self.keep else {}),
             **({} if self.thin is None else {"thin": self.thin}),
             **({} if self.outliers is None else {"outliers": "{!r},{}".format(*self.outliers)}),
             **({} if self.moving is None else {"moving": "{!r},{}".format(*self.moving)}),

@@ -29,7 +29,7 @@ from ..schemas.codec import (
     point_dtype,
     point_rows,
 )
-from ..schemas.errors import CorruptError
+from ..schemas.errors import BadRequestError, CorruptError
 from ..schemas.row_stream import RowStream, pwrite_all
 from ..schemas.voxel import CELL_BITS, Cells, Nodes, VoxelData, top_shift
 from .cells import CellTrees, block_points, build_trees, leaf_runs
@@ -82,6 +82,16 @@ class BuiltVoxel(NamedTuple):
 def is_dense(points: int, config: BuildConfig) -> bool:
     """Whether a voxel of so many points is built in parts. Balanced cells, kept to compare, want the whole voxel."""
     return points > DENSE_POINTS and config.cells == "octree"
+
+
+def check_normals(counts: NDArray[np.int64], config: BuildConfig) -> None:
+    """Refuse normals where a voxel, of `counts` (v,) points, is built in parts: neighbours may be in another."""
+    most = int(counts.max(initial=0))
+    if "normal" in config.keep and is_dense(most, config):
+        raise BadRequestError(
+            f"--keep normal: a voxel of {config.voxel:g} m holds {most} points, more than are held at once: give a "
+            "smaller --voxel, or leave it out: a server finds the normals it needs"
+        )
 
 
 def plan_parts(spool: Spool, key: int, config: BuildConfig) -> Iterator[list[Cube]]:

@@ -62,6 +62,7 @@ def record_bytes_a_point(config: BuildConfig) -> int:
         scan_index="scan" in config.keep,
         intensity="intensity" in config.keep,
         radius_class=config.models != {"mean"},
+        normal="normal" in config.keep,
     )
     return 2 * row.itemsize + math.ceil(NODES_A_FULL_LEAF * RECORD_BYTES_A_NODE / config.leaf)
 

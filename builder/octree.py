@@ -17,13 +17,14 @@ class VoxelPoints(NamedTuple):
     """The points of one voxel, in any order.
 
     local: (n, 3) int32 [voxel steps].  scan_index: (n,) uint16 or None.  intensity: (n,) float32 or None.
-    radius_class: (n,) uint8 or None, the same for equal points.
+    radius_class: (n,) uint8 or None, normal: (n,) uint16 or None: the same for equal points.
     """
 
     local: NDArray[np.int32]
     scan_index: NDArray[np.uint16] | None = None
     intensity: NDArray[np.float32] | None = None
     radius_class: NDArray[np.uint8] | None = None
+    normal: NDArray[np.uint16] | None = None
 
 
 def canonical(points: VoxelPoints) -> tuple[VoxelPoints, NDArray[np.uint64]]:

@@ -17,6 +17,7 @@ from ..schemas.shard import SHARD_FOLDER, file_checksum
 from ..schemas.voxel_grid import Lattice
 from .believed import check_runs
 from .config import BuildConfig
+from .dense import check_normals
 from .executor import Executor
 from .filter_rules import filter_dtype, filter_passes, is_filtered, make_rules
 from .journal import Work, resumed
@@ -215,6 +216,7 @@ def build_shards(
     stages: Stages,
 ) -> list[Shard]:
     """Third pass: every voxel's octree and hierarchies, into shards; those with the most points first."""
+    check_normals(spool.counts, config)
     folder = place.archive / SHARD_FOLDER
     # Beside the voxel itself, or a part of it.
     most_near = max(1 << 16, memory_share(executor.jobs, config) // (2 * VOXEL_BYTES_A_POINT))

@@ -228,7 +228,9 @@ def estimate(scene: Scene, config: BuildConfig, rates: Rates, target: Path | Non
     pitch = math.sqrt(scene.area / scene.points)
     voxels = _voxels(scene, config.voxel, rates)
     jobs = jobs_that_fit(worker_count(config.jobs, scene.points), config)
-    columns = sum({"scan": 0.2, "intensity": 2.0}[name] for name in config.keep) + (config.models != {"mean"})
+    columns = sum({"scan": 0.2, "intensity": 2.0, "normal": 2.0}[name] for name in config.keep) + (
+        config.models != {"mean"}
+    )
     each = rates.bytes_a_point(pitch / step) + columns
     size = round(scene.points * each + voxels * (INDEX_BYTES + GROUP_BYTES))
     spool = scene.points * spool_dtype(config).itemsize

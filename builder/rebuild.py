@@ -18,7 +18,7 @@ from ..schemas.shard import SHARD_FOLDER
 from ..schemas.voxel_grid import voxel_coordinates
 from .change import Change, publish, reading_back, show_kept, verify_new
 from .config import RADIUS_SAMPLE
-from .dense import DENSE_POINTS
+from .dense import DENSE_POINTS, check_normals
 from .partition import LEAST_RUN_POINTS
 from .passes import VOXEL_BYTES_A_POINT
 from .pipeline import ARCHIVE_BYTES_A_POINT, SCRATCH_BYTES_A_POINT
@@ -236,6 +236,7 @@ def _most_near(change: Change) -> int:
 def _build(change: Change, header: Header, spool: Spool, wanted: set[int]) -> list[Shard]:
     """Build the voxels of `wanted` that hold points, into new shards in the hidden folder."""
     which = np.isin(spool.keys, np.array(sorted(wanted), np.uint64))
+    check_normals(spool.counts[which], change.config)
     units = [
         ShardUnit(
             number, header.generation, keys, points, spool, header.lattice, change.config, _most_near(change),

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..schemas.codec import encode_voxel
+from ..schemas.normals import normal_reach
 from ..schemas.radius_model import RADIUS_CLASSES
 from ..schemas.shard import shard_name, write_shard
 from ..schemas.voxel_grid import Lattice
@@ -95,9 +96,8 @@ def build_shard(unit: ShardUnit) -> Shard:
     """Gather, build, compress and write the voxels of one shard, one at a time."""
     classes = None if unit.config.models == {"mean"} else _ClassCounts(unit)
     path = unit.folder / shard_name(unit.number, unit.generation)
-    rows, checksum = write_shard(
-        path, unit.number, unit.archive_id, _voxels(unit, classes), version=1 if classes is None else 2
-    )
+    version = 4 if "normal" in unit.config.keep else 1 if classes is None else 2
+    rows, checksum = write_shard(path, unit.number, unit.archive_id, _voxels(unit, classes), version=version)
     counts, capped = (
         (np.zeros(RADIUS_CLASSES, np.int64), 0) if classes is None else (classes.of, classes.capped)
     )
@@ -115,6 +115,13 @@ def _voxels(unit: ShardUnit, classes: _ClassCounts | None) -> Iterator[BuiltVoxe
         low, high = (edge(points.local, axis=0).astype(np.int64) for edge in (np.min, np.max))
         if classes is not None:
             points = points._replace(radius_class=classes.find(key, points.local))
+        if "normal" in unit.config.keep:
+            from .normals import (
+                voxel_normals,
+            )  # most builds have no use for its kernels, and do not load them
+
+            square = normal_reach(unit.config.normal_reach, unit.lattice.step, len(points.local))
+            points = points._replace(normal=voxel_normals(points.local, square))
         voxel = build_voxel(key, points, unit.lattice.voxel_steps, unit.config)
         del points
         yield BuiltVoxel(voxel, encode_voxel(voxel, unit.archive_id), low, high)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from ..schemas.archive import Archive
 from ..schemas.codec import OpenRecord
 from ..schemas.errors import BadRequestError, CorruptError
+from ..schemas.normals import normal_reach
 from ..schemas.radius_model import RADIUS_CLASSES
 from ..schemas.shard import SHARD_FOLDER
 from .exact import loose_nodes, sample_nodes
@@ -19,6 +20,7 @@ from .kernels.records import measure_points, sum_places
 from .portions import jobs_of, portions, run_units
 from .preview import preview_faults
 from .progress import Progress, Silent
+from .radius import voxel_points
 from .record_points import leaves_of, spheres_of
 from .unchanged import unchanged
 
@@ -81,7 +83,8 @@ def verify_archive(
     executor: Executor | None = None,
     places: int | None = None,
 ) -> VerifyReport:
-    """Read every record and check it; with `deep`, also that every bound encloses all points below it, exactly.
+    """Read every record and check it; with `deep`, also that every bound encloses all points below it, exactly, and
+    that normals are those of the points.
 
     exact: prove the bounds once more in Python's integers, without compiled code.  sample: only so many of them,
     spread over the archive; None: all.  executor: what runs the work; None: this process.  places: what
@@ -163,14 +166,18 @@ def _verify_rows(unit: _Unit) -> _Found:
         for i, row in enumerate(unit.rows):
             known = len(faults)
             try:
-                record = archive.open_voxel(row, columns=("radius_class",))
+                record = archive.open_voxel(row, columns=("radius_class", "normal"))
                 with archive.locating(row):
                     faults += voxel_faults(archive, row, record, unit.deep)
                     counted = record.class_counts()
+                    if archive.header.normals:
+                        record.check_normals()
                 if unit.summed:
                     corner = archive.coordinates[row] * record.voxel_steps
                     places += int(sum_places(leaves_of(record), corner, SEEDS[0]))
                 del record
+                if unit.deep and archive.header.normals:
+                    faults += normal_faults(archive, row)
                 if unit.asked is not None:
                     loose = loose_nodes(*archive.read_voxel(row), unit.asked[i].tolist())
                     faults += [_loose(archive, row, node) for node in loose]
@@ -209,6 +216,20 @@ def voxel_faults(archive: Archive, row: int, record: OpenRecord, deep: bool) -> 
         if node >= 0:
             faults.append(_loose(archive, row, node))
     return faults
+
+
+def normal_faults(archive: Archive, row: int) -> list[str]:
+    """The fault of a voxel whose normals are not those of its points, which are held, all columns and all."""
+    from .normals import voxel_normals  # most archives have none
+
+    header = archive.header
+    voxel, links = archive.read_voxel(row)
+    square = normal_reach(header.normal_reach, header.lattice.step, len(voxel.points))
+    found = voxel_normals(voxel_points(voxel, links).astype(np.int32), square)
+    wrong = int(np.count_nonzero(found != voxel.normal))
+    if not wrong:
+        return []
+    return [f"{archive.where(row)}: {wrong} normals are not those of the points: rebuild the archive"]
 
 
 def _strangers(archive: Archive) -> list[str]:

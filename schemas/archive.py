@@ -79,6 +79,7 @@ class Archive:
             scan_index=self.header.scan_index,
             intensity=self.header.intensity,
             radius_class=self.header.radius_class,
+            normal=self.header.normals,
         )
         self._check_shards()
         # All of them now: an archive that is replaced while it is read stays the one that was opened.

@@ -52,10 +52,10 @@ NODE_DTYPE = np.dtype(
 
 
 # The optional columns of the points, in the order of their fields in a row.
-OPTIONAL_COLUMNS = ("scan_index", "intensity", "radius_class")
+OPTIONAL_COLUMNS = ("scan_index", "intensity", "radius_class", "normal")
 
 
-def point_dtype(*, scan_index: bool, intensity: bool, radius_class: bool) -> np.dtype:
+def point_dtype(*, scan_index: bool, intensity: bool, radius_class: bool, normal: bool = False) -> np.dtype:
     """The row of the points dataset: x, y, z and the optional columns."""
     fields: list[tuple] = [("xyz", "<u2", (3,))]
     if scan_index:
@@ -64,6 +64,8 @@ def point_dtype(*, scan_index: bool, intensity: bool, radius_class: bool) -> np.
         fields.append(("intensity", "<f4"))
     if radius_class:
         fields.append(("radius_class", "u1"))
+    if normal:
+        fields.append(("normal", "<u2"))
     return np.dtype(fields)
 
 
@@ -199,6 +201,22 @@ class OpenRecord(NamedTuple):
                 f"voxel {self.key:#x}: radius class {greatest}, expected at most {RADIUS_CLASSES - 1}"
             )
 
+    def read_normals(self, lanes: NDArray[np.uint16]) -> None:
+        """Write normal, in a record that has it, into lanes (b, MAX_LEAF), as `read_points` does.
+
+        Raises CorruptError for what is no code (kernels/normals.py).
+        """
+        self.check_normals()
+        at = self.dtype.fields["normal"][1]  # type: ignore[index]  # its dtype has fields
+        leaf_column(self.planes[at : at + 2], self.tree, self.nodes.count, lanes)
+
+    def check_normals(self) -> None:
+        """Refuse a record with what is no code of a normal: both bytes are 0, or neither is."""
+        at = self.dtype.fields["normal"][1]  # type: ignore[index]  # its dtype has fields
+        low, high = self.planes[at : at + 2]
+        if wrong := int(np.count_nonzero((low == 0) != (high == 0))):
+            raise CorruptError(f"voxel {self.key:#x}: {wrong} normals that are no codes, expected none")
+
     def class_counts(self) -> NDArray[np.int64]:
         """The points of each radius class, (RADIUS_CLASSES,); zeros in a record without. Raises as `read_classes`."""
         counts = np.zeros(256, np.int64)
@@ -211,7 +229,7 @@ class OpenRecord(NamedTuple):
 
     def decode(self) -> tuple[VoxelData, Links]:
         """The whole voxel, its points in rows. Raises CorruptError when a point lies outside its cell, and for a
-        radius class that there is none of."""
+        radius class or a normal that there is none of."""
         lanes = np.empty((self.leaves, 3, MAX_LEAF), np.uint16)
         self.read_points(lanes)
         points = np.empty((self.planes.shape[1], 3), np.uint16)
@@ -223,6 +241,8 @@ class OpenRecord(NamedTuple):
         }
         if "radius_class" in kept:
             self._check_classes(int(kept["radius_class"].max()))
+        if "normal" in kept:
+            self.check_normals()
         cells, nodes = transposed(self.cells), transposed(self.nodes)
         voxel = VoxelData(self.key, top_shift(self.voxel_steps), cells, nodes, points, **kept)
         return voxel, self.links

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .normals import MAX_REACH
 from .radius_model import LOCAL_CLASSES, RADIUS_CLASSES, local_radii
 from .voxel_grid import Lattice
 
@@ -85,6 +86,7 @@ class Header:
     left out; unknown_everywhere: one was left out of which not even the bounds are known.
     generation: how often scans were added or removed since the build.  radius_now: what `radius` would be if it were
     measured now; None in generation 0, where it is, and where it was given.
+    normal_reach: what the points' normals were estimated with [m] (kernels/normals.py); 0: they have none.
     """
 
     archive_id: bytes
@@ -111,6 +113,7 @@ class Header:
     unknown_everywhere: bool
     generation: int = 0
     radius_now: RadiusNow | None = None
+    normal_reach: float = 0.0
 
     @property
     def radius_class(self) -> bool:
@@ -118,8 +121,15 @@ class Header:
         return self.models != ("mean",)
 
     @property
+    def normals(self) -> bool:
+        """Whether every point has a normal, or the code that says it has none."""
+        return self.normal_reach > 0
+
+    @property
     def format_version(self) -> int:
         """The version of the format that says all of this: the first where nothing newer is in it."""
+        if self.normals:
+            return 4
         if self.generation:
             return 3
         return 2 if self.radius_class else 1
@@ -189,19 +199,21 @@ def index_columns(header: Header, voxels: NDArray, shards: list[tuple[str, int]]
     lattice = header.lattice
     columns = [header.scan_index, header.intensity]
     classes = {}
-    if header.radius_class:
+    if header.radius_class or header.normals:
         columns += ["local" in header.models, "border" in header.models]
+    if header.radius_class:
         classes = {
             "radius_counts": header.radius_counts.astype("<u8"),
             "radius_capped": np.array([header.radius_capped], "<u8"),
         }
     later: dict[str, NDArray] = {}
+    if header.normals:
+        columns += [True]
+        later["normal_reach"] = np.array([header.normal_reach], "<f8")
     if header.generation:
         now = header.radius_now or RadiusNow(header.radius, header.radius_error, 0)
-        later = {
-            "generation": np.array([header.generation], "<u4"),
-            "radius_now": np.array([now.radius, now.error, now.sample], "<f8"),
-        }
+        later["generation"] = np.array([header.generation], "<u4")
+        later["radius_now"] = np.array([now.radius, now.error, now.sample], "<f8")
     return {
         "origin": np.array(lattice.origin, "<f8"),
         "step": np.array([lattice.step], "<f8"),
@@ -243,6 +255,16 @@ def _check_counts(counts: NDArray, capped: int, points: int) -> None:
         raise ValueError(
             f"radius_counts {counted}, radius_capped {capped}: expected those of {points} points"
         )
+
+
+def _normal_reach(columns: dict[str, NDArray]) -> float:
+    """The reach of the normals, 0 where points have none. Raises ValueError for one that is none."""
+    if len(columns["columns"]) < 5:
+        return 0.0
+    reach = float(columns["normal_reach"][0])
+    if not (0 < reach <= MAX_REACH and columns["columns"][4] == 1):
+        raise ValueError(f"normal_reach {reach}: expected above 0, at most {MAX_REACH:g}")
+    return reach
 
 
 def _unknown_row(row: Any, boxes: int) -> int | None:
@@ -313,4 +335,5 @@ def read_header(archive_id: bytes, columns: dict[str, NDArray]) -> Header:
         unknown_everywhere=bool(columns["unknown_everywhere"][0]),
         generation=generation,
         radius_now=now,
+        normal_reach=_normal_reach(columns),
     )

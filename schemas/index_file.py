@@ -14,7 +14,7 @@ from .index import Header, index_columns, index_digest
 from .new_file import new_file, publish
 
 # What this software reads, and writes: the first version that holds what is to be said (schemas/index.py Header).
-FORMAT_VERSIONS = (1, 2, 3)
+FORMAT_VERSIONS = (1, 2, 3, 4)
 INDEX_NAME = "index.h5"
 
 

@@ -7,7 +7,7 @@ from .errors import BadRequestError
 
 # Points so near have a say in a point's normal [m]: some forty a scanner sees of a façade, and no more than a hand.
 DEFAULT_REACH = 0.08
-# Farther is no surface any more, and sums fit 63 bits for up to 2^22 points of a voxel at the finest step [m].
+# Farther is no surface any more, and at steps of 0.1 mm sums fit 63 bits for any voxel.
 MAX_REACH = 1.0
 
 
@@ -15,13 +15,13 @@ def normal_reach(reach: float, step: float, points: int) -> int:
     """The greatest square of a distance within `reach` [m], in squared steps; BadRequestError for one that is none.
 
     Both lengths count as their decimal texts: 800 steps of 0.1 mm are 8 cm.  points: of the largest voxel, whose sums
-    must fit 63 bits.
+    must fit 63 bits, also those taken from a place a diameter off and moved (builder/kernels/normals.py).
     """
     if not 0 < reach <= MAX_REACH:
         raise BadRequestError(f"normal reach {reach!r}: expected a length above 0, at most {MAX_REACH:g} m")
     square = int((Fraction(repr(float(reach))) / Fraction(repr(step))) ** 2)
-    if square * max(points, 1) >= 1 << 62:
-        most = 0.995 * math.sqrt((1 << 62) / max(points, 1)) * step
+    if square * max(points, 1) >= 1 << 59:
+        most = 0.995 * math.sqrt((1 << 59) / max(points, 1)) * step
         raise BadRequestError(
             f"normal reach {reach!r} m: of {points} points in a voxel sums do not fit 63 bits: give {most:.3g} at most"
         )

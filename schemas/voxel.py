@@ -67,7 +67,7 @@ class VoxelData(NamedTuple):
     key: voxel key.  top_shift: see Nodes.center.  cells, nodes: see there.
     points: (p, 3) uint16 x, y, z from their leaf node's block_low, in leaf-node order [steps].
     scan_index: (p,) uint16 or None.  intensity: (p,) float32 or None.  radius_class: (p,) uint8 below
-    RADIUS_CLASSES, or None.
+    RADIUS_CLASSES, or None.  normal: (p,) uint16, codes of kernels/normals.py, or None.
     """
 
     key: int
@@ -78,6 +78,7 @@ class VoxelData(NamedTuple):
     scan_index: NDArray[np.uint16] | None = None
     intensity: NDArray[np.float32] | None = None
     radius_class: NDArray[np.uint8] | None = None
+    normal: NDArray[np.uint16] | None = None
 
 
 class Links(NamedTuple):

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..schemas.kernels.normals import NONE, decode_normal
 from ..schemas.normals import normal_reach
 from .kernels.layout import LANES
-from .kernels.normals import UNASKED, code_at, find_voxel
+from .kernels.normals import UNASKED, code_at, find_voxel, stored_code_at
 from .request import SceneData
 from .store import Store
 
@@ -23,7 +23,8 @@ SHARE = 1 / 32
 class Normals:
     """The normals of one generation of an archive. Thread-safe.
 
-    What is estimated is kept, two bytes for each point of a voxel, from the first question about it until the voxel is
+    Those that the store has loaded (`Store.with_normals`) are looked up where somebody asks for their reach. What is
+    estimated is kept, two bytes for each point of a voxel, from the first question about it until the voxel is
     evicted or others need the room: those asked first go first.
     used_bytes: of these.  most_bytes: their bound.  estimated: normals that were computed.  visits: tree nodes, of all.
     """
@@ -42,6 +43,11 @@ class Normals:
         self._codes: OrderedDict[tuple[int, int], NDArray[np.uint16]] = OrderedDict()
         self._evictions = 0
         self._squares: dict[float, int] = {}
+        self._stored = -1
+        if store.with_normals:
+            self._stored = normal_reach(
+                store.archive.header.normal_reach, data.arrays.step, self._most_points
+            )
 
     def at(self, cloud: ArrayLike, toward: ArrayLike, reach: float) -> NDArray[np.float64] | None:
         """The unit normal (3,) of the surface at a scan point, on the side that `toward` points to.
@@ -85,6 +91,10 @@ class Normals:
 
     def _look(self, row: int, x: int, y: int, z: int, square: int) -> int:
         """`code` of a lattice point in a resident voxel, which stays."""
+        if square == self._stored:
+            found, visits = stored_code_at(self._data.arrays, row, x, y, z, self._data.keeps_scan)
+            self.visits += int(visits)
+            return int(found)
         self._drop_evicted()
         codes = self._codes.get((row, square))
         if codes is None:
@@ -107,11 +117,13 @@ class Normals:
         self.used_bytes -= self._codes.pop(key).nbytes
 
     def _make(self, row: int, square: int) -> NDArray[np.uint16]:
-        """Room for the codes of a voxel, of which none is known; others go for it."""
-        codes = np.full(int(self._leaves[row]) * LANES, UNASKED)
-        if codes.nbytes <= self.most_bytes:
-            while self.used_bytes + codes.nbytes > self.most_bytes:
-                self._drop(next(iter(self._codes)))
-            self._codes[row, square] = codes
-            self.used_bytes += codes.nbytes
+        """Room for the codes of a voxel, of which none is known; others go for it. None where it takes too much."""
+        points = int(self._leaves[row]) * LANES
+        if points * UNASKED.itemsize > self.most_bytes:
+            return np.empty(0, np.uint16)
+        codes = np.full(points, UNASKED)
+        while self.used_bytes + codes.nbytes > self.most_bytes:
+            self._drop(next(iter(self._codes)))
+        self._codes[row, square] = codes
+        self.used_bytes += codes.nbytes
         return codes

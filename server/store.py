@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..schemas.archive import Archive
+from ..schemas.codec import OPTIONAL_COLUMNS
 from ..schemas.errors import CorruptError
 from ..schemas.voxel import top_shift
 from .kernels.front import MOST_LEVELS
@@ -16,6 +17,7 @@ from .kernels.layout import (
     block_words,
     lay_classes,
     lay_out,
+    normal_run,
     resident_bytes,
     scan_run,
 )
@@ -24,18 +26,30 @@ from .kernels.layout import (
 class Store:
     """An archive's voxels by index row.
 
-    archive: see schemas/archive.py.  sizes: (v,) int64, bytes of each voxel once decoded.
+    archive: see schemas/archive.py.  sizes: (v,) int64, bytes of each voxel once decoded.  with_normals: whether those
+    include normals.
     """
 
-    def __init__(self, folder: str | Path, open_archive: Callable[[str | Path], Archive] = Archive) -> None:
-        """Open the archive in `folder`; open_archive: how. Raises FormatError or CorruptError."""
+    def __init__(
+        self,
+        folder: str | Path,
+        open_archive: Callable[[str | Path], Archive] = Archive,
+        normals: float | None = None,
+    ) -> None:
+        """Open the archive in `folder`; open_archive: how. Raises FormatError or CorruptError.
+
+        normals: the reach of those that will be asked for [m]; where the archive has them, they are loaded too.
+        """
         self.archive = open_archive(folder)
         rows, header = self.archive.voxels, self.archive.header
+        self.with_normals = header.normals and header.normal_reach == normals
+        self._columns = [name for name in OPTIONAL_COLUMNS if name != "normal" or self.with_normals]
         self.sizes = resident_bytes(
             rows["rows"][:, 1].astype(np.int64),
             rows["leaves"].astype(np.int64),
             with_scan=header.scan_index,
             with_class=header.radius_class,
+            with_normal=self.with_normals,
         )
 
     def load(self, row: int, arena: Arena, offset: int) -> NDArray[np.int64]:
@@ -49,7 +63,7 @@ class Store:
         self, row: int, frames: tuple[bytes, bytes, bytes], arena: Arena, offset: int
     ) -> NDArray[np.int64]:
         """`load` from the frames already read (`Archive.read_frames`), for the benchmark to time alone."""
-        record = self.archive.open_voxel(row, frames)
+        record = self.archive.open_voxel(row, frames, self._columns)
         links, leaves = record.links, record.leaves
         if leaves != int(self.archive.voxels["leaves"][row]):
             raise CorruptError(
@@ -76,6 +90,10 @@ class Store:
         if header.scan_index:
             scans = arena.halves[scan_run(where[None], 0, words) :]
             record.read_scans(scans[: leaves * LANES].reshape(leaves, LANES))
+        if self.with_normals:
+            normals = arena.halves[normal_run(where[None], 0, words, header.scan_index) :]
+            with self.archive.locating(row):
+                record.read_normals(normals[: leaves * LANES].reshape(leaves, LANES))
         return where
 
     def close(self) -> None:

@@ -1,7 +1,7 @@
 """A voxel as the overlap kernel reads it, in the arena of resident voxels.
 
 The arena is one buffer seen as float32 words, int32 words and uint16 halfwords. A voxel takes three runs, and one
-more where the archive keeps scan numbers (`--keep scan`):
+more where the archive keeps scan numbers (`--keep scan`), and one where its normals are asked for:
 
 - rows: (n, 12) words, one a node: center x, y, z, radius [voxel steps], the slab's normal x, y, z, its length,
   least and greatest dot(normal, point - center), then as int32: first child row, or ~block for a leaf node, and
@@ -11,7 +11,9 @@ more where the archive keeps scan numbers (`--keep scan`):
   keeps radius classes (b, 12): the classes of the block's points follow, four to an int32, the first in its low byte;
 - lanes: (b, 3, LANES) halfwords: x[], y[], z[] of the block's points from that corner, the last one repeated
   to the end, so that a test of all lanes needs no mask;
-- scans: (b, LANES) halfwords, the scan each point came from (`scan_run`); not there where it is not kept.
+- scans: (b, LANES) halfwords, the scan each point came from (`scan_run`); not there where it is not kept;
+- normals: (b, LANES) halfwords, the code of each point's normal (`normal_run`); there only where a scene asks for
+  normals that the archive has.
 
 For the façade this is 8.7 bytes a point, 6 of them the points (scripts/bench_engine --only memory), 2 more for the
 scans and 1.1 for the radius classes where kept.
@@ -86,12 +88,13 @@ def resident_bytes(
     *,
     with_scan: bool = False,
     with_class: bool = False,
+    with_normal: bool = False,
 ) -> NDArray[np.int64]:
     """Bytes (v,) that voxels of so many nodes, of them leaf nodes, take in the arena; multiples of 16.
 
-    with_scan, with_class: whether scan numbers and radius classes are kept.
+    with_scan, with_class, with_normal: whether scan numbers, radius classes and normals are kept.
     """
-    halves = LANES * (4 if with_scan else 3)
+    halves = LANES * (3 + with_scan + with_normal)
     return 4 * ROW_WORDS * nodes + 4 * block_words(with_class) * leaves + 2 * halves * leaves
 
 
@@ -100,6 +103,13 @@ def scan_run(where, voxel, block_words):
     """Where a resident voxel's scans begin [halves], in an archive that keeps them: behind its lanes, LANES a block."""
     leaves = (where[voxel, 2] // 2 - where[voxel, 1]) // block_words
     return where[voxel, 2] + leaves * 3 * LANES
+
+
+@nb.njit(nogil=True, cache=True)
+def normal_run(where, voxel, block_words, with_scan):
+    """Where a resident voxel's normals begin [halves], where they are kept: behind its scans, LANES a block."""
+    leaves = (where[voxel, 2] // 2 - where[voxel, 1]) // block_words
+    return where[voxel, 2] + leaves * LANES * (4 if with_scan else 3)
 
 
 @borrowing

@@ -11,7 +11,7 @@ from ...schemas.kernels.morton import morton_code
 from ...schemas.kernels.normals import NONE, normal_code
 from ...schemas.voxel_grid import KEY_BIAS
 from .compiled import borrowing
-from .layout import COUNT, COUNTED, FIRST, LANES, ROW_WORDS
+from .layout import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, normal_run
 from .rays import STACK
 from .reach import find_key
 
@@ -124,7 +124,7 @@ def code_at(scene, voxel, x, y, z, square, codes):
     """The code of the normal at a lattice point of a resident voxel, looked up in `codes`, else estimated and kept.
 
     scene: SceneArrays.  x, y, z: int64.  square: of the reach [steps^2], with `normals.normal_reach` found to fit.
-    codes: (blocks * LANES,) uint16, UNASKED where not estimated yet; written.
+    codes: (blocks * LANES,) uint16, UNASKED where not estimated yet; written. Of length 0: nothing is kept.
     Returns (code, nodes visited, whether it was estimated): NONE where no point of the voxel is there.
     """
     rows, sums = np.empty(STACK, np.int64), np.zeros(SUMS, np.int64)
@@ -134,8 +134,23 @@ def code_at(scene, voxel, x, y, z, square, codes):
     lane, visits = _find_point(scene, voxel, x, y, z, rows)
     if lane < 0:
         return NONE, visits, False
-    fresh = codes[lane] == UNASKED
-    if fresh:
-        visits += _add_near(scene, voxel, x, y, z, square, rows, sums)
-        codes[lane] = normal_code(sums)
-    return codes[lane], visits, fresh
+    if codes.shape[0] > 0 and codes[lane] != UNASKED:
+        return codes[lane], visits, False
+    visits += _add_near(scene, voxel, x, y, z, square, rows, sums)
+    code = normal_code(sums)
+    if codes.shape[0] > 0:
+        codes[lane] = code
+    return code, visits, True
+
+
+@nb.njit(nogil=True, cache=True)
+def stored_code_at(scene, voxel, x, y, z, with_scan):
+    """`code_at` of an archive whose normals are in memory. with_scan: whether scan numbers are."""
+    rows = np.empty(STACK, np.int64)
+    x -= scene.coordinates[voxel, 0] * scene.voxel_steps
+    y -= scene.coordinates[voxel, 1] * scene.voxel_steps
+    z -= scene.coordinates[voxel, 2] * scene.voxel_steps
+    lane, visits = _find_point(scene, voxel, x, y, z, rows)
+    if lane < 0:
+        return NONE, visits
+    return scene.halves[normal_run(scene.where, voxel, scene.block_words, with_scan) + lane], visits

@@ -41,7 +41,10 @@ def build(
     spacing: Annotated[
         float | None, typer.Option(help="Sample meshes this far apart [m] instead of at vertices.")
     ] = None,
-    keep: Annotated[str, typer.Option(help="Columns to keep: scan, intensity or both, by comma.")] = "",
+    keep: Annotated[str, typer.Option(help="Columns to keep: scan, intensity, normal, by comma.")] = "",
+    normal_reach: Annotated[
+        float, typer.Option(help="A normal is estimated of the points so near [m], where normals are kept.")
+    ] = 0.08,
     radius: Annotated[
         str,
         typer.Option(
@@ -99,6 +102,7 @@ def build(
         memory_bytes=parse_bytes(memory, "--memory"),
         spacing=spacing,
         keep=frozenset(filter(None, keep.split(","))),
+        normal_reach=normal_reach,
         radius=fixed,
         models=models,
         strict=strict,

@@ -34,7 +34,7 @@ def plan(
     resolution: Annotated[float | None, typer.Option(help="Lattice step [m].")] = None,
     jobs: Annotated[int, typer.Option(help="Worker processes; 0: one a core.")] = 0,
     memory: Annotated[str, typer.Option(help="What the build may hold in memory.")] = "2GB",
-    keep: Annotated[str, typer.Option(help="Columns to keep: scan, intensity or both, by comma.")] = "",
+    keep: Annotated[str, typer.Option(help="Columns to keep: scan, intensity, normal, by comma.")] = "",
     skip_bad: Annotated[bool, typer.Option("--skip-bad", help="Leave out broken scans.")] = False,
     measure: Annotated[
         bool, typer.Option("--measure", help="Measure this machine first, some seconds, and go by that.")

@@ -1,10 +1,12 @@
 """An archive somebody has stays readable: the committed one holds what the JSON beside it says, to the bit."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import naive_classes
+import naive_normals
 import numpy as np
 import pytest
 from solidcloud.builder.config import BuildConfig
@@ -13,13 +15,15 @@ from solidcloud.builder.pipeline import build_archive
 from solidcloud.builder.radius import voxel_points
 from solidcloud.builder.verify import verify_archive
 from solidcloud.schemas.archive import Archive
+from solidcloud.schemas.kernels.normals import LINE, THICK, decode_normal
 from solidcloud.schemas.radius_model import RADIUS_CLASSES, RIM_BIT
 
 GOLDEN = Path(__file__).resolve().parents[2] / "golden"
 
 
 # The archives of each format version, and how many of the scans went into them.
-SCANS = {"archive": 2, "archive-2": 3, "archive-3": 3}
+SCANS = {"archive": 2, "archive-2": 3, "archive-3": 3, "archive-4": 3}
+NORMAL_REACH = {"archive-4": 0.3}
 
 
 @pytest.fixture(params=SCANS)
@@ -43,6 +47,7 @@ def test_the_golden_archive_holds_what_is_written_beside_it(name: str, expected:
         assert list(header.models) == expected.get("models", ["mean"])
         assert header.radius_counts.tolist() == expected.get("radius_counts", [0] * RADIUS_CLASSES)
         assert header.radius_capped == expected.get("radius_capped", 0)
+        assert header.normal_reach == NORMAL_REACH.get(name, 0.0)
         now = header.radius_now
         assert header.generation == expected.get("generation", 0)
         assert (
@@ -72,6 +77,7 @@ def test_the_golden_archive_holds_what_is_written_beside_it(name: str, expected:
             assert links.height == voxel["height"]
             cells = np.column_stack([data.cells.low, data.cells.log2_size])
             assert cells.tolist() == voxel["cells"]
+            assert (None if data.normal is None else data.normal.tolist()) == voxel.get("normals")
 
 
 def golden_points(folder: Path) -> np.ndarray:
@@ -109,6 +115,29 @@ def test_the_golden_archive_holds_the_radius_classes_of_its_points(name: str) ->
     assert classes == {point: found.local + RIM_BIT * found.rim for point, found in judged.items()}
 
 
+def test_the_golden_archive_holds_the_normals_of_its_points() -> None:
+    square, found = 300**2, 0
+    with Archive(GOLDEN / "archive-4") as archive:
+        assert archive.header.lattice.step == 0.001
+        for row in range(len(archive.voxels)):
+            voxel, links = archive.read_voxel(row)
+            points = voxel_points(voxel, links)
+            assert voxel.normal is not None
+            for at, code in zip(points, voxel.normal.tolist(), strict=True):
+                judged = naive_normals.find(points, at, square)
+                few = judged is None or judged.count < 3
+                if (
+                    few
+                    or judged.values[1] <= LINE * judged.values[2]
+                    or judged.values[0] > THICK * judged.values[1]
+                ):
+                    assert code == 0
+                    continue
+                assert naive_normals.angle(np.array(decode_normal(code)), judged.normal) < 0.56
+                found += 1
+    assert found > 100
+
+
 def test_the_golden_archive_holds_the_points_of_its_scans(name: str, expected: dict[str, Any]) -> None:
     built = 2 if name == "archive-3" else SCANS[name]  # before any was added: they make the origin
     tables, lows = [], []
@@ -133,6 +162,8 @@ def test_a_build_today_gives_the_golden_points_and_cells(
         voxel=1.0, resolution=0.001, leaf=8, degree=3, cell_points=40, keep=frozenset({"scan", "intensity"}), jobs=1,
         models=frozenset(expected.get("models", ["mean"])),
     )  # fmt: skip
+    if name in NORMAL_REACH:
+        config = replace(config, keep=config.keep | {"normal"}, normal_reach=NORMAL_REACH[name])
     scans = [Path(f"scan-{number}.xyz") for number in range(SCANS[name])]
     if name == "archive-3":
         build_archive(scans[1::-1], tmp_path / "a", config)
@@ -141,7 +172,7 @@ def test_a_build_today_gives_the_golden_points_and_cells(
     else:
         build_archive(scans[::-1], tmp_path / "a", config)
     assert np.array_equal(golden_points(tmp_path / "a"), golden_points(GOLDEN / name))
-    if name != "archive":
+    if name in ("archive-2", "archive-3"):
         assert golden_classes(tmp_path / "a") == golden_classes(GOLDEN / name)
     with Archive(tmp_path / "a") as new, Archive(GOLDEN / name) as golden:
         assert repr(new.header) == repr(golden.header)

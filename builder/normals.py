@@ -1,0 +1,25 @@
+"""Normals of all points of a voxel, as codes; the definition is in schemas/kernels/normals.py."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .kernels.neighbours import bound_boxes, box_starts
+from .kernels.normals import box_sums, point_normals
+from .kernels.octree import voxel_codes
+
+
+def voxel_normals(local: NDArray[np.int32], square: int) -> NDArray[np.uint16]:
+    """The codes (n,) of the normals at all points (n, 3) of a voxel [voxel steps], in any order, n >= 1.
+
+    square: of the reach [steps^2], which `normal_reach` found to fit. Points in one place count each.
+    """
+    _, first, back, times = np.unique(
+        voxel_codes(local), return_index=True, return_inverse=True, return_counts=True
+    )
+    points = np.ascontiguousarray(local[first])
+    starts = box_starts(len(points))
+    boxes = bound_boxes(points, starts)
+    sums = box_sums(points, times, boxes, starts, square)
+    codes = np.empty(len(points), np.uint16)
+    point_normals(points, times, boxes, starts, sums, square, codes)
+    return codes[back]

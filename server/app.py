@@ -10,19 +10,9 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 from ..schemas import keys
-from ..schemas.answers import (
-    CollideAnswers,
-    ContactsAnswers,
-    DistanceAnswers,
-    ObjectsAnswers,
-    Part,
-    RaycastAnswers,
-    SweepAnswers,
-    WithinAnswers,
-)
 from ..schemas.errors import (
     BadRequestError,
     ErrorCode,
@@ -35,18 +25,16 @@ from ..schemas.messages import (
     MSGPACK,
     WIRE_VERSION,
     AddAvatarRequest,
-    AvatarInfo,
     CollideRequest,
     ContactsRequest,
     DistanceRequest,
     ErrorReply,
+    MoveRequest,
     ObjectsRequest,
     PathRequest,
     RaycastRequest,
     ReloadAnswer,
-    SceneInfo,
     ScenesAnswer,
-    StatsAnswer,
     StatsRequest,
     SweepRequest,
     WithinRequest,
@@ -56,36 +44,11 @@ from ..schemas.messages import (
 )
 from ..schemas.requests import Question
 from .config import ServerConfig
-from .transport import Answer, Transport
+from .frames import Frames
+from .served import Answer, SceneLike
+from .transport import Transport
 
 log = logging.getLogger(__name__)
-
-
-class SceneLike(Protocol):
-    """What a service asks its questions of; thread-safe. Raises SolidcloudErrors for what it refuses.
-
-    The questions take what those of `Scene` do.
-    """
-
-    name: str
-
-    def info(self) -> SceneInfo: ...
-    def add_avatar(
-        self, name: str, points: Any, radius: float | None = None, *, client: str = ""
-    ) -> AvatarInfo: ...
-    def collide(self, *what: Any, **effort: Any) -> CollideAnswers: ...
-    def distance(self, *what: Any, **effort: Any) -> DistanceAnswers: ...
-    def contacts(self, *what: Any, **effort: Any) -> ContactsAnswers: ...
-    def sweep(self, *what: Any, **effort: Any) -> SweepAnswers: ...
-    def raycast(self, *what: Any, **effort: Any) -> RaycastAnswers: ...
-    def within(self, *what: Any, **effort: Any) -> WithinAnswers: ...
-    def objects(self, *what: Any, **effort: Any) -> ObjectsAnswers: ...
-    def path(self, *what: Any, **parameters: Any) -> Iterator[Part]: ...
-    def drop_client(self, client: str) -> None: ...
-    def reload(self) -> ReloadAnswer: ...
-    def stats(self, keys: bool = False) -> StatsAnswer: ...
-    def warm(self) -> None: ...
-    def close(self) -> None: ...
 
 
 class _Operation(NamedTuple):
@@ -142,6 +105,9 @@ _OPERATIONS = {
     ),
     "within": _Operation(WithinRequest, "points", lambda s, r, c: s.within(r.points, r.reach, **_effort(r))),
     "objects": _Operation(ObjectsRequest, "poses", _ask_objects),
+    "move": _Operation(
+        MoveRequest, "", lambda s, r, c: s.move(r.avatar, r.pose_from, r.pose_to, r.seconds, client=c)
+    ),
     "path": _Operation(
         PathRequest, "poses", lambda s, r, c: s.path(r.avatar, r.poses, r.op, client=c, **r.parameters())
     ),
@@ -157,6 +123,7 @@ class Service:
             raise BadRequestError(f"scenes {', '.join(names)}: each needs a name of its own")
         self._scenes = {scene.name: scene for scene in scenes}
         self._config = config
+        self._frames: dict[str, Frames] = {}
 
     def scenes(self, encoding: str | None) -> Answer:
         """Which scenes are served here."""
@@ -214,14 +181,23 @@ class Service:
         )
 
     def client_gone(self, scene: str, client: str) -> None:
-        """Forget the avatars of a client that went."""
+        """Forget the avatars of a client that went, and end its bodies."""
+        if (frames := self._frames.get(scene)) is not None:
+            frames.client_gone(client)
         self._scenes[scene].drop_client(client)
+
+    def frames(self, scene: str, publish: Callable[[keys.User, Answer], None]) -> Frames | None:
+        """The sessions of a scene, whose states are sent by `publish`; None: it simulates nothing."""
+        simulation = self._scenes[scene].simulation
+        if simulation is None:
+            return None
+        return self._frames.setdefault(scene, Frames(simulation, publish))
 
     def warm(self) -> None:
         """Warm every scene, so that the first client does not wait for compilers."""
         for scene in self._scenes.values():
             log.info("warming %s: the first start on a machine compiles, for a minute or two", scene.name)
-            scene.warm()
+            (scene.simulation or scene).warm()
 
     def _ask(self, key: str, payload: bytes, encoding: str) -> Any:
         """Put one question to the scene its key names."""
@@ -270,7 +246,7 @@ class Service:
             count, most = len(getattr(request, operation.counted)), self._config.max_poses
             if count > most:
                 raise TooLargeError(f"{count} {operation.counted} in a request: at most {most}: split them")
-        elif len(request.points) > self._config.max_avatar_points:
+        elif operation.request is AddAvatarRequest and len(request.points) > self._config.max_avatar_points:
             most = self._config.max_avatar_points
             raise TooLargeError(f"avatar of {len(request.points)} points: at most {most}: thin it out first")
 

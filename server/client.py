@@ -4,6 +4,7 @@ What no server answers is `unknown`, never clear: zenoh's empty reply looks the 
 there, a server died or a message was dropped (WIRE.md, "Empty replies").
 """
 
+import itertools
 import logging
 import queue
 import threading
@@ -53,6 +54,7 @@ from ..schemas.requests import (
     make_poses,
     make_positions,
 )
+from .client_session import ClientSession
 from .config import DEFAULT_ENDPOINT
 from .questions import Questions
 from .transport import session_config
@@ -94,6 +96,7 @@ class Client(Questions):
         self._endpoint, self._timeout = endpoint, timeout
         self._id = uuid.uuid4().hex
         self._avatars: dict[str, _Avatar] = {}
+        self._numbers: dict[str, itertools.count[int]] = {}  # of wishes, by avatar
         self._lock = threading.Lock()
         self._seen = False  # whether a server of this scene ever answered
         self._stack: ExitStack | None = None
@@ -252,27 +255,41 @@ class Client(Questions):
         """The replies to a path until there are no more, or none came in time; errors are raised."""
         try:
             yield from self._stream("path", request)
-        except UnknownAvatarError:
+        except UnknownAvatarError as unknown:
             # Said before the first part, if at all: nothing was taken yet.
-            if self._add_again([name]):
+            if self._add_again([name], unknown):
                 yield from self._stream("path", request)
+
+    def session(self, avatar: str) -> ClientSession:
+        """A session of an avatar, this client's or one of the scene's own: `with` it, wish and hear where it gets to.
+
+        avatar: 1 to 64 of A-Z, a-z, 0-9, '.', '_' and '-'.  The scene's server simulates the effects that it calls for.
+        """
+        if self._stack is None:
+            raise BadRequestError("this client is closed: ask inside `with Client(...) as scene`")
+        user = keys.User(self._id, keys.check_name(avatar, "avatar of a session"))
+        with self._lock:
+            numbers = self._numbers.setdefault(avatar, itertools.count(1))
+        return ClientSession(
+            self._session, self.name, user, numbers, lambda unknown: self._add_again([avatar], unknown)
+        )
 
     def _ask_about(self, operation: str, request: bytes, names: Sequence[str]) -> bytes | None:
         """Ask about avatars, adding them again where the server does not know them; None: nobody answered."""
         try:
             return self._ask(operation, request)
-        except UnknownAvatarError:
-            return self._ask(operation, request) if self._add_again(names) else None
+        except UnknownAvatarError as unknown:
+            return self._ask(operation, request) if self._add_again(names, unknown) else None
 
-    def _add_again(self, names: Sequence[str]) -> bool:
+    def _add_again(self, names: Sequence[str], unknown: UnknownAvatarError) -> bool:
         """Add avatars to a server that was restarted, or that took us for gone; False: nobody answered.
 
-        To be called while an UnknownAvatarError is handled: it is raised again if we do not know one either.
+        unknown: what the server says; raised again if we do not know one either.
         """
         with self._lock:
             known = [(name, self._avatars[name]) for name in names if name in self._avatars]
         if len(known) < len(names):
-            raise
+            raise unknown
         return all(self._ask("add_avatar", _add_request(*each)) is not None for each in known)
 
     def _ask(self, operation: str, request: bytes) -> bytes | None:

@@ -9,7 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Generator, Iterator
 from contextlib import suppress
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import Any, Self
 
 import numpy as np
@@ -40,6 +40,7 @@ from .within import within
 MOST_SEEN = 8
 # Margins and reaches that are asked for [m], and scales of avatars; others will be refused (kernels/placing.py).
 MOST_AROUND, LEAST_SCALE = 16.0, 1e-3
+NUMBER = (float, int)  # `float | int` would be made anew for each request
 # A user is taken to need what is so near to it, however far it asks [m].
 NEAR = 1.0
 # Of the budget, what coarse tops may take: 6 KB each.
@@ -51,8 +52,10 @@ MOST_MODELS = 64
 class Opened:
     """An archive's store and resident voxels, held open by who reads them. Thread-safe.
 
-    data: what every question reads, spheres of the archive's one figure.  radius_model: the same under a radius model,
-    by its name; BadRequestError for one that is none, or not stored. Both are there for who has taken it.
+    data: what every question reads, spheres as a scene has them by default.  radius_model: the same under a radius
+    model, by its name, None: as by default; BadRequestError for one that is none, or not stored. Both are there for who
+    has taken it.
+    kept: what others keep of this generation, by their names; it goes with it.
     number: tells those of one scene apart.  ended: set once the last reader is gone and all is closed.
     """
 
@@ -66,12 +69,15 @@ class Opened:
         policy: str = "lru",
         number: int = 0,
         took: Callable[[float], None] | None = None,
+        radius_model: str | None = None,
     ) -> None:
         """Hold `store` open for a first reader, the scene, which must `release` it.
 
-        policy: see policies.py.  took: told the seconds that each load took.
+        policy: see policies.py.  took: told the seconds that each load took.  radius_model: by default; None: the
+        archive's one figure. BadRequestError for one that the archive does not hold.
         """
         self.store, self.number = store, number
+        self.kept: dict[str, Any] = {}
         self.ended = threading.Event()
         index, lattice = make_scene_index(store.archive), store.archive.header.lattice
         around = Neighbourhood(index, lattice.voxel_steps, lattice.origin, lattice.step)
@@ -87,8 +93,15 @@ class Opened:
         # Where there is not room for all, it is for those that somebody came near.
         fill = Filling(coarse, store) if coarse is not None and coarse.holds_all else None
         self.prefetcher = Prefetcher(residency, around, ahead=ahead, idle=fill)
-        self.data = make_scene_data(store.archive, residency, index, coarse)
-        self.radius_model = lru_cache(MOST_MODELS)(partial(with_radius_model, self.data, store.archive))
+        figure = make_scene_data(store.archive, residency, index, coarse)
+        data = figure if radius_model is None else with_radius_model(figure, store.archive, radius_model)
+        self.data = data
+
+        @lru_cache(MOST_MODELS)
+        def under(text: str | None) -> SceneData:
+            return data if text is None else with_radius_model(figure, store.archive, text)
+
+        self.radius_model = under
         self._lock = threading.Lock()
         self._readers = 1
         self._ending: threading.Thread | None = None
@@ -122,7 +135,7 @@ class Opened:
     def _end(self) -> None:
         """Stop loading, close all."""
         self.prefetcher.stop()
-        del self.data, self.radius_model, self.prefetcher
+        del self.data, self.radius_model, self.prefetcher, self.kept
         self.store.close()
         self.ended.set()
 
@@ -151,19 +164,23 @@ class Opened:
             return False
         if not len(poses) or not len(avatar.points):
             return False
-        if not isinstance(other, float | int) or not 0 <= other <= MOST_AROUND:
+        if not isinstance(other, NUMBER) or not 0 <= other <= MOST_AROUND:
             return False
         if len(poses) > MOST_SEEN:
             return True
-        pose = poses[-1].tolist()
+        (a, b, c, tx), (d, e, f, ty), (g, h, i, tz), _ = poses[-1].tolist()
         x, y, z = avatar.arrays.center[0].tolist()
-        center = [a * x + b * y + c * z + d for a, b, c, d in pose[:3]]
-        scale = math.hypot(pose[0][0], pose[1][0], pose[2][0])
-        if not (LEAST_SCALE <= scale <= 1 / LEAST_SCALE and all(abs(c) <= MAX_COORDINATE for c in center)):
+        x, y, z = a * x + b * y + c * z + tx, d * x + e * y + f * z + ty, g * x + h * y + i * z + tz
+        scale = math.sqrt(a * a + d * d + g * g)
+        most = MAX_COORDINATE
+        if not (
+            LEAST_SCALE <= scale <= 1 / LEAST_SCALE and abs(x) <= most and abs(y) <= most and abs(z) <= most
+        ):
             return False
         # Who asks how far away things are will not stand in all of them.
-        reach = avatar.bounding_radius * scale + self.data.radius_units / UNITS_PER_METRE + min(other, NEAR)
-        return self.prefetcher.saw(user, (center[0], center[1], center[2]), reach)
+        near = other if other < NEAR else NEAR
+        reach = avatar.bounding_radius * scale + self.data.radius_units / UNITS_PER_METRE + near
+        return self.prefetcher.saw(user, (x, y, z), reach)
 
     def warm(self) -> None:
         """Ask one of everything, a load included, so that nobody waits for compilers after."""

@@ -7,6 +7,8 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any, TypeVar, Unpack
 
+import numpy as np
+
 from ..schemas.answers import (
     CollideAnswers,
     ContactsAnswers,
@@ -15,6 +17,7 @@ from ..schemas.answers import (
     ObjectsAnswers,
     RaycastAnswers,
     SweepAnswers,
+    Verdict,
     WithinAnswers,
 )
 from ..schemas.columns import check_answers, join, unknown
@@ -23,6 +26,7 @@ from ..schemas.messages import (
     CollideRequest,
     ContactsRequest,
     DistanceRequest,
+    MoveRequest,
     ObjectsRequest,
     RaycastRequest,
     SweepRequest,
@@ -30,6 +34,7 @@ from ..schemas.messages import (
     decode_answer,
     encode,
 )
+from ..schemas.moves import FRAME_SECONDS, Moved
 from ..schemas.requests import (
     Question,
     QuestionOptions,
@@ -193,6 +198,24 @@ class Questions:
 
         names = list(dict.fromkeys(item.avatar for item in items))
         return self._question(ObjectsAnswers, request, len(items), options, names, batch=max(1, len(items)))
+
+    def move(self, name: str, pose_from: Any, pose_to: Any, seconds: float = FRAME_SECONDS) -> Moved:
+        """Where an avatar gets from one pose (1, 4, 4) towards another in a frame of so many seconds.
+
+        By the effects that the scene calls for; nothing is remembered. What nobody answered went nowhere, `UNKNOWN`.
+        """
+        request = MoveRequest(
+            avatar=name,
+            pose_from=make_poses(pose_from, "pose_from"),
+            pose_to=make_poses(pose_to, "pose_to"),
+            seconds=float(seconds),
+        )
+        payload = self._ask_about("move", encode(request), [name])
+        if payload is None:
+            way = request.pose_to[0, :3, 3] - request.pose_from[0, :3, 3]
+            left = float(np.linalg.norm(way))
+            return Moved(pose=request.pose_from, verdict=int(Verdict.UNKNOWN), left=left)
+        return decode_answer(Moved, payload)
 
     def _question(
         self,

@@ -26,10 +26,11 @@ from ..schemas.answers import (
 from ..schemas.errors import BadRequestError, BusyError, UnknownAvatarError
 from ..schemas.messages import AvatarInfo, ReloadAnswer, SceneInfo, StatsAnswer
 from ..schemas.requests import QuestionOptions, make_objects, make_poses
+from ..schemas.scene import scene_of
 from .avatar import AvatarModel, make_avatar
 from .collide import collide
 from .contacts import contacts
-from .describe import describe, make_stats
+from .describe import describe, describe_scene, make_stats
 from .distance import distance
 from .effort import Effort, make_effort
 from .metrics import Metrics
@@ -39,7 +40,9 @@ from .path import PATH_THREADS, largest_part, path_parts, path_question
 from .rays import raycast
 from .request import SceneData
 from .residency import Residency
+from .served import EVERYBODY
 from .session import Walker
+from .simulated import Simulated
 from .store import OpenStore, Store
 from .sweep import sweep
 from .within import within
@@ -52,7 +55,7 @@ DEFAULT_BUDGET = 512 << 20
 RELOAD_WAIT = 10.0
 
 
-class Scene:
+class Scene(Simulated):
     """A served archive. Thread-safe; a context manager.
 
     name: what clients call it; the archive's folder name unless given. What is in the folder when the scene is opened
@@ -60,15 +63,21 @@ class Scene:
     """
 
     def __init__(
-        self, store: Store, name: str, budget_bytes: int, policy: str, open_store: OpenStore
+        self,
+        store: Store,
+        name: str,
+        budget_bytes: int,
+        policy: str,
+        open_store: OpenStore,
+        radius_model: str | None = None,
     ) -> None:
         """Serve the voxels of `store`; use `Scene.open`."""
         self.name, self._folder, self._open_store = name, store.archive.folder, open_store
-        self._budget_bytes, self._policy = budget_bytes, policy
+        self._budget_bytes, self._policy, self._radius_model = budget_bytes, policy, radius_model
         self._metrics = Metrics()
-        self._opened = Opened(store, budget_bytes, policy, took=self._metrics.loaded)
+        self._opened = self._open(store, 0)
         self._before: Opened | None = None  # swapped out; perhaps not ended yet
-        self._info = describe(store, name)
+        self._info = describe_scene(describe(store, name), scene_of(name))
         self._avatars: dict[tuple[str, str], AvatarModel] = {}
         self._pool: ThreadPoolExecutor | None = None
         self._closed = False
@@ -84,16 +93,19 @@ class Scene:
         budget_bytes: int = DEFAULT_BUDGET,
         policy: str = "lru",
         open_store: OpenStore = Store,
+        radius_model: str | None = None,
     ) -> "Scene":
         """Open the archive in `folder`, keeping at most budget_bytes of decoded voxels in memory.
 
         policy: which of them go first, and whether others are loaded before they are asked for, see policies.py.
         open_store: opens the folder, now and at each reload (effects/through.py).
+        radius_model: of questions that name none, see schemas/radius_model.py; None: the archive's one figure.
         Raises FormatError or CorruptError when it is no whole archive, BadRequestError for too small a budget.
         """
         store = open_store(folder)
         try:
-            return cls(store, name or Path(folder).resolve().name, budget_bytes, policy, open_store)
+            name = name or Path(folder).resolve().name
+            return cls(store, name, budget_bytes, policy, open_store, radius_model)
         except BaseException:
             store.close()
             raise
@@ -127,14 +139,14 @@ class Scene:
         BusyError when the one before the old is still being read; the old one is served on.
         """
         begin = time.perf_counter()
-        with self._reloading, self._take() as old:
+        with self._reloading, self.take() as old:
             if self._before is not None and not self._before.ended.wait(RELOAD_WAIT):
                 raise BusyError(
                     f"{self.name}: the generation before the one served is still asked, by a path perhaps: reload later"
                 )
             store = self._open_store(self._folder)
             try:
-                new = Opened(store, self._budget_bytes, self._policy, old.number + 1, self._metrics.loaded)
+                new = self._open(store, old.number + 1)
             except BaseException:
                 store.close()
                 raise
@@ -144,7 +156,8 @@ class Scene:
                 with self._lock:
                     if self._closed:
                         raise BadRequestError(f"{self.name}: closed while it was reloaded: open it again")
-                    self._opened, self._before, self._info = new, old, describe(store, self.name)
+                    info = describe_scene(describe(store, self.name), scene_of(self.name))
+                    self._opened, self._before, self._info = new, old, info
             except BaseException:
                 new.release()
                 raise
@@ -154,7 +167,13 @@ class Scene:
             self.name, before.generation, now.generation, now.points, time.perf_counter() - begin
         )
 
-    def _take(self) -> Opened:
+    def _open(self, store: Store, number: int) -> Opened:
+        """A generation as this scene serves it."""
+        return Opened(
+            store, self._budget_bytes, self._policy, number, self._metrics.loaded, self._radius_model
+        )
+
+    def take(self) -> Opened:
         """What is asked now, to be released: for a `with`. BadRequestError when closed."""
         while True:
             opened = self._opened
@@ -163,7 +182,7 @@ class Scene:
             if opened is self._opened:  # nobody swapped it: it was closed
                 return opened.taken()
 
-    def _pool_of_threads(self) -> ThreadPoolExecutor:
+    def pool_of_threads(self) -> ThreadPoolExecutor:
         """The threads that compute parts of paths, one a core; started when first needed, shared by all paths."""
         with self._lock:
             if self._pool is None:
@@ -171,10 +190,10 @@ class Scene:
                 self._pool = ThreadPoolExecutor(workers, thread_name_prefix=f"solidcloud-{self.name}-path")
             return self._pool
 
-    def _avatar(self, name: str, client: str) -> AvatarModel:
-        """A client's avatar; UnknownAvatarError."""
+    def avatar(self, name: str, client: str) -> AvatarModel:
+        """A client's avatar, or the scene's own; UnknownAvatarError."""
         with self._lock:
-            avatar = self._avatars.get((client, name))
+            avatar = self._avatars.get((client, name)) or self._avatars.get((EVERYBODY, name))
         if avatar is None:
             raise UnknownAvatarError(f"avatar {name!r} is not known: add it with add_avatar first")
         return avatar
@@ -191,7 +210,7 @@ class Scene:
 
     def warm(self) -> None:
         """Ask one of everything, a load included, so that nobody waits for compilers after."""
-        with self._take() as opened:
+        with self.take() as opened:
             opened.warm()
 
     def info(self) -> SceneInfo:
@@ -200,7 +219,7 @@ class Scene:
 
     def stats(self, keys: bool = False) -> StatsAnswer:
         """What is in memory, what was asked, and what had to be waited for. keys: name the resident voxels, too."""
-        with self._take() as opened:
+        with self.take() as opened:
             coarse = opened.data.coarse
             return make_stats(
                 opened.store,
@@ -257,9 +276,9 @@ class Scene:
 
         question: takes scene, avatar, `what`, and `effort`.  around: margin or reach [m].
         """
-        with self._take() as opened:
+        with self.take() as opened:
             data, effort = self._terms(opened, **options)
-            avatar = self._avatar(name, client)
+            avatar = self.avatar(name, client)
             if opened.saw((client, name), avatar, poses, around):
                 effort = effort._replace(scan=True)
             answers = question(data, avatar, *what, effort=effort)
@@ -278,8 +297,8 @@ class Scene:
         """Whether avatar `name` touches the scene under each of the poses (k, 4, 4); see server/collide.py.
 
         options, here and below: tolerance [m], budget_ms, budget_visits: what the answer may cost, see
-        server/effort.py; radius_model: how large the scan's spheres are, see schemas/radius_model.py, None: the
-        archive's one figure.
+        server/effort.py; radius_model: how large the scan's spheres are, see schemas/radius_model.py, None: as the
+        scene was opened.
         """
         return self._ask(collide, name, client, poses, (poses, margin), margin, options)
 
@@ -287,7 +306,7 @@ class Scene:
         self, name: str, margin: float = 0.0, *, radius_model: str | None = None, client: str = ""
     ) -> Walker:
         """A session of avatar `name`: its `collide` remembers the last pose; see server/session.py."""
-        return Walker(self._take, self._avatar(name, client), margin, radius_model, (client, name))
+        return Walker(self.take, self.avatar(name, client), margin, radius_model, (client, name))
 
     def distance(
         self,
@@ -339,7 +358,7 @@ class Scene:
         **options: Unpack[QuestionOptions],
     ) -> RaycastAnswers:
         """Which scan point's sphere rays (k, 3), (k, 3) hit first, up to `reach` [m]; see server/rays.py."""
-        with self._take() as opened:
+        with self.take() as opened:
             data, effort = self._terms(opened, **options)
             answers = raycast(data, origins, directions, reach, effort)
         self._metrics.answered("", "", answers)
@@ -352,7 +371,7 @@ class Scene:
         **options: Unpack[QuestionOptions],
     ) -> WithinAnswers:
         """Which scan point is nearest to each loose point (k, 3), up to `reach` [m]; see server/within.py."""
-        with self._take() as opened:
+        with self.take() as opened:
             data, effort = self._terms(opened, **options)
             answers = within(data, points, reach, effort)
         self._metrics.answered("", "", answers)
@@ -370,10 +389,10 @@ class Scene:
 
         See server/objects.py.
         """
-        with self._take() as opened:
+        with self.take() as opened:
             data, effort = self._terms(opened, **options)
             items, poses = make_objects(objects)
-            avatars = [self._avatar(item.avatar, client) for item in items]
+            avatars = [self.avatar(item.avatar, client) for item in items]
             groups = np.array([item.group for item in items], np.uint32)
             masks = np.array([item.mask for item in items], np.uint32)
             answers = ask_objects(data, avatars, poses, groups, masks, margin, effort)
@@ -397,9 +416,9 @@ class Scene:
         threads: parts computed at a time.  sweep: k - 1 motions, from each pose to the next. Every part is the answer
         of its question for [first, first + n) of `total`. All poses are checked before the first part.
         """
-        opened = self._take()
+        opened = self.take()
         try:
-            data, avatar = opened.radius_model(radius_model), self._avatar(name, client)
+            data, avatar = opened.radius_model(radius_model), self.avatar(name, client)
             ask, total = path_question(data, avatar, make_poses(poses), op, parameters)
 
             def ask_held(start: int, stop: int) -> Cost:
@@ -409,7 +428,7 @@ class Scene:
                 return part
 
             most = largest_part(op, parameters)
-            ahead = (self._pool_of_threads(), 2 * threads) if threads > 1 else (None, 1)
+            ahead = (self.pool_of_threads(), 2 * threads) if threads > 1 else (None, 1)
             return HeldParts(path_parts(ask_held, total, most, *ahead), opened)
         except BaseException:
             opened.release()
@@ -420,6 +439,6 @@ class Scene:
         with self._lock:
             for key in [key for key in self._avatars if key[0] == client]:
                 del self._avatars[key]
-        with suppress(BadRequestError), self._take() as opened:  # closed, it keeps nothing for anybody
+        with suppress(BadRequestError), self.take() as opened:  # closed, it keeps nothing for anybody
             opened.prefetcher.leave_client(client)
         self._metrics.drop_client(client)

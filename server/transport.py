@@ -10,10 +10,8 @@ import json
 import logging
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
-from enum import Enum
 from types import TracebackType
 from typing import Any, NamedTuple, Protocol, Self
 
@@ -23,6 +21,9 @@ from ..schemas import keys
 from ..schemas.errors import BadRequestError, SolidcloudError
 from ..schemas.messages import JSON, MAX_MESSAGE_BYTES, MSGPACK
 from .config import ServerConfig
+from .fair_queues import FairQueues, Offer
+from .served import Answer
+from .session_transport import Sessions, declare_sessions
 
 log = logging.getLogger(__name__)
 
@@ -35,98 +36,13 @@ _GIVE_UP_SECONDS = 2.0
 _ENCODINGS = {name: zenoh.Encoding(name) for name in (MSGPACK, JSON)}
 
 
-class Answer(NamedTuple):
-    """One reply: its bytes, their encoding, and whether it is an answer or an error."""
-
-    payload: bytes
-    encoding: str
-    ok: bool
-
-
-class ServiceLike(Protocol):
+class ServiceLike(Sessions, Protocol):
     """What a transport carries questions to. No method raises: an error is an answer too."""
 
     def scenes(self, encoding: str | None) -> Answer: ...
     def answer(self, key: str, payload: bytes, encoding: str | None) -> Answer | Iterator[Answer]: ...
     def busy(self, encoding: str | None) -> Answer: ...
     def client_gone(self, scene: str, client: str) -> None: ...
-
-
-class Offer(Enum):
-    """What becomes of a request that was offered."""
-
-    RUN = "run it now"
-    WAIT = "it waits; whoever finishes takes it"
-    FULL = "refused"
-
-
-class FairQueues:
-    """A queue for each client: one request of each in flight, the clients in turn, the whole bounded.
-
-    Thread-safe. Every RUN is followed by `finished`, or by `detach` and `release`, and so is every request that these
-    return; that is why nothing that waits is ever forgotten.
-    """
-
-    def __init__(self, workers: int, max_requests: int, max_bytes: int) -> None:
-        self._lock = threading.Lock()
-        self._workers, self._max_requests, self._max_bytes = workers, max_requests, max_bytes
-        self._waiting: dict[str, deque[tuple[Any, int]]] = {}
-        self._ready: deque[str] = deque()  # clients with something waiting and nothing in flight
-        self._running: dict[str, int] = {}  # client: bytes of its request in flight
-        self._requests = self._bytes = 0
-
-    def offer(self, client: str, request: Any, size: int, *, always: bool = False) -> Offer:
-        """Take in a request of `size` bytes; `always`: even where the bound is reached."""
-        with self._lock:
-            full = self._requests >= self._max_requests or self._bytes + size > self._max_bytes
-            if full and self._requests and not always:
-                return Offer.FULL
-            self._requests += 1
-            self._bytes += size
-            if client not in self._running and len(self._running) < self._workers:
-                self._running[client] = size
-                return Offer.RUN
-            if client not in self._waiting:
-                self._waiting[client] = deque()
-                if client not in self._running:
-                    self._ready.append(client)
-            self._waiting[client].append((request, size))
-            return Offer.WAIT
-
-    def finished(self, client: str) -> tuple[str, Any] | None:
-        """The client's request in flight is answered. Returns the (client, request) to run next, if any."""
-        size, following = self.detach(client)
-        self.release(size)
-        return following
-
-    def detach(self, client: str) -> tuple[int, tuple[str, Any] | None]:
-        """The client's request in flight goes on, but takes up neither a worker nor its client's turn.
-
-        Returns its size, to be given to `release` once it is answered, and the (client, request) to run next, if any.
-        """
-        with self._lock:
-            size = self._running.pop(client)
-            if client in self._waiting:
-                self._ready.append(client)
-            if not self._ready:
-                return size, None
-            following = self._ready.popleft()
-            request, following_size = self._waiting[following].popleft()
-            if not self._waiting[following]:
-                del self._waiting[following]
-            self._running[following] = following_size
-            return size, (following, request)
-
-    def release(self, size: int) -> None:
-        """A request of `size` bytes is answered."""
-        with self._lock:
-            self._requests -= 1
-            self._bytes -= size
-
-    def __len__(self) -> int:
-        """Requests taken in and not yet finished."""
-        with self._lock:
-            return self._requests
 
 
 def session_config(*, listen: str | None = None, connect: str | None = None) -> zenoh.Config:
@@ -164,10 +80,22 @@ def session_config(*, listen: str | None = None, connect: str | None = None) -> 
                     "flows": ["ingress"],
                     "permission": "deny",
                     "key_exprs": [f"{keys.ROOT}/**"],
-                }
+                },
+                {
+                    "id": "nobody-else-publishes-states",
+                    "messages": ["put", "delete"],
+                    "flows": ["ingress"],
+                    "permission": "deny",
+                    "key_exprs": [f"{keys.ROOT}/{what}/**" for what in ("state", "refused")],
+                },
             ],
             "subjects": [{"id": "everybody"}],
-            "policies": [{"rules": ["nobody-else-answers"], "subjects": ["everybody"]}],
+            "policies": [
+                {
+                    "rules": ["nobody-else-answers", "nobody-else-publishes-states"],
+                    "subjects": ["everybody"],
+                }
+            ],
         }
     config = zenoh.Config()
     for path, value in settings.items():
@@ -252,6 +180,7 @@ class Transport:
             keys.questions_key(scene), zenoh.handlers.FifoChannel(_CHANNEL), complete=True
         )
         self._declared.append(queryable)
+        self._declared += declare_sessions(session, scene, self._service, self._start)
         for number in range(config.workers):
             self._start(f"{scene}-{number}", lane.take, queryable.handler)
 

@@ -15,7 +15,13 @@ PACKAGES = ("schemas", "builder", "server")
 DOORS = {
     "h5py": ("schemas/new_file.py", "schemas/shard.py", "schemas/index_file.py", "schemas/vtkhdf.py"),
     "zstandard": ("schemas/frames.py",),
-    "zenoh": ("server/transport.py", "server/client.py"),
+    # Questions and sessions, of either side.
+    "zenoh": (
+        "server/transport.py",
+        "server/client.py",
+        "server/session_transport.py",
+        "server/client_session.py",
+    ),
     "numba": ("schemas/kernels/", "builder/kernels/", "server/kernels/", "server/report/kernels/"),
     "laspy": ("builder/made/write.py", "builder/export_las.py"),
     "lazrs": ("builder/sources/las.py",),

@@ -28,8 +28,13 @@ from solidcloud.schemas.messages import (
     SourceInfo,
     StatsAnswer,
 )
+from solidcloud.schemas.moves import Moved, Touched
+from solidcloud.schemas.scene import Limits, SceneFile, scene_of
 from solidcloud.server.app import serve
+from solidcloud.server.avatar import make_avatar
 from solidcloud.server.config import ServerConfig
+from solidcloud.server.frame_log import Begin, FrameLog
+from solidcloud.server.simulation import Simulation
 
 PART = 10  # poses in a part of a path
 
@@ -39,6 +44,34 @@ def floor_verdicts(points, radius, poses, margin=0.0):
     heights = np.einsum("kj,nj->kn", poses[:, 2, :3], points) + poses[:, 2, 3:4]
     touched = heights.min(axis=1) - radius <= margin
     return np.where(touched, Verdict.CONTACT, Verdict.CLEAR).astype(np.uint8)
+
+
+class FloorPipeline:
+    """Stands in for effects: an avatar gets as low as the floor lets it. One named "crash" raises."""
+
+    def __init__(self):
+        self.frames = 0
+
+    def run(self, body, wish, seconds, *, skip=None):
+        self.frames += 1
+        if body.name.endswith("/crash"):
+            raise RuntimeError("a secret of the server's own")
+        pose = wish.copy()
+        lowest = (body.avatar.points @ wish[:3, :3].T)[:, 2].min() - body.avatar.radius
+        touched = []
+        if wish[2, 3] + lowest <= 0:
+            pose[2, 3] = np.nextafter(-lowest, np.inf)
+            touched = [Touched((float(wish[0, 3]), float(wish[1, 3]), 0.0))]
+        body.pose = pose
+        left = float(pose[2, 3] - wish[2, 3])
+        skipped = sorted(skip) if skip else []
+        return Moved(pose=pose[None], left=left, touched=touched, simulated=["stop"], skipped=skipped)
+
+
+def floor_simulation(name="floor", users=64, **fields):
+    """A simulation of the floor, with a stand-in for its effects."""
+    file = SceneFile(format=1, archives=scene_of(name).archives, limits=Limits(users=users), **fields)
+    return Simulation(FloorScene(name), file, FloorPipeline())
 
 
 class FloorScene:
@@ -52,6 +85,7 @@ class FloorScene:
         self.at_work = self.warmed = self.parts = self.reloaded = 0
         self.refuses = None  # what a reload raises
         self.lock = threading.Lock()
+        self.simulation = None
 
     def warm(self):
         self.warmed += 1
@@ -98,6 +132,17 @@ class FloorScene:
         radius = 0.05 if radius is None else radius
         self.avatars[client, name] = (points, radius)
         return AvatarInfo(name, len(points), radius, 1.0)
+
+    def avatar(self, name, client):
+        found = self.avatars.get((client, name)) or self.avatars.get(("*", name))
+        if found is None:
+            raise UnknownAvatarError(f"avatar {name!r}")
+        return make_avatar(*found)
+
+    def move(self, name, pose_from, pose_to, seconds, *, client=""):
+        self.check(name, pose_from, client)
+        self.asked.append(("move", (name, seconds), {}))
+        return Moved(pose=pose_to, verdict=int(Verdict.CONTACT), left=0.5, simulated=["stop"])
 
     def collide(self, name, poses, margin=0.0, *, client="", **effort):
         self.check(name, poses, client)
@@ -197,5 +242,12 @@ if __name__ == "__main__":
     parser.add_argument("listen")
     parser.add_argument("--name", default="floor")
     parser.add_argument("--delay", type=float, default=0.0)
+    parser.add_argument("--walked", action="store_true", help="users may walk it")
+    parser.add_argument("--log")
     arguments = parser.parse_args()
-    serve([FloorScene(arguments.name, arguments.delay)], ServerConfig(listen=arguments.listen))
+    scene = FloorScene(arguments.name, arguments.delay)
+    if arguments.walked:
+        scene = floor_simulation(arguments.name)
+    if arguments.log:
+        scene.record(FrameLog(arguments.log, Begin(arguments.name, "", b"", [])))
+    serve([scene], ServerConfig(listen=arguments.listen))

@@ -1,0 +1,281 @@
+"""A session: one avatar of a client that wishes many times a second, and hears where it got to.
+
+Over zenoh, beside the questions of `Client`: wishes go out and states come in without anybody waiting for an answer.
+"""
+
+import itertools
+import logging
+import math
+import queue
+import threading
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from time import monotonic
+from types import TracebackType
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+import zenoh
+
+from ..schemas import keys
+from ..schemas.encoding import MSGPACK, decode_answer, encode
+from ..schemas.errors import (
+    BadRequestError,
+    BusyError,
+    SolidcloudError,
+    UnknownAvatarError,
+    error_from_code,
+)
+from ..schemas.messages import ErrorReply
+from ..schemas.moves import State, Wish
+from .session_transport import FRAME_QOS
+
+log = logging.getLogger(__name__)
+
+# States kept for whoever asks for each of them: some ten seconds; of more, the oldest go.
+_KEPT = 1024
+# Refusals in a row that a server is told of an avatar again for: one that refuses it all the same is at fault.
+_MOST_AGAIN = 100
+
+
+class Latest(NamedTuple):
+    """The last state that came, and how long ago that was [s]."""
+
+    state: State
+    age: float
+
+
+class ClientSession:
+    """One avatar's session; made by `Client.session`, a context manager, thread-safe.
+
+    What the server says comes to `states`, each in its order, and to `latest`. While no server answers there are none,
+    and `latest` grows old; once there is one again, it goes on from where the last state left the avatar.
+    """
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        scene: str,
+        user: keys.User,
+        numbers: "itertools.count[int]",
+        add_again: Callable[[UnknownAvatarError], bool],
+    ) -> None:
+        """numbers: of wishes, growing over all sessions of this user.  add_again: adds the avatar to a server that does
+        not know it; False: nobody answered; raises what it is given where this client has not added it either."""
+        self._session, self._scene, self._user = session, scene, user
+        self._numbers, self._add_again = numbers, add_again
+        self._came: queue.SimpleQueue[tuple[bool, Any] | None] = queue.SimpleQueue()
+        self._publishing = threading.Lock()  # so that wishes leave in the order of their numbers
+        self._wished: Wish | None = None
+        self._changed = threading.Condition()
+        self._kept: deque[State | SolidcloudError] = deque(maxlen=_KEPT)
+        self._latest: State | None = None
+        self._error: SolidcloudError | None = None  # newer than `_latest`
+        self._when = -math.inf
+        self._again = 0
+        self._stack: ExitStack | None = None
+
+    def __enter__(self) -> Self:
+        with ExitStack() as stack:
+            # First, so that it is undone last: the thread ends when nothing more comes.
+            thread = threading.Thread(
+                target=self._hear, name=f"solidcloud-session-{self._user.avatar}", daemon=True
+            )
+            stack.callback(thread.join)
+            stack.callback(self._came.put, None)
+            for ok, key in ((True, keys.state_key), (False, keys.refused_key)):
+                stack.enter_context(
+                    self._session.declare_subscriber(key(self._scene, self._user), self._comes(ok))
+                )
+            self._publisher = stack.enter_context(
+                self._session.declare_publisher(
+                    keys.wish_key(self._scene, self._user), encoding=MSGPACK, **FRAME_QOS
+                )
+            )
+            thread.start()
+            self._stack = stack.pop_all()
+        return self
+
+    def _comes(self, ok: bool) -> Any:
+        """What zenoh calls for each sample: it may not block, nor use zenoh."""
+        # Without bound: what is heard is taken at once, but for the moments in which an avatar is added again.
+        return lambda sample: self._came.put((ok, sample))
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Leave the scene: others may walk where the avatar stood. Closing twice is allowed."""
+        with self._publishing:
+            stack, self._stack = self._stack, None
+            if stack is not None:
+                try:
+                    self._publisher.delete()
+                except zenoh.ZError as error:  # the client was closed before: the server sees that by itself
+                    log.debug("leaving: %s", error)
+        if stack is not None:
+            stack.close()
+            with self._changed:
+                self._changed.notify_all()
+
+    def wish(
+        self,
+        pose: Any = None,
+        velocity: Any = None,
+        turn: float = 0.0,
+        *,
+        objects: dict[str, list[list[float]]] | None = None,
+        time: float | None = None,
+    ) -> int:
+        """Wish to be at a pose, (4, 4) or (1, 4, 4) float64, or to go at a velocity (3,) [m/s]; one of the two.
+
+        Returns the number of the wish, which its state has as `seq`. turn: with a velocity, about the scene's up axis
+        [rad/s].  objects: poses of the scene's objects that this user moves.  time: of the wish, on a clock of the
+        caller's that does not go back [s]; None: this process's. What no server hears is lost, and nothing says so but
+        that no states come: wish on. BadRequestError: what is no wish, or the session is closed.
+        """
+        array = np.empty((0, 4, 4)) if pose is None else np.asarray(pose, np.float64).reshape(-1, 4, 4)
+        speed = None if velocity is None else tuple(float(part) for part in velocity)
+        if speed is not None and len(speed) != 3:
+            raise BadRequestError(f"velocity of {len(speed)} numbers: expected 3 [m/s]")
+        with self._publishing:
+            wish = Wish(
+                seq=next(self._numbers),
+                time=monotonic() if time is None else float(time),
+                pose=np.ascontiguousarray(array),
+                velocity=speed,  # type: ignore[arg-type]
+                turn=float(turn),
+                objects=objects or {},
+            )
+            self._publish(wish)
+            self._wished = wish
+        return wish.seq
+
+    def _publish(self, wish: Wish) -> None:
+        """Send a wish. To be called with `_publishing` held."""
+        if self._stack is None:
+            raise BadRequestError("this session is closed: wish inside `with client.session(...) as session`")
+        self._publisher.put(encode(wish))
+
+    def latest(self) -> Latest | None:
+        """The last state that came, and its age; None: none came yet. Raises, once, what the server refused since."""
+        with self._changed:
+            self._raise_error()
+            return None if self._latest is None else Latest(self._latest, monotonic() - self._when)
+
+    def wait(self, seq: int, timeout: float = 5.0) -> State:
+        """The state of a wish, or of a newer one, waited for. BusyError: none came within `timeout` [s].
+
+        Raises, once, what the server refused since the last state.
+        """
+        with self._changed:
+            self._changed.wait_for(
+                lambda: bool(self._error) or self._stack is None or self._reached(seq), timeout
+            )
+            self._raise_error()
+            if self._latest is None or self._latest.seq < seq:
+                raise BusyError(
+                    f"no state of wish {seq} of avatar {self._user.avatar!r} in scene {self._scene!r} within "
+                    f"{timeout:g} s: no server heard it, or it is behind: wish on"
+                )
+            return self._latest
+
+    def _raise_error(self) -> None:
+        """Raise, once, what the server refused since the last state. To be called with `_changed` held."""
+        error, self._error = self._error, None
+        if error is not None:
+            raise error
+
+    def _reached(self, seq: int) -> bool:
+        """Whether the state of a wish came. To be called with `_changed` held."""
+        return self._latest is not None and self._latest.seq >= seq
+
+    def states(self, timeout: float = 5.0) -> Iterator[State]:
+        """Each state as it comes, in order, until none came for `timeout` [s] or the session is closed.
+
+        Of more than 1,024 that nobody took, the oldest are left out. Raises what the server refused, where it stands
+        among them.
+        """
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: bool(self._kept) or self._stack is None, timeout)
+                if not self._kept:
+                    return
+                said = self._kept.popleft()
+            if isinstance(said, SolidcloudError):
+                raise said
+            yield said
+
+    def _hear(self) -> None:
+        """Take what comes. A thread's work."""
+        while True:
+            came = [self._came.get()]
+            while not self._came.empty():
+                came.append(self._came.get())
+            unknown: UnknownAvatarError | None = None
+            for item in came:
+                if item is None:
+                    return
+                try:
+                    ok, payload = item[0], item[1].payload.to_bytes()
+                    said = decode_answer(State, payload) if ok else _error_of(payload)
+                except SolidcloudError as error:
+                    said = error
+                if isinstance(said, UnknownAvatarError):
+                    unknown = said
+                else:
+                    self._keep(said)
+            if unknown is not None:
+                self._begin_again(unknown)
+
+    def _keep(self, said: State | SolidcloudError) -> None:
+        """Have what the server says where it is asked for."""
+        with self._changed:
+            if isinstance(said, SolidcloudError):
+                self._error = said
+            else:
+                self._latest, self._error = said, None
+                self._when, self._again = monotonic(), 0
+            self._kept.append(said)
+            self._changed.notify_all()
+
+    def _begin_again(self, unknown: UnknownAvatarError) -> None:
+        """Come to a server that does not know the avatar, or where it is: it was restarted, or took us for gone."""
+        last, wished = self._latest, self._wished
+        self._again += 1
+        try:
+            try:
+                if not self._add_again(unknown):
+                    return  # nobody answered; the next wish asks again
+            except UnknownAvatarError:
+                if last is None:  # neither this client's nor the scene's
+                    raise
+            if wished is None or self._again > _MOST_AGAIN or (wished.velocity is not None and last is None):
+                raise unknown
+            with self._publishing:
+                if self._stack is None:
+                    return
+                if wished.velocity is not None and last is not None:
+                    there = Wish(seq=next(self._numbers), time=wished.time, pose=last.pose.copy())
+                    self._publish(there)
+                wished = self._wished or wished
+                self._wished = _numbered(wished, next(self._numbers))
+                self._publish(self._wished)
+        except SolidcloudError as error:
+            self._keep(error)
+
+
+def _numbered(wish: Wish, seq: int) -> Wish:
+    """The same wish under another number."""
+    return Wish(
+        seq=seq, time=wish.time, pose=wish.pose, velocity=wish.velocity, turn=wish.turn, objects=wish.objects
+    )
+
+
+def _error_of(payload: bytes) -> SolidcloudError:
+    """What a refusal says."""
+    reply = decode_answer(ErrorReply, payload)
+    return error_from_code(reply.code, reply.message)

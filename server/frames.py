@@ -1,0 +1,199 @@
+"""Frames: the wishes of users on their way to a simulation, and their states on the way back. No zenoh here.
+
+A mailbox for each user holds its latest wish; a thread empties all of them, has one frame simulated, and publishes what
+came of it. It waits while nobody wishes, so that frames come at most as fast as wishes do.
+"""
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Iterable
+from typing import NamedTuple
+
+from ..schemas.encoding import MSGPACK, decode_request, encode, wire_encoding
+from ..schemas.errors import BadRequestError, BusyError, SolidcloudError
+from ..schemas.keys import User
+from ..schemas.messages import ErrorReply
+from ..schemas.moves import State, Wish
+from .served import Answer, Outcome, Simulates, Turn
+
+log = logging.getLogger(__name__)
+
+# Mailboxes for each user that a scene has room for: who comes when it is full is told so, frame by frame.
+_BOXES_A_USER = 2
+
+
+class Post(NamedTuple):
+    """What was taken out of mailboxes. left, gone: users and clients that leave, before the turns.
+
+    encodings: of each turn's wish, which its state is to have.
+    """
+
+    left: list[User]
+    gone: list[str]
+    turns: list[Turn]
+    encodings: list[str]
+
+
+class _Box:
+    """One user's mailbox. seq: of the latest wish ever.  late: wishes dropped.  wish: the one that waits."""
+
+    __slots__ = ("encoding", "late", "seq", "wish")
+
+    def __init__(self) -> None:
+        self.seq, self.late = -1, 0
+        self.wish: Wish | None = None
+        self.encoding = MSGPACK
+
+
+class Mailboxes:
+    """The latest wish of each user. Thread-safe; bounded."""
+
+    def __init__(self, most: int) -> None:
+        """most: mailboxes, at a time."""
+        self._most = most
+        self._boxes: dict[User, _Box] = {}
+        self._waiting: dict[User, None] = {}  # with a wish, in the order they came
+        self._left: list[User] = []
+        self._gone: list[str] = []
+        self._closed = False
+        self._changed = threading.Condition()
+
+    def put(self, user: User, wish: Wish, encoding: str = MSGPACK) -> None:
+        """A wish came: it takes the place of one that waits. One no newer than the latest is dropped, and counted.
+
+        BusyError: no room for one more user.
+        """
+        with self._changed:
+            box = self._boxes.get(user)
+            if box is None:
+                if len(self._boxes) >= self._most:
+                    raise BusyError(f"{len(self._boxes)} users wish to walk this scene: come again later")
+                box = self._boxes[user] = _Box()
+            if wish.seq <= box.seq:
+                box.late += 1
+                return
+            if box.wish is not None:
+                box.late += 1
+            box.seq, box.wish, box.encoding = wish.seq, wish, encoding
+            self._waiting[user] = None
+            self._changed.notify()
+
+    def leave(self, user: User) -> None:
+        """A user leaves; what it wished before is dropped."""
+        with self._changed:
+            self._forget([user])
+            self._left.append(user)
+            self._changed.notify()
+
+    def leave_client(self, client: str) -> None:
+        """All users of a client leave."""
+        with self._changed:
+            self._forget([user for user in self._boxes if user.client == client])
+            self._gone.append(client)
+            self._changed.notify()
+
+    def keep(self, users: Iterable[User]) -> None:
+        """Forget all other users but those whose wishes wait."""
+        with self._changed:
+            kept = {*users, *self._waiting}
+            self._forget([user for user in self._boxes if user not in kept])
+
+    def _forget(self, users: list[User]) -> None:
+        for user in users:
+            self._boxes.pop(user, None)
+            self._waiting.pop(user, None)
+
+    def take(self) -> Post | None:
+        """All that waits, waiting for some of it; None: closed, and nothing is left."""
+        with self._changed:
+            while not (self._waiting or self._left or self._gone or self._closed):
+                self._changed.wait()
+            if not (self._waiting or self._left or self._gone):
+                return None
+            post = Post(self._left, self._gone, [], [])
+            for user in self._waiting:
+                box = self._boxes[user]
+                assert box.wish is not None, "only boxes with a wish wait"
+                post.turns.append(Turn(user, box.wish, box.late))
+                post.encodings.append(box.encoding)
+                box.wish = None
+            self._waiting, self._left, self._gone = {}, [], []
+            return post
+
+    def close(self) -> None:
+        """Take no more in; what waits is still taken."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+
+    def __len__(self) -> int:
+        """Mailboxes there are."""
+        with self._changed:
+            return len(self._boxes)
+
+
+class Frames:
+    """The sessions of one scene: wishes as bytes in, states as bytes out. No method raises."""
+
+    def __init__(self, simulation: Simulates, publish: Callable[[User, Answer], None]) -> None:
+        """publish: sends a user's state, or why there is none; must not block."""
+        self._simulation, self._publish = simulation, publish
+        self._boxes = Mailboxes(_BOXES_A_USER * simulation.most_users)
+
+    def wish(self, user: User, payload: bytes, encoding: str | None) -> None:
+        """A wish came. What is none is refused at once."""
+        try:
+            stated = wire_encoding(encoding)
+            self._boxes.put(user, decode_request(Wish, payload, stated), stated)
+        except SolidcloudError as error:
+            self._send(user, error, encoding)
+
+    def leave(self, user: User) -> None:
+        """A user leaves the scene."""
+        self._boxes.leave(user)
+
+    def client_gone(self, client: str) -> None:
+        """All users of a client leave the scene."""
+        self._boxes.leave_client(client)
+
+    def run(self) -> None:
+        """Simulate frames until `close`. A thread's work."""
+        while (post := self._boxes.take()) is not None:
+            try:
+                self._frame(post)
+            except Exception:  # of this frame alone
+                log.exception("a frame of %d users", len(post.turns))
+
+    def _frame(self, post: Post) -> None:
+        """One frame, and what is said of it."""
+        for user in post.left:
+            self._simulation.end(user)
+        for client in post.gone:
+            self._simulation.end_client(client)
+        if post.turns:
+            outcomes: list[Outcome] = self._simulation.step(post.turns, time.monotonic())
+            for outcome, encoding in zip(outcomes, post.encodings, strict=True):
+                self._send(outcome.user, outcome.state, encoding)
+        users = self._simulation.users
+        if len(self._boxes) > len(users):
+            self._boxes.keep(users)
+
+    def _send(self, user: User, said: State | SolidcloudError, encoding: str | None) -> None:
+        """Publish what is said to a user; what cannot be sent is logged, for nobody waits for it."""
+        try:
+            stated = wire_encoding(encoding)
+        except BadRequestError:
+            stated = MSGPACK
+        try:
+            if isinstance(said, SolidcloudError):
+                reply = ErrorReply(said.code, str(said))
+                self._publish(user, Answer(encode(reply, stated), stated, False))
+            else:
+                self._publish(user, Answer(encode(said, stated), stated, True))
+        except Exception:
+            log.exception("the state of %s of client %s", user.avatar, user.client)
+
+    def close(self) -> None:
+        """End `run` once what came is done."""
+        self._boxes.close()

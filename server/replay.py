@@ -1,0 +1,135 @@
+"""A log's frames once more: the same wishes must give the same poses, bit for bit."""
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+
+from ..schemas.encoding import decode_request
+from ..schemas.errors import BadRequestError, SolidcloudError
+from ..schemas.keys import User
+from ..schemas.moves import Wish
+from .frame_log import Begin, Dropped, Ended, Entered, Frame, Points, Record, Reloaded, Said, said
+from .served import Turn
+from .simulation import Simulation
+
+
+class Difference(NamedTuple):
+    """Where a replay differs from its log. logged, found: what came of the turn."""
+
+    frame: int
+    user: User
+    logged: Said
+    found: Said
+
+    def __str__(self) -> str:
+        """One line."""
+        return (
+            f"frame {self.frame}, avatar {self.user.avatar} of client {self.user.client}: "
+            f"logged {_words(self.logged)}, replayed {_words(self.found)}"
+        )
+
+
+class Replayed(NamedTuple):
+    """What a replay found. frames, turns: run again.  different: turns that came out otherwise; first: of them.
+
+    reloaded: the generation that the log's scene was reloaded to, where the replay ends; None: it was not.
+    """
+
+    frames: int
+    turns: int
+    different: int
+    first: Difference | None
+    reloaded: int | None
+
+
+def replay(simulation: Simulation, records: Iterable[Record]) -> Replayed:
+    """Run the frames of a log, on a simulation of the same scene that nobody walked yet.
+
+    Each frame skips the effects that the log says it skipped: why it did was a matter of time. The replay ends where
+    the log's scene was reloaded. Raises what reading the records raises, and BadRequestError for a log whose avatars
+    are not those of the scene.
+    """
+    bodies = _Bodies(simulation)
+    frames = turns = different = 0
+    first: Difference | None = None
+    for record in records:
+        if isinstance(record, Points):
+            bodies.known[record.digest] = record
+        elif isinstance(record, Entered):
+            bodies.enter(record)
+        elif isinstance(record, Dropped):
+            bodies.drop(record.client)
+        elif isinstance(record, Ended):
+            for user in record.users:
+                simulation.end(user)
+        elif isinstance(record, Reloaded):
+            return Replayed(frames, turns, different, first, record.generation)
+        elif isinstance(record, Frame):
+            frames, turns = frames + 1, turns + len(record.turns)
+            for difference in _differences(simulation, record):
+                different, first = different + 1, first or difference
+    return Replayed(frames, turns, different, first, None)
+
+
+def _differences(simulation: Simulation, record: Frame) -> list[Difference]:
+    """Run one frame; what comes out otherwise."""
+    wished = [Turn(User(*user), decode_request(Wish, wish)) for user, wish in record.turns]
+    outcomes = simulation.step(wished, skips=[logged.skipped for logged in record.said])
+    return [
+        Difference(record.number, outcome.user, logged, found)
+        for outcome, logged in zip(outcomes, record.said, strict=True)
+        if ((found := said(outcome)).pose, found.error) != (logged.pose, logged.error)
+    ]
+
+
+class _Bodies:
+    """The avatars of a log, put into a scene as users come in with them."""
+
+    def __init__(self, simulation: Simulation) -> None:
+        self._simulation = simulation
+        self.known: dict[bytes, Points] = {}
+        self._added: dict[User, bytes] = {}
+
+    def enter(self, entered: Entered) -> None:
+        """Have an avatar known before its user's first turn."""
+        user = User(*entered.user)
+        if self._added.get(user, entered.digest) != entered.digest:
+            # The client went and came again with another avatar of that name, all others of it too.
+            self.drop(user.client)
+        if user not in self._added:
+            record = self.known.get(entered.digest)
+            if record is None:
+                raise BadRequestError(f"avatar {user.avatar!r} of the log: its points are not in it")
+            points = np.frombuffer(record.points, "<f8").reshape(-1, 3)
+            try:
+                self._simulation.add_avatar(user.avatar, points, record.radius, client=user.client)
+            except SolidcloudError as error:
+                raise BadRequestError(f"the log is of another scene: {error}") from None
+            self._added[user] = entered.digest
+
+    def drop(self, client: str) -> None:
+        """Forget the avatars of a client."""
+        self._simulation.drop_client(client)
+        for user in [user for user in self._added if user.client == client]:
+            del self._added[user]
+
+
+def check_same(begin: Begin, archives: list[tuple[str, int]], where: str) -> None:
+    """BadRequestError unless a log is of these archives: id and generation of each. where: they lie, for the error."""
+    if [tuple(each) for each in begin.archives] != archives:
+        logged = ", ".join(
+            f"{archive[:8]} of generation {generation}" for archive, generation in begin.archives
+        )
+        found = ", ".join(f"{archive[:8]} of generation {generation}" for archive, generation in archives)
+        raise BadRequestError(
+            f"{where}: archive {found}: expected {logged}, which the log is of ({begin.path})"
+        )
+
+
+def _words(said: Said) -> str:
+    """What came of a turn, for people."""
+    if said.error:
+        return f"error {said.error}"
+    x, y, z = np.frombuffer(said.pose, "<f8").reshape(4, 4)[:3, 3].tolist()
+    return f"a pose at ({x!r}, {y!r}, {z!r})"

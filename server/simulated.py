@@ -1,0 +1,63 @@
+"""How a scene gets its frames: the world and the effects that its file declares, and no others, are imported here.
+
+`Simulated` gives them to a `Scene`, an archive without a file: it and `stop`.
+"""
+
+import threading
+from collections.abc import Mapping
+from typing import Any
+
+from ..schemas.moves import FRAME_SECONDS, Moved
+from ..schemas.scene import SceneFile, scene_of
+from .served import EVERYBODY
+from .simulation import Simulation, Stage
+
+_MAKING = threading.Lock()
+
+
+def simulate(
+    served: Stage, file: SceneFile, avatars: Mapping[str, tuple[Any, float | None]] | None = None
+) -> Simulation:
+    """The simulation of what is served, as its file says.
+
+    avatars: the scene's own, points (n, 3) [m] and radius by name; None: of half the mean closest-point distance.
+    """
+    # Here, and not above: whoever only asks questions has no use for effects and their kernels.
+    from .effects.pipeline import make_pipeline
+    from .world import World
+
+    own = [
+        served.add_avatar(name, points, radius, client=EVERYBODY)
+        for name, (points, radius) in (avatars or {}).items()
+    ]
+    pipeline = make_pipeline(file, World(served, file))
+    # Effects of one scene that let users meet share one account of who is where.
+    meeting: list[Any] = [runner for runner in pipeline.runners if hasattr(runner, "bodies")]
+    for runner in meeting[1:]:
+        runner.bodies = meeting[0].bodies
+    return Simulation(served, file, pipeline, own, meeting[0].bodies if meeting else None)
+
+
+class Simulated:
+    """What a scene without a file moves users by; made at its first use."""
+
+    name: str
+    _simulation: Simulation | None = None
+
+    @property
+    def simulation(self: Any) -> Simulation:
+        """What simulates frames of this scene."""
+        with _MAKING:
+            if self._simulation is None:
+                self._simulation = simulate(self, scene_of(self.name))
+            made: Simulation = self._simulation
+        return made
+
+    def move(
+        self, name: str, pose_from: Any, pose_to: Any, seconds: float = FRAME_SECONDS, *, client: str = ""
+    ) -> Moved:
+        """Where avatar `name` gets from one pose (1, 4, 4) towards another in a frame; nothing is remembered.
+
+        What it touches stops it. See `Simulation.move`.
+        """
+        return self.simulation.move(name, pose_from, pose_to, seconds, client=client)

@@ -1,0 +1,336 @@
+"""Simulation: a scene, and what happens in it frame by frame: where users get to, by the effects it calls for.
+
+The same methods as `Scene`, which answers the questions; besides them `move`, one frame of which nothing is
+remembered, and `step`, one frame of everybody who wished, whose bodies are remembered until they end. The same wishes
+in the same order give the same poses, bit for bit: nothing here reads a clock but to say how long a frame took.
+"""
+
+import logging
+import threading
+import time
+from collections.abc import Collection, Iterator, Sequence
+from typing import Any, Protocol
+
+import numpy as np
+
+from ..schemas.answers import (
+    CollideAnswers,
+    ContactsAnswers,
+    DistanceAnswers,
+    ObjectsAnswers,
+    Part,
+    RaycastAnswers,
+    SweepAnswers,
+    WithinAnswers,
+)
+from ..schemas.errors import BadRequestError, BusyError, InternalError, SolidcloudError
+from ..schemas.keys import User
+from ..schemas.messages import AvatarInfo, ReloadAnswer, SceneInfo, StatsAnswer
+from ..schemas.moves import FRAME_SECONDS, Moved, MoveRequest, State, Wish
+from ..schemas.requests import make_poses
+from ..schemas.scene import SceneFile
+from .avatar import AvatarModel
+from .describe import describe_scene
+from .effects.frame import Body
+from .served import EVERYBODY, Outcome, SceneLike, Turn
+from .wishes import Pose, check_rigid, first_pose, frame_seconds, wished_pose
+
+log = logging.getLogger(__name__)
+
+# A user that wished nothing for so long has left: others may walk where it stood [s].
+SILENT_SECONDS = 30.0
+# No client's name either.
+_WARM = "*warm"
+
+
+class Pipeline(Protocol):
+    """The effects that a scene declares, as effects/pipeline.py makes them."""
+
+    def run(
+        self, body: Body, wish: Pose, seconds: float, *, skip: Collection[str] | None = None
+    ) -> Moved: ...
+
+
+class Stage(SceneLike, Protocol):
+    """A scene whose users can be simulated."""
+
+    def avatar(self, name: str, client: str) -> AvatarModel: ...
+
+
+class Bodies(Protocol):
+    """All that moves and blocks, for effects that let users meet one another or objects; see effects/bodies.py."""
+
+    def __setitem__(self, user: User, body: Body) -> None: ...
+    def pop(self, user: User, default: None = None) -> Any: ...
+    def tell(self, poses: dict[str, list[list[float]]]) -> None: ...
+
+
+class Recorder(Protocol):
+    """Who is told of all that decides what comes of wishes, in order; see frame_log.py."""
+
+    def entered(self, user: User, avatar: AvatarModel) -> None: ...
+    def ended(self, users: list[User]) -> None: ...
+    def dropped(self, client: str) -> None: ...
+    def frame(self, number: int, turns: Sequence[Turn], outcomes: Sequence[Outcome]) -> None: ...
+    def reloaded(self, generation: int) -> None: ...
+
+
+class _Presence:
+    """A user who walks the scene: its body, when it wished last on its own clock and on the server's."""
+
+    __slots__ = ("body", "heard", "time")
+
+    def __init__(self, body: Body) -> None:
+        self.body = body
+        self.time: float | None = None
+        self.heard = 0.0
+
+
+class Simulation:
+    """A scene and its frames. Thread-safe; a context manager.
+
+    served: what answers the questions.  file: what the scene calls for.  pipeline: its effects.  avatars: the scene's
+    own, which every user finds: `served` knows them as those of EVERYBODY.  bodies: kept up to date, where users meet.
+    """
+
+    def __init__(
+        self,
+        served: Stage,
+        file: SceneFile,
+        pipeline: Pipeline,
+        avatars: Sequence[AvatarInfo] = (),
+        bodies: Bodies | None = None,
+    ) -> None:
+        self.name, self.file = served.name, file
+        self.served, self._pipeline = served, pipeline
+        self._up = np.array(file.up) / np.linalg.norm(file.up)
+        self._own = list(avatars)
+        self._present: dict[User, _Presence] = {}
+        self._bodies = bodies
+        self._recorder: Recorder | None = None
+        self._frames = 0
+        self._frame = threading.Lock()  # held for a frame: bodies change under it alone
+
+    def __enter__(self) -> "Simulation":
+        """The simulation itself."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close the scene."""
+        self.close()
+
+    @property
+    def simulation(self) -> "Simulation":
+        """What simulates the frames: itself."""
+        return self
+
+    @property
+    def most_users(self) -> int:
+        """How many may walk it at a time."""
+        return self.file.limits.users
+
+    @property
+    def users(self) -> list[User]:
+        """Who walks it now."""
+        return list(self._present)
+
+    def record(self, recorder: Recorder | None) -> None:
+        """Tell `recorder` of every frame from now on, before anybody walks the scene; None: nobody."""
+        with self._frame:
+            self._recorder = recorder
+
+    def move(
+        self,
+        name: str,
+        pose_from: Any,
+        pose_to: Any,
+        seconds: float = FRAME_SECONDS,
+        *,
+        client: str = "",
+    ) -> Moved:
+        """Where avatar `name` gets from one pose (1, 4, 4) towards another in a frame; nothing is remembered.
+
+        seconds: that the frame lasts [s]. Raises BadRequestError, BadTransformError, UnknownAvatarError.
+        """
+        asked = MoveRequest(
+            avatar=name,
+            pose_from=make_poses(pose_from, "pose_from"),
+            pose_to=make_poses(pose_to, "pose_to"),
+            seconds=float(seconds),
+        )
+        user = User(client, name)
+        begin = check_rigid(asked.pose_from[0].copy(), "pose_from")
+        wish = check_rigid(asked.pose_to[0], "pose_to")
+        body = Body(_body_name(user), self.served.avatar(name, client), begin)
+        return self._pipeline.run(body, wish, asked.seconds)
+
+    def step(
+        self,
+        turns: Sequence[Turn],
+        now: float | None = None,
+        skips: Sequence[Collection[str]] | None = None,
+    ) -> list[Outcome]:
+        """One frame of everybody who wished, one after the other in the order of `turns`; what came of each.
+
+        A user's first wish puts its body where the scene's spawn is, or else where it wishes to be. What a wish is
+        refused for is its outcome; the others go on.
+        now: on a clock of the caller's [s]; who has not wished for SILENT_SECONDS of it ends first; None: nobody does.
+        skips: of each turn, the effects to be left out, as a frame recorded says; None: as the frame's budget has it.
+        """
+        with self._frame:
+            if now is not None:
+                self._leave([u for u, there in self._present.items() if now - there.heard > SILENT_SECONDS])
+            self._frames += 1
+            outcomes = []
+            for number, turn in enumerate(turns):
+                skip = None if skips is None else skips[number]
+                outcomes.append(Outcome(turn.user, self._turn(turn, now, skip)))
+            if self._recorder is not None:
+                self._recorder.frame(self._frames, turns, outcomes)
+            return outcomes
+
+    def _turn(self, turn: Turn, now: float | None, skip: Collection[str] | None) -> State | SolidcloudError:
+        """One user's frame; what it is refused for is returned."""
+        begin = time.perf_counter()
+        try:
+            moved = self._moved(turn.user, turn.wish, now, skip)
+        except SolidcloudError as error:
+            return error
+        except Exception as error:  # of this user alone: the others' frames go on
+            log.exception("a frame of %s in %s", _body_name(turn.user), self.name)
+            return InternalError(f"{type(error).__name__} in the server: its log says more")
+        wish = turn.wish
+        return State(
+            **{name: getattr(moved, name) for name in Moved.__struct_fields__},
+            seq=wish.seq,
+            time=wish.time,
+            frame=self._frames,
+            late=turn.late,
+            seconds=time.perf_counter() - begin,
+        )
+
+    def _moved(self, user: User, wish: Wish, now: float | None, skip: Collection[str] | None) -> Moved:
+        """What comes of one wish; its user's body is begun with it, and not where it is refused."""
+        there = self._present.get(user)
+        present = self._begun(user, wish) if there is None else there
+        seconds = frame_seconds(wish, present.time)
+        aim = wished_pose(wish, present.body.pose, seconds, self._up)
+        if wish.objects:
+            if self._bodies is None:
+                raise BadRequestError(f"{self.name}: a wish moves objects: this scene has none")
+            self._bodies.tell(wish.objects)
+        moved = self._pipeline.run(present.body, aim, seconds, skip=skip)
+        present.time = wish.time
+        present.heard = present.heard if now is None else now
+        self._present[user] = present
+        if self._bodies is not None:
+            self._bodies[user] = present.body
+        return moved
+
+    def _begun(self, user: User, wish: Wish) -> _Presence:
+        """A user who comes in; BusyError where the scene is full."""
+        if len(self._present) >= self.most_users:
+            raise BusyError(
+                f"{self.name}: {len(self._present)} users walk it, as many as its limits allow: come again later"
+            )
+        avatar = self.served.avatar(user.avatar, user.client)
+        if self._recorder is not None:
+            self._recorder.entered(user, avatar)
+        return _Presence(Body(_body_name(user), avatar, first_pose(wish, self.file.spawn, self._up)))
+
+    def _leave(self, users: list[User]) -> None:
+        """End bodies."""
+        users = [user for user in users if user in self._present]
+        for user in users:
+            del self._present[user]
+            if self._bodies is not None:
+                self._bodies.pop(user)
+        if users and self._recorder is not None:
+            self._recorder.ended(users)
+
+    def end(self, user: User) -> None:
+        """A user leaves the scene: others may walk where it stood. Its next wish is a first one."""
+        with self._frame:
+            self._leave([user])
+
+    def end_client(self, client: str) -> None:
+        """All users of a client leave the scene."""
+        with self._frame:
+            self._leave([user for user in self._present if user.client == client])
+
+    def drop_client(self, client: str) -> None:
+        """Forget the bodies and avatars of a client that is gone."""
+        with self._frame:
+            self._leave([user for user in self._present if user.client == client])
+            self.served.drop_client(client)
+            if self._recorder is not None:
+                self._recorder.dropped(client)
+
+    def add_avatar(
+        self, name: str, points: Any, radius: float | None = None, *, client: str = ""
+    ) -> AvatarInfo:
+        """Add an avatar; see `Scene.add_avatar`. One named as one of the scene's own must be it."""
+        own = any(avatar.name == name for avatar in self._own)
+        return self.served.add_avatar(name, points, radius, client=EVERYBODY if own else client)
+
+    def info(self) -> SceneInfo:
+        """What is served, and which effects its frames simulate."""
+        return describe_scene(self.served.info(), self.file, self._own)
+
+    def warm(self) -> None:
+        """Warm the scene, and simulate a frame, so that nobody waits for compilers after."""
+        self.served.warm()
+        low = np.eye(4)[None]
+        low[0, :3, 3] = self.served.info().bounds[0]
+        high = low.copy()
+        high[0, :3, 3] += 0.01
+        self.served.add_avatar("warm", [[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]], 0.05, client=_WARM)
+        for pose_from, pose_to in ((low, high), (high, low)):
+            self.move("warm", pose_from, pose_to, client=_WARM)
+        self.served.drop_client(_WARM)
+
+    def reload(self) -> ReloadAnswer:
+        """Serve what is in the archives' folders now; see `Scene.reload`."""
+        answer = self.served.reload()
+        if self._recorder is not None:
+            with self._frame:
+                self._recorder.reloaded(answer.generation_after)
+        return answer
+
+    def close(self) -> None:
+        """Close the scene."""
+        self.served.close()
+
+    def stats(self, keys: bool = False) -> StatsAnswer:
+        """What is in memory, and how that did."""
+        return self.served.stats(keys)
+
+    def collide(self, *what: Any, **options: Any) -> CollideAnswers:
+        """See `Scene.collide`, and so for the questions below."""
+        return self.served.collide(*what, **options)
+
+    def distance(self, *what: Any, **options: Any) -> DistanceAnswers:
+        return self.served.distance(*what, **options)
+
+    def contacts(self, *what: Any, **options: Any) -> ContactsAnswers:
+        return self.served.contacts(*what, **options)
+
+    def sweep(self, *what: Any, **options: Any) -> SweepAnswers:
+        return self.served.sweep(*what, **options)
+
+    def raycast(self, *what: Any, **options: Any) -> RaycastAnswers:
+        return self.served.raycast(*what, **options)
+
+    def within(self, *what: Any, **options: Any) -> WithinAnswers:
+        return self.served.within(*what, **options)
+
+    def objects(self, *what: Any, **options: Any) -> ObjectsAnswers:
+        return self.served.objects(*what, **options)
+
+    def path(self, *what: Any, **parameters: Any) -> Iterator[Part]:
+        return self.served.path(*what, **parameters)
+
+
+def _body_name(user: User) -> str:
+    """What a body is called where others meet it."""
+    return f"{user.client}/{user.avatar}"

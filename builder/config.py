@@ -5,7 +5,7 @@ import re
 from dataclasses import dataclass, field
 
 from ..schemas.errors import BadRequestError
-from ..schemas.normals import DEFAULT_REACH, MAX_REACH
+from ..schemas.index import MAX_NORMAL_REACH, NORMAL_REACH
 from ..schemas.radius_model import MAX_RADIUS, STORED_MODELS
 from ..schemas.voxel import MAX_DEGREE, MAX_LEAF, MIN_DEGREE
 
@@ -118,7 +118,7 @@ class BuildConfig:
     jobs: int = 0
     memory_bytes: int = 2 << 30
     keep: frozenset[str] = field(default_factory=frozenset)
-    normal_reach: float = DEFAULT_REACH
+    normal_reach: float = NORMAL_REACH
     strict: bool = False
     skip_bad: bool = False
     overwrite: bool = False
@@ -169,9 +169,9 @@ class BuildConfig:
                 "scan, intensity, normal, by comma",
             ),
             (
-                0 < self.normal_reach <= MAX_REACH,
+                0 < self.normal_reach <= MAX_NORMAL_REACH,
                 f"--normal-reach {self.normal_reach}",
-                f"a length above 0, at most {MAX_REACH:g} m",
+                f"a length above 0, at most {MAX_NORMAL_REACH:g} m",
             ),
             (self.thin is None or 0 < self.thin < math.inf, f"--thin {self.thin}", "a positive distance"),
             (

@@ -12,9 +12,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .normals import MAX_REACH
 from .radius_model import LOCAL_CLASSES, RADIUS_CLASSES, local_radii
 from .voxel_grid import Lattice
+
+# Points so near have a say in a point's normal, unless another reach is given [m]: some forty that a scanner sees of a
+# façade, on no more than a hand.
+NORMAL_REACH = 0.08
+# Farther is no surface any more, and at steps of 0.1 mm sums fit 63 bits for any voxel (normals.py) [m].
+MAX_NORMAL_REACH = 1.0
 
 # One row a voxel, sorted by key. frame_*: where the dataset's only chunk lies in its shard, in the order of
 # DATASETS; checksum: the last four bytes of the zstd frame, so that a wrong offset cannot deliver another's.
@@ -262,8 +267,8 @@ def _normal_reach(columns: dict[str, NDArray]) -> float:
     if len(columns["columns"]) < 5:
         return 0.0
     reach = float(columns["normal_reach"][0])
-    if not (0 < reach <= MAX_REACH and columns["columns"][4] == 1):
-        raise ValueError(f"normal_reach {reach}: expected above 0, at most {MAX_REACH:g}")
+    if not (0 < reach <= MAX_NORMAL_REACH and columns["columns"][4] == 1):
+        raise ValueError(f"normal_reach {reach}: expected above 0, at most {MAX_NORMAL_REACH:g}")
     return reach
 
 

@@ -4,11 +4,7 @@ import math
 from fractions import Fraction
 
 from .errors import BadRequestError
-
-# Points so near have a say in a point's normal [m]: some forty a scanner sees of a façade, and no more than a hand.
-DEFAULT_REACH = 0.08
-# Farther is no surface any more, and at steps of 0.1 mm sums fit 63 bits for any voxel.
-MAX_REACH = 1.0
+from .index import MAX_NORMAL_REACH
 
 
 def normal_reach(reach: float, step: float, points: int) -> int:
@@ -17,8 +13,10 @@ def normal_reach(reach: float, step: float, points: int) -> int:
     Both lengths count as their decimal texts: 800 steps of 0.1 mm are 8 cm.  points: of the largest voxel, whose sums
     must fit 63 bits, also those taken from a place a diameter off and moved (builder/kernels/normals.py).
     """
-    if not 0 < reach <= MAX_REACH:
-        raise BadRequestError(f"normal reach {reach!r}: expected a length above 0, at most {MAX_REACH:g} m")
+    if not 0 < reach <= MAX_NORMAL_REACH:
+        raise BadRequestError(
+            f"normal reach {reach!r}: expected a length above 0, at most {MAX_NORMAL_REACH:g} m"
+        )
     square = int((Fraction(repr(float(reach))) / Fraction(repr(step))) ** 2)
     if square * max(points, 1) >= 1 << 59:
         most = 0.995 * math.sqrt((1 << 59) / max(points, 1)) * step

@@ -234,3 +234,41 @@ def test_nobody_imports_it_but_who_asks() -> None:
     env = {**os.environ, "NUMBA_DISABLE_JIT": "1"}
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=env)
     assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize("keep", [("normal",), ("normal", "scan", "intensity")])
+@pytest.mark.parametrize("models", [{"mean"}, {"mean", "border"}])
+def test_what_is_stored_is_what_is_found_at_first_use(
+    tmp_path: Path, keep: tuple[str, ...], models: set[str]
+) -> None:
+    options = {"keep": frozenset(keep), "normal_reach": REACH, "models": frozenset(models)}
+    case = build(tmp_path, "corner", COUNT // 3, **options)
+    with asked(case.archive) as (opened, normals):
+        assert not opened.store.with_normals
+        places = [place for place, *_ in judged(opened, case.points)]
+        first = [normals.code(place, REACH) for place in places]
+        own = opened.store.sizes
+        assert normals.estimated == len(places) and len(set(first)) > 20
+    opened = Opened(Store(case.archive, normals=REACH), 2 * int(own.max()))
+    try:
+        normals = Normals(opened.store, opened.data)
+        leaves = opened.store.archive.voxels["leaves"]
+        assert (opened.store.sizes == own + 64 * leaves.astype(int)).all()
+        assert [normals.code(place, REACH) for place in places] == first
+        assert normals.estimated == normals.used_bytes == 0 < opened.data.residency.evictions
+        assert normals.code(places[0] + 0.01, REACH) == NONE
+        opened.data.residency.check()
+        # Another reach is found as ever.
+        assert normals.code(places[0], REACH / 2) in range(1 << 16) and normals.estimated == 1
+    finally:
+        opened.release()
+
+
+@pytest.mark.parametrize("normals", [None, REACH / 2])
+def test_of_normals_that_nobody_asks_for_nothing_is_in_memory(tmp_path: Path, normals: float | None) -> None:
+    case = build(tmp_path, "plane", COUNT // 3, keep=frozenset({"normal"}), normal_reach=REACH)
+    plain = build(tmp_path, "plane", COUNT // 3)
+    kept, other = Store(case.archive, normals=normals), Store(plain.archive)
+    assert (kept.sizes == other.sizes).all() and not kept.with_normals
+    kept.close()
+    other.close()

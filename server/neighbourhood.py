@@ -5,7 +5,7 @@ turning), carried as far ahead as loading takes. Then the ring around where the 
 Nothing here loads, pins or evicts, and no clock is read: `now` is the caller's, in seconds, of any one clock.
 
 Safe to call from several threads. One lock guards the poses, held for microseconds; it is taken inside whatever its
-callers hold, and nothing is taken inside it. `nearness` takes none.
+callers hold, and nothing is taken inside it. `nearness` takes none: whoever evicts holds one that is its own.
 """
 
 import threading
@@ -107,7 +107,10 @@ class Neighbourhood:
         self._lock = threading.Lock()
         self._users: dict[User, int] = {}  # the row of each in `_walks`, in their order
         self._walks = np.zeros((FEW_USERS, WALK))
-        self._ways = np.empty((0, PIECES + 1, 3))  # of the last plan [steps]; replaced, never written
+        # Of the last plan, the ways [steps] and its number; replaced, never written. And how far each row is from them
+        # [m], where it was asked since `_asked`, the number of a plan: committed by the system as rows are asked for.
+        self._planned = np.empty((0, PIECES + 1, 3)), 1
+        self._asked, self._far = np.zeros(len(index.keys), np.int64), np.zeros(len(index.keys))
 
     @property
     def users(self) -> list[User]:
@@ -194,7 +197,8 @@ class Neighbourhood:
         load_seconds: what loading one voxel takes now, queueing included: an upper percentile of what was measured.
         """
         look = self._look._replace(horizon=self.ahead.horizon(load_seconds))
-        rows, need, self._ways = plan_walks(self._snapshot(), now, look, self._index)
+        rows, need, ways = plan_walks(self._snapshot(), now, look, self._index)
+        self._planned = ways, self._planned[1] + 1
         return Wanted(rows, need)
 
     def kept(self, now: float, after: float = EXPIRY) -> NDArray[np.int64]:
@@ -216,8 +220,17 @@ class Neighbourhood:
             if needed <= len(rows):
                 return starts, rows[:needed]
 
-    def nearness(self, rows: Sequence[int]) -> NDArray[np.float64]:
-        """How near (n,) the points' boxes of rows are to any user's way in the last plan [m]; inf: no users."""
-        far = np.empty(len(rows))
-        distance_to_ways(self._ways, np.asarray(rows, np.int64), self._index, far)
-        return far * self._step
+    def nearness(self, rows: ArrayLike) -> NDArray[np.float64]:
+        """How near (n,) the points' boxes of rows are to any user's way in the last plan [m]; inf: no users.
+
+        One call at a time. What was found since that plan is remembered: of 10,000 rows and 8 users finding it takes a
+        millisecond or two, and looking it up some 20 us.
+        """
+        each = np.asarray(rows, np.int64)
+        ways, number = self._planned
+        new = each[self._asked[each] != number]
+        if len(new):
+            far = np.empty(len(new))
+            distance_to_ways(ways, new, self._index, far)
+            self._far[new], self._asked[new] = far * self._step, number
+        return self._far[each]

@@ -5,8 +5,8 @@ traces with the same objects. What a policy is not told of, pins and predictions
 names every resident row, and those in use are passed over.
 """
 
-from collections import OrderedDict
-from collections.abc import Callable, Iterator, Sequence
+from collections import OrderedDict, deque
+from collections.abc import Callable, Iterator
 from typing import Protocol
 
 import numpy as np
@@ -24,8 +24,10 @@ SCAN_SHARE = 0.1
 # S3-FIFO's small queue, of the budget, and the uses counted: two bits ([Yang23]).
 SMALL_SHARE = 0.1
 MOST_USES = 3
+# `distance`: rows there is room for at first; and those at the front that are put in order before the rest.
+FEW_ROWS, SOME_ROWS = 64, 256
 
-Nearness = Callable[[Sequence[int]], NDArray[np.float64]]
+Nearness = Callable[[NDArray[np.int64]], NDArray[np.float64]]
 
 
 class Policy(Protocol):
@@ -124,7 +126,8 @@ class Lru:
 class Distance:
     """Farthest from every user's predicted way first; of those as far, least recently used first.
 
-    What a scan added needs no share: far from users it goes first as it is.
+    What a scan added needs no share: far from users it goes first as it is. Rows lie in arrays, in no order: the first
+    to go is found in one pass over them, those behind it in the order of a part, and only then of all.
     """
 
     name = "distance"
@@ -132,31 +135,48 @@ class Distance:
     def __init__(self, nearness: Nearness) -> None:
         """nearness: rows -> (n,) float64, least distance of each to any user's predicted way [m], inf: no users."""
         self._nearness = nearness
-        self._order: OrderedDict[int, None] = OrderedDict()
+        self._at: dict[int, int] = {}  # where each row is in the arrays
+        self._rows = np.empty(FEW_ROWS, np.int64)
+        self._used = np.empty(FEW_ROWS, np.int64)  # when, in uses of any
+        self._uses = 0
 
     def added(self, row: int, size: int, *, scan: bool) -> None:
         """See `Policy`."""
-        self._order[row] = None
+        count = len(self._at)
+        if count == len(self._rows):
+            self._rows, self._used = np.resize(self._rows, 2 * count), np.resize(self._used, 2 * count)
+        self._at[row] = count
+        self._rows[count] = row
+        self.used(row, scan=scan)
 
     def used(self, row: int, *, scan: bool) -> None:
         """See `Policy`."""
-        self._order.move_to_end(row)
+        self._uses += 1
+        self._used[self._at[row]] = self._uses
 
     def removed(self, row: int, *, evicted: bool) -> None:
         """See `Policy`."""
-        del self._order[row]
+        at, last = self._at.pop(row), len(self._at)
+        if at < last:  # the last takes its place
+            moved = int(self._rows[last])
+            self._rows[at], self._used[at], self._at[moved] = moved, self._used[last], at
 
     def victims(self) -> Iterator[int]:
         """See `Policy`."""
-        rows = list(self._order)
-        if not rows:
+        count = len(self._at)
+        if not count:
             return
+        rows, used = self._rows[:count], self._used[:count]
         far = self._nearness(rows)
-        first = int(np.argmax(far))  # of equals the first, as a stable sort has it
-        yield rows[first]
-        for at in np.argsort(-far, kind="stable").tolist():
-            if at != first:
-                yield rows[at]
+        farthest = np.flatnonzero(far == far.max())
+        first = int(rows[farthest[np.argmin(used[farthest])]])
+        yield first
+        # Who looks further is refused the first ones, and seldom more than a few.
+        least = np.partition(far, count - SOME_ROWS)[count - SOME_ROWS] if count > SOME_ROWS else -np.inf
+        for some in (far >= least, far < least):
+            at = np.flatnonzero(some)
+            order = at[np.lexsort((used[at], -far[at]))]
+            yield from (row for row in rows[order].tolist() if row != first)
 
 
 class _Queues:
@@ -168,13 +188,6 @@ class _Queues:
         self.uses: dict[int, int] = {}
         self.small_bytes, self.small_most = 0, small_most
 
-    def copy(self) -> "_Queues":
-        """The same, on its own."""
-        other = _Queues(self.small_most)
-        other.small, other.main, other.uses = self.small.copy(), self.main.copy(), self.uses.copy()
-        other.small_bytes = self.small_bytes
-        return other
-
     def remove(self, row: int) -> int | None:
         """Take a row out. Returns its bytes if it was in the small queue, else None."""
         del self.uses[row]
@@ -185,13 +198,13 @@ class _Queues:
         self.small_bytes -= size
         return size
 
-    def victim(self) -> int | None:
-        """Who goes next, None: nobody is there. What was used changes its place, as algorithm 1 has it."""
+    def settle(self) -> None:
+        """Bring who goes next to the front of its queue: what was used changes its place, as algorithm 1 has it."""
         while self.small or self.main:
             if self.small and (self.small_bytes >= self.small_most or not self.main):
                 row = next(iter(self.small))
                 if self.uses[row] <= 1:
-                    return row
+                    return
                 size = self.small.pop(row)
                 self.small_bytes -= size
                 self.main[row] = size
@@ -199,10 +212,33 @@ class _Queues:
             else:
                 row = next(iter(self.main))
                 if not self.uses[row]:
-                    return row
+                    return
                 self.uses[row] -= 1
                 self.main.move_to_end(row)
-        return None
+
+    def victims(self) -> Iterator[int]:
+        """Who goes, one after another, were each to go; nothing changes its place. `settle`, looked up only."""
+        small, small_bytes = iter(self.small.items()), self.small_bytes
+        main = ((row, self.uses[row]) for row in self.main)
+        again: deque[tuple[int, int]] = deque()  # what was moved to the end of the main queue: row, uses left
+        new, old = next(small, None), next(main, None)
+        while new or old:
+            if new and (small_bytes >= self.small_most or not old):
+                row, size = new
+                new, small_bytes = next(small, None), small_bytes - size
+                if self.uses[row] <= 1:
+                    yield row
+                    continue
+                again.append((row, 0))
+            elif old:
+                row, uses = old
+                old = None
+                if not uses:
+                    yield row
+                else:
+                    again.append((row, uses - 1))
+            if old is None:
+                old = next(main, None) or (again.popleft() if again else None)
 
 
 class S3Fifo:
@@ -255,16 +291,7 @@ class S3Fifo:
     def victims(self) -> Iterator[int]:
         """See `Policy`. To find the first, rows change places as algorithm 1 has it; those behind are only looked up.
 
-        So whoever looks at all of them leaves the counts as they are, but for one eviction's. What comes after the
-        first takes a copy of the queues.
+        So whoever looks at all of them leaves the counts as they are, but for one eviction's.
         """
-        row = self._queues.victim()
-        if row is None:
-            return
-        yield row
-        queues = self._queues.copy()
-        while row is not None:
-            queues.remove(row)
-            row = queues.victim()
-            if row is not None:
-                yield row
+        self._queues.settle()
+        yield from self._queues.victims()

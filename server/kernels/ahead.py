@@ -296,6 +296,16 @@ def rows_in_reach(centers, reaches, index, voxel_steps, starts, rows):
     return needed
 
 
+@borrowing
+def _square_between(low, high, other_low, other_high):
+    """Square of the distance between two boxes of corners (3,)."""
+    square = 0.0
+    for k in range(3):
+        gap = max(low[k] - other_high[k], other_low[k] - high[k], 0.0)
+        square += gap * gap
+    return square
+
+
 @nb.njit(nogil=True, cache=True)
 def distance_to_ways(ways, rows, index, far):
     """Fill far (n,) with the least distance from the box of each of rows (n,) to the centres of u ways [steps].
@@ -303,14 +313,25 @@ def distance_to_ways(ways, rows, index, far):
     ways: (u, m, 3) float64. Infinite where u is 0.
     """
     low, high = np.empty(3), np.empty(3)
+    users = ways.shape[0]
+    boxes, apart = (
+        np.empty((users, 2, 3)),
+        np.empty(users),
+    )  # of whole ways, and how far, squared: no centre is nearer
+    for u in range(users):
+        for k in range(3):
+            boxes[u, 0, k], boxes[u, 1, k] = ways[u, :, k].min(), ways[u, :, k].max()
     for j in range(rows.shape[0]):
         _box_of(index, rows[j], low, high)
-        least = np.inf
-        for u in range(ways.shape[0]):
-            for i in range(ways.shape[1]):
-                square = 0.0
-                for k in range(3):
-                    gap = max(low[k] - ways[u, i, k], ways[u, i, k] - high[k], 0.0)
-                    square += gap * gap
-                least = min(least, square)
-        far[j] = math.sqrt(least)
+        first = 0
+        for u in range(users):
+            apart[u] = _square_between(low, high, boxes[u, 0], boxes[u, 1])
+            if apart[u] < apart[first]:
+                first = u
+        nearest = np.inf
+        for turn in range(users):
+            u = first if turn == 0 else turn - 1 if turn <= first else turn
+            if apart[u] < nearest:
+                for i in range(ways.shape[1]):
+                    nearest = min(nearest, _square_between(low, high, ways[u, i], ways[u, i]))
+        far[j] = math.sqrt(nearest)

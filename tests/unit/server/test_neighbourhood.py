@@ -288,6 +288,11 @@ def test_nearness_is_the_distance_to_the_nearest_way() -> None:
     at_end = {tuple(c[:2]): float(d) for c, d in zip(COORDINATES.tolist(), near, strict=True)}
     assert at_end[(15, 0)] == pytest.approx(30.0 - straight(3.0)[-1, 0] - 6.0, abs=0.3)
     assert at_end[(-16, -10)] == pytest.approx(31.0 - 20.0, abs=0.01)
+    assert np.array_equal(around.nearness(rows[::-1]), near[::-1]), "asked again"
+    around.leave(YOU)
+    around.plan(now, 0.25)
+    alone = around.nearness(rows)
+    assert (alone >= near).all() and (alone > near).any(), "the ways of the last plan alone count"
     around.leave_client("client")
     around.plan(now, 0.25)
     assert np.isinf(around.nearness(rows)).all()

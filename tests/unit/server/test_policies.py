@@ -258,6 +258,24 @@ def test_to_look_at_all_victims_changes_nothing(name: str) -> None:
         left_alone.removed(victim, evicted=True)
 
 
+@pytest.mark.parametrize("some", [1, 3, 39, 40, 41])
+def test_distance_puts_some_in_order_before_the_rest(some: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In whatever parts, the order is the model's; and rows that go leave the others as they were."""
+    monkeypatch.setattr("solidcloud.server.policies.SOME_ROWS", some)
+    rng = np.random.default_rng(some)
+    policy, naive = make_policy("distance", BUDGET, near), NaiveDistance()
+    for row in rng.permutation(200)[:100].tolist():  # more than there is room for at first
+        policy.added(row, 1, scan=False)
+        naive.added(row, 1, False)
+    for row in rng.choice(naive.order, 300).tolist():
+        policy.used(row, scan=False)
+        naive.used(row, False)
+    for row in rng.permutation(naive.order)[:60].tolist():
+        policy.removed(row, evicted=True)
+        naive.removed(row, True)
+    assert len(named(policy, naive, 100)) == 40
+
+
 def test_without_users_distance_is_lru() -> None:
     policy = make_policy("distance", BUDGET, lambda rows: np.full(len(rows), np.inf))
     for row in (5, 2, 9):

@@ -25,6 +25,7 @@ from .probe import Probe, Swept
 from .request import SceneData
 from .scene import Scene
 from .served import EVERYBODY
+from .within import within
 
 # Avatars a thread has probes of at a time: users of one scene, and its objects.
 _PROBES = 256
@@ -182,6 +183,19 @@ class World:
             pose, same = self._probe(avatar).between(origin, pose_from, pose_to, fraction)
         return pose, same and self._alone
 
+    def lowest(self) -> float:
+        """How far up the lowest corner of the archives' boxes is from the world's origin [m]."""
+        least = np.inf
+        with self as seen:
+            for each in seen:
+                arrays, index = each.data.arrays, each.data.broad
+                box = np.array([index.scene_low, index.scene_high]) * arrays.step + arrays.origin
+                corners = np.array([[box[i & 1, 0], box[i >> 1 & 1, 1], box[i >> 2, 2]] for i in range(8)])
+                if each.placed.pose is not None:
+                    corners = moved(each.placed.pose, corners)
+                least = min(least, float((corners @ self.up).min()))
+        return least
+
     def deepest(self, avatar: AvatarModel, pose: Pose, effort: Effort = EXACT) -> Hit | None:
         """The deepest contact at a pose, with fraction 0; None where there is none."""
         found: Hit | None = None
@@ -196,6 +210,21 @@ class World:
                         _out(each, place) for place in (answers.avatar_point[0], answers.cloud_point[0])
                     )
                     found = Hit(0.0, Verdict.CONTACT, own, cloud, "", number)
+        return found
+
+    def nearest(self, place: Vec, reach: float, effort: Effort = EXACT) -> Hit | None:
+        """The scan point nearest to a place (3,), within a reach [m], as a Hit of it without an avatar."""
+        found: Hit | None = None
+        least = np.inf
+        with self as seen:
+            for number, each in enumerate(seen):
+                there = place if each.placed.inverse is None else moved(each.placed.inverse, place[None])[0]
+                answers = within(each.data, there[None], reach, effort)
+                self._held.visits += int(answers.node_visits[0])
+                if answers.distance[0] < least:
+                    least = float(answers.distance[0])
+                    cloud = _out(each, answers.cloud_point[0])
+                    found = Hit(0.0, Verdict(int(answers.verdict[0])), None, cloud, "", number)
         return found
 
     def distance(

@@ -1,5 +1,6 @@
 """One frame of one user on its way through the effects: what was wished, and what came of it so far."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol
@@ -77,8 +78,8 @@ class Frame:
     wish: where to.  seconds: since the frame before.  world: what is asked (world.py).  pose, verdict: so far.
     clear: whether nothing is touched at `pose`, which is asked once: `go` keeps it so.
     left: (3,) of the translation wished, not gone yet [m].  hits: what ended motions, in order.  blocked: what ended
-    the wish, or what was gone of it last; None: nothing did.  obstacles: what else blocks.  go: as far as nothing is
-    touched; `stop` or `sweep` puts it there.  reports: fields of `Moved`.
+    the wish first, and met: where; None: nothing did.  obstacles: what else blocks.  go: as far as nothing is touched;
+    `stop` or `sweep` puts it there.  reports: fields of `Moved`.
     """
 
     body: Body
@@ -92,6 +93,7 @@ class Frame:
     left: Vec = field(default_factory=lambda: np.zeros(3))
     hits: list[Hit] = field(default_factory=list)
     blocked: Hit | None = None
+    met: Pose | None = None
     obstacles: list[Obstacle] = field(default_factory=list)
     go: "Go | None" = None
     fall_speed: float = 0.0
@@ -123,3 +125,15 @@ def moved_by(pose: Pose, way: Vec) -> Pose:
     there = pose.copy()
     there[:3, 3] += way
     return there
+
+
+def dot(one: Vec, other: Vec) -> float:
+    """The product of two vectors (3,), as a number: numpy takes a microsecond for it."""
+    (a, b, c), (x, y, z) = one.tolist(), other.tolist()
+    return float(a * x + b * y + c * z)
+
+
+def size(way: Vec) -> float:
+    """The length of a vector (3,)."""
+    x, y, z = way.tolist()
+    return math.sqrt(x * x + y * y + z * z)

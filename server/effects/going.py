@@ -3,12 +3,10 @@
 `stop` and `sweep` put `frame.go` together of this.
 """
 
-import math
-
 import numpy as np
 
 from ...schemas.answers import Verdict
-from .frame import Frame, Hit, Pose, Vec
+from .frame import Frame, Hit, Pose, dot, size
 
 # A motion that is stopped sooner is not begun [m]: else an avatar that pushes would tremble by what `lower` is off.
 LEAST_WAY = 2e-5
@@ -64,12 +62,7 @@ def farthest(frame: Frame, to: Pose) -> float:
         return 0.0
     turn, way = to[:3, :3] - begin[:3, :3], to[:3, 3] - begin[:3, 3]
     center = way + turn @ avatar.arrays.center[0]
-    return _length(center) + float(np.linalg.norm(turn)) * float(avatar.arrays.radius[0])
-
-
-def _length(way: Vec) -> float:
-    x, y, z = way.tolist()
-    return math.sqrt(x * x + y * y + z * z)
+    return size(center) + float(np.linalg.norm(turn)) * float(avatar.arrays.radius[0])
 
 
 def way_back(frame: Frame, to: Pose, hit: Hit, skin: float) -> float:
@@ -84,10 +77,10 @@ def way_back(frame: Frame, to: Pose, hit: Hit, skin: float) -> float:
     # The point that touches, in the avatar's frame, and how it moves.
     point = (hit.avatar - there[:3, 3]) @ there[:3, :3]
     goes = (to[:3, 3] - frame.pose[:3, 3]) + (to[:3, :3] - frame.pose[:3, :3]) @ point
-    length, speed = _length(out), _length(goes)
+    length, speed = size(out), size(goes)
     if speed <= 1e-9 * way:
         return min(1.0, skin / way)
-    into = speed if length == 0.0 else -float(goes @ out) / length
+    into = speed if length == 0.0 else -dot(goes, out) / length
     return skin / max(into, speed / MOST_BACK)
 
 
@@ -117,4 +110,5 @@ def set_out(frame: Frame) -> None:
     """Go for the wish."""
     assert frame.go is not None
     frame.blocked = frame.go(frame, frame.wish)
+    frame.met = None if frame.blocked is None else frame.pose
     frame.left = frame.wish[:3, 3] - frame.pose[:3, 3]

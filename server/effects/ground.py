@@ -1,0 +1,242 @@
+"""`ground`: gravity, with feet held a little above what they stand on, or falling.
+
+Each frame, where the avatar got to, it is swept straight down. What is met within reach and is no steeper than `slope`
+is stood on: the avatar is held `clearance` above it, so that a floor's bumps stop nobody, and low sills are walked
+over. What is steeper is no ground: gravity goes on along it. Without anything there it falls: v t + g t^2 / 2 in a
+frame of t, at most `fall_speed`, swept like any motion, so that it lands in the frame that reaches the ground.
+
+Scans have holes, floors behind columns and under furniture above all. Who stood and has nothing to stand on falls only
+if feet would land: where nothing at all was scanned below, or the rest of the body would be caught by a hole's rim or
+the ledge just left, the avatar walks on at its height, until there is ground again or it is clear of the ledge.
+
+What a wish says of up and down is ignored, standing and falling: who has weight does not choose its height.
+"""
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ...schemas.answers import Verdict
+from ...schemas.effects import Ground, Slide, Step, Sweep
+from ...schemas.moves import GroundReport
+from ..world import World
+from .frame import Frame, Hit, Vec, dot, moved_by, size
+from .going import first_hit, note, settle
+
+# Feet this near to their height are left there [m]: at rest nothing moves.
+DEAD_BAND = 1e-4
+# A frame of gravity lasts no longer [s].
+LONGEST_FRAME = 0.1
+# The points that make the normal of what is stood on are so near the one that is touched [m].
+NORMAL_REACH = 0.08
+# An edge is looked at so far into what it is the edge of, for points as near to there [m].
+EDGE, EDGE_REACH = 0.08, 0.04
+# What is steeper is no edge, but the side of something: points on both sides of an edge make 45 degrees.
+_EDGE_RISES = 0.4
+# So far away from a wall the ground is looked for [m], and for so many walls.
+_ASIDE, _ASIDES = 0.01, 3
+# Normals are kept to a third of a degree: of a cosine so much.
+_ROUNDING = 0.005
+# Feet so far beneath a scene's lowest point touch nothing more, whatever its spheres [m]; how exactly that is asked.
+_BELOW, _ROUGH = 16.0, 1e-2
+# Without `sweep` [m].
+_TOLERANCE = 1e-5
+
+
+class Below(NamedTuple):
+    """What is straight down. hit: None: nothing.  reach: looked so far [m].  free: nothing is met before [m].
+
+    normal: (3,) of ground; None: none, or it is too steep.  aside: found a little aside, where nothing steep is met.
+    """
+
+    hit: Hit | None
+    reach: float
+    free: float
+    normal: Vec | None
+    aside: bool
+
+
+class Grounded:
+    """The effect of one scene. clearance: as `Ground` has it."""
+
+    name = "ground"
+
+    def __init__(self, effect: Ground, step: float, tolerance: float, sliding: Any) -> None:
+        """step: how far below the next step may be [m].  sliding: `slide`, where the scene calls for it, or None."""
+        self.clearance, self._gravity, self._most = effect.clearance, effect.gravity, effect.fall_speed
+        self._down = effect.clearance + max(step, effect.clearance)
+        self._tolerance, self._sliding = tolerance, sliding
+        self._walkable = math.cos(math.radians(effect.slope)) - _ROUNDING
+
+    def begin(self, frame: Frame) -> None:
+        """Take up and down out of the wish."""
+        up, begin = frame.world.up, frame.body.pose[:3, 3]
+        way = frame.wish[:3, 3] - begin
+        rises = dot(way, up)
+        if rises == 0.0:
+            return
+        level = way - rises * up
+        if size(level) <= 1e-12 * abs(rises):  # rounding alone
+            level[:] = 0.0
+        frame.wish = frame.wish.copy()
+        frame.wish[:3, 3] = begin + level
+
+    def run(self, frame: Frame) -> None:
+        """Stand, or fall."""
+        stood, seconds = frame.body.on_ground, min(frame.seconds, LONGEST_FRAME)
+        speed = 0.0 if stood else frame.body.fall_speed
+        after = min(speed + self._gravity * seconds, self._most)
+        fall = 0.5 * (speed + after) * seconds
+        below = self.below(frame, max(self._down if stood else 0.0, fall + self.clearance))
+        hit = below.hit
+        frame.on_ground, frame.fall_speed = False, after
+        if hit is None and not self._falls(frame, below.reach, stood=stood):
+            frame.on_ground, frame.fall_speed = stood, 0.0
+        elif hit is None:
+            self.lower(frame, below, fall)
+        elif hit.verdict == Verdict.UNKNOWN:
+            # Whether there is ground is not known: nothing falls into the unknown.
+            note(frame, hit)
+            self.lower(frame, below, min(fall, below.free - self.clearance))
+            frame.on_ground, frame.fall_speed = stood, 0.0
+        elif below.normal is not None:
+            frame.on_ground, frame.fall_speed = True, 0.0
+            lower = below.free - self.clearance
+            if lower > DEAD_BAND:
+                self.lower(frame, below, lower)
+            elif lower < -DEAD_BAND:
+                self.slide(frame, -lower * frame.world.up)
+        else:
+            self._fall_along(frame, fall, seconds)
+        normal = None if below.normal is None else tuple(below.normal.tolist())
+        frame.reports["ground"] = GroundReport(frame.on_ground, frame.fall_speed, normal)
+
+    def below(self, frame: Frame, reach: float) -> Below:
+        """What is met first straight down from frame.pose within a reach [m].
+
+        Beside a wall the way down leads by its bumps: what is too steep is looked past, a little away from it.
+        """
+        aside = np.zeros(3)
+        first: Below | None = None
+        for _ in range(_ASIDES):
+            begin = frame.pose
+            frame.pose = moved_by(begin, aside)
+            hit = first_hit(frame, moved_by(frame.pose, -reach * frame.world.up), self._tolerance)
+            frame.pose = begin
+            found = Below(hit, reach, reach, None, first is not None)
+            if hit is None:
+                return found
+            found = found._replace(free=hit.fraction * reach)
+            if hit.verdict == Verdict.UNKNOWN:
+                return found
+            found = found._replace(normal=self.standing(frame, hit))
+            if found.normal is not None:
+                return found
+            first = first or found
+            away = self._away(frame, hit)
+            if away is None:
+                break
+            aside = aside + _ASIDE * away
+        assert first is not None
+        return first
+
+    def _away(self, frame: Frame, hit: Hit) -> Vec | None:
+        """The level direction away from something steep."""
+        if hit.avatar is None or hit.cloud is None:
+            return None
+        out = frame.world.normal(hit, NORMAL_REACH)
+        if out is None:
+            out = hit.avatar - hit.cloud
+        level = out - dot(out, frame.world.up) * frame.world.up
+        length = size(level)
+        return None if length == 0.0 else level / length
+
+    def lower(self, frame: Frame, below: Below, way: float) -> None:
+        """Go straight down by a way [m] within what was found free."""
+        assert frame.go is not None
+        if way <= 0.0:
+            return
+        if not below.aside:
+            down = moved_by(frame.pose, -below.reach * frame.world.up)
+            settle(frame, down, way / below.reach, below.free / below.reach if below.hit else 1.0)
+            return
+        self.slide(frame, -way * frame.world.up)
+
+    def slide(self, frame: Frame, way: Vec) -> None:
+        """Go by a way (3,) [m], along what is met."""
+        assert frame.go is not None
+        begin, hits = frame.pose[:3, 3], len(frame.hits)
+        hit = frame.go(frame, moved_by(frame.pose, way))
+        if hit is not None and self._sliding is not None:
+            self._sliding.along(frame, hit, way - (frame.pose[:3, 3] - begin), way, stands=False)
+        del frame.hits[hits:]
+
+    def _falls(self, frame: Frame, reach: float, *, stood: bool) -> bool:
+        """Whether an avatar under whose feet nothing is within reach would land on something, or that is not known."""
+        world, avatar, up = frame.world, frame.body.avatar, frame.world.up
+        if not len(avatar.points):
+            return False
+        feet = dot(frame.pose[:3, 3], up) + float((avatar.points @ (frame.pose[:3, :3].T @ up)).min())
+        deep = feet - avatar.radius - world.lowest() + _BELOW
+        if deep <= reach:
+            return False
+        swept = world.sweep(avatar, frame.pose, moved_by(frame.pose, -deep * up), _ROUGH, frame.effort)
+        if swept.verdict != Verdict.CONTACT:
+            return bool(swept.verdict == Verdict.UNKNOWN)
+        # A hole's rim, or the ledge behind it, is met by what is higher and wider than the feet.
+        return not stood or dot(swept.cloud, up) < feet - avatar.radius - reach
+
+    def standing(self, frame: Frame, hit: Hit) -> Vec | None:
+        """The normal of what was met, if it can be stood on; None: it is too steep.
+
+        The points around an edge, of a stair say, have a slanting normal. It is stood upon where what lies farther in,
+        at its height, is ground.
+        """
+        if hit.avatar is None or hit.cloud is None:
+            return None
+        up, out = frame.world.up, hit.avatar - hit.cloud
+        length = size(out)
+        normal: Vec | None = frame.world.normal(hit, NORMAL_REACH)
+        if normal is None:
+            normal = out / length if length > 0.0 else up
+        rises = dot(normal, up)
+        if rises >= self._walkable:
+            return normal
+        level = normal - rises * up
+        steep = size(level)
+        if hit.archive < 0 or rises <= _EDGE_RISES or steep == 0.0:
+            return None
+        inner = frame.world.nearest(hit.cloud - EDGE / steep * level, EDGE_REACH, frame.effort)
+        if inner is None:
+            return None
+        top = frame.world.normal(
+            hit._replace(avatar=inner.cloud + up, cloud=inner.cloud, archive=inner.archive), NORMAL_REACH
+        )
+        return top if top is not None and dot(top, up) >= self._walkable else None
+
+    def _fall_along(self, frame: Frame, fall: float, seconds: float) -> None:
+        """Fall onto something steep, and along it; what is not fallen takes its speed away."""
+        begin = frame.pose[:3, 3]
+        self.slide(frame, -fall * frame.world.up)
+        fell = -dot(frame.pose[:3, 3] - begin, frame.world.up)
+        if seconds > 0.0:
+            frame.fall_speed = min(frame.fall_speed, max(fell, 0.0) / seconds)
+
+
+def make(effect: Ground, world: World) -> Grounded:
+    """The effect of a scene."""
+    declared = {type(each): each for each in world.file.effects}
+    step, sweep, slide = declared.get(Step), declared.get(Sweep), declared.get(Slide)
+    sliding = None
+    if isinstance(slide, Slide):
+        # Here: what no effect asks for is not imported.
+        from .slide import make as make_sliding
+
+        sliding = make_sliding(slide, world)
+    return Grounded(
+        effect,
+        step.height if isinstance(step, Step) else 0.0,
+        sweep.tolerance if isinstance(sweep, Sweep) else _TOLERANCE,
+        sliding,
+    )

@@ -1,0 +1,143 @@
+"""`slide`: what is left of a stopped motion goes along the surface touched, several of them, creases and corners.
+
+Collide and slide with the planes of a frame: what is left of the translation is clipped against every surface met in
+it, so that the way goes into none of them; along the crease of two, and nowhere between three. It never goes against
+the wish, and never farther than what was left: no energy appears.
+
+A surface is a plane by the smoothed normal of the scan points around the one that was touched. The scan's spheres make
+a flat wall bumpy, by up to their radius: where the plane is one that the frame has met already, a bump is in the way,
+and the plane square to the two spheres' centres leads over it. Nearly head on, what is left along a surface is
+mostly what the normal is off: an avatar that pushes so stays (STICK).
+
+Turning: the wish's screw motion is tried first; what is left of its translation slides at the orientation reached, and
+then what is left of the turn is tried on the spot.
+"""
+
+import math
+from itertools import combinations
+
+import numpy as np
+
+from ...schemas.answers import Verdict
+from ...schemas.effects import Ground, Slide
+from ..world import World
+from .frame import Frame, Hit, Vec, dot, moved_by, size
+
+# Of what is left, a smaller share along the surfaces is not gone: a degree off head on, or less.
+STICK = 0.02
+# Nor is a shorter way [m]: an avatar in a corner would tremble.
+LEAST_SLIDE = 1e-5
+# Normals so close are of one plane: 8 degrees.
+SAME_PLANE = 0.99
+# A way that goes into a surface by no more than rounding, as a share of it, does not.
+_ROUNDING = 1e-9
+
+
+class Sliding:
+    """The effect of one scene. surfaces, normal_reach: as `Slide` has them."""
+
+    name = "slide"
+
+    def __init__(self, surfaces: int, normal_reach: float, slope: float | None, world: World) -> None:
+        """slope: what is steeper is a wall to who stands [degrees]; None: the scene has no ground."""
+        self.surfaces, self.normal_reach = surfaces, normal_reach
+        self._up = world.up
+        self._walkable = None if slope is None else math.cos(math.radians(slope))
+
+    def run(self, frame: Frame) -> None:
+        """Slide, and turn on the spot."""
+        hit = frame.blocked
+        if hit is None or frame.go is None:
+            return
+        wish = frame.wish[:3, 3] - frame.body.pose[:3, 3]
+        self.along(frame, hit, frame.wish[:3, 3] - frame.pose[:3, 3], wish, stands=frame.body.on_ground)
+        if frame.pose[:3, :3].tobytes() != frame.wish[:3, :3].tobytes():
+            turned = frame.wish.copy()
+            turned[:3, 3] = frame.pose[:3, 3]
+            frame.go(frame, turned)
+        frame.left = frame.wish[:3, 3] - frame.pose[:3, 3]
+
+    def along(self, frame: Frame, hit: Hit, left: Vec, wish: Vec, *, stands: bool) -> Hit | None:
+        """Go on along what ended a motion. left: of its translation, wish: all of it (3,) [m].
+
+        stands: nothing steep is climbed. Returns what ended it in the end; None: nothing did.
+        """
+        assert frame.go is not None
+        planes: list[Vec] = []
+        met: list[Vec] = []
+        for _ in range(self.surfaces):
+            if hit.verdict == Verdict.UNKNOWN:
+                return hit
+            normal = self._normal(frame, hit, left, met)
+            if normal is None:
+                return hit
+            met.append(normal)
+            planes.append(self._wall(normal) if stands else normal)
+            way = clip(left, planes)
+            if way is None or size(way) < max(STICK * size(left), LEAST_SLIDE) or dot(way, wish) <= 0.0:
+                return hit
+            begin = frame.pose
+            next_hit = frame.go(frame, moved_by(begin, way))
+            if next_hit is None:
+                return None
+            hit = next_hit
+            left = way - (frame.pose[:3, 3] - begin[:3, 3])
+        return hit
+
+    def _normal(self, frame: Frame, hit: Hit, left: Vec, met: list[Vec]) -> Vec | None:
+        """The plane to go along, and write it down; None: nothing says where it is."""
+        if hit.avatar is None or hit.cloud is None:
+            return None
+        normal: Vec | None = frame.world.normal(hit, self.normal_reach)
+        if normal is not None and (
+            dot(normal, left) >= 0.0 or any(dot(normal, each) > SAME_PLANE for each in met)
+        ):
+            normal = None
+        if normal is None:
+            out = hit.avatar - hit.cloud
+            length = size(out)
+            if length == 0.0:
+                return None
+            normal = out / length
+        if frame.hits and frame.hits[-1] is hit:
+            frame.hits[-1] = hit._replace(normal=normal)
+        return normal
+
+    def _wall(self, normal: Vec) -> Vec:
+        """A plane as it is to who stands: what is too steep to be walked is upright."""
+        rises = dot(normal, self._up)
+        if self._walkable is None or rises >= self._walkable:
+            return normal
+        level = normal - rises * self._up
+        length = size(level)
+        return normal if length < 0.1 else level / length
+
+
+def clip(left: Vec, planes: list[Vec]) -> Vec | None:
+    """The part of a way (3,) that goes into none of the planes (unit normals, on the free side), as long as may be.
+
+    All of it; else along one plane; else along the crease of two; None: there is none.
+    """
+    least = -_ROUNDING * size(left)
+
+    def free(way: Vec) -> bool:
+        return all(dot(way, each) >= least for each in planes)
+
+    if free(left):
+        return left
+    ways = [left - dot(left, each) * each for each in planes]
+    found = [way for way in ways if free(way)]
+    if not found:
+        for one, other in combinations(planes, 2):
+            crease = np.cross(one, other)
+            square = dot(crease, crease)
+            if square > 1e-6:
+                found.append(crease * (dot(left, crease) / square))
+        found = [way for way in found if free(way)]
+    return max(found, key=size, default=None)
+
+
+def make(effect: Slide, world: World) -> Sliding:
+    """The effect of a scene."""
+    slope = next((each.slope for each in world.file.effects if isinstance(each, Ground)), None)
+    return Sliding(effect.surfaces, effect.normal_reach, slope, world)

@@ -1,0 +1,81 @@
+"""`step`: what is no higher than `height` is climbed, and descended without a fall.
+
+Who stands and was stopped goes up by `height`, as far as nothing is touched, forward by what was left of the wish, and
+down. That is kept where it led farther along the wish than sliding did, ends on ground, and rose by no more than
+`height`; else all is as it was. Descending is `ground`'s: it looks so far down for what to stand on.
+"""
+
+from ...schemas.answers import Verdict
+from ...schemas.effects import Ground, Step
+from ..world import World
+from .frame import Frame, Pose, Vec, dot, moved_by, size
+from .going import LEAST_WAY
+from .ground import DEAD_BAND, Grounded
+from .ground import make as make_ground
+
+# It must lead so much farther than sliding [m], and so large a share of what was left.
+_FARTHER, _SHARE = 2e-4, 0.02
+
+
+class Stepping:
+    """The effect of one scene."""
+
+    name = "step"
+
+    def __init__(self, height: float, ground: Grounded) -> None:
+        self._height, self._ground = height, ground
+
+    def run(self, frame: Frame) -> None:
+        """Climb what stopped the wish, if it can be climbed."""
+        hit, met = frame.blocked, frame.met
+        if hit is None or met is None or not frame.body.on_ground or hit.verdict == Verdict.UNKNOWN:
+            return
+        begin = frame.body.pose[:3, 3]
+        wish = frame.wish[:3, 3] - begin
+        length = size(wish)
+        if length < LEAST_WAY:
+            return
+        along = wish / length
+        so_far = dot(frame.pose[:3, 3] - begin, along)
+        least = so_far + max(_FARTHER, _SHARE * (length - so_far))
+        if least >= length:
+            return
+        before, hits, verdict = frame.pose, len(frame.hits), frame.verdict
+        frame.pose = met
+        rose = self._climb(frame, along, length, least)
+        if rose is None:
+            frame.pose, frame.verdict = before, verdict
+        else:
+            frame.reports["stepped"] = rose
+            frame.left = frame.wish[:3, 3] - rose * frame.world.up - frame.pose[:3, 3]
+        del frame.hits[hits:]
+
+    def _climb(self, frame: Frame, along: Vec, length: float, least: float) -> float | None:
+        """Up, forward and down from frame.pose. Returns how far it rose [m], None: not onto ground, or too far."""
+        assert frame.go is not None
+        up, begin, start = frame.world.up, frame.body.pose[:3, 3], frame.pose
+        self._ground.slide(frame, self._height * up)  # beside a riser the way up leads by its bumps
+        rose = self._rise(start, frame.pose, up)
+        if rose < LEAST_WAY:
+            return None
+        frame.go(frame, moved_by(frame.pose, (length - dot(frame.pose[:3, 3] - begin, along)) * along))
+        if dot(frame.pose[:3, 3] - begin, along) < least:
+            return None
+        below = self._ground.below(frame, rose + 2.0 * self._ground.clearance)
+        if below.normal is None:
+            return None
+        lower = below.free - self._ground.clearance
+        if rose - lower > self._height + DEAD_BAND:
+            return None
+        self._ground.lower(frame, below, lower)
+        return self._rise(start, frame.pose, up)
+
+    @staticmethod
+    def _rise(start: Pose, pose: Pose, up: Vec) -> float:
+        return dot(pose[:3, 3] - start[:3, 3], up)
+
+
+def make(effect: Step, world: World) -> Stepping:
+    """The effect of a scene."""
+    ground = next(each for each in world.file.effects if isinstance(each, Ground))
+    return Stepping(effect.height, make_ground(ground, world))

@@ -11,7 +11,16 @@ from ..schemas.effects import Objects, Through, Uncertainty
 from ..schemas.scene import SceneFile, effect_name, identity, read_scene, scene_name, up_of
 from .describe import run_order
 from .posed import moved_boxes
-from .scene_file import Found, FoundAvatar, ReadPoints, at_place, find_archives, read_avatars, store_opener
+from .scene_file import (
+    Found,
+    FoundAvatar,
+    ReadPoints,
+    at_place,
+    find_archives,
+    normals_asked,
+    read_avatars,
+    store_opener,
+)
 
 
 class Checked(NamedTuple):
@@ -122,6 +131,13 @@ def _notes(file: SceneFile, archives: list[Found], left_out: int) -> Iterator[st
     names = {effect_name(effect) for effect in file.effects}
     if "stop" in names and "sweep" not in names:
         yield "`stop` without `sweep`: what is thinner than a frame's motion may be passed through between two frames"
+    reach = normals_asked(file)
+    for found in archives:
+        if reach is not None and found.normal_reach != reach:
+            yield (
+                f"{found.folder} keeps no normals within {reach:g} m (build --keep normal --normal-reach {reach:g}): "
+                "effects ask for them, and they are estimated when first needed"
+            )
     if file.spawn is not None:
         low, high = _bounds(file, archives)
         if not all(a <= x <= b for a, x, b in zip(low, file.spawn.position, high, strict=True)):

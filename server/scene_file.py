@@ -5,6 +5,7 @@ What a scene does not call for is not imported: several archives, what points ar
 
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,8 +13,9 @@ import numpy as np
 from msgspec import structs
 from numpy.typing import NDArray
 
-from ..schemas.effects import Through, Uncertainty
+from ..schemas.effects import Ground, Slide, Through, Uncertainty
 from ..schemas.errors import BadRequestError, SolidcloudError
+from ..schemas.index import NORMAL_REACH
 from ..schemas.messages import AvatarInfo, SceneInfo
 from ..schemas.radius_model import class_radii
 from ..schemas.scene import SUFFIX, SceneFile, identity, read_scene, scene_name
@@ -31,13 +33,14 @@ ReadPoints = Callable[[Path], NDArray[np.float64]]
 class Found(NamedTuple):
     """One archive of a scene. info: what it says of itself.  sizes: (v,) int64, bytes of each voxel once decoded.
 
-    keeps_scan: whether it knows the scan of each point.
+    keeps_scan: whether it knows the scan of each point.  normal_reach: of the normals it keeps [m]; 0: it keeps none.
     """
 
     folder: Path
     info: SceneInfo
     sizes: NDArray[np.int64]
     keeps_scan: bool
+    normal_reach: float
 
 
 class FoundAvatar(NamedTuple):
@@ -80,7 +83,9 @@ def open_scene(
     own = {item.name: (a.points, a.info.radius) for item, a in zip(file.avatars, avatars, strict=True)}
     with ExitStack() as stack:
         served = _open_archives(file, path, name, found, budget_bytes, policy, stack)
-        yield stack.enter_context(simulate(served, file, own))
+        with at_place(path, "$.effects"):
+            simulation = simulate(served, file, own)
+        yield stack.enter_context(simulation)
 
 
 def find_archives(file: SceneFile, path: Path) -> list[Found]:
@@ -91,14 +96,16 @@ def find_archives(file: SceneFile, path: Path) -> list[Found]:
     found = []
     for number, item in enumerate(file.archives):
         with at_place(path, f"$.archives[{number}].path"):
-            store = Store((path.parent / item.path).resolve())
+            store = Store((path.parent / item.path).resolve(), normals=normals_asked(file))
         try:
             header = store.archive.header
             if file.radius_model is not None:
                 with at_place(path, f"$.radius_model: {store.archive.folder}"):
                     class_radii(file.radius_model, header.radius, header.models)
             info = describe(store, store.archive.folder.name)
-            found.append(Found(store.archive.folder, info, store.sizes, header.scan_index))
+            found.append(
+                Found(store.archive.folder, info, store.sizes, header.scan_index, header.normal_reach)
+            )
         finally:
             store.close()
     _check_noise(file, path, found)
@@ -120,13 +127,24 @@ def read_avatars(file: SceneFile, path: Path, read_points: ReadPoints) -> list[F
 
 
 def store_opener(file: SceneFile, number: int) -> OpenStore:
-    """What opens the folder of archive `number`: as it is, or without the points that are passed through."""
+    """What opens the folder of archive `number`: with normals if effects ask for them, and without the points that are
+    passed through."""
+    opener: OpenStore = Store
     for effect in file.effects:
         if isinstance(effect, Through):
             from .effects.through import store_without
 
-            return store_without(effect, file.archives[number].pose)
-    return Store
+            opener = store_without(effect, file.archives[number].pose)
+    reach = normals_asked(file)
+    return opener if reach is None else partial(opener, normals=reach)
+
+
+def normals_asked(file: SceneFile) -> float | None:
+    """The reach of the normals that a scene's effects ask for [m]; None: they ask for none."""
+    for effect in file.effects:
+        if isinstance(effect, Slide):
+            return effect.normal_reach
+    return NORMAL_REACH if any(isinstance(effect, Ground) for effect in file.effects) else None
 
 
 def share_budget(budget_bytes: int, sizes: list[NDArray[np.int64]]) -> list[int]:

@@ -16,19 +16,23 @@ STOP_SECONDS = 15.0
 
 
 @contextmanager
-def served(archive: Path, name: str, *options: str) -> Iterator[str]:
-    """Serve an archive under a name while inside; gives the endpoint. options: more, as the command takes them.
+def served(what: Path, name: str | None, *options: str) -> Iterator[str]:
+    """Serve an archive or a scene file while inside; gives the endpoint.
+
+    name: what clients call it; None: as the file or folder has it.  options: more, as the command takes them.
 
     SolidcloudError: the server did not start; its own error stands on standard error. On the way out, whatever
     the reason, it is asked to stop, and killed if it does not.
     """
     endpoint = f"tcp/127.0.0.1:{free_port()}"
-    command = [sys.executable, "-P", "-m", "solidcloud.server.cli", "serve", str(archive)]
+    command = [sys.executable, "-P", "-m", "solidcloud.server.cli", "serve", str(what)]
     process = subprocess.Popen(
-        [*command, "--name", name, "--listen", endpoint, *options], stdout=subprocess.PIPE, text=True
+        [*command, *(["--name", name] if name else []), "--listen", endpoint, *options],
+        stdout=subprocess.PIPE,
+        text=True,
     )
     try:
-        _wait_ready(process, archive)
+        _wait_ready(process, what)
         yield endpoint
     finally:
         process.terminate()

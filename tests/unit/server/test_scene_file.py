@@ -1,0 +1,264 @@
+"""What a scene file says, opened: archives and budgets, the radius model, avatars for everybody, faults with a place."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from solidcloud.schemas.answers import Verdict
+from solidcloud.schemas.errors import (
+    BadRequestError,
+    CorruptError,
+    FormatError,
+    ScanError,
+    UnknownAvatarError,
+)
+from solidcloud.schemas.messages import (
+    JSON,
+    MSGPACK,
+    AvatarInfo,
+    ObjectInfo,
+    SceneInfo,
+    SpawnInfo,
+    decode_answer,
+    encode,
+)
+from solidcloud.schemas.scene import parse_scene
+from solidcloud.server.cli import run
+from solidcloud.server.scene import Scene
+from solidcloud.server.scene_file import (
+    at_place,
+    is_scene_file,
+    normals_asked,
+    open_scene,
+    share_budget,
+    store_opener,
+)
+
+TOP = 'format = 1\n[[archives]]\npath = "floor"\n'
+BALL = '[[avatars]]\nname = "ball"\nfile = "ball.xyz"\nradius = 0.05\n'
+STOP = '[[effects]]\neffect = "stop"\n'
+# Of points 0.1 m apart: half of that.
+RADIUS = 0.05
+
+
+def read_points(path: Path) -> np.ndarray:
+    if not path.exists():
+        raise ScanError(f"{path}: no such file")
+    return np.loadtxt(path, ndmin=2)
+
+
+def at(*places: tuple[float, float, float]) -> np.ndarray:
+    poses = np.tile(np.eye(4), (len(places), 1, 1))
+    poses[:, :3, 3] = places
+    return poses
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A level floor at z = 0 from -0.5 to 0.5, and a ball."""
+    folder = tmp_path_factory.mktemp("scene")
+    x, y = np.meshgrid(np.arange(-0.5, 0.55, 0.1), np.arange(-0.5, 0.55, 0.1))
+    np.savetxt(folder / "floor.xyz", np.column_stack([x.ravel(), y.ravel(), 0 * x.ravel()]), fmt="%.4f")
+    assert (
+        run(["build", str(folder / "floor.xyz"), "-o", str(folder / "floor"), "--voxel", "2", "--jobs", "1"])
+        == 0
+    )
+    (folder / "ball.xyz").write_text("0 0 0\n")
+    return folder
+
+
+Write = Callable[[str], Path]
+
+
+@pytest.fixture
+def write(folder: Path) -> Write:
+    def written(text: str) -> Path:
+        (folder / "hall.toml").write_text(text)
+        return folder / "hall.toml"
+
+    return written
+
+
+def test_an_archive_is_itself_and_stop(folder: Path) -> None:
+    with open_scene(folder / "floor", read_points=read_points) as scene:
+        assert isinstance(scene, Scene) and scene.name == "floor"
+        info = scene.info()
+        assert info.effects == ["stop"] and info.avatars == [] and info.spawn is None and info.up == (0, 0, 1)
+    with open_scene(folder / "floor", read_points=read_points, name="hall") as scene:
+        assert scene.name == "hall"
+
+
+def test_a_scene_file_is_told_by_its_suffix(tmp_path: Path) -> None:
+    (tmp_path / "folder.toml").mkdir()
+    assert is_scene_file(tmp_path / "nowhere.toml") and not is_scene_file(tmp_path / "folder.toml")
+    assert not is_scene_file(tmp_path / "nowhere")
+
+
+def test_a_scene_has_its_name_its_avatars_and_says_so(write: Write) -> None:
+    text = (
+        'format = 1\nup = [0, 0, 9]\nradius_model = "fixed:0.02"\n' + TOP[11:] + BALL + STOP
+        + '[[objects]]\nname = "b"\navatar = "ball"\nkind = "pushed"\npose = [[1, 0, 0, 5], [0, 1, 0, 5], [0, 0, 1, 5],'
+        ' [0, 0, 0, 1]]\n[[effects]]\neffect = "objects"\n[spawn]\nposition = [0, 0, 2]\nheading = 90\n'
+    )  # fmt: skip
+    with open_scene(write(text), read_points=read_points) as scene:
+        assert scene.name == "hall"
+        info = scene.info()
+        assert info.scene == "hall" and info.effects == ["objects", "stop"] and info.up == (0, 0, 1)
+        assert info.avatars == [AvatarInfo("ball", 1, 0.05, info.avatars[0].bounding_radius)]
+        assert info.avatars[0].bounding_radius == pytest.approx(0.05, abs=1e-5)
+        assert info.spawn == SpawnInfo((0.0, 0.0, 2.0), 90.0) and info.default_radius_model == "fixed:0.02"
+        assert info.objects == [ObjectInfo("b", "ball", at((5, 5, 5))[0].tolist(), "pushed")]
+        for encoding in (JSON, MSGPACK):
+            assert decode_answer(SceneInfo, encode(info, encoding), encoding) == info
+        # Of the scan 0.02 m and of the ball 0.05 m, for every client, who need not add it.
+        poses = at((0, 0, 0.06), (0, 0, 0.08))
+        for client in ("one", "two"):
+            answers = scene.collide("ball", poses, client=client)
+            assert answers.verdict.tolist() == [Verdict.CONTACT, Verdict.CLEAR]
+            mean = scene.collide("ball", poses, client=client, radius_model="mean")
+            assert mean.verdict.tolist() == [Verdict.CONTACT, Verdict.CONTACT]
+            assert scene.distance("ball", poses[1:], 1.0, client=client).signed_distance == pytest.approx(
+                [0.01]
+            )
+        with pytest.raises(UnknownAvatarError):
+            scene.collide("other", poses, client="one")
+        (part,) = scene.path("ball", poses, client="one")
+        assert part.verdict.tolist() == [Verdict.CONTACT, Verdict.CLEAR]
+        scene.drop_client("one")
+        assert scene.collide("ball", poses[1:], client="one").verdict.tolist() == [Verdict.CLEAR]
+
+
+def test_a_name_that_is_given_goes_before_the_files(write: Write) -> None:
+    file = write('format = 1\nname = "said"\n' + TOP[11:])
+    with open_scene(file, read_points=read_points) as scene:
+        assert scene.name == scene.info().scene == "said"
+    with open_scene(file, read_points=read_points, name="given") as scene:
+        assert scene.name == scene.info().scene == "given"
+
+
+def test_a_scene_moves_as_its_effects_say(write: Write) -> None:
+    begin, end = at((0, 0, 0.5)), at((0, 0, -0.5))
+    for effects, last in (("", -0.5), (STOP + '[[effects]]\neffect = "sweep"\n', 0.1)):
+        # Without a table of effects there is `stop`; a list of none is none.
+        text = TOP + BALL + effects if effects else "format = 1\neffects = []\n" + TOP[11:] + BALL
+        with open_scene(write(text), read_points=read_points) as scene:
+            moved = scene.move("ball", begin, end, client="any")
+            assert moved.simulated == (["stop", "sweep"] if effects else [])
+            assert last <= moved.pose[0, 2, 3] <= last + 0.01
+
+
+def test_what_is_passed_through_is_not_there(write: Write) -> None:
+    through = '[[effects]]\neffect = "through"\nboxes = [{name = "hole", low = [-0.25, -9, -1], high = [0.25, 9, 1]}]\n'
+    with open_scene(write(TOP + BALL + STOP + through), read_points=read_points) as scene:
+        assert scene.info().effects == ["through", "stop"]
+        answers = scene.collide("ball", at((0, 0, 0), (0.4, 0, 0)), client="any")
+        assert answers.verdict.tolist() == [Verdict.CLEAR, Verdict.CONTACT]
+
+
+@pytest.mark.parametrize(
+    "second", ["", "pose = [[0, -1, 0, 10], [1, 0, 0, 0], [0, 0, 1, 2], [0, 0, 0, 1]]\n"]
+)
+def test_several_archives_answer_as_one(write: Write, second: str) -> None:
+    text = TOP + '[[archives]]\npath = "floor"\n' + second + BALL + STOP
+    with open_scene(write(text), read_points=read_points, budget_bytes=64 << 20) as scene:
+        info = scene.info()
+        assert (info.points, info.scene, info.effects) == (242, "hall", ["stop"])
+        answers = scene.collide("ball", at((0.5, 0.5, 0.05), (9.5, 0.5, 2.05)), client="any")
+        assert answers.verdict.tolist() == [Verdict.CONTACT, Verdict.CONTACT if second else Verdict.CLEAR]
+        assert 0 < scene.stats().budget_bytes <= 64 << 20
+
+
+def test_one_archive_at_a_pose_is_there(write: Write) -> None:
+    pose = "pose = [[1, 0, 0, 100], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]\n"
+    with open_scene(write(TOP + pose + BALL + STOP), read_points=read_points) as scene:
+        answers = scene.collide("ball", at((0, 0, 0), (100, 0, 0)), client="any")
+        assert answers.verdict.tolist() == [Verdict.CLEAR, Verdict.CONTACT]
+
+
+def test_a_cache_is_shared_by_what_archives_take() -> None:
+    sizes = [np.array([1000, 3000]), np.array([1000]), np.zeros(0, np.int64)]
+    shares = share_budget(100_000, sizes)
+    assert sum(shares) <= 100_000 and sum(shares) > 100_000 - 3
+    assert shares[0] > 3 * shares[1] > 0 and shares[2] == 0
+    least = [share_budget(5000, sizes[:2])[i] - (3000, 1000)[i] for i in (0, 1)]
+    assert min(least) >= 0
+    assert share_budget(7, sizes[:1]) == [7]
+    with pytest.raises(BadRequestError, match="cache of 3999 bytes: the largest voxels of 2 archives take 4"):
+        share_budget(3999, sizes[:2])
+
+
+@pytest.mark.parametrize(
+    ("effects", "reach"),
+    [
+        ("", None),
+        ('[[effects]]\neffect = "slide"\nnormal_reach = 0.2\n[[effects]]\neffect = "ground"\n', 0.2),
+        ('[[effects]]\neffect = "ground"\n', 0.08),
+    ],
+)
+def test_normals_are_loaded_where_effects_ask_for_them(
+    folder: Path, effects: str, reach: float | None
+) -> None:
+    archive = folder / f"normals-{reach}"
+    keep = [] if reach is None else ["--keep", "normal", "--normal-reach", str(reach)]
+    assert (
+        run(["build", str(folder / "floor.xyz"), "-o", str(archive), "--voxel", "2", "--jobs", "1", *keep])
+        == 0
+    )
+    file = parse_scene((TOP + STOP + effects).encode(), "hall.toml")
+    assert normals_asked(file) == reach
+    store = store_opener(file, 0)(archive)
+    assert store.with_normals == (reach is not None)
+    store.close()
+    if reach is not None:
+        plain = store_opener(parse_scene((TOP + STOP).encode(), "hall.toml"), 0)(archive)
+        assert not plain.with_normals and plain.sizes.sum() < store.sizes.sum()
+        plain.close()
+
+
+@pytest.mark.parametrize(
+    ("text", "kind", "said"),
+    [
+        (TOP.replace("floor", "wall"), FormatError, "$.archives[0].path: {}/wall: no archive here"),
+        (TOP + BALL.replace(".xyz", ".ply"), ScanError, "$.avatars[0].file: {}/ball.ply: no such file"),
+        (TOP + BALL.replace("radius = 0.05", ""), BadRequestError, "$.avatars[0]: avatar of a single distinct point"),
+        (
+            'format = 1\nradius_model = "local"\n' + TOP[11:], BadRequestError,
+            "$.radius_model: {}/floor: radius model 'local': this archive holds mean",
+        ),
+        (TOP + '[[archives]]\npath = "ball.xyz"\n', FormatError, "$.archives[1].path: {}/ball.xyz"),
+    ],
+)  # fmt: skip
+def test_a_fault_of_what_is_named_has_the_file_and_the_place(
+    folder: Path, write: Write, text: str, kind: type[Exception], said: str
+) -> None:
+    file = write(text)
+    with pytest.raises(kind) as found, open_scene(file, read_points=read_points):
+        pass
+    assert str(found.value).startswith(f"{file}: {said.format(folder)}")
+
+
+def test_too_small_a_cache_is_told(write: Write) -> None:
+    with (
+        pytest.raises(
+            BadRequestError, match=r"hall.toml: \$.archives\[0\]: cache of 10 bytes: the largest voxel"
+        ),
+        open_scene(write(TOP), read_points=read_points, budget_bytes=10),
+    ):
+        pass
+    two = write(TOP + '[[archives]]\npath = "floor"\n')
+    with (
+        pytest.raises(
+            BadRequestError, match=r"hall.toml: \$.archives: cache of 10 bytes: the largest voxels of 2"
+        ),
+        open_scene(two, read_points=read_points, budget_bytes=10),
+    ):
+        pass
+
+
+def test_an_error_keeps_its_kind_and_its_paths() -> None:
+    with pytest.raises(CorruptError) as found, at_place(Path("a.toml"), "$.x"):
+        raise CorruptError("broken", (Path("b.h5"),))
+    assert str(found.value) == "a.toml: $.x: broken" and found.value.paths == (Path("b.h5"),)
+    with pytest.raises(BadRequestError, match=r"^a.toml: \$.x: .*denied"), at_place(Path("a.toml"), "$.x"):
+        raise PermissionError(13, "Permission denied")

@@ -137,3 +137,8 @@ def size(way: Vec) -> float:
     """The length of a vector (3,)."""
     x, y, z = way.tolist()
     return math.sqrt(x * x + y * y + z * z)
+
+
+def lowest(avatar: AvatarModel, pose: Pose, up: Vec) -> float:
+    """How far up the lowest of an avatar's spheres, not none, begins under a pose [m]."""
+    return dot(pose[:3, 3], up) + float((avatar.points @ (pose[:3, :3].T @ up)).min()) - avatar.radius

@@ -21,7 +21,7 @@ from ...schemas.answers import Verdict
 from ...schemas.effects import Ground, Slide, Step, Sweep
 from ...schemas.moves import GroundReport
 from ..world import World
-from .frame import Frame, Hit, Vec, dot, moved_by, size
+from .frame import Frame, Hit, Vec, dot, lowest, moved_by, size
 from .going import first_hit, note, settle
 
 # Feet this near to their height are left there [m]: at rest nothing moves.
@@ -177,15 +177,15 @@ class Grounded:
         world, avatar, up = frame.world, frame.body.avatar, frame.world.up
         if not len(avatar.points):
             return False
-        feet = dot(frame.pose[:3, 3], up) + float((avatar.points @ (frame.pose[:3, :3].T @ up)).min())
-        deep = feet - avatar.radius - world.lowest() + _BELOW
+        feet = lowest(avatar, frame.pose, up)
+        deep = feet - world.lowest() + _BELOW
         if deep <= reach:
             return False
         swept = world.sweep(avatar, frame.pose, moved_by(frame.pose, -deep * up), _ROUGH, frame.effort)
         if swept.verdict != Verdict.CONTACT:
             return bool(swept.verdict == Verdict.UNKNOWN)
         # A hole's rim, or the ledge behind it, is met by what is higher and wider than the feet.
-        return not stood or dot(swept.cloud, up) < feet - avatar.radius - reach
+        return not stood or dot(swept.cloud, up) < feet - reach
 
     def standing(self, frame: Frame, hit: Hit) -> Vec | None:
         """The normal of what was met, if it can be stood on; None: it is too steep.

@@ -6,8 +6,8 @@ the wish, and never farther than what was left: no energy appears.
 
 A surface is a plane by the smoothed normal of the scan points around the one that was touched. The scan's spheres make
 a flat wall bumpy, by up to their radius: where the plane is one that the frame has met already, a bump is in the way,
-and the plane square to the two spheres' centres leads over it. Nearly head on, what is left along a surface is
-mostly what the normal is off: an avatar that pushes so stays (STICK).
+and the plane square to the two spheres' centres leads over it, a short way. Nearly head on, what is left along a
+surface is mostly what the normal is off: an avatar that pushes so stays (STICK).
 
 Turning: the wish's screw motion is tried first; what is left of its translation slides at the orientation reached, and
 then what is left of the turn is tried on the spot.
@@ -29,6 +29,10 @@ STICK = 0.02
 LEAST_SLIDE = 1e-5
 # Normals so close are of one plane: 8 degrees.
 SAME_PLANE = 0.99
+# Over a bump it goes no farther than so many times the two spheres' radii: the wall goes on behind it.
+_OVER = 1.0
+# Motions of a frame for each surface: bumps take some, too.
+_MOTIONS = 2
 # A way that goes into a surface by no more than rounding, as a share of it, does not.
 _ROUNDING = 1e-9
 
@@ -63,44 +67,51 @@ class Sliding:
         stands: nothing steep is climbed. Returns what ended it in the end; None: nothing did.
         """
         assert frame.go is not None
-        planes: list[Vec] = []
         met: list[Vec] = []
-        for _ in range(self.surfaces):
-            if hit.verdict == Verdict.UNKNOWN:
-                return hit
-            normal = self._normal(frame, hit, left, met)
-            if normal is None:
-                return hit
-            met.append(normal)
-            planes.append(self._wall(normal) if stands else normal)
-            way = clip(left, planes)
-            if way is None or size(way) < max(STICK * size(left), LEAST_SLIDE) or dot(way, wish) <= 0.0:
-                return hit
+        planes: list[Vec] = []
+        bumps: list[Vec] = []
+        ended: Hit | None = hit
+        for _ in range(_MOTIONS * self.surfaces):
+            if ended is not None:
+                if ended.verdict == Verdict.UNKNOWN or ended.avatar is None or ended.cloud is None:
+                    return ended
+                normal = self._surface(frame, ended, left, met)
+                if normal is None:
+                    out = ended.avatar - ended.cloud
+                    across = size(out)
+                    if across == 0.0:
+                        return ended
+                    bumps.append(out / across)
+                elif len(met) == self.surfaces:
+                    return ended
+                else:
+                    met.append(normal)
+                    planes.append(self._wall(normal) if stands else normal)
+            far = size(left)
+            way = clip(left, planes + bumps)
+            if way is None or size(way) < max(STICK * far, LEAST_SLIDE) or dot(way, wish) <= 0.0:
+                return ended
+            if bumps:
+                way = way * min(1.0, _OVER * across / size(way))
             begin = frame.pose
-            next_hit = frame.go(frame, moved_by(begin, way))
-            if next_hit is None:
-                return None
-            hit = next_hit
-            left = way - (frame.pose[:3, 3] - begin[:3, 3])
-        return hit
+            ended = frame.go(frame, moved_by(begin, way))
+            gone = frame.pose[:3, 3] - begin[:3, 3]
+            left = left * max(0.0, 1.0 - size(gone) / far) if bumps else way - gone
+            if ended is None:
+                if not bumps:
+                    return None
+                bumps.clear()
+        return ended
 
-    def _normal(self, frame: Frame, hit: Hit, left: Vec, met: list[Vec]) -> Vec | None:
-        """The plane to go along, and write it down; None: nothing says where it is."""
-        if hit.avatar is None or hit.cloud is None:
-            return None
+    def _surface(self, frame: Frame, hit: Hit, left: Vec, met: list[Vec]) -> Vec | None:
+        """The normal of the surface that was met, noted; None: a bump, of one met before, or of none that is known."""
         normal: Vec | None = frame.world.normal(hit, self.normal_reach)
-        if normal is not None and (
-            dot(normal, left) >= 0.0 or any(dot(normal, each) > SAME_PLANE for each in met)
-        ):
-            normal = None
         if normal is None:
-            out = hit.avatar - hit.cloud
-            length = size(out)
-            if length == 0.0:
-                return None
-            normal = out / length
+            return None
         if frame.hits and frame.hits[-1] is hit:
             frame.hits[-1] = hit._replace(normal=normal)
+        if dot(normal, left) >= 0.0 or any(dot(normal, each) > SAME_PLANE for each in met):
+            return None
         return normal
 
     def _wall(self, normal: Vec) -> Vec:

@@ -5,10 +5,9 @@ down. That is kept where it led farther along the wish than sliding did, ends on
 `height`; else all is as it was. Descending is `ground`'s: it looks so far down for what to stand on.
 """
 
-from ...schemas.answers import Verdict
 from ...schemas.effects import Ground, Step
 from ..world import World
-from .frame import Frame, Pose, Vec, dot, moved_by, size
+from .frame import Frame, Pose, Vec, dot, lowest, moved_by, size
 from .going import LEAST_WAY
 from .ground import DEAD_BAND, Grounded
 from .ground import make as make_ground
@@ -28,8 +27,11 @@ class Stepping:
     def run(self, frame: Frame) -> None:
         """Climb what stopped the wish, if it can be climbed."""
         hit, met = frame.blocked, frame.met
-        if hit is None or met is None or not frame.body.on_ground or hit.verdict == Verdict.UNKNOWN:
+        if hit is None or met is None or not frame.body.on_ground or hit.cloud is None:
             return
+        feet = lowest(frame.body.avatar, met, frame.world.up)
+        if dot(hit.cloud, frame.world.up) - feet > self._height:
+            return  # a wall
         begin = frame.body.pose[:3, 3]
         wish = frame.wish[:3, 3] - begin
         length = size(wish)

@@ -114,6 +114,10 @@ class World:
         """Node visits of all that this thread has asked."""
         return self._held.visits
 
+    def count(self, visits: int) -> None:
+        """Add node visits of what this thread asked of the archives it holds, and not through here."""
+        self._held.visits += visits
+
     def generations(self) -> tuple[int, ...]:
         """What tells the archives held now from those before a reload."""
         with self as seen:

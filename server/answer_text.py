@@ -19,6 +19,7 @@ from ..schemas.answers import (
     WithinAnswers,
 )
 from ..schemas.arrays import array_fields
+from ..schemas.moves import Moved
 
 _NAMES = {int(verdict): verdict.name.lower() for verdict in Verdict}
 _TOTALS = ("engine_seconds", "hits", "misses", "resident", "resident_bytes", "faults", "wait_seconds", "late")
@@ -48,6 +49,18 @@ def summary_line(answers: Any) -> str:
     word = next((word for kind, word in _WORDS.items() if isinstance(answers, kind)), "poses")
     counts = ", ".join(f"{(answers.verdict == verdict).sum()} {verdict.name.lower()}" for verdict in Verdict)
     return f"{len(answers)} {word}: {counts}; {answers.engine_seconds * 1e3:.2f} ms in the engine"
+
+
+def move_line(label: str, moved: Moved) -> str:
+    """What came of a frame: verdict, where it ended, what it lacks of the wish, what stopped it."""
+    line = f"{label}  {_NAMES[moved.verdict]:<8}at {_place(moved.pose[0, :3, 3])}"
+    if moved.left:
+        line += f", {moved.left:.4f} m left"
+    if moved.touched:
+        line += f", touching {_place(np.array(moved.touched[0].place))}"
+    if moved.skipped:
+        line += f", without {', '.join(moved.skipped)}"
+    return line
 
 
 def answers_json(times: list[float], answers: Cost) -> dict[str, Any]:

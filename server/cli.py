@@ -11,7 +11,21 @@ from typing import Any
 import typer
 
 from ..schemas.errors import BadRequestError, SolidcloudError
-from .verbs import accuracy, archive, build, export, generation, inspect, make, plan, query, scene, serve, top
+from .verbs import (
+    accuracy,
+    archive,
+    build,
+    export,
+    generation,
+    inspect,
+    make,
+    plan,
+    query,
+    replay,
+    scene,
+    serve,
+    top,
+)
 from .verbs.options import complain
 
 # Without rich's markup: importing it doubles the time --help takes, to over the 0.3 s it may.
@@ -42,7 +56,15 @@ for verb in (
     query.query,
 ):
     app.command()(verb)
-for verb in (export.export, generation.add, generation.remove, generation.reload, plan.plan, top.top):
+for verb in (
+    export.export,
+    generation.add,
+    generation.remove,
+    generation.reload,
+    plan.plan,
+    top.top,
+    replay.replay,
+):
     app.command()(verb)
 
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from ..schemas.answers import PATH_ANSWERS, Cost
 from ..schemas.columns import join, without_part
 from ..schemas.errors import BadRequestError
+from ..schemas.moves import LONGEST_SECONDS, Moved
 from ..schemas.requests import PATH_PARAMETERS, Question
 from .pose_file import read_objects, read_poses, read_rays
 
@@ -23,6 +24,7 @@ _OPTIONS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "raycast": (("rays", "reach"), ()),
     "within": (("points", "reach"), ()),
     "objects": (("objects",), ("radius", "margin")),
+    "move": (("avatar", "poses"), ("radius",)),
     "path": (("avatar", "poses"), ("radius", "along", "margin", "reach", "limit", "cluster_distance")),
 }
 
@@ -39,6 +41,7 @@ class Asker(Protocol):
     def sweep(self, *what: Any, **parameters: Any) -> Any: ...
     def objects(self, *what: Any, **parameters: Any) -> Any: ...
     def path(self, *what: Any, **parameters: Any) -> Any: ...
+    def move(self, *what: Any) -> Moved: ...
 
 
 class Asked(NamedTuple):
@@ -72,9 +75,11 @@ def check_query(op: str, options: dict[str, Any]) -> Query:
             raise BadRequestError(f"--along {along}: expected one of {', '.join(PATH_PARAMETERS)}")
         needed, others = _OPTIONS[along][0], (*_OPTIONS[along][1], "along")
     asked = f"--op path --along {along}" if op == "path" else f"--op {op}"
-    takes = ", ".join(map(_option, (*needed, *others, *_OF_ALL)))
+    # What a frame may cost is the scene's to say.
+    others = others if op == "move" else (*others, *_OF_ALL)
+    takes = ", ".join(map(_option, (*needed, *others)))
     for name in given:
-        if name not in (*needed, *others, *_OF_ALL):
+        if name not in (*needed, *others):
             raise BadRequestError(f"{_option(name)} does not go with {asked}: it takes {takes}")
     for name in needed:
         if name not in given:
@@ -107,6 +112,19 @@ def ask(scene: Asker, query: Query, read_points: ReadPoints) -> Iterator[Asked]:
         yield Asked(labels, begins, scene.sweep("avatar", poses[:-1], poses[1:], **parameters))
     else:
         yield Asked(labels, begins, getattr(scene, op)("avatar", poses, **parameters))
+
+
+def ask_moves(scene: Asker, query: Query, read_points: ReadPoints) -> Iterator[tuple[str, Moved]]:
+    """Where the avatar gets from each pose towards the next, and which it is as words; no frame remembers another.
+
+    A frame lasts from one pose's time to the next one's.
+    """
+    times, poses = read_poses(query.given["poses"])
+    scene.add_avatar("avatar", read_points(query.given["avatar"]), query.given.get("radius"))
+    labels, _ = _labels("sweep", times.tolist())
+    for number, (label, seconds) in enumerate(zip(labels, np.diff(times).tolist(), strict=True)):
+        pose_from, pose_to = poses[number : number + 1], poses[number + 1 : number + 2]
+        yield label, scene.move("avatar", pose_from, pose_to, min(seconds, LONGEST_SECONDS))
 
 
 def joined(found: list[Asked]) -> Asked:

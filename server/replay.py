@@ -1,7 +1,9 @@
 """A log's frames once more: the same wishes must give the same poses, bit for bit."""
 
-from collections.abc import Iterable
-from typing import NamedTuple
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -9,8 +11,8 @@ from ..schemas.encoding import decode_request
 from ..schemas.errors import BadRequestError, SolidcloudError
 from ..schemas.keys import User
 from ..schemas.moves import Wish
-from .frame_log import Begin, Dropped, Ended, Entered, Frame, Points, Record, Reloaded, Said, said
-from .served import Turn
+from .frame_log import Begin, Dropped, Ended, Entered, Frame, FrameLog, Points, Record, Reloaded, Said, said
+from .served import SceneLike, Turn
 from .simulation import Simulation
 
 
@@ -115,16 +117,52 @@ class _Bodies:
             del self._added[user]
 
 
-def check_same(begin: Begin, archives: list[tuple[str, int]], where: str) -> None:
-    """BadRequestError unless a log is of these archives: id and generation of each. where: they lie, for the error."""
-    if [tuple(each) for each in begin.archives] != archives:
-        logged = ", ".join(
-            f"{archive[:8]} of generation {generation}" for archive, generation in begin.archives
-        )
-        found = ", ".join(f"{archive[:8]} of generation {generation}" for archive, generation in archives)
+def archives_of(simulation: Simulation) -> list[tuple[str, int]]:
+    """The id, hexadecimal, and the generation of each archive that a scene is made of."""
+    served: Any = simulation.served
+    found = []
+    for scene, _ in getattr(served, "archives", None) or [(served, None)]:
+        with scene.take() as opened:
+            header = opened.store.archive.header
+            found.append((header.archive_id.hex(), header.generation))
+    return found
+
+
+def begin_of(simulation: Simulation, path: Path) -> Begin:
+    """What a log of a scene begins with. path: of its archive or scene file."""
+    file = path.read_bytes() if path.is_file() else b""
+    return Begin(simulation.name, str(path.resolve()), file, archives_of(simulation))
+
+
+@contextmanager
+def recorded(scene: SceneLike, path: Path, log: Path) -> Iterator[None]:
+    """Log the frames of a scene to a new file while inside. path: of its archive or scene file. BadRequestError."""
+    simulation: Any = scene.simulation
+    with FrameLog(log, begin_of(simulation, path)) as frames:
+        simulation.record(frames)
+        try:
+            yield
+        finally:
+            simulation.record(None)
+
+
+def check_same(begin: Begin, simulation: Simulation, path: Path) -> bool:
+    """Whether a scene's file is that which the log began with. BadRequestError unless its archives are.
+
+    path: of the archive or scene file.
+    """
+    found = archives_of(simulation)
+    if [tuple(each) for each in begin.archives] != found:
         raise BadRequestError(
-            f"{where}: archive {found}: expected {logged}, which the log is of ({begin.path})"
+            f"{path}: holds {_archives(found)}: expected {_archives(begin.archives)}, which the log is of "
+            f"({begin.path})"
         )
+    return begin.file == (path.read_bytes() if path.is_file() else b"")
+
+
+def _archives(archives: Sequence[tuple[str, int]]) -> str:
+    """Archives in words."""
+    return " and ".join(f"archive {name[:8]} of generation {generation}" for name, generation in archives)
 
 
 def _words(said: Said) -> str:

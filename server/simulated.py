@@ -31,11 +31,7 @@ def simulate(
         for name, (points, radius) in (avatars or {}).items()
     ]
     pipeline = make_pipeline(file, World(served, file))
-    # Effects of one scene that let users meet share one account of who is where.
-    meeting: list[Any] = [runner for runner in pipeline.runners if hasattr(runner, "bodies")]
-    for runner in meeting[1:]:
-        runner.bodies = meeting[0].bodies
-    return Simulation(served, file, pipeline, own, meeting[0].bodies if meeting else None)
+    return Simulation(served, file, pipeline, own, pipeline.bodies)
 
 
 class Simulated:

@@ -2,7 +2,7 @@
 
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -16,14 +16,18 @@ def query(
     scene: Annotated[str, typer.Option(help="Name of the scene.")],
     op: Annotated[
         str,
-        typer.Option(help="collide, distance, contacts, sweep, raycast, within, objects, or path in parts."),
+        typer.Option(
+            help="collide, distance, contacts, sweep, raycast, within, objects, move, or path in parts."
+        ),
     ] = "collide",
     avatar: Annotated[
         Path | None, typer.Option(help="Points of the avatar: OBJ PLY XYZ and what build reads.")
     ] = None,
     poses: Annotated[
         Path | None,
-        typer.Option(help="CSV file of poses: t,x,y,z,qw,qx,qy,qz; a sweep moves from each to the next."),
+        typer.Option(
+            help="CSV file of poses: t,x,y,z,qw,qx,qy,qz; a sweep or move goes from each to the next."
+        ),
     ] = None,
     rays: Annotated[Path | None, typer.Option(help="CSV file of rays: x,y,z,dx,dy,dz.")] = None,
     points: Annotated[Path | None, typer.Option(help="Loose points: PLY XYZ and what build reads.")] = None,
@@ -70,6 +74,9 @@ def query(
     from ..report.points import read_avatar
 
     question = check_query(op, options)
+    if op == "move":
+        _ask_moves(connect, scene, question, as_json)
+        return
     found = []
     with Client(connect, scene=scene) as client:
         for part in ask(client, question, read_avatar):
@@ -84,3 +91,28 @@ def query(
         print_json(answers_json(whole.times, whole.answers))
     else:
         print(summary_line(whole.answers))
+
+
+def _ask_moves(connect: str, scene: str, question: Any, as_json: bool) -> None:
+    """Frame after frame, a line each, or all as JSON."""
+    from msgspec import json
+
+    from ...schemas.answers import Verdict
+    from ...schemas.encoding import JSON, encode
+    from ..answer_text import move_line
+    from ..client import Client
+    from ..query import ask_moves
+    from ..report.points import read_avatar
+
+    found = []
+    with Client(connect, scene=scene) as client:
+        for label, moved in ask_moves(client, question, read_avatar):
+            found.append(json.decode(encode(moved, JSON)))
+            if not as_json:
+                print(move_line(label, moved))
+    if found and not any(
+        moved.get("simulated") or moved.get("verdict", 0) < Verdict.UNKNOWN for moved in found
+    ):
+        print(f"no server of scene {scene!r} answered at {connect}", file=sys.stderr)
+    if as_json:
+        print_json(found)

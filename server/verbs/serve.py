@@ -26,20 +26,31 @@ def serve(
     metrics_port: Annotated[
         int, typer.Option(help="TCP port of Prometheus' text, at http://127.0.0.1:PORT/metrics; 0: none.")
     ] = 0,
+    log: Annotated[
+        Path | None,
+        typer.Option(help="New file for the frames of all users, for solidcloud replay; it only grows."),
+    ] = None,
     insecure: Annotated[
         bool, typer.Option("--insecure", help="Allow an endpoint that other hosts reach.")
     ] = False,
 ) -> None:
     """Serve an archive, which stops who touches it, or a scene over zenoh until told to stop."""
     import logging
+    from contextlib import ExitStack
 
     from ..app import serve as serve_scenes
     from ..config import ServerConfig
+    from ..replay import recorded
     from ..report.points import read_avatar
     from ..scene_file import open_scene
 
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(message)s")
     config = ServerConfig(listen=listen, insecure=insecure, metrics_port=metrics_port)
     budget = parse_bytes(cache, "--cache")
-    with open_scene(what, read_points=read_avatar, name=name, budget_bytes=budget, policy=policy) as scene:
+    with ExitStack() as stack:
+        scene = stack.enter_context(
+            open_scene(what, read_points=read_avatar, name=name, budget_bytes=budget, policy=policy)
+        )
+        if log is not None:
+            stack.enter_context(recorded(scene, what, log))
         serve_scenes([scene], config)

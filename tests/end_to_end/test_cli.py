@@ -14,7 +14,7 @@ from solidcloud.server.cli import run
 from solidcloud.server.report.serving import free_port, served
 from solidcloud.server.verbs.options import parse_bytes
 
-VERBS = ["build", "info", "validate", "serve", "query", "accuracy", "add", "remove", "reload", "top", "make"]
+VERBS = ["build", "info", "validate", "serve", "query", "accuracy", "add", "remove", "reload", "top", "replay", "make"]
 RADIUS = 0.05
 
 

@@ -1,0 +1,47 @@
+"""`solidcloud replay`: a log's frames once more, compared bit for bit."""
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from .options import AsJson, parse_bytes, print_json
+
+
+def replay(
+    log: Annotated[Path, typer.Argument(help="A log that serve --log wrote.")],
+    what: Annotated[
+        Path | None,
+        typer.Argument(metavar="[ARCHIVE|SCENE.toml]", help="What was served; left out: where it was then."),
+    ] = None,
+    cache: Annotated[str, typer.Option(help="Decoded voxels kept in memory, at most.")] = "512MB",
+    as_json: AsJson = False,
+) -> int:
+    """Simulate a log's frames again and compare their poses bit for bit. Exit code 1: some differ."""
+    from ..frame_log import Begin, read_log
+    from ..replay import check_same
+    from ..replay import replay as replay_log
+    from ..report.points import read_avatar
+    from ..scene_file import open_scene
+
+    records = read_log(log)
+    begin = next(records)
+    assert isinstance(begin, Begin), "read_log sees to it"
+    path = Path(begin.path) if what is None else what
+    with open_scene(
+        path, read_points=read_avatar, name=begin.scene, budget_bytes=parse_bytes(cache, "--cache")
+    ) as scene:
+        if not check_same(begin, scene.simulation, path):
+            print(f"warning: {path} is not the scene file that was logged", file=sys.stderr)
+        found = replay_log(scene.simulation, records)
+    if as_json:
+        first = None if found.first is None else str(found.first)
+        print_json({**found._asdict(), "first": first})
+        return int(found.different > 0)
+    print(f"{found.frames} frames, {found.turns} turns: {found.different or 'none'} different")
+    if found.first is not None:
+        print(f"first: {found.first}")
+    if found.reloaded is not None:
+        print(f"ends where the scene was reloaded, to generation {found.reloaded}")
+    return int(found.different > 0)

@@ -3,8 +3,8 @@
 First the bounds of all bodies against those of the motion, in one kernel call of some microseconds; mostly nobody is
 near. Then, exactly, those that are (kernels/meeting.py, kernels/pairs.py).
 
-What is overlapped when the frame begins blocks only a motion that goes against `Bodies.way_out`; a motion along it,
-across it or about the mover's own axis is let, and so is one up or down. So bodies that came to be in one place, by
+What is overlapped when the frame begins blocks only a translation that goes against `Bodies.way_out`: one along it,
+across it, up or down is let, and so is a turn. So bodies that came to be in one place, by
 where they began or by an object that was told to be there, get apart, and none is ever held.
 """
 
@@ -83,9 +83,7 @@ class Blocking:
             shape = bodies.shape_of(avatar)
             there = self._from_origin(pose)
             rows = self._near(shape, there, there)
-            if not len(rows):
-                return None
-            touching = bodies.touching(shape, pose, rows, self._margin_units)
+            touching = bodies.touching(shape, pose, rows, self._margin_units) if len(rows) else []
             for row in rows[touching].tolist():
                 if not self._is_overlapped(row):
                     return self._hit(shape, pose, row)
@@ -151,14 +149,12 @@ class Blocking:
         return found
 
     def _goes_deeper(self, shape: Shape, pose_from: Pose, pose_to: Pose) -> Hit | None:
-        """What of that overlapped when the frame began a motion goes against the way out of."""
-        center = None
+        """What of that overlapped when the frame began the translation of a motion goes against the way out of."""
+        way = pose_to[:3, 3] - pose_from[:3, 3]
         for row in sorted(row for row, overlapped in self._overlapped.items() if overlapped):
-            if center is None:
-                center = shape.center(pose_from)
-                way = shape.center(pose_to) - center
             out = self._out(row)
             if way @ out < -_ACROSS * np.linalg.norm(out) * np.linalg.norm(way):
+                center = shape.center(pose_from)
                 return Hit(0.0, Verdict.CONTACT, center, center - out, self._bodies.names[row])
         return None
 

@@ -67,9 +67,8 @@ class Bodies:
         self._users: dict[Hashable, Body] = {}
         self._known: dict[int, Shape] = {}
         self._numbered = 0
-        self._clear: dict[
-            tuple[str, str], Vec
-        ] = {}  # user, object: the user's centre when last clear, object's frame
+        # Of user and object, see `_remember_way`.
+        self._came_from: dict[tuple[str, str], Vec] = {}
 
     # --- shapes -------------------------------------------------------------------------------------------
 

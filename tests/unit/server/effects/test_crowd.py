@@ -1,0 +1,208 @@
+"""`crowd`: users do not walk through one another. The judge asks every pair of points of every two of them."""
+
+import subprocess
+import sys
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+import pytest
+from moving_bodies import INTERPRETED, Stage, at, ball, box, staged, touch
+from numpy.typing import NDArray
+from solidcloud.schemas.effects import AnyEffect, Crowd, Stop, Sweep
+from solidcloud.schemas.errors import BadRequestError
+from solidcloud.server.avatar import make_avatar
+from solidcloud.server.effects import crowd
+from solidcloud.server.effects.frame import Body
+from solidcloud.server.kernels.meeting import Scratch
+
+SMALL = ball(0.2, 12 if INTERPRETED else 60)
+CONTINUOUS: list[AnyEffect] = [Stop(), Sweep()]
+
+
+def overlapping(stage: Stage, margin: float = 0.0) -> list[tuple[str, str]]:
+    """Who touches whom."""
+    origin = stage.bodies.origin
+    return [
+        (one, other)
+        for one, other in combinations(stage.users, 2)
+        if touch(
+            stage.users[one].avatar, stage.users[one].pose, stage.users[other].avatar, stage.users[other].pose,
+            origin, margin,
+        )
+    ]  # fmt: skip
+
+
+def around(count: int, distance: float) -> NDArray[np.float64]:
+    """Places (count, 3) on a circle."""
+    angle = 2 * np.pi * np.arange(count) / count
+    return np.stack([distance * np.cos(angle), distance * np.sin(angle), np.zeros(count)], axis=1)
+
+
+@pytest.mark.interpreted
+@pytest.mark.parametrize("margin", [0.0, 0.05])
+def test_users_pushed_into_one_spot_do_not_overlap(tmp_path: Path, margin: float) -> None:
+    count, frames = (4, 6) if INTERPRETED else (10, 40)
+    met = 0
+    with staged(tmp_path, [*CONTINUOUS, Crowd(margin=margin)]) as stage:
+        for number, place in enumerate(around(count, 1.2)):
+            stage.enter(f"c/{number}", SMALL, at(*place))
+        for frame in range(frames):
+            for name, body in stage.users.items():
+                way = -body.pose[:3, 3] * (1.0 if frame % 7 == 0 else 0.2)
+                moved = stage.step(name, way)
+                assert moved.crowd is not None
+                met += moved.crowd.met
+                assert (moved.crowd.met > 0) == any(each.what for each in moved.touched)
+            assert overlapping(stage, margin) == [], f"frame {frame}"
+        nearest = min(np.linalg.norm(body.pose[:3, 3]) for body in stage.users.values())
+        assert met and nearest < 0.5, "they came together"
+
+
+@pytest.mark.interpreted
+@pytest.mark.parametrize("effects", [CONTINUOUS, [Stop()]], ids=["continuous", "discrete"])
+def test_users_who_begin_in_one_spot_get_apart(tmp_path: Path, effects: list[AnyEffect]) -> None:
+    """Each wishes to go its own way out; who would come nearer to another's middle waits."""
+    count = 3 if INTERPRETED else 7
+    ways = around(count, 0.06)
+    with staged(tmp_path, [*effects, Crowd()]) as stage:
+        for number in range(count):
+            stage.enter(f"c/{number}", SMALL, at(0))
+        assert len(overlapping(stage)) == count * (count - 1) // 2
+        frames = 0
+        while overlapping(stage):
+            for way, name in zip(ways, list(stage.users), strict=True):
+                before = {pair: _apart(stage, *pair) for pair in overlapping(stage)}
+                stage.step(name, way)
+                for pair in overlapping(stage):
+                    assert pair in before, f"frame {frames}: {pair} overlap, and did not"
+                    assert _apart(stage, *pair) >= before[pair] - 1e-9, f"frame {frames}: {pair} went deeper"
+            frames += 1
+            assert frames < 300, overlapping(stage)
+
+
+def _apart(stage: Stage, one: str, other: str) -> float:
+    """How far two users' middles are from each other [m]."""
+    return float(np.linalg.norm(stage.users[one].pose[:3, 3] - stage.users[other].pose[:3, 3]))
+
+
+@pytest.mark.interpreted
+def test_who_overlaps_may_turn_stand_and_go_up_but_not_deeper(tmp_path: Path) -> None:
+    with staged(tmp_path, [*CONTINUOUS, Crowd()]) as stage:
+        stage.enter("c/still", SMALL, at(0.2))
+        for name, wish, goes in (
+            ("out", at(-0.3), True), ("across", at(0, 0.3), True), ("turn", at(0, heading=2.0), True),
+            ("up", at(0, 0, 0.1), True), ("stay", at(0), True), ("deeper", at(0.1), False),
+            ("through", at(3.0), False),
+        ):  # fmt: skip
+            body = stage.enter("c/walker", SMALL, at(0))
+            moved = stage.go("c/walker", wish)
+            assert np.array_equal(body.pose, wish if goes else at(0)), name
+            assert moved.crowd is not None and moved.crowd.met == (not goes), name
+
+
+@pytest.mark.interpreted
+def test_a_thin_body_is_met_at_fifty_metres_a_frame(tmp_path: Path) -> None:
+    leaf = box(0.02, 0.8, 0.8, 0.1 if INTERPRETED else 0.02, 0.01)
+    if INTERPRETED:
+        leaf = make_avatar(leaf.points, 0.03)
+    with staged(tmp_path, [*CONTINUOUS, Crowd()]) as stage:
+        stage.enter("c/leaf", leaf, at(0.5))
+        for start, wish in (
+            (at(-25, 0, 1), at(25, 0, 1)),
+            (at(0), at(1.0)),
+            (at(25, 0, 2), at(-25, 0.1, 2)),
+        ):
+            body = stage.enter("c/walker", SMALL, start)
+            stage.users["c/leaf"].pose = at(0.5, 0, start[2, 3])
+            stage.bodies["c/leaf"] = stage.users["c/leaf"]
+            stage.go("c/walker", wish)
+            assert abs(body.pose[0, 3] - 0.5) < 0.26, "it stands before the leaf"
+            assert (body.pose[0, 3] > 0.5) == (start[0, 3] > 0.5), "on its own side"
+            assert not overlapping(stage)
+
+
+@pytest.mark.interpreted
+def test_nobody_near_asks_nothing_of_trees(tmp_path: Path) -> None:
+    with staged(tmp_path, [*CONTINUOUS, Crowd()]) as stage:
+        for number, place in enumerate(around(8, 5.0)):
+            stage.enter(f"c/{number}", SMALL, at(*place, heading=number))
+        scratch: Scratch = stage.bodies.scratch
+        for name in stage.users:
+            moved = stage.step(name, (0.1, 0.1, 0))
+            assert moved.crowd is not None and moved.crowd.met == 0
+        assert scratch.counters.tolist() == [0, 0]
+        stage.step("c/0", (-9.9, 0, 0))
+        assert scratch.counters[0] > 0
+
+
+def _walk(folder: Path, seed: int) -> bytes:
+    """Poses of a crowd that jostles, all of them."""
+    rng, found = np.random.default_rng(seed), []
+    with staged(folder, [*CONTINUOUS, Crowd(margin=0.01)]) as stage:
+        for number in range(4):
+            stage.enter(f"c/{number}", SMALL, at(*rng.uniform(-0.6, 0.6, 3)))
+        for _ in range(2 if INTERPRETED else 20):
+            for name, body in stage.users.items():
+                wish = at(*rng.uniform(-0.5, 0.5, 3), heading=rng.uniform(0, 6))
+                stage.go(name, wish)
+                found.append(body.pose.tobytes())
+    return b"".join(found)
+
+
+@pytest.mark.interpreted
+def test_the_same_wishes_give_the_same_poses_bit_for_bit(tmp_path: Path) -> None:
+    (tmp_path / "a").mkdir()
+    (tmp_path / "b").mkdir()
+    assert _walk(tmp_path / "a", 3) == _walk(tmp_path / "b", 3)
+
+
+@pytest.mark.parametrize("effects", [CONTINUOUS, [Stop()]], ids=["continuous", "discrete"])
+def test_random_frames_never_end_in_a_new_overlap(tmp_path: Path, effects: list[AnyEffect]) -> None:
+    rng = np.random.default_rng(11)
+    stops = 0
+    with staged(tmp_path, [*effects, Crowd()]) as stage:
+        models = [SMALL, box(0.5, 0.2, 0.6, 0.06, 0.03), make_avatar(np.zeros((0, 3)), 0.1)]
+        for number, place in enumerate(around(6, 1.0)):
+            stage.enter(f"c/{number}", models[number % 3], at(*place))
+        for _ in range(60):
+            for name, body in stage.users.items():
+                wish = at(*rng.normal(size=3) * [0.5, 0.5, 0.1], heading=rng.uniform(0, 6))
+                moved = stage.go(name, wish)
+                stops += bool(moved.touched)
+                assert not np.array_equal(body.pose, wish) or not moved.touched
+            assert overlapping(stage) == []
+    assert stops > 50
+
+
+@pytest.mark.interpreted
+def test_a_move_of_which_nothing_is_remembered_meets_users_but_not_its_own(tmp_path: Path) -> None:
+    with staged(tmp_path, [*CONTINUOUS, Crowd()]) as stage:
+        stage.enter("c/one", SMALL, at(0))
+        stage.enter("c/two", SMALL, at(1))
+        moved = stage.pipeline.run(Body("c/one", SMALL, at(0.1)), at(3))
+        assert moved.crowd is not None and moved.crowd.met == 1
+        assert moved.pose[0, 0, 3] < 1
+        assert np.array_equal(stage.users["c/one"].pose, at(0))
+        stage.bodies.pop("c/two")
+        stage.bodies.pop("c/two")
+        assert stage.pipeline.run(Body("c/one", SMALL, at(0.1)), at(1.5)).pose[0, 0, 3] == 1.5
+
+
+def test_a_margin_beyond_reason_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(BadRequestError, match="margin 9 m of crowd"):
+        crowd.make(Crowd(margin=9.0), None)
+    large = make_avatar(np.zeros((1, 3)), 5.0)
+    with staged(tmp_path, [Crowd(), Stop()]) as stage, pytest.raises(BadRequestError, match="at most 4 m"):
+        stage.enter("c/large", large, at(0))
+
+
+def test_what_is_not_declared_is_not_imported() -> None:
+    program = """
+import sys
+import solidcloud.server.effects.pipeline, solidcloud.server.effects.stop, solidcloud.server.effects.sweep
+names = ["effects." + name for name in ("crowd", "objects", "bodies", "blocking")] + ["kernels.meeting"]
+print([name for name in names if "solidcloud.server." + name in sys.modules])
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

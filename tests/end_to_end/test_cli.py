@@ -14,7 +14,8 @@ from solidcloud.server.cli import run
 from solidcloud.server.report.serving import free_port, served
 from solidcloud.server.verbs.options import parse_bytes
 
-VERBS = ["build", "info", "validate", "serve", "query", "accuracy", "add", "remove", "reload", "top", "replay", "make"]
+VERBS = "build info validate serve query accuracy add remove reload top replay make".split()
+NESTED = ["make facade", "make town", "make figure", "make walk", "scene", "scene new", "scene check"]
 RADIUS = 0.05
 
 
@@ -46,7 +47,7 @@ def errors(capsys: pytest.CaptureFixture[str]) -> list[str]:
     return [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
 
 
-@pytest.mark.parametrize("verb", ["", *VERBS, "make facade", "make town", "make figure", "make walk"])
+@pytest.mark.parametrize("verb", ["", *VERBS, *NESTED])
 def test_help_loads_no_numpy(verb: str) -> None:
     code = f"import sys; from solidcloud.server.cli import run; code = run({[*verb.split(), '--help']!r})"
     heavy = ["pydantic", "numpy", "numba", "h5py", "zenoh", "rich"]

@@ -18,7 +18,10 @@ from solidcloud.schemas.messages import (
     AvatarInfo,
     CollideRequest,
     ErrorReply,
+    ObjectInfo,
+    SceneInfo,
     ScenesAnswer,
+    SpawnInfo,
     check_answers,
     decode_answer,
     decode_request,
@@ -191,6 +194,18 @@ def test_truncated_or_random_bytes_are_bad_request():
         assert request.poses.shape[1:] == (4, 4) and np.isfinite(request.poses).all()
 
 
+SCENE = {
+    "scene": "hall", "format_version": 3, "wire_version": 1, "points": 9, "voxels": 1,
+    "bounds": [[0, 0, 0], [1, 1, 1]], "origin": [0, 0, 0], "lattice_step": 1e-4, "lattice_source": "default",
+    "voxel_size": 2.0, "radius": 0.05, "radius_model": "mean", "radius_error": 0.0, "radius_sample": 9,
+    "moved_max": 0.0, "degree": 8, "leaf": 32, "sources": [], "skipped": [], "record_bytes": 100, "resident_bytes": 400,
+    "effects": ["stop", "sweep"], "avatars": [{"name": "al", "points": 3, "radius": 0.1, "bounding_radius": 1.0}],
+    "up": [0, 1, 0], "spawn": {"position": [1, 2, 3], "heading": 90}, "default_radius_model": "local",
+    "objects": [{"name": "door", "avatar": "al", "pose": np.eye(4).tolist(), "kind": "hinged"}],
+}  # fmt: skip
+OF_A_FILE = ("effects", "avatars", "up", "spawn", "objects", "default_radius_model")
+
+
 def test_unknown_fields_are_refused_in_requests_and_ignored_in_answers():
     later = {"name": "al", "points": 3, "radius": 0.1, "bounding_radius": 1.0, "mood": "good"}
     for encoding, encoder in ((MSGPACK, msgspec.msgpack), (JSON, msgspec.json)):
@@ -207,6 +222,21 @@ def test_unknown_fields_are_refused_in_requests_and_ignored_in_answers():
     }
     got = decode_answer(CollideAnswers, msgspec.msgpack.encode(columns | {"mood": 1}))
     assert len(check_answers(got, 1)) == 1 and got.faults == ()
+
+
+def test_a_scene_of_an_older_server_has_no_file():
+    older = {name: SCENE[name] for name in SCENE if name not in OF_A_FILE}
+    for encoding, encoder in ((MSGPACK, msgspec.msgpack), (JSON, msgspec.json)):
+        found = decode_answer(SceneInfo, encoder.encode(older), encoding)
+        assert (found.effects, found.avatars, found.objects, found.spawn) == ([], [], [], None)
+        assert found.up == (0.0, 0.0, 1.0) and found.default_radius_model is None
+        later = {**SCENE, "weather": "fine", "spawn": {"position": [1, 2, 3], "mood": "good"}}
+        found = decode_answer(SceneInfo, encoder.encode(later), encoding)
+        assert found.spawn == SpawnInfo((1.0, 2.0, 3.0), 0.0) and found.avatars == [
+            AvatarInfo("al", 3, 0.1, 1.0)
+        ]
+        assert found.objects == [ObjectInfo("door", "al", np.eye(4).tolist(), "hinged")]
+        assert decode_answer(SceneInfo, encode(found, encoding), encoding) == found
 
 
 def test_answers_that_are_none_are_internal_errors_never_guesses():

@@ -228,7 +228,7 @@ def estimate(scene: Scene, config: BuildConfig, rates: Rates, target: Path | Non
     pitch = math.sqrt(scene.area / scene.points)
     voxels = _voxels(scene, config.voxel, rates)
     jobs = jobs_that_fit(worker_count(config.jobs, scene.points), config)
-    columns = sum({"scan": 0.2, "intensity": 2.0, "normal": 2.0}[name] for name in config.keep) + (
+    columns = sum({"scan": 0.2, "intensity": 2.0, "normal": 1.2}[name] for name in config.keep) + (
         config.models != {"mean"}
     )
     each = rates.bytes_a_point(pitch / step) + columns
@@ -318,6 +318,8 @@ def _assumed(config: BuildConfig, rates: Rates, jobs: int) -> tuple[str, ...]:
     )
     if config.models != {"mean"}:
         said.append("radius classes: their bytes are counted, their time (2.5 µs a point of one core) is not")
+    if "normal" in config.keep:
+        said.append("normals: their bytes are counted, their time (1.6 µs a point of one core) is not")
     if config.thin is not None or config.outliers is not None or config.moving is not None:
         said.append(
             "no point is left out by filters, and their time (0.3 to 3 µs a point of one core) is not counted"

@@ -6,6 +6,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 import cases
@@ -17,6 +18,7 @@ import scans
 from numpy.typing import NDArray
 from solidcloud.schemas.errors import BadRequestError
 from solidcloud.schemas.kernels.normals import LINE, NONE, THICK
+from solidcloud.server.left_out import LeftOut
 from solidcloud.server.normals import Normals
 from solidcloud.server.opened import Opened
 from solidcloud.server.store import Store
@@ -272,3 +274,26 @@ def test_of_normals_that_nobody_asks_for_nothing_is_in_memory(tmp_path: Path, no
     assert (kept.sizes == other.sizes).all() and not kept.with_normals
     kept.close()
     other.close()
+
+
+def test_what_is_left_out_has_no_say_whether_normals_are_stored_or_not(tmp_path: Path) -> None:
+    options = {"keep": frozenset({"normal"}), "normal_reach": REACH}
+    case = build(tmp_path, "corner", COUNT // 3, **options)
+    box = np.array([[-0.6, -0.6, -0.6], [0.1, 0.4, 1.5]])
+    without = partial(LeftOut, boxes=[box])
+    found = []
+    for reach in (None, REACH):
+        opened = Opened(Store(case.archive, without, normals=reach), 1 << 24)
+        try:
+            assert opened.store.with_normals == (reach is not None)
+            normals = Normals(opened.store, opened.data)
+            places = [place for place, *_ in judged(opened, case.points)]
+            left = [place for place in places if not ((box[0] <= place) & (place <= box[1])).all()]
+            assert len(places) > len(left) > 20
+            found.append([normals.code(place, REACH) for place in left])
+            assert normals.estimated == (0 if reach else len(left))
+        finally:
+            opened.release()
+    assert found[0] == found[1]
+    with asked(case.archive) as (_, normals):
+        assert [normals.code(place, REACH) for place in left] != found[0]

@@ -19,11 +19,7 @@ multiplied in the order of their numbers.
 """
 
 import math
-from collections.abc import Mapping
-from typing import NamedTuple
-
-import numpy as np
-from numpy.typing import NDArray
+from collections.abc import Iterable, Mapping
 
 # How many standard deviations away a scan is left out, and what it adds to the probability at most.
 FARTHEST = 4.0
@@ -38,52 +34,21 @@ def contact_probability(gap: float, sigma: float) -> float:
 LEFT_OUT = contact_probability(FARTHEST, 1.0)
 
 
-class Probable(NamedTuple):
-    """That of contact lies between `least` and `most`.  scans: of each scan alone, by its number, ascending."""
+def each_alone(gaps: Mapping[int, float], sigmas: Mapping[int, float]) -> dict[int, float]:
+    """The probability of contact with each scan alone, by its number, ascending; those within FARTHEST of its sigma.
 
-    least: float
-    most: float
-    scans: dict[int, float]
-
-    @property
-    def known(self) -> bool:
-        """Whether least and most are the same, within what the model leaves out of each scan."""
-        return self.most - self.least <= LEFT_OUT
-
-
-def least_gaps(scans: NDArray[np.int32], gaps: NDArray[np.float64]) -> dict[int, float]:
-    """The least signed gap of each scan, by its number, in ascending order.
-
-    scans, gaps: (p,) the scan and the signed gap [m] of pairs, deepest first, as `contacts` lists them.
+    gaps: the least signed gap [m] of scans.  sigmas: [m], of these and perhaps others.
     """
-    numbers, first = np.unique(scans, return_index=True)
-    return dict(zip(numbers.tolist(), gaps[first].tolist(), strict=True))
-
-
-def probable(
-    gaps: Mapping[int, float], sigmas: Mapping[int, float], farthest: float | None = None
-) -> Probable:
-    """The probability of contact.
-
-    gaps: the least signed gap [m] of each scan that was met.  sigmas: [m] of each scan that there is, those met and
-    others.  farthest: others are at least so far [m]; None: out of the question.
-    """
-    alone = {
+    return {
         number: contact_probability(gaps[number], sigmas[number])
         for number in sorted(gaps)
         if gaps[number] <= FARTHEST * sigmas[number]
     }
-    least = 0.0
-    for own in alone.values():
-        least = _either(least, own)
-    most = least
-    if farthest is not None:
-        for number in sorted(sigmas.keys() - gaps.keys()):
-            if farthest <= FARTHEST * sigmas[number]:
-                most = _either(most, contact_probability(farthest, sigmas[number]))
-    return Probable(least, most, alone)
 
 
-def _either(one: float, other: float) -> float:
-    """The probability of one or the other of two that are independent; not below either, nor above 1."""
-    return min(1.0, one + other * (1.0 - one))
+def together(alone: Iterable[float]) -> float:
+    """The probability of contact with any of several scans that are independent; not below any one's, nor above 1."""
+    found = 0.0
+    for own in alone:
+        found = min(1.0, found + own * (1.0 - found))
+    return found

@@ -5,7 +5,7 @@ import statistics
 
 import numpy as np
 import pytest
-from solidcloud.server.uncertainty import FARTHEST, LEFT_OUT, contact_probability, least_gaps, probable
+from solidcloud.server.uncertainty import FARTHEST, LEFT_OUT, contact_probability, each_alone, together
 
 # Upper tails of the normal distribution, from tables (Abramowitz and Stegun, table 26.1; 26.2 for the last).
 TAILS = {
@@ -34,7 +34,7 @@ def test_both_ends_are_zero_and_one_and_nothing_overflows() -> None:
         assert contact_probability(-16.0, sigma) == 1.0 or sigma == 1.0
         assert 0.0 <= contact_probability(16.0, sigma) < 1e-50
     assert contact_probability(-16.0, 1e-300) == 1.0 and contact_probability(16.0, 1e-300) == 0.0
-    assert probable({}, {0: 0.01}).least == 0.0
+    assert together(each_alone({}, {0: 0.01}).values()) == 0.0
 
 
 def test_scans_are_independent(rng: np.random.Generator) -> None:
@@ -43,33 +43,20 @@ def test_scans_are_independent(rng: np.random.Generator) -> None:
         sigmas = dict(enumerate(rng.uniform(0.001, 0.05, 6).tolist()))
         gaps = {number: float(sigmas[number] * rng.uniform(-3, 3)) for number in range(5, -1, -1)}
         expected = 1 - math.prod(normal.cdf(gaps[number] / sigmas[number]) for number in gaps)
-        found = probable(gaps, sigmas)
-        assert found.least == found.most == pytest.approx(expected, abs=1e-14) and found.known
-        assert list(found.scans) == sorted(gaps)
-        assert max(found.scans.values()) <= found.least <= min(1.0, sum(found.scans.values()))
+        alone = each_alone(gaps, sigmas)
+        assert together(alone.values()) == pytest.approx(expected, abs=1e-14)
+        assert list(alone) == sorted(gaps)
+        assert max(alone.values()) <= together(alone.values()) <= min(1.0, sum(alone.values()))
 
 
 def test_what_is_farther_than_four_deviations_is_left_out_and_adds_less_than_said() -> None:
     sigma = 0.01
     at, beyond = FARTHEST * sigma, np.nextafter(FARTHEST * sigma, 1.0)
-    assert probable({0: at}, {0: sigma}).scans == {0: pytest.approx(LEFT_OUT)}
-    assert probable({0: float(beyond)}, {0: sigma}) == (0.0, 0.0, {})
+    assert each_alone({0: at}, {0: sigma}) == {0: pytest.approx(LEFT_OUT)}
+    assert each_alone({0: float(beyond)}, {0: sigma}) == {}
     assert 3.1e-5 < LEFT_OUT < 3.2e-5
     # Of each scan its own.
-    assert list(probable({0: at, 1: at}, {0: sigma, 1: sigma / 2}).scans) == [0]
-
-
-def test_scans_that_were_not_listed_are_bounded_by_the_last_pair_listed() -> None:
-    sigmas = {0: 0.01, 1: 0.01, 2: 0.02, 3: 0.001}
-    found = probable({0: 0.002}, sigmas, farthest=0.01)
-    one, two, none = (contact_probability(0.01, sigmas[number]) for number in (1, 2, 3))
-    assert none < 1e-20  # 10 deviations: left out
-    assert found.least == contact_probability(0.002, 0.01)
-    assert found.most == pytest.approx(1 - (1 - found.least) * (1 - one) * (1 - two))
-    assert not found.known
-    assert probable({0: -0.06}, sigmas, farthest=-0.001).known, "whatever the others are, it is contact"
-    assert probable({0: 0.002}, sigmas, farthest=0.1).known, "the others are too far"
-    assert probable({0: 0.002}, {0: 0.01}, farthest=0.002).known, "there are no others"
+    assert list(each_alone({0: at, 1: at}, {0: sigma, 1: sigma / 2})) == [0]
 
 
 def test_more_noise_or_less_gap_never_lessens_the_probability_of_what_is_clear(
@@ -80,11 +67,3 @@ def test_more_noise_or_less_gap_never_lessens_the_probability_of_what_is_clear(
     assert said == sorted(said, reverse=True)
     said = [contact_probability(0.01, 0.001 + gap) for gap in gaps]
     assert said == sorted(said)
-
-
-def test_the_least_gap_of_each_scan_is_the_first_listed() -> None:
-    scans = np.array([2, 2, 0, 2, 0, 7], np.int32)
-    gaps = np.array([-0.3, -0.2, -0.1, 0.0, 0.1, 0.2])
-    assert least_gaps(scans, gaps) == {0: -0.1, 2: -0.3, 7: 0.2}
-    assert list(least_gaps(scans, gaps)) == [0, 2, 7]
-    assert least_gaps(scans[:0], gaps[:0]) == {}

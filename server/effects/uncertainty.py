@@ -1,0 +1,177 @@
+"""`uncertainty`: how probable contact is, each frame, where scans measure ranges with some noise.
+
+server/uncertainty.py says what is assumed. Of the scene as scanned; users and dynamic objects are not in it.
+"""
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from pathlib import PurePath
+from typing import Any, NamedTuple
+
+from ...schemas.effects import Uncertainty
+from ...schemas.errors import BadRequestError
+from ...schemas.messages import SceneInfo, SourceInfo
+from ...schemas.moves import UncertaintyReport
+from ...schemas.voxel_grid import UNITS_PER_METRE
+from ..by_scan import ANY_SCAN, gaps_by_scan
+from ..near import near
+from ..posed import under
+from ..uncertainty import FARTHEST, each_alone, together
+from .apart import farther
+from .frame import Frame
+
+# Names told in an error.
+TOLD = 8
+# A margin is rounded to exact units: one more, so that nothing within four sigma is left out.
+UNIT = 1.0 / UNITS_PER_METRE
+
+# What a source may be called, shortest first: a later one tells apart what an earlier one does not.
+_NAMES: tuple[Callable[[SourceInfo], str], ...] = (
+    lambda source: PurePath(source.path).name,
+    lambda source: source.path,
+    lambda source: f"{source.path}:{source.index}",
+)
+
+
+def scan_names(sources: Sequence[SourceInfo]) -> list[str]:
+    """What each source is called in reports: its file's name; where others have it too, its path; where it is one scan
+    of several in a file, with its place in it."""
+    counts = [Counter(name(source) for source in sources) for name in _NAMES]
+    return [
+        next(
+            (name(s) for name, count in zip(_NAMES, counts, strict=True) if count[name(s)] == 1),
+            _NAMES[-1](s),
+        )
+        for s in sources
+    ]
+
+
+def _called(effect: Uncertainty, source: SourceInfo) -> float | None:
+    """The standard deviation [m] that `scans` gives a source, by the longest of its names; None: none."""
+    own = [effect.scans[name(source)] for name in reversed(_NAMES) if name(source) in effect.scans]
+    return own[0] if own else None
+
+
+def check(effect: Uncertainty, *infos: SceneInfo) -> None:
+    """BadRequestError where a name in `scans` is that of no scan. infos: of the scene's archives."""
+    sources = [source for info in infos for source in info.sources if not source.fault]
+    names = {name(source) for source in sources for name in _NAMES}
+    for name in effect.scans:
+        if name not in names:
+            listed = sorted({_NAMES[0](source) for source in sources})
+            more = f", and {len(listed) - TOLD} more" if len(listed) > TOLD else ""
+            raise BadRequestError(
+                f"uncertainty: scans: {name!r} is no scan of {', '.join(info.scene for info in infos)}: expected "
+                f"{', '.join(listed[:TOLD])}{more}: `solidcloud info` lists them"
+            )
+
+
+class Scans(NamedTuple):
+    """The scans of one archive. sigmas: [m], by their rows in `SceneInfo.sources`.  names: of each row, in reports.
+
+    one: the only one there is, or ANY_SCAN, where the archive does not say which scan a point is of; None: it does.
+    """
+
+    sigmas: dict[int, float]
+    names: list[str]
+    one: int | None
+
+
+class Known(NamedTuple):
+    """The scans of each archive of a world, of these generations."""
+
+    generations: tuple[int, ...]
+    scans: list[Scans]
+
+
+def scans_of(effect: Uncertainty, info: SceneInfo, keeps_scan: bool) -> Scans:
+    """The scans of an archive. keeps_scan: whether it says which scan each point is of."""
+    sigmas, live = {ANY_SCAN: effect.sigma}, []
+    for number, source in enumerate(info.sources):
+        if not source.fault:
+            live.append(number)
+            own = _called(effect, source)
+            sigmas[number] = effect.sigma if own is None else own
+    one = live[0] if len(live) == 1 else None if keeps_scan else ANY_SCAN
+    return Scans(sigmas, scan_names(info.sources), one)
+
+
+def _check_kept(effect: Uncertainty, info: SceneInfo) -> None:
+    """BadRequestError where `scans` tells apart what an archive does not that keeps no scans."""
+    live = [source for source in info.sources if not source.fault]
+    for source in live:
+        if len(live) > 1 and _called(effect, source) is not None:
+            raise BadRequestError(
+                f"uncertainty: scans: {info.scene} does not keep which scan a point is of: build it with --keep scan, "
+                f"or leave {_NAMES[0](source)!r} out"
+            )
+
+
+def make(effect: Uncertainty, world: Any) -> "UncertaintyRunner":
+    """The effect of a scene. BadRequestError as `check`, and where `scans` tells apart what an archive does not."""
+    with world as seen:
+        infos = [each.placed.scene.info() for each in seen]
+        check(effect, *infos)
+        for each, info in zip(seen, infos, strict=True):
+            if not each.data.keeps_scan:
+                _check_kept(effect, info)
+    return UncertaintyRunner(effect, world)
+
+
+class UncertaintyRunner:
+    """Reports the probability of contact at the frame's pose."""
+
+    name = "uncertainty"
+
+    def __init__(self, effect: Uncertainty, world: Any) -> None:
+        """world: whose scans there are; after a reload, others."""
+        self._effect = effect
+        self._margin = FARTHEST * max(effect.sigma, *effect.scans.values(), 0.0)
+        self._known = self._scans_of(world)
+
+    def _scans_of(self, world: Any) -> Known:
+        """The scans of each archive, as they are now."""
+        with world as seen:
+            return Known(
+                world.generations(),
+                [scans_of(self._effect, each.placed.scene.info(), each.data.keeps_scan) for each in seen],
+            )
+
+    def run(self, frame: Frame) -> None:
+        """Look, and report."""
+        frame.reports[self.name] = self._report(frame)
+
+    def _report(self, frame: Frame) -> UncertaintyReport:
+        """What is to be said: at least so probable, where not all in reach could be looked at."""
+        if farther(frame, self._margin):
+            return UncertaintyReport(0.0)
+        alone: list[float] = []
+        named: dict[str, float] = {}
+        exact = True
+        with frame.world as seen:
+            known = self._known
+            if known.generations != frame.world.generations():
+                known = self._known = self._scans_of(frame.world)
+            for archive, (each, scans) in enumerate(zip(seen, known.scans, strict=True)):
+                gaps, all_seen = self._gaps(frame, each, scans)
+                exact &= all_seen
+                for number, own in each_alone(gaps, scans.sigmas).items():
+                    alone.append(own)
+                    if number != ANY_SCAN:
+                        name = scans.names[number]
+                        # One file may be in two archives.
+                        named[name if name not in named else f"{name} ({archive})"] = own
+        return UncertaintyReport(together(alone), named, not exact)
+
+    def _gaps(self, frame: Frame, each: Any, scans: Scans) -> tuple[dict[int, float], bool]:
+        """The least signed gap [m] of each scan of an archive that is within the margin, and whether all was seen."""
+        inverse, avatar, margin = each.placed.inverse, frame.body.avatar, self._margin + UNIT
+        pose = frame.pose if inverse is None else under(inverse, frame.pose[None])[0]
+        if scans.one is None:
+            found = gaps_by_scan(each.data, avatar, pose, margin, len(scans.names), frame.effort)
+            frame.world.count(found.node_visits)
+            return found.gaps, found.exact
+        answers = near(each.data, avatar, pose, margin, frame.effort)
+        frame.world.count(int(answers.node_visits[0]))
+        gap = float(answers.signed_distance[0])
+        return {scans.one: gap} if gap <= margin else {}, bool(answers.exact[0])

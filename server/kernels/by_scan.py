@@ -1,0 +1,208 @@
+"""The nearest pair of each scan: two hierarchies descended together, a scan's nearest pair so far bounding its next.
+
+The descent is that of contacts.py; what is nearer, and what a pair rules out, is that of closest.py, for every scan
+that has points here. A node does not know whose points it holds, so it is looked into as far as the margin; a leaf node
+does, and is left alone where it is farther than the nearest of each scan that it has points of: a wall that one scan
+saw costs no more than its nodes and the numbers of its points.
+"""
+
+import math
+from typing import NamedTuple
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+
+from ...schemas.voxel_grid import UNITS_PER_METRE
+from .closest import lower_bound, set_cut
+from .compiled import borrowing
+from .layout import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, node_class, point_class, scan_run
+from .overlap import STACK, nodes_meet
+from .placed import ByClass, make_by_class, make_placed, pair_square, place_block, place_nodes, set_by_class
+
+
+class Nearer(NamedTuple):
+    """What is known of each of n scans; the last stands for numbers that no scan has.
+
+    gaps: (n,) float64, least signed gap [m], inf: none within the margin.  units: (n,) int64, what |a - b| + drop of
+    its nearest pair is at most, exact units (closest.py).
+    """
+
+    gaps: NDArray[np.float64]
+    units: NDArray[np.int64]
+
+
+class Work(NamedTuple):
+    """Scratch of one call. cut, far: (n, classes) float32, see `closest.Best`, by scan.  frame: (5,), of `Best`.
+
+    by_class: thresholds of the margin.  stack: (STACK, 2) int64.  off: (3,) float32.  squares: (LANES,) float32.
+    keep: (LANES,) bool.  counts: (3,) int64, voxels missing, node visits, point tests.
+    """
+
+    cut: NDArray[np.float32]
+    far: NDArray[np.float32]
+    frame: NDArray[np.float64]
+    by_class: ByClass
+    stack: NDArray[np.int64]
+    off: NDArray[np.float32]
+    squares: NDArray[np.float32]
+    keep: NDArray[np.bool_]
+    counts: NDArray[np.int64]
+
+
+@borrowing
+def _measure(
+    avatar, m, block, lane, placed, scene, voxel, lane_at, block_at, j, s, own, radii, most, nearer, work
+):
+    """Take one pair as its scan's nearest if it is. radii: r_a + r_b of it, most: with the margin, exact units."""
+    square = pair_square(avatar, m, block, lane, placed, scene, voxel, lane_at, block_at, j)
+    if square < 0 or square > most * most:
+        return
+    root = math.sqrt(np.float64(square))
+    both = root + np.float64(radii)
+    # As signed.py has it.
+    gap = np.float64(square - radii * radii) / both / UNITS_PER_METRE if both > 0.0 else 0.0
+    if gap < nearer.gaps[s]:
+        nearer.gaps[s] = gap
+        units = np.int64(root) + 2 + scene.drop[own]
+        if units < nearer.units[s]:
+            nearer.units[s] = units
+            set_cut(work.cut[s], work.far[s], work.frame, scene.drop, units)
+
+
+@borrowing
+def _search_leaves(avatar, m, a, block, placed, scene, voxel, row, reach_units, margin_units, nearer, work):
+    """Take up what is nearer, of each scan, of the points of an avatar's leaf node and of a scene's, at work.off."""
+    words, ints, halves, off = scene.words, scene.ints, scene.halves, work.off
+    keep, squares, cut, far, mask = work.keep, work.squares, work.cut, work.far, work.by_class.mask
+    nodes, lanes, last = placed.nodes, placed.lanes, nearer.gaps.shape[0] - 1
+    number = ~ints[row + FIRST]
+    block_at = scene.where[voxel, 1] + number * scene.block_words
+    lane_at = scene.where[voxel, 2] + number * 3 * LANES
+    scan_at = scan_run(scene.where, voxel, scene.block_words) + number * LANES
+    c, held = node_class(ints, row, mask), ints[row + COUNT] & COUNTED
+    bound = lower_bound(
+        words, row, nodes[0, a] - off[0], nodes[1, a] - off[1], nodes[2, a] - off[2], nodes[3, a]
+    )
+    wanted = False
+    for j in range(held):
+        keep[j] = bound <= cut[min(np.int64(halves[scan_at + j]), last), c]
+        wanted |= keep[j]
+    if not wanted:
+        return
+    if placed.stamp[block] != 0:
+        place_block(avatar, m, block, placed, scene)
+        placed.stamp[block] = 0
+    low_x = off[0] + np.float32(ints[block_at])
+    low_y = off[1] + np.float32(ints[block_at + 1])
+    low_z = off[2] + np.float32(ints[block_at + 2])
+    for j in range(held):
+        s = min(np.int64(halves[scan_at + j]), last)
+        if not keep[j] or not bound <= cut[s, c]:
+            continue
+        own = point_class(ints, block_at, j, mask)
+        x = np.float32(halves[lane_at + j])
+        y = np.float32(halves[lane_at + LANES + j])
+        z = np.float32(halves[lane_at + 2 * LANES + j])
+        work.counts[2] += LANES
+        within = far[s, own]
+        touched = False
+        for lane in range(LANES):
+            dx = x - (lanes[block, 0, lane] - low_x)
+            dy = y - (lanes[block, 1, lane] - low_y)
+            dz = z - (lanes[block, 2, lane] - low_z)
+            squares[lane] = dx * dx + dy * dy + dz * dz
+            touched |= squares[lane] <= within
+        if not touched:
+            continue
+        most = reach_units - scene.drop[own]
+        for lane in range(avatar.count[a]):
+            if squares[lane] <= far[s, own]:
+                _measure(
+                    avatar, m, block, lane, placed, scene, voxel, lane_at, block_at, j, s, own, most - margin_units,
+                    most, nearer, work,
+                )  # fmt: skip
+
+
+@borrowing
+def _search_voxel(avatar, m, placed, scene, voxel, reach_units, margin_units, visits, nearer, work):
+    """Search one resident voxel for each scan's nearest pair. Returns whether it was looked at to the end."""
+    words, ints = scene.words, scene.ints
+    base = scene.where[voxel, 0]
+    nodes, off, stack, counts = placed.nodes, work.off, work.stack, work.counts
+    first, held = avatar.first, avatar.count
+    rooms, mask = work.by_class.room, work.by_class.mask
+    for r in range(3):
+        off[r] = np.float32(scene.coordinates[voxel, r] * scene.voxel_steps - placed.frame[r])
+    counts[1] += 1
+    stack[0, 0], stack[0, 1] = 0, base
+    depth = 1 if nodes_meet(
+        words, base, nodes[0, 0] - off[0], nodes[1, 0] - off[1], nodes[2, 0] - off[2], nodes[3, 0],
+        rooms[node_class(ints, base, mask)],
+    ) else 0  # fmt: skip
+    while depth > 0:
+        depth -= 1
+        a, row = stack[depth, 0], stack[depth, 1]
+        a_first, b_first = first[a], ints[row + FIRST]
+        if a_first < 0 and b_first < 0:
+            _search_leaves(
+                avatar, m, a, ~a_first, placed, scene, voxel, row, reach_units, margin_units, nearer, work
+            )
+            continue
+        if counts[1] >= visits:
+            return False
+        if b_first < 0 or (a_first >= 0 and nodes[3, a] > words[row + 3]):
+            counts[1] += held[a]
+            room = rooms[node_class(ints, row, mask)]
+            for child in range(a_first, a_first + held[a]):
+                if nodes_meet(
+                    words, row, nodes[0, child] - off[0], nodes[1, child] - off[1], nodes[2, child] - off[2],
+                    nodes[3, child], room,
+                ):  # fmt: skip
+                    stack[depth, 0], stack[depth, 1] = child, row
+                    depth += 1
+        else:
+            x, y, z = nodes[0, a] - off[0], nodes[1, a] - off[1], nodes[2, a] - off[2]
+            children = ints[row + COUNT] & COUNTED
+            counts[1] += children
+            for child in range(children):
+                child_row = base + (b_first + child) * ROW_WORDS
+                if nodes_meet(
+                    words, child_row, x, y, z, nodes[3, a], rooms[node_class(ints, child_row, mask)]
+                ):
+                    stack[depth, 0], stack[depth, 1] = a, child_row
+                    depth += 1
+    return True
+
+
+@nb.njit(nogil=True, cache=True)
+def nearest_by_scan(poses, avatar, scene, reach, margin_units, visits, nearer, counts):
+    """The least signed gap of each scan to an avatar under one pose, within a margin.
+
+    poses: (1, 4, 4), checked.  avatar: not empty.  scene: with scan numbers.  reach: Reach of the pose; a voxel in it
+    that is not resident is counted as missing.  margin_units: of it, what is not the radii.  visits: node visits after
+    which no node is looked into.  nearer: inf and reach.units to begin with, or as a call for other voxels left it.
+    counts: (3,) int64, voxels missing, node visits, point tests, added to.
+    Returns whether all resident voxels were looked at to the end.
+    """
+    m, units = poses[0], reach.units[0]
+    placed, n, classes = make_placed(avatar), nearer.gaps.shape[0], scene.drop.shape[0]
+    work = Work(
+        np.empty((n, classes), np.float32), np.empty((n, classes), np.float32), np.empty(5), make_by_class(scene.drop),
+        np.empty((STACK, 2), np.int64), np.empty(3, np.float32), np.empty(LANES, np.float32),
+        np.empty(LANES, np.bool_), counts,
+    )  # fmt: skip
+    extent, farthest = place_nodes(avatar, m, reach.scales[0], placed, scene)
+    work.frame[0], work.frame[1] = extent, farthest
+    work.frame[2], work.frame[3] = scene.units_per_step, np.float64(scene.voxel_steps)
+    set_by_class(work.by_class, scene.drop, units, scene.units_per_step, extent, farthest, scene.voxel_steps)
+    for s in range(n):
+        set_cut(work.cut[s], work.far[s], work.frame, scene.drop, nearer.units[s])
+    done = True
+    for at in range(reach.starts[0], reach.starts[1]):
+        voxel = reach.rows[at]
+        if scene.where[voxel, 0] < 0:
+            counts[0] += 1
+        else:
+            done &= _search_voxel(avatar, m, placed, scene, voxel, units, margin_units, visits, nearer, work)
+    return done

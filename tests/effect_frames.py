@@ -1,0 +1,85 @@
+"""Frames for one effect at a time: a world of archives, a body, and the effect's report at a pose."""
+
+import os
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from solidcloud.schemas.archive import Archive
+from solidcloud.schemas.scene import ArchiveItem, SceneFile
+from solidcloud.server.avatar import AvatarModel
+from solidcloud.server.effects.frame import Body, Frame
+from solidcloud.server.effort import EXACT, Effort
+from solidcloud.server.scene import Scene
+from solidcloud.server.world import World
+
+
+class Counting:
+    """A world whose questions are counted, by name. reaches: of `distance`."""
+
+    def __init__(self, world: World) -> None:
+        self._world = world
+        self.asked = {"distance": 0, "contacts": 0}
+        self.reaches: list[float] = []
+
+    def __enter__(self) -> Any:
+        return self._world.__enter__()
+
+    def __exit__(self, *what: object) -> None:
+        self._world.__exit__(*what)
+
+    def generations(self) -> tuple[int, ...]:
+        """As the world's."""
+        return self._world.generations()
+
+    def count(self, visits: int) -> None:
+        """As the world's."""
+        self._world.count(visits)
+
+    def distance(self, avatar: AvatarModel, pose: Any, reach: float, **how: Any) -> Any:
+        """Counted."""
+        self.asked["distance"] += 1
+        self.reaches.append(reach)
+        return self._world.distance(avatar, pose, reach, **how)
+
+    def contacts(self, *what: Any, **how: Any) -> Any:
+        """Counted."""
+        self.asked["contacts"] += 1
+        return self._world.contacts(*what, **how)
+
+
+def world_of(*scenes: Scene, poses: Any = ()) -> Counting:
+    """The world of opened archives. poses: of each, archive to world; left out: the identity."""
+
+    archives = list(zip(scenes, poses or [None] * len(scenes), strict=True))
+    file = SceneFile(format=1, archives=[ArchiveItem(path=scene.name) for scene in scenes])
+    return Counting(World(SimpleNamespace(archives=archives), file))
+
+
+def flip_a_byte(archive: Path, voxel: tuple[int, int, int]) -> None:
+    """Damage the points of one voxel's record."""
+    with Archive(archive) as opened:
+        row = int(np.flatnonzero((opened.coordinates == voxel).all(axis=1))[0])
+        entry = opened.voxels[row]
+        path = opened.shard_path(int(entry["shard"]))
+    with open(path, "r+b") as file:
+        offset = int(entry["frame_offset"][2]) + int(entry["frame_bytes"][2]) // 2
+        byte = os.pread(file.fileno(), 1, offset)[0]
+        os.pwrite(file.fileno(), bytes([byte ^ 1]), offset)
+
+
+def report(runner: Any, world: Any, body: Body, pose: NDArray[np.float64], effort: Effort = EXACT) -> Any:
+    """What an effect says of a body at a pose, the world held as the pipeline holds it."""
+    frame = Frame(body, pose, 1 / 30, world, effort, pose)
+    with world:
+        runner.run(frame)
+    assert list(frame.reports) == [runner.name]
+    assert frame.pose is pose, "it says something, it moves nothing"
+    return frame.reports[runner.name]
+
+
+def body_of(avatar: AvatarModel) -> Body:
+    """A user that nothing is remembered of."""
+    return Body("client/body", avatar, np.eye(4))

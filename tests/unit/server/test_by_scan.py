@@ -1,0 +1,66 @@
+"""`gaps_by_scan`: one wall that two scans saw, and what is missing."""
+
+from contextlib import closing
+from pathlib import Path
+
+import cases
+import cases_contacts
+import numpy as np
+import pytest
+from solidcloud.server.avatar import make_avatar
+from solidcloud.server.by_scan import ANY_SCAN, ScanGaps, gaps_by_scan
+from solidcloud.server.effort import Effort
+
+BALL = make_avatar([[0.0, 0, 0], [0.02, 0, 0]], 0.1)
+POSE = cases.pose_of(np.eye(3), np.array([0.5, 0.0, 0.13]))
+
+
+def row(folder: Path) -> cases_contacts.ScanCase:
+    """Twelve points in a row, by turns of two scans; spheres of 1 cm."""
+    points = np.column_stack([np.arange(12) * 0.1, np.zeros(12), np.zeros(12)])
+    return cases_contacts.open_case(folder, points, np.random.default_rng(3), leaf=2, voxel=4.0)
+
+
+@pytest.mark.interpreted
+def test_each_scan_has_its_nearest_pair(tmp_path: Path) -> None:
+    case = row(tmp_path)
+    spheres = (BALL.points + POSE[:3, 3])[:, None] - case.points
+    gaps = np.linalg.norm(spheres, axis=2).min(axis=0) - 0.11
+    with closing(case.store):
+        found = gaps_by_scan(case.data, BALL, POSE, 0.15, 2)
+    assert found.exact and found.point_tests > 0
+    for scan in (0, 1):
+        assert found.gaps[scan] == pytest.approx(gaps[case.numbers == scan].min(), abs=1e-7)
+    assert found.gaps[0] != found.gaps[1]
+
+
+@pytest.mark.interpreted
+def test_beyond_the_margin_a_scan_is_not_there(tmp_path: Path) -> None:
+    case = row(tmp_path)
+    with closing(case.store):
+        both = gaps_by_scan(case.data, BALL, POSE, 0.15, 2).gaps
+        less = float(np.mean(list(both.values())))
+        first = min(both, key=both.__getitem__)
+        assert gaps_by_scan(case.data, BALL, POSE, less, 2).gaps == {first: both[first]}
+        assert gaps_by_scan(case.data, BALL, POSE, 0.0, 2).gaps == {}
+
+
+@pytest.mark.interpreted
+def test_what_is_missing_or_not_looked_at_is_not_exact(tmp_path: Path) -> None:
+    case = row(tmp_path)
+    with closing(case.store):
+        assert gaps_by_scan(case.data, make_avatar(np.empty((0, 3))), POSE, 0.1, 2) == ScanGaps({}, True)
+        assert not gaps_by_scan(case.data, BALL, POSE, 0.1, 2, Effort(visits=1)).exact
+        late = gaps_by_scan(case.data, BALL, POSE, 0.1, 2, Effort(deadline=0.0))
+        assert late == ScanGaps({}, False)
+        lost = case.data._replace(unknown_everywhere=True)
+        assert not gaps_by_scan(lost, BALL, POSE, 0.1, 2).exact
+
+
+@pytest.mark.interpreted
+def test_a_number_that_no_scan_has_harms_nothing(tmp_path: Path) -> None:
+    case = row(tmp_path)
+    with closing(case.store):
+        both = gaps_by_scan(case.data, BALL, POSE, 0.15, 2).gaps
+        fewer = gaps_by_scan(case.data, BALL, POSE, 0.15, 1).gaps
+    assert fewer == {0: both[0], ANY_SCAN: both[1]}

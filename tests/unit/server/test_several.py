@@ -169,6 +169,7 @@ def test_a_sweep_ends_at_the_earliest_contact(
     both: SeveralScenes, whole: Scene, built: Built, rng: np.random.Generator
 ) -> None:
     poses = near(rng, np.vstack(built.points))
+    poses[:2, 2, 3] += [5.0, 6.0]  # a motion between these two meets nothing
     ends = np.roll(poses, 1, axis=0)
     found, expected = both.sweep("al", poses, ends), whole.sweep("al", poses, ends)
     assert found.verdict.tolist() == expected.verdict.tolist()
@@ -182,6 +183,7 @@ def test_a_sweep_ends_at_the_earliest_contact(
     assert np.abs(apart - (RADIUS + 0.01)).max() < 0.2 and (apart <= RADIUS + 0.01 + 1e-7).all()
 
 
+@pytest.mark.interpreted
 def test_an_archive_moved_exactly_answers_as_the_pose_moved(built: Built, rng: np.random.Generator) -> None:
     for _ in range(3):
         pose = exact_pose(rng)
@@ -219,6 +221,7 @@ def test_an_archive_moved_exactly_answers_as_the_pose_moved(built: Built, rng: n
             np.testing.assert_array_equal(hits[0].cloud_point, moved(pose, hits[1].cloud_point))
 
 
+@pytest.mark.interpreted
 def test_verdicts_are_those_of_the_naive_judge_of_both(built: Built, rng: np.random.Generator) -> None:
     pose = exact_pose(rng)
     seen = np.vstack([built.points[0], moved(pose, built.points[1])])
@@ -306,7 +309,7 @@ def test_time_that_is_up_leaves_nothing_clear(
     [
         ("collide", {"margin": 0.01}),
         ("distance", {"reach": 0.2}),
-        ("contacts", {"limit": 3, "margin": 0.04}),
+        ("contacts", {"limit": 1, "margin": 0.05}),
         ("sweep", {}),
         ("collide", {"budget_visits": 60, "tolerance": 1e-4}),
         ("sweep", {"budget_visits": 100_000}),
@@ -333,7 +336,7 @@ def test_a_path_answers_as_its_question(
             if op == "contacts":
                 counts = np.concatenate([np.diff(part.pair_starts) for part in parts])
                 assert counts.tolist() == np.diff(expected.pair_starts).tolist()
-                assert counts.max() == 3
+                assert counts.max() == 1 < expected.pairs_found.max()
             if op == "sweep":
                 assert np.concatenate([part.upper for part in parts]).tobytes() == expected.upper.tobytes()
         taken = scene.path("al", poses, op, threads=2, **parameters)
@@ -436,6 +439,7 @@ def test_what_is_refused_says_why(built: Built, both: SeveralScenes) -> None:
             SeveralScenes([], "hall")
 
 
+@pytest.mark.interpreted
 def test_the_inverse_of_a_pose_carries_back(rng: np.random.Generator) -> None:
     assert archive_pose(np.eye(4)) is None and archive_pose(None) is None
     for _ in range(20):

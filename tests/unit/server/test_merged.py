@@ -1,0 +1,179 @@
+"""Answers of several archives as one: what is contact, what is unknown, and what is surely the nearest."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from solidcloud.schemas.answers import (
+    CollideAnswers,
+    ContactsAnswers,
+    DistanceAnswers,
+    RaycastAnswers,
+    SweepAnswers,
+    Verdict,
+)
+from solidcloud.schemas.arrays import array_fields
+from solidcloud.schemas.columns import unknown
+from solidcloud.server.merged import carried, limited, merged
+
+CLEAR, CONTACT, UNKNOWN = (int(v) for v in Verdict)
+INF = np.inf
+
+pytestmark = pytest.mark.interpreted
+
+
+def answers(kind: Any, k: int, **columns: Any) -> Any:
+    """Answers of k poses, unknown but for what is given."""
+    blank = unknown(kind, k)
+    types = array_fields(kind)
+    given = {
+        name: np.array(values, types[name].dtype) if name in types else values
+        for name, values in columns.items()
+    }
+    return type(blank)(**{name: getattr(blank, name) for name in blank.__struct_fields__} | given)
+
+
+def test_contact_wins_then_unknown_then_clear() -> None:
+    first = answers(CollideAnswers, 9, verdict=[0, 0, 0, 1, 1, 1, 2, 2, 2], exact=[True] * 6 + [False] * 3)
+    second = answers(
+        CollideAnswers, 9, verdict=[0, 1, 2] * 3, exact=[True, False, False] * 3, outside=[True] * 9
+    )
+    found = merged([first, second])
+    assert found.verdict.tolist() == [0, 1, 2, 1, 1, 1, 2, 1, 2]
+    # A contact is exact if one is; what is clear is so by all.
+    assert found.exact.tolist() == [True, False, False, True, True, True, False, False, False]
+    assert not found.outside.any(), "outside of one alone"
+
+
+def test_counts_are_added_and_do_not_wrap() -> None:
+    most = np.iinfo(np.uint32).max
+    first = answers(CollideAnswers, 2, node_visits=[most, 3], hits=2, misses=1, faults=("a", "b"), late=(7,))
+    second = answers(
+        CollideAnswers, 2, node_visits=[5, 4], hits=3, engine_seconds=0.5, faults=("b",), late=(7, 8)
+    )
+    found = merged([first, second])
+    assert found.node_visits.tolist() == [most, 7]
+    assert (found.hits, found.misses, found.engine_seconds) == (5, 1, 0.5)
+    assert found.faults == ("a", "b") and found.late == (7, 8)
+
+
+def test_the_nearest_is_exact_if_nobody_may_hold_a_nearer_one() -> None:
+    first = answers(DistanceAnswers, 4, signed_distance=[1.0, 1.0, 1.0, INF], lower=[1.0, 1.0, 0.5, 2.0],
+                    upper=[1.0, 1.0, 1.0, INF], exact=[True, True, False, True], verdict=[0] * 4)  # fmt: skip
+    second = answers(DistanceAnswers, 4, signed_distance=[3.0, INF, 2.0, INF], lower=[0.9, 1.0, 2.0, 2.0],
+                     upper=[3.0, INF, 2.0, INF], exact=[False, False, True, True], verdict=[2, 2, 0, 0])  # fmt: skip
+    for pair in ([first, second], [second, first]):
+        found = merged(pair)
+        assert found.signed_distance.tolist() == [1.0, 1.0, 1.0, INF]
+        assert found.exact.tolist() == [False, True, False, True]
+        assert found.lower.tolist() == [0.9, 1.0, 0.5, 2.0]
+        assert found.upper.tolist() == [1.0, 1.0, 1.0, INF]
+        assert found.verdict.tolist() == [UNKNOWN, UNKNOWN, CLEAR, CLEAR]
+
+
+def test_of_equals_the_least_scan_point_is_named_then_the_least_avatar_centre() -> None:
+    near = {"signed_distance": [0.5, 0.5], "lower": [0.5, 0.5], "upper": [0.5, 0.5], "exact": [True, True]}
+    first = answers(
+        DistanceAnswers,
+        2,
+        **near,
+        witness_cloud=[[1, 2, 3], [1, 2, 3]],
+        witness_avatar=[[0, 0, 0], [9, 0, 2]],
+    )
+    second = answers(
+        DistanceAnswers,
+        2,
+        **near,
+        witness_cloud=[[1, 2, 2], [1, 2, 3]],
+        witness_avatar=[[5, 5, 5], [9, 0, 1]],
+    )
+    for pair in ([first, second], [second, first]):
+        found = merged(pair)
+        assert found.witness_cloud.tolist() == [[1, 2, 2], [1, 2, 3]]
+        assert found.witness_avatar.tolist() == [[5, 5, 5], [9, 0, 1]]
+
+
+@pytest.mark.parametrize(
+    ("other", "lower", "exact", "verdict"),
+    [
+        ((CLEAR, 1.0, INF, True), 0.5, True, CONTACT),
+        ((UNKNOWN, 0.25, INF, False), 0.25, False, CONTACT),  # what could not be told comes first
+        ((UNKNOWN, 0.75, INF, False), 0.5, True, CONTACT),  # what could not be told comes later
+        ((CONTACT, 0.499, 0.75, True), 0.499, True, CONTACT),  # an interval around the one that is answered
+        ((CONTACT, 0.499, 0.75, False), 0.499, False, CONTACT),
+        ((CONTACT, 0.5, 0.75, False), 0.5, True, CONTACT),
+    ],
+)
+def test_a_sweep_is_exact_if_what_begins_first_is_told(
+    other: tuple[Any, ...], lower: float, exact: bool, verdict: int
+) -> None:
+    first = answers(SweepAnswers, 1, verdict=[CONTACT], lower=[0.5], upper=[0.5001], exact=[True],
+                    witness_cloud=[[1, 0, 0]], steps=[3])  # fmt: skip
+    names = ("verdict", "lower", "upper", "exact")
+    second = answers(SweepAnswers, 1, steps=[4], **{n: [v] for n, v in zip(names, other, strict=True)})
+    for pair in ([first, second], [second, first]):
+        found = merged(pair)
+        assert (found.lower[0], found.upper[0], found.exact[0], found.verdict[0]) == (
+            lower,
+            0.5001,
+            exact,
+            verdict,
+        )
+        assert found.witness_cloud.tolist() == [[1, 0, 0]] and found.steps.tolist() == [7]
+
+
+def test_a_motion_without_contact_is_clear_or_unknown_from_the_first_doubt_on() -> None:
+    first = answers(SweepAnswers, 2, verdict=[0, 0], lower=[1, 1], exact=[True, True])
+    second = answers(SweepAnswers, 2, verdict=[0, 2], lower=[1, 0.25], exact=[True, False])
+    found = merged([first, second])
+    assert found.verdict.tolist() == [CLEAR, UNKNOWN]
+    assert (found.lower.tolist(), found.upper.tolist(), found.exact.tolist()) == (
+        [1.0, 0.25],
+        [INF, INF],
+        [True, False],
+    )
+
+
+def test_a_ray_that_starts_in_two_spheres_names_one() -> None:
+    columns = {"verdict": [1], "distance": [0.0], "lower": [0.0], "upper": [0.0], "exact": [True]}
+    pair = [answers(RaycastAnswers, 1, **columns, cloud_point=[[x, 0, 0]]) for x in (2.0, 1.0)]
+    assert merged(pair).cloud_point.tolist() == [[1.0, 0, 0]]
+
+
+def listed(depths: list[list[float]], scan: int) -> ContactsAnswers:
+    """Contacts of poses, each a cluster of its own."""
+    counts = [len(own) for own in depths]
+    flat = np.array([depth for own in depths for depth in own])
+    rows = len(flat)
+    place = np.outer(flat, [1.0, 0, 0])
+    starts = np.cumsum([0, *counts])
+    return answers(
+        ContactsAnswers, len(depths), verdict=[int(c > 0) for c in counts], exact=[True] * len(depths),
+        pairs_found=counts, pair_starts=starts, avatar_point=place, cloud_point=place, signed_distance=flat,
+        avatar_index=np.arange(rows), scan_index=np.full(rows, scan), cluster=[i for c in counts for i in range(c)],
+        cluster_starts=starts, cluster_count=np.ones(rows), cluster_deepest=flat, cluster_avatar=place,
+        cluster_cloud=place, cluster_scan=np.full(rows, scan), cluster_low=place, cluster_high=place,
+    )  # fmt: skip
+
+
+def test_contacts_are_listed_by_depth_with_the_clusters_they_are_in() -> None:
+    found = merged(
+        [listed([[-3.0, -1.0], [], [-5.0]], 0), carried(listed([[-2.0], [], [-6.0, -4.0]], 0), None, 2)]
+    )
+    assert found.pair_starts.tolist() == found.cluster_starts.tolist() == [0, 3, 3, 6]
+    assert found.signed_distance.tolist() == found.cluster_deepest.tolist() == [-3, -2, -1, -6, -5, -4]
+    assert found.cluster.tolist() == [0, 1, 2, 0, 1, 2]
+    assert found.scan_index.tolist() == found.cluster_scan.tolist() == [0, 2, 0, 2, 0, 2]
+    assert found.pairs_found.tolist() == [3, 0, 3]
+    assert found.verdict.tolist() == [CONTACT, CLEAR, CONTACT]
+    few = limited(found, 2)
+    assert few.pair_starts.tolist() == [0, 2, 2, 4] and few.signed_distance.tolist() == [-3, -2, -6, -5]
+    assert few.cluster_deepest.tolist() == found.cluster_deepest.tolist()
+    assert limited(found, 0).signed_distance.tolist() == []
+    assert limited(found, 3) is found
+
+
+def test_scans_that_were_not_kept_get_no_number_of_another_archive() -> None:
+    assert carried(listed([[-3.0]], -1), None, 4).scan_index.tolist() == [-1]
+    alone = listed([[-3.0]], 1)
+    assert merged([alone]) is alone and carried(alone, None) is alone

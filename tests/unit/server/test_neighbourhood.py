@@ -231,10 +231,10 @@ def test_a_clock_that_starts_again_starts_afresh() -> None:
 def test_poses_asked_as_fast_as_they_are_answered_span_the_history_all_the_same() -> None:
     """10,000 a second: the direction is seen as well as at 30 a second."""
     around = make(NO_RING)
-    for number in range(5000):
+    for number in range(8000):
         around.saw(ME, number * 1e-4, at(1.0 + 3.0 * number * 1e-4, 1.0), REACH)
-    wanted = around.plan(0.5, 0.25)
-    assert max(x for x, _ in cells(wanted.rows)) == int((1.0 + 1.5 + 6.0 + REACH) // EDGE)
+    wanted = around.plan(0.8, 0.25)
+    assert max(x for x, _ in cells(wanted.rows)) == int((1.0 + 2.4 + 6.0 + REACH) // EDGE)
 
 
 def test_a_user_wants_no_more_than_so_many_and_the_soonest() -> None:

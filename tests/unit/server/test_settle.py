@@ -1,5 +1,6 @@
 """Which pairs of pose and voxel coarse tops settle, and which they leave to those who look closer."""
 
+from itertools import chain
 from pathlib import Path
 
 import cases
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from solidcloud.schemas.radius_model import LOCAL_CLASSES
 from solidcloud.server.avatar import make_avatar
 from solidcloud.server.coarse import Coarse, settle
+from solidcloud.server.kernels.coarse import any_to_settle
 from solidcloud.server.kernels.overlap import CLEAR, CONTACT, overlap_poses
 
 
@@ -97,6 +99,35 @@ def test_resident_voxels_and_those_without_a_slot_stay(made: Made, rng: np.rando
     _, all_gone = made.settled(avatar, poses)
     assert gone == [[row for row in rows if row not in (0, 2)] for rows in all_gone]
     assert 0 < sum(map(len, gone)) < sum(map(len, all_gone)) < sum(map(len, before))
+
+
+@pytest.mark.interpreted
+def test_what_is_settled_of_a_long_avatar_is_clear(made: Made, rng: np.random.Generator) -> None:
+    """A rod, much of which is far from its middle: along each axis, at random places."""
+    made.fill()
+    everything = made.resident(*range(made.voxels))
+    for axis in range(3):
+        rod = make_avatar(
+            np.roll(np.column_stack([np.linspace(-0.6, 0.6, 40), np.zeros((40, 2))]), axis, axis=1), 0.01
+        )
+        poses = shifted(*rng.uniform(0, 2, (30, 3)).tolist())
+        before, gone = made.settled(rod, poses)
+        assert 0 < sum(map(len, gone)) < sum(map(len, before))
+        starts = np.cumsum([0, *map(len, gone)])
+        reach = made.reach(rod, poses)._replace(starts=starts, rows=np.array(list(chain(*gone)), np.int64))
+        verdict, counts = np.zeros(30, np.uint8), np.zeros((3, 30), np.uint32)
+        overlap_poses(poses, rod.arrays, everything.arrays, reach, np.arange(30), verdict, counts)
+        assert (verdict == CLEAR).all()
+
+
+@pytest.mark.interpreted
+def test_only_what_is_not_resident_and_has_a_slot_is_worth_asking() -> None:
+    """Also at the very beginning of the arena, and of the slots."""
+    where = np.array([[-1, -1, -1], [0, 0, 0], [-1, -1, -1]])
+    slot = np.array([0, 1, -1], np.int32)
+    for rows, worth in (([0], True), ([1], False), ([2], False), ([1, 2], False), ([2, 1, 0], True)):
+        assert any_to_settle(where, slot, np.array(rows), len(rows)) is worth
+    assert not any_to_settle(where, slot, np.array([1, 0]), 1), "of the first alone"
 
 
 @pytest.mark.interpreted

@@ -1,0 +1,269 @@
+"""`objects`: doors that are told where to be, crates that are pushed; what they touch, by brute force."""
+
+from pathlib import Path
+from typing import Any
+
+import naive_objects
+import numpy as np
+import pytest
+from moving_bodies import INTERPRETED, Stage, at, ball, box, room, staged, touch
+from numpy.typing import NDArray
+from solidcloud.schemas.answers import Verdict
+from solidcloud.schemas.effects import AnyEffect, Crowd, Objects, Stop, Sweep
+from solidcloud.schemas.errors import BadRequestError, BadTransformError
+from solidcloud.schemas.scene import ObjectItem
+from solidcloud.server.avatar import make_avatar
+from solidcloud.server.effects.frame import Body
+
+COARSE = INTERPRETED
+USER = ball(0.2, 12 if COARSE else 60)
+CRATE = box(0.4, 0.4, 0.4, 0.17 if COARSE else 0.05, 0.1 if COARSE else 0.03)
+# A leaf of 2 cm, its hinge at the origin.
+LEAF = make_avatar(
+    box(0.8, 0.02, 0.8, 0.08 if COARSE else 0.02, 0.01).points + np.array([0.4, 0, 0]),
+    0.05 if COARSE else 0.01,
+)
+AVATARS = {"crate": CRATE, "leaf": LEAF}
+MOVING: list[AnyEffect] = [Stop(), Sweep(), Objects()]
+
+
+def item(name: str, pose: NDArray[np.float64], *, avatar: str = "crate", pushed: bool = True) -> ObjectItem:
+    return ObjectItem(name=name, avatar=avatar, pose=pose.tolist(), kind="pushed" if pushed else "kinematic")
+
+
+def where(stage: Stage, name: str) -> NDArray[np.float64]:
+    """The pose of an object now."""
+    pose: NDArray[np.float64] = stage.bodies.poses[stage.bodies.row_of(name, user=False)].copy()
+    return pose
+
+
+def free_of(stage: Stage, name: str) -> bool:
+    """Whether an object touches neither a user, nor another object, nor the scene."""
+    bodies, world = stage.bodies, stage.world
+    row = bodies.row_of(name, user=False)
+    model, pose = bodies.shapes[row].model, bodies.poses[row]
+    if world.collide(model, pose) != Verdict.CLEAR:
+        return False
+    return not any(
+        touch(model, pose, bodies.shapes[other].model, bodies.poses[other], bodies.origin)
+        for other in range(len(bodies.names))
+        if other != row
+    )
+
+
+# --- pushed -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.interpreted
+def test_a_pushed_crate_stops_at_the_wall_and_the_user_behind_it(tmp_path: Path) -> None:
+    with staged(tmp_path, MOVING, avatars=AVATARS, objects=(item("crate", at(1.0)),)) as stage:
+        body = stage.enter("c/u", USER, at(0))
+        stops = 0
+        for _ in range(8 if COARSE else 40):
+            before, wish = body.pose[0, 3], body.pose[0, 3] + (0.4 if COARSE else 0.05)
+            begun = where(stage, "crate")[0, 3]
+            moved = stage.go("c/u", at(wish))
+            gone = where(stage, "crate")[0, 3] - begun
+            assert 0 <= gone <= wish - before, "no farther than was wished"
+            assert moved.objects is not None and ("crate" in moved.objects.poses or not gone)
+            if gone:
+                assert moved.objects.poses["crate"] == where(stage, "crate").tolist()
+            assert free_of(stage, "crate")
+            stops += bool(moved.touched)
+            assert {each.what for each in moved.touched} <= {"crate"}
+        assert where(stage, "crate")[0, 3] > 1.65 and body.pose[0, 3] > 1.2 and stops
+        assert np.array_equal(where(stage, "crate")[1:], at(0)[1:]), "pushed straight on"
+        stood = where(stage, "crate")
+        for _ in range(3):
+            moved = stage.go("c/u", body.pose.copy())
+            assert np.array_equal(where(stage, "crate"), stood), "nobody pushes: it stands"
+        assert moved.objects is not None and moved.objects.poses == {}
+
+
+@pytest.mark.interpreted
+def test_fifty_metres_a_frame_push_the_crate_no_farther_than_the_wall(tmp_path: Path) -> None:
+    with staged(tmp_path, MOVING, avatars=AVATARS, objects=(item("crate", at(1.0)),)) as stage:
+        body = stage.enter("c/u", USER, at(-3))
+        stage.go("c/u", at(47))
+        assert 1.65 < where(stage, "crate")[0, 3] < 2.0
+        assert 1.2 < body.pose[0, 3] < where(stage, "crate")[0, 3] - 0.3
+        assert free_of(stage, "crate")
+
+
+@pytest.mark.interpreted
+def test_a_crate_is_not_pushed_through_another_nor_into_a_user_nor_pulled_nor_pressed_down(
+    tmp_path: Path,
+) -> None:
+    objects = (item("crate", at(0.6)), item("other", at(1.2)))
+    with staged(tmp_path, [*MOVING, Crowd()], avatars=AVATARS, objects=objects) as stage:
+        body = stage.enter("c/u", USER, at(0))
+        stage.enter("c/still", USER, at(0.6, 1.0))
+        for way in ((3, 0, 0), (3, 0, 0), (0.05, 0, 0)):
+            stage.step("c/u", way)
+            assert free_of(stage, "crate") and free_of(stage, "other")
+        assert np.array_equal(where(stage, "other"), at(1.2)), "what is pushed pushes nothing"
+        assert 0.65 < where(stage, "crate")[0, 3] < 0.8
+        stood = where(stage, "crate")
+        stage.step("c/u", (-1, 0, 0))
+        assert np.array_equal(where(stage, "crate"), stood)
+        body.pose[:] = at(stood[0, 3], 0, 0.6)
+        stage.step("c/u", (0, 0, -1))
+        assert np.array_equal(where(stage, "crate"), stood) and body.pose[2, 3] > 0.3
+        body.pose[:] = at(stood[0, 3], -1)
+        stage.step("c/u", (0, 5, 0))
+        assert 0.1 < where(stage, "crate")[1, 3] < 1.0, "the user who stands there is not pushed"
+        assert free_of(stage, "crate") and np.array_equal(stage.users["c/still"].pose, at(0.6, 1.0))
+
+
+@pytest.mark.interpreted
+def test_a_move_of_which_nothing_is_remembered_pushes_nothing(tmp_path: Path) -> None:
+    with staged(tmp_path, MOVING, avatars=AVATARS, objects=(item("crate", at(1.0)),)) as stage:
+        moved = stage.pipeline.run(Body("c/u", USER, at(0)), at(3))
+        assert np.array_equal(where(stage, "crate"), at(1.0))
+        assert [each.what for each in moved.touched] == ["crate"] and moved.pose[0, 0, 3] < 0.7
+
+
+# --- told ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.interpreted
+def test_a_door_blocks_until_it_is_opened(tmp_path: Path) -> None:
+    """The leaf lies along x, its hinge at the origin; the user goes along y."""
+    door = item("door", at(0), avatar="leaf", pushed=False)
+    with staged(tmp_path, MOVING, avatars=AVATARS, objects=(door,)) as stage:
+        body = stage.enter("c/u", USER, at(0.5, -1))
+        for wish in (at(0.5, 1), at(0.5, 49), at(0.5, 0.5)):
+            moved = stage.go("c/u", wish)
+            assert body.pose[1, 3] < -0.2 and [each.what for each in moved.touched] == ["door"]
+        stage.bodies.tell({"door": at(0, heading=np.pi / 2).tolist()})
+        moved = stage.go("c/u", at(0.5, 1))
+        assert np.array_equal(body.pose, at(0.5, 1)) and not moved.touched
+        assert moved.objects is not None
+        assert moved.objects.poses == {"door": at(0, heading=np.pi / 2).tolist()}
+
+
+@pytest.mark.interpreted
+@pytest.mark.parametrize("angle", [0.3, -0.3])
+def test_a_door_that_closes_on_a_user_lets_go_of_it_on_the_side_it_was_on(
+    tmp_path: Path, angle: float
+) -> None:
+    """It swings into who stands in its way; who then wishes through it stays, who goes back gets free."""
+    door = item("door", at(0, heading=angle), avatar="leaf", pushed=False)
+    side = -np.sign(angle)
+    with staged(tmp_path, [*MOVING, Crowd()], avatars=AVATARS, objects=(door,)) as stage:
+        body = stage.enter("c/u", USER, at(0.5, 0.08 * side))
+        stage.go("c/u", body.pose.copy())
+        for swing in np.linspace(angle, -angle / 6, 4)[1:]:
+            stage.bodies.tell({"door": at(0, heading=float(swing)).tolist()})
+            stage.go("c/u", body.pose.copy())
+            assert np.array_equal(body.pose, at(0.5, 0.08 * side)), "a door moves nobody"
+        inside = touch(USER, body.pose, LEAF, where(stage, "door"), stage.bodies.origin)
+        assert inside
+        for wish in (at(0.5, -1 * side), at(0.8, -0.5 * side)):
+            moved = stage.go("c/u", wish)
+            assert (body.pose[1, 3] - 0.08 * side) * side >= 0, "not through it"
+            assert "door" in [each.what for each in moved.touched]
+        moved = stage.go("c/u", at(0.5, 0.6 * side))
+        assert np.array_equal(body.pose, at(0.5, 0.6 * side)) and not moved.touched
+        stage.go("c/u", at(0.5, -1 * side))
+        assert body.pose[1, 3] * side > 0.1, "free, it is stopped as ever"
+
+
+def test_wishes_for_objects_that_cannot_be_granted_are_refused_and_nothing_moves(tmp_path: Path) -> None:
+    objects = (item("door", at(0), avatar="leaf", pushed=False), item("crate", at(1.0)))
+    with staged(tmp_path, MOVING, avatars=AVATARS, objects=objects) as stage:
+        good = {"door": at(0, 0, 0.1).tolist()}
+        skewed, mirrored = at(0), at(0)
+        skewed[0, 1], mirrored[0, 0] = 1e-3, -1.0
+        refused: list[tuple[str, Any, type[Exception], str]] = [
+            ("gate", at(0).tolist(), BadRequestError, "'gate' is none of this scene: expected one of door"),
+            ("crate", at(0).tolist(), BadRequestError, "is pushed, and not told"),
+            ("door", skewed.tolist(), BadTransformError, "not rigid"),
+            ("door", mirrored.tolist(), BadTransformError, "not rigid"),
+            ("door", (at(0) * 2).tolist(), BadTransformError, "not rigid"),
+            ("door", at(float("nan")).tolist(), BadRequestError, "finite"),
+            ("door", at(2e9).tolist(), BadRequestError, "within 1e9 m"),
+            ("door", at(0)[:3].tolist(), BadRequestError, "4 rows"),
+        ]
+        for name, pose, error, text in refused:
+            with pytest.raises(error, match=text):
+                stage.bodies.tell({**good, name: pose})
+            assert np.array_equal(where(stage, "door"), at(0)), name
+
+
+# --- what they touch ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.interpreted
+def test_what_is_reported_to_touch_does_by_brute_force(tmp_path: Path) -> None:
+    rng = np.random.default_rng(8)
+    names = ["a", "b", "c"] if COARSE else ["a", "b", "c", "d", "e"]
+    objects = tuple(item(name, at(number), pushed=False) for number, name in enumerate(names))
+    found = set()
+    with staged(tmp_path, MOVING, avatars=AVATARS, objects=objects) as stage:
+        body = stage.enter("c/u", USER, at(0, 0, 5))
+        with stage.world as seen:
+            arrays, units = seen[0].data.arrays, seen[0].data.radius_units
+        lattice = np.rint((room() - arrays.origin) / arrays.step).astype(np.int64)
+        for _ in range(2 if COARSE else 12):
+            told = rng.choice(names, 2, replace=False).tolist()
+            places = {name: rng.uniform(-0.6, 0.6, 3) for name in told}
+            stage.bodies.tell(
+                {name: at(1.2 + x, y, z, heading=5 * x).tolist() for name, (x, y, z) in places.items()}
+            )
+            report = stage.go("c/u", body.pose.copy()).objects
+            assert report is not None
+            poses = np.array([where(stage, name) for name in names])
+            ones = [1] * len(names)
+            pairs = naive_objects.touching_pairs(
+                [CRATE.points] * len(names), [CRATE.radius] * len(names), poses, ones, ones, arrays.origin
+            )
+            scene = naive_objects.touching_scene(
+                lattice, arrays.step, np.full(len(lattice), units), [CRATE.points] * len(names),
+                [CRATE.radius] * len(names), poses, arrays.origin,
+            )  # fmt: skip
+            judged = [("", name) for name, touches in zip(names, scene, strict=True) if touches]
+            judged += [(names[i], names[j]) for i, j in pairs]
+            assert report.touching == judged
+            found |= {bool(one) for one, _ in judged}
+    assert COARSE or found == {False, True}
+
+
+@pytest.mark.interpreted
+def test_what_has_not_moved_is_not_asked_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    objects = tuple(item(name, at(number), pushed=False) for number, name in enumerate("abc"))
+    with staged(tmp_path, [Objects()], avatars=AVATARS, objects=objects) as stage:
+        body = stage.enter("c/u", USER, at(0, 0, 5))
+        asked = []
+        collide = stage.world.collide
+
+        def counted(avatar: Any, *rest: Any) -> Verdict:
+            asked.append(avatar)
+            return collide(avatar, *rest)
+
+        monkeypatch.setattr(stage.world, "collide", counted)
+        for told, count in (({}, 3), ({}, 0), ({"b": at(1, 1).tolist()}, 1), ({"b": at(1, 1).tolist()}, 0)):
+            stage.bodies.tell(told)
+            stage.go("c/u", body.pose.copy())
+            assert len([avatar for avatar in asked if avatar is not USER]) == count
+            asked.clear()
+
+
+@pytest.mark.interpreted
+def test_the_same_wishes_give_the_same_poses_bit_for_bit(tmp_path: Path) -> None:
+    found = []
+    for folder in ("a", "b"):
+        (tmp_path / folder).mkdir()
+        rng = np.random.default_rng(4)
+        objects = (item("crate", at(0.6)), item("door", at(0.4, 0.6), avatar="leaf", pushed=False))
+        poses = []
+        with staged(tmp_path / folder, [*MOVING, Crowd()], avatars=AVATARS, objects=objects) as stage:
+            for number in range(2):
+                stage.enter(f"c/{number}", USER, at(-0.5, number))
+            for _ in range(2 if COARSE else 15):
+                stage.bodies.tell({"door": at(0.4, 0.6, heading=rng.uniform(0, 1)).tolist()})
+                for name in stage.users:
+                    stage.go(name, at(*rng.uniform(-1, 1, 3) * [1, 1, 0.1]))
+                poses.append(stage.bodies.poses.tobytes())
+        found.append(b"".join(poses))
+    assert found[0] == found[1]

@@ -5,7 +5,7 @@ archive's pose, server/posed.py), are within low to high on each axis, both incl
 
 The few voxels with such points are built anew by the builder's code when the archive is opened, and their records kept
 in a temporary file without a name: a load costs what it always does, no memory is taken that nobody counts, and the
-bytes a voxel takes are known before it is loaded. Voxels that are left empty are gone. Nothing else is another: the
+bytes a voxel takes are known before it is loaded. Voxels that are left empty are gone. All else stays: the
 header stays the archive's, its bounds (`outside`), counts and radius with it, and so do regions of scans left out,
 which are unknown inside a box too.
 """

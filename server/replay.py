@@ -26,9 +26,13 @@ class Difference(NamedTuple):
 
     def __str__(self) -> str:
         """One line."""
+        where = f"frame {self.frame}, avatar {self.user.avatar} of client {self.user.client}"
+        if self.logged.error or self.found.error:
+            return f"{where}: logged {_words(self.logged)}, replayed {_words(self.found)}"
+        logged, found = np.frombuffer(self.logged.pose), np.frombuffer(self.found.pose)
+        at = int(np.flatnonzero(logged.view(np.int64) != found.view(np.int64))[0])
         return (
-            f"frame {self.frame}, avatar {self.user.avatar} of client {self.user.client}: "
-            f"logged {_words(self.logged)}, replayed {_words(self.found)}"
+            f"{where}: pose[{at // 4}, {at % 4}] logged {float(logged[at])!r}, replayed {float(found[at])!r}"
         )
 
 
@@ -170,4 +174,4 @@ def _words(said: Said) -> str:
     if said.error:
         return f"error {said.error}"
     x, y, z = np.frombuffer(said.pose, "<f8").reshape(4, 4)[:3, 3].tolist()
-    return f"a pose at ({x!r}, {y!r}, {z!r})"
+    return f"a pose at {x:g} {y:g} {z:g}"

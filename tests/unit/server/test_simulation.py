@@ -1,0 +1,249 @@
+"""A simulation, with a stand-in for its effects: whose frame it is, who is there, what is remembered."""
+
+import inspect
+import threading
+
+import numpy as np
+import pytest
+from fake_server import FloorScene, floor_simulation
+from solidcloud.schemas.effects import Ground, Stop
+from solidcloud.schemas.errors import (
+    BadRequestError,
+    BadTransformError,
+    BusyError,
+    InternalError,
+    UnknownAvatarError,
+)
+from solidcloud.schemas.keys import User
+from solidcloud.schemas.moves import FRAME_SECONDS, Moved, State, Wish
+from solidcloud.schemas.scene import SceneFile, Spawn, scene_of
+from solidcloud.server.client import Client
+from solidcloud.server.scene import Scene
+from solidcloud.server.served import EVERYBODY, SceneLike, Turn
+from solidcloud.server.simulation import SILENT_SECONDS, Simulation
+
+AL, BO = User("a", "al"), User("b", "bo")
+POINTS = np.array([[0.0, 0.0, 0.5], [0.0, 0.25, 1.0]])
+
+
+def pose_at(z, x=0.0):
+    pose = np.eye(4)[None].copy()
+    pose[0, [0, 2], 3] = x, z
+    return pose
+
+
+def wish(seq, z=None, velocity=None, time=None, **fields):
+    pose = np.empty((0, 4, 4)) if z is None else pose_at(z)
+    return Wish(seq=seq, time=float(seq if time is None else time), pose=pose, velocity=velocity, **fields)
+
+
+@pytest.fixture
+def floor():
+    simulation = floor_simulation()
+    for user in (AL, BO):
+        simulation.add_avatar(user.avatar, POINTS, 0.125, client=user.client)
+    return simulation
+
+
+def test_a_frame_goes_on_from_where_the_last_one_ended(floor):
+    ((_, first),) = floor.step([Turn(AL, wish(1, 0.5))])
+    assert isinstance(first, State) and np.array_equal(first.pose, pose_at(0.5))
+    ((user, second),) = floor.step([Turn(AL, wish(2, velocity=(2.0, 0.0, -1.0), time=1.0625), late=7)])
+    assert user == AL and np.array_equal(second.pose, pose_at(0.4375, 0.125))
+    assert (second.seq, second.time, second.frame, second.late) == (2, 1.0625, 2, 7)
+    ((_, third),) = floor.step([Turn(AL, wish(3, velocity=(0.0, 0.0, -1e3), time=1.125))])
+    assert third.pose[0, 2, 3] == np.nextafter(-0.375, 1.0), "stopped by the floor"
+    ((_, fourth),) = floor.step([Turn(AL, wish(4, velocity=(1.0, 0.0, 0.0), time=1.25))])
+    assert fourth.pose[0, 2, 3] == third.pose[0, 2, 3], "from where it was stopped"
+
+
+def test_users_begin_at_the_spawn():
+    simulation = floor_simulation(spawn=Spawn(position=(3.0, 4.0, 5.0)))
+    simulation.add_avatar("al", POINTS, 0.125, client="a")
+    ((_, state),) = simulation.step([Turn(AL, wish(1, velocity=(3.0, 0.0, 0.0)))])
+    assert np.array_equal(state.pose[0, :3, 3], [3.0 + 3.0 * FRAME_SECONDS, 4.0, 5.0])
+
+
+def test_everybody_who_wished_has_one_frame_in_the_order_given(floor):
+    order = []
+    run = floor._pipeline.run
+    floor._pipeline.run = lambda body, *rest, **more: [order.append(body.name), run(body, *rest, **more)][1]
+    outcomes = floor.step([Turn(BO, wish(1, 0.25)), Turn(AL, wish(1, 0.5))])
+    assert [outcome.user for outcome in outcomes] == [BO, AL] and order == ["b/bo", "a/al"]
+    assert {outcome.state.frame for outcome in outcomes} == {1}
+    assert floor.step([]) == [] and floor.step([Turn(AL, wish(2, 0.5))])[0].state.frame == 3
+
+
+def test_a_refused_wish_is_its_users_alone_and_changes_nothing(floor):
+    floor.add_avatar("crash", POINTS, 0.125, client="a")
+    floor.step([Turn(AL, wish(1, 0.5))])
+    crash, nobody = User("a", "crash"), User("a", "nobody")
+    sheared = wish(2, 0.25)
+    sheared.pose[0, 0, 1] = 0.5
+    outcomes = floor.step(
+        [Turn(AL, sheared), Turn(crash, wish(1, 0.5)), Turn(nobody, wish(1, 0.5)), Turn(BO, wish(1, 0.25))]
+    )
+    kinds = [type(outcome.state) for outcome in outcomes]
+    assert kinds == [BadTransformError, InternalError, UnknownAvatarError, State]
+    assert "secret" not in str(outcomes[1].state)
+    assert floor.users == [AL, BO], "who was refused at first is not there"
+    ((_, state),) = floor.step([Turn(AL, wish(3, velocity=(0.0, 0.0, 1.0), time=1.0625))])
+    assert np.array_equal(state.pose, pose_at(0.5625)), "its clock and its pose are as before"
+
+
+def test_there_is_room_for_so_many_users_and_who_leaves_makes_room():
+    simulation = floor_simulation(users=1)
+    for user in (AL, BO):
+        simulation.add_avatar(user.avatar, POINTS, 0.125, client=user.client)
+    outcomes = simulation.step([Turn(AL, wish(1, 0.5)), Turn(BO, wish(1, 0.5))])
+    assert isinstance(outcomes[0].state, State) and isinstance(outcomes[1].state, BusyError)
+    simulation.end(AL)
+    simulation.end(AL)
+    assert isinstance(simulation.step([Turn(BO, wish(1, 0.5))])[0].state, State)
+    simulation.end_client("a")
+    assert simulation.users == [BO]
+    simulation.drop_client("b")
+    assert simulation.users == [] and simulation.served.gone == ["b"]
+    assert isinstance(simulation.step([Turn(BO, wish(2, 0.5))])[0].state, UnknownAvatarError)
+
+
+def test_who_wishes_nothing_for_long_has_left(floor):
+    floor.step([Turn(AL, wish(1, 0.5)), Turn(BO, wish(1, 0.5))], now=100.0)
+    floor.step([Turn(BO, wish(2, 0.5))], now=100.0 + SILENT_SECONDS)
+    assert floor.users == [AL, BO]
+    floor.step([Turn(BO, wish(3, 0.5))], now=100.5 + SILENT_SECONDS)
+    assert floor.users == [BO]
+    floor.step([], now=100.0 + 2 * SILENT_SECONDS)
+    assert floor.users == [BO], "half a second short of it"
+
+
+def test_effects_are_skipped_as_a_recorded_frame_says(floor):
+    outcomes = floor.step([Turn(AL, wish(1, 0.5)), Turn(BO, wish(1, 0.5))], skips=[["proximity"], []])
+    assert [outcome.state.skipped for outcome in outcomes] == [["proximity"], []]
+
+
+def test_a_move_is_remembered_by_nobody(floor):
+    floor.step([Turn(AL, wish(1, 0.5))])
+    moved = floor.move("al", pose_at(0.0), pose_at(-1.0), 0.25, client="a")
+    assert type(moved) is Moved and moved.pose[0, 2, 3] == np.nextafter(-0.375, 1.0)
+    ((_, state),) = floor.step([Turn(AL, wish(2, velocity=(0.0, 0.0, 0.0)))])
+    assert np.array_equal(state.pose, pose_at(0.5)) and state.frame == 2
+    poses = pose_at(0.0)
+    assert floor.move("al", poses, poses, client="a").pose is not poses
+
+
+def test_a_move_that_is_none_is_refused(floor):
+    good, bad = pose_at(0.0), 2 * pose_at(0.0)
+    for pose_from, pose_to in ((bad, good), (good, bad)):
+        with pytest.raises(BadTransformError, match="pose_"):
+            floor.move("al", pose_from, pose_to, client="a")
+    for pose_to, seconds in ((np.tile(good, (2, 1, 1)), 0.1), (good, -1.0), (np.full((1, 4, 4), "x"), 0.1)):
+        with pytest.raises(BadRequestError):
+            floor.move("al", good, pose_to, seconds, client="a")
+    with pytest.raises(UnknownAvatarError):
+        floor.move("al", good, good, client="b")
+
+
+def test_wishes_for_objects_where_there_are_none_are_refused(floor):
+    objects = {"door": np.eye(4).tolist()}
+    ((_, error),) = floor.step([Turn(AL, wish(1, 0.5, objects=objects))])
+    assert isinstance(error, BadRequestError) and "objects" in str(error)
+
+
+def test_the_bodies_that_may_meet_are_kept_up_to_date():
+    class Bodies(dict):
+        def tell(self, poses):
+            self.told = poses
+
+    bodies = Bodies()
+    file = SceneFile(format=1, archives=scene_of("floor").archives)
+    stand_in = floor_simulation()
+    simulation = Simulation(stand_in.served, file, stand_in._pipeline, bodies=bodies)
+    simulation.add_avatar("al", POINTS, 0.125, client="a")
+    objects = {"door": np.eye(4).tolist()}
+    simulation.step([Turn(AL, wish(1, 0.5, objects=objects))])
+    assert list(bodies) == [AL] and np.array_equal(bodies[AL].pose, pose_at(0.5)[0])
+    assert bodies.told == objects
+    simulation.end(AL)
+    assert not bodies
+
+
+def test_the_scenes_own_avatars_are_everybodys():
+    stand_in = floor_simulation()
+    own = stand_in.served.add_avatar("guide", POINTS, 0.125, client=EVERYBODY)
+    file = SceneFile(format=1, archives=scene_of("floor").archives, effects=[Ground(), Stop()])
+    simulation = Simulation(stand_in.served, file, stand_in._pipeline, [own])
+    guides = [User("a", "guide"), User("b", "guide")]
+    outcomes = simulation.step([Turn(user, wish(1, 0.5)) for user in guides])
+    assert all(isinstance(outcome.state, State) for outcome in outcomes)
+    assert simulation.add_avatar("guide", POINTS, 0.125, client="c") == own
+    with pytest.raises(BadRequestError):
+        simulation.add_avatar("guide", POINTS + 1, 0.125, client="c")
+    info = simulation.info()
+    assert info.effects == ["stop", "ground"] and info.avatars == [own]
+
+
+def test_warming_simulates_a_frame_and_leaves_nothing(floor):
+    before = floor._pipeline.frames
+    avatars = dict(floor.served.avatars)
+    floor.warm()
+    assert floor.served.warmed == 1 and floor._pipeline.frames > before
+    assert floor.served.avatars == avatars and floor.users == []
+
+
+def test_frames_come_one_at_a_time(floor):
+    inside, most = [], []
+
+    def run(body, aim, seconds, *, skip=None):
+        inside.append(body.name)
+        most.append(len(inside))
+        threading.Event().wait(0.001)
+        inside.remove(body.name)
+        return Moved(pose=aim[None])
+
+    floor._pipeline.run = run
+    threads = [
+        threading.Thread(
+            target=lambda user=user: [floor.step([Turn(user, wish(seq, 0.5))]) for seq in range(20)]
+        )
+        for user in (AL, BO)
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(20.0)
+    assert max(most) == 1 and len(most) == 40
+
+
+def test_it_has_all_that_a_scene_has():
+    wanted = {
+        name
+        for name, found in inspect.getmembers(SceneLike)
+        if not name.startswith("_") and (callable(found) or isinstance(found, property))
+    }
+    assert {"move", "collide", "simulation", "reload", "path"} <= wanted
+    for kind in (Simulation, Scene, FloorScene):
+        missing = {name for name in wanted if not hasattr(kind, name)} - {"simulation"}
+        assert not missing, kind
+    asked = {name for name in wanted if name not in ("simulation", "drop_client", "warm")}
+    assert {name for name in asked if not hasattr(Client, name)} == set()
+
+
+@pytest.mark.parametrize(
+    "operation, what",
+    [
+        ("collide", ("al", pose_at(0.0), 0.125)),
+        ("distance", ("al", pose_at(0.0), 0.75)),
+        ("contacts", ("al", pose_at(0.0), 9, 0.125, 0.5)),
+        ("sweep", ("al", pose_at(0.0), pose_at(0.0), 0.125)),
+        ("raycast", (POINTS, POINTS, 2.0)),
+        ("within", (POINTS, 2.0)),
+        ("objects", ([("al", pose_at(0.0)[0], 1, 2)], 0.125)),
+        ("path", ("al", pose_at(0.0), "collide")),
+    ],
+)
+def test_questions_are_the_scenes(floor, operation, what):
+    options = {} if operation in ("raycast", "within") else {"client": "a"}
+    getattr(floor, operation)(*what, **options)
+    assert [asked[0] for asked in floor.served.asked] == [operation]
+    assert floor.stats(keys=True).keys == [3, 5] and floor.reload().generation_after == 1

@@ -191,9 +191,10 @@ def _faults(scene: SceneFile) -> Iterator[tuple[str, str]]:
     yield from _twice([item.name for item in scene.avatars], "avatars", "name")
     yield from _twice([item.name for item in scene.objects], "objects", "name")
     yield from _objects(scene, names)
-    for what, items in (("archives", scene.archives), ("objects", scene.objects)):
-        for number, item in enumerate(items):
-            yield from _pose(item.pose, f"$.{what}[{number}].pose")
+    for number, archive in enumerate(scene.archives):
+        yield from _pose(archive.pose, f"$.archives[{number}].pose")
+    for number, thing in enumerate(scene.objects):
+        yield from _pose(thing.pose, f"$.objects[{number}].pose")
     if not 1e-100 < math.hypot(*scene.up) < 1e100:  # whose squares are neither
         yield "$.up", f"found {list(scene.up)}: expected a direction, of any length but zero"
     if scene.spawn is not None:

@@ -252,7 +252,7 @@ def _expected(node: Any) -> str:
     if isinstance(node, inspect.StrType):
         return f"a string{_lengths(node, 'characters')}"
     if isinstance(node, inspect.LiteralType):
-        return " or ".join(shown(value) for value in sorted(node.values))
+        return " or ".join(shown(value) for value in sorted(node.values, key=str))
     if isinstance(node, inspect.TupleType):
         return f"a list of {len(node.item_types)}, each {_expected(node.item_types[0])}"
     if isinstance(node, inspect.ListType):

@@ -45,7 +45,7 @@ scenes = typer.Typer(help="Begin a scene file, or check one.", rich_markup_mode=
 app.add_typer(scenes, name="scene")
 scenes.command("new")(scene.new)
 scenes.command("check")(scene.check)
-verb: Callable[..., None]
+verb: Callable[..., int | None]
 for verb in (
     inspect.inspect,
     build.build,

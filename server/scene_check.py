@@ -62,9 +62,9 @@ def scene_facts(checked: Checked) -> Iterator[tuple[str, str]]:
         )
     yield "up", _numbers(up_of(file))
     yield "radius model", file.radius_model or "each archive's one figure"
-    for item, avatar in zip(file.avatars, checked.avatars, strict=True):
+    for avatar in checked.avatars:
         made = avatar.info
-        yield f"avatar {item.name}", f"{avatar.file}: {made.points:,} points of {made.radius:.4g} m radius"
+        yield f"avatar {made.name}", f"{avatar.file}: {made.points:,} points of {made.radius:.4g} m radius"
     for thing in file.objects:
         x, y, z = (row[3] for row in thing.pose[:3])
         yield f"object {thing.name}", f"{thing.kind}, avatar {thing.avatar}, at {_numbers((x, y, z))} m"

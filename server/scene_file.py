@@ -25,6 +25,7 @@ from .describe import describe
 from .scene import DEFAULT_BUDGET, Scene
 from .served import SceneLike
 from .simulated import simulate
+from .simulation import Stage
 from .store import OpenStore, Store
 
 ReadPoints = Callable[[Path], NDArray[np.float64]]
@@ -129,14 +130,13 @@ def read_avatars(file: SceneFile, path: Path, read_points: ReadPoints) -> list[F
 def store_opener(file: SceneFile, number: int) -> OpenStore:
     """What opens the folder of archive `number`: with normals if effects ask for them, and without the points that are
     passed through."""
-    opener: OpenStore = Store
+    reach = normals_asked(file)
     for effect in file.effects:
         if isinstance(effect, Through):
             from .effects.through import store_without
 
-            opener = store_without(effect, file.archives[number].pose)
-    reach = normals_asked(file)
-    return opener if reach is None else partial(opener, normals=reach)
+            return store_without(effect, file.archives[number].pose, reach)
+    return partial(Store, normals=reach)
 
 
 def normals_asked(file: SceneFile) -> float | None:
@@ -173,7 +173,7 @@ def _open_archives(
     budget_bytes: int,
     policy: str,
     stack: ExitStack,
-) -> SceneLike:
+) -> Stage:
     """The archives as one scene; stack: closes them where that fails, else whoever has it does."""
     with at_place(path, "$.archives"):
         budgets = share_budget(budget_bytes, [each.sizes for each in found])

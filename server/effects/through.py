@@ -13,10 +13,11 @@ from ..left_out import LeftOut
 from ..store import OpenStore, Store
 
 
-def store_without(effect: Through, pose: ArrayLike | None = None) -> OpenStore:
+def store_without(effect: Through, pose: ArrayLike | None = None, normals: float | None = None) -> OpenStore:
     """What opens an archive's folder without the points in the boxes, for `Scene.open(..., open_store=...)`.
 
-    pose: (4, 4) where the archive lies in the world, as boxes are world boxes; None: at the identity.
+    pose: (4, 4) where the archive lies in the world, as boxes are world boxes; None: at the identity.  normals: as
+    `Store` takes it.
     """
     boxes = [(box.low, box.high) for box in effect.boxes]
-    return partial(Store, open_archive=partial(LeftOut, boxes=boxes, pose=pose))
+    return partial(Store, open_archive=partial(LeftOut, boxes=boxes, pose=pose), normals=normals)

@@ -35,6 +35,8 @@ from solidcloud.server.scene_file import (
     store_opener,
 )
 
+pytestmark = pytest.mark.interpreted
+
 TOP = 'format = 1\n[[archives]]\npath = "floor"\n'
 BALL = '[[avatars]]\nname = "ball"\nfile = "ball.xyz"\nradius = 0.05\n'
 STOP = '[[effects]]\neffect = "stop"\n'
@@ -125,6 +127,10 @@ def test_a_scene_has_its_name_its_avatars_and_says_so(write: Write) -> None:
             scene.collide("other", poses, client="one")
         (part,) = scene.path("ball", poses, client="one")
         assert part.verdict.tolist() == [Verdict.CONTACT, Verdict.CLEAR]
+        same = scene.add_avatar("ball", [[0, 0, 0]], 0.05, client="one")
+        assert same == info.avatars[0]
+        with pytest.raises(BadRequestError, match="'ball' exists with other points or another radius"):
+            scene.add_avatar("ball", [[0, 0, 1]], 0.05, client="one")
         scene.drop_client("one")
         assert scene.collide("ball", poses[1:], client="one").verdict.tolist() == [Verdict.CLEAR]
 

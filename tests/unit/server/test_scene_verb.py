@@ -9,6 +9,8 @@ import pytest
 from solidcloud.schemas.scene import parse_scene, read_scene
 from solidcloud.server.cli import run
 
+pytestmark = pytest.mark.interpreted
+
 GOLDEN = Path(__file__).resolve().parents[2] / "golden"
 TOP = 'format = 1\n[[archives]]\npath = "scans/hall"\n'
 VISITOR = '[[avatars]]\nname = "visitor"\nfile = "visitor.xyz"\n'

@@ -281,7 +281,7 @@ class World:
         reach: points so near the one touched are its surface [m].
         """
         if hit.cloud is None or hit.avatar is None or hit.archive < 0:
-            return None
+            return hit.normal  # what is none of the scene's brings its own
         with self as seen:
             each = seen[hit.archive]
             kept = each.opened.kept

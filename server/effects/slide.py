@@ -53,8 +53,13 @@ class Sliding:
         hit = frame.blocked
         if hit is None or frame.go is None:
             return
-        wish = frame.wish[:3, 3] - frame.body.pose[:3, 3]
-        self.along(frame, hit, frame.wish[:3, 3] - frame.pose[:3, 3], wish, stands=frame.body.on_ground)
+        begin = frame.body.pose[:3, 3]
+        wish, left = frame.wish[:3, 3] - begin, frame.wish[:3, 3] - frame.pose[:3, 3]
+        far = size(left)
+        if far > 0.0:
+            # Who turns goes by an arc: with all that is left it could get farther than it wished.
+            left = left * min(1.0, max(0.0, size(wish) - size(frame.pose[:3, 3] - begin)) / far)
+            self.along(frame, hit, left, wish, stands=frame.body.on_ground)
         if frame.pose[:3, :3].tobytes() != frame.wish[:3, :3].tobytes():
             turned = frame.wish.copy()
             turned[:3, 3] = frame.pose[:3, 3]

@@ -24,6 +24,9 @@ INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
 FLAT, HIGH = (0.1, 0.1) if not INTERPRETED else (0.2, 0.2)  # spacing of floor and walls [m]
 
 
+WALL = 0.12 if INTERPRETED else 0.06  # radius of their points: nothing slips between [m]
+
+
 def room(side: float = 4.0, height: float = 1.0) -> NDArray[np.float64]:
     """Points (n, 3) of a floor around the origin, at z = -0.5, and a wall at x = side / 2 [m]."""
     across = np.arange(-side / 2, side / 2 + FLAT / 2, FLAT)
@@ -100,7 +103,7 @@ def staged(
     avatars: dict[str, AvatarModel] | None = None, objects: tuple[ObjectItem, ...] = (),
 ) -> Iterator[Stage]:  # fmt: skip
     """A scene with these effects, of the room where no points are given."""
-    case = cases.build(folder, room() if points is None else points, voxel=1.0)
+    case = cases.build(folder, room() if points is None else points, voxel=1.0, radius=WALL)
     items = [AvatarItem(name=name, file=f"{name}.ply") for name in avatars or {}]
     file = SceneFile(
         format=1, archives=[ArchiveItem(path=str(case.archive))], effects=effects, avatars=items, objects=list(objects)

@@ -8,6 +8,8 @@ across it, up or down is let, and so is a turn. So bodies that came to be in one
 where they began or by an object that was told to be there, get apart, and none is ever held.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,6 +22,16 @@ from .frame import Body, Frame, Hit, Pose, Vec
 
 # Of a way that is across what is overlapped: rounding is not going deeper.
 _ACROSS = 1e-9
+
+
+class _First(NamedTuple):
+    """What ended a motion first. row: of the body.  witness: (2, 3) centres of the two spheres, world [m].  point: of
+    the body's model that touches."""
+
+    row: int
+    fraction: float
+    witness: NDArray[np.float64]
+    point: int
 
 
 class Blocking:
@@ -67,13 +79,12 @@ class Blocking:
             ends = self._from_origin(pose_from), self._from_origin(pose_to)
             rows = self._near(shape, *ends)
             while len(rows):
-                row, fraction, witness = self._first(shape, ends, rows, tolerance)
-                if row < 0:
+                first = self._first(shape, ends, rows, tolerance)
+                if first is None:
                     break
-                if fraction > 0.0 or not self._is_overlapped(row):
-                    hit = Hit(fraction, Verdict.CONTACT, witness[0], witness[1], bodies.names[row])
-                    return self._goes_deeper(shape, pose_from, pose_to) or hit
-                rows = rows[rows != row]
+                if first.fraction > 0.0 or not self._is_overlapped(first.row):
+                    return self._goes_deeper(shape, pose_from, pose_to) or self._hit_of(first)
+                rows = rows[rows != first.row]
             return self._goes_deeper(shape, pose_from, pose_to)
 
     def _touches(self, avatar: AvatarModel, pose: Pose) -> Hit | None:
@@ -86,7 +97,7 @@ class Blocking:
             touching = bodies.touching(shape, pose, rows, self._margin_units) if len(rows) else []
             for row in rows[touching].tolist():
                 if not self._is_overlapped(row):
-                    return self._hit(shape, pose, row)
+                    return self._hit_at(shape, pose, row)
             return self._goes_deeper(shape, self._start, pose)
 
     def give_way(self, frame: Frame, hit: Hit, to: Pose) -> bool:
@@ -118,25 +129,37 @@ class Blocking:
 
     def _first(
         self, shape: Shape, ends: tuple[Pose, Pose], rows: NDArray[np.int64], tolerance: float
-    ) -> tuple[int, float, NDArray[np.float64]]:
-        """Of these rows, what ends the motion first: (row, fraction, witness (2, 3)); row -1: nothing does."""
-        bodies = self._bodies
-        numbers = bodies.numbers[rows]
-        best, until, witness = -1, np.inf, np.empty((2, 3))
+    ) -> "_First | None":
+        """What ends a motion first, of the bodies of these rows."""
+        bodies, numbers = self._bodies, self._bodies.numbers[rows]
+        best: _First | None = None
+        until = np.inf
         while len(rows):
             same = numbers == numbers[0]
             other = bodies.shapes[int(rows[0])]
             if len(other.model.points):
-                place = np.empty((2, 3))
+                witness, named = np.empty((2, 3)), np.empty(2, np.int64)
                 row, fraction = sweep_bodies(
                     shape.model.arrays, shape.box, shape.units, *ends, other.model.arrays, bodies.poses,
-                    other.units, rows[same], bodies.origin, self._margin_units, tolerance, until, place,
+                    other.units, rows[same], bodies.origin, self._margin_units, tolerance, until, witness, named,
                     bodies.scratch,
                 )  # fmt: skip
                 if row >= 0:
-                    best, until, witness = row, fraction, place
+                    best, until = (
+                        _First(row, fraction, witness, int(other.model.rows[named[0], named[1]])),
+                        fraction,
+                    )
             rows, numbers = rows[~same], numbers[~same]
-        return best, until, witness
+        return best
+
+    def _hit_of(self, first: "_First") -> Hit:
+        """What ended a motion; with the normal of its surface where it is an object."""
+        bodies, row, (own, other) = self._bodies, first.row, first.witness
+        normal = None if bodies.kinds[row] == USER else bodies.shapes[row].normal_at(first.point)
+        if normal is not None:
+            normal = bodies.poses[row, :3, :3] @ normal
+            normal = -normal if normal @ (own - other) < 0.0 else normal
+        return Hit(first.fraction, Verdict.CONTACT, own, other, bodies.names[row], normal=normal)
 
     def _is_overlapped(self, row: int) -> bool:
         """Whether a body was touched where the mover was when the frame began."""
@@ -164,7 +187,7 @@ class Blocking:
         center = bodies.shape_of(self._model).center(self._start)
         return bodies.way_out(row, self._mover if self._user else "", center)
 
-    def _hit(self, shape: Shape, pose: Pose, row: int) -> Hit:
+    def _hit_at(self, shape: Shape, pose: Pose, row: int) -> Hit:
         """A body touched at a pose: nothing is known of when, so that its centre says where."""
         bodies, center = self._bodies, shape.center(pose)
         out = center - bodies.shapes[row].center(bodies.poses[row])
@@ -183,3 +206,4 @@ def warm() -> None:
     blocking = Blocking("", bodies, USER, "a", model, poses[0])
     blocking.sweep(model, poses[0], poses[1], 1e-6)
     blocking.touches(model, poses[1])
+    bodies.shape_of(model).normal_at(0)

@@ -12,6 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas.errors import BadRequestError, BadTransformError
+from ...schemas.kernels.normals import NONE, decode_normal, normal_code
+from ...schemas.voxel_grid import UNITS_PER_METRE
 from ..avatar import AvatarModel
 from ..kernels.meeting import bound_body, make_scratch
 from ..kernels.pairs import CONTACT, touch_pairs
@@ -21,23 +23,45 @@ from .frame import Body, Pose, Vec
 
 USER, TOLD, PUSHED = 1, 2, 4  # kinds, one bit each
 _EVER = 1 << 62  # node visits: no budget
+# Points so near one another make a body's surface [m], as `slide` and `ground` have it of scans.
+_SURFACE = 0.08
 # Shapes kept of avatars that are of no body, before they are forgotten.
 _MOST_LOOSE = 64
 
 
 class Shape(NamedTuple):
     """An avatar's model with what a broad phase asks. box: (2, 3) of its points [m], zeros where it has none.
-    units: its radius, exact units.  number: of it among its `Bodies`."""
+
+    units: its radius, exact units.  number: of it among its `Bodies`.  normals: those asked for, by point.
+    """
 
     model: AvatarModel
     box: NDArray[np.float64]
     units: int
     number: int
+    normals: dict[int, Vec | None]
 
     def center(self, pose: Pose) -> Vec:
         """The middle of its box, placed."""
         placed: Vec = pose[:3, :3] @ (0.5 * (self.box[0] + self.box[1])) + pose[:3, 3]
         return placed
+
+    def normal_at(self, point: int) -> Vec | None:
+        """The unit normal of its surface at a point, avatar frame, or its opposite; None: there is none.
+
+        As that of a scan's (schemas/kernels/normals.py), its lattice being exact units.
+        """
+        if point not in self.normals:
+            points = self.model.points
+            apart = points - points[point]
+            near = np.rint(apart[(apart * apart).sum(axis=1) <= _SURFACE**2] * UNITS_PER_METRE).astype(
+                np.int64
+            )
+            x, y, z = near.T
+            products = [x * x, y * y, z * z, y * z, z * x, x * y]
+            code = normal_code(np.array([len(near), *(c.sum() for c in (x, y, z, *products))], np.int64))
+            self.normals[point] = None if code == NONE else np.array(decode_normal(code))
+        return self.normals[point]
 
 
 class Bodies:
@@ -85,7 +109,7 @@ class Bodies:
         units = to_units(model.radius, "radius")
         if units > MAX_REACH_UNITS // 4:
             raise BadRequestError(f"avatar radius {model.radius:g} m: expected at most 4 m where bodies meet")
-        shape = self._known[id(model.points)] = Shape(model, box, units, self._numbered)
+        shape = self._known[id(model.points)] = Shape(model, box, units, self._numbered, {})
         self._numbered += 1
         return shape
 

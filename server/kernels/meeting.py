@@ -326,7 +326,8 @@ def _advance(meeting, size, until, tolerance):
 
 @nb.njit(nogil=True, cache=True)
 def sweep_bodies(
-    a, box, units_a, first, last, b, poses, units_b, rows, origin, margin_units, tolerance, until, witness, scratch
+    a, box, units_a, first, last, b, poses, units_b, rows, origin, margin_units, tolerance, until, witness, named,
+    scratch,
 ):  # fmt: skip
     """Which of some bodies that stand, all of avatar b, ends a motion of avatar a first; neither avatar empty.
 
@@ -334,7 +335,8 @@ def sweep_bodies(
     rigid, world.  units_a, units_b, margin_units: radii and margin, exact units.  rows: (m,) int64, of poses.
     until: what comes no sooner is of no interest; inf: all.  Returns (row, fraction): nothing of these touches before,
     and the row's body does, or all but, at most `tolerance` [m] of the fastest point's way later; (-1, until) if none
-    does. Writes witness (2, 3): the centres of the two spheres there, world [m]. Adds to scratch.counters.
+    does. Writes witness (2, 3): the centres of the two spheres there, world [m]; named (2,) int64: block and lane of
+    the body's. Adds to scratch.counters.
     """
     motion = make_motion(first, last, box, np.zeros(3))
     shift, shifts = np.empty(3), scratch.shifts
@@ -364,6 +366,7 @@ def sweep_bodies(
             continue
         best, found = row, since
         pair = scratch.pair
+        named[0], named[1] = pair[2], pair[3]
         pose_at(motion, since, pose)
         for r in range(3):
             shift[r] = pose[r, 3]

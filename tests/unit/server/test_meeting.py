@@ -44,11 +44,14 @@ def ask(
     ends = [pose.copy() for pose in (first, last)]
     for end in ends:
         end[:3, 3] -= ORIGIN
-    witness = np.full((2, 3), np.nan)
+    witness, named = np.full((2, 3), np.nan), np.full(2, -1)
     row, fraction = kernel.sweep_bodies(
         a.arrays, box_of(a), units_of(a), *ends, b.arrays, poses, units_of(b), np.arange(len(poses)), ORIGIN,
-        int(np.rint(margin * naive.UNITS)), TOLERANCE, until, witness, kernel.make_scratch(),
+        int(np.rint(margin * naive.UNITS)), TOLERANCE, until, witness, named, kernel.make_scratch(),
     )  # fmt: skip
+    if row >= 0:
+        point = b.points[b.rows[named[0], named[1]]]
+        assert np.allclose(poses[row, :3, :3] @ point + poses[row, :3, 3], witness[1], atol=1e-9)
     return Asked(int(row), float(fraction), witness)
 
 

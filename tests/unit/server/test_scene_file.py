@@ -1,4 +1,4 @@
-"""What a scene file says, opened: archives and budgets, the radius model, avatars for everybody, faults with a place."""
+"""What a scene file says, opened: archives, budgets, radius model, avatars for everybody, faults with their place."""
 
 from collections.abc import Callable
 from pathlib import Path

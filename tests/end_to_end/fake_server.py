@@ -47,7 +47,8 @@ def floor_verdicts(points, radius, poses, margin=0.0):
 
 
 class FloorPipeline:
-    """Stands in for effects: an avatar gets as low as the floor lets it. One named "crash" raises."""
+    """Stands in for effects: an avatar gets as low as the floor lets it. One named "crash" raises, of one named "large"
+    the states are."""
 
     def __init__(self):
         self.frames = 0
@@ -62,6 +63,8 @@ class FloorPipeline:
         if wish[2, 3] + lowest <= 0:
             pose[2, 3] = np.nextafter(-lowest, np.inf)
             touched = [Touched((float(wish[0, 3]), float(wish[1, 3]), 0.0))]
+        if body.name.endswith("/large"):
+            touched = [Touched((0.0, 0.0, 0.0))] * 2000
         body.pose = pose
         left = float(pose[2, 3] - wish[2, 3])
         skipped = sorted(skip) if skip else []

@@ -1,0 +1,445 @@
+"""Sessions over zenoh: wishes go out, states come in, whatever becomes of other clients and of servers."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+import zenoh
+from fake_server import floor_simulation
+from floor import DEADLINE, POINTS, eventually, server_process
+from solidcloud.schemas import keys
+from solidcloud.schemas.encoding import JSON, MSGPACK, decode_answer, encode
+from solidcloud.schemas.errors import (
+    BadRequestError,
+    BadTransformError,
+    BusyError,
+    InternalError,
+    UnknownAvatarError,
+)
+from solidcloud.schemas.messages import ErrorReply
+from solidcloud.schemas.moves import State, Wish
+from solidcloud.server.app import serving
+from solidcloud.server.client import Client
+from solidcloud.server.config import ServerConfig
+from solidcloud.server.frame_log import Frame, read_log
+from solidcloud.server.replay import replay
+from solidcloud.server.transport import session_config
+
+REST = np.nextafter(-0.375, 1.0)  # where POINTS with a radius of 0.125 come to rest on the floor
+
+
+def pose_at(x, z, y=0.0):
+    pose = np.eye(4)
+    pose[:3, 3] = x, y, z
+    return pose
+
+
+def outcome(pose):
+    """The judge: where the floor lets an avatar get to."""
+    there = pose.copy()
+    there[2, 3] = max(pose[2, 3], REST)
+    return there
+
+
+@pytest.fixture
+def floor():
+    return floor_simulation()
+
+
+@pytest.fixture
+def served(floor, endpoint):
+    with serving([floor], ServerConfig(listen=endpoint)):
+        yield floor
+
+
+@contextmanager
+def walking(endpoint, name="al", **fields):
+    """A client with one avatar, and its session."""
+    with Client(endpoint, scene="floor", timeout=DEADLINE) as client:
+        client.add_avatar(name, POINTS, 0.125)
+        with client.session(name) as session:
+            yield session
+
+
+def walk(client, name, count, found):
+    """A viewer of 60 frames a second: wish, and take what comes."""
+    rng = np.random.default_rng(len(found))
+    client.add_avatar(name, POINTS, 0.125)
+    with client.session(name) as session:
+        for _ in range(count):
+            pose = pose_at(*rng.normal(scale=0.5, size=2))
+            seq = session.wish(pose)
+            threading.Event().wait(1 / 60)
+        last = session.wait(seq, DEADLINE)
+        found[name] = ([state for state in session.states(0.0)], pose, last, seq)
+
+
+def test_eight_users_at_sixty_frames_a_second(served, endpoint):
+    found = {}
+    with Client(endpoint, scene="floor") as one, Client(endpoint, scene="floor") as two:
+        threads = [
+            threading.Thread(target=walk, args=((one, two)[number % 2], f"user-{number}", 150, found))
+            for number in range(8)
+        ]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join(60.0)
+    assert sorted(found) == [f"user-{number}" for number in range(8)]
+    for states, pose, last, seq in found.values():
+        numbers = [state.seq for state in states]
+        assert numbers == sorted(set(numbers)) and numbers[-1] == last.seq == seq
+        frames = [state.frame for state in states]
+        assert frames == sorted(set(frames))
+        assert np.array_equal(last.pose[0], outcome(pose))
+        # What a link has no room for is dropped, and nobody can count that.
+        assert 10 < len(states) <= seq - last.late
+    eventually(lambda: not served.users)
+
+
+def test_what_is_not_simulated_in_time_is_dropped_and_counted(served, endpoint):
+    gate, entered = threading.Event(), threading.Event()
+    run = served._pipeline.run
+
+    def slow(body, aim, seconds, *, skip=None):
+        entered.set()
+        assert gate.wait(DEADLINE)
+        return run(body, aim, seconds, skip=skip)
+
+    with walking(endpoint) as session:
+        served._pipeline.run = slow
+        session.wish(pose_at(0.0, 1.0))
+        assert entered.wait(DEADLINE)
+        for number in range(50):
+            seq = session.wish(pose_at(0.0, 1.0 + number))
+        with pytest.raises(BusyError, match="no state of wish"):
+            session.wait(seq, 0.0)
+        assert session.latest() is None
+        gate.set()
+        last = session.wait(seq, DEADLINE)
+        states = list(session.states(0.0))
+    assert last.pose[0, 2, 3] == 50.0 and states[0].seq == 1
+    assert len(states) <= 51 - last.late and last.late > 0
+
+
+def test_a_velocity_goes_on_from_where_it_was(served, endpoint):
+    with walking(endpoint) as session:
+        session.wish(pose_at(0.0, 0.5), time=1.0)
+        seq = session.wish(velocity=(1.0, 0.0, -100.0), turn=np.pi, time=1.0625)
+        state = session.wait(seq, DEADLINE)
+    first = next(iter([state]))
+    assert np.allclose(first.pose[0, :3, 3], [0.0625, 0.0, REST], atol=1e-15)
+    assert np.isclose(first.pose[0, 1, 0], np.sin(np.pi / 16))
+
+
+def test_users_leave_with_their_session_and_with_their_client(served, endpoint):
+    with Client(endpoint, scene="floor") as client:
+        client.add_avatar("al", POINTS, 0.125)
+        client.add_avatar("bo", POINTS, 0.125)
+        with client.session("al") as one, client.session("bo") as two:
+            two.wait(two.wish(pose_at(0.0, 1.0)), DEADLINE)
+            one.wait(one.wish(pose_at(0.0, 1.0)), DEADLINE)
+            assert len(served.users) == 2
+            one.close()
+            one.close()
+            eventually(lambda: [user.avatar for user in served.users] == ["bo"])
+            with pytest.raises(BadRequestError, match="closed"):
+                one.wish(pose_at(0.0, 1.0))
+            client.close()
+        eventually(lambda: not served.users)
+    with pytest.raises(BadRequestError, match="closed"):
+        client.session("al")
+
+
+def test_a_session_may_be_begun_again(served, endpoint):
+    with Client(endpoint, scene="floor") as client:
+        client.add_avatar("al", POINTS, 0.125)
+        seen = []
+        for _ in range(3):
+            with client.session("al") as session:
+                seen.append(session.wait(session.wish(pose_at(0.0, 1.0)), DEADLINE).seq)
+    assert seen == [1, 2, 3]
+
+
+CLIENT = """
+import sys, threading, numpy as np, zenoh
+from solidcloud.server.client import Client
+from solidcloud.server.transport import session_config
+points = np.array([[0.0, 0.0, 0.5], [0.25, 0.0, 1.0], [0.0, 0.25, 1.5]])
+with Client(sys.argv[1], scene="floor") as client, zenoh.open(session_config(connect=sys.argv[1])) as other:
+    client.add_avatar("other", points, 0.125)
+    with client.session("other") as session, other.declare_subscriber("solidcloud/1/state/**", lambda sample: None):
+        session.wait(session.wish(np.eye(4)), 20.0)
+        print("there", flush=True)
+        while True:
+            session.wish(np.eye(4))
+            threading.Event().wait(1 / 60)
+"""
+
+
+@contextmanager
+def other_client(endpoint):
+    """A client in a process of its own, that walks, and hears everybody's states."""
+    command = [sys.executable, "-P", "-c", CLIENT, endpoint]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout.readline() == "there\n"
+            yield process
+        finally:
+            process.kill()
+
+
+def test_a_frozen_client_stops_nobody(served, endpoint):
+    with other_client(endpoint) as other, walking(endpoint, "large") as session:
+        os.kill(other.pid, signal.SIGSTOP)
+        try:
+            # It has asked for these states too: 20 MB, more than sockets and queues hold.
+            for number in range(250):
+                seq = session.wish(pose_at(number / 1000, 1.0))
+                state = session.wait(seq, DEADLINE)
+                assert state.pose[0, 0, 3] == number / 1000 and len(state.touched) == 2000
+        finally:
+            os.kill(other.pid, signal.SIGCONT)
+
+
+def test_a_killed_client_leaves_the_scene(served, endpoint):
+    with other_client(endpoint) as other:
+        assert [user.avatar for user in served.users] == ["other"]
+        other.kill()
+        eventually(lambda: not served.users)
+    _, client = served.served.gone  # the first is who warmed it
+    assert client != "*warm" and not served.served.avatars
+
+
+def test_a_session_goes_on_with_a_server_that_was_restarted(endpoint):
+    with Client(endpoint, scene="floor", timeout=1.0) as client:
+        client.add_avatar("al", POINTS, 0.125)
+        with client.session("al") as session:
+            for restart in range(3):
+                with server_process(endpoint, "--walked") as process:
+                    last = keep_wishing(session, lambda: session.wish(velocity=(0.0, 1.0, 0.0)), restart == 0)
+                    # A state more, of the server that is there now.
+                    assert last.pose[0, 1, 3] > 0.001 * restart
+                    process.kill()
+                age = session.latest().age
+                eventually(lambda age=age: session.latest().age > age)
+                assert session.latest().state.seq == last.seq or restart == 0
+    assert last.pose[0, 0, 3] == 0.25, "from where the first server had left it"
+
+
+def keep_wishing(session, wish, first):
+    """Wish until a server says something, as a viewer does; the first wish of all says where it begins."""
+    before = session.latest().state.seq if session.latest() else 0
+    found = []
+
+    def answered():
+        session.wish(pose_at(0.25, 1.0)) if first and not found else wish()
+        latest = session.latest()
+        if latest is not None and latest.state.seq > before:
+            found.append(latest.state)
+        return len(found) > 5
+
+    eventually(answered)
+    return found[-1]
+
+
+def test_the_avatar_is_added_to_a_server_that_does_not_know_it(served, endpoint):
+    with walking(endpoint) as session:
+        session.wait(session.wish(pose_at(0.5, 1.0)), DEADLINE)
+        (user,) = served.users
+        served.drop_client(user.client)
+        # Refused, added again, and wished again, although nobody wishes after it.
+        state = session.wait(session.wish(velocity=(0.0, 0.0, 0.0)), DEADLINE)
+        assert state.pose[0, 0, 3] == 0.5, "from where it was"
+        assert served.users == [user]
+
+
+def test_what_is_refused_is_raised_where_it_is_waited_for(served, endpoint):
+    with walking(endpoint) as session:
+        session.wait(session.wish(pose_at(0.0, 1.0)), DEADLINE)
+        seq = session.wish(2 * pose_at(0.0, 1.0))
+        with pytest.raises(BadTransformError):
+            session.wait(seq, DEADLINE)
+        states = session.states(0.0)
+        assert next(states).seq == 1
+        with pytest.raises(BadTransformError):
+            next(states)
+        state = session.wait(session.wish(pose_at(0.0, 2.0)), DEADLINE)
+        assert state.pose[0, 2, 3] == 2.0 and session.latest().state is state
+        session.wish(velocity=(0.0, 0.0, 0.0), objects={"door": np.eye(4).tolist()})
+        eventually_raises(session.latest, BadRequestError)
+        assert session.latest().state is state, "said once"
+
+
+def eventually_raises(ask, kind):
+    """Ask until it raises an error of a kind."""
+
+    def raised():
+        try:
+            ask()
+        except kind:
+            return True
+        return False
+
+    eventually(raised)
+
+
+def test_an_avatar_that_nobody_knows_is_said_to_be_unknown(served, endpoint):
+    with Client(endpoint, scene="floor") as client:
+        with client.session("nobody") as session:
+            seq = session.wish(pose_at(0.0, 1.0))
+            with pytest.raises(UnknownAvatarError):
+                session.wait(seq, DEADLINE)
+        client.add_avatar("al", POINTS, 0.125)
+        with client.session("al") as session:
+            seq = session.wish(velocity=(0.0, 0.0, 1.0))
+            with pytest.raises(UnknownAvatarError, match="begin with a pose"):
+                session.wait(seq, DEADLINE)
+            assert session.wait(session.wish(pose_at(0.0, 1.0)), DEADLINE).pose[0, 2, 3] == 1.0
+        with pytest.raises(BadRequestError, match="expected 1 to 64"):
+            client.session("a b")
+
+
+def test_an_effect_that_fails_is_an_error_of_the_servers(served, endpoint):
+    with walking(endpoint, "crash") as session:
+        seq = session.wish(pose_at(0.0, 1.0))
+        with pytest.raises(InternalError, match="its log says more"):
+            session.wait(seq, DEADLINE)
+
+
+@pytest.mark.parametrize(
+    "wish", [{}, {"pose": np.eye(3)}, {"velocity": (1.0, 2.0)}, {"velocity": (0, 0, np.nan)}]
+)
+def test_what_is_no_wish_is_refused_before_it_is_sent(served, endpoint, wish):
+    with walking(endpoint) as session, pytest.raises((BadRequestError, ValueError)):
+        session.wish(**wish)
+
+
+def test_a_full_scene_says_so(endpoint):
+    with (
+        serving([floor_simulation(users=1)], ServerConfig(listen=endpoint)),
+        walking(endpoint) as one,
+        walking(endpoint) as two,
+    ):
+        one.wait(one.wish(pose_at(0.0, 1.0)), DEADLINE)
+        seq = two.wish(pose_at(0.0, 1.0))
+        with pytest.raises(BusyError, match="limits"):
+            two.wait(seq, DEADLINE)
+        one.close()
+        eventually(lambda: reached(two))
+
+
+def reached(session):
+    """Whether a wish has a state now."""
+    try:
+        session.wait(session.wish(pose_at(0.0, 1.0)), DEADLINE)
+    except BusyError:
+        return False
+    return True
+
+
+@pytest.mark.parametrize("encoding", [MSGPACK, JSON])
+def test_plain_zenoh_is_enough_to_walk(served, endpoint, encoding):
+    user, heard = keys.User("me", "al"), []
+    served.add_avatar("al", POINTS, 0.125, client="me")
+    with zenoh.open(session_config(connect=endpoint)) as session:
+        hearing = [
+            session.declare_subscriber(key("floor", user), lambda sample: heard.append(sample))
+            for key in (keys.state_key, keys.refused_key)
+        ]
+        wish = Wish(seq=7, time=1.0, pose=pose_at(0.0, -2.0)[None])
+        key = keys.wish_key("floor", user)
+        session.put(key, encode(wish, encoding), encoding=encoding)
+        eventually(lambda: len(heard) == 1)
+        state = decode_answer(State, heard[0].payload.to_bytes(), encoding)
+        assert str(heard[0].encoding) == encoding and str(heard[0].key_expr) == keys.state_key("floor", user)
+        assert (state.seq, state.frame) == (7, 1) and np.array_equal(state.pose[0], outcome(wish.pose[0]))
+        for number, payload in enumerate((b"\xc1", b"{}", b"", b"\x80")):
+            session.put(key, payload, encoding=encoding)
+            eventually(lambda number=number: len(heard) == 2 + number)
+            error = decode_answer(ErrorReply, heard[-1].payload.to_bytes(), encoding)
+            assert str(heard[-1].key_expr) == keys.refused_key("floor", user) and error.code == "bad_request"
+        session.put(key, encode(wish), encoding="text/plain")
+        eventually(lambda: len(heard) == 6)
+        assert decode_answer(ErrorReply, heard[-1].payload.to_bytes(), MSGPACK).code == "bad_request"
+        session.put("solidcloud/1/wish/floor/me/*", b"")  # of nobody: no answer, and nothing breaks
+        assert served.users == [user]
+        session.delete(key)
+        eventually(lambda: not served.users)
+        for each in hearing:
+            each.undeclare()
+
+
+@pytest.mark.parametrize("mode", ["client", "peer"])
+def test_nobody_else_publishes_states(served, endpoint, mode):
+    config = session_config(connect=endpoint)
+    config.insert_json5("mode", f'"{mode}"')
+    hearer = session_config(connect=endpoint)
+    hearer.insert_json5("mode", '"client"')
+    heard = []
+    with (
+        walking(endpoint) as session,
+        zenoh.open(hearer) as listener,
+        listener.declare_subscriber("solidcloud/1/**", heard.append),
+        zenoh.open(config) as rogue,
+    ):
+        session.wait(session.wish(pose_at(0.0, 1.0)), DEADLINE)
+        (user,) = served.users
+        lie = State(pose=pose_at(9.0, 9.0)[None], seq=10**6, time=0.0, frame=1)
+        for _ in range(20):
+            rogue.put(keys.state_key("floor", user), encode(lie))
+            rogue.put(keys.refused_key("floor", user), encode(ErrorReply("internal", "a lie")))
+            rogue.delete(keys.state_key("floor", user))
+        # What comes over the same link after them is heard, so they were heard of, if at all.
+        rogue.put("solidcloud/1/else", b"")
+        if mode == "client":
+            eventually(lambda: any(str(sample.key_expr) == "solidcloud/1/else" for sample in heard))
+        state = session.wait(session.wish(pose_at(0.0, 2.0)), DEADLINE)
+        assert state.pose[0, 2, 3] == 2.0 and session.latest().state is state
+        assert all(each.pose[0, 0, 3] == 0.0 for each in session.states(0.0))
+        told = [str(sample.key_expr).split("/")[2] for sample in heard]
+        assert "refused" not in told and not [s for s in heard if s.payload.to_bytes() == encode(lie)]
+        assert not [s for s in heard if s.kind == zenoh.SampleKind.DELETE]
+
+
+def test_a_server_that_stops_ends_its_sessions(endpoint):
+    with server_process(endpoint, "--walked") as process, walking(endpoint) as session:
+        session.wait(session.wish(pose_at(0.0, 1.0)), DEADLINE)
+        ended = threading.Event()
+
+        def wish():
+            while not ended.is_set():
+                session.wish(pose_at(0.0, 1.0))
+                ended.wait(1 / 200)
+
+        thread = threading.Thread(target=wish)
+        thread.start()
+        try:
+            process.send_signal(signal.SIGTERM)
+            assert process.wait(DEADLINE) == 0
+        finally:
+            ended.set()
+            thread.join(DEADLINE)
+
+
+def test_a_killed_server_leaves_a_log_that_replays(endpoint, tmp_path):
+    log = tmp_path / "frames.log"
+    with server_process(endpoint, "--walked", "--log", str(log)) as process, walking(endpoint) as session:
+        rng = np.random.default_rng(4)
+        for number in range(200):
+            pose = pose_at(*rng.normal(size=2))
+            seq = (
+                session.wish(pose) if number % 3 == 0 else session.wish(velocity=rng.normal(size=3), turn=1.0)
+            )
+            session.wait(seq, DEADLINE)
+        process.kill()
+    records = list(read_log(log))
+    found = replay(floor_simulation(), records)
+    assert found == (200, 200, 0, None, None)
+    last = [record for record in records if isinstance(record, Frame)][-1]
+    assert last.said[0].pose == session.latest().state.pose.tobytes()

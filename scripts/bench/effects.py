@@ -1,0 +1,151 @@
+"""What effects cost: the 40-second walk, a frame at a time in this process, under every set of effects."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from solidcloud.schemas.effects import (
+    AnyEffect,
+    Contacts,
+    Crowd,
+    Ground,
+    Objects,
+    Proximity,
+    Slide,
+    Step,
+    Stop,
+    Sweep,
+    Through,
+    ThroughBox,
+    Uncertainty,
+)
+from solidcloud.schemas.scene import ArchiveItem, SceneFile, effect_name
+from solidcloud.server.avatar import AvatarModel
+from solidcloud.server.effects.frame import Body, Frame, Runner
+from solidcloud.server.effects.pipeline import Pipeline, make_pipeline
+from solidcloud.server.scene import Scene
+from solidcloud.server.world import World
+
+Floats = NDArray[np.float64]
+
+STOP, SWEEP, SLIDE, STEP, GROUND = Stop(), Sweep(), Slide(), Step(), Ground()
+WALKING: tuple[AnyEffect, ...] = (STOP, SWEEP, SLIDE, STEP, GROUND)
+EVERYTHING: tuple[AnyEffect, ...] = (*WALKING, Crowd(), Proximity(), Contacts(), Uncertainty())
+# An effect alone, beside what it needs: what it costs is the difference.
+ALONE: dict[str, tuple[tuple[AnyEffect, ...], tuple[AnyEffect, ...]]] = {
+    "stop": ((), (STOP,)),
+    "sweep": ((STOP,), (STOP, SWEEP)),
+    "slide": ((STOP, SWEEP), (STOP, SWEEP, SLIDE)),
+    "ground": ((STOP, SWEEP, SLIDE), (STOP, SWEEP, SLIDE, GROUND)),
+    "step": ((STOP, SWEEP, SLIDE, GROUND), WALKING),
+    "objects": ((STOP, SWEEP), (STOP, SWEEP, Objects())),
+    "crowd": ((STOP, SWEEP), (STOP, SWEEP, Crowd())),
+    "proximity": ((), (Proximity(),)),
+    "contacts": ((), (Contacts(),)),
+    "uncertainty": ((), (Uncertainty(),)),
+}
+# For `through`, which costs when a scene is opened: a box in the main door's arch that holds some points.
+ARCH = Through(boxes=[ThroughBox(name="arch", low=(-1.0, -0.2, 3.0), high=(1.0, 1.4, 4.5))])
+FRAME = 1 / 30
+
+
+def file_of(effects: Sequence[AnyEffect]) -> SceneFile:
+    """A scene that calls for these."""
+    return SceneFile(format=1, archives=[ArchiveItem(path=".")], effects=list(effects))
+
+
+class Timed:
+    """An effect, and what each of its frames took [s]."""
+
+    def __init__(self, runner: Runner) -> None:
+        self.runner, self.name = runner, runner.name
+        self.seconds: list[float] = []
+
+    def run(self, frame: Frame) -> None:
+        """Its part of one frame."""
+        begin = time.perf_counter()
+        self.runner.run(frame)
+        self.seconds.append(time.perf_counter() - begin)
+
+
+@dataclass
+class Walk:
+    """What came of one walk. frames: (k,) of each frame [s].  effects: name -> (k,) of each in it [s]; of walks that
+    time them.  places: (k, 3) where the body was.  visits: node visits of all frames."""
+
+    frames: Floats
+    effects: dict[str, Floats] = field(default_factory=dict)
+    places: Floats = field(default_factory=lambda: np.empty((0, 3)))
+    visits: int = 0
+
+
+class Stage:
+    """One archive, resident, and pipelines of effects over it, each made once. A context manager."""
+
+    def __init__(self, archive: Path, avatar: AvatarModel, poses: Floats) -> None:
+        """poses: (k, 4, 4) the wishes, a frame each."""
+        self.scene = Scene.open(archive, budget_bytes=1 << 30)
+        self.avatar, self.poses = avatar, poses
+        self._made: dict[str, tuple[World, Pipeline]] = {}
+        self.scene.add_avatar("all", avatar.points, avatar.radius)
+        self.scene.collide("all", poses)  # everything is resident
+
+    def __enter__(self) -> "Stage":
+        """The stage itself."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close the archive."""
+        self.scene.close()
+
+    def pipeline(self, effects: Sequence[AnyEffect]) -> tuple[World, Pipeline]:
+        """The effects' pipeline over the archive."""
+        key = " ".join(effect_name(effect) for effect in effects)
+        if key not in self._made:
+            file = file_of(effects)
+            world = World(self.scene, file)
+            self._made[key] = world, make_pipeline(file, world)
+        return self._made[key]
+
+    def walk(self, effects: Sequence[AnyEffect], *, timed: bool = False) -> Walk:
+        """The whole walk of one user. timed: each effect, too, which adds a tenth of a microsecond to each."""
+        world, pipeline = self.pipeline(effects)
+        plain = pipeline.runners
+        if timed:
+            pipeline.runners = [Timed(runner) for runner in plain]
+        body = Body("bench/one", self.avatar, self.poses[0].copy())
+        took = np.empty(len(self.poses))
+        places = np.empty((len(self.poses), 3))
+        before = world.visits
+        for number, wish in enumerate(self.poses):
+            begin = time.perf_counter()
+            moved = pipeline.run(body, wish, FRAME)
+            took[number] = time.perf_counter() - begin
+            places[number] = moved.pose[0, :3, 3]
+        found = Walk(took, places=places, visits=world.visits - before)
+        if timed:
+            found.effects = {each.name: np.array(each.seconds) for each in pipeline.runners}  # type: ignore[attr-defined]
+            pipeline.runners = plain
+        return found
+
+    def crowd(self, effects: Sequence[AnyEffect], users: int) -> Floats:
+        """The walk of so many users, each some way behind the one before: what each frame of all took (k,) [s]."""
+        pipeline = self.pipeline(effects)[1]
+        apart = len(self.poses) // users
+        bodies = [
+            Body(f"bench/{user}", self.avatar, self.poses[user * apart].copy()) for user in range(users)
+        ]
+        if pipeline.bodies is not None:
+            for body in bodies:
+                client, _, avatar = body.name.rpartition("/")
+                pipeline.bodies[client, avatar] = body
+        took = np.empty(apart)
+        for number in range(apart):
+            begin = time.perf_counter()
+            for user, body in enumerate(bodies):
+                pipeline.run(body, self.poses[user * apart + number], FRAME)
+            took[number] = time.perf_counter() - begin
+        return took

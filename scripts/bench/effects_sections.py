@@ -1,0 +1,171 @@
+"""The sections of bench_effects: effects alone and in company, many users, and what is not declared."""
+
+import statistics
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+from solidcloud.schemas.effects import Crowd
+from solidcloud.schemas.scene import effect_name
+from solidcloud.server.effects.through import store_without
+from solidcloud.server.scene import Scene
+from solidcloud.server.store import Store
+
+from .effects import ALONE, ARCH, EVERYTHING, WALKING, Stage
+from .machine import Clock
+from .results import Part
+
+FRAME_GOAL, USERS, USERS_GOAL, UNDECLARED_GOAL = 100.0, 30, 5.0, 1.02
+NOTES = {
+    "frame": "stop, sweep, slide, step and ground on the walk of 1,200 frames, mean; the median frame beside it",
+    "users": "30 users on the same walk, 40 frames apart, one after the other in one thread",
+    "undeclared": "the same scene in two processes in turn: one that never imported another effect, and one where a "
+    "scene with all effects is open, too; the middle of the turns' ratios",
+}
+TURNS = 15
+
+
+def _name(effects: tuple) -> str:
+    return ", ".join(effect_name(effect) for effect in effects) or "nothing"
+
+
+def walk(stage: Stage, clock: Clock, loops: int) -> tuple[Part, dict[str, np.ndarray]]:
+    """Each set of effects in turn; and, of all together, what each effect took of each frame."""
+    part = Part("walk")
+    sets = {_name(e): e for pair in ALONE.values() for e in pair} | {_name(EVERYTHING): EVERYTHING}
+    means: dict[str, list[float]] = {name: [] for name in sets}
+    medians: dict[str, list[float]] = {name: [] for name in sets}
+    stacked: list[dict[str, np.ndarray]] = []
+    for effects in sets.values():
+        stage.walk(effects)
+    for _ in clock.loops(loops):
+        for name, effects in sets.items():
+            found = stage.walk(effects)
+            means[name].append(1e6 * found.frames.mean())
+            medians[name].append(1e6 * float(np.median(found.frames)))
+        stacked.append(stage.walk(EVERYTHING, timed=True).effects)
+        clock.look_around()
+    count = len(stage.poses)
+    for name in sets:
+        part.add(name, "frame", "mean", means[name], "us", count)
+        part.add(name, "frame", "median", medians[name], "us", count)
+    company = {name: np.median([each[name] for each in stacked], axis=0) for name in stacked[0]}
+    for name, (without, with_it) in ALONE.items():
+        own = np.array(means[_name(with_it)]) - np.array(means[_name(without)])
+        part.add("an effect", name, f"alone, beside {_name(without)}", own, "us", count)
+        if name in company:
+            part.add("an effect", name, "in company of all", 1e6 * company[name].mean(), "us", count)
+    part.goal(
+        "frame",
+        f"{_name(WALKING)}: mean frame",
+        part.value(_name(WALKING), "frame", "mean"),
+        FRAME_GOAL,
+        "us",
+    )
+    part.remarks.append(f"of {count} frames, {_counts(stage)}")
+    return part, company
+
+
+def _counts(stage: Stage) -> str:
+    """How much was looked at, a frame."""
+    found = stage.walk(WALKING)
+    far = np.linalg.norm(found.places[:, :2] - stage.poses[:, :2, 3], axis=1)
+    return (
+        f"{found.visits / len(found.frames):.0f} node visits each; the body is {1e3 * np.median(far):.1f} mm from its "
+        f"wish in the middle, {1e3 * far.max():.0f} mm at most"
+    )
+
+
+def users(stage: Stage, clock: Clock, loops: int) -> Part:
+    """Many users in one frame."""
+    part = Part("users")
+    for effects in (WALKING, (*WALKING, Crowd())):
+        stage.crowd(effects, USERS)
+        mean, worst = [], []
+        for _ in clock.loops(loops, 0.5):
+            took = 1e3 * stage.crowd(effects, USERS)
+            mean.append(took.mean())
+            worst.append(np.percentile(took, 99))
+        name = f"{USERS} users, {_name(effects)}"
+        value = part.add(name, "frame of all", "mean", mean, "ms", USERS)
+        part.add(name, "frame of all", "p99", worst, "ms", USERS)
+        part.goal("users", name, value, USERS_GOAL, "ms")
+        clock.look_around()
+    return part
+
+
+def through(archive: Path, loops: int) -> Part:
+    """Opening a scene with a box and without; then nothing differs but the points that are there."""
+    part = Part("through")
+    took: dict[str, list[float]] = {"without": [], "with a box": []}
+    for _ in range(loops):
+        for name, values in took.items():
+            begin = time.perf_counter()
+            with Scene.open(archive, open_store=store_without(ARCH) if name == "with a box" else Store):
+                values.append(1e3 * (time.perf_counter() - begin))
+    for name, values in took.items():
+        part.add("opening the scene", name, "time", values, "ms")
+    return part
+
+
+class Child:
+    """A process that walks when it is told to, and says how long a frame took on average [us]."""
+
+    def __init__(self, script: Path, archive: Path, everything: bool) -> None:
+        options = ["--child", str(archive), "everything" if everything else "alone"]
+        self._process = subprocess.Popen(
+            [sys.executable, str(script), *options], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        )
+
+    def turn(self) -> float:
+        """One walk."""
+        assert self._process.stdin is not None and self._process.stdout is not None
+        print("walk", file=self._process.stdin, flush=True)
+        return float(self._process.stdout.readline())
+
+    def close(self) -> None:
+        """End it."""
+        self._process.communicate()
+
+
+def undeclared(script: Path, archive: Path, clock: Clock) -> Part:
+    """The same scene beside all that it does not declare, and without; in turn, first the one, then the other."""
+    part = Part("undeclared")
+    children = [Child(script, archive, everything) for everything in (False, True)]
+    try:
+        for child in children:
+            child.turn()
+        ratios, times = [], ([], [])
+        for number in range(TURNS):
+            found = [0.0, 0.0]
+            for which in (0, 1) if number % 2 else (1, 0):
+                found[which] = children[which].turn()
+                times[which].append(found[which])
+            ratios.append(found[1] / found[0])
+            clock.look_around()
+    finally:
+        for child in children:
+            child.close()
+    part.add(_name(WALKING), "nothing else imported", "median frame", times[0], "us")
+    part.add(_name(WALKING), "all effects imported, and a scene of them open", "median frame", times[1], "us")
+    middle = part.add(_name(WALKING), "the latter / the former", "ratio", ratios, "x")
+    part.goal("undeclared", "effects not declared: frame / frame without them", middle, UNDECLARED_GOAL, "x")
+    part.remarks.append(
+        f"ratios of {TURNS} turns: {min(ratios):.3f} to {max(ratios):.3f}, "
+        f"middle half {np.percentile(ratios, 25):.3f} to {np.percentile(ratios, 75):.3f}"
+    )
+    return part
+
+
+def child(archive: Path, everything: bool, stage: Stage) -> None:
+    """A child's work: a walk for each line it reads."""
+    other = Stage(archive, stage.avatar, stage.poses) if everything else None
+    if other is not None:
+        other.walk(EVERYTHING)
+    stage.walk(WALKING)
+    for _ in sys.stdin:
+        print(statistics.median((1e6 * stage.walk(WALKING).frames).tolist()), flush=True)
+    if other is not None:
+        other.scene.close()

@@ -1,0 +1,145 @@
+"""The made façade as a scene with effects, served over zenoh, and a user who walks in it frame by frame."""
+
+import socket
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from solidcloud.builder.config import BuildConfig
+from solidcloud.builder.made.scenes import make_facade
+from solidcloud.builder.made.truth import FacadeTruth, read_truth
+from solidcloud.builder.pipeline import build_archive
+from solidcloud.schemas.answers import Verdict
+from solidcloud.schemas.moves import Moved
+from solidcloud.server.app import serving
+from solidcloud.server.client import Client
+from solidcloud.server.config import ServerConfig
+from solidcloud.server.scene_file import open_scene
+
+WALKING = ("stop", "sweep", "slide", "step", "ground")
+FRAME = 1 / 30
+
+
+def build_facade_archive(
+    folder: Path, points: int, *, door: float = 1.6, models: tuple[str, ...] = ("mean",)
+) -> tuple[Path, FacadeTruth]:
+    """The archive of a façade of so many points, and the truth about it."""
+    made = make_facade(folder / "facade.laz", points=points, door=door)
+    build_archive([folder / "facade.laz"], folder / "facade", BuildConfig(jobs=1, models=frozenset(models)))
+    return folder / "facade", read_truth(made.truth).facades[0]
+
+
+def scene_text(archive: Path, effects: tuple[str, ...] = WALKING, **top: Any) -> str:
+    """A scene file with these effects, all as by default. top: other keys, as TOML has them."""
+    lines = ["format = 1", *(f"{key} = {value}" for key, value in top.items())]
+    lines += ["", "[[archives]]", f"path = '{archive}'"]
+    for effect in effects:
+        lines += ["", "[[effects]]", f'effect = "{effect}"']
+    return "\n".join(lines) + "\n"
+
+
+def cylinder(
+    width: float, height: float = 1.75, radius: float = 0.02, spacing: float = 0.03
+) -> NDArray[np.float64]:
+    """Points of an upright cylinder that stands on z = 0, `width` across with its spheres [m]."""
+    inner = width / 2 - radius
+    around = np.linspace(0, 2 * np.pi, max(8, round(2 * np.pi * inner / spacing)), endpoint=False)
+    heights = np.linspace(radius, height - radius, round(height / spacing))
+    side = [
+        np.column_stack([inner * np.cos(around), inner * np.sin(around), np.full(around.size, z)])
+        for z in heights
+    ]
+    grid = np.arange(-inner, inner + 1e-9, spacing)
+    x, y = (axis.ravel() for axis in np.meshgrid(grid, grid))
+    inside = np.hypot(x, y) < inner - spacing / 2
+    caps = [
+        np.column_stack([x[inside], y[inside], np.full(inside.sum(), z)]) for z in (radius, height - radius)
+    ]
+    return np.concatenate(side + caps)
+
+
+def standing(x: float, y: float, z: float, heading: float = 0.0) -> NDArray[np.float64]:
+    """The pose (4, 4) of a body that stands there, turned about z [rad]."""
+    pose = np.eye(4)
+    c, s = np.cos(heading), np.sin(heading)
+    pose[:2, :2] = [[c, -s], [s, c]]
+    pose[:3, 3] = x, y, z
+    return pose
+
+
+class Walker:
+    """A user whose wishes are sent one at a time, each waited for."""
+
+    def __init__(self, session: Any) -> None:
+        self.session, self.states = session, []
+
+    def wish(self, **wish: Any) -> Moved:
+        """One frame."""
+        seq = self.session.wish(**wish)
+        state = self.session.wait(seq, timeout=20.0)
+        self.states.append(state)
+        return state
+
+    def to(self, start: NDArray[np.float64], end: NDArray[np.float64], speed: float = 1.5) -> Moved:
+        """Wish to be ever farther on the straight way between two poses of one heading, a frame at a time."""
+        way = end[:3, 3] - start[:3, 3]
+        frames = max(1, int(np.ceil(np.linalg.norm(way) / (speed * FRAME))))
+        for number in range(1, frames + 1):
+            pose = start.copy()
+            pose[:3, 3] += way * (number / frames)
+            self.wish(pose=pose, time=(len(self.states) + 1) * FRAME)
+        return self.states[-1]
+
+    def go(self, velocity: tuple[float, float, float], seconds: float) -> Moved:
+        """Wish to go on at this velocity, for so long."""
+        for _ in range(round(seconds / FRAME)):
+            self.wish(velocity=velocity, time=(len(self.states) + 1) * FRAME)
+        return self.states[-1]
+
+    @property
+    def places(self) -> NDArray[np.float64]:
+        """Where the body was after each frame (k, 3) [m]."""
+        return np.array([state.pose[0, :3, 3] for state in self.states])
+
+
+def _no_avatars(path: Path) -> NDArray[np.float64]:
+    """Nothing: these scenes have none of their own."""
+    raise AssertionError(path)
+
+
+class Served(NamedTuple):
+    """A scene that is served, and a client of it."""
+
+    client: Client
+
+    @contextmanager
+    def walking(self, name: str, start: NDArray[np.float64]) -> Iterator[Walker]:
+        """A user whose body begins at `start`."""
+        with self.client.session(name) as session:
+            walker = Walker(session)
+            walker.wish(pose=start, time=0.0)
+            yield walker
+
+    def assert_clear(self, name: str, walker: Walker, **options: Any) -> None:
+        """No pose that was answered is in contact."""
+        poses = np.concatenate([state.pose for state in walker.states])
+        verdicts = self.client.collide(name, poses, **options).verdict
+        assert (verdicts == Verdict.CLEAR).all(), f"frames {np.flatnonzero(verdicts).tolist()}"
+
+
+@contextmanager
+def serving_scene(folder: Path, text: str) -> Iterator[Served]:
+    """Serve a scene file of this text over zenoh, on loopback."""
+    (folder / "scene.toml").write_text(text)
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        endpoint = f"tcp/127.0.0.1:{free.getsockname()[1]}"
+    with (
+        open_scene(folder / "scene.toml", read_points=_no_avatars) as scene,
+        serving([scene], ServerConfig(listen=endpoint)),
+        Client(endpoint, scene=scene.name) as client,
+    ):
+        yield Served(client)

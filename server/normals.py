@@ -20,6 +20,15 @@ from .store import Store
 SHARE = 1 / 32
 
 
+def warm(data: SceneData) -> None:
+    """Have the kernels compiled before anybody waits for them: a frame asks for normals only where it touches."""
+    nowhere = data.arrays._replace(where=np.full_like(data.arrays.where, -1))
+    find_voxel(data.broad.keys, nowhere.voxel_steps, 0, 0, 0)
+    code_at(nowhere, 0, 0, 0, 0, 1, np.empty(0, np.uint16))
+    stored_code_at(nowhere, 0, 0, 0, 0, data.keeps_scan)
+    decode_normal(int(UNASKED) << 8 | 1)
+
+
 class Normals:
     """The normals of one generation of an archive. Thread-safe.
 

@@ -20,6 +20,7 @@ import numpy as np
 from ...schemas.answers import Verdict
 from ...schemas.effects import Ground, Slide, Step, Sweep
 from ...schemas.moves import GroundReport
+from ..normals import warm
 from ..world import World
 from .frame import Frame, Hit, Vec, dot, lowest, moved_by, size
 from .going import first_hit, note, settle
@@ -227,6 +228,8 @@ class Grounded:
 def make(effect: Ground, world: World) -> Grounded:
     """The effect of a scene."""
     declared = {type(each): each for each in world.file.effects}
+    with world as seen:
+        warm(seen[0].data)
     step, sweep, slide = declared.get(Step), declared.get(Sweep), declared.get(Slide)
     sliding = None
     if isinstance(slide, Slide):

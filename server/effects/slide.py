@@ -20,6 +20,7 @@ import numpy as np
 
 from ...schemas.answers import Verdict
 from ...schemas.effects import Ground, Slide
+from ..normals import warm
 from ..world import World
 from .frame import Frame, Hit, Vec, dot, moved_by, size
 
@@ -156,4 +157,6 @@ def clip(left: Vec, planes: list[Vec]) -> Vec | None:
 def make(effect: Slide, world: World) -> Sliding:
     """The effect of a scene."""
     slope = next((each.slope for each in world.file.effects if isinstance(each, Ground)), None)
+    with world as seen:
+        warm(seen[0].data)
     return Sliding(effect.surfaces, effect.normal_reach, slope, world)

@@ -121,12 +121,15 @@ def _add_near(scene, voxel, x, y, z, square, rows, sums):
 
 @nb.njit(nogil=True, cache=True)
 def code_at(scene, voxel, x, y, z, square, codes):
-    """The code of the normal at a lattice point of a resident voxel, looked up in `codes`, else estimated and kept.
+    """The code of the normal at a lattice point, looked up in `codes`, else estimated and kept.
 
     scene: SceneArrays.  x, y, z: int64.  square: of the reach [steps^2], with `normals.normal_reach` found to fit.
     codes: (blocks * LANES,) uint16, UNASKED where not estimated yet; written. Of length 0: nothing is kept.
-    Returns (code, nodes visited, whether it was estimated): NONE where no point of the voxel is there.
+    Returns (code, nodes visited, whether it was estimated): NONE where no point of the voxel is there, or the voxel is
+    not resident.
     """
+    if scene.where[voxel, 0] < 0:
+        return NONE, 0, False
     rows, sums = np.empty(STACK, np.int64), np.zeros(SUMS, np.int64)
     x -= scene.coordinates[voxel, 0] * scene.voxel_steps
     y -= scene.coordinates[voxel, 1] * scene.voxel_steps
@@ -146,6 +149,8 @@ def code_at(scene, voxel, x, y, z, square, codes):
 @nb.njit(nogil=True, cache=True)
 def stored_code_at(scene, voxel, x, y, z, with_scan):
     """`code_at` of an archive whose normals are in memory. with_scan: whether scan numbers are."""
+    if scene.where[voxel, 0] < 0:
+        return NONE, 0
     rows = np.empty(STACK, np.int64)
     x -= scene.coordinates[voxel, 0] * scene.voxel_steps
     y -= scene.coordinates[voxel, 1] * scene.voxel_steps

@@ -17,9 +17,10 @@ import pytest
 import scans
 from numpy.typing import NDArray
 from solidcloud.schemas.errors import BadRequestError
-from solidcloud.schemas.kernels.normals import LINE, NONE, THICK
+from solidcloud.schemas.kernels.normals import LINE, NONE, THICK, decode_normal
+from solidcloud.server.kernels.normals import code_at, find_voxel, stored_code_at
 from solidcloud.server.left_out import LeftOut
-from solidcloud.server.normals import Normals
+from solidcloud.server.normals import Normals, warm
 from solidcloud.server.opened import Opened
 from solidcloud.server.store import Store
 
@@ -297,3 +298,15 @@ def test_what_is_left_out_has_no_say_whether_normals_are_stored_or_not(tmp_path:
         finally:
             opened.release()
     assert found[0] == found[1] != whole
+
+
+def test_warming_loads_nothing_and_leaves_nothing_to_compile(tmp_path: Path) -> None:
+    case = build(tmp_path, "plane", COUNT // 3)
+    with asked(case.archive) as (opened, normals):
+        warm(opened.data)
+        assert opened.data.residency.resident == 0
+        kernels = (find_voxel, code_at, stored_code_at, decode_normal)
+        compiled = [len(getattr(kernel, "signatures", ())) for kernel in kernels]
+        place = next(place for place, *_ in judged(opened, case.points))
+        assert normals.at(place, UP, REACH) is not None
+        assert [len(getattr(kernel, "signatures", ())) for kernel in kernels] == compiled

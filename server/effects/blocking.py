@@ -94,8 +94,9 @@ class Blocking:
             shape = bodies.shape_of(avatar)
             there = self._from_origin(pose)
             rows = self._near(shape, there, there)
-            touching = bodies.touching(shape, pose, rows, self._margin_units) if len(rows) else []
-            for row in rows[touching].tolist():
+            if len(rows):
+                rows = rows[bodies.touching(shape, pose, rows, self._margin_units)]
+            for row in rows.tolist():
                 if not self._is_overlapped(row):
                     return self._hit_at(shape, pose, row)
             return self._goes_deeper(shape, self._start, pose)

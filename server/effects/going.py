@@ -99,6 +99,11 @@ def settle(frame: Frame, to: Pose, fraction: float, proved: float) -> None:
         back = max(_GROWS * back, _BACK / way)
 
 
+def gives_way(frame: Frame, hit: Hit, to: Pose) -> bool:
+    """Whether what was met on the way to a pose is pushed on, so that the way is worth trying again."""
+    return bool(hit.what) and any(obstacle.give_way(frame, hit, to) for obstacle in frame.obstacles)
+
+
 def note(frame: Frame, hit: Hit) -> None:
     """Write down what ended a motion."""
     frame.hits.append(hit)

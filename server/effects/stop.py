@@ -13,7 +13,7 @@ from ...schemas.answers import Verdict
 from ...schemas.effects import Stop, Sweep
 from ..world import World
 from .frame import Frame, Hit, Pose, Vec, moved_by
-from .going import is_clear, note, set_out, touched_at
+from .going import gives_way, is_clear, note, set_out, touched_at
 
 # How far an avatar gets free by itself [m], and the ways it tries.
 MOST_FREE = 0.5
@@ -45,6 +45,8 @@ def go(frame: Frame, to: Pose) -> Hit | None:
     if frame.pose.tobytes() == to.tobytes():
         return None
     hit = touched_at(frame, to)
+    if hit is not None and gives_way(frame, hit, to):
+        hit = touched_at(frame, to)
     if hit is None:
         frame.pose, frame.clear = to, True
         if frame.verdict == Verdict.CONTACT:

@@ -7,7 +7,7 @@ at a pose that is clear by `collide`: proved by the sweep where the pose is the 
 from ...schemas.effects import Stop, Sweep
 from ..world import World
 from .frame import Frame, Hit, Pose
-from .going import first_hit, note, set_out, settle, way_back
+from .going import first_hit, gives_way, note, set_out, settle, way_back
 
 # What gives way is pushed on so often at most in one motion.
 _PUSHES = 4
@@ -36,14 +36,10 @@ class Sweeping:
                 frame.pose = to
                 return None
             settle(frame, to, hit.fraction - way_back(frame, to, hit, self.skin), hit.fraction)
-            if not hit.what or not self._gives_way(frame, hit, to):
+            if not gives_way(frame, hit, to):
                 break
         note(frame, hit)
         return hit
-
-    def _gives_way(self, frame: Frame, hit: Hit, to: Pose) -> bool:
-        """Whether what was met is pushed on."""
-        return any(obstacle.give_way(frame, hit, to) for obstacle in frame.obstacles)
 
 
 def make(effect: Sweep, world: World) -> Sweeping:

@@ -9,7 +9,7 @@ import pytest
 from moving_bodies import INTERPRETED, Stage, at, ball, box, room, staged, touch
 from numpy.typing import NDArray
 from solidcloud.schemas.answers import Verdict
-from solidcloud.schemas.effects import AnyEffect, Crowd, Objects, Stop, Sweep
+from solidcloud.schemas.effects import AnyEffect, Crowd, Ground, Objects, Slide, Stop, Sweep
 from solidcloud.schemas.errors import BadRequestError, BadTransformError
 from solidcloud.schemas.scene import ObjectItem
 from solidcloud.server.avatar import make_avatar
@@ -121,6 +121,46 @@ def test_a_move_of_which_nothing_is_remembered_pushes_nothing(tmp_path: Path) ->
         moved = stage.pipeline.run(Body("c/u", USER, at(0)), at(3))
         assert np.array_equal(where(stage, "crate"), at(1.0))
         assert [each.what for each in moved.touched] == ["crate"] and moved.pose[0, 0, 3] < 0.7
+
+
+@pytest.mark.interpreted
+def test_without_sweep_a_crate_gives_way_to_a_whole_step_or_blocks_it(tmp_path: Path) -> None:
+    with staged(tmp_path, [Stop(), Objects()], avatars=AVATARS, objects=(item("crate", at(0.6)),)) as stage:
+        body = stage.enter("c/u", USER, at(0))
+        stage.go("c/u", at(0.3))
+        assert np.array_equal(body.pose, at(0.3)) and abs(where(stage, "crate")[0, 3] - 0.9) < 1e-12
+        stage.go("c/u", at(1.0))
+        assert np.array_equal(body.pose, at(1.0)) and abs(where(stage, "crate")[0, 3] - 1.6) < 1e-12
+        moved = stage.go("c/u", at(1.5))
+        assert np.array_equal(body.pose, at(1.0)) and [each.what for each in moved.touched] == ["crate"]
+        assert 1.65 < where(stage, "crate")[0, 3] < 1.8 and free_of(stage, "crate")
+
+
+@pytest.mark.interpreted
+def test_who_stands_on_a_crate_is_on_the_ground_and_who_walks_along_a_leaf_slides(tmp_path: Path) -> None:
+    walking: list[AnyEffect] = [Stop(), Sweep(), Slide(), Ground(), Objects()]
+    door = item("door", at(-0.4), avatar="leaf", pushed=False)
+    lift = item("lift", at(-1.2), pushed=False)
+    with staged(tmp_path, walking, avatars=AVATARS, objects=(door, lift)) as stage:
+        body = stage.enter("c/u", USER, at(-1.2, 0, 0.5))
+        for _ in range(15):
+            moved = stage.go("c/u", body.pose.copy())
+        assert moved.ground is not None and moved.ground.on_ground
+        assert 0.38 < body.pose[2, 3] < 0.45, "its clearance above the lift"
+        stood = body.pose.copy()
+        stage.go("c/u", body.pose.copy())
+        assert np.array_equal(body.pose, stood), "at rest it stays, bit for bit"
+        for rise in np.linspace(0.02, 0.2, 10):
+            stage.bodies.tell({"lift": at(-1.2, 0, rise).tolist()})
+            stage.go("c/u", body.pose.copy())
+            assert not touch(USER, body.pose, CRATE, where(stage, "lift"), stage.bodies.origin)
+        assert 0.58 < body.pose[2, 3] < 0.65 and np.array_equal(body.pose[:2], stood[:2]), "it is lifted"
+    with staged(tmp_path, [Stop(), Sweep(), Slide(), Objects()], avatars=AVATARS, objects=(door,)) as stage:
+        body = stage.enter("c/u", USER, at(-0.2, -0.3))
+        for _ in range(10):
+            moved = stage.step("c/u", (0.05, 0.05, 0))
+            assert body.pose[1, 3] < -0.2
+        assert body.pose[0, 3] > 0.1, "along it"
 
 
 # --- told ---------------------------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ import classes
 import numpy as np
 import pytest
 import scans
-from clouds import KINDS, TREES, cloud
+from clouds import COUNTS, FAR, KINDS, OFF, SCALES, STEPS, TREES, cloud
 from coarse_tops import Made, least_margin, open_made
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -66,13 +66,13 @@ def judge(
 @given(
     seed=st.integers(0, 2**32 - 1),
     kind=st.sampled_from(KINDS),
-    count=st.sampled_from([1, 2, 33, 300]),
+    count=COUNTS,
     body=st.sampled_from(KINDS),
-    step=st.sampled_from([1e-6, cases.BINARY_STEP, 1e-4, 1e-2, 0.3]),
+    step=STEPS,
     voxel_steps=st.sampled_from([7, 1000, 70_000, 1 << 21]),
-    far=st.sampled_from([0.0, 5e5, 6.4e6, 1e8]),
-    scale=st.sampled_from([1.0, 1.0, 1e-3, 0.3, 999.0]),
-    off=st.sampled_from([0.0, 0.0, 1e3, 1e5]),
+    far=FAR,
+    scale=SCALES,
+    off=OFF,
     tree=TREES,
 )
 def test_nothing_in_contact_is_settled(

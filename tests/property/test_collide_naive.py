@@ -13,7 +13,7 @@ import naive
 import numpy as np
 import pytest
 import scans
-from clouds import KINDS, TREES, cloud, signed_permutations
+from clouds import COUNTS, FAR, KINDS, OFF, SCALES, STEPS, TREES, VOXEL_STEPS, cloud, signed_permutations
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -29,13 +29,13 @@ def build(points: NDArray[np.float64], folder: str, **options: Any) -> cases.Cas
 @given(
     seed=st.integers(0, 2**32 - 1),
     kind=st.sampled_from(KINDS),
-    count=st.sampled_from([1, 2, 33, 300]),
+    count=COUNTS,
     body=st.sampled_from(KINDS),
-    step=st.sampled_from([1e-6, cases.BINARY_STEP, 1e-4, 1e-2, 0.3]),
-    voxel_steps=st.sampled_from([1, 7, 1000, 70_000, 1 << 21]),
-    far=st.sampled_from([0.0, 5e5, 6.4e6, 1e8]),
-    scale=st.sampled_from([1.0, 1.0, 1e-3, 0.3, 999.0]),
-    off=st.sampled_from([0.0, 0.0, 1e3, 1e5]),
+    step=STEPS,
+    voxel_steps=VOXEL_STEPS,
+    far=FAR,
+    scale=SCALES,
+    off=OFF,
     tree=TREES,
 )
 def test_contact_begins_where_the_definition_says(

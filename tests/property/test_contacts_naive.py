@@ -8,7 +8,7 @@ import cases
 import numpy as np
 import pytest
 from cases_contacts import ScanCase, compare, open_case, tight
-from clouds import KINDS, TREES, cloud, signed_permutations
+from clouds import COUNTS, FAR, KINDS, SCALES, STEPS, TREES, VOXEL_STEPS, cloud, signed_permutations
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from solidcloud.schemas.answers import ContactsAnswers
@@ -22,12 +22,12 @@ from solidcloud.server.effort import Effort, make_effort
 @given(
     seed=st.integers(0, 2**32 - 1),
     kind=st.sampled_from(KINDS),
-    count=st.sampled_from([1, 2, 33, 300]),
+    count=COUNTS,
     body=st.sampled_from(KINDS),
-    step=st.sampled_from([1e-6, cases.BINARY_STEP, 1e-4, 1e-2, 0.3]),
-    voxel_steps=st.sampled_from([1, 7, 1000, 70_000, 1 << 21]),
-    far=st.sampled_from([0.0, 5e5, 6.4e6, 1e8]),
-    scale=st.sampled_from([1.0, 1.0, 1e-3, 0.3, 999.0]),
+    step=STEPS,
+    voxel_steps=VOXEL_STEPS,
+    far=FAR,
+    scale=SCALES,
     limit=st.sampled_from([0, 1, 7, 100, 10_000]),
     scan_count=st.sampled_from([0, 1, 3]),
     tree=TREES,

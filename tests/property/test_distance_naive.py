@@ -10,7 +10,7 @@ import naive_distance
 import numpy as np
 import pytest
 import scans
-from clouds import KINDS, TREES, cloud, signed_permutations
+from clouds import COUNTS, FAR, KINDS, OFF, SCALES, STEPS, TREES, VOXEL_STEPS, cloud, signed_permutations
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from judged import compare
@@ -22,13 +22,13 @@ from solidcloud.server.scene import Scene
 @given(
     seed=st.integers(0, 2**32 - 1),
     kind=st.sampled_from(KINDS),
-    count=st.sampled_from([1, 2, 33, 300]),
+    count=COUNTS,
     body=st.sampled_from(KINDS),
-    step=st.sampled_from([1e-6, cases.BINARY_STEP, 1e-4, 1e-2, 0.3]),
-    voxel_steps=st.sampled_from([1, 7, 1000, 70_000, 1 << 21]),
-    far=st.sampled_from([0.0, 5e5, 6.4e6, 1e8]),
-    scale=st.sampled_from([1.0, 1.0, 1e-3, 0.3, 999.0]),
-    off=st.sampled_from([0.0, 0.0, 1e3, 1e5]),
+    step=STEPS,
+    voxel_steps=VOXEL_STEPS,
+    far=FAR,
+    scale=SCALES,
+    off=OFF,
     tree=TREES,
 )
 def test_distance_and_witnesses_are_those_of_the_definition(

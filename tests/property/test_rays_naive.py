@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import scans
 from cases_rays import KINDS, opened, same_points, same_rays, some_rays
-from clouds import TREES, cloud
+from clouds import FAR, STEPS, TREES, VOXEL_STEPS, cloud
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -33,9 +33,9 @@ def stored(case: cases.Case, data: SceneData) -> NDArray[np.float64]:
     seed=st.integers(0, 2**32 - 1),
     kind=st.sampled_from(KINDS),
     count=st.sampled_from([1, 2, 33, 300, 1500]),
-    step=st.sampled_from([1e-6, cases.BINARY_STEP, 1e-4, 1e-2, 0.3]),
-    voxel_steps=st.sampled_from([1, 7, 1000, 70_000, 1 << 21]),
-    far=st.sampled_from([0.0, 5e5, 6.4e6, 1e8]),
+    step=STEPS,
+    voxel_steps=VOXEL_STEPS,
+    far=FAR,
     thick=st.sampled_from([0.0, 0.7, 9.0, 4000.0]),
     tree=TREES,
 )

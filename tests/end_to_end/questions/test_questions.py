@@ -18,10 +18,7 @@ from corner import (
     RNG,
     TOWARDS,
     add_avatars,
-    client_of,
-    opened,
     same,
-    served,
 )
 from solidcloud.schemas import keys
 from solidcloud.schemas.answers import (
@@ -41,24 +38,6 @@ from solidcloud.server import path as path_module
 from solidcloud.server.client import Client
 from solidcloud.server.scene import Scene
 from solidcloud.server.transport import session_config
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    with opened(tmp_path_factory.mktemp("corner")) as scene:
-        yield scene
-
-
-@pytest.fixture(scope="module")
-def endpoint(scene):
-    with served(scene) as endpoint:
-        yield endpoint
-
-
-@pytest.fixture
-def client(endpoint):
-    with client_of(endpoint) as client:
-        yield client
 
 
 @pytest.mark.parametrize("question", QUESTIONS)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import zenoh
-from corner import POSES, client_of, opened, same, served
+from corner import POSES, same
 from solidcloud.schemas import keys
 from solidcloud.schemas.answers import (
     PARTS,
@@ -21,24 +21,6 @@ from solidcloud.schemas.messages import (
 )
 from solidcloud.server import path as path_module
 from solidcloud.server.transport import session_config
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    with opened(tmp_path_factory.mktemp("corner")) as scene:
-        yield scene
-
-
-@pytest.fixture(scope="module")
-def endpoint(scene):
-    with served(scene) as endpoint:
-        yield endpoint
-
-
-@pytest.fixture
-def client(endpoint):
-    with client_of(endpoint) as client:
-        yield client
 
 
 @pytest.mark.parametrize(

@@ -98,7 +98,11 @@ def _ahead(frame: Frame, reach: float, looked: float) -> DistanceAnswers | None:
     return answers if answers.exact[0] and abs(answers.lower[0] - reach) > ROUNDED else None
 
 
+def surely_farther(answers: DistanceAnswers | None, metres: float) -> bool:
+    """Whether the spheres are farther apart than this, by what `nearest` answers of it."""
+    return answers is None or bool(answers.exact[0] and answers.signed_distance[0] > metres + ROUNDED)
+
+
 def farther(frame: Frame, metres: float) -> bool:
     """Whether the avatar is surely farther from the scene than this: its spheres, from all spheres of the scan."""
-    answers = nearest(frame, metres)
-    return answers is None or bool(answers.exact[0] and answers.signed_distance[0] > metres + ROUNDED)
+    return surely_farther(nearest(frame, metres), metres)

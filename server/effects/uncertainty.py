@@ -8,16 +8,20 @@ from collections.abc import Callable, Sequence
 from pathlib import PurePath
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from ...schemas.effects import Uncertainty
 from ...schemas.errors import BadRequestError
 from ...schemas.messages import SceneInfo, SourceInfo
 from ...schemas.moves import UncertaintyReport
-from ...schemas.voxel_grid import UNITS_PER_METRE
+from ...schemas.voxel_grid import MAX_COORDINATE, UNITS_PER_METRE
+from ..avatar import make_avatar
 from ..by_scan import ANY_SCAN, gaps_by_scan
 from ..near import near
 from ..posed import under
+from ..request import SceneData
 from ..uncertainty import FARTHEST, each_alone, together
-from .apart import farther
+from .apart import nearest, surely_farther
 from .frame import Frame
 
 # Names told in an error.
@@ -69,7 +73,8 @@ def check(effect: Uncertainty, *infos: SceneInfo) -> None:
 class Scans(NamedTuple):
     """The scans of one archive. sigmas: [m], by their rows in `SceneInfo.sources`.  names: of each row, in reports.
 
-    one: the only one there is, or ANY_SCAN, where the archive does not say which scan a point is of; None: it does.
+    one: the only one there is, or ANY_SCAN, where the archive does not say which scan a point is of, and one sigma
+    holds for all; None: it does.
     """
 
     sigmas: dict[int, float]
@@ -96,26 +101,21 @@ def scans_of(effect: Uncertainty, info: SceneInfo, keeps_scan: bool) -> Scans:
     return Scans(sigmas, scan_names(info.sources), one)
 
 
-def _check_kept(effect: Uncertainty, info: SceneInfo) -> None:
-    """BadRequestError where `scans` tells apart what an archive does not that keeps no scans."""
-    live = [source for source in info.sources if not source.fault]
-    for source in live:
-        if len(live) > 1 and _called(effect, source) is not None:
-            raise BadRequestError(
-                f"uncertainty: scans: {info.scene} does not keep which scan a point is of: build it with --keep scan, "
-                f"or leave {_NAMES[0](source)!r} out"
-            )
-
-
 def make(effect: Uncertainty, world: Any) -> "UncertaintyRunner":
-    """The effect of a scene. BadRequestError as `check`, and where `scans` tells apart what an archive does not."""
+    """The effect of a scene. BadRequestError as `check`."""
     with world as seen:
-        infos = [each.placed.scene.info() for each in seen]
-        check(effect, *infos)
-        for each, info in zip(seen, infos, strict=True):
-            if not each.data.keeps_scan:
-                _check_kept(effect, info)
+        check(effect, *(each.placed.scene.info() for each in seen))
+        for each in seen:
+            if each.data.keeps_scan:
+                _warm(each.data)
     return UncertaintyRunner(effect, world)
+
+
+def _warm(data: SceneData) -> None:
+    """Have the kernel compiled, before anybody waits for it: a frame gets to it only where something is near."""
+    nowhere = np.eye(4)
+    nowhere[:3, 3] = MAX_COORDINATE / 2
+    gaps_by_scan(data, make_avatar([[0.0, 0.0, 0.0]], 0.1), nowhere, 0.0, 1)
 
 
 class UncertaintyRunner:
@@ -143,7 +143,8 @@ class UncertaintyRunner:
 
     def _report(self, frame: Frame) -> UncertaintyReport:
         """What is to be said: at least so probable, where not all in reach could be looked at."""
-        if farther(frame, self._margin):
+        answers = nearest(frame, self._margin)
+        if surely_farther(answers, self._margin):
             return UncertaintyReport(0.0)
         alone: list[float] = []
         named: dict[str, float] = {}
@@ -153,7 +154,11 @@ class UncertaintyRunner:
             if known.generations != frame.world.generations():
                 known = self._known = self._scans_of(frame.world)
             for archive, (each, scans) in enumerate(zip(seen, known.scans, strict=True)):
-                gaps, all_seen = self._gaps(frame, each, scans)
+                if scans.one is not None and len(known.scans) == 1 and answers is not None:
+                    # The nearest pair of all is that of the only scan.
+                    gaps, all_seen = {scans.one: float(answers.signed_distance[0])}, bool(answers.exact[0])
+                else:
+                    gaps, all_seen = self._gaps(frame, each, scans)
                 exact &= all_seen
                 for number, own in each_alone(gaps, scans.sigmas).items():
                     alone.append(own)

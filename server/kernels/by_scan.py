@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from ...schemas.voxel_grid import UNITS_PER_METRE
 from .closest import lower_bound, set_cut
 from .compiled import borrowing
+from .lanes import keep_near
 from .layout import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, node_class, point_class, scan_run
 from .overlap import STACK, nodes_meet
 from .placed import ByClass, make_by_class, make_placed, pair_square, place_block, place_nodes, set_by_class
@@ -84,21 +85,23 @@ def _search_leaves(avatar, m, a, block, placed, scene, voxel, row, reach_units, 
     bound = lower_bound(
         words, row, nodes[0, a] - off[0], nodes[1, a] - off[1], nodes[2, a] - off[2], nodes[3, a]
     )
-    wanted = False
+    widest = np.float32(-1.0)
     for j in range(held):
-        keep[j] = bound <= cut[min(np.int64(halves[scan_at + j]), last), c]
-        wanted |= keep[j]
-    if not wanted:
+        widest = max(widest, cut[min(np.int64(halves[scan_at + j]), last), c])
+    if not bound <= widest:
         return
     if placed.stamp[block] != 0:
         place_block(avatar, m, block, placed, scene)
         placed.stamp[block] = 0
+    # Of flat walls along flat avatars the avatar's sphere tells little, its points tell nearly all.
+    if not keep_near(lanes, block, words, row, off[0], off[1], off[2], widest, keep):
+        return
     low_x = off[0] + np.float32(ints[block_at])
     low_y = off[1] + np.float32(ints[block_at + 1])
     low_z = off[2] + np.float32(ints[block_at + 2])
     for j in range(held):
         s = min(np.int64(halves[scan_at + j]), last)
-        if not keep[j] or not bound <= cut[s, c]:
+        if not bound <= cut[s, c]:
             continue
         own = point_class(ints, block_at, j, mask)
         x = np.float32(halves[lane_at + j])

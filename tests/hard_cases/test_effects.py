@@ -1,24 +1,30 @@
 """Hard case of what is not asked for; a test's number is its row in NUMERICS.md.
 
-There are no effects yet. What can be asserted of them is: a scene declares none, and what a question does not need is
-neither imported nor called, whatever else the scene holds.
+An effect that a scene does not declare is not imported, not called, and adds nothing to what is answered; what a scene
+declares changes no question's answer, nor what it costs.
 """
 
 import json
 import os
 import subprocess
 import sys
+from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import cases
+import msgspec
 import numpy as np
 import pytest
 import same_answers
 import scans
 from solidcloud.schemas.messages import MSGPACK, CollideRequest, encode
+from solidcloud.schemas.scene import SceneFile
 from solidcloud.server.app import Service
 from solidcloud.server.config import ServerConfig
+from solidcloud.server.effects import ORDER
 from solidcloud.server.scene import Scene
+from solidcloud.server.simulated import simulate
 
 INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
 
@@ -33,10 +39,124 @@ with Scene.open(pathlib.Path(sys.argv[1])) as scene:
 print(json.dumps([verdict, effects, sorted(sys.modules)]))
 """
 
+# Each effect in the smallest scene that has it; `objects` is tested beside its own objects.
+ALONE: dict[str, list[str]] = {
+    "nothing": [],
+    "stop": ["stop"],
+    "sweep": ["stop", "sweep"],
+    "slide": ["stop", "slide"],
+    "ground": ["stop", "ground"],
+    "step": ["stop", "slide", "ground", "step"],
+    "proximity": ["proximity"],
+    "contacts": ["contacts"],
+    "uncertainty": ["uncertainty"],
+    "objects": ["objects"],
+    "crowd": ["stop", "crowd"],
+}
+# What only some effects have a use for, and which; every effect has itself.
+HELPERS = {
+    "server.effects.apart": {"proximity", "contacts", "uncertainty"},
+    "server.uncertainty": {"uncertainty"},
+    "server.by_scan": {"uncertainty"},
+    "server.kernels.by_scan": {"uncertainty"},
+    "server.left_out": {"through"},
+    "server.effects.bodies": {"objects", "crowd"},
+    "server.effects.blocking": {"objects", "crowd"},
+    "server.kernels.meeting": {"objects", "crowd"},
+    "server.normals": {"slide", "ground", "step"},
+    "server.kernels.normals": {"slide", "ground", "step"},
+}
+# All that needs no objects of its own.
+EVERY_EFFECT = msgspec.convert(
+    {"format": 1, "archives": [{"path": "a"}], "limits": {"longest_move": 1000.0},
+     "effects": [{"effect": name} for name in ORDER if name != "objects"]},
+    SceneFile,
+)  # fmt: skip
+SAID = ("stepped", "ground", "proximity", "contacts", "uncertainty", "objects", "crowd")
+
+# One process, that has what every scene has; each scene in a child of it, so that one imports nothing for another.
+FRAMES = """
+import json, os, pathlib, sys
+import msgspec
+import numpy as np
+from solidcloud.schemas.messages import encode, JSON
+from solidcloud.schemas.scene import ArchiveItem, SceneFile
+from solidcloud.server import world
+from solidcloud.server.effects import pipeline
+from solidcloud.server.scene import Scene
+from solidcloud.server.simulated import simulate
+def child(names):
+    effects = [{"effect": name} for name in names]
+    file = msgspec.convert({"format": 1, "archives": [{"path": "a"}], "effects": effects}, SceneFile)
+    with Scene.open(pathlib.Path(sys.argv[1])) as scene:
+        simulation = simulate(scene, file)
+        simulation.add_avatar("ball", np.zeros((1, 3)), 0.1, client="c")
+        pose = np.eye(4)[None]
+        pose[0, 2, 3] = 0.3
+        said = []
+        for way in ([0.1, 0, 0], [0, 0, -0.5], [0.1, 0, -0.1]):
+            wish = pose.copy()
+            wish[0, :3, 3] += way
+            moved = simulation.move("ball", pose, wish, client="c")
+            pose = moved.pose
+            said.append(json.loads(encode(moved, JSON)))
+    ours = [m.removeprefix("solidcloud.") for m in sys.modules if m.startswith("solidcloud.")]
+    return {"said": said, "modules": sorted(ours)}
+found = {}
+for key, names in json.loads(sys.argv[2]).items():
+    reading, writing = os.pipe()
+    if os.fork() == 0:
+        with os.fdopen(writing, "w") as out:
+            out.write(json.dumps(child(names)))
+        os._exit(0)
+    os.close(writing)
+    with os.fdopen(reading) as out:
+        found[key] = json.loads(out.read())
+    os.wait()
+print(json.dumps(found))
+"""
+
 
 @pytest.mark.case(
     31,
-    "(no effects yet) a scene opened and asked imports no report, maker, reader, transport, zenoh or plotting",
+    "each effect alone: of all effects, and of what only some have a use for, what it needs is imported and said",
+)
+@pytest.mark.interpreted
+def test_case_31_of_all_effects_only_those_declared_are_imported_and_say_something(tmp_path: Path) -> None:
+    floor = np.stack(np.meshgrid(np.arange(-3, 4), np.arange(-3, 4), [0]), axis=-1).reshape(-1, 3) * 0.1
+    case = cases.build(tmp_path, floor, radius=0.05)
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", FRAMES, str(case.archive), json.dumps(ALONE)],
+        env=os.environ | {"NUMBA_DISABLE_JIT": "1"}, capture_output=True, text=True, check=True, timeout=240,
+    )  # fmt: skip
+    found = json.loads(done.stdout)
+    every = {"through", *ORDER}
+    for key, names in ALONE.items():
+        modules, declared = set(found[key]["modules"]), set(names)
+        loaded = {name for name in every if f"server.effects.{name}" in modules}
+        # `step` goes on as `ground` does, and `sweep` is how `stop` goes on.
+        assert loaded == declared, (key, loaded)
+        for module, users in HELPERS.items():
+            assert module not in modules or users & declared, (key, module)
+        for frame in found[key]["said"]:
+            assert frame.get("simulated", []) == [name for name in ORDER if name in declared], key
+            assert {name for name in SAID if name in frame} <= declared | {"stepped"} & (
+                {"stepped"} if "step" in declared else set()
+            ), key
+    for name in ("proximity", "contacts", "uncertainty"):
+        assert all(name in frame for frame in found[name]["said"])
+    nothing = found["nothing"]["said"]
+    assert all(frame.keys() <= {"pose", "verdict", "left"} for frame in nothing), (
+        "where it is, and what it touches"
+    )
+    for frame, beside in zip(found["proximity"]["said"], nothing, strict=True):
+        assert frame.pop("proximity") is not None and frame.pop("simulated") == ["proximity"]
+        assert frame == beside
+
+
+@pytest.mark.case(
+    31,
+    "a scene opened and asked imports no effect, report, maker, reader, transport, zenoh or plotting",
 )
 @pytest.mark.interpreted
 def test_case_31_what_is_not_declared_is_not_imported(tmp_path: Path) -> None:
@@ -46,10 +166,16 @@ def test_case_31_what_is_not_declared_is_not_imported(tmp_path: Path) -> None:
         env=os.environ | {"NUMBA_DISABLE_JIT": "1"}, capture_output=True, text=True, check=True, timeout=120,
     )  # fmt: skip
     verdict, effects, modules = json.loads(done.stdout)
-    assert verdict == [1] and effects == []
+    assert verdict == [1] and effects == ["stop"], "that of a scene without a file, for who moves in it"
     ours = {name.removeprefix("solidcloud.") for name in modules if name.startswith("solidcloud.")}
     assert {"server.scene", "server.collide"} <= ours
-    for part in ("server.effects", "server.report", "server.app", "server.transport", "server.client", "server.cli",
+    # What a frame is made of, and their order, are types; nothing that would simulate one.
+    assert {name for name in ours if name.startswith("server.effects")} <= {
+        "server.effects",
+        "server.effects.frame",
+    }
+    assert not {"server.world", "server.probe", *HELPERS} & ours
+    for part in ("server.report", "server.app", "server.transport", "server.client", "server.cli",
                  "builder.made", "builder.sources", "builder.pipeline"):  # fmt: skip
         assert not [name for name in ours if name == part or name.startswith(part + ".")], part
     for library in (
@@ -68,7 +194,7 @@ def test_case_31_what_is_not_declared_is_not_imported(tmp_path: Path) -> None:
 
 @pytest.mark.case(
     31,
-    "(no effects yet) with other avatars, walkers and questions about, collide replies the same bytes at the same cost",
+    "beside other avatars, walkers and questions, and every effect, collide replies the same bytes at the same cost",
 )
 @pytest.mark.interpreted
 def test_case_31_what_else_a_scene_holds_costs_a_question_nothing(
@@ -78,22 +204,29 @@ def test_case_31_what_else_a_scene_holds_costs_a_question_nothing(
     body, other = rng.uniform(-0.2, 0.2, (2, 20, 3))
     poses = cases.near_poses(rng, case.points, body, 6 if INTERPRETED else 60, 0.2)
     replies = []
-    for declared in (False, True):
+    for beside in ("nothing", "others", "effects"):
         with Scene.open(case.archive, "scene") as scene:
-            if declared:
+            asked: Any = scene
+            if beside == "others":
                 for name in ("other", "third"):
                     scene.add_avatar(name, other, 0.02, client="c")
                 scene.walker("other", client="c").collide(poses)
                 scene.contacts("third", poses, 5, client="c")
                 scene.objects([("other", pose) for pose in poses], client="c")
                 scene.raycast(poses[:, :3, 3], poses[:, :3, 0], 1.0)
+            if beside == "effects":
+                asked = simulate(scene, EVERY_EFFECT)
+                scene.add_avatar("other", other, 0.02, client="c")
+                for pose, wish in pairwise(poses):
+                    moved = asked.move("other", pose[None], wish[None], client="c")
+                    assert moved.simulated == [name for name in ORDER if name != "objects"]
             scene.add_avatar("body", body, 0.01, client="c")
-            found = scene.collide("body", poses, client="c")
-            service = Service([scene], ServerConfig())
+            found = asked.collide("body", poses, client="c")
+            service = Service([asked], ServerConfig())
             payload = encode(CollideRequest("body", poses), MSGPACK)
             answer = service.answer("solidcloud/1/scene/scene/c/collide", payload, MSGPACK)
             assert answer.ok
         columns = (found.verdict, found.outside, found.node_visits, found.point_tests)
         replies.append(([column.tolist() for column in columns], len(answer.payload)))
-    assert replies[0] == replies[1]
+    assert replies[0] == replies[1] == replies[2]
     assert sum(replies[0][0][2]) > 0

@@ -154,10 +154,7 @@ def test_without_the_scan_of_each_point_there_is_one(tmp_path: Path) -> None:
     with opened(tmp_path, floor(0.0), floor(0.0, 0.01), keep=False) as scene:
         found = said(scene, at(0.062), sigma=0.005)
         assert found.scans == {} and 0.2 < found.probability < 0.5
-        with pytest.raises(
-            BadRequestError, match=r"scene does not keep which scan a point is of: .*--keep scan"
-        ):
-            said(scene, at(0.06), sigma=0.005, scans={"scan1.ply": 0.01})
+        assert said(scene, at(0.062), sigma=0.005, scans={"scan1.ply": 0.01}) == found, "one sigma for all"
 
 
 @pytest.mark.interpreted

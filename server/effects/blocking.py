@@ -189,9 +189,9 @@ class Blocking:
         return bodies.way_out(row, self._mover if self._user else "", center)
 
     def _hit_at(self, shape: Shape, pose: Pose, row: int) -> Hit:
-        """A body touched at a pose: nothing is known of when, so that its centre says where."""
+        """A body touched at a pose: nothing is known of when, so that its middle says where, from the frame's start."""
         bodies, center = self._bodies, shape.center(pose)
-        out = center - bodies.shapes[row].center(bodies.poses[row])
+        out = shape.center(self._start) - bodies.shapes[row].center(bodies.poses[row])
         level = out - (out @ bodies.up) * bodies.up
         return Hit(0.0, Verdict.CONTACT, center, center - level, bodies.names[row])
 

@@ -5,12 +5,17 @@
 
 import threading
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
+
+import numpy as np
 
 from ..schemas.moves import FRAME_SECONDS, Moved
 from ..schemas.scene import SceneFile, scene_of
+from .posed import moved
 from .served import EVERYBODY
 from .simulation import Simulation, Stage
+from .within import within
 
 _MAKING = threading.Lock()
 
@@ -30,8 +35,21 @@ def simulate(
         served.add_avatar(name, points, radius, client=EVERYBODY)
         for name, (points, radius) in (avatars or {}).items()
     ]
-    pipeline = make_pipeline(file, World(served, file))
-    return Simulation(served, file, pipeline, own, pipeline.bodies)
+    world = World(served, file)
+    pipeline = make_pipeline(file, world)
+    return Simulation(served, file, pipeline, own, pipeline.bodies, partial(_scan_point, world))
+
+
+def _scan_point(world: Any) -> Any:
+    """Some scan point of a world, (3,) [m]; its archive's least corner where none is found."""
+    with world as seen:
+        archive, data, pose = seen[0].opened.store.archive, seen[0].data, seen[0].placed.pose
+        lattice = archive.header.lattice
+        corner = archive.coordinates[0] * lattice.voxel_steps + archive.voxels["low"][0]
+        place = lattice.to_world(corner[None])
+        found = within(data, place, min(16.0, 2 * lattice.voxel_size)).cloud_point
+        place = found if np.isfinite(found).all() else place
+        return (place if pose is None else moved(pose, place))[0]
 
 
 class Simulated:

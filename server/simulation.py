@@ -8,7 +8,8 @@ in the same order give the same poses, bit for bit: nothing here reads a clock b
 import logging
 import threading
 import time
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import suppress
 from typing import Any, Protocol
 
 import numpy as np
@@ -91,6 +92,7 @@ class Simulation:
 
     served: what answers the questions.  file: what the scene calls for.  pipeline: its effects.  avatars: the scene's
     own, which every user finds: `served` knows them as those of EVERYBODY.  bodies: kept up to date, where users meet.
+    place: of some scan point, (3,) world [m].
     """
 
     def __init__(
@@ -100,13 +102,14 @@ class Simulation:
         pipeline: Pipeline,
         avatars: Sequence[AvatarInfo] = (),
         bodies: Bodies | None = None,
+        place: Callable[[], Any] | None = None,
     ) -> None:
         self.name, self.file = served.name, file
         self.served, self._pipeline = served, pipeline
         self._up = np.array(file.up) / np.linalg.norm(file.up)
         self._own = list(avatars)
         self._present: dict[User, _Presence] = {}
-        self._bodies = bodies
+        self._bodies, self._place = bodies, place
         self._recorder: Recorder | None = None
         self._frames = 0
         self._frame = threading.Lock()  # held for a frame: bodies change under it alone
@@ -278,15 +281,29 @@ class Simulation:
         return describe_scene(self.served.info(), self.file, self._own)
 
     def warm(self) -> None:
-        """Warm the scene, and simulate a frame, so that nobody waits for compilers after."""
+        """Warm the scene, and simulate some frames, so that nobody waits for compilers after.
+
+        They go at a scan point from above, out of it and past it, and at another user.
+        """
         self.served.warm()
-        low = np.eye(4)[None]
-        low[0, :3, 3] = self.served.info().bounds[0]
-        high = low.copy()
-        high[0, :3, 3] += 0.01
+        place = np.array(self.served.info().bounds[0]) if self._place is None else self._place()
+        user, other = User(_WARM, "warm"), User(_WARM, "other")
         self.served.add_avatar("warm", [[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]], 0.05, client=_WARM)
-        for pose_from, pose_to in ((low, high), (high, low)):
-            self.move("warm", pose_from, pose_to, client=_WARM)
+        across = np.roll(self._up, 1)
+        far = min(0.5, self.file.limits.longest_move / 4)
+        for way in (self._up, -self._up, across, self._up + across, 0 * across):
+            for begin, end in ((way, -way), (-0 * way, way), (way, way + across)):
+                poses = np.tile(np.eye(4), (2, 1, 1, 1))
+                poses[:, 0, :3, 3] = place + far * begin, place + far * end
+                with self._frame, suppress(SolidcloudError):  # of a place where a frame makes no sense
+                    body = Body(_body_name(user), self.served.avatar("warm", _WARM), poses[0, 0])
+                    if self._bodies is not None:
+                        there = Body(_body_name(other), body.avatar, poses[:, 0].mean(axis=0))
+                        self._bodies[other] = there
+                    for pose in (poses[1, 0], poses[1, 0], poses[0, 0]):
+                        self._pipeline.run(body, pose, FRAME_SECONDS)
+        if self._bodies is not None:
+            self._bodies.pop(other)
         self.served.drop_client(_WARM)
 
     def reload(self) -> ReloadAnswer:

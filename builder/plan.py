@@ -43,6 +43,8 @@ PREVIEW, PREVIEW_BYTES = (20_000, 200_000, 8), 6
 # A frame's length is uint32 in the index; the column of scans is uint16 (schemas/FORMAT.md).
 MAX_FRAME = 1 << 32
 MAX_SCANS = 1 << 16
+# A voxel of more points is built in parts, and has no normals (dense.py).
+DENSE_POINTS = 1 << 20
 # A folder of more files than this is slow to list on most file systems.
 MANY_FILES = 1_000_000
 # The densest voxel holds about so many times the mean (measured: 7 on a made façade in voxels of 8 m, 3 of 2 m).
@@ -356,6 +358,10 @@ def _limits(
                 "build in parts",
             )
         )
+    if "normal" in config.keep:
+        most = Limit("points of the densest voxel, with --keep normal", plan.points_a_voxel * DENSEST, DENSE_POINTS,
+                     "points", "give a smaller --voxel, or leave normals out")  # fmt: skip
+        found.append(most)
     if target is not None:
         free = shutil.disk_usage(next(p for p in (target, *target.absolute().parents) if p.exists())).free
         found.insert(

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import scans
 from scans import write_xyz
+from solidcloud.builder import dense, sample
 from solidcloud.builder import plan as plans
-from solidcloud.builder import sample
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.measure import POINTS, measured, room
 from solidcloud.builder.pipeline import build_archive
@@ -159,6 +159,10 @@ def test_limits_that_bind_are_named(monkeypatch: pytest.MonkeyPatch, tmp_path: P
     assert binding(1e9, voxel=0.001, resolution=1e-5) >= {"voxels along an axis"}
     assert binding(1e6, voxel=300.0) == {"lattice steps a voxel"}
     assert binding(1e12, keep=frozenset({"scan"})) >= {"scans"}
+    normals = {"points of the densest voxel"}
+    assert not binding(1e8, voxel=2.0, keep=frozenset({"normal"})) & normals
+    assert binding(1e8, voxel=64.0, keep=frozenset({"normal"})) >= normals
+    assert plans.DENSE_POINTS == dense.DENSE_POINTS
     assert binding(1e12, 1e5, voxel=200.0) >= {"the densest voxel"}
 
 

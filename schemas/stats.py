@@ -65,17 +65,38 @@ class UserStats(msgspec.Struct, frozen=True):
     silent_seconds: float = 0.0
 
 
-class StatsAnswer(msgspec.Struct, frozen=True, kw_only=True):
+class Counters(msgspec.Struct, frozen=True, kw_only=True):
+    """What a memory for voxels did so far; voxels but where bytes are said.
+
+    hits: asked for and there, or being loaded; waits: of them being loaded.  misses: asked for and not there.
+    late: asked for and not there in time.  prefetched: loads begun before anybody asked; used: of them asked for since;
+    wasted: of them failed, or gone again without.  evicted: gone for others; too_soon: of them asked for again shortly
+    after.  moved_bytes: of voxels moved to join free room.  failed: loads that failed.
+    """
+
+    hits: int = 0
+    waits: int = 0
+    misses: int = 0
+    late: int = 0
+    prefetched: int = 0
+    prefetched_bytes: int = 0
+    used: int = 0
+    wasted: int = 0
+    wasted_bytes: int = 0
+    evicted: int = 0
+    too_soon: int = 0
+    moved_bytes: int = 0
+    failed: int = 0
+
+
+class StatsAnswer(Counters, frozen=True, kw_only=True):
     """What a scene keeps in memory, and how it did so far.
 
     generation: of the archive.  policy: which voxel goes first.  budget_bytes: for decoded voxels and coarse tops;
     resident_bytes: taken of it by decoded voxels, `resident` of the `voxels`; coarse_bytes: by coarse tops.
     kept: voxels that users stand in.
 
-    Voxels, since this generation is served: hits: asked for and there, or being loaded; waits: of them being loaded;
-    misses: asked for and not there; late: not there in time.  prefetched: loaded before anybody asked; used: of them
-    asked for since; wasted: of them gone again without.  evicted: gone for others; too_soon: of them asked for again
-    shortly after.  moved_bytes: of voxels moved to join free room.  failed: loads that failed.
+    Counters are of this generation, since it is served.
 
     Since the scene is served: requests, the parts of paths one by one; answers: poses (rays, points, motions, objects)
     in them; unknown: of the answers; waited: requests that waited for voxels.
@@ -93,19 +114,6 @@ class StatsAnswer(msgspec.Struct, frozen=True, kw_only=True):
     voxels: int = 0
     resident: int = 0
     kept: int = 0
-    hits: int = 0
-    waits: int = 0
-    misses: int = 0
-    late: int = 0
-    prefetched: int = 0
-    prefetched_bytes: int = 0
-    used: int = 0
-    wasted: int = 0
-    wasted_bytes: int = 0
-    evicted: int = 0
-    too_soon: int = 0
-    moved_bytes: int = 0
-    failed: int = 0
     requests: int = 0
     answers: int = 0
     unknown: int = 0

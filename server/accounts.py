@@ -4,39 +4,15 @@ import math
 import time
 from collections import deque
 from collections.abc import Collection, Sequence
-from typing import NamedTuple
 
-# A voxel that is asked for again so soon after it went for another had better stayed [s].
+from ..schemas.stats import Counters
+
+# `Counters.too_soon`: a voxel that is asked for again so soon after it went for another had better stayed [s].
 TOO_SOON = 10.0
 # Voxels of which it is remembered for longer when they went.
 MOST_WENT = 4096
 # Loads whose times are remembered.
 TIMES = 256
-
-
-class Counters(NamedTuple):
-    """What a residency has done so far; voxels but where bytes are said.
-
-    hits: asked for and there, or being loaded; waits: of them being loaded.  misses: asked for and not there.
-    late: asked for and not there in time.  prefetched: loads begun before anybody asked; used: of them asked for since;
-    wasted: of them failed, or gone again without.  evicted: gone for others; too_soon: of them asked for again within
-    TOO_SOON.
-    moved_bytes: of voxels moved to join free room.  failed: loads that failed.
-    """
-
-    hits: int = 0
-    waits: int = 0
-    misses: int = 0
-    late: int = 0
-    prefetched: int = 0
-    prefetched_bytes: int = 0
-    used: int = 0
-    wasted: int = 0
-    wasted_bytes: int = 0
-    evicted: int = 0
-    too_soon: int = 0
-    moved_bytes: int = 0
-    failed: int = 0
 
 
 class Accounts:
@@ -102,8 +78,9 @@ class Accounts:
     def counters(self, evicted: int, moved_bytes: int) -> Counters:
         """All of them."""
         return Counters(
-            self.hits, self.waits, self.misses, self.late, self.prefetched, self.prefetched_bytes, self.used,
-            self.wasted, self.wasted_bytes, evicted, self.too_soon, moved_bytes, self.failed,
+            hits=self.hits, waits=self.waits, misses=self.misses, late=self.late, prefetched=self.prefetched,
+            prefetched_bytes=self.prefetched_bytes, used=self.used, wasted=self.wasted, wasted_bytes=self.wasted_bytes,
+            evicted=evicted, too_soon=self.too_soon, moved_bytes=moved_bytes, failed=self.failed,
         )  # fmt: skip
 
     def check(self) -> None:

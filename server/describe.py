@@ -122,5 +122,5 @@ def make_stats(
         engine_seconds=total.engine.times(),
         users=users,
         keys=resident,
-        **residency.counters()._asdict(),
+        **structs.asdict(residency.counters()),
     )

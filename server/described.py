@@ -7,15 +7,14 @@ import numpy as np
 from msgspec import structs
 
 from ..schemas.messages import SceneInfo, StatsAnswer
-from ..schemas.stats import Times
+from ..schemas.stats import Counters, Times
 from .metrics import Metrics, times_of
 from .posed import Pose, moved_boxes, under
 
 # Of StatsAnswer: what archives have each, to be added.
 _MEMORY = (
-    "generation", "budget_bytes", "resident_bytes", "coarse_bytes", "voxels", "resident", "kept", "hits", "waits",
-    "misses", "late", "prefetched", "prefetched_bytes", "used", "wasted", "wasted_bytes", "evicted", "too_soon",
-    "moved_bytes", "failed",
+    "generation", "budget_bytes", "resident_bytes", "coarse_bytes", "voxels", "resident", "kept",
+    *Counters.__struct_fields__,
 )  # fmt: skip
 
 

@@ -22,7 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..schemas.errors import BadRequestError, CorruptError
-from .accounts import Accounts, Counters
+from ..schemas.stats import Counters
+from .accounts import Accounts
 from .arena import ArenaBuffer
 from .policies import Policy, make_policy
 from .room import Room

@@ -5,7 +5,7 @@ import importlib
 import sys
 import urllib.request
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, get_type_hints
 
 import pytest
 
@@ -18,7 +18,7 @@ from solidcloud.server.config import ServerConfig
 from solidcloud.server.metrics import Histogram
 from solidcloud.server.prometheus import FEW_USERS, metrics_served
 
-FIELDS = [name for name in StatsAnswer.__struct_fields__ if StatsAnswer.__annotations__[name] is int]
+FIELDS = [name for name, kind in get_type_hints(StatsAnswer).items() if kind is int]
 
 
 class CountedScene:

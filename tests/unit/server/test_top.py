@@ -2,7 +2,7 @@
 
 import io
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, get_type_hints
 
 import pytest
 from rich.console import Console
@@ -92,8 +92,8 @@ def test_on_a_terminal_one_table_is_drawn_over_and_the_cursor_comes_back() -> No
 def test_every_count_is_shown() -> None:
     counted = {
         name: 1001 + number
-        for number, name in enumerate(StatsAnswer.__struct_fields__)
-        if StatsAnswer.__annotations__[name] is int and "bytes" not in name and name != "generation"
+        for number, (name, kind) in enumerate(get_type_hints(StatsAnswer).items())
+        if kind is int and "bytes" not in name and name != "generation"
     }
     text = shown([hall(**counted)], once=True)
     assert [name for name, value in counted.items() if f"{value:,}" not in text] == []

@@ -301,12 +301,12 @@ def test_what_is_left_out_has_no_say_whether_normals_are_stored_or_not(tmp_path:
 
 
 def test_warming_loads_nothing_and_leaves_nothing_to_compile(tmp_path: Path) -> None:
-    case = build(tmp_path, "plane", COUNT // 3)
+    case = build(tmp_path, "plane")
     with asked(case.archive) as (opened, normals):
         warm(opened.data)
         assert opened.data.residency.resident == 0
         kernels = (find_voxel, code_at, stored_code_at, decode_normal)
         compiled = [len(getattr(kernel, "signatures", ())) for kernel in kernels]
-        place = next(place for place, *_ in judged(opened, case.points))
-        assert normals.at(place, UP, REACH) is not None
+        places = [place for place, *_ in judged(opened, case.points)][:40]
+        assert any(normals.at(place, UP, REACH) is not None for place in places)
         assert [len(getattr(kernel, "signatures", ())) for kernel in kernels] == compiled

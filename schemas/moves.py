@@ -12,7 +12,7 @@ import numpy as np
 from .answers import Verdict
 from .arrays import Poses
 from .errors import BadRequestError
-from .requests import Count, Length, Name, Request, check_one_pose
+from .requests import Count, Length, Name, Request, check_one_pose, make_poses
 
 Vector = tuple[float, float, float]
 
@@ -52,7 +52,7 @@ class Wish(Request, frozen=True, kw_only=True):
 
     seq: Count
     time: Length
-    pose: Poses = msgspec.field(default_factory=lambda: np.empty((0, 4, 4)))
+    pose: Poses = msgspec.field(default_factory=lambda: make_poses(np.empty((0, 4, 4))))
     velocity: Vector | None = None
     turn: float = 0.0
     objects: dict[str, list[list[float]]] = msgspec.field(default_factory=dict)

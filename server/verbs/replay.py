@@ -2,7 +2,7 @@
 
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -32,9 +32,10 @@ def replay(
     with open_scene(
         path, read_points=read_avatar, name=begin.scene, budget_bytes=parse_bytes(cache, "--cache")
     ) as scene:
-        if not check_same(begin, scene.simulation, path):
+        simulation: Any = scene.simulation
+        if not check_same(begin, simulation, path):
             print(f"warning: {path} is not the scene file that was logged", file=sys.stderr)
-        found = replay_log(scene.simulation, records)
+        found = replay_log(simulation, records)
     if as_json:
         first = None if found.first is None else str(found.first)
         print_json({**found._asdict(), "first": first})

@@ -3,6 +3,7 @@
 import sys
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 from solidcloud.schemas.answers import (
@@ -16,6 +17,7 @@ from solidcloud.schemas.answers import (
     WithinAnswers,
 )
 from solidcloud.schemas.errors import BadRequestError, FormatError
+from solidcloud.schemas.keys import User
 from solidcloud.schemas.messages import (
     JSON,
     MSGPACK,
@@ -25,6 +27,8 @@ from solidcloud.schemas.messages import (
     ContactsRequest,
     DistanceRequest,
     ErrorReply,
+    Moved,
+    MoveRequest,
     ObjectsRequest,
     PathRequest,
     RaycastRequest,
@@ -32,6 +36,7 @@ from solidcloud.schemas.messages import (
     SceneInfo,
     ScenesAnswer,
     SweepRequest,
+    Wish,
     WithinRequest,
     check_answers,
     decode_answer,
@@ -43,7 +48,7 @@ from solidcloud.server.app import Service
 from solidcloud.server.config import ServerConfig
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "end_to_end"))
-from fake_server import FloorScene, floor_verdicts
+from fake_server import FloorScene, floor_simulation, floor_verdicts
 
 POINTS = np.array([[0.0, 0.0, 0.5], [0.0, 0.25, 1.0]])
 
@@ -125,6 +130,52 @@ def test_what_is_asked_reaches_the_scene(service, scene, request_, kind, k, aske
     answer = ask(service, operation, request_, encoding)
     assert answer.ok and len(check_answers(decode_answer(kind, answer.payload, encoding), k)) == k
     assert scene.asked == [(operation, asked, effort)]
+
+
+@pytest.mark.parametrize("encoding", [MSGPACK, JSON])
+def test_a_move_is_asked_of_the_scene(service, scene, encoding):
+    ask(service, "add_avatar", AddAvatarRequest("al", POINTS, 0.25))
+    request = MoveRequest(avatar="al", pose_from=POSES[:1], pose_to=POSES[1:2], seconds=0.125)
+    answer = ask(service, "move", request, encoding)
+    moved = decode_answer(Moved, answer.payload, encoding)
+    assert answer.ok and np.array_equal(moved.pose, POSES[1:2])
+    assert (moved.verdict, moved.left, moved.simulated) == (1, 0.5, ["stop"])
+    assert scene.asked == [("move", ("al", 0.125), {})]
+    assert error(ask(service, "move", request, encoding, client="d"), encoding).code == "unknown_avatar"
+
+
+@pytest.mark.parametrize("poses", [POSES[:0], POSES[:2], np.full((1, 4, 4), np.nan)])
+def test_a_move_of_other_than_one_pose_is_refused(service, poses):
+    fields = {"avatar": "al", "pose_from": POSES[:1].tobytes(), "pose_to": poses.tobytes()}
+    answer = service.answer(key("move"), msgspec.msgpack.encode(fields), MSGPACK)
+    assert error(answer).code == "bad_request" and "pose_to" in error(answer).message
+
+
+def test_a_scene_that_simulates_nothing_has_no_sessions(service, scene):
+    assert service.frames("floor", lambda user, answer: None) is None
+    service.client_gone("floor", "c")
+    assert scene.gone == ["c"]
+
+
+def test_the_sessions_of_a_client_that_is_gone_end():
+    scene = floor_simulation()
+    service = Service([scene], ServerConfig())
+    sent = []
+    frames = service.frames("floor", lambda user, answer: sent.append((user, answer.ok)))
+    for client in ("c", "d"):
+        ask(service, "add_avatar", AddAvatarRequest("al", POINTS, 0.25), client=client)
+        wish = Wish(seq=1, time=0.0, pose=POSES[:1])
+        frames.wish(User(client, "al"), encode(wish), None)
+    service.client_gone("floor", "c")
+    frames.close()
+    frames.run()
+    assert sent == [(User("d", "al"), True)] and scene.users == [User("d", "al")]
+
+
+def test_warming_warms_the_frames_too(scene):
+    simulation = floor_simulation()
+    Service([simulation], ServerConfig()).warm()
+    assert simulation.served.warmed == 1 and simulation._pipeline.frames > 0
 
 
 @pytest.mark.parametrize("encoding", [MSGPACK, JSON])

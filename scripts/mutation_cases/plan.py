@@ -124,6 +124,8 @@ TESTS: dict[str, tuple[str, ...]] = {
     "server/kernels/coarse.py": (
         SERVER + "test_coarse.py::test_the_nodes_of_a_top_enclose_all_points",
         SERVER + "test_coarse.py::test_filled_and_remembered_are_the_same_rows",
+        SERVER + "test_coarse.py::test_no_point_has_a_larger_sphere_than_its_node_says",
+        SERVER + "test_settle.py",
     ),
     "server/kernels/contacts.py": (*work("contacts", "contacts deep"), *tangent("contacts")),
     "server/kernels/front.py": work("collide", "distance"),
@@ -147,6 +149,7 @@ TESTS: dict[str, tuple[str, ...]] = {
     "server/kernels/sweep.py": work("sweep", "sweep bounded"),
     "server/kernels/voxel_tree.py": (SERVER + "test_voxel_tree.py",),
     "server/kernels/walking.py": (*work("walker"), *tangent("walker")),
+    "server/kernels/walks.py": (SERVER + "test_neighbourhood.py",),
     "server/kernels/within.py": (*work("within", "within bounded"), SERVER + "test_within_exact.py"),
     "server/kernels/clusters.py": (
         SERVER + "test_clusters.py",

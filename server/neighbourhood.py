@@ -224,7 +224,7 @@ class Neighbourhood:
         """How near (n,) the points' boxes of rows are to any user's way in the last plan [m]; inf: no users.
 
         One call at a time. What was found since that plan is remembered: of 10,000 rows and 8 users finding it takes a
-        millisecond or two, and looking it up some 20 us.
+        millisecond, and looking it up some 20 us (scripts/bench_cache).
         """
         each = np.asarray(rows, np.int64)
         ways, number = self._planned

@@ -19,8 +19,8 @@ from .residency import Ahead, Residency
 log = logging.getLogger(__name__)
 
 # What is wanted is found out at most so often [s]: at 5 m/s a user moves a quarter of a metre meanwhile. And with very
-# many users so seldom that it rests so many times as long as it takes: 64 of them take 0.15 ms, a third of it with the
-# interpreter held; when each was looked at in Python it was 1 ms, all of it held.
+# many users so seldom that it rests so many times as long as it takes: 64 of them take 0.2 ms, 512 take 3
+# (scripts/bench_cache), most of it without the interpreter.
 PLAN_SECONDS, PLAN_REST = 0.05, 10.0
 # How long nothing may be heard of a user whose voxels are kept [s].
 SILENCE = 10.0

@@ -30,6 +30,8 @@ from .within import within
 # Avatars a thread has probes of at a time: users of one scene, and its objects.
 _PROBES = 256
 _NOWHERE = np.zeros(3)
+# Where a scan is so thin that the points near one make no surface, those so many times as near are asked.
+SPARSE = 3.0
 
 
 class Placed(NamedTuple):
@@ -278,7 +280,7 @@ class World:
     def normal(self, hit: Hit, reach: float) -> Vec | None:
         """The unit normal of the surface that was touched, towards the avatar; None where the points make none.
 
-        reach: points so near the one touched are its surface [m].
+        reach: points so near the one touched are its surface [m]; those SPARSE times as near, where these make none.
         """
         if hit.cloud is None or hit.avatar is None or hit.archive < 0:
             return hit.normal  # what is none of the scene's brings its own
@@ -293,11 +295,13 @@ class World:
                 normals = kept.setdefault("normals", Normals(each.opened.store, each.data))
             pose, inverse = each.placed.pose, each.placed.inverse
             way = hit.avatar - hit.cloud
-            if pose is None or inverse is None:
-                found: Vec | None = normals.at(hit.cloud, way, reach)
-                return found
-            found = normals.at(moved(inverse, hit.cloud[None])[0], turned(inverse, way[None])[0], reach)
-            return None if found is None else turned(pose, found[None])[0]
+            place = hit.cloud
+            if inverse is not None:
+                place, way = moved(inverse, place[None])[0], turned(inverse, way[None])[0]
+            found: Vec | None = normals.at(place, way, reach)
+            if found is None:
+                found = normals.at(place, way, SPARSE * reach)
+            return found if found is None or pose is None else turned(pose, found[None])[0]
 
 
 def _into(seen: Seen, pose: Pose) -> Pose:

@@ -20,7 +20,7 @@ from solidcloud.server.world import World
 
 INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
 # Spheres of the scan [m] and their spacing: closer than their size, so that walls have no holes; fewer interpreted.
-RADIUS, APART = (0.06, 0.1) if not INTERPRETED else (0.12, 0.2)
+RADIUS, APART = (0.03, 0.04) if not INTERPRETED else (0.12, 0.2)
 
 Points = NDArray[np.float64]
 
@@ -56,11 +56,11 @@ def body_box(half: float = 0.15, radius: float = 0.08) -> AvatarModel:
     return make_avatar([[0.0, 0.0, 0.0], *corners], radius)
 
 
-def person(radius: float = 0.1) -> AvatarModel:
+def person(radius: float = 0.05) -> AvatarModel:
     """A body 0.4 m wide and 1 m high, feet at the origin."""
-    heights = (radius, 0.35, 0.6, 1.0 - radius)
-    ring = [(0.1, 0.1), (0.1, -0.1), (-0.1, 0.1), (-0.1, -0.1)]
-    return make_avatar([[x, y, z] for z in heights for x, y in ring], radius)
+    heights = np.linspace(radius, 1.0 - radius, 6)
+    side = np.linspace(-0.2 + radius, 0.2 - radius, 3)
+    return make_avatar([[x, y, z] for z in heights for x in side for y in side], radius)
 
 
 def at(x: float, y: float, z: float, angle: float = 0.0) -> Points:

@@ -33,8 +33,8 @@ LONGEST_FRAME = 0.1
 NORMAL_REACH = 0.08
 # An edge is looked at so far into what it is the edge of, for points as near to there [m].
 EDGE, EDGE_REACH = 0.08, 0.04
-# What is steeper is no edge, but the side of something: points on both sides of an edge make 45 degrees.
-_EDGE_RISES = 0.4
+# What is steeper is no edge, but the side of something: points of both sides of an edge make some 45 degrees.
+_EDGE_RISES = 0.15
 # So far away from a wall the ground is looked for [m], and for so many walls.
 _ASIDE, _ASIDES = 0.01, 3
 # Normals are kept to a third of a degree: of a cosine so much.
@@ -170,7 +170,7 @@ class Grounded:
         begin, hits = frame.pose[:3, 3], len(frame.hits)
         hit = frame.go(frame, moved_by(frame.pose, way))
         if hit is not None and self._sliding is not None:
-            self._sliding.along(frame, hit, way - (frame.pose[:3, 3] - begin), way, stands=False)
+            self._sliding.along(frame, hit, way - (frame.pose[:3, 3] - begin), way, upright=False)
         del frame.hits[hits:]
 
     def _falls(self, frame: Frame, reach: float, *, stood: bool) -> bool:

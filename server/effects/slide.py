@@ -19,7 +19,7 @@ from itertools import combinations
 import numpy as np
 
 from ...schemas.answers import Verdict
-from ...schemas.effects import Ground, Slide
+from ...schemas.effects import Ground, Slide, Stop
 from ..normals import warm
 from ..world import World
 from .frame import Frame, Hit, Vec, dot, moved_by, size
@@ -27,11 +27,14 @@ from .frame import Frame, Hit, Vec, dot, moved_by, size
 # Of what is left, a smaller share along the surfaces is not gone: a degree off head on, or less.
 STICK = 0.02
 # Nor is a shorter way [m]: an avatar in a corner would tremble.
-LEAST_SLIDE = 1e-5
+LEAST_SLIDE = 5e-5
 # Normals so close are of one plane: 8 degrees.
 SAME_PLANE = 0.99
 # Over a bump it goes no farther than so many times the two spheres' radii: the wall goes on behind it.
 _OVER = 1.0
+# And is lifted off it, so that it does not graze the next one [m].
+LEAST_LIFT = 5e-4
+_SAME_BUMP = 0.9999
 # Motions of a frame for each surface: bumps take some, too.
 _MOTIONS = 2
 # A way that goes into a surface by no more than rounding, as a share of it, does not.
@@ -43,8 +46,11 @@ class Sliding:
 
     name = "slide"
 
-    def __init__(self, surfaces: int, normal_reach: float, slope: float | None, world: World) -> None:
-        """slope: what is steeper is a wall to who stands [degrees]; None: the scene has no ground."""
+    def __init__(
+        self, surfaces: int, normal_reach: float, skin: float, slope: float | None, world: World
+    ) -> None:
+        """skin: of `stop` [m].  slope: what is steeper is a wall [degrees]; None: there is no ground."""
+        self._lift = max(skin, LEAST_LIFT)
         self.surfaces, self.normal_reach = surfaces, normal_reach
         self._up = world.up
         self._walkable = None if slope is None else math.cos(math.radians(slope))
@@ -60,17 +66,18 @@ class Sliding:
         if far > 0.0:
             # Who turns goes by an arc: with all that is left it could get farther than it wished.
             left = left * min(1.0, max(0.0, size(wish) - size(frame.pose[:3, 3] - begin)) / far)
-            self.along(frame, hit, left, wish, stands=frame.body.on_ground)
+            self.along(frame, hit, left, wish, upright=True)
         if frame.pose[:3, :3].tobytes() != frame.wish[:3, :3].tobytes():
             turned = frame.wish.copy()
             turned[:3, 3] = frame.pose[:3, 3]
             frame.go(frame, turned)
         frame.left = frame.wish[:3, 3] - frame.pose[:3, 3]
 
-    def along(self, frame: Frame, hit: Hit, left: Vec, wish: Vec, *, stands: bool) -> Hit | None:
+    def along(self, frame: Frame, hit: Hit, left: Vec, wish: Vec, *, upright: bool) -> Hit | None:
         """Go on along what ended a motion. left: of its translation, wish: all of it (3,) [m].
 
-        stands: nothing steep is climbed. Returns what ended it in the end; None: nothing did.
+        upright: what is too steep to be walked is a wall, where there is ground. Returns what ended it in the end;
+        None: nothing did.
         """
         assert frame.go is not None
         met: list[Vec] = []
@@ -87,18 +94,24 @@ class Sliding:
                     across = size(out)
                     if across == 0.0:
                         return ended
-                    bumps.append(out / across)
+                    out /= across
+                    if any(dot(out, each) > _SAME_BUMP for each in bumps):
+                        return ended  # no way over it
+                    bumps.append(out)
                 elif len(met) == self.surfaces:
                     return ended
                 else:
                     met.append(normal)
-                    planes.append(self._wall(normal) if stands else normal)
+                    planes.append(self._wall(normal) if upright else normal)
             far = size(left)
             way = clip(left, planes + bumps)
-            if way is None or size(way) < max(STICK * far, LEAST_SLIDE) or dot(way, wish) <= 0.0:
+            if way is None or size(way) < max(STICK * far, LEAST_SLIDE):
                 return ended
             if bumps:
-                way = way * min(1.0, _OVER * across / size(way))
+                way = way * min(1.0, _OVER * across / size(way)) + self._lift * bumps[-1]
+                way *= min(1.0, far / size(way))
+            if dot(way, wish) <= 0.0:
+                return ended
             begin = frame.pose
             ended = frame.go(frame, moved_by(begin, way))
             gone = frame.pose[:3, 3] - begin[:3, 3]
@@ -121,7 +134,7 @@ class Sliding:
         return normal
 
     def _wall(self, normal: Vec) -> Vec:
-        """A plane as it is to who stands: what is too steep to be walked is upright."""
+        """A plane as it is to who has weight: what is too steep to be walked is upright."""
         rises = dot(normal, self._up)
         if self._walkable is None or rises >= self._walkable:
             return normal
@@ -159,4 +172,5 @@ def make(effect: Slide, world: World) -> Sliding:
     slope = next((each.slope for each in world.file.effects if isinstance(each, Ground)), None)
     with world as seen:
         warm(seen[0].data)
-    return Sliding(effect.surfaces, effect.normal_reach, slope, world)
+    skin = next(each.skin for each in world.file.effects if isinstance(each, Stop))
+    return Sliding(effect.surfaces, effect.normal_reach, skin, slope, world)

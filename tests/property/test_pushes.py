@@ -16,7 +16,7 @@ from solidcloud.server.effects.frame import Body
 # Pushes of a test, and of the one that is asked for with -m slow.
 PUSHES, MANY = (800, 100_000) if not INTERPRETED else (6, 6)
 REST = 1_000 if not INTERPRETED else 5
-SIZE = 4.0 if not INTERPRETED else 1.6
+SIZE = 2.4 if not INTERPRETED else 1.6
 # Pushes go so far [m].
 LEAST, MOST = 0.01, 50.0
 

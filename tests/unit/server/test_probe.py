@@ -1,0 +1,98 @@
+"""One motion, one pose in a kernel call: the answers of `sweep` and `collide` to the last bit."""
+
+from pathlib import Path
+
+import cases
+import naive_sweep
+import numpy as np
+import pytest
+import scans
+import swept
+from numpy.typing import NDArray
+from solidcloud.schemas.answers import Verdict
+from solidcloud.server.avatar import make_avatar
+from solidcloud.server.collide import collide
+from solidcloud.server.effort import EXACT, Effort
+from solidcloud.server.probe import Probe, Swept
+from solidcloud.server.request import SceneData
+from solidcloud.server.sweep import sweep
+
+Poses = NDArray[np.float64]
+COUNT = 12
+
+
+def same(probe: Probe, data: SceneData, first: Poses, last: Poses, tolerance: float = 1e-6) -> list[Swept]:
+    """What a probe says of motions (k, 4, 4), asserted to be what `sweep` says."""
+    answers = sweep(data, probe.avatar, first, last, tolerance=tolerance)
+    found = []
+    for i in range(len(first)):
+        one = probe.sweep(data, first[i], last[i], tolerance, EXACT)
+        assert one.verdict == answers.verdict[i] and one.visits == answers.node_visits[i]
+        assert (one.lower, one.upper, one.exact) == (answers.lower[i], answers.upper[i], answers.exact[i])
+        if one.verdict == Verdict.CONTACT:
+            np.testing.assert_array_equal(one.avatar, answers.witness_avatar[i])
+            np.testing.assert_array_equal(one.cloud, answers.witness_cloud[i])
+        else:
+            assert one.avatar is None and one.cloud is None
+        found.append(one)
+    return found
+
+
+@pytest.mark.interpreted
+@pytest.mark.parametrize("name", ["plane", "corner", "noise", "one point"])
+@pytest.mark.parametrize("far", [0.0, 2.0**18])
+def test_motions_and_poses_are_answered_to_the_last_bit(
+    tmp_path: Path, rng: np.random.Generator, name: str, far: float
+) -> None:
+    points = scans.make_scan(name, 5, 200) + far
+    case = cases.build(tmp_path, points, resolution=cases.BINARY_STEP)
+    avatar = make_avatar(rng.uniform(-0.2, 0.2, (12, 3)), 0.02)
+    first, last = swept.motions(rng, points, avatar.points, COUNT, 0.3, 0.2, 0.5)
+    last[::3, :3, :3] = first[::3, :3, :3]
+    last[1] = first[1]
+    probe = Probe(avatar)
+    with swept.opened(case) as data:
+        same(probe, data, first, last)  # loads
+        found = same(probe, data, first, last)
+        assert {each.verdict for each in found} >= {Verdict.CONTACT}
+        verdicts = collide(data, avatar, first)
+        for i in range(COUNT):
+            assert probe.collide(data, first[i], EXACT) == (verdicts.verdict[i], verdicts.node_visits[i])
+
+
+@pytest.mark.interpreted
+def test_what_is_no_quick_question_is_answered_as_well(tmp_path: Path, rng: np.random.Generator) -> None:
+    points = scans.make_scan("plane", 5, 200)
+    case = cases.build(tmp_path, points)
+    with swept.opened(case) as data:
+        first, last = swept.motions(rng, points, np.zeros((1, 3)), 4, 0.3, 0.2, 0.5)
+        assert all(each.verdict == Verdict.CLEAR for each in same(Probe(make_avatar(np.zeros((0, 3)))), data, first, last))
+        long = last.copy()
+        long[:, :3, 3] += [60.0, 0, 0]
+        large = first.copy()
+        large[:, :3, :3] *= 2.0
+        probe = Probe(make_avatar([[0.0, 0, 0], [0.1, 0, 0]], 0.05))
+        same(probe, data, first, long)
+        same(probe, data, large, large)
+        spent = Effort(visits=0)
+        assert probe.sweep(data, first[0], last[0], 1e-6, spent).verdict != Verdict.CLEAR
+        unseen = data._replace(unknown_everywhere=True)
+        for seen in (unseen, data._replace(unknown=np.array([[[-(10**6)] * 3, [10**6] * 3]]))):
+            assert {each.verdict for each in same(probe, seen, first, last)} <= {
+                Verdict.UNKNOWN,
+                Verdict.CONTACT,
+            }
+            assert probe.collide(seen, first[0], EXACT)[0] != Verdict.CLEAR
+
+
+@pytest.mark.interpreted
+def test_the_pose_between_is_the_sweeps(tmp_path: Path, rng: np.random.Generator) -> None:
+    probe = Probe(make_avatar([[0.0, 0, 0], [0.1, 0, 0]], 0.05))
+    first, last = swept.motions(rng, np.zeros((1, 3)), probe.avatar.points, 8, 0.3, 2.0, 2.0)
+    for one, other in zip(first, last, strict=True):
+        for fraction in (0.0, 0.3, 1.0):
+            pose, holds = probe.between(np.zeros(3), one, other, fraction)
+            assert holds
+            np.testing.assert_allclose(pose, naive_sweep.pose_at(one, other, fraction), atol=1e-12)
+        pose, _ = probe.between(np.array([1e6, 0, 0]), one, other, 0.0)
+        np.testing.assert_allclose(pose, one, atol=1e-9)

@@ -1,5 +1,6 @@
 """`proximity`: it reports what `distance` answers; what is remembered changes what that costs, and nothing else."""
 
+import shutil
 from pathlib import Path
 
 import cases
@@ -179,3 +180,17 @@ def test_a_scene_file_says_how_far() -> None:
         b'format = 1\n[[archives]]\npath = "a"\n[[effects]]\neffect = "proximity"\nreach = 0.25\n', "f"
     )
     assert file.effects == [Proximity(reach=0.25)]
+
+
+@pytest.mark.interpreted
+def test_what_was_remembered_before_a_reload_tells_nothing(tmp_path: Path) -> None:
+    case, other = cases.build(tmp_path, GRID), cases.build(tmp_path, GRID + np.array([0, 0, 2.0]))
+    runner, body = make(Proximity(reach=0.2), None), body_of(BALL)
+    with Scene.open(case.archive, "scene") as scene:
+        world = world_of(scene)
+        for _ in range(3):
+            assert report(runner, world, body, at(0.5, 0.5, 2.15)).distance is None
+        shutil.rmtree(case.archive)
+        other.archive.rename(case.archive)
+        scene.reload()
+        assert report(runner, world, body, at(0.5, 0.5, 2.15)).distance is not None

@@ -1,6 +1,7 @@
 """`uncertainty`, the effect: against a Monte Carlo judge that displaces scans, at its extremes, and what it refuses."""
 
 import math
+import shutil
 from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
@@ -205,3 +206,21 @@ def test_sources_are_called_by_as_little_as_tells_them_apart() -> None:
         )
     ]
     assert scan_names(sources) == ["a/hall.e57:0", "a/hall.e57:1", "a/yard.las", "b/yard.las", "x.ply"]
+
+
+@pytest.mark.interpreted
+def test_after_a_reload_scans_are_those_of_the_new_archive(tmp_path: Path) -> None:
+    own, new = tmp_path / "own", tmp_path / "new"
+    own.mkdir()
+    new.mkdir()
+    with opened(new, floor(-0.01), floor(-0.02), floor(0.0)) as scene:
+        expected = said(scene, at(0.06), sigma=0.005, scans={"scan1.ply": 0.02})
+    with opened(own, floor(0.0), floor(0.0, 0.01)) as scene:
+        world = world_of(scene)
+        runner, body = make(Uncertainty(sigma=0.005, scans={"scan1.ply": 0.02}), world), body_of(MODEL)
+        assert sorted(report(runner, world, body, at(0.06)).scans) == ["scan0.ply", "scan1.ply"]
+        shutil.rmtree(own / "archive")
+        (new / "archive").rename(own / "archive")
+        scene.reload()
+        found = report(runner, world, body, at(0.06))
+    assert found == expected and sorted(found.scans) == ["scan0.ply", "scan1.ply", "scan2.ply"]

@@ -111,6 +111,14 @@ def test_help_loads_no_numpy(verb: str) -> None:
             2,
             "expected avatar,x,y,z,qw,qx,qy,qz,group,mask",
         ),
+        (
+            "query --scene hall --op move --avatar {scan}",
+            2,
+            "--op move needs --poses: it takes --avatar, --poses",
+        ),
+        ("query --scene hall --op path --along move", 2, "--along move: expected one of collide"),
+        ("replay {out}", 3, "expected a log, as serve --log writes it"),
+        ("replay {scan}", 3, "expected a log of serve --log"),
         ("make facade -o {out}.obj", 2, "cannot write '.obj'"),
     ],
 )

@@ -221,6 +221,15 @@ def test_a_log_with_one_bit_changed_is_not_believed(
     assert out.startswith("302 frames, 302 turns: 1 different\nfirst: frame 101, avatar ")
 
 
+def test_a_log_is_not_written_over(
+    logged: tuple[Path, Path], archive: Path, endpoint: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = logged[1].read_bytes()
+    assert run(["serve", str(archive), "--listen", endpoint, "--log", str(logged[1])]) == 2
+    assert "frames.log: exists: expected none" in capsys.readouterr().err
+    assert logged[1].read_bytes() == before
+
+
 def test_a_log_of_another_archive_is_refused(
     logged: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -198,3 +198,20 @@ def test_a_state_that_cannot_be_sent_stops_nobody(floor, caplog):
     frames.wish(BO, encode(wish(1)), None)
     run(frames)
     assert sent == [BO] and "the link is gone" in caplog.text
+
+
+def test_whatever_bytes_come_each_is_answered(floor, caplog):
+    sent = []
+    frames = Frames(floor, lambda user, answer: sent.append(answer))
+    rng = np.random.default_rng(11)
+    whole = encode(wish(1, 0.5, objects={"door": np.eye(4).tolist()}))
+    for seq in range(3000):
+        payload = bytearray(whole)
+        for _ in range(rng.integers(1, 4)):
+            payload[rng.integers(len(payload))] ^= 1 << rng.integers(8)
+        frames.wish(User("a", f"al-{seq}"), bytes(payload[: rng.integers(len(payload) + 1)]), None)
+        frames._boxes.keep([])
+    run(frames)
+    assert 2000 < len(sent) <= 3000 and not any(answer.ok for answer in sent)
+    assert {said(answer).code for answer in sent} <= {"bad_request", "busy", "unknown_avatar"}
+    assert not caplog.records

@@ -29,20 +29,25 @@ from .placing import Avatar, largest_term, place, to_units
 _LEAST_SAGITTA = 0.25
 _CHORD_BEND = 1.0 / 16.0
 _MOST_REFUSED = 512
+# Children of a pair are written below it before it goes: as many more.
+_STACK = STACK + 256
 
 
 class Scratch(NamedTuple):
     """Scratch of one thread, by `make_scratch`.
 
-    nodes: (STACK, 2) int64, at: (STACK, 9) float64: pairs to be looked at, where the moving one's centre begins, its
-    way, and the other's centre.  lanes: (3, LANES) of a standing block.  ends: (2, 4, 4), shifts: (3, 3): the poses of
-    a chord's ends, their translations and the standing one's.  gap, way: (3,).  first: (2,) when anything could
-    touch, and when something must.  pair: (4,) int64 block, lane of either.  counters: (2,) node visits, point tests.
+    nodes: (s, 2) int64, at: (s, 9) float64: pairs to be looked at, where the moving one's centre begins, its
+    way, and the other's centre.  lanes: (3, LANES) of a standing block; ways: (7, LANES) of a moving one: where it
+    begins, its way, 1 / its square; keep: (LANES,).  ends: (2, 4, 4), shifts: (3, 3): the poses of a chord's ends,
+    their translations and the standing one's.  gap, way: (3,).  first: (2,) when anything could touch, and when
+    something must.  pair: (4,) int64 block, lane of either.  counters: (2,) node visits, point tests.
     """
 
     nodes: NDArray[np.int64]
     at: NDArray[np.float64]
     lanes: NDArray[np.float64]
+    ways: NDArray[np.float64]
+    keep: NDArray[np.bool_]
     ends: NDArray[np.float64]
     shifts: NDArray[np.float64]
     gap: NDArray[np.float64]
@@ -55,8 +60,9 @@ class Scratch(NamedTuple):
 def make_scratch() -> Scratch:
     """Scratch for `sweep_bodies`."""
     return Scratch(
-        np.empty((STACK, 2), np.int64), np.empty((STACK, 9)), np.empty((3, LANES)), np.empty((2, 4, 4)),
-        np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(2), np.zeros(4, np.int64), np.zeros(2, np.int64),
+        np.empty((_STACK, 2), np.int64), np.empty((_STACK, 9)), np.empty((3, LANES)), np.empty((7, LANES)),
+        np.empty(LANES, np.bool_), np.empty((2, 4, 4)), np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(2),
+        np.zeros(4, np.int64), np.zeros(2, np.int64),
     )  # fmt: skip
 
 
@@ -180,34 +186,99 @@ def _try_pair(meeting, chord, block_a, lane_a, block_b, lane_b):
 
 
 @borrowing
-def _leaves(meeting, chord, i, j, bx, by, bz, radius_b):
-    """Take all pairs of two leaf nodes into account; (bx, by, bz) with radius_b is the standing one's sphere."""
-    scratch = meeting.scratch
-    lanes, ends, shifts = scratch.lanes, scratch.ends, scratch.shifts
-    block_a, block_b = ~meeting.a.first[i], ~meeting.b.first[j]
+def _place_blocks(meeting, block_a, block_b):
+    """The points of a moving and a standing leaf node into lanes and ways."""
+    lanes, ways, ends, shifts = (
+        meeting.scratch.lanes,
+        meeting.scratch.ways,
+        meeting.scratch.ends,
+        meeting.scratch.shifts,
+    )
     points, others = meeting.a.points, meeting.b.points
     for r in range(3):
         for k in range(LANES):
             x, y, z = others[block_b, 0, k], others[block_b, 1, k], others[block_b, 2, k]
             lanes[r, k] = place(meeting.pose, shifts[2], r, x, y, z)
+        for k in range(LANES):
+            x, y, z = points[block_a, 0, k], points[block_a, 1, k], points[block_a, 2, k]
+            begin = place(ends[0], shifts[0], r, x, y, z)
+            ways[r, k] = begin
+            ways[3 + r, k] = place(ends[1], shifts[1], r, x, y, z) - begin
+    for k in range(LANES):
+        wx, wy, wz = ways[3, k], ways[4, k], ways[5, k]
+        square = wx * wx + wy * wy + wz * wz
+        ways[6, k] = 1.0 / square if square > 1e-200 else 0.0
+
+
+@borrowing
+def _bounds_of(lane, room):
+    """The least and the greatest of some coordinates (LANES,), and `room` more on either side."""
+    least, most = lane[0], lane[0]
+    for k in range(LANES):
+        least, most = min(least, lane[k]), max(most, lane[k])
+    return least - room * (1.0 + 1e-12), most + room * (1.0 + 1e-12)
+
+
+@borrowing
+def _leaves(meeting, chord, i, j, bx, by, bz, radius_b):
+    """Take all pairs of two leaf nodes into account; (bx, by, bz) with radius_b is the standing one's sphere.
+
+    Moving points against that sphere, then against its points, each in one vector loop: LANES is a constant, so that
+    what is beyond a node's count, its last point repeated, is looked at too.
+    """
+    scratch = meeting.scratch
+    lanes, ways, keep = scratch.lanes, scratch.ways, scratch.keep
+    block_a, block_b = ~meeting.a.first[i], ~meeting.b.first[j]
+    _place_blocks(meeting, block_a, block_b)
     far, span = chord.room * chord.room * (1.0 + 1e-12), (radius_b + chord.room) * (1.0 + 1e-12)
-    for lane in range(meeting.a.count[i]):
-        x, y, z = points[block_a, 0, lane], points[block_a, 1, lane], points[block_a, 2, lane]
-        px, py, pz = (
-            place(ends[0], shifts[0], 0, x, y, z),
-            place(ends[0], shifts[0], 1, x, y, z),
-            place(ends[0], shifts[0], 2, x, y, z),
+    span *= span
+    latest = _latest(scratch)
+    low_x, high_x = _bounds_of(lanes[0], chord.room)
+    low_y, high_y = _bounds_of(lanes[1], chord.room)
+    low_z, high_z = _bounds_of(lanes[2], chord.room)
+    for k in range(LANES):
+        px, py, pz, wx, wy, wz = ways[0, k], ways[1, k], ways[2, k], ways[3, k], ways[4, k], ways[5, k]
+        gx, gy, gz = px - bx, py - by, pz - bz
+        t = min(max(-(gx * wx + gy * wy + gz * wz) * ways[6, k], 0.0), latest)
+        ex, ey, ez = gx + t * wx, gy + t * wy, gz + t * wz
+        qx, qy, qz = px + latest * wx, py + latest * wy, pz + latest * wz
+        keep[k] = (
+            (ex * ex + ey * ey + ez * ez <= span)
+            & (min(px, qx) <= high_x)
+            & (max(px, qx) >= low_x)
+            & (min(py, qy) <= high_y)
+            & (max(py, qy) >= low_y)
+            & (min(pz, qz) <= high_z)
+            & (max(pz, qz) >= low_z)
         )
-        wx = place(ends[1], shifts[1], 0, x, y, z) - px
-        wy = place(ends[1], shifts[1], 1, x, y, z) - py
-        wz = place(ends[1], shifts[1], 2, x, y, z) - pz
-        latest = _latest(scratch)
-        if _least_square(px - bx, py - by, pz - bz, wx, wy, wz, latest) > span * span:
+    for lane in range(meeting.a.count[i]):
+        if not keep[lane]:
             continue
         scratch.counters[1] += LANES
+        px, py, pz, wx, wy, wz = (
+            ways[0, lane],
+            ways[1, lane],
+            ways[2, lane],
+            ways[3, lane],
+            ways[4, lane],
+            ways[5, lane],
+        )
+        inverse = ways[6, lane]
+        touched = False
+        for k in range(LANES):
+            gx, gy, gz = px - lanes[0, k], py - lanes[1, k], pz - lanes[2, k]
+            t = min(max(-(gx * wx + gy * wy + gz * wz) * inverse, 0.0), latest)
+            ex, ey, ez = gx + t * wx, gy + t * wy, gz + t * wz
+            touched |= ex * ex + ey * ey + ez * ez <= far
+        if not touched:
+            continue
         for k in range(meeting.b.count[j]):
-            if _least_square(px - lanes[0, k], py - lanes[1, k], pz - lanes[2, k], wx, wy, wz, latest) <= far:
+            gx, gy, gz = px - lanes[0, k], py - lanes[1, k], pz - lanes[2, k]
+            t = min(max(-(gx * wx + gy * wy + gz * wz) * inverse, 0.0), latest)
+            ex, ey, ez = gx + t * wx, gy + t * wy, gz + t * wz
+            if ex * ex + ey * ey + ez * ez <= far:
                 _try_pair(meeting, chord, block_a, lane, block_b, k)
+                latest = _latest(scratch)
 
 
 @borrowing
@@ -231,8 +302,35 @@ def _place_standing(meeting, node, at, depth):
 
 
 @borrowing
+def _may_touch(meeting, chord, depth):
+    """The least square of how far apart the centres of a pair on the stack come, inf where nothing below can touch
+    before what was found."""
+    at, nodes = meeting.scratch.at, meeting.scratch.nodes
+    radii = (meeting.a.radius[nodes[depth, 0]] + meeting.b.radius[nodes[depth, 1]]) * STRETCH
+    both = (radii + chord.room) * (1.0 + 1e-12)
+    square = _least_square(
+        at[depth, 0] - at[depth, 6], at[depth, 1] - at[depth, 7], at[depth, 2] - at[depth, 8],
+        at[depth, 3], at[depth, 4], at[depth, 5], _latest(meeting.scratch),
+    )  # fmt: skip
+    return square if square <= both * both else INFINITE
+
+
+@borrowing
+def _swap(scratch, one, other):
+    """Swap two pairs on the stack."""
+    nodes, at = scratch.nodes, scratch.at
+    for r in range(2):
+        nodes[one, r], nodes[other, r] = nodes[other, r], nodes[one, r]
+    for r in range(9):
+        at[one, r], at[other, r] = at[other, r], at[one, r]
+
+
+@borrowing
 def _descend(meeting, chord):
-    """One descent of both trees for one chord, the larger inner node opened, a leaf never; fills scratch.first."""
+    """One descent of both trees for one chord, the larger inner node opened, a leaf never; fills scratch.first.
+
+    Of children the pair whose centres come nearest goes first: what touches early is found early, and prunes.
+    """
     scratch, a, b = meeting.scratch, meeting.a, meeting.b
     nodes, at, counters = scratch.nodes, scratch.at, scratch.counters
     scratch.first[0], scratch.first[1] = INFINITE, INFINITE
@@ -243,40 +341,37 @@ def _descend(meeting, chord):
     depth = 1
     while depth > 0:
         depth -= 1
-        i, j = nodes[depth, 0], nodes[depth, 1]
-        px, py, pz, wx, wy, wz = (
-            at[depth, 0],
-            at[depth, 1],
-            at[depth, 2],
-            at[depth, 3],
-            at[depth, 4],
-            at[depth, 5],
-        )
-        bx, by, bz = at[depth, 6], at[depth, 7], at[depth, 8]
-        radius_a, radius_b = a.radius[i] * STRETCH, b.radius[j] * STRETCH
-        both = (radius_a + radius_b + chord.room) * (1.0 + 1e-12)
-        if _least_square(px - bx, py - by, pz - bz, wx, wy, wz, _latest(scratch)) > both * both:
+        if _may_touch(meeting, chord, depth) == INFINITE:
             continue
+        i, j = nodes[depth, 0], nodes[depth, 1]
         first_a, first_b = a.first[i], b.first[j]
         if first_a < 0 and first_b < 0:
-            _leaves(meeting, chord, i, j, bx, by, bz, radius_b)
+            _leaves(meeting, chord, i, j, at[depth, 6], at[depth, 7], at[depth, 8], b.radius[j] * STRETCH)
             if scratch.first[0] <= 0.0:
                 return
-        elif first_b < 0 or (first_a >= 0 and radius_a > radius_b):
-            counters[0] += a.count[i]
-            for child in range(first_a, first_a + a.count[i]):
+            continue
+        opens_a = first_b < 0 or (first_a >= 0 and a.radius[i] > b.radius[j])
+        first, count = (first_a, a.count[i]) if opens_a else (first_b, b.count[j])
+        counters[0] += count
+        # The pair itself goes to where its last child would, so that children can be written below it.
+        parent, nearest, least = depth + count, depth, INFINITE
+        _swap(scratch, depth, parent)
+        for child in range(first, first + count):
+            for r in range(9):
+                at[depth, r] = at[parent, r]
+            if opens_a:
                 nodes[depth, 0], nodes[depth, 1] = child, j
                 _place_chord(meeting, child, at, depth)
-                at[depth, 6], at[depth, 7], at[depth, 8] = bx, by, bz
-                depth += 1
-        else:
-            counters[0] += b.count[j]
-            for child in range(first_b, first_b + b.count[j]):
+            else:
                 nodes[depth, 0], nodes[depth, 1] = i, child
-                at[depth, 0], at[depth, 1], at[depth, 2] = px, py, pz
-                at[depth, 3], at[depth, 4], at[depth, 5] = wx, wy, wz
                 _place_standing(meeting, child, at, depth)
+            square = _may_touch(meeting, chord, depth)
+            if square < INFINITE:
+                if square < least:
+                    nearest, least = depth, square
                 depth += 1
+        if least < INFINITE:
+            _swap(scratch, nearest, depth - 1)
 
 
 @borrowing

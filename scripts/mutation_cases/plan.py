@@ -138,7 +138,12 @@ TESTS: dict[str, tuple[str, ...]] = {
     "server/kernels/moments.py": (*work("sweep", "sweep bounded"), *SWEEPS),
     "server/kernels/moving.py": (SERVER + "test_moving.py", *work("sweep", "sweep bounded")),
     "server/kernels/memory.py": work("walker"),
+    "server/kernels/by_scan.py": (SERVER + "test_by_scan.py",),
     "server/kernels/nearest.py": work("distance", "distance deep"),
+    "server/kernels/nearest_resident.py": (
+        SERVER + "test_near.py",
+        "tests/property/test_near.py::test_one_pose_has_the_bits_of_distance",
+    ),
     "server/kernels/overlap.py": (*work("collide", "collide deep", "collide one"), *tangent("collide")),
     "server/kernels/placed.py": (SERVER + "test_placed.py", *tangent("collide"), *work("collide")),
     "server/kernels/priority.py": (

@@ -64,3 +64,25 @@ def test_a_number_that_no_scan_has_harms_nothing(tmp_path: Path) -> None:
         both = gaps_by_scan(case.data, BALL, POSE, 0.15, 2).gaps
         fewer = gaps_by_scan(case.data, BALL, POSE, 0.15, 1).gaps
     assert fewer == {0: both[0], ANY_SCAN: both[1]}
+
+
+@pytest.mark.interpreted
+def test_trees_of_several_levels_give_the_gaps_of_all_pairs_at_the_same_cost(tmp_path: Path) -> None:
+    rng = np.random.default_rng(5)
+    points = rng.uniform(0, 1, (120, 3)) * [1, 1, 0.05]
+    avatar = make_avatar(rng.uniform(-0.3, 0.3, (90, 3)) * [1, 1, 0.1], 0.02)
+    case = cases_contacts.open_case(
+        tmp_path, points, rng, scan_count=3, voxel=0.5, leaf=8, cell_points=20, degree=3
+    )
+    visits, tests = [], []
+    with closing(case.store):
+        for height in (0.02, 0.13, 0.3):
+            pose = cases.pose_of(cases.random_rotation(rng), np.array([0.5, 0.5, height]))
+            placed = avatar.points @ pose[:3, :3].T + pose[:3, 3]
+            gaps = np.linalg.norm(placed[:, None] - points, axis=2).min(axis=0) - 0.03
+            expected = {s: gaps[case.numbers == s].min() for s in range(3)}
+            found = gaps_by_scan(case.data, avatar, pose, 0.05, 3)
+            assert found.gaps == pytest.approx({s: g for s, g in expected.items() if g <= 0.05}, abs=2e-4)
+            visits.append(found.node_visits)
+            tests.append(found.point_tests)
+    assert visits == [105, 108, 76] and tests == [2432, 2400, 1248]

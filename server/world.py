@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ..schemas.answers import ContactsAnswers, DistanceAnswers, Verdict
 from ..schemas.scene import SceneFile
+from ..schemas.voxel_grid import UNITS_PER_METRE
 from .avatar import AvatarModel
 from .contacts import contacts
 from .effects.frame import Hit, Pose, Vec
@@ -190,7 +191,7 @@ class World:
         return pose, same and self._alone
 
     def lowest(self) -> float:
-        """How far up the lowest corner of the archives' boxes is from the world's origin [m]."""
+        """How far up the lowest corner of the archives' boxes is from the world's origin, spheres included [m]."""
         least = np.inf
         with self as seen:
             for each in seen:
@@ -199,7 +200,8 @@ class World:
                 corners = np.array([[box[i & 1, 0], box[i >> 1 & 1, 1], box[i >> 2, 2]] for i in range(8)])
                 if each.placed.pose is not None:
                     corners = moved(each.placed.pose, corners)
-                least = min(least, float((corners @ self.up).min()))
+                radius = each.data.radius_units / UNITS_PER_METRE
+                least = min(least, float((corners @ self.up).min()) - radius)
         return least
 
     def deepest(self, avatar: AvatarModel, pose: Pose, effort: Effort = EXACT) -> Hit | None:

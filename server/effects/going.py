@@ -60,7 +60,10 @@ def farthest(frame: Frame, to: Pose) -> float:
     avatar, begin = frame.body.avatar, frame.pose
     if not len(avatar.points):
         return 0.0
-    turn, way = to[:3, :3] - begin[:3, :3], to[:3, 3] - begin[:3, 3]
+    way = to[:3, 3] - begin[:3, 3]
+    if to[:3, :3].tobytes() == begin[:3, :3].tobytes():
+        return size(way)
+    turn = to[:3, :3] - begin[:3, :3]
     center = way + turn @ avatar.arrays.center[0]
     return size(center) + float(np.linalg.norm(turn)) * float(avatar.arrays.radius[0])
 

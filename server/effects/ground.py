@@ -39,8 +39,8 @@ _EDGE_RISES = 0.15
 _ASIDE, _ASIDES = 0.01, 3
 # Normals are kept to a third of a degree: of a cosine so much.
 _ROUNDING = 0.005
-# Feet so far beneath a scene's lowest point touch nothing more, whatever its spheres [m]; how exactly that is asked.
-_BELOW, _ROUGH = 16.0, 1e-2
+# The body is swept so far beneath a scene's lowest sphere, its own height apart [m]; how exactly that is asked.
+_BELOW, _ROUGH = 0.1, 1e-2
 # Without `sweep` [m].
 _TOLERANCE = 1e-5
 
@@ -118,14 +118,18 @@ class Grounded:
 
         Beside a wall the way down leads by its bumps: what is too steep is looked past, a little away from it.
         """
-        aside = np.zeros(3)
         first: Below | None = None
+        aside = np.zeros(3)
+        for hit in frame.hits[-_ASIDES:]:  # what the avatar stands beside now
+            if hit.normal is not None and abs(dot(hit.normal, frame.world.up)) < _EDGE_RISES:
+                aside = _ASIDE * hit.normal
+        beside = bool(aside.any())
         for _ in range(_ASIDES):
             begin = frame.pose
             frame.pose = moved_by(begin, aside)
             hit = first_hit(frame, moved_by(frame.pose, -reach * frame.world.up), self._tolerance)
             frame.pose = begin
-            found = Below(hit, reach, reach, None, first is not None)
+            found = Below(hit, reach, reach, None, beside or first is not None)
             if hit is None:
                 return found
             found = found._replace(free=hit.fraction * reach)
@@ -179,7 +183,9 @@ class Grounded:
         if not len(avatar.points):
             return False
         feet = lowest(avatar, frame.pose, up)
-        deep = feet - world.lowest() + _BELOW
+        deep = (
+            feet - world.lowest() + _BELOW
+        )  # feet are what falls first: what they do not reach nothing lands on
         if deep <= reach:
             return False
         swept = world.sweep(avatar, frame.pose, moved_by(frame.pose, -deep * up), _ROUGH, frame.effort)

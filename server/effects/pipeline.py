@@ -19,7 +19,7 @@ from ...schemas.scene import SceneFile, effect_name
 from ..effort import EXACT, Effort
 from ..world import World
 from . import NEVER_SKIPPED, ORDER
-from .frame import Body, Frame, Hit, Pose, Runner, Vec
+from .frame import Body, Frame, Hit, Pose, Runner, Vec, size
 
 # What an effect usually takes follows what it took by this share.
 _FOLLOWS = 0.1
@@ -85,7 +85,7 @@ class Pipeline:
         begin = time.perf_counter()
         body.pose = np.ascontiguousarray(body.pose, np.float64)
         wish = np.array(wish, np.float64)
-        far = float(np.linalg.norm(wish[:3, 3] - body.pose[:3, 3]))
+        far = size(wish[:3, 3] - body.pose[:3, 3])
         if not far <= self.file.limits.longest_move:
             raise BadRequestError(
                 f"the wish is {far:g} m away: expected within {self.file.limits.longest_move:g} m, the scene's longest "

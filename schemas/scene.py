@@ -16,7 +16,7 @@ from .effects import AnyEffect, Stop, Through, Vector
 from .errors import BadRequestError
 from .keys import check_name
 from .radius_model import parse_radius_model
-from .toml_faults import decode, fault, nearest, shown
+from .toml_faults import MOST_BYTES, decode, fault, nearest, shown
 from .voxel_grid import MAX_COORDINATE
 
 SUFFIX = ".toml"
@@ -134,8 +134,13 @@ def scene_name(scene: SceneFile, path: Path) -> str:
 def read_scene(path: Path) -> SceneFile:
     """The scene of a file, all that can be said without opening an archive checked. BadRequestError: what is wrong,
     with file, place and what is allowed."""
+    if path.suffix != SUFFIX:
+        raise BadRequestError(
+            f"{path}: expected a scene file, by a name that ends in {SUFFIX}: `serve` knows it by that"
+        )
     try:
-        text = path.read_bytes()
+        with open(path, "rb") as file:
+            text = file.read(MOST_BYTES + 1)  # no more of a scan that was given by mistake
     except OSError as error:
         raise BadRequestError(
             f"{path}: {error.strerror}: expected a scene file: make one with: solidcloud scene new"
@@ -192,7 +197,10 @@ def _faults(scene: SceneFile) -> Iterator[tuple[str, str]]:
     yield from _twice([item.name for item in scene.objects], "objects", "name")
     yield from _objects(scene, names)
     for number, archive in enumerate(scene.archives):
+        yield from _path(archive.path, f"$.archives[{number}].path")
         yield from _pose(archive.pose, f"$.archives[{number}].pose")
+    for number, avatar in enumerate(scene.avatars):
+        yield from _path(avatar.file, f"$.avatars[{number}].file")
     for number, thing in enumerate(scene.objects):
         yield from _pose(thing.pose, f"$.objects[{number}].pose")
     if not 1e-100 < math.hypot(*scene.up) < 1e100:  # whose squares are neither
@@ -243,6 +251,12 @@ def _boxes(effect: Through, place: str) -> Iterator[tuple[str, str]]:
                 f"box {shown(box.name)} from {list(box.low)} to {list(box.high)}: expected low <= high along each axis",
             )
     yield from _twice([box.name for box in effect.boxes], place[2:], "name")
+
+
+def _path(path: str, place: str) -> Iterator[tuple[str, str]]:
+    """A path that no file has."""
+    if "\0" in path:
+        yield place, f"found {shown(path)}: expected a path, without the character NUL"
 
 
 def _position(position: Vector, place: str) -> Iterator[tuple[str, str]]:

@@ -4,6 +4,7 @@ msgspec says where (`$.effects[0].skin`) and of what type; here is added what wa
 nearest name to one that is none, and the line.
 """
 
+import bisect
 import difflib
 import json
 import math
@@ -26,6 +27,16 @@ _PLACE = re.compile(r" - at `(?:key in )?(\$[^`]*)`$")
 _TOKEN = re.compile(r"\.([^.\[]+)|\[(\d+|\.\.\.)\]")
 _FIELD = re.compile(r"^Object (contains unknown|missing required) field `([^`]*)`")
 _LONGEST_SHOWN = 60
+# TOML's integers are of 64 bits; Python's have as many as memory, and more than 4,300 digits it does not print.
+_MOST_BITS = 63
+# What decides where a statement ends: brackets and line ends, but for those in strings and comments.
+_MARKS = re.compile(
+    r'"""(?:\\.|[^\\])*?"""(?:"{0,2})'
+    r"|'''.*?'''(?:'{0,2})"
+    r'|"(?:\\.|[^"\\\n])*"'
+    r"|'[^'\n]*'|#[^\n]*|[\[\]{}\n]",
+    re.DOTALL,
+)
 
 
 def decode(text: bytes, kind: type[_T], where: str) -> _T:
@@ -34,34 +45,47 @@ def decode(text: bytes, kind: type[_T], where: str) -> _T:
     BadRequestError: in one sentence, what is wrong with it.
     """
     data = load(text, where)
-    for place, value in _numbers(data, "$"):
-        if not math.isfinite(value):
-            raise fault(where, place, f"found {shown(value)}: expected a finite number", text)
     try:
+        for place, value in _numbers(data, "$"):
+            if isinstance(value, int):
+                if value.bit_length() > _MOST_BITS:
+                    said = f"found an integer of {value.bit_length():,} bits: expected at most {_MOST_BITS}"
+                    raise fault(where, place, said, text)
+            elif not math.isfinite(value):
+                raise fault(where, place, f"found {shown(value)}: expected a finite number", text)
         return msgspec.convert(data, kind)
     except msgspec.ValidationError as error:
         place, said = _explained(str(error), data, kind)
         raise fault(where, place, said, text) from None
+    except RecursionError:  # dotted keys nest without brackets
+        raise BadRequestError(f"{where}: nested too deeply") from None
 
 
 def load(text: bytes, where: str) -> dict[str, Any]:
     """The tables of a TOML file; BadRequestError says line and column."""
     if len(text) > MOST_BYTES:
-        raise BadRequestError(f"{where}: {len(text):,} bytes, expected at most {MOST_BYTES:,}")
+        raise BadRequestError(f"{where}: more than {MOST_BYTES:,} bytes: expected a scene file")
     try:
-        return tomllib.loads(text.decode("utf-8"))
+        return tomllib.loads(_decoded(text))
     except UnicodeDecodeError as error:
         line = text.count(b"\n", 0, error.start) + 1
         raise BadRequestError(f"{where}: line {line}: bytes that are no UTF-8: save it as UTF-8") from None
     except tomllib.TOMLDecodeError as error:
         raise BadRequestError(f"{where}: no TOML: {error}") from None
+    except ValueError:
+        raise BadRequestError(f"{where}: a number of more digits than any has") from None
     except RecursionError:
         raise BadRequestError(f"{where}: nested too deeply") from None
 
 
+def _decoded(text: bytes) -> str:
+    """A file's text, without the byte order mark that some editors put in front."""
+    return text.decode("utf-8-sig")
+
+
 def fault(where: str, place: str, said: str, text: bytes | None = None) -> BadRequestError:
     """What is wrong at a place of a file; text: its bytes, for the line."""
-    line = None if text is None else line_of(text.decode("utf-8"), place)
+    line = None if text is None else line_of(_decoded(text), place)
     at = f"line {line}: " if line else ""
     return BadRequestError(f"{where}: {at}{place}: {said}")
 
@@ -82,34 +106,28 @@ def line_of(text: str, place: str) -> int | None:
     """The line, from 1, where the statement begins that makes a place of a TOML file; None for the whole of it, and
     for what is not in it.
 
-    A prefix of lines that can be parsed ends with a whole statement, so the last of them without the place ends right
-    before it. Once there, it is there in every longer prefix: that is bisected.
+    Lines up to where a statement begins can be parsed. Once the place is there, it is there in every longer prefix:
+    that is bisected.
     """
     tokens = _tokens(place)
     if not tokens or not _has(tomllib.loads(text), tokens):
         return None
-    lines = text.split("\n")
+    begins = [*_statements(text), len(text)]
+    first = bisect.bisect_left(begins, True, key=lambda end: _has(tomllib.loads(text[:end]), tokens))
+    return text.count("\n", 0, begins[first - 1]) + 1
 
-    def holds(count: int) -> tuple[int, bool]:
-        """The least prefix of so many lines or more that can be parsed, and whether it has the place."""
-        for longer in range(count, len(lines)):
-            try:
-                data = tomllib.loads("\n".join(lines[:longer]) + "\n")
-            except tomllib.TOMLDecodeError:
-                continue
-            return longer, _has(data, tokens)
-        return len(lines), True
 
-    # Without the place; the least known to lead to a prefix with it.
-    without, has = 0, len(lines)
-    while has - without > 1:
-        middle = (without + has) // 2
-        longer, there = holds(middle)
-        if there:
-            has = middle
-        else:
-            without = longer
-    return without + 1
+def _statements(text: str) -> list[int]:
+    """Where the lines of a TOML file begin that do not go on with the line before."""
+    begins, depth = [0], 0
+    for mark in _MARKS.finditer(text):
+        if mark[0] in "[{":
+            depth += 1
+        elif mark[0] in "]}":
+            depth -= 1
+        elif mark[0] == "\n" and not depth:
+            begins.append(mark.end())
+    return begins
 
 
 def _tokens(place: str) -> list[str | int]:
@@ -132,9 +150,9 @@ def _has(data: Any, tokens: list[str | int]) -> bool:
     return True
 
 
-def _numbers(value: Any, place: str) -> Iterator[tuple[str, float]]:
+def _numbers(value: Any, place: str) -> Iterator[tuple[str, int | float]]:
     """All numbers, and where."""
-    if isinstance(value, float):
+    if isinstance(value, int | float):
         yield place, value
     elif isinstance(value, dict):
         for name, inner in value.items():

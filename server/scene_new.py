@@ -1,17 +1,24 @@
 """A new scene file, written where there is none, once all it names was found whole."""
 
 import os
+import re
 from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
 
 from ..schemas.errors import BadRequestError, SolidcloudError
+from ..schemas.keys import check_name
 from ..schemas.radius_model import STORED_MODELS
-from ..schemas.scene import parse_scene, scene_name
+from ..schemas.scene import SUFFIX, parse_scene, scene_name
 from .describe import describe
 from .scene_text import Beginning, scene_text
 from .store import Store
+
+# What is in no name of an avatar (schemas/scene.py, SceneName), and how long one may be.
+_NO_NAME = re.compile(r"[^A-Za-z0-9._-]+")
+_LONGEST_NAME = 64
 
 
 def new_scene(
@@ -28,24 +35,22 @@ def new_scene(
     force: replace what is there. Raises BadRequestError for what such a file may not say, and where one is there;
     FormatError or CorruptError for an archive that is none.
     """
-    if out.suffix != ".toml":
+    if out.suffix != SUFFIX:
         raise BadRequestError(
-            f"{out}: expected a name that ends in .toml, by which `serve` knows a scene file"
+            f"{out}: expected a name that ends in {SUFFIX}, by which `serve` knows a scene file"
         )
     if not archives:
         raise BadRequestError("no archive given: expected at least one")
+    if name is not None:
+        check_name(name, "--name")
     infos = []
     for folder in archives:
-        store = Store(folder)
-        infos.append(describe(store, folder.resolve().name))
-        store.close()
-    for file in avatars:
-        if not file.is_file():
-            raise BadRequestError(f"{file}: no such file, expected points of an avatar")
+        with closing(Store(folder)) as store:
+            infos.append(describe(store, folder.resolve().name))
     bounds = np.array([info.bounds for info in infos])
     begin = Beginning(
         [_relative(folder, out) for folder in archives],
-        [(file.stem, _relative(file, out)) for file in avatars],
+        [(called, _relative(file, out)) for called, file in _named(avatars).items()],
         effects,
         name,
         [model for model in STORED_MODELS if all(model in info.radius_models for info in infos)],
@@ -53,16 +58,45 @@ def new_scene(
         bounds[:, 1].max(axis=0).tolist(),
     )
     text = scene_text(begin).encode()
-    scene_name(parse_scene(text, str(out)), out)
+    scene_name(parse_scene(text, f"{out}, which is not written"), out)
     try:
-        with open(out, "wb" if force else "xb") as opened:
-            opened.write(text)
+        _write(out, text, force)
     except FileExistsError:
         raise BadRequestError(f"{out} is there: give another -o, or --force to replace it") from None
     except OSError as error:
         raise SolidcloudError(f"{out}: {error.strerror}") from None
 
 
+def _named(avatars: Sequence[Path]) -> dict[str, Path]:
+    """The files of avatars by what these are called: as the files, with - for what such a name may not hold."""
+    found: dict[str, Path] = {}
+    for file in avatars:
+        if not file.is_file():
+            raise BadRequestError(f"{file}: no such file, expected points of an avatar")
+        called = _NO_NAME.sub("-", file.stem)[:_LONGEST_NAME]
+        if called in found:
+            raise BadRequestError(
+                f"--avatar {file}: its avatar would be called {called}, as that of {found[called]}: expected names of "
+                "their own: give it under another"
+            )
+        found[called] = file
+    return found
+
+
+def _write(out: Path, text: bytes, force: bool) -> None:
+    """Write the file whole or not at all. FileExistsError where one is there, unless it may be replaced."""
+    written = out.with_name(f"{out.name}.{os.getpid()}.tmp") if force else out
+    with open(written, "xb") as opened:
+        try:
+            opened.write(text)
+            opened.close()
+            if force:
+                os.replace(written, out)
+        except BaseException:
+            written.unlink()
+            raise
+
+
 def _relative(path: Path, out: Path) -> str:
     """A path as the file has it: relative to it."""
-    return os.path.relpath(path.resolve(), out.resolve().parent)
+    return os.path.relpath(path.resolve(), out.parent.resolve())

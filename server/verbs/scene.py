@@ -16,7 +16,9 @@ def new(
     ] = None,
     avatar: Annotated[
         list[Path] | None,
-        typer.Option(help="Points of an avatar that every user finds, named as the file; may be repeated."),
+        typer.Option(
+            help="Points of an avatar that every user finds, named nearly as the file; may be repeated."
+        ),
     ] = None,
     effects: Annotated[
         str, typer.Option(help="What is simulated, with commas between; the others are commented out.")
@@ -24,11 +26,13 @@ def new(
     force: Annotated[bool, typer.Option("--force", help="Replace the file if it is there.")] = False,
 ) -> None:
     """Write a scene file with every field explained."""
+    import shlex
+
     from ..scene_new import new_scene
 
     wanted = [effect.strip() for effect in effects.split(",") if effect.strip()]
     new_scene(out, archives, avatar or [], effects=wanted, name=name, force=force)
-    print(f"{out}: written; edit it, then: solidcloud scene check {out}")
+    print(f"{out}: written; edit it, then: {shlex.join(['solidcloud', 'scene', 'check', str(out)])}")
 
 
 def check(

@@ -1,6 +1,7 @@
 """What is wrong with a TOML file: where a statement begins, what is no TOML, what a type allows."""
 
 import random
+import tomllib
 
 import msgspec
 import pytest
@@ -28,7 +29,7 @@ def refused(text: str) -> str:
         (b"format = 1\nformat = 1\n", "Cannot overwrite a value (at line 2"),
         (b"format = 1\n# \xff\n", "hall.toml: line 2: bytes that are no UTF-8: save it as UTF-8"),
         (b"a = " + b"[" * 100_000, "hall.toml: nested too deeply"),
-        (b"#" * ((4 << 20) + 1), "hall.toml: 4,194,305 bytes, expected at most 4,194,304"),
+        (b"#" * ((4 << 20) + 1), "hall.toml: more than 4,194,304 bytes: expected a scene file"),
     ],
 )
 def test_what_is_no_toml_says_where(text: bytes, said: str) -> None:
@@ -104,3 +105,39 @@ def test_other_types_are_told_as_well(text: str, said: str) -> None:
     with pytest.raises(BadRequestError) as found:
         decode(text.encode(), _Outer, "x.toml")
     assert str(found.value).startswith("x.toml: ") and said in str(found.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (".".join(["a"] * 5000) + " = 1", "nested too deeply"),
+        ("names." + ".".join(["a"] * 5000) + " = 1", "nested too deeply"),
+        ("inner = " + "9" * 5000, "a number of more digits than any has"),
+        ("inner = 0x" + "F" * 5000, "line 1: $.inner: found an integer of 20,000 bits: expected at most 63"),
+        ("\ufeffinner = 3", "line 1: $.inner: found 3: expected a table of size, flag"),
+    ],
+)
+def test_what_no_editor_writes_is_told_as_well(text: str, said: str) -> None:
+    with pytest.raises(BadRequestError) as found:
+        decode(text.encode(), _Outer, "x.toml")
+    assert str(found.value) == f"x.toml: {said}"
+
+
+def test_a_file_is_read_a_few_times_to_find_a_line_of_a_long_list(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not once for every line that a statement goes on for."""
+    inner = "".join(f' {{name = "b{number}"}}, # ] }}\n' for number in range(2000))
+    text = f"first = 1\nboxes = [\n{inner}]\nlast = 2\n"
+    read: list[str] = []
+    loads = tomllib.loads
+    monkeypatch.setattr(tomllib, "loads", lambda part: read.append(part) or loads(part))
+    assert line_of(text, "$.boxes[1999].name") == 2 and line_of(text, "$.last") == 2004
+    assert len(read) < 12
+
+
+def test_brackets_and_quotes_in_strings_and_comments_end_no_statement() -> None:
+    text = (
+        'a = """x [ \\"\n { """""\nb = \'\'\'[{ \n\'\'\'\'\'\n# [ [ \'\nc = [ # ]\n 1, "]",\n 2]\n[d."]x["]\n'
+        'e = \'[\'\n"f]" = "\\"["\n[[g]]\nh = {i = 1}\n'
+    )
+    places = {"$.a": 1, "$.b": 3, "$.c[2]": 6, "$.d": 9, "$.g[0]": 12, "$.g[0].h.i": 13}
+    assert {place: line_of(text, place) for place in places} == places

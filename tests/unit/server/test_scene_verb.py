@@ -2,12 +2,14 @@
 
 import json
 import re
+import shlex
 import shutil
 from pathlib import Path
 
 import pytest
 from solidcloud.schemas.scene import parse_scene, read_scene
 from solidcloud.server.cli import run
+from solidcloud.server.scene_file import is_scene_file
 
 pytestmark = pytest.mark.interpreted
 
@@ -106,7 +108,13 @@ def test_what_is_there_is_replaced_only_with_force(folder: Path, capsys: pytest.
         ("{archive} -o {folder}/no/new.toml", 1, "no/new.toml: No such file or directory"),
         ("{folder}/scans -o {folder}/new.toml", 3, "scans: no archive here"),
         ("{archive} -o {folder}/new.toml --avatar {folder}/no.ply", 2, "no.ply: no such file"),
-        ("{archive} -o {folder}/new.toml --name a/b", 2, '$.name: found "a/b": expected 1 to 64 of A-Z'),
+        ("{archive} -o {folder}/new.toml --name a/b", 2, "--name 'a/b': expected 1 to 64 of A-Z"),
+        (
+            "{archive} -o {folder}/new.toml --avatar {folder}/visitor.xyz --avatar {folder}/scans/visitor.obj",
+            2,
+            "scans/visitor.obj: its avatar would be called visitor, as that of",
+        ),
+        ("{archive} -o {folder}/new.toml --effects step", 2, "new.toml, which is not written: line"),
         ("-o {folder}/new.toml", 2, "Missing argument 'archives'"),
     ],
 )
@@ -114,6 +122,7 @@ def test_what_cannot_be_written_is_one_line(
     folder: Path, capsys: pytest.CaptureFixture[str], arguments: str, code: int, said: str
 ) -> None:
     archive = folder / "scans/hall"
+    (folder / "scans/visitor.obj").write_text("v 0 0 0\n")
     assert run(["scene", "new", *arguments.format(folder=folder, archive=archive).split()]) == code
     if code:
         assert said in one_error(capsys)
@@ -235,3 +244,62 @@ def test_serve_refuses_a_scene_file_that_is_wrong(
         else "No such file or directory: expected a scene"
     )
     assert f"{name}: " in (error := one_error(capsys)) and said in error
+
+
+def test_names_with_spaces_are_fine(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shutil.copytree(folder / "scans/hall", folder / "my scans/great hall")
+    (folder / "my visitor.xyz").write_text("0 0 0\n0.1 0 0\n")
+    (folder / "my scenes").mkdir()
+    file = folder / "my scenes/hall.toml"
+    arguments = [
+        str(folder / "my scans/great hall"),
+        "-o",
+        str(file),
+        "--avatar",
+        str(folder / "my visitor.xyz"),
+    ]
+    assert run(["scene", "new", *arguments]) == 0
+    line = capsys.readouterr().out.split("then: ")[1]
+    assert shlex.split(line) == ["solidcloud", "scene", "check", str(file)]
+    assert read_scene(file).avatars[0].name == "my-visitor"
+    assert run(shlex.split(line)[1:]) == 0
+
+
+def test_a_new_scene_in_place_of_another_finds_its_archives_through_links(folder: Path) -> None:
+    (folder / "deep/down").mkdir(parents=True)
+    (folder / "deep/down/old.toml").write_text("old")
+    (folder / "hall.toml").symlink_to(folder / "deep/down/old.toml")
+    assert new(folder) == 2 and new(folder, "--force") == 0
+    assert run(["scene", "check", str(folder / "hall.toml")]) == 0
+    assert (folder / "deep/down/old.toml").read_text() == "old"
+    assert sorted(path.name for path in folder.glob("*.toml*")) == ["hall.toml"]
+
+
+def test_what_serve_does_not_take_for_a_scene_file_check_refuses(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("hall.TOML", "hall", "visitor.xyz"):
+        path = folder / name
+        path.write_text(TOP)
+        assert not is_scene_file(path)
+        assert run(["scene", "check", str(path)]) == 2
+        assert f"{name}: expected a scene file, by a name that ends in .toml" in one_error(capsys)
+
+
+def test_a_scan_given_as_a_scene_file_is_not_read_whole(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with open(folder / "scan.toml", "wb") as file:
+        file.truncate(1 << 40)  # a hole: that much memory nobody has
+    assert run(["scene", "check", str(folder / "scan.toml")]) == 2
+    assert "scan.toml: more than 4,194,304 bytes" in one_error(capsys)
+
+
+@pytest.mark.parametrize("place", ["path", "file"])
+def test_a_path_that_no_file_has_is_told(
+    folder: Path, capsys: pytest.CaptureFixture[str], place: str
+) -> None:
+    text = TOP + VISITOR
+    name = {"path": "scans/hall", "file": "visitor.xyz"}[place]
+    assert check(folder, text.replace(f'{place} = "{name}"', f'{place} = "a\\u0000b"')) == 2
+    assert f'[0].{place}: found "a\\u0000b": expected a path' in one_error(capsys)

@@ -23,3 +23,7 @@ def main() -> None:
     with zenoh.open(config) as session, session.declare_queryable("echo/*", echo):
         print("ready", flush=True)
         sys.stdin.read()
+
+
+if __name__ == "__main__":
+    main()

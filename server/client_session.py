@@ -67,7 +67,8 @@ class ClientSession:
         self._numbers, self._add_again = numbers, add_again
         self._came: queue.SimpleQueue[tuple[bool, Any] | None] = queue.SimpleQueue()
         self._publishing = threading.Lock()  # so that wishes leave in the order of their numbers
-        self._wished: Wish | None = None
+        self._aim: Any = None  # the pose last wished, until a velocity goes on from a state
+        self._time = 0.0
         self._changed = threading.Condition()
         self._kept: deque[State | SolidcloudError] = deque(maxlen=_KEPT)
         self._latest: State | None = None
@@ -151,7 +152,11 @@ class ClientSession:
                 objects=objects or {},
             )
             self._publish(wish)
-            self._wished = wish
+            self._time = wish.time
+            if len(wish.pose):
+                self._aim = wish.pose
+            elif self._latest is not None:
+                self._aim = None
         return wish.seq
 
     def _publish(self, wish: Wish) -> None:
@@ -243,36 +248,31 @@ class ClientSession:
             self._changed.notify_all()
 
     def _begin_again(self, unknown: UnknownAvatarError) -> None:
-        """Come to a server that does not know the avatar, or where it is: it was restarted, or took us for gone."""
-        last, wished = self._latest, self._wished
+        """Come to a server that does not know the avatar, or where it is: it was restarted, took us for gone, or a
+        velocity took the place of the pose that was to be the first wish."""
         self._again += 1
         try:
             try:
                 if not self._add_again(unknown):
                     return  # nobody answered; the next wish asks again
             except UnknownAvatarError:
-                if last is None:  # neither this client's nor the scene's
+                if self._latest is None:  # neither this client's nor the scene's
                     raise
-            if wished is None or self._again > _MOST_AGAIN or (wished.velocity is not None and last is None):
-                raise unknown
             with self._publishing:
-                if self._stack is None:
-                    return
-                if wished.velocity is not None and last is not None:
-                    there = Wish(seq=next(self._numbers), time=wished.time, pose=last.pose.copy())
-                    self._publish(there)
-                wished = self._wished or wished
-                self._wished = _numbered(wished, next(self._numbers))
-                self._publish(self._wished)
+                pose = self._where()
+                if pose is None or self._again > _MOST_AGAIN:
+                    raise unknown
+                if self._stack is not None:
+                    # Alone: a velocity behind it might take its place once more. It is one frame's way.
+                    self._publish(Wish(seq=next(self._numbers), time=self._time, pose=pose))
         except SolidcloudError as error:
             self._keep(error)
 
-
-def _numbered(wish: Wish, seq: int) -> Wish:
-    """The same wish under another number."""
-    return Wish(
-        seq=seq, time=wish.time, pose=wish.pose, velocity=wish.velocity, turn=wish.turn, objects=wish.objects
-    )
+    def _where(self) -> Any:
+        """The pose (1, 4, 4) last wished, or where the avatar was when the server last said so; None: neither."""
+        if self._aim is not None:
+            return self._aim
+        return None if self._latest is None else self._latest.pose.copy()
 
 
 def _error_of(payload: bytes) -> SolidcloudError:

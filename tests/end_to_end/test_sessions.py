@@ -103,16 +103,8 @@ def test_eight_users_at_sixty_frames_a_second(served, endpoint):
 
 
 def test_what_is_not_simulated_in_time_is_dropped_and_counted(served, endpoint):
-    gate, entered = threading.Event(), threading.Event()
-    run = served._pipeline.run
-
-    def slow(body, aim, seconds, *, skip=None):
-        entered.set()
-        assert gate.wait(DEADLINE)
-        return run(body, aim, seconds, skip=skip)
-
+    gate, entered = holding(served)
     with walking(endpoint) as session:
-        served._pipeline.run = slow
         session.wish(pose_at(0.0, 1.0))
         assert entered.wait(DEADLINE)
         for number in range(50):
@@ -129,12 +121,38 @@ def test_what_is_not_simulated_in_time_is_dropped_and_counted(served, endpoint):
 
 def test_a_velocity_goes_on_from_where_it_was(served, endpoint):
     with walking(endpoint) as session:
-        session.wish(pose_at(0.0, 0.5), time=1.0)
+        session.wait(session.wish(pose_at(0.0, 0.5), time=1.0), DEADLINE)
         seq = session.wish(velocity=(1.0, 0.0, -100.0), turn=np.pi, time=1.0625)
+        pose = session.wait(seq, DEADLINE).pose[0]
+    assert np.allclose(pose[:3, 3], [0.0625, 0.0, REST], atol=1e-15)
+    assert np.isclose(pose[1, 0], np.sin(np.pi / 16))
+
+
+def test_a_velocity_that_took_the_place_of_the_first_pose_is_no_error(served, endpoint):
+    gate, entered = holding(served)
+    with walking(endpoint, "other") as other, walking(endpoint) as session:
+        other.wish(pose_at(0.0, 1.0))
+        assert entered.wait(DEADLINE), "no frame comes meanwhile: of what follows the last is seen"
+        session.wish(pose_at(0.25, 0.5), time=1.0)
+        for number in range(3):
+            seq = session.wish(velocity=(0.0, 1.0, 0.0), time=1.0 + number / 16)
+        gate.set()
         state = session.wait(seq, DEADLINE)
-    first = next(iter([state]))
-    assert np.allclose(first.pose[0, :3, 3], [0.0625, 0.0, REST], atol=1e-15)
-    assert np.isclose(first.pose[0, 1, 0], np.sin(np.pi / 16))
+    assert state.pose[0, 0, 3] == 0.25 and state.pose[0, 2, 3] == 0.5
+
+
+def holding(simulation):
+    """Have its frames wait: an event that lets them go on, and one that is set when the first waits."""
+    gate, entered = threading.Event(), threading.Event()
+    run = simulation._pipeline.run
+
+    def held(body, aim, seconds, *, skip=None):
+        entered.set()
+        assert gate.wait(DEADLINE)
+        return run(body, aim, seconds, skip=skip)
+
+    simulation._pipeline.run = held
+    return gate, entered
 
 
 def test_users_leave_with_their_session_and_with_their_client(served, endpoint):

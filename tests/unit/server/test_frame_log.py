@@ -22,6 +22,8 @@ from solidcloud.server.frame_log import (
 )
 from solidcloud.server.served import Turn
 
+pytestmark = pytest.mark.interpreted
+
 AL, BO, NOBODY = User("a", "al"), User("b", "bo"), User("c", "nobody")
 POINTS = np.array([[0.0, 0.0, 0.5], [0.0, 0.25, 1.0]])
 BEGIN = Begin("floor", "/scans/floor", b"format = 1", [("ab" * 16, 3)])

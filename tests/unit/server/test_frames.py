@@ -12,6 +12,8 @@ from solidcloud.schemas.messages import ErrorReply
 from solidcloud.schemas.moves import State, Wish
 from solidcloud.server.frames import Frames, Mailboxes
 
+pytestmark = pytest.mark.interpreted
+
 AL, BO, CY = User("a", "al"), User("b", "bo"), User("a", "cy")
 POINTS = np.array([[0.0, 0.0, 0.5], [0.0, 0.25, 1.0]])
 DEADLINE = 20.0

@@ -14,6 +14,8 @@ from solidcloud.server.frame_log import Begin, Entered, Frame, FrameLog, Points,
 from solidcloud.server.replay import replay
 from solidcloud.server.served import Turn
 
+pytestmark = pytest.mark.interpreted
+
 AL, BO, CY = User("a", "al"), User("b", "bo"), User("a", "cy")
 POINTS = np.array([[0.0, 0.0, 0.5], [0.0, 0.25, 1.0]])
 

@@ -22,6 +22,8 @@ from solidcloud.server.scene import Scene
 from solidcloud.server.served import EVERYBODY, SceneLike, Turn
 from solidcloud.server.simulation import SILENT_SECONDS, Simulation
 
+pytestmark = pytest.mark.interpreted
+
 AL, BO = User("a", "al"), User("b", "bo")
 POINTS = np.array([[0.0, 0.0, 0.5], [0.0, 0.25, 1.0]])
 

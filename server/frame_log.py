@@ -77,11 +77,15 @@ class Reloaded(msgspec.Struct, frozen=True, tag="reloaded"):
 
 
 class Said(msgspec.Struct, frozen=True, array_like=True):
-    """What came of a turn. pose: (4, 4) float64, little-endian; b"": refused.  error: the code.  skipped: effects."""
+    """What came of a turn. pose: (4, 4) float64, little-endian; b"": refused.  error: the code.  skipped: effects.
+
+    opened: how often each archive had been reloaded when the user last moved; empty where it never did.
+    """
 
     pose: bytes
     error: str = ""
     skipped: list[str] = []
+    opened: list[int] = []
 
 
 class Frame(msgspec.Struct, frozen=True, tag="frame"):
@@ -98,11 +102,11 @@ _ENCODER = msgspec.msgpack.Encoder()
 _DECODER = msgspec.msgpack.Decoder(Record)
 
 
-def said(outcome: Outcome) -> Said:
-    """What a log says of an outcome."""
+def said(outcome: Outcome, opened: Sequence[int] = ()) -> Said:
+    """What a log says of an outcome. opened: how often each archive had been reloaded."""
     if isinstance(outcome.state, SolidcloudError):
         return Said(b"", str(outcome.state.code))
-    return Said(pose_bytes(outcome.state.pose), "", list(outcome.state.skipped))
+    return Said(pose_bytes(outcome.state.pose), "", list(outcome.state.skipped), list(opened))
 
 
 def pose_bytes(pose: Any) -> bytes:
@@ -166,13 +170,16 @@ class FrameLog:
         """The archives were opened anew."""
         self._write(Reloaded(generation))
 
-    def frame(self, number: int, turns: Sequence[Turn], outcomes: Sequence[Outcome]) -> None:
-        """One frame."""
-        self._write(
-            Frame(
-                number, [(turn.user, encode(turn.wish)) for turn in turns], [said(each) for each in outcomes]
-            )
-        )
+    def frame(
+        self,
+        number: int,
+        turns: Sequence[Turn],
+        outcomes: Sequence[Outcome],
+        opened: Sequence[Sequence[int]],
+    ) -> None:
+        """One frame. opened: of each turn, how often each archive had been reloaded."""
+        wished = [(turn.user, encode(turn.wish)) for turn in turns]
+        self._write(Frame(number, wished, [said(*each) for each in zip(outcomes, opened, strict=True)]))
 
     def _write(self, record: Record) -> None:
         """Append one record."""

@@ -11,7 +11,7 @@ from ..schemas.encoding import decode_request
 from ..schemas.errors import BadRequestError, SolidcloudError
 from ..schemas.keys import User
 from ..schemas.moves import Wish
-from .frame_log import Begin, Dropped, Ended, Entered, Frame, FrameLog, Points, Record, Reloaded, Said, said
+from .frame_log import Begin, Dropped, Ended, Entered, Frame, FrameLog, Points, Record, Said, said
 from .served import SceneLike, Turn
 from .simulation import Simulation
 
@@ -39,7 +39,7 @@ class Difference(NamedTuple):
 class Replayed(NamedTuple):
     """What a replay found. frames, turns: run again.  different: turns that came out otherwise; first: of them.
 
-    reloaded: the generation that the log's scene was reloaded to, where the replay ends; None: it was not.
+    reloaded: the frame that the replay ends before, since the log's scene had been reloaded; None: it was not.
     """
 
     frames: int
@@ -57,6 +57,7 @@ def replay(simulation: Simulation, records: Iterable[Record]) -> Replayed:
     are not those of the scene.
     """
     bodies = _Bodies(simulation)
+    opened: list[int] | None = None
     frames = turns = different = 0
     first: Difference | None = None
     for record in records:
@@ -69,9 +70,11 @@ def replay(simulation: Simulation, records: Iterable[Record]) -> Replayed:
         elif isinstance(record, Ended):
             for user in record.users:
                 simulation.end(user)
-        elif isinstance(record, Reloaded):
-            return Replayed(frames, turns, different, first, record.generation)
         elif isinstance(record, Frame):
+            for logged in record.said:
+                opened = opened or logged.opened
+                if logged.opened not in ([], opened):
+                    return Replayed(frames, turns, different, first, record.number)
             frames, turns = frames + 1, turns + len(record.turns)
             for difference in _differences(simulation, record):
                 different, first = different + 1, first or difference

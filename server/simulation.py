@@ -72,7 +72,13 @@ class Recorder(Protocol):
     def entered(self, user: User, avatar: AvatarModel) -> None: ...
     def ended(self, users: list[User]) -> None: ...
     def dropped(self, client: str) -> None: ...
-    def frame(self, number: int, turns: Sequence[Turn], outcomes: Sequence[Outcome]) -> None: ...
+    def frame(
+        self,
+        number: int,
+        turns: Sequence[Turn],
+        outcomes: Sequence[Outcome],
+        opened: Sequence[Sequence[int]],
+    ) -> None: ...
     def reloaded(self, generation: int) -> None: ...
 
 
@@ -184,12 +190,14 @@ class Simulation:
             if now is not None:
                 self._leave([u for u, there in self._present.items() if now - there.heard > SILENT_SECONDS])
             self._frames += 1
-            outcomes = []
+            outcomes, opened = [], []
             for number, turn in enumerate(turns):
                 skip = None if skips is None else skips[number]
                 outcomes.append(Outcome(turn.user, self._turn(turn, now, skip)))
+                there = self._present.get(turn.user)
+                opened.append(() if there is None else there.body.generations)
             if self._recorder is not None:
-                self._recorder.frame(self._frames, turns, outcomes)
+                self._recorder.frame(self._frames, turns, outcomes, opened)
             return outcomes
 
     def _turn(self, turn: Turn, now: float | None, skip: Collection[str] | None) -> State | SolidcloudError:

@@ -44,5 +44,5 @@ def replay(
     if found.first is not None:
         print(f"first: {found.first}")
     if found.reloaded is not None:
-        print(f"ends where the scene was reloaded, to generation {found.reloaded}")
+        print(f"ends before frame {found.reloaded}: the scene had been reloaded")
     return int(found.different > 0)

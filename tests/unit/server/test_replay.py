@@ -24,13 +24,14 @@ class Drifting:
     """Stands in for effects whose outcome depends on all frames before it, and on what was skipped."""
 
     def __init__(self):
-        self.total, self.skips = 0.0, True
+        self.total, self.skips, self.reloads = 0.0, True, 0
 
     def run(self, body, wish, seconds, *, skip=None):
         skipped = (["proximity"] if self.skips else []) if skip is None else list(skip)
         self.total += float(wish[0, 3]) * seconds + len(body.avatar.points) + 0.1 * len(skipped)
         body.pose = wish.copy()
         body.pose[1, 3] = self.total
+        body.generations = (self.reloads, 0)
         return Moved(pose=body.pose[None].copy(), skipped=skipped)
 
 
@@ -148,11 +149,12 @@ def test_a_replay_ends_where_the_scene_was_reloaded(tmp_path):
     with FrameLog(path, Begin("floor", "", b"", [])) as frames:
         simulation.record(frames)
         for number in range(4):
+            simulation._pipeline.reloads = int(number == 3)
             wish = Wish(seq=number, time=float(number), pose=np.eye(4)[None])
             simulation.step([Turn(AL, wish)])
             if number == 1:
                 simulation.reload()
-    assert replay(simulated(), read_log(path)) == (2, 2, 0, None, 1)
+    assert replay(simulated(), read_log(path)) == (3, 3, 0, None, 4)
 
 
 def test_an_avatar_that_is_not_in_the_log_is_an_error():

@@ -156,7 +156,7 @@ class Blocking:
     def _hit_of(self, first: "_First") -> Hit:
         """What ended a motion; with the normal of its surface where it is an object."""
         bodies, row, (own, other) = self._bodies, first.row, first.witness
-        normal = None if bodies.kinds[row] == USER else bodies.shapes[row].normal_at(first.point)
+        normal = bodies.shapes[row].normal_at(first.point)
         if normal is not None:
             normal = bodies.poses[row, :3, :3] @ normal
             normal = -normal if normal @ (own - other) < 0.0 else normal

@@ -78,7 +78,7 @@ class Bodies:
         self._begin = begin
         self.origin, self.up = np.array(origin, np.float64), np.array(up, np.float64)
         self.lock = threading.RLock()
-        self.scratch = make_scratch()
+        self.scratch = make_scratch(1, 1)
         self.names: list[str] = []
         self.kinds = np.empty(0, np.uint8)
         self.poses = np.empty((0, 4, 4))
@@ -109,6 +109,12 @@ class Bodies:
         units = to_units(model.radius, "radius")
         if units > MAX_REACH_UNITS // 4:
             raise BadRequestError(f"avatar radius {model.radius:g} m: expected at most 4 m where bodies meet")
+        nodes = max(len(model.arrays.radius), self.scratch.moving.shape[1])
+        blocks = max(len(model.arrays.points), len(self.scratch.lanes))
+        if nodes > self.scratch.moving.shape[1] or blocks > len(self.scratch.lanes):
+            counters = self.scratch.counters
+            self.scratch = make_scratch(nodes, blocks)
+            self.scratch.counters[:] = counters
         shape = self._known[id(model.points)] = Shape(model, box, units, self._numbered, {})
         self._numbered += 1
         return shape

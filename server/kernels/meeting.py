@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas.voxel_grid import UNITS_PER_METRE
-from .compiled import borrowing
+from .compiled import borrowing, inlined
 from .layout import LANES
 from .moments import INFINITE, pair_times
 from .motion import Motion, make_motion, pose_at
@@ -29,24 +29,26 @@ from .placing import Avatar, largest_term, place, to_units
 _LEAST_SAGITTA = 0.25
 _CHORD_BEND = 1.0 / 16.0
 _MOST_REFUSED = 512
-# Children of a pair are written below it before it goes: as many more.
-_STACK = STACK + 256
 
 
 class Scratch(NamedTuple):
-    """Scratch of one thread, by `make_scratch`.
+    """Scratch of one thread, for avatars of so many nodes and blocks, by `make_scratch`.
 
-    nodes: (s, 2) int64, at: (s, 9) float64: pairs to be looked at, where the moving one's centre begins, its
-    way, and the other's centre.  lanes: (3, LANES) of a standing block; ways: (7, LANES) of a moving one: where it
-    begins, its way, 1 / its square; keep: (LANES,).  ends: (2, 4, 4), shifts: (3, 3): the poses of a chord's ends,
-    their translations and the standing one's.  gap, way: (3,).  first: (2,) when anything could touch, and when
-    something must.  pair: (4,) int64 block, lane of either.  counters: (2,) node visits, point tests.
+    stack: (s, 2) int64, pairs of nodes to be looked at.  moving: (8, nodes): where a node's centre begins, its way,
+    1 / its square, its radius; ways: (blocks, 7, LANES) likewise of points.  standing: (4, nodes) centres and radii;
+    lanes: (blocks, 3, LANES) points.  stamps: (2, blocks) int64: the chord and the body that a block was placed for;
+    turns: (2,) int64, chords and bodies so far.  keep: (LANES,).  ends: (2, 4, 4), shifts: (3, 3): the poses of a
+    chord's ends, their translations and the standing one's.  gap, way: (3,).  first: (2,) when anything could touch,
+    and when something must.  pair: (4,) int64 block, lane of either.  counters: (2,) node visits, point tests.
     """
 
-    nodes: NDArray[np.int64]
-    at: NDArray[np.float64]
-    lanes: NDArray[np.float64]
+    stack: NDArray[np.int64]
+    moving: NDArray[np.float64]
     ways: NDArray[np.float64]
+    standing: NDArray[np.float64]
+    lanes: NDArray[np.float64]
+    stamps: NDArray[np.int64]
+    turns: NDArray[np.int64]
     keep: NDArray[np.bool_]
     ends: NDArray[np.float64]
     shifts: NDArray[np.float64]
@@ -57,10 +59,11 @@ class Scratch(NamedTuple):
     counters: NDArray[np.int64]
 
 
-def make_scratch() -> Scratch:
-    """Scratch for `sweep_bodies`."""
+def make_scratch(nodes: int, blocks: int) -> Scratch:
+    """Scratch for `sweep_bodies` of avatars of at most so many nodes and blocks."""
     return Scratch(
-        np.empty((_STACK, 2), np.int64), np.empty((_STACK, 9)), np.empty((3, LANES)), np.empty((7, LANES)),
+        np.empty((STACK, 2), np.int64), np.empty((8, nodes)), np.empty((blocks, 7, LANES)), np.empty((4, nodes)),
+        np.empty((blocks, 3, LANES)), np.full((2, blocks), -1, np.int64), np.zeros(2, np.int64),
         np.empty(LANES, np.bool_), np.empty((2, 4, 4)), np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(2),
         np.zeros(4, np.int64), np.zeros(2, np.int64),
     )  # fmt: skip
@@ -129,15 +132,19 @@ def find_near(box, first, last, more, bounds, kinds, wanted, skip, rows):
     return count
 
 
-@borrowing
-def _least_square(gx, gy, gz, wx, wy, wz, latest):
-    """The least square of a length that goes from g to g + latest w."""
-    square = wx * wx + wy * wy + wz * wz
-    t = 0.0
-    if square > 1e-200:
-        t = min(max(-(gx * wx + gy * wy + gz * wz) / square, 0.0), latest)
+@inlined
+def _least_square(gx, gy, gz, wx, wy, wz, inverse, latest):
+    """The least square of a length that goes from g to g + latest w; inverse: 1 / w^2."""
+    t = min(max(-(gx * wx + gy * wy + gz * wz) * inverse, 0.0), latest)
     ex, ey, ez = gx + t * wx, gy + t * wy, gz + t * wz
     return ex * ex + ey * ey + ez * ez
+
+
+@borrowing
+def _inverse(x, y, z):
+    """1 / (x^2 + y^2 + z^2), or 0 where that is too small to be divided by."""
+    square = x * x + y * y + z * z
+    return 1.0 / square if square > 1e-200 else 0.0
 
 
 @borrowing
@@ -147,8 +154,8 @@ def _latest(scratch):
 
 
 @borrowing
-def _goes_away(meeting, chord, x, y, z, lane_b):
-    """Whether a pair that is within the band where the motion begins, (x, y, z) and a lane, does not touch there and
+def _goes_away(meeting, chord, x, y, z, block_b, lane_b):
+    """Whether a pair that is within the band where the motion begins, (x, y, z) and a point, does not touch there and
     comes no nearer."""
     scratch = meeting.scratch
     gap, way = scratch.gap, scratch.way
@@ -159,7 +166,7 @@ def _goes_away(meeting, chord, x, y, z, lane_b):
     square = np.int64(0)
     for r in range(3):
         begin = to_units(place(scratch.ends[0], scratch.shifts[0], r, x, y, z))
-        difference = begin - to_units(scratch.lanes[r, lane_b])
+        difference = begin - to_units(scratch.lanes[block_b, r, lane_b])
         square += difference * difference
     return square > meeting.units * meeting.units
 
@@ -173,10 +180,10 @@ def _try_pair(meeting, chord, block_a, lane_a, block_b, lane_b):
     for r in range(3):
         begin = place(ends[0], scratch.shifts[0], r, x, y, z) * UNITS_PER_METRE
         end = place(ends[1], scratch.shifts[1], r, x, y, z) * UNITS_PER_METRE
-        gap[r] = begin - np.float64(to_units(scratch.lanes[r, lane_b]))
+        gap[r] = begin - np.float64(to_units(scratch.lanes[block_b, r, lane_b]))
         way[r] = end - begin
     enters, certain, _ = pair_times(gap, way, chord.inner, chord.outer)
-    if enters == 0.0 and certain > 0.0 and _goes_away(meeting, chord, x, y, z, lane_b):
+    if enters == 0.0 and certain > 0.0 and _goes_away(meeting, chord, x, y, z, block_b, lane_b):
         return
     if enters < first[0]:
         first[0] = enters
@@ -186,28 +193,58 @@ def _try_pair(meeting, chord, block_a, lane_a, block_b, lane_b):
 
 
 @borrowing
-def _place_blocks(meeting, block_a, block_b):
-    """The points of a moving and a standing leaf node into lanes and ways."""
-    lanes, ways, ends, shifts = (
-        meeting.scratch.lanes,
-        meeting.scratch.ways,
+def _place_moving(meeting, block):
+    """Place the points of a leaf node of the moving one at both ends of a chord."""
+    ways, ends, shifts = meeting.scratch.ways, meeting.scratch.ends, meeting.scratch.shifts
+    points = meeting.a.points
+    for r in range(3):
+        for k in range(LANES):
+            x, y, z = points[block, 0, k], points[block, 1, k], points[block, 2, k]
+            begin = place(ends[0], shifts[0], r, x, y, z)
+            ways[block, r, k] = begin
+            ways[block, 3 + r, k] = place(ends[1], shifts[1], r, x, y, z) - begin
+    for k in range(LANES):
+        ways[block, 6, k] = _inverse(ways[block, 3, k], ways[block, 4, k], ways[block, 5, k])
+
+
+@borrowing
+def _place_standing(meeting, block):
+    """Place the points of a leaf node of the standing one."""
+    lanes, points = meeting.scratch.lanes, meeting.b.points
+    for r in range(3):
+        for k in range(LANES):
+            x, y, z = points[block, 0, k], points[block, 1, k], points[block, 2, k]
+            lanes[block, r, k] = place(meeting.pose, meeting.scratch.shifts[2], r, x, y, z)
+
+
+@borrowing
+def _place_moving_nodes(meeting, count):
+    """Place the first `count` nodes of the moving one at both ends of a chord."""
+    moving, center, ends, shifts = (
+        meeting.scratch.moving,
+        meeting.a.center,
         meeting.scratch.ends,
         meeting.scratch.shifts,
     )
-    points, others = meeting.a.points, meeting.b.points
-    for r in range(3):
-        for k in range(LANES):
-            x, y, z = others[block_b, 0, k], others[block_b, 1, k], others[block_b, 2, k]
-            lanes[r, k] = place(meeting.pose, shifts[2], r, x, y, z)
-        for k in range(LANES):
-            x, y, z = points[block_a, 0, k], points[block_a, 1, k], points[block_a, 2, k]
+    for i in range(count):
+        x, y, z = center[i, 0], center[i, 1], center[i, 2]
+        for r in range(3):
             begin = place(ends[0], shifts[0], r, x, y, z)
-            ways[r, k] = begin
-            ways[3 + r, k] = place(ends[1], shifts[1], r, x, y, z) - begin
-    for k in range(LANES):
-        wx, wy, wz = ways[3, k], ways[4, k], ways[5, k]
-        square = wx * wx + wy * wy + wz * wz
-        ways[6, k] = 1.0 / square if square > 1e-200 else 0.0
+            moving[r, i] = begin
+            moving[3 + r, i] = place(ends[1], shifts[1], r, x, y, z) - begin
+        moving[6, i] = _inverse(moving[3, i], moving[4, i], moving[5, i])
+        moving[7, i] = meeting.a.radius[i] * STRETCH
+
+
+@borrowing
+def _place_standing_nodes(meeting, count):
+    """Place the first `count` nodes of the standing one."""
+    standing, center = meeting.scratch.standing, meeting.b.center
+    for j in range(count):
+        x, y, z = center[j, 0], center[j, 1], center[j, 2]
+        for r in range(3):
+            standing[r, j] = place(meeting.pose, meeting.scratch.shifts[2], r, x, y, z)
+        standing[3, j] = meeting.b.radius[j] * STRETCH
 
 
 @borrowing
@@ -220,30 +257,22 @@ def _bounds_of(lane, room):
 
 
 @borrowing
-def _leaves(meeting, chord, i, j, bx, by, bz, radius_b):
-    """Take all pairs of two leaf nodes into account; (bx, by, bz) with radius_b is the standing one's sphere.
-
-    Moving points against that sphere, then against its points, each in one vector loop: LANES is a constant, so that
-    what is beyond a node's count, its last point repeated, is looked at too.
-    """
-    scratch = meeting.scratch
-    lanes, ways, keep = scratch.lanes, scratch.ways, scratch.keep
-    block_a, block_b = ~meeting.a.first[i], ~meeting.b.first[j]
-    _place_blocks(meeting, block_a, block_b)
-    far, span = chord.room * chord.room * (1.0 + 1e-12), (radius_b + chord.room) * (1.0 + 1e-12)
+def _sift(scratch, block_a, block_b, j, room):
+    """Which points of a moving block come near a standing block's sphere, of node j, and box, into scratch.keep."""
+    standing, ways, keep, latest = scratch.standing, scratch.ways, scratch.keep, _latest(scratch)
+    bx, by, bz = standing[0, j], standing[1, j], standing[2, j]
+    span = (standing[3, j] + room) * (1.0 + 1e-12)
     span *= span
-    latest = _latest(scratch)
-    low_x, high_x = _bounds_of(lanes[0], chord.room)
-    low_y, high_y = _bounds_of(lanes[1], chord.room)
-    low_z, high_z = _bounds_of(lanes[2], chord.room)
+    low_x, high_x = _bounds_of(scratch.lanes[block_b, 0], room)
+    low_y, high_y = _bounds_of(scratch.lanes[block_b, 1], room)
+    low_z, high_z = _bounds_of(scratch.lanes[block_b, 2], room)
     for k in range(LANES):
-        px, py, pz, wx, wy, wz = ways[0, k], ways[1, k], ways[2, k], ways[3, k], ways[4, k], ways[5, k]
-        gx, gy, gz = px - bx, py - by, pz - bz
-        t = min(max(-(gx * wx + gy * wy + gz * wz) * ways[6, k], 0.0), latest)
-        ex, ey, ez = gx + t * wx, gy + t * wy, gz + t * wz
+        px, py, pz = ways[block_a, 0, k], ways[block_a, 1, k], ways[block_a, 2, k]
+        wx, wy, wz = ways[block_a, 3, k], ways[block_a, 4, k], ways[block_a, 5, k]
+        square = _least_square(px - bx, py - by, pz - bz, wx, wy, wz, ways[block_a, 6, k], latest)
         qx, qy, qz = px + latest * wx, py + latest * wy, pz + latest * wz
         keep[k] = (
-            (ex * ex + ey * ey + ez * ez <= span)
+            (square <= span)
             & (min(px, qx) <= high_x)
             & (max(px, qx) >= low_x)
             & (min(py, qy) <= high_y)
@@ -251,78 +280,57 @@ def _leaves(meeting, chord, i, j, bx, by, bz, radius_b):
             & (min(pz, qz) <= high_z)
             & (max(pz, qz) >= low_z)
         )
+
+
+@borrowing
+def _leaves(meeting, chord, i, j):
+    """Take all pairs of two leaf nodes into account.
+
+    Moving points against the standing one's bounds, then against its points, each in one vector loop: LANES is a
+    constant, so that what is beyond a node's count, its last point repeated, is looked at too.
+    """
+    scratch = meeting.scratch
+    lanes, ways, stamps, turns = scratch.lanes, scratch.ways, scratch.stamps, scratch.turns
+    block_a, block_b = ~meeting.a.first[i], ~meeting.b.first[j]
+    if stamps[0, block_a] != turns[0]:
+        _place_moving(meeting, block_a)
+        stamps[0, block_a] = turns[0]
+    if stamps[1, block_b] != turns[1]:
+        _place_standing(meeting, block_b)
+        stamps[1, block_b] = turns[1]
+    _sift(scratch, block_a, block_b, j, chord.room)
+    far, latest = chord.room * chord.room * (1.0 + 1e-12), _latest(scratch)
     for lane in range(meeting.a.count[i]):
-        if not keep[lane]:
+        if not scratch.keep[lane]:
             continue
         scratch.counters[1] += LANES
-        px, py, pz, wx, wy, wz = (
-            ways[0, lane],
-            ways[1, lane],
-            ways[2, lane],
-            ways[3, lane],
-            ways[4, lane],
-            ways[5, lane],
-        )
-        inverse = ways[6, lane]
+        px, py, pz = ways[block_a, 0, lane], ways[block_a, 1, lane], ways[block_a, 2, lane]
+        wx, wy, wz = ways[block_a, 3, lane], ways[block_a, 4, lane], ways[block_a, 5, lane]
+        inverse = ways[block_a, 6, lane]
         touched = False
         for k in range(LANES):
-            gx, gy, gz = px - lanes[0, k], py - lanes[1, k], pz - lanes[2, k]
-            t = min(max(-(gx * wx + gy * wy + gz * wz) * inverse, 0.0), latest)
-            ex, ey, ez = gx + t * wx, gy + t * wy, gz + t * wz
-            touched |= ex * ex + ey * ey + ez * ez <= far
+            gx, gy, gz = px - lanes[block_b, 0, k], py - lanes[block_b, 1, k], pz - lanes[block_b, 2, k]
+            touched |= _least_square(gx, gy, gz, wx, wy, wz, inverse, latest) <= far
         if not touched:
             continue
         for k in range(meeting.b.count[j]):
-            gx, gy, gz = px - lanes[0, k], py - lanes[1, k], pz - lanes[2, k]
-            t = min(max(-(gx * wx + gy * wy + gz * wz) * inverse, 0.0), latest)
-            ex, ey, ez = gx + t * wx, gy + t * wy, gz + t * wz
-            if ex * ex + ey * ey + ez * ez <= far:
+            gx, gy, gz = px - lanes[block_b, 0, k], py - lanes[block_b, 1, k], pz - lanes[block_b, 2, k]
+            if _least_square(gx, gy, gz, wx, wy, wz, inverse, latest) <= far:
                 _try_pair(meeting, chord, block_a, lane, block_b, k)
                 latest = _latest(scratch)
 
 
 @borrowing
-def _place_chord(meeting, node, at, depth):
-    """Where a moving node's centre begins, and its way, into at[depth, :6]."""
-    scratch, center = meeting.scratch, meeting.a.center
-    x, y, z = center[node, 0], center[node, 1], center[node, 2]
-    for r in range(3):
-        begin = place(scratch.ends[0], scratch.shifts[0], r, x, y, z)
-        at[depth, r] = begin
-        at[depth, 3 + r] = place(scratch.ends[1], scratch.shifts[1], r, x, y, z) - begin
-
-
-@borrowing
-def _place_standing(meeting, node, at, depth):
-    """Where a standing node's centre is, into at[depth, 6:]."""
-    center = meeting.b.center
-    x, y, z = center[node, 0], center[node, 1], center[node, 2]
-    for r in range(3):
-        at[depth, 6 + r] = place(meeting.pose, meeting.scratch.shifts[2], r, x, y, z)
-
-
-@borrowing
-def _may_touch(meeting, chord, depth):
-    """The least square of how far apart the centres of a pair on the stack come, inf where nothing below can touch
-    before what was found."""
-    at, nodes = meeting.scratch.at, meeting.scratch.nodes
-    radii = (meeting.a.radius[nodes[depth, 0]] + meeting.b.radius[nodes[depth, 1]]) * STRETCH
-    both = (radii + chord.room) * (1.0 + 1e-12)
+def _nearest(scratch, room, i, j):
+    """The least square of how far apart the centres of two nodes come, inf where nothing below them can touch before
+    what was found."""
+    moving, standing = scratch.moving, scratch.standing
+    both = (moving[7, i] + standing[3, j] + room) * (1.0 + 1e-12)
     square = _least_square(
-        at[depth, 0] - at[depth, 6], at[depth, 1] - at[depth, 7], at[depth, 2] - at[depth, 8],
-        at[depth, 3], at[depth, 4], at[depth, 5], _latest(meeting.scratch),
+        moving[0, i] - standing[0, j], moving[1, i] - standing[1, j], moving[2, i] - standing[2, j],
+        moving[3, i], moving[4, i], moving[5, i], moving[6, i], _latest(scratch),
     )  # fmt: skip
     return square if square <= both * both else INFINITE
-
-
-@borrowing
-def _swap(scratch, one, other):
-    """Swap two pairs on the stack."""
-    nodes, at = scratch.nodes, scratch.at
-    for r in range(2):
-        nodes[one, r], nodes[other, r] = nodes[other, r], nodes[one, r]
-    for r in range(9):
-        at[one, r], at[other, r] = at[other, r], at[one, r]
 
 
 @borrowing
@@ -332,46 +340,45 @@ def _descend(meeting, chord):
     Of children the pair whose centres come nearest goes first: what touches early is found early, and prunes.
     """
     scratch, a, b = meeting.scratch, meeting.a, meeting.b
-    nodes, at, counters = scratch.nodes, scratch.at, scratch.counters
+    stack, counters = scratch.stack, scratch.counters
+    scratch.turns[0] += 1
     scratch.first[0], scratch.first[1] = INFINITE, INFINITE
-    nodes[0, 0], nodes[0, 1] = 0, 0
-    _place_chord(meeting, 0, at, 0)
-    _place_standing(meeting, 0, at, 0)
     counters[0] += 1
+    _place_moving_nodes(meeting, 1)
+    if _nearest(scratch, chord.room, 0, 0) == INFINITE:
+        return
+    _place_moving_nodes(meeting, a.center.shape[0])
+    stack[0, 0], stack[0, 1] = 0, 0
     depth = 1
     while depth > 0:
         depth -= 1
-        if _may_touch(meeting, chord, depth) == INFINITE:
+        i, j = stack[depth, 0], stack[depth, 1]
+        if _nearest(scratch, chord.room, i, j) == INFINITE:
             continue
-        i, j = nodes[depth, 0], nodes[depth, 1]
         first_a, first_b = a.first[i], b.first[j]
         if first_a < 0 and first_b < 0:
-            _leaves(meeting, chord, i, j, at[depth, 6], at[depth, 7], at[depth, 8], b.radius[j] * STRETCH)
+            _leaves(meeting, chord, i, j)
             if scratch.first[0] <= 0.0:
                 return
             continue
         opens_a = first_b < 0 or (first_a >= 0 and a.radius[i] > b.radius[j])
         first, count = (first_a, a.count[i]) if opens_a else (first_b, b.count[j])
         counters[0] += count
-        # The pair itself goes to where its last child would, so that children can be written below it.
-        parent, nearest, least = depth + count, depth, INFINITE
-        _swap(scratch, depth, parent)
+        nearest, least = depth, INFINITE
         for child in range(first, first + count):
-            for r in range(9):
-                at[depth, r] = at[parent, r]
-            if opens_a:
-                nodes[depth, 0], nodes[depth, 1] = child, j
-                _place_chord(meeting, child, at, depth)
-            else:
-                nodes[depth, 0], nodes[depth, 1] = i, child
-                _place_standing(meeting, child, at, depth)
-            square = _may_touch(meeting, chord, depth)
-            if square < INFINITE:
-                if square < least:
-                    nearest, least = depth, square
-                depth += 1
+            one, other = (child, j) if opens_a else (i, child)
+            square = _nearest(scratch, chord.room, one, other)
+            if square == INFINITE:
+                continue
+            stack[depth, 0], stack[depth, 1] = one, other
+            if square < least:
+                nearest, least = depth, square
+            depth += 1
         if least < INFINITE:
-            _swap(scratch, nearest, depth - 1)
+            last = depth - 1
+            one, other = stack[nearest, 0], stack[nearest, 1]
+            stack[nearest, 0], stack[nearest, 1] = stack[last, 0], stack[last, 1]
+            stack[last, 0], stack[last, 1] = one, other
 
 
 @borrowing
@@ -455,6 +462,8 @@ def sweep_bodies(
         error = max(largest_a, largest + b.radius[0]) * 2.0**-49
         units = np.int64(units_a + units_b + margin_units)
         meeting = _Meeting(motion, a, b, poses[row], units, error, scratch)
+        scratch.turns[1] += 1
+        _place_standing_nodes(meeting, b.center.shape[0])
         stop = min(found, 1.0)
         since = _advance(meeting, size, stop, tolerance)
         if since >= found or since == INFINITE:

@@ -36,6 +36,11 @@ def units_of(model: AvatarModel) -> int:
     return int(np.rint(model.radius * naive.UNITS))
 
 
+def scratch_of(*models: AvatarModel) -> kernel.Scratch:
+    """Scratch that just holds these."""
+    return kernel.make_scratch(max(len(m.arrays.radius) for m in models), max(len(m.rows) for m in models))
+
+
 def ask(
     a: AvatarModel, first: NDArray[np.float64], last: NDArray[np.float64],
     b: AvatarModel, poses: NDArray[np.float64], margin: float = 0.0, until: float = np.inf,
@@ -47,7 +52,7 @@ def ask(
     witness, named = np.full((2, 3), np.nan), np.full(2, -1)
     row, fraction = kernel.sweep_bodies(
         a.arrays, box_of(a), units_of(a), *ends, b.arrays, poses, units_of(b), np.arange(len(poses)), ORIGIN,
-        int(np.rint(margin * naive.UNITS)), TOLERANCE, until, witness, named, kernel.make_scratch(),
+        int(np.rint(margin * naive.UNITS)), TOLERANCE, until, witness, named, scratch_of(a, b),
     )  # fmt: skip
     if row >= 0:
         point = b.points[b.rows[named[0], named[1]]]

@@ -3,31 +3,37 @@
 The rule: a point is in a box if its world coordinates, as every answer gives them (`Lattice.to_world`, then the
 archive's pose, server/posed.py), are within low to high on each axis, both included.
 
-The few voxels with such points are built anew by the builder's code when the archive is opened, and their records kept
+The few voxels that a box cuts are built anew by the builder's code when the archive is opened, and their records kept
 in a temporary file without a name: a load costs what it always does, no memory is taken that nobody counts, and the
-bytes a voxel takes are known before it is loaded. Voxels that are left empty are gone. All else stays: the
-header stays the archive's, its bounds (`outside`), counts and radius with it, and so do regions of scans left out,
-which are unknown inside a box too.
+bytes a voxel takes are known before it is loaded. Voxels that lie in a box whole, by the index, are gone unread, so
+however large a box, what it costs is what its borders cut. All else stays: the header stays the archive's, its bounds
+(`outside`), counts and radius with it, and so do regions of scans left out, which are unknown inside a box too.
 """
 
+import io
+import logging
 import os
 import tempfile
-from collections.abc import Sequence
+import time
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..builder.without import BuiltVoxel, build_rest, read_points
 from ..schemas.archive import Archive
-from ..schemas.errors import BadRequestError, CorruptError
+from ..schemas.errors import BadRequestError, CorruptError, FormatError, SolidcloudError
+from ..schemas.row_stream import pwrite_all
 from .posed import archive_pose, moved, moved_boxes
+
+log = logging.getLogger(__name__)
 
 # What a corner carried by a pose may be off, of the largest coordinate: boxes of voxels are only to choose those that
 # are read.
 _ROUNDING = 1e-14
-
+# How often whoever waits is told how far it is [s].
+_SAID_EVERY = 10.0
 
 # Where a record built anew lies in the temporary file: (offset, bytes) of each frame.
 _Place = list[tuple[int, int]]
@@ -41,13 +47,15 @@ class LeftOut(Archive):
     ) -> None:
         """Open the archive in `folder`, which lies at `pose` in the world; None: at the identity.
 
-        boxes: (2, 3) each, low and high, world [m]. The voxels that meet one are read. Raises FormatError as `Archive`
-        does, OSError where one cannot be read now; BadRequestError where the boxes hold all points. A corrupt record
-        stays one: whoever asks for the voxel is told why.
+        boxes: (2, 3) each, low and high, world [m]. The voxels that they cut are read. Raises FormatError as `Archive`
+        does, and where one cannot be read now; SolidcloudError where there is no room for what is built anew,
+        BadRequestError where the boxes hold all points. A corrupt record stays one: whoever asks for the voxel is told
+        why.
         """
         self._boxes = [np.asarray(box, np.float64) for box in boxes]
         self._pose = archive_pose(pose)
-        self._file: BinaryIO | None = None
+        self._file: io.FileIO | None = None
+        self._end = 0
         self._anew: dict[int, _Place] = {}
         self._corrupt: dict[int, tuple[str, tuple[Path, ...]]] = {}
         super().__init__(folder)
@@ -64,26 +72,31 @@ class LeftOut(Archive):
             self._file.close()
 
     def _leave_out(self) -> None:
-        """Build anew what meets a box, and make the index say so."""
-        voxels, empty = self.voxels.copy(), set[int]()
+        """Build anew what a box cuts, and make the index say so."""
+        voxels = self.voxels.copy()
         anew: dict[int, _Place] = {}
         corrupt: dict[int, tuple[str, tuple[Path, ...]]] = {}
-        for row, boxes in self._met():
+        cut, gone = self._met()
+        for row, boxes in self._telling(cut):
             try:
                 points = read_points(self, row)
             except CorruptError as error:
                 corrupt[row] = (str(error), error.paths)
                 continue
+            except OSError as error:
+                raise FormatError(
+                    f"{self.where(row)}: cannot be read ({error.strerror}): check it"
+                ) from error
             stays = ~self._in_boxes(row, points.local, boxes)
             if stays.all():
                 continue
             if not stays.any():
-                empty.add(row)
+                gone[row] = True
                 continue
             built = build_rest(self.header, int(self.voxels["key"][row]), points, stays)
             anew[row] = self._keep(built)
             _say(voxels, row, built)
-        kept = np.array([row for row in range(len(voxels)) if row not in empty], np.int64)
+        kept = np.flatnonzero(~gone)
         if len(voxels) and not len(kept):
             raise BadRequestError(
                 f"{self.folder}: the boxes that are passed through hold all of its points: leave the archive out of "
@@ -94,19 +107,37 @@ class LeftOut(Archive):
         self._anew = {now[row]: place for row, place in anew.items()}
         self._corrupt = {now[row]: said for row, said in corrupt.items()}
 
-    def _met(self) -> list[tuple[int, list[NDArray[np.float64]]]]:
-        """The rows of voxels whose points' bounds meet boxes, and these."""
+    def _met(self) -> tuple[dict[int, list[NDArray[np.float64]]], NDArray[np.bool_]]:
+        """The rows of voxels that boxes cut, and these; and which voxels (v,) lie in one whole.
+
+        Both by the bounds of their points in the index, which the broad phase trusts as well.
+        """
         base = self.coordinates * self.header.lattice.voxel_steps
         low, high = (self.header.lattice.to_world(base + self.voxels[side]) for side in ("low", "high"))
         if self._pose is not None and len(base):
             far = max(float(np.abs(side).max()) for side in (low, high, self._pose[:3, 3]))
             low, high = moved_boxes(self._pose, low, high)
             low, high = low - far * _ROUNDING, high + far * _ROUNDING
-        meets = np.zeros((len(self._boxes), len(base)), bool)
-        for i, (least, greatest) in enumerate(self._boxes):
-            meets[i] = ((low <= greatest) & (high >= least)).all(axis=1)
-        rows = np.flatnonzero(meets.any(axis=0))
-        return [(int(row), [self._boxes[i] for i in np.flatnonzero(meets[:, row])]) for row in rows]
+        whole = np.zeros(len(base), bool)
+        met: dict[int, list[NDArray[np.float64]]] = {}
+        for box in self._boxes:
+            least, greatest = box
+            meets = np.flatnonzero(((low <= greatest) & (high >= least)).all(axis=1))
+            whole[meets] |= ((low[meets] >= least) & (high[meets] <= greatest)).all(axis=1)
+            for row in meets.tolist():
+                met.setdefault(row, []).append(box)
+        return {row: met[row] for row in sorted(met) if not whole[row]}, whole
+
+    def _telling(
+        self, cut: dict[int, list[NDArray[np.float64]]]
+    ) -> Iterator[tuple[int, list[NDArray[np.float64]]]]:
+        """The voxels that are cut, one after the other; where they take long, the log says how far it is."""
+        said = time.monotonic()
+        for number, (row, boxes) in enumerate(cut.items()):
+            if time.monotonic() - said > _SAID_EVERY:
+                said = time.monotonic()
+                log.info("%s: %d of %d voxels that boxes cut are built anew", self.folder, number, len(cut))
+            yield row, boxes
 
     def _in_boxes(
         self, row: int, local: NDArray[np.int32], boxes: list[NDArray[np.float64]]
@@ -123,14 +154,21 @@ class LeftOut(Archive):
 
     def _keep(self, built: BuiltVoxel) -> _Place:
         """Write a record into the temporary file."""
-        if self._file is None:
-            self._file = tempfile.TemporaryFile(prefix="solidcloud-through-")  # noqa: SIM115  closed with the archive
         frames: _Place = []
-        for frame in (built.record.cells, built.record.nodes, built.record.points):
-            data = bytes(frame)
-            frames.append((self._file.tell(), len(data)))
-            self._file.write(data)
-        self._file.flush()
+        try:
+            if self._file is None:
+                self._file = tempfile.TemporaryFile(  # noqa: SIM115  closed with the archive
+                    prefix="solidcloud-through-", buffering=0
+                )
+            for frame in (built.record.cells, built.record.nodes, built.record.points):
+                data = bytes(frame)
+                frames.append((self._end, len(data)))
+                self._end += pwrite_all(self._file.fileno(), data, self._end)
+        except OSError as error:
+            raise SolidcloudError(
+                f"{tempfile.gettempdir()}: {error.strerror}: the voxels that boxes cut are kept there: make room, or "
+                "set TMPDIR"
+            ) from error
         return frames
 
     def _read_frame(self, row: int, i: int) -> bytes:

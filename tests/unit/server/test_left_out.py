@@ -24,9 +24,11 @@ from solidcloud.builder.radius import voxel_points
 from solidcloud.schemas.archive import Archive
 from solidcloud.schemas.columns import array_fields
 from solidcloud.schemas.effects import Through, ThroughBox
-from solidcloud.schemas.errors import BadRequestError, BadTransformError
+from solidcloud.schemas.errors import BadRequestError, BadTransformError, SolidcloudError
+from solidcloud.server import left_out
 from solidcloud.server.effects.through import store_without
 from solidcloud.server.left_out import LeftOut
+from solidcloud.server.posed import moved
 from solidcloud.server.scene import Scene
 
 STEP = cases.BINARY_STEP
@@ -359,20 +361,82 @@ def test_a_pose_that_is_not_rigid_is_refused(whole: Path, pose: NDArray[np.float
         open_without(whole, DOOR, pose=pose)
 
 
-def test_what_fails_while_it_is_opened_leaves_no_file_open(
-    whole: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("fails", "said"),
+    [
+        (
+            "pwrite_all",
+            ": No space left on device: the voxels that boxes cut are kept there: make room, or set",
+        ),
+        ("read_points", r"voxel \(.*\): cannot be read \(No space left on device\)"),
+    ],
+)
+def test_what_fails_while_it_is_opened_is_told_and_leaves_no_file_open(
+    whole: Path, monkeypatch: pytest.MonkeyPatch, fails: str, said: str
 ) -> None:
     def full(*_: Any) -> None:
         raise OSError(28, "No space left on device")
 
     before = len(os.listdir("/proc/self/fd"))
-    monkeypatch.setattr(LeftOut, "_keep", full)
-    with pytest.raises(OSError, match="No space left"):
-        open_without(whole, DOOR)
+    with open_without(whole, DOOR) as scene:
+        scene.add_avatar("al", BODY, 0.02)
+        within = len(os.listdir("/proc/self/fd"))
+        monkeypatch.setattr(left_out, fails, full)
+        with pytest.raises(SolidcloudError, match=said):
+            open_without(whole, DOOR)
+        with pytest.raises(SolidcloudError, match=said):
+            scene.reload()
+        # What was served is served on.
+        assert len(os.listdir("/proc/self/fd")) == within
+        assert len(scene.collide("al", np.eye(4)[None])) == 1
     assert len(os.listdir("/proc/self/fd")) == before
-    monkeypatch.undo()
-    open_without(whole, DOOR).close()
-    assert len(os.listdir("/proc/self/fd")) == before
+
+
+@pytest.mark.interpreted
+@pytest.mark.parametrize("posed", [False, True])
+def test_voxels_that_lie_in_a_box_whole_are_not_read(
+    whole: Path, monkeypatch: pytest.MonkeyPatch, posed: bool
+) -> None:
+    pose = (
+        cases.pose_of(cases.random_rotation(np.random.default_rng(3)), np.array([5.0, 0, 1]))
+        if posed
+        else None
+    )
+    low, high = (-9.0, -9.0, -9.0), (1.6, 1.6, 1.6)
+    read: list[int] = []
+    read_points = left_out.read_points
+
+    def counted(archive: Archive, row: int) -> Any:
+        read.append(row)
+        return read_points(archive, row)
+
+    with Archive(whole) as before:
+        bounds = before.header.lattice.to_world(
+            np.stack([before.voxels["low"], before.voxels["high"]])
+            + before.coordinates * before.header.lattice.voxel_steps
+        )
+        every = np.concatenate(
+            [
+                before.header.lattice.to_world(
+                    voxel_points(*before.read_voxel(row))
+                    + before.coordinates[row] * before.header.lattice.voxel_steps
+                )
+                for row in range(len(before.voxels))
+            ]
+        )
+    monkeypatch.setattr(left_out, "read_points", counted)
+    if pose is not None:
+        middle = moved(pose, np.array([[0.8, 0.8, 0.8]]))[0]
+        low, high = tuple((middle - 0.7).tolist()), tuple((middle + 0.7).tolist())
+    with LeftOut(whole, [(low, high)], pose) as archive:
+        rows = archive.voxels["rows"][:, 2].sum()
+    world = every if pose is None else moved(pose, every)
+    assert rows == (~in_boxes(world, (ThroughBox("box", low, high),))).sum()
+    # Of eight corners all in the box, a voxel's points are.
+    corners = np.array([bounds[[i & 1, i >> 1 & 1, i >> 2], :, [0, 1, 2]].T for i in range(8)])
+    carried = corners if pose is None else moved(pose, corners.reshape(-1, 3)).reshape(corners.shape)
+    inside = ((carried >= low) & (carried <= high)).all(axis=(0, 2))
+    assert inside.any() and read and not set(np.flatnonzero(inside)) & set(read)
 
 
 def test_a_scene_without_boxes_imports_nothing_of_it(whole: Path) -> None:

@@ -13,14 +13,19 @@ import pytest
 from floor import DEADLINE, eventually
 from solidcloud.schemas.answers import Verdict
 from solidcloud.schemas.effects import Contacts, Crowd, Ground, Proximity, Slide, Step, Stop, Sweep
+from solidcloud.schemas.keys import User
+from solidcloud.schemas.moves import Wish
 from solidcloud.schemas.scene import SceneFile, scene_of
 from solidcloud.server.app import serving
 from solidcloud.server.cli import run
 from solidcloud.server.client import Client
 from solidcloud.server.config import ServerConfig
 from solidcloud.server.frame_log import MAGIC, Frame, read_log
+from solidcloud.server.replay import recorded, replay
 from solidcloud.server.report.serving import served
 from solidcloud.server.scene import Scene
+from solidcloud.server.scene_file import open_scene
+from solidcloud.server.served import Turn
 from solidcloud.server.simulated import simulate
 
 # A body of a metre and a half, of three spheres.
@@ -189,6 +194,39 @@ def test_a_replay_gives_the_same_poses_bit_for_bit(
     frames = [record for record in read_log(log) if isinstance(record, Frame)]
     moved = {said.pose for frame in frames for said in frame.said}
     assert len(moved) > 200, "they did not just stand there"
+
+
+THINGS = """format = 1
+archives = [{{ path = "{archive}" }}]
+avatars = [{{ name = "box", file = "box.xyz", radius = 0.2 }}]
+objects = [
+    {{ name = "door", avatar = "box", pose = [[1, 0, 0, 0], [0, 1, 0, 1.0], [0, 0, 1, 0.1], [0, 0, 0, 1]] }},
+    {{ name = "crate", avatar = "box", kind = "pushed" }},
+]
+effects = [{{ effect = "stop" }}, {{ effect = "sweep" }}, {{ effect = "objects" }}, {{ effect = "crowd" }}]
+"""
+
+
+def test_objects_that_users_move_are_moved_the_same_in_a_replay(archive: Path, tmp_path: Path) -> None:
+    (tmp_path / "things.toml").write_text(THINGS.format(archive=archive))
+    np.savetxt(tmp_path / "box.xyz", [[0, 0, 0.3], [0, 0.3, 0.3], [0, 0, 0.8]], fmt="%.3f")
+    path, log = tmp_path / "things.toml", tmp_path / "frames.log"
+    rng = np.random.default_rng(12)
+    users = [User("a", "box"), User("b", "box")]  # as the scene's own avatar
+    moved = {}
+    with open_scene(path, read_points=np.loadtxt) as scene, recorded(scene, path, log):
+        scene.simulation.warm()
+        for number in range(60):
+            turns = []
+            for at, user in enumerate(users):
+                pose = pose_at(-1.0 + number / 40, 0.7 * at + 0.05 * rng.normal())
+                told = {"door": pose_at(0.0, 1.0 + 0.1 * rng.normal()).tolist()} if number % 7 == 3 else {}
+                turns.append(Turn(user, Wish(seq=number, time=number * STEP, pose=pose[None], objects=told)))
+            for outcome in scene.simulation.step(turns):
+                moved.update(outcome.state.objects.poses)
+    assert set(moved) == {"door", "crate"} and moved["crate"][0][3] > 0.3, "it was pushed"
+    with open_scene(path, read_points=np.loadtxt) as scene:  # not warmed: that leaves nothing behind
+        assert replay(scene.simulation, read_log(log)) == (60, 120, 0, None, None)
 
 
 def records_of(whole: bytes) -> Iterator[tuple[int, int]]:

@@ -13,20 +13,25 @@ import numpy as np
 from msgspec import structs
 from numpy.typing import NDArray
 
-from ..schemas.effects import Ground, Slide, Through, Uncertainty
+from ..schemas.effects import Crowd, Ground, Objects, Slide, Through, Uncertainty
 from ..schemas.errors import BadRequestError, SolidcloudError
 from ..schemas.index import NORMAL_REACH
 from ..schemas.messages import AvatarInfo, SceneInfo
 from ..schemas.radius_model import class_radii
 from ..schemas.scene import SUFFIX, SceneFile, identity, read_scene, scene_name
+from ..schemas.voxel_grid import UNITS_PER_METRE
 from .arena import ArenaBuffer
 from .avatar import make_avatar
 from .describe import describe
+from .kernels.placing import MAX_REACH_UNITS
 from .scene import DEFAULT_BUDGET, Scene
 from .served import SceneLike
 from .simulated import simulate
 from .simulation import Stage
 from .store import OpenStore, Store
+
+# Of avatars that meet one another [m]: two, and a margin, are within what a pair may reach (effects/bodies.py).
+MOST_BODY_RADIUS = MAX_REACH_UNITS / 4 / UNITS_PER_METRE
 
 ReadPoints = Callable[[Path], NDArray[np.float64]]
 
@@ -116,12 +121,18 @@ def find_archives(file: SceneFile, path: Path) -> list[Found]:
 def read_avatars(file: SceneFile, path: Path, read_points: ReadPoints) -> list[FoundAvatar]:
     """The avatars that a scene file names. Raises what `read_points` does, and BadRequestError."""
     found = []
+    meet = any(isinstance(effect, Objects | Crowd) for effect in file.effects)
     for number, item in enumerate(file.avatars):
         avatar_file = (path.parent / item.file).resolve()
         with at_place(path, f"$.avatars[{number}].file"):
             points = read_points(avatar_file)
         with at_place(path, f"$.avatars[{number}]"):
             model = make_avatar(points, item.radius)
+            if meet and model.radius > MOST_BODY_RADIUS:
+                raise BadRequestError(
+                    f"avatar radius {model.radius:g} m: expected at most {MOST_BODY_RADIUS:g} m where `objects` or "
+                    "`crowd` let it meet others"
+                )
         info = AvatarInfo(item.name, len(points), model.radius, model.bounding_radius)
         found.append(FoundAvatar(avatar_file, points, info))
     return found

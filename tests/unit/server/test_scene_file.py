@@ -26,6 +26,7 @@ from solidcloud.schemas.messages import (
 from solidcloud.schemas.scene import parse_scene
 from solidcloud.server.cli import run
 from solidcloud.server.scene import Scene
+from solidcloud.server.scene_check import check_scene_file
 from solidcloud.server.scene_file import (
     at_place,
     is_scene_file,
@@ -232,6 +233,10 @@ def test_normals_are_loaded_where_effects_ask_for_them(
             'format = 1\nradius_model = "local"\n' + TOP[11:], BadRequestError,
             "$.radius_model: {}/floor: radius model 'local': this archive holds mean",
         ),
+        (
+            TOP + BALL.replace("0.05", "4.5") + STOP + '[[effects]]\neffect = "crowd"\n', BadRequestError,
+            "$.avatars[0]: avatar radius 4.5 m: expected at most 4 m where `objects` or `crowd` let it meet others",
+        ),
         (TOP + '[[archives]]\npath = "ball.xyz"\n', FormatError, "$.archives[1].path: {}/ball.xyz"),
     ],
 )  # fmt: skip
@@ -242,6 +247,14 @@ def test_a_fault_of_what_is_named_has_the_file_and_the_place(
     with pytest.raises(kind) as found, open_scene(file, read_points=read_points):
         pass
     assert str(found.value).startswith(f"{file}: {said.format(folder)}")
+    with pytest.raises(kind) as checked:
+        check_scene_file(file, read_points)
+    assert str(checked.value) == str(found.value)
+
+
+def test_a_large_avatar_that_meets_nobody_is_fine(write: Write) -> None:
+    with open_scene(write(TOP + BALL.replace("0.05", "4.5") + STOP), read_points=read_points) as scene:
+        assert scene.collide("ball", at((0, 0, 4)), client="any").verdict.tolist() == [Verdict.CONTACT]
 
 
 def test_too_small_a_cache_is_told(write: Write) -> None:

@@ -122,11 +122,18 @@ class Bodies:
     # --- who is there -------------------------------------------------------------------------------------
 
     def begin(self) -> None:
-        """What is there first is there."""
+        """What is there first is there. Raises what makes it none, each time: nobody walks through what is missing."""
         with self.lock:
             begin, self._begin = self._begin, None
-            if begin is not None:
+            if begin is None:
+                return
+            try:
                 begin(self)
+            except BaseException:
+                self._begin = begin
+                for row in reversed(range(len(self.names))):
+                    self._remove(row)
+                raise
 
     def __setitem__(self, user: Hashable, body: Body) -> None:
         """A user is there, where its body is now."""

@@ -13,6 +13,7 @@ from solidcloud.schemas.effects import AnyEffect, Crowd, Ground, Objects, Slide,
 from solidcloud.schemas.errors import BadRequestError, BadTransformError
 from solidcloud.schemas.scene import ObjectItem
 from solidcloud.server.avatar import make_avatar
+from solidcloud.server.effects.bodies import Bodies
 from solidcloud.server.effects.frame import Body
 
 COARSE = INTERPRETED
@@ -307,3 +308,17 @@ def test_the_same_wishes_give_the_same_poses_bit_for_bit(tmp_path: Path) -> None
                 poses.append(stage.bodies.poses.tobytes())
         found.append(b"".join(poses))
     assert found[0] == found[1]
+
+
+def test_objects_that_cannot_begin_are_refused_each_time_and_not_once() -> None:
+    """Once refused, and the next frame walked through what was missing."""
+
+    def begin(bodies: Bodies) -> None:
+        bodies.add_object("small", ball(), at(5.0), pushed=False)
+        bodies.add_object("large", make_avatar([[0.0, 0, 0]], 4.5), at(0.0), pushed=False)
+
+    bodies = Bodies(np.zeros(3), np.array([0.0, 0, 1]), begin)
+    for _ in range(2):
+        with pytest.raises(BadRequestError, match="at most 4 m where bodies meet"):
+            bodies.begin()
+        assert not bodies.names and not len(bodies.poses)

@@ -167,14 +167,18 @@ class World:
 
         Of several archives: `lower` is the least, and `upper` and witness are those of the earliest contact.
         """
-        probe = self._probe(avatar)
+        probe, held = self._probe(avatar), self._held
+        if self._alone and held.depth:
+            swept = probe.sweep(held.seen[0].data, pose_from, pose_to, tolerance, effort)
+            held.visits += swept.visits
+            return swept
         with self as seen:
             found: Swept | None = None
             for number, each in enumerate(seen):
                 swept = probe.sweep(
                     each.data, _into(each, pose_from), _into(each, pose_to), tolerance, effort
                 )
-                self._held.visits += swept.visits
+                held.visits += swept.visits
                 if not self._alone:
                     swept = _carried(swept, each, number)
                 found = swept if found is None else _earlier(found, swept)

@@ -76,10 +76,12 @@ class Frame:
     """One user's one frame. body: as the frame before left it; written once, when the frame is done (pipeline.py).
 
     wish: where to.  seconds: since the frame before.  world: what is asked (world.py).  pose, verdict: so far.
-    clear: whether nothing is touched at `pose`, which is asked once: `go` keeps it so.
+    generations: of the archives asked.  clear: whether nothing is touched at `pose`, which is asked once: `go` keeps
+    it so.
     left: (3,) of the translation wished, not gone yet [m].  hits: what ended motions, in order.  blocked: what ended
     the wish first, and met: where; None: nothing did.  obstacles: what else blocks.  go: as far as nothing is touched;
     `stop` or `sweep` puts it there.  reports: fields of `Moved`.
+    kept: what goes into `Body.kept`.
     """
 
     body: Body
@@ -89,6 +91,7 @@ class Frame:
     effort: Effort = EXACT
     pose: Pose = field(default_factory=lambda: np.eye(4))
     verdict: Verdict = Verdict.CLEAR
+    generations: tuple[int, ...] = ()
     clear: bool = False
     left: Vec = field(default_factory=lambda: np.zeros(3))
     hits: list[Hit] = field(default_factory=list)
@@ -101,6 +104,7 @@ class Frame:
     simulated: list[str] = field(default_factory=list)
     skipped: list[str] = field(default_factory=list)
     reports: dict[str, Any] = field(default_factory=dict)
+    kept: dict[str, Any] = field(default_factory=dict)
 
 
 # Go towards a pose from `frame.pose`, as far as nothing is touched; sets frame.pose, returns what ended it.

@@ -27,6 +27,8 @@ from .going import first_hit, note, settle
 
 # Feet this near to their height are left there [m]: at rest nothing moves.
 DEAD_BAND = 1e-4
+# And beside a wall, by whose bumps the way up and down leads.
+ASIDE_BAND = 5e-3
 # A frame of gravity lasts no longer [s].
 LONGEST_FRAME = 0.1
 # The points that make the normal of what is stood on are so near the one that is touched [m].
@@ -39,6 +41,8 @@ _EDGE_RISES = 0.15
 _NEAR = 2.0
 # So far away from a wall the ground is looked for [m], and for so many walls.
 _ASIDE, _ASIDES = 0.01, 3
+# Points so near the plane of what was stood on last, and so near where, are of it [m].
+_SAME_FLOOR, _FLOOR = 5e-3, 0.3
 # Normals are kept to a third of a degree: of a cosine so much.
 _ROUNDING = 0.005
 # The body is swept so far beneath a scene's lowest sphere, its own height apart [m]; how exactly that is asked.
@@ -65,8 +69,10 @@ class Grounded:
 
     name = "ground"
 
-    def __init__(self, effect: Ground, step: float, tolerance: float, sliding: Any) -> None:
-        """step: how far below the next step may be [m].  sliding: `slide`, where the scene calls for it, or None."""
+    def __init__(self, effect: Ground, up: Vec, step: float, tolerance: float, sliding: Any) -> None:
+        """up: unit.  step: how far below the next step may be [m].  sliding: `slide`, where the scene calls for it."""
+        along = np.flatnonzero(up)
+        self._axis = int(along[0]) if len(along) == 1 else None
         self.clearance, self._gravity, self._most = effect.clearance, effect.gravity, effect.fall_speed
         self._down = effect.clearance + max(step, effect.clearance)
         self._tolerance, self._sliding = tolerance, sliding
@@ -75,6 +81,11 @@ class Grounded:
     def begin(self, frame: Frame) -> None:
         """Take up and down out of the wish."""
         up, begin = frame.world.up, frame.body.pose[:3, 3]
+        if self._axis is not None:
+            if frame.wish[self._axis, 3] != begin[self._axis]:
+                frame.wish = frame.wish.copy()
+                frame.wish[self._axis, 3] = begin[self._axis]
+            return
         way = frame.wish[:3, 3] - begin
         rises = dot(way, up)
         if rises == 0.0:
@@ -106,14 +117,22 @@ class Grounded:
         elif below.normal is not None:
             frame.on_ground, frame.fall_speed = True, 0.0
             lower = below.free - self.clearance
-            if lower > DEAD_BAND:
+            self._remember(frame, hit, below.normal)
+            band = ASIDE_BAND if below.aside else DEAD_BAND
+            if lower > band:
                 self.lower(frame, below, lower)
-            elif lower < -DEAD_BAND:
+            elif lower < -band:
                 self.slide(frame, -lower * frame.world.up)
         else:
             self._fall_along(frame, fall, seconds)
         normal = None if below.normal is None else tuple(below.normal.tolist())
         frame.reports["ground"] = GroundReport(frame.on_ground, frame.fall_speed, normal)
+
+    def _remember(self, frame: Frame, hit: Hit, normal: Vec) -> None:
+        """Note what is stood on, where it is not the plane noted already."""
+        stood = frame.body.kept.get(self.name)
+        if hit.archive >= 0 and hit.cloud is not None and (stood is None or normal is not stood[1]):
+            frame.kept[self.name] = hit.cloud, normal
 
     def below(self, frame: Frame, reach: float) -> Below:
         """What is met first straight down from frame.pose within a reach [m].
@@ -194,9 +213,7 @@ class Grounded:
         if not len(avatar.points):
             return False
         feet = lowest(avatar, frame.pose, up)
-        deep = (
-            feet - world.lowest() + _BELOW
-        )  # feet are what falls first: what they do not reach nothing lands on
+        deep = feet - world.lowest() + _BELOW
         if deep <= reach:
             return False
         swept = world.sweep(avatar, frame.pose, moved_by(frame.pose, -deep * up), _ROUGH, frame.effort)
@@ -213,6 +230,11 @@ class Grounded:
         """
         if hit.avatar is None or hit.cloud is None:
             return None
+        stood = frame.body.kept.get(self.name)
+        if stood is not None and hit.archive >= 0:
+            way = hit.cloud - stood[0]
+            if abs(dot(way, stood[1])) <= _SAME_FLOOR and size(way) <= _FLOOR:
+                return stood[1]  # what was stood on last: a normal takes as long as half a sweep
         up, out = frame.world.up, hit.avatar - hit.cloud
         length = size(out)
         normal: Vec | None = frame.world.normal(hit, NORMAL_REACH)
@@ -256,6 +278,7 @@ def make(effect: Ground, world: World) -> Grounded:
         sliding = make_sliding(slide, world)
     return Grounded(
         effect,
+        world.up,
         step.height if isinstance(step, Step) else 0.0,
         sweep.tolerance if isinstance(sweep, Sweep) else _TOLERANCE,
         sliding,

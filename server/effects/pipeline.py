@@ -48,7 +48,8 @@ class Usual:
 class Pipeline:
     """The effects of one scene in their order. Thread-safe, but for one body at a time.
 
-    runners: the effects.  usual: what each takes, by name.  bodies: see bodies.py; None where no effect asks for it.
+    runners: the effects.  usual: what each takes, by name, where there is a budget.  bodies: see bodies.py; None
+    where no effect asks for it.
     """
 
     def __init__(self, file: SceneFile, world: World, runners: list[Runner]) -> None:
@@ -66,6 +67,7 @@ class Pipeline:
         limits = file.limits
         self._seconds = None if limits.frame_ms is None else limits.frame_ms / 1e3
         self._visits = limits.frame_visits
+        self._free = self._seconds is None and self._visits is None  # nothing to be measured for
 
     def run(
         self,
@@ -94,20 +96,25 @@ class Pipeline:
         frame = Frame(body, wish, seconds, self.world, effort, body.pose)
         frame.fall_speed, frame.on_ground = body.fall_speed, body.on_ground
         with self.world as seen:
+            frame.generations = tuple([each.opened.number for each in seen])
             for runner in self._beginners:
                 runner.begin(frame)
             if not self._stops:
                 frame.pose = frame.wish
             since = self.world.visits
             for runner in self.runners:
-                self._run_one(runner, frame, begin, since, skip)
+                if self._free and not skip:
+                    runner.run(frame)
+                    frame.simulated.append(runner.name)
+                else:
+                    self._run_one(runner, frame, begin, since, skip)
             if not self._stops:
                 frame.verdict = self.world.collide(body.avatar, frame.pose, effort)
             client, _, avatar = body.name.rpartition("/")
             self.world.saw((client, avatar), body.avatar, frame.pose)
-            body.generations = tuple([each.opened.number for each in seen])
-        body.pose, body.clear = frame.pose, frame.clear
+        body.pose, body.clear, body.generations = frame.pose, frame.clear, frame.generations
         body.fall_speed, body.on_ground = frame.fall_speed, frame.on_ground
+        body.kept.update(frame.kept)
         return _moved(frame)
 
     def _run_one(

@@ -32,8 +32,7 @@ class Stopping:
     def run(self, frame: Frame) -> None:
         """Begin clear; without `sweep`, go for the wish."""
         frame.go = go
-        body, generations = frame.body, frame.world.generations()
-        frame.clear = body.clear and body.generations == generations
+        frame.clear = frame.body.clear and frame.body.generations == frame.generations
         if not frame.clear:
             get_free(frame)
         if not self._continuous:

@@ -66,7 +66,10 @@ def test_what_is_no_quick_question_is_answered_as_well(tmp_path: Path, rng: np.r
     case = cases.build(tmp_path, points)
     with swept.opened(case) as data:
         first, last = swept.motions(rng, points, np.zeros((1, 3)), 4, 0.3, 0.2, 0.5)
-        assert all(each.verdict == Verdict.CLEAR for each in same(Probe(make_avatar(np.zeros((0, 3)))), data, first, last))
+        assert all(
+            each.verdict == Verdict.CLEAR
+            for each in same(Probe(make_avatar(np.zeros((0, 3)))), data, first, last)
+        )
         long = last.copy()
         long[:, :3, 3] += [60.0, 0, 0]
         large = first.copy()

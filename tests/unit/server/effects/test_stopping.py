@@ -70,7 +70,7 @@ def test_far_from_the_origin_nobody_ends_in_contact(tmp_path: Path, rng: np.rand
     case = pushed.build(tmp_path, pushed.plane((0, -0.6, -0.6), (0, 0.6, 0.6)) + far)
     with play(case.archive, Stop(skin=0.0), Sweep(), Slide()) as game:
         for _ in range(10):
-            start = (*far, -1, *rng.uniform(-0.4, 0.4, 2))
+            start = far + np.array([-1, *rng.uniform(-0.4, 0.4, 2)])
             body = game.body(BALL, at(*start))
             game.go(body, (2.0, *rng.uniform(-0.5, 0.5, 2)))
             assert not game.touches(body) and body.pose[0, 3] < far[0]

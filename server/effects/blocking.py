@@ -4,8 +4,8 @@ First the bounds of all bodies against those of the motion, in one kernel call o
 near. Then, exactly, those that are (kernels/meeting.py, kernels/pairs.py).
 
 What is overlapped when the frame begins blocks only a translation that goes against `Bodies.way_out`: one along it,
-across it, up or down is let, and so is a turn. So bodies that came to be in one place, by
-where they began or by an object that was told to be there, get apart, and none is ever held.
+across it, up or down is let, and so is a turn. So bodies that came to be in one place, by where they began or by an
+object that was told to be there, get apart, and none is ever held.
 """
 
 from typing import NamedTuple
@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from ...schemas.answers import Verdict
 from ...schemas.voxel_grid import UNITS_PER_METRE
 from ..avatar import AvatarModel, make_avatar
-from ..kernels.meeting import find_near, sweep_bodies
+from ..kernels.meeting import sweep_bodies
+from ..kernels.near_bodies import find_near
 from .bodies import USER, Bodies, Shape
 from .frame import Body, Frame, Hit, Pose, Vec
 

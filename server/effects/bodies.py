@@ -15,7 +15,8 @@ from ...schemas.errors import BadRequestError, BadTransformError
 from ...schemas.kernels.normals import NONE, decode_normal, normal_code
 from ...schemas.voxel_grid import UNITS_PER_METRE
 from ..avatar import AvatarModel
-from ..kernels.meeting import bound_body, make_scratch
+from ..kernels.meeting_placed import make_scratch
+from ..kernels.near_bodies import bound_body
 from ..kernels.pairs import CONTACT, touch_pairs
 from ..kernels.placing import MAX_REACH_UNITS, SIMILARITY_TOLERANCE
 from ..request import kernel_poses, to_units

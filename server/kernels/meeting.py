@@ -11,140 +11,30 @@ All is float64: avatars are some thousand points, and few of them are near one a
 """
 
 import math
-from typing import NamedTuple
 
 import numba as nb
 import numpy as np
-from numpy.typing import NDArray
 
 from ...schemas.voxel_grid import UNITS_PER_METRE
-from .compiled import borrowing, inlined
+from .compiled import borrowing
 from .layout import LANES
+from .meeting_placed import (
+    Chord,
+    Meeting,
+    least_square,
+    place_moving,
+    place_moving_nodes,
+    place_standing,
+    place_standing_nodes,
+)
 from .moments import INFINITE, pair_times
-from .motion import Motion, make_motion, pose_at
-from .pairs import STACK, STRETCH
-from .placing import Avatar, largest_term, place, to_units
+from .motion import make_motion, pose_at
+from .placing import largest_term, place, to_units
 
 # As in sweep.py, advance.py: what is not worth halving; of a first chord; advances that settled nothing.
 _LEAST_SAGITTA = 0.25
 _CHORD_BEND = 1.0 / 16.0
 _MOST_REFUSED = 512
-
-
-class Scratch(NamedTuple):
-    """Scratch of one thread, for avatars of so many nodes and blocks, by `make_scratch`.
-
-    stack: (s, 2) int64, pairs of nodes to be looked at.  moving: (8, nodes): where a node's centre begins, its way,
-    1 / its square, its radius; ways: (blocks, 7, LANES) likewise of points.  standing: (4, nodes) centres and radii;
-    lanes: (blocks, 3, LANES) points.  stamps: (2, blocks) int64: the chord and the body that a block was placed for;
-    turns: (2,) int64, chords and bodies so far.  keep: (LANES,).  ends: (2, 4, 4), shifts: (3, 3): the poses of a
-    chord's ends, their translations and the standing one's.  gap, way: (3,).  first: (2,) when anything could touch,
-    and when something must.  pair: (4,) int64 block, lane of either.  counters: (2,) node visits, point tests.
-    """
-
-    stack: NDArray[np.int64]
-    moving: NDArray[np.float64]
-    ways: NDArray[np.float64]
-    standing: NDArray[np.float64]
-    lanes: NDArray[np.float64]
-    stamps: NDArray[np.int64]
-    turns: NDArray[np.int64]
-    keep: NDArray[np.bool_]
-    ends: NDArray[np.float64]
-    shifts: NDArray[np.float64]
-    gap: NDArray[np.float64]
-    way: NDArray[np.float64]
-    first: NDArray[np.float64]
-    pair: NDArray[np.int64]
-    counters: NDArray[np.int64]
-
-
-def make_scratch(nodes: int, blocks: int) -> Scratch:
-    """Scratch for `sweep_bodies` of avatars of at most so many nodes and blocks."""
-    return Scratch(
-        np.empty((STACK, 2), np.int64), np.empty((8, nodes)), np.empty((blocks, 7, LANES)), np.empty((4, nodes)),
-        np.empty((blocks, 3, LANES)), np.full((2, blocks), -1, np.int64), np.zeros(2, np.int64),
-        np.empty(LANES, np.bool_), np.empty((2, 4, 4)), np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(2),
-        np.zeros(4, np.int64), np.zeros(2, np.int64),
-    )  # fmt: skip
-
-
-class _Meeting(NamedTuple):
-    """One motion against one body. motion: Motion of avatar a.  pose: (4, 4) of b.  units: of both radii and margin.
-    error: of a distance of two placed centres, and of what rounds to units [m]."""
-
-    motion: Motion
-    a: Avatar
-    b: Avatar
-    pose: NDArray[np.float64]
-    units: np.int64
-    error: float
-    scratch: Scratch
-
-
-class _Chord(NamedTuple):
-    """One interval from t0 on. inner, outer: U - band, U + band, exact units.  room: outer with the error [m].
-    final: not worth halving."""
-
-    t0: float
-    inner: float
-    outer: float
-    room: float
-    final: bool
-
-
-@nb.njit(nogil=True, cache=True)
-def bound_body(box, pose, origin, more, bounds):
-    """Write bounds (2, 3), from the origin [m], of a body's box (2, 3), avatar frame, placed; `more` on all sides."""
-    for r in range(3):
-        middle, half, size = pose[r, 3] - origin[r], 0.0, abs(pose[r, 3]) + abs(origin[r])
-        for c in range(3):
-            middle += pose[r, c] * (0.5 * (box[0, c] + box[1, c]))
-            half += abs(pose[r, c]) * (0.5 * (box[1, c] - box[0, c]))
-            size += abs(pose[r, c]) * (abs(box[0, c]) + abs(box[1, c]))
-        half += more + 2.0 / UNITS_PER_METRE + size * 2.0**-48
-        bounds[0, r], bounds[1, r] = middle - half, middle + half
-
-
-@nb.njit(nogil=True, cache=True)
-def find_near(box, first, last, more, bounds, kinds, wanted, skip, rows):
-    """Bodies whose bounds meet those of a motion, ascending into rows (n,) int64; returns how many.
-
-    box: (2, 3) of the moving avatar.  first, last: (4, 4), translations from the origin.  more: its radius and the
-    margin [m].  bounds: (n, 2, 3), see `bound_body`.  kinds: (n,) uint8, one bit each; wanted: bits.  skip: a row.
-    """
-    origin = np.zeros(3)
-    begin, end = np.empty((2, 3)), np.empty((2, 3))
-    stray = make_motion(first, last, box, origin).bend / 8.0
-    bound_body(box, first, origin, more + stray, begin)
-    bound_body(box, last, origin, more + stray, end)
-    count = 0
-    for i in range(bounds.shape[0]):
-        if i == skip or not kinds[i] & wanted:
-            continue
-        apart = False
-        for r in range(3):
-            apart |= min(begin[0, r], end[0, r]) > bounds[i, 1, r]
-            apart |= max(begin[1, r], end[1, r]) < bounds[i, 0, r]
-        if not apart:
-            rows[count] = i
-            count += 1
-    return count
-
-
-@inlined
-def _least_square(gx, gy, gz, wx, wy, wz, inverse, latest):
-    """The least square of a length that goes from g to g + latest w; inverse: 1 / w^2."""
-    t = min(max(-(gx * wx + gy * wy + gz * wz) * inverse, 0.0), latest)
-    ex, ey, ez = gx + t * wx, gy + t * wy, gz + t * wz
-    return ex * ex + ey * ey + ez * ez
-
-
-@borrowing
-def _inverse(x, y, z):
-    """1 / (x^2 + y^2 + z^2), or 0 where that is too small to be divided by."""
-    square = x * x + y * y + z * z
-    return 1.0 / square if square > 1e-200 else 0.0
 
 
 @borrowing
@@ -193,61 +83,6 @@ def _try_pair(meeting, chord, block_a, lane_a, block_b, lane_b):
 
 
 @borrowing
-def _place_moving(meeting, block):
-    """Place the points of a leaf node of the moving one at both ends of a chord."""
-    ways, ends, shifts = meeting.scratch.ways, meeting.scratch.ends, meeting.scratch.shifts
-    points = meeting.a.points
-    for r in range(3):
-        for k in range(LANES):
-            x, y, z = points[block, 0, k], points[block, 1, k], points[block, 2, k]
-            begin = place(ends[0], shifts[0], r, x, y, z)
-            ways[block, r, k] = begin
-            ways[block, 3 + r, k] = place(ends[1], shifts[1], r, x, y, z) - begin
-    for k in range(LANES):
-        ways[block, 6, k] = _inverse(ways[block, 3, k], ways[block, 4, k], ways[block, 5, k])
-
-
-@borrowing
-def _place_standing(meeting, block):
-    """Place the points of a leaf node of the standing one."""
-    lanes, points = meeting.scratch.lanes, meeting.b.points
-    for r in range(3):
-        for k in range(LANES):
-            x, y, z = points[block, 0, k], points[block, 1, k], points[block, 2, k]
-            lanes[block, r, k] = place(meeting.pose, meeting.scratch.shifts[2], r, x, y, z)
-
-
-@borrowing
-def _place_moving_nodes(meeting, count):
-    """Place the first `count` nodes of the moving one at both ends of a chord."""
-    moving, center, ends, shifts = (
-        meeting.scratch.moving,
-        meeting.a.center,
-        meeting.scratch.ends,
-        meeting.scratch.shifts,
-    )
-    for i in range(count):
-        x, y, z = center[i, 0], center[i, 1], center[i, 2]
-        for r in range(3):
-            begin = place(ends[0], shifts[0], r, x, y, z)
-            moving[r, i] = begin
-            moving[3 + r, i] = place(ends[1], shifts[1], r, x, y, z) - begin
-        moving[6, i] = _inverse(moving[3, i], moving[4, i], moving[5, i])
-        moving[7, i] = meeting.a.radius[i] * STRETCH
-
-
-@borrowing
-def _place_standing_nodes(meeting, count):
-    """Place the first `count` nodes of the standing one."""
-    standing, center = meeting.scratch.standing, meeting.b.center
-    for j in range(count):
-        x, y, z = center[j, 0], center[j, 1], center[j, 2]
-        for r in range(3):
-            standing[r, j] = place(meeting.pose, meeting.scratch.shifts[2], r, x, y, z)
-        standing[3, j] = meeting.b.radius[j] * STRETCH
-
-
-@borrowing
 def _bounds_of(lane, room):
     """The least and the greatest of some coordinates (LANES,), and `room` more on either side."""
     least, most = lane[0], lane[0]
@@ -269,7 +104,7 @@ def _sift(scratch, block_a, block_b, j, room):
     for k in range(LANES):
         px, py, pz = ways[block_a, 0, k], ways[block_a, 1, k], ways[block_a, 2, k]
         wx, wy, wz = ways[block_a, 3, k], ways[block_a, 4, k], ways[block_a, 5, k]
-        square = _least_square(px - bx, py - by, pz - bz, wx, wy, wz, ways[block_a, 6, k], latest)
+        square = least_square(px - bx, py - by, pz - bz, wx, wy, wz, ways[block_a, 6, k], latest)
         qx, qy, qz = px + latest * wx, py + latest * wy, pz + latest * wz
         keep[k] = (
             (square <= span)
@@ -293,10 +128,10 @@ def _leaves(meeting, chord, i, j):
     lanes, ways, stamps, turns = scratch.lanes, scratch.ways, scratch.stamps, scratch.turns
     block_a, block_b = ~meeting.a.first[i], ~meeting.b.first[j]
     if stamps[0, block_a] != turns[0]:
-        _place_moving(meeting, block_a)
+        place_moving(meeting, block_a)
         stamps[0, block_a] = turns[0]
     if stamps[1, block_b] != turns[1]:
-        _place_standing(meeting, block_b)
+        place_standing(meeting, block_b)
         stamps[1, block_b] = turns[1]
     _sift(scratch, block_a, block_b, j, chord.room)
     far, latest = chord.room * chord.room * (1.0 + 1e-12), _latest(scratch)
@@ -310,12 +145,12 @@ def _leaves(meeting, chord, i, j):
         touched = False
         for k in range(LANES):
             gx, gy, gz = px - lanes[block_b, 0, k], py - lanes[block_b, 1, k], pz - lanes[block_b, 2, k]
-            touched |= _least_square(gx, gy, gz, wx, wy, wz, inverse, latest) <= far
+            touched |= least_square(gx, gy, gz, wx, wy, wz, inverse, latest) <= far
         if not touched:
             continue
         for k in range(meeting.b.count[j]):
             gx, gy, gz = px - lanes[block_b, 0, k], py - lanes[block_b, 1, k], pz - lanes[block_b, 2, k]
-            if _least_square(gx, gy, gz, wx, wy, wz, inverse, latest) <= far:
+            if least_square(gx, gy, gz, wx, wy, wz, inverse, latest) <= far:
                 _try_pair(meeting, chord, block_a, lane, block_b, k)
                 latest = _latest(scratch)
 
@@ -326,7 +161,7 @@ def _nearest(scratch, room, i, j):
     what was found."""
     moving, standing = scratch.moving, scratch.standing
     both = (moving[7, i] + standing[3, j] + room) * (1.0 + 1e-12)
-    square = _least_square(
+    square = least_square(
         moving[0, i] - standing[0, j], moving[1, i] - standing[1, j], moving[2, i] - standing[2, j],
         moving[3, i], moving[4, i], moving[5, i], moving[6, i], _latest(scratch),
     )  # fmt: skip
@@ -344,10 +179,10 @@ def _descend(meeting, chord):
     scratch.turns[0] += 1
     scratch.first[0], scratch.first[1] = INFINITE, INFINITE
     counters[0] += 1
-    _place_moving_nodes(meeting, 1)
+    place_moving_nodes(meeting, 1)
     if _nearest(scratch, chord.room, 0, 0) == INFINITE:
         return
-    _place_moving_nodes(meeting, a.center.shape[0])
+    place_moving_nodes(meeting, a.center.shape[0])
     stack[0, 0], stack[0, 1] = 0, 0
     depth = 1
     while depth > 0:
@@ -397,7 +232,7 @@ def _search(meeting, t0, t1):
     outer = np.float64(meeting.units) + band
     final = sagitta <= _LEAST_SAGITTA
     room = outer / UNITS_PER_METRE + 2.0 / UNITS_PER_METRE + 8.0 * meeting.error
-    _descend(meeting, _Chord(t0, np.float64(meeting.units) - band, outer, room, final))
+    _descend(meeting, Chord(t0, np.float64(meeting.units) - band, outer, room, final))
     return final
 
 
@@ -461,9 +296,9 @@ def sweep_bodies(
         largest = largest_term(poses[row], shifts[2], b.center[0, 0], b.center[0, 1], b.center[0, 2])
         error = max(largest_a, largest + b.radius[0]) * 2.0**-49
         units = np.int64(units_a + units_b + margin_units)
-        meeting = _Meeting(motion, a, b, poses[row], units, error, scratch)
+        meeting = Meeting(motion, a, b, poses[row], units, error, scratch)
         scratch.turns[1] += 1
-        _place_standing_nodes(meeting, b.center.shape[0])
+        place_standing_nodes(meeting, b.center.shape[0])
         stop = min(found, 1.0)
         since = _advance(meeting, size, stop, tolerance)
         if since >= found or since == INFINITE:

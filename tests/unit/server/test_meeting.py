@@ -11,6 +11,8 @@ import pytest
 from numpy.typing import NDArray
 from solidcloud.server.avatar import AvatarModel, make_avatar
 from solidcloud.server.kernels import meeting as kernel
+from solidcloud.server.kernels import meeting_placed as placed
+from solidcloud.server.kernels import near_bodies
 from swept import turned
 
 pytestmark = pytest.mark.interpreted
@@ -36,9 +38,9 @@ def units_of(model: AvatarModel) -> int:
     return int(np.rint(model.radius * naive.UNITS))
 
 
-def scratch_of(*models: AvatarModel) -> kernel.Scratch:
+def scratch_of(*models: AvatarModel) -> placed.Scratch:
     """Scratch that just holds these."""
-    return kernel.make_scratch(max(len(m.arrays.radius) for m in models), max(len(m.rows) for m in models))
+    return placed.make_scratch(max(len(m.arrays.radius) for m in models), max(len(m.rows) for m in models))
 
 
 def ask(
@@ -193,16 +195,16 @@ def test_bodies_whose_bounds_a_motion_does_not_meet_are_not_touched(turn: float)
         )
         bounds = np.empty((n, 2, 3))
         for pose, bound in zip(poses, bounds, strict=True):
-            kernel.bound_body(box_of(b), pose, ORIGIN, b.radius, bound)
-            placed = (pose[:3, :3] @ b.points.T).T + pose[:3, 3] - ORIGIN
-            assert (bound[0] <= placed.min(axis=0) - b.radius).all()
-            assert (bound[1] >= placed.max(axis=0) + b.radius).all()
+            near_bodies.bound_body(box_of(b), pose, ORIGIN, b.radius, bound)
+            points = (pose[:3, :3] @ b.points.T).T + pose[:3, 3] - ORIGIN
+            assert (bound[0] <= points.min(axis=0) - b.radius).all()
+            assert (bound[1] >= points.max(axis=0) + b.radius).all()
         ends = [pose.copy() for pose in (first, last)]
         for end in ends:
             end[:3, 3] -= ORIGIN
         rows = np.empty(n, np.int64)
         for wanted, skip in ((7, -1), (4, 2)):
-            count = kernel.find_near(box_of(a), *ends, a.radius, bounds, kinds, wanted, skip, rows)
+            count = near_bodies.find_near(box_of(a), *ends, a.radius, bounds, kinds, wanted, skip, rows)
             named = rows[:count].tolist()
             assert named == sorted(named) and skip not in named
             assert all(kinds[row] & wanted for row in named)

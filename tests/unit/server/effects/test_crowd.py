@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from moving_bodies import INTERPRETED, Stage, at, ball, box, staged, touch
 from numpy.typing import NDArray
-from solidcloud.schemas.effects import AnyEffect, Crowd, Stop, Sweep
+from solidcloud.schemas.effects import AnyEffect, Crowd, Slide, Stop, Sweep
 from solidcloud.schemas.errors import BadRequestError
 from solidcloud.server.avatar import make_avatar
 from solidcloud.server.effects import crowd
 from solidcloud.server.effects.frame import Body
-from solidcloud.server.kernels.meeting import Scratch
+from solidcloud.server.kernels.meeting_placed import Scratch
 
 SMALL = ball(0.2, 12 if INTERPRETED else 60)
 CONTINUOUS: list[AnyEffect] = [Stop(), Sweep()]
@@ -157,7 +157,11 @@ def test_the_same_wishes_give_the_same_poses_bit_for_bit(tmp_path: Path) -> None
     assert _walk(tmp_path / "a", 3) == _walk(tmp_path / "b", 3)
 
 
-@pytest.mark.parametrize("effects", [CONTINUOUS, [Stop()]], ids=["continuous", "discrete"])
+@pytest.mark.parametrize(
+    "effects",
+    [CONTINUOUS, [*CONTINUOUS, Slide()], [Stop()]],
+    ids=["continuous", "sliding", "discrete"],
+)
 def test_random_frames_never_end_in_a_new_overlap(tmp_path: Path, effects: list[AnyEffect]) -> None:
     rng = np.random.default_rng(11)
     stops = 0
@@ -201,7 +205,8 @@ def test_what_is_not_declared_is_not_imported() -> None:
     program = """
 import sys
 import solidcloud.server.effects.pipeline, solidcloud.server.effects.stop, solidcloud.server.effects.sweep
-names = ["effects." + name for name in ("crowd", "objects", "bodies", "blocking")] + ["kernels.meeting"]
+names = ["effects." + name for name in ("crowd", "objects", "bodies", "blocking")]
+names += ["kernels." + name for name in ("meeting", "meeting_placed", "near_bodies")]
 print([name for name in names if "solidcloud.server." + name in sys.modules])
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)

@@ -77,6 +77,14 @@ class _Avatar(NamedTuple):
     points: Positions
     radius: float | None
 
+    def request(self, name: str) -> bytes:
+        """The request that adds it."""
+        return encode(AddAvatarRequest(name, self.points, self.radius))
+
+    def is_same(self, other: "_Avatar") -> bool:
+        """Whether two avatars are one, bit for bit."""
+        return self.radius == other.radius and np.array_equal(self.points, other.points)
+
 
 class Client(Questions):
     """A scene served elsewhere; a context manager, thread-safe, with the methods of `Scene`.
@@ -184,10 +192,10 @@ class Client(Questions):
         by another one.
         """
         avatar = _Avatar(make_positions(points).copy(), None if radius is None else float(radius))
-        request = _add_request(name, avatar)
+        request = avatar.request(name)
         with self._lock:
             known = self._avatars.get(name)
-            if known is not None and not _same_avatar(known, avatar):
+            if known is not None and not known.is_same(avatar):
                 raise BadRequestError(
                     f"avatar {name!r} was added with other points or another radius: choose another name"
                 )
@@ -265,8 +273,7 @@ class Client(Questions):
 
         avatar: 1 to 64 of A-Z, a-z, 0-9, '.', '_' and '-'.  The scene's server simulates the effects that it calls for.
         """
-        if self._stack is None:
-            raise BadRequestError("this client is closed: ask inside `with Client(...) as scene`")
+        self._check_open()
         user = keys.User(self._id, keys.check_name(avatar, "avatar of a session"))
         with self._lock:
             numbers = self._numbers.setdefault(avatar, itertools.count(1))
@@ -290,7 +297,7 @@ class Client(Questions):
             known = [(name, self._avatars[name]) for name in names if name in self._avatars]
         if len(known) < len(names):
             raise unknown
-        return all(self._ask("add_avatar", _add_request(*each)) is not None for each in known)
+        return all(self._ask("add_avatar", avatar.request(name)) is not None for name, avatar in known)
 
     def _ask(self, operation: str, request: bytes) -> bytes | None:
         """Ask, and wait for the answer; None: nobody answered in time. Raises what an error reply says."""
@@ -329,9 +336,13 @@ class Client(Questions):
 
     def _querier(self, operation: str) -> zenoh.Querier:
         """What asks one operation."""
+        self._check_open()
+        return self._queriers[operation]
+
+    def _check_open(self) -> None:
+        """BadRequestError where this client is closed."""
         if self._stack is None:
             raise BadRequestError("this client is closed: ask inside `with Client(...) as scene`")
-        return self._queriers[operation]
 
     def _check_served(self) -> None:
         """UnknownSceneError if servers answer and none of them serves this scene."""
@@ -388,16 +399,6 @@ def _ask_scenes(session: zenoh.Session, timeout: float) -> tuple[set[str], set[i
             served.update(answer.scenes)
             versions.add(answer.wire_version)
     return served, versions
-
-
-def _add_request(name: str, avatar: _Avatar) -> bytes:
-    """The request that adds an avatar."""
-    return encode(AddAvatarRequest(name, avatar.points, avatar.radius))
-
-
-def _same_avatar(known: _Avatar, other: _Avatar) -> bool:
-    """Whether two avatars are one, bit for bit."""
-    return known.radius == other.radius and np.array_equal(known.points, other.points)
 
 
 def _raise_error(error: Any) -> None:

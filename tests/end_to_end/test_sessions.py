@@ -1,17 +1,12 @@
 """Sessions over zenoh: wishes go out, states come in, whatever becomes of other clients and of servers."""
 
-import os
-import signal
-import subprocess
-import sys
 import threading
-from contextlib import contextmanager
 
 import numpy as np
 import pytest
 import zenoh
 from fake_server import floor_simulation
-from floor import DEADLINE, POINTS, eventually, server_process
+from floor import DEADLINE, POINTS, eventually
 from solidcloud.schemas import keys
 from solidcloud.schemas.encoding import JSON, MSGPACK, decode_answer, encode
 from solidcloud.schemas.errors import (
@@ -26,24 +21,8 @@ from solidcloud.schemas.moves import State, Wish
 from solidcloud.server.app import serving
 from solidcloud.server.client import Client
 from solidcloud.server.config import ServerConfig
-from solidcloud.server.frame_log import Frame, read_log
-from solidcloud.server.replay import replay
 from solidcloud.server.transport import session_config
-
-REST = np.nextafter(-0.375, 1.0)  # where POINTS with a radius of 0.125 come to rest on the floor
-
-
-def pose_at(x, z, y=0.0):
-    pose = np.eye(4)
-    pose[:3, 3] = x, y, z
-    return pose
-
-
-def outcome(pose):
-    """The judge: where the floor lets an avatar get to."""
-    there = pose.copy()
-    there[2, 3] = max(pose[2, 3], REST)
-    return there
+from walkers import REST, outcome, pose_at, walking
 
 
 @pytest.fixture
@@ -55,15 +34,6 @@ def floor():
 def served(floor, endpoint):
     with serving([floor], ServerConfig(listen=endpoint)):
         yield floor
-
-
-@contextmanager
-def walking(endpoint, name="al", **fields):
-    """A client with one avatar, and its session."""
-    with Client(endpoint, scene="floor", timeout=DEADLINE) as client:
-        client.add_avatar(name, POINTS, 0.125)
-        with client.session(name) as session:
-            yield session
 
 
 def walk(client, name, count, found):
@@ -182,88 +152,6 @@ def test_a_session_may_be_begun_again(served, endpoint):
             with client.session("al") as session:
                 seen.append(session.wait(session.wish(pose_at(0.0, 1.0)), DEADLINE).seq)
     assert seen == [1, 2, 3]
-
-
-CLIENT = """
-import sys, threading, numpy as np, zenoh
-from solidcloud.server.client import Client
-from solidcloud.server.transport import session_config
-points = np.array([[0.0, 0.0, 0.5], [0.25, 0.0, 1.0], [0.0, 0.25, 1.5]])
-with Client(sys.argv[1], scene="floor") as client, zenoh.open(session_config(connect=sys.argv[1])) as other:
-    client.add_avatar("other", points, 0.125)
-    with client.session("other") as session, other.declare_subscriber("solidcloud/1/state/**", lambda sample: None):
-        session.wait(session.wish(np.eye(4)), 20.0)
-        print("there", flush=True)
-        while True:
-            session.wish(np.eye(4))
-            threading.Event().wait(1 / 60)
-"""
-
-
-@contextmanager
-def other_client(endpoint):
-    """A client in a process of its own, that walks, and hears everybody's states."""
-    command = [sys.executable, "-P", "-c", CLIENT, endpoint]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        try:
-            assert process.stdout.readline() == "there\n"
-            yield process
-        finally:
-            process.kill()
-
-
-def test_a_frozen_client_stops_nobody(served, endpoint):
-    with other_client(endpoint) as other, walking(endpoint, "large") as session:
-        os.kill(other.pid, signal.SIGSTOP)
-        try:
-            # It has asked for these states too: 20 MB, more than sockets and queues hold.
-            for number in range(250):
-                seq = session.wish(pose_at(number / 1000, 1.0))
-                state = session.wait(seq, DEADLINE)
-                assert state.pose[0, 0, 3] == number / 1000 and len(state.touched) == 2000
-        finally:
-            os.kill(other.pid, signal.SIGCONT)
-
-
-def test_a_killed_client_leaves_the_scene(served, endpoint):
-    with other_client(endpoint) as other:
-        assert [user.avatar for user in served.users] == ["other"]
-        other.kill()
-        eventually(lambda: not served.users)
-    _, client = served.served.gone  # the first is who warmed it
-    assert client != "*warm" and not served.served.avatars
-
-
-def test_a_session_goes_on_with_a_server_that_was_restarted(endpoint):
-    with Client(endpoint, scene="floor", timeout=1.0) as client:
-        client.add_avatar("al", POINTS, 0.125)
-        with client.session("al") as session:
-            for restart in range(3):
-                with server_process(endpoint, "--walked") as process:
-                    last = keep_wishing(session, lambda: session.wish(velocity=(0.0, 1.0, 0.0)), restart == 0)
-                    # A state more, of the server that is there now.
-                    assert last.pose[0, 1, 3] > 0.001 * restart
-                    process.kill()
-                age = session.latest().age
-                eventually(lambda age=age: session.latest().age > age)
-                assert session.latest().state.seq == last.seq or restart == 0
-    assert last.pose[0, 0, 3] == 0.25, "from where the first server had left it"
-
-
-def keep_wishing(session, wish, first):
-    """Wish until a server says something, as a viewer does; the first wish of all says where it begins."""
-    before = session.latest().state.seq if session.latest() else 0
-    found = []
-
-    def answered():
-        session.wish(pose_at(0.25, 1.0)) if first and not found else wish()
-        latest = session.latest()
-        if latest is not None and latest.state.seq > before:
-            found.append(latest.state)
-        return len(found) > 5
-
-    eventually(answered)
-    return found[-1]
 
 
 def test_the_avatar_is_added_to_a_server_that_does_not_know_it(served, endpoint):
@@ -423,41 +311,3 @@ def test_nobody_else_publishes_states(served, endpoint, mode):
         told = [str(sample.key_expr).split("/")[2] for sample in heard]
         assert "refused" not in told and not [s for s in heard if s.payload.to_bytes() == encode(lie)]
         assert not [s for s in heard if s.kind == zenoh.SampleKind.DELETE]
-
-
-def test_a_server_that_stops_ends_its_sessions(endpoint):
-    with server_process(endpoint, "--walked") as process, walking(endpoint) as session:
-        session.wait(session.wish(pose_at(0.0, 1.0)), DEADLINE)
-        ended = threading.Event()
-
-        def wish():
-            while not ended.is_set():
-                session.wish(pose_at(0.0, 1.0))
-                ended.wait(1 / 200)
-
-        thread = threading.Thread(target=wish)
-        thread.start()
-        try:
-            process.send_signal(signal.SIGTERM)
-            assert process.wait(DEADLINE) == 0
-        finally:
-            ended.set()
-            thread.join(DEADLINE)
-
-
-def test_a_killed_server_leaves_a_log_that_replays(endpoint, tmp_path):
-    log = tmp_path / "frames.log"
-    with server_process(endpoint, "--walked", "--log", str(log)) as process, walking(endpoint) as session:
-        rng = np.random.default_rng(4)
-        for number in range(200):
-            pose = pose_at(*rng.normal(size=2))
-            seq = (
-                session.wish(pose) if number % 3 == 0 else session.wish(velocity=rng.normal(size=3), turn=1.0)
-            )
-            session.wait(seq, DEADLINE)
-        process.kill()
-    records = list(read_log(log))
-    found = replay(floor_simulation(), records)
-    assert found == (200, 200, 0, None, None)
-    last = [record for record in records if isinstance(record, Frame)][-1]
-    assert last.said[0].pose == session.latest().state.pose.tobytes()

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from msgspec import structs
 
+from ..schemas.index import Header
 from ..schemas.messages import (
     WIRE_VERSION,
     AvatarInfo,
@@ -24,8 +25,6 @@ def describe(store: Store, name: str) -> SceneInfo:
     """What the archive of `store` holds: counts, bounds, lattice, radius, sources. Reads no voxel."""
     header = store.archive.header
     lattice, now = header.lattice, header.radius_now
-    # Those of a point's scan_index are rows of this: what was left out stays in its place where others stand behind.
-    listed = max((number for number, s in enumerate(header.sources, 1) if not s.fault), default=0)
     return SceneInfo(
         scene=name,
         format_version=header.format_version,
@@ -47,7 +46,7 @@ def describe(store: Store, name: str) -> SceneInfo:
         leaf=header.leaf,
         sources=[
             SourceInfo(s.path, s.index, s.sha256, s.count, s.format, s.pose.tolist(), s.skipped, s.fault)
-            for s in header.sources[:listed]
+            for s in header.sources[: listed_sources(header)]
         ],
         skipped=[s.fault for s in header.sources if s.fault],
         record_bytes=int(store.archive.voxels["frame_bytes"].sum(dtype=np.int64)),
@@ -58,6 +57,12 @@ def describe(store: Store, name: str) -> SceneInfo:
         radius_now=now.radius if now else None,
         radius_now_error=now.error if now else None,
     )
+
+
+def listed_sources(header: Header) -> int:
+    """How many sources an archive lists: a point's scan_index is a row of them, so what was left out stays in its place
+    where others stand behind."""
+    return max((number for number, s in enumerate(header.sources, 1) if not s.fault), default=0)
 
 
 def describe_scene(info: SceneInfo, file: SceneFile, avatars: Sequence[AvatarInfo] = ()) -> SceneInfo:

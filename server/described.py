@@ -8,7 +8,9 @@ from msgspec import structs
 
 from ..schemas.messages import SceneInfo, StatsAnswer
 from ..schemas.stats import Counters, Times
+from .describe import listed_sources
 from .metrics import Metrics, times_of
+from .opened import Opened
 from .posed import Pose, moved_boxes, under
 
 # Of StatsAnswer: what archives have each, to be added.
@@ -57,6 +59,14 @@ def info_of_several(name: str, each: Sequence[tuple[SceneInfo, Pose | None]]) ->
         radius_now=largest.radius_now,
         radius_now_error=largest.radius_now_error,
     )
+
+
+def sources_asked(opened: Opened) -> int:
+    """How many sources an archive lists, of the generation that is asked: those of the next archive stand behind."""
+    count = opened.kept.get("sources")
+    if count is None:
+        count = opened.kept["sources"] = listed_sources(opened.store.archive.header)
+    return int(count)
 
 
 def _box(box: list[list[float]], pose: Pose | None) -> Any:

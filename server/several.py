@@ -28,13 +28,13 @@ from ..schemas.answers import (
     SweepAnswers,
     WithinAnswers,
 )
-from ..schemas.errors import BadRequestError
+from ..schemas.errors import BadRequestError, SolidcloudError
 from ..schemas.messages import AvatarInfo, ReloadAnswer, SceneInfo, StatsAnswer
 from ..schemas.requests import QuestionOptions, make_objects, make_poses, make_vectors
 from .avatar import AvatarModel
 from .collide import collide
 from .contacts import contacts
-from .described import info_of_several, stats_of_several
+from .described import info_of_several, sources_asked, stats_of_several
 from .distance import distance
 from .effort import NO_LIMIT, Effort, make_effort
 from .merged import carried, limited, merged
@@ -123,7 +123,14 @@ class SeveralScenes(Simulated):
         Where one cannot be opened those before it are new, and it and those behind are served on as they were.
         """
         begin = time.perf_counter()
-        each = [scene.reload() for scene, _ in self.archives]
+        each: list[ReloadAnswer] = []
+        for number, (scene, _) in enumerate(self.archives):
+            try:
+                each.append(scene.reload())
+            except SolidcloudError as error:
+                new = f": of {len(self.archives)} archives the first {number} are reloaded" if number else ""
+                error.args = (f"archive {number}: {error}{new}",)
+                raise
         before, after = (sum(getattr(a, f"generation_{side}") for a in each) for side in ("before", "after"))
         return ReloadAnswer(
             self.name, before, after, sum(a.points for a in each), time.perf_counter() - begin
@@ -155,11 +162,6 @@ class SeveralScenes(Simulated):
             scene.drop_client(client)
         self._metrics.drop_client(client)
 
-    def _sources(self) -> list[int]:
-        """Which of the scene's sources the first of each archive is."""
-        counts = [len(scene.info().sources) for scene, _ in self.archives]
-        return [0, *np.cumsum(counts[:-1]).tolist()]
-
     def _each(
         self,
         k: int,
@@ -176,14 +178,16 @@ class SeveralScenes(Simulated):
         effort = make_effort(tolerance, budget_ms, budget_visits)
         visits = np.zeros(k, np.int64)
         answers: list[_A] = []
-        for archive, first in zip(self._archives, self._sources(), strict=True):
+        first = 0
+        for archive in self._archives:
             with archive.scene.take() as opened:
                 data = opened.radius_model(radius_model)
                 ask, scan = prepare(archive, opened)
                 found = in_budget(ask, data, effort._replace(scan=scan), visits)
+                answers.append(carried(found, archive.pose, first))
+                first += sources_asked(opened)
             if effort.visits < NO_LIMIT:
                 visits += found.node_visits  # type: ignore[attr-defined]  # all answers have them
-            answers.append(carried(found, archive.pose, first))
         return merged(answers)
 
     def _ask(
@@ -353,9 +357,10 @@ class SeveralScenes(Simulated):
         try:
             for archive in self._archives:
                 taken.append(archive.scene.take())
+            firsts = [0, *np.cumsum([sources_asked(opened) for opened in taken]).tolist()]
             legs = [
                 Leg(opened.radius_model(radius_model), archive.pose, first, archive.poses_in(array))
-                for opened, archive, first in zip(taken, self._archives, self._sources(), strict=True)
+                for opened, archive, first in zip(taken, self._archives, firsts, strict=False)
             ]
             ask, total = along(legs, avatar, op, parameters)
 

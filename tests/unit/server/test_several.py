@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 import scans
 from clouds import signed_permutations
+from msgspec import structs
 from numpy.typing import NDArray
 from solidcloud.schemas.archive import Archive
 from solidcloud.schemas.arrays import array_fields
-from solidcloud.schemas.errors import BadRequestError, BadTransformError, UnknownAvatarError
+from solidcloud.schemas.errors import BadRequestError, BadTransformError, FormatError, UnknownAvatarError
 from solidcloud.server.app import Service
 from solidcloud.server.config import ServerConfig
 from solidcloud.server.posed import archive_pose, inverse_of, moved, under
@@ -416,6 +417,41 @@ def test_info_stats_and_reload_speak_of_all_archives(built: Built, rng: np.rando
         scene.warm()
         service = Service([scene], ServerConfig())
         assert service.scenes(None).ok
+
+
+def test_scans_are_numbered_by_the_archives_that_are_asked(
+    built: Built, both: SeveralScenes, monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator
+) -> None:
+    """And not by those that a reload puts there meanwhile, of which `info` speaks already."""
+    first, second = (scene for scene, _ in both.archives)
+    monkeypatch.setattr(first, "_info", structs.replace(first.info(), sources=first.info().sources * 3))
+    poses = near(rng, built.points[1], 20)
+    found, own = both.contacts("al", poses), first.contacts("al", poses)
+    assert found.pairs_found.sum() > own.pairs_found.sum()
+    assert set(found.scan_index.tolist()) <= {0, 1} and 1 in found.scan_index
+    parts = list(both.path("al", poses, "contacts"))
+    assert np.concatenate([part.scan_index for part in parts]).tobytes() == found.scan_index.tobytes()
+    assert second.info().sources
+
+
+def test_a_reload_that_fails_says_which_archives_are_new(
+    both: SeveralScenes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first, second = (scene for scene, _ in both.archives)
+    before = [scene._opened for scene in (first, second)]
+
+    def gone(_: Any) -> Any:
+        raise FormatError("hall: no archive here")
+
+    monkeypatch.setattr(second, "_open_store", gone)
+    said = "^archive 1: hall: no archive here: of 2 archives the first 1 are reloaded$"
+    with pytest.raises(FormatError, match=said):
+        both.reload()
+    assert [scene._opened is was for scene, was in zip((first, second), before, strict=True)] == [False, True]
+    monkeypatch.setattr(first, "_open_store", gone)
+    with pytest.raises(FormatError, match=r"^archive 0: hall: no archive here$"):
+        both.reload()
+    assert len(both.collide("al", np.eye(4)[None])) == 1
 
 
 def test_what_is_refused_says_why(built: Built, both: SeveralScenes) -> None:

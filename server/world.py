@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..schemas.answers import ContactsAnswers, DistanceAnswers, Verdict
+from ..schemas.index import MAX_NORMAL_REACH
 from ..schemas.scene import SceneFile
 from ..schemas.voxel_grid import UNITS_PER_METRE
 from .avatar import AvatarModel
@@ -286,7 +287,8 @@ class World:
     def normal(self, hit: Hit, reach: float) -> Vec | None:
         """The unit normal of the surface that was touched, towards the avatar; None where the points make none.
 
-        reach: points so near the one touched are its surface [m]; those SPARSE times as near, where these make none.
+        reach: points so near the one touched are its surface [m]; those SPARSE times as near, but
+        no farther than MAX_NORMAL_REACH, where these make none.
         """
         if hit.cloud is None or hit.avatar is None or hit.archive < 0:
             return hit.normal  # what is none of the scene's brings its own
@@ -306,7 +308,7 @@ class World:
                 place, way = moved(inverse, place[None])[0], turned(inverse, way[None])[0]
             found: Vec | None = normals.at(place, way, reach)
             if found is None:
-                found = normals.at(place, way, SPARSE * reach)
+                found = normals.at(place, way, min(SPARSE * reach, MAX_NORMAL_REACH))
             return found if found is None or pose is None else turned(pose, found[None])[0]
 
 

@@ -72,7 +72,7 @@ def nearest(frame: Frame, reach: float) -> DistanceAnswers | None:
                 return known.answers
         elif at_least - went(known.rows, rows, avatar) > reach + ROUNDED:
             return None
-        if at_least >= reach:
+        if at_least >= reach > ROUNDED:  # of no reach twice as far is no farther
             looked = reach + min(reach, AHEAD)
             ahead = _ahead(frame, reach, looked)
             if ahead is not None:

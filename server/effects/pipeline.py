@@ -23,6 +23,9 @@ from .frame import Body, Frame, Hit, Pose, Runner, Vec, size
 
 # What an effect usually takes follows what it took by this share.
 _FOLLOWS = 0.1
+# What a skipped effect is taken to need fades by this share a frame, so that it is tried again. What once took long, a
+# compiler's time or a disk's in it, would else be skipped for ever; what always does gets one frame in some dozens.
+_FADES = 0.02
 # Things touched that an answer names at most.
 _MOST_TOUCHED = 16
 
@@ -30,19 +33,28 @@ _MOST_TOUCHED = 16
 class Usual:
     """What an effect usually takes: seconds and node visits. The first frame says nothing: it compiles."""
 
-    __slots__ = ("frames", "seconds", "visits")
+    __slots__ = ("frames", "seconds", "tried", "visits")
 
     def __init__(self) -> None:
         self.frames, self.seconds, self.visits = 0, 0.0, 0.0
+        self.tried = False  # whether the next time it runs is the first after it was skipped
 
     def took(self, seconds: float, visits: int) -> None:
         """It took so much now."""
         self.frames += 1
         if self.frames == 1:
             return
-        share = max(_FOLLOWS, 1.0 / (self.frames - 1))
+        # What faded says nothing any more: a trial counts whole, or the next would follow at once.
+        share = 1.0 if self.tried else max(_FOLLOWS, 1.0 / (self.frames - 1))
+        self.tried = False
         self.seconds += share * (seconds - self.seconds)
         self.visits += share * (visits - self.visits)
+
+    def skipped(self) -> None:
+        """There was no room for it."""
+        self.tried = True
+        self.seconds *= 1.0 - _FADES
+        self.visits *= 1.0 - _FADES
 
 
 class Pipeline:
@@ -127,6 +139,7 @@ class Pipeline:
             skips = self._no_room(usual, now - begin, visits - since) if skip is None else name in skip
             if skips:
                 frame.skipped.append(name)
+                usual.skipped()
                 return
         runner.run(frame)
         frame.simulated.append(name)

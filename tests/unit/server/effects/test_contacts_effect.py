@@ -115,3 +115,14 @@ def test_of_several_archives_the_deepest_come_first(tmp_path: Path, rng: np.rand
     deepest = [cluster.deepest for cluster in found.clusters]
     assert deepest == sorted(deepest) and deepest[0] == pytest.approx(0.08 - 0.16, abs=1e-3)
     assert found.clusters[0].cloud == pytest.approx((2.0, 0.0, 0.02), abs=1e-6), "in the world"
+
+
+@pytest.mark.interpreted
+def test_without_a_margin_it_is_asked_once_a_frame_whether_anything_is_near(tmp_path: Path) -> None:
+    case = cases.build(tmp_path, ROW)
+    runner, body = contacts.make(Contacts(margin=0.0), None), body_of(BALL)
+    with Scene.open(case.archive, "scene") as scene:
+        world = world_of(scene)
+        for step in range(5):
+            assert report(runner, world, body, at(0.1 * step, 0, 0.3)) == ContactsReport()
+        assert world.asked == {"distance": 5, "contacts": 0}

@@ -14,6 +14,8 @@ from solidcloud.schemas.errors import BadTransformError
 from solidcloud.schemas.moves import Moved
 from solidcloud.schemas.scene import Limits
 from solidcloud.server.avatar import make_avatar
+from solidcloud.server.effects.frame import Frame, Runner
+from solidcloud.server.world import World
 
 BALL = make_avatar([[0.0, 0, 0]], 0.2)
 
@@ -31,6 +33,18 @@ with Scene.open(sys.argv[1]) as scene:
 names = [name.rpartition(".")[2] for name in sys.modules if name.startswith("solidcloud.server.effects.")]
 print(*sorted(names), "solidcloud.server.normals" in sys.modules)
 """
+
+
+class Counted:
+    """An effect that takes some node visits more."""
+
+    def __init__(self, world: World, runner: Runner) -> None:
+        self.name, self.visits, self._world, self._runner = runner.name, 0, world, runner
+
+    def run(self, frame: Frame) -> None:
+        """As the effect."""
+        self._runner.run(frame)
+        self._world.count(self.visits)
 
 
 @pytest.fixture(scope="module")
@@ -97,6 +111,29 @@ def test_a_frame_without_room_skips_what_may_be_skipped_and_says_which(floor: ca
         moved = game.go(body, (0.05, 0, 0))
         assert moved.simulated == ["stop", "sweep"] and moved.skipped == ["slide", "ground", "proximity"]
         assert body.pose[0, 3] == 0.05
+
+
+@pytest.mark.interpreted
+def test_an_effect_that_once_took_long_is_tried_again(floor: cases.Case) -> None:
+    with play(floor.archive, Stop(), Proximity(), limits=Limits(frame_visits=10_000)) as game:
+        body = game.body(BALL, at(0, 0, 0.5))
+        runner, long = Counted(game.world, game.pipeline.runners[-1]), 1_000_000
+        game.pipeline.runners[-1] = runner
+
+        def frames(count: int) -> list[bool]:
+            moves = [game.go(body, (0.001 * (-1) ** number, 0, 0)) for number in range(count)]
+            return [bool(moved.skipped) for moved in moves]
+
+        assert not any(frames(4))
+        runner.visits = long
+        assert not any(frames(1))
+        runner.visits = 0
+        # 100 times the budget, fading by 2 % a frame, from the share of it that the mean took up.
+        after = frames(200)
+        assert 50 < after.count(True) < 180 and after == sorted(after, reverse=True)
+        runner.visits = long
+        always = frames(1000)
+        assert 2 <= always.count(False) <= 6, "what always takes too long is hardly ever tried"
 
 
 @pytest.mark.interpreted

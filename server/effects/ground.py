@@ -141,9 +141,9 @@ class Grounded:
         """
         first: Below | None = None
         aside = np.zeros(3)
-        for hit in frame.hits[-_ASIDES:]:  # what the avatar stands beside now
-            if hit.normal is not None and abs(dot(hit.normal, frame.world.up)) < _EDGE_RISES:
-                aside = _ASIDE * hit.normal
+        for met in frame.hits[-_ASIDES:]:  # what the avatar stands beside now
+            if met.normal is not None and abs(dot(met.normal, frame.world.up)) < _EDGE_RISES:
+                aside = _ASIDE * met.normal
         beside = bool(aside.any())
         for _ in range(_ASIDES):
             begin = frame.pose

@@ -48,8 +48,8 @@ class Stepping:
         if rose is None:
             frame.pose, frame.verdict = before, verdict
         else:
-            frame.reports["stepped"] = rose
-            frame.left = frame.wish[:3, 3] - rose * frame.world.up - frame.pose[:3, 3]
+            frame.reports["stepped"] = max(rose, 0.0)
+            frame.left = frame.wish[:3, 3] + rose * frame.world.up - frame.pose[:3, 3]
         del frame.hits[hits:]
 
     def _climb(self, frame: Frame, along: Vec, length: float, least: float) -> float | None:
@@ -70,6 +70,9 @@ class Stepping:
         if rose - lower > self._height + DEAD_BAND:
             return None
         self._ground.lower(frame, below, lower)
+        # Down beside something it may have been led back.
+        if dot(frame.pose[:3, 3] - begin, along) < least:
+            return None
         return self._rise(start, frame.pose, up)
 
     @staticmethod

@@ -28,6 +28,7 @@ class Sweeping:
 
     def go(self, frame: Frame, to: Pose) -> Hit | None:
         """Go towards a pose as far as nothing is touched."""
+        hit: Hit | None = None
         for _ in range(_PUSHES):
             if frame.pose.tobytes() == to.tobytes():
                 return None
@@ -38,7 +39,8 @@ class Sweeping:
             settle(frame, to, hit.fraction - way_back(frame, to, hit, self.skin), hit.fraction)
             if not gives_way(frame, hit, to):
                 break
-        note(frame, hit)
+        if hit is not None:
+            note(frame, hit)
         return hit
 
 

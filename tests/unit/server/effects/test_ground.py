@@ -15,7 +15,7 @@ from solidcloud.schemas.effects import Ground, Slide, Step, Stop, Sweep
 from solidcloud.schemas.moves import Moved
 from solidcloud.server.effects.frame import Body
 
-FRAMES = 60 if not INTERPRETED else 8
+FRAMES = 60 if not INTERPRETED else 30
 CLEARANCE = 0.03
 PERSON = pushed.person()
 ALL = (Stop(), Sweep(), Slide(), Step(), Ground())

@@ -55,7 +55,6 @@ def test_a_motion_ends_a_skin_before_what_it_meets(wall: cases.Case, skin: float
         assert body.pose.tobytes() == before
 
 
-@pytest.mark.interpreted
 def test_grazing_a_wall_keeps_the_skin_as_far_as_a_way_back_of_four(wall: cases.Case) -> None:
     with play(wall.archive, Stop(skin=0.01), Sweep()) as game:
         body = game.body(BALL, at(-TOUCH - 0.05, -0.6, 0))

@@ -1,0 +1,103 @@
+"""Several archives as one, asked about one avatar: where they lie, which is met first, and what is held."""
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pushed
+import pytest
+from pushed import at
+from solidcloud.schemas.answers import Verdict
+from solidcloud.schemas.scene import ArchiveItem, SceneFile
+from solidcloud.server.avatar import make_avatar
+from solidcloud.server.effects.frame import Hit
+from solidcloud.server.scene import Scene
+from solidcloud.server.world import World
+
+BALL = make_avatar([[0.0, 0, 0]], 0.2)
+# A quarter turn about z, and a shift.
+THERE = at(2.0, 1.0, 0.5, np.pi / 2)
+THERE[:2, :2] = [[0.0, -1.0], [1.0, 0.0]]
+
+
+def world_of(*archives: tuple[Scene, np.ndarray | None]) -> World:
+    """The world of scenes at poses."""
+    file = SceneFile(format=1, archives=[ArchiveItem(path=scene.name) for scene, _ in archives])
+    return World(SimpleNamespace(archives=list(archives)), file)
+
+
+@pytest.mark.interpreted
+def test_an_archive_at_a_pose_is_met_where_it_lies_and_first_comes_first(tmp_path: Path) -> None:
+    wall = pushed.plane((0, -0.8, -0.8), (0, 0.8, 0.8))
+    case = pushed.build(tmp_path, wall)
+    carried = pushed.build(tmp_path, wall @ THERE[:3, :3].T + THERE[:3, 3])
+    motions = [
+        (at(2, 0.3, 0.5), at(2, 1.6, 0.5)),
+        (at(2.1, 1.8, 0.4), at(2, 0.1, 0.5)),
+        (at(1, 0, 0), at(-1, 0, 0)),
+        (at(2, 0.5, 0.5), at(0, 0, 0)),
+        (at(1, 0.2, 0), at(1, 0.3, 0)),
+    ]
+    with (
+        Scene.open(case.archive) as one,
+        Scene.open(case.archive) as other,
+        Scene.open(carried.archive) as plain,
+    ):
+        world, alone = world_of((one, None), (other, THERE)), world_of((plain, None))
+        first = world_of((one, None))
+        seen = set()
+        for begin, end in motions:
+            found = world.sweep(BALL, begin, end)
+            parts = [each.sweep(BALL, begin, end) for each in (first, alone)]
+            expected = min(parts, key=lambda each: each.lower)
+            seen.add((found.verdict, found.archive if found.verdict else 0))
+            assert found.verdict == expected.verdict
+            assert found.lower == pytest.approx(expected.lower, abs=1e-6)
+            if found.cloud is None or found.avatar is None:
+                continue
+            np.testing.assert_allclose(found.cloud, expected.cloud, atol=1e-3)
+            hit = Hit(found.lower, found.verdict, found.avatar, found.cloud, "", found.archive)
+            normal = world.normal(hit, 0.1 if not pushed.INTERPRETED else 0.5)
+            assert normal is not None and normal @ (found.avatar - found.cloud) > 0
+            axis = 0 if found.archive == 0 else 1
+            assert abs(normal[axis]) == pytest.approx(1.0, abs=1e-3)
+            pose, _ = world.between(BALL, begin, end, found.upper)
+            assert world.collide(BALL, pose) == Verdict.CONTACT
+            deepest = world.deepest(BALL, pose)
+            assert deepest is not None and deepest.archive == found.archive
+            nearest = world.nearest(found.cloud + 0.001, 0.05)
+            assert nearest is not None and nearest.cloud is not None and nearest.archive == found.archive
+            np.testing.assert_allclose(nearest.cloud, found.cloud, atol=1e-6)
+        assert seen == {(Verdict.CONTACT, 0), (Verdict.CONTACT, 1), (Verdict.CLEAR, 0)}
+        assert world.collide(BALL, at(2, 0.1, 0.5)) == Verdict.CLEAR
+        assert world.deepest(BALL, at(2, 0.1, 0.5)) is None
+        assert world.nearest(np.array([2.0, 0.1, 0.5]), 0.05) is None
+        assert world.lowest() == pytest.approx(-0.8 - pushed.RADIUS, abs=2e-3)
+
+
+@pytest.mark.interpreted
+def test_what_is_held_stays_through_a_reload_and_no_longer(tmp_path: Path) -> None:
+    case = pushed.build(tmp_path, pushed.plane((0, -0.4, -0.4), (0, 0.4, 0.4)))
+    with Scene.open(case.archive) as scene:
+        world = world_of((scene, None))
+        before = world.generations()
+        with world as seen:
+            opened = seen[0].opened
+            scene.reload()
+            assert world.generations() == before and not opened.ended.is_set()
+            assert world.collide(BALL, at(0.1, 0, 0)) == Verdict.CONTACT
+        assert opened.ended.wait(10)
+        assert world.generations() != before
+        assert world.collide(BALL, at(0.1, 0, 0)) == Verdict.CONTACT
+
+
+@pytest.mark.interpreted
+def test_visits_add_up(tmp_path: Path) -> None:
+    case = pushed.build(tmp_path, pushed.plane((0, -0.4, -0.4), (0, 0.4, 0.4)))
+    with Scene.open(case.archive) as scene:
+        world = world_of((scene, None))
+        before = world.visits
+        swept = world.sweep(BALL, at(1, 0, 0), at(0, 0, 0))
+        assert world.visits == before + swept.visits and swept.visits > 0
+        world.collide(BALL, at(0.1, 0, 0))
+        assert world.visits > before + swept.visits

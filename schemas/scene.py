@@ -79,8 +79,8 @@ class Spawn(_Part, frozen=True):
 
 class Limits(_Part, frozen=True):
     """What a scene may cost. users: at a time.  frame_ms: of one user's frame; effects it has no room for are skipped,
-    `stop` and `sweep` never.  frame_visits: its twin that needs no clock, node visits.  longest_move: of a frame [m].
-    """
+    `stop`, `sweep`, `objects` and `crowd` never.  frame_visits: its twin that needs no clock, node visits.
+    longest_move: of a frame [m]."""
 
     users: Annotated[int, msgspec.Meta(ge=1, le=1024)] = 64
     frame_ms: Annotated[float, msgspec.Meta(gt=0, le=10_000)] | None = None

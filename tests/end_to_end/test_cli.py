@@ -14,7 +14,20 @@ from solidcloud.server.cli import run
 from solidcloud.server.report.serving import free_port, served
 from solidcloud.server.verbs.options import parse_bytes
 
-VERBS = "build info validate serve query accuracy add remove reload top replay make".split()
+VERBS = [
+    "build",
+    "info",
+    "validate",
+    "serve",
+    "query",
+    "accuracy",
+    "add",
+    "remove",
+    "reload",
+    "top",
+    "replay",
+    "make",
+]
 NESTED = ["make facade", "make town", "make figure", "make walk", "scene", "scene new", "scene check"]
 RADIUS = 0.05
 

@@ -1,5 +1,7 @@
 """A server started from a scene file serves what it says: over zenoh, to clients that add nothing."""
 
+import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -115,6 +117,38 @@ def test_a_server_of_a_scene_file_serves_what_it_says(folder: Path) -> None:
                 assert moved.proximity is not None
         with Client(endpoint, scene="two-floors") as other:
             assert np.array_equal(other.collide("ball", poses).verdict == Verdict.CONTACT, found)
+
+
+def test_a_new_scene_file_is_checked_served_and_asked(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As a user does it, in folders with spaces in their names."""
+    home = tmp_path / "my scenes"
+    home.mkdir()
+    shutil.copytree(folder / "lower", tmp_path / "my scans/ground floor")
+    np.savetxt(tmp_path / "my ball.xyz", [[0.0, 0.0, 0.0], [0.0, 0.0, 0.1]])
+    (home / "poses of a walk.csv").write_text("t,x,y,z,qw,qx,qy,qz\n0,0,0,0.5,1,0,0,0\n1,0,0,0.02,1,0,0,0\n")
+    file = home / "ground.toml"
+    begin = ["scene", "new", str(tmp_path / "my scans/ground floor"), "-o", str(file)]
+    begin += ["--avatar", str(tmp_path / "my ball.xyz"), "--effects", "stop,sweep,proximity"]
+    assert run(begin) == 0
+    assert run(["scene", "check", str(file), "--json"]) == 0
+    checked = json.loads(capsys.readouterr().out.partition("\n")[2])
+    assert checked["order"] == ["stop", "sweep", "proximity"] and checked["notes"] == []
+    with served(file, None) as endpoint:
+        with Client(endpoint, scene="ground") as client:
+            info = client.info()
+            assert info.effects == checked["order"] and info.points == checked["archives"][0]["points"]
+            assert [avatar.name for avatar in info.avatars] == ["my-ball"]
+        ask = ["query", "--scene", "ground", "--connect", endpoint, "--avatar", str(tmp_path / "my ball.xyz")]
+        ask += ["--poses", str(home / "poses of a walk.csv"), "--json"]
+        capsys.readouterr()
+        assert run(ask) == 0
+        # Of points 0.1 m apart both radii are 0.05.
+        assert [a["verdict"] for a in json.loads(capsys.readouterr().out)["answers"]] == ["clear", "contact"]
+        assert run([*ask, "--op", "move"]) == 0
+        (moved,) = json.loads(capsys.readouterr().out)
+        assert moved["simulated"] == checked["order"] and 0.1 < moved["pose"][0][2][3] < 0.11
 
 
 def test_a_server_of_a_scene_file_that_is_wrong_ends_with_one_line(folder: Path) -> None:

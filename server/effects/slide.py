@@ -7,8 +7,8 @@ the wish, and never farther than what was left: no energy appears.
 A surface is a plane by the smoothed normal of the scan points around the one that was touched. The scan's spheres make
 a flat wall bumpy, by up to their radius: where the plane is one that the frame has met already, a bump is in the way.
 The avatar goes off the surface by a few millimetres, and on; that counts where it led farther along the wish. So each
-frame of one wish gains on the one before or changes nothing, and nobody who pushes on trembles for ever. Nearly head on,
-what is left along a surface is mostly what the normal is off: an avatar that pushes so stays, as by friction (STICK).
+frame of one wish gains on the one before or changes nothing, and nobody who pushes on trembles for ever. Nearly head
+on, what is left along a surface is mostly what the normal is off: who pushes so stays, as by friction (STICK).
 
 Turning: the wish's screw motion is tried first; what is left of its translation slides at the orientation reached, and
 then what is left of the turn is tried on the spot.

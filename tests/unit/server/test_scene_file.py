@@ -1,7 +1,10 @@
 """What a scene file says, opened: archives, budgets, radius model, avatars for everybody, faults with their place."""
 
+import os
+import threading
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,6 +27,7 @@ from solidcloud.schemas.messages import (
     encode,
 )
 from solidcloud.schemas.scene import parse_scene
+from solidcloud.server import scene_file
 from solidcloud.server.cli import run
 from solidcloud.server.scene import Scene
 from solidcloud.server.scene_check import check_scene_file
@@ -35,6 +39,7 @@ from solidcloud.server.scene_file import (
     share_budget,
     store_opener,
 )
+from solidcloud.server.several import SeveralScenes
 
 pytestmark = pytest.mark.interpreted
 
@@ -273,6 +278,39 @@ def test_too_small_a_cache_is_told(write: Write) -> None:
         open_scene(two, read_points=read_points, budget_bytes=10),
     ):
         pass
+
+
+@pytest.mark.parametrize(
+    "fails", ["store_opener", "simulate", "share_budget", "Scene.__init__", "SeveralScenes.__init__"]
+)
+def test_what_fails_half_way_leaves_no_file_open(
+    write: Write, monkeypatch: pytest.MonkeyPatch, fails: str
+) -> None:
+    through = '[[effects]]\neffect = "through"\nboxes = [{name = "hole", low = [-0.25, -9, -1], high = [0.25, 9, 1]}]\n'
+    file = write(TOP + '[[archives]]\npath = "floor"\n' + BALL + STOP + through)
+    with open_scene(file, read_points=read_points):  # what it imports opens files
+        pass
+    calls: list[int] = []
+    place, _, method = fails.partition(".")
+    at_fault: Any = {"Scene": Scene, "SeveralScenes": SeveralScenes}.get(place, scene_file)
+    name = method or place
+    right = getattr(at_fault, name)
+
+    def fault(*what: Any, **options: Any) -> Any:
+        calls.append(1)
+        if len(calls) == 2 or place not in ("store_opener", "Scene"):
+            raise BadRequestError("no")
+        return right(*what, **options)
+
+    monkeypatch.setattr(at_fault, name, fault)
+    before = os.listdir("/proc/self/fd")
+    with (
+        pytest.raises(BadRequestError, match=r"hall.toml: \$.*no"),
+        open_scene(file, read_points=read_points, policy="lru+prefetch"),
+    ):
+        pass
+    assert calls and len(os.listdir("/proc/self/fd")) == len(before)
+    assert not [each for each in threading.enumerate() if each.name.startswith("solidcloud")]
 
 
 def test_an_error_keeps_its_kind_and_its_paths() -> None:

@@ -12,7 +12,9 @@ from solidcloud.builder import dense
 from solidcloud.builder import normals as normals_module
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.generation import add_scans, remove_scans
-from solidcloud.builder.kernels.neighbours import BLOCK
+from solidcloud.builder.kernels.neighbours import BLOCK, FAN, bound_boxes, box_starts
+from solidcloud.builder.kernels.normals import box_sums
+from solidcloud.builder.kernels.octree import voxel_codes
 from solidcloud.builder.normals import voxel_normals
 from solidcloud.builder.radius import voxel_points
 from solidcloud.builder.verify import verify_archive
@@ -47,6 +49,33 @@ def test_codes_are_those_of_the_definition(kind: str, reach: int) -> None:
     assert found.tolist() == expected
     if kind in ("plane", "corner") and reach == 900:
         assert np.count_nonzero(found != NONE) > len(local) / 2
+
+
+def test_sums_of_boxes_are_those_of_their_points_and_of_those_that_fit_no_reach_zeros() -> None:
+    rng = np.random.default_rng(7)
+    local = np.unique(rng.integers(0, STEPS, (FAN * FAN * BLOCK + 5, 3), dtype=np.int32), axis=0)
+    local = np.ascontiguousarray(local[np.argsort(voxel_codes(local))])
+    times = rng.integers(1, 5, len(local))
+    starts = box_starts(len(local))
+    boxes = bound_boxes(local, starts)
+    assert len(starts) == 5, "three levels of boxes over the blocks"
+    own, zeros = np.repeat(local, times, axis=0).astype(np.int64), 0
+    at = np.repeat(np.arange(len(local)), times)
+    for square in (400**2, 1000**2, 9000**2):
+        sums = box_sums(local, times, boxes, starts, square)
+        for level in range(4):
+            size = BLOCK * FAN**level
+            for box in range(starts[level], starts[level + 1]):
+                away = own[at // size == box - starts[level]] - boxes[box, :3]
+                fits = ((boxes[box, 3:].astype(np.int64) - boxes[box, :3]) ** 2).sum() <= 4 * square
+                x, y, z = away.T
+                expected = [
+                    len(away),
+                    *(c.sum() for c in (x, y, z, x * x, y * y, z * z, y * z, z * x, x * y)),
+                ]
+                assert sums[box].tolist() == (expected if fits else [0] * 10)
+                zeros += not fits
+    assert zeros > 10
 
 
 def test_order_changes_nothing_and_a_heap_costs_what_a_point_does() -> None:

@@ -7,6 +7,7 @@ import cases
 import cases_contacts
 import numpy as np
 import pytest
+from effect_frames import flip_a_byte
 from solidcloud.server.avatar import make_avatar
 from solidcloud.server.by_scan import ANY_SCAN, ScanGaps, gaps_by_scan
 from solidcloud.server.effort import Effort
@@ -86,3 +87,40 @@ def test_trees_of_several_levels_give_the_gaps_of_all_pairs_at_the_same_cost(tmp
             visits.append(found.node_visits)
             tests.append(found.point_tests)
     assert visits == [105, 108, 76] and tests == [2432, 2400, 1248]
+
+
+@pytest.mark.interpreted
+def test_of_an_avatar_larger_than_nodes_of_the_scan_all_pairs_count_at_the_same_cost(tmp_path: Path) -> None:
+    """A row of spheres along each axis by turns, through a slab of points: the avatar's nodes are opened first."""
+    rng = np.random.default_rng(6)
+    points = rng.uniform(0, 1, (120, 3)) * [1, 1, 0.3]
+    case = cases_contacts.open_case(
+        tmp_path, points, rng, scan_count=3, voxel=2.0, leaf=8, cell_points=20, degree=3
+    )
+    visits, tests = [], []
+    with closing(case.store):
+        for axis in range(3):
+            row = np.zeros((130, 3))
+            row[:, axis] = np.linspace(-2, 2, 130)
+            avatar = make_avatar(row, 0.02)
+            pose = cases.pose_of(np.eye(3), np.array([0.4, 0.6, 0.15]))
+            gaps = np.linalg.norm((row + pose[:3, 3])[:, None] - points, axis=2).min(axis=0) - 0.03
+            found = gaps_by_scan(case.data, avatar, pose, 0.1, 3)
+            least = {s: gaps[case.numbers == s].min() for s in range(3)}
+            assert found.gaps == pytest.approx({s: g for s, g in least.items() if g <= 0.1}, abs=2e-4)
+            assert found.exact
+            visits.append(found.node_visits)
+            tests.append(found.point_tests)
+    assert visits == [84, 77, 83] and tests == [1792, 1632, 1376]
+
+
+@pytest.mark.interpreted
+def test_a_voxel_that_cannot_be_read_is_missing_and_the_rest_is_found(tmp_path: Path) -> None:
+    points = np.column_stack([np.arange(12) * 0.1, np.zeros(12), np.zeros(12)])
+    case = cases_contacts.open_case(tmp_path, points, np.random.default_rng(3), voxel=0.5)
+    flip_a_byte(case.store.archive.folder, (0, 0, 0))
+    with closing(case.store):
+        found = gaps_by_scan(case.data, BALL, POSE, 0.15, 2)
+        assert not found.exact and set(found.gaps) == {0, 1}
+        away = cases.pose_of(np.eye(3), np.array([0.9, 0.0, 0.13]))
+        assert gaps_by_scan(case.data, BALL, away, 0.02, 2).exact

@@ -6,10 +6,12 @@ import cases
 import numpy as np
 import pytest
 from solidcloud.schemas.answers import DistanceAnswers, Verdict
+from solidcloud.schemas.errors import BadTransformError
 from solidcloud.server import near as module
 from solidcloud.server.avatar import make_avatar
+from solidcloud.server.distance import distance
 from solidcloud.server.effort import Effort
-from solidcloud.server.near import QUICK_REACH, near
+from solidcloud.server.near import QUICK_REACH, QUICK_ROWS, near
 from solidcloud.server.scene import Scene
 
 BALL = make_avatar([[0.0, 0, 0]], 0.1)
@@ -93,3 +95,37 @@ def test_a_pose_that_cannot_be_written_to_is_taken(tmp_path: Path) -> None:
             near(scene._data, BALL, p, 0.5).signed_distance[0] for p in (pose, np.asfortranarray(pose), pose)
         ]
     assert len(set(found)) == 1 and np.isfinite(found[0])
+
+
+@pytest.mark.interpreted
+@pytest.mark.parametrize("radius", [0.0, 0.1])
+def test_centres_that_coincide_are_as_distance_says(tmp_path: Path, radius: float) -> None:
+    case = cases.build(tmp_path, ROW, voxel=1.0, resolution=1e-3, radius=radius)
+    ball = make_avatar([[0.0, 0, 0]], radius)
+    with Scene.open(case.archive) as scene:
+        data, pose = scene._data, above(0.5, 0.0)
+        expected = distance(data, ball, pose[None], 0.5)
+        found = near(data, ball, pose, 0.5)
+    assert found.hits == expected.misses > 0
+    assert found.signed_distance.tolist() == expected.signed_distance.tolist()
+    assert found.signed_distance[0] == pytest.approx(-2 * radius, abs=1e-7)
+    assert found.normal.tolist() == expected.normal.tolist() == [[0.0, 0.0, 0.0]]
+    assert found.verdict.tolist() == [Verdict.CONTACT]
+
+
+@pytest.mark.interpreted
+def test_more_voxels_than_one_call_looks_into_are_left_to_distance(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    left = Left(monkeypatch)
+    row = np.zeros((QUICK_ROWS + 1, 3))
+    row[:, 0] = 0.02 + 0.05 * np.arange(QUICK_ROWS + 1)
+    case = cases.build(tmp_path, row, voxel=0.05, resolution=1e-3)
+    with Scene.open(case.archive) as scene:
+        data = scene._data
+        for reach, calls in ((2.0, 1), (2.0, 2), (1.0, 2)):
+            found = near(data, BALL, above(1.62, 0.3), reach)
+            assert left.count == calls and found.signed_distance.tolist() == pytest.approx([0.19], abs=1e-3)
+        assert found.hits < QUICK_ROWS
+        with pytest.raises(BadTransformError):
+            near(data, BALL, np.diag([1.0, 1, -1, 1]), 0.1)

@@ -29,6 +29,7 @@ pytestmark = pytest.mark.interpreted
 INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
 COUNT = 150 if INTERPRETED else 1500
 REACH = 0.4 if INTERPRETED else 0.15
+VISITS = [3262, 3646, 4581]
 COARSE = 0.56  # of codes [degrees]
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -137,6 +138,20 @@ def test_codes_are_the_same_in_any_order_and_whatever_else_is_resident(tmp_path:
             backward = [normals.code(place, REACH) for place in reversed(places)]
             assert backward[::-1] == forward
             assert opened.data.residency.evictions > 0
+
+
+def test_what_is_looked_into_is_what_it_was(tmp_path: Path) -> None:
+    """What bounds leave out is in no answer: nodes visited for the same points."""
+    case = build(tmp_path, "corner", 150, voxel=8.0)
+    with asked(case.archive, most_bytes=0) as (opened, normals):
+        places = [place for place, *_ in judged(opened, case.points)]
+        visits = []
+        for reach in (0.02, 0.3, 1.0):
+            before = normals.visits
+            for place in places:
+                normals.code(place, reach)
+            visits.append(normals.visits - before)
+    assert visits == VISITS
 
 
 def test_of_an_evicted_voxel_nothing_is_kept_and_the_same_is_found(tmp_path: Path) -> None:

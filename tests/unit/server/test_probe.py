@@ -1,6 +1,7 @@
 """One motion, one pose in a kernel call: the answers of `sweep` and `collide` to the last bit."""
 
 from pathlib import Path
+from typing import Any
 
 import cases
 import naive_sweep
@@ -10,9 +11,11 @@ import scans
 import swept
 from numpy.typing import NDArray
 from solidcloud.schemas.answers import Verdict
+from solidcloud.server import probe as module
 from solidcloud.server.avatar import make_avatar
 from solidcloud.server.collide import collide
 from solidcloud.server.effort import EXACT, Effort
+from solidcloud.server.kernels.placing import SIMILARITY_TOLERANCE
 from solidcloud.server.probe import Probe, Swept
 from solidcloud.server.request import SceneData
 from solidcloud.server.sweep import sweep
@@ -99,3 +102,36 @@ def test_the_pose_between_is_the_sweeps(tmp_path: Path, rng: np.random.Generator
             np.testing.assert_allclose(pose, naive_sweep.pose_at(one, other, fraction), atol=1e-12)
         pose, _ = probe.between(np.array([1e6, 0, 0]), one, other, 0.0)
         np.testing.assert_allclose(pose, one, atol=1e-9)
+
+
+@pytest.mark.interpreted
+def test_what_is_resident_rigid_and_short_is_asked_in_one_call(
+    tmp_path: Path, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    points = scans.make_scan("plane", 5, 200)
+    case = cases.build(tmp_path, points)
+    first, last = swept.motions(rng, points, np.zeros((1, 3)), 6, 0.3, 0.2, 0.5)
+    probe, left = Probe(make_avatar([[0.0, 0, 0], [0.1, 0, 0]], 0.05)), []
+
+    def counted(*arguments: Any, **options: Any) -> Any:
+        left.append(arguments)
+        return sweep(*arguments, **options)
+
+    with swept.opened(case) as data:
+        same(probe, data, first, last)
+        monkeypatch.setattr(module, "sweep", counted)
+        used = data.residency.hits
+        same(probe, data, first, last)
+        assert not left and data.residency.hits > used
+        turned = np.tile(np.diag([0.0, 0.0, 1.0, 1.0]), (6, 1, 1))
+        turned[:, 0, 1], turned[:, 1, 0] = -1.0, 1.0
+        turned[:, :3, 3] = first[:, :3, 3]
+        same(probe, data, turned, turned)
+        assert not left
+        # Of a scale that `sweep` takes to be 1 only just: it says whether it is.
+        for size, calls in ((1 + 0.2 * SIMILARITY_TOLERANCE, 0), (1 + 0.4 * SIMILARITY_TOLERANCE, 6)):
+            scaled = first.copy()
+            scaled[:, :3, :3] *= size
+            left.clear()
+            same(probe, data, scaled, scaled)
+            assert len(left) == calls

@@ -58,9 +58,24 @@ AHEAD = tuple(
     )
 )
 
+# Of the tests of normals, those that ask kernels, without the slowest.
+NORMALS = tuple(
+    SERVER + f"test_normals.py::test_{name}"
+    for name in (
+        "what_is_stored_is_what_is_found_at_first_use",
+        "where_no_point_is_there_is_no_normal",
+        "normals_are_those_of_numpy",
+        "of_an_evicted_voxel_nothing_is_kept_and_the_same_is_found",
+        "what_is_kept_is_bounded_and_the_oldest_goes_first",
+        "warming_loads_nothing_and_leaves_nothing_to_compile",
+        "codes_are_the_same_in_any_order_and_whatever_else_is_resident",
+    )
+)
+
 TESTS: dict[str, tuple[str, ...]] = {
     "schemas/kernels/links.py": (SCHEMAS + "test_links.py",),
     "schemas/kernels/morton.py": (SCHEMAS + "test_morton.py",),
+    "schemas/kernels/normals.py": (SCHEMAS + "test_normals.py",),
     "schemas/kernels/rows.py": (SCHEMAS + "test_rows.py",),
     "builder/kernels/bisection.py": (BUILDER + "test_bisection.py",),
     "builder/kernels/bounding_sphere.py": (
@@ -98,6 +113,11 @@ TESTS: dict[str, tuple[str, ...]] = {
     "builder/kernels/records.py": (BUILDER + "test_records.py",),
     "builder/kernels/boxes.py": (BUILDER + "test_boxes.py",),
     "builder/kernels/lzf.py": (BUILDER + "test_lzf.py",),
+    "builder/kernels/normals.py": (
+        BUILDER + "test_normals.py::test_codes_are_those_of_the_definition",
+        BUILDER + "test_normals.py::test_sums_at_the_bound_are_exact",
+        BUILDER + "test_normals.py::test_order_changes_nothing_and_a_heap_costs_what_a_point_does",
+    ),
     "builder/kernels/octree.py": (
         BUILDER + "test_octree.py::test_cells_are_runs_of_the_sorted_codes",
         BUILDER + "test_octree.py::test_a_cell_is_split_only_when_it_must_be",
@@ -144,12 +164,17 @@ TESTS: dict[str, tuple[str, ...]] = {
         SERVER + "test_near.py",
         "tests/property/test_near.py::test_one_pose_has_the_bits_of_distance",
     ),
+    "server/kernels/meeting.py": (SERVER + "test_meeting.py",),
+    "server/kernels/meeting_placed.py": (SERVER + "test_meeting.py",),
+    "server/kernels/near_bodies.py": (SERVER + "test_meeting.py",),
+    "server/kernels/normals.py": NORMALS,
     "server/kernels/overlap.py": (*work("collide", "collide deep", "collide one"), *tangent("collide")),
     "server/kernels/placed.py": (SERVER + "test_placed.py", *tangent("collide"), *work("collide")),
     "server/kernels/priority.py": (
         *work("bounded deep", "collide bounded", "distance bounded"),
         *tangent("bounded"),
     ),
+    "server/kernels/probing.py": (SERVER + "test_probe.py",),
     "server/kernels/rays.py": work("raycast", "raycast bounded"),
     "server/kernels/sweep.py": work("sweep", "sweep bounded"),
     "server/kernels/voxel_tree.py": (SERVER + "test_voxel_tree.py",),

@@ -102,7 +102,7 @@ def find_archives(file: SceneFile, path: Path) -> list[Found]:
     found = []
     for number, item in enumerate(file.archives):
         with at_place(path, f"$.archives[{number}].path"):
-            store = Store((path.parent / item.path).resolve(), normals=normals_asked(file))
+            store = Store(_beside(path, item.path), normals=normals_asked(file))
         try:
             header = store.archive.header
             if file.radius_model is not None:
@@ -123,7 +123,7 @@ def read_avatars(file: SceneFile, path: Path, read_points: ReadPoints) -> list[F
     found = []
     meet = any(isinstance(effect, Objects | Crowd) for effect in file.effects)
     for number, item in enumerate(file.avatars):
-        avatar_file = (path.parent / item.file).resolve()
+        avatar_file = _beside(path, item.file)
         with at_place(path, f"$.avatars[{number}].file"):
             points = read_points(avatar_file)
         with at_place(path, f"$.avatars[{number}]"):
@@ -207,6 +207,15 @@ def _open_archives(
 
     with at_place(path, "$.archives"):
         return SeveralScenes(list(zip(scenes, poses, strict=True)), name)
+
+
+def _beside(path: Path, named: str) -> Path:
+    """A path that a scene file names. Links in it are followed whenever it is opened: a reload finds where they point
+    then."""
+    folder, there = path.parent.resolve(), Path(named)
+    while there.parts[:1] == ("..",):
+        folder, there = folder.parent, Path(*there.parts[1:])
+    return folder / there
 
 
 def _check_noise(file: SceneFile, path: Path, found: list[Found]) -> None:

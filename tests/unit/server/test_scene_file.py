@@ -1,6 +1,7 @@
 """What a scene file says, opened: archives, budgets, radius model, avatars for everybody, faults with their place."""
 
 import os
+import shutil
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -311,6 +312,32 @@ def test_what_fails_half_way_leaves_no_file_open(
         pass
     assert calls and len(os.listdir("/proc/self/fd")) == len(before)
     assert not [each for each in threading.enumerate() if each.name.startswith("solidcloud")]
+
+
+def test_a_reload_finds_where_a_link_points_then(folder: Path, tmp_path: Path) -> None:
+    """As it does of an archive that is served without a file; and the working directory may change meanwhile."""
+    (tmp_path / "one/deep").mkdir(parents=True)
+    shutil.copytree(folder / "floor", tmp_path / "first")
+    (tmp_path / "more.xyz").write_text("0 0 0\n0.1 0 0\n0 0.1 0\n")
+    build = [
+        "build",
+        str(tmp_path / "more.xyz"),
+        "-o",
+        str(tmp_path / "second"),
+        "--voxel",
+        "2",
+        "--jobs",
+        "1",
+    ]
+    assert run(build) == 0
+    (tmp_path / "current").symlink_to("first")
+    (tmp_path / "linked").symlink_to("one/deep")
+    (tmp_path / "one/deep/hall.toml").write_text('format = 1\n[[archives]]\npath = "./../../current/"\n')
+    with open_scene(tmp_path / "linked/hall.toml", read_points=read_points) as scene:
+        assert scene.info().points == 121
+        (tmp_path / "current").unlink()
+        (tmp_path / "current").symlink_to("second")
+        assert scene.reload().points == scene.info().points == 3
 
 
 def test_an_error_keeps_its_kind_and_its_paths() -> None:

@@ -25,15 +25,16 @@ _LAST_VERDICT = int(max(Verdict))
 _A = TypeVar("_A", bound=Cost)
 
 _BOUNDS = frozenset(("lower", "upper", "exact"))
-_PAIR_COLUMNS = ("avatar_point", "cloud_point", "signed_distance", "avatar_index", "scan_index", "cluster")
-_CLUSTER_COLUMNS = (
+# Of ContactsAnswers: columns of one row a pair, and of one a cluster.
+PAIR_COLUMNS = ("avatar_point", "cloud_point", "signed_distance", "avatar_index", "scan_index", "cluster")
+CLUSTER_COLUMNS = (
     "cluster_count", "cluster_deepest", "cluster_avatar", "cluster_cloud", "cluster_scan", "cluster_low",
     "cluster_high",
 )  # fmt: skip
 # Of the columns that have not one element an answer: the column of starts that says how many.
 _ROWS = {
-    **dict.fromkeys(_PAIR_COLUMNS, "pair_starts"),
-    **dict.fromkeys(_CLUSTER_COLUMNS, "cluster_starts"),
+    **dict.fromkeys(PAIR_COLUMNS, "pair_starts"),
+    **dict.fromkeys(CLUSTER_COLUMNS, "cluster_starts"),
 }
 # What `upper`, distances and vectors are where nothing is known; `lower` is a fraction or a length along a ray in some.
 _UNKNOWN = {"verdict": float(Verdict.UNKNOWN), "upper": np.inf, "distance": np.inf, "signed_distance": np.inf}

@@ -27,9 +27,12 @@ _ALMOST_RIGID = 1e-6
 _RIGID = 1e-12
 
 Matrix = Annotated[list[Annotated[list[float], msgspec.Meta(min_length=4, max_length=4)]], msgspec.Meta(min_length=4, max_length=4)]  # fmt: skip  # noqa: E501
+# `$` of Python's is before a line end, too.
 SceneName = Annotated[
     str,
-    msgspec.Meta(pattern=r"^[A-Za-z0-9._-]{1,64}$", description="1 to 64 of A-Z, a-z, 0-9, '.', '_' and '-'"),
+    msgspec.Meta(
+        pattern=r"^[A-Za-z0-9._-]{1,64}$(?!\n)", description="1 to 64 of A-Z, a-z, 0-9, '.', '_' and '-'"
+    ),
 ]
 PathText = Annotated[str, msgspec.Meta(min_length=1)]
 ItemName = Annotated[str, msgspec.Meta(min_length=1, max_length=64)]

@@ -21,6 +21,7 @@ from ..schemas.answers import (
     Verdict,
     WithinAnswers,
 )
+from ..schemas.columns import CLUSTER_COLUMNS, PAIR_COLUMNS
 from .posed import Pose, moved, moved_boxes, turned
 
 _A = TypeVar("_A", bound=Cost)
@@ -30,12 +31,6 @@ _PLACES = (
 )  # fmt: skip
 _SUMS = ("voxels_missing", "node_visits", "point_tests", "steps")
 _MOST = np.iinfo(np.uint32).max
-# Of ContactsAnswers: columns of one row a pair, and of one a cluster.
-_PAIR = ("avatar_point", "cloud_point", "signed_distance", "avatar_index", "scan_index", "cluster")
-_CLUSTER = (
-    "cluster_count", "cluster_deepest", "cluster_avatar", "cluster_cloud", "cluster_scan", "cluster_low",
-    "cluster_high",
-)  # fmt: skip
 
 
 def carried(answers: _A, pose: Pose | None, first_source: int = 0) -> _A:
@@ -208,13 +203,13 @@ def _contacts(answers: Sequence[ContactsAnswers]) -> dict[str, Any]:
     cloud = np.concatenate([a.cluster_cloud for a in answers])[clusters]
     order = np.lexsort((*cloud.T[::-1], deepest, cluster_rows))
     clusters = clusters[order]
-    fields |= {name: np.concatenate([_of(a, name) for a in answers])[clusters] for name in _CLUSTER}
+    fields |= {name: np.concatenate([_of(a, name) for a in answers])[clusters] for name in CLUSTER_COLUMNS}
     fields["cluster_starts"] = cluster_starts
     # Where each archive's own cluster of each pose went, from the pose's first.
     place = np.empty(len(clusters), np.int64)
     place[clusters] = np.arange(len(clusters)) - cluster_starts[cluster_rows[order]]
     pairs, pair_starts, pair_rows = _by_pose(answers, "pair_starts", k)
-    columns = {name: np.concatenate([_of(a, name) for a in answers])[pairs] for name in _PAIR}
+    columns = {name: np.concatenate([_of(a, name) for a in answers])[pairs] for name in PAIR_COLUMNS}
     columns["cluster"] = place[_own_clusters(answers)][pairs].astype(np.int32)
     keys = (columns["avatar_index"], *columns["avatar_point"].T[::-1], *columns["cloud_point"].T[::-1])
     order = np.lexsort((*keys, columns["signed_distance"], pair_rows))
@@ -248,7 +243,7 @@ def limited(answers: ContactsAnswers, limit: int) -> ContactsAnswers:
         return answers
     starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
     rows = np.arange(starts[-1]) + np.repeat(answers.pair_starts[:-1] - starts[:-1], counts)
-    columns = {name: _of(answers, name)[rows] for name in _PAIR}
+    columns = {name: _of(answers, name)[rows] for name in PAIR_COLUMNS}
     return structs.replace(answers, pair_starts=starts, **columns)
 
 

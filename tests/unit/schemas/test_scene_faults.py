@@ -61,6 +61,12 @@ FAULTS = {
             "`limits` of the file itself stands above its first [table]",
         ],
     ),
+    "a line end in an avatar's name": (
+        TOP + '[[avatars]]\nname = "a\\n"\nfile = "a.ply"\n',
+        5,
+        "$.avatars[0].name",
+        ['found "a\\n"', "1 to 64 of A-Z, a-z, 0-9"],
+    ),
     "name": (
         'format = 1\nname = "a b"\n' + TOP[11:],
         2,

@@ -27,6 +27,10 @@ from .going import first_hit, note, settle
 
 # Feet this near to their height are left there [m]: at rest nothing moves.
 DEAD_BAND = 1e-4
+# Who stands and goes on is left at its height within so large a share of `clearance`: a floor's bumps would move it up
+# and down in every frame, each time by a motion that is swept. Of the 1,200 frames of
+# the façade's walk 1,017 take two questions, without it 558.
+BAND = 0.2
 # And beside a wall, by whose bumps the way up and down leads.
 ASIDE_BAND = 5e-3
 # A frame of gravity lasts no longer [s].
@@ -118,7 +122,9 @@ class Grounded:
             frame.on_ground, frame.fall_speed = True, 0.0
             lower = below.free - self.clearance
             self._remember(frame, hit, below.normal)
-            band = ASIDE_BAND if below.aside else DEAD_BAND
+            band = max(DEAD_BAND, BAND * self.clearance) if stood else DEAD_BAND
+            if below.aside:
+                band = max(band, ASIDE_BAND)
             if lower > band:
                 self.lower(frame, below, lower)
             elif lower < -band:

@@ -20,6 +20,13 @@ INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
 
 ORIGIN = np.array([3.0, -20.0, 500.0])
 TOLERANCE = 1e-6
+WORK = [
+    (-1, -1, -1, 72, 2976),
+    (-1, -1, -1, 39, 0),
+    (-1, 0, 1, 221, 7936),
+    (-1, 0, -1, 102, 928),
+    (-1, 0, -1, 78, 352),
+]
 
 
 class Asked(NamedTuple):
@@ -46,6 +53,7 @@ def scratch_of(*models: AvatarModel) -> placed.Scratch:
 def ask(
     a: AvatarModel, first: NDArray[np.float64], last: NDArray[np.float64],
     b: AvatarModel, poses: NDArray[np.float64], margin: float = 0.0, until: float = np.inf,
+    scratch: placed.Scratch | None = None,
 ) -> Asked:  # fmt: skip
     """Ask for all bodies at once."""
     ends = [pose.copy() for pose in (first, last)]
@@ -54,7 +62,7 @@ def ask(
     witness, named = np.full((2, 3), np.nan), np.full(2, -1)
     row, fraction = kernel.sweep_bodies(
         a.arrays, box_of(a), units_of(a), *ends, b.arrays, poses, units_of(b), np.arange(len(poses)), ORIGIN,
-        int(np.rint(margin * naive.UNITS)), TOLERANCE, until, witness, named, scratch_of(a, b),
+        int(np.rint(margin * naive.UNITS)), TOLERANCE, until, witness, named, scratch or scratch_of(a, b),
     )  # fmt: skip
     if row >= 0:
         point = b.points[b.rows[named[0], named[1]]]
@@ -214,3 +222,51 @@ def test_bodies_whose_bounds_a_motion_does_not_meet_are_not_touched(turn: float)
                     continue
                 assert ask(a, first, last, b, poses[row : row + 1]).row < 0, (row, poses[row].tolist())
     assert 0 < near < (20 if INTERPRETED else 200)
+
+
+def test_what_is_looked_at_is_what_it_was() -> None:
+    """What bounds leave out is in no answer: node visits and point tests of fixed motions, and how far they go."""
+    rng = np.random.default_rng(9)
+    a = make_avatar(rng.normal(size=(70, 3)) * np.array([0.2, 0.05, 0.3]), 0.02)
+    b = make_avatar(rng.normal(size=(150, 3)) * np.array([0.3, 0.02, 0.3]), 0.015)
+    found = []
+    for way, turn in ((1.0, 0.0), (30.0, 0.0), (0.5, 0.7), (0.0, 3.1), (5.0, 2.0)):
+        scratch, rows = scratch_of(a, b), []
+        for _ in range(3):
+            first, last = random_motion(rng, way, turn)
+            poses = [cases.pose_of(cases.random_rotation(rng), ORIGIN + rng.normal(size=3)) for _ in range(2)]
+            rows.append(ask(a, first, last, b, np.array(poses), scratch=scratch).row)
+        found.append((*rows, *scratch.counters.tolist()))
+    assert found == WORK
+
+
+def test_bounds_of_bodies_and_of_motions_are_no_wider_than_they_must_be() -> None:
+    rng = np.random.default_rng(11)
+    box = np.array([[-0.3, -0.1, 0.2], [0.5, 0.4, 1.9]])
+    corners = np.array([[x, y, z] for x in box[:, 0] for y in box[:, 1] for z in box[:, 2]])
+    bound = np.empty((2, 3))
+    for _ in range(20):
+        pose = cases.pose_of(cases.random_rotation(rng), ORIGIN + rng.normal(size=3))
+        near_bodies.bound_body(box, pose, ORIGIN, 0.07, bound)
+        placed_corners = corners @ pose[:3, :3].T + pose[:3, 3] - ORIGIN
+        low, high = placed_corners.min(axis=0) - 0.07, placed_corners.max(axis=0) + 0.07
+        assert ((bound[0] < low) & (low < bound[0] + 1e-6)).all()
+        assert ((bound[1] > high) & (high > bound[1] - 1e-6)).all()
+    # A metre along each axis either way: bodies a millimetre beyond its bounds, and as much within.
+    first = np.eye(4)
+    kinds = np.full(4, 2, np.uint8)
+    for axis in range(3):
+        for way in (-1.0, 1.0):
+            last = first.copy()
+            last[axis, 3] = way
+            low, high = box[0, axis] - 0.07 + min(way, 0.0), box[1, axis] + 0.07 + max(way, 0.0)
+            bounds = np.tile([[-1.0] * 3, [3.0] * 3], (4, 1, 1))
+            edges = [low - 1e-3, low + 1e-3, high - 1e-3, high + 1e-3]
+            bounds[:, 0, axis] = [-9.0, -9.0, edges[2], edges[3]]
+            bounds[:, 1, axis] = [edges[0], edges[1], 9.0, 9.0]
+            rows = np.full(5, -7)
+            assert near_bodies.find_near(box, first, last, 0.07, bounds, kinds, 6, -1, rows) == 2
+            assert rows.tolist() == [1, 2, -7, -7, -7]
+            assert near_bodies.find_near(box, first, last, 0.07, bounds, kinds, 5, -1, rows) == 0
+            assert near_bodies.find_near(box, first, last, 0.07, bounds, kinds, 2, 1, rows) == 1
+            assert rows[0] == 2

@@ -1,5 +1,6 @@
 """One motion, one pose in a kernel call: the answers of `sweep` and `collide` to the last bit."""
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from solidcloud.server import probe as module
 from solidcloud.server.avatar import make_avatar
 from solidcloud.server.collide import collide
 from solidcloud.server.effort import EXACT, Effort
+from solidcloud.server.kernels import probing as kernel
 from solidcloud.server.kernels.placing import SIMILARITY_TOLERANCE
 from solidcloud.server.probe import Probe, Swept
 from solidcloud.server.request import SceneData
@@ -22,6 +24,7 @@ from solidcloud.server.sweep import sweep
 
 Poses = NDArray[np.float64]
 COUNT = 12
+INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
 
 
 def same(probe: Probe, data: SceneData, first: Poses, last: Poses, tolerance: float = 1e-6) -> list[Swept]:
@@ -135,3 +138,46 @@ def test_what_is_resident_rigid_and_short_is_asked_in_one_call(
             left.clear()
             same(probe, data, scaled, scaled)
             assert len(left) == calls
+
+
+@pytest.mark.interpreted
+def test_a_motion_that_would_keep_others_waiting_is_left_to_sweep(
+    tmp_path: Path, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    points = scans.make_scan("plane", 5, 200)
+    case = cases.build(tmp_path, points)
+    first, last = swept.motions(rng, points, np.zeros((1, 3)), 6, 0.3, 0.2, 0.5)
+    probe, left = Probe(make_avatar([[0.0, 0, 0], [0.1, 0, 0]], 0.05)), []
+
+    def counted(*arguments: Any, **options: Any) -> Any:
+        left.append(arguments)
+        return sweep(*arguments, **options)
+
+    with swept.opened(case) as data:
+        looked = [each.visits for each in same(probe, data, first, last)]
+        # Compiled, a kernel has taken the figure up already.
+        monkeypatch.setattr(kernel, "MOST_VISITS", 3)
+        monkeypatch.setattr(module, "sweep", counted)
+        same(probe, data, first, last)
+        assert max(looked) > 3 and (len(left) > 0) == INTERPRETED
+
+
+@pytest.mark.interpreted
+def test_a_pose_between_holds_where_the_origin_comes_off_again(rng: np.random.Generator) -> None:
+    probe = Probe(make_avatar([[0.0, 0, 0], [0.1, 0, 0]], 0.05))
+    said = set()
+    for size in (0.1, 1e3, 1e6):
+        for _ in range(20):
+            origin = rng.uniform(-size, size, 3)
+            first, last = swept.motions(rng, origin[None], probe.avatar.points, 1, 0.3, 0.5, 0.5)
+            one, other = first[0].copy(), last[0].copy()
+            one[:3, 3] -= origin
+            other[:3, 3] -= origin
+            near, _ = probe.between(np.zeros(3), one, other, 0.3)
+            pose, holds = probe.between(origin, first[0], last[0], 0.3)
+            there = near[:3, 3] + origin
+            np.testing.assert_array_equal(pose[:3, 3], there)
+            assert holds == bool((there - origin == near[:3, 3]).all())
+            for r in range(3):
+                said.add(float(np.sign(there[r] - origin[r] - near[r, 3])))
+    assert said == {-1.0, 0.0, 1.0}

@@ -64,6 +64,7 @@ NORMALS = tuple(
     for name in (
         "what_is_stored_is_what_is_found_at_first_use",
         "where_no_point_is_there_is_no_normal",
+        "what_is_looked_into_is_what_it_was",
         "normals_are_those_of_numpy",
         "of_an_evicted_voxel_nothing_is_kept_and_the_same_is_found",
         "what_is_kept_is_bounded_and_the_oldest_goes_first",
@@ -116,6 +117,8 @@ TESTS: dict[str, tuple[str, ...]] = {
     "builder/kernels/normals.py": (
         BUILDER + "test_normals.py::test_codes_are_those_of_the_definition",
         BUILDER + "test_normals.py::test_sums_at_the_bound_are_exact",
+        BUILDER
+        + "test_normals.py::test_sums_of_boxes_are_those_of_their_points_and_of_those_that_fit_no_reach_zeros",
         BUILDER + "test_normals.py::test_order_changes_nothing_and_a_heap_costs_what_a_point_does",
     ),
     "builder/kernels/octree.py": (

@@ -1,95 +1,23 @@
 """Points in boxes left out: what is served is, bit for bit, an archive of the points that are left."""
 
-import hashlib
-import os
-import subprocess
-import sys
 from collections.abc import Iterator
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import cases
-import classes
 import naive
 import naive_distance
 import numpy as np
 import pytest
-import scans
+from boxed import BODY, DOOR, ROOM, STEP, build, in_boxes, open_without, two_scans
 from msgspec.structs import asdict
 from numpy.typing import NDArray
-from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.pipeline import build_archive
 from solidcloud.builder.radius import voxel_points
 from solidcloud.schemas.archive import Archive
 from solidcloud.schemas.columns import array_fields
-from solidcloud.schemas.effects import Through, ThroughBox
-from solidcloud.schemas.errors import BadRequestError, BadTransformError, SolidcloudError
-from solidcloud.server import left_out
-from solidcloud.server.effects.through import store_without
+from solidcloud.schemas.effects import ThroughBox
 from solidcloud.server.left_out import LeftOut
-from solidcloud.server.posed import moved
 from solidcloud.server.scene import Scene
-
-STEP = cases.BINARY_STEP
-# Voxels of half a metre, points from 0 to 2 m an axis: 0.5 and 1 are borders between them.
-OPTIONS: dict[str, Any] = {
-    "voxel": 0.5, "resolution": STEP, "radius": 0.01, "jobs": 1, "leaf": 8, "degree": 3, "cell_points": 24,
-    "models": frozenset({"mean", "local", "border"}), "keep": frozenset({"scan", "intensity", "normal"}),
-}  # fmt: skip
-BODY = np.array([[0.0, 0, 0], [0.11, 0, 0], [0.0, 0.21, 0], [0.05, 0.05, 0.1]])
-# The points that give every archive the same lattice and bounds, whatever is left out between them.
-ENDS = np.array([[0.0, 0, 0], [2.0, 2.0, 2.0]])
-DOOR = ThroughBox("door", (0.375, 0.25, 0.25), (0.625, 1.125, 0.875))
-ROOM = ThroughBox("room", (1.0, 1.0, 0.5), (1.5, 1.5, 1.0))
-
-
-def on_lattice(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The points moved onto the lattice, so that no build moves them."""
-    return np.rint(points / STEP) * STEP
-
-
-def two_scans() -> list[NDArray[np.float64]]:
-    """A scan of free points and one of a corner, some of them on the borders of the boxes and in both scans."""
-    first = on_lattice(scans.make_scan("noise", 5, 500))
-    second = on_lattice(scans.make_scan("corner", 6, 300))
-    edges = np.array(
-        [DOOR.low, DOOR.high, ROOM.low, ROOM.high, [0.375, 0.5, 0.875], [0.376953125, 0.25, 0.5]]
-    )
-    just_out = np.array([[0.625 + STEP, 0.5, 0.5], [0.5, 0.25 - STEP, 0.5], [0.5, 0.5, 0.875 + STEP]])
-    return [np.vstack([ENDS, first, edges, just_out]), np.vstack([ENDS, second, edges])]
-
-
-def in_boxes(points: NDArray[np.float64], boxes: tuple[ThroughBox, ...]) -> NDArray[np.bool_]:
-    """The rule, point by point, of an archive at the identity."""
-    return np.array(
-        [
-            any(all(low <= c <= high for low, c, high in zip(b.low, p, b.high, strict=True)) for b in boxes)
-            for p in points.tolist()
-        ]
-    )
-
-
-def build(folder: Path, parts: list[NDArray[np.float64]]) -> Path:
-    """An archive of scans whose points have classes by their place alone, and intensities by theirs."""
-    folder.mkdir()
-    files: list[Path] = []
-    digests = [b""]
-    for i, xyz in enumerate(parts):
-        # Scans are numbered by their files' hashes: points are turned round until these are in order.
-        for turn in range(64):
-            points = np.roll(xyz, turn, axis=0)
-            intensity = np.floor(points.sum(axis=1) * 64).astype(np.float32)
-            file = scans.write_ply(folder / f"{i}.ply", points, intensity)
-            digest = hashlib.sha256(file.read_bytes()).digest()
-            if digest > digests[-1] and (i > 0 or digest[0] < 64):
-                break
-        files.append(file)
-        digests.append(digest)
-    assert digests == sorted(digests)
-    with classes.any_classes():
-        build_archive(files, folder / "archive", BuildConfig(**OPTIONS))
-    return folder / "archive"
 
 
 @pytest.fixture(scope="module")
@@ -103,11 +31,6 @@ def rest(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The archive of the points that are in neither box."""
     parts = [part[~in_boxes(part, (DOOR, ROOM))] for part in two_scans()]
     return build(tmp_path_factory.mktemp("left_out") / "rest", parts)
-
-
-def open_without(archive: Path, *boxes: ThroughBox, pose: Any = None, **options: Any) -> Scene:
-    """A scene without the points in the boxes."""
-    return Scene.open(archive, "hall", open_store=store_without(Through(list(boxes)), pose), **options)
 
 
 def voxel_bytes(archive: Archive) -> dict[int, list[Any]]:
@@ -252,44 +175,6 @@ def test_scan_intensity_and_class_of_the_points_that_stay_are_what_they_were(who
     assert {point[:2] for point in everything} == numbered
 
 
-def corrupt(archive: Path, place: NDArray[np.float64]) -> str:
-    """Flip a byte of the points of the voxel that holds a place; returns how messages name the voxel."""
-    with Archive(archive) as opened:
-        voxel = (place // 0.5).astype(int)
-        row = int(np.flatnonzero((opened.coordinates == voxel).all(axis=1))[0])
-        entry = opened.voxels[row]
-        path = opened.shard_path(int(entry["shard"]))
-    with open(path, "r+b") as file:
-        offset = int(entry["frame_offset"][2]) + int(entry["frame_bytes"][2]) // 2
-        byte = os.pread(file.fileno(), 1, offset)[0]
-        os.pwrite(file.fileno(), bytes([byte ^ 0x10]), offset)
-    return f"voxel ({', '.join(map(str, voxel.tolist()))})"
-
-
-def test_a_corrupt_record_in_a_box_says_so_and_is_unknown(tmp_path: Path) -> None:
-    archive = build(tmp_path / "own", two_scans())
-    place = np.array([0.25, 0.75, 0.75])
-    named = corrupt(archive, place)
-    pose = cases.pose_of(np.eye(3), place)[None]
-    with open_without(archive, DOOR) as scene, Scene.open(archive) as plain:
-        answers = []
-        for each in (scene, plain):
-            each.add_avatar("ball", [[0.0, 0, 0]], 0.01)
-            answers.append(each.collide("ball", pose))
-        assert answers[0].verdict.tolist() == [2]
-        # What zstandard says of it depends on which columns were read; where it lies, and what to do, does not.
-        said = [answer.faults[0].partition(" (decompression")[0].partition(" (zstd")[0] for answer in answers]
-        assert said[0] == said[1]
-        assert named in said[0] and said[0].endswith("damaged frame")
-        assert "restore the shard or rebuild the archive" in answers[0].faults[0]
-        # Mended, it is not served with the points in the box; a reload serves it without.
-        corrupt(archive, place)
-        assert scene.collide("ball", pose).verdict.tolist() == [2]
-        scene.reload()
-        assert scene.collide("ball", pose).verdict.tolist() != [2]
-        scene.residency.check()
-
-
 def test_a_reload_keeps_the_boxes(whole: Path, rng: np.random.Generator) -> None:
     poses = poses_near(rng, 8)
     with open_without(whole, DOOR, ROOM) as scene:
@@ -338,113 +223,3 @@ def test_boxes_are_in_the_world_where_an_archive_lies_at_a_pose(
             base = archive.coordinates[row] * archive.header.lattice.voxel_steps
             found.append(archive.header.lattice.to_world(voxel_points(*archive.read_voxel(row)) + base))
     assert sorted(np.concatenate(found).tolist()) == sorted(expected.tolist())
-
-
-def test_boxes_that_hold_everything_are_refused(whole: Path) -> None:
-    with pytest.raises(BadRequestError, match="hold all of its points: leave the archive out"):
-        open_without(whole, ThroughBox("all", (0.0, 0.0, 0.0), (2.0, 2.0, 2.0)))
-
-
-@pytest.mark.parametrize(
-    ("pose", "said"),
-    [
-        (np.diag([2.0, 2, 2, 1]), "not rigid"),
-        (np.diag([-1.0, 1, 1, 1]), "not rigid"),
-        (np.eye(4) * np.nan, "finite"),
-        (np.eye(3), r"shape \(3, 3\)"),
-        (cases.pose_of(np.eye(3), np.array([2e9, 0, 0])), "within 1e9 m"),
-    ],
-)
-def test_a_pose_that_is_not_rigid_is_refused(whole: Path, pose: NDArray[np.float64], said: str) -> None:
-    error = BadTransformError if said == "not rigid" else BadRequestError
-    with pytest.raises(error, match=said):
-        open_without(whole, DOOR, pose=pose)
-
-
-@pytest.mark.parametrize(
-    ("fails", "said"),
-    [
-        (
-            "pwrite_all",
-            ": No space left on device: the voxels that boxes cut are kept there: make room, or set",
-        ),
-        ("read_points", r"voxel \(.*\): cannot be read \(No space left on device\)"),
-    ],
-)
-def test_what_fails_while_it_is_opened_is_told_and_leaves_no_file_open(
-    whole: Path, monkeypatch: pytest.MonkeyPatch, fails: str, said: str
-) -> None:
-    def full(*_: Any) -> None:
-        raise OSError(28, "No space left on device")
-
-    before = len(os.listdir("/proc/self/fd"))
-    with open_without(whole, DOOR) as scene:
-        scene.add_avatar("al", BODY, 0.02)
-        within = len(os.listdir("/proc/self/fd"))
-        monkeypatch.setattr(left_out, fails, full)
-        with pytest.raises(SolidcloudError, match=said):
-            open_without(whole, DOOR)
-        with pytest.raises(SolidcloudError, match=said):
-            scene.reload()
-        # What was served is served on.
-        assert len(os.listdir("/proc/self/fd")) == within
-        assert len(scene.collide("al", np.eye(4)[None])) == 1
-    assert len(os.listdir("/proc/self/fd")) == before
-
-
-@pytest.mark.interpreted
-@pytest.mark.parametrize("posed", [False, True])
-def test_voxels_that_lie_in_a_box_whole_are_not_read(
-    whole: Path, monkeypatch: pytest.MonkeyPatch, posed: bool
-) -> None:
-    pose = (
-        cases.pose_of(cases.random_rotation(np.random.default_rng(3)), np.array([5.0, 0, 1]))
-        if posed
-        else None
-    )
-    low, high = (-9.0, -9.0, -9.0), (1.6, 1.6, 1.6)
-    read: list[int] = []
-    read_points = left_out.read_points
-
-    def counted(archive: Archive, row: int) -> Any:
-        read.append(row)
-        return read_points(archive, row)
-
-    with Archive(whole) as before:
-        bounds = before.header.lattice.to_world(
-            np.stack([before.voxels["low"], before.voxels["high"]])
-            + before.coordinates * before.header.lattice.voxel_steps
-        )
-        every = np.concatenate(
-            [
-                before.header.lattice.to_world(
-                    voxel_points(*before.read_voxel(row))
-                    + before.coordinates[row] * before.header.lattice.voxel_steps
-                )
-                for row in range(len(before.voxels))
-            ]
-        )
-    monkeypatch.setattr(left_out, "read_points", counted)
-    if pose is not None:
-        middle = moved(pose, np.array([[0.8, 0.8, 0.8]]))[0]
-        low, high = tuple((middle - 0.7).tolist()), tuple((middle + 0.7).tolist())
-    with LeftOut(whole, [(low, high)], pose) as archive:
-        rows = archive.voxels["rows"][:, 2].sum()
-    world = every if pose is None else moved(pose, every)
-    assert rows == (~in_boxes(world, (ThroughBox("box", low, high),))).sum()
-    # Of eight corners all in the box, a voxel's points are.
-    corners = np.array([bounds[[i & 1, i >> 1 & 1, i >> 2], :, [0, 1, 2]].T for i in range(8)])
-    carried = corners if pose is None else moved(pose, corners.reshape(-1, 3)).reshape(corners.shape)
-    inside = ((carried >= low) & (carried <= high)).all(axis=(0, 2))
-    assert inside.any() and read and not set(np.flatnonzero(inside)) & set(read)
-
-
-def test_a_scene_without_boxes_imports_nothing_of_it(whole: Path) -> None:
-    program = (
-        "import sys; from solidcloud.server.scene import Scene; Scene.open(sys.argv[1]).close(); "
-        "print(*(m for m in sys.modules if m.endswith(('left_out', 'without', 'builder.octree', 'through'))))"
-    )
-    done = partial(subprocess.run, capture_output=True, text=True, check=True)(
-        [sys.executable, "-c", program, str(whole)]
-    )
-    assert done.stdout.split() == []

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from solidcloud.schemas.answers import Verdict
 from solidcloud.schemas.effects import (
     AnyEffect,
     Contacts,

@@ -79,7 +79,7 @@ def _counts(stage: Stage) -> str:
 
 
 def users(stage: Stage, clock: Clock, loops: int) -> Part:
-    """Many users in one frame."""
+    """Many users in one frame; with `crowd` they jam at the door, through which the walk goes both ways."""
     part = Part("users")
     for effects in (WALKING, (*WALKING, Crowd())):
         stage.crowd(effects, USERS)
@@ -91,7 +91,8 @@ def users(stage: Stage, clock: Clock, loops: int) -> Part:
         name = f"{USERS} users, {_name(effects)}"
         value = part.add(name, "frame of all", "mean", mean, "ms", USERS)
         part.add(name, "frame of all", "p99", worst, "ms", USERS)
-        part.goal("users", name, value, USERS_GOAL, "ms")
+        if effects is WALKING:
+            part.goal("users", name, value, USERS_GOAL, "ms")
         clock.look_around()
     return part
 

@@ -148,11 +148,16 @@ class Stage:
         return found
 
     def crowd(self, effects: Sequence[AnyEffect], users: int) -> Floats:
-        """The walk of so many users, each some way behind the one before: what each frame of all took (k,) [s]."""
+        """The walk of so many users, each some way behind the one before: what each frame of all took (k,) [s].
+
+        Each begins at the next pose that is clear: the walk brushes walls on purpose.
+        """
         pipeline = self.pipeline(effects)[1]
         apart = len(self.poses) // users
+        clear = np.flatnonzero(self.scene.collide("all", self.poses).verdict == Verdict.CLEAR)
+        starts = clear[np.searchsorted(clear, np.arange(users) * apart)].tolist()
         bodies = [
-            Body(f"bench/{user}", self.avatar, self.poses[user * apart].copy()) for user in range(users)
+            Body(f"bench/{user}", self.avatar, self.poses[start].copy()) for user, start in enumerate(starts)
         ]
         if pipeline.bodies is not None:
             for body in bodies:
@@ -161,7 +166,8 @@ class Stage:
         took = np.empty(apart)
         for number in range(apart):
             wishes = [
-                towards(body.pose, self.poses[user * apart + number]) for user, body in enumerate(bodies)
+                towards(body.pose, self.poses[min(start + number, len(self.poses) - 1)])
+                for start, body in zip(starts, bodies, strict=True)
             ]
             begin = time.perf_counter()
             for body, wish in zip(bodies, wishes, strict=True):

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 from ..schemas.encoding import MSGPACK, decode_request, encode, wire_encoding
-from ..schemas.errors import BadRequestError, BusyError, SolidcloudError
+from ..schemas.errors import BadRequestError, BusyError, SolidcloudError, TooLargeError
 from ..schemas.keys import User
 from ..schemas.messages import ErrorReply
 from ..schemas.moves import State, Wish
@@ -21,6 +21,8 @@ log = logging.getLogger(__name__)
 
 # Mailboxes for each user that a scene has room for: who comes when it is full is told so, frame by frame.
 _BOXES_A_USER = 2
+# Of a wish: 2,048 objects take a fifth of it. What is more is not read, and comes into no log.
+_MOST_BYTES = 2 << 20
 
 
 class Post(NamedTuple):
@@ -54,8 +56,8 @@ class Mailboxes:
         self._most = most
         self._boxes: dict[User, _Box] = {}
         self._waiting: dict[User, None] = {}  # with a wish, in the order they came
-        self._left: list[User] = []
-        self._gone: list[str] = []
+        self._left: dict[User, None] = {}  # each once, however often it says so
+        self._gone: dict[str, None] = {}
         self._closed = False
         self._changed = threading.Condition()
 
@@ -80,17 +82,19 @@ class Mailboxes:
             self._changed.notify()
 
     def leave(self, user: User) -> None:
-        """A user leaves; what it wished before is dropped."""
+        """A user leaves; what it wished before is dropped. Who has no mailbox is not there."""
         with self._changed:
+            if user not in self._boxes:
+                return
             self._forget([user])
-            self._left.append(user)
+            self._left[user] = None
             self._changed.notify()
 
     def leave_client(self, client: str) -> None:
         """All users of a client leave."""
         with self._changed:
             self._forget([user for user in self._boxes if user.client == client])
-            self._gone.append(client)
+            self._gone[client] = None
             self._changed.notify()
 
     def keep(self, users: Iterable[User]) -> None:
@@ -111,14 +115,14 @@ class Mailboxes:
                 self._changed.wait()
             if not (self._waiting or self._left or self._gone):
                 return None
-            post = Post(self._left, self._gone, [], [])
+            post = Post(list(self._left), list(self._gone), [], [])
             for user in self._waiting:
                 box = self._boxes[user]
                 assert box.wish is not None, "only boxes with a wish wait"
                 post.turns.append(Turn(user, box.wish, box.late))
                 post.encodings.append(box.encoding)
                 box.wish = None
-            self._waiting, self._left, self._gone = {}, [], []
+            self._waiting, self._left, self._gone = {}, {}, {}
             return post
 
     def close(self) -> None:
@@ -145,6 +149,8 @@ class Frames:
         """A wish came. What is none is refused at once."""
         try:
             stated = wire_encoding(encoding)
+            if len(payload) > _MOST_BYTES:
+                raise TooLargeError(f"a wish of {len(payload)} bytes: at most {_MOST_BYTES}")
             self._boxes.put(user, decode_request(Wish, payload, stated), stated)
         except SolidcloudError as error:
             self._send(user, error, encoding)

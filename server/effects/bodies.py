@@ -234,8 +234,8 @@ class Bodies:
     def _told(self, name: str) -> int:
         """The row of an object that wishes may move; BadRequestError for others."""
         row = self.row_of(name, user=False)
-        told = [each for each, kind in zip(self.names, self.kinds, strict=True) if kind == TOLD]
         if row < 0 or self.kinds[row] != TOLD:
+            told = [each for each, kind in zip(self.names, self.kinds, strict=True) if kind == TOLD]
             found = "is none of this scene" if row < 0 else "is pushed, and not told where to be"
             raise BadRequestError(
                 f"object {name!r} {found}: expected one of {', '.join(told) or 'none: no object is kinematic'}"

@@ -47,10 +47,13 @@ def touched_at(frame: Frame, pose: Pose) -> Hit | None:
     return next((hit for each in frame.obstacles if (hit := each.touches(avatar, pose))), None)
 
 
-def is_clear(frame: Frame, pose: Pose) -> bool:
-    """Whether nothing is touched at a pose, and that is known."""
+def is_clear(frame: Frame, pose: Pose, *, proved: bool = False) -> bool:
+    """Whether nothing is touched at a pose, and that is known.
+
+    proved: of the scene; then only what else blocks is asked.
+    """
     avatar = frame.body.avatar
-    if frame.world.collide(avatar, pose, frame.effort) != Verdict.CLEAR:
+    if not proved and frame.world.collide(avatar, pose, frame.effort) != Verdict.CLEAR:
         return False
     return not any(each.touches(avatar, pose) for each in frame.obstacles)
 
@@ -96,7 +99,7 @@ def settle(frame: Frame, to: Pose, fraction: float, proved: float) -> None:
     back = 0.0
     while (fraction - back) * way >= LEAST_WAY:
         pose, same = frame.world.between(frame.body.avatar, begin, to, fraction - back)
-        if (same and fraction - back < proved and not frame.obstacles) or is_clear(frame, pose):
+        if is_clear(frame, pose, proved=same and fraction - back < proved):
             frame.pose = pose
             return
         back = max(_GROWS * back, _BACK / way)

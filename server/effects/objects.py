@@ -51,7 +51,8 @@ class ObjectsRunner:
         with world as seen:
             self.bodies = Bodies(seen[0].data.arrays.origin, world.up, self._begin)
         self._items = list(items)
-        self._asked: dict[int, int] = {}  # row: when it had moved last, as it was asked what it touches
+        # Row: when it had moved last, and the archives asked, as it was asked what it touches.
+        self._asked: dict[int, tuple[int, tuple[int, ...]]] = {}
         self._touching: set[tuple[int, int]] = set()  # rows, the lesser first; -1: the scene
 
     def _begin(self, bodies: Bodies) -> None:
@@ -65,7 +66,7 @@ class ObjectsRunner:
         bodies = self.bodies
         with bodies.lock:
             bodies.begin()
-            since, frame.body.kept[self.name] = frame.body.kept.get(self.name, 0), bodies.clock
+            since, frame.kept[self.name] = frame.body.kept.get(self.name, 0), bodies.clock
             frame.obstacles.append(Things(self, frame.body, since))
             frame.reports[self.name] = self.report(since)
 
@@ -86,9 +87,10 @@ class ObjectsRunner:
 
     def _find_touching(self) -> list[tuple[int, int]]:
         """What touches, by rows; asked of what has moved since it was asked last."""
-        bodies, rows = self.bodies, self._objects()
+        bodies, rows, archives = self.bodies, self._objects(), self._world.generations()
         for row in rows:
-            if self._asked.get(row) == bodies.changed[row]:
+            now = bodies.changed[row], archives
+            if self._asked.get(row) == now:
                 continue
             shape, pose = bodies.shapes[row], bodies.poses[row]
             self._touching = {pair for pair in self._touching if row not in pair}
@@ -102,7 +104,7 @@ class ObjectsRunner:
             for other in near[bodies.touching(shape, pose, near, 0)].tolist():
                 self._touching.add((min(row, other), max(row, other)))
             if verdict != Verdict.UNKNOWN:  # else it is asked again, once what is missing may be there
-                self._asked[row] = bodies.changed[row]
+                self._asked[row] = now
         return sorted(self._touching)
 
     def push(self, name: str, way: Vec, user: str) -> bool:

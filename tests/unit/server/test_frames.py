@@ -93,6 +93,19 @@ def test_who_leaves_has_its_wishes_dropped_and_may_count_from_the_start_again():
     assert len(boxes) == 1
 
 
+def test_who_says_a_thousand_times_that_it_leaves_is_remembered_once():
+    boxes = Mailboxes(8)
+    boxes.put(AL, wish(1))
+    for number in range(1000):
+        boxes.leave(AL)
+        boxes.leave(User("stranger", str(number)))
+        boxes.leave_client("a")
+        boxes.put(BO, wish(number))
+    post = boxes.take()
+    assert (post.left, post.gone) == ([AL], ["a"])
+    assert [(turn.user, turn.wish.seq) for turn in post.turns] == [(BO, 999)]
+
+
 def test_who_takes_waits_until_something_came_or_all_is_over():
     boxes, got = Mailboxes(8), []
     thread = threading.Thread(target=lambda: [got.append(taken(boxes)), got.append(boxes.take())])
@@ -158,6 +171,18 @@ def test_what_is_no_wish_is_refused_and_changes_nothing(floor):
     ]  # fmt: skip
     assert [said(answer).code for _, answer in sent[:3]] == ["bad_request"] * 3
     assert floor.users == [BO]
+
+
+def test_a_wish_of_megabytes_is_refused_unread(floor):
+    sent = []
+    frames = Frames(floor, lambda user, answer: sent.append((user, answer)))
+    frames.wish(AL, b"\xc1" * ((2 << 20) + 1), None)
+    frames.wish(
+        BO, encode(wish(1, objects={f"{n:064}": np.eye(4).tolist() for n in range(2048)}), JSON), JSON
+    )
+    run(frames)
+    assert [said(answer).code for _, answer in sent] == ["too_large", "bad_request"]
+    assert "2097153 bytes" in said(sent[0][1]).message and "has none" in said(sent[1][1]).message
 
 
 def test_a_user_too_many_is_busy_and_the_others_go_on(floor):

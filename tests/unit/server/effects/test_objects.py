@@ -291,6 +291,52 @@ def test_what_has_not_moved_is_not_asked_again(tmp_path: Path, monkeypatch: pyte
 
 
 @pytest.mark.interpreted
+def test_what_moved_is_said_once_a_frame_is_done_and_not_lost_with_one_that_fails(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    objects = (item("door", at(0, 1), avatar="leaf", pushed=False),)
+    with staged(tmp_path, MOVING, avatars=AVATARS, objects=objects) as stage:
+        body = stage.enter("c/u", USER, at(0, -1))
+        stage.go("c/u", at(0, -1))
+        there = at(0, 1.5).tolist()
+        stage.bodies.tell({"door": there})
+        with monkeypatch.context() as broken, pytest.raises(OSError, match="disk"):
+            broken.setattr(stage.world, "sweep", lambda *_: (_ for _ in ()).throw(OSError("disk")))
+            stage.go("c/u", at(0.1, -1))
+        assert np.array_equal(body.pose, at(0, -1))
+        for expected in ({"door": there}, {}):
+            moved = stage.go("c/u", at(0, -1))
+            assert moved.objects is not None and moved.objects.poses == expected
+
+
+def test_where_a_sweep_proved_the_scene_clear_only_objects_are_asked_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with staged(tmp_path, MOVING, avatars=AVATARS, objects=(item("crate", at(0, 1.5)),)) as stage:
+        body = stage.enter("c/u", USER, at(0))
+        stage.go("c/u", at(0))
+        asked = []
+        collide = stage.world.collide
+        monkeypatch.setattr(stage.world, "collide", lambda *what: asked.append(what) or collide(*what))
+        for _ in range(3):
+            stage.go("c/u", at(3))
+        assert 1.6 < body.pose[0, 3] < 1.8 and not asked
+        assert collide(USER, body.pose) == Verdict.CLEAR
+
+
+def test_what_touches_the_scene_is_asked_anew_of_other_archives(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with staged(tmp_path, [Objects()], avatars=AVATARS, objects=(item("a", at(0), pushed=False),)) as stage:
+        stage.enter("c/u", USER, at(0, 0, 5))
+        stage.go("c/u", at(0, 0, 5))
+        monkeypatch.setattr(stage.world, "generations", lambda: (7,))
+        monkeypatch.setattr(stage.world, "collide", lambda *_: Verdict.CONTACT)
+        report = stage.go("c/u", at(0, 0, 5)).objects
+        assert report is not None and report.touching == [("", "a")]
+
+
+@pytest.mark.interpreted
 def test_the_same_wishes_give_the_same_poses_bit_for_bit(tmp_path: Path) -> None:
     found = []
     for folder in ("a", "b"):

@@ -154,7 +154,9 @@ def test_voxels_that_lie_in_a_box_whole_are_not_read(
     if pose is not None:
         middle = moved(pose, np.array([[0.8, 0.8, 0.8]]))[0]
         low, high = tuple((middle - 0.7).tolist()), tuple((middle + 0.7).tolist())
-    with LeftOut(whole, [(low, high)], pose) as archive:
+    # Another box cuts what lies in the first whole.
+    middle = np.mean([low, high], axis=0) if posed else np.full(3, 0.75)
+    with LeftOut(whole, [(low, high), (middle, middle + 0.01)], pose) as archive:
         rows = archive.voxels["rows"][:, 2].sum()
     world = every if pose is None else moved(pose, every)
     assert rows == (~in_boxes(world, (ThroughBox("box", low, high),))).sum()

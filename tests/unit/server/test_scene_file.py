@@ -189,6 +189,29 @@ def test_one_archive_at_a_pose_is_there(write: Write) -> None:
         assert answers.verdict.tolist() == [Verdict.CLEAR, Verdict.CONTACT]
 
 
+def test_what_is_passed_through_lies_in_the_world_for_each_archive(write: Write) -> None:
+    """The second floor stands upright behind the first, which has points at the same places of its own frame."""
+    second = (
+        '[[archives]]\npath = "floor"\npose = [[1, 0, 0, 0], [0, 0, -1, 5], [0, 1, 0, 1], [0, 0, 0, 1]]\n'
+    )
+    through = (
+        '[[effects]]\neffect = "through"\nboxes = [{name = "hatch", low = [-0.25, 4, 0.75], high = [0.25, 6, 1.25]}, '
+        '{name = "drain", low = [0.25, 0.25, -1], high = [1, 1, 1]}]\n'
+    )
+    spawn = "[spawn]\nposition = [0, 5, 1.5]\n"
+    file = write(TOP + second + BALL + STOP + through + spawn)
+    places = at((0, 5, 1), (0.4, 5, 1), (0, 0, 0), (0.4, 0.4, 0))
+    with open_scene(file, read_points=read_points, policy="lru+prefetch") as scene:
+        expected = [Verdict.CLEAR, Verdict.CONTACT, Verdict.CONTACT, Verdict.CLEAR]
+        assert scene.collide("ball", places, client="any").verdict.tolist() == expected
+        assert scene.stats().policy == "lru+prefetch"
+    # 25 points of the one, 9 of the other; users begin within what is scanned, but for two metres more.
+    checked = check_scene_file(file, read_points)
+    assert checked.left_out == 25 + 9 and not [note for note in checked.notes if "spawn" in note]
+    outside = check_scene_file(write(file.read_text().replace("5, 1.5]", "7, 1.5]")), read_points)
+    assert [note for note in outside.notes if "spawn lies outside what is scanned" in note]
+
+
 def test_a_cache_is_shared_by_what_archives_take() -> None:
     sizes = [np.array([1000, 3000]), np.array([1000]), np.zeros(0, np.int64)]
     shares = share_budget(100_000, sizes)

@@ -58,11 +58,12 @@ def nearest_resident(poses, avatar, radius, radius_units, reach_units, reach, sc
     fault, pose, found, needed = find_reach(
         poses, avatar, radius, radius_units + reach_units, scene, index, around
     )
-    if fault != GOOD or needed > rows.shape[0]:
+    ready = fault == GOOD and needed <= rows.shape[0]
+    if ready:
+        for at in range(needed):
+            ready &= scene.where[rows[at], 0] >= 0
+    if not ready:
         return fault, pose, found, -1, False, 0, 0
-    for at in range(needed):
-        if scene.where[rows[at], 0] < 0:
-            return fault, pose, found, -1, False, 0, 0
     nearest = Nearest(
         np.full(1, -1, np.int64), np.zeros((1, 6), np.int64), np.zeros(1, np.int64), np.full(1, np.inf)
     )

@@ -16,6 +16,8 @@ from .placing import GOOD, SIMILARITY_TOLERANCE, check_poses
 
 _CLEAR, _CONTACT, _UNKNOWN = int(Verdict.CLEAR), int(Verdict.CONTACT), int(Verdict.UNKNOWN)
 
+# What `sweep_resident` returns of a motion that it leaves to others.
+_LEFT = (-1, _UNKNOWN, 0, 0, 0)
 # Columns of what is said of a motion: fractions, how far any point goes at most [m], the witness's centres, world [m].
 LOWER, UPPER, SPEED, AVATAR, CLOUD, COLUMNS = 0, 1, 2, 3, 6, 9
 # Node visits of a motion that is answered so, while nobody else can use the residency: a few milliseconds at most.
@@ -59,7 +61,7 @@ def sweep_resident(
     for poses, found_units in ((first, others), (last, units)):
         fault, _, _ = check_poses(poses, avatar.radius, radius, other_units, scene, scales, found_units)
         if fault != GOOD or not _rigid(poses[0]):
-            return -1, _UNKNOWN, 0, 0, 0
+            return _LEFT
     units[0] = max(units[0], others[0])
     for r in range(3):
         first[0, r, 3] -= origin[r]
@@ -78,10 +80,10 @@ def sweep_resident(
         box, first, last, avatar, scales, units, from_zero, index, which, progress, starts, rows
     )
     if needed > rows.shape[0] or (needed > 0 and progress.end[0] < 1.0):
-        return -1, _UNKNOWN, 0, 0, 0
+        return _LEFT
     for at in range(needed):
         if scene.where[rows[at], 0] < 0:
-            return -1, _UNKNOWN, 0, 0, 0
+            return _LEFT
     proved = 1.0
     if needed > 0:
         progress.lower[0] = progress.end[0]
@@ -90,7 +92,7 @@ def sweep_resident(
             which, tolerance, progress, counts,
         )  # fmt: skip
         if progress.visits[0] < 0:
-            return -1, _UNKNOWN, 0, 0, 0
+            return _LEFT
         proved = progress.lower[0]
     upper = progress.upper[0]
     if unknown_everywhere:

@@ -124,3 +124,24 @@ def test_a_voxel_that_cannot_be_read_is_missing_and_the_rest_is_found(tmp_path: 
         assert not found.exact and set(found.gaps) == {0, 1}
         away = cases.pose_of(np.eye(3), np.array([0.9, 0.0, 0.13]))
         assert gaps_by_scan(case.data, BALL, away, 0.02, 2).exact
+
+
+@pytest.mark.interpreted
+def test_in_voxels_far_along_one_axis_each_scan_is_found_at_the_same_cost(tmp_path: Path) -> None:
+    """Some points near one corner of a voxel, the avatar beside them: its place in the voxel differs by axis."""
+    rng = np.random.default_rng(8)
+    visits, tests = [], []
+    for axis in range(3):
+        at = np.roll([1.9, 0.05, 0.3], axis)
+        points = at + rng.uniform(-0.02, 0.02, (24, 3))
+        case = cases_contacts.open_case(tmp_path, points, rng, leaf=4, cell_points=8, degree=2)
+        pose = cases.pose_of(np.eye(3), at + np.array([0.05, 0.08, -0.1]))
+        spheres = (BALL.points + pose[:3, 3])[:, None] - points
+        gaps = np.linalg.norm(spheres, axis=2).min(axis=0) - 0.11
+        with closing(case.store):
+            found = gaps_by_scan(case.data, BALL, pose, 0.1, 2)
+        expected = {scan: gaps[case.numbers == scan].min() for scan in (0, 1)}
+        assert found.gaps == pytest.approx(expected, abs=2e-4)
+        visits.append(found.node_visits)
+        tests.append(found.point_tests)
+    assert visits == [25, 18, 17] and tests == [256, 384, 416]

@@ -57,8 +57,11 @@ def test_motions_and_poses_are_answered_to_the_last_bit(
     last[::3, :3, :3] = first[::3, :3, :3]
     last[1] = first[1]
     probe = Probe(avatar)
+    with swept.opened(case) as fresh:  # loads
+        loaded = [probe.sweep(fresh, one, other, 1e-6, EXACT) for one, other in zip(first, last, strict=True)]
     with swept.opened(case) as data:
-        same(probe, data, first, last)  # loads
+        for own, expected in zip(loaded, same(probe, data, first, last), strict=True):
+            assert own[:3] == expected[:3]
         found = same(probe, data, first, last)
         assert {each.verdict for each in found} >= {Verdict.CONTACT}
         verdicts = collide(data, avatar, first)

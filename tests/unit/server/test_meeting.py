@@ -270,3 +270,29 @@ def test_bounds_of_bodies_and_of_motions_are_no_wider_than_they_must_be() -> Non
             assert near_bodies.find_near(box, first, last, 0.07, bounds, kinds, 5, -1, rows) == 0
             assert near_bodies.find_near(box, first, last, 0.07, bounds, kinds, 2, 1, rows) == 1
             assert rows[0] == 2
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_what_all_but_touches_is_left_along_any_axis_and_by_turning_what_touches_is_not(axis: int) -> None:
+    """As above, along each axis; then spheres that touch, to the unit, and are turned apart: that is a contact."""
+    unit = 2.0**-26
+    one = make_avatar(np.zeros((1, 3)), 0.5)
+    along, across = np.roll(np.eye(3), axis, axis=1)[:2]
+    pose = cases.pose_of(np.eye(3), ORIGIN + (1 + unit) * along)
+    first = cases.pose_of(np.eye(3), ORIGIN + 0.4 * unit * along)
+    for way, ends in (
+        (-along, False),
+        (across, False),
+        (across - 1e-3 * along, False),
+        (across + along, True),
+    ):
+        last = first.copy()
+        last[:3, 3] += way
+        assert (ask(one, first, last, one, pose[None]).row == 0) == ends, way
+    arm = make_avatar(along[None], 0.5)
+    quarter = cases.pose_of(np.column_stack([across, -along, np.cross(across, -along)]), ORIGIN)
+    quarter[:3, :3] = quarter[:3, :3] @ np.column_stack([along, across, np.cross(along, across)]).T
+    begin = cases.pose_of(np.eye(3), ORIGIN)
+    for gap, fraction in ((0.0, 0.0), (1e-3, np.inf)):
+        there = cases.pose_of(np.eye(3), ORIGIN + (2 + gap) * along)
+        assert ask(arm, begin, quarter, one, there[None]).fraction == fraction

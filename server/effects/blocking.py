@@ -102,26 +102,40 @@ class Blocking:
                     return self._hit_at(shape, pose, row)
             return self._goes_deeper(shape, self._start, pose)
 
+    def overlaps(self, avatar: AvatarModel, pose: Pose) -> bool:
+        """Whether any body is touched there, whatever the margin; those touched when the frame began, too."""
+        bodies = self._bodies
+        with bodies.lock:
+            shape = bodies.shape_of(avatar)
+            there = self._from_origin(pose)
+            rows = self._in_reach(shape, there, there)
+            return bool(len(rows) and bodies.touching(shape, pose, rows, 0).any())
+
     def give_way(self, frame: Frame, hit: Hit, to: Pose) -> bool:
         """Nothing here does."""
         return False
 
-    def _near(self, shape: Shape, first: Pose, last: Pose) -> NDArray[np.int64]:
-        """Rows that a motion, from the origin, could meet, but for those overlapped when the frame began."""
+    def _in_reach(self, shape: Shape, first: Pose, last: Pose) -> NDArray[np.int64]:
+        """Rows that a motion, from the origin, could meet."""
         bodies = self._bodies
         rows = np.empty(len(bodies.names), np.int64)
         if not len(rows) or not len(shape.model.points):
             return rows[:0]
-        if self._layout != bodies.layout:
-            self._layout, self._overlapped = bodies.layout, {}
         own = bodies.row_of(self._mover, user=self._user)
         more = shape.model.radius + self._margin_units / UNITS_PER_METRE
         count = find_near(shape.box, first, last, more, bodies.bounds, bodies.kinds, self._wanted, own, rows)
-        found = rows[:count]
+        return rows[:count]
+
+    def _near(self, shape: Shape, first: Pose, last: Pose) -> NDArray[np.int64]:
+        """Rows that a motion, from the origin, could meet, but for those overlapped when the frame began."""
+        bodies = self._bodies
+        if self._layout != bodies.layout:
+            self._layout, self._overlapped = bodies.layout, {}
+        found = self._in_reach(shape, first, last)
         left_out = [row for row, overlapped in self._overlapped.items() if overlapped]
         if self._skip:
             left_out.append(bodies.row_of(self._skip, user=True))
-        return found[~np.isin(found, left_out)] if count and left_out else found
+        return found[~np.isin(found, left_out)] if len(found) and left_out else found
 
     def _from_origin(self, pose: Pose) -> Pose:
         """A pose with its translation from the bodies' origin."""

@@ -48,6 +48,9 @@ class Obstacle(Protocol):
     def touches(self, avatar: AvatarModel, pose: Pose) -> Hit | None:
         """Whether it is touched by an avatar there."""
 
+    def overlaps(self, avatar: AvatarModel, pose: Pose) -> bool:
+        """Whether an avatar there touches it, whatever was touched when the frame began."""
+
     def give_way(self, frame: "Frame", hit: Hit, to: Pose) -> bool:
         """Asked of what ended a motion, the avatar at frame.pose and on its way to `to`: it may be pushed on, and then
         says that it was and that the way is worth going on."""

@@ -122,6 +122,9 @@ class Pipeline:
                     self._run_one(runner, frame, begin, since, skip)
             if not self._stops:
                 frame.verdict = self.world.collide(body.avatar, frame.pose, effort)
+            # What came into it, an object say, blocks nobody: then the verdict alone says so.
+            if any(each.overlaps(body.avatar, frame.pose) for each in frame.obstacles):
+                frame.verdict = Verdict.CONTACT
             client, _, avatar = body.name.rpartition("/")
             self.world.saw((client, avatar), body.avatar, frame.pose)
         body.pose, body.clear, body.generations = frame.pose, frame.clear, frame.generations

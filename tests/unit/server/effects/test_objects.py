@@ -196,9 +196,10 @@ def test_a_door_that_closes_on_a_user_lets_go_of_it_on_the_side_it_was_on(
         stage.go("c/u", body.pose.copy())
         for swing in np.linspace(angle, -angle / 6, 4)[1:]:
             stage.bodies.tell({"door": at(0, heading=float(swing)).tolist()})
-            stage.go("c/u", body.pose.copy())
+            moved = stage.go("c/u", body.pose.copy())
             assert np.array_equal(body.pose, at(0.5, 0.08 * side)), "a door moves nobody"
-        inside = touch(USER, body.pose, LEAF, where(stage, "door"), stage.bodies.origin)
+            inside = touch(USER, body.pose, LEAF, where(stage, "door"), stage.bodies.origin)
+            assert moved.verdict == (Verdict.CONTACT if inside else Verdict.CLEAR)
         assert inside
         for wish in (at(0.5, -1 * side), at(0.8, -0.5 * side)):
             moved = stage.go("c/u", wish)
@@ -206,6 +207,7 @@ def test_a_door_that_closes_on_a_user_lets_go_of_it_on_the_side_it_was_on(
             assert "door" in [each.what for each in moved.touched]
         moved = stage.go("c/u", at(0.5, 0.6 * side))
         assert np.array_equal(body.pose, at(0.5, 0.6 * side)) and not moved.touched
+        assert moved.verdict == Verdict.CLEAR
         stage.go("c/u", at(0.5, -1 * side))
         assert body.pose[1, 3] * side > 0.1, "free, it is stopped as ever"
 

@@ -296,3 +296,4 @@ def test_what_all_but_touches_is_left_along_any_axis_and_by_turning_what_touches
     for gap, fraction in ((0.0, 0.0), (1e-3, np.inf)):
         there = cases.pose_of(np.eye(3), ORIGIN + (2 + gap) * along)
         assert ask(arm, begin, quarter, one, there[None]).fraction == fraction
+        assert ask(arm, begin, begin, one, there[None]).fraction == fraction, "at rest"

@@ -69,8 +69,8 @@ class Step(Effect, frozen=True, tag="step"):
 class Ground(Effect, frozen=True, tag="ground"):
     """Gravity: feet on the ground, or falling.
 
-    slope: what is steeper is no ground [degrees].  clearance: feet are held so far above what they stand on [m].
-    gravity: [m/s^2].  fall_speed: at most [m/s].
+    slope: what is steeper is no ground [degrees].  clearance: feet are held so far above what they stand on, walking
+    within a fifth of it [m].  gravity: [m/s^2].  fall_speed: at most [m/s].
     """
 
     needs: ClassVar[tuple[str, ...]] = ("stop",)

@@ -35,7 +35,8 @@ BAND = 0.2
 ASIDE_BAND = 5e-3
 # A frame of gravity lasts no longer [s].
 LONGEST_FRAME = 0.1
-# The points that make the normal of what is stood on are so near the one that is touched [m].
+# The points that make the normal of what is stood on are so near the one that is touched [m]; with `slide`, as it says,
+# for normals that an archive keeps are of one reach.
 NORMAL_REACH = 0.08
 # An edge is looked at so far into what it is the edge of, for points as near to there [m].
 EDGE, EDGE_REACH = 0.08, 0.04
@@ -80,6 +81,7 @@ class Grounded:
         self.clearance, self._gravity, self._most = effect.clearance, effect.gravity, effect.fall_speed
         self._down = effect.clearance + max(step, effect.clearance)
         self._tolerance, self._sliding = tolerance, sliding
+        self._normal_reach = NORMAL_REACH if sliding is None else sliding.normal_reach
         self._walkable = math.cos(math.radians(effect.slope)) - _ROUNDING
 
     def begin(self, frame: Frame) -> None:
@@ -186,7 +188,7 @@ class Grounded:
         """The level direction away from something steep."""
         if hit.avatar is None or hit.cloud is None:
             return None
-        out = frame.world.normal(hit, NORMAL_REACH)
+        out = frame.world.normal(hit, self._normal_reach)
         if out is None:
             out = hit.avatar - hit.cloud
         level = out - dot(out, frame.world.up) * frame.world.up
@@ -243,7 +245,7 @@ class Grounded:
                 return stood[1]  # what was stood on last: a normal takes as long as half a sweep
         up, out = frame.world.up, hit.avatar - hit.cloud
         length = size(out)
-        normal: Vec | None = frame.world.normal(hit, NORMAL_REACH)
+        normal: Vec | None = frame.world.normal(hit, self._normal_reach)
         if normal is None:
             normal = out / length if length > 0.0 else up
         rises = dot(normal, up)
@@ -257,7 +259,8 @@ class Grounded:
         if inner is None:
             return None
         top = frame.world.normal(
-            hit._replace(avatar=inner.cloud + up, cloud=inner.cloud, archive=inner.archive), NORMAL_REACH
+            hit._replace(avatar=inner.cloud + up, cloud=inner.cloud, archive=inner.archive),
+            self._normal_reach,
         )
         return top if top is not None and dot(top, up) >= self._walkable else None
 

@@ -9,7 +9,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from typing import Any, Protocol
 
 import numpy as np
@@ -63,7 +63,7 @@ class Bodies(Protocol):
 
     def __setitem__(self, user: User, body: Body) -> None: ...
     def pop(self, user: User, default: None = None) -> Any: ...
-    def tell(self, poses: dict[str, list[list[float]]]) -> None: ...
+    def tell(self, poses: dict[str, list[list[float]]]) -> Callable[[], None]: ...
 
 
 class Recorder(Protocol):
@@ -226,11 +226,13 @@ class Simulation:
         present = self._begun(user, wish) if there is None else there
         seconds = frame_seconds(wish, present.time)
         aim = wished_pose(wish, present.body.pose, seconds, self._up)
-        if wish.objects:
-            if self._bodies is None:
-                raise BadRequestError(f"{self.name}: a wish moves objects: this scene has none")
-            self._bodies.tell(wish.objects)
-        moved = self._pipeline.run(present.body, aim, seconds, skip=skip)
+        with ExitStack() as refused:
+            if wish.objects:
+                if self._bodies is None:
+                    raise BadRequestError(f"{self.name}: a wish moves objects: this scene has none")
+                refused.callback(self._bodies.tell(wish.objects))
+            moved = self._pipeline.run(present.body, aim, seconds, skip=skip)
+            refused.pop_all()
         present.time = wish.time
         present.heard = present.heard if now is None else now
         self._present[user] = present

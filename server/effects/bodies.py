@@ -218,18 +218,27 @@ class Bodies:
             self.clock += 1
             self.changed[row] = self.clock
 
-    def tell(self, poses: Mapping[str, Sequence[Sequence[float]]]) -> None:
+    def tell(self, poses: Mapping[str, Sequence[Sequence[float]]]) -> Callable[[], None]:
         """Objects are where a wish puts them, whatever is there: a user that is, starts its next frame in contact.
 
         poses: (4, 4) row-major by name. All are checked before any is put: BadRequestError, BadTransformError.
+        Returns what puts them back, for a wish that is refused after all.
         """
         with self.lock:
             self.begin()
             checked = [(self._told(name), _checked(name, poses[name])) for name in sorted(poses)]
-            for row, pose in checked:
-                before = self.poses[row].copy()
+            came_from, stood = dict(self._came_from), [(row, self.poses[row].copy()) for row, _ in checked]
+            for (row, pose), (_, before) in zip(checked, stood, strict=True):
                 self._put(row, pose)
                 self._remember_way(row, before)
+
+        def put_back() -> None:
+            with self.lock:
+                for row, before in stood:
+                    self._put(row, before)
+                self._came_from = came_from
+
+        return put_back
 
     def _told(self, name: str) -> int:
         """The row of an object that wishes may move; BadRequestError for others."""

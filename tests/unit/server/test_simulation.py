@@ -154,8 +154,11 @@ def test_wishes_for_objects_where_there_are_none_are_refused(floor):
 
 def test_the_bodies_that_may_meet_are_kept_up_to_date():
     class Bodies(dict):
+        put_back = 0
+
         def tell(self, poses):
             self.told = poses
+            return lambda: setattr(self, "put_back", self.put_back + 1)
 
     bodies = Bodies()
     file = SceneFile(format=1, archives=scene_of("floor").archives)
@@ -165,7 +168,10 @@ def test_the_bodies_that_may_meet_are_kept_up_to_date():
     objects = {"door": np.eye(4).tolist()}
     simulation.step([Turn(AL, wish(1, 0.5, objects=objects))])
     assert list(bodies) == [AL] and np.array_equal(bodies[AL].pose, pose_at(0.5)[0])
-    assert bodies.told == objects
+    assert bodies.told == objects and not bodies.put_back
+    simulation._pipeline.run = None
+    ((_, error),) = simulation.step([Turn(AL, wish(2, 0.5, objects=objects))])
+    assert isinstance(error, InternalError) and bodies.put_back == 1
     simulation.end(AL)
     assert not bodies
 

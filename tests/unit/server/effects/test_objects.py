@@ -234,6 +234,25 @@ def test_wishes_for_objects_that_cannot_be_granted_are_refused_and_nothing_moves
             assert np.array_equal(where(stage, "door"), at(0)), name
 
 
+@pytest.mark.interpreted
+def test_what_a_wish_told_is_put_back_where_the_wish_is_refused(tmp_path: Path) -> None:
+    objects = (
+        item("door", at(0), avatar="leaf", pushed=False),
+        item("gate", at(0, 1), avatar="leaf", pushed=False),
+    )
+    with staged(tmp_path, MOVING, avatars=AVATARS, objects=objects) as stage:
+        body = stage.enter("c/u", USER, at(0.4, -0.5))
+        stage.bodies.tell({"gate": at(0, 1.5).tolist()})
+        put_back = stage.bodies.tell({"door": at(0, -0.5).tolist(), "gate": at(0, 2).tolist()})
+        put_back()
+        assert np.array_equal(where(stage, "door"), at(0)) and np.array_equal(
+            where(stage, "gate"), at(0, 1.5)
+        )
+        moved = stage.go("c/u", body.pose.copy())
+        assert moved.verdict == Verdict.CLEAR and moved.objects is not None
+        assert moved.objects.poses["door"] == at(0).tolist()
+
+
 # --- what they touch ----------------------------------------------------------------------------------------
 
 

@@ -139,7 +139,7 @@ def test_in_voxels_far_along_one_axis_each_scan_is_found_at_the_same_cost(tmp_pa
         spheres = (BALL.points + pose[:3, 3])[:, None] - points
         gaps = np.linalg.norm(spheres, axis=2).min(axis=0) - 0.11
         with closing(case.store):
-            found = gaps_by_scan(case.data, BALL, pose, 0.1, 2)
+            found = gaps_by_scan(case.data, BALL, pose, 0.05, 2)
         expected = {scan: gaps[case.numbers == scan].min() for scan in (0, 1)}
         assert found.gaps == pytest.approx(expected, abs=2e-4)
         visits.append(found.node_visits)

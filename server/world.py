@@ -31,6 +31,8 @@ from .within import within
 
 # Avatars a thread has probes of at a time: users of one scene, and its objects.
 _PROBES = 256
+# And points of theirs, so that avatars long dropped do not fill the memory: some 100 MB a thread.
+_PROBED_POINTS = 1 << 20
 _NOWHERE = np.zeros(3)
 # Where a scan is so thin that the points near one make no surface, those so many times as near are asked.
 SPARSE = 3.0
@@ -61,6 +63,7 @@ class _Held(threading.local):
     def __init__(self) -> None:
         self.seen: list[Seen] = []
         self.probes: OrderedDict[int, Probe] = OrderedDict()
+        self.points = 0
 
 
 class World:
@@ -138,9 +141,13 @@ class World:
         probes, key = self._held.probes, id(avatar.points)
         probe = probes.get(key)
         if probe is None or probe.avatar.arrays is not avatar.arrays or probe.avatar.radius != avatar.radius:
+            if probe is not None:
+                self._held.points -= len(probes.pop(key).avatar.points)
             probe = probes[key] = Probe(avatar)
-            if len(probes) > _PROBES:
-                probes.popitem(last=False)
+            self._held.points += len(avatar.points)
+            while len(probes) > 1 and (len(probes) > _PROBES or self._held.points > _PROBED_POINTS):
+                _, oldest = probes.popitem(last=False)
+                self._held.points -= len(oldest.avatar.points)
         return probe
 
     def collide(self, avatar: AvatarModel, pose: Pose, effort: Effort = EXACT) -> Verdict:

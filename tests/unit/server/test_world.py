@@ -1,5 +1,7 @@
 """Several archives as one, asked about one avatar: where they lie, which is met first, and what is held."""
 
+import gc
+import weakref
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -73,6 +75,22 @@ def test_an_archive_at_a_pose_is_met_where_it_lies_and_first_comes_first(tmp_pat
         assert world.deepest(BALL, at(2, 0.1, 0.5)) is None
         assert world.nearest(np.array([2.0, 0.1, 0.5]), 0.05) is None
         assert world.lowest() == pytest.approx(-0.8 - pushed.RADIUS, abs=2e-3)
+
+
+@pytest.mark.interpreted
+def test_avatars_that_were_dropped_are_let_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    case = pushed.build(tmp_path, pushed.plane((0, -0.4, -0.4), (0, 0.4, 0.4)))
+    monkeypatch.setattr("solidcloud.server.world._PROBED_POINTS", 100)
+    with Scene.open(case.archive) as scene:
+        world, points = world_of((scene, None)), []
+        for count in (1, 40, 40, 40, 200, 200, 3, 1):
+            avatar = make_avatar(np.linspace([0.0, 0, 0], [0.1, 0, 0], count), 0.2)
+            points.append(weakref.ref(avatar.points))
+            for x, verdict in ((1.0, Verdict.CLEAR), (0.0, Verdict.CONTACT), (1.0, Verdict.CLEAR)):
+                assert world.collide(avatar, at(x, 0, 0)) == verdict
+        del avatar
+        gc.collect()
+        assert [len(kept()) for kept in points if kept() is not None] == [3, 1]
 
 
 @pytest.mark.interpreted

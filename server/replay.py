@@ -1,4 +1,8 @@
-"""A log's frames once more: the same wishes must give the same poses, bit for bit."""
+"""A log's frames once more: the same wishes must give the same poses, bit for bit.
+
+On a processor of the same kind and by the same numpy: between kernels effects multiply small matrices by its BLAS,
+which takes other instructions on another kind and may round otherwise.
+"""
 
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager

@@ -76,6 +76,17 @@ def test_there_is_a_bound_and_who_left_makes_room():
     assert taken(boxes) == [(CY, 1, 0)], "a wish that waits is kept"
 
 
+def test_a_client_of_many_avatars_leaves_room_for_others():
+    boxes = Mailboxes(6)
+    for number in range(9):
+        try:
+            boxes.put(User("a", str(number)), wish(1))
+        except BusyError as error:
+            assert number >= 3 and "3 of this client" in str(error)
+    boxes.put(BO, wish(1))
+    assert taken(boxes) == [(User("a", str(number)), 1, 0) for number in range(3)] + [(BO, 1, 0)]
+
+
 def test_who_leaves_has_its_wishes_dropped_and_may_count_from_the_start_again():
     boxes = Mailboxes(8)
     for user in (AL, BO, CY):

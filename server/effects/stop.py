@@ -4,15 +4,15 @@ Alone it is discrete: the wish is taken where nothing is touched there, and else
 `sweep` it goes as far as it can.
 
 An avatar that touches something before it goes (it was put there, or what it stands in is served anew) gets free first:
-by its wish, or by the shortest of a few ways, out of the deepest contact and up, of at most MOST_FREE, whose end is
-clear. What lies between is not asked: an avatar in a wall has no clear side to keep to. Where none is clear it stays,
-and the verdict says so.
+by its wish, where that does not go deeper into the deepest contact, or by the shortest of a few ways, out of that and
+up, of at most MOST_FREE, whose end is clear. What lies between is not asked: an avatar in a wall has no clear side to
+keep to. Where none is clear it stays, and the verdict says so.
 """
 
 from ...schemas.answers import Verdict
 from ...schemas.effects import Stop, Sweep
 from ..world import World
-from .frame import Frame, Hit, Pose, Vec, moved_by
+from .frame import Frame, Hit, Pose, Vec, dot, moved_by
 from .going import gives_way, is_clear, note, set_out, touched_at
 
 # How far an avatar gets free by itself [m], and the ways it tries.
@@ -72,14 +72,16 @@ def get_free(frame: Frame) -> None:
 def _ways(frame: Frame, hit: Hit) -> list[Vec]:
     """The ways to get free, shortest first."""
     directions: list[Vec] = [frame.world.up]
+    wished = frame.wish[:3, 3] - frame.pose[:3, 3]
+    deeper = False
     if hit.avatar is not None and hit.cloud is not None:
         out = hit.avatar - hit.cloud
         size = float((out @ out) ** 0.5)
         if size > 0.0:
             directions.insert(0, out / size)
-    wished = frame.wish[:3, 3] - frame.pose[:3, 3]
+            deeper = dot(wished, out) < 0.0  # it might lead through what is touched
     ways = [way * direction for way in _WAYS for direction in directions]
-    if 0.0 < float(wished @ wished) <= MOST_FREE**2:
+    if not deeper and 0.0 < float(wished @ wished) <= MOST_FREE**2:
         ways.insert(0, wished)
     return ways
 

@@ -127,6 +127,16 @@ def test_what_cannot_be_read_stops_and_is_said(
 
 
 @pytest.mark.interpreted
+def test_who_touches_a_wall_does_not_get_free_through_it(wall: cases.Case) -> None:
+    with play(wall.archive, Stop(), Sweep()) as game:
+        for side in (-1.0, 1.0):
+            body = game.body(BALL, at(side * (TOUCH - 0.01), 0, 0))
+            assert game.touches(body)
+            game.go(body, (-side * 0.49, 0, 0))
+            assert body.pose[0, 3] * side > TOUCH and not game.touches(body)
+
+
+@pytest.mark.interpreted
 def test_a_wish_that_is_too_far_is_refused_and_changes_nothing(wall: cases.Case) -> None:
     with play(wall.archive, Stop(), Sweep(), limits=Limits(longest_move=2.0)) as game:
         body = game.body(BALL, at(-1, 0, 0))

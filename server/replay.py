@@ -1,7 +1,7 @@
 """A log's frames once more: the same wishes must give the same poses, bit for bit.
 
-On a processor of the same kind and by the same numpy: between kernels effects multiply small matrices by its BLAS,
-which takes other instructions on another kind and may round otherwise.
+On another machine, too: kernels round as NUMERICS.md has it, and between them effects add and multiply in one order
+(vectors.py). Only the probability of `uncertainty` is by the machine's own error function; no pose depends on it.
 """
 
 from collections.abc import Iterable, Iterator, Sequence

@@ -34,6 +34,7 @@ from .avatar import AvatarModel
 from .describe import describe_scene
 from .effects.frame import Body
 from .served import EVERYBODY, Outcome, SceneLike, Turn
+from .vectors import unit
 from .wishes import Pose, check_rigid, first_pose, frame_seconds, wished_pose
 
 log = logging.getLogger(__name__)
@@ -112,7 +113,7 @@ class Simulation:
     ) -> None:
         self.name, self.file = served.name, file
         self.served, self._pipeline = served, pipeline
-        self._up = np.array(file.up) / np.linalg.norm(file.up)
+        self._up = unit(file.up)
         self._own = list(avatars)
         self._present: dict[User, _Presence] = {}
         self._bodies, self._place = bodies, place

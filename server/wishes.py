@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from ..schemas.errors import BadTransformError, UnknownAvatarError
 from ..schemas.moves import FRAME_SECONDS, Wish
 from ..schemas.scene import Spawn
+from .vectors import product, rotation, straightened
 
 Pose = NDArray[np.float64]  # (4, 4) float64, avatar to world, rigid
 
@@ -50,14 +51,14 @@ def wished_pose(wish: Wish, pose: Pose, seconds: float, up: NDArray[np.float64])
     there = pose.copy()
     there[:3, 3] += np.array(wish.velocity) * seconds
     if wish.turn and seconds:
-        there[:3, :3] = _straightened(turned(up, wish.turn * seconds) @ pose[:3, :3])
+        there[:3, :3] = straightened(product(rotation(up, wish.turn * seconds), pose))
     return there
 
 
 def spawn_pose(spawn: Spawn, up: NDArray[np.float64]) -> Pose:
     """Where users begin."""
     pose = np.eye(4)
-    pose[:3, :3] = turned(up, math.radians(spawn.heading))
+    pose[:3, :3] = rotation(up, math.radians(spawn.heading))
     pose[:3, 3] = spawn.position
     return pose
 
@@ -69,18 +70,3 @@ def first_pose(wish: Wish, spawn: Spawn | None, up: NDArray[np.float64]) -> Pose
     if wish.velocity is not None:
         raise UnknownAvatarError("the avatar is nowhere yet, and the scene has no spawn: begin with a pose")
     return check_rigid(wish.pose[0].copy(), "pose")
-
-
-def turned(up: NDArray[np.float64], angle: float) -> NDArray[np.float64]:
-    """The rotation (3, 3) about a unit vector by an angle [rad], after Rodrigues."""
-    x, y, z = up.tolist()
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * (cross @ cross)
-
-
-def _straightened(turn: NDArray[np.float64]) -> NDArray[np.float64]:
-    """A rotation made one again: turned for hours, rounding would add up."""
-    first = turn[:, 0] / math.sqrt(float(turn[:, 0] @ turn[:, 0]))
-    second = turn[:, 1] - first * float(first @ turn[:, 1])
-    second /= math.sqrt(float(second @ second))
-    return np.column_stack([first, second, np.cross(first, second)])

@@ -27,6 +27,7 @@ from .probe import Probe, Swept
 from .request import SceneData
 from .scene import Scene
 from .served import EVERYBODY
+from .vectors import lowest_of, unit
 from .within import within
 
 # Avatars a thread has probes of at a time: users of one scene, and its objects.
@@ -75,7 +76,7 @@ class World:
     def __init__(self, served: Any, file: SceneFile) -> None:
         """served: a `Scene`, or several with their poses (`archives`)."""
         self.file, self._served = file, served
-        self.up: Vec = np.array(file.up, np.float64) / np.linalg.norm(file.up)
+        self.up: Vec = unit(file.up)
         placed = getattr(served, "archives", None)
         self.scenes = [
             Placed(scene, pose, None if pose is None else inverse_of(pose))
@@ -213,7 +214,7 @@ class World:
                 if each.placed.pose is not None:
                     corners = moved(each.placed.pose, corners)
                 radius = each.data.radius_units / UNITS_PER_METRE
-                least = min(least, float((corners @ self.up).min()) - radius)
+                least = min(least, lowest_of(corners, self.up) - radius)
         return least
 
     def deepest(self, avatar: AvatarModel, pose: Pose, effort: Effort = EXACT) -> Hit | None:

@@ -18,6 +18,7 @@ from ...schemas.voxel_grid import UNITS_PER_METRE
 from ..avatar import AvatarModel, make_avatar
 from ..kernels.meeting import sweep_bodies
 from ..kernels.near_bodies import find_near
+from ..vectors import dot, level, size, turned_by
 from .bodies import USER, Bodies, Shape
 from .frame import Body, Frame, Hit, Pose, Vec
 
@@ -173,8 +174,8 @@ class Blocking:
         bodies, row, (own, other) = self._bodies, first.row, first.witness
         normal = bodies.shapes[row].normal_at(first.point)
         if normal is not None:
-            normal = bodies.poses[row, :3, :3] @ normal
-            normal = -normal if normal @ (own - other) < 0.0 else normal
+            normal = turned_by(bodies.poses[row], normal)
+            normal = -normal if dot(normal, own - other) < 0.0 else normal
         return Hit(first.fraction, Verdict.CONTACT, own, other, bodies.names[row], normal=normal)
 
     def _is_overlapped(self, row: int) -> bool:
@@ -192,7 +193,7 @@ class Blocking:
         way = pose_to[:3, 3] - pose_from[:3, 3]
         for row in sorted(row for row, overlapped in self._overlapped.items() if overlapped):
             out = self._out(row)
-            if way @ out < -_ACROSS * np.linalg.norm(out) * np.linalg.norm(way):
+            if dot(way, out) < -_ACROSS * size(out) * size(way):
                 center = shape.center(pose_from)
                 return Hit(0.0, Verdict.CONTACT, center, center - out, self._bodies.names[row])
         return None
@@ -207,8 +208,7 @@ class Blocking:
         """A body touched at a pose: nothing is known of when, so that its middle says where, from the frame's start."""
         bodies, center = self._bodies, shape.center(pose)
         out = shape.center(self._start) - bodies.shapes[row].center(bodies.poses[row])
-        level = out - (out @ bodies.up) * bodies.up
-        return Hit(0.0, Verdict.CONTACT, center, center - level, bodies.names[row])
+        return Hit(0.0, Verdict.CONTACT, center, center - level(out, bodies.up), bodies.names[row])
 
 
 def warm() -> None:

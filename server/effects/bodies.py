@@ -20,6 +20,7 @@ from ..kernels.near_bodies import bound_body
 from ..kernels.pairs import CONTACT, touch_pairs
 from ..kernels.placing import MAX_REACH_UNITS, SIMILARITY_TOLERANCE
 from ..request import kernel_poses, to_units
+from ..vectors import level, turned_back, turned_by
 from .frame import Body, Pose, Vec
 
 USER, TOLD, PUSHED = 1, 2, 4  # kinds, one bit each
@@ -44,7 +45,7 @@ class Shape(NamedTuple):
 
     def center(self, pose: Pose) -> Vec:
         """The middle of its box, placed."""
-        placed: Vec = pose[:3, :3] @ (0.5 * (self.box[0] + self.box[1])) + pose[:3, 3]
+        placed: Vec = turned_by(pose, 0.5 * (self.box[0] + self.box[1])) + pose[:3, 3]
         return placed
 
     def normal_at(self, point: int) -> Vec | None:
@@ -262,7 +263,7 @@ class Bodies:
         touching &= ~self.touching(self.shapes[thing], before, near, 0)
         for row in near[touching].tolist():
             center = self.shapes[row].center(self.poses[row])
-            own = [pose[:3, :3].T @ (center - pose[:3, 3]) for pose in (before, now)]
+            own = [turned_back(pose, center - pose[:3, 3]) for pose in (before, now)]
             self._came_from[self.names[row], self.names[thing]] = own[0] - own[1]
 
     def way_out(self, row: int, user: str, center: Vec) -> Vec:
@@ -273,9 +274,8 @@ class Bodies:
         """
         came_from = self._came_from.get((user, self.names[row])) if self.kinds[row] != USER else None
         pose = self.poses[row]
-        way = center - self.shapes[row].center(pose) if came_from is None else pose[:3, :3] @ came_from
-        level: Vec = way - (way @ self.up) * self.up
-        return level
+        way = center - self.shapes[row].center(pose) if came_from is None else turned_by(pose, came_from)
+        return level(way, self.up)
 
     def touching(
         self, shape: Shape, pose: Pose, rows: NDArray[np.int64], margin_units: int

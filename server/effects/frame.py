@@ -1,6 +1,5 @@
 """One frame of one user on its way through the effects: what was wished, and what came of it so far."""
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol
@@ -11,6 +10,7 @@ from numpy.typing import NDArray
 from ...schemas.answers import Verdict
 from ..avatar import AvatarModel
 from ..effort import EXACT, Effort
+from ..vectors import dot, lowest_of, turned_back
 
 Vec = NDArray[np.float64]  # (3,) [m]
 Pose = NDArray[np.float64]  # (4, 4) float64, avatar to world, rigid
@@ -134,18 +134,6 @@ def moved_by(pose: Pose, way: Vec) -> Pose:
     return there
 
 
-def dot(one: Vec, other: Vec) -> float:
-    """The product of two vectors (3,), as a number: numpy takes a microsecond for it."""
-    (a, b, c), (x, y, z) = one.tolist(), other.tolist()
-    return float(a * x + b * y + c * z)
-
-
-def size(way: Vec) -> float:
-    """The length of a vector (3,)."""
-    x, y, z = way.tolist()
-    return math.sqrt(x * x + y * y + z * z)
-
-
 def lowest(avatar: AvatarModel, pose: Pose, up: Vec) -> float:
     """How far up the lowest of an avatar's spheres, not none, begins under a pose [m]."""
-    return dot(pose[:3, 3], up) + float((avatar.points @ (pose[:3, :3].T @ up)).min()) - avatar.radius
+    return dot(pose[:3, 3], up) + lowest_of(avatar.points, turned_back(pose, up)) - avatar.radius

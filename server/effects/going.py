@@ -3,10 +3,9 @@
 `stop` and `sweep` put `frame.go` together of this.
 """
 
-import numpy as np
-
 from ...schemas.answers import Verdict
-from .frame import Frame, Hit, Pose, dot, size
+from ..vectors import dot, size, spread, turned_back, turned_by
+from .frame import Frame, Hit, Pose
 
 # A motion that is stopped sooner is not begun [m]: else an avatar that pushes would tremble by what `lower` is off.
 LEAST_WAY = 2e-5
@@ -67,8 +66,8 @@ def farthest(frame: Frame, to: Pose) -> float:
     if to[:3, :3].tobytes() == begin[:3, :3].tobytes():
         return size(way)
     turn = to[:3, :3] - begin[:3, :3]
-    center = way + turn @ avatar.arrays.center[0]
-    return size(center) + float(np.linalg.norm(turn)) * float(avatar.arrays.radius[0])
+    center = way + turned_by(turn, avatar.arrays.center[0])
+    return size(center) + spread(turn) * float(avatar.arrays.radius[0])
 
 
 def way_back(frame: Frame, to: Pose, hit: Hit, skin: float) -> float:
@@ -81,8 +80,8 @@ def way_back(frame: Frame, to: Pose, hit: Hit, skin: float) -> float:
     out = hit.avatar - hit.cloud
     there, _ = frame.world.between(frame.body.avatar, frame.pose, to, min(hit.fraction, 1.0))
     # The point that touches, in the avatar's frame, and how it moves.
-    point = (hit.avatar - there[:3, 3]) @ there[:3, :3]
-    goes = (to[:3, 3] - frame.pose[:3, 3]) + (to[:3, :3] - frame.pose[:3, :3]) @ point
+    point = turned_back(there, hit.avatar - there[:3, 3])
+    goes = (to[:3, 3] - frame.pose[:3, 3]) + turned_by(to[:3, :3] - frame.pose[:3, :3], point)
     length, speed = size(out), size(goes)
     if speed <= 1e-9 * way:
         return min(1.0, skin / way)

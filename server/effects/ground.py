@@ -21,8 +21,9 @@ from ...schemas.answers import Verdict
 from ...schemas.effects import Ground, Slide, Step, Sweep
 from ...schemas.moves import GroundReport
 from ..normals import warm
+from ..vectors import dot, size
 from ..world import World
-from .frame import Frame, Hit, Vec, dot, lowest, moved_by, size
+from .frame import Frame, Hit, Vec, lowest, moved_by
 from .going import first_hit, note, settle
 
 # Feet this near to their height are left there [m]: at rest nothing moves.

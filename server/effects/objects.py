@@ -17,6 +17,7 @@ from ...schemas.answers import Verdict
 from ...schemas.effects import Objects
 from ...schemas.moves import ObjectsReport
 from ...schemas.scene import ObjectItem
+from ..vectors import dot, level, size
 from .blocking import Blocking, warm
 from .bodies import PUSHED, TOLD, USER, Bodies
 from .frame import Body, Frame, Hit, Pose, Vec, moved_by
@@ -113,7 +114,7 @@ class ObjectsRunner:
         user: who pushes, and follows: it does not stand in the way.
         """
         bodies = self.bodies
-        row, length = bodies.row_of(name, user=False), float(np.linalg.norm(way))
+        row, length = bodies.row_of(name, user=False), size(way)
         if length < _LEAST:
             return False
         model, pose = bodies.shapes[row].model, bodies.poses[row].copy()
@@ -152,11 +153,9 @@ class Things(Blocking):
                 return False
             if hit.avatar is None or hit.cloud is None:
                 return False
-            left = to[:3, 3] - frame.pose[:3, 3]
-            left -= (left @ bodies.up) * bodies.up
-            inward = hit.cloud - hit.avatar
-            inward -= (inward @ bodies.up) * bodies.up
-            if not left @ inward > _HEAD_ON * np.linalg.norm(left) * np.linalg.norm(inward):
+            left = level(to[:3, 3] - frame.pose[:3, 3], bodies.up)
+            inward = level(hit.cloud - hit.avatar, bodies.up)
+            if not dot(left, inward) > _HEAD_ON * size(left) * size(inward):
                 return False
             if not self._runner.push(hit.what, left, frame.body.name):
                 return False

@@ -17,9 +17,10 @@ from ...schemas.errors import BadRequestError
 from ...schemas.moves import FRAME_SECONDS, Moved, Touched
 from ...schemas.scene import SceneFile, effect_name
 from ..effort import EXACT, Effort
+from ..vectors import size
 from ..world import World
 from . import NEVER_SKIPPED, ORDER
-from .frame import Body, Frame, Hit, Pose, Runner, Vec, size
+from .frame import Body, Frame, Hit, Pose, Runner, Vec
 
 # What an effect usually takes follows what it took by this share.
 _FOLLOWS = 0.1

@@ -22,8 +22,9 @@ import numpy as np
 from ...schemas.answers import Verdict
 from ...schemas.effects import Ground, Slide, Stop
 from ..normals import warm
+from ..vectors import dot, size
 from ..world import World
-from .frame import Frame, Hit, Vec, dot, moved_by, size
+from .frame import Frame, Hit, Vec, moved_by
 
 # Of what is left, a smaller share along the surfaces is not gone: 6 degrees off head on, or less. Smoothed normals are
 # off by a few: at 0.02 an avatar pushed straight at a flat wall crept along it.
@@ -189,7 +190,8 @@ def clip(left: Vec, planes: list[Vec]) -> Vec | None:
     found = [way for way in ways if free(way)]
     if not found:
         for one, other in combinations(planes, 2):
-            crease = np.cross(one, other)
+            (a, b, c), (x, y, z) = one.tolist(), other.tolist()
+            crease = np.array([b * z - c * y, c * x - a * z, a * y - b * x])
             square = dot(crease, crease)
             if square > 1e-6:
                 found.append(crease * (dot(left, crease) / square))

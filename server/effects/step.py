@@ -6,8 +6,9 @@ down. That is kept where it led farther along the wish than sliding did, ends on
 """
 
 from ...schemas.effects import Ground, Step
+from ..vectors import dot, size
 from ..world import World
-from .frame import Frame, Pose, Vec, dot, lowest, moved_by, size
+from .frame import Frame, Pose, Vec, lowest, moved_by
 from .going import LEAST_WAY
 from .ground import DEAD_BAND, Grounded
 from .ground import make as make_ground

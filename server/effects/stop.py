@@ -11,8 +11,9 @@ keep to. Where none is clear it stays, and the verdict says so.
 
 from ...schemas.answers import Verdict
 from ...schemas.effects import Stop, Sweep
+from ..vectors import dot, size
 from ..world import World
-from .frame import Frame, Hit, Pose, Vec, dot, moved_by
+from .frame import Frame, Hit, Pose, Vec, moved_by
 from .going import gives_way, is_clear, note, set_out, touched_at
 
 # How far an avatar gets free by itself [m], and the ways it tries.
@@ -76,12 +77,12 @@ def _ways(frame: Frame, hit: Hit) -> list[Vec]:
     deeper = False
     if hit.avatar is not None and hit.cloud is not None:
         out = hit.avatar - hit.cloud
-        size = float((out @ out) ** 0.5)
-        if size > 0.0:
-            directions.insert(0, out / size)
+        across = size(out)
+        if across > 0.0:
+            directions.insert(0, out / across)
             deeper = dot(wished, out) < 0.0  # it might lead through what is touched
     ways = [way * direction for way in _WAYS for direction in directions]
-    if not deeper and 0.0 < float(wished @ wished) <= MOST_FREE**2:
+    if not deeper and 0.0 < size(wished) <= MOST_FREE:
         ways.insert(0, wished)
     return ways
 

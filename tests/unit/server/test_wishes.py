@@ -7,13 +7,13 @@ import pytest
 from solidcloud.schemas.errors import BadRequestError, BadTransformError, UnknownAvatarError
 from solidcloud.schemas.moves import FRAME_SECONDS, MoveRequest, Wish
 from solidcloud.schemas.scene import Spawn
+from solidcloud.server.vectors import rotation
 from solidcloud.server.wishes import (
     LONGEST_FRAME,
     check_rigid,
     first_pose,
     frame_seconds,
     spawn_pose,
-    turned,
     wished_pose,
 )
 
@@ -24,7 +24,7 @@ UP = np.array([0.0, 0.0, 1.0])
 
 def pose_at(x, y, z, heading=0.0):
     pose = np.eye(4)
-    pose[:3, :3] = turned(UP, heading)
+    pose[:3, :3] = rotation(UP, heading)
     pose[:3, 3] = x, y, z
     return pose
 

@@ -35,18 +35,18 @@ Floats = NDArray[np.float64]
 STOP, SWEEP, SLIDE, STEP, GROUND = Stop(), Sweep(), Slide(), Step(), Ground()
 WALKING: tuple[AnyEffect, ...] = (STOP, SWEEP, SLIDE, STEP, GROUND)
 EVERYTHING: tuple[AnyEffect, ...] = (*WALKING, Crowd(), Proximity(), Contacts(), Uncertainty())
-# An effect alone, beside what it needs: what it costs is the difference.
-ALONE: dict[str, tuple[tuple[AnyEffect, ...], tuple[AnyEffect, ...]]] = {
-    "stop": ((), (STOP,)),
-    "sweep": ((STOP,), (STOP, SWEEP)),
-    "slide": ((STOP, SWEEP), (STOP, SWEEP, SLIDE)),
-    "ground": ((STOP, SWEEP, SLIDE), (STOP, SWEEP, SLIDE, GROUND)),
-    "step": ((STOP, SWEEP, SLIDE, GROUND), WALKING),
-    "objects": ((STOP, SWEEP), (STOP, SWEEP, Objects())),
-    "crowd": ((STOP, SWEEP), (STOP, SWEEP, Crowd())),
-    "proximity": ((), (Proximity(),)),
-    "contacts": ((), (Contacts(),)),
-    "uncertainty": ((), (Uncertainty(),)),
+# The least scene in which each effect means something.
+ALONE: dict[str, tuple[AnyEffect, ...]] = {
+    "stop": (STOP,),
+    "sweep": (STOP, SWEEP),
+    "slide": (STOP, SWEEP, SLIDE),
+    "ground": (STOP, SWEEP, SLIDE, GROUND),
+    "step": WALKING,
+    "objects": (STOP, SWEEP, Objects()),
+    "crowd": (STOP, SWEEP, Crowd()),
+    "proximity": (Proximity(),),
+    "contacts": (Contacts(),),
+    "uncertainty": (Uncertainty(),),
 }
 # For `through`, which costs when a scene is opened: a box in the main door's arch that holds some points.
 ARCH = Through(boxes=[ThroughBox(name="arch", low=(-1.0, -0.2, 3.0), high=(1.0, 1.4, 4.5))])

@@ -56,8 +56,8 @@ def _means(axes, parts: list[Part]) -> None:  # type: ignore[no-untyped-def]
     """What each effect adds alone, and takes in company."""
     figures = [f for part in parts for f in part.figures if f.case == "an effect"]
     names = list(dict.fromkeys(f.side for f in figures))
-    alone = {f.side: f.value for f in figures if f.what.startswith("alone")}
-    company = {f.side: f.value for f in figures if f.what.startswith("in company")}
+    alone = {f.side: f.value for f in figures if "alone" in f.what}
+    company = {f.side: f.value for f in figures if "in company" in f.what}
     at = np.arange(len(names))
     axes.barh(
         at - 0.2, [alone.get(n, 0) for n in names], 0.38, color=[COLOURS[n] for n in names], label="alone"

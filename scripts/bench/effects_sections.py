@@ -34,7 +34,7 @@ def _name(effects: tuple) -> str:
 def walk(stage: Stage, clock: Clock, loops: int) -> tuple[Part, dict[str, np.ndarray]]:
     """Each set of effects in turn; and, of all together, what each effect took of each frame."""
     part = Part("walk")
-    sets = {_name(e): e for pair in ALONE.values() for e in pair} | {_name(EVERYTHING): EVERYTHING}
+    sets = {_name(e): e for e in ((), *ALONE.values(), EVERYTHING)}
     means: dict[str, list[float]] = {name: [] for name in sets}
     medians: dict[str, list[float]] = {name: [] for name in sets}
     stacked: list[dict[str, np.ndarray]] = []
@@ -52,11 +52,14 @@ def walk(stage: Stage, clock: Clock, loops: int) -> tuple[Part, dict[str, np.nda
         part.add(name, "frame", "mean", means[name], "us", count)
         part.add(name, "frame", "median", medians[name], "us", count)
     company = {name: np.median([each[name] for each in stacked], axis=0) for name in stacked[0]}
-    for name, (without, with_it) in ALONE.items():
-        own = np.array(means[_name(with_it)]) - np.array(means[_name(without)])
-        part.add("an effect", name, f"alone, beside {_name(without)}", own, "us", count)
+    for name, effects in ALONE.items():
+        own = [1e6 * stage.walk(effects, timed=True).effects[name].mean() for _ in range(min(loops, 3))]
+        beside = _name(tuple(effect for effect in effects if effect_name(effect) != name))
+        part.add("an effect", name, f"own time, alone beside {beside}", own, "us", count)
         if name in company:
-            part.add("an effect", name, "in company of all", 1e6 * company[name].mean(), "us", count)
+            part.add(
+                "an effect", name, "own time, in company of all", 1e6 * company[name].mean(), "us", count
+            )
     part.goal(
         "frame",
         f"{_name(WALKING)}: mean frame",

@@ -83,10 +83,16 @@ def test_what_is_not_simulated_in_time_is_dropped_and_counted(served, endpoint):
             session.wait(seq, 0.0)
         assert session.latest() is None
         gate.set()
-        last = session.wait(seq, DEADLINE)
+        # What a link has no room for is dropped, the last as well: who wants to be there wishes on.
+        for _ in range(100):
+            try:
+                last = session.wait(seq, DEADLINE / 100)
+                break
+            except BusyError:
+                seq = session.wish(pose_at(0.0, 50.0))
         states = list(session.states(0.0))
     assert last.pose[0, 2, 3] == 50.0 and states[0].seq == 1
-    assert len(states) <= 51 - last.late and last.late > 0
+    assert len(states) <= seq - last.late and last.late > 0
 
 
 def test_a_velocity_goes_on_from_where_it_was(served, endpoint):

@@ -44,10 +44,9 @@ def _stack(axes, company: dict[str, np.ndarray], limit: float) -> None:  # type:
     at = np.arange(len(values[0])) / 30.0
     axes.stackplot(at, values, labels=names, colors=[COLOURS[name] for name in names], linewidth=0)
     axes.axhline(limit, color=VERDICTS[MISSED], lw=1.2, ls="--")
-    axes.text(at[-1], limit, f" goal of walking: {limit:g} µs in the mean", color=VERDICTS[MISSED], fontsize=9,
-              va="bottom", ha="right")  # fmt: skip
     axes.set(xlim=(0, at[-1]), xlabel="time on the walk [s]", ylabel="time of a frame [µs]")
-    axes.set_title(f"all effects together, means of {SMOOTH} frames", loc="left", fontsize=11)
+    title = f"all effects together, means of {SMOOTH} frames; dashed: what walking is to take in the mean, {limit:g} µs"
+    axes.set_title(title, loc="left", fontsize=11)
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend(loc="upper left", ncols=len(names), frameon=False, fontsize=9)
 

@@ -6,6 +6,7 @@ from itertools import groupby
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..schemas.answers import (
     CollideAnswers,
@@ -44,11 +45,17 @@ def answer_lines(labels: list[str], times: list[float], answers: Any) -> Iterato
             yield f"objects {first} and {second}  {_NAMES[verdict]}"
 
 
-def summary_line(answers: Any) -> str:
-    """How many there are of each verdict, and the time they took."""
-    word = next((word for kind, word in _WORDS.items() if isinstance(answers, kind)), "poses")
+def word_of(answers: Any) -> str:
+    """Return the plural of what each of the answers is about."""
+    return next((word for kind, word in _WORDS.items() if isinstance(answers, kind)), "poses")
+
+
+def summary_line(answers: Any, outside: NDArray[np.bool_] | None = None) -> str:
+    """How many there are of each verdict, how many lie outside the scan where some do, and the time they took."""
     counts = ", ".join(f"{(answers.verdict == verdict).sum()} {verdict.name.lower()}" for verdict in Verdict)
-    return f"{len(answers)} {word}: {counts}; {answers.engine_seconds * 1e3:.2f} ms in the engine"
+    if outside is not None and outside.any():
+        counts += f", {outside.sum()} outside the scan"
+    return f"{len(answers)} {word_of(answers)}: {counts}; {answers.engine_seconds * 1e3:.2f} ms in the engine"
 
 
 def move_line(label: str, moved: Moved) -> str:
@@ -63,8 +70,13 @@ def move_line(label: str, moved: Moved) -> str:
     return line
 
 
-def answers_json(times: list[float], answers: Cost) -> dict[str, Any]:
-    """Answers as they are printed with --json; what is infinite or NaN is null. times: (k,) [s], or empty."""
+def answers_json(
+    times: list[float], answers: Cost, outside: NDArray[np.bool_] | None = None
+) -> dict[str, Any]:
+    """Answers as they are printed with --json; what is infinite or NaN is null. times: (k,) [s], or empty.
+
+    outside: (k,), which lie outside the scan; None where that is not known.
+    """
     k = len(answers)  # type: ignore[arg-type]
     rows: list[dict[str, Any]] = [{"t": t} for t in times] or [{} for _ in range(k)]
     for name, of in array_fields(type(answers)).items():
@@ -74,6 +86,9 @@ def answers_json(times: list[float], answers: Cost) -> dict[str, Any]:
             for row, value in zip(rows, values, strict=True):
                 row[name] = _NAMES[value] if name == "verdict" else value
     totals = {name: getattr(answers, name) for name in _TOTALS}
+    totals["outside_scan"] = None if outside is None else int(outside.sum())
+    for row, lies in zip(rows, [] if outside is None else outside.tolist(), strict=outside is not None):
+        row["outside_scan"] = lies
     if isinstance(answers, ContactsAnswers):
         for i, row in enumerate(rows):
             row |= {"contacts": _rows(answers, "pair", i), "clusters": _rows(answers, "cluster", i)}

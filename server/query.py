@@ -14,6 +14,7 @@ from ..schemas.errors import BadRequestError
 from ..schemas.moves import LONGEST_SECONDS, Moved
 from ..schemas.requests import PATH_PARAMETERS, Question
 from .pose_file import read_objects, read_poses, read_rays
+from .scan_bounds import Bodies, Places, Points, Rays, box_of
 
 # What each question takes beside the scene and what all take; the first of these are needed.
 _OPTIONS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
@@ -45,11 +46,15 @@ class Asker(Protocol):
 
 
 class Asked(NamedTuple):
-    """Answers and what each is the answer to, as words; `times`, where it is a pose or motion, [s]."""
+    """Answers and what each is the answer to, as words; `times`, where it is a pose or motion, [s].
+
+    places: where everything lies that the whole question asks about, of which this may be a part.
+    """
 
     labels: list[str]
     times: list[float]
     answers: Cost
+    places: Places
 
 
 class Query(NamedTuple):
@@ -97,41 +102,59 @@ def ask(scene: Asker, query: Query, read_points: ReadPoints) -> Iterator[Asked]:
     if query.op in ("raycast", "within"):
         what = read_rays(given["rays"]) if query.op == "raycast" else (read_points(given["points"]),)
         answers = getattr(scene, query.op)(*what, **parameters)
-        word = "ray" if query.op == "raycast" else "point"
-        yield Asked([f"{word} {number}" for number in range(len(answers))], [], answers)
+        word, kind = ("ray", Rays) if query.op == "raycast" else ("point", Points)
+        labels = [f"{word} {number}" for number in range(len(answers))]
+        yield Asked(labels, [], answers, kind(*what, given["reach"]))
         return
     times, poses = read_poses(given["poses"])
-    scene.add_avatar("avatar", read_points(given["avatar"]), given.get("radius"))
     op = query.along if query.op == "path" else query.op
     labels, begins = _labels(op, times.tolist())
+    places = _add_body(scene, query, read_points, poses, moving=op == "sweep")
     if query.op == "path":
         for part in scene.path("avatar", poses, op, **parameters):
             which = slice(part.first, part.first + len(part))
-            yield Asked(labels[which], begins[which], without_part(PATH_ANSWERS[op], part))
+            yield Asked(labels[which], begins[which], without_part(PATH_ANSWERS[op], part), places)
     elif op == "sweep":
-        yield Asked(labels, begins, scene.sweep("avatar", poses[:-1], poses[1:], **parameters))
+        yield Asked(labels, begins, scene.sweep("avatar", poses[:-1], poses[1:], **parameters), places)
     else:
-        yield Asked(labels, begins, getattr(scene, op)("avatar", poses, **parameters))
+        yield Asked(labels, begins, getattr(scene, op)("avatar", poses, **parameters), places)
 
 
-def ask_moves(scene: Asker, query: Query, read_points: ReadPoints) -> Iterator[tuple[str, Moved]]:
+def ask_moves(
+    scene: Asker, query: Query, read_points: ReadPoints
+) -> tuple[Places, Iterator[tuple[str, Moved]]]:
     """Where the avatar gets from each pose towards the next, and which it is as words; no frame remembers another.
 
-    A frame lasts from one pose's time to the next one's.
+    A frame lasts from one pose's time to the next one's. Returns where the motions lie, and the frames.
     """
     times, poses = read_poses(query.given["poses"])
-    scene.add_avatar("avatar", read_points(query.given["avatar"]), query.given.get("radius"))
+    places = _add_body(scene, query, read_points, poses, moving=True)
     labels, _ = _labels("sweep", times.tolist())
-    for number, (label, seconds) in enumerate(zip(labels, np.diff(times).tolist(), strict=True)):
-        pose_from, pose_to = poses[number : number + 1], poses[number + 1 : number + 2]
-        yield label, scene.move("avatar", pose_from, pose_to, min(seconds, LONGEST_SECONDS))
+
+    def frames() -> Iterator[tuple[str, Moved]]:
+        for number, (label, seconds) in enumerate(zip(labels, np.diff(times).tolist(), strict=True)):
+            pose_from, pose_to = poses[number : number + 1], poses[number + 1 : number + 2]
+            yield label, scene.move("avatar", pose_from, pose_to, min(seconds, LONGEST_SECONDS))
+
+    return places, frames()
 
 
 def joined(found: list[Asked]) -> Asked:
     """The parts of one question as one piece."""
     labels = [label for part in found for label in part.labels]
     times = [time for part in found for time in part.times]
-    return Asked(labels, times, join([part.answers for part in found]))
+    return Asked(labels, times, join([part.answers for part in found]), found[0].places)
+
+
+def _add_body(
+    scene: Asker, query: Query, read_points: ReadPoints, poses: NDArray[np.float64], *, moving: bool
+) -> Bodies:
+    """Add the avatar of a question, and return where it is at each pose, or between each and the next."""
+    points = read_points(query.given["avatar"])
+    radius = scene.add_avatar("avatar", points, query.given.get("radius")).radius
+    reach = query.given.get("reach", query.given.get("margin", 0.0))
+    ends = (poses[:-1], poses[1:]) if moving else (poses, poses)
+    return Bodies(box_of(points)[None], np.array([radius or 0.0]), reach, *ends)
 
 
 _FILES = ("avatar", "radius", "poses", "rays", "points", "objects")
@@ -145,12 +168,19 @@ def _ask_objects(
     names = {
         avatar: f"avatar-{number}" for number, avatar in enumerate(dict.fromkeys(row.avatar for row in rows))
     }
+    bodies = {}
     for avatar, name in names.items():
-        scene.add_avatar(name, read_points(avatar), radius)
+        points = read_points(avatar)
+        bodies[avatar] = box_of(points), scene.add_avatar(name, points, radius).radius or 0.0
     answers = scene.objects(
         [(names[row.avatar], row.pose, row.group, row.mask) for row in rows], **parameters
     )
-    return Asked([f"object {number} {row.avatar.name}" for number, row in enumerate(rows)], [], answers)
+    boxes = np.array([bodies[row.avatar][0] for row in rows]).reshape(-1, 2, 3)
+    radii = np.array([bodies[row.avatar][1] for row in rows], np.float64)
+    poses = np.array([row.pose for row in rows]).reshape(-1, 4, 4)
+    places = Bodies(boxes, radii, parameters.get("margin", 0.0), poses, poses)
+    labels = [f"object {number} {row.avatar.name}" for number, row in enumerate(rows)]
+    return Asked(labels, [], answers, places)
 
 
 def _labels(op: str, times: list[float]) -> tuple[list[str], list[float]]:

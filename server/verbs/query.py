@@ -66,9 +66,12 @@ def query(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Ask a server what poses of an avatar, rays, points or objects touch."""
+    """Ask a server what poses of an avatar, rays, points or objects touch.
+
+    Those that lie outside the scan's bounds, reach included, are counted, and said on standard error.
+    """
     options = {name: value for name, value in locals().items() if name not in _NOT_OF_THE_QUESTION}
-    from ..answer_text import answer_lines, answers_json, summary_line
+    from ..answer_text import answer_lines, answers_json, summary_line, word_of
     from ..client import Client
     from ..query import ask, check_query, joined
     from ..report.points import read_avatar
@@ -82,19 +85,41 @@ def query(
         for part in ask(client, question, read_avatar):
             found.append(part)
             if not as_json:
-                for line in answer_lines(*part):
+                for line in answer_lines(part.labels, part.times, part.answers):
                     print(line, flush=op == "path")
-    whole = joined(found)
+        whole = joined(found)
+        said = whole.answers
+        outside = None
+        if said.engine_seconds or not whole.labels:
+            outside = _outside(client, whole.places, said.outside, said.verdict, word_of(said))
     if whole.labels and whole.answers.engine_seconds == 0.0:
         print(f"no server of scene {scene!r} answered at {connect}", file=sys.stderr)
     if as_json:
-        print_json(answers_json(whole.times, whole.answers))
+        print_json(answers_json(whole.times, whole.answers, outside))
     else:
-        print(summary_line(whole.answers))
+        print(summary_line(whole.answers, outside))
+
+
+def _outside(client: Any, places: Any, leaves: Any, verdicts: Any, word: str) -> Any:
+    """Say on standard error how many places lie outside the scan; return which, or None where that is not known."""
+    from ...schemas.errors import BusyError
+    from ..scan_bounds import lying_outside, outside_line
+
+    if not leaves.any():
+        return leaves
+    try:
+        info = client.info()
+    except BusyError:  # the server has gone since
+        return None
+    outside = lying_outside(places, leaves, verdicts, info)
+    if outside.any():
+        print(f"warning: {outside_line(places, outside, info, word)}", file=sys.stderr)
+    return outside
 
 
 def _ask_moves(connect: str, scene: str, question: Any, as_json: bool) -> None:
     """Frame after frame, a line each, or all as JSON."""
+    import numpy as np
     from msgspec import json
 
     from ...schemas.answers import Verdict
@@ -105,14 +130,19 @@ def _ask_moves(connect: str, scene: str, question: Any, as_json: bool) -> None:
     from ..report.points import read_avatar
 
     found = []
+    outside = None
     with Client(connect, scene=scene) as client:
-        for label, moved in ask_moves(client, question, read_avatar):
+        places, frames = ask_moves(client, question, read_avatar)
+        for label, moved in frames:
             found.append(json.decode(encode(moved, JSON)))
             if not as_json:
                 print(move_line(label, moved))
-    if found and not any(
-        moved.get("simulated") or moved.get("verdict", 0) < Verdict.UNKNOWN for moved in found
-    ):
+        answered = any(moved.get("simulated") or moved.get("verdict", 0) < Verdict.UNKNOWN for moved in found)
+        if answered:
+            verdicts = np.array([moved.get("verdict", 0) for moved in found])
+            outside = _outside(client, places, np.ones(len(found), bool), verdicts, "motions")
+    if found and not answered:
         print(f"no server of scene {scene!r} answered at {connect}", file=sys.stderr)
     if as_json:
-        print_json(found)
+        lie = [None] * len(found) if outside is None else outside.tolist()
+        print_json([{**moved, "outside_scan": lies} for moved, lies in zip(found, lie, strict=True)])

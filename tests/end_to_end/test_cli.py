@@ -310,7 +310,7 @@ LINES = {
         r"0\.000 s  clear +0\.200000 m from .*",
         r"1\.000 s  contact +-0\.010000 m from 0\.0000 0\.0000 0\.0900 to 0\.0000 0\.0000 0\.0000",
         r"2\.000 s  clear +nothing within 1\.000000 m",
-        r"3 poses: 2 clear, 1 contact, 0 unknown; .*",
+        r"3 poses: 2 clear, 1 contact, 0 unknown, 1 outside the scan; .*",
     ],
     "contacts": [
         r"0\.000 s  clear",
@@ -337,7 +337,7 @@ LINES = {
         r"object 0 ball\.xyz  contact",
         r"object 1 ball\.xyz  clear",
         r"objects 0 and 1  contact",
-        r"2 objects: 1 clear, 1 contact, 0 unknown; .*",
+        r"2 objects: 1 clear, 1 contact, 0 unknown, 1 outside the scan; .*",
     ],
 }
 LINES["path"] = LINES["distance"]
@@ -366,6 +366,89 @@ def test_every_question_from_the_command_line(
         assert run(["query", "--connect", endpoint, "--scene", "hall", "--op", op, *options]) == 0
         shown = capsys.readouterr()
         assert " 0 clear, 0 contact, " in shown.out and "no server of scene 'hall'" in shown.err
+
+
+# What each question is asked about, and which of these lie outside the floor: 4 m wide, at a height of 0.
+OUTSIDE = {
+    "collide": ("poses", [False, True]),
+    "distance": ("poses", [False, True]),
+    "contacts": ("poses", [False, True]),
+    "sweep": ("motions", [False]),
+    "path": ("poses", [False, True]),
+    "move": ("motions", [False]),
+    "raycast": ("rays", [False, True]),
+    "within": ("points", [False, True]),
+    "objects": ("objects", [False, True]),
+}
+
+
+def outside_files(folder: Path, first: float) -> dict[str, list[str]]:
+    """What is asked of the floor, 0.3 m above its plane, at two places: x = first, and x = 9 m, which is beside it."""
+    here, there = f"{first},0,0.3", "9,0.5,0.3"
+    (folder / "ball.xyz").write_text("0 0 0\n")
+    (folder / "poses.csv").write_text(f"t,x,y,z,qw,qx,qy,qz\n0,{here},1,0,0,0\n1,{there},1,0,0,0\n")
+    (folder / "rays.csv").write_text(f"x,y,z,dx,dy,dz\n{here},0,0,-1\n{there},0,0,-1\n")
+    (folder / "loose.xyz").write_text(f"{here}\n{there}\n".replace(",", " "))
+    columns = "avatar,x,y,z,qw,qx,qy,qz,group,mask\n"
+    (folder / "objects.csv").write_text(
+        f"{columns}ball.xyz,{here},1,0,0,0,1,0xffffffff\nball.xyz,{there},1,0,0,0,1,0xffffffff\n"
+    )
+    ball = ["--avatar", str(folder / "ball.xyz"), "--radius", str(RADIUS)]
+    ball += ["--poses", str(folder / "poses.csv")]
+    return {
+        "collide": [*ball, "--margin", "0.2"],
+        "distance": [*ball, "--reach", "0.5"],
+        "contacts": [*ball, "--margin", "0.2"],
+        "sweep": ball,
+        "path": [*ball, "--margin", "0.2"],
+        "move": ball,
+        "raycast": ["--rays", str(folder / "rays.csv"), "--reach", "1"],
+        "within": ["--points", str(folder / "loose.xyz"), "--reach", "0.5"],
+        "objects": ["--objects", str(folder / "objects.csv"), "--radius", str(RADIUS), "--margin", "0.2"],
+    }
+
+
+def test_places_outside_the_scan_are_said_and_counted(
+    archive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with served(archive, "hall", "--cache", "64MB") as endpoint:
+        for first in (0.2, 12.0):
+            for op, options in outside_files(tmp_path, first).items():
+                word, lie = OUTSIDE[op]
+                lie = lie if first < 9 else [True] * len(lie)
+                ask = ["query", "--connect", endpoint, "--scene", "hall", "--op", op, *options]
+                assert run(ask) == 0, (op, errors(capsys))
+                shown = capsys.readouterr()
+                warnings = [line for line in shown.err.splitlines() if line.startswith("warning: ")]
+                counted = f"{sum(lie)} of {len(lie)} {word} lie outside the scan"
+                bounds = r"\(its bounds: -2\.000 -2\.000 0\.000 \.\. 1\.900 1\.900 0\.000 m\)"
+                assert len(warnings) == any(lie), (op, shown.err)
+                if any(lie):
+                    assert re.fullmatch(f"warning: {counted} {bounds}", warnings[0]), (op, warnings)
+                if op != "move":
+                    said = f", {sum(lie)} outside the scan; " if any(lie) else " unknown; "
+                    assert said in shown.out.splitlines()[-1], (op, shown.out)
+                assert run([*ask, "--json"]) == 0
+                told = json.loads(capsys.readouterr().out)
+                rows = told if op == "move" else told["answers"]
+                assert [row["outside_scan"] for row in rows] == lie, (op, first)
+                assert op == "move" or told["outside_scan"] == sum(lie)
+
+
+def test_poses_in_millimetres_are_called_so(
+    archive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "ball.xyz").write_text("0 0 0\n")
+    places = np.random.default_rng(7).uniform(-1.9, 1.8, (40, 2)) * 1000
+    rows = "".join(f"{t},{x},{y},50,1,0,0,0\n" for t, (x, y) in enumerate(places))
+    (tmp_path / "poses.csv").write_text("t,x,y,z,qw,qx,qy,qz\n" + rows)
+    ask = ["query", "--avatar", str(tmp_path / "ball.xyz"), "--poses", str(tmp_path / "poses.csv")]
+    with served(archive, "hall", "--cache", "64MB") as endpoint:
+        assert run([*ask, "--radius", "0.05", "--connect", endpoint, "--scene", "hall"]) == 0
+    shown = capsys.readouterr()
+    assert "40 of 40 poses lie outside the scan (its bounds: -2.000" in shown.err
+    assert "divided by 1000 they would lie inside: expected metres, not millimetres?" in shown.err
+    assert "40 poses: 40 clear, 0 contact, 0 unknown, 40 outside the scan; " in shown.out
 
 
 def check_json(op: str, told: dict[str, Any]) -> None:

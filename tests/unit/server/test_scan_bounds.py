@@ -1,0 +1,142 @@
+"""Which places lie outside a scan, and in which units they would not."""
+
+import numpy as np
+import pytest
+from solidcloud.server.scan_bounds import Bodies, Points, Rays, box_of, lying_outside, outside_line
+
+LOW, HIGH = np.array([-1.0, -2.0, 0.0]), np.array([4.0, 3.0, 5.0])
+
+
+class Info:
+    """What is read of a SceneInfo."""
+
+    def __init__(self, radius=0.0):
+        self.bounds = [LOW.tolist(), HIGH.tolist()]
+        self.radius = radius
+
+
+def poses_at(places, scale=1.0):
+    poses = np.tile(np.eye(4), (len(places), 1, 1))
+    poses[:, :3, :3] *= scale
+    poses[:, :3, 3] = places
+    return poses
+
+
+def bodies(places, *, half=0.5, radius=0.1, reach=0.0, scale=1.0, to=None):
+    """Cubes at places, or on their way to others."""
+    box = np.array([[[-half] * 3, [half] * 3]])
+    poses = poses_at(places, scale)
+    return Bodies(box, np.array([radius]), reach, poses, poses if to is None else poses_at(to, scale))
+
+
+def lies(places, radius=0.0):
+    """Whether the one place lies outside."""
+    info = Info(radius)
+    leaves, verdicts = np.array([True]), np.array([0], np.uint8)
+    return bool(lying_outside(places, leaves, verdicts, info)[0])
+
+
+@pytest.mark.parametrize(
+    ("x", "reach", "scale", "radius", "outside"),
+    [
+        (4.59, 0.0, 1.0, 0.0, False),  # half a metre of body, a tenth of radius
+        (4.61, 0.0, 1.0, 0.0, True),
+        (4.61, 0.02, 1.0, 0.0, False),  # what is asked reaches in
+        (4.61, 0.0, 1.0, 0.02, False),  # the spheres of the scan reach out
+        (5.19, 0.0, 2.0, 0.0, False),
+        (5.21, 0.0, 2.0, 0.0, True),
+        (3.9, 0.0, 1.0, 0.0, False),  # pokes out
+    ],
+)
+def test_a_body_lies_outside_where_nothing_of_the_scan_is_in_reach(x, reach, scale, radius, outside):
+    assert lies(bodies([[x, 0.0, 1.0]], reach=reach, scale=scale), radius) is outside
+
+
+def test_a_turned_body_is_held_by_its_box():
+    turn = np.eye(4)
+    angle = np.radians(45)
+    turn[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    for x, outside in ((4.0 + 0.1 + 0.70, False), (4.0 + 0.1 + 0.72, True)):
+        turn[:3, 3] = [x, 0.0, 1.0]
+        poses = turn[None]
+        body = Bodies(np.array([[[-0.5] * 3, [0.5] * 3]]), np.array([0.1]), 0.0, poses, poses)
+        assert lies(body) is outside
+
+
+def test_contact_and_what_stays_within_the_bounds_never_lie_outside():
+    far = bodies([[90.0, 0, 0]] * 3)
+    said = lying_outside(far, np.array([True, True, False]), np.array([0, 1, 0], np.uint8), Info())
+    assert said.tolist() == [True, False, False]
+
+
+def test_a_motion_through_the_scan_does_not_lie_outside():
+    assert not lies(bodies([[-9.0, 0, 1]], to=[[9.0, 0, 1]]))
+    assert lies(bodies([[9.0, 0, 1]], to=[[99.0, 0, 1]])) is False  # an arc of that length could reach in
+    assert lies(bodies([[90.0, 0, 1]], to=[[99.0, 0, 1]]))
+
+
+def test_no_point_of_a_turning_motion_leaves_the_box_that_is_judged(rng):
+    """A screw of up to half a turn: its points, sampled, stay within the bulge of the ends' box."""
+    for _ in range(50):
+        angle, radius = rng.uniform(0, np.pi), rng.uniform(0.1, 5)
+        axis_at = rng.uniform(-3, 3, 2)
+
+        def pose(turned, radius=radius, axis_at=axis_at):
+            found = np.eye(4)
+            c, s = np.cos(turned), np.sin(turned)
+            found[:2, :2] = [[c, -s], [s, c]]
+            found[:2, 3] = axis_at + radius * np.array([c, s])
+            return found
+
+        body = bodies([[0, 0, 0]])._replace(pose_from=pose(0)[None], pose_to=pose(angle)[None])
+        corners = (body.boxes[0][[[i >> k & 1 for k in range(3)] for i in range(8)], range(3)]).T
+        for part in np.linspace(0, angle, 9):
+            for place in (pose(part)[:3, :3] @ corners + pose(part)[:3, 3:]).T:
+                assert not body.outside(place - 1e-9, place + 1e-9)[0]
+
+
+@pytest.mark.parametrize(
+    ("origin", "direction", "reach", "outside"),
+    [
+        ([0, 0, 9], [0, 0, -2], 3.9, True),
+        ([0, 0, 9], [0, 0, -2], 4.1, False),
+        ([0, 0, 9], [0, 0, 1], 99, True),
+        ([0, 0, 1], [0, 0, 1], 0, False),
+        ([9, 9, 9], [1, 0, 0], 99, True),
+        ([9, 1, 9], [-1, -1, -1], 99, True),  # passes the bounds at a distance
+        ([7, 6, 8], [-1, -1, -1], 99, False),
+    ],
+)
+def test_a_ray_lies_outside_where_it_does_not_meet_the_bounds(origin, direction, reach, outside):
+    rays = Rays(np.array([origin], float), np.array([direction], float), reach)
+    assert lies(rays) is outside
+
+
+def test_a_point_lies_outside_beyond_its_reach():
+    assert lies(Points(np.array([[5.0, 4.0, 6.0]]), 1.73))
+    assert not lies(Points(np.array([[5.0, 4.0, 6.0]]), 1.74))
+
+
+def line(places):
+    info = Info()
+    k = len(places.pose_from)
+    outside = lying_outside(places, np.ones(k, bool), np.zeros(k, np.uint8), info)
+    return outside_line(places, outside, info, "poses")
+
+
+def test_millimetres_are_found_out():
+    walk = np.random.default_rng(3).uniform(LOW, HIGH, (12, 3))
+    assert line(bodies(walk * 1000)) == (
+        "12 of 12 poses lie outside the scan (its bounds: -1.000 -2.000 0.000 .. 4.000 3.000 5.000 m); "
+        "divided by 1000 they would lie inside: expected metres, not millimetres?"
+    )
+
+
+def test_units_are_not_suggested_where_they_explain_nothing():
+    assert line(bodies([[5e6, 4e6, 100.0], [0.0, 0.0, 1.0]])).endswith(" m)")
+    assert line(bodies([[5e6, 4e6, 100.0], [0.0, 0.0, 1.0]])).startswith("1 of 2 poses lie outside")
+
+
+def test_an_avatar_without_points_lies_where_its_origin_is():
+    assert box_of(np.empty((0, 3))).tolist() == [[0, 0, 0], [0, 0, 0]]
+    assert bodies(np.empty((0, 3))).outside(LOW, HIGH).tolist() == []

@@ -46,6 +46,7 @@ from ..schemas.requests import Question
 from .config import ServerConfig
 from .frames import Frames
 from .served import Answer, SceneLike
+from .stop import Stop
 from .transport import Transport
 
 log = logging.getLogger(__name__)
@@ -135,8 +136,13 @@ class Service:
         except SolidcloudError as error:
             return self._error(encoding, error.code, str(error))
 
-    def answer(self, key: str, payload: bytes, encoding: str | None) -> Answer | Iterator[Answer]:
-        """The answer to the question asked under this key; an iterator where it comes in parts."""
+    def answer(
+        self, key: str, payload: bytes, encoding: str | None, stop: Stop | None = None
+    ) -> Answer | Iterator[Answer]:
+        """Return the answer to the question asked under this key; an iterator where it comes in parts.
+
+        stop: ends the work early once it is set; what was not reached then is unknown.
+        """
         try:
             stated = wire_encoding(encoding)
             found = self._ask(key, payload, stated)
@@ -173,12 +179,17 @@ class Service:
             encoding, ErrorCode.INTERNAL, f"{type(error).__name__} in the server: its log says more"
         )
 
-    def busy(self, encoding: str | None) -> Answer:
-        """The answer to a question there is no room for."""
-        most = self._config.max_in_flight
-        return self._error(
-            encoding, ErrorCode.BUSY, f"up to {most} requests are in flight here: ask again later"
-        )
+    def busy(self, encoding: str | None, own: bool = False) -> Answer:
+        """Return the answer to a question there is no room for. own: its client has too many in flight."""
+        if own:
+            most = self._config.max_in_flight_by_client
+            message = (
+                f"{most} requests of this client are in flight, the most that this server takes (all clients without a "
+                "liveliness token count as one): wait for answers"
+            )
+        else:
+            message = f"up to {self._config.max_in_flight} requests are in flight here: ask again later"
+        return self._error(encoding, ErrorCode.BUSY, message)
 
     def client_gone(self, scene: str, client: str) -> None:
         """Forget the avatars of a client that went, and end its bodies."""

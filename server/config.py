@@ -1,5 +1,6 @@
 """What an operator may set for a server, each default with its reason."""
 
+import math
 import re
 from dataclasses import dataclass
 
@@ -19,24 +20,30 @@ class ServerConfig:
     listen: the zenoh endpoint to be reached at. Loopback only, because anyone who reaches it may ask.
     insecure: allow an endpoint that other hosts reach; there is no authentication yet.
     workers: requests answered at the same time. 2: one client that does not take its replies holds one.
+    max_slow: requests at work for longer than some 10 ms; they hold no worker. More of them wait for one to end.
+    max_request_seconds: server time for one request; what was not reached by then is `unknown`.
     max_in_flight: requests accepted and not yet answered, over all clients; one more is answered `busy`.
-    max_in_flight_bytes: the same for the bytes of their payloads.
+    max_in_flight_by_client: the same for one client; all clients without a liveliness token count as one.
+    max_in_flight_bytes: bytes of the payloads of all requests in flight.
     max_paths: paths answered at the same time, each by a thread that sends its parts, half of them of one client; one
     more is answered `busy`.
     max_poses, max_avatar_points: of one request; more is answered `too_large`.
-    stop_seconds: how long a stop waits for accepted requests to be answered.
+    stop_seconds: how long a stop waits for accepted requests to be answered before it stops them.
     metrics_port: where Prometheus' text is served over HTTP, on loopback unless `insecure`; 0: nowhere.
     """
 
     listen: str = DEFAULT_ENDPOINT
     insecure: bool = False
     workers: int = 2
+    max_slow: int = 4
+    max_request_seconds: float = 2.0
     max_in_flight: int = 1024
-    max_in_flight_bytes: int = 256 << 20
+    max_in_flight_by_client: int = 64
+    max_in_flight_bytes: int = 128 << 20
     max_paths: int = 16
     max_poses: int = MAX_POSES
     max_avatar_points: int = MAX_AVATAR_POINTS
-    stop_seconds: float = 10.0
+    stop_seconds: float = 1.0
     metrics_port: int = 0
 
     def __post_init__(self) -> None:
@@ -50,9 +57,15 @@ class ServerConfig:
         for name, most in (("max_poses", MAX_POSES), ("max_avatar_points", MAX_AVATAR_POINTS)):
             if not 1 <= getattr(self, name) <= most:
                 raise BadRequestError(f"{name} is {getattr(self, name)}: expected 1 to {most} (WIRE.md)")
-        for name in ("workers", "max_in_flight", "max_in_flight_bytes", "max_paths"):
+        for name in (
+            "workers", "max_slow", "max_in_flight", "max_in_flight_by_client", "max_in_flight_bytes", "max_paths"
+        ):  # fmt: skip
             if getattr(self, name) < 1:
                 raise BadRequestError(f"{name} is {getattr(self, name)}: expected at least 1")
+        if not 0 < self.max_request_seconds < math.inf:
+            raise BadRequestError(
+                f"max_request_seconds is {self.max_request_seconds}: expected seconds above 0"
+            )
         if not 0 <= self.metrics_port < 1 << 16:
             raise BadRequestError(f"--metrics-port {self.metrics_port}: expected 1 to 65535, or 0 for none")
 

@@ -1,83 +1,259 @@
-"""Whose request is answered next: one of each client at a time, the clients in turn. No zenoh here."""
+"""The order in which requests are answered: one of each client at a time, the clients in turn. No zenoh here.
+
+A request is *quick* until it has been at work for longer than its watcher allows, or is *slow* from the start. Quick
+requests share the workers. Slow ones keep their client's turn but hold no worker; their number is bounded too.
+"""
 
 import threading
 from collections import deque
 from enum import Enum
-from typing import Any
+from typing import Any, NamedTuple
 
 
 class Offer(Enum):
     """What becomes of a request that was offered."""
 
     RUN = "run it now"
-    WAIT = "it waits; whoever finishes takes it"
-    FULL = "refused"
+    START = "run it now, in a thread of its own: it is slow"
+    WAIT = "it waits; whoever finishes starts it"
+    FULL = "refused: the server has too many requests in flight"
+    FULL_TURN = "refused: this client has too many requests in flight"
+
+
+class State(Enum):
+    """Where an accepted request is."""
+
+    WAITING = "in its turn's queue"
+    WORKING = "holds a worker and its turn"
+    SLOW = "holds its turn and a place among the slow ones"
+    SENDING = "holds its turn; its answer is on the way"
+    DETACHED = "holds nothing but its bytes"
+    DONE = "answered, or dropped"
+
+
+class Bounds(NamedTuple):
+    """The bounds of the queues.
+
+    workers: quick requests at work.  slow: slow requests at work.  sending: requests that hold no worker because their
+    client takes no reply.  requests, size: requests accepted and not yet answered, and their bytes.  by_turn: requests
+    of one turn.
+    """
+
+    workers: int
+    slow: int
+    sending: int
+    requests: int
+    size: int
+    by_turn: int
+
+
+class Ticket:
+    """One request in the queues.
+
+    client: whose it is.  turn: which turn it takes, by default its client's.  size: its bytes.  slow: whether it needs
+    a slow place to run.  request: anything; the queues do not look at it.  left: whether the request has given up its
+    worker; whoever carries it out must then not take another one.
+    """
+
+    __slots__ = ("client", "left", "request", "size", "slow", "state", "turn")
+
+    def __init__(
+        self, client: str, request: Any, size: int, *, turn: str | None = None, slow: bool = False
+    ) -> None:
+        """Make a ticket that is not offered yet."""
+        self.client, self.request, self.size, self.slow = client, request, size, slow
+        self.turn = client if turn is None else turn
+        self.state, self.left = State.WAITING, False
+
+    def __repr__(self) -> str:
+        """Return the ticket as text, for messages of tests."""
+        return f"Ticket({self.client!r}, {self.request!r}, {self.state.name})"
+
+
+class _Turn:
+    """The requests that take turns as one. busy: whether one of them is at work.  count: of all in flight."""
+
+    __slots__ = ("busy", "count", "waiting")
+
+    def __init__(self) -> None:
+        self.waiting: deque[Ticket] = deque()
+        self.busy, self.count = False, 0
 
 
 class FairQueues:
-    """A queue for each client: one request of each in flight, the clients in turn, the whole bounded.
+    """A queue for each turn: one request of each at work, the turns in order, the whole bounded. Thread-safe.
 
-    Thread-safe. Every RUN is followed by `finished`, or by `detach` and `release`, and so is every request that these
-    return; that is why nothing that waits is ever forgotten.
+    A turn is a client's own, or shared by several clients. The requests of one client stay in order: while it has
+    requests in flight, new ones take the same turn.
+
+    Methods that make room return the tickets to be started. Each of them, and each that was offered with RUN or START,
+    is followed by one call of `finished`, or of `put_back`, or of `detach` and later `release`. So nothing that waits
+    is forgotten.
     """
 
-    def __init__(self, workers: int, max_requests: int, max_bytes: int) -> None:
+    def __init__(self, bounds: Bounds) -> None:
+        """Make empty queues."""
+        self._bounds = bounds
         self._lock = threading.Lock()
-        self._workers, self._max_requests, self._max_bytes = workers, max_requests, max_bytes
-        self._waiting: dict[str, deque[tuple[Any, int]]] = {}
-        self._ready: deque[str] = deque()  # clients with something waiting and nothing in flight
-        self._running: dict[str, int] = {}  # client: bytes of its request in flight
+        self._turns: dict[str, _Turn] = {}
+        self._clients: dict[str, tuple[str, int]] = {}  # client: its turn, its requests in flight
+        # Turns with something waiting and nothing at work, by what the first one needs.
+        self._ready: dict[bool, deque[str]] = {False: deque(), True: deque()}
+        self._at_work = dict.fromkeys((State.WORKING, State.SLOW, State.SENDING), 0)
         self._requests = self._bytes = 0
 
-    def offer(self, client: str, request: Any, size: int, *, always: bool = False) -> Offer:
-        """Take in a request of `size` bytes; `always`: even where the bound is reached."""
+    def offer(self, ticket: Ticket, *, always: bool = False) -> Offer:
+        """Accept or refuse a request. always: accept it even where a bound is reached."""
         with self._lock:
-            full = self._requests >= self._max_requests or self._bytes + size > self._max_bytes
-            if full and self._requests and not always:
-                return Offer.FULL
+            ticket.turn, own = self._clients.get(ticket.client, (ticket.turn, 0))
+            turn = self._turns.get(ticket.turn)
+            if not always and self._requests:
+                if turn is not None and turn.count >= self._bounds.by_turn:
+                    return Offer.FULL_TURN
+                if self._requests >= self._bounds.requests or self._bytes + ticket.size > self._bounds.size:
+                    return Offer.FULL
+            if turn is None:
+                turn = self._turns[ticket.turn] = _Turn()
             self._requests += 1
-            self._bytes += size
-            if client not in self._running and len(self._running) < self._workers:
-                self._running[client] = size
-                return Offer.RUN
-            if client not in self._waiting:
-                self._waiting[client] = deque()
-                if client not in self._running:
-                    self._ready.append(client)
-            self._waiting[client].append((request, size))
+            self._bytes += ticket.size
+            turn.count += 1
+            self._clients[ticket.client] = ticket.turn, own + 1
+            if not turn.busy and not turn.waiting and self._has_place(ticket.slow):
+                self._begin(ticket, turn)
+                return Offer.START if ticket.slow else Offer.RUN
+            turn.waiting.append(ticket)
+            if not turn.busy and len(turn.waiting) == 1:
+                self._ready[ticket.slow].append(ticket.turn)
             return Offer.WAIT
 
-    def finished(self, client: str) -> tuple[str, Any] | None:
-        """The client's request in flight is answered. Returns the (client, request) to run next, if any."""
-        size, following = self.detach(client)
-        self.release(size)
-        return following
+    def finished(self, ticket: Ticket) -> list[Ticket]:
+        """End a request that is at work. Returns the tickets to be started."""
+        with self._lock:
+            self._leave(ticket, State.DONE)
+            self._forget(ticket)
+            return self._start_waiting()
 
-    def detach(self, client: str) -> tuple[int, tuple[str, Any] | None]:
-        """The client's request in flight goes on, but takes up neither a worker nor its client's turn.
+    def put_back(self, ticket: Ticket) -> list[Ticket]:
+        """Put a request at work back, as a slow one, before all others of its turn.
 
-        Returns its size, to be given to `release` once it is answered, and the (client, request) to run next, if any.
+        Returns the tickets to be started.
         """
         with self._lock:
-            size = self._running.pop(client)
-            if client in self._waiting:
-                self._ready.append(client)
-            if not self._ready:
-                return size, None
-            following = self._ready.popleft()
-            request, following_size = self._waiting[following].popleft()
-            if not self._waiting[following]:
-                del self._waiting[following]
-            self._running[following] = following_size
-            return size, (following, request)
+            self._leave(ticket, State.WAITING, ready=False)
+            ticket.slow, ticket.left = True, False
+            self._turns[ticket.turn].waiting.appendleft(ticket)
+            self._ready[True].append(ticket.turn)
+            return self._start_waiting()
 
-    def release(self, size: int) -> None:
-        """A request of `size` bytes is answered."""
+    def slow(self, ticket: Ticket) -> list[Ticket] | None:
+        """Take the worker of a request that has been at work for long; it keeps its turn.
+
+        Returns the tickets to be started; None: it holds no worker, or all slow places are taken.
+        """
         with self._lock:
-            self._requests -= 1
-            self._bytes -= size
+            if ticket.state is not State.WORKING or self._at_work[State.SLOW] >= self._bounds.slow:
+                return None
+            self._move(ticket, State.SLOW)
+            return self._start_waiting()
+
+    def sending(self, ticket: Ticket) -> list[Ticket] | None:
+        """Take the worker, or the slow place, of a request whose answer is on the way; it keeps its turn.
+
+        Returns the tickets to be started; None: it holds neither, or too many answers are on the way.
+        """
+        with self._lock:
+            held = ticket.state in (State.WORKING, State.SLOW)
+            if not held or self._at_work[State.SENDING] >= self._bounds.sending:
+                return None
+            self._move(ticket, State.SENDING)
+            return self._start_waiting()
+
+    def detach(self, ticket: Ticket) -> list[Ticket]:
+        """Take worker and turn of a request that goes on by itself. Returns the tickets to be started."""
+        with self._lock:
+            self._leave(ticket, State.DETACHED)
+            return self._start_waiting()
+
+    def release(self, ticket: Ticket) -> None:
+        """End a detached request."""
+        with self._lock:
+            ticket.state = State.DONE
+            self._forget(ticket)
+
+    def drop(self, client: str) -> list[Ticket]:
+        """Forget the waiting requests of a client, and return them."""
+        with self._lock:
+            if client not in self._clients:
+                return []
+            name = self._clients[client][0]
+            turn = self._turns[name]
+            dropped = [ticket for ticket in turn.waiting if ticket.client == client]
+            if not dropped:
+                return []
+            if not turn.busy:
+                self._ready[turn.waiting[0].slow].remove(name)
+            turn.waiting = deque(ticket for ticket in turn.waiting if ticket.client != client)
+            if not turn.busy and turn.waiting:
+                self._ready[turn.waiting[0].slow].append(name)
+            for ticket in dropped:
+                ticket.state = State.DONE
+                self._forget(ticket)
+            return dropped
 
     def __len__(self) -> int:
-        """Requests taken in and not yet finished."""
+        """Return the number of requests accepted and not yet answered."""
         with self._lock:
             return self._requests
+
+    def _has_place(self, slow: bool) -> bool:
+        """Return whether one more request may be at work."""
+        if slow:
+            return self._at_work[State.SLOW] < self._bounds.slow
+        return self._at_work[State.WORKING] < self._bounds.workers
+
+    def _begin(self, ticket: Ticket, turn: _Turn) -> None:
+        """Put a request to work."""
+        ticket.state = State.SLOW if ticket.slow else State.WORKING
+        ticket.left = ticket.slow
+        turn.busy = True
+        self._at_work[ticket.state] += 1
+
+    def _move(self, ticket: Ticket, state: State) -> None:
+        """Have a request hold another place than a worker."""
+        self._at_work[ticket.state] -= 1
+        self._at_work[state] += 1
+        ticket.state, ticket.left = state, True
+
+    def _leave(self, ticket: Ticket, state: State, *, ready: bool = True) -> None:
+        """Take what a request at work holds. ready: let the next one of its turn begin."""
+        self._at_work[ticket.state] -= 1
+        ticket.state = state
+        turn = self._turns[ticket.turn]
+        turn.busy = False
+        if ready and turn.waiting:
+            self._ready[turn.waiting[0].slow].append(ticket.turn)
+
+    def _forget(self, ticket: Ticket) -> None:
+        """Count a request no longer."""
+        self._requests -= 1
+        self._bytes -= ticket.size
+        turn = self._turns[ticket.turn]
+        turn.count -= 1
+        if not turn.count:
+            del self._turns[ticket.turn]
+        name, own = self._clients[ticket.client]
+        if own == 1:
+            del self._clients[ticket.client]
+        else:
+            self._clients[ticket.client] = name, own - 1
+
+    def _start_waiting(self) -> list[Ticket]:
+        """Put waiting requests to work while there are places."""
+        started: list[Ticket] = []
+        for slow, ready in self._ready.items():
+            while ready and self._has_place(slow):
+                turn = self._turns[ready.popleft()]
+                ticket = turn.waiting.popleft()
+                self._begin(ticket, turn)
+                started.append(ticket)
+        return started

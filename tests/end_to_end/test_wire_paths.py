@@ -20,7 +20,7 @@ from solidcloud.schemas.messages import (
     PathRequest,
     encode,
 )
-from solidcloud.server import transport as transport_module
+from solidcloud.server import lanes as lanes_module
 from solidcloud.server.app import serving
 from solidcloud.server.client import Client
 from solidcloud.server.config import ServerConfig
@@ -177,12 +177,12 @@ def test_a_client_whose_token_goes_is_sent_no_more_parts(scene, endpoint):
 def test_paths_that_ended_are_no_longer_in_flight(scene, endpoint, monkeypatch):
     made = []
 
-    class Queues(transport_module.FairQueues):
+    class Queues(lanes_module.FairQueues):
         def __init__(self, *bounds):
             super().__init__(*bounds)
             made.append(self)
 
-    monkeypatch.setattr(transport_module, "FairQueues", Queues)
+    monkeypatch.setattr(lanes_module, "FairQueues", Queues)
     with serving([scene], ServerConfig(listen=endpoint)), Client(endpoint, scene="floor") as client:
         client.add_avatar("al", POINTS, 0.125)
         client.add_avatar("wait", POINTS, 0.125)

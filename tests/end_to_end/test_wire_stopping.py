@@ -41,7 +41,7 @@ def test_a_server_that_stops_gives_up_what_takes_too_long(endpoint):
             eventually(lambda: client.collide("al", heights([-1.0])).verdict.tolist() == [Verdict.CONTACT])
             path = client.path("al", np.tile(PATH, (100, 1, 1)))
             first = next(path)
-            asked = [threading.Thread(target=client.collide, args=("al", PATH)) for _ in range(100)]
+            asked = [threading.Thread(target=client.collide, args=("al", PATH)) for _ in range(60)]
             for thread in asked:
                 thread.start()
                 stack.callback(thread.join)
@@ -50,7 +50,7 @@ def test_a_server_that_stops_gives_up_what_takes_too_long(endpoint):
         assert [name for name in left if name.startswith("solidcloud-")] == []
         verdicts = joined([first, *path])
         assert len(verdicts) == 100 * len(PATH) and verdicts[-1] == Verdict.UNKNOWN
-        assert scene.parts < 40 and scene.at_work < 100
+        assert scene.parts < 40 and scene.at_work < 60
 
 
 def test_terminated_server_answers_what_it_accepted_and_exits_0(endpoint):

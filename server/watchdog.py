@@ -1,0 +1,76 @@
+"""A thread that looks, every few milliseconds, at what is at work. No zenoh here."""
+
+import logging
+import os
+import sys
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+
+log = logging.getLogger(__name__)
+
+# How often the thread looks [s]. A look costs some 10 µs of the interpreter.
+PERIOD = 0.005
+# How long the thread goes on looking after there was something at work [s]. Being woken costs the first request more
+# than a look does.
+LINGER = 1.0
+# The nice value of threads whose requests are slow. Linux gives them a tenth of what a thread at 0 gets.
+_LOW_PRIORITY = 10
+
+
+class Watchdog:
+    """Calls a function at intervals while there is something to look at.
+
+    look: takes the time on `time.monotonic`'s clock [s] and returns whether anything is at work. It is called every
+    `PERIOD` then, and once in `idle` seconds otherwise.
+    """
+
+    def __init__(self, look: Callable[[float], bool], *, idle: float = LINGER) -> None:
+        """Make a watchdog that does not look yet."""
+        self._look, self._idle = look, idle
+        self._woken = threading.Event()
+        self._closed = False
+        self.asleep = True
+
+    def wake(self) -> None:
+        """Have the thread look from now on: something has begun."""
+        self.asleep = False
+        self._woken.set()
+
+    def close(self) -> None:
+        """End the thread after its next look."""
+        self._closed = True
+        self._woken.set()
+
+    def run(self) -> None:
+        """Look until the watchdog is closed. A thread's work."""
+        until = 0.0
+        while not self._closed:
+            now = time.monotonic()
+            try:
+                busy = self._look(now)
+            except Exception:  # of this look alone
+                log.exception("a look at what is at work")
+                busy = True
+            if busy:
+                until = now + LINGER
+            if now < until:
+                time.sleep(PERIOD)
+                continue
+            # Whoever begins after this wakes the thread, even before it waits.
+            self._woken.clear()
+            self.asleep = True
+            if not self._look(time.monotonic()) and not self._closed:
+                self._woken.wait(self._idle)
+            self.asleep = False
+
+
+def lower_priority(thread_id: int) -> None:
+    """Lower the priority of a thread for good, where the system has priorities of threads.
+
+    thread_id: as `threading.get_native_id` returns it. Raising a priority again takes privileges.
+    """
+    if sys.platform == "linux":  # elsewhere this would change the whole process
+        with suppress(OSError):  # the thread has ended, or a limit forbids it
+            os.setpriority(os.PRIO_PROCESS, thread_id, _LOW_PRIORITY)

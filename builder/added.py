@@ -15,6 +15,7 @@ from ..schemas.index import Header, Source
 from ..schemas.voxel_grid import voxel_coordinates
 from .change import Change, scan_name
 from .classes import ALL_CODES
+from .coincident import coincide
 from .partition import SpoolUnit, run_points, spool_range
 from .passes import MAX_SCANS
 from .pipeline import ARCHIVE_BYTES_A_POINT
@@ -125,7 +126,7 @@ def source_of(survey: Survey) -> Source:
     assert scan is not None
     return Source(
         str(survey.path), scan.index, scan.format, survey.sha256, survey.count, scan.pose, survey.dropped,
-        crs=scan.crs, units=scan.units, up=scan.up,
+        crs=scan.crs, units=scan.units, up=scan.up, one_place=coincide(survey.low, survey.high, survey.count),
     )  # fmt: skip
 
 

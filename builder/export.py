@@ -88,7 +88,10 @@ def export_archive(
             f"{output}: within the archive itself, expected a place outside: give another name"
         )
     if not output.parent.is_dir():
-        raise BadRequestError(f"{output.parent}: no such folder: make it first")
+        found = "a file, expected a folder: give another name"
+        raise BadRequestError(
+            f"{output.parent}: {found if output.parent.exists() else 'no such folder: make it first'}"
+        )
     with Archive(folder) as archive:
         limits = lattice_box(archive.header.lattice, box)
         base = archive.coordinates * archive.header.lattice.voxel_steps

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from ..schemas.index import Header, Source
 from ..schemas.radius_model import RADIUS_CLASSES
 from ..schemas.voxel_grid import Lattice, voxel_coordinates
+from .coincident import coincide
 from .config import BuildConfig
 from .partition import Spooled
 from .shards import Shard
@@ -94,7 +95,7 @@ def _good_source(survey: Survey, filtered: dict[str, int]) -> Source:
     skipped = {**survey.dropped, **filtered}
     return Source(
         str(survey.path), scan.index, scan.format, survey.sha256, kept, scan.pose, skipped,
-        crs=scan.crs, units=scan.units, up=scan.up,
+        crs=scan.crs, units=scan.units, up=scan.up, one_place=coincide(survey.low, survey.high, survey.count),
     )  # fmt: skip
 
 

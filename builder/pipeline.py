@@ -20,8 +20,10 @@ from ..schemas.archive import Archive
 from ..schemas.errors import BadRequestError, CorruptError, ScanError, SolidcloudError
 from ..schemas.index import Header
 from ..schemas.index_file import write_index
+from ..schemas.os_errors import os_error_words
 from ..schemas.voxel_grid import Lattice
 from ..schemas.vtkhdf import PREVIEW_NAME
+from .coincident import coincident_sources, coincident_text
 from .config import RADIUS_SAMPLE, BuildConfig
 from .dense import DENSE_POINTS
 from .executor import Executor, make_executor, worker_count
@@ -70,6 +72,7 @@ class BuildSummary(NamedTuple):
     stages: seconds of each.  skipped: reason -> points left out.
     lattice_step, moved_max, radius, radius_error: [m], see schemas/index.py Header.  faults: scans left out.
     already: nothing was built, for the archive was there, of the same scans with the same options.
+    warnings: sentences about scans that are in and look wrong.
     """
 
     archive: Path
@@ -88,6 +91,7 @@ class BuildSummary(NamedTuple):
     skipped: dict[str, int]
     faults: tuple[str, ...]
     already: bool = False
+    warnings: tuple[str, ...] = ()
 
 
 def build_archive(
@@ -179,7 +183,11 @@ def _check_request(surveys: Sequence[Survey], lattice: Lattice, config: BuildCon
     check_filters(config, lattice)
     low, high = np.min([s.low for s in surveys], axis=0), np.max([s.high for s in surveys], axis=0)
     if config.radius is None and (low == high).all():
-        raise BadRequestError(ONE_POINT)
+        if (count := sum(s.count for s in surveys)) == 1:
+            raise BadRequestError(ONE_POINT)
+        first, others = surveys[0], len(surveys) - 1
+        where = f"{first.path}{f' and {others} more scans' if others else ''}"
+        raise ScanError(coincident_text(where, first.scan.index if first.scan else 0, count))
 
 
 def _check_voxels(spool: Spool, config: BuildConfig) -> None:
@@ -284,6 +292,7 @@ def _summary(
         skipped=dict(sum((Counter(s.skipped) for s in header.sources), Counter())),
         faults=tuple(s.fault for s in header.sources if s.fault),
         already=already,
+        warnings=coincident_sources(header.sources),
     )
 
 
@@ -301,12 +310,11 @@ def _machine_errors(target: Path) -> Iterator[None]:
     except OSError as error:
         # HDF5 puts the number into its text alone.
         full = error.errno in (errno.ENOSPC, errno.EDQUOT) or f"errno = {errno.ENOSPC}" in str(error)
-        found = "no space left on the disk" if full else str(error)
-        what = "make room" if full else "check the disk"
-        where = f" ({error.filename})" if full and error.filename else ""
+        found = os_error_words(OSError(errno.ENOSPC, "") if full else error)
+        where = f" ({error.filename})" if error.filename else ""
         raise SolidcloudError(
-            f"{target.parent}: {found}{where}: {what}, then give the same command again: it goes on from what is done, "
-            f"in {folder}"
+            f"{target.parent}{where}: {found}, then give the same command again: it goes on from what is done, in "
+            f"{folder}"
         ) from error
 
 

@@ -17,6 +17,7 @@ from ..schemas.index_file import write_index
 from ..schemas.shard import SHARD_FOLDER
 from ..schemas.voxel_grid import voxel_coordinates
 from .change import Change, publish, reading_back, show_kept, verify_new
+from .coincident import coincident_sources
 from .config import RADIUS_SAMPLE
 from .dense import DENSE_POINTS, check_normals
 from .partition import LEAST_RUN_POINTS
@@ -42,6 +43,7 @@ class ChangeSummary(NamedTuple):
     bytes: of the new shards.  dead_bytes: of records that were replaced, but stay on disk in shards that are in use.
     radius: the stored figure; radius_now: what it would be now, None where it was given [m].
     scans: those added or removed, as the index names them.  skipped: reason -> points of those added left out.
+    warnings: sentences about those added.
     """
 
     archive: Path
@@ -59,6 +61,7 @@ class ChangeSummary(NamedTuple):
     radius: float
     radius_now: RadiusNow | None
     skipped: dict[str, int]
+    warnings: tuple[str, ...] = ()
 
 
 class Difference(NamedTuple):
@@ -128,6 +131,7 @@ def rebuild(
         radius=header.radius,
         radius_now=header.radius_now,
         skipped=_left_out(header.sources[len(before.sources) :]),
+        warnings=coincident_sources(header.sources[len(before.sources) :]),
     )
 
 

@@ -1,8 +1,9 @@
 """The list of scans that a build reads: found by their headers, written as TOML for hands to edit, read back.
 
 `inspect` makes entries of files and folders, `write_scan_list` and `read_scan_list` a file of them, `inputs` what a
-build opens: files and folders as they are, or a list with what was changed in it. Nothing here reads points, but the
-text of PTX and PTS files, in which the second scan can only be found by reading past the first.
+build opens: files and folders as they are, or a list with what was changed in it. Points are read only of the text of
+PTX and PTS files, in which the second scan can only be found by reading past the first, and of small scans without
+declared bounds (coincident.py).
 """
 
 import math
@@ -22,6 +23,7 @@ from numpy.typing import NDArray
 
 from ..schemas.errors import BadRequestError, ScanError
 from ..schemas.new_file import sync_folder
+from .coincident import coincident_scan
 from .passing import raise_passing
 from .progress import Progress, Silent
 from .sources import METRES, TURNS, Scan, header_bounds, open_scans, placed, scan_files, sha256_of
@@ -52,7 +54,8 @@ class ScanEntry:
     count: points that its header declares; None: not said.  bounds: (2, 3) as declared, in the file's units and frame
     or where its pose puts it; None: not said.  pose: (4, 4), None where there is none.  units, up: keys of METRES and
     TURNS.  scale: besides.  crs: text of the coordinate reference system, or "".  sha256: of the file, "" where not
-    asked.  use: whether a build takes it.  fault: why it cannot be read, or "".
+    asked.  use: whether a build takes it.  fault: why it cannot be read, or "".  warning: what looks wrong, or ""; not
+    written to a list.
     """
 
     path: Path
@@ -68,6 +71,7 @@ class ScanEntry:
     sha256: str = ""
     use: bool = True
     fault: str = ""
+    warning: str = ""
 
 
 class Input(NamedTuple):
@@ -126,6 +130,7 @@ def _inspect_file(path: Path, with_sha256: bool) -> list[ScanEntry]:
             scan.crs,
             digest,
             fault=scan.fault,
+            warning=coincident_scan(scan),
         )
         for scan in scans
     ]

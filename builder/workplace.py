@@ -46,8 +46,8 @@ def check_target(target: Path, overwrite: bool) -> None:
 def made_parents(target: Path) -> Iterator[None]:
     """Make the folders above the target; after a failure, remove those that were made here."""
     made = [folder for folder in target.parents if not folder.exists()]
-    target.parent.mkdir(parents=True, exist_ok=True)
     try:
+        target.parent.mkdir(parents=True, exist_ok=True)
         yield
     except BaseException:
         for folder in made:

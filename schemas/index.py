@@ -48,6 +48,7 @@ class Source:
     crs: the text of the coordinate reference system that the file names, or "".  units, up: what a length of the file
     was taken for, and which of its axes for up; `pose` has both in it.  unknown: the row of the header's `unknown`
     where a scan that was left out may have had points, -1 where that is not known; None: nothing was lost with it.
+    one_place: all its points, several, lay at one place.
     """
 
     path: str
@@ -62,10 +63,11 @@ class Source:
     units: str = "m"
     up: str = "z"
     unknown: int | None = None
+    one_place: bool = False
 
 
 # Fields of a source that texts name only where they are not the default: without, an archive stays what it was.
-_OPTIONAL = {"crs": "", "units": "m", "up": "z", "unknown": None}
+_OPTIONAL = {"crs": "", "units": "m", "up": "z", "unknown": None, "one_place": False}
 
 
 @dataclass(frozen=True, slots=True)
@@ -296,6 +298,7 @@ def read_header(archive_id: bytes, columns: dict[str, NDArray]) -> Header:
             s["fault"],
             **{name: str(s[name]) for name in ("crs", "units", "up") if name in s},
             unknown=_unknown_row(s.get("unknown"), len(columns["unknown"])),
+            one_place=s.get("one_place") is True,
         )
         for i, s in enumerate(texts["sources"])
     )

@@ -11,6 +11,7 @@ from typing import Any
 import typer
 
 from ..schemas.errors import BadRequestError, SolidcloudError
+from ..schemas.os_errors import os_error_line
 from .verbs import (
     accuracy,
     archive,
@@ -93,8 +94,10 @@ def run(arguments: Sequence[str]) -> int:
         # Whoever read the output has had enough. Python would complain again when it flushes at exit.
         sys.stdout = None
         return 1
-    except (OSError, MemoryError) as error:
-        return complain(str(error) or type(error).__name__, 1)
+    except OSError as error:
+        return complain(os_error_line(error), 1)
+    except MemoryError as error:
+        return complain(f"out of memory{f' ({error})' if str(error) else ''}: close other programs", 1)
 
 
 def _find_verb(arguments: Sequence[str]) -> tuple[Any, str, list[str]]:

@@ -20,6 +20,7 @@ import numpy as np
 from ..schemas.encoding import encode
 from ..schemas.errors import BadRequestError, CorruptError, FormatError, SolidcloudError
 from ..schemas.keys import User
+from ..schemas.os_errors import write_error_words
 from .avatar import AvatarModel
 from .served import Outcome, Turn
 
@@ -130,7 +131,9 @@ class FrameLog:
                 f"{path}: exists: expected none, a log is not written over: name another"
             ) from None
         except OSError as error:
-            raise BadRequestError(f"{path}: {error.strerror}: a log cannot be written there") from None
+            raise BadRequestError(
+                f"{path}: the log cannot be written: {write_error_words(error, self._path)}"
+            ) from None
         self._known: set[bytes] = set()
         self._write_all(MAGIC)
         self._write(begin)

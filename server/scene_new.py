@@ -10,6 +10,7 @@ import numpy as np
 
 from ..schemas.errors import BadRequestError, SolidcloudError
 from ..schemas.keys import check_name
+from ..schemas.os_errors import write_error_words
 from ..schemas.radius_model import STORED_MODELS
 from ..schemas.scene import SUFFIX, parse_scene, scene_name
 from .describe import describe
@@ -64,7 +65,7 @@ def new_scene(
     except FileExistsError:
         raise BadRequestError(f"{out} is there: give another -o, or --force to replace it") from None
     except OSError as error:
-        raise SolidcloudError(f"{out}: {error.strerror}") from None
+        raise SolidcloudError(f"{out}: cannot be written: {write_error_words(error, out)}") from None
 
 
 def _named(avatars: Sequence[Path]) -> dict[str, Path]:

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 from ...builder.config import BuildConfig
 from ...builder.progress import Progress
 from ...schemas.archive import Archive
+from ...schemas.os_errors import check_writable
 from .accuracy_arithmetic import PRIMITIVE, VOLUME, check_judge, measure_plain, plain_settings
 from .accuracy_case import (
     AVATAR,
@@ -73,6 +74,7 @@ def run(
     if archive is not None:
         Archive(archive).close()  # what cannot be opened leaves no empty folder
     out.mkdir(parents=True, exist_ok=True)
+    check_writable(out)
     report = measure(scratch, plan, progress, archive, avatar)
     progress.start("draw", 1, "page")
     write_rows(report, out)

@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from .interrupt import interruptible
 from .options import needs_extra
 
 
@@ -24,13 +25,20 @@ def accuracy(
     """
     import tempfile
 
+    from ...schemas.os_errors import writing
+
     with needs_extra("made"):
         from ..report.accuracy import run as measure
     from ..progress import progress_listener
     from ..report.accuracy_plan import BRIEF, FULL
     from ..report.accuracy_words import findings
 
-    with tempfile.TemporaryDirectory(prefix="solidcloud-accuracy-") as scratch, progress_listener() as bars:
+    with (
+        interruptible(),
+        writing(output),
+        tempfile.TemporaryDirectory(prefix="solidcloud-accuracy-") as scratch,
+        progress_listener() as bars,
+    ):
         report = measure(output, Path(scratch), FULL if full else BRIEF, bars, archive, avatar)
     for line in (
         *report.facts["warnings"],

@@ -124,10 +124,11 @@ def build(
 def _build(scans: list[Path], output: Path, config: "BuildConfig", log_json: bool, as_json: bool) -> None:
     """Build, and say what was built."""
     from ...builder.pipeline import build_archive
+    from ...schemas.os_errors import writing
     from ..console import print_build
     from ..progress import progress_listener
 
-    with interruptible(lambda: _kept(output)), progress_listener(log_json) as listener:
+    with interruptible(lambda: _kept(output)), writing(output), progress_listener(log_json) as listener:
         summary = build_archive(scans, output, config, listener)
     if as_json:
         print_json({**summary._asdict(), "archive": str(summary.archive)})
@@ -139,6 +140,8 @@ def _build(scans: list[Path], output: Path, config: "BuildConfig", log_json: boo
             "records were not read, which `solidcloud validate` does; --overwrite builds it anew",
             file=sys.stderr,
         )
+    for warning in summary.warnings:
+        print(f"warning: {warning}", file=sys.stderr)
     for fault in summary.faults:
         print(f"left out: {fault}", file=sys.stderr)
 
@@ -160,7 +163,8 @@ def _estimate(scans: Sequence[Path], output: Path, config: "BuildConfig", as_jso
     from ..console import print_facts
     from .plan import plan_facts
 
-    found = estimate(seen_scene(inputs(scans, config.spacing), config), config, load_rates(), output)
+    with interruptible():
+        found = estimate(seen_scene(inputs(scans, config.spacing), config), config, load_rates(), output)
     if as_json:
         print_json(found.as_json())
     else:

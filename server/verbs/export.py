@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from .interrupt import interruptible
 from .options import ArchivePath, AsJson, needs_extra, print_json
 
 
@@ -31,10 +32,11 @@ def export(
     Coordinates are the archive's own, to the last bit; intensity and scan where they are stored.
     """
     from ...builder.export import export_archive
+    from ...schemas.os_errors import writing
     from ..progress import progress_listener
     from .facts import print_export
 
-    with needs_extra("readers"), progress_listener() as bars:
+    with interruptible(), needs_extra("readers"), writing(output), progress_listener() as bars:
         done = export_archive(archive, output, box=box, form=form, overwrite=overwrite, progress=bars)
     if as_json:
         print_json({**done._asdict(), "file": str(done.file)})

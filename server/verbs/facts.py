@@ -32,8 +32,9 @@ def archive_details(store: "Store") -> dict[str, Any]:
 
     densest: the voxel with the most points, their number and what it takes decoded.  scans: of each source that has
     any of it, by its number: scanner (its origin [m]), crs, units, up.  preview: bytes of the file for ParaView, None
-    where there is none.
+    where there is none.  warnings: sentences about scans that look wrong.
     """
+    from ...builder.coincident import coincident_sources
     from ...schemas.vtkhdf import PREVIEW_NAME
 
     archive = store.archive
@@ -52,6 +53,7 @@ def archive_details(store: "Store") -> dict[str, Any]:
             if not source.fault and (said := _of_source(source))
         ],
         "preview": preview.stat().st_size if preview.exists() else None,
+        "warnings": list(coincident_sources(archive.header.sources)),
     }
 
 
@@ -81,3 +83,5 @@ def detail_facts(details: dict[str, Any]) -> Iterator[tuple[str, str]]:
         yield "system", f"{' '.join(crs.split())[:300]} ({scans} of the scans)"
     if details["preview"] is not None:
         yield "preview", f"preview.vtkhdf for ParaView, {bytes_text(details['preview'])}"
+    for warning in details["warnings"]:
+        yield "warning", warning

@@ -1,5 +1,6 @@
 """`solidcloud add`, `remove`, `reload`: one generation more of an archive, and a server that is told of it."""
 
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -35,9 +36,10 @@ def add(
     As a new generation, that a running server serves when it is told to reload.
     """
     from ...builder.generation import add_scans
+    from ...schemas.os_errors import writing
     from ..progress import progress_listener
 
-    with interruptible(lambda: _as_it_is(archive)), progress_listener() as bars:
+    with interruptible(lambda: _as_it_is(archive)), writing(archive), progress_listener() as bars:
         summary = add_scans(
             archive,
             scans,
@@ -65,9 +67,10 @@ def remove(
     As a new generation, that a running server serves when it is told to reload.
     """
     from ...builder.generation import remove_scans
+    from ...schemas.os_errors import writing
     from ..progress import progress_listener
 
-    with interruptible(lambda: _as_it_is(archive)), progress_listener() as bars:
+    with interruptible(lambda: _as_it_is(archive)), writing(archive), progress_listener() as bars:
         summary = remove_scans(
             archive, scans, jobs=jobs, memory_bytes=parse_bytes(memory, "--memory"), progress=bars
         )
@@ -88,6 +91,8 @@ def _as_it_is(archive: Path) -> str:
 
 def _print(summary: "ChangeSummary", what: str, as_json: bool) -> None:
     """Say what was done."""
+    for warning in summary.warnings:
+        print(f"warning: {warning}", file=sys.stderr)
     now = summary.radius_now
     if as_json:
         print_json(

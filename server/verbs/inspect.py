@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from .interrupt import interruptible
 from .options import AsJson, complain, print_json
 
 if TYPE_CHECKING:
@@ -26,10 +27,11 @@ def inspect(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a list of that name.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Say what scans are, by their headers alone, and write a list of them to edit; exit code 3 if one is broken."""
+    """Say what scans are, by their headers, and write a list of them to edit; exit code 3 if one is broken."""
     from ...builder.scan_list import inspect as inspect_scans
     from ...builder.scan_list import write_scan_list
     from ...schemas.errors import BadRequestError
+    from ...schemas.os_errors import writing
     from ..progress import progress_listener
 
     if output and output.exists() and not overwrite:
@@ -46,8 +48,12 @@ def inspect(
             f"{DEFAULT_LIST}: exists and stays as it is; -o writes another, --overwrite this", file=sys.stderr
         )
     elif output or not as_json:
-        write_scan_list(output or DEFAULT_LIST, entries)
+        with interruptible(), writing(output or DEFAULT_LIST):
+            write_scan_list(output or DEFAULT_LIST, entries)
         print(f"{output or DEFAULT_LIST}: {len(entries)} scans", file=sys.stderr)
+    for entry in entries:
+        if entry.warning:
+            print(f"warning: {entry.warning}", file=sys.stderr)
     faults = [entry.fault for entry in entries if entry.fault]
     for fault in faults:
         complain(fault, 3)
@@ -70,6 +76,7 @@ def _plain(entry: "ScanEntry") -> dict[str, Any]:
         "sha256": entry.sha256,
         "use": entry.use,
         "fault": entry.fault,
+        "warning": entry.warning,
     }
 
 

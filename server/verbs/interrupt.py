@@ -1,4 +1,4 @@
-"""Commands that write: SIGTERM ends them as Ctrl-C does, tidied up, and what is left is said."""
+"""Commands that write: SIGTERM ends them as Ctrl-C does: temporary files are removed, and what is left is said."""
 
 import signal
 import sys
@@ -10,14 +10,14 @@ import typer
 
 
 @contextmanager
-def interruptible(left: Callable[[], str]) -> Iterator[None]:
-    """Take SIGTERM for Ctrl-C, and say what is left."""
+def interruptible(left: Callable[[], str] | None = None) -> Iterator[None]:
+    """Take SIGTERM for Ctrl-C. left: says what is left when it comes; None: nothing is."""
     main = threading.current_thread() is threading.main_thread()  # no other thread may say what a signal does
     before = signal.signal(signal.SIGTERM, _interrupt) if main else None
     try:
         yield
     except KeyboardInterrupt:
-        print(f"interrupted: {left()}", file=sys.stderr)
+        print(f"interrupted: {left()}" if left else "interrupted", file=sys.stderr)
         raise typer.Exit(130) from None  # all is said
     finally:
         if main:

@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from .interrupt import interruptible
 from .options import needs_extra
 
 ScanOutput = Annotated[
@@ -26,9 +27,10 @@ def make_facade(
     """
     with needs_extra("made"):
         from ...builder.made.scenes import make_facade as make_it
+    from ...schemas.os_errors import writing
     from ..progress import progress_listener
 
-    with progress_listener() as bars:
+    with interruptible(), writing(output), progress_listener() as bars:
         made = make_it(output, points=points, seed=seed, door=door, progress=bars.made)
     print(f"{made.points:,} points in {output}, the truth in {made.truth}")
 
@@ -44,9 +46,10 @@ def make_town(
     """
     with needs_extra("made"):
         from ...builder.made.scenes import make_town as make_it
+    from ...schemas.os_errors import writing
     from ..progress import progress_listener
 
-    with progress_listener() as bars:
+    with interruptible(), writing(output), progress_listener() as bars:
         made = make_it(output, points=points, seed=seed, progress=bars.made)
     print(f"{made.points:,} points in {output}, the truth in {made.truth}")
 
@@ -59,8 +62,10 @@ def make_figure(
 ) -> None:
     """Make a human figure in mid-walk: an avatar."""
     from ...builder.made.figure import figure_points, write_figure
+    from ...schemas.os_errors import writing
 
-    write_figure(output, figure_points(points, seed, height))
+    with interruptible(), writing(output):
+        write_figure(output, figure_points(points, seed, height))
     print(f"{points:,} points in {output}")
 
 
@@ -75,7 +80,9 @@ def make_walk(
     """
     from ...builder.made.truth import read_truth
     from ...builder.made.walk import walk_poses
+    from ...schemas.os_errors import writing
     from ..pose_file import write_poses
 
-    write_poses(output, *walk_poses(read_truth(truth).facades[0], frames))
+    with interruptible(), writing(output):
+        write_poses(output, *walk_poses(read_truth(truth).facades[0], frames))
     print(f"{frames} poses in {output}")

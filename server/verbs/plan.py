@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from .interrupt import interruptible
 from .options import AsJson, parse_bytes, print_json
 
 if TYPE_CHECKING:
@@ -66,7 +67,7 @@ def plan(
     if measure:
         from ...builder.measure import measured
 
-        with progress_listener() as bars:
+        with interruptible(), progress_listener() as bars:
             rates = measured(rates, bars)
     if points is not None:
         found = estimate(imagined(_number(points), rates, density, number_of_scans), config, rates, output)

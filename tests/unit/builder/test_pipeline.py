@@ -205,10 +205,11 @@ def test_points_that_are_not_finite_are_counted(out: Path, tmp_path: Path) -> No
 def test_a_point_alone_needs_a_radius(out: Path, tmp_path: Path) -> None:
     write_xyz(tmp_path / "a.xyz", make_scan("one point", 1))
     write_xyz(tmp_path / "b.xyz", np.repeat(make_scan("one point", 1), 10_000, axis=0))
-    for name in ("a.xyz", "b.xyz"):
-        with pytest.raises(
-            BadRequestError, match="single distinct point has no closest point: give --radius"
-        ):
+    for name, kind, said in (
+        ("a.xyz", BadRequestError, "single distinct point has no closest point: give --radius"),
+        ("b.xyz", ScanError, r"b\.xyz: all 10,000 points of scan 0 lie at one place, expected a surface"),
+    ):
+        with pytest.raises(kind, match=said):
             build([tmp_path / name], out / "a")
         assert not list(out.iterdir())
         summary = build([tmp_path / name], out / name, radius=0.01)

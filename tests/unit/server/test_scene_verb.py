@@ -105,7 +105,7 @@ def test_what_is_there_is_replaced_only_with_force(folder: Path, capsys: pytest.
         ("{archive} -o {folder}/new.toml --effects slide", 2, "`slide` means nothing without `stop`"),
         ("{archive} -o {folder}/new.toml --effects stop,stop", 0, ""),
         ("{archive} -o {folder}/new.txt", 2, "new.txt: expected a name that ends in .toml"),
-        ("{archive} -o {folder}/no/new.toml", 1, "no/new.toml: No such file or directory"),
+        ("{archive} -o {folder}/no/new.toml", 1, "no/new.toml: cannot be written: there is no folder"),
         ("{folder}/scans -o {folder}/new.toml", 3, "scans: no archive here"),
         ("{archive} -o {folder}/new.toml --avatar {folder}/no.ply", 2, "no.ply: no such file"),
         ("{archive} -o {folder}/new.toml --name a/b", 2, "--name 'a/b': expected 1 to 64 of A-Z"),

@@ -1,5 +1,6 @@
 """Key expressions: where on zenoh each question is asked, and who is alive. WIRE.md lists them."""
 
+import hashlib
 import re
 from functools import lru_cache
 from typing import NamedTuple
@@ -87,6 +88,19 @@ def clients_alive_key(scene: str) -> str:
     return f"{ROOT}/client/{check_name(scene, 'scene')}/*"
 
 
+def parse_client_alive(key: str) -> str:
+    """Return the client that a liveliness token is of; BadRequestError for any other key, wildcards included."""
+    return _parse(key, "client", ("scene", "client"))[1]
+
+
+def public_id(client: str) -> str:
+    """Return the name under which others are told of a client: 12 hex digits of the SHA-256 of its id, "" of "".
+
+    The id itself is a secret: whoever knows it may ask, wish and leave in the client's name.
+    """
+    return hashlib.sha256(client.encode()).hexdigest()[:12] if client else ""
+
+
 def wish_key(scene: str, user: User) -> str:
     """Where a client publishes what its avatar wishes; deleted, the avatar leaves the scene."""
     return _user_key("wish", scene, user)
@@ -98,23 +112,23 @@ def wishes_key(scene: str) -> str:
 
 
 def parse_wish(key: str) -> User:
-    """Whose wish comes under this key; BadRequestError where it is none, wildcards included."""
-    prefix = f"{ROOT}/wish/"
-    parts = key.removeprefix(prefix).split("/")
-    if not key.startswith(prefix) or len(parts) != 3:
-        raise BadRequestError(f"key {key!r}: expected {prefix}SCENE/CLIENT/AVATAR")
-    wish_key(parts[0], user := User(parts[1], parts[2]))
-    return user
+    """Return the user whose wish comes under a key; BadRequestError for any other key, wildcards included."""
+    return User(*_parse(key, "wish", ("scene", "client", "avatar of a session"))[1:])
 
 
 def state_key(scene: str, user: User) -> str:
-    """Where a server publishes what came of a user's wishes."""
+    """Return the key under which a client asks for the states of one of its users, and the server replies with them."""
     return _user_key("state", scene, user)
 
 
-def refused_key(scene: str, user: User) -> str:
-    """Where a server says why a wish has no state."""
-    return _user_key("refused", scene, user)
+def states_key(scene: str) -> str:
+    """Return the key that a server declares: the states of all users of its scene."""
+    return f"{ROOT}/state/{check_name(scene, 'scene')}/*/*"
+
+
+def parse_state(key: str) -> User:
+    """Return the user whose states are asked for; BadRequestError for any other key, wildcards included."""
+    return User(*_parse(key, "state", ("scene", "client", "avatar of a session"))[1:])
 
 
 def _user_key(what: str, scene: str, user: User) -> str:
@@ -123,3 +137,12 @@ def _user_key(what: str, scene: str, user: User) -> str:
     check_name(user.client, "client")
     check_name(user.avatar, "avatar of a session")
     return f"{ROOT}/{what}/{scene}/{user.client}/{user.avatar}"
+
+
+def _parse(key: str, what: str, names: tuple[str, ...]) -> list[str]:
+    """Return the chunks of a key behind `what`; BadRequestError unless they are names, as many as expected."""
+    prefix = f"{ROOT}/{what}/"
+    parts = key.removeprefix(prefix).split("/")
+    if not key.startswith(prefix) or len(parts) != len(names):
+        raise BadRequestError(f"key {key!r}: expected {prefix}{'/'.join(names).upper()}")
+    return [check_name(part, name) for part, name in zip(parts, names, strict=True)]

@@ -171,7 +171,7 @@ class Moved(msgspec.Struct, frozen=True, eq=False, kw_only=True, omit_defaults=T
 
 
 class State(Moved, frozen=True, eq=False, kw_only=True, omit_defaults=True):
-    """`Moved`, published to the user who wished it. seq, time: of the wish.  frame: the server's, growing.
+    """`Moved`, as the user who wished it is told. seq, time: of the wish.  frame: the server's, growing.
 
     late: wishes dropped so far because a newer one had come.  seconds: the frame took in the server.
     """

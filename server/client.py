@@ -4,7 +4,6 @@ What no server answers is `unknown`, never clear: zenoh's empty reply looks the 
 there, a server died or a message was dropped (WIRE.md, "Empty replies").
 """
 
-import itertools
 import logging
 import queue
 import threading
@@ -54,9 +53,10 @@ from ..schemas.requests import (
     make_poses,
     make_positions,
 )
-from .client_session import ClientSession
+from .client_session import ClientSession, WishNumbers
 from .config import DEFAULT_ENDPOINT
 from .questions import Questions
+from .replies import read_reply
 from .transport import session_config
 
 log = logging.getLogger(__name__)
@@ -102,9 +102,13 @@ class Client(Questions):
         if not timeout > 0:
             raise BadRequestError(f"timeout is {timeout}: expected seconds above 0")
         self._endpoint, self._timeout = endpoint, timeout
+        # A secret: whoever knows it may ask and wish in our name. 122 random bits.
         self._id = uuid.uuid4().hex
+        self._keys = {
+            operation: keys.question_key(self.name, self._id, operation) for operation in keys.OPERATIONS
+        }
         self._avatars: dict[str, _Avatar] = {}
-        self._numbers: dict[str, itertools.count[int]] = {}  # of wishes, by avatar
+        self._numbers: dict[str, WishNumbers] = {}  # by avatar
         self._lock = threading.Lock()
         self._seen = False  # whether a server of this scene ever answered
         self._stack: ExitStack | None = None
@@ -119,13 +123,13 @@ class Client(Questions):
             self._queriers = {
                 operation: stack.enter_context(
                     self._session.declare_querier(
-                        keys.question_key(self.name, self._id, operation),
+                        key,
                         # By default zenoh keeps a reply back until the server has said that no other comes.
                         consolidation=zenoh.ConsolidationMode.NONE,
                         timeout=max(self._timeout, _SECONDS.get(operation, 0.0)),
                     )
                 )
-                for operation in keys.OPERATIONS
+                for operation, key in self._keys.items()
             }
             self._check_served()
             self._stack = stack.pop_all()
@@ -276,7 +280,7 @@ class Client(Questions):
         self._check_open()
         user = keys.User(self._id, keys.check_name(avatar, "avatar of a session"))
         with self._lock:
-            numbers = self._numbers.setdefault(avatar, itertools.count(1))
+            numbers = self._numbers.setdefault(avatar, WishNumbers())
         return ClientSession(
             self._session, self.name, user, numbers, lambda unknown: self._add_again([avatar], unknown)
         )
@@ -301,12 +305,12 @@ class Client(Questions):
 
     def _ask(self, operation: str, request: bytes) -> bytes | None:
         """Ask, and wait for the answer; None: nobody answered in time. Raises what an error reply says."""
-        for reply in self._querier(operation).get(payload=request, encoding=_ENCODING):
-            sample = reply.ok
-            if sample is not None:
+        querier = self._querier(operation)
+        for reply in querier.get(payload=request, encoding=_ENCODING):
+            payload = _answer_of(reply, self._keys[operation])
+            if payload is not None:
                 self._seen = True
-                return sample.payload.to_bytes()
-            _raise_error(reply.err)
+                return payload
         if not self._seen:
             self._check_served()
         return None
@@ -326,11 +330,10 @@ class Client(Questions):
                 break
             if reply is None:
                 break
-            if reply.ok is None:
-                _raise_error(reply.err)
-                continue
-            self._seen = answered = True
-            yield reply.ok.payload.to_bytes()
+            payload = _answer_of(reply, self._keys[operation])
+            if payload is not None:
+                self._seen = answered = True
+                yield payload
         if not answered and not self._seen:
             self._check_served()
 
@@ -394,18 +397,24 @@ def _ask_scenes(session: zenoh.Session, timeout: float) -> tuple[set[str], set[i
         encoding=_ENCODING,
     )
     for reply in replies:
-        if reply.ok is not None:
-            answer = decode_answer(ScenesAnswer, reply.ok.payload.to_bytes())
+        ok, payload = read_reply(reply, keys.scenes_key()) or (False, b"")
+        if ok:
+            answer = decode_answer(ScenesAnswer, payload)
             served.update(answer.scenes)
             versions.add(answer.wire_version)
     return served, versions
 
 
-def _raise_error(error: Any) -> None:
-    """Raise what an error reply says; return where zenoh, and not a server, is the one who says it."""
-    if str(error.encoding).split(";", 1)[0] != MSGPACK:
-        # zenoh's own, such as "Timeout": nobody answered.
-        log.debug("no answer: %s", error.payload.to_bytes()[:200])
-        return
-    reply = decode_answer(ErrorReply, error.payload.to_bytes())
-    raise error_from_code(reply.code, reply.message)
+def _answer_of(reply: zenoh.Reply, key: str) -> bytes | None:
+    """Return the bytes of an answer to a question asked under `key`; None: no server said it.
+
+    Raises the error of an error reply.
+    """
+    found = read_reply(reply, key)
+    if found is None:
+        return None
+    ok, payload = found
+    if not ok:
+        said = decode_answer(ErrorReply, payload)
+        raise error_from_code(said.code, said.message)
+    return payload

@@ -3,10 +3,8 @@
 Over zenoh, beside the questions of `Client`: wishes go out and states come in without anybody waiting for an answer.
 """
 
-import itertools
 import logging
 import math
-import queue
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -30,13 +28,39 @@ from ..schemas.errors import (
 from ..schemas.messages import ErrorReply
 from ..schemas.moves import State, Wish
 from .session_transport import FRAME_QOS
+from .state_query import StateQuery
 
 log = logging.getLogger(__name__)
 
 # States kept for whoever asks for each of them: some ten seconds; of more, the oldest go.
 _KEPT = 1024
+# Numbers beyond this are not followed: a wish's is an int64 in most programs.
+_MOST_NUMBER = 1 << 62
 # Refusals in a row that a server is told of an avatar again for: one that refuses it all the same is at fault.
 _MOST_AGAIN = 100
+
+
+class WishNumbers:
+    """The numbers of one user's wishes, growing. Thread-safe."""
+
+    def __init__(self) -> None:
+        self._last = 0
+        self._lock = threading.Lock()
+
+    def next(self) -> int:
+        """Return a number above all before."""
+        with self._lock:
+            self._last += 1
+            return self._last
+
+    def follow(self, seq: int) -> None:
+        """Go on above a number that the server has had, from another program of the same client perhaps.
+
+        The server drops a wish whose number is no greater than the last one's.
+        """
+        with self._lock:
+            if self._last < seq < _MOST_NUMBER:
+                self._last = seq
 
 
 class Latest(NamedTuple):
@@ -58,17 +82,18 @@ class ClientSession:
         session: zenoh.Session,
         scene: str,
         user: keys.User,
-        numbers: "itertools.count[int]",
+        numbers: "WishNumbers",
         add_again: Callable[[UnknownAvatarError], bool],
     ) -> None:
         """numbers: of wishes, growing over all sessions of this user.  add_again: adds the avatar to a server that does
         not know it; False: nobody answered; raises what it is given where this client has not added it either."""
         self._session, self._scene, self._user = session, scene, user
         self._numbers, self._add_again = numbers, add_again
-        self._came: queue.SimpleQueue[tuple[bool, Any] | None] = queue.SimpleQueue()
+        self._states = StateQuery(session, keys.state_key(scene, user))
         self._publishing = threading.Lock()  # so that wishes leave in the order of their numbers
         self._aim: Any = None  # the pose last wished, until a velocity goes on from a state
         self._time = 0.0
+        self._wished = -math.inf  # when, on the monotonic clock
         self._changed = threading.Condition()
         self._kept: deque[State | SolidcloudError] = deque(maxlen=_KEPT)
         self._latest: State | None = None
@@ -83,12 +108,10 @@ class ClientSession:
             thread = threading.Thread(
                 target=self._hear, name=f"solidcloud-session-{self._user.avatar}", daemon=True
             )
+            stack.callback(self._states.close)
             stack.callback(thread.join)
-            stack.callback(self._came.put, None)
-            for ok, key in ((True, keys.state_key), (False, keys.refused_key)):
-                stack.enter_context(
-                    self._session.declare_subscriber(key(self._scene, self._user), self._comes(ok))
-                )
+            self._states.open()
+            stack.callback(self._states.end)
             self._publisher = stack.enter_context(
                 self._session.declare_publisher(
                     keys.wish_key(self._scene, self._user), encoding=MSGPACK, **FRAME_QOS
@@ -97,11 +120,6 @@ class ClientSession:
             thread.start()
             self._stack = stack.pop_all()
         return self
-
-    def _comes(self, ok: bool) -> Any:
-        """What zenoh calls for each sample: it may not block, nor use zenoh."""
-        # Without bound: what is heard is taken at once, but for the moments in which an avatar is added again.
-        return lambda sample: self._came.put((ok, sample))
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -144,7 +162,7 @@ class ClientSession:
             raise BadRequestError(f"velocity of {len(speed)} numbers: expected 3 [m/s]")
         with self._publishing:
             wish = Wish(
-                seq=next(self._numbers),
+                seq=self._numbers.next(),
                 time=monotonic() if time is None else float(time),
                 pose=np.ascontiguousarray(array),
                 velocity=speed,  # type: ignore[arg-type]
@@ -164,6 +182,7 @@ class ClientSession:
         if self._stack is None:
             raise BadRequestError("this session is closed: wish inside `with client.session(...) as session`")
         self._publisher.put(encode(wish))
+        self._wished = monotonic()
 
     def latest(self) -> Latest | None:
         """The last state that came, and its age; None: none came yet. Raises, once, what the server refused since."""
@@ -216,16 +235,10 @@ class ClientSession:
 
     def _hear(self) -> None:
         """Take what comes. A thread's work."""
-        while True:
-            came = [self._came.get()]
-            while not self._came.empty():
-                came.append(self._came.get())
+        while (came := self._states.take(lambda: self._wished)) is not None:
             unknown: UnknownAvatarError | None = None
-            for item in came:
-                if item is None:
-                    return
+            for ok, payload in came:
                 try:
-                    ok, payload = item[0], item[1].payload.to_bytes()
                     said = decode_answer(State, payload) if ok else _error_of(payload)
                 except SolidcloudError as error:
                     said = error
@@ -243,6 +256,7 @@ class ClientSession:
                 self._error = said
             else:
                 self._latest, self._error = said, None
+                self._numbers.follow(said.seq)
                 self._when, self._again = monotonic(), 0
             self._kept.append(said)
             self._changed.notify_all()
@@ -264,7 +278,7 @@ class ClientSession:
                     raise unknown
                 if self._stack is not None:
                     # Alone: a velocity behind it might take its place once more. It is one frame's way.
-                    self._publish(Wish(seq=next(self._numbers), time=self._time, pose=pose))
+                    self._publish(Wish(seq=self._numbers.next(), time=self._time, pose=pose))
         except SolidcloudError as error:
             self._keep(error)
 

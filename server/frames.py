@@ -147,6 +147,7 @@ class Frames:
     def __init__(self, simulation: Simulates, publish: Callable[[User, Answer], None]) -> None:
         """publish: sends a user's state, or why there is none; must not block."""
         self._simulation, self._publish = simulation, publish
+        self.most_users = simulation.most_users
         self._boxes = Mailboxes(_BOXES_A_USER * simulation.most_users)
 
     def wish(self, user: User, payload: bytes, encoding: str | None) -> None:

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 
 from ..schemas.answers import Cost, Verdict
+from ..schemas.keys import public_id
 from ..schemas.stats import TIME_BOUNDS, Times, UserStats
 
 # Users remembered, a client's avatar each: 2 kB apiece, and as many lines of an answer of `stats`.
@@ -235,7 +236,7 @@ def _user_stats(key: tuple[str, str], silent: float, user: Counts) -> UserStats:
     client, avatar = key
     p50, p99 = user.stalls.percentiles(0.5, 0.99)
     return UserStats(
-        client,
+        public_id(client),
         avatar,
         user.requests,
         user.answers,

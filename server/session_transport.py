@@ -1,7 +1,7 @@
-"""Sessions over zenoh, the server's side: wishes that clients publish, and states that are published to them.
+"""Sessions over zenoh, the server's side: wishes that clients publish, states that they ask for with one long query.
 
-zenoh hands wishes to a bounded channel that a thread of ours empties into mailboxes at once; another simulates frames
-and publishes (frames.py). A state is dropped where a client takes none, and never waits for one.
+zenoh hands wishes and queries to bounded channels. One thread empties wishes into mailboxes, one opens streams of
+states, and another simulates frames and sends their states (frames.py).
 """
 
 import logging
@@ -11,20 +11,20 @@ from typing import Any, Protocol
 import zenoh
 
 from ..schemas import keys
-from ..schemas.encoding import JSON, MSGPACK
 from ..schemas.errors import BadRequestError
 from .frames import Frames
+from .replies import send_reply
 from .served import Answer
+from .state_streams import StateStreams
 
 log = logging.getLogger(__name__)
 
 # Wishes that zenoh may hand over before the thread takes them: of a thousand users one each.
 _CHANNEL = 1024
+# Queries for states that may be open for each user that a scene has room for.
+_STREAMS_A_USER = 2
 
-_ENCODINGS = {name: zenoh.Encoding(name) for name in (MSGPACK, JSON)}
-
-# How wishes and states travel. Not at the priority of replies: what is dropped where there is no room would wait
-# behind a reply that blocks (zenoh's issue 2584). Express: a frame's states are not kept back to fill a batch.
+# How wishes travel; states travel the same way (access.state_priority).
 FRAME_QOS: dict[str, Any] = {
     "congestion_control": zenoh.CongestionControl.DROP,
     "priority": zenoh.Priority.INTERACTIVE_HIGH,
@@ -36,49 +36,86 @@ class Sessions(Protocol):
     """What has the frames of a scene simulated."""
 
     def frames(self, scene: str, publish: Callable[[keys.User, Answer], None]) -> Frames | None: ...
+    def busy(self, encoding: str | None, own: bool = False) -> Answer: ...
 
 
-def declare_sessions(
-    session: zenoh.Session, scene: str, service: Sessions, start: Callable[..., None]
-) -> list[Any]:
-    """Carry the sessions of a scene; returns what is to be undeclared at the end: then its threads end too.
+class SceneSessions:
+    """The sessions of one scene. declared: what is to be undeclared at the end; then its threads end too."""
 
-    start: starts a thread of a name, that runs a function with arguments.
-    """
+    def __init__(
+        self, session: zenoh.Session, scene: str, service: Sessions, start: Callable[..., None]
+    ) -> None:
+        """Declare them. start: starts a thread of a name that runs a function with arguments."""
+        self.declared: list[Any] = []
+        self._service = service
+        frames = service.frames(scene, self._send)
+        self._streams = StateStreams(0 if frames is None else _STREAMS_A_USER * frames.most_users)
+        if frames is None:
+            return
+        self._frames = frames
+        queryable = session.declare_queryable(
+            keys.states_key(scene), zenoh.handlers.FifoChannel(_CHANNEL), complete=True
+        )
+        wishes = session.declare_subscriber(keys.wishes_key(scene), zenoh.handlers.FifoChannel(_CHANNEL))
+        self.declared += [queryable, wishes]
+        start(f"{scene}-states", self._open_streams, queryable.handler)
+        start(f"{scene}-wishes", self._take_wishes, wishes.handler)
+        start(f"{scene}-frames", self._run_frames)
 
-    def publish(user: keys.User, answer: Answer) -> None:
-        key = (keys.state_key if answer.ok else keys.refused_key)(scene, user)
-        session.put(key, answer.payload, encoding=_ENCODINGS[answer.encoding], **FRAME_QOS)
+    def client_gone(self, client: str) -> None:
+        """End what a client that is gone has asked for."""
+        self._streams.end_client(client)
 
-    frames = service.frames(scene, publish)
-    if frames is None:
-        return []
-    subscriber = session.declare_subscriber(keys.wishes_key(scene), zenoh.handlers.FifoChannel(_CHANNEL))
-    start(f"{scene}-wishes", _take, subscriber.handler, frames)
-    start(f"{scene}-frames", frames.run)
-    return [subscriber]
+    def _send(self, user: keys.User, answer: Answer) -> None:
+        self._streams.send(user, answer)
 
+    def _run_frames(self) -> None:
+        """Simulate until there are no more wishes, then end the streams. A thread's work."""
+        try:
+            self._frames.run()
+        finally:
+            self._streams.close()
 
-def _take(samples: Any, frames: Frames) -> None:
-    """One thread's work: take wishes in until there are no more, then end the frames."""
-    try:
-        for sample in samples:
+    def _open_streams(self, queries: Any) -> None:
+        """Take the queries for states. A thread's work."""
+        for query in queries:
             try:
-                _take_one(sample, frames)
-            except Exception:  # of this wish alone
-                log.exception("a wish")
-    finally:
-        frames.close()
+                self._open_stream(query)
+            except Exception:  # of this query alone
+                log.exception("a query for states")
 
+    def _open_stream(self, query: zenoh.Query) -> None:
+        """Open a stream, or say that there is no room; a query for the states of several users ends without a reply."""
+        try:
+            user = keys.parse_state(str(query.key_expr))
+        except BadRequestError as error:
+            log.debug("a query for nobody's states: %s", error)
+            query.drop()
+            return
+        if not self._streams.open(user, query):
+            with query:
+                encoding = None if query.encoding is None else str(query.encoding)
+                send_reply(query, query.key_expr, self._service.busy(encoding))
 
-def _take_one(sample: zenoh.Sample, frames: Frames) -> None:
-    """Take in one wish, or that a user leaves."""
-    try:
-        user = keys.parse_wish(str(sample.key_expr))
-    except BadRequestError as error:
-        log.debug("a wish of nobody: %s", error)
-        return
-    if sample.kind == zenoh.SampleKind.DELETE:
-        frames.leave(user)
-    else:
-        frames.wish(user, sample.payload.to_bytes(), str(sample.encoding))
+    def _take_wishes(self, samples: Any) -> None:
+        """Take wishes in until there are no more, then end the frames. A thread's work."""
+        try:
+            for sample in samples:
+                try:
+                    self._take_wish(sample)
+                except Exception:  # of this wish alone
+                    log.exception("a wish")
+        finally:
+            self._frames.close()
+
+    def _take_wish(self, sample: zenoh.Sample) -> None:
+        """Take in one wish, or that a user leaves."""
+        try:
+            user = keys.parse_wish(str(sample.key_expr))
+        except BadRequestError as error:
+            log.debug("a wish of nobody: %s", error)
+            return
+        if sample.kind == zenoh.SampleKind.DELETE:
+            self._frames.leave(user)
+        else:
+            self._frames.wish(user, sample.payload.to_bytes(), str(sample.encoding))

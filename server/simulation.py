@@ -25,7 +25,7 @@ from ..schemas.answers import (
     WithinAnswers,
 )
 from ..schemas.errors import BadRequestError, BusyError, InternalError, SolidcloudError
-from ..schemas.keys import User
+from ..schemas.keys import User, public_id
 from ..schemas.messages import AvatarInfo, ReloadAnswer, SceneInfo, StatsAnswer
 from ..schemas.moves import FRAME_SECONDS, Moved, MoveRequest, State, Wish
 from ..schemas.requests import make_poses
@@ -171,7 +171,7 @@ class Simulation:
         user = User(client, name)
         begin = check_rigid(asked.pose_from[0].copy(), "pose_from")
         wish = check_rigid(asked.pose_to[0], "pose_to")
-        body = Body(_body_name(user), self.served.avatar(name, client), begin)
+        body = _body(user, self.served.avatar(name, client), begin)
         return self._pipeline.run(body, wish, asked.seconds)
 
     def step(
@@ -209,7 +209,7 @@ class Simulation:
         except SolidcloudError as error:
             return error
         except Exception as error:  # of this user alone: the others' frames go on
-            log.exception("a frame of %s in %s", _body_name(turn.user), self.name)
+            log.exception("a frame of %s in %s", _public_name(turn.user), self.name)
             return InternalError(f"{type(error).__name__} in the server: its log says more")
         wish = turn.wish
         return State(
@@ -250,7 +250,7 @@ class Simulation:
         avatar = self.served.avatar(user.avatar, user.client)
         if self._recorder is not None:
             self._recorder.entered(user, avatar)
-        return _Presence(Body(_body_name(user), avatar, first_pose(wish, self.file.spawn, self._up)))
+        return _Presence(_body(user, avatar, first_pose(wish, self.file.spawn, self._up)))
 
     def _leave(self, users: list[User]) -> None:
         """End bodies."""
@@ -307,9 +307,9 @@ class Simulation:
                 poses = np.tile(np.eye(4), (2, 1, 1, 1))
                 poses[:, 0, :3, 3] = place + far * begin, place + far * end
                 with self._frame, suppress(SolidcloudError):  # of a place where a frame makes no sense
-                    body = Body(_body_name(user), self.served.avatar("warm", _WARM), poses[0, 0])
+                    body = _body(user, self.served.avatar("warm", _WARM), poses[0, 0])
                     if self._bodies is not None:
-                        there = Body(_body_name(other), body.avatar, poses[:, 0].mean(axis=0))
+                        there = _body(other, body.avatar, poses[:, 0].mean(axis=0))
                         self._bodies[other] = there
                     for pose in (poses[1, 0], poses[1, 0], poses[0, 0]):
                         self._pipeline.run(body, pose, FRAME_SECONDS)
@@ -359,6 +359,11 @@ class Simulation:
         return self.served.path(*what, **parameters)
 
 
-def _body_name(user: User) -> str:
-    """What a body is called where others meet it."""
-    return f"{user.client}/{user.avatar}"
+def _body(user: User, avatar: AvatarModel, pose: Pose) -> Body:
+    """Return a user's body where it begins."""
+    return Body(_public_name(user), avatar, pose, user=user)
+
+
+def _public_name(user: User) -> str:
+    """Return a name that others may be told, and logs: the client's id is a secret."""
+    return f"{public_id(user.client)}/{user.avatar}"

@@ -16,12 +16,14 @@ from typing import Any, Protocol, Self
 import zenoh
 
 from ..schemas import keys
-from ..schemas.errors import SolidcloudError
-from ..schemas.messages import JSON, MAX_MESSAGE_BYTES, MSGPACK
+from ..schemas.errors import BadRequestError, SolidcloudError
+from ..schemas.messages import MAX_MESSAGE_BYTES
+from .access import access_control, state_priority
 from .config import ServerConfig
 from .lanes import Lane, Questions, Wire
+from .replies import send_reply
 from .served import Answer
-from .session_transport import Sessions, declare_sessions
+from .session_transport import SceneSessions, Sessions
 
 log = logging.getLogger(__name__)
 
@@ -31,8 +33,6 @@ _CHANNEL = 1024
 # How long a stop waits, twice, for threads whose work was given up [s]. Kernels look at a stop every few milliseconds;
 # a reply to a client that takes none waits for `wait_before_close`.
 _GIVE_UP_SECONDS = 0.4
-
-_ENCODINGS = {name: zenoh.Encoding(name) for name in (MSGPACK, JSON)}
 
 
 class ServiceLike(Sessions, Questions, Protocol):
@@ -65,34 +65,8 @@ def session_config(*, listen: str | None = None, connect: str | None = None) -> 
         "transport/unicast/accept_pending": 1000,
     }
     if listen:
-        # Whoever is connected could else declare our keys, and a zenoh "client" would be routed to it.
-        settings["access_control"] = {
-            "enabled": True,
-            "default_permission": "allow",
-            "rules": [
-                {
-                    "id": "nobody-else-answers",
-                    "messages": ["declare_queryable", "reply"],
-                    "flows": ["ingress"],
-                    "permission": "deny",
-                    "key_exprs": [f"{keys.ROOT}/**"],
-                },
-                {
-                    "id": "nobody-else-publishes-states",
-                    "messages": ["put", "delete"],
-                    "flows": ["ingress"],
-                    "permission": "deny",
-                    "key_exprs": [f"{keys.ROOT}/{what}/**" for what in ("state", "refused")],
-                },
-            ],
-            "subjects": [{"id": "everybody"}],
-            "policies": [
-                {
-                    "rules": ["nobody-else-answers", "nobody-else-publishes-states"],
-                    "subjects": ["everybody"],
-                }
-            ],
-        }
+        settings["access_control"] = access_control()
+        settings["qos/network"] = state_priority()
     config = zenoh.Config()
     for path, value in settings.items():
         config.insert_json5(path, json.dumps(value))
@@ -175,11 +149,12 @@ class Transport:
         )
         self._declared.append(queryable)
         lane = Lane(
-            self._service, scene, self._config, queryable.handler, self._start, Wire(_encoding, _reply)
+            self._service, scene, self._config, queryable.handler, self._start, Wire(_encoding, send_reply)
         )
         self._lanes.append(lane)
-        self._declared += declare_sessions(session, scene, self._service, self._start)
-        self._start(f"{scene}-watch", _watch, watch.handler, lane)
+        sessions = SceneSessions(session, scene, self._service, self._start)
+        self._declared += sessions.declared
+        self._start(f"{scene}-watch", _watch, watch.handler, lane, sessions)
         lane.start()
         return lane
 
@@ -193,7 +168,7 @@ class Transport:
         def take(queries: Any) -> None:
             for query in queries:
                 with query:
-                    _reply(query, keys.scenes_key(), self._service.scenes(_encoding(query)))
+                    send_reply(query, keys.scenes_key(), self._service.scenes(_encoding(query)))
 
         self._start("scenes", take, queryable.handler)
 
@@ -205,12 +180,17 @@ class Transport:
             self._threads = [other for other in self._threads if other.is_alive()] + [thread]
 
 
-def _watch(samples: Any, lane: Lane) -> None:
-    """Tell a lane which clients come and go. A thread's work."""
+def _watch(samples: Any, lane: Lane, sessions: SceneSessions) -> None:
+    """Tell a lane and the sessions of its scene which clients come and go. A thread's work."""
     for sample in samples:
-        client = str(sample.key_expr).rpartition("/")[2]
+        try:
+            client = keys.parse_client_alive(str(sample.key_expr))
+        except BadRequestError as error:
+            log.debug("a token of no client: %s", error)
+            continue
         try:
             if sample.kind == zenoh.SampleKind.DELETE:
+                sessions.client_gone(client)
                 lane.client_gone(client)
             else:
                 lane.client_here(client)
@@ -221,16 +201,3 @@ def _watch(samples: Any, lane: Lane) -> None:
 def _encoding(query: zenoh.Query) -> str | None:
     """The encoding a query states, if any."""
     return None if query.encoding is None else str(query.encoding)
-
-
-def _reply(query: zenoh.Query, key: Any, answer: Answer) -> bool:
-    """Send one answer; False where that fails: the client is gone, or its link is. Logged, nothing else to do."""
-    try:
-        if answer.ok:
-            query.reply(key, answer.payload, encoding=_ENCODINGS[answer.encoding])
-        else:
-            query.reply_err(answer.payload, encoding=_ENCODINGS[answer.encoding])
-    except zenoh.ZError as error:
-        log.warning("reply to %s: %s", query.key_expr, error)
-        return False
-    return True

@@ -58,10 +58,11 @@ class Obstacle(Protocol):
 
 @dataclass(slots=True)
 class Body:
-    """What is remembered of a user between frames. name: client/avatar.  avatar: its model.  pose: where it is.
+    """What is remembered of a user between frames. name: as others are told.  avatar: its model.  pose: where it is.
 
     fall_speed: [m/s], 0 on the ground.  on_ground: whether the last frame left it standing.  clear: whether `pose` was
     found clear, of the archives `generations` (World.generations).  kept: what an effect keeps for itself, by its name.
+    user: client and avatar.
     """
 
     name: str
@@ -72,6 +73,7 @@ class Body:
     clear: bool = False
     generations: tuple[int, ...] = ()
     kept: dict[str, Any] = field(default_factory=dict)
+    user: tuple[str, str] = ("", "")
 
 
 @dataclass(slots=True)

@@ -126,8 +126,7 @@ class Pipeline:
             # What came into it, an object say, blocks nobody: then the verdict alone says so.
             if any(each.overlaps(body.avatar, frame.pose) for each in frame.obstacles):
                 frame.verdict = Verdict.CONTACT
-            client, _, avatar = body.name.rpartition("/")
-            self.world.saw((client, avatar), body.avatar, frame.pose)
+            self.world.saw(body.user, body.avatar, frame.pose)
         body.pose, body.clear, body.generations = frame.pose, frame.clear, frame.generations
         body.fall_speed, body.on_ground = frame.fall_speed, frame.on_ground
         body.kept.update(frame.kept)

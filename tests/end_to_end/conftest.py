@@ -9,12 +9,22 @@ from solidcloud.server.client import Client
 from solidcloud.server.config import ServerConfig
 
 
-@pytest.fixture
-def endpoint():
+def _free_endpoint():
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     return f"tcp/127.0.0.1:{port}"
+
+
+@pytest.fixture(scope="session")
+def free_endpoint():
+    """Make endpoints on loopback that nobody listens on."""
+    return _free_endpoint
+
+
+@pytest.fixture
+def endpoint():
+    return _free_endpoint()
 
 
 @pytest.fixture

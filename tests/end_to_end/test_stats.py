@@ -21,7 +21,7 @@ import pytest
 import scans
 from solidcloud.schemas.answers import Verdict
 from solidcloud.schemas.errors import BadRequestError, BusyError
-from solidcloud.schemas.keys import question_key
+from solidcloud.schemas.keys import public_id, question_key
 from solidcloud.schemas.messages import (
     JSON,
     MSGPACK,
@@ -117,7 +117,7 @@ def test_a_server_says_what_was_asked_of_it(archive: Path, endpoint: str) -> Non
         now = client.stats(keys=True)
         asked = [*answers, *parts]
         (user,) = now.users
-        assert (user.client, user.avatar, user.requests) == (client._id, "al", len(asked))
+        assert (user.client, user.avatar, user.requests) == (public_id(client._id), "al", len(asked))
         assert now.requests == user.requests and now.answers == user.answers == 6 + 2 + 6
         assert now.unknown == sum((answer.verdict == Verdict.UNKNOWN).sum() for answer in asked) == 0
         assert user.hits == sum(answer.hits for answer in asked) > 0
@@ -199,12 +199,12 @@ def test_the_command_serves_metrics_and_top_shows_them(
             text = reply.read().decode()
         assert 'solidcloud_requests_total{scene="hall"} 3.0' in text
         assert 'solidcloud_scene_info{policy="s3fifo",scene="hall"} 1.0' in text
-        assert f'client="{client._id}"' in text
+        assert f'client="{public_id(client._id)}"' in text and client._id not in text
         # All that are served, one by name, and as JSON.
         for more in ([], ["--scene", "hall"]):
             assert run(["top", "--connect", endpoint, "--once", *more]) == 0
             shown = capsys.readouterr().out
-            assert "hall, policy s3fifo" in shown and f"{client._id[:6]} al" in shown
+            assert "hall, policy s3fifo" in shown and f"{public_id(client._id)[:6]} al" in shown
             assert re.search(r"^requests +3 ", shown, re.MULTILINE)
         assert run(["top", "--connect", endpoint, "--json"]) == 0
         (told,) = json.loads(capsys.readouterr().out)

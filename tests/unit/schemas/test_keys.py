@@ -17,7 +17,7 @@ def test_keys_look_as_in_the_document():
     assert keys.wish_key("hall", user) == "solidcloud/1/wish/hall/c-1/al"
     assert keys.wishes_key("hall") == "solidcloud/1/wish/hall/*/*"
     assert keys.state_key("hall", user) == "solidcloud/1/state/hall/c-1/al"
-    assert keys.refused_key("hall", user) == "solidcloud/1/refused/hall/c-1/al"
+    assert keys.states_key("hall") == "solidcloud/1/state/hall/*/*"
     assert f"solidcloud/{WIRE_VERSION}" == keys.ROOT
 
 
@@ -30,6 +30,18 @@ def test_a_question_is_read_as_it_was_written():
 def test_a_wish_is_read_as_it_was_written():
     user = keys.User("c-1", "al.2")
     assert keys.parse_wish(keys.wish_key("hall", user)) == user
+    assert keys.parse_state(keys.state_key("hall", user)) == user
+
+
+def test_a_token_is_read_as_it_was_written_and_no_wider_one():
+    assert keys.parse_client_alive(keys.client_alive_key("hall", "c-1")) == "c-1"
+    for key in ("solidcloud/1/client/hall/*", "solidcloud/1/client/**", "solidcloud/1/client/hall/c/x", "**"):
+        with pytest.raises(BadRequestError):
+            keys.parse_client_alive(key)
+
+
+def test_others_are_told_a_name_that_the_id_cannot_be_found_from():
+    assert keys.public_id("abc") == "ba7816bf8f01"
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from solidcloud.schemas.answers import CollideAnswers, Cost
+from solidcloud.schemas.keys import public_id
 from solidcloud.schemas.stats import TIME_BOUNDS, Times, UserStats
 from solidcloud.server import metrics as metrics_module
 from solidcloud.server.metrics import BOUNDS, Histogram, Metrics, times_of
@@ -116,7 +117,7 @@ def test_a_request_counts_for_its_user_and_in_all(metrics: Metrics, clock: Clock
     al = users[1]
     assert (users[0].avatar, users[0].silent_seconds) == ("bo", 6.0), "heard of last"
     assert al == UserStats(
-        "c", "al", requests=2, answers=4, hits=5, misses=1, late=2, unknown=2, waited=1,
+        public_id("c"), "al", requests=2, answers=4, hits=5, misses=1, late=2, unknown=2, waited=1,
         stall_p99=0.02, stall_max=0.02, silent_seconds=7.0,
     )  # fmt: skip
     counts = total.counts
@@ -145,7 +146,7 @@ def test_a_client_that_went_is_forgotten_and_counts_in_all(metrics: Metrics) -> 
     metrics.drop_client("a")
     metrics.drop_client("nobody")
     total, users = metrics.snapshot()
-    assert [(user.client, user.avatar) for user in users] == [("b", "al")]
+    assert [(user.client, user.avatar) for user in users] == [(public_id("b"), "al")]
     assert (total.counts.requests, total.counts.unknown, total.counts.stalls.count) == (3, 3, 3)
     metrics.answered("a", "al", answers(0))
     assert metrics.snapshot()[1][0].requests == 1, "it begins anew"
@@ -158,7 +159,7 @@ def test_the_longest_silent_is_forgotten_for_a_new_one(
     for client in "abcadae":
         metrics.answered(client, "al", answers(0, hits=1))
     total, users = metrics.snapshot()
-    assert [user.client for user in users] == ["e", "a", "d"]
+    assert [user.client for user in users] == [public_id(client) for client in "ead"]
     assert (total.counts.requests, total.counts.hits) == (7, 7)
     assert [user.requests for user in users] == [1, 3, 1]
 

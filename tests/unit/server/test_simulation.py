@@ -14,7 +14,7 @@ from solidcloud.schemas.errors import (
     InternalError,
     UnknownAvatarError,
 )
-from solidcloud.schemas.keys import User
+from solidcloud.schemas.keys import User, public_id
 from solidcloud.schemas.moves import FRAME_SECONDS, Moved, State, Wish
 from solidcloud.schemas.scene import SceneFile, Spawn, scene_of
 from solidcloud.server.client import Client
@@ -71,7 +71,10 @@ def test_everybody_who_wished_has_one_frame_in_the_order_given(floor):
     run = floor._pipeline.run
     floor._pipeline.run = lambda body, *rest, **more: [order.append(body.name), run(body, *rest, **more)][1]
     outcomes = floor.step([Turn(BO, wish(1, 0.25)), Turn(AL, wish(1, 0.5))])
-    assert [outcome.user for outcome in outcomes] == [BO, AL] and order == ["b/bo", "a/al"]
+    assert [outcome.user for outcome in outcomes] == [BO, AL] and order == [
+        f"{public_id('b')}/bo",
+        f"{public_id('a')}/al",
+    ]
     assert {outcome.state.frame for outcome in outcomes} == {1}
     assert floor.step([]) == [] and floor.step([Turn(AL, wish(2, 0.5))])[0].state.frame == 3
 

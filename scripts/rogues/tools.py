@@ -1,0 +1,205 @@
+"""What a rogue tries against one victim: each tool under each width of key expression, and what came of it.
+
+The victim is a `Client` of the made floor of the tests, with a session. A rogue is a plain zenoh session at the
+same server. An attempt succeeds if the victim hears a lie or loses something, or if the rogue hears of the victim.
+"""
+
+import json
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+import zenoh
+from solidcloud.schemas.answers import CollideAnswers, CollidePart, Verdict
+from solidcloud.schemas.encoding import decode_request, encode
+from solidcloud.schemas.errors import SolidcloudError
+from solidcloud.schemas.messages import CollideRequest, ErrorReply, PathRequest
+from solidcloud.schemas.moves import State, Wish
+from solidcloud.server.client import Client
+from solidcloud.server.client_session import ClientSession
+from solidcloud.server.transport import session_config
+
+MODES = ("client", "peer", "router")
+AVATAR = "al"
+POINTS = np.array([[0.0, 0.0, 0.5], [0.25, 0.0, 1.0], [0.0, 0.25, 1.5]])
+MSGPACK = "application/msgpack"
+# A state waited for on a busy machine [s], a query that nobody lets through [s].
+DEADLINE, NO_REPLY = 20.0, 0.02
+
+
+def widths(scene: str, client: str) -> list[str]:
+    """Key expressions that match the victim's keys, from the widest to its own, and some that are its neighbours."""
+    return [
+        "**",
+        "solidcloud/**",
+        "solidcloud/1/**",
+        "*/1/scene/**",
+        f"solidcloud/*/scene/{scene}/*/*",
+        f"solidcloud/1/*/{scene}/**",
+        f"solidcloud/1/scene/{scene}/{client}/**",
+        f"solidcloud/1/stat$*/{scene}/{client}/{AVATAR}",
+        f"solidcloud/1/*/{scene}/*/{AVATAR}",
+        f"solidcloud/1/state/{scene}/*/*",
+        f"solidcloud/1/wish/{scene}/*/*",
+        f"solidcloud/1/client/{scene}/*",
+    ]
+
+
+class Victim(NamedTuple):
+    """A client of the floor that walks it, and its id."""
+
+    client: Client
+    session: ClientSession
+    id: str
+
+
+class Rogue:
+    """A zenoh session of a rogue; a context manager."""
+
+    def __init__(self, endpoint: str, mode: str) -> None:
+        config = session_config(connect=endpoint)
+        config.insert_json5("mode", json.dumps(mode))
+        self.session = zenoh.open(config)
+
+    def __enter__(self) -> "Rogue":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.session.close()  # type: ignore[no-untyped-call]
+
+    def settle(self) -> None:
+        """Wait until the server has seen what was declared and sent: it answers what comes behind it on this link."""
+        assert list(self.session.get("solidcloud/1/scenes", timeout=DEADLINE)), "the server is there"
+
+
+Tool = Callable[[Rogue, str, Victim], list[str]]
+
+
+def attempt(tool: str, rogue: Rogue, width: str, victim: Victim) -> list[str]:
+    """Try a tool under one width; what it achieved, in words."""
+    try:
+        return TOOLS[tool](rogue, width, victim)
+    except zenoh.ZError:
+        return []  # zenoh itself refuses such a key
+
+
+def pose_at(x: float, z: float) -> Any:
+    """A pose (4, 4), not turned."""
+    pose = np.eye(4)
+    pose[0, 3], pose[2, 3] = x, z
+    return pose
+
+
+def _queryable(rogue: Rogue, width: str, victim: Victim) -> list[str]:
+    heard: list[str] = []
+
+    def lie(query: zenoh.Query) -> None:
+        with query:
+            heard.append(str(query.key_expr))
+            if query.payload is not None:
+                query.reply(query.key_expr, _zeros(query), encoding=MSGPACK)
+
+    with rogue.session.declare_queryable(width, lie, complete=True):
+        rogue.settle()
+        found = _asked(victim)
+        state = _walked(victim, 0.5)
+    return found + state + [f"asked {key}" for key in heard if victim.id in key]
+
+
+def _zeros(query: zenoh.Query) -> bytes:
+    """An answer that says `clear` of everything."""
+    payload, path = query.payload.to_bytes(), str(query.key_expr).endswith("/path")
+    try:
+        count = len(decode_request(PathRequest if path else CollideRequest, payload, MSGPACK).poses)
+    except SolidcloudError:
+        return encode(State(pose=pose_at(9.0, 9.0)[None], seq=10**9, time=0.0, frame=1))
+    none = np.zeros(count, np.uint32)
+    if path:
+        return encode(CollidePart(none.astype(np.uint8), none > 0, none, none, none, first=0, total=count))
+    return encode(CollideAnswers(none.astype(np.uint8), none > 0, none, none, none))
+
+
+def _asked(victim: Victim) -> list[str]:
+    """What is wrong with what the victim is told about poses in the floor."""
+    poses = np.tile(pose_at(0.0, -1.0), (3, 1, 1))
+    verdicts = [victim.client.collide(AVATAR, poses).verdict]
+    verdicts += [part.verdict for part in victim.client.path(AVATAR, poses)]
+    if (np.concatenate(verdicts) == Verdict.CONTACT).all():
+        return []
+    return [f"verdicts {[verdict.tolist() for verdict in verdicts]}"]
+
+
+def _walked(victim: Victim, z: float) -> list[str]:
+    """What is wrong with where the victim gets to."""
+    try:
+        for _ in range(3):
+            state = victim.session.wait(victim.session.wish(pose_at(0.0, z)), DEADLINE)
+            if state.pose[0, 0, 3] != 0.0 or state.pose[0, 2, 3] != z or state.seq > 10**8:
+                return [f"at {state.pose[0, :3, 3].tolist()}, number {state.seq}"]
+        latest = victim.session.latest()
+        return [] if latest is not None and latest.state is state else ["another state than the last"]
+    except SolidcloudError as error:
+        return [f"{type(error).__name__}: {error}"]
+
+
+def _put(rogue: Rogue, width: str, victim: Victim) -> list[str]:
+    far = pose_at(9.0, 9.0)[None]
+    for message in (
+        State(pose=far, seq=10**9, time=0.0, frame=1),
+        ErrorReply("internal", "a lie"),
+        Wish(seq=10**9, time=1.0, pose=far),
+    ):
+        rogue.session.put(width, encode(message), encoding=MSGPACK)
+    rogue.session.delete(width)
+    rogue.settle()
+    return _walked(victim, 0.75)
+
+
+def _token(rogue: Rogue, width: str, victim: Victim) -> list[str]:
+    rogue.session.liveliness().declare_token(width).undeclare()
+    rogue.settle()
+    time.sleep(0.005)  # the server hears of tokens on a channel of its own
+    request = encode(CollideRequest(AVATAR, pose_at(0.0, -1.0)[None]))
+    try:
+        victim.client._ask("collide", request)
+    except SolidcloudError as error:
+        _asked(victim)  # the avatar is added again
+        return [f"{type(error).__name__}: {error}"]
+    return []
+
+
+def _subscriber(rogue: Rogue, width: str, victim: Victim) -> list[str]:
+    heard: list[Any] = []
+    with rogue.session.declare_subscriber(width, heard.append):
+        rogue.settle()
+        wrong = _walked(victim, 0.25)
+        rogue.settle()
+    return wrong + [f"heard {sample.key_expr}" for sample in heard]
+
+
+def _liveliness(rogue: Rogue, width: str, victim: Victim) -> list[str]:
+    heard: list[Any] = []
+    liveliness = rogue.session.liveliness()
+    with liveliness.declare_subscriber(width, heard.append, history=True):
+        rogue.settle()
+        heard += [reply.ok for reply in liveliness.get(width, timeout=NO_REPLY) if reply.ok is not None]
+    return [f"heard of {sample.key_expr}" for sample in heard if victim.id in str(sample.key_expr)]
+
+
+def _query(rogue: Rogue, width: str, victim: Victim) -> list[str]:
+    replies = rogue.session.get(
+        width, target=zenoh.QueryTarget.ALL, consolidation=zenoh.ConsolidationMode.NONE, timeout=NO_REPLY
+    )
+    said = [(str(r.ok.key_expr), r.ok.payload.to_bytes()) for r in replies if r.ok is not None]
+    return [f"told {key}" for key, payload in said if victim.id in key or victim.id.encode() in payload]
+
+
+TOOLS: dict[str, Tool] = {
+    "queryable": _queryable,
+    "put": _put,
+    "token": _token,
+    "subscriber": _subscriber,
+    "liveliness": _liveliness,
+    "query": _query,
+}

@@ -1,0 +1,85 @@
+"""Rogues at the server's port: whatever they declare, put and ask for, others hear no lie and lose nothing."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from fake_server import floor_simulation
+from floor import eventually
+from solidcloud.server.app import serving
+from solidcloud.server.client import Client
+from solidcloud.server.config import ServerConfig
+from solidcloud.server.served import EVERYBODY
+from walkers import pose_at
+
+# Appended, so that nothing of scripts/ hides a module of the tests.
+sys.path.append(str(Path(__file__).parents[2] / "scripts"))
+
+from rogues.tools import AVATAR, DEADLINE, MODES, POINTS, TOOLS, Rogue, Victim, attempt, widths
+
+SCRIPTS = Path(__file__).parents[2] / "scripts"
+
+
+@pytest.fixture(scope="module")
+def endpoint(free_endpoint):
+    return free_endpoint()
+
+
+@pytest.fixture(scope="module")
+def victim(endpoint):
+    """A client with an avatar and a session, of a server that rogues reach too."""
+    with (
+        serving([floor_simulation()], ServerConfig(listen=endpoint)),
+        Client(endpoint, scene="floor", timeout=DEADLINE) as client,
+    ):
+        client.add_avatar(AVATAR, POINTS, 0.125)
+        with client.session(AVATAR) as session:
+            session.wait(session.wish(pose_at(0.0, 1.0)), DEADLINE)
+            yield Victim(client, session, client._id)
+
+
+@pytest.fixture(scope="module", params=MODES)
+def rogue(request, endpoint, victim):
+    with Rogue(endpoint, request.param) as rogue:
+        yield rogue
+
+
+@pytest.mark.parametrize("tool", TOOLS)
+def test_no_tool_of_a_rogue_has_a_success(rogue, victim, tool):
+    found = {}
+    for width in widths("floor", victim.id):
+        if said := attempt(tool, rogue, width, victim):
+            found[width] = said
+    assert not found
+
+
+def test_a_rogue_is_not_gossiped_to_clients(rogue, victim):
+    session = victim.client._session
+    assert len(list(session.info.peers_zid())) + len(list(session.info.routers_zid())) == 1
+
+
+def test_a_token_of_everybody_leaves_the_scenes_own_avatars(free_endpoint):
+    """The scene's own avatars are kept under the client "*", which is no client's name."""
+    endpoint, floor = free_endpoint(), floor_simulation()
+    floor.served.add_avatar("own", POINTS, 0.125, client=EVERYBODY)
+    with serving([floor], ServerConfig(listen=endpoint)), Rogue(endpoint, "client") as rogue:
+        gone = len(floor.served.gone)
+        for key in ("solidcloud/1/client/floor/*", "solidcloud/1/client/floor/last"):
+            rogue.session.liveliness().declare_token(key).undeclare()
+            rogue.settle()
+        eventually(lambda: "last" in floor.served.gone)  # behind the others on one channel
+        assert floor.served.gone[gone:] == ["last"] and floor.served.avatar("own", "anybody")
+
+
+def test_few_attacks_by_the_script_have_no_success():
+    """scripts/attack_wire, in a process of its own."""
+    done = subprocess.run(
+        [sys.executable, SCRIPTS / "attack_wire", "--attempts", "36"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert json.loads(done.stdout.splitlines()[-1])["successes"] == 0

@@ -12,8 +12,8 @@ import pytest
 
 SEED = 2012
 
-# Before anything imports numba: its cache does not notice an edit in another file, nor a changed imported
-# constant, so it starts empty, for this process and for those it starts. Set it to keep one.
+# Before anything imports numba: compiled kernels are kept in a new folder, for this process and for those it starts, so
+# that every run compiles all of them. Set NUMBA_CACHE_DIR to keep them: what an edit changes is compiled anew.
 _OWN_CACHE = "NUMBA_CACHE_DIR" not in os.environ
 if _OWN_CACHE:
     os.environ["NUMBA_CACHE_DIR"] = tempfile.mkdtemp(prefix="solidcloud-numba-")

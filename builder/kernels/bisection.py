@@ -1,6 +1,6 @@
 """Bisection of sorted values, inside kernels: np.searchsorted of a part, without a slice of it."""
 
-import numba as nb
+from ...schemas.kernels import compiling as nb
 
 
 @nb.njit(nogil=True, cache=True)

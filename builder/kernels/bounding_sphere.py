@@ -10,8 +10,9 @@ guess (NUMERICS.md N3).
 
 import math
 
-import numba as nb
 import numpy as np
+
+from ...schemas.kernels import compiling as nb
 
 # Ratio to the minimal ball: see tests/hard_cases/test_bounds.py, at most 1.25 on leaf blocks.
 # Large sets get fewer steps, because each step visits every point and an upper node is tested rarely.

@@ -6,9 +6,9 @@ theirs in the mean; in half a disc at 0.36 of it, about a right-angled crease at
 neighbours, in the plane through them, finds the same rims, but takes an eigenvector.
 """
 
-import numba as nb
 import numpy as np
 
+from ...schemas.kernels import compiling as nb
 from ...schemas.radius_model import LOCAL_CLASSES, RIM_BIT
 from .neighbours import STACK, closest_distinct
 

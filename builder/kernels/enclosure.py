@@ -1,8 +1,8 @@
 """Does every bound of a record enclose the points below it? The check behind `solidcloud validate --deep`."""
 
-import numba as nb
 import numpy as np
 
+from ...schemas.kernels import compiling as nb
 from ...schemas.kernels.rows import LANES
 from .records import U, link_parents, read_leaf
 

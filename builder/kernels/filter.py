@@ -5,9 +5,9 @@ by the cell of a grid they are in, cells numbered as `cell_numbers` does. Cells 
 so that all that is near a point is in its own cell and the 26 around it: nine runs of three.
 """
 
-import numba as nb
 import numpy as np
 
+from ...schemas.kernels import compiling as nb
 from .bisection import first_at_least
 
 

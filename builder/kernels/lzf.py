@@ -1,7 +1,8 @@
 """Decoding of LZF, the compression of PCD files, a piece at a time: a loop in Python takes 1 us a byte."""
 
-import numba as nb
 import numpy as np
+
+from ...schemas.kernels import compiling as nb
 
 # A reference copies at most this many bytes, from at most so far back [liblzf, lzf_d.c].
 LONGEST_COPY = 264

@@ -2,10 +2,10 @@
 
 from typing import NamedTuple
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from ...schemas.kernels import compiling as nb
 from ...schemas.kernels.rows import LANES
 from .bounding_sphere import ceil_sqrt
 from .records import U, read_leaf

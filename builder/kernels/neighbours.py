@@ -5,8 +5,9 @@ boxes. A point's closest are looked for in the blocks beside it first, which bou
 opened for.
 """
 
-import numba as nb
 import numpy as np
+
+from ...schemas.kernels import compiling as nb
 
 BLOCK = 16
 FAN = 8

@@ -5,9 +5,9 @@ exact in int64: a box whose sums are used lies in the ball of the reach, so it i
 `normal_reach` (schemas/normals.py) leaves room for it.
 """
 
-import numba as nb
 import numpy as np
 
+from ...schemas.kernels import compiling as nb
 from ...schemas.kernels.normals import normal_code
 from .neighbours import BLOCK, FAN, STACK
 

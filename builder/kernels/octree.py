@@ -1,8 +1,8 @@
 """The octree of one voxel, split by occupancy, over points in Morton order."""
 
-import numba as nb
 import numpy as np
 
+from ...schemas.kernels import compiling as nb
 from ...schemas.kernels.morton import morton_code
 from .bisection import first_at_least
 

@@ -9,8 +9,9 @@ rank in rows, and what stands there at the end is the order of the leaf nodes. L
 schemas/kernels.
 """
 
-import numba as nb
 import numpy as np
+
+from ...schemas.kernels import compiling as nb
 
 # Most bins of the histogram that a median is looked for in.
 BINS = 256

@@ -7,10 +7,10 @@ in schemas/kernels/rows.py. What a record is to a kernel is a `Leaves`, or a tup
 
 from typing import NamedTuple
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from ...schemas.kernels import compiling as nb
 from ...schemas.kernels.rows import LANES
 from .content import mix
 

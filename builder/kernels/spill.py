@@ -1,7 +1,8 @@
 """Points of cells, (3, n), and the same with each cell's x, y and z side by side, so that one read gets a cell."""
 
-import numba as nb
 import numpy as np
+
+from ...schemas.kernels import compiling as nb
 
 
 @nb.njit(nogil=True, cache=True)

@@ -4,9 +4,9 @@ Each step is a loop of its own over a few thousand points, which stay in the nea
 compiler makes vectors of every loop that has no branch in it.
 """
 
-import numba as nb
 import numpy as np
 
+from ...schemas.kernels import compiling as nb
 from ...schemas.kernels.morton import morton_code, morton_decode
 from .content import mix_column, mixed_sum
 

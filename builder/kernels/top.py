@@ -5,9 +5,9 @@ how the cells' points are spread. Neither needs a point again. Radius and slab d
 order, and a node's bounds grow to hold them. All of it is the same whether a voxel is held or read block by block.
 """
 
-import numba as nb
 import numpy as np
 
+from ...schemas.kernels import compiling as nb
 from .bounding_sphere import (
     LARGE_STEPS,
     SMALL_SET,

@@ -3,9 +3,9 @@
 Rows of `nodes`, a tuple of arrays as in schemas/voxel.py `Nodes`: center, radius, normal, slab, count, axis, block_low.
 """
 
-import numba as nb
 import numpy as np
 
+from ...schemas.kernels import compiling as nb
 from .bounding_sphere import SPREAD, bound_run, bound_space, join_spread, leaf_spread
 from .pack import ROWS, longest_edge, most_nodes, pack_points, pack_space, sort_run
 

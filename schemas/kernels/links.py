@@ -1,6 +1,6 @@
 """Where the children of a voxel's nodes are: derived from counts alone, and checked on the way."""
 
-import numba as nb
+from . import compiling as nb
 
 
 @nb.njit(nogil=True, cache=True)

@@ -4,8 +4,9 @@ The bit-spreading constants are the usual ones for 21 bits an axis (Morton 1966;
 the gap between groups at each line).
 """
 
-import numba as nb
 import numpy as np
+
+from . import compiling as nb
 
 
 @nb.njit(nogil=True, cache=True)

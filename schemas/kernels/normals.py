@@ -19,8 +19,9 @@ the high byte, v the low one, so both are 1 to 255. The axes are exact, other di
 
 import math
 
-import numba as nb
 import numpy as np
+
+from . import compiling as nb
 
 NONE = np.uint16(0)
 LEAST_POINTS = 3

@@ -5,8 +5,9 @@ over bytes and halfwords and then leaves it scalar (3 times as slow). And they i
 indices a wrap-around check, and LLVM then loads element by element.
 """
 
-import numba as nb
 import numpy as np
+
+from . import compiling as nb
 
 # Points of a leaf node side by side, all of a vector test; MAX_LEAF of schemas/voxel.py.
 LANES = 32

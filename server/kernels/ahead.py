@@ -6,9 +6,9 @@ A way is where the user's ball goes: m + 1 centres from the last pose on [steps 
 import math
 from typing import NamedTuple
 
-import numba as nb
 import numpy as np
 
+from ...schemas.kernels import compiling as nb
 from ...schemas.kernels.morton import morton_code
 from ...schemas.voxel_grid import KEY_BIAS
 from .compiled import borrowing

@@ -9,10 +9,10 @@ saw costs no more than its nodes and the numbers of its points.
 import math
 from typing import NamedTuple
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from ...schemas.kernels import compiling as nb
 from ...schemas.voxel_grid import UNITS_PER_METRE
 from .closest import lower_bound, set_cut
 from .compiled import borrowing

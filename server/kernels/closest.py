@@ -12,10 +12,10 @@ and the order.
 import math
 from typing import NamedTuple
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from ...schemas.kernels import compiling as nb
 from .closer import compare_gaps
 from .compiled import borrowing
 from .lanes import list_squares

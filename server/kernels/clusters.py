@@ -9,10 +9,10 @@ with the pairs listed, never with the pairs found.
 
 from typing import NamedTuple
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from ...schemas.kernels import compiling as nb
 from .closer import compare_gaps
 from .compiled import borrowing
 from .placed import U32

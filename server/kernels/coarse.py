@@ -7,10 +7,10 @@ the rooms by radius class are those of overlap.py, so a pair that is settled her
 
 from typing import NamedTuple
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from ...schemas.kernels import compiling as nb
 from .compiled import borrowing
 from .front import MAX_FRONT, place_front, sift
 from .layout import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, node_class

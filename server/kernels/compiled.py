@@ -9,7 +9,7 @@ np.empty and its like, and assignments of whole arrays, are refused by the compi
 
 from typing import Any
 
-import numba as nb
+from ...schemas.kernels import compiling as nb
 
 # By name, because numba's own types leave the option out: its underscore says that it may change. Without it kernels
 # are slower and as right.

@@ -10,10 +10,10 @@ with the least gap between its spheres, |a - b| - r_a - r_b. Nodes and blocks ar
 
 from typing import NamedTuple
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from ...schemas.kernels import compiling as nb
 from .clusters import (
     CELLS,
     CENTER,

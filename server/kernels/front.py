@@ -10,10 +10,10 @@ each lane gets an address of its own and is loaded alone (six times slower, scri
 
 from typing import NamedTuple
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from ...schemas.kernels import compiling as nb
 from .compiled import borrowing, inlined
 from .layout import LANES
 from .placed import ONE_SLACK, SLACK, node_reach

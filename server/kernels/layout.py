@@ -24,10 +24,10 @@ where all of them have it: the class of the largest sphere below the node, whate
 
 from typing import NamedTuple
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from ...schemas.kernels import compiling as nb
 from ...schemas.radius_model import LOCAL_CLASSES, RIM_BIT
 from ...schemas.voxel import MAX_LEAF
 from .compiled import borrowing

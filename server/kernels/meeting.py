@@ -12,9 +12,9 @@ All is float64: avatars are some thousand points, and few of them are near one a
 
 import math
 
-import numba as nb
 import numpy as np
 
+from ...schemas.kernels import compiling as nb
 from ...schemas.voxel_grid import UNITS_PER_METRE
 from .compiled import borrowing
 from .layout import LANES

@@ -17,10 +17,10 @@ machine, compiled and interpreted. No library's sine promises that.
 import math
 from typing import NamedTuple
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from ...schemas.kernels import compiling as nb
 from .compiled import borrowing
 
 # Of sin(x) / x and cos(x), by powers of x^2, highest first. Up to pi/2 what is left out is below 2^-58.

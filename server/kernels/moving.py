@@ -3,10 +3,10 @@
 import math
 from typing import NamedTuple
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from ...schemas.kernels import compiling as nb
 from .compiled import borrowing
 from .layout import LANES, SceneArrays
 from .motion import Motion

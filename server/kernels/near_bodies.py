@@ -1,8 +1,8 @@
 """Which of some bodies could a motion meet at all? Their boxes are compared one by one: users are some hundreds."""
 
-import numba as nb
 import numpy as np
 
+from ...schemas.kernels import compiling as nb
 from ...schemas.voxel_grid import UNITS_PER_METRE
 from .motion import make_motion
 

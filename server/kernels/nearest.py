@@ -15,10 +15,10 @@ children in the order of their bounds, which are all alike over a floor, a tenth
 import math
 from typing import NamedTuple
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from ...schemas.kernels import compiling as nb
 from .closest import found_units, lower_bound, make_best, set_cut, settle, take_candidates
 from .compiled import borrowing, inlined
 from .front import make_front, move_node, pad, place_front, sift, take_kept

@@ -6,9 +6,9 @@ operations, so that the bits are the same. In columns of one element they took f
 
 import math
 
-import numba as nb
 import numpy as np
 
+from ...schemas.kernels import compiling as nb
 from ...schemas.voxel_grid import UNITS_PER_METRE
 from .closest import Nearest
 from .compiled import borrowing

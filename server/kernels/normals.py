@@ -4,9 +4,9 @@ The definition is in schemas/kernels/normals.py. Spheres prune, in whole numbers
 decided by integers.
 """
 
-import numba as nb
 import numpy as np
 
+from ...schemas.kernels import compiling as nb
 from ...schemas.kernels.morton import morton_code
 from ...schemas.kernels.normals import NONE, normal_code
 from ...schemas.voxel_grid import KEY_BIAS

@@ -16,10 +16,10 @@ points below `near` touch, above `far` do not; only between them are the integer
 
 from typing import NamedTuple
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from ...schemas.kernels import compiling as nb
 from .compiled import borrowing, inlined
 from .front import MOST_LEVELS, make_front, move_node, pad, place_front, sift, take_kept
 from .layout import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, node_class, point_class

@@ -9,9 +9,9 @@ definition rounds each placed point once, and a product of two poses would add a
 are compared in float32 from the centre of one of the two leaf nodes, with a certified band in which integers decide.
 """
 
-import numba as nb
 import numpy as np
 
+from ...schemas.kernels import compiling as nb
 from ...schemas.voxel_grid import UNITS_PER_METRE
 from .layout import LANES
 from .placed import U32

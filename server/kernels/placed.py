@@ -8,10 +8,10 @@ cannot tell, the integers of NUMERICS.md N5 decide: `pair_square`.
 import math
 from typing import NamedTuple
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from ...schemas.kernels import compiling as nb
 from .compiled import borrowing
 from .layout import LANES
 from .placing import MAX_REACH_UNITS, largest_term, lattice_to_units, place, to_units

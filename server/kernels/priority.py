@@ -17,10 +17,10 @@ less than that of its radius class, and some point's is at most its `sure` drop.
 import math
 from typing import NamedTuple
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from ...schemas.kernels import compiling as nb
 from ...schemas.radius_model import RIM_BIT
 from .closest import (
     Best,

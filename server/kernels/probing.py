@@ -4,10 +4,10 @@ What a motion costs is then its search: between Python and a kernel each array h
 microsecond, and each question about it another call.
 """
 
-import numba as nb
 import numpy as np
 
 from ...schemas.answers import Verdict
+from ...schemas.kernels import compiling as nb
 from ...schemas.voxel_grid import UNITS_PER_METRE
 from .advance import Progress, avatar_box, look_around, plan_segments, sweep_segments
 from .layout import SceneArrays

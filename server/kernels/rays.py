@@ -21,10 +21,10 @@ Everything else here prunes and never decides: node bounds in float64, 32 points
 import math
 from typing import NamedTuple
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from ...schemas.kernels import compiling as nb
 from .compiled import borrowing
 from .layout import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, node_class, point_class
 from .placed import U32

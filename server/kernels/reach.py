@@ -3,10 +3,10 @@
 import math
 from typing import NamedTuple
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from ...schemas.kernels import compiling as nb
 from ...schemas.kernels.morton import morton_code
 from ...schemas.voxel_grid import KEY_BIAS
 from .compiled import borrowing

@@ -7,9 +7,10 @@ time. An entry of a list carries `near`, a distance no point of that voxel under
 import math
 from typing import NamedTuple
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
+
+from ...schemas.kernels import compiling as nb
 
 FAN = 8
 # FAN - 1 siblings stay behind on each level; 2^63 rows have 21 levels.

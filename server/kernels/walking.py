@@ -7,10 +7,10 @@ some eight a pose at 30 frames a second and 4 cm a step, four at 90.
 import math
 from typing import NamedTuple
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from ...schemas.kernels import compiling as nb
 from .compiled import borrowing, inlined
 from .front import U
 from .layout import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, node_class

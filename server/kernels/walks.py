@@ -8,10 +8,10 @@ and place [m].
 import math
 from typing import NamedTuple
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from ...schemas.kernels import compiling as nb
 from .ahead import Motion, predict_way, rows_ahead, rows_in_reach
 from .compiled import borrowing
 

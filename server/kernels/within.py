@@ -10,9 +10,9 @@ Everything else here prunes and never decides: node bounds in float64, 32 points
 
 import math
 
-import numba as nb
 import numpy as np
 
+from ...schemas.kernels import compiling as nb
 from .compiled import borrowing
 from .layout import COUNT, COUNTED, FIRST, LANES, ROW_WORDS
 from .placed import U32

@@ -8,10 +8,10 @@ that none loses a contact: what a bounding volume changes is how often it says "
 import math
 from typing import NamedTuple
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from ....schemas.kernels import compiling as nb
 from ....schemas.voxel_grid import UNITS_PER_METRE
 from ...kernels.compiled import borrowing
 from ...kernels.layout import LANES

@@ -7,10 +7,10 @@ arithmetic alone. Coordinates are float64 metres from the dataset's origin until
 import math
 from typing import NamedTuple
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from ....schemas.kernels import compiling as nb
 from ....schemas.voxel_grid import UNITS_PER_METRE
 from ...kernels.compiled import borrowing
 from ...kernels.layout import LANES

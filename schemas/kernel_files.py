@@ -1,0 +1,243 @@
+"""The folder of compiled kernels: files of machine code, each checked before it is used.
+
+A file holds a magic number, a SHA-256 over its own name and its payload, and the payload. The payload is unpickled
+and run, so a file is used only if its digest is right, and a folder only if nobody else may write it. A damaged file is
+removed, said once, and compiled again. Nothing here raises because of a file: a process that cannot use the folder
+compiles.
+"""
+
+import contextlib
+import errno
+import fcntl
+import hashlib
+import logging
+import os
+import secrets
+import shutil
+import stat
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+log = logging.getLogger(__name__)
+
+_MAGIC = b"solidcloud k 1\n\0"
+_HEAD = len(_MAGIC) + hashlib.sha256().digest_size
+_SUFFIX = ".kernel"
+_TEMPORARY = ".tmp"
+_STARTING = ".starting"
+_DAY = 86_400.0
+# What is kept: all kernels of one version of this package take 37 MB.
+MOST_BYTES = 1 << 29
+MOST_DAYS = 60.0
+
+
+def default_folder(cache: str) -> Path:
+    """Return where compiled kernels are kept. cache: what NUMBA_CACHE_DIR says, "" for nothing."""
+    if cache:
+        return Path(cache).absolute() / "solidcloud-kernels"
+    home = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
+    return Path(home).absolute() / "solidcloud" / "kernels"
+
+
+class KernelFiles:
+    """One folder of compiled kernels. Threads may share it; processes may share the folder.
+
+    folder: where the files are; made when it is first used.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._said: set[str] = set()
+        self._pruned = False
+        self._descriptor = self._open()
+
+    def __del__(self) -> None:
+        """Close the folder."""
+        if (descriptor := getattr(self, "_descriptor", None)) is not None:
+            os.close(descriptor)
+
+    def read(self, name: str) -> bytes | None:
+        """Return the payload that was written under `name`; None where there is none, or none that may be used."""
+        if self._descriptor is None:
+            return None
+        try:
+            content = self._content(name)
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            self.discard(name, error.strerror or str(error))
+            return None
+        payload = content[_HEAD:]
+        if content[:_HEAD] != _head(name, payload):
+            self.discard(name, f"its {len(content)} bytes do not match their digest")
+            return None
+        return payload
+
+    def write(self, name: str, payload: bytes) -> None:
+        """Keep a payload under `name`, whole or not at all."""
+        if self._descriptor is None:
+            return
+        if not self._pruned:
+            self._pruned = True
+            self.prune()
+        temporary = f"{secrets.token_hex(12)}{_TEMPORARY}"
+        try:
+            try:
+                self._create(temporary, _head(name, payload), payload)
+                os.replace(temporary, name, src_dir_fd=self._descriptor, dst_dir_fd=self._descriptor)
+            except BaseException:
+                with contextlib.suppress(OSError):
+                    os.unlink(temporary, dir_fd=self._descriptor)
+                raise
+        except OSError as error:
+            self._not_kept(error.strerror or str(error))
+
+    def discard(self, name: str, fault: str) -> None:
+        """Remove a file that is not what was written, and say so the first time."""
+        removed = self._remove(name)
+        outcome = "removed" if removed else "it cannot be removed: remove the folder"
+        self._say(
+            "damaged",
+            f"compiled kernels in {self.folder}: {name} is damaged ({fault}): {outcome}; "
+            "whatever is damaged is compiled again",
+        )
+
+    def wipe(self) -> None:
+        """Remove every compiled kernel."""
+        for name in self._names(_SUFFIX):
+            self._remove(name)
+
+    def prune(self, most_bytes: int = MOST_BYTES, most_days: float = MOST_DAYS) -> None:
+        """Remove what was not used for `most_days`, then the least recently used until `most_bytes` are left."""
+        now, kept = time.time(), 0
+        for name, found in self._files(_TEMPORARY):
+            if now - found.st_mtime > _DAY:
+                self._remove(name)
+        listed = [(found.st_mtime, found.st_size, name) for name, found in self._files(_SUFFIX)]
+        for used, size, name in sorted(listed, reverse=True):
+            kept += size
+            if kept > most_bytes or now - used > most_days * _DAY:
+                self._remove(name)
+
+    @contextlib.contextmanager
+    def starting(self) -> Iterator[bool]:
+        """Mark the folder while inside; yield whether a process ended inside without leaving, as one that crashes does.
+
+        A mark is a file that its process holds locked: the system unlocks it however the process ends.
+        """
+        unfinished = any([self._left_behind(name) for name in self._names(_STARTING)])
+        with contextlib.ExitStack() as stack:
+            with contextlib.suppress(OSError):
+                if self._descriptor is not None:
+                    name, flags = f"{secrets.token_hex(12)}{_STARTING}", os.O_RDWR | os.O_CREAT | os.O_EXCL
+                    mark = os.open(name, flags | os.O_CLOEXEC, 0o600, dir_fd=self._descriptor)
+                    stack.callback(os.close, mark)
+                    stack.callback(self._remove, name)
+                    fcntl.flock(mark, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            yield unfinished
+
+    def _left_behind(self, name: str) -> bool:
+        """Return whether nobody holds this mark, and remove it then."""
+        try:
+            mark = os.open(name, os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC, dir_fd=self._descriptor)
+        except OSError:
+            return False
+        try:
+            fcntl.flock(mark, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return self._remove(name)
+        except OSError:
+            return False
+        finally:
+            os.close(mark)
+
+    def _open(self) -> int | None:
+        """Open the folder, made if need be; None, and said, where it cannot be used."""
+        try:
+            self.folder.parent.mkdir(parents=True, exist_ok=True)
+            with contextlib.suppress(FileExistsError):
+                self.folder.mkdir(mode=0o700)
+            descriptor = os.open(self.folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
+        except OSError as error:
+            self._not_kept(error.strerror or str(error))
+            return None
+        found = os.fstat(descriptor)
+        if found.st_uid in (os.geteuid(), 0) and not found.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+            return descriptor
+        os.close(descriptor)
+        mode = stat.S_IMODE(found.st_mode)
+        self._not_kept(f"owner {found.st_uid}, mode {mode:o}: expected owner {os.geteuid()}, mode 700")
+        return None
+
+    def _content(self, name: str) -> bytes:
+        """Read a file, and note that it is used. OSError: it cannot be read, or is no file."""
+        flags = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+        descriptor = os.open(name, flags, dir_fd=self._descriptor)
+        with open(descriptor, "rb", buffering=0, closefd=True) as file:
+            found = os.fstat(descriptor)
+            if not stat.S_ISREG(found.st_mode):
+                raise OSError(errno.EINVAL, "not a regular file")
+            if time.time() - found.st_mtime > _DAY:
+                with contextlib.suppress(OSError):  # another owner's folder
+                    os.utime(descriptor)
+            return file.readall()
+
+    def _create(self, name: str, *parts: bytes) -> None:
+        """Write a new file."""
+        flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
+        descriptor = os.open(name, flags, 0o600, dir_fd=self._descriptor)
+        with open(descriptor, "wb") as file:
+            file.writelines(parts)
+
+    def _names(self, suffix: str) -> list[str]:
+        """List what the folder holds under names of one kind."""
+        if self._descriptor is None:
+            return []
+        try:
+            return [name for name in os.listdir(self._descriptor) if name.endswith(suffix)]
+        except OSError:
+            return []
+
+    def _files(self, suffix: str) -> Iterator[tuple[str, os.stat_result]]:
+        """Yield names of one kind and what the system says of them."""
+        for name in self._names(suffix):
+            if (found := self._stat(name)) is not None:
+                yield name, found
+
+    def _stat(self, name: str) -> os.stat_result | None:
+        try:
+            return os.stat(name, dir_fd=self._descriptor, follow_symlinks=False)
+        except OSError:
+            return None
+
+    def _remove(self, name: str) -> bool:
+        """Remove what is there under `name`; return whether nothing is any more."""
+        try:
+            os.unlink(name, dir_fd=self._descriptor)
+        except FileNotFoundError:
+            return True
+        except IsADirectoryError:
+            shutil.rmtree(name, ignore_errors=True, dir_fd=self._descriptor)
+        except OSError:
+            return False
+        return self._stat(name) is None
+
+    def _not_kept(self, fault: str) -> None:
+        self._say(
+            "not kept",
+            f"compiled kernels are not kept in {self.folder} ({fault}), so each start compiles for a minute or more: "
+            "set NUMBA_CACHE_DIR to a folder that you alone may write",
+        )
+
+    def _say(self, kind: str, message: str) -> None:
+        """Log a line, the first of its kind alone."""
+        if kind not in self._said:
+            self._said.add(kind)
+            log.warning(message)
+
+
+def _head(name: str, payload: bytes) -> bytes:
+    """Return what a file begins with: the digest covers its name too, so that no file stands in for another."""
+    digest = hashlib.sha256(f"{name}\0".encode())
+    digest.update(payload)
+    return _MAGIC + digest.digest()

@@ -1,0 +1,125 @@
+"""How kernels are compiled, and how what was compiled is kept: the only module that imports numba.
+
+numba's own cache unpickles and runs whatever its files hold, does not notice an edit in another file, and numbers its
+data files so that two processes may take the same number for two signatures. Here a file's name is a digest of
+everything that decided the machine code: the sources, the signature, the processor, the versions and numba's settings.
+`schemas/kernel_files.py` checks its content.
+"""
+
+import functools
+import hashlib
+import pickle
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import llvmlite
+import numba
+import numpy as np
+from numba.core import config
+from numba.core.caching import _Cache
+from numba.core.compiler import CompileResult
+from numba.core.serialize import dumps
+
+from ..kernel_files import KernelFiles, default_folder
+from ..kernel_sources import source_digest
+
+# Settings of numba that do not change machine code, and differ from process to process.
+_UNRELATED = frozenset({"CACHE_DIR", "COLOR_SCHEME", "NUMBA_DEFAULT_NUM_THREADS", "NUMBA_NUM_THREADS"})
+# A file name holds 255 bytes, the digest takes 64.
+_MOST_LABEL = 150
+
+
+def njit(*, cache: bool = False, **options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """Return a decorator that compiles a function of a kernels module as numba's `njit` does.
+
+    cache: keep what is compiled in `kernel_files()`.  options: numba's.
+    """
+    compiled = numba.njit(**options)
+
+    def decorate(function: Callable[..., Any]) -> Any:
+        kernel = compiled(function)
+        if cache and kernel is not function:  # interpreted, with NUMBA_DISABLE_JIT=1
+            kernel._cache = _Kept(function)
+        return kernel
+
+    return decorate
+
+
+@functools.cache
+def kernel_files() -> KernelFiles:
+    """Return the folder of compiled kernels of this process."""
+    return KernelFiles(default_folder(config.CACHE_DIR))
+
+
+class _Kept(_Cache):  # type: ignore[misc]
+    """What numba asks for the machine code of one function."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        if function.__closure__ is not None:
+            raise TypeError(f"kernel {function.__qualname__}: expected no variables of an enclosing function")
+        self._function = function
+        self._enabled = True
+
+    @property
+    def cache_path(self) -> str:
+        """Return the folder, for numba's statistics."""
+        return str(kernel_files().folder)
+
+    def load_overload(self, sig: Any, target_context: Any) -> CompileResult | None:
+        """Return what was compiled for a signature; None where nothing usable is kept."""
+        if not self._enabled:
+            return None
+        target_context.refresh()
+        name = self._name(sig, target_context.codegen())
+        payload = kernel_files().read(name)
+        if payload is None:
+            return None
+        try:
+            kept, reduced = pickle.loads(payload)
+            if kept != sig:
+                raise ValueError(f"it is for {kept}, expected {sig}")
+            return CompileResult._rebuild(target_context, *reduced)
+        except Exception as error:
+            kernel_files().discard(name, f"{type(error).__name__}: {error}")
+            return None
+
+    def save_overload(self, sig: Any, data: CompileResult) -> None:
+        """Keep what was compiled for a signature."""
+        if not self._enabled or data.library.has_dynamic_globals or any(not x.can_cache for x in data.lifted):
+            return
+        kernel_files().write(self._name(sig, data.codegen), dumps((sig, data._reduce())))
+
+    def enable(self) -> None:
+        """Use what is kept."""
+        self._enabled = True
+
+    def disable(self) -> None:
+        """Use nothing that is kept, and keep nothing."""
+        self._enabled = False
+
+    def flush(self) -> None:
+        """Forget nothing: a file that was right stays right."""
+
+    def _name(self, sig: Any, codegen: Any) -> str:
+        """Return the name of the file for a signature and a processor."""
+        module, qualname = self._function.__module__, self._function.__qualname__
+        decides = (
+            _settings(),
+            source_digest(module).hex(),
+            module,
+            qualname,
+            self._function.__code__.co_firstlineno,
+            codegen.magic_tuple(),
+            sig,
+        )
+        digest = hashlib.sha256(repr(decides).encode()).hexdigest()
+        return f"{module.partition('.')[2]}.{qualname}"[:_MOST_LABEL] + f"-{digest}.kernel"
+
+
+@functools.cache
+def _settings() -> tuple[Any, ...]:
+    """Return versions and numba's settings: what decides the machine code beside sources, signature and processor."""
+    names = [name for name in dir(config) if name.isupper() and name not in _UNRELATED]
+    versions = (sys.version, numba.__version__, llvmlite.__version__, np.__version__)
+    return (*versions, *((name, repr(getattr(config, name))) for name in names))

@@ -1,0 +1,155 @@
+"""A start with damaged compiled kernels: right answers, exit code 0, one line, and the next start is silent."""
+
+import json
+import os
+import pickle
+import random
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from solidcloud.schemas.kernel_files import KernelFiles
+from solidcloud.schemas.kernels.compiling import njit
+
+pytestmark = pytest.mark.skipif(
+    os.environ.get("NUMBA_DISABLE_JIT") == "1", reason="interpreted kernels are not kept"
+)
+
+CODE = """
+import json
+import numpy as np
+from solidcloud.schemas.kernels.morton import morton_decode, morton_encode
+codes = morton_encode(np.array([[1, 2, 3], [7, 0, 5]], np.uint64))
+print(json.dumps({
+    "codes": codes.tolist(),
+    "decoded": morton_decode(codes).tolist(),
+    "compiled": sum(sum(kernel.stats.cache_misses.values()) for kernel in (morton_encode, morton_decode)),
+}))
+"""
+# Interleaved by hand: bits of x, y, z from the lowest.
+ANSWER = {"codes": [53, 333], "decoded": [[1, 2, 3], [7, 0, 5]]}
+
+
+def start(cache: Path, **environment: str) -> tuple[dict[str, object], list[str]]:
+    """Run a process that needs two kernels; what it printed, and the lines of its standard error."""
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", CODE],
+        env=os.environ | {"NUMBA_CACHE_DIR": str(cache)} | environment,
+        capture_output=True,
+        text=True,
+        timeout=240,
+    )
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout), done.stderr.splitlines()
+
+
+@pytest.fixture(scope="module")
+def warm(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A cache in which both kernels are."""
+    cache = tmp_path_factory.mktemp("warm")
+    found, said = start(cache)
+    assert found == ANSWER | {"compiled": 2}
+    assert said == []
+    return cache
+
+
+@pytest.fixture
+def cache(warm: Path, tmp_path: Path) -> Path:
+    """A copy of it."""
+    shutil.copytree(warm, tmp_path / "cache")
+    return tmp_path / "cache"
+
+
+def kernels(cache: Path) -> list[Path]:
+    """The files that a warm start reads."""
+    folder = cache / "solidcloud-kernels"
+    return sorted([*folder.glob("*.morton_encode-*"), *folder.glob("*.morton_decode-*")])
+
+
+def test_a_warm_start_compiles_nothing_and_is_silent(cache: Path) -> None:
+    assert start(cache) == (ANSWER | {"compiled": 0}, [])
+
+
+def flip(paths: list[Path]) -> None:
+    random.seed(2012)
+    for path in paths:
+        content = bytearray(path.read_bytes())
+        content[random.randrange(len(content))] ^= 1 << random.randrange(8)
+        path.write_bytes(content)
+
+
+def swap(paths: list[Path]) -> None:
+    one, other = (path.read_bytes() for path in paths)
+    paths[0].write_bytes(other)
+    paths[1].write_bytes(one)
+
+
+def replace_by_folder(paths: list[Path]) -> None:
+    for path in paths:
+        path.unlink()
+        (path / "inside").mkdir(parents=True)
+
+
+def rewrite(paths: list[Path], payload: bytes) -> None:
+    """Payloads that are nothing of numba's, with digests that are right: written damaged."""
+    for path in paths:
+        KernelFiles(path.parent).write(path.name, payload)
+
+
+DAMAGES: dict[str, Callable[[list[Path]], object]] = {
+    "flipped": flip,
+    "truncated": lambda paths: [path.write_bytes(path.read_bytes()[:-1]) for path in paths],
+    "cut in half": lambda paths: [os.truncate(path, path.stat().st_size // 2) for path in paths],
+    "emptied": lambda paths: [path.write_bytes(b"") for path in paths],
+    "zeros": lambda paths: [path.write_bytes(bytes(path.stat().st_size)) for path in paths],
+    "swapped": swap,
+    "other name": lambda paths: shutil.copy(paths[0], paths[1]),
+    "pickle": lambda paths: [path.write_bytes(pickle.dumps({"a": 1})) for path in paths],
+    "folders": replace_by_folder,
+    "wrong pickle": lambda paths: rewrite(paths, pickle.dumps(([1, 2], 3))),
+    "no pickle": lambda paths: rewrite(paths, b"nothing of the kind"),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_damaged_kernel_is_compiled_again(cache: Path, damage: str) -> None:
+    paths = kernels(cache)
+    assert len(paths) == 2
+    DAMAGES[damage](paths)
+    found, said = start(cache)
+    assert found == ANSWER | {"compiled": 1 if damage == "other name" else 2}
+    assert len(said) == 1 and "is damaged" in said[0] and str(cache) in said[0]
+    assert start(cache) == (ANSWER | {"compiled": 0}, [])
+
+
+def test_other_settings_have_kernels_of_their_own(cache: Path) -> None:
+    assert start(cache, NUMBA_BOUNDSCHECK="1") == (ANSWER | {"compiled": 2}, [])
+    assert start(cache, NUMBA_CPU_NAME="generic", NUMBA_CPU_FEATURES="") == (ANSWER | {"compiled": 2}, [])
+    assert start(cache) == (ANSWER | {"compiled": 0}, [])
+
+
+def test_processes_that_start_at_once_share_a_cache(tmp_path: Path) -> None:
+    command = [sys.executable, "-P", "-c", CODE]
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    at_once = [
+        subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        for _ in range(3)
+    ]
+    for child in at_once:
+        out, error = child.communicate(timeout=240)
+        assert (child.returncode, error) == (0, "")
+        assert json.loads(out)["codes"] == ANSWER["codes"]
+    assert start(tmp_path) == (ANSWER | {"compiled": 0}, [])
+
+
+def test_a_kernel_with_variables_of_its_surroundings_is_refused() -> None:
+    """Their values would decide the machine code, and are in no source."""
+    value = 3
+    with pytest.raises(TypeError, match="enclosing function"):
+
+        @njit(cache=True)
+        def kernel() -> int:
+            return value

@@ -1,0 +1,81 @@
+"""Which edits invalidate which kernels."""
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import solidcloud
+from solidcloud.schemas import kernel_sources
+from solidcloud.schemas.kernel_sources import source_digest
+
+CODE = """
+import sys, importlib
+sys.path.insert(0, sys.argv[1])
+from solidcloud.schemas.kernel_sources import source_digest
+print(*[source_digest(name).hex() for name in sys.argv[2:]])
+"""
+MODULES = [
+    "server.kernels.overlap",
+    "server.kernels.moments",
+    "schemas.kernels.morton",
+    "builder.kernels.pack",
+]
+
+
+@pytest.fixture
+def copy(tmp_path: Path) -> Path:
+    """The package's sources in a folder of their own."""
+    for room in ("schemas", "builder", "server"):
+        source = Path(next(iter(solidcloud.__path__))) / room
+        shutil.copytree(source, tmp_path / "solidcloud" / room, ignore=shutil.ignore_patterns("__pycache__"))
+    return tmp_path
+
+
+def digests(copy: Path) -> dict[str, str]:
+    names = [f"solidcloud.{module}" for module in MODULES]
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", CODE, str(copy), *names], capture_output=True, text=True, check=True
+    )
+    return dict(zip(MODULES, done.stdout.split(), strict=True))
+
+
+def test_an_edit_invalidates_what_depends_on_it_and_no_more(copy: Path) -> None:
+    before = digests(copy)
+
+    def changed(edited: str) -> set[str]:
+        path = copy / "solidcloud" / edited
+        path.write_text(path.read_text() + "\n# edited\n")
+        after = digests(copy)
+        found = {module for module in MODULES if after[module] != before[module]}
+        before.update(after)
+        return found
+
+    assert changed("server/kernels/overlap.py") == {"server.kernels.overlap"}
+    assert changed("server/kernels/placing.py") == {"server.kernels.overlap", "server.kernels.moments"}
+    assert changed("schemas/kernels/compiling.py") == set(MODULES)
+    assert changed("builder/kernels/pack.py") == {"builder.kernels.pack"}
+    # A constant of a module that holds no kernel.
+    assert changed("schemas/voxel_grid.py") == {"server.kernels.overlap", "server.kernels.moments"}
+    assert changed("server/scene.py") == set()
+
+
+def test_the_place_of_the_package_does_not_count(copy: Path) -> None:
+    assert digests(copy)["schemas.kernels.morton"] == source_digest("solidcloud.schemas.kernels.morton").hex()
+
+
+def test_imports_over_several_lines_are_found() -> None:
+    """server/kernels/overlap.py imports server/kernels/placed.py in parentheses."""
+    reached = kernel_sources._reached(("server", "kernels", "overlap"))
+    assert {("server", "kernels", "placed"), ("schemas", "kernels", "compiling")} <= reached
+
+
+def test_a_module_of_another_package_is_refused() -> None:
+    with pytest.raises(ValueError, match="expected one of solidcloud"):
+        source_digest("numpy.linalg")
+
+
+def test_a_source_that_is_not_there_is_an_error() -> None:
+    with pytest.raises(OSError):
+        source_digest("solidcloud.schemas.nothing")

@@ -282,9 +282,12 @@ def serving(scenes: Sequence[SceneLike], config: ServerConfig) -> Iterator[Servi
         yield service
 
 
-def serve(scenes: Sequence[SceneLike], config: ServerConfig) -> None:
+def serve(
+    scenes: Sequence[SceneLike], config: ServerConfig, ready: Callable[[], object] = lambda: None
+) -> None:
     """Serve scenes until SIGTERM or SIGINT, then answer what was accepted and return. Main thread only.
 
+    ready: called once all is warm and reachable.
     SIGHUP: what is in the archives' folders now is served from then on, see `Scene.reload`.
     """
     # A thread in pure Python may keep the interpreter for 5 ms by default while a reply waits for it.
@@ -297,6 +300,7 @@ def serve(scenes: Sequence[SceneLike], config: ServerConfig) -> None:
         serving(scenes, config) as service,
         _reloader(service) as wanted,
     ):
+        ready()
         names = ", ".join(scene.name for scene in scenes)
         print(f"serving {names} at {config.listen}", flush=True)
         while signals.recv(1)[0] == signal.SIGHUP:

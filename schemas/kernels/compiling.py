@@ -16,13 +16,16 @@ from typing import Any
 import llvmlite
 import numba
 import numpy as np
-from numba.core import config
+from numba.core import config as numba_config
 from numba.core.caching import _Cache
 from numba.core.compiler import CompileResult
 from numba.core.serialize import dumps
 
 from ..kernel_files import KernelFiles, default_folder
 from ..kernel_sources import source_digest
+
+# Its attributes are made when it is imported, out of sight of type checkers.
+config: Any = numba_config
 
 # Settings of numba that do not change machine code, and differ from process to process.
 _UNRELATED = frozenset({"CACHE_DIR", "COLOR_SCHEME", "NUMBA_DEFAULT_NUM_THREADS", "NUMBA_NUM_THREADS"})
@@ -84,7 +87,7 @@ class _Kept(_Cache):  # type: ignore[misc]
             kernel_files().discard(name, f"{type(error).__name__}: {error}")
             return None
 
-    def save_overload(self, sig: Any, data: CompileResult) -> None:
+    def save_overload(self, sig: Any, data: Any) -> None:
         """Keep what was compiled for a signature."""
         if not self._enabled or data.library.has_dynamic_globals or any(not x.can_cache for x in data.lifted):
             return

@@ -38,19 +38,24 @@ def serve(
     import logging
     from contextlib import ExitStack
 
+    from ...schemas.kernels.compiling import kernel_files
     from ..app import serve as serve_scenes
     from ..config import ServerConfig
     from ..replay import recorded
     from ..report.points import read_avatar
     from ..scene_file import open_scene
+    from .rehearsal import rehearse
 
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(message)s")
     config = ServerConfig(listen=listen, insecure=insecure, metrics_port=metrics_port)
     budget = parse_bytes(cache, "--cache")
-    with ExitStack() as stack:
+    files = kernel_files()
+    with ExitStack() as stack, ExitStack() as start:
+        if start.enter_context(files.starting()):
+            rehearse(what, files)
         scene = stack.enter_context(
             open_scene(what, read_points=read_avatar, name=name, budget_bytes=budget, policy=policy)
         )
         if log is not None:
             stack.enter_context(recorded(scene, what, log))
-        serve_scenes([scene], config)
+        serve_scenes([scene], config, ready=start.close)

@@ -1,0 +1,99 @@
+"""A trial of compiled kernels in a process of its own, before a server that did not come up the last time uses them.
+
+A digest shows that a kernel is what was written. It cannot show that what was written is right for this machine. So
+a server marks its start (`KernelFiles.starting`), and where the start before did not come to its end, everything that
+a start does is tried in a child process first. If the child crashes, hangs or gives a wrong answer, all compiled
+kernels are removed, and compiled again. A start that follows a complete one pays nothing for this.
+"""
+
+import logging
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...schemas.answers import Verdict
+from ...schemas.errors import SolidcloudError
+from ...schemas.kernel_files import KernelFiles
+from ..served import SceneLike
+
+log = logging.getLogger(__name__)
+
+# The child may have to compile all kernels, on a slow machine.
+SECONDS = 900.0
+_CLIENT = "rehearsal"
+_RADIUS, _REACH = 0.05, 0.5
+
+
+def rehearse(what: Path, files: KernelFiles, seconds: float = SECONDS) -> None:
+    """Start `what`, an archive or a scene file, in a child process; remove all compiled kernels if that fails."""
+    command = [sys.executable, "-P", "-m", __name__, str(what)]
+    try:
+        code = subprocess.run(command, capture_output=True, timeout=seconds).returncode
+    except subprocess.TimeoutExpired:
+        fault = f"was not done within {seconds:g} s"
+    else:
+        if code == 0:
+            return
+        fault = f"ended with {signal.Signals(-code).name if code < 0 else f'exit code {code}'}"
+    files.wipe()
+    log.warning(
+        "compiled kernels in %s: the last start did not come to its end, and a trial of them %s: "
+        "removed; all are compiled again",
+        files.folder,
+        fault,
+    )
+
+
+def check_answers(scene: SceneLike) -> None:
+    """Ask questions whose answers are known. AssertionError: a kernel computes what is not so.
+
+    `collide` and `distance`, which descend by different kernels, agree at the corners and the centre of the scene's
+    bounds; a sphere around a scan point is in contact; far from the bounds there is no point.
+    """
+    low, high = (np.array(bound) for bound in scene.info().bounds)
+    scene.add_avatar(_CLIENT, [[0.0, 0.0, 0.0]], _RADIUS, client=_CLIENT)
+    corners = np.stack(np.meshgrid(*zip(low, high, strict=True)), axis=-1).reshape(-1, 3)
+    places = np.vstack([corners, (low + high) / 2, high + 2 * _REACH])
+    found = scene.distance(_CLIENT, _poses(places), _REACH, client=_CLIENT)
+    touches = scene.collide(_CLIENT, _poses(places), 0.0, client=_CLIENT).verdict == Verdict.CONTACT
+    _require(np.array_equal(touches, found.signed_distance <= 0), "collide and distance disagree")
+    _require(not touches[-1] and found.signed_distance[-1] == np.inf, "a point where there is none")
+    points = found.witness_cloud[~np.isnan(found.witness_cloud[:, 0])]
+    if len(points):
+        verdicts = scene.collide(_CLIENT, _poses(points), 0.0, client=_CLIENT).verdict
+        _require(bool(np.all(verdicts == Verdict.CONTACT)), "no contact at a scan point")
+
+
+def _poses(places: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return poses (k, 4, 4) that stand upright at places (k, 3), world [m]."""
+    poses = np.tile(np.eye(4), (len(places), 1, 1))
+    poses[:, :3, 3] = places
+    return poses
+
+
+def _require(holds: bool, fault: str) -> None:
+    """Raise an AssertionError, with -O too."""
+    if not holds:
+        raise AssertionError(fault)
+
+
+def main(path: str) -> int:
+    """Do what a start does; 0 where kernels are not at fault."""
+    from ..report.points import read_avatar
+    from ..scene_file import open_scene
+
+    try:
+        with open_scene(path, read_points=read_avatar) as scene:
+            (scene.simulation or scene).warm()
+            check_answers(scene)
+    except SolidcloudError:
+        return 0  # of the archive or the scene file, which the start says itself
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1]))

@@ -64,10 +64,10 @@ def test_kernels_that_are_right_are_kept(
     shutil.copytree(kernel_files().folder, tmp_path / "solidcloud-kernels")
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
     files = KernelFiles(tmp_path / "solidcloud-kernels")
-    before = sorted(os.listdir(files.folder))
+    before = set(os.listdir(files.folder))
     rehearse(ARCHIVE, files)
     assert caplog.records == []
-    assert sorted(os.listdir(files.folder)) == before
+    assert before <= set(os.listdir(files.folder))  # a rehearsal simulates frames too
 
 
 @compiled

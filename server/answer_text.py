@@ -58,6 +58,21 @@ def summary_line(answers: Any, outside: NDArray[np.bool_] | None = None) -> str:
     return f"{len(answers)} {word_of(answers)}: {counts}; {answers.engine_seconds * 1e3:.2f} ms in the engine"
 
 
+def unknown_line(answers: Any, unanswered: int) -> str:
+    """Return how many answers are unknown for another reason than that nobody answered, and why; "" where none is."""
+    count = int((answers.verdict == Verdict.UNKNOWN).sum()) - unanswered
+    if count <= 0:
+        return ""
+    if answers.faults:
+        more = len(answers.faults) - 1
+        why = answers.faults[0] + (f" (and {more} more)" if more else "")
+    elif answers.late:
+        why = f"{len(answers.late)} voxels were not loaded in time"
+    else:
+        why = "the budget was spent, or a scan that the build left out is in reach"
+    return f"{count} of {len(answers)} {word_of(answers)} are unknown: {why}"
+
+
 def move_line(label: str, moved: Moved) -> str:
     """What came of a frame: verdict, where it ended, what it lacks of the wish, what stopped it."""
     line = f"{label}  {_NAMES[moved.verdict]:<8}at {_place(moved.pose[0, :3, 3])}"

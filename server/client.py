@@ -95,6 +95,8 @@ class Client(Questions):
     Entering asks which scenes are served: UnknownSceneError names them if this one is not among them. With
     no server there, entering succeeds all the same: `collide` says `UNKNOWN`, and right answers come once
     a server does. Avatars are remembered, and added again to a server that does not know them.
+
+    unanswered: how many poses, rays, points, motions and objects nobody answered so far, and are `UNKNOWN` for that.
     """
 
     def __init__(self, endpoint: str = DEFAULT_ENDPOINT, *, scene: str, timeout: float = 5.0) -> None:
@@ -110,6 +112,7 @@ class Client(Questions):
         self._avatars: dict[str, _Avatar] = {}
         self._numbers: dict[str, WishNumbers] = {}  # by avatar
         self._lock = threading.Lock()
+        self.unanswered = 0
         self._seen = False  # whether a server of this scene ever answered
         self._stack: ExitStack | None = None
 
@@ -173,6 +176,19 @@ class Client(Questions):
             raise BusyError(self._silence(operation, seconds, time.monotonic() - begin))
         return payload
 
+    def silence(self, operation: str) -> str:
+        """Say why nobody may have answered an operation, and what to do."""
+        if not self._seen:
+            return self._silence(operation, self._timeout, 0.0)
+        return (
+            f"the server of scene {self.name!r} at {self._endpoint} is gone, or has not answered {operation!r} within "
+            f"{self._timeout:g} s: ask again, or start one with: {self._start()}"
+        )
+
+    def _start(self) -> str:
+        """Return the command that starts a server of this scene."""
+        return f"solidcloud serve ARCHIVE --name {self.name} --listen {self._endpoint}"
+
     def _silence(self, operation: str, seconds: float, waited: float) -> str:
         """Why a question may have had no answer, and what to do. seconds: for which one was waited for at most."""
         where = f"scene {self.name!r} at {self._endpoint}"
@@ -183,7 +199,7 @@ class Client(Questions):
                 f"the server of {where} has not answered {operation!r} within {seconds:g} s: it may still be at work"
                 f"{then}: ask again, or start it anew"
             )
-        start = f"solidcloud serve ARCHIVE --name {self.name} --listen {self._endpoint}"
+        start = self._start()
         if self._seen:
             return f"the server of {where} is gone, expected its answer to {operation!r}: start one with: {start}"
         return f"no server of {where}, expected one that answers {operation!r}: start one with: {start}"
@@ -238,6 +254,7 @@ class Client(Questions):
         """The parts of a path, each once and in order, whatever came of them."""
 
         def missing(stop: int) -> Part:
+            self._note_unanswered(stop - expected)
             part: Part = as_part(unknown(kind, stop - expected, bounded=bounded), expected, total)
             return part
 
@@ -284,6 +301,11 @@ class Client(Questions):
         return ClientSession(
             self._session, self.name, user, numbers, lambda unknown: self._add_again([avatar], unknown)
         )
+
+    def _note_unanswered(self, count: int) -> None:
+        """Count what nobody answered."""
+        with self._lock:
+            self.unanswered += count
 
     def _ask_about(self, operation: str, request: bytes, names: Sequence[str]) -> bytes | None:
         """Ask about avatars, adding them again where the server does not know them; None: nobody answered."""

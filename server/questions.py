@@ -73,6 +73,10 @@ class Questions:
         """Ask about avatars of these names; None: nobody answered. Raises what an error reply says."""
         raise NotImplementedError
 
+    def _note_unanswered(self, count: int) -> None:
+        """Take note of so many poses, rays, points, motions or objects that nobody answered."""
+        raise NotImplementedError
+
     def collide(
         self,
         name: str,
@@ -212,6 +216,7 @@ class Questions:
         )
         payload = self._ask_about("move", encode(request), [name])
         if payload is None:
+            self._note_unanswered(1)
             way = request.pose_to[0, :3, 3] - request.pose_from[0, :3, 3]
             left = float(np.linalg.norm(way))
             return Moved(pose=request.pose_from, verdict=int(Verdict.UNKNOWN), left=left)
@@ -252,6 +257,7 @@ class Questions:
                     left = {**options, "budget_ms": rest}
             if payload is None:
                 # Not asked for the rest: a server that is frozen would cost a timeout for every batch.
+                self._note_unanswered(k - start)
                 parts.append(unknown(kind, k - start, bounded=is_bounded(options)))
                 break
             parts.append(check_answers(decode_answer(kind, payload), stop - start))

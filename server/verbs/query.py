@@ -2,11 +2,14 @@
 
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from .options import AsJson, print_json
+from .options import AsJson, complain, print_json
+
+if TYPE_CHECKING:
+    from ..client import Client
 
 # Options that are not parameters of what is asked.
 _NOT_OF_THE_QUESTION = ("scene", "op", "connect", "as_json")
@@ -65,42 +68,64 @@ def query(
         ),
     ] = None,
     as_json: AsJson = False,
-) -> None:
+) -> int:
     """Ask a server what poses of an avatar, rays, points or objects touch.
 
     Those that lie outside the scan's bounds, reach included, are counted, and said on standard error.
+
+    Exit code 1: nobody answered; then nothing is printed but the error. Where only some answers did not come, what came
+    is printed, the rest is unknown, and the exit code is 1 too. What the server itself calls unknown (its budget was
+    spent, or what is in reach could not be looked at) is said on standard error, with exit code 0.
     """
     options = {name: value for name, value in locals().items() if name not in _NOT_OF_THE_QUESTION}
-    from ..answer_text import answer_lines, answers_json, summary_line, word_of
+    from ..answer_text import answer_lines, answers_json, summary_line, unknown_line, word_of
     from ..client import Client
     from ..query import ask, check_query, joined
     from ..report.points import read_avatar
 
     question = check_query(op, options)
     if op == "move":
-        _ask_moves(connect, scene, question, as_json)
-        return
-    found = []
+        return _ask_moves(connect, scene, question, as_json)
+    found, asked, printed = [], 0, 0
     with Client(connect, scene=scene) as client:
         for part in ask(client, question, read_avatar):
             found.append(part)
-            if not as_json:
-                for line in answer_lines(part.labels, part.times, part.answers):
+            asked += len(part.labels)
+            if as_json or client.unanswered == asked:
+                continue  # printed once an answer comes
+            for each in found[printed:]:
+                for line in answer_lines(each.labels, each.times, each.answers):
                     print(line, flush=op == "path")
+            printed = len(found)
+        _check_answered(client, asked, op)
         whole = joined(found)
         said = whole.answers
-        outside = None
-        if said.engine_seconds or not whole.labels:
-            outside = _outside(client, whole.places, said.outside, said.verdict, word_of(said))
-    if whole.labels and whole.answers.engine_seconds == 0.0:
-        print(f"no server of scene {scene!r} answered at {connect}", file=sys.stderr)
+        outside = _outside(client, whole.places, said.outside, said.verdict, word_of(said))
     if as_json:
-        print_json(answers_json(whole.times, whole.answers, outside))
+        print_json(answers_json(whole.times, said, outside))
     else:
-        print(summary_line(whole.answers, outside))
+        print(summary_line(said, outside))
+    return _say_unknown(client, op, word_of(said), asked, unknown_line(said, client.unanswered))
 
 
-def _outside(client: Any, places: Any, leaves: Any, verdicts: Any, word: str) -> Any:
+def _check_answered(client: "Client", asked: int, op: str) -> None:
+    """BusyError: nobody answered anything of what was asked."""
+    from ...schemas.errors import BusyError
+
+    if asked and client.unanswered == asked:
+        raise BusyError(client.silence(op))
+
+
+def _say_unknown(client: "Client", op: str, word: str, asked: int, line: str) -> int:
+    """Say on standard error what nobody answered, or else `line` of what is unknown; return the exit code."""
+    if client.unanswered:
+        return complain(f"{client.unanswered} of {asked} {word} were not answered: {client.silence(op)}", 1)
+    if line:
+        print(f"warning: {line}", file=sys.stderr)
+    return 0
+
+
+def _outside(client: "Client", places: Any, leaves: Any, verdicts: Any, word: str) -> Any:
     """Say on standard error how many places lie outside the scan; return which, or None where that is not known."""
     from ...schemas.errors import BusyError
     from ..scan_bounds import lying_outside, outside_line
@@ -117,8 +142,8 @@ def _outside(client: Any, places: Any, leaves: Any, verdicts: Any, word: str) ->
     return outside
 
 
-def _ask_moves(connect: str, scene: str, question: Any, as_json: bool) -> None:
-    """Frame after frame, a line each, or all as JSON."""
+def _ask_moves(connect: str, scene: str, question: Any, as_json: bool) -> int:
+    """Ask frame after frame and print a line each, or all as JSON; return the exit code."""
     import numpy as np
     from msgspec import json
 
@@ -129,20 +154,26 @@ def _ask_moves(connect: str, scene: str, question: Any, as_json: bool) -> None:
     from ..query import ask_moves
     from ..report.points import read_avatar
 
-    found = []
-    outside = None
+    found: list[dict[str, Any]] = []
+    waiting: list[str] = []
     with Client(connect, scene=scene) as client:
         places, frames = ask_moves(client, question, read_avatar)
         for label, moved in frames:
             found.append(json.decode(encode(moved, JSON)))
-            if not as_json:
-                print(move_line(label, moved))
-        answered = any(moved.get("simulated") or moved.get("verdict", 0) < Verdict.UNKNOWN for moved in found)
-        if answered:
-            verdicts = np.array([moved.get("verdict", 0) for moved in found])
-            outside = _outside(client, places, np.ones(len(found), bool), verdicts, "motions")
-    if found and not answered:
-        print(f"no server of scene {scene!r} answered at {connect}", file=sys.stderr)
+            waiting.append(move_line(label, moved))
+            if not as_json and client.unanswered < len(found):
+                print("\n".join(waiting))
+                waiting.clear()
+        _check_answered(client, len(found), "move")
+        verdicts = np.array([moved.get("verdict", 0) for moved in found])
+        outside = _outside(client, places, np.ones(len(found), bool), verdicts, "motions")
     if as_json:
         lie = [None] * len(found) if outside is None else outside.tolist()
         print_json([{**moved, "outside_scan": lies} for moved, lies in zip(found, lie, strict=True)])
+    count = int((verdicts == Verdict.UNKNOWN).sum())
+    line = (
+        f"{count} of {len(found)} motions are unknown: what is in reach could not be looked at"
+        if count
+        else ""
+    )
+    return _say_unknown(client, "move", "motions", len(found), line)

@@ -1,0 +1,231 @@
+"""The command line where answers do not come: exit code 1, one line that says where, what and what to do."""
+
+import json
+import subprocess
+import sys
+import threading
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from fake_server import FloorScene, floor_simulation
+from solidcloud.schemas.answers import CollideAnswers, Verdict
+from solidcloud.schemas.moves import Moved
+from solidcloud.server import questions as questions_module
+from solidcloud.server.app import serving
+from solidcloud.server.cli import run
+from solidcloud.server.config import ServerConfig
+
+OPS = [
+    "collide",
+    "distance",
+    "contacts",
+    "sweep",
+    "raycast",
+    "within",
+    "objects",
+    "move",
+    "path",
+    "path collide",
+    "path distance",
+    "path contacts",
+    "path sweep",
+]
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> dict[str, Any]:
+    """What each question takes: six poses from low to high, so five motions; two rays, points and objects."""
+    (tmp_path / "ball.xyz").write_text("0 0 0\n")
+    rows = "".join(f"{t},0,0,{t - 1},1,0,0,0\n" for t in range(6))
+    (tmp_path / "poses.csv").write_text("t,x,y,z,qw,qx,qy,qz\n" + rows)
+    (tmp_path / "rays.csv").write_text("x,y,z,dx,dy,dz\n0,0,1,0,0,-2\n0,0,1,0,0,1\n")
+    (tmp_path / "loose.xyz").write_text("0 0 0.25\n0.5 0.5 3\n")
+    objects = "ball.xyz,0,0,1,1,0,0,0,1,0xffffffff\nball.xyz,0,0,2,1,0,0,0,1,0xffffffff\n"
+    (tmp_path / "objects.csv").write_text("avatar,x,y,z,qw,qx,qy,qz,group,mask\n" + objects)
+    ball = ["--avatar", f"{tmp_path}/ball.xyz", "--poses", f"{tmp_path}/poses.csv", "--radius", "0.05"]
+    reach = {"distance": ["--reach", "1"]}
+    given = {op: [*ball, *reach.get(op.split()[-1], [])] for op in OPS}
+    given["raycast"] = ["--rays", f"{tmp_path}/rays.csv", "--reach", "2"]
+    given["within"] = ["--points", f"{tmp_path}/loose.xyz", "--reach", "1"]
+    given["objects"] = ["--objects", f"{tmp_path}/objects.csv", "--radius", "0.05"]
+    return given
+
+
+def query(endpoint: str, op: str, options: list[str]) -> list[str]:
+    """The arguments of a question; `op` as in OPS."""
+    name, _, along = op.partition(" ")
+    arguments = ["query", "--connect", endpoint, "--scene", "floor", "--op", name, *options]
+    return [*arguments, "--along", along] if along else arguments
+
+
+@pytest.mark.parametrize("form", [[], ["--json"]], ids=["text", "json"])
+@pytest.mark.parametrize("op", OPS)
+def test_a_question_that_nobody_answers_fails(
+    endpoint: str, files: dict[str, Any], op: str, form: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run([*query(endpoint, op, files[op]), *form]) == 1
+    shown = capsys.readouterr()
+    assert shown.out == ""
+    (line,) = shown.err.splitlines()
+    assert line == (
+        f"error: no server of scene 'floor' at {endpoint}, expected one that answers {op.split()[0]!r}: "
+        f"start one with: solidcloud serve ARCHIVE --name floor --listen {endpoint}"
+    )
+
+
+@pytest.mark.parametrize(
+    "verb",
+    [
+        "reload --scene floor",
+        "reload --scene floor --json",
+        "top --scene floor",
+        "top --scene floor --once",
+        "top --scene floor --json",
+        "top",
+        "top --once",
+        "top --json",
+    ],
+)
+def test_every_other_verb_that_asks_a_server_fails(
+    endpoint: str, verb: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run([*verb.split(), "--connect", endpoint]) == 1
+    shown = capsys.readouterr()
+    assert shown.out.strip() == ""
+    (line,) = shown.err.splitlines()
+    assert line.startswith("error: no server ") and endpoint in line
+    assert "start one with: solidcloud serve ARCHIVE" in line
+
+
+@pytest.mark.parametrize("verb", ["query", "reload", "top"])
+def test_the_command_itself_exits_with_1(endpoint: str, files: dict[str, Any], verb: str) -> None:
+    arguments = (
+        query(endpoint, "collide", files["collide"]) if verb == "query" else [verb, "--scene", "floor"]
+    )
+    command = [sys.executable, "-P", "-m", "solidcloud.server.cli", *arguments]
+    command += [] if verb == "query" else ["--connect", endpoint]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stdout.strip(), len(done.stderr.splitlines())) == (1, "", 1)
+    assert "start one with" in done.stderr
+
+
+class Stalls(FloorScene):
+    """Answers two poses, and the rest once it may."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.may = threading.Event()
+
+    def collide(self, name: str, poses: Any, *what: Any, **effort: Any) -> Any:
+        if any(asked[0] == "collide" for asked in self.asked):
+            self.may.wait(60)
+        return super().collide(name, poses, *what, **effort)
+
+
+@pytest.mark.parametrize("form", [[], ["--json"]], ids=["text", "json"])
+def test_where_some_answers_do_not_come_the_others_are_printed(
+    endpoint: str,
+    files: dict[str, Any],
+    form: list[str],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(questions_module, "BATCH_POSES", 2)
+    scene = Stalls()
+    with serving([scene], ServerConfig(listen=endpoint)):
+        try:
+            code = run([*query(endpoint, "collide", files["collide"]), *form])
+        finally:
+            scene.may.set()
+    shown = capsys.readouterr()
+    assert code == 1
+    if form:
+        verdicts = [answer["verdict"] for answer in json.loads(shown.out)["answers"]]
+        assert verdicts == ["contact", "contact", *["unknown"] * 4]
+    else:
+        assert "6 poses: 0 clear, 2 contact, 4 unknown" in shown.out
+    (line,) = [line for line in shown.err.splitlines() if line.startswith("error: ")]
+    assert line.startswith(
+        f"error: 4 of 6 poses were not answered: the server of scene 'floor' at {endpoint} is gone"
+    )
+    assert "within 5 s: ask again, or start one with: solidcloud serve ARCHIVE" in line
+
+
+class Doubts(FloorScene):
+    """Cannot tell of the first two poses, nor where frames end."""
+
+    def __init__(self, fault: str) -> None:
+        super().__init__()
+        self.fault = fault
+
+    def collide(self, name: str, poses: Any, *what: Any, **effort: Any) -> Any:
+        found = super().collide(name, poses, *what, **effort)
+        found.verdict[:2] = Verdict.UNKNOWN
+        columns = {field: getattr(found, field) for field in CollideAnswers.__struct_fields__}
+        return CollideAnswers(**columns | {"faults": (self.fault,) if self.fault else ()})
+
+    def move(self, name: str, pose_from: Any, pose_to: Any, *what: Any, **fields: Any) -> Any:
+        super().move(name, pose_from, pose_to, *what, **fields)
+        return Moved(pose=pose_to, verdict=int(Verdict.UNKNOWN), simulated=["stop"])
+
+
+@pytest.mark.parametrize(
+    ("fault", "why"),
+    [
+        ("hall.h5: voxel 3 is broken", "hall.h5: voxel 3 is broken"),
+        ("", "the budget was spent, or a scan that the build left out is in reach"),
+    ],
+)
+def test_what_the_server_itself_does_not_know_is_said(
+    endpoint: str, files: dict[str, Any], fault: str, why: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with serving([Doubts(fault)], ServerConfig(listen=endpoint)):
+        assert run(query(endpoint, "collide", files["collide"])) == 0
+        shown = capsys.readouterr()
+        assert "6 poses: 4 clear, 0 contact, 2 unknown" in shown.out
+        (line,) = [line for line in shown.err.splitlines() if "unknown" in line]
+        assert line == f"warning: 2 of 6 poses are unknown: {why}"
+        assert run(query(endpoint, "move", files["move"])) == 0
+        shown = capsys.readouterr()
+        assert len(shown.out.splitlines()) == 5
+        (line,) = [line for line in shown.err.splitlines() if "unknown" in line]
+        assert line == "warning: 5 of 5 motions are unknown: what is in reach could not be looked at"
+
+
+def test_a_path_that_stops_after_its_first_part(
+    endpoint: str, tmp_path: Path, files: dict[str, Any], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The parts that came are printed, the rest is unknown and counted."""
+    count = 45
+    rows = "".join(f"{t},0,0,1,1,0,0,0\n" for t in range(count))
+    (tmp_path / "poses.csv").write_text("t,x,y,z,qw,qx,qy,qz\n" + rows)
+
+    class Waits(FloorScene):
+        def path(self, name: str, *what: Any, client: str = "", **parameters: Any) -> Any:
+            # By another name: the floor waits after the first part of a path of "wait".
+            self.avatars[client, "wait"] = self.avatars[client, name]
+            return super().path("wait", *what, client=client, **parameters)
+
+    scene = Waits()
+    with serving([scene], ServerConfig(listen=endpoint)):
+        try:
+            code = run(query(endpoint, "path", files["path"]))
+        finally:
+            scene.gate.set()
+    shown = capsys.readouterr()
+    assert code == 1
+    unknown = int(np.array(shown.out.splitlines()[-1].split(", ")[2].split()[0], int))
+    assert 0 < unknown < count
+    assert f"error: {unknown} of {count} poses were not answered" in shown.err
+
+
+def test_frames_that_are_answered(endpoint: str, files: dict[str, Any], capsys: Any) -> None:
+    """All of them: a simulation that answers is not taken for one that does not, whatever its verdicts."""
+    simulation = floor_simulation()
+    scene = simulation.served
+    scene.simulation = simulation
+    with serving([scene], ServerConfig(listen=endpoint)):
+        assert run(query(endpoint, "move", files["move"])) == 0
+    assert len(capsys.readouterr().out.splitlines()) == 5

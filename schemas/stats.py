@@ -65,6 +65,24 @@ class UserStats(msgspec.Struct, frozen=True):
     silent_seconds: float = 0.0
 
 
+class AvatarStats(msgspec.Struct, frozen=True):
+    """What the avatars of a scene's clients take of memory, and how much they may.
+
+    bytes, avatars, clients: of their arrays; their number, those being built included; how many clients have any.
+    max_bytes, max_avatars, max_clients: the limits of these; max_bytes_by_client, max_avatars_by_client: those of one
+    client. 0: no limit.
+    """
+
+    bytes: int = 0
+    avatars: int = 0
+    clients: int = 0
+    max_bytes: int = 0
+    max_bytes_by_client: int = 0
+    max_avatars: int = 0
+    max_avatars_by_client: int = 0
+    max_clients: int = 0
+
+
 class Counters(msgspec.Struct, frozen=True, kw_only=True):
     """What a memory for voxels did so far; voxels but where bytes are said.
 
@@ -103,6 +121,7 @@ class StatsAnswer(Counters, frozen=True, kw_only=True):
     load_seconds: count, sum and buckets of all loads; the rest of the last ones.  stall_seconds: what each request
     waited for voxels.  engine_seconds: what each took in the engine, waits included.
     users: those heard of last, the most recent first.  keys: of the resident voxels, ascending; null: not asked for.
+    avatars: what clients' avatars take.
     """
 
     scene: str
@@ -123,3 +142,4 @@ class StatsAnswer(Counters, frozen=True, kw_only=True):
     engine_seconds: Times = Times()
     users: list[UserStats] = []
     keys: list[int] | None = None
+    avatars: AvatarStats = AvatarStats()

@@ -8,7 +8,7 @@ import signal
 import socket
 import sys
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import Any, NamedTuple
 
@@ -125,6 +125,8 @@ class Service:
         self._scenes = {scene.name: scene for scene in scenes}
         self._config = config
         self._frames: dict[str, Frames] = {}
+        for scene in scenes:
+            scene.limit_avatars(config.avatar_limits)
 
     def scenes(self, encoding: str | None) -> Answer:
         """Which scenes are served here."""
@@ -196,6 +198,10 @@ class Service:
         if (frames := self._frames.get(scene)) is not None:
             frames.client_gone(client)
         self._scenes[scene].drop_client(client)
+
+    def drop_unused(self, scene: str, alive: Collection[str]) -> None:
+        """Forget avatars that were not used for long, but for those of clients in `alive`."""
+        self._scenes[scene].drop_unused_avatars(alive, self._config.avatar_seconds)
 
     def frames(self, scene: str, publish: Callable[[keys.User, Answer], None]) -> Frames | None:
         """The sessions of a scene, whose states are sent by `publish`; None: it simulates nothing."""

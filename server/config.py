@@ -3,6 +3,7 @@
 import math
 import re
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from ..schemas.errors import BadRequestError
 from ..schemas.messages import MAX_AVATAR_POINTS, MAX_POSES
@@ -11,6 +12,19 @@ DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 
 _ENDPOINT = re.compile(r"(?P<protocol>[a-z0-9-]+)/(?P<address>[^?#\s]+)(?P<rest>[?#]\S*)?")
 _LOOPBACK = re.compile(r"(127(\.\d{1,3}){3}|localhost|\[::1\]):\d{1,5}")
+
+
+class AvatarLimits(NamedTuple):
+    """How much memory avatars may take; of all clients together, and of each one.
+
+    bytes: of their arrays.  avatars: their number.  clients: how many clients may have any.
+    """
+
+    bytes: int
+    bytes_by_client: int
+    avatars: int
+    avatars_by_client: int
+    clients: int
 
 
 @dataclass(frozen=True)
@@ -28,6 +42,9 @@ class ServerConfig:
     max_paths: paths answered at the same time, each by a thread that sends its parts, half of them of one client; one
     more is answered `busy`.
     max_poses, max_avatar_points: of one request; more is answered `too_large`.
+    max_avatar_bytes, max_avatar_bytes_by_client: what the arrays of avatars may take, some 54 bytes a point.
+    max_avatars, max_avatars_by_client, max_avatar_clients: their number, and of clients that have any.
+    avatar_seconds: an avatar that was not used for so long is dropped, unless its client has a liveliness token.
     stop_seconds: how long a stop waits for accepted requests to be answered before it stops them.
     metrics_port: where Prometheus' text is served over HTTP, on loopback unless `insecure`; 0: nowhere.
     """
@@ -39,10 +56,16 @@ class ServerConfig:
     max_request_seconds: float = 2.0
     max_in_flight: int = 1024
     max_in_flight_by_client: int = 64
-    max_in_flight_bytes: int = 128 << 20
+    max_in_flight_bytes: int = 64 << 20
     max_paths: int = 16
     max_poses: int = MAX_POSES
     max_avatar_points: int = MAX_AVATAR_POINTS
+    max_avatar_bytes: int = 512 << 20
+    max_avatar_bytes_by_client: int = 256 << 20
+    max_avatars: int = 16_384
+    max_avatars_by_client: int = 4096
+    max_avatar_clients: int = 1024
+    avatar_seconds: float = 60.0
     stop_seconds: float = 1.0
     metrics_port: int = 0
 
@@ -58,7 +81,9 @@ class ServerConfig:
             if not 1 <= getattr(self, name) <= most:
                 raise BadRequestError(f"{name} is {getattr(self, name)}: expected 1 to {most} (WIRE.md)")
         for name in (
-            "workers", "max_slow", "max_in_flight", "max_in_flight_by_client", "max_in_flight_bytes", "max_paths"
+            "workers", "max_slow", "max_in_flight", "max_in_flight_by_client", "max_in_flight_bytes", "max_paths",
+            "max_avatar_bytes", "max_avatar_bytes_by_client", "max_avatars", "max_avatars_by_client",
+            "max_avatar_clients",
         ):  # fmt: skip
             if getattr(self, name) < 1:
                 raise BadRequestError(f"{name} is {getattr(self, name)}: expected at least 1")
@@ -68,6 +93,17 @@ class ServerConfig:
             )
         if not 0 <= self.metrics_port < 1 << 16:
             raise BadRequestError(f"--metrics-port {self.metrics_port}: expected 1 to 65535, or 0 for none")
+
+    @property
+    def avatar_limits(self) -> AvatarLimits:
+        """The limits of one scene's avatars."""
+        return AvatarLimits(
+            self.max_avatar_bytes,
+            self.max_avatar_bytes_by_client,
+            self.max_avatars,
+            self.max_avatars_by_client,
+            self.max_avatar_clients,
+        )
 
     @property
     def metrics_host(self) -> str:

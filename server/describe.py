@@ -16,6 +16,7 @@ from ..schemas.messages import (
     StatsAnswer,
 )
 from ..schemas.scene import SceneFile, effect_name, up_of
+from ..schemas.stats import AvatarStats
 from .metrics import Metrics, times_of
 from .residency import Residency
 from .store import Store
@@ -96,11 +97,13 @@ def make_stats(
     metrics: Metrics,
     *,
     coarse_bytes: int = 0,
+    avatars: AvatarStats = AvatarStats(),  # noqa: B008  # frozen
     keys: bool = False,
 ) -> StatsAnswer:
     """What a scene keeps in memory of the archive of `store`, and how it did so far.
 
-    coarse_bytes: of coarse tops, beside the residency's budget.  keys: name the resident voxels, too.
+    coarse_bytes: of coarse tops, beside the residency's budget.  avatars: of the clients' avatars.
+    keys: name the resident voxels, too.
     """
     total, users = metrics.snapshot()
     counts = total.counts
@@ -127,5 +130,6 @@ def make_stats(
         engine_seconds=total.engine.times(),
         users=users,
         keys=resident,
+        avatars=avatars,
         **structs.asdict(residency.counters()),
     )

@@ -8,7 +8,7 @@ takes the worker's place, and the slow one ends after its request.
 import logging
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from typing import Any, NamedTuple, Protocol
 
 from ..schemas import keys
@@ -28,6 +28,8 @@ SLOW_SECONDS = 0.01
 _SLOW_BYTES, _SLOW_AVATAR_BYTES, _SLOW_JSON_BYTES = 1 << 20, 1 << 17, 1 << 17
 # Threads that wait for a client to take a reply; zenoh closes the client's link after `wait_before_close`.
 _MOST_SENDING = 64
+# How often avatars that nobody uses are looked for [s].
+_DROP_SECONDS = 5.0
 # The turn of all clients without a liveliness token; no client's name. zenoh does not tell which session a query comes
 # from: `Query.source_info` holds what the asker put there, by default nothing.
 _ANONYMOUS = ""
@@ -41,6 +43,7 @@ class Questions(Protocol):
     ) -> Answer | Iterator[Answer]: ...
     def busy(self, encoding: str | None, own: bool = False) -> Answer: ...
     def client_gone(self, scene: str, client: str) -> None: ...
+    def drop_unused(self, scene: str, alive: Collection[str]) -> None: ...
 
 
 class Wire(NamedTuple):
@@ -146,6 +149,7 @@ class Lane:
         self._jobs: set[_Job] = set()  # at work now
         self._streaming: dict[_Request, _Job] = {}  # whose answers are on their way in parts
         self._given_up = False
+        self._dropped = 0.0  # when unused avatars were looked for
         self._watchdog = Watchdog(self._look)
 
     def start(self) -> None:
@@ -343,6 +347,9 @@ class Lane:
         for job in jobs:
             if now - job.begun >= SLOW_SECONDS:
                 self._look_at(job, now)
+        if now - self._dropped >= _DROP_SECONDS:
+            self._dropped = now
+            self._service.drop_unused(self._scene, frozenset(self._alive))
         return bool(jobs)
 
     def _look_at(self, job: _Job, now: float) -> None:

@@ -3,7 +3,7 @@
 import os
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
@@ -23,12 +23,14 @@ from ..schemas.answers import (
     SweepAnswers,
     WithinAnswers,
 )
-from ..schemas.errors import BadRequestError, BusyError, UnknownAvatarError
+from ..schemas.errors import BadRequestError, BusyError
 from ..schemas.messages import AvatarInfo, ReloadAnswer, SceneInfo, StatsAnswer
 from ..schemas.requests import QuestionOptions, make_objects, make_poses
 from ..schemas.scene import scene_of
-from .avatar import AvatarModel, make_avatar
+from .avatar import AvatarModel
+from .avatars import Avatars
 from .collide import collide
+from .config import AvatarLimits
 from .contacts import contacts
 from .describe import describe, describe_scene, make_stats
 from .distance import distance
@@ -40,7 +42,6 @@ from .path import PATH_THREADS, largest_part, path_parts, path_question
 from .rays import raycast
 from .request import SceneData
 from .residency import Residency
-from .served import EVERYBODY
 from .session import Walker
 from .simulated import Simulated
 from .store import OpenStore, Store
@@ -78,7 +79,7 @@ class Scene(Simulated):
         self._opened = self._open(store, 0)
         self._before: Opened | None = None  # swapped out; perhaps not ended yet
         self._info = describe_scene(describe(store, name), scene_of(name))
-        self._avatars: dict[tuple[str, str], AvatarModel] = {}
+        self._avatars = Avatars()
         self._pool: ThreadPoolExecutor | None = None
         self._closed = False
         self._lock = threading.Lock()
@@ -191,12 +192,8 @@ class Scene(Simulated):
             return self._pool
 
     def avatar(self, name: str, client: str) -> AvatarModel:
-        """A client's avatar, or the scene's own; UnknownAvatarError."""
-        with self._lock:
-            avatar = self._avatars.get((client, name)) or self._avatars.get((EVERYBODY, name))
-        if avatar is None:
-            raise UnknownAvatarError(f"avatar {name!r} is not known: add it with add_avatar first")
-        return avatar
+        """Return a client's avatar, or the scene's own. Raises UnknownAvatarError."""
+        return self._avatars.get(name, client)
 
     @property
     def _data(self) -> SceneData:
@@ -227,8 +224,17 @@ class Scene(Simulated):
                 opened.data.residency,
                 self._metrics,
                 coarse_bytes=0 if coarse is None else coarse.bytes,
+                avatars=self._avatars.stats(),
                 keys=keys,
             )
+
+    def limit_avatars(self, limits: AvatarLimits) -> None:
+        """Limit the memory of clients' avatars from now on; those that are there stay."""
+        self._avatars.limits = limits
+
+    def drop_unused_avatars(self, alive: Collection[str], seconds: float) -> None:
+        """Forget avatars that were not used for so long [s], but for those of clients in `alive`."""
+        self._avatars.drop_unused(alive, seconds)
 
     def add_avatar(
         self, name: str, points: ArrayLike, radius: float | None = None, *, client: str = ""
@@ -237,17 +243,9 @@ class Scene(Simulated):
 
         radius: of each point's sphere [m]; None: half the mean closest-point distance of the points.
         client: whose it is; avatars of different clients do not meet. The same name again with the same points and
-        radius changes nothing; with others it is a BadRequestError.
+        radius changes nothing; with others it is a BadRequestError. TooLargeError: over the limits.
         """
-        model = make_avatar(points, radius)
-        with self._lock:
-            known = self._avatars.setdefault((client, name), model)
-        if known is not model and not (
-            known.radius == model.radius and np.array_equal(known.points, model.points)
-        ):
-            raise BadRequestError(
-                f"avatar {name!r} exists with other points or another radius: use another name"
-            )
+        model = self._avatars.add(name, points, radius, client)
         return AvatarInfo(name, len(model.points), model.radius, model.bounding_radius)
 
     def _terms(
@@ -436,9 +434,7 @@ class Scene(Simulated):
 
     def drop_client(self, client: str) -> None:
         """Forget the avatars of a client that is gone."""
-        with self._lock:
-            for key in [key for key in self._avatars if key[0] == client]:
-                del self._avatars[key]
+        self._avatars.drop_client(client)
         with suppress(BadRequestError), self.take() as opened:  # closed, it keeps nothing for anybody
             opened.prefetcher.leave_client(client)
         self._metrics.drop_client(client)

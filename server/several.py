@@ -10,7 +10,7 @@ all. What a request may cost is for all of them together: each archive is given 
 """
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import ExitStack
 from typing import Any, NamedTuple, TypeVar, Unpack
 
@@ -33,6 +33,7 @@ from ..schemas.messages import AvatarInfo, ReloadAnswer, SceneInfo, StatsAnswer
 from ..schemas.requests import QuestionOptions, make_objects, make_poses, make_vectors
 from .avatar import AvatarModel
 from .collide import collide
+from .config import AvatarLimits
 from .contacts import contacts
 from .described import info_of_several, sources_asked, stats_of_several
 from .distance import distance
@@ -155,6 +156,14 @@ class SeveralScenes(Simulated):
     def avatar(self, name: str, client: str) -> AvatarModel:
         """A client's avatar, or the scene's own; UnknownAvatarError."""
         return self._first.avatar(name, client)
+
+    def limit_avatars(self, limits: AvatarLimits) -> None:
+        """Limit the memory of clients' avatars; see `Scene.limit_avatars`."""
+        self._first.limit_avatars(limits)
+
+    def drop_unused_avatars(self, alive: Collection[str], seconds: float) -> None:
+        """Forget avatars that are not used; see `Scene.drop_unused_avatars`."""
+        self._first.drop_unused_avatars(alive, seconds)
 
     def drop_client(self, client: str) -> None:
         """Forget the avatars of a client that is gone."""

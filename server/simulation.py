@@ -31,6 +31,7 @@ from ..schemas.moves import FRAME_SECONDS, Moved, MoveRequest, State, Wish
 from ..schemas.requests import make_poses
 from ..schemas.scene import SceneFile
 from .avatar import AvatarModel
+from .config import AvatarLimits
 from .describe import describe_scene
 from .effects.frame import Body
 from .served import EVERYBODY, Outcome, SceneLike, Turn
@@ -279,6 +280,15 @@ class Simulation:
             self.served.drop_client(client)
             if self._recorder is not None:
                 self._recorder.dropped(client)
+
+    def limit_avatars(self, limits: AvatarLimits) -> None:
+        """Limit the memory of clients' avatars; see `Scene.limit_avatars`."""
+        self.served.limit_avatars(limits)
+
+    def drop_unused_avatars(self, alive: Collection[str], seconds: float) -> None:
+        """Forget avatars that are not used, by a body either; see `Scene.drop_unused_avatars`."""
+        present = {user.client for user in self.users}
+        self.served.drop_unused_avatars({*alive, *present}, seconds)
 
     def add_avatar(
         self, name: str, points: Any, radius: float | None = None, *, client: str = ""

@@ -30,6 +30,20 @@ def serve(
         Path | None,
         typer.Option(help="New file for the frames of all users, for solidcloud replay; it only grows."),
     ] = None,
+    max_request_seconds: Annotated[
+        float, typer.Option(help="Server time for one request; what was not reached is unknown.")
+    ] = 2.0,
+    max_slow: Annotated[int, typer.Option(help="Requests at work for longer than 10 ms, at a time.")] = 4,
+    max_in_flight_by_client: Annotated[
+        int, typer.Option(help="Requests of one client at a time; all without a liveliness token are one.")
+    ] = 64,
+    max_avatar_bytes: Annotated[
+        str, typer.Option(help="Memory for the avatars of all clients, some 54 bytes a point.")
+    ] = "512MB",
+    max_avatar_bytes_by_client: Annotated[str, typer.Option(help="The same for one client.")] = "256MB",
+    max_avatars: Annotated[int, typer.Option(help="Avatars of all clients.")] = 16384,
+    max_avatars_by_client: Annotated[int, typer.Option(help="Avatars of one client.")] = 4096,
+    max_avatar_clients: Annotated[int, typer.Option(help="Clients that have avatars.")] = 1024,
     insecure: Annotated[
         bool, typer.Option("--insecure", help="Allow an endpoint that other hosts reach.")
     ] = False,
@@ -47,7 +61,19 @@ def serve(
     from .rehearsal import rehearse
 
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(message)s")
-    config = ServerConfig(listen=listen, insecure=insecure, metrics_port=metrics_port)
+    config = ServerConfig(
+        listen=listen,
+        insecure=insecure,
+        metrics_port=metrics_port,
+        max_request_seconds=max_request_seconds,
+        max_slow=max_slow,
+        max_in_flight_by_client=max_in_flight_by_client,
+        max_avatar_bytes=parse_bytes(max_avatar_bytes, "--max-avatar-bytes"),
+        max_avatar_bytes_by_client=parse_bytes(max_avatar_bytes_by_client, "--max-avatar-bytes-by-client"),
+        max_avatars=max_avatars,
+        max_avatars_by_client=max_avatars_by_client,
+        max_avatar_clients=max_avatar_clients,
+    )
     budget = parse_bytes(cache, "--cache")
     files = kernel_files()
     with ExitStack() as stack, ExitStack() as start:

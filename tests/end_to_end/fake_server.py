@@ -84,7 +84,7 @@ class FloorScene:
         self.name, self.delay = name, delay
         self.gate = threading.Event()
         self.avatars = {}
-        self.gone, self.asked = [], []
+        self.gone, self.asked, self.unused = [], [], []
         self.at_work = self.warmed = self.parts = self.reloaded = 0
         self.refuses = None  # what a reload raises
         self.lock = threading.Lock()
@@ -230,6 +230,12 @@ class FloorScene:
     def keep(self, kind, k, operation, asked, effort):
         self.asked.append((operation, asked, effort))
         return unknown(kind, k)
+
+    def limit_avatars(self, limits):
+        self.limits = limits
+
+    def drop_unused_avatars(self, alive, seconds):
+        self.unused.append((set(alive), seconds))
 
     def drop_client(self, client):
         for key in [key for key in self.avatars if key[0] == client]:

@@ -8,6 +8,7 @@ import zenoh
 from floor import DEADLINE, POINTS, eventually, heights
 from solidcloud.schemas.answers import Verdict
 from solidcloud.schemas.messages import CollideRequest, ErrorReply, decode_answer, encode
+from solidcloud.server import lanes as lanes_module
 from solidcloud.server.app import Service, serving
 from solidcloud.server.client import Client
 from solidcloud.server.config import ServerConfig
@@ -228,3 +229,15 @@ def test_a_stop_ends_what_is_at_work(scene, endpoint):
         for token in tokens:
             token.undeclare()
     assert service.reasons == ["the server stops"] * 3
+
+
+def test_avatars_of_clients_with_a_token_are_kept(scene, endpoint, monkeypatch):
+    monkeypatch.setattr(lanes_module, "_DROP_SECONDS", 0.01)
+    config = ServerConfig(listen=endpoint, avatar_seconds=3.0, max_avatar_bytes=10**6)
+    with serving([scene], config):
+        assert scene.limits.bytes == 10**6
+        with Light(endpoint) as light:
+            name = light.client._id
+            eventually(lambda: any(name in alive for alive, _ in scene.unused))
+        eventually(lambda: name not in scene.unused[-1][0])
+    assert {seconds for _, seconds in scene.unused} == {3.0}

@@ -1,0 +1,190 @@
+"""The avatars of a scene's clients: who has which, what they take of memory, and how much they may."""
+
+import threading
+import time
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager, nullcontext
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..schemas.errors import BadRequestError, TooLargeError, UnknownAvatarError
+from ..schemas.messages import make_positions
+from ..schemas.stats import AvatarStats
+from .avatar import AvatarModel, make_avatar
+from .config import AvatarLimits
+from .served import EVERYBODY
+
+# What the arrays of an avatar take, at most [bytes]: 53.5 a point were measured, and one block for a few points.
+_BYTES_A_POINT, _LEAST_BYTES = 56, 1200
+# Avatars of more points are built one at a time: while one is built it takes three times its bytes.
+_LARGE = 50_000
+
+
+class _Held(NamedTuple):
+    """What the avatars of all clients take. bytes: of their arrays.  avatars, clients: numbers."""
+
+    bytes: int
+    avatars: int
+    clients: int
+
+
+class _Entry:
+    """One avatar. model: None while it is built.  asked: the radius it was added with.  used: when it was last [s]."""
+
+    __slots__ = ("asked", "bytes", "model", "used")
+
+    def __init__(self, count: int, asked: float | None) -> None:
+        self.model: AvatarModel | None = None
+        self.asked = asked
+        self.bytes = _LEAST_BYTES + _BYTES_A_POINT * count
+        self.used = time.monotonic()
+
+
+class Avatars:
+    """Avatars by client and name. Thread-safe.
+
+    limits: None: no limits. The scene's own avatars, those of `EVERYBODY`, are neither limited nor counted.
+    """
+
+    def __init__(self, limits: AvatarLimits | None = None) -> None:
+        """Make a table without avatars."""
+        self.limits = limits
+        self._changed = threading.Condition()
+        self._large = threading.Lock()  # held while a large avatar is built
+        self._clients: dict[str, dict[str, _Entry]] = {}
+
+    def get(self, name: str, client: str) -> AvatarModel:
+        """Return a client's avatar, or the scene's own. Raises UnknownAvatarError."""
+        with self._changed:
+            for owner in (client, EVERYBODY):
+                entry = self._clients.get(owner, {}).get(name)
+                if entry is not None and entry.model is not None:
+                    entry.used = time.monotonic()
+                    return entry.model
+        raise UnknownAvatarError(f"avatar {name!r} is not known: add it with add_avatar first")
+
+    def add(self, name: str, points: ArrayLike, radius: float | None, client: str) -> AvatarModel:
+        """Build an avatar of points (n, 3) [m] and keep it; the same one again is not built again.
+
+        Raises BadRequestError where the name is taken by another avatar, TooLargeError where it is over the limits.
+        """
+        array = make_positions(points)
+        with self._reserved(name, client, array, radius) as entry:
+            if entry.model is None:
+                with self._large if len(array) > _LARGE else nullcontext():
+                    model = make_avatar(array, radius)
+                with self._changed:
+                    entry.model, entry.bytes, entry.used = model, bytes_of(model), time.monotonic()
+            known = entry.model
+        # Without a radius given the same points may still make another avatar: only building it tells.
+        same = np.array_equal(known.points, array) and (
+            radius in (entry.asked, known.radius) or make_avatar(array, radius).radius == known.radius
+        )
+        if not same:
+            raise BadRequestError(
+                f"avatar {name!r} exists with other points or another radius: use another name"
+            )
+        return known
+
+    def drop_client(self, client: str) -> None:
+        """Forget the avatars of a client."""
+        with self._changed:
+            self._clients.pop(client, None)
+
+    def drop_unused(self, alive: Collection[str], seconds: float) -> None:
+        """Forget avatars that were not used for so long [s], but for those of clients in `alive`."""
+        before = time.monotonic() - seconds
+        with self._changed:
+            for client, entries in list(self._clients.items()):
+                if client == EVERYBODY or client in alive:
+                    continue
+                for name in [n for n, e in entries.items() if e.model is not None and e.used < before]:
+                    del entries[name]
+                if not entries:
+                    del self._clients[client]
+
+    def stats(self) -> AvatarStats:
+        """Return what the avatars of all clients take, and the limits."""
+        with self._changed:
+            held = self._held()
+        limits = self.limits
+        if limits is None:
+            return AvatarStats(*held)
+        return AvatarStats(
+            *held,
+            max_bytes=limits.bytes,
+            max_bytes_by_client=limits.bytes_by_client,
+            max_avatars=limits.avatars,
+            max_avatars_by_client=limits.avatars_by_client,
+            max_clients=limits.clients,
+        )
+
+    def _held(self) -> _Held:
+        own = [entries for client, entries in self._clients.items() if client != EVERYBODY]
+        each = [entry.bytes for entries in own for entry in entries.values()]
+        return _Held(sum(each), len(each), len(own))
+
+    @contextmanager
+    def _reserved(self, name: str, client: str, points: np.ndarray, radius: float | None) -> Iterator[_Entry]:
+        """Yield the entry of a name: one that is known, or a new one, counted while it is built and kept if it was."""
+        with self._changed:
+            while True:
+                entries = self._clients.get(client, {})
+                entry = entries.get(name)
+                if entry is None or entry.model is not None:
+                    break
+                self._changed.wait()  # another request builds it
+            if entry is None:
+                entry = _Entry(len(points), radius)
+                if client != EVERYBODY:
+                    self._check(name, len(points), entry.bytes, client)
+                self._clients.setdefault(client, entries)[name] = entry
+        try:
+            yield entry
+        finally:
+            with self._changed:
+                if entry.model is None:
+                    self._remove(entry, name, client)
+                self._changed.notify_all()
+
+    def _remove(self, entry: _Entry, name: str, client: str) -> None:
+        entries = self._clients.get(client, {})
+        if entries.get(name) is entry:
+            del entries[name]
+            if not entries:
+                del self._clients[client]
+
+    def _check(self, name: str, count: int, size: int, client: str) -> None:
+        """Raise TooLargeError where one more avatar is over the limits."""
+        limits = self.limits
+        if limits is None:
+            return
+        held = self._held()
+        own = self._clients.get(client, {})
+        own_bytes = sum(entry.bytes for entry in own.values())
+        for found, more, most, what, then in (
+            (own_bytes, size, limits.bytes_by_client, "bytes of this client's avatars", "thin it out"),
+            (len(own), 1, limits.avatars_by_client, "avatars of this client", "use one of them again"),
+            (
+                held.bytes,
+                size,
+                limits.bytes,
+                "bytes of all clients' avatars",
+                "thin it out, or try again later",
+            ),
+            (held.avatars, 1, limits.avatars, "avatars of all clients", "try again later"),
+            (held.clients, not own, limits.clients, "clients with avatars", "try again later"),
+        ):
+            if found + more > most:
+                raise TooLargeError(
+                    f"avatar {name!r} of {count} points: {found} {what} are there, this one makes it {found + more}, "
+                    f"at most {most} are allowed: {then}"
+                )
+
+
+def bytes_of(model: AvatarModel) -> int:
+    """Return what the arrays of an avatar take of memory [bytes]."""
+    arrays = [model.points, model.rows, *(each for each in model.arrays if isinstance(each, np.ndarray))]
+    return sum(array.nbytes for array in arrays)

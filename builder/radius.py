@@ -5,6 +5,7 @@ taken over distinct points, across voxel borders; duplicates would make it zero 
 """
 
 import math
+from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
@@ -22,6 +23,8 @@ SUM_UNITS = 2.0**32
 FINEST_STEP = 2.0**-20
 # Most lattice steps an avatar extends, so that the bounds' arithmetic stays inside int64 and int32.
 MOST_STEPS = 1 << 22
+# Distances summed at a time, between which other threads may take the interpreter.
+_PIECE = 4096
 
 
 class MeanDistance(NamedTuple):
@@ -78,12 +81,26 @@ def mean_closest_distance(local: LocalHierarchy) -> float:
     search = SearchTree(
         local.hierarchy.bounds.center, local.hierarchy.bounds.radius, first, tree.count, is_leaf, points
     )
-    queries = np.unique(points, axis=0)
+    queries = _distinct(points)
     if len(queries) < 2:
         return 0.0
     best = np.full(len(queries), FAR)
     closest_other(search, queries, best)
-    return math.fsum(np.sqrt(best.astype(np.float64)) * local.step) / len(queries)
+    distances = np.sqrt(best.astype(np.float64)) * local.step
+    # Piece by piece: math.fsum of the array would keep the interpreter for all of it, 50 ms for 10^6 points.
+    pieces = (distances[i : i + _PIECE].tolist() for i in range(0, len(distances), _PIECE))
+    return math.fsum(chain.from_iterable(pieces)) / len(queries)
+
+
+def _distinct(points: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the distinct rows of points (n, 3), n >= 1, in lexicographic order.
+
+    As `np.unique(points, axis=0)`, which sorts without letting go of the interpreter: 0.9 s for 10^6 points.
+    """
+    ordered = points[np.lexsort(points.T[::-1])]
+    first = np.ones(len(ordered), bool)
+    first[1:] = (ordered[1:] != ordered[:-1]).any(axis=1)
+    return ordered[first]
 
 
 def voxel_points(voxel: VoxelData, links: Links) -> NDArray[np.int64]:

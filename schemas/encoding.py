@@ -7,7 +7,9 @@ are in MessagePack, as null in JSON, read back by what the field is (`_of_null`)
 
 import inspect
 import math
+import re
 import sys
+from collections.abc import Iterator
 from functools import cache
 from typing import Any, TypeVar, get_type_hints
 
@@ -21,6 +23,12 @@ from .requests import Request, check_finite
 
 MSGPACK = "application/msgpack"
 JSON = "application/json"
+
+# What is larger is read and written in pieces, between which other threads may take the interpreter: a whole message in
+# JSON would keep it for half a second. Bytes of a bin; bytes of a message in JSON, and of a piece; numbers of a piece.
+_LARGE_BIN = 1 << 18
+_LARGE_JSON, _JSON_PIECE = 1 << 17, 1 << 16
+_LISTED = 1 << 13
 
 # Raised, a peer of version 1 would drop the larger messages unread.
 MAX_MESSAGE_BYTES = 32 << 20
@@ -80,7 +88,11 @@ def _array_from_bin(name: str, value: bytes, of: ArrayType, request: bool) -> np
     if dtype.kind == "b" and value.translate(None, b"\0\1"):
         raise ValueError("a byte that is neither 0 nor 1, expected truth values")
     # A request's of a copy: bytes are read-only, and numba compiles another kernel for a read-only array.
-    array = np.ndarray((rows,) + tail, dtype, bytearray(value) if request else value)  # noqa: RUF005
+    if request and len(value) > _LARGE_BIN:
+        array = np.empty((rows, *tail), dtype)
+        np.copyto(array, np.ndarray(array.shape, dtype, value))  # lets other threads have the interpreter
+    else:
+        array = np.ndarray((rows,) + tail, dtype, bytearray(value) if request else value)  # noqa: RUF005
     if request and dtype.kind == "f":
         check_finite(name, array)
     return array
@@ -112,6 +124,28 @@ def _array_from_lists(name: str, value: list[Any], of: ArrayType, request: bool)
     return array
 
 
+def _array_from_raw(name: str, raw: msgspec.Raw, of: ArrayType, request: bool) -> np.ndarray:
+    """An array from the text of its nested lists in JSON, piece by piece; ValueError says what is wrong with them."""
+    text = bytes(raw).strip()
+    if not text.startswith(b"["):
+        raise ValueError("expected nested lists")
+    pieces = [_array_from_lists(name, piece, of, request) for piece in _pieces(text, len(of[1]))]
+    return pieces[0] if len(pieces) == 1 else np.concatenate(pieces)
+
+
+def _pieces(text: bytes, depth: int) -> Iterator[list[Any]]:
+    """A list in JSON, some of its elements at a time. depth: of the lists that its elements are; 0: numbers."""
+    ends = re.compile(rb"\]\s*" * depth + b",")
+    begin, last = 1, len(text) - 1
+    while True:
+        end = ends.search(text, begin + _JSON_PIECE, last)
+        stop = last if end is None else end.end() - 1
+        yield _LIST_DECODER.decode(b"[" + text[begin:stop] + b"]")
+        if end is None:
+            return
+        begin = stop + 1
+
+
 def _filled(found: np.ndarray, of_null: float) -> np.ndarray:
     """An array of numbers and None with the None replaced; as it was where it holds anything else."""
     values = found.ravel().tolist()
@@ -138,12 +172,17 @@ def _array_to_lists(value: Any) -> Any:
     """The nested lists of an array, or a number of numpy's, for JSON; msgspec writes what is not finite as null."""
     if not isinstance(value, np.ndarray | np.generic):
         raise NotImplementedError(f"a message cannot hold {type(value).__name__}")
-    return value.tolist()
+    if value.size <= _LISTED:
+        return value.tolist()
+    rows = max(1, _LISTED * len(value) // value.size)
+    pieces = (value[begin : begin + rows].tolist() for begin in range(0, len(value), rows))
+    return msgspec.Raw(b"[" + b",".join(_JSON_ENCODER.encode(piece)[1:-1] for piece in pieces) + b"]")
 
 
 # Encoders and decoders are made once: making one costs more than a whole message does.
 _MSGPACK_ENCODER = msgspec.msgpack.Encoder(enc_hook=_array_to_bin)
 _JSON_ENCODER = msgspec.json.Encoder(enc_hook=_array_to_lists)
+_LIST_DECODER = msgspec.json.Decoder(list)
 
 
 @cache
@@ -166,16 +205,22 @@ class _Decoder:
         self._convert: Any = _array_from_lists if encoding == JSON else _array_from_bin
         module = msgspec.json if encoding == JSON else msgspec.msgpack
         self._decoder: Any = module.Decoder(self._twin(encoding) if self._arrays else kind)
+        # Of a large message in JSON the arrays stay text at first.
+        in_pieces = encoding == JSON and self._arrays
+        self._raw_decoder: Any = module.Decoder(self._twin(encoding, raw=True)) if in_pieces else None
 
-    def _twin(self, encoding: str) -> type:
-        """The same fields, with bytes or lists for arrays."""
-        raw, empty = (list, []) if encoding == JSON else (bytes, b"")
+    def _twin(self, encoding: str, raw: bool = False) -> type:
+        """The same fields, with bytes or lists for arrays; raw: with the text of lists."""
+        held: Any
+        held, empty = (list, []) if encoding == JSON else (bytes, b"")
+        if raw:
+            held, empty = msgspec.Raw, msgspec.Raw(b"[]")
         names = {name for name, _ in self._arrays}
         fields: list[Any] = []
         for name, hint in get_type_hints(self._kind, include_extras=True).items():
             default = _default(self._kind, name)
             if name in names:
-                fields.append((name, raw, *((empty,) if default else ())))
+                fields.append((name, held, *((empty,) if default else ())))
             else:
                 fields.append((name, hint, *default))
         refuse = self._request  # fields that are not known
@@ -185,13 +230,15 @@ class _Decoder:
 
     def decode(self, payload: bytes) -> Any:
         """The message. msgspec.DecodeError, with what it names, where the payload is not one."""
-        message = self._decoder.decode(payload)
+        large = self._raw_decoder is not None and len(payload) > _LARGE_JSON
+        message = (self._raw_decoder if large else self._decoder).decode(payload)
         if not self._arrays:
             return message
         fields = asdict(message)
+        convert = _array_from_raw if large else self._convert
         for name, of in self._arrays:
             try:
-                fields[name] = self._convert(name, fields[name], of, self._request)
+                fields[name] = convert(name, fields[name], of, self._request)
             except ValueError as error:
                 raise _wrong(name, str(error)) from None
         return self._kind(**fields)

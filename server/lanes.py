@@ -8,6 +8,7 @@ takes the worker's place, and the slow one ends after its request.
 import logging
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator
 from typing import Any, NamedTuple, Protocol
 
@@ -148,6 +149,7 @@ class Lane:
         self._alive: set[str] = set()  # clients with a liveliness token
         self._jobs: set[_Job] = set()  # at work now
         self._streaming: dict[_Request, _Job] = {}  # whose answers are on their way in parts
+        self._to_start: deque[Ticket] = deque()
         self._given_up = False
         self._dropped = 0.0  # when unused avatars were looked for
         self._watchdog = Watchdog(self._look)
@@ -201,6 +203,11 @@ class Lane:
         """Carry out requests, each in a thread of its own."""
         for ticket in tickets:
             self._start_thread(self._scene, self._run, ticket)
+
+    def _hand_over(self, tickets: Iterable[Ticket]) -> None:
+        """Have the watchdog start requests: threads that a slow thread starts would have its low priority."""
+        self._to_start.extend(tickets)
+        self._watchdog.wake()
 
     def _take_all(self) -> None:
         """Take queries, and answer them or leave them to a thread that is at work. A worker's work."""
@@ -261,7 +268,7 @@ class Lane:
         while following is not None:
             left, started = self._carry_out(following, takes)
             if left:
-                self._start(started)
+                self._hand_over(started)
                 return False
             following = next((each for each in started if not each.slow), None)
             self._start(each for each in started if each is not following)
@@ -318,7 +325,7 @@ class Lane:
                 return answer
             answer = self._service.busy(request.encoding)
         if job.ticket is not None and job.ticket.left:
-            self._start(self._queues.sending(job.ticket) or [])
+            self._hand_over(self._queues.sending(job.ticket) or [])
         # Leaving `with query` tells the client that no more will come.
         with request.query as query:
             self._wire.reply(query, request.key_expr, answer)
@@ -343,6 +350,8 @@ class Lane:
 
     def _look(self, now: float) -> bool:
         """Look at all jobs; returns whether there are any."""
+        while self._to_start:
+            self._start([self._to_start.popleft()])
         jobs = list(self._jobs)
         for job in jobs:
             if now - job.begun >= SLOW_SECONDS:

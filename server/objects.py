@@ -196,12 +196,17 @@ def _meet(placing: Placing, origin: NDArray[np.float64], effort: Effort) -> Met:
     # As contact is symmetric, each two avatars need be met in one order only.
     turned = kinds[:, 0] > kinds[:, 1]
     ordered = np.where(turned[:, None], pairs[:, ::-1], pairs)
-    kinds.sort(axis=1)
+    models = len(placing.models)
+    # One number a kind: sorting rows of two would keep the interpreter, for a second where there are 10^6 pairs.
+    kind = kinds.min(axis=1) * models + kinds.max(axis=1)
+    order = np.argsort(kind, kind="stable")
+    firsts = np.flatnonzero(np.diff(kind[order], prepend=-1))
     verdict = np.full(len(pairs), UNKNOWN, np.uint8)
     counters = np.zeros(2, np.int64)
     tested = 0
-    for a, b in np.unique(kinds, axis=0).tolist():
-        rows = np.flatnonzero((kinds == (a, b)).all(axis=1))
+    for first, last in zip(firsts.tolist(), [*firsts[1:].tolist(), len(order)], strict=False):
+        rows = order[first:last]
+        a, b = divmod(int(kind[rows[0]]), models)
         step = TIMED_PAIRS if effort.deadline < np.inf else len(rows)
         for begin in range(0, len(rows), step):
             if effort.spent:

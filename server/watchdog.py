@@ -15,8 +15,8 @@ PERIOD = 0.005
 # How long the thread goes on looking after there was something at work [s]. Being woken costs the first request more
 # than a look does.
 LINGER = 1.0
-# The nice value of threads whose requests are slow. Linux gives them a tenth of what a thread at 0 gets.
-_LOW_PRIORITY = 10
+# What is added to the nice value of threads whose requests are slow: Linux gives them a tenth of what others get.
+_NICER = 10
 
 
 class Watchdog:
@@ -34,7 +34,7 @@ class Watchdog:
         self.asleep = True
 
     def wake(self) -> None:
-        """Have the thread look from now on: something has begun."""
+        """Have the thread look now, and from now on."""
         self.asleep = False
         self._woken.set()
 
@@ -46,31 +46,38 @@ class Watchdog:
     def run(self) -> None:
         """Look until the watchdog is closed. A thread's work."""
         until = 0.0
+        self.asleep = False
         while not self._closed:
             now = time.monotonic()
-            try:
-                busy = self._look(now)
-            except Exception:  # of this look alone
-                log.exception("a look at what is at work")
-                busy = True
-            if busy:
+            if self._is_busy(now):
                 until = now + LINGER
             if now < until:
-                time.sleep(PERIOD)
+                if self._woken.wait(PERIOD):
+                    self._woken.clear()
                 continue
             # Whoever begins after this wakes the thread, even before it waits.
             self._woken.clear()
             self.asleep = True
-            if not self._look(time.monotonic()) and not self._closed:
+            if not self._is_busy(time.monotonic()) and not self._closed:
                 self._woken.wait(self._idle)
             self.asleep = False
+
+    def _is_busy(self, now: float) -> bool:
+        """Look once."""
+        try:
+            return self._look(now)
+        except Exception:  # of this look alone
+            log.exception("a look at what is at work")
+            return True
 
 
 def lower_priority(thread_id: int) -> None:
     """Lower the priority of a thread for good, where the system has priorities of threads.
 
-    thread_id: as `threading.get_native_id` returns it. Raising a priority again takes privileges.
+    thread_id: as `threading.get_native_id` returns it. Raising a priority again takes privileges, and threads that are
+    started by such a thread have its priority.
     """
     if sys.platform == "linux":  # elsewhere this would change the whole process
         with suppress(OSError):  # the thread has ended, or a limit forbids it
-            os.setpriority(os.PRIO_PROCESS, thread_id, _LOW_PRIORITY)
+            now = os.getpriority(os.PRIO_PROCESS, thread_id)
+            os.setpriority(os.PRIO_PROCESS, thread_id, now + _NICER)

@@ -181,8 +181,7 @@ def test_requests_of_a_client_that_is_gone_are_stopped_and_dropped(scene, endpoi
         eventually(lambda: service.began == 1 and service.in_flight() == 5)
         token.undeclare()
         eventually(lambda: scene.gone == ["c"])
-        for handler in asked[1:]:
-            assert not list(handler)
+        assert sum(len(list(handler)) for handler in asked) <= 1, "of the one that was at work"
     assert service.began == 1 and service.reasons == ["its client is gone"]
 
 

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 from scans import make_scan, make_steps
+from solidcloud.builder import radius
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.octree import VoxelPoints, build_voxel
 from solidcloud.builder.radius import (
@@ -67,3 +68,9 @@ def test_an_avatar_of_any_extent_fits_its_lattice(extent: float) -> None:
     local = build_local(points, leaf=2, degree=2)
     assert 0 <= local.hierarchy.points.min() <= local.hierarchy.points.max() <= 1 << 23
     assert math.log2(local.step).is_integer()
+
+
+@pytest.mark.parametrize("count", [1, 2, 5000])
+def test_distinct_points_are_those_of_numpy(count: int) -> None:
+    points = np.random.default_rng(count).integers(-8, 8, (count, 3))
+    assert np.array_equal(radius._distinct(points), np.unique(points, axis=0))

@@ -344,3 +344,53 @@ def test_wire_version_is_the_documents():
 def test_error_reply_keeps_codes_it_does_not_know():
     payload = msgspec.msgpack.encode({"code": "tired", "message": "so"})
     assert decode_answer(ErrorReply, payload) == ErrorReply("tired", "so")
+
+
+@pytest.mark.parametrize("space", [b"", b" "])
+@pytest.mark.parametrize("k", [1000, 20_000])
+def test_large_messages_in_json_are_read_in_pieces_and_are_the_same(k, space):
+    rng = np.random.default_rng(k)
+    poses = rng.normal(size=(k, 4, 4))
+    text = encode(CollideRequest("al", poses), JSON)
+    assert text == msgspec.json.encode(
+        {"avatar": "al", "poses": poses.tolist(), "margin": 0.0, "tolerance": 0.0, "budget_ms": None,
+         "budget_visits": None, "radius_model": None}
+    )  # fmt: skip
+    text = text.replace(b"]", space + b"]" + space).replace(b"[", space + b"[" + space)
+    found = decode_request(CollideRequest, text, JSON)
+    assert found.poses.tobytes() == poses.tobytes() and found.poses.flags.writeable
+    points = rng.normal(size=(4 * k, 3))
+    text = encode(AddAvatarRequest("al", points), JSON)
+    assert decode_request(AddAvatarRequest, text, JSON).points.tobytes() == points.tobytes()
+
+
+@pytest.mark.parametrize("k", [20_000])
+def test_large_answers_in_json_keep_nulls_and_empty_columns(k):
+    answers = unknown(CollideAnswers, k)
+    found = decode_answer(CollideAnswers, encode(answers, JSON), JSON)
+    for name in CollideAnswers.__struct_fields__:
+        assert np.array_equal(getattr(found, name), getattr(answers, name)), name
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda text: text.replace(b"1.5", b"null", 1),
+        lambda text: text.replace(b"1.5", b'"]],"', 1),
+        lambda text: text.replace(b"1.5,", b"", 1),
+        lambda text: text[:-200],
+        lambda text: text.replace(b'"poses":[', b'"poses":7,"x":[', 1),
+        lambda text: text.replace(b"1.5", b"1e999", 1),
+        lambda text: text.replace(b"]],[[", b"],[", 1),
+    ],
+)
+def test_large_malformed_json_is_bad_request(change):
+    text = encode(CollideRequest("al", np.full((20_000, 4, 4), 1.5)), JSON)
+    with pytest.raises(BadRequestError):
+        decode_request(CollideRequest, change(text), JSON)
+
+
+def test_a_large_bin_is_writable_and_the_same():
+    points = np.random.default_rng(4).normal(size=(50_000, 3))
+    found = decode_request(AddAvatarRequest, encode(AddAvatarRequest("al", points))).points
+    assert found.tobytes() == points.tobytes() and found.flags.writeable and found.flags.c_contiguous

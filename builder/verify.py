@@ -124,9 +124,6 @@ def verify_archive(
     points = sum(part.points for part in found)
     others = False
     classes = np.sum([part.classes for part in found], axis=0, dtype=np.int64)
-    if not faults and points != header.points:
-        others = True
-        faults.append(f"{folder}: {points} points in the records, {header.points} in the index: rebuild it")
     if not faults and (classes != header.radius_counts).any():
         faults.append(
             f"{folder}: radius classes counted {classes.tolist()} in the records, "
@@ -201,16 +198,10 @@ def voxel_faults(archive: Archive, row: int, record: OpenRecord, deep: bool) -> 
     """Faults of one voxel that opening it does not look for. CorruptError: a point outside its cell."""
     faults = []
     low, high = np.empty(3, np.int64), np.empty(3, np.int64)
-    leaves, entry = leaves_of(record), archive.voxels[row]
+    leaves = leaves_of(record)
     if not measure_points(leaves, np.int64(record.voxel_steps), low, high):
         raise CorruptError(f"voxel {record.key:#x}: a point outside its cell")
-    if record.leaves != int(entry["leaves"]):
-        faults.append(
-            f"{archive.where(row)}: {record.leaves} leaf nodes, the index says {int(entry['leaves'])}: "
-            "rebuild the archive"
-        )
-    if (low != entry["low"]).any() or (high != entry["high"]).any():
-        faults.append(f"{archive.where(row)}: points are not where the index says: rebuild the archive")
+    record.check_bounds(np.stack([low, high]))
     if deep:
         node = last_loose_node(leaves, spheres_of(record), record.nodes.normal, record.nodes.slab)
         if node >= 0:

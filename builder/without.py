@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from ..schemas.archive import Archive
 from ..schemas.codec import OPTIONAL_COLUMNS, encode_voxel
-from ..schemas.errors import CorruptError
 from ..schemas.index import Header
 from ..schemas.normals import normal_reach
 from .config import BuildConfig
@@ -24,9 +23,6 @@ __all__ = ["BuiltVoxel", "build_rest", "read_points"]
 def read_points(archive: Archive, row: int) -> VoxelPoints:
     """All points of the voxel of index row `row`, with all columns stored. Raises CorruptError, OSError."""
     voxel, links = archive.read_voxel(row)
-    leaves = int(np.count_nonzero(links.is_leaf))
-    if leaves != int(archive.voxels["leaves"][row]):
-        raise CorruptError(f"{archive.where(row)}: {leaves} leaf nodes, the index says otherwise: rebuild it")
     local = voxel_points(voxel, links).astype(np.int32)
     return VoxelPoints(local, **{name: getattr(voxel, name) for name in OPTIONAL_COLUMNS})
 

@@ -22,8 +22,9 @@ from .codec import (
     point_dtype,
 )
 from .errors import CorruptError, FormatError
-from .index import VOXEL_DTYPE, read_header
+from .index import read_header
 from .index_file import INDEX_NAME, read_columns
+from .index_limits import check_voxels
 from .shard import DATASETS, SHARD_FOLDER, SHARD_NAME
 from .voxel import Links, VoxelData
 from .voxel_grid import voxel_coordinates
@@ -66,22 +67,27 @@ class Archive:
         try:
             archive_id, columns = read_columns(path)
             self.header = read_header(archive_id, columns)
-            self.voxels = columns["voxels"].astype(VOXEL_DTYPE)
+            self.voxels = columns["voxels"]
+            self._shape_dtype = point_dtype(
+                scan_index=self.header.scan_index,
+                intensity=self.header.intensity,
+                radius_class=self.header.radius_class,
+                normal=self.header.normals,
+            )
             self._shards = [
                 (bytes(name).decode("ascii", "replace"), int(size)) for name, size in columns["shards"]
             ]
+            self._check_shards()
+            check_voxels(columns, self._shape_dtype.itemsize)
         except (OSError, KeyError, ValueError, TypeError, AttributeError, RuntimeError) as error:
             raise FormatError(
                 f"{path}: not a readable archive index ({error}): restore or rebuild it"
             ) from error
         self.coordinates = voxel_coordinates(self.voxels["key"])
-        self._shape_dtype = point_dtype(
-            scan_index=self.header.scan_index,
-            intensity=self.header.intensity,
-            radius_class=self.header.radius_class,
-            normal=self.header.normals,
+        counts = self.header.radius_counts
+        self._classes = (
+            sum(1 << c for c in np.flatnonzero(counts).tolist()) if self.header.radius_class else None
         )
-        self._check_shards()
         # All of them now: an archive that is replaced while it is read stays the one that was opened.
         try:
             for number in range(len(self._shards)):
@@ -91,7 +97,9 @@ class Archive:
             raise FormatError(f"{error.filename}: cannot be opened ({error.strerror}): check it") from error
 
     def _check_shards(self) -> None:
-        """Every shard exists, is as long as the index says, and holds every frame the index places in it."""
+        """Check that every shard is there, under its own name and as long as the index says. Raises FormatError."""
+        if len({name for name, _ in self._shards}) < len(self._shards):
+            raise FormatError(f"{self.folder}: the index names a shard twice: restore or rebuild it")
         for name, size in self._shards:
             path = self.folder / SHARD_FOLDER / name
             if not SHARD_NAME.fullmatch(name):
@@ -108,25 +116,6 @@ class Archive:
                 raise FormatError(
                     f"{path}: {held.st_size} bytes, expected {size}: truncated? restore or rebuild it"
                 )
-        sizes = np.array([size for _, size in self._shards], np.uint64)
-        if len(self.voxels) and (
-            self.voxels["shard"].max() >= len(sizes)
-            or (self.voxels["key"][1:] <= self.voxels["key"][:-1]).any()
-            # Three coordinates of 21 bits: with one bit more two keys would be one voxel.
-            or self.voxels["key"][-1] >= 1 << 63
-        ):
-            raise FormatError(f"{self.folder}: the index does not add up: restore or rebuild it")
-        # The broad phase searches ascending keys and prunes by these bounds: it would call clear what they hide.
-        base = self.coordinates * self.header.lattice.voxel_steps
-        low, high = base + self.voxels["low"], base + self.voxels["high"]
-        if (
-            len(base)
-            and ((low.min(axis=0) != self.header.low) | (high.max(axis=0) != self.header.high)).any()
-        ):
-            raise FormatError(f"{self.folder}: the voxels' bounds are not the scene's: restore or rebuild it")
-        ends = self.voxels["frame_offset"] + self.voxels["frame_bytes"]
-        if (ends > sizes[self.voxels["shard"]][:, None]).any():
-            raise FormatError(f"{self.folder}: the index points beyond a shard's end: restore or rebuild it")
 
     def __enter__(self) -> "Archive":
         """The archive itself."""
@@ -186,7 +175,7 @@ class Archive:
         try:
             yield
         except CorruptError as error:
-            raise CorruptError(
+            raise type(error)(
                 f"{self.where(row)}: {error}: restore the shard or rebuild the archive",
                 (self.shard_path(int(self.voxels["shard"][row])),),
             ) from error
@@ -231,8 +220,12 @@ class Archive:
 
     def _shape(self, row: int) -> RecordShape:
         """What the index says of the record of index row `row`."""
-        cells, nodes, points = (int(n) for n in self.voxels["rows"][row])
-        return RecordShape(cells, nodes, points, self._shape_dtype)
+        entry = self.voxels[row]
+        cells, nodes, points = entry["rows"].tolist()
+        bounds = np.stack([entry["low"], entry["high"]])
+        return RecordShape(
+            cells, nodes, points, self._shape_dtype, int(entry["leaves"]), bounds, self._classes
+        )
 
     def read_voxel(self, row: int) -> tuple[VoxelData, Links]:
         """Read, decompress and check the voxel in index row `row`. Raises CorruptError saying where."""

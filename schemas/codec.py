@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import CorruptError
+from .errors import CorruptError, MisleadingIndexError
 from .frames import Frame, column_of, pack, unpack
 from .kernels.rows import delta_along, lanes_to_points, leaf_bytes, leaf_column
 from .radius_model import RADIUS_CLASSES
@@ -20,6 +20,8 @@ from .voxel import (
     Links,
     Nodes,
     VoxelData,
+    check_cell_nodes,
+    check_cell_points,
     check_tree,
     link_nodes,
     link_tree,
@@ -87,12 +89,20 @@ class Record(NamedTuple):
 
 
 class RecordShape(NamedTuple):
-    """What the index says of a record: rows of each dataset, and the optional columns."""
+    """What the index says of a record.
+
+    cell_rows, node_rows, point_rows: rows of each dataset.  point_dtype: with the optional columns.  leaves: leaf
+    nodes.  bounds: (2, 3) int, least and greatest coordinates of the points [voxel steps].  classes: bit c is set where
+    points of the archive have radius class c. None: not known, and not compared with the record.
+    """
 
     cell_rows: int
     node_rows: int
     point_rows: int
     point_dtype: np.dtype
+    leaves: int | None = None
+    bounds: NDArray[np.int32] | None = None
+    classes: int | None = None
 
 
 def encode_voxel(voxel: VoxelData, archive_id: bytes) -> Record:
@@ -157,6 +167,7 @@ class OpenRecord(NamedTuple):
 
     cells, nodes: columns of several components as (3, n), as the byte planes give them.  links: see there.
     leaves: leaf nodes, b.  planes: (w, p) uint8, the byte planes of the points' rows, of dtype `dtype`.
+    shape: what the index says of the record.
     """
 
     key: int
@@ -167,6 +178,7 @@ class OpenRecord(NamedTuple):
     leaves: int
     planes: NDArray[np.uint8]
     dtype: np.dtype
+    shape: RecordShape
 
     @property
     def tree(self) -> tuple[NDArray[np.int32], NDArray[np.bool_], NDArray[np.int32]]:
@@ -176,10 +188,22 @@ class OpenRecord(NamedTuple):
     def read_points(self, lanes: NDArray[np.uint16]) -> None:
         """Write the points into lanes (b, 3, MAX_LEAF), the last of a leaf node repeated to its end.
 
-        Raises CorruptError when one lies outside its cell; what is in `lanes` then means nothing.
+        Raises CorruptError when one lies outside its cell, MisleadingIndexError when the bounds of all are not those in
+        the index; what is in `lanes` then means nothing.
         """
         name = f"voxel {self.key:#x}"
-        read_lanes(name, self.planes[:6], self.cells, self.nodes, self.links, self.voxel_steps, lanes)
+        self.check_bounds(
+            read_lanes(name, self.planes[:6], self.cells, self.nodes, self.links, self.voxel_steps, lanes)
+        )
+
+    def check_bounds(self, found: NDArray[np.int64]) -> None:
+        """Compare the bounds (2, 3) of the points [voxel steps] with the index. Raises MisleadingIndexError."""
+        expected = self.shape.bounds
+        if expected is not None and (found != expected).any():
+            raise MisleadingIndexError(
+                f"voxel {self.key:#x}: points from {found[0].tolist()} to {found[1].tolist()}, "
+                f"the index says from {expected[0].tolist()} to {expected[1].tolist()}"
+            )
 
     def read_scans(self, lanes: NDArray[np.uint16]) -> None:
         """Write scan_index, in a record that has it, into lanes (b, MAX_LEAF), as `read_points` does."""
@@ -192,13 +216,23 @@ class OpenRecord(NamedTuple):
         Raises CorruptError for a class that no table of radii has: a kernel would look it up beyond the table's end.
         """
         at = self.dtype.fields["radius_class"][1]  # type: ignore[index]  # its dtype has fields
-        self._check_classes(leaf_bytes(self.planes[at], self.tree, self.nodes.count, lanes))
+        greatest, seen = leaf_bytes(self.planes[at], self.tree, self.nodes.count, lanes)
+        self._check_classes(int(greatest), int(seen))
 
-    def _check_classes(self, greatest: int) -> None:
-        """Refuse a record whose greatest radius class is not below RADIUS_CLASSES."""
+    def _check_classes(self, greatest: int, seen: int) -> None:
+        """Refuse a record whose greatest radius class is not below RADIUS_CLASSES, or that has one the index has not.
+
+        seen: bit c is set where the record has class c. Questions reach no farther than the largest sphere of the
+        classes that the index counts.
+        """
         if greatest >= RADIUS_CLASSES:
             raise CorruptError(
                 f"voxel {self.key:#x}: radius class {greatest}, expected at most {RADIUS_CLASSES - 1}"
+            )
+        expected = self.shape.classes
+        if expected is not None and (other := seen & ~expected):
+            raise MisleadingIndexError(
+                f"voxel {self.key:#x}: points of radius class {other.bit_length() - 1}, the index counts none of it"
             )
 
     def read_normals(self, lanes: NDArray[np.uint16]) -> None:
@@ -224,7 +258,8 @@ class OpenRecord(NamedTuple):
             plane = self.planes[self.dtype.fields["radius_class"][1]]  # type: ignore[index]  # its dtype has fields
             for begin in range(0, len(plane), 1 << 16):  # bincount makes int64 of what it is given
                 counts += np.bincount(plane[begin : begin + (1 << 16)], minlength=256)
-            self._check_classes(int(np.flatnonzero(counts)[-1]))
+            found = np.flatnonzero(counts).tolist()
+            self._check_classes(found[-1], sum(1 << c for c in found if c < RADIUS_CLASSES))
         return counts[:RADIUS_CLASSES]
 
     def decode(self) -> tuple[VoxelData, Links]:
@@ -240,7 +275,7 @@ class OpenRecord(NamedTuple):
             if field in (self.dtype.names or ())
         }
         if "radius_class" in kept:
-            self._check_classes(int(kept["radius_class"].max()))
+            self.class_counts()
         if "normal" in kept:
             self.check_normals()
         cells, nodes = transposed(self.cells), transposed(self.nodes)
@@ -266,9 +301,10 @@ def open_record(
     """
     names = [n for n in shape.point_dtype.names or () if n == "xyz" or n in columns]
     kept = np.dtype([(n, shape.point_dtype[n]) for n in names])
-    planes = unpack(points, shape.point_dtype, shape.point_rows, f"voxel {key:#x}, points", kept)
+    # In this order, so that each frame is decompressed only when those before it say how many rows it must have.
     tree = open_tree(cells, nodes, shape, key, archive_id, voxel_steps)
-    return OpenRecord(key, voxel_steps, *tree, planes, kept)
+    planes = unpack(points, shape.point_dtype, shape.point_rows, f"voxel {key:#x}, points", kept)
+    return OpenRecord(key, voxel_steps, *tree, planes, kept, shape)
 
 
 def open_tree(
@@ -277,15 +313,20 @@ def open_tree(
     """`open_record` without the points: they need not have been read."""
     name = f"voxel {key:#x}"
     cell_planes = unpack(cells, CELL_DTYPE, shape.cell_rows, f"{name}, cells")
-    node_planes = unpack(nodes, NODE_DTYPE, shape.node_rows, f"{name}, nodes")
     identity = np.frombuffer(archive_id + key.to_bytes(8, "little"), np.uint8)
     if (cell_planes[: len(identity)] != identity[:, None]).any():  # archive and voxel come first in a row
         raise CorruptError(f"{name}: the record found is another voxel's or another archive's")
     cell_columns = Cells(*(column_of(cell_planes, CELL_DTYPE, field) for field in Cells._fields))
+    check_cell_nodes(name, cell_columns, shape.node_rows)
+    check_cell_points(name, cell_columns, shape.point_rows)
+    node_planes = unpack(nodes, NODE_DTYPE, shape.node_rows, f"{name}, nodes")
     node_columns = Nodes(*(column_of(node_planes, NODE_DTYPE, field) for field in Nodes._fields))
     links = link_tree(name, cell_columns, node_columns.count)
     check_tree(name, cell_columns, node_columns, links, shape.point_rows, voxel_steps)
-    return OpenTree(cell_columns, node_columns, links, int(np.count_nonzero(links.is_leaf)))
+    leaves = int(np.count_nonzero(links.is_leaf))
+    if shape.leaves is not None and leaves != shape.leaves:
+        raise CorruptError(f"{name}: {leaves} leaf nodes, the index says {shape.leaves}")
+    return OpenTree(cell_columns, node_columns, links, leaves)
 
 
 def decode_voxel(

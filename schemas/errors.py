@@ -109,6 +109,13 @@ class CorruptError(FormatError):
         self.paths = paths
 
 
+class MisleadingIndexError(CorruptError):
+    """A record that contradicts what questions believed of the index before they read it: where its points are.
+
+    An index that is wrong once may be wrong about any voxel that was never read, so nothing is known to be clear.
+    """
+
+
 _BY_CODE: dict[ErrorCode, type[SolidcloudError]] = {
     cls.code: cls
     for cls in (

@@ -7,8 +7,9 @@ The one place where the index's datasets have names: `index_columns` makes them,
 import hashlib
 import json
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any, Literal, NoReturn
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -274,43 +275,74 @@ def _normal_reach(columns: dict[str, NDArray]) -> float:
     return reach
 
 
-def _unknown_row(row: Any, boxes: int) -> int | None:
-    """Which of the boxes is of a source. Raises ValueError for none of them."""
-    if row is None or (type(row) is int and -1 <= row < boxes):
-        return row
-    raise ValueError(f"a source with box {row!r} of {boxes}: expected one of them, or -1")
+_Count = Annotated[int, msgspec.Meta(ge=0)]
+
+
+class _SourceTexts(msgspec.Struct):
+    """What `texts` says of a source; see `Source`."""
+
+    path: str
+    index: _Count
+    format: str
+    sha256: str
+    skipped: dict[str, _Count]
+    fault: str
+    crs: str = ""
+    units: str = "m"
+    up: str = "z"
+    unknown: int | None = None
+    one_place: bool = False
+
+
+class _Texts(msgspec.Struct):
+    """What `texts` says; see `_texts`."""
+
+    lattice_source: Literal["sources", "given", "default"]
+    radius_model: Literal["mean", "given"]
+    options: dict[str, Any]
+    sources: list[_SourceTexts]
+
+
+def _no_number(name: str) -> NoReturn:
+    """Refuse NaN and infinity, which Python's JSON takes for numbers."""
+    raise ValueError(f"texts with {name}: expected JSON")
+
+
+def _read_texts(columns: dict[str, NDArray]) -> _Texts:
+    """Parse `texts` and compare it with the datasets beside it. Raises ValueError."""
+    try:
+        texts = msgspec.convert(
+            json.loads(columns["texts"].tobytes(), parse_constant=_no_number), _Texts, strict=True
+        )
+    except (msgspec.ValidationError, RecursionError) as error:
+        raise ValueError(f"texts: {error}") from error
+    sources, boxes = len(texts.sources), len(columns["unknown"])
+    if sources != len(columns["source_pose"]):
+        raise ValueError(f"texts of {sources} sources: expected {len(columns['source_pose'])}")
+    rows = [s.unknown for s in texts.sources if s.unknown is not None and s.unknown != -1]
+    if len(set(rows)) < len(rows) or not all(0 <= row < boxes for row in rows):
+        raise ValueError(f"sources with boxes {rows} of {boxes}: expected one of them each, or -1")
+    if any(s.unknown == -1 for s in texts.sources) and not columns["unknown_everywhere"][0]:
+        raise ValueError("unknown_everywhere 0: expected 1, as a source was left out that may be anywhere")
+    return texts
 
 
 def read_header(archive_id: bytes, columns: dict[str, NDArray]) -> Header:
-    """The header from the index's datasets; the digest has vouched for them. Raises ValueError, KeyError for what is
-    no index."""
-    texts = json.loads(columns["texts"].tobytes())
-    poses, counts = columns["source_pose"], columns["source_count"]
+    """Return the header of the index's datasets, which `check_columns` accepts (index_limits.py). Raises ValueError."""
+    texts = _read_texts(columns)
+    counts = columns["source_count"]
     sources = tuple(
         Source(
-            s["path"],
-            s["index"],
-            s["format"],
-            s["sha256"],
-            int(counts[i]),
-            poses[i],
-            s["skipped"],
-            s["fault"],
-            **{name: str(s[name]) for name in ("crs", "units", "up") if name in s},
-            unknown=_unknown_row(s.get("unknown"), len(columns["unknown"])),
-            one_place=s.get("one_place") is True,
+            s.path, s.index, s.format, s.sha256, int(counts[i]), columns["source_pose"][i], s.skipped, s.fault,
+            s.crs, s.units, s.up, s.unknown, s.one_place,
         )
-        for i, s in enumerate(texts["sources"])
-    )
+        for i, s in enumerate(texts.sources)
+    )  # fmt: skip
     x, y, z = (float(v) for v in columns["origin"])
     generation, now = 0, None
     if "generation" in columns:
         generation = int(columns["generation"][0])
         radius, error, sample = (float(v) for v in columns["radius_now"])
-        if generation < 1 or not (0 <= radius < np.inf and 0 <= error < np.inf and 0 <= sample < 2**53):
-            raise ValueError(
-                f"generation {generation}, radius_now {radius} {error} {sample}: not what is written"
-            )
         now = RadiusNow(radius, error, int(sample)) if sample else None
     held = columns["columns"].astype(bool).tolist()
     models = ("mean", *(name for name, here in zip(("local", "border"), held[2:], strict=False) if here))
@@ -321,12 +353,12 @@ def read_header(archive_id: bytes, columns: dict[str, NDArray]) -> Header:
     return Header(
         archive_id=archive_id,
         lattice=Lattice((x, y, z), float(columns["step"][0]), int(columns["voxel_steps"][0])),
-        lattice_source=texts["lattice_source"],
+        lattice_source=texts.lattice_source,
         points=int(columns["points"][0]),
         low=columns["bounds"][0].astype(np.int64),
         high=columns["bounds"][1].astype(np.int64),
         radius=float(columns["radius"][0]),
-        radius_model=texts["radius_model"],
+        radius_model=texts.radius_model,
         radius_error=float(columns["radius"][1]),
         radius_sample=int(columns["radius_sample"][0]),
         moved_max=float(columns["moved_max"][0]),
@@ -337,7 +369,7 @@ def read_header(archive_id: bytes, columns: dict[str, NDArray]) -> Header:
         models=models,
         radius_counts=counts.astype(np.int64),
         radius_capped=capped,
-        options=texts["options"],
+        options=texts.options,
         sources=sources,
         unknown=columns["unknown"].astype(np.int64),
         unknown_everywhere=bool(columns["unknown_everywhere"][0]),

@@ -11,11 +11,14 @@ from numpy.typing import NDArray
 
 from .errors import CorruptError, FormatError
 from .index import Header, index_columns, index_digest
+from .index_limits import check_columns, check_layout
 from .new_file import new_file, publish
 
 # What this software reads, and writes: the first version that holds what is to be said (schemas/index.py Header).
 FORMAT_VERSIONS = (1, 2, 3, 4)
 INDEX_NAME = "index.h5"
+# Members of the root, and bytes of a text attribute: more than any version has.
+MOST_MEMBERS, MOST_NAME = 64, 64
 
 
 def write_index(folder: Path, header: Header, voxels: NDArray, shards: list[tuple[str, int]]) -> None:
@@ -42,23 +45,40 @@ def _text_attribute(file: h5py.File, name: str) -> str:
     Text of variable length lies in HDF5's global heap, which has no checksum: with one byte flipped there, HDF5
     2.0 never came back. So it is neither written nor read.
     """
-    if name not in file.attrs or file.attrs.get_id(name).dtype.kind != "S":
+    if name not in file.attrs:
+        return ""
+    attribute = file.attrs.get_id(name)
+    if attribute.dtype.kind != "S" or attribute.shape != () or attribute.dtype.itemsize > MOST_NAME:
         return ""
     return bytes(file.attrs[name]).decode("ascii", "replace")
 
 
-def read_columns(path: Path) -> tuple[bytes, dict[str, NDArray]]:
-    """The archive's id and every dataset of an index, none of which leads elsewhere or claims more than the file holds.
+def _number_attribute(file: h5py.File, name: str, dtype: str, shape: tuple[int, ...]) -> NDArray:
+    """Return an attribute of numbers, whose type and shape are looked at before it is read. Raises ValueError."""
+    if name not in file.attrs:
+        raise ValueError(f"attribute {name} not found")
+    attribute = file.attrs.get_id(name)
+    if attribute.dtype != np.dtype(dtype) or attribute.shape != shape:
+        raise ValueError(
+            f"attribute {name} {attribute.dtype.str} {attribute.shape}: expected {dtype} {shape}"
+        )
+    return np.asarray(file.attrs[name])
 
-    Raises FormatError or CorruptError naming the file; of HDF5 what it raises for a file that is damaged.
+
+def read_columns(path: Path) -> tuple[bytes, dict[str, NDArray]]:
+    """Return the archive's id and every dataset of an index, each within what `check_columns` accepts.
+
+    No dataset leads elsewhere or claims more than the file holds. Raises FormatError or CorruptError naming the file,
+    ValueError for a number that no index has; of HDF5 what it raises for a file that is damaged.
     """
     size = path.stat().st_size
+    columns: dict[str, NDArray] = {}
     with h5py.File(path, "r") as file:
         if _text_attribute(file, "format") != "solidcloud":
             raise FormatError(
                 f"{path}: not a solidcloud index: give the folder that `solidcloud build` wrote"
             )
-        version = int(file.attrs["format_version"])
+        version = int(_number_attribute(file, "format_version", "<u4", ()))
         if version not in FORMAT_VERSIONS:
             known = ", ".join(map(str, FORMAT_VERSIONS))
             raise FormatError(
@@ -67,7 +87,8 @@ def read_columns(path: Path) -> tuple[bytes, dict[str, NDArray]]:
         units = _text_attribute(file, "units")
         if units != "m":
             raise FormatError(f"{path}: units {units!r}, expected 'm': rebuild the archive")
-        columns = {}
+        if len(file) > MOST_MEMBERS:
+            raise FormatError(f"{path}: {len(file)} datasets, expected at most {MOST_MEMBERS}: do not use it")
         for name in file:
             link = file.get(name, getlink=True)
             dataset = file.get(name) if isinstance(link, h5py.HardLink) else None
@@ -80,14 +101,16 @@ def read_columns(path: Path) -> tuple[bytes, dict[str, NDArray]]:
                 raise FormatError(
                     f"{path}: {name} is no plain dataset: not written by solidcloud, do not use it"
                 )
-            if dataset.dtype.hasobject or dataset.size * dataset.dtype.itemsize > size:
+            check_layout(name, dataset.dtype, dataset.shape)
+            if dataset.size * dataset.dtype.itemsize > size:
                 raise FormatError(
                     f"{path}: {name} claims more than the file holds: damaged, restore or rebuild it"
                 )
             columns[name] = dataset[()]
-        archive_id = file.attrs["archive_id"].tobytes()
-        if index_digest(archive_id, columns) != file.attrs["sha256"].tobytes():
+        archive_id = _number_attribute(file, "archive_id", "|u1", (16,)).tobytes()
+        if index_digest(archive_id, columns) != _number_attribute(file, "sha256", "|u1", (32,)).tobytes():
             raise CorruptError(
                 f"{path}: checksum differs from the one stored: damaged, restore or rebuild it"
             )
+    check_columns(version, columns)
     return archive_id, columns

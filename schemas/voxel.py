@@ -23,6 +23,9 @@ from .kernels.rows import LANES, NO_AXIS, leaf_lanes
 # what LLVM vectorises and 8 or 16 are not (see there).
 MAX_LEAF = LANES
 MIN_DEGREE, MAX_DEGREE = 2, 16
+# Levels of nodes, root to leaf. Trees of degree 2 over 2^31 points have 32 levels a BSH, and a voxel has two BSHs one
+# upon the other. Kernels have stacks and lists for so many.
+MAX_LEVELS = 80
 
 # Coordinates inside a leaf cell are 16 bits an axis (NUMERICS.md N3).
 CELL_BITS = 16
@@ -106,15 +109,30 @@ def link_nodes(voxel: VoxelData) -> Links:
 
 def link_tree(name: str, cells: Cells, count: NDArray[np.uint8]) -> Links:
     """`link_nodes` of cells and the counts (n,) of nodes. name: of the voxel, for messages."""
-    n, c = len(count), len(cells.nodes)
-    top = n - int(cells.nodes.sum(dtype=np.int64))
-    if c == 0 or not cells.nodes.all() or not cells.points.all() or top < 0 or (top == 0) != (c == 1):
-        raise CorruptError(f"{name}: {n} nodes for {c} cells do not add up")
+    n = len(count)
+    check_cell_nodes(name, cells, n)
     first, cell_of, is_leaf = np.empty(n, np.int32), np.empty(n, np.int32), np.zeros(n, bool)
     height = link_rows(count, cells.nodes, cells.points, first, is_leaf, cell_of)
     if height < 0:
         raise CorruptError(f"{name}: the counts of node {-1 - height} do not add up to a tree")
+    if height > MAX_LEVELS:
+        raise CorruptError(f"{name}: {height} levels of nodes, expected at most {MAX_LEVELS}")
     return Links(first, is_leaf, cell_of, height)
+
+
+def check_cell_nodes(name: str, cells: Cells, nodes: int) -> None:
+    """Check the cells' counts of nodes against the nodes of the voxel. Raises CorruptError."""
+    c = len(cells.nodes)
+    top = nodes - int(cells.nodes.sum(dtype=np.int64))
+    if c == 0 or not cells.nodes.all() or not cells.points.all() or top < 0 or (top == 0) != (c == 1):
+        raise CorruptError(f"{name}: {nodes} nodes for {c} cells do not add up")
+
+
+def check_cell_points(name: str, cells: Cells, points: int) -> None:
+    """Check the cells' counts of points against the points of the voxel. Raises CorruptError."""
+    claimed = int(cells.points.sum(dtype=np.int64))
+    if claimed != points:
+        raise CorruptError(f"{name}: cells claim {claimed} points, found {points}")
 
 
 Columns = TypeVar("Columns", Cells, Nodes)
@@ -132,9 +150,7 @@ def check_tree(name: str, cells: Cells, nodes: Nodes, links: Links, points: int,
     name: of the voxel, for messages.  cells, nodes: transposed.  points: how many there are. Raises CorruptError
     naming the fault.
     """
-    claimed = int(cells.points.sum(dtype=np.int64))
-    if claimed != points:
-        raise CorruptError(f"{name}: cells claim {claimed} points, found {points}")
+    check_cell_points(name, cells, points)
     if (cells.log2_size > CELL_BITS).any():
         raise CorruptError(f"{name}: a cell larger than 2^{CELL_BITS} steps")
     size = np.int64(1) << cells.log2_size.astype(np.int64)
@@ -157,8 +173,10 @@ def read_lanes(
     lanes: NDArray[np.uint16],
     *,
     deltas: bool = True,
-) -> None:
+) -> NDArray[np.int64]:
     """Read the points of a checked tree from their byte planes (6, p) into lanes (leaf nodes, 3, MAX_LEAF).
+
+    Return the bounds (2, 3) of the points, as `leaf_lanes` finds them.
 
     cells, nodes: transposed.  deltas: whether the points are, see codec.py. They lie inside their cell, so their
     sums with block_low stay inside 16 bits and kernels that add them cannot leave the certified range: CorruptError
@@ -167,8 +185,10 @@ def read_lanes(
     axis = nodes.axis if deltas else np.full(len(nodes.axis), NO_AXIS, np.uint8)
     tree = (links.first, links.is_leaf, links.cell)
     leaf = (nodes.count, axis, nodes.block_low)
-    if not leaf_lanes(planes, tree, leaf, (cells.low, cells.log2_size), voxel_steps, lanes):
+    bounds = np.empty((2, 3), np.int64)
+    if not leaf_lanes(planes, tree, leaf, (cells.low, cells.log2_size), voxel_steps, lanes, bounds):
         raise CorruptError(f"{name}: a point outside its cell")
+    return bounds
 
 
 def check_voxel(voxel: VoxelData, voxel_steps: int) -> Links:

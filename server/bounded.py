@@ -184,7 +184,7 @@ def collide_bounded(
     contact = truly | found | (known.upper <= enough)
     lost = (counts[0] > 0) | (known.lower < math.inf)
     if len(avatar.points):
-        lost |= in_unknown(around.boxes, data.unknown, data.unknown_everywhere)
+        lost |= in_unknown(around.boxes, data.unknown, data.nothing_clear)
         np.minimum(known.gap, unknown_gaps(data, around), out=known.gap)
     floor = signed_bound(np.minimum(known.gap, known.lower), data, radii)
     lower = np.minimum(np.maximum(floor, -radii / UNITS_PER_METRE), np.minimum(upper, margin))

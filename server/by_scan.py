@@ -55,7 +55,7 @@ def gaps_by_scan(
                     poses, avatar.arrays, arrays, part, margin_units, effort.visits, nearer, counts
                 )
             )
-    exact &= counts[0] == 0 and not in_unknown(reach.boxes, data.unknown, data.unknown_everywhere)[0]
+    exact &= counts[0] == 0 and not in_unknown(reach.boxes, data.unknown, data.nothing_clear)[0]
     found = np.flatnonzero(nearer.gaps < np.inf).tolist()
     gaps = {ANY_SCAN if number == scans else number: float(nearer.gaps[number]) for number in found}
     return ScanGaps(gaps, bool(exact), int(counts[1]), int(counts[2]))

@@ -10,7 +10,6 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from ..schemas.errors import CorruptError
 from ..schemas.voxel import top_shift
 from .kernels.coarse import SLOT_WORDS, CoarseArrays, any_to_settle, settle_pairs, take_top
 from .kernels.layout import BLOCK_WORDS, CLASS_SHIFT, LOCAL_MASK, ROW_WORDS, Arena, SceneArrays, lay_out
@@ -135,10 +134,6 @@ class Coarse:
 def _lay_out_tree(store: Store, row: int) -> Arena:
     """The nodes of a voxel as `Store.load` lays them out, at the beginning of an arena of their own; no points."""
     tree = store.archive.open_tree(row)
-    if tree.leaves != int(store.archive.voxels["leaves"][row]):
-        raise CorruptError(
-            f"{store.archive.where(row)}: {tree.leaves} leaf nodes, the index says otherwise: rebuild it"
-        )
     links = tree.links
     words = np.empty(ROW_WORDS * len(links.first) + BLOCK_WORDS * tree.leaves, np.float32)
     arena = Arena(words, words.view(np.int32), words.view(np.uint16))

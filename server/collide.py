@@ -73,7 +73,7 @@ def collide(
     margin_units = to_units(margin, "margin")
     other_units = data.radius_units + margin_units
     k = len(array)
-    unseen = data.unknown_everywhere or len(data.unknown) > 0
+    unseen = data.nothing_clear or len(data.unknown) > 0
     if k == 1 and len(avatar.points) <= QUICK_POINTS and not unseen and effort.tolerance == 0:
         answers = _answer_at_once(data, avatar, array, other_units, begin)
         if answers is not None:
@@ -88,8 +88,8 @@ def collide(
         with residency.hold(rows, scan=effort.scan) as held:
             overlap_poses(array, avatar.arrays, data.arrays, part, which, verdict, counts)
         spent.add(held)
-    if unseen and len(avatar.points):
-        lost = in_unknown(reach.boxes, data.unknown, data.unknown_everywhere)
+    if (data.nothing_clear or unseen) and len(avatar.points):  # a load may have found the index wrong
+        lost = in_unknown(reach.boxes, data.unknown, data.nothing_clear)
         verdict[lost & (verdict == CLEAR)] = UNKNOWN
     return CollideAnswers(
         verdict, reach.outside, counts[0], counts[1], counts[2], **spent.cost(data),

@@ -188,7 +188,7 @@ def _columns(
     """The fields of `ContactsAnswers` but the cost of the request."""
     exact = ~tally.cut & (tally.counts[0] == 0)
     if has_points:  # an empty avatar is clear, whatever is unknown here
-        exact &= ~in_unknown(reach.boxes, data.unknown, data.unknown_everywhere)
+        exact &= ~in_unknown(reach.boxes, data.unknown, data.nothing_clear)
     verdict = np.where(exact, Verdict.CLEAR, Verdict.UNKNOWN)
     verdict[tally.pairs > 0] = Verdict.CONTACT
     pair_starts, pairs = _by_pose(memory.pairs, tally.runs[:, :2])

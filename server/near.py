@@ -36,7 +36,7 @@ def _near_at_once(
     data: SceneData, avatar: AvatarModel, poses: ArrayLike, reach: float, effort: Effort
 ) -> DistanceAnswers | None:
     """The answer of one kernel call; None: something has to be loaded, or it is not to be had so."""
-    if effort.limited or len(avatar.points) > QUICK_POINTS or data.unknown_everywhere or len(data.unknown):
+    if effort.limited or len(avatar.points) > QUICK_POINTS or data.nothing_clear or len(data.unknown):
         return None
     begin = time.perf_counter()
     reach_units = to_units(reach, "reach")

@@ -89,7 +89,7 @@ class Probe:
             with residency.still():
                 needed, verdict, visits, _, _ = sweep_resident(
                     pose_from, pose_to, avatar.arrays, avatar.radius, data.radius_units, self._box, data.arrays,
-                    data.broad, data.unknown, data.unknown_everywhere, max(tolerance, effort.tolerance), rows, said,
+                    data.broad, data.unknown, data.nothing_clear, max(tolerance, effort.tolerance), rows, said,
                 )  # fmt: skip
                 if needed > 0:
                     self._use(residency, rows[:needed].tolist())
@@ -123,7 +123,7 @@ class Probe:
 
     def collide(self, data: SceneData, pose: Pose, effort: Effort) -> tuple[Verdict, int]:
         """Whether the avatar touches at a pose (4, 4), and the node visits; see server/collide.py."""
-        if self.quick and not effort.limited and not data.unknown_everywhere and not len(data.unknown):
+        if self.quick and not effort.limited and not data.nothing_clear and not len(data.unknown):
             avatar, residency, rows = self.avatar, data.residency, self._rows
             poses, verdict, counts = self._poses, self._verdict, self._counts
             poses[0] = pose

@@ -61,6 +61,11 @@ class SceneData(NamedTuple):
     keeps_scan: bool
     coarse: Coarse | None = None
 
+    @property
+    def nothing_clear(self) -> bool:
+        """Whether no place is known to be clear: a scan was left out anywhere, or a load found the index wrong."""
+        return self.unknown_everywhere or self.residency.misled
+
 
 def kernel_poses(poses: ArrayLike) -> NDArray[np.float64]:
     """Poses (k, 4, 4) as kernels take them: numba would compile them anew for a read-only array. BadRequestError."""

@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..schemas.errors import BadRequestError, CorruptError
+from ..schemas.errors import BadRequestError, CorruptError, MisleadingIndexError
 from ..schemas.stats import Counters
 from .accounts import Accounts
 from .arena import ArenaBuffer
@@ -87,6 +87,8 @@ class Residency:
     kept: rows that users stand in: they go only when a request would not fit otherwise.  owed: called when a load is
     owed to somebody who could not wait for it, see `take_owed`.  loaded: called with the row and where it is of each
     voxel that was loaded, by the thread that did, before others know of it; took: then, with the seconds it took.
+    misled: whether a record that was loaded has points that the index places elsewhere. Voxels are chosen by the index,
+    so after that it is not known what else was not chosen.
     """
 
     def __init__(self, store: Store, budget_bytes: int, policy: Policy | None = None) -> None:
@@ -107,6 +109,7 @@ class Residency:
         self.owed: Callable[[], None] | None = None
         self.loaded: Callable[[int, NDArray[np.int64]], None] | None = None
         self.took: Callable[[float], None] | None = None
+        self.misled = False
         self._store = store
         self._sizes = [ArenaBuffer.rounded(int(size)) for size in store.sizes]
         self.policy = policy or make_policy("lru", budget_bytes)
@@ -401,6 +404,7 @@ class Residency:
                 self.loaded(row, where)  # now, for it may go as soon as others know of it
         except CorruptError as error:
             fault, corrupt = str(error), True
+            self.misled |= isinstance(error, MisleadingIndexError)
         except OSError as error:
             fault = f"cannot be read ({error}): check the disk"
         except BaseException as error:

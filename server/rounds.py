@@ -115,7 +115,7 @@ def look(
             if needed <= capacity:
                 break
             capacity = needed
-        if data.unknown_everywhere:
+        if data.nothing_clear:
             part.unseen[:] = 0.0
         cursor = lists.starts[:-1].copy()
         looked: NDArray[np.bool_] = np.zeros(len(data.arrays.where), bool)
@@ -132,6 +132,8 @@ def look(
             spent.add(found, int(looked[rows].sum()))
             looked |= held
         best.counts[:, begin:end] = part.counts
+    if data.nothing_clear:  # a load may have found the index wrong
+        best.unseen[:] = 0.0
     return best
 
 

@@ -78,7 +78,7 @@ class Walker:
 
     def _collide(self, data: SceneData, poses: NDArray[np.float64], begin: float) -> CollideAnswers:
         """`collide` of the archive that is current."""
-        if not self._front or data.unknown_everywhere or len(data.unknown):
+        if not self._front or data.nothing_clear or len(data.unknown):
             return collide(data, self._avatar, poses, self._margin)
         if len(poses) == 1:
             answers = self._collide_at_once(data, poses, begin)

@@ -45,7 +45,7 @@ def signed_bound(
 def unknown_gaps(data: SceneData, reach: Reach) -> NDArray[np.float64]:
     """How far (k,) an avatar's centres are at least from any region whose scan was left out [steps]; inf: none."""
     k = len(reach.scales)
-    if data.unknown_everywhere:
+    if data.nothing_clear:
         return np.zeros(k)
     # The boxes hold the avatar's centres and the reach around them.
     own = (reach.units / data.arrays.units_per_step)[:, None]

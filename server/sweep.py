@@ -182,7 +182,7 @@ def sweep(
         outside,
         lost,
     )
-    if data.unknown_everywhere:
+    if data.nothing_clear:
         lost[:] = 0.0
     met = lost <= until
     proved[met] = np.minimum(proved, lost)[met]

@@ -77,19 +77,22 @@ def _greatest(values):
 
 
 @nb.njit(nogil=True, cache=True)
-def leaf_lanes(planes, links, nodes, cells, voxel_steps, lanes):
+def leaf_lanes(planes, links, nodes, cells, voxel_steps, lanes, bounds):
     """Read the points of every leaf node, undo their deltas, and check that they lie in their cell and voxel.
 
     planes: (6 or more, p) uint8: low and high bytes of x, y, z.  links: (first, is_leaf, cell) of schemas/voxel.py.
     nodes: (count, axis, block_low) (n,), (n,), (3, n); axis NO_AXIS: no deltas.  cells: (low (3, c), log2_size (c,)).
     Writes lanes (b, 3, LANES) uint16: x[], y[], z[] of each leaf node's points from its block_low, in the order of
     the rows, the last one repeated to the end. Returns whether all lie inside; stops at the first that does not.
+    Writes bounds (2, 3) int64: the least low corner of a leaf node's box and the greatest coordinate of a point
+    [voxel steps]. The low corner of a box is the least coordinate of its points in a record that follows FORMAT.md.
     Assumes that the tree has been checked: runs inside the planes, at most LANES points, axis 0 to 3, b leaf nodes.
     """
     first, is_leaf, cell_of = links
     count, axis, block_low = nodes
     cell_low, log2_size = cells
     block = np.uint64(0)
+    bounds[0], bounds[1] = voxel_steps, -1
     for i in range(np.uint64(first.shape[0])):
         if not is_leaf[i]:
             continue
@@ -99,9 +102,12 @@ def leaf_lanes(planes, links, nodes, cells, voxel_steps, lanes):
             out = lanes[block, k]
             _join(planes[np.uint64(2) * k], planes[np.uint64(2) * k + np.uint64(1)], begin, held, out)
             high = np.int64(_undo_delta(held, out) if np.uint64(axis[i]) == k else _greatest(out))
-            high += np.int64(block_low[k, i])
-            if high >= size or high + np.int64(cell_low[k, cell]) >= voxel_steps:
+            low, corner = np.int64(block_low[k, i]), np.int64(cell_low[k, cell])
+            high += low
+            if high >= size or high + corner >= voxel_steps:
                 return False
+            bounds[0, k] = min(bounds[0, k], low + corner)
+            bounds[1, k] = max(bounds[1, k], high + corner)
         block += np.uint64(1)
     return True
 
@@ -121,11 +127,11 @@ def leaf_column(planes, links, count, lanes):
 def leaf_bytes(plane, links, count, lanes):
     """A column of one byte a point as `leaf_lanes` lays it out: lanes (b, LANES) uint8 from plane (p,) uint8.
 
-    Returns the greatest byte.
+    Returns the greatest byte, and a uint32 with bit b set where a byte is b, modulo 32.
     """
     first, is_leaf, _ = links
     block = np.uint64(0)
-    greatest = np.uint8(0)
+    greatest, seen = np.uint8(0), np.uint32(0)
     for i in range(np.uint64(first.shape[0])):
         if not is_leaf[i]:
             continue
@@ -136,8 +142,10 @@ def leaf_bytes(plane, links, count, lanes):
             out[j] = out[held - np.uint64(1)]
         for j in range(np.uint64(out.shape[0])):
             greatest = max(greatest, out[j])
+        for j in range(np.uint64(out.shape[0])):
+            seen |= np.uint32(1) << np.uint32(out[j] & np.uint8(31))
         block += np.uint64(1)
-    return greatest
+    return greatest, seen
 
 
 @nb.njit(nogil=True, cache=True)

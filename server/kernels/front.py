@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas.kernels import compiling as nb
+from ...schemas.voxel import MAX_LEVELS
 from .compiled import borrowing, inlined
 from .layout import LANES
 from .placed import ONE_SLACK, SLACK, node_reach
@@ -21,8 +22,7 @@ from .placed import ONE_SLACK, SLACK, node_reach
 U = np.uint64
 # Larger avatars have a front of inner nodes. 256 are eight vector steps.
 MAX_FRONT = 256
-# Trees of degree 2 over 2^31 points have 32 levels a BSH, and a voxel has two BSHs one upon the other.
-MOST_LEVELS = 80
+MOST_LEVELS = MAX_LEVELS
 # A list is written for each level that is descended, none longer than the one above.
 POOL = MAX_FRONT * (MOST_LEVELS + 2)
 # Fills a list up to whole vector steps; so far away, and of radius 0, that no test keeps it.

@@ -25,14 +25,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas.kernels import compiling as nb
+from ...schemas.voxel import MAX_LEVELS
 from .compiled import borrowing
 from .layout import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, node_class, point_class
 from .placed import U32
 from .placing import lattice_to_units
 
-# Siblings left behind by a descent of one tree; levels as in overlap.py.
-MOST_LEVELS = 80
-STACK = MOST_LEVELS * 15 + 16
+# Siblings left behind by a descent of one tree.
+STACK = MAX_LEVELS * 15 + 16
 
 
 class Rays(NamedTuple):

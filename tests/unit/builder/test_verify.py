@@ -188,7 +188,7 @@ def test_points_that_are_not_where_the_index_says_are_found(copy: Path) -> None:
 
     rewrite(copy, move)
     (fault,) = verify_archive(copy).faults
-    assert "points are not where the index says" in fault
+    assert "points from [" in fault and "the index says from [" in fault
 
 
 def test_points_that_are_not_those_expected_are_a_fault(copy: Path) -> None:
@@ -204,8 +204,8 @@ def test_points_that_are_not_those_expected_are_a_fault(copy: Path) -> None:
 
 def test_a_wrong_count_in_the_index_is_found(copy: Path) -> None:
     rewrite(copy, header_with=lambda header: replace(header, points=header.points + 1))
-    (fault,) = verify_archive(copy).faults
-    assert "1001 points in the records, 1002 in the index" in fault
+    with pytest.raises(FormatError, match=r"1001 points.*expected .*1002"):
+        verify_archive(copy)
 
 
 def test_wrong_bounds_in_the_index_are_refused(copy: Path) -> None:
@@ -251,7 +251,7 @@ def test_counts_of_radius_classes_that_cannot_be_are_refused(tmp_path: Path, spo
     models = frozenset({"mean", "local"})
     build_archive([scan], tmp_path / "a", BuildConfig(voxel=1.1, models=models, radius=0.01, jobs=1))
     rewrite(tmp_path / "a", header_with=lambda header: replace(header, **spoilt))
-    with pytest.raises(FormatError, match=r"radius_counts .* of 200 points"):
+    with pytest.raises(FormatError, match=r"radius_counts .*expected .*(of 200 points|\(32,\))"):
         verify_archive(tmp_path / "a")
 
 

@@ -83,7 +83,7 @@ def test_a_generation_that_is_none_is_refused(change: dict[str, Any], copy: Path
     with Archive(copy) as archive:
         header, shards = archive.header, archive.shards()
         write_index(copy, replace(header, **change), archive.voxels, shards)
-    with pytest.raises(FormatError, match="generation 1, radius_now"):
+    with pytest.raises(FormatError, match=r"radius_now .*expected a radius"):
         Archive(copy)
     good = RadiusNow(0.25, 0.125, 7)
     write_index(copy, replace(header, generation=2**32 - 1, radius_now=good), archive.voxels, shards)
@@ -148,7 +148,7 @@ def test_rows_out_of_order_are_refused(copy: Path) -> None:
 
 def test_bounds_of_voxels_that_are_not_the_scenes_are_refused(copy: Path) -> None:
     def widen(rows: np.ndarray) -> None:
-        rows["high"] += 1000
+        rows["high"][:, 2] += 1
 
     rewrite_index(copy, widen)
     with pytest.raises(FormatError, match="bounds are not the scene's"):

@@ -105,7 +105,7 @@ EDITS: dict[str, tuple[Callable[[h5py.File], None], str]] = {
     "other id": (set_attribute("archive_id", np.zeros(16, "u1")), "checksum differs"),
     "other number": (lambda f: f["origin"].__setitem__(0, 1.0), "checksum differs"),
     "dataset gone": (lambda f: f.__delitem__("origin"), "checksum differs"),
-    "dataset more": (lambda f: f.__setitem__("zzz", [1]), "checksum differs"),
+    "dataset more": (lambda f: f.__setitem__("zzz", [1]), "dataset 'zzz': expected one of"),
     "checksum gone": (lambda f: f.attrs.__delitem__("sha256"), "not a readable archive index"),
     "external link": (
         replace_with("origin", lambda f, n: f.__setitem__(n, h5py.ExternalLink("other.h5", "/x"))),
@@ -125,10 +125,10 @@ EDITS: dict[str, tuple[Callable[[h5py.File], None], str]] = {
     ),
     "text": (
         replace_with("origin", lambda f, n: f.create_dataset(n, data=["x"], dtype=h5py.string_dtype())),
-        "origin claims more",
+        "origin .O .1,.: expected <f8",
     ),
     "never written": (
-        replace_with("origin", lambda f, n: f.create_dataset(n, (1 << 40,), "<f8")), "origin claims more",
+        replace_with("texts", lambda f, n: f.create_dataset(n, (1 << 40,), "u1")), "texts claims more",
     ),
 }  # fmt: skip
 

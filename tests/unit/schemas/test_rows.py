@@ -76,6 +76,11 @@ def padded(run: np.ndarray) -> list:
     return np.concatenate([run, np.repeat(run[-1:], LANES - len(run), axis=0)]).tolist()
 
 
+def bounds() -> np.ndarray:
+    """Room for the bounds of points."""
+    return np.empty((2, 3), np.int64)
+
+
 def read(
     own: Leaves, voxel_steps: int = 1 << 20, log2: tuple[int, int] = (16, 15)
 ) -> tuple[bool, np.ndarray]:
@@ -83,7 +88,7 @@ def read(
     lanes = np.full((len(own.runs) + 1, 3, LANES), 7, np.uint16)
     cells = np.array([[0, 1000], [0, 2000], [0, 3000]], np.int32), np.array(log2, np.uint8)
     nodes = own.count, own.axis, own.block_low
-    said = leaf_lanes(planes_of(plain_deltas(own)), own.links, nodes, cells, voxel_steps, lanes)
+    said = leaf_lanes(planes_of(plain_deltas(own)), own.links, nodes, cells, voxel_steps, lanes, bounds())
     return bool(said), lanes
 
 
@@ -128,6 +133,21 @@ def test_a_point_one_step_outside_its_cell_or_voxel_is_seen(seed: int) -> None:
             assert read(moved, log2=other)[0]
 
 
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_bounds_are_from_the_least_corner_to_the_farthest_point(seed: int) -> None:
+    own = leaves(seed)
+    corner = np.array([[0, 0, 0], [1000, 2000, 3000]])
+    lows = [corner[own.links[2][i]] + own.block_low[:, i] for i, _ in leaf_rows(own)]
+    highs = [
+        low + own.points[a : a + n].max(axis=0) for low, (_, (a, n)) in zip(lows, leaf_rows(own), strict=True)
+    ]
+    found, lanes = bounds(), np.empty((len(own.runs), 3, LANES), np.uint16)
+    cells = np.ascontiguousarray(corner.T.astype(np.int32)), np.array([16, 15], np.uint8)
+    nodes = own.count, own.axis, own.block_low
+    assert leaf_lanes(planes_of(plain_deltas(own)), own.links, nodes, cells, 1 << 20, lanes, found)
+    assert found.tolist() == [np.min(lows, axis=0).tolist(), np.max(highs, axis=0).tolist()]
+
+
 def leaf_rows(own: Leaves) -> list[tuple[int, tuple[int, int]]]:
     """Row, and (begin, count), of every leaf node."""
     return list(zip(np.flatnonzero(own.links[1]).tolist(), [run[:2] for run in own.runs], strict=True))
@@ -140,9 +160,9 @@ def test_deltas_that_add_up_beyond_16_bits_are_outside() -> None:
     cells = np.zeros((3, 1), np.int32), np.full(1, 16, np.uint8)
     planes = planes_of(np.array([[30_000, 0, 0]] * 3))
     lanes = np.empty((1, 3, LANES), np.uint16)
-    assert not leaf_lanes(planes, links, nodes, cells, 1 << 20, lanes)
+    assert not leaf_lanes(planes, links, nodes, cells, 1 << 20, lanes, bounds())
     planes = planes_of(np.array([[20_000, 0, 0]] * 3))
-    assert leaf_lanes(planes, links, nodes, cells, 1 << 20, lanes)
+    assert leaf_lanes(planes, links, nodes, cells, 1 << 20, lanes, bounds())
     assert lanes[0, 0].tolist() == [20_000, 40_000] + [60_000] * (LANES - 2)
 
 
@@ -152,11 +172,12 @@ def test_columns_are_laid_out_as_the_points_are() -> None:
     lanes = np.full((len(own.runs), LANES), 7, np.uint16)
     leaf_column(np.array([column & 255, column >> 8], np.uint8), own.links, own.count, lanes)
     small = np.full((len(own.runs), LANES), 7, np.uint8)
-    greatest = leaf_bytes((column % 200).astype(np.uint8), own.links, own.count, small)
+    greatest, seen = leaf_bytes((column % 200).astype(np.uint8), own.links, own.count, small)
     for block, (begin, count, _) in enumerate(own.runs):
         assert lanes[block].tolist() == padded(column[begin : begin + count])
         assert small[block].tolist() == padded(column[begin : begin + count] % 200)
     assert greatest == (column % 200).max() > (column % 200)[-own.runs[-1][1] :].max()
+    assert seen == sum(1 << bit for bit in set((column % 200 % 32).tolist()))
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.uint32, np.uint64])

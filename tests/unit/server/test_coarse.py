@@ -228,7 +228,7 @@ def _remembered(made: Made, row: int) -> list:
 
 def test_a_record_of_another_shape_than_the_index_says_has_no_slot(made: Made) -> None:
     made.store.archive.voxels["leaves"][1] += 1
-    with pytest.raises(CorruptError, match="leaf nodes, the index says otherwise"):
+    with pytest.raises(CorruptError, match=r"leaf nodes, the index says \d+"):
         made.coarse.fill(made.store, 1)
     made.store.archive.voxels["rows"][2][2] += 1
     with pytest.raises(CorruptError, match="points"):

@@ -11,6 +11,7 @@ import time
 import uuid
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
+from pathlib import Path
 from types import TracebackType
 from typing import Any, NamedTuple, Self
 
@@ -54,9 +55,9 @@ from ..schemas.requests import (
     make_positions,
 )
 from .client_session import ClientSession, WishNumbers
-from .config import DEFAULT_ENDPOINT
+from .endpoints import DEFAULT_ENDPOINT, check_endpoint, zenoh_words
 from .questions import Questions
-from .replies import read_reply
+from .replies import Anchor, Asked
 from .transport import session_config
 
 log = logging.getLogger(__name__)
@@ -91,6 +92,8 @@ class Client(Questions):
 
     endpoint: where the server listens.  scene: the name it is served under.
     timeout: how long one request may take [s]; a long list of poses is several requests.
+    key_file: holds the server's key, as given to `solidcloud serve --key-file`; None: the key that a server of the same
+    user on the same host has left is found by itself. With a key, a reply that is not sealed with it is as no reply.
 
     Entering asks which scenes are served: UnknownSceneError names them if this one is not among them. With
     no server there, entering succeeds all the same: `collide` says `UNKNOWN`, and right answers come once
@@ -99,11 +102,19 @@ class Client(Questions):
     unanswered: how many poses, rays, points, motions and objects nobody answered so far, and are `UNKNOWN` for that.
     """
 
-    def __init__(self, endpoint: str = DEFAULT_ENDPOINT, *, scene: str, timeout: float = 5.0) -> None:
+    def __init__(
+        self,
+        endpoint: str = DEFAULT_ENDPOINT,
+        *,
+        scene: str,
+        timeout: float = 5.0,
+        key_file: Path | str | None = None,
+    ) -> None:
         self.name = keys.check_name(scene, "scene")
         if not timeout > 0:
             raise BadRequestError(f"timeout is {timeout}: expected seconds above 0")
         self._endpoint, self._timeout = endpoint, timeout
+        self._anchor = Anchor(endpoint, key_file)
         # A secret: whoever knows it may ask and wish in our name. 122 random bits.
         self._id = uuid.uuid4().hex
         self._keys = {
@@ -299,7 +310,12 @@ class Client(Questions):
         with self._lock:
             numbers = self._numbers.setdefault(avatar, WishNumbers())
         return ClientSession(
-            self._session, self.name, user, numbers, lambda unknown: self._add_again([avatar], unknown)
+            self._session,
+            self.name,
+            user,
+            numbers,
+            self._anchor,
+            lambda unknown: self._add_again([avatar], unknown),
         )
 
     def _note_unanswered(self, count: int) -> None:
@@ -328,8 +344,11 @@ class Client(Questions):
     def _ask(self, operation: str, request: bytes) -> bytes | None:
         """Ask, and wait for the answer; None: nobody answered in time. Raises what an error reply says."""
         querier = self._querier(operation)
-        for reply in querier.get(payload=request, encoding=_ENCODING):
-            payload = _answer_of(reply, self._keys[operation])
+        asked = Asked(self._anchor, self._keys[operation], request)
+        replies = querier.get(payload=request, encoding=_ENCODING, attachment=asked.nonce)
+        asked.sent()
+        for reply in replies:
+            payload = _answer_of(reply, asked)
             if payload is not None:
                 self._seen = True
                 return payload
@@ -342,7 +361,8 @@ class Client(Questions):
         # Without bound: a channel that is full would hold up all that comes over this session.
         came: queue.SimpleQueue[Any] = queue.SimpleQueue()
         handler = zenoh.handlers.Callback(came.put, lambda: came.put(None))
-        self._querier(operation).get(handler, payload=request, encoding=_ENCODING)
+        asked = Asked(self._anchor, self._keys[operation], request)
+        self._querier(operation).get(handler, payload=request, encoding=_ENCODING, attachment=asked.nonce)
         answered = False
         while True:
             try:
@@ -352,7 +372,7 @@ class Client(Questions):
                 break
             if reply is None:
                 break
-            payload = _answer_of(reply, self._keys[operation])
+            payload = _answer_of(reply, asked)
             if payload is not None:
                 self._seen = answered = True
                 yield payload
@@ -371,7 +391,7 @@ class Client(Questions):
 
     def _check_served(self) -> None:
         """UnknownSceneError if servers answer and none of them serves this scene."""
-        served, versions = _ask_scenes(self._session, self._timeout)
+        served, versions = _ask_scenes(self._session, self._timeout, self._anchor)
         if versions - {WIRE_VERSION}:
             raise InternalError(
                 f"a server at {self._endpoint} speaks wire version {max(versions)}, this client "
@@ -384,10 +404,13 @@ class Client(Questions):
             raise UnknownSceneError(f"scene {self.name!r} is not served at {self._endpoint}; served: {names}")
 
 
-def scenes_at(endpoint: str = DEFAULT_ENDPOINT, timeout: float = 5.0) -> list[str]:
+def scenes_at(
+    endpoint: str = DEFAULT_ENDPOINT, timeout: float = 5.0, key_file: Path | str | None = None
+) -> list[str]:
     """The names of the scenes that are served at an endpoint, in order. BusyError: nobody answered."""
+    anchor = Anchor(endpoint, key_file)
     with _session(endpoint) as session:
-        served, versions = _ask_scenes(session, timeout)
+        served, versions = _ask_scenes(session, timeout, anchor)
     if not versions:
         raise BusyError(
             f"no server answered at {endpoint} within {timeout:g} s: "
@@ -398,20 +421,23 @@ def scenes_at(endpoint: str = DEFAULT_ENDPOINT, timeout: float = 5.0) -> list[st
 
 def _session(endpoint: str) -> zenoh.Session:
     """A session connected to an endpoint; BadRequestError for one that is none."""
+    check_endpoint(endpoint, "endpoint")
     try:
         return zenoh.open(session_config(connect=endpoint))
     except zenoh.ZError as error:
         raise BadRequestError(
-            f"endpoint {endpoint!r}: {error}: expected one such as {DEFAULT_ENDPOINT}"
+            f"endpoint {endpoint!r}: {zenoh_words(error)}: expected one such as {DEFAULT_ENDPOINT}"
         ) from None
 
 
-def _ask_scenes(session: zenoh.Session, timeout: float) -> tuple[set[str], set[int]]:
+def _ask_scenes(session: zenoh.Session, timeout: float, anchor: Anchor) -> tuple[set[str], set[int]]:
     """The scenes that are served, and the wire versions of the servers that answered."""
     served: set[str] = set()
     versions: set[int] = set()
+    asked = Asked(anchor, keys.scenes_key())
     replies = session.get(
         keys.scenes_key(),
+        attachment=asked.nonce,
         # Several servers answer under the one key, and all of them count.
         target=zenoh.QueryTarget.ALL,
         consolidation=zenoh.ConsolidationMode.NONE,
@@ -419,7 +445,7 @@ def _ask_scenes(session: zenoh.Session, timeout: float) -> tuple[set[str], set[i
         encoding=_ENCODING,
     )
     for reply in replies:
-        ok, payload = read_reply(reply, keys.scenes_key()) or (False, b"")
+        ok, payload = asked.read(reply) or (False, b"")
         if ok:
             answer = decode_answer(ScenesAnswer, payload)
             served.update(answer.scenes)
@@ -427,12 +453,12 @@ def _ask_scenes(session: zenoh.Session, timeout: float) -> tuple[set[str], set[i
     return served, versions
 
 
-def _answer_of(reply: zenoh.Reply, key: str) -> bytes | None:
-    """Return the bytes of an answer to a question asked under `key`; None: no server said it.
+def _answer_of(reply: zenoh.Reply, asked: Asked) -> bytes | None:
+    """Return the bytes of an answer to what was asked; None: it is not the server's.
 
     Raises the error of an error reply.
     """
-    found = read_reply(reply, key)
+    found = asked.read(reply)
     if found is None:
         return None
     ok, payload = found

@@ -27,6 +27,7 @@ from ..schemas.errors import (
 )
 from ..schemas.messages import ErrorReply
 from ..schemas.moves import State, Wish
+from .replies import Anchor
 from .session_transport import FRAME_QOS
 from .state_query import StateQuery
 
@@ -83,13 +84,14 @@ class ClientSession:
         scene: str,
         user: keys.User,
         numbers: "WishNumbers",
+        anchor: Anchor,
         add_again: Callable[[UnknownAvatarError], bool],
     ) -> None:
         """numbers: of wishes, growing over all sessions of this user.  add_again: adds the avatar to a server that does
         not know it; False: nobody answered; raises what it is given where this client has not added it either."""
         self._session, self._scene, self._user = session, scene, user
         self._numbers, self._add_again = numbers, add_again
-        self._states = StateQuery(session, keys.state_key(scene, user))
+        self._states = StateQuery(session, keys.state_key(scene, user), anchor)
         self._publishing = threading.Lock()  # so that wishes leave in the order of their numbers
         self._aim: Any = None  # the pose last wished, until a velocity goes on from a state
         self._time = 0.0

@@ -1,17 +1,13 @@
 """What an operator may set for a server, each default with its reason."""
 
 import math
-import re
 from dataclasses import dataclass
+from pathlib import Path
 from typing import NamedTuple
 
 from ..schemas.errors import BadRequestError
 from ..schemas.messages import MAX_AVATAR_POINTS, MAX_POSES
-
-DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
-
-_ENDPOINT = re.compile(r"(?P<protocol>[a-z0-9-]+)/(?P<address>[^?#\s]+)(?P<rest>[?#]\S*)?")
-_LOOPBACK = re.compile(r"(127(\.\d{1,3}){3}|localhost|\[::1\]):\d{1,5}")
+from .endpoints import DEFAULT_ENDPOINT, check_endpoint, is_loopback
 
 
 class AvatarLimits(NamedTuple):
@@ -46,6 +42,7 @@ class ServerConfig:
     max_avatars, max_avatars_by_client, max_avatar_clients: their number, and of clients that have any.
     avatar_seconds: an avatar that was not used for so long is dropped, unless its client has a liveliness token.
     stop_seconds: how long a stop waits for accepted requests to be answered before it stops them.
+    key_file: holds the key that replies are sealed with, for clients that have it too; None: one made at the start.
     metrics_port: where Prometheus' text is served over HTTP, on loopback unless `insecure`; 0: nowhere.
     """
 
@@ -68,10 +65,10 @@ class ServerConfig:
     avatar_seconds: float = 60.0
     stop_seconds: float = 1.0
     metrics_port: int = 0
+    key_file: Path | None = None
 
     def __post_init__(self) -> None:
-        if not _ENDPOINT.fullmatch(self.listen):
-            raise BadRequestError(f"listen {self.listen!r}: expected an endpoint such as {DEFAULT_ENDPOINT}")
+        check_endpoint(self.listen, "listen")
         if not self.insecure and not is_loopback(self.listen):
             raise BadRequestError(
                 f"listen {self.listen!r}: other hosts could reach it, and there is no authentication: "
@@ -109,13 +106,3 @@ class ServerConfig:
     def metrics_host(self) -> str:
         """The address that metrics are served at."""
         return "0.0.0.0" if self.insecure else "127.0.0.1"
-
-
-def is_loopback(endpoint: str) -> bool:
-    """Whether only processes of this host can reach a zenoh endpoint; unsure counts as no."""
-    match = _ENDPOINT.fullmatch(endpoint)
-    if not match:
-        return False
-    if match["protocol"] in ("unixsock-stream", "unixpipe"):
-        return True
-    return bool(_LOOPBACK.fullmatch(match["address"])) and match["rest"] is None

@@ -48,10 +48,15 @@ class Questions(Protocol):
 
 
 class Wire(NamedTuple):
-    """How a lane reads and answers queries. reply: sends an answer under a key; False where that fails."""
+    """How a lane reads and answers queries.
+
+    sealer: returns what seals the replies to a query, of its key expression and payload.  reply: sends an answer under
+    a key, sealed, with its number among the replies; False where that fails.
+    """
 
     encoding: Callable[[Any], str | None]
-    reply: Callable[[Any, Any, Answer], bool]
+    sealer: Callable[[Any, str, bytes], Any]
+    reply: Callable[[Any, Any, Answer, Any, int], bool]
 
 
 class _Gone(NamedTuple):
@@ -63,11 +68,11 @@ class _Gone(NamedTuple):
 class _Request:
     """A query on its way, and what was read of it: each property of a query is a copy that costs."""
 
-    __slots__ = ("client", "encoding", "key", "key_expr", "operation", "payload", "query")
+    __slots__ = ("client", "encoding", "key", "key_expr", "operation", "payload", "query", "sealer")
 
-    def __init__(self, query: Any, encoding: str | None) -> None:
+    def __init__(self, query: Any, wire: Wire) -> None:
         """Read a query."""
-        self.query, self.encoding = query, encoding
+        self.query, self.encoding = query, wire.encoding(query)
         self.key_expr = query.key_expr
         self.key = str(self.key_expr)
         try:
@@ -77,6 +82,7 @@ class _Request:
             self.client = self.operation = ""  # nobody's: the service will refuse it
         payload = query.payload
         self.payload = b"" if payload is None else payload.to_bytes()
+        self.sealer = wire.sealer(query, self.key, self.payload)
 
     @property
     def slow(self) -> bool:
@@ -226,7 +232,7 @@ class Lane:
 
     def _take(self, query: Any) -> bool:
         """Answer a query, or leave it to a thread that is at work. Returns whether this thread is still a worker."""
-        request = _Request(query, self._wire.encoding(query))
+        request = _Request(query, self._wire)
         client = request.client
         turn = client if client in self._alive else _ANONYMOUS
         ticket = Ticket(client, request, len(request.payload), turn=turn, slow=request.slow)
@@ -246,7 +252,7 @@ class Lane:
         self._enter(job)
         try:
             with request.query as query:
-                self._wire.reply(query, request.key_expr, busy)
+                self._wire.reply(query, request.key_expr, busy, request.sealer, 0)
         finally:
             with self._lock:
                 self._jobs.discard(job)
@@ -328,7 +334,7 @@ class Lane:
             self._hand_over(self._queues.sending(job.ticket) or [])
         # Leaving `with query` tells the client that no more will come.
         with request.query as query:
-            self._wire.reply(query, request.key_expr, answer)
+            self._wire.reply(query, request.key_expr, answer, request.sealer, 0)
         return None
 
     def _stream(self, ticket: Ticket, answers: Iterator[Answer], job: _Job) -> None:
@@ -336,9 +342,9 @@ class Lane:
         request = ticket.request
         try:
             with request.query as query:
-                for answer in answers:
+                for number, answer in enumerate(answers):
                     left = self._given_up or request not in self._streaming
-                    if left or not self._wire.reply(query, request.key_expr, answer):
+                    if left or not self._wire.reply(query, request.key_expr, answer, request.sealer, number):
                         break
         except Exception:
             log.exception("parts for client %s of scene %s", request.client, self._scene)

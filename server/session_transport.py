@@ -12,6 +12,7 @@ import zenoh
 
 from ..schemas import keys
 from ..schemas.errors import BadRequestError
+from ..schemas.seals import Sealer
 from .frames import Frames
 from .replies import send_reply
 from .served import Answer
@@ -43,11 +44,19 @@ class SceneSessions:
     """The sessions of one scene. declared: what is to be undeclared at the end; then its threads end too."""
 
     def __init__(
-        self, session: zenoh.Session, scene: str, service: Sessions, start: Callable[..., None]
+        self,
+        session: zenoh.Session,
+        scene: str,
+        service: Sessions,
+        start: Callable[..., None],
+        sealer: Callable[[zenoh.Query, str, bytes], Sealer | None],
     ) -> None:
-        """Declare them. start: starts a thread of a name that runs a function with arguments."""
+        """Declare them.
+
+        start: starts a thread of a name that runs a function with arguments.  sealer: as in `Wire`.
+        """
         self.declared: list[Any] = []
-        self._service = service
+        self._service, self._sealer = service, sealer
         frames = service.frames(scene, self._send)
         self._streams = StateStreams(0 if frames is None else _STREAMS_A_USER * frames.most_users)
         if frames is None:
@@ -87,15 +96,18 @@ class SceneSessions:
     def _open_stream(self, query: zenoh.Query) -> None:
         """Open a stream, or say that there is no room; a query for the states of several users ends without a reply."""
         try:
-            user = keys.parse_state(str(query.key_expr))
+            key = str(query.key_expr)
+            user = keys.parse_state(key)
         except BadRequestError as error:
             log.debug("a query for nobody's states: %s", error)
             query.drop()
             return
-        if not self._streams.open(user, query):
+        payload = query.payload
+        sealer = self._sealer(query, key, b"" if payload is None else payload.to_bytes())
+        if not self._streams.open(user, query, sealer):
             with query:
                 encoding = None if query.encoding is None else str(query.encoding)
-                send_reply(query, query.key_expr, self._service.busy(encoding))
+                send_reply(query, query.key_expr, self._service.busy(encoding), sealer)
 
     def _take_wishes(self, samples: Any) -> None:
         """Take wishes in until there are no more, then end the frames. A thread's work."""

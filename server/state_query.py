@@ -9,7 +9,7 @@ from typing import Any
 import zenoh
 
 from ..schemas.encoding import MSGPACK
-from .replies import read_reply
+from .replies import Anchor, Asked
 
 log = logging.getLogger(__name__)
 
@@ -24,12 +24,12 @@ _QUERY_SECONDS = 3600.0
 class StateQuery:
     """The query for one user's states. One thread takes what comes; `end` may be called by another."""
 
-    def __init__(self, session: zenoh.Session, key: str) -> None:
+    def __init__(self, session: zenoh.Session, key: str, anchor: Anchor) -> None:
         """key: of the user's states."""
-        self._session, self._key = session, key
+        self._session, self._key, self._anchor = session, key, anchor
         # Without bound: what is heard is taken at once, but for the moments in which an avatar is added again.
-        self._came: queue.SimpleQueue[tuple[int, Any] | None] = queue.SimpleQueue()
-        self._number = 0  # of the query that is open, or was last
+        self._came: queue.SimpleQueue[tuple[Asked, Any] | None] = queue.SimpleQueue()
+        self._asked_now: Asked | None = None  # the query that is open, or was last
         self._open = self._over = False
         self._asked = self._heard = 0.0  # when, on the monotonic clock
         self._pause = _PAUSE
@@ -80,12 +80,12 @@ class StateQuery:
             if item is None:
                 self._over = True
                 break
-            number, reply = item
-            if number != self._number:
+            asked, reply = item
+            if asked is not self._asked_now:
                 continue  # of a query before this one
             if reply is None:
                 self._open = False
-            elif (said := read_reply(reply, self._key)) is not None:
+            elif (said := asked.read(reply)) is not None:
                 found.append(said)
                 self._heard, self._pause = monotonic(), _PAUSE
         return found
@@ -96,17 +96,19 @@ class StateQuery:
 
     def _ask(self) -> None:
         """Ask, in place of an earlier query."""
-        self._number = number = self._number + 1
+        self._asked_now = asked = Asked(self._anchor, self._key)
         self._pause = min(2 * self._pause, _MOST_PAUSE)
         self._asked, self._open = monotonic(), True
         # zenoh calls these: they may not block, nor use zenoh.
         handler = zenoh.handlers.Callback(
-            lambda reply: self._came.put((number, reply)), lambda: self._came.put((number, None))
+            lambda reply: self._came.put((asked, reply)), lambda: self._came.put((asked, None))
         )
         try:
             self._cancel.cancel()
             self._cancel = zenoh.CancellationToken()
-            self._querier.get(handler, encoding=MSGPACK, cancellation_token=self._cancel)
+            self._querier.get(
+                handler, encoding=MSGPACK, attachment=asked.nonce, cancellation_token=self._cancel
+            )
         except zenoh.ZError as error:  # the zenoh session is closed
             self._open = False
             log.debug("asking %s: %s", self._key, error)

@@ -12,6 +12,7 @@ from typing import Any
 import zenoh
 
 from ..schemas.keys import User
+from ..schemas.seals import Sealer
 from .replies import send_reply
 from .served import Answer
 
@@ -22,13 +23,20 @@ _KEPT_SECONDS = 5.0
 
 
 class _Stream:
-    """One open query. used: when it was opened or last replied to, on the monotonic clock [s]."""
+    """One open query. used: when it was opened or last replied to, on the monotonic clock [s].  number: of replies."""
 
-    __slots__ = ("key", "query", "used")
+    __slots__ = ("_key", "_sealer", "number", "query", "used")
 
-    def __init__(self, query: zenoh.Query) -> None:
-        self.query, self.key = query, query.key_expr
+    def __init__(self, query: zenoh.Query, sealer: Sealer | None) -> None:
+        self.query, self._key, self._sealer = query, query.key_expr, sealer
         self.used = time.monotonic()
+        self.number = 0
+
+    def reply(self, answer: Answer) -> bool:
+        """Send one reply; return False where the client is gone."""
+        sent = send_reply(self.query, self._key, answer, self._sealer, self.number)
+        self.number += 1
+        return sent
 
 
 class StateStreams:
@@ -42,7 +50,7 @@ class StateStreams:
         self._closed = False
         self._lock = threading.Lock()
 
-    def open(self, user: User, query: zenoh.Query) -> bool:
+    def open(self, user: User, query: zenoh.Query, sealer: Sealer | None) -> bool:
         """Send the user's states as replies to this query from now on, and end an earlier query of the user.
 
         Returns False where there is no room: then the query is still the caller's to answer.
@@ -51,10 +59,10 @@ class StateStreams:
             if self._closed or not self._make_room(user):
                 return False
             self._end(user)
-            self._streams[user] = stream = _Stream(query)
+            self._streams[user] = stream = _Stream(query, sealer)
             when, answer = self._kept.pop(user, (0.0, None))
             if answer is not None and time.monotonic() - when < _KEPT_SECONDS:
-                send_reply(stream.query, stream.key, answer)
+                stream.reply(answer)
         return True
 
     def send(self, user: User, answer: Answer) -> None:
@@ -66,7 +74,7 @@ class StateStreams:
                 return
             stream.used = time.monotonic()
             self._streams.move_to_end(user)
-            if not send_reply(stream.query, stream.key, answer):
+            if not stream.reply(answer):
                 self._end(user)
 
     def end_client(self, client: str) -> None:

@@ -18,10 +18,13 @@ import zenoh
 from ..schemas import keys
 from ..schemas.errors import BadRequestError, SolidcloudError
 from ..schemas.messages import MAX_MESSAGE_BYTES
+from ..schemas.seals import Sealer
 from .access import access_control, state_priority
 from .config import ServerConfig
+from .endpoints import zenoh_words
+from .key_files import published_key
 from .lanes import Lane, Questions, Wire
-from .replies import send_reply
+from .replies import sealer_of, send_reply
 from .served import Answer
 from .session_transport import SceneSessions, Sessions
 
@@ -90,6 +93,8 @@ class Transport:
     def __enter__(self) -> Self:
         with ExitStack() as stack:
             session = stack.enter_context(self._open())
+            # Once the endpoint is ours: the key of a server that is still there is not written over.
+            self._key = stack.enter_context(published_key(self._config.listen, self._config.key_file))
             for scene in self._scenes:
                 stack.callback(self._declare_scene(session, scene).close)
             self._declare_scenes(session)
@@ -133,9 +138,9 @@ class Transport:
         try:
             return zenoh.open(session_config(listen=self._config.listen))
         except zenoh.ZError as error:
-            raise SolidcloudError(
-                f"cannot listen on {self._config.listen}: {error}: is another server there? try another port"
-            ) from None
+            said = zenoh_words(error)
+            hint = "is another server there? try another port" if "in use" in said else "try another endpoint"
+            raise SolidcloudError(f"cannot listen on {self._config.listen}: {said}: {hint}") from None
 
     def _declare_scene(self, session: zenoh.Session, scene: str) -> Lane:
         """Answer the questions about one scene, and watch which clients come and go."""
@@ -149,10 +154,15 @@ class Transport:
         )
         self._declared.append(queryable)
         lane = Lane(
-            self._service, scene, self._config, queryable.handler, self._start, Wire(_encoding, send_reply)
+            self._service,
+            scene,
+            self._config,
+            queryable.handler,
+            self._start,
+            Wire(_encoding, self._sealer, send_reply),
         )
         self._lanes.append(lane)
-        sessions = SceneSessions(session, scene, self._service, self._start)
+        sessions = SceneSessions(session, scene, self._service, self._start, self._sealer)
         self._declared += sessions.declared
         self._start(f"{scene}-watch", _watch, watch.handler, lane, sessions)
         lane.start()
@@ -168,9 +178,15 @@ class Transport:
         def take(queries: Any) -> None:
             for query in queries:
                 with query:
-                    send_reply(query, keys.scenes_key(), self._service.scenes(_encoding(query)))
+                    # Under its own key: a wider one that matches is no server's.
+                    sealer = self._sealer(query, keys.scenes_key(), b"")
+                    send_reply(query, keys.scenes_key(), self._service.scenes(_encoding(query)), sealer)
 
         self._start("scenes", take, queryable.handler)
+
+    def _sealer(self, query: zenoh.Query, key_expression: str, request: bytes) -> Sealer | None:
+        """What seals the replies to a query with this server's key."""
+        return sealer_of(query, self._key, key_expression, request)
 
     def _start(self, name: str, run: Callable[..., None], *arguments: Any) -> None:
         """A thread that is waited for at the end."""

@@ -1,5 +1,6 @@
 """What every test may ask for. Tests see the solidcloud that is installed, never the checkout's folders."""
 
+import atexit
 import json
 import os
 import shutil
@@ -17,6 +18,10 @@ SEED = 2012
 _OWN_CACHE = "NUMBA_CACHE_DIR" not in os.environ
 if _OWN_CACHE:
     os.environ["NUMBA_CACHE_DIR"] = tempfile.mkdtemp(prefix="solidcloud-numba-")
+
+# Servers leave the keys of their replies there, and clients look for them there; not among the user's own.
+os.environ["XDG_RUNTIME_DIR"] = _RUNTIME = tempfile.mkdtemp(prefix="solidcloud-run-")
+atexit.register(shutil.rmtree, _RUNTIME, ignore_errors=True)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

@@ -14,7 +14,7 @@ import zenoh
 from solidcloud.schemas.answers import CollideAnswers, CollidePart, Verdict
 from solidcloud.schemas.encoding import decode_request, encode
 from solidcloud.schemas.errors import SolidcloudError
-from solidcloud.schemas.messages import CollideRequest, ErrorReply, PathRequest
+from solidcloud.schemas.messages import AvatarInfo, CollideRequest, ErrorReply, PathRequest, ScenesAnswer
 from solidcloud.schemas.moves import State, Wish
 from solidcloud.server.client import Client
 from solidcloud.server.client_session import ClientSession
@@ -203,3 +203,56 @@ TOOLS: dict[str, Tool] = {
     "liveliness": _liveliness,
     "query": _query,
 }
+
+
+class Impostor:
+    """A program that listens where a server was and says `clear` under the right keys; a context manager.
+
+    seal: makes the attachment of a reply, from the query and the payload; by default there is none.
+    """
+
+    def __init__(
+        self, endpoint: str, seal: Callable[[zenoh.Query, bytes], bytes | None] | None = None
+    ) -> None:
+        """Begin to listen."""
+        config = session_config()
+        config.insert_json5("listen/endpoints", json.dumps([endpoint]))
+        self.asked: list[str] = []
+        self._seal = seal or (lambda query, payload: None)
+        self._states: list[zenoh.Query] = []
+        self._session = zenoh.open(config)
+        for key in ("solidcloud/1/scenes", "solidcloud/1/scene/*/*/*", "solidcloud/1/state/*/*/*"):
+            self._session.declare_queryable(key, self._answer, complete=True)
+        self._session.declare_subscriber("solidcloud/1/wish/*/*/*", self._wished)
+
+    def __enter__(self) -> "Impostor":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._states.clear()
+        self._session.close()  # type: ignore[no-untyped-call]
+
+    def _answer(self, query: zenoh.Query) -> None:
+        key = str(query.key_expr)
+        self.asked.append(key.rpartition("/")[2] if "/scene/" in key else key.split("/")[2])
+        if "/state/" in key:
+            self._states.append(query)
+            return
+        with query:
+            if key.endswith("/scenes"):
+                self._reply(query, encode(ScenesAnswer(["floor"], 1, 1)))
+            elif key.endswith("/add_avatar"):
+                self._reply(query, encode(AvatarInfo(AVATAR, 3, 0.125, 1.0)))
+            elif query.payload is not None:
+                self._reply(query, _zeros(query))
+
+    def _wished(self, sample: zenoh.Sample) -> None:
+        if sample.kind != zenoh.SampleKind.PUT:
+            return
+        wish = decode_request(Wish, sample.payload.to_bytes())
+        state = State(pose=pose_at(9.0, 9.0)[None], seq=wish.seq, time=wish.time, frame=1)
+        for query in list(self._states):
+            self._reply(query, encode(state))
+
+    def _reply(self, query: zenoh.Query, payload: bytes) -> None:
+        query.reply(query.key_expr, payload, encoding=MSGPACK, attachment=self._seal(query, payload))

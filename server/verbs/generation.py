@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from .interrupt import interruptible
-from .options import ArchivePath, AsJson, parse_bytes, print_json
+from .options import ArchivePath, AsJson, KeyFile, parse_bytes, print_json
 
 if TYPE_CHECKING:
     from ...builder.rebuild import ChangeSummary
@@ -129,6 +129,7 @@ def _print(summary: "ChangeSummary", what: str, as_json: bool) -> None:
 def reload(
     scene: Annotated[str, typer.Option(help="Name of the scene.")],
     connect: Annotated[str, typer.Option(help="zenoh endpoint of the server.")] = "tcp/127.0.0.1:7447",
+    key_file: KeyFile = None,
     as_json: AsJson = False,
 ) -> None:
     """Have a server serve what is in the archive's folder now, without losing a question."""
@@ -136,7 +137,7 @@ def reload(
 
     from ..client import Client
 
-    with Client(connect, scene=scene) as client:
+    with Client(connect, scene=scene, key_file=key_file) as client:
         answer = client.reload()
     if as_json:
         print_json(msgspec.to_builtins(answer))

@@ -13,6 +13,12 @@ import typer
 from ...schemas.errors import BadRequestError, SolidcloudError
 
 ArchivePath = Annotated[Path, typer.Argument(help="Folder of an archive.")]
+KeyFile = Annotated[
+    Path | None,
+    typer.Option(
+        help="File with the server's key; left out: the one that a server of this user has left is found."
+    ),
+]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")]
 
 

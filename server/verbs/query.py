@@ -6,13 +6,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from .options import AsJson, complain, print_json
+from .options import AsJson, KeyFile, complain, print_json
 
 if TYPE_CHECKING:
     from ..client import Client
 
 # Options that are not parameters of what is asked.
-_NOT_OF_THE_QUESTION = ("scene", "op", "connect", "as_json")
+_NOT_OF_THE_QUESTION = ("scene", "op", "connect", "key_file", "as_json")
 
 
 def query(
@@ -67,6 +67,7 @@ def query(
             "local:0.8 if wanted, or fixed:METRES; default: the scene's one figure."
         ),
     ] = None,
+    key_file: KeyFile = None,
     as_json: AsJson = False,
 ) -> int:
     """Ask a server what poses of an avatar, rays, points or objects touch.
@@ -85,9 +86,9 @@ def query(
 
     question = check_query(op, options)
     if op == "move":
-        return _ask_moves(connect, scene, question, as_json)
+        return _ask_moves(connect, scene, question, as_json, key_file)
     found, asked, printed = [], 0, 0
-    with Client(connect, scene=scene) as client:
+    with Client(connect, scene=scene, key_file=key_file) as client:
         for part in ask(client, question, read_avatar):
             found.append(part)
             asked += len(part.labels)
@@ -142,7 +143,7 @@ def _outside(client: "Client", places: Any, leaves: Any, verdicts: Any, word: st
     return outside
 
 
-def _ask_moves(connect: str, scene: str, question: Any, as_json: bool) -> int:
+def _ask_moves(connect: str, scene: str, question: Any, as_json: bool, key_file: Path | None) -> int:
     """Ask frame after frame and print a line each, or all as JSON; return the exit code."""
     import numpy as np
     from msgspec import json
@@ -156,7 +157,7 @@ def _ask_moves(connect: str, scene: str, question: Any, as_json: bool) -> int:
 
     found: list[dict[str, Any]] = []
     waiting: list[str] = []
-    with Client(connect, scene=scene) as client:
+    with Client(connect, scene=scene, key_file=key_file) as client:
         places, frames = ask_moves(client, question, read_avatar)
         for label, moved in frames:
             found.append(json.decode(encode(moved, JSON)))

@@ -26,6 +26,13 @@ def serve(
     metrics_port: Annotated[
         int, typer.Option(help="TCP port of Prometheus' text, at http://127.0.0.1:PORT/metrics; 0: none.")
     ] = 0,
+    key_file: Annotated[
+        Path | None,
+        typer.Option(
+            help="File with the key that replies are sealed with, 64 hex digits, for clients that have it too; left "
+            "out: a new one, which clients of this user find by themselves."
+        ),
+    ] = None,
     log: Annotated[
         Path | None,
         typer.Option(help="New file for the frames of all users, for solidcloud replay; it only grows."),
@@ -65,6 +72,7 @@ def serve(
         listen=listen,
         insecure=insecure,
         metrics_port=metrics_port,
+        key_file=key_file,
         max_request_seconds=max_request_seconds,
         max_slow=max_slow,
         max_in_flight_by_client=max_in_flight_by_client,

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from .options import AsJson, print_json
+from .options import AsJson, KeyFile, print_json
 
 
 def top(
@@ -15,6 +15,7 @@ def top(
     connect: Annotated[str, typer.Option(help="zenoh endpoint of the server.")] = "tcp/127.0.0.1:7447",
     interval: Annotated[float, typer.Option(help="Seconds between two looks.")] = 1.0,
     once: Annotated[bool, typer.Option("--once", help="Print one table and end.")] = False,
+    key_file: KeyFile = None,
     as_json: AsJson = False,
 ) -> None:
     """Show what a server keeps in memory, and how its users fare, until Ctrl-C."""
@@ -27,8 +28,8 @@ def top(
     if not 0.1 <= interval <= 3600:
         raise BadRequestError(f"--interval {interval}: expected 0.1 to 3600 seconds")
     with ExitStack() as stack:
-        names = [scene] if scene is not None else scenes_at(connect)
-        clients = [stack.enter_context(Client(connect, scene=name)) for name in names]
+        names = [scene] if scene is not None else scenes_at(connect, key_file=key_file)
+        clients = [stack.enter_context(Client(connect, scene=name, key_file=key_file)) for name in names]
         if as_json:
             print_json([msgspec.to_builtins(client.stats()) for client in clients])
             return

@@ -1,0 +1,193 @@
+"""A program at the endpoint of a server that is dead: without the server's key nobody believes it."""
+
+import os
+import struct
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zenoh
+from floor import DEADLINE, PATH, POINTS, TRUTH, eventually, heights, joined, server_process
+from solidcloud.schemas import keys
+from solidcloud.schemas.answers import Verdict
+from solidcloud.schemas.encoding import MSGPACK, encode
+from solidcloud.schemas.errors import BadRequestError, BusyError
+from solidcloud.schemas.messages import AvatarInfo, ErrorReply
+from solidcloud.schemas.moves import State
+from solidcloud.schemas.seals import Sealer, hash_of
+from solidcloud.server.app import serving
+from solidcloud.server.client import Client, scenes_at
+from solidcloud.server.config import ServerConfig
+from solidcloud.server.key_files import find_key, key_paths
+from walkers import pose_at
+
+# Appended, so that nothing of scripts/ hides a module of the tests.
+sys.path.append(str(Path(__file__).parents[2] / "scripts"))
+
+from rogues.tools import Impostor
+
+POSES = heights([-1.0, -2.0])
+CONTACTS = [Verdict.CONTACT] * 2
+COUNT = 5
+
+
+def seals_seen(seals):
+    """What replays a seal that the true server once gave."""
+    return lambda query, payload: seals[0]
+
+
+def garbage(query, payload):
+    """A seal of the right length under another key."""
+    return Sealer(
+        os.urandom(32), query.attachment.to_bytes(), str(query.key_expr), hash_of(query.payload.to_bytes())
+    ).seal(0, True, MSGPACK, payload)
+
+
+def asked_of(client, impostor):
+    """Ask the impostor all kinds of questions; verdicts that are not unknown, and states."""
+    found = []
+    for _ in range(COUNT):
+        eventually(lambda: client.collide("al", POSES) is not None and "collide" in impostor.asked)
+        found += [verdict for verdict in client.collide("al", POSES).verdict if verdict != Verdict.UNKNOWN]
+        for part in client.path("al", PATH):
+            found += [verdict for verdict in part.verdict if verdict != Verdict.UNKNOWN]
+    assert {"collide", "path"} <= set(impostor.asked), "it was asked"
+    return found
+
+
+@pytest.mark.parametrize("seal", ["none", "garbage", "replayed"])
+def test_a_rogue_at_a_dead_servers_port_is_never_believed(endpoint, seal, caplog):
+    with Client(endpoint, scene="floor", timeout=1.0) as client:
+        client.add_avatar("al", POINTS, 0.125)
+        with server_process(endpoint, "--walked") as process, client.session("al") as session:
+            eventually(lambda: client.collide("al", POSES).verdict.tolist() == CONTACTS)
+            assert session.wait(session.wish(pose_at(0.0, 1.0)), DEADLINE).pose[0, 2, 3] == 1.0
+            seals = [seal_of_the_server(client)]
+            process.kill()
+            process.wait(DEADLINE)
+            make = {"none": None, "garbage": garbage, "replayed": seals_seen(seals)}[seal]
+            with Impostor(endpoint, make) as impostor:
+                assert asked_of(client, impostor) == []
+                eventually(lambda: "state" in impostor.asked)
+                for _ in range(COUNT):
+                    with pytest.raises(BusyError, match="no state"):
+                        session.wait(session.wish(pose_at(0.0, 2.0)), 0.1)
+                assert session.latest().state.pose[0, 2, 3] == 1.0
+                with Client(endpoint, scene="floor", timeout=1.0) as another:
+                    another.add_avatar("al", POINTS, 0.125)
+                    assert asked_of(another, impostor) == [], "the file is still there"
+                with pytest.raises(BusyError):
+                    scenes_at(endpoint, timeout=1.0)
+        said = [record.getMessage() for record in caplog.records if "not sealed" in record.getMessage()]
+        assert len(said) == 3, "once for each client"
+        # A new server has another key, in the file.
+        with server_process(endpoint, "--walked"):
+            eventually(lambda: client.collide("al", POSES).verdict.tolist() == CONTACTS)
+            assert np.array_equal(joined(list(client.path("al", PATH))), TRUTH)
+
+
+def seal_of_the_server(client):
+    """A seal as the server gives it, for another question."""
+    replies = client._session.get(
+        keys.question_key("floor", client._id, "info"), attachment=bytes(16), encoding=MSGPACK
+    )
+    return next(iter(replies)).ok.attachment.to_bytes()
+
+
+def test_without_a_key_replies_are_taken_as_they_come_and_that_is_said_once(
+    endpoint, caplog, monkeypatch, tmp_path
+):
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "nowhere"))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "nowhere"))
+    with Impostor(endpoint) as impostor, Client(endpoint, scene="floor", timeout=1.0) as client:
+        client.add_avatar("al", POINTS, 0.125)
+        assert Verdict.CLEAR in asked_of(client, impostor), "the impostor is one"
+        with client.session("al") as session:
+            # It keeps no state for a query that comes after the wish.
+            eventually(lambda: session.wish(pose_at(0.0, 1.0)) and session.latest() is not None)
+            assert session.latest().state.pose[0, 2, 3] == 9.0
+    said = [record.getMessage() for record in caplog.records if "no key of the server" in record.getMessage()]
+    assert len(said) == 1
+
+
+def test_a_key_that_is_found_later_is_demanded_from_then_on(scene, endpoint):
+    with Client(endpoint, scene="floor", timeout=1.0) as client:
+        client.add_avatar("al", POINTS, 0.125)
+        assert client.collide("al", POSES).verdict.tolist() == [Verdict.UNKNOWN] * 2
+        with serving([scene], ServerConfig(listen=endpoint)):
+            eventually(lambda: client.collide("al", POSES).verdict.tolist() == CONTACTS)
+        assert not key_paths(endpoint)[0].exists(), "it goes with the server"
+        with Impostor(endpoint) as impostor:
+            assert asked_of(client, impostor) == []
+
+
+def test_a_key_may_be_handed_out(scene, endpoint, tmp_path, monkeypatch):
+    ours, theirs = tmp_path / "ours", tmp_path / "theirs"
+    for path, key in ((ours, "ab" * 32), (theirs, "cd" * 32)):
+        path.write_text(key)
+        path.chmod(0o600)
+    with serving([scene], ServerConfig(listen=endpoint, key_file=ours)):
+        assert find_key(endpoint).key == b"\xab" * 32
+        monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "nowhere"))
+        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "nowhere"))
+        with Client(endpoint, scene="floor", key_file=ours) as client:
+            client.add_avatar("al", POINTS, 0.125)
+            assert client.collide("al", POSES).verdict.tolist() == CONTACTS
+            with pytest.raises(BadRequestError, match="names none"):
+                error_of(client)
+        with Client(endpoint, scene="floor", key_file=theirs, timeout=1.0) as client:
+            client.add_avatar("al", POINTS, 0.125)
+            assert client.collide("al", POSES).verdict.tolist() == [Verdict.UNKNOWN] * 2
+        assert scenes_at(endpoint, key_file=ours) == ["floor"]
+    with pytest.raises(BadRequestError, match="No such file"):
+        Client(endpoint, scene="floor", key_file=tmp_path / "none")
+
+
+def error_of(client):
+    """An error reply is sealed too."""
+    try:
+        client._ask("collide", b"\xc1")
+    except BadRequestError as error:
+        raise BadRequestError("names none") from error
+
+
+def test_a_state_that_was_heard_before_is_ignored(endpoint, tmp_path):
+    """Whoever can repeat what the server said cannot have it heard twice, nor out of order."""
+    key = b"\xab" * 32
+    (tmp_path / "key").write_text(key.hex())
+    (tmp_path / "key").chmod(0o600)
+    config = ServerConfig(listen=endpoint)  # for its check alone
+    open_queries = []
+    from solidcloud.server.transport import session_config
+
+    with zenoh.open(session_config(listen=config.listen)) as session:
+        session.declare_queryable("solidcloud/1/state/floor/*/*", open_queries.append, complete=True)
+        with (
+            Client(endpoint, scene="floor", timeout=0.2, key_file=tmp_path / "key") as client,
+            client.session("al") as walker,
+        ):
+            eventually(lambda: open_queries)
+            query = open_queries[-1]
+            sealer = Sealer(key, query.attachment.to_bytes(), str(query.key_expr), hash_of(b""))
+            for number in (0, 1, 1, 0, 3, 2, 4):
+                payload = encode(State(pose=pose_at(0.0, number)[None], seq=number, time=0.0, frame=1))
+                query.reply(
+                    query.key_expr,
+                    payload,
+                    encoding=MSGPACK,
+                    attachment=sealer.seal(number, True, MSGPACK, payload),
+                )
+            walker.wait(4, DEADLINE)
+            assert [state.seq for state in walker.states(0.0)] == [0, 1, 3, 4]
+            error = encode(ErrorReply("busy", "not from the server"))
+            query.reply_err(error, encoding=MSGPACK)
+            payload = encode(AvatarInfo("a", 1))
+            query.reply_err(error, encoding=f"{MSGPACK};{struct.pack('<Q', 9).hex()}{'00' * 32}")
+            state = encode(State(pose=pose_at(0.0, 5.0)[None], seq=5, time=0.0, frame=1))
+            query.reply(
+                query.key_expr, state, encoding=MSGPACK, attachment=sealer.seal(5, True, MSGPACK, state)
+            )
+            assert walker.wait(5, DEADLINE).seq == 5, "no error was heard"
+            open_queries.clear()
+            del query

@@ -32,6 +32,7 @@ class Cost(msgspec.Struct, frozen=True, eq=False, kw_only=True):
     faults: one sentence for each voxel that could not be read, where and why; empty when all is well.
     wait_seconds: of engine_seconds, those that voxels were waited for [s].  late: keys of the voxels that were not
     there in time, which a budget does not wait for: what depends on them is `UNKNOWN`, and they are being loaded.
+    stopped: why the request was ended before all was looked at; empty: it was not.
     """
 
     engine_seconds: float = 0.0
@@ -42,6 +43,7 @@ class Cost(msgspec.Struct, frozen=True, eq=False, kw_only=True):
     faults: tuple[str, ...] = ()
     wait_seconds: float = 0.0
     late: tuple[int, ...] = ()
+    stopped: str = ""
 
 
 class CollideAnswer(NamedTuple):

@@ -82,6 +82,7 @@ def join(parts: Sequence[_A]) -> _A:
         faults=tuple(dict.fromkeys(fault for part in parts for fault in part.faults)),
         wait_seconds=sum(part.wait_seconds for part in parts),
         late=tuple(dict.fromkeys(key for part in parts for key in part.late)),
+        stopped=next((part.stopped for part in parts if part.stopped), ""),
     )
 
 

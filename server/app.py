@@ -46,7 +46,7 @@ from ..schemas.requests import Question
 from .config import ServerConfig
 from .frames import Frames
 from .served import Answer, SceneLike
-from .stop import Stop
+from .stop import NEVER, Stop
 from .transport import Transport
 
 log = logging.getLogger(__name__)
@@ -56,61 +56,71 @@ class _Operation(NamedTuple):
     """How an operation with a payload is answered.
 
     request: its type.  counted: the field whose length is bounded by `ServerConfig.max_poses`, "" for none.
-    ask: a scene, the request and the client to an answer, or to the parts of one.
+    ask: a scene, the request, the client and the stop flag to an answer, or to the parts of one.
     """
 
     request: type
     counted: str
-    ask: Callable[[SceneLike, Any, str], Any]
+    ask: Callable[[SceneLike, Any, str, Stop], Any]
 
 
-def _effort(request: Question) -> dict[str, Any]:
-    """What every question takes, as those of a scene take it."""
-    return {name: getattr(request, name) for name in Question.__struct_fields__}
+def _effort(request: Question, stop: Stop) -> dict[str, Any]:
+    """Return the options of a question to a scene."""
+    return {"stop": stop, **{name: getattr(request, name) for name in Question.__struct_fields__}}
 
 
-def _ask_objects(scene: SceneLike, request: ObjectsRequest, client: str) -> Any:
+def _ask_objects(scene: SceneLike, request: ObjectsRequest, client: str, stop: Stop) -> Any:
     items = zip(request.objects, request.poses, strict=True)
     listed = [(item.avatar, pose, item.group, item.mask) for item, pose in items]
-    return scene.objects(listed, request.margin, client=client, **_effort(request))
+    return scene.objects(listed, request.margin, client=client, **_effort(request, stop))
 
 
 _OPERATIONS = {
     "add_avatar": _Operation(
-        AddAvatarRequest, "", lambda s, r, c: s.add_avatar(r.name, r.points, r.radius, client=c)
+        AddAvatarRequest, "", lambda s, r, c, stop: s.add_avatar(r.name, r.points, r.radius, client=c)
     ),
     "collide": _Operation(
         CollideRequest,
         "poses",
-        lambda s, r, c: s.collide(r.avatar, r.poses, r.margin, client=c, **_effort(r)),
+        lambda s, r, c, stop: s.collide(r.avatar, r.poses, r.margin, client=c, **_effort(r, stop)),
     ),
     "distance": _Operation(
         DistanceRequest,
         "poses",
-        lambda s, r, c: s.distance(r.avatar, r.poses, r.reach, client=c, **_effort(r)),
+        lambda s, r, c, stop: s.distance(r.avatar, r.poses, r.reach, client=c, **_effort(r, stop)),
     ),
     "contacts": _Operation(
         ContactsRequest,
         "poses",
-        lambda s, r, c: s.contacts(
-            r.avatar, r.poses, r.limit, r.margin, r.cluster_distance, client=c, **_effort(r)
+        lambda s, r, c, stop: s.contacts(
+            r.avatar, r.poses, r.limit, r.margin, r.cluster_distance, client=c, **_effort(r, stop)
         ),
     ),
     "sweep": _Operation(
         SweepRequest,
         "pose_from",
-        lambda s, r, c: s.sweep(r.avatar, r.pose_from, r.pose_to, r.margin, client=c, **_effort(r)),
+        lambda s, r, c, stop: s.sweep(
+            r.avatar, r.pose_from, r.pose_to, r.margin, client=c, **_effort(r, stop)
+        ),
     ),
     "raycast": _Operation(
-        RaycastRequest, "origins", lambda s, r, c: s.raycast(r.origins, r.directions, r.reach, **_effort(r))
+        RaycastRequest,
+        "origins",
+        lambda s, r, c, stop: s.raycast(r.origins, r.directions, r.reach, **_effort(r, stop)),
     ),
-    "within": _Operation(WithinRequest, "points", lambda s, r, c: s.within(r.points, r.reach, **_effort(r))),
+    "within": _Operation(
+        WithinRequest, "points", lambda s, r, c, stop: s.within(r.points, r.reach, **_effort(r, stop))
+    ),
     "objects": _Operation(ObjectsRequest, "poses", _ask_objects),
     "move": _Operation(
-        MoveRequest, "", lambda s, r, c: s.move(r.avatar, r.pose_from, r.pose_to, r.seconds, client=c)
+        MoveRequest,
+        "",
+        lambda s, r, c, stop: s.move(r.avatar, r.pose_from, r.pose_to, r.seconds, client=c, stop=stop),
     ),
     "path": _Operation(
-        PathRequest, "poses", lambda s, r, c: s.path(r.avatar, r.poses, r.op, client=c, **r.parameters())
+        PathRequest,
+        "poses",
+        lambda s, r, c, stop: s.path(r.avatar, r.poses, r.op, client=c, stop=stop, **r.parameters()),
     ),
 }
 
@@ -147,7 +157,7 @@ class Service:
         """
         try:
             stated = wire_encoding(encoding)
-            found = self._ask(key, payload, stated)
+            found = self._ask(key, payload, stated, NEVER if stop is None else stop)
             if isinstance(found, Iterator):
                 return self._parts(key, found, stated)
             return self._encoded(found, stated)
@@ -208,7 +218,7 @@ class Service:
         simulation = self._scenes[scene].simulation
         if simulation is None:
             return None
-        return self._frames.setdefault(scene, Frames(simulation, publish))
+        return self._frames.setdefault(scene, Frames(simulation, publish, self._config.max_request_seconds))
 
     def warm(self) -> None:
         """Warm every scene, so that the first client does not wait for compilers."""
@@ -216,7 +226,7 @@ class Service:
             log.info("warming %s: the first start on a machine compiles, for a minute or two", scene.name)
             (scene.simulation or scene).warm()
 
-    def _ask(self, key: str, payload: bytes, encoding: str) -> Any:
+    def _ask(self, key: str, payload: bytes, encoding: str, stop: Stop) -> Any:
         """Put one question to the scene its key names."""
         route = keys.parse_question(key)
         scene = self._scenes.get(route.scene)
@@ -236,7 +246,7 @@ class Service:
             return self._reload(scene) if route.operation == "reload" else scene.info()
         request: Any = decode_request(operation.request, payload, encoding)
         self._check_size(operation, request)
-        return operation.ask(scene, request, route.client)
+        return operation.ask(scene, request, route.client, stop)
 
     def _reload(self, scene: SceneLike) -> Iterator[ReloadAnswer]:
         """Reload one scene when the answer is asked for; what goes wrong is logged here, and raised."""

@@ -49,15 +49,16 @@ def _search_until(
     which: NDArray[np.int64],
     heap: int,
     goal: Goal,
-    deadline: float,
+    effort: Effort,
     known: Known,
     counts: NDArray[np.uint32],
 ) -> None:
     """Search for the poses `which`, each with its share of the time left. data: its arrays as held."""
+    deadline = effort.deadline
     search = make_search(avatar.arrays, data.arrays, heap)
     for done, pose in enumerate(which.tolist()):
         now = time.perf_counter()
-        if now >= deadline:
+        if effort.spent:
             _leave_open(data, part, which[done:], known, counts)
             return
         share = now + (deadline - now) / (len(which) - done)
@@ -68,7 +69,7 @@ def _search_until(
             )  # fmt: skip
             if status != OPEN:
                 break
-            if time.perf_counter() >= share:
+            if effort.stop or time.perf_counter() >= share:
                 end_search(search, pose, known, counts)
                 break
             fresh, until = False, until + SLICE_VISITS
@@ -107,11 +108,14 @@ def _gather(
     counts = np.zeros((3, k), np.uint32)
     residency, spent = data.residency, Spent(time.perf_counter())
     for which, rows, part in pieces(reach, residency, effort.share) if len(avatar.points) else ():
+        if effort.stop:
+            _leave_open(data, part, which, known, counts)
+            continue
         heap = max(HEAP_PAIRS, int(np.diff(part.starts).max(initial=0)))
         with residency.hold(rows, effort.loads_until(), scan=effort.scan) as held:
             seen = as_held(data, held)
             if effort.deadline < math.inf:
-                _search_until(seen, avatar, array, part, which, heap, goal, effort.deadline, known, counts)
+                _search_until(seen, avatar, array, part, which, heap, goal, effort, known, counts)
             else:
                 search_poses(
                     array, avatar.arrays, seen.arrays, data.broad, part, which, heap, goal, known, counts

@@ -13,7 +13,7 @@ from .bounded import collide_bounded
 from .coarse import settle
 from .effort import EXACT, Effort
 from .kernels.overlap import CLEAR, CONTACT, UNKNOWN, answer_resident, overlap_poses
-from .request import SceneData, check_request, in_unknown, kernel_poses, pieces, refuse, to_units
+from .request import SceneData, as_held, check_request, in_unknown, kernel_poses, pieces, refuse, to_units
 from .spent import Spent
 
 # An avatar up to this size is answered under the residency's lock when a request holds one pose: 20 µs for the
@@ -85,8 +85,12 @@ def collide(
     residency, spent = data.residency, Spent(begin)
     # An empty avatar is clear, whatever is unknown here.
     for which, rows, part in pieces(reach, residency, effort.share) if len(avatar.points) else ():
-        with residency.hold(rows, scan=effort.scan) as held:
-            overlap_poses(array, avatar.arrays, data.arrays, part, which, verdict, counts)
+        if effort.stop:
+            verdict[which[verdict[which] == CLEAR]] = UNKNOWN
+            continue
+        with residency.hold(rows, effort.loads_until(), scan=effort.scan) as held:
+            seen = as_held(data, held)
+            overlap_poses(array, avatar.arrays, seen.arrays, part, which, verdict, counts)
         spent.add(held)
     if (data.nothing_clear or unseen) and len(avatar.points):  # a load may have found the index wrong
         lost = in_unknown(reach.boxes, data.unknown, data.nothing_clear)

@@ -12,7 +12,7 @@ from .bounded import distance_bounded
 from .effort import EXACT, Effort
 from .kernels.closest import Nearest
 from .kernels.nearest import nearest_poses
-from .request import SceneData, check_request, kernel_poses, pieces, to_units
+from .request import SceneData, as_held, check_request, kernel_poses, pieces, to_units
 from .signed import distance_columns, signed_from_square, unknown_gaps
 from .spent import Spent
 
@@ -43,9 +43,13 @@ def distance(
     residency, spent = data.residency, Spent(begin)
     if len(avatar.points):
         for which, rows, part in pieces(around, residency, effort.share):
-            with residency.hold(rows, scan=effort.scan) as held:
+            if effort.stop:
+                nearest.gap[which] = 0.0
+                continue
+            with residency.hold(rows, effort.loads_until(), scan=effort.scan) as held:
+                seen = as_held(data, held)
                 nearest_poses(
-                    array, avatar.arrays, data.arrays, data.broad, part, reach_units, which, nearest, counts
+                    array, avatar.arrays, seen.arrays, data.broad, part, reach_units, which, nearest, counts
                 )
             spent.add(held)
         np.minimum(nearest.gap, unknown_gaps(data, around), out=nearest.gap)

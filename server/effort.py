@@ -9,6 +9,8 @@ import time
 from typing import NamedTuple
 
 from ..schemas.errors import BadRequestError
+from ..schemas.requests import QuestionOptions
+from .stop import NEVER, Stop
 
 # No budget: more node visits than any request could make.
 NO_LIMIT = 1 << 62
@@ -24,6 +26,7 @@ class Effort(NamedTuple):
     visits: node visits a pose (ray, point, motion).  deadline: on time.perf_counter()'s clock [s], inf: none.
     scan: what is looked at is passed by, as on a sweep along a path: it is not to wash the cache (policies.py).
     share: of the cache, what may be held at a time. Counts of work depend on it, where not all fits; no verdict does.
+    stop: ends the work early once it is set; what was not looked at then is unknown.
     """
 
     tolerance: float = 0.0
@@ -31,6 +34,7 @@ class Effort(NamedTuple):
     deadline: float = math.inf
     scan: bool = False
     share: float = 1.0
+    stop: Stop = NEVER
 
     @property
     def limited(self) -> bool:
@@ -43,27 +47,37 @@ class Effort(NamedTuple):
 
     @property
     def spent(self) -> bool:
-        """Whether the time is up."""
-        return self.deadline < math.inf and time.perf_counter() >= self.deadline
+        """Whether the time is up, or the request was stopped."""
+        return bool(self.stop) or (self.deadline < math.inf and time.perf_counter() >= self.deadline)
 
     def loads_until(self) -> float:
         """Until when loads that begin now may go on, on the same clock [s]; inf: until they are done."""
         if self.deadline == math.inf:
-            return math.inf
+            return self.stop.until
         now = time.perf_counter()
-        return now + (self.deadline - now) * LOAD_SHARE
+        return min(now + (self.deadline - now) * LOAD_SHARE, self.stop.until)
 
 
 EXACT = Effort()
 
 
+class EngineOptions(QuestionOptions, total=False):
+    """The options of a question to a scene: those of the wire, and the stop flag of whoever asks."""
+
+    stop: Stop
+
+
 def make_effort(
-    tolerance: float = 0.0, budget_ms: float | None = None, budget_visits: int | None = None
+    tolerance: float = 0.0,
+    budget_ms: float | None = None,
+    budget_visits: int | None = None,
+    stop: Stop = NEVER,
 ) -> Effort:
     """The effort of a request that starts now.
 
     tolerance: [m], finite and >= 0.  budget_ms: waiting for loads and work together; None: no limit.
-    budget_visits: its twin that needs no clock, node visits a pose; None: no limit. Raises BadRequestError.
+    budget_visits: its twin that needs no clock, node visits a pose; None: no limit.  stop: the request's stop flag.
+    Raises BadRequestError.
     """
     if not 0 <= tolerance < math.inf:
         raise BadRequestError(f"tolerance is {tolerance}: expected a finite number of metres, 0 or more")
@@ -72,4 +86,5 @@ def make_effort(
     if budget_visits is not None and not 0 <= budget_visits <= NO_LIMIT:
         raise BadRequestError(f"budget_visits is {budget_visits}: expected node visits, 0 or more, or none")
     deadline = math.inf if budget_ms is None else time.perf_counter() + budget_ms / 1e3
-    return Effort(float(tolerance), NO_LIMIT if budget_visits is None else int(budget_visits), deadline)
+    visits = NO_LIMIT if budget_visits is None else int(budget_visits)
+    return Effort(float(tolerance), visits, deadline, stop=stop)

@@ -5,6 +5,7 @@ came of it. It waits while nobody wishes, so that frames come at most as fast as
 """
 
 import logging
+import math
 import threading
 import time
 from collections.abc import Callable, Iterable
@@ -16,11 +17,15 @@ from ..schemas.keys import User
 from ..schemas.messages import ErrorReply
 from ..schemas.moves import State, Wish
 from .served import Answer, Outcome, Simulates, Turn
+from .stop import Stop
+from .watchdog import Watchdog
 
 log = logging.getLogger(__name__)
 
 # Mailboxes for each user that a scene has room for: who comes when it is full is told so, frame by frame.
 _BOXES_A_USER = 2
+# How often the thread that ends long frames looks [s].
+_LOOK_SECONDS = 0.05
 # Of a wish: 2,048 objects take a fifth of it. What is more is not read, and comes into no log.
 _MOST_BYTES = 2 << 20
 
@@ -144,9 +149,20 @@ class Mailboxes:
 class Frames:
     """The sessions of one scene: wishes as bytes in, states as bytes out. No method raises."""
 
-    def __init__(self, simulation: Simulates, publish: Callable[[User, Answer], None]) -> None:
-        """publish: sends a user's state, or why there is none; must not block."""
-        self._simulation, self._publish = simulation, publish
+    def __init__(
+        self,
+        simulation: Simulates,
+        publish: Callable[[User, Answer], None],
+        max_seconds: float = math.inf,
+    ) -> None:
+        """Make mailboxes for the users of a simulation.
+
+        publish: sends a user's state, or why there is none; must not block.  max_seconds: what one frame of all users
+        may take; users that it did not come to by then stay where they were.
+        """
+        self._simulation, self._publish, self._max_seconds = simulation, publish, max_seconds
+        self._at_work: tuple[float, Stop] | None = None  # since when, and what ends it
+        self._watchdog = Watchdog(self._look, period=_LOOK_SECONDS)
         self.most_users = simulation.most_users
         self._boxes = Mailboxes(_BOXES_A_USER * simulation.most_users)
 
@@ -170,11 +186,26 @@ class Frames:
 
     def run(self) -> None:
         """Simulate frames until `close`. A thread's work."""
-        while (post := self._boxes.take()) is not None:
-            try:
-                self._frame(post)
-            except Exception:  # of this frame alone
-                log.exception("a frame of %d users", len(post.turns))
+        watching = threading.Thread(target=self._watchdog.run, name="solidcloud-frames-watchdog", daemon=True)
+        watching.start()
+        try:
+            while (post := self._boxes.take()) is not None:
+                try:
+                    self._frame(post)
+                except Exception:  # of this frame alone
+                    log.exception("a frame of %d users", len(post.turns))
+        finally:
+            self._watchdog.close()
+            watching.join()
+
+    def _look(self, now: float) -> bool:
+        """Stop a frame that has taken too long; return whether there is one at work."""
+        if (at_work := self._at_work) is None:
+            return False
+        begun, stop = at_work
+        if now - begun >= self._max_seconds:
+            stop.set(f"the frame took longer than {self._max_seconds:g} s")
+        return True
 
     def _frame(self, post: Post) -> None:
         """One frame, and what is said of it."""
@@ -183,12 +214,23 @@ class Frames:
         for client in post.gone:
             self._simulation.end_client(client)
         if post.turns:
-            outcomes: list[Outcome] = self._simulation.step(post.turns, time.monotonic())
+            outcomes = self._step(post.turns)
             for outcome, encoding in zip(outcomes, post.encodings, strict=True):
                 self._send(outcome.user, outcome.state, encoding)
         users = self._simulation.users
         if len(self._boxes) > len(users):
             self._boxes.keep(users)
+
+    def _step(self, turns: list[Turn]) -> list[Outcome]:
+        """Simulate one frame, which the watchdog ends if it takes too long."""
+        stop, now = Stop(), time.monotonic()
+        self._at_work = now, stop
+        if self._watchdog.asleep:
+            self._watchdog.wake()
+        try:
+            return self._simulation.step(turns, now, stops=[stop] * len(turns))
+        finally:
+            self._at_work = None
 
     def _send(self, user: User, said: State | SolidcloudError, encoding: str | None) -> None:
         """Publish what is said to a user; what cannot be sent is logged, for nobody waits for it."""
@@ -206,5 +248,7 @@ class Frames:
             log.exception("the state of %s of client %s", user.avatar, user.client)
 
     def close(self) -> None:
-        """End `run` once what came is done."""
+        """End `run` once what came is done; a frame that is at work is ended early."""
         self._boxes.close()
+        if (at_work := self._at_work) is not None:
+            at_work[1].set("the server stops")

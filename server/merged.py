@@ -88,6 +88,7 @@ def _cost(answers: Sequence[Cost]) -> dict[str, Any]:
     }
     for name in ("faults", "late"):
         total[name] = tuple(dict.fromkeys(each for a in answers for each in getattr(a, name)))
+    total["stopped"] = next((a.stopped for a in answers if a.stopped), "")
     return total
 
 

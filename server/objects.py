@@ -215,7 +215,7 @@ def _meet(placing: Placing, origin: NDArray[np.float64], effort: Effort) -> Met:
             found = np.empty(len(part), np.uint8)
             touch_pairs(
                 placing.models[a].arrays, placing.models[b].arrays, placing.poses, placing.scales, placing.units,
-                ordered[part], placing.margin_units, origin, effort.visits, found, counters,
+                ordered[part], placing.margin_units, origin, effort.visits, effort.stop.flag, found, counters,
             )  # fmt: skip
             verdict[part] = found
             tested += len(part)

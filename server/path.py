@@ -14,7 +14,7 @@ import numpy as np
 
 from ..schemas.answers import PATH_ANSWERS, ContactsAnswers, Cost, Part
 from ..schemas.arrays import Poses
-from ..schemas.columns import as_part, in_pieces, unknown
+from ..schemas.columns import as_part, in_pieces
 from ..schemas.errors import SolidcloudError
 from ..schemas.requests import check_path_parameters
 from .avatar import AvatarModel
@@ -24,6 +24,8 @@ from .distance import distance
 from .effort import make_effort
 from .kernels.placing import check_poses
 from .request import SceneData, kernel_poses, refuse, to_units
+from .stop import NEVER, Stop
+from .stopped_answers import ask_until_stopped, unknown_part
 from .sweep import sweep
 
 # Parts computed at a time, by default.
@@ -42,11 +44,17 @@ Ask = Callable[[int, int], Cost]
 
 
 def path_question(
-    data: SceneData, avatar: AvatarModel, poses: Poses, op: str, parameters: dict[str, Any]
+    data: SceneData,
+    avatar: AvatarModel,
+    poses: Poses,
+    op: str,
+    parameters: dict[str, Any],
+    stop: Stop = NEVER,
 ) -> tuple[Ask, int]:
     """What answers [start, stop) of a path, and how many answers there are. The budget's time begins now.
 
-    poses: (k, 4, 4) float64.  parameters: of `op`, tolerance and budgets included. All poses are checked here, so that
+    poses: (k, 4, 4) float64.  stop: ends the path early.  parameters: of `op`,
+    tolerance and budgets included. All poses are checked here, so that
     an error names one by its place on the path. BadRequestError, BadTransformError, TooLargeError.
     """
     given = {name: value for name, value in parameters.items() if value is not None}
@@ -54,7 +62,7 @@ def path_question(
     budgets = {name: given.pop(name) for name in ("budget_ms", "budget_visits") if name in given}
     tolerance = given.pop("tolerance", 1e-6 if op == "sweep" else 0.0)
     # Nobody stays along a path; what users stand in, at most half of the cache (prefetch.py), can stay beside it.
-    effort = make_effort(tolerance, **budgets)._replace(scan=True, share=0.5)
+    effort = make_effort(tolerance, **budgets, stop=stop)._replace(scan=True, share=0.5)
     poses = kernel_poses(poses)  # copied once if at all, or every part would copy its own
     other = (
         to_units(given["reach"], "reach")
@@ -72,12 +80,13 @@ def path_question(
     if op == "sweep":
         given["tolerance"] = tolerance
 
-    def ask(start: int, stop: int) -> Cost:
+    def ask(start: int, end: int) -> Cost:
         if effort.spent:
-            return unknown(PATH_ANSWERS[op], stop - start)
-        what = [poses[start:stop], poses[start + 1 : stop + 1]] if op == "sweep" else [poses[start:stop]]
-        answers: Cost = question(data, avatar, *what, **given, effort=effort)
-        return answers
+            return unknown_part(PATH_ANSWERS[op], end - start, effort)
+        what = [poses[start:end], poses[start + 1 : end + 1]] if op == "sweep" else [poses[start:end]]
+        return ask_until_stopped(
+            question, end - start, effort, lambda: question(data, avatar, *what, **given, effort=effort)
+        )
 
     return ask, max(0, len(poses) - 1) if op == "sweep" else len(poses)
 

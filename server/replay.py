@@ -12,12 +12,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..schemas.encoding import decode_request
-from ..schemas.errors import BadRequestError, SolidcloudError
+from ..schemas.errors import BadRequestError, ErrorCode, SolidcloudError
 from ..schemas.keys import User
 from ..schemas.moves import Wish
 from .frame_log import Begin, Dropped, Ended, Entered, Frame, FrameLog, Points, Record, Said, said
 from .served import SceneLike, Turn
 from .simulation import Simulation
+from .stop import NEVER, Stop
 
 
 class Difference(NamedTuple):
@@ -88,7 +89,11 @@ def replay(simulation: Simulation, records: Iterable[Record]) -> Replayed:
 def _differences(simulation: Simulation, record: Frame) -> list[Difference]:
     """Run one frame; what comes out otherwise."""
     wished = [Turn(User(*user), decode_request(Wish, wish)) for user, wish in record.turns]
-    outcomes = simulation.step(wished, skips=[logged.skipped for logged in record.said])
+    # A turn that the server ended early depended on a clock: it is ended again, and moves nobody.
+    ended = Stop()
+    ended.set("ended early when it was logged")
+    stops = [ended if logged.error == ErrorCode.EXPIRED else NEVER for logged in record.said]
+    outcomes = simulation.step(wished, skips=[logged.skipped for logged in record.said], stops=stops)
     return [
         Difference(record.number, outcome.user, logged, found)
         for outcome, logged in zip(outcomes, record.said, strict=True)

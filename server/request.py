@@ -17,6 +17,11 @@ from .kernels import placing
 from .kernels.layout import SceneArrays, block_words
 from .kernels.reach import Reach, SceneIndex, find_reach
 from .residency import Held, Residency
+from .stop import NEVER, Stop, StoppedError
+
+# Voxels in reach of all poses of one request: 128 MB of row numbers. The index would make gigabytes of them for 100,000
+# poses whose reach covers thousands of voxels.
+MOST_ROWS = 1 << 24
 
 _POSE_FAULTS: dict[int, tuple[type[SolidcloudError], str]] = {
     placing.NOT_FINITE: (BadRequestError, "holds {}: expected finite numbers"),
@@ -112,6 +117,7 @@ def make_scene_data(
         lattice.voxel_steps,
         block_words(header.radius_class),
         np.zeros(1, np.int64),
+        NEVER.flag,
     )
     return SceneData(
         residency,
@@ -139,6 +145,11 @@ def with_radius_model(data: SceneData, archive: Archive, text: str | None) -> Sc
     return data._replace(arrays=data.arrays._replace(drop=drop), radius_units=largest)
 
 
+def with_stop(data: SceneData, stop: Stop) -> SceneData:
+    """Return the same scene for a request that `stop` ends early."""
+    return data if stop is NEVER else data._replace(arrays=data.arrays._replace(stop=stop.flag))
+
+
 def _empty_reach(k: int, rows: int) -> Reach:
     """A `Reach` to be filled for k poses with room for so many voxel rows."""
     return Reach(
@@ -159,7 +170,8 @@ def check_request(
 ) -> Reach:
     """The voxels in reach of each pose (k, 4, 4); none for an empty avatar.
 
-    Raises BadRequestError, BadTransformError or TooLargeError naming the pose.
+    Raises BadRequestError, BadTransformError or TooLargeError naming the pose, TooLargeError for more than MOST_ROWS
+    voxels in reach of all poses, and StoppedError.
     """
     needed = 16 * len(poses) + 64
     while True:
@@ -168,8 +180,15 @@ def check_request(
             poses, avatar.arrays, avatar.radius, other_units, data.arrays, data.broad, reach
         )
         refuse(fault, pose, found)
+        if needed < 0:
+            raise StoppedError
         if needed <= len(reach.rows):
             return reach
+        if needed > MOST_ROWS:
+            raise TooLargeError(
+                f"{needed} voxels in reach of {len(poses)} poses: at most {MOST_ROWS} in a request: ask about fewer "
+                "poses, or with a smaller margin or reach"
+            )
 
 
 def pieces(
@@ -183,9 +202,9 @@ def pieces(
     (NUMERICS.md case 23), and so appears in several pieces.
     """
     k = len(reach.scales)
-    everything = reach.rows[: reach.starts[k]].tolist()
-    if k > 1:
-        everything = np.unique(everything).tolist()
+    rows = reach.rows[: reach.starts[k]]
+    # A sort in numpy lets other threads run meanwhile; of a list, it would not.
+    everything = (np.unique(rows) if k > 1 else rows).tolist()
     budget = int(residency.buffer.total_bytes * share)
     if residency.bytes_of(everything) <= budget:
         yield np.arange(k), everything, reach

@@ -110,7 +110,7 @@ def look(
             )
             needed = list_voxels(
                 voxel_tree(data), at_units[begin:end], directions, direction is not None, reach_units, radius_units,
-                data.arrays.units_per_step, lists,
+                data.arrays.units_per_step, data.arrays.stop, lists,
             )  # fmt: skip
             if needed <= capacity:
                 break
@@ -126,7 +126,8 @@ def look(
             rows = _next_rows(data, lists, cursor, open_)
             held = np.zeros(len(looked), bool)
             held[rows] = True
-            with data.residency.hold(rows.tolist(), effort.deadline, scan=effort.scan) as found:
+            until = min(effort.deadline, effort.stop.until)
+            with data.residency.hold(rows.tolist(), until, scan=effort.scan) as found:
                 held[list(found.late)] = False  # they may be written to just now
                 kernel(begin, end, lists, cursor, held, part)
             spent.add(found, int(looked[rows].sum()))

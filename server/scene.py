@@ -3,7 +3,7 @@
 import os
 import threading
 import time
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence, Sized
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
@@ -25,7 +25,7 @@ from ..schemas.answers import (
 )
 from ..schemas.errors import BadRequestError, BusyError
 from ..schemas.messages import AvatarInfo, ReloadAnswer, SceneInfo, StatsAnswer
-from ..schemas.requests import QuestionOptions, make_objects, make_poses
+from ..schemas.requests import make_objects, make_poses
 from ..schemas.scene import scene_of
 from .avatar import AvatarModel
 from .avatars import Avatars
@@ -34,16 +34,18 @@ from .config import AvatarLimits
 from .contacts import contacts
 from .describe import describe, describe_scene, make_stats
 from .distance import distance
-from .effort import Effort, make_effort
+from .effort import Effort, EngineOptions, make_effort
 from .metrics import Metrics
 from .objects import objects as ask_objects
 from .opened import HeldParts, Opened
 from .path import PATH_THREADS, largest_part, path_parts, path_question
 from .rays import raycast
-from .request import SceneData
+from .request import SceneData, with_stop
 from .residency import Residency
 from .session import Walker
 from .simulated import Simulated
+from .stop import NEVER, Stop
+from .stopped_answers import ask_until_stopped
 from .store import OpenStore, Store
 from .sweep import sweep
 from .within import within
@@ -255,10 +257,12 @@ class Scene(Simulated):
         budget_ms: float | None = None,
         budget_visits: int | None = None,
         radius_model: str | None = None,
+        stop: Stop = NEVER,
     ) -> tuple[SceneData, Effort]:
         """What a question with these options reads, and what it may cost."""
-        effort = make_effort(tolerance, budget_ms, budget_visits)
-        return opened.data if radius_model is None else opened.radius_model(radius_model), effort
+        effort = make_effort(tolerance, budget_ms, budget_visits, stop)
+        data = opened.data if radius_model is None else opened.radius_model(radius_model)
+        return with_stop(data, stop), effort
 
     def _ask(
         self,
@@ -268,7 +272,7 @@ class Scene(Simulated):
         poses: ArrayLike,
         what: tuple[Any, ...],
         around: float,
-        options: QuestionOptions,
+        options: EngineOptions,
     ) -> _A:
         """Ask about an avatar under some poses; the last one says where its user is.
 
@@ -279,7 +283,9 @@ class Scene(Simulated):
             avatar = self.avatar(name, client)
             if opened.saw((client, name), avatar, poses, around):
                 effort = effort._replace(scan=True)
-            answers = question(data, avatar, *what, effort=effort)
+            answers = ask_until_stopped(
+                question, _count(poses), effort, lambda: question(data, avatar, *what, effort=effort)
+            )
         self._metrics.answered(client, name, answers)
         return answers
 
@@ -290,7 +296,7 @@ class Scene(Simulated):
         margin: float = 0.0,
         *,
         client: str = "",
-        **options: Unpack[QuestionOptions],
+        **options: Unpack[EngineOptions],
     ) -> CollideAnswers:
         """Whether avatar `name` touches the scene under each of the poses (k, 4, 4); see server/collide.py.
 
@@ -313,7 +319,7 @@ class Scene(Simulated):
         reach: float,
         *,
         client: str = "",
-        **options: Unpack[QuestionOptions],
+        **options: Unpack[EngineOptions],
     ) -> DistanceAnswers:
         """How far avatar `name` is from the scene under each pose, up to `reach` [m]; see server/distance.py."""
         return self._ask(distance, name, client, poses, (poses, reach), reach, options)
@@ -327,7 +333,7 @@ class Scene(Simulated):
         cluster_distance: float | None = None,
         *,
         client: str = "",
-        **options: Unpack[QuestionOptions],
+        **options: Unpack[EngineOptions],
     ) -> ContactsAnswers:
         """Which pairs of points are in contact under each of the poses, deepest first; see server/contacts.py."""
         what = (poses, limit, margin, cluster_distance)
@@ -341,7 +347,7 @@ class Scene(Simulated):
         margin: float = 0.0,
         *,
         client: str = "",
-        **options: Unpack[QuestionOptions],
+        **options: Unpack[EngineOptions],
     ) -> SweepAnswers:
         """When avatar `name` first touches the scene on its way between poses; see server/sweep.py."""
         options.setdefault("tolerance", 1e-6)
@@ -353,12 +359,14 @@ class Scene(Simulated):
         origins: ArrayLike,
         directions: ArrayLike,
         reach: float,
-        **options: Unpack[QuestionOptions],
+        **options: Unpack[EngineOptions],
     ) -> RaycastAnswers:
         """Which scan point's sphere rays (k, 3), (k, 3) hit first, up to `reach` [m]; see server/rays.py."""
         with self.take() as opened:
             data, effort = self._terms(opened, **options)
-            answers = raycast(data, origins, directions, reach, effort)
+            answers = ask_until_stopped(
+                raycast, _count(origins), effort, lambda: raycast(data, origins, directions, reach, effort)
+            )
         self._metrics.answered("", "", answers)
         return answers
 
@@ -366,12 +374,14 @@ class Scene(Simulated):
         self,
         points: ArrayLike,
         reach: float,
-        **options: Unpack[QuestionOptions],
+        **options: Unpack[EngineOptions],
     ) -> WithinAnswers:
         """Which scan point is nearest to each loose point (k, 3), up to `reach` [m]; see server/within.py."""
         with self.take() as opened:
             data, effort = self._terms(opened, **options)
-            answers = within(data, points, reach, effort)
+            answers = ask_until_stopped(
+                within, _count(points), effort, lambda: within(data, points, reach, effort)
+            )
         self._metrics.answered("", "", answers)
         return answers
 
@@ -381,7 +391,7 @@ class Scene(Simulated):
         margin: float = 0.0,
         *,
         client: str = "",
-        **options: Unpack[QuestionOptions],
+        **options: Unpack[EngineOptions],
     ) -> ObjectsAnswers:
         """Which of several avatars (name, pose, group = 1, mask = all) touch the scene and one another.
 
@@ -393,7 +403,12 @@ class Scene(Simulated):
             avatars = [self.avatar(item.avatar, client) for item in items]
             groups = np.array([item.group for item in items], np.uint32)
             masks = np.array([item.mask for item in items], np.uint32)
-            answers = ask_objects(data, avatars, poses, groups, masks, margin, effort)
+            answers = ask_until_stopped(
+                ask_objects,
+                len(items),
+                effort,
+                lambda: ask_objects(data, avatars, poses, groups, masks, margin, effort),
+            )
         self._metrics.answered(client, "", answers)
         return answers
 
@@ -406,6 +421,7 @@ class Scene(Simulated):
         threads: int = PATH_THREADS,
         radius_model: str | None = None,
         client: str = "",
+        stop: Stop = NEVER,
         **parameters: Any,
     ) -> Iterator[Part]:
         """Ask `op` (collide, distance, contacts, sweep) along the poses; the answers come part by part, in order.
@@ -416,12 +432,12 @@ class Scene(Simulated):
         """
         opened = self.take()
         try:
-            data, avatar = opened.radius_model(radius_model), self.avatar(name, client)
-            ask, total = path_question(data, avatar, make_poses(poses), op, parameters)
+            data, avatar = with_stop(opened.radius_model(radius_model), stop), self.avatar(name, client)
+            ask, total = path_question(data, avatar, make_poses(poses), op, parameters, stop)
 
-            def ask_held(start: int, stop: int) -> Cost:
+            def ask_held(start: int, end: int) -> Cost:
                 with opened.taken():  # whoever wanted the parts may be gone, and their hold with them
-                    part = ask(start, stop)
+                    part = ask(start, end)
                 self._metrics.answered(client, name, part)
                 return part
 
@@ -438,3 +454,8 @@ class Scene(Simulated):
         with suppress(BadRequestError), self.take() as opened:  # closed, it keeps nothing for anybody
             opened.prefetcher.leave_client(client)
         self._metrics.drop_client(client)
+
+
+def _count(rows: ArrayLike) -> int:
+    """Return how many rows an argument has; 0 for one that the question is about to refuse."""
+    return len(rows) if isinstance(rows, Sized) else 0

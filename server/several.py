@@ -12,6 +12,7 @@ all. What a request may cost is for all of them together: each archive is given 
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import ExitStack
+from functools import partial
 from typing import Any, NamedTuple, TypeVar, Unpack
 
 import numpy as np
@@ -30,14 +31,14 @@ from ..schemas.answers import (
 )
 from ..schemas.errors import BadRequestError, SolidcloudError
 from ..schemas.messages import AvatarInfo, ReloadAnswer, SceneInfo, StatsAnswer
-from ..schemas.requests import QuestionOptions, make_objects, make_poses, make_vectors
+from ..schemas.requests import make_objects, make_poses, make_vectors
 from .avatar import AvatarModel
 from .collide import collide
 from .config import AvatarLimits
 from .contacts import contacts
 from .described import info_of_several, sources_asked, stats_of_several
 from .distance import distance
-from .effort import NO_LIMIT, Effort, make_effort
+from .effort import NO_LIMIT, Effort, EngineOptions, make_effort
 from .merged import carried, limited, merged
 from .metrics import Metrics
 from .objects import SCENE_GROUP
@@ -46,10 +47,12 @@ from .opened import HeldParts, Opened
 from .path import PATH_THREADS, largest_part, path_parts
 from .posed import Pose, archive_pose, inverse_of, moved, turned, under
 from .rays import make_directions, raycast
-from .request import SceneData
+from .request import SceneData, with_stop
 from .scene import Scene
 from .several_path import LISTED, Ask, Leg, along, in_budget
 from .simulated import Simulated
+from .stop import NEVER, Stop
+from .stopped_answers import ask_until_stopped
 from .sweep import sweep
 from .within import within
 
@@ -173,26 +176,30 @@ class SeveralScenes(Simulated):
 
     def _each(
         self,
+        question: Callable[..., _A],
         k: int,
         prepare: Callable[[_Archive, Opened], tuple[Ask[_A], bool]],
         tolerance: float = 0.0,
         budget_ms: float | None = None,
         budget_visits: int | None = None,
         radius_model: str | None = None,
+        stop: Stop = NEVER,
     ) -> _A:
         """Ask every archive about k poses (rays, points, motions, objects), and merge.
 
-        prepare: what asks an archive, and whether what is looked at is passed by (`Effort.scan`).
+        question: what is asked.  prepare: what asks an archive, and whether what is looked at is passed by
+        (`Effort.scan`).
         """
-        effort = make_effort(tolerance, budget_ms, budget_visits)
+        effort = make_effort(tolerance, budget_ms, budget_visits, stop)
         visits = np.zeros(k, np.int64)
         answers: list[_A] = []
         first = 0
         for archive in self._archives:
             with archive.scene.take() as opened:
-                data = opened.radius_model(radius_model)
+                data = with_stop(opened.radius_model(radius_model), stop)
                 ask, scan = prepare(archive, opened)
-                found = in_budget(ask, data, effort._replace(scan=scan), visits)
+                own = effort._replace(scan=scan)
+                found = ask_until_stopped(question, k, own, partial(in_budget, ask, data, own, visits))
                 answers.append(carried(found, archive.pose, first))
                 first += sources_asked(opened)
             if effort.visits < NO_LIMIT:
@@ -207,7 +214,7 @@ class SeveralScenes(Simulated):
         poses: Sequence[ArrayLike],
         what: tuple[Any, ...],
         around: float,
-        options: QuestionOptions,
+        options: EngineOptions,
     ) -> _A:
         """Ask about an avatar; poses: (k, 4, 4) each, the last of the last ones is where its user is.
 
@@ -223,7 +230,7 @@ class SeveralScenes(Simulated):
 
             return ask, opened.saw((client, name), avatar, own[-1], around)
 
-        answers = self._each(len(arrays[0]), prepare, **options)
+        answers = self._each(question, len(arrays[0]), prepare, **options)
         self._metrics.answered(client, name, answers)
         return answers
 
@@ -234,7 +241,7 @@ class SeveralScenes(Simulated):
         margin: float = 0.0,
         *,
         client: str = "",
-        **options: Unpack[QuestionOptions],
+        **options: Unpack[EngineOptions],
     ) -> CollideAnswers:
         """Whether avatar `name` touches any archive under each of the poses (k, 4, 4); see `Scene.collide`."""
         return self._ask(collide, name, client, [poses], (margin,), margin, options)
@@ -246,7 +253,7 @@ class SeveralScenes(Simulated):
         reach: float,
         *,
         client: str = "",
-        **options: Unpack[QuestionOptions],
+        **options: Unpack[EngineOptions],
     ) -> DistanceAnswers:
         """How far avatar `name` is from the nearest of all archives under each pose; see `Scene.distance`."""
         return self._ask(distance, name, client, [poses], (reach,), reach, options)
@@ -260,7 +267,7 @@ class SeveralScenes(Simulated):
         cluster_distance: float | None = None,
         *,
         client: str = "",
-        **options: Unpack[QuestionOptions],
+        **options: Unpack[EngineOptions],
     ) -> ContactsAnswers:
         """Which pairs are in contact, of all archives together, deepest first; see `Scene.contacts`.
 
@@ -277,7 +284,7 @@ class SeveralScenes(Simulated):
         margin: float = 0.0,
         *,
         client: str = "",
-        **options: Unpack[QuestionOptions],
+        **options: Unpack[EngineOptions],
     ) -> SweepAnswers:
         """When avatar `name` first touches any archive on its way between poses; see `Scene.sweep`."""
         options.setdefault("tolerance", 1e-6)
@@ -291,7 +298,7 @@ class SeveralScenes(Simulated):
         origins: ArrayLike,
         directions: ArrayLike,
         reach: float,
-        **options: Unpack[QuestionOptions],
+        **options: Unpack[EngineOptions],
     ) -> RaycastAnswers:
         """Which sphere of all archives rays (k, 3), (k, 3) hit first, up to `reach` [m]; see `Scene.raycast`."""
         begins, ways = make_vectors(origins, "origins"), make_vectors(directions, "directions")
@@ -301,11 +308,11 @@ class SeveralScenes(Simulated):
             own, along = archive.points_in(begins), archive.ways_in(ways)
             return (lambda data, effort, k: raycast(data, own[k], along[k], reach, effort)), False
 
-        answers = self._each(len(begins), prepare, **options)
+        answers = self._each(raycast, len(begins), prepare, **options)
         self._metrics.answered("", "", answers)
         return answers
 
-    def within(self, points: ArrayLike, reach: float, **options: Unpack[QuestionOptions]) -> WithinAnswers:
+    def within(self, points: ArrayLike, reach: float, **options: Unpack[EngineOptions]) -> WithinAnswers:
         """Which point of all archives is nearest to each loose point (k, 3), up to `reach` [m]; see `Scene.within`."""
         places = make_vectors(points, "points")
 
@@ -313,7 +320,7 @@ class SeveralScenes(Simulated):
             own = archive.points_in(places)
             return (lambda data, effort, k: within(data, own[k], reach, effort)), False
 
-        answers = self._each(len(places), prepare, **options)
+        answers = self._each(within, len(places), prepare, **options)
         self._metrics.answered("", "", answers)
         return answers
 
@@ -323,7 +330,7 @@ class SeveralScenes(Simulated):
         margin: float = 0.0,
         *,
         client: str = "",
-        **options: Unpack[QuestionOptions],
+        **options: Unpack[EngineOptions],
     ) -> ObjectsAnswers:
         """Which of several avatars touch any archive, and one another; see `Scene.objects`.
 
@@ -345,7 +352,7 @@ class SeveralScenes(Simulated):
 
             return ask, False
 
-        answers = self._each(len(items), prepare, **options)
+        answers = self._each(ask_objects, len(items), prepare, **options)
         self._metrics.answered(client, "", answers)
         return answers
 
@@ -358,6 +365,7 @@ class SeveralScenes(Simulated):
         threads: int = PATH_THREADS,
         radius_model: str | None = None,
         client: str = "",
+        stop: Stop = NEVER,
         **parameters: Any,
     ) -> Iterator[Part]:
         """Ask `op` along the poses, of all archives together; the answers come part by part; see `Scene.path`."""
@@ -368,16 +376,21 @@ class SeveralScenes(Simulated):
                 taken.append(archive.scene.take())
             firsts = [0, *np.cumsum([sources_asked(opened) for opened in taken]).tolist()]
             legs = [
-                Leg(opened.radius_model(radius_model), archive.pose, first, archive.poses_in(array))
+                Leg(
+                    with_stop(opened.radius_model(radius_model), stop),
+                    archive.pose,
+                    first,
+                    archive.poses_in(array),
+                )
                 for opened, archive, first in zip(taken, self._archives, firsts, strict=False)
             ]
-            ask, total = along(legs, avatar, op, parameters)
+            ask, total = along(legs, avatar, op, parameters, stop)
 
-            def ask_held(start: int, stop: int) -> Cost:
+            def ask_held(start: int, end: int) -> Cost:
                 with ExitStack() as stack:  # whoever wanted the parts may be gone, and their holds with them
                     for opened in taken:
                         stack.enter_context(opened.taken())
-                    part = ask(start, stop)
+                    part = ask(start, end)
                 self._metrics.answered(client, name, part)
                 return part
 

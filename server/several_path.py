@@ -15,6 +15,7 @@ from .merged import carried, limited, merged
 from .path import path_question
 from .posed import Pose
 from .request import SceneData
+from .stop import NEVER, Stop
 
 _A = TypeVar("_A", bound=Cost)
 # Asks one archive about some rows of a request.
@@ -55,12 +56,12 @@ def in_budget(ask: Ask[_A], data: SceneData, effort: Effort, visits: NDArray[np.
 
 
 def along(
-    legs: Sequence[Leg], avatar: AvatarModel, op: str, parameters: dict[str, Any]
+    legs: Sequence[Leg], avatar: AvatarModel, op: str, parameters: dict[str, Any], stop: Stop = NEVER
 ) -> tuple[Callable[[int, int], Cost], int]:
     """What answers [start, stop) of a path through all archives, and how many answers there are."""
     begin = time.perf_counter()
     # All poses are checked here, so that an error names one by its place on the path.
-    asks = [path_question(leg.data, avatar, leg.poses, op, parameters) for leg in legs]
+    asks = [path_question(leg.data, avatar, leg.poses, op, parameters, stop) for leg in legs]
     visits, budget_ms = parameters.get("budget_visits"), parameters.get("budget_ms")
     limit = parameters.get("limit")
 
@@ -73,16 +74,16 @@ def along(
             options = parameters | {"budget_visits": effort.visits}
             if budget_ms is not None:
                 options["budget_ms"] = max(0.0, budget_ms - (time.perf_counter() - begin) * 1e3)
-            return path_question(data, avatar, own, op, options)[0](0, k.stop - k.start)
+            return path_question(data, avatar, own, op, options, stop)[0](0, k.stop - k.start)
 
         return in_budget(ask, leg.data, Effort(visits=int(visits or 0)), spent)
 
-    def ask(start: int, stop: int) -> Cost:
-        spent = np.zeros(stop - start, np.int64)
+    def ask(start: int, end: int) -> Cost:
+        spent = np.zeros(end - start, np.int64)
         answers: list[Cost] = []
         for leg, (ask_all, _) in zip(legs, asks, strict=True):
-            if visits is None or stop == start:
-                found = ask_all(start, stop)
+            if visits is None or end == start:
+                found = ask_all(start, end)
             else:
                 found = ask_bounded(leg, start, spent)
                 spent += found.node_visits  # type: ignore[attr-defined]  # all answers have them

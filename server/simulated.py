@@ -15,6 +15,7 @@ from ..schemas.scene import SceneFile, scene_of
 from .posed import moved
 from .served import EVERYBODY
 from .simulation import Simulation, Stage
+from .stop import NEVER, Stop
 from .within import within
 
 _MAKING = threading.Lock()
@@ -68,10 +69,17 @@ class Simulated:
         return made
 
     def move(
-        self, name: str, pose_from: Any, pose_to: Any, seconds: float = FRAME_SECONDS, *, client: str = ""
+        self,
+        name: str,
+        pose_from: Any,
+        pose_to: Any,
+        seconds: float = FRAME_SECONDS,
+        *,
+        client: str = "",
+        stop: Stop = NEVER,
     ) -> Moved:
         """Where avatar `name` gets from one pose (1, 4, 4) towards another in a frame; nothing is remembered.
 
         What it touches stops it. See `Simulation.move`.
         """
-        return self.simulation.move(name, pose_from, pose_to, seconds, client=client)
+        return self.simulation.move(name, pose_from, pose_to, seconds, client=client, stop=stop)

@@ -22,9 +22,10 @@ from ..schemas.answers import (
     Part,
     RaycastAnswers,
     SweepAnswers,
+    Verdict,
     WithinAnswers,
 )
-from ..schemas.errors import BadRequestError, BusyError, InternalError, SolidcloudError
+from ..schemas.errors import BadRequestError, BusyError, ExpiredError, InternalError, SolidcloudError
 from ..schemas.keys import User, public_id
 from ..schemas.messages import AvatarInfo, ReloadAnswer, SceneInfo, StatsAnswer
 from ..schemas.moves import FRAME_SECONDS, Moved, MoveRequest, State, Wish
@@ -34,8 +35,10 @@ from .avatar import AvatarModel
 from .config import AvatarLimits
 from .describe import describe_scene
 from .effects.frame import Body
+from .effort import EXACT, Effort
 from .served import EVERYBODY, Outcome, SceneLike, Turn
-from .vectors import unit
+from .stop import NEVER, Stop, StoppedError
+from .vectors import size, unit
 from .wishes import Pose, check_rigid, first_pose, frame_seconds, wished_pose
 
 log = logging.getLogger(__name__)
@@ -50,7 +53,13 @@ class Pipeline(Protocol):
     """The effects that a scene declares, as effects/pipeline.py makes them."""
 
     def run(
-        self, body: Body, wish: Pose, seconds: float, *, skip: Collection[str] | None = None
+        self,
+        body: Body,
+        wish: Pose,
+        seconds: float,
+        effort: Effort = EXACT,
+        *,
+        skip: Collection[str] | None = None,
     ) -> Moved: ...
 
 
@@ -158,10 +167,12 @@ class Simulation:
         seconds: float = FRAME_SECONDS,
         *,
         client: str = "",
+        stop: Stop = NEVER,
     ) -> Moved:
         """Where avatar `name` gets from one pose (1, 4, 4) towards another in a frame; nothing is remembered.
 
-        seconds: that the frame lasts [s]. Raises BadRequestError, BadTransformError, UnknownAvatarError.
+        seconds: that the frame lasts [s].  stop: ends the frame early: the avatar stays, and its verdict is unknown.
+        Raises BadRequestError, BadTransformError, UnknownAvatarError.
         """
         asked = MoveRequest(
             avatar=name,
@@ -173,13 +184,18 @@ class Simulation:
         begin = check_rigid(asked.pose_from[0].copy(), "pose_from")
         wish = check_rigid(asked.pose_to[0], "pose_to")
         body = _body(user, self.served.avatar(name, client), begin)
-        return self._pipeline.run(body, wish, asked.seconds)
+        try:
+            return self._pipeline.run(body, wish, asked.seconds, Effort(stop=stop))
+        except StoppedError:
+            left = size(wish[:3, 3] - begin[:3, 3])
+            return Moved(pose=begin[None], verdict=int(Verdict.UNKNOWN), left=left)
 
     def step(
         self,
         turns: Sequence[Turn],
         now: float | None = None,
         skips: Sequence[Collection[str]] | None = None,
+        stops: Sequence[Stop] | None = None,
     ) -> list[Outcome]:
         """One frame of everybody who wished, one after the other in the order of `turns`; what came of each.
 
@@ -187,6 +203,7 @@ class Simulation:
         refused for is its outcome; the others go on.
         now: on a clock of the caller's [s]; who has not wished for SILENT_SECONDS of it ends first; None: nobody does.
         skips: of each turn, the effects to be left out, as a frame recorded says; None: as the frame's budget has it.
+        stops: of each turn, what ends it early: its user stays where it was, and the outcome is ExpiredError.
         """
         with self._frame:
             if now is not None:
@@ -195,20 +212,25 @@ class Simulation:
             outcomes, opened = [], []
             for number, turn in enumerate(turns):
                 skip = None if skips is None else skips[number]
-                outcomes.append(Outcome(turn.user, self._turn(turn, now, skip)))
+                stop = NEVER if stops is None else stops[number]
+                outcomes.append(Outcome(turn.user, self._turn(turn, now, skip, stop)))
                 there = self._present.get(turn.user)
                 opened.append(() if there is None else there.body.generations)
             if self._recorder is not None:
                 self._recorder.frame(self._frames, turns, outcomes, opened)
             return outcomes
 
-    def _turn(self, turn: Turn, now: float | None, skip: Collection[str] | None) -> State | SolidcloudError:
+    def _turn(
+        self, turn: Turn, now: float | None, skip: Collection[str] | None, stop: Stop
+    ) -> State | SolidcloudError:
         """One user's frame; what it is refused for is returned."""
         begin = time.perf_counter()
         try:
-            moved = self._moved(turn.user, turn.wish, now, skip)
+            moved = self._moved(turn.user, turn.wish, now, skip, stop)
         except SolidcloudError as error:
             return error
+        except StoppedError:
+            return ExpiredError(f"{stop.reason}: the user stays where it was")
         except Exception as error:  # of this user alone: the others' frames go on
             log.exception("a frame of %s in %s", _public_name(turn.user), self.name)
             return InternalError(f"{type(error).__name__} in the server: its log says more")
@@ -222,7 +244,9 @@ class Simulation:
             seconds=time.perf_counter() - begin,
         )
 
-    def _moved(self, user: User, wish: Wish, now: float | None, skip: Collection[str] | None) -> Moved:
+    def _moved(
+        self, user: User, wish: Wish, now: float | None, skip: Collection[str] | None, stop: Stop
+    ) -> Moved:
         """What comes of one wish; its user's body is begun with it, and not where it is refused."""
         there = self._present.get(user)
         present = self._begun(user, wish) if there is None else there
@@ -233,7 +257,7 @@ class Simulation:
                 if self._bodies is None:
                     raise BadRequestError(f"{self.name}: a wish moves objects: this scene has none")
                 refused.callback(self._bodies.tell(wish.objects))
-            moved = self._pipeline.run(present.body, aim, seconds, skip=skip)
+            moved = self._pipeline.run(present.body, aim, seconds, Effort(stop=stop), skip=skip)
             refused.pop_all()
         present.time = wish.time
         present.heard = present.heard if now is None else now

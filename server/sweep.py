@@ -146,6 +146,8 @@ def sweep(
             starts,
             rows,
         )
+        if needed < 0:
+            break
         if needed > len(rows):
             rows = np.empty(2 * needed, np.int64)
             continue
@@ -154,6 +156,9 @@ def sweep(
         around = Reach(scales, units, starts, rows, boxes, outside)
         for part, held_rows, reach in pieces(around, residency, effort.share):
             chunk = len(part) if effort.deadline == np.inf else _PER_CALL
+            if effort.stop:
+                progress.lower[part] = np.minimum(progress.lower[part], progress.at[part])
+                continue
             with residency.hold(held_rows, effort.loads_until(), scan=effort.scan) as held:
                 seen = as_held(data, held)
                 for at in range(0, len(part), chunk):
@@ -166,6 +171,10 @@ def sweep(
                     )  # fmt: skip
             spent.add(held)
         which = _next_round(which, progress, proved)
+        if effort.stop:
+            break
+    # Those that were stopped on their way: nothing is known beyond.
+    proved[which] = np.minimum(proved[which], progress.at[which])
     until = np.minimum(progress.upper, 1.0)
     lost = np.empty(k)
     look_around(

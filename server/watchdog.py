@@ -23,12 +23,14 @@ class Watchdog:
     """Calls a function at intervals while there is something to look at.
 
     look: takes the time on `time.monotonic`'s clock [s] and returns whether anything is at work. It is called every
-    `PERIOD` then, and once in `idle` seconds otherwise.
+    `period` seconds then, and once in `idle` seconds otherwise.
     """
 
-    def __init__(self, look: Callable[[float], bool], *, idle: float = LINGER) -> None:
+    def __init__(
+        self, look: Callable[[float], bool], *, period: float = PERIOD, idle: float = LINGER
+    ) -> None:
         """Make a watchdog that does not look yet."""
-        self._look, self._idle = look, idle
+        self._look, self._period, self._idle = look, period, idle
         self._woken = threading.Event()
         self._closed = False
         self.asleep = True
@@ -52,7 +54,7 @@ class Watchdog:
             if self._is_busy(now):
                 until = now + LINGER
             if now < until:
-                if self._woken.wait(PERIOD):
+                if self._woken.wait(self._period):
                     self._woken.clear()
                 continue
             # Whoever begins after this wakes the thread, even before it waits.

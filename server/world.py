@@ -24,9 +24,10 @@ from .near import near
 from .opened import Opened
 from .posed import inverse_of, moved, turned, under
 from .probe import Probe, Swept
-from .request import SceneData
+from .request import SceneData, with_stop
 from .scene import Scene
 from .served import EVERYBODY
+from .stop import NEVER, Stop
 from .vectors import lowest_of, unit
 from .within import within
 
@@ -60,6 +61,7 @@ class _Held(threading.local):
 
     depth = 0
     visits = 0
+    stop: Stop = NEVER
 
     def __init__(self) -> None:
         self.seen: list[Seen] = []
@@ -94,7 +96,8 @@ class World:
                 for placed in self.scenes:
                     opened = placed.scene.take()
                     seen.append(Seen(opened, opened.data, placed))
-                    seen[-1] = Seen(opened, opened.radius_model(self.file.radius_model), placed)
+                    data = with_stop(opened.radius_model(self.file.radius_model), held.stop)
+                    seen[-1] = Seen(opened, data, placed)
             except BaseException:
                 for each in seen:
                     each.opened.release()
@@ -102,6 +105,10 @@ class World:
             held.seen = seen
         held.depth += 1
         return held.seen
+
+    def stop_by(self, stop: Stop) -> None:
+        """Have `stop` end early what this thread asks from the next hold on."""
+        self._held.stop = stop
 
     def __exit__(self, *_: object) -> None:
         """Let them go."""

@@ -122,6 +122,7 @@ def open_made(folder: Path, model: str | None = None, budget_bytes: int = ROOM) 
         lattice.voxel_steps,
         block_words(header.radius_class),
         radii.max() - radii,
+        np.zeros(1, np.int64),
     )
     broad = SceneIndex(
         archive.voxels["key"].astype(np.uint64),

@@ -17,12 +17,16 @@ import llvmlite
 import numba
 import numpy as np
 from numba.core import config as numba_config
+from numba.core import types
 from numba.core.caching import _Cache
 from numba.core.compiler import CompileResult
 from numba.core.serialize import dumps
+from numba.extending import intrinsic
 
 from ..kernel_files import KernelFiles, default_folder
 from ..kernel_sources import source_digest
+
+__all__ = ["config", "intrinsic", "kernel_files", "njit", "types"]
 
 # Its attributes are made when it is imported, out of sight of type checkers.
 config: Any = numba_config

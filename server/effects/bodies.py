@@ -20,6 +20,7 @@ from ..kernels.near_bodies import bound_body
 from ..kernels.pairs import CONTACT, touch_pairs
 from ..kernels.placing import MAX_REACH_UNITS, SIMILARITY_TOLERANCE
 from ..request import kernel_poses, to_units
+from ..stop import NEVER
 from ..vectors import level, turned_back, turned_by
 from .frame import Body, Pose, Vec
 
@@ -297,7 +298,7 @@ class Bodies:
             verdict = np.empty(len(at), np.uint8)
             touch_pairs(
                 shape.model.arrays, model.arrays, poses, scales, units, pairs, margin_units, self.origin, _EVER,
-                verdict, self.scratch.counters,
+                NEVER.flag, verdict, self.scratch.counters,
             )  # fmt: skip
             found[at] = verdict == CONTACT
         return found

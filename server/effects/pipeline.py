@@ -17,6 +17,7 @@ from ...schemas.errors import BadRequestError
 from ...schemas.moves import FRAME_SECONDS, Moved, Touched
 from ...schemas.scene import SceneFile, effect_name
 from ..effort import EXACT, Effort
+from ..stop import StoppedError
 from ..vectors import size
 from ..world import World
 from . import NEVER_SKIPPED, ORDER
@@ -95,7 +96,7 @@ class Pipeline:
 
         seconds: that the frame lasts.  skip: the effects to leave out, as a frame before had to; None: those that the
         frame's budget has no room for. The body is as it was where this raises: BadRequestError for a wish that is
-        farther than limits.longest_move, and what questions about its poses raise.
+        farther than limits.longest_move, what questions about its poses raise, and StoppedError.
         """
         begin = time.perf_counter()
         body.pose = np.ascontiguousarray(body.pose, np.float64)
@@ -108,6 +109,7 @@ class Pipeline:
             )
         frame = Frame(body, wish, seconds, self.world, effort, body.pose)
         frame.fall_speed, frame.on_ground = body.fall_speed, body.on_ground
+        self.world.stop_by(effort.stop)
         with self.world as seen:
             frame.generations = tuple([each.opened.number for each in seen])
             for runner in self._beginners:
@@ -127,6 +129,8 @@ class Pipeline:
             if any(each.overlaps(body.avatar, frame.pose) for each in frame.obstacles):
                 frame.verdict = Verdict.CONTACT
             self.world.saw(body.user, body.avatar, frame.pose)
+        if effort.stop:  # what the effects made of unfinished answers counts for nothing
+            raise StoppedError
         body.pose, body.clear, body.generations = frame.pose, frame.clear, frame.generations
         body.fall_speed, body.on_ground = frame.fall_speed, frame.on_ground
         body.kept.update(frame.kept)

@@ -15,6 +15,7 @@ from .motion import make_motion, pose_at
 from .moving import Job, make_moving
 from .placing import largest_term, place
 from .reach import find_key
+from .stopping import stopped
 from .sweep import search
 
 # What a segment covers, and with it what must be resident together: four avatars and 8 m more.
@@ -154,6 +155,8 @@ def _list_rows(begin, end, span, still, scene, index, rows, count):
     sides = last - first + 1
     total = index.keys.shape[0] if listed else sides[0] * sides[1] * sides[2]
     for n in range(total):
+        if stopped(scene.stop):
+            return count
         row = n
         if not listed:
             ix = first[0] + n // (sides[1] * sides[2])
@@ -184,12 +187,15 @@ def plan_segments(box, first, last, avatar, scales, units, scene, index, which, 
     progress.at and moves it on to where the segment begins, all before being out of reach of everything; writes end and
     speed; `at` is 1 for a motion with nothing left in reach, which gets no rows. Fills starts (k + 1,) and rows
     (capacity,) int64, with no rows for motions not in `which` (ascending). Returns how many rows there are; those
-    beyond the capacity are not written, and progress.at is then as it was.
+    beyond the capacity are not written, and progress.at is then as it was. Returns -1, and progress.at as it was, when
+    the scene's stop flag is set.
     """
     pose, shift, begin, end = np.empty((4, 4)), np.empty(3), np.empty(3), np.empty(3)
     moved = np.empty(which.shape[0])
     count, next_start = 0, 0
     for number in range(which.shape[0]):
+        if stopped(scene.stop):
+            return -1
         i = which[number]
         starts[next_start : i + 1] = count
         next_start = i + 1
@@ -199,7 +205,7 @@ def plan_segments(box, first, last, avatar, scales, units, scene, index, which, 
         most = min(_SEGMENT_SIZES * size + _SEGMENT_MORE, _SEGMENT_STEPS * scene.step)
         segment = _longest(motion, most, _SEGMENT_BEND * size)
         t, length, before = progress.at[i], 1.0, count
-        while t < 1.0 and count == before:
+        while t < 1.0 and count == before and not stopped(scene.stop):
             # Far away the whole rest of the way is tried first, then half of it ...
             length = min(max(length, segment), 1.0 - t)
             stop = 1.0 if t + length >= 1.0 - 1e-12 else t + length
@@ -216,6 +222,8 @@ def plan_segments(box, first, last, avatar, scales, units, scene, index, which, 
             else:
                 progress.end[i] = stop
         moved[number] = t
+    if stopped(scene.stop):
+        return -1
     starts[next_start:] = count
     if count <= rows.shape[0]:
         for number in range(which.shape[0]):
@@ -233,7 +241,8 @@ def sweep_segments(
     box, first, last, scales, units: as in `plan_segments`.  loose: (k,) what units may differ by on the way.  starts,
     rows: the voxels of each motion's segment that this piece holds.  tolerance: [m].  Lowers progress.lower and upper,
     names a witness with upper, and adds to counts (4, k): voxels missing, node visits, point tests, advances.
-    A voxel that is not resident is unknown from where the root sphere's cube reaches it.
+    A voxel that is not resident is unknown from where the root sphere's cube reaches it. Once the scene's stop flag is
+    set, a motion is unknown from where it has come to.
     """
     moving = make_moving(avatar, scene.drop)
     begin, end = np.empty(3), np.empty(3)
@@ -241,7 +250,7 @@ def sweep_segments(
         i = which[number]
         if starts[i + 1] == starts[i]:
             continue
-        if progress.visits[i] < 0:
+        if progress.visits[i] < 0 or stopped(scene.stop):
             progress.lower[i] = min(progress.lower[i], progress.at[i])
             continue
         motion = make_motion(first[i], last[i], box, scene.origin)
@@ -363,11 +372,15 @@ def look_around(box, first, last, avatar, scales, units, scene, index, unknown, 
     lost (k,) float64, when it first meets one of the boxes unknown (u, 2, 3) int64 [steps], inf: never.
 
     The reach is the cube around the avatar's root sphere, as `collide` has it, along chords; neither depends on voxels.
+    Once the scene's stop flag is set, motions are outside and lost from their beginning.
     """
     pose, shift, begin, end = np.empty((4, 4)), np.empty(3), np.empty(3), np.empty(3)
     for i in range(first.shape[0]):
         motion = make_motion(first[i], last[i], box, scene.origin)
         outside[i], lost[i] = False, INFINITE
+        if stopped(scene.stop):
+            outside[i], lost[i] = True, 0.0
+            continue
         size = _size_of(box, scales[i], units[i])
         parts = int(min(1024.0, math.ceil(math.sqrt(motion.bend / size) * until[i]))) + 1
         parts = 1 if motion.bend == 0.0 else parts

@@ -20,6 +20,7 @@ from .lanes import keep_near
 from .layout import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, node_class, point_class, scan_run
 from .overlap import STACK, nodes_meet
 from .placed import ByClass, make_by_class, make_placed, pair_square, place_block, place_nodes, set_by_class
+from .stopping import stopped
 
 
 class Nearer(NamedTuple):
@@ -144,6 +145,8 @@ def _search_voxel(avatar, m, placed, scene, voxel, reach_units, margin_units, vi
         rooms[node_class(ints, base, mask)],
     ) else 0  # fmt: skip
     while depth > 0:
+        if stopped(scene.stop):
+            return False
         depth -= 1
         a, row = stack[depth, 0], stack[depth, 1]
         a_first, b_first = first[a], ints[row + FIRST]

@@ -16,6 +16,7 @@ from ...schemas.kernels import compiling as nb
 from .closer import compare_gaps
 from .compiled import borrowing
 from .placed import U32
+from .stopping import stopped
 
 # Columns of a record; the first ORDER of them say which pair is deeper: |a - b|^2 [exact units^2] and by how much the
 # scan point's sphere is smaller than the largest [exact units]; where the gaps of two are equal, compared in turn: scan
@@ -97,11 +98,15 @@ def _sift_down(rows, n, at):
 
 
 @nb.njit(nogil=True, cache=True)
-def sort_rows(rows, n):
-    """Sort rows[:n] deepest first, in place (Williams, heapsort)."""
+def sort_rows(rows, n, stop):
+    """Sort rows[:n] deepest first, in place (Williams, heapsort), until the stop flag is set."""
     for at in range(n // 2 - 1, -1, -1):
+        if stopped(stop):
+            return
         _sift_down(rows, n, at)
     for end in range(n - 1, 0, -1):
+        if stopped(stop):
+            return
         _swap(rows, 0, end)
         _sift_down(rows, end, 0)
 
@@ -240,12 +245,14 @@ def _root(parent, row):
 
 
 @nb.njit(nogil=True, cache=True)
-def _join_neighbours(cells, used, parent):
-    """Fill parent (used,): union-find over cells that share a face, an edge or a corner."""
+def _join_neighbours(cells, used, parent, stop):
+    """Fill parent (used,): union-find over cells that share a face, an edge or a corner, until the stop flag is set."""
     table = cells.table
     for row in range(used):
         parent[row] = row
     for row in range(used):
+        if stopped(stop):
+            return
         # Half of the 26 neighbours: of two neighbours each other's, one looks.
         for n in range(14, 27):
             slot = find_slot(
@@ -271,21 +278,24 @@ def _with_room(rows, used, more):
 
 
 @nb.njit(nogil=True, cache=True)
-def list_pose(memory, runs):
+def list_pose(memory, runs, stop):
     """List the pairs and clusters of the pose at hand, deepest first, and forget its cells.
 
-    Writes runs (4,) int64: first pair, pairs, first cluster, clusters. Returns the memory, its lists grown.
+    Writes runs (4,) int64: first pair, pairs, first cluster, clusters. Returns the memory, its lists grown, and whether
+    the pose is listed: when the stop flag (1,) is set it has no pairs and no clusters, and the memory takes no more.
     """
     cells, heap, sizes = memory.cells, memory.heap, memory.sizes
     table, used, kept = cells.table, sizes[CELLS], sizes[KEPT]
     parent, found = np.empty(used, np.int64), 0
-    _join_neighbours(cells, used, parent)
+    _join_neighbours(cells, used, parent, stop)
     for row in range(used):
         found += 1 if parent[row] == row else 0
     clusters = _with_room(memory.clusters, sizes[CLUSTERS], found)
     own = clusters[sizes[CLUSTERS] :]
     rank, at = np.empty(used, np.int64), 0
     for row in range(used):  # a root comes before all that hang below it
+        if stopped(stop):
+            break
         root = _root(parent, row)
         if root == row:
             own[at] = table[row, :CLUSTER]
@@ -300,11 +310,16 @@ def list_pose(memory, runs):
         for r in range(3):
             own[mine, LOW + r] = min(own[mine, LOW + r], table[row, LOW + r])
             own[mine, HIGH + r] = max(own[mine, HIGH + r], table[row, HIGH + r])
-    sort_rows(own, found)
-    for at in range(found):
-        rank[own[at, TAG]] = at
-    sort_rows(heap, kept)
+    sort_rows(own, found, stop)
+    if not stopped(stop):
+        for at in range(found):
+            rank[own[at, TAG]] = at
+    sort_rows(heap, kept, stop)
     pairs = _with_room(memory.pairs, sizes[LISTED], kept)
+    if stopped(stop):  # what stands above may be in any order
+        runs[0], runs[1], runs[2], runs[3] = sizes[LISTED], 0, sizes[CLUSTERS], 0
+        sizes[CELLS], sizes[KEPT], sizes[LAST] = 0, 0, -1
+        return Memory(cells, heap, sizes, memory.cursor, memory.stack, pairs, clusters), False
     for i in range(kept):
         pairs[sizes[LISTED] + i] = heap[i]
         pairs[sizes[LISTED] + i, TAG] = rank[_root(parent, heap[i, TAG])]
@@ -313,4 +328,4 @@ def list_pose(memory, runs):
     sizes[CLUSTERS] += found
     empty_cells(cells, used)
     sizes[CELLS], sizes[KEPT], sizes[LAST] = 0, 0, -1
-    return Memory(cells, heap, sizes, memory.cursor, memory.stack, pairs, clusters)
+    return Memory(cells, heap, sizes, memory.cursor, memory.stack, pairs, clusters), True

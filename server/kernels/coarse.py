@@ -16,6 +16,7 @@ from .front import MAX_FRONT, place_front, sift
 from .layout import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, node_class
 from .overlap import lanes_meet, make_spot, nodes_meet
 from .placed import make_by_class, make_placed, place_block, place_root, set_by_class
+from .stopping import stopped
 
 # Nodes of a slot, 48 bytes each. Of the pairs of pose and voxel that are clear on the walk through a made town of 10^7
 # points (voxels of 8 m, 282 KB decoded in the mean) 32 nodes settle 14 %, 64 35 %, 96 45 %, 128 52 %, 192 59 %; on the
@@ -117,7 +118,7 @@ def _settle_pairs(poses, avatar, scene, coarse, reach, starts, rows, placed, by_
         for at in range(reach.starts[i], reach.starts[i + 1]):
             voxel = reach.rows[at]
             number = np.int64(coarse.slot[voxel])
-            if number >= 0 and scene.where[voxel, 0] < 0:
+            if number >= 0 and scene.where[voxel, 0] < 0 and not stopped(scene.stop):
                 if front == 0:
                     extent, farthest = place_root(avatar, m, scale, placed, scene)
                     set_by_class(

@@ -54,6 +54,7 @@ from .placed import (
     set_by_class,
 )
 from .placing import MAX_REACH_UNITS, lattice_to_units, place, to_units
+from .stopping import stopped
 
 
 class Asked(NamedTuple):
@@ -253,14 +254,15 @@ def _gather_voxel(avatar, m, i, placed, scene, voxel, asked, memory, work, tally
     """Gather all pairs in contact of the placed avatar and one resident voxel, the two trees descended together.
 
     Goes on where memory.cursor and its stack say. Stops, and then the cursor's depth is not 0, before a node test once
-    the pose has cost `stop` node visits, and where the cells have no room for another LANES.
+    the pose has cost `stop` node visits, where the cells have no room for another LANES, and when the scene's stop
+    flag is set.
     """
     words, ints = scene.words, scene.ints
     base = scene.where[voxel, 0]
     nodes, off, stack, counts = placed.nodes, work.off, memory.stack, tally.counts
     first, held, stamp, edges = avatar.first, avatar.count, placed.stamp, asked.edges
     sizes, most_cells = memory.sizes, memory.cells.table.shape[0]
-    rooms, mask = work.by_class.room, work.by_class.mask
+    rooms, mask, flag = work.by_class.room, work.by_class.mask, scene.stop
     for r in range(3):
         off[r] = np.float32(scene.coordinates[voxel, r] * scene.voxel_steps - placed.frame[r])
     depth = memory.cursor[2]
@@ -278,6 +280,8 @@ def _gather_voxel(avatar, m, i, placed, scene, voxel, asked, memory, work, tally
         leaves = a_first < 0 and b_first < 0
         # A pair of leaf nodes costs no visits, but room.
         if sizes[CELLS] + LANES > most_cells if leaves else counts[1, i] >= stop:
+            break
+        if stopped(flag):
             break
         depth -= 1
         if leaves:
@@ -358,7 +362,7 @@ def gather_contacts(poses, avatar, scene, reach, which, asked, closes, pause, me
                 # Over the budget, and not only stopped for want of room?
                 if before >= asked.visits and not (short and cursor[2] > 0):
                     break
-                if left <= 0:
+                if left <= 0 or stopped(scene.stop):
                     return memory
                 stop = min(np.int64(asked.visits), before + left)
                 if short:
@@ -375,7 +379,8 @@ def gather_contacts(poses, avatar, scene, reach, which, asked, closes, pause, me
         if cursor[1] < end:
             tally.cut[i] = True
         if closes:
-            memory = list_pose(memory, tally.runs[i])
+            memory, listed = list_pose(memory, tally.runs[i], scene.stop)
+            tally.cut[i] |= not listed
         cursor[0] += 1
         cursor[1] = -1
     return memory

@@ -62,6 +62,7 @@ class SceneArrays(NamedTuple):
     coordinates: (v, 3) int64 voxel coordinates.  origin: (3,) float64 [m].  step: [m].
     block_words: of a block, with classes or without.  drop: (1,) or (RADIUS_CLASSES,) int64, how much smaller than
     the largest radius that of each class is, exact units; 1 where all spheres are the same.
+    stop: (1,) int64, the request's stop flag (stopping.py).
     """
 
     words: NDArray[np.float32]
@@ -75,6 +76,7 @@ class SceneArrays(NamedTuple):
     voxel_steps: int
     block_words: int
     drop: NDArray[np.int64]
+    stop: NDArray[np.int64]
 
 
 def block_words(radius_class: bool) -> int:

@@ -58,7 +58,7 @@ def nearest_resident(poses, avatar, radius, radius_units, reach_units, reach, sc
     fault, pose, found, needed = find_reach(
         poses, avatar, radius, radius_units + reach_units, scene, index, around
     )
-    ready = fault == GOOD and needed <= rows.shape[0]
+    ready = fault == GOOD and 0 <= needed <= rows.shape[0]
     if ready:
         for at in range(needed):
             ready &= scene.where[rows[at], 0] >= 0

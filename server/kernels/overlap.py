@@ -37,6 +37,7 @@ from .placed import (
 )
 from .placing import GOOD, place
 from .reach import Reach, find_reach
+from .stopping import stopped
 
 # A pair is pushed for each child of one of its nodes, so at most 15 a level stay behind on the stack: this holds
 # two trees of MOST_LEVELS.
@@ -211,7 +212,7 @@ def _below_touches(avatar, m, scale, extent, pose, placed, scene, voxel, spot, a
     steps = scale / scene.step
     below[0] = a
     depth = 1
-    while depth > 0:
+    while depth > 0 and not stopped(scene.stop):
         depth -= 1
         a = below[depth]
         a_first = avatar.first[a]
@@ -266,11 +267,11 @@ def _overlap_voxel(avatar, m, scale, extent, pose, placed, scene, voxel, spot, b
     shift, frame, step = placed.shift, placed.frame, scene.step
     off_x, off_y, off_z = spot.x, spot.y, spot.z
     rooms, mask = by_class.room, by_class.mask
-    some_smaller, room = mask > U(0), rooms[0]
+    some_smaller, room, stop = mask > U(0), rooms[0], scene.stop
     x, y, z, radius = nodes[0, 0] - off_x, nodes[1, 0] - off_y, nodes[2, 0] - off_z, nodes[3, 0]
     stack[0, 0], stack[0, 1], stack[0, 2] = spot.rows, 0, count
     depth = 1
-    while depth > 0:
+    while depth > 0 and not stopped(stop):
         depth -= 1
         row, at, count = stack[U(depth), 0], stack[U(depth), 1], stack[U(depth), 2]
         first = np.int64(ints[U(row + FIRST)])
@@ -352,7 +353,7 @@ def overlap_poses(poses, avatar, scene, reach, which, verdict, counts):
     resident is counted as missing.
     Adds to what verdict (k,) uint8 and counts (3, k) uint32 (voxels missing, node visits, point tests) hold, CLEAR
     and 0 to begin with, so that a pose may be answered in pieces: a contact wins over anything missing, and
-    that over CLEAR.
+    that over CLEAR. Once the scene's stop flag is set, poses without a contact so far become UNKNOWN.
     """
     placed, front, work = make_placed(avatar), make_front(avatar), make_work(avatar)
     by_class = make_by_class(scene.drop)
@@ -366,6 +367,9 @@ def _overlap_poses(poses, avatar, scene, reach, which, verdict, counts, placed, 
     for number in range(which.shape[0]):
         i = which[number]
         if verdict[i] == CONTACT or reach.starts[i + 1] == reach.starts[i]:
+            continue
+        if stopped(scene.stop):
+            verdict[i] = UNKNOWN
             continue
         m, scale = poses[i], reach.scales[i]
         work.counters[0], work.counters[1] = 0, 0
@@ -393,6 +397,9 @@ def _overlap_poses(poses, avatar, scene, reach, which, verdict, counts, placed, 
             ):
                 verdict[i] = CONTACT
                 break
+            if stopped(scene.stop):
+                verdict[i] = UNKNOWN
+                break
         counts[1, i] += np.uint32(work.counters[0])
         counts[2, i] += np.uint32(work.counters[1])
 
@@ -411,7 +418,7 @@ def answer_resident(poses, avatar, radius, other_units, scene, index, rows, outs
         np.empty(k), np.empty(k, np.int64), np.zeros(k + 1, np.int64), rows, np.empty((k, 2, 3)), outside
     )
     fault, pose, found, needed = find_reach(poses, avatar, radius, other_units, scene, index, reach)
-    if fault != GOOD or needed > rows.shape[0]:
+    if fault != GOOD or needed < 0 or needed > rows.shape[0]:
         return fault, pose, found, -1
     for at in range(needed):
         if scene.where[rows[at], 0] < 0:

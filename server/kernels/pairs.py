@@ -16,6 +16,7 @@ from ...schemas.voxel_grid import UNITS_PER_METRE
 from .layout import LANES
 from .placed import U32
 from .placing import MAX_REACH_UNITS, largest_term, place, to_units
+from .stopping import stopped
 
 CLEAR, CONTACT, UNKNOWN = 0, 1, 2  # schemas/answers.py Verdict
 # As in overlap.py: a pair of trees leaves at most 15 pairs a level behind.
@@ -143,8 +144,9 @@ def _leaves_touch(
 
 
 @nb.njit(nogil=True, cache=True)
-def _touch(a, ma, scale_a, b, mb, scale_b, units, origin, visits, nodes, at, lanes, counters):
-    """Whether two avatars, neither empty, touch: CLEAR, CONTACT, or UNKNOWN where the visits were spent.
+def _touch(a, ma, scale_a, b, mb, scale_b, units, origin, visits, stop, nodes, at, lanes, counters):
+    """Return whether two avatars, neither empty, touch: CLEAR or CONTACT; UNKNOWN where the visits were spent or the
+    stop flag was set.
 
     Descent after [Fig12] figures 5 and 6, corrected as in overlap.py: the larger inner node is opened, a leaf never.
     nodes: (STACK, 2) int64, at: (STACK, 6) float64, scratch: pairs to be looked at, and where their centres are.
@@ -176,7 +178,7 @@ def _touch(a, ma, scale_a, b, mb, scale_b, units, origin, visits, nodes, at, lan
         both = (radius_a + radius_b + reach) * (1.0 + 1e-12)
         if dx * dx + dy * dy + dz * dz > both * both:
             continue
-        if counters[0] > visits:
+        if counters[0] > visits or stopped(stop):
             return UNKNOWN
         first_a, first_b = a.first[i], b.first[j]
         if first_a < 0 and first_b < 0:
@@ -204,11 +206,12 @@ def _touch(a, ma, scale_a, b, mb, scale_b, units, origin, visits, nodes, at, lan
 
 
 @nb.njit(nogil=True, cache=True)
-def touch_pairs(a, b, poses, scales, units, pairs, margin_units, origin, visits, verdict, counters):
+def touch_pairs(a, b, poses, scales, units, pairs, margin_units, origin, visits, stop, verdict, counters):
     """Whether objects pairs[:, 0] of avatar a touch objects pairs[:, 1] of avatar b; neither avatar empty.
 
     poses: (n, 4, 4), checked, of all objects; scales, units: (n,), see `check_poses`, units without the margin.
-    pairs: (p, 2) int64.  origin: (3,) of the dataset [m].  visits: node visits a pair.
+    pairs: (p, 2) int64.  origin: (3,) of the dataset [m].  visits: node visits a pair.  stop: (1,) int64, the
+    request's stop flag; once it is set, pairs are UNKNOWN.
     Writes verdict (p,) uint8; adds to counters (2,) int64: node visits, pairs of points tested.
     """
     nodes, at = np.empty((STACK, 2), np.int64), np.empty((STACK, 6))
@@ -220,7 +223,7 @@ def touch_pairs(a, b, poses, scales, units, pairs, margin_units, origin, visits,
         own[1] = 0
         reach = units[i] + units[j] + margin_units
         verdict[number] = _touch(
-            a, poses[i], scales[i], b, poses[j], scales[j], reach, origin, visits, nodes, at, lanes, own
+            a, poses[i], scales[i], b, poses[j], scales[j], reach, origin, visits, stop, nodes, at, lanes, own
         )
         counters[0] += own[0]
         counters[1] += own[1]

@@ -37,6 +37,7 @@ from .nearest import box_gap
 from .overlap import STACK
 from .placed import SLACK, Placed, make_placed, place_block, place_nodes
 from .placing import MAX_REACH_UNITS
+from .stopping import stopped
 
 # The search goes on; nothing is open; what was asked is known; the budget of visits is spent.
 OPEN, DONE, ENOUGH, SPENT = range(4)
@@ -265,6 +266,9 @@ def _go_on(m, pose, avatar, scene, search, goal, enough, budget, until):
             return
         if counters[0] >= until:
             return
+        if stopped(scene.stop):
+            search.status[0] = SPENT
+            return
         at = 0 if sizes[1] == 0 else heap + sizes[1] - 1
         key, a, row, voxel = keys[at, 0], pairs[at, 0], pairs[at, 1], pairs[at, 2]
         a_first = avatar_first[a]
@@ -375,6 +379,9 @@ def search_poses(poses, avatar, scene, index, reach, which, heap, goal, known, c
     """`go_on` to the end for each of the poses numbered in `which`: one call for a request without a deadline."""
     search = make_search(avatar, scene, heap)
     for number in range(which.shape[0]):
+        if stopped(scene.stop):
+            known.lower[which[number]] = 0.0
+            continue
         go_on(
             poses, avatar, scene, index, reach, which[number], True, np.int64(1) << 62, search, goal, known, counts
         )  # fmt: skip

@@ -13,6 +13,7 @@ from .advance import Progress, avatar_box, look_around, plan_segments, sweep_seg
 from .layout import SceneArrays
 from .motion import make_motion, pose_at
 from .placing import GOOD, SIMILARITY_TOLERANCE, check_poses
+from .stopping import stopped
 
 _CLEAR, _CONTACT, _UNKNOWN = int(Verdict.CLEAR), int(Verdict.CONTACT), int(Verdict.UNKNOWN)
 
@@ -68,7 +69,7 @@ def sweep_resident(
         last[0, r, 3] -= origin[r]
     from_zero = SceneArrays(
         scene.words, scene.ints, scene.halves, scene.where, scene.coordinates, zero, scene.step, scene.units_per_step,
-        scene.voxel_steps, scene.block_words, scene.drop,
+        scene.voxel_steps, scene.block_words, scene.drop, scene.stop,
     )  # fmt: skip
     progress = Progress(
         np.zeros(1), np.ones(1), np.ones(1), np.full(1, np.inf), np.zeros(1), np.full((1, 2, 3), np.nan),
@@ -79,7 +80,7 @@ def sweep_resident(
     needed = plan_segments(
         box, first, last, avatar, scales, units, from_zero, index, which, progress, starts, rows
     )
-    if needed > rows.shape[0] or (needed > 0 and progress.end[0] < 1.0):
+    if needed < 0 or needed > rows.shape[0] or (needed > 0 and progress.end[0] < 1.0):
         return _LEFT
     for at in range(needed):
         if scene.where[rows[at], 0] < 0:
@@ -91,7 +92,7 @@ def sweep_resident(
             box, first, last, avatar, radius, other_units, scales, units, np.zeros(1), from_zero, index, starts, rows,
             which, tolerance, progress, counts,
         )  # fmt: skip
-        if progress.visits[0] < 0:
+        if progress.visits[0] < 0 or stopped(scene.stop):
             return _LEFT
         proved = progress.lower[0]
     upper = progress.upper[0]

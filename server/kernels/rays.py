@@ -30,6 +30,7 @@ from .compiled import borrowing
 from .layout import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, node_class, point_class
 from .placed import U32
 from .placing import lattice_to_units
+from .stopping import stopped
 
 # Siblings left behind by a descent of one tree.
 STACK = MAX_LEVELS * 15 + 16
@@ -241,7 +242,7 @@ def _follow(scene, voxel, rays, i, ray, near, tolerance, visits, best, rows, bou
         depth -= 1
         row, above = rows[depth], bounds[depth]
         bound = (above - error) * scene.units_per_step
-        if bound > best.value[i] - tolerance or spent >= visits:
+        if bound > best.value[i] - tolerance or spent >= visits or stopped(scene.stop):
             if bound <= best.value[i]:
                 best.unseen[i] = min(best.unseen[i], max(bound, 0.0))
             continue
@@ -270,7 +271,8 @@ def follow_rays(rays, lists, cursor, held, scene, tolerance, visits, best):
 
     lists: Lists of these rays.  cursor: (k,) int64, entries done; one at the end of its list is done altogether.
     held: (v,) bool, voxels that stay as they are during this call; of these one not resident is counted as missing.
-    tolerance: exact units.  visits: node visits a ray. Updates cursor and best.
+    tolerance: exact units.  visits: node visits a ray. Updates cursor and best. Once the scene's stop flag is set, no
+    more visits are spent.
     """
     ray = np.empty(12)
     rows, bounds = np.empty(STACK, np.int64), np.empty(STACK)
@@ -283,7 +285,7 @@ def follow_rays(rays, lists, cursor, held, scene, tolerance, visits, best):
         while cursor[i] < end:
             at = cursor[i]
             near, voxel = lists.near[at], lists.rows[at]
-            if near > best.value[i] - tolerance or best.counts[1, i] >= visits:
+            if near > best.value[i] - tolerance or best.counts[1, i] >= visits or stopped(scene.stop):
                 if near <= best.value[i]:
                     best.unseen[i] = min(best.unseen[i], near)
                 cursor[i] = end

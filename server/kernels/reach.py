@@ -11,6 +11,7 @@ from ...schemas.kernels.morton import morton_code
 from ...schemas.voxel_grid import KEY_BIAS
 from .compiled import borrowing
 from .placing import GOOD, check_poses, largest_term, place
+from .stopping import stopped
 
 
 class SceneIndex(NamedTuple):
@@ -86,7 +87,8 @@ def voxels_in_reach(poses, avatar, scene, index, reach):
     """List, for each pose, the voxels whose points the avatar's root sphere could touch, in an order of place.
 
     poses: (k, 4, 4), checked.  avatar: not empty.  scene: SceneArrays. Fills starts, rows, boxes and outside of
-    `reach` from its scales and units. Returns how many rows are needed; those beyond the capacity are not written.
+    `reach` from its scales and units. Returns how many rows are needed; those beyond the capacity are not written. -1:
+    the scene's stop flag is set, and `reach` is not filled.
     The reach is widened by more than the rounding of this function: a millionth of itself, a step, and 2^-49 of the
     largest term that was added up.
     """
@@ -99,6 +101,8 @@ def voxels_in_reach(poses, avatar, scene, index, reach):
     box_low, box_high = np.empty(3), np.empty(3)
     needed = 0
     for i in range(poses.shape[0]):
+        if stopped(scene.stop):
+            return -1
         m = poses[i]
         for r in range(3):
             shift[r] = m[r, 3] - scene.origin[r]

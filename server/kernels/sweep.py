@@ -35,6 +35,7 @@ from .moments import INFINITE, try_pair
 from .motion import pose_at
 from .moving import ZERO, Chord, place_block, place_nodes
 from .placed import ONE_SLACK, SLACK, make_limits
+from .stopping import stopped
 
 # An interval whose sagitta is below this many units is not worth halving: rounding alone makes up 0.87 of the band.
 LEAST_SAGITTA = 0.25
@@ -137,7 +138,8 @@ def _leaves(job, chord, voxel, block, row):
 def _sweep_voxel(job, chord, voxel):
     """Take one resident voxel into account: the two trees descended together, depth first.
 
-    Returns whether to go on: not when nothing can be earlier, nor when the visits are spent.
+    Returns whether to go on: not when nothing can be earlier, when the visits are spent, or when the scene's stop flag
+    is set.
     """
     avatar, scene, moving = job.avatar, job.scene, job.moving
     words, ints = scene.words, scene.ints
@@ -157,7 +159,7 @@ def _sweep_voxel(job, chord, voxel):
     ):  # fmt: skip
         depth = 1
     while depth > 0:
-        if counters[0] > counters[3]:
+        if counters[0] > counters[3] or stopped(scene.stop):
             return False
         depth -= 1
         a, row = stack[depth, 0], stack[depth, 1]
@@ -222,5 +224,5 @@ def search(job, t0, t1, rows):
     for row in rows:
         if scene.where[row, 0] >= 0 and not _sweep_voxel(job, chord, row):
             break
-    spent = moving.counters[0] > moving.counters[3] and moving.first[2] > 0.0
-    return not spent, chord.final
+    spent = moving.counters[0] > moving.counters[3] or stopped(scene.stop)
+    return not (spent and moving.first[2] > 0.0), chord.final

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas.kernels import compiling as nb
+from .stopping import stopped
 
 FAN = 8
 # FAN - 1 siblings stay behind on each level; 2^63 rows have 21 levels.
@@ -102,12 +103,13 @@ def _sort(rows, near, begin, end):
 
 
 @nb.njit(nogil=True, cache=True)
-def list_voxels(tree, at_units, direction, along, reach_units, radius_units, units_per_step, lists):
+def list_voxels(tree, at_units, direction, along, reach_units, radius_units, units_per_step, stop, lists):
     """Fill `lists` for k rays (along) or loose points: the voxels with a point that could be hit within reach.
 
     at_units: (k, 3) int64, origins, exact units.  direction: (k, 3) float64, unit vectors, read of rays only.
     reach_units: of all.  radius_units: of the scan's largest sphere, 0 for points.  Boxes are grown by it, a step,
     and more than the rounding of this function: 2^-46 of the largest figure in it.
+    stop: the request's stop flag: once it is set, the rest is not listed, and unseen from the start.
     Returns how many entries are needed; those beyond the capacity are not written.
     """
     at, far = np.empty(3), 0.0
@@ -118,6 +120,9 @@ def list_voxels(tree, at_units, direction, along, reach_units, radius_units, uni
     last = tree.low.shape[0] - 1
     for i in range(at_units.shape[0]):
         lists.starts[i], lists.unseen[i] = needed, np.inf
+        if stopped(stop):
+            lists.unseen[i] = 0.0
+            continue
         far = reach
         for r in range(3):
             at[r] = np.float64(at_units[i, r]) / units_per_step

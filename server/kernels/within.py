@@ -18,6 +18,7 @@ from .layout import COUNT, COUNTED, FIRST, LANES, ROW_WORDS
 from .placed import U32
 from .placing import MAX_REACH_UNITS, lattice_to_units
 from .rays import STACK, is_less
+from .stopping import stopped
 
 
 @borrowing
@@ -142,7 +143,8 @@ def _search(scene, voxel, at_units, i, near, tolerance, visits, best, limit, row
         depth -= 1
         row, above = rows[depth], bounds[depth]
         bound = (above - error) * scene.units_per_step
-        if bound > nearest - (tolerance if best.square[i] >= 0 else 0.0) or spent >= visits:
+        far = bound > nearest - (tolerance if best.square[i] >= 0 else 0.0)
+        if far or spent >= visits or stopped(scene.stop):
             if bound <= nearest:
                 best.unseen[i] = min(best.unseen[i], max(bound, 0.0))
             continue
@@ -192,7 +194,8 @@ def search_points(at_units, reach, lists, cursor, held, scene, tolerance, visits
             at = cursor[i]
             near, voxel = lists.near[at], lists.rows[at]
             nearest = math.sqrt(np.float64(limit)) * (1.0 + 2.0**-52)
-            if near > nearest - (tolerance if best.square[i] >= 0 else 0.0) or best.counts[1, i] >= visits:
+            far = near > nearest - (tolerance if best.square[i] >= 0 else 0.0)
+            if far or best.counts[1, i] >= visits or stopped(scene.stop):
                 if near <= nearest:
                     best.unseen[i] = min(best.unseen[i], near)
                 cursor[i] = end

@@ -53,7 +53,7 @@ class FloorPipeline:
     def __init__(self):
         self.frames = 0
 
-    def run(self, body, wish, seconds, *, skip=None):
+    def run(self, body, wish, seconds, effort=None, *, skip=None):
         self.frames += 1
         if body.name.endswith("/crash"):
             raise RuntimeError("a secret of the server's own")
@@ -142,9 +142,9 @@ class FloorScene:
             raise UnknownAvatarError(f"avatar {name!r}")
         return make_avatar(*found)
 
-    def move(self, name, pose_from, pose_to, seconds, *, client=""):
+    def move(self, name, pose_from, pose_to, seconds, *, client="", **options):
         self.check(name, pose_from, client)
-        self.asked.append(("move", (name, seconds), {}))
+        self.asked.append(("move", (name, seconds), options))
         return Moved(pose=pose_to, verdict=int(Verdict.CONTACT), left=0.5, simulated=["stop"])
 
     def collide(self, name, poses, margin=0.0, *, client="", **effort):

@@ -19,7 +19,17 @@ SHIFTS = [(500_000, 5_600_000, 100), (4_027_894, 307_045, 4_919_475), (-2_694_89
 # Columns of world positions, and that of a ray's hit: it is no lattice point, so float64 rounds it where it lies.
 PLACES = ("witness_avatar", "witness_cloud", "avatar_point", "cloud_point", "cluster_avatar", "cluster_cloud",
           "cluster_low", "cluster_high")  # fmt: skip
-COST = ("engine_seconds", "wait_seconds", "hits", "misses", "late", "resident", "resident_bytes", "faults")
+COST = (
+    "engine_seconds",
+    "wait_seconds",
+    "hits",
+    "misses",
+    "late",
+    "resident",
+    "resident_bytes",
+    "faults",
+    "stopped",
+)
 
 
 def dyadic(values: NDArray[np.float64]) -> NDArray[np.float64]:

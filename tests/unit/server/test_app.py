@@ -46,6 +46,7 @@ from solidcloud.schemas.requests import ObjectItem
 from solidcloud.server import app as app_module
 from solidcloud.server.app import Service
 from solidcloud.server.config import ServerConfig
+from solidcloud.server.stop import Stop
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "end_to_end"))
 from fake_server import FloorScene, floor_simulation, floor_verdicts
@@ -67,9 +68,13 @@ def service(scene):
     return Service([scene], ServerConfig(max_poses=5, max_avatar_points=4, max_in_flight=7))
 
 
+# What ends every request of these tests early: it has to reach the scene.
+STOP = Stop()
+
+
 def ask(service, operation, request, encoding=MSGPACK, **where):
     payload = encode(request, encoding) if request is not None else b""
-    return service.answer(key(operation, **where), payload, encoding)
+    return service.answer(key(operation, **where), payload, encoding, STOP)
 
 
 def error(answer, encoding=MSGPACK):
@@ -129,7 +134,7 @@ def test_what_is_asked_reaches_the_scene(service, scene, request_, kind, k, aske
     ask(service, "add_avatar", AddAvatarRequest("al", POINTS, 0.25))
     answer = ask(service, operation, request_, encoding)
     assert answer.ok and len(check_answers(decode_answer(kind, answer.payload, encoding), k)) == k
-    assert scene.asked == [(operation, asked, effort)]
+    assert scene.asked == [(operation, asked, effort | {"stop": STOP})]
 
 
 @pytest.mark.parametrize("encoding", [MSGPACK, JSON])
@@ -140,7 +145,7 @@ def test_a_move_is_asked_of_the_scene(service, scene, encoding):
     moved = decode_answer(Moved, answer.payload, encoding)
     assert answer.ok and np.array_equal(moved.pose, POSES[1:2])
     assert (moved.verdict, moved.left, moved.simulated) == (1, 0.5, ["stop"])
-    assert scene.asked == [("move", ("al", 0.125), {})]
+    assert scene.asked == [("move", ("al", 0.125), {"stop": STOP})]
     assert error(ask(service, "move", request, encoding, client="d"), encoding).code == "unknown_avatar"
 
 
@@ -190,7 +195,7 @@ def test_a_path_is_answered_in_parts(scene, encoding):
     assert [(part.first, len(part), part.total) for part in parts] == [(0, 10, 25), (10, 10, 25), (20, 5, 25)]
     verdicts = np.concatenate([part.verdict for part in parts])
     assert np.array_equal(verdicts, floor_verdicts(POINTS, 0.25, poses, 0.125)) and {0, 1} == set(verdicts)
-    assert scene.asked == [("path", ("al", "collide"), {"margin": 0.125, "budget_ms": 9.0})]
+    assert scene.asked == [("path", ("al", "collide"), {"stop": STOP, "margin": 0.125, "budget_ms": 9.0})]
 
 
 def test_what_ends_a_path_early_is_its_last_answer(scene, caplog):

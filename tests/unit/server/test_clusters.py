@@ -26,6 +26,7 @@ from solidcloud.server.kernels.clusters import (
     make_cells,
     sort_rows,
 )
+from solidcloud.server.stop import NEVER
 
 pytestmark = pytest.mark.interpreted
 
@@ -52,7 +53,7 @@ def test_the_deepest_are_kept_whatever_the_order(rng: np.random.Generator, limit
         heap, kept = np.empty((limit, RECORD), np.int64), 0
         for record in rng.permutation(records):
             kept = keep_deepest(heap, kept, record[None])
-        sort_rows(heap, kept)
+        sort_rows(heap, kept, NEVER.flag)
         assert [place_of(record) for record in heap[:kept].tolist()] == expected
 
 
@@ -66,7 +67,7 @@ def test_rows_are_sorted_by_all_columns_that_order(rng: np.random.Generator, cou
     rows[:, TAG] = np.arange(count)
     expected = sorted(map(place_of, rows.tolist()))
     before = {tuple(row) for row in rows.tolist()}
-    sort_rows(rows, count)
+    sort_rows(rows, count, NEVER.flag)
     assert [place_of(row) for row in rows.tolist()] == expected
     assert {tuple(row) for row in rows.tolist()} == before
 
@@ -119,7 +120,8 @@ def test_neighbouring_cells_are_one_cluster(rng: np.random.Generator, spread: in
             memory.cells.table[row, PAIRS : PAIRS + 7] = [1, *pair.point, *pair.point]
             memory.sizes[KEPT] = keep_deepest(memory.heap, memory.sizes[KEPT], record)
         runs = np.empty(4, np.int64)
-        memory = list_pose(memory, runs)
+        memory, listed = list_pose(memory, runs, NEVER.flag)
+        assert listed
         clusters, of_pair = clusters_of(sorted(pairs), 1)
         own = memory.clusters[runs[2] : runs[2] + runs[3]]
         assert own[:, PAIRS].tolist() == [cluster.count for cluster in clusters]

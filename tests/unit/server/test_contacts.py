@@ -27,7 +27,17 @@ from solidcloud.server.residency import Residency
 from solidcloud.server.store import Store
 
 CLEAR, CONTACT, UNKNOWN = Verdict
-COST = ("engine_seconds", "wait_seconds", "hits", "misses", "late", "resident", "resident_bytes", "faults")
+COST = (
+    "engine_seconds",
+    "wait_seconds",
+    "hits",
+    "misses",
+    "late",
+    "resident",
+    "resident_bytes",
+    "faults",
+    "stopped",
+)
 
 
 def at(*places: tuple[float, float, float]) -> NDArray[np.float64]:

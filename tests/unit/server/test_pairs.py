@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from solidcloud.server.avatar import AvatarModel, make_avatar
 from solidcloud.server.kernels import pairs as kernel
 from solidcloud.server.kernels.layout import LANES
+from solidcloud.server.stop import NEVER
 
 pytestmark = pytest.mark.interpreted
 interpreted_only = pytest.mark.skipif(
@@ -115,7 +116,7 @@ class Asked:
         a, b, pair = (self.b, self.a, [1, 0]) if turned else (self.a, self.b, [0, 1])
         kernel.touch_pairs(
             a.arrays, b.arrays, self.poses, self.scales, units, np.array([pair]), reach - int(units.sum()),
-            ORIGIN, visits, verdict, counters,
+            ORIGIN, visits, NEVER.flag, verdict, counters,
         )  # fmt: skip
         return int(verdict[0]), int(counters[0]) - 100, int(counters[1]) - 200
 

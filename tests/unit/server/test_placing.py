@@ -24,6 +24,7 @@ SCENE = SceneArrays(
     80_000,
     BLOCK_WORDS,
     np.zeros(1, np.int64),
+    np.zeros(1, np.int64),
 )
 
 

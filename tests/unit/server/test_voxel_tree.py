@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from solidcloud.server.kernels.voxel_tree import FAN, Lists, list_voxels, make_voxel_tree
+from solidcloud.server.stop import NEVER
 
 pytestmark = pytest.mark.interpreted
 
@@ -48,7 +49,15 @@ def listed(tree: tuple, at: NDArray, direction: NDArray, along: bool, reach: flo
         lists = Lists(np.zeros(k + 1, np.int64), np.full(room, -1), np.full(room, np.nan), np.zeros(k))
         units = np.rint(at * UNITS).astype(np.int64)
         needed = list_voxels(
-            tree, units, direction, along, round(reach * UNITS), round(radius * UNITS), UNITS, lists
+            tree,
+            units,
+            direction,
+            along,
+            round(reach * UNITS),
+            round(radius * UNITS),
+            UNITS,
+            NEVER.flag,
+            lists,
         )
         assert needed == lists.starts[k]
         if needed <= room:
@@ -108,7 +117,7 @@ def test_boxes_far_away_are_grown_by_what_rounding_takes(along: bool, sign: floa
         units = np.rint(at * 4).astype(np.int64)
         lists = Lists(np.zeros(2, np.int64), np.full(4, -1), np.zeros(4), np.zeros(1))
         reach = 40 if along else 0
-        assert list_voxels(tree, units, direction, along, reach, 0, 4.0, lists) == found
+        assert list_voxels(tree, units, direction, along, reach, 0, 4.0, NEVER.flag, lists) == found
 
 
 def test_equal_distances_are_sorted_by_row() -> None:

@@ -18,7 +18,8 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, TypeVar
 
 from ..schemas.errors import BadRequestError, SolidcloudError
-from .executor import Result, Unit, results_in_order
+from ..schemas.interrupts import check, children_ignore
+from .executor import ASK_SECONDS, Result, Unit, results_in_order
 from .memory import CLUSTER_WORKER_KILLED, cluster_worker_limit
 from .progress import Progress
 from .software import software
@@ -50,8 +51,8 @@ REACH_SECONDS = 10
 # A cluster without any worker for so long is given up: a batch system may take a while to start others in their place,
 # dask a second. One that is killed while it starts dask does not always start anew.
 LONELY_SECONDS, LONELY_LOCAL_SECONDS = 300, 60
-# How often a unit that is waited for is asked about; a result that comes is taken at once.
-ASK_SECONDS = 5
+# How often it is looked whether there is any worker while a unit is waited for, and whether the builder is interrupted.
+LOOK_SECONDS = 5.0
 
 LOCAL = "local:"
 _START_WORKERS = "start its workers as `dask worker tcp://HOST:PORT --nthreads 1 --nworkers N`"
@@ -241,10 +242,13 @@ class ClusterExecutor:
     def _patiently(self, ask: Callable[[], Answer], future: Future | None = None) -> Answer:
         """Ask again for as long as there is anybody to give an answer. future: what is asked, where it may raise."""
         alone_since: float | None = None
+        looked = time.monotonic()
         while True:
+            check()
             try:
                 return ask()
             except (FutureCancelledError, FuturesCancelledError):
+                check()  # its processes may have had the signal too
                 raise SolidcloudError(
                     f"{self._address}: the scheduler was lost, expected it to last as long as the build: start it, "
                     "then the same command again goes on where it was"
@@ -253,6 +257,9 @@ class ClusterExecutor:
                 # Of waiting; or of the function itself, which then has been heard.
                 if future is not None and future.status == "error":
                     raise
+            if time.monotonic() - looked < LOOK_SECONDS:
+                continue
+            looked = time.monotonic()
             if self._client.scheduler_info(n_workers=-1)["workers"]:
                 alone_since = None
                 continue
@@ -290,13 +297,13 @@ class _Watch(SchedulerPlugin):
 
 
 def dask_setup(_: Worker) -> None:
-    """Called by dask in each worker started here: Ctrl-C is the builder's, as in `executor.py`."""
+    """Leave Ctrl-C to the builder, as in `executor.py`; dask calls this in each worker started here."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _start_local(number: int, memory_bytes: int, watch: _Watch) -> LocalCluster:
     """A scheduler in this process and `number` workers of one thread, all on the loopback interface alone."""
-    with dask.config.set(
+    settings = dask.config.set(
         {
             # Results are small. A worker that is over its limit is killed; paused, it would wait for ever.
             "distributed.worker.memory.target": False,
@@ -304,7 +311,8 @@ def _start_local(number: int, memory_bytes: int, watch: _Watch) -> LocalCluster:
             "distributed.worker.memory.pause": False,
             "distributed.worker.memory.terminate": CLUSTER_WORKER_KILLED,
         }
-    ):
+    )
+    with settings, children_ignore():
         return LocalCluster(
             n_workers=number,
             threads_per_worker=1,

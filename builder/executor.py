@@ -12,6 +12,7 @@ from types import TracebackType
 from typing import Any, Protocol, Self, TypeVar
 
 from ..schemas.errors import SolidcloudError
+from ..schemas.interrupts import check, children_ignore
 from .config import BuildConfig
 from .progress import Progress
 
@@ -23,6 +24,8 @@ Ticket = TypeVar("Ticket")
 POINTS_WORTH_A_PROCESS = 4_000_000
 # Units handed out and not done, and results that wait for those before them, a process.
 WAITING, AHEAD = 4, 64
+# How often whoever waits for a unit looks whether it is interrupted.
+ASK_SECONDS = 0.1
 
 
 class Executor(Protocol):
@@ -128,8 +131,9 @@ def make_executor(config: BuildConfig, jobs: int) -> Executor:
 
 
 def _begin_worker() -> None:
-    """Ctrl-C is the builder's: it stops its workers, and they say nothing. If it is killed, they end with it."""
+    """Leave Ctrl-C to the builder: it stops its workers, and they say nothing. If it is killed, they end with it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})  # blocked since it was started
     threading.Thread(target=_end_with_builder, daemon=True).start()
 
 
@@ -180,7 +184,10 @@ class ProcessExecutor:
         """See `Executor`, and `results_in_order`."""
         if self._pool is None:
             for unit in units:
-                yield function(unit)
+                check()
+                result = function(unit)
+                check()
+                yield result
                 progress.advance(size(unit))
             return
         yield from results_in_order(self, function, units, progress, size)
@@ -188,12 +195,15 @@ class ProcessExecutor:
     def hand_out(self, function: Callable[[Unit], Result], unit: Unit) -> Future[Result]:
         """See `Hands`."""
         assert self._pool is not None
-        with _worker_deaths():
+        with _worker_deaths(), children_ignore():
             return self._pool.submit(function, unit)
 
     def done(self, tickets: Sequence[Future[Any]]) -> Iterable[Future[Any]]:
         """See `Hands`."""
-        return wait(tickets, return_when=FIRST_COMPLETED).done
+        while True:
+            check()
+            if done := wait(tickets, ASK_SECONDS, FIRST_COMPLETED).done:
+                return done
 
     def result(self, ticket: Future[Any]) -> Any:
         """See `Hands`."""
@@ -207,6 +217,7 @@ def _worker_deaths() -> Iterator[None]:
     try:
         yield
     except BrokenProcessPool:
+        check()  # a signal to the whole group ends the workers too
         raise SolidcloudError(
             "a worker process ended at once: out of memory, or an error that cannot be sent here? give fewer --jobs or "
             "a smaller --memory; the same command goes on where it was"

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, Generic, TypeVar
 
+from ..schemas.interrupts import check
 from ..schemas.new_file import sync_folder
 from .executor import Executor
 from .progress import Progress
@@ -120,6 +121,7 @@ class _Noting(Generic[Unit, Result]):
     def __call__(self, named: tuple[str, Unit]) -> Result:
         name, unit = named
         result = self.run(unit)
+        check()  # what was made while a signal came is not believed
         self.journal.note(name, self.dump(result))
         return result
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..schemas.errors import ScanError
+from ..schemas.interrupts import check
 from ..schemas.voxel_grid import KEY_BIAS, MAX_COORDINATE, Lattice, voxel_keys
 from .config import BuildConfig
 from .kernels.content import SEEDS
@@ -228,9 +229,11 @@ class _Held:
             scatter(numbers, self.bits[:size], place.copy(), bits)
         scatter(numbers, self.codes[:size], place, codes)
         for begin, end in zip(starts[:-1].tolist(), starts[1:].tolist(), strict=True):
+            check()
             sort_voxel(codes[begin:end], None if bits is None else bits[begin:end])
         with new_run(path) as file:
             for rows in self._rows(codes, bits):
+                check()
                 file.write(rows.view(np.uint8).data)
         directory = write_directory(path, self.keys[:voxels][order], starts)
         self.size = 0

@@ -20,6 +20,7 @@ from ..schemas.archive import Archive
 from ..schemas.errors import BadRequestError, CorruptError, ScanError, SolidcloudError
 from ..schemas.index import Header
 from ..schemas.index_file import write_index
+from ..schemas.interrupts import check
 from ..schemas.os_errors import os_error_words
 from ..schemas.voxel_grid import Lattice
 from ..schemas.vtkhdf import PREVIEW_NAME
@@ -122,6 +123,7 @@ def build_archive(
         with workplace(target, what, fresh=config.fresh) as place:
             header, built = _build(inputs, what, place, target, config, stages)
             _check_unchanged(inputs, what, place, config)
+            check()
             with stages.timed("publish"):
                 publish_folder(place.archive, target, config.overwrite)
     return _summary(target, header, sum(len(s.rows) for s in built), len(built), begin, stages)

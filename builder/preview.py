@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from ..schemas.archive import Archive
 from ..schemas.errors import CorruptError
 from ..schemas.index import Header
+from ..schemas.interrupts import check
 from ..schemas.new_file import new_file, publish
 from ..schemas.vtkhdf import PREVIEW_NAME, VtkPoints, read_points
 from .executor import Executor
@@ -85,6 +86,7 @@ def preview_faults(folder: Path, header: Header) -> tuple[list[str], list[str]]:
         found = read_points(path)
         stamp = found.attributes["archive_id"].tobytes(), int(found.attributes["generation"])
     except (CorruptError, OSError) as error:
+        check()
         return [str(error)], []
     except KeyError:
         return [f"{path}: does not say whose preview it is: delete it"], []

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..schemas.codec import encode_voxel
+from ..schemas.interrupts import check
 from ..schemas.normals import normal_reach
 from ..schemas.radius_model import RADIUS_CLASSES
 from ..schemas.shard import shard_name, write_shard
@@ -107,6 +108,7 @@ def build_shard(unit: ShardUnit) -> Shard:
 def _voxels(unit: ShardUnit, classes: _ClassCounts | None) -> Iterator[BuiltVoxel]:
     """Each voxel of a unit built, its record, and the bounds of its points."""
     for key in unit.keys:
+        check()
         if is_dense(unit.spool.count(key), unit.config):
             classify = None if classes is None else partial(classes.find, key)
             yield build_dense(key, unit.spool, unit.config, unit.archive_id, unit.folder, classify)

@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..schemas.errors import CorruptError
+from ..schemas.interrupts import check
 from ..schemas.shard import file_checksum
 from ..schemas.voxel_grid import Lattice, voxel_coordinates
 from .config import BuildConfig
@@ -335,6 +336,7 @@ class Spool:
 
     def _read(self, part: _Part) -> NDArray:
         """The rows of a part. Raises CorruptError for a run that is shorter than its directory says."""
+        check()
         path = self._merged().paths[part.run]
         rows = np.fromfile(path, self.dtype, part.size, offset=part.start * self.dtype.itemsize)
         if len(rows) != part.size:

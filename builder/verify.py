@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from ..schemas.archive import Archive
 from ..schemas.codec import OpenRecord
 from ..schemas.errors import BadRequestError, CorruptError
+from ..schemas.interrupts import check
 from ..schemas.normals import normal_reach
 from ..schemas.radius_model import RADIUS_CLASSES
 from ..schemas.shard import SHARD_FOLDER
@@ -162,6 +163,7 @@ def _verify_rows(unit: _Unit) -> _Found:
     with Archive(unit.folder) as archive:
         for i, row in enumerate(unit.rows):
             known = len(faults)
+            check()
             try:
                 record = archive.open_voxel(row, columns=("radius_class", "normal"))
                 with archive.locating(row):
@@ -180,6 +182,7 @@ def _verify_rows(unit: _Unit) -> _Found:
                     faults += [_loose(archive, row, node) for node in loose]
                     proved += len(unit.asked[i]) - len(loose)
             except (CorruptError, OSError) as error:
+                check()
                 faults.append(str(error))
             else:
                 points += int(archive.voxels["rows"][row, 2])

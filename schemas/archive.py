@@ -25,6 +25,7 @@ from .errors import CorruptError, FormatError
 from .index import read_header
 from .index_file import INDEX_NAME, read_columns
 from .index_limits import check_voxels
+from .interrupts import check
 from .shard import DATASETS, SHARD_FOLDER, SHARD_NAME
 from .voxel import Links, VoxelData
 from .voxel_grid import voxel_coordinates
@@ -153,6 +154,7 @@ class Archive:
         """The frame of dataset `i` of a voxel, as `read_frames` gives it."""
         if not self._descriptors:
             raise ValueError(f"{self.folder}: the archive is closed")
+        check()
         entry = self.voxels[row]
         size, offset = int(entry["frame_bytes"][i]), int(entry["frame_offset"][i])
         frame = os.pread(self._descriptors[int(entry["shard"])], size, offset)

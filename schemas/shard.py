@@ -20,6 +20,7 @@ from .codec import CELL_DTYPE, NODE_DTYPE, Record, voxel_point_dtype
 from .errors import CorruptError
 from .frames import Frame
 from .index import VOXEL_DTYPE
+from .interrupts import check
 from .new_file import new_file, publish, temporary_path
 from .voxel import VoxelData
 
@@ -119,6 +120,7 @@ def file_checksum(path: Path) -> int:
     checksum, buffer = 0, memoryview(bytearray(READ_BYTES))
     with open(path, "rb", buffering=0) as file:
         while got := file.readinto(buffer):
+            check()
             checksum = zlib.crc32(buffer[:got], checksum)
     return checksum
 

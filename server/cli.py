@@ -4,6 +4,8 @@ Every verb imports what it needs inside itself: `--help` is to be answered befor
 Exit codes: 0; 1 failed; 2 a request that cannot be understood; 3 bad data; 130 interrupted.
 """
 
+import contextlib
+import signal
 import sys
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -11,6 +13,7 @@ from typing import Any
 import typer
 
 from ..schemas.errors import BadRequestError, SolidcloudError
+from ..schemas.interrupts import taken
 from ..schemas.os_errors import os_error_line
 from .verbs import (
     accuracy,
@@ -68,18 +71,23 @@ for verb in (
 ):
     app.command()(verb)
 
+# Verbs that wait, for others or for people: an interrupt ends them at once. All others work, and end where they check.
+WAITING = frozenset({"serve", "query", "reload", "top"})
+
 
 def main() -> None:
     """Run the command and exit."""
-    sys.exit(run(sys.argv[1:]))
+    code = run(sys.argv[1:])
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # all is said: what is left is Python's own end
+    sys.exit(code)
 
 
 def run(arguments: Sequence[str]) -> int:
     """Run the command with these arguments and return its exit code; an error is one line, not a traceback."""
     try:
         command, name, rest = _find_verb(arguments or ["--help"])
-        code = command.main(args=rest, prog_name=name, standalone_mode=False)
-        return code if isinstance(code, int) else 0
+        with contextlib.nullcontext() if name.split()[-1] in WAITING else taken():
+            return _run(command, name, rest)
     except SolidcloudError as error:
         return complain(str(error), error.exit_code)
     except typer.TyperException as error:
@@ -88,8 +96,9 @@ def run(arguments: Sequence[str]) -> int:
         return complain(
             f"{error.format_message().rstrip('.')}: see {command} --help", BadRequestError.exit_code
         )
-    except (KeyboardInterrupt, typer.Abort):
-        return complain("interrupted", 130)
+    except (KeyboardInterrupt, typer.Abort) as error:
+        print(": ".join(filter(None, ("interrupted", str(error)))), file=sys.stderr)
+        return 130
     except BrokenPipeError:
         # Whoever read the output has had enough. Python would complain again when it flushes at exit.
         sys.stdout = None
@@ -98,6 +107,16 @@ def run(arguments: Sequence[str]) -> int:
         return complain(os_error_line(error), 1)
     except MemoryError as error:
         return complain(f"out of memory{f' ({error})' if str(error) else ''}: close other programs", 1)
+
+
+def _run(command: Any, name: str, arguments: list[str]) -> int:
+    """Run one verb and return its exit code. typer's own `main` would end an interrupted one without a word."""
+    try:
+        with command.make_context(name, arguments) as context:
+            code = command.invoke(context)
+    except typer.Exit as left:
+        code = left.exit_code
+    return code if isinstance(code, int) else 0
 
 
 def _find_verb(arguments: Sequence[str]) -> tuple[Any, str, list[str]]:

@@ -15,6 +15,8 @@ from rich.progress import BarColumn, Progress, ProgressColumn, Task, TaskID
 from rich.table import Column
 from rich.text import Text
 
+from ..schemas.interrupts import check
+
 # A rate is that of the last so many seconds: work comes in lumps of a second or two, and a disk's mood changes.
 RATE_SECONDS = 30.0
 # What is done so soon after a stage began was done before it began, by a build that was interrupted.
@@ -95,12 +97,14 @@ class Listener:
         pass
 
     def start(self, stage: str, total: int, unit: str) -> None:
-        """A stage begins."""
+        """Begin a stage. Raises Interrupted where a signal has come."""
+        check()
         self._pace = Pace(stage, total, unit, self._clock)
         self._began(self._pace)
 
     def advance(self, amount: int) -> None:
-        """So much more of the stage is done."""
+        """Add to what is done of the stage. Raises Interrupted where a signal has come."""
+        check()
         if self._pace is not None:
             self._pace.advance(amount)
             self._moved(self._pace)

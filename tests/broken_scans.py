@@ -28,7 +28,7 @@ PAGE = 1024
 
 
 def _las(path: Path, xyz: np.ndarray, point_format: int) -> None:
-    light = np.arange(len(xyz), dtype=np.uint16)
+    light = np.arange(len(xyz)).astype(np.uint16)
     offset = (1000.0, 2000.0, 3.0)
     write_las(path, np.rint(xyz * 1000), offset=offset, intensity=light, point_format=point_format)
 
@@ -57,7 +57,8 @@ def _variable_laz(path: Path, xyz: np.ndarray) -> None:
 
 
 def _e57(path: Path, xyz: np.ndarray) -> None:
-    light, state = np.arange(COUNT) / COUNT, (np.arange(COUNT) % 7 == 0).astype(np.int8)
+    order = np.arange(len(xyz))
+    light, state = order / len(xyz), (order % 7 == 0).astype(np.int8)
     scaled = {f"cartesian{axis}": (0.001, 0.5) for axis in "XYZ"}
     first = {"columns": {**cartesian(xyz), "intensity": light, "cartesianInvalidState": state}}
     first |= {"translation": [1.0, 2, 3], "rotation": [0.5, 0.5, -0.5, 0.5], "bounds": [[-5] * 3, [5] * 3]}
@@ -75,7 +76,7 @@ def _spherical(path: Path, xyz: np.ndarray) -> None:
 
 
 def _ply(path: Path, xyz: np.ndarray, text: bool, order: str) -> None:
-    vertex = np.zeros(COUNT, [("x", "f8"), ("y", "f4"), ("z", "f8"), ("red", "u1"), ("intensity", "f4")])
+    vertex = np.zeros(len(xyz), [("x", "f8"), ("y", "f4"), ("z", "f8"), ("red", "u1"), ("intensity", "f4")])
     vertex["x"], vertex["y"], vertex["z"] = xyz.T
     face = np.array([([0, 1, 2],), ([1, 2, 3],)], dtype=[("vertex_indices", "i4", (3,))])
     elements = [plyfile.PlyElement.describe(vertex, "vertex"), plyfile.PlyElement.describe(face, "face")]
@@ -83,7 +84,7 @@ def _ply(path: Path, xyz: np.ndarray, text: bool, order: str) -> None:
 
 
 def _stl(path: Path, xyz: np.ndarray) -> None:
-    record = np.zeros(COUNT // 3, [("normal", "<f4", 3), ("corners", "<f4", 9), ("attribute", "<u2")])
+    record = np.zeros(len(xyz) // 3, [("normal", "<f4", 3), ("corners", "<f4", 9), ("attribute", "<u2")])
     record["corners"] = xyz.reshape(-1, 9)
     path.write_bytes(b"binary".ljust(80) + np.uint32(len(record)).tobytes() + record.tobytes())
 
@@ -97,9 +98,9 @@ def _ascii_stl(path: Path, xyz: np.ndarray) -> None:
 
 
 def _glb(path: Path, xyz: np.ndarray) -> None:
-    document = glb_document(COUNT, 30)
+    document = glb_document(len(xyz), 30)
     document["nodes"] = [{"children": [1], "scale": [2, 2, 2]}, {"mesh": 0, "rotation": [0, 0, 1, 0]}]
-    corners = np.arange(30, dtype="<u2") % COUNT
+    corners = (np.arange(30) % len(xyz)).astype("<u2")
     write_glb(path, document, glb_vertices(xyz) + corners.tobytes())
 
 
@@ -113,18 +114,18 @@ def _obj(path: Path, xyz: np.ndarray) -> None:
 
 def _text(separator: str, head: str = "", end: str = "\n") -> Callable[[Path, np.ndarray], None]:
     def write(path: Path, xyz: np.ndarray) -> None:
-        rows = text_rows(xyz, np.arange(COUNT)).replace(" ", separator).replace("\n", end)
+        rows = text_rows(xyz, np.arange(len(xyz))).replace(" ", separator).replace("\n", end)
         path.write_bytes((head + rows).encode())
 
     return write
 
 
 def _ptx(path: Path, xyz: np.ndarray) -> None:
-    light = np.arange(COUNT)
+    light = np.arange(len(xyz))
     path.write_text(ptx_scan(xyz, light, POSE, 6) + ptx_scan(xyz[:9], light[:9]))
 
 
-# File name -> what writes it, of points (COUNT, 3) within 5 m of the origin, with three decimals.
+# File name -> what writes it, of points (n, 3), n a multiple of 6, within 5 m of the origin, with three decimals.
 SEEDS: dict[str, Callable[[Path, np.ndarray], object]] = {
     "plain.las": lambda path, xyz: _las(path, xyz, 1),
     "new.las": lambda path, xyz: _las(path, xyz, 6),
@@ -136,11 +137,11 @@ SEEDS: dict[str, Callable[[Path, np.ndarray], object]] = {
     "little.ply": lambda path, xyz: _ply(path, xyz, False, "<"),
     "big.ply": lambda path, xyz: _ply(path, xyz, False, ">"),
     "text.ply": lambda path, xyz: _ply(path, xyz, True, "="),
-    "text.pcd": lambda path, xyz: write_pcd(path, xyz, np.arange(COUNT), "ascii"),
-    "binary.pcd": lambda path, xyz: write_pcd(path, xyz, np.arange(COUNT), "binary"),
-    "packed.pcd": lambda path, xyz: write_pcd(path, xyz, np.arange(COUNT), "binary_compressed"),
+    "text.pcd": lambda path, xyz: write_pcd(path, xyz, np.arange(len(xyz)), "ascii"),
+    "binary.pcd": lambda path, xyz: write_pcd(path, xyz, np.arange(len(xyz)), "binary"),
+    "packed.pcd": lambda path, xyz: write_pcd(path, xyz, np.arange(len(xyz)), "binary_compressed"),
     "two.ptx": _ptx,
-    "two.pts": lambda path, xyz: write_pts(path, [(xyz, np.arange(COUNT)), (xyz[:5], np.arange(5))]),
+    "two.pts": lambda path, xyz: write_pts(path, [(xyz, np.arange(len(xyz))), (xyz[:5], np.arange(5))]),
     "blanks.xyz": _text(" "),
     "header.csv": _text(",", "x,y,z,intensity\n"),
     "crlf.txt": _text(";", end="\r\n"),

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ...schemas.interrupts import check
 from .rows import CHUNK_BYTES, LONGEST_LINE, NEWLINE, is_number, number_rows, split_row
 from .scan import NO_RETURN, Block, Scan, apply_pose, scan_error
 
@@ -95,6 +96,7 @@ def skip_rows(file: BufferedReader, path: Path, index: int, count: int, first_li
         )
     wanted, last = count - 1, NEWLINE
     while wanted:
+        check()
         data = file.read(CHUNK_BYTES)
         if not data:
             # A last row without a line end is one too.

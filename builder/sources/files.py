@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas.errors import BadRequestError
+from ...schemas.interrupts import check
 from .e57 import e57_bounds, open_e57
 from .glb import open_glb
 from .las import las_bounds, open_las
@@ -134,6 +135,7 @@ def header_bounds(path: Path) -> NDArray[np.float64] | None:
         reader = readers.get(Path(path).suffix.lower())
         return reader(Path(path)) if reader else None
     except Exception:
+        check()
         # Best effort on a file known to be broken; its own error was raised by open_scans() or blocks().
         return None
 

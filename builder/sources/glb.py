@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ...schemas.interrupts import check
 from .scan import BLOCK_BYTES, Block, Scan, apply_pose, library_errors, quaternion_pose, scan_error
 
 # The words of a scene of ten thousand parts take about 4 MiB; parsed they take thirty times that.
@@ -126,6 +127,7 @@ def _rows(file: BufferedReader, path: Path, column: Column, block_rows: int) -> 
         # The last row may end before its stride does, and the file with it.
         wanted = (count - 1) * column.stride + column.width * item
         file.seek(column.start + begin * column.stride)
+        check()
         data = file.read(wanted)
         if len(data) < wanted:
             raise _damaged(path, "a file that ends within its vertices", "all of them")

@@ -13,6 +13,7 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ...schemas.interrupts import kept_back
 from .las_crs import las_crs
 from .laz_chunks import VLR_HEADER_BYTES, ChunksFrom, check_chunks
 from .scan import (
@@ -97,9 +98,10 @@ class LasScan(SeekableScan):
             | lazrs.SELECTIVE_DECOMPRESS_Z
             | lazrs.SELECTIVE_DECOMPRESS_INTENSITY
         )
-        source: Any = ChunksFrom(lazrs, file, self._start, self._laszip, start) if start else file
-        # Serial decompression: one process a core is what the builder runs already.
-        decompressor = lazrs.LasZipDecompressor(source, self._laszip, wanted)
+        with kept_back():
+            source: Any = ChunksFrom(lazrs, file, self._start, self._laszip, start) if start else file
+            # Serial decompression: one process a core is what the builder runs already.
+            decompressor = lazrs.LasZipDecompressor(source, self._laszip, wanted)
         step = max(1, min(block_points, BLOCK_BYTES // self._record.itemsize))
         buffer = np.empty(step, self._record)
         raw = buffer.view(np.uint8)
@@ -107,11 +109,13 @@ class LasScan(SeekableScan):
         before = source.skip if start else 0
         while before:
             count = min(step, before)
-            decompressor.decompress_many(raw[: count * self._record.itemsize])
+            with kept_back():  # lazrs reads by way of Python
+                decompressor.decompress_many(raw[: count * self._record.itemsize])
             before -= count
         for seen in range(start, stop, step):
             count = min(step, stop - seen)
-            decompressor.decompress_many(raw[: count * self._record.itemsize])
+            with kept_back():
+                decompressor.decompress_many(raw[: count * self._record.itemsize])
             yield buffer[:count]
 
     def _block(self, record: NDArray[np.void]) -> Block:

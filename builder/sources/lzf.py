@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ...schemas.interrupts import check
 from ..kernels.lzf import FARTHEST_BACK, LONGEST_CODE, LONGEST_COPY, decode
 from .scan import scan_error
 
@@ -58,6 +59,7 @@ class LzfStream:
 
     def _decode(self, file: BufferedReader) -> None:
         """Decode on, with what a reference may go back to kept in front."""
+        check()
         kept = min(self._have, FARTHEST_BACK)
         self._out[:kept] = self._out[self._have - kept : self._have]
         if len(self._source) < LONGEST_CODE and self._at < self._past:

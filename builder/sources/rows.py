@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas.errors import ScanError
+from ...schemas.interrupts import check
 from .scan import scan_error
 
 # 4 MiB of text is about 130,000 rows of three numbers. At worst ("1 1 1 ...") it is 2 M numbers, 16 MiB.
@@ -32,6 +33,7 @@ def text_chunks(file: BinaryIO, path: Path, first_line: int = 1) -> Iterator[tup
     rest = b""
     line = first_line
     while data := file.read(CHUNK_BYTES):
+        check()  # an OBJ may have nothing but faces for gigabytes
         data = rest + data
         # A file system that lost a part of a file gives zeros in its place; OBJ would skip them as no vertex.
         if b"\0" in data:

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas.errors import ScanError, SolidcloudError
+from ...schemas.interrupts import check
 
 # A block of 2^18 points is 6 MiB of float64: large enough that the cost of a Python loop round is lost in
 # it, small enough that a few of them count as nothing beside any --memory.
@@ -27,6 +28,9 @@ BLOCK_POINTS = 1 << 18
 # Bytes of raw records held at once. A hostile header may claim records of 65,535 bytes (LAS) or a thousand
 # properties (PLY); without this bound a block of them would be gigabytes.
 BLOCK_BYTES = 64 << 20
+
+# Bytes of a file that are hashed at a time.
+HASHED_BYTES = 1 << 20
 
 # No coordinate is farther from the origin than this [m] (NUMERICS.md, case 16).
 FARTHEST = 1e9
@@ -125,7 +129,9 @@ class Scan(ABC):
         self.dropped = {}
         blocks = self._read_range(block_points, start, stop)
         with library_errors(self.path):
-            yield from blocks
+            for block in blocks:
+                check()
+                yield block
 
     def _read_range(self, block_points: int, start: int, stop: int | None) -> Iterator[Block]:
         """The blocks of a range; refuses any but the whole, which SeekableScan does not."""
@@ -202,10 +208,15 @@ def scan_error(path: Path, found: str, expected: str, what_to_do: str) -> ScanEr
 
 @contextmanager
 def library_errors(path: Path) -> Iterator[None]:
-    """Turn whatever a format's library or the file system raises into a ScanError; that memory ran out is none."""
+    """Turn whatever a format's library or the file system raises into a ScanError.
+
+    What is raised once the command is interrupted is Interrupted, and that memory ran out is a SolidcloudError.
+    """
     try:
         yield
+        check()
     except SolidcloudError:
+        check()
         raise
     except BaseException as error:
         if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM):
@@ -216,6 +227,7 @@ def library_errors(path: Path) -> Iterator[None]:
         # A panic inside lazrs (Rust) is a BaseException of its own and not an Exception.
         if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
             raise
+        check()
         # libe57 appends a page of debugging text to its message; the first line says it all.
         first_line = next(iter(str(error).strip().splitlines()), "")
         raise scan_error(
@@ -310,6 +322,10 @@ def quaternion_pose(
 
 
 def sha256_of(path: Path) -> str:
-    """The SHA-256 of a file's bytes in hexadecimal, read as a stream. Raises ScanError."""
-    with library_errors(path), path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+    """Return the SHA-256 of a file's bytes in hexadecimal, read as a stream. Raises ScanError."""
+    with library_errors(path), path.open("rb", buffering=0) as file:
+        digest, buffer = hashlib.sha256(), memoryview(bytearray(HASHED_BYTES))
+        while size := file.readinto(buffer):
+            check()
+            digest.update(buffer[:size])
+    return digest.hexdigest()

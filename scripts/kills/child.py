@@ -90,6 +90,7 @@ def _build(arguments: list[str], log: Path, gate: int, before: Callable[[], None
         if before is not None:
             before()
         code = run(arguments)
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # as the command does
     except SystemExit as error:
         code = error.code if isinstance(error.code, int) else 1
     except BaseException:

@@ -12,6 +12,7 @@ from .options import AsJson, parse_bytes, print_json
 
 if TYPE_CHECKING:
     from ...builder.config import BuildConfig
+    from ...builder.pipeline import BuildSummary
 
 Scans = Annotated[
     list[Path],
@@ -128,8 +129,15 @@ def _build(scans: list[Path], output: Path, config: "BuildConfig", log_json: boo
     from ..console import print_build
     from ..progress import progress_listener
 
-    with interruptible(lambda: _kept(output)), writing(output), progress_listener(log_json) as listener:
-        summary = build_archive(scans, output, config, listener)
+    built: list[BuildSummary] = []
+    whole = f"{output} is whole: all was done"
+    with (
+        interruptible(lambda: whole if built else _kept(output)),
+        writing(output),
+        progress_listener(log_json) as listener,
+    ):
+        built.append(build_archive(scans, output, config, listener))
+    summary = built[0]
     if as_json:
         print_json({**summary._asdict(), "archive": str(summary.archive)})
     else:
@@ -147,12 +155,13 @@ def _build(scans: list[Path], output: Path, config: "BuildConfig", log_json: boo
 
 
 def _kept(output: Path) -> str:
-    """What is left of a build that was interrupted."""
+    """Say what is left of a build that was interrupted."""
     from ...builder.workplace import building_folder
 
     folder = building_folder(output)
-    kept = f"what is done is kept in {folder}: the same command goes on, --fresh starts over"
-    return kept if folder.exists() else "nothing was done"
+    if folder.exists():
+        return f"what is done is kept in {folder}: the same command goes on where it was, --fresh starts over"
+    return "nothing was done"
 
 
 def _estimate(scans: Sequence[Path], output: Path, config: "BuildConfig", as_json: bool) -> None:

@@ -184,7 +184,7 @@ def test_a_cluster_that_is_not_as_needed_is_refused(monkeypatch: pytest.MonkeyPa
         empty.scale(1)
         empty.wait_for_workers(1, 30)
         with ClusterExecutor(empty.scheduler_address, say=lambda _: None) as executor:
-            monkeypatch.setattr(cluster_module, "ASK_SECONDS", 0.1)
+            monkeypatch.setattr(cluster_module, "LOOK_SECONDS", 0.1)
             monkeypatch.setattr(cluster_module, "LONELY_SECONDS", 0.3)
             empty.scale(0)
             while executor._client.scheduler_info()["workers"]:

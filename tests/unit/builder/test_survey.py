@@ -139,7 +139,7 @@ def test_that_memory_ran_out_is_no_fault_of_the_scan(
             raise error
 
     scan = Starved(listed(tmp_path, np.ones((4, 3))).path, np.ones((4, 3)), 50)
-    monkeypatch.setattr("hashlib.file_digest", lambda *_: (_ for _ in ()).throw(error))
+    monkeypatch.setattr("hashlib.sha256", lambda *_: (_ for _ in ()).throw(error))
     with pytest.raises(SolidcloudError, match=r"listed\.xyz: out of memory.*give fewer --jobs") as caught:
         survey_range(ranges(scan, 4)[0]) if where == "survey_range" else hash_file(scan.path)
     assert not isinstance(caught.value, ScanError)

@@ -1,14 +1,19 @@
-"""Signals kept back until a block ends or asks for them."""
+"""Signals that are noted, and raised where the work checks or where a block of a library's calls ends."""
 
+import contextlib
 import os
 import signal
+import subprocess
+import sys
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
-from solidcloud.schemas.interrupts import kept_back
+from solidcloud.schemas import interrupts
+from solidcloud.schemas.interrupts import Interrupted, came, check, children_ignore, kept_back, taken
 from solidcloud.schemas.new_file import new_file
 
 
@@ -78,3 +83,126 @@ def test_an_interrupt_while_hdf5_writes_is_one(tmp_path: Path, monkeypatch: pyte
     with pytest.raises(KeyboardInterrupt), new_file(tmp_path / "a.h5") as file:
         file.create_dataset("x", data=np.arange(10))
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_is_raised_where_the_work_checks(number: int) -> None:
+    seen = []
+    before = signal.getsignal(number)
+    with pytest.raises(Interrupted), taken():
+        check()
+        os.kill(os.getpid(), number)
+        os.kill(os.getpid(), number)  # twice, as a wrapper may pass on what the terminal sent too
+        seen.append(came())
+        check()
+        seen.append(False)
+    assert seen == [True]
+    assert signal.getsignal(number) is before and not came()
+    check()  # of the next command, nothing has come
+
+
+def test_whatever_ends_an_interrupted_block_is_an_interrupt() -> None:
+    with pytest.raises(Interrupted) as caught, taken():
+        os.kill(os.getpid(), signal.SIGINT)
+        raise ValueError("of a library")
+    assert isinstance(caught.value.__cause__, ValueError)
+    with pytest.raises(Interrupted), taken():
+        os.kill(os.getpid(), signal.SIGINT)
+    with pytest.raises(ValueError), taken():
+        raise ValueError("of the file")
+
+
+def test_a_check_that_was_swallowed_is_made_up_for() -> None:
+    with pytest.raises(Interrupted), taken():
+        os.kill(os.getpid(), signal.SIGINT)
+        with contextlib.suppress(BaseException):
+            check()
+
+
+def test_work_that_does_not_check_is_interrupted_where_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(interrupts, "GRACE_SECONDS", 0.05)
+    deadline = time.monotonic() + 30
+    with pytest.raises(Interrupted), taken():
+        os.kill(os.getpid(), signal.SIGINT)
+        while time.monotonic() < deadline:
+            time.sleep(0.01)
+    assert time.monotonic() < deadline
+
+
+def test_an_interrupt_that_python_has_to_drop_comes_again_without_a_word(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(interrupts, "GRACE_SECONDS", 0.05)
+
+    class Long:
+        def __del__(self) -> None:
+            until = time.monotonic() + 0.3
+            while time.monotonic() < until:
+                time.sleep(0.01)
+
+    hook, deadline = sys.unraisablehook, time.monotonic() + 30
+    with pytest.raises(Interrupted), taken():
+        os.kill(os.getpid(), signal.SIGINT)
+        Long()
+        while time.monotonic() < deadline:
+            time.sleep(0.01)
+    assert time.monotonic() < deadline and sys.unraisablehook is hook
+    assert capsys.readouterr().err == ""
+
+
+def test_a_second_signal_after_a_while_does_not_wait(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(Interrupted), taken():
+        os.kill(os.getpid(), signal.SIGINT)
+        monkeypatch.setattr(interrupts, "GRACE_SECONDS", 0.0)
+        os.kill(os.getpid(), signal.SIGINT)
+        pytest.fail("it went on")
+
+
+def test_calls_of_a_library_are_not_interrupted_however_long(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(interrupts, "GRACE_SECONDS", 0.02)
+    seen = []
+    with pytest.raises(Interrupted), taken():
+        with kept_back():
+            os.kill(os.getpid(), signal.SIGINT)
+            until = time.monotonic() + 0.2
+            while time.monotonic() < until:
+                time.sleep(0.01)
+            os.kill(os.getpid(), signal.SIGTERM)
+            seen.append("went on")
+        seen.append("too far")
+    assert seen == ["went on"]
+
+
+def test_an_ignored_signal_stays_ignored_and_other_threads_take_none() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    with taken():
+        os.kill(os.getpid(), signal.SIGINT)
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN and not came()
+    handlers = []
+
+    def run() -> None:
+        with taken():
+            handlers.append(signal.getsignal(signal.SIGTERM))
+
+    before = signal.getsignal(signal.SIGTERM)
+    thread = threading.Thread(target=run)
+    thread.start()
+    thread.join()
+    assert handlers == [before]
+
+
+def test_a_block_within_a_block_is_part_of_it() -> None:
+    seen = []
+    with pytest.raises(Interrupted), taken():
+        with taken():
+            os.kill(os.getpid(), signal.SIGINT)
+        seen.append(came())
+        check()
+    assert seen == [True]
+
+
+def test_a_process_started_by_others_is_not_reached_by_the_terminal() -> None:
+    code = "import signal, sys; sys.exit(signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, ()))"
+    with children_ignore():
+        assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 1
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

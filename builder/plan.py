@@ -3,8 +3,9 @@
 Everything follows from a few figures of the scene (`Scene`: of scans that are there, found by `sample.py`, or of a
 number of points that are thought of) and from measured rates (`Rates`: rates.json, which `scripts/bench_build
 --write-rates` writes, or measured here). A stage takes a start, and so much a point; what of that is shared among
-workers was found by measuring with one and with two. Bytes a point follow the density of points on surfaces.
-An estimate holds within a factor of 1.5 where the scene is like a scanned building; it says what it assumed.
+workers was found by measuring with one and with two. Bytes a point are those of a sample that is packed
+(`packed_sample.py`), and hold within 15 %; without one they follow the density of points on surfaces, a guess. Times
+hold within a factor of 1.5 where the scene is like a scanned building. An estimate says what it assumed.
 """
 
 import json
@@ -29,10 +30,11 @@ from .spool import spool_dtype
 RATES_NAME = "rates.json"
 VERSION = 1
 
-# Bytes of the index a voxel (schemas/FORMAT.md); of a shard's file beside the records, HDF5's own; and of a voxel in a
-# run's directory, read by every process.
+# Bytes of the index beside its voxels, and a voxel (schemas/FORMAT.md); of a shard's file beside the records, HDF5's
+# own, a voxel (measured: 1,020 to 1,050); and of a voxel in a run's directory, read by every process.
+HEADER_BYTES = 7500
 INDEX_BYTES = 100
-GROUP_BYTES = 1200
+GROUP_BYTES = 1030
 DIRECTORY_BYTES = 40
 # Runs that a voxel is spread over, about: scans that overlap, and ranges of a scan that meet.
 RUNS_A_VOXEL = 8
@@ -49,6 +51,8 @@ DENSE_POINTS = 1 << 20
 MANY_FILES = 1_000_000
 # The densest voxel holds about so many times the mean (measured: 7 on a made façade in voxels of 8 m, 3 of 2 m).
 DENSEST = 8
+# Bytes of the archive are within this factor of an estimate, of scans whose points were packed, and of others.
+MEASURED_WITHIN, GUESSED_WITHIN = 1.15, 2.5
 
 
 class Stage(NamedTuple):
@@ -139,7 +143,8 @@ class Scene:
     points, scans: how many.  largest: points of the largest scan.  input_bytes: of files; None: not known.
     formats: format -> points.  step: lattice step that all scans share [m], or None.  area: of the surfaces [m^2].
     voxels: how many hold points, by a voxel's edge [m], found by a look; else they follow from the area.
-    extent: greatest length along an axis [m], or None.  assumed: sentences.
+    extent: greatest length along an axis [m], or None.  assumed: sentences.  packed: bytes a point of records of a
+    sample, with scan and intensity where they are kept; None: not measured.
     """
 
     points: int
@@ -152,6 +157,7 @@ class Scene:
     voxels: tuple[float, float] | None = None
     extent: float | None = None
     assumed: tuple[str, ...] = ()
+    packed: float | None = None
 
 
 def imagined(points: int, rates: Rates, density: float | None = None, scans: int | None = None) -> Scene:
@@ -194,7 +200,10 @@ class Limit(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Plan:
-    """What a build will take: bytes, seconds; see `estimate`. disk_bytes: at most at one time, beside the scans."""
+    """What a build will take: bytes, seconds; see `estimate`. disk_bytes: at most at one time, beside the scans.
+
+    archive_within: the archive has archive_bytes divided by this at least, and times this at most.
+    """
 
     points: int
     scans: int
@@ -205,6 +214,7 @@ class Plan:
     jobs: int
     archive_bytes: int
     bytes_a_point: float
+    archive_within: float
     index_bytes: int
     spool_bytes: int
     preview_bytes: int
@@ -230,11 +240,11 @@ def estimate(scene: Scene, config: BuildConfig, rates: Rates, target: Path | Non
     pitch = math.sqrt(scene.area / scene.points)
     voxels = _voxels(scene, config.voxel, rates)
     jobs = jobs_that_fit(worker_count(config.jobs, scene.points), config)
-    columns = sum({"scan": 0.2, "intensity": 2.0, "normal": 1.2}[name] for name in config.keep) + (
-        config.models != {"mean"}
-    )
-    each = rates.bytes_a_point(pitch / step) + columns
-    size = round(scene.points * each + voxels * (INDEX_BYTES + GROUP_BYTES))
+    bytes_of = {"scan": 0.2, "intensity": 2.0, "normal": 1.2}
+    measured = set() if scene.packed is None else {"scan", "intensity"}
+    columns = sum(bytes_of[name] for name in config.keep - measured) + (config.models != {"mean"})
+    each = columns + (rates.bytes_a_point(pitch / step) if scene.packed is None else scene.packed)
+    size = round(scene.points * each + voxels * (INDEX_BYTES + GROUP_BYTES)) + HEADER_BYTES
     spool = scene.points * spool_dtype(config).itemsize
     runs = _runs(scene, config, jobs)
     directories = min(runs * voxels, scene.points, RUNS_A_VOXEL * voxels + runs) * DIRECTORY_BYTES
@@ -249,6 +259,7 @@ def estimate(scene: Scene, config: BuildConfig, rates: Rates, target: Path | Non
         jobs=jobs,
         archive_bytes=size,
         bytes_a_point=size / scene.points,
+        archive_within=MEASURED_WITHIN if scene.packed is not None else GUESSED_WITHIN,
         index_bytes=voxels * INDEX_BYTES,
         spool_bytes=spool,
         preview_bytes=round(

@@ -14,11 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..schemas.errors import ScanError
-from ..schemas.voxel_grid import MAX_COORDINATE, MAX_VOXEL_STEPS, MIN_STEP
-from .config import BuildConfig
+from ..schemas.voxel_grid import MAX_COORDINATE, MAX_VOXEL_STEPS, MIN_STEP, make_lattice
+from .config import DEFAULT_STEP, BuildConfig
+from .packed_sample import Packed, packed_sample
 from .plan import Plan, Rates, Scene, estimate, load_rates
 from .scan_list import Input, inputs
 from .sources import Scan
+from .survey import shared_step
 
 # Surfaces are measured in cubes of the first of these edges [m] that is far more than the distance of points, so that
 # a cube has at least so many: far less than a room.
@@ -26,6 +28,8 @@ CUBES = (0.25, 0.5, 1.0, 2.0)
 POINTS_A_CUBE = 8
 # Looks at all scans together, and points at a time; a chunk of LAZ, 50,000 points, is decoded for each.
 LOOKS, LOOK_POINTS = 512, 2048
+# Of the points looked at one in so many is kept.
+SOME = 8
 # Points looked at of a scan that cannot seek, and the time after which no more scans are looked at [s].
 FIRST_POINTS = 1 << 17
 SECONDS = 10.0
@@ -34,10 +38,14 @@ TEXT_BYTES = 30
 
 
 class _Look(NamedTuple):
-    """What was seen at one place. points: looked at.  held: edge [m] -> (k,) int64 keys of cubes that hold some."""
+    """What was seen at one place. points: looked at.  held: edge [m] -> (k,) int64 keys of cubes that hold some.
+
+    some: (m, 3) [m], one point in SOME.
+    """
 
     points: int
     held: dict[float, NDArray[np.int64]]
+    some: NDArray[np.float64]
 
 
 def _keys(xyz: NDArray[np.float64], edge: float) -> NDArray[np.int64]:
@@ -57,7 +65,8 @@ class _Grid(NamedTuple):
     def look(self, xyz: NDArray[np.float64]) -> _Look:
         """What points (n, 3) [m] are in."""
         xyz = xyz[(np.abs(xyz) <= MAX_COORDINATE).all(axis=1)] - self.origin
-        return _Look(len(xyz), {edge: _keys(xyz, edge) for edge in {*CUBES, self.edge}})
+        held = {edge: _keys(xyz, edge) for edge in {*CUBES, self.edge}}
+        return _Look(len(xyz), held, xyz[::SOME] + self.origin)
 
 
 def unseen(looks: Sequence[NDArray[np.int64]]) -> float:
@@ -107,9 +116,12 @@ def _see(scan: Scan, looks: int, grid: _Grid) -> _Seen:
     return _Seen(count, found, whole)
 
 
-def seen_scene(inputs: Sequence[Input], config: BuildConfig) -> Scene:
-    """What a look at opened scans tells of a build of them.
+def seen_scene(
+    inputs: Sequence[Input], config: BuildConfig, rates: Rates | None = None, *, quick: bool = False
+) -> Scene:
+    """Return what a look at opened scans tells of a build of them; some blocks of points are packed.
 
+    quick: look at a few points alone, and pack none.  rates: None: those of the package.
     Raises ScanError where no scan has a point, and for a broken one unless `skip_bad`.
     """
     faults = [each.fault for each in inputs if each.fault]
@@ -151,6 +163,13 @@ def seen_scene(inputs: Sequence[Input], config: BuildConfig) -> Scene:
         assumed.append(
             f"{unsaid:,} files do not say how many points they hold: a point in {TEXT_BYTES} bytes"
         )
+    packed = None if quick else _packed(scans, seen, bounds, points / area, config, rates or load_rates())
+    if packed is not None:
+        assumed.append(
+            f"bytes as {packed.points:,} points take, packed as a build packs them; {packed.share:.0%} of all were read"
+        )
+        if packed.voxels is not None:
+            voxels = float(packed.voxels)
     return Scene(
         points=points,
         scans=len(scans),
@@ -162,6 +181,37 @@ def seen_scene(inputs: Sequence[Input], config: BuildConfig) -> Scene:
         voxels=(config.voxel, max(1.0, min(voxels, points))),
         extent=None if bounds is None else float((bounds[1] - bounds[0]).max()),
         assumed=tuple(assumed),
+        packed=None if packed is None else packed.bytes_a_point,
+    )
+
+
+def _packed(
+    scans: Sequence[Scan],
+    seen: Sequence[_Seen],
+    bounds: NDArray[np.float64] | None,
+    density: float,
+    config: BuildConfig,
+    rates: Rates,
+) -> Packed | None:
+    """Return what a sample of the scans tells; None where nothing can be packed as they are asked to be built."""
+    some = [look.some for each in seen for look in each.looks]
+    if not any(map(len, some)):
+        return None
+    step = config.resolution or _shared_step(scans, config.voxel) or DEFAULT_STEP
+    if not (step >= MIN_STEP and 1 <= round(config.voxel / step) <= MAX_VOXEL_STEPS):
+        return None
+    low = np.min(np.concatenate(some), axis=0) if bounds is None else bounds[0]
+    # Of a scan that was not looked at, or is broken, nothing is read.
+    used = [(scan, each.points) for scan, each in zip(scans, seen, strict=True) if each.points and each.looks]
+    all_over = all(each.all_over for each in seen)
+    return packed_sample(
+        [scan for scan, _ in used],
+        [points for _, points in used],
+        make_lattice(low, step, config.voxel),
+        density,
+        np.concatenate(some) if all_over else None,
+        config,
+        rates,
     )
 
 
@@ -182,11 +232,8 @@ def _total(seen: Sequence[_Seen], edge: float) -> float:
 
 
 def _shared_step(scans: Sequence[Scan], voxel: float) -> float | None:
-    """The step of the lattice that all scans have, by their headers; about as survey.py chooses it."""
-    steps = {step for scan in scans for step in (scan.lattice.scale if scan.lattice else (None,))}
-    if len(steps) != 1:
-        return None
-    (step,) = steps
+    """Return the step of the lattice that all scans have, by their headers, as survey.py chooses it; or None."""
+    step = shared_step([scan.lattice for scan in scans])
     return step if step and max(MIN_STEP, voxel / MAX_VOXEL_STEPS) <= step <= voxel else None
 
 
@@ -198,10 +245,18 @@ def _bounds(scans: Sequence[Scan]) -> NDArray[np.float64] | None:
     return np.stack([np.min([b[0] for b in bounds], axis=0), np.max([b[1] for b in bounds], axis=0)])
 
 
-def planned(paths: Sequence[Path], config: BuildConfig, target: Path, rates: Rates | None = None) -> Plan:
-    """What building scans, folders of them or a list will take; reads headers and some points.
+def planned(
+    paths: Sequence[Path],
+    config: BuildConfig,
+    target: Path,
+    rates: Rates | None = None,
+    *,
+    quick: bool = False,
+) -> Plan:
+    """Return what building scans, folders of them or a list will take. quick: as of `seen_scene`.
 
     Raises ScanError and BadRequestError as a build would, as far as a look can tell.
     """
-    scene = seen_scene(inputs(paths, config.spacing), config)
-    return estimate(scene, config, rates or load_rates(), target)
+    rates = rates or load_rates()
+    scene = seen_scene(inputs(paths, config.spacing), config, rates, quick=quick)
+    return estimate(scene, config, rates, target)

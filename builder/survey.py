@@ -18,6 +18,7 @@ from .config import DEFAULT_STEP, BuildConfig
 from .kernels.spool import usable_bounds
 from .passing import raise_passing
 from .sources import NOT_FINITE, Scan, sha256_of
+from .sources.scan import Lattice as SourceLattice
 
 # A header's bounds are believed when no point lies farther outside [m]: they are rounded, but not by more.
 BOUNDS_WITHIN = 0.01
@@ -227,8 +228,12 @@ def choose_lattice(surveys: list[Survey], config: BuildConfig) -> tuple[Lattice,
 
 
 def _shared_step(surveys: list[Survey]) -> float | None:
-    """The step of the lattice on which all sources lie, if they share one: same scale, offsets apart by whole steps."""
-    lattices = [s.scan.lattice for s in surveys if s.scan is not None]
+    """Return the step of `shared_step` for what was surveyed."""
+    return shared_step([s.scan.lattice for s in surveys if s.scan is not None])
+
+
+def shared_step(lattices: Sequence[SourceLattice | None]) -> float | None:
+    """Return the step of the lattice on which all sources lie: same scale, offsets apart by whole steps; or None."""
     if not lattices or any(lattice is None for lattice in lattices):
         return None
     first = lattices[0]

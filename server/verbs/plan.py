@@ -40,6 +40,12 @@ def plan(
     measure: Annotated[
         bool, typer.Option("--measure", help="Measure this machine first, some seconds, and go by that.")
     ] = False,
+    quick: Annotated[
+        bool,
+        typer.Option(
+            "--quick", help="Look at few points and pack none: bytes are a guess, and a range is said."
+        ),
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Estimate what a build takes: bytes, memory, time by stage, and the limits that would stop it."""
@@ -74,7 +80,7 @@ def plan(
     else:
         from ...builder.sample import planned
 
-        found = planned(scans or [], config, output, rates)
+        found = planned(scans or [], config, output, rates, quick=quick)
     if as_json:
         print_json(found.as_json())
     else:
@@ -102,7 +108,8 @@ def plan_facts(plan: "Plan") -> Iterator[tuple[str, str]]:
     yield (
         "archive",
         f"{bytes_text(plan.archive_bytes)}, {plan.bytes_a_point:.2f} bytes a point at {plan.lattice_step * 1e3:g} mm; "
-        f"{plan.shards:,} shards",
+        f"{plan.shards:,} shards; from {bytes_text(plan.archive_bytes / plan.archive_within)} to "
+        f"{bytes_text(plan.archive_bytes * plan.archive_within)}",
     )
     yield (
         "voxels",

@@ -90,7 +90,7 @@ def test_an_estimate_adds_up() -> None:
     pitch = math.sqrt(1 / 400) / 1e-4
     voxels = round(0.5 * scene.area / 64)
     assert found.voxels == voxels
-    assert found.archive_bytes == round(10**6 * RATES.bytes_a_point(pitch) + 1300 * voxels)
+    assert found.archive_bytes == round(10**6 * RATES.bytes_a_point(pitch) + 1130 * voxels) + 7500
     assert found.preview_bytes == 125_000 * 6
     assert found.spool_bytes == 12 * 10**6
     assert found.disk_bytes == found.archive_bytes + found.spool_bytes

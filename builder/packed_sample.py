@@ -1,0 +1,327 @@
+"""Bytes a point of the archive that scans would make: some compact blocks of points, packed by the code that builds.
+
+How well points compress depends on how close they are to each other, of all scans together. So the sample is not thin:
+whole cubes of the octree are taken, around points that are spread evenly over the scans, with all points in them.
+Scans are read whole where there is time for it, else in pieces around those points; what the pieces lack is made up
+for by how bytes a point fall when points are left out.
+"""
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..schemas.codec import encode_voxel
+from ..schemas.interrupts import check
+from ..schemas.voxel_grid import Lattice
+from .config import BuildConfig
+from .kernels.cubes import FREE, insert_all, take_cubes
+from .octree import VoxelPoints, build_voxel
+from .partition import usable
+from .plan import Rates
+from .sources import Block, Scan
+
+# Blocks that are packed, and points of one: packing takes about 1 us a point.
+BLOCKS, BLOCK_POINTS = 48, 12_000
+# Scans of fewer points than this together are packed whole, a voxel at a time.
+ALL_POINTS = 400_000
+# A cube is gathered with room for so many times the points, as scans are denser here and there.
+ROOM = 4
+# Reading may take so long [s], and so much a point where that is more; finding the cubes takes so much a point.
+READ_SECONDS, READ_SECONDS_A_POINT, FIND_SECONDS = 2.0, 2e-8, 1e-8
+# Points read to find one that a block is taken around; some may be no returns.
+PROBE_POINTS = 256
+# Scans are read whole where there is time for so much of them.
+MOST_SHARE = 0.8
+# Of a record; as hard to compress as any other.
+_KEY, _ID = 0x1B3A75C2D49E6F08, bytes.fromhex("8f1e6a03b7c95d2470eb42d81fa6395c")
+# Points that are held until cubes that hold too many are halved.
+MOST_HELD = 6_000_000
+
+
+class Packed(NamedTuple):
+    """What packing a sample tells. bytes_a_point: of records, with the columns scan and intensity where they are kept.
+
+    points: packed.  share: of all points that were read.  voxels: that hold points; None where not all were read.
+    """
+
+    bytes_a_point: float
+    points: int
+    share: float
+    voxels: int | None
+
+
+class _Gathered(NamedTuple):
+    """Points of the chosen cubes: slot (n,), local (n, 3) [steps], scan (n,) and intensity (n,) of each."""
+
+    slot: NDArray[np.int64]
+    local: NDArray[np.int32]
+    scan: NDArray[np.uint16]
+    intensity: NDArray[np.float32]
+
+    def rows(self, which: NDArray) -> "_Gathered":
+        """Return some of the points."""
+        return _Gathered(*(column[which] for column in self))
+
+
+_NOTHING = _Gathered(
+    np.empty(0, np.int64), np.empty((0, 3), np.int32), np.empty(0, np.uint16), np.empty(0, np.float32)
+)
+
+
+class _Cubes:
+    """Cubes of the octree, each around a point.
+
+    around: (c, 3) int64, the point in its voxel [steps].  chosen: (c, 5), see `take_cubes`.  weight: (c,), how many of
+    the points that were drawn lie in it.
+    """
+
+    def __init__(self, drawn: NDArray[np.float64], lattice: Lattice, shift: int) -> None:
+        """Choose the cubes of 2^shift steps that points (n, 3) [m] lie in."""
+        steps = lattice.to_lattice(drawn)
+        voxels = steps // lattice.voxel_steps
+        at = steps - voxels * lattice.voxel_steps
+        most = (1 << 20) - 1
+        x, y, z = (np.clip(voxels, -most, most) + most).T
+        cubes = np.column_stack([(x << 42) | (y << 21) | z, at >> shift, np.full(len(at), shift)])
+        found, first, self.weight = np.unique(cubes, axis=0, return_index=True, return_counts=True)
+        self.chosen, self.around = np.ascontiguousarray(found, np.int64), at[first]
+
+    def shrink(self, slot: int, found: _Gathered, mine: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Halve a cube around its point; return which of its points, `mine` of those found, are still in it."""
+        shift = self.chosen[slot, 4] - 1
+        cube = self.around[slot] >> shift
+        self.chosen[slot, 1:4], self.chosen[slot, 4] = cube, shift
+        return mine & (found.local >> shift == cube).all(axis=1)
+
+    def cropped(self, found: _Gathered, most: int) -> _Gathered:
+        """Return the points found, with cubes halved until none holds more than so many."""
+        keep = np.ones(len(found.slot), bool)
+        for slot in np.flatnonzero(np.bincount(found.slot, minlength=1) > most).tolist():
+            mine = found.slot == slot
+            keep &= ~mine
+            while np.count_nonzero(mine) > most and self.chosen[slot, 4]:
+                mine = self.shrink(slot, found, mine)
+            keep |= mine
+        return found.rows(keep)
+
+
+class _Reader:
+    """Reads scans, counts voxels, and gathers the points of cubes."""
+
+    def __init__(self, scans: Sequence[Scan], lattice: Lattice) -> None:
+        """Nothing read so far."""
+        self.scans, self.lattice = scans, lattice
+        self.read = 0
+        self.table, self._known = np.full(1 << 12, FREE), np.zeros(1, np.int64)
+
+    @property
+    def voxels(self) -> int:
+        """Return how many voxels hold points that were read."""
+        return int(self._known[0])
+
+    def gather(self, pieces: Sequence[tuple[int, int, int | None]], cubes: _Cubes | None) -> _Gathered:
+        """Read pieces (scan, start, stop) and return the points in cubes; those that hold too many are halved."""
+        parts, held = [_NOTHING], 0
+        chosen = np.empty((0, 5), np.int64) if cubes is None else cubes.chosen
+        for number, start, stop in pieces:
+            for block in _usable_blocks(self.scans[number], start, stop):
+                parts.append(self.taken(number, block, chosen))
+                held += len(parts[-1].slot)
+                if cubes is not None and held > MOST_HELD:
+                    parts = [cubes.cropped(_joined(parts), ROOM * BLOCK_POINTS)]
+                    held = len(parts[0].slot)
+        return _joined(parts)
+
+    def taken(self, number: int, block: Block, chosen: NDArray[np.int64]) -> _Gathered:
+        """Return the points of a block that are in chosen cubes."""
+        lattice, size = self.lattice, len(block.xyz)
+        self.read += size
+        picked, slots = np.empty(size, np.int64), np.empty(size, np.int64)
+        local = np.empty((size, 3), np.int64)
+        count = done = 0
+        while done < size:
+            more, past = take_cubes(
+                block.xyz[done:], np.array(lattice.origin), lattice.step, lattice.voxel_steps, chosen,
+                self.table, self._known, picked[count:], slots[count:], local[count:],
+            )  # fmt: skip
+            picked[count : count + more] += done
+            count, done = count + more, done + past
+            if done < size:
+                table = np.full(2 * len(self.table), FREE)
+                insert_all(self.table, table)
+                self.table = table
+        light = np.zeros(size, np.float32) if block.intensity is None else block.intensity
+        return _Gathered(
+            slots[:count],
+            local[:count].astype(np.int32),
+            np.full(count, number % (1 << 16), np.uint16),
+            light[picked[:count]],
+        )
+
+
+def _usable_blocks(scan: Scan, start: int, stop: int | None) -> Iterator[Block]:
+    """Yield the usable points of a piece of a scan; of one that cannot seek, from its beginning."""
+    seen = 0
+    for block in scan.blocks(start=start, stop=stop) if scan.seekable else scan.blocks():
+        yield usable(block)
+        seen += len(block.xyz)
+        if stop is not None and seen >= stop - start:
+            return
+
+
+def _joined(parts: Sequence[_Gathered]) -> _Gathered:
+    return _Gathered(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def packed_sample(
+    scans: Sequence[Scan],
+    counts: Sequence[int],
+    lattice: Lattice,
+    density: float,
+    some: NDArray[np.float64] | None,
+    config: BuildConfig,
+    rates: Rates,
+) -> Packed | None:
+    """Pack some blocks of scans. counts: points of each, about.  density: points a square metre, about.
+
+    some: (m, 3) [m], points from all over all scans; None where there are only those of their beginnings.
+    Returns None where no point was found.
+    """
+    total = sum(counts)
+    if total <= ALL_POINTS:
+        return _all_packed(scans, lattice, config)
+    share = _share(scans, counts, rates)
+    edge = np.sqrt(ROOM * BLOCK_POINTS / density)
+    whole = int(lattice.voxel_steps - 1).bit_length()
+    places = _places(counts)
+    drawn = _drawn(scans, places, share)
+    if not len(drawn):
+        return None
+    cubes = _Cubes(drawn, lattice, int(np.clip(np.log2(edge / lattice.step), 0, whole)))
+    reader = _Reader(scans, lattice)
+    found = reader.gather(_pieces(scans, counts, places, share), cubes)
+    lacking = 1.0
+    if share < 1 and some is not None:
+        expected = (
+            len(_Reader(scans, lattice).taken(0, Block(some, None), cubes.chosen).slot) / len(some) * total
+        )
+        lacking = max(1.0, expected / max(1, len(found.slot)))
+    found = cubes.cropped(found, BLOCK_POINTS)
+    each = _bytes_a_point(found, cubes.weight, lacking, lattice, config)
+    return Packed(each, len(found.slot), min(1.0, reader.read / total), reader.voxels if share == 1 else None)
+
+
+def _share(scans: Sequence[Scan], counts: Sequence[int], rates: Rates) -> float:
+    """Return the share of all points that there is time to read; 1 where it is most."""
+    reading = sum(
+        count * (rates.read.get(scan.format, rates.read["las"]) + FIND_SECONDS)
+        for scan, count in zip(scans, counts, strict=True)
+    )
+    share = max(READ_SECONDS, READ_SECONDS_A_POINT * sum(counts)) / reading
+    return share if share < MOST_SHARE else 1.0
+
+
+def _bytes_a_point(
+    found: _Gathered, weight: NDArray, lacking: float, lattice: Lattice, config: BuildConfig
+) -> float:
+    """Return the mean of all blocks, for points so many times as dense as those found."""
+    each, less, weights = [], [], []
+    rng = np.random.default_rng(0)
+    for slot in np.unique(found.slot).tolist():
+        block = found.rows(found.slot == slot)
+        weights.append(weight[slot])
+        each.append(_packed_bytes(block, lattice, config) / len(block.slot))
+        if lacking > 1:
+            half = block.rows(rng.permutation(len(block.slot))[: -(-len(block.slot) // 2)])
+            less.append(_packed_bytes(half, lattice, config) / len(half.slot) - each[-1])
+    mean = float(np.average(each, weights=weights))
+    # Twice the points take so much less each, as half of them take more.
+    return max(1.0, mean - float(np.average(less, weights=weights)) * np.log2(lacking)) if less else mean
+
+
+def _packed_bytes(block: _Gathered, lattice: Lattice, config: BuildConfig) -> int:
+    """Return the bytes of the record that points of one voxel make."""
+    check()
+    points = VoxelPoints(
+        np.ascontiguousarray(block.local),
+        block.scan if "scan" in config.keep else None,
+        block.intensity if "intensity" in config.keep else None,
+    )
+    record = encode_voxel(build_voxel(_KEY, points, lattice.voxel_steps, config), _ID)
+    return len(record.cells) + len(record.nodes) + len(record.points)
+
+
+def _all_packed(scans: Sequence[Scan], lattice: Lattice, config: BuildConfig) -> Packed | None:
+    """Pack every voxel of scans that are few points."""
+    pieces = [(number, 0, None) for number in range(len(scans))]
+    reader = _Reader(scans, lattice)
+    reader.gather(pieces, None)
+    keys = np.sort(reader.table[reader.table != FREE])
+    chosen = np.zeros((len(keys), 5), np.int64)
+    chosen[:, 0], chosen[:, 4] = keys, int(lattice.voxel_steps - 1).bit_length()
+    parts = [
+        reader.taken(number, block, chosen)
+        for number, start, stop in pieces
+        for block in _usable_blocks(scans[number], start, stop)
+    ]
+    found = _joined([_NOTHING, *parts])
+    if not len(found.slot):
+        return None
+    order = np.argsort(found.slot, kind="stable")
+    voxels = np.split(order, np.flatnonzero(np.diff(found.slot[order])) + 1)
+    size = sum(_packed_bytes(found.rows(which), lattice, config) for which in voxels)
+    return Packed(size / len(order), len(order), 1.0, len(keys))
+
+
+def _places(counts: Sequence[int]) -> list[tuple[int, int]]:
+    """Return (scan, point) of BLOCKS points that are spread evenly over all scans."""
+    ends = np.cumsum(counts)
+    at = ((np.arange(BLOCKS) + 0.5) / BLOCKS * ends[-1]).astype(np.int64)
+    numbers = np.searchsorted(ends, at, side="right")
+    return list(zip(numbers.tolist(), (at - ends[numbers] + np.array(counts)[numbers]).tolist(), strict=True))
+
+
+def _drawn(scans: Sequence[Scan], places: Sequence[tuple[int, int]], share: float) -> NDArray[np.float64]:
+    """Return the points (n, 3) [m] at some places, or near them; of scans that cannot seek, in what will be read."""
+    found = [np.empty((0, 3))]
+    for number, scan in enumerate(scans):
+        wanted = [at for which, at in places if which == number]
+        if scan.seekable:
+            for at in wanted:
+                stop = min(at + PROBE_POINTS, scan.declared_count or 0)
+                found += [block.xyz[:1] for block in _usable_blocks(scan, at, stop)][:1]
+            continue
+        wanted, seen = [int(at * share) for at in wanted], 0
+        blocks = _usable_blocks(scan, 0, None)
+        for block in blocks if wanted else ():
+            here = [at - seen for at in wanted if 0 <= at - seen < len(block.xyz)]
+            found.append(block.xyz[here])
+            seen += len(block.xyz)
+            if seen > wanted[-1]:
+                break
+    return np.concatenate(found)
+
+
+def _pieces(
+    scans: Sequence[Scan], counts: Sequence[int], places: Sequence[tuple[int, int]], share: float
+) -> list[tuple[int, int, int | None]]:
+    """Return what to read (scan, start, stop): all of every scan, or pieces around places, of share of the points."""
+    pieces: list[tuple[int, int, int | None]] = []
+    for number, (scan, count) in enumerate(zip(scans, counts, strict=True)):
+        wanted = [at for which, at in places if which == number]
+        if share == 1:
+            pieces.append((number, 0, None))
+        elif not scan.seekable:
+            pieces.append((number, 0, max(1, int(count * share))))
+        else:
+            wanted = wanted or [count // 2]
+            half = max(1, int(count * share / len(wanted)) // 2)
+            past = 0
+            for at in wanted:
+                start, stop = max(past, at - half), min(count, at + half)
+                if start < stop:
+                    pieces.append((number, start, stop))
+                past = max(past, stop)
+    return pieces

@@ -262,6 +262,6 @@ def _check_bounds(columns: dict[str, NDArray]) -> None:
         found = f"{low[row].tolist()} to {high[row].tolist()}"
         _refuse(f"{_at(voxels, wrong)} bounds", found, f"low up to high, 0 to {steps - 1}")
     base = voxel_coordinates(voxels["key"]) * steps
-    found = np.stack([(base + low).min(axis=0), (base + high).max(axis=0)])
-    if (found != columns["bounds"]).any():
-        _refuse("the voxels' bounds are not the scene's:", found.tolist(), f"{columns['bounds'].tolist()}")
+    together = np.stack([(base + low).min(axis=0), (base + high).max(axis=0)])
+    if (together != columns["bounds"]).any():
+        _refuse("the voxels' bounds are not the scene's:", together.tolist(), f"{columns['bounds'].tolist()}")

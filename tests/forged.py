@@ -70,7 +70,7 @@ def read_rows(folder: Path, columns: Columns, voxel: int, i: int) -> NDArray:
     plain = zstandard.decompress(data[begin : begin + int(entry["frame_bytes"][i])])
     dtype = row_types(columns)[i]
     planes = np.frombuffer(plain, np.uint8).reshape(dtype.itemsize, -1)
-    return np.ascontiguousarray(planes.T).view(dtype)[:, 0]
+    return planes.T.copy().view(dtype)[:, 0]
 
 
 def put_frame(folder: Path, columns: Columns, voxel: int, i: int, frame: bytes) -> None:

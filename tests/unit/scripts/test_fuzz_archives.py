@@ -1,0 +1,21 @@
+"""scripts/fuzz_archives: some hundred forged archives now, and a fault is found where there is one."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+SCRIPT = Path(__file__).parents[3] / "scripts" / "fuzz_archives"
+
+
+def test_forged_archives_are_refused_or_answered_right() -> None:
+    """A share of the 100,000 of scripts/fuzz_archives, which is where to look for more."""
+    command = [sys.executable, str(SCRIPT), "--cases", "300", "--seed", "3", "--jobs", "1", "--seconds", "10"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.stdout, done.stderr
+    found = json.loads(done.stdout)
+    assert found["faults"] == [] and done.returncode == 0
+    # Neither is all of it stopped at the first check, nor is the damage too slight to be seen.
+    assert found["outcomes"]["refused"] > 60 and found["outcomes"]["found"] > 20
+    assert found["outcomes"]["right"] > 20 and found["with_unknown"] > 10
+    assert len(found["by_field"]) > 35

@@ -1,7 +1,8 @@
 """Which points lie in some chosen cubes, and which voxels hold any: what a look at scans does with every point."""
 
-import numba as nb
 import numpy as np
+
+from ...schemas.kernels import compiling as nb
 
 # A free place of a table of voxels: no key is negative.
 FREE = np.int64(-1)

@@ -172,7 +172,7 @@ def _array_to_lists(value: Any) -> Any:
     """The nested lists of an array, or a number of numpy's, for JSON; msgspec writes what is not finite as null."""
     if not isinstance(value, np.ndarray | np.generic):
         raise NotImplementedError(f"a message cannot hold {type(value).__name__}")
-    if value.size <= _LISTED:
+    if isinstance(value, np.generic) or value.size <= _LISTED:
         return value.tolist()
     rows = max(1, _LISTED * len(value) // value.size)
     pieces = (value[begin : begin + rows].tolist() for begin in range(0, len(value), rows))

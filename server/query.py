@@ -104,7 +104,7 @@ def ask(scene: Asker, query: Query, read_points: ReadPoints) -> Iterator[Asked]:
         answers = getattr(scene, query.op)(*what, **parameters)
         word, kind = ("ray", Rays) if query.op == "raycast" else ("point", Points)
         labels = [f"{word} {number}" for number in range(len(answers))]
-        yield Asked(labels, [], answers, kind(*what, given["reach"]))
+        yield Asked(labels, [], answers, kind(*what, given["reach"]))  # type: ignore[call-arg]
         return
     times, poses = read_poses(given["poses"])
     op = query.along if query.op == "path" else query.op

@@ -100,7 +100,7 @@ class StateQuery:
         self._pause = min(2 * self._pause, _MOST_PAUSE)
         self._asked, self._open = monotonic(), True
         # zenoh calls these: they may not block, nor use zenoh.
-        handler = zenoh.handlers.Callback(
+        handler: Any = zenoh.handlers.Callback(
             lambda reply: self._came.put((asked, reply)), lambda: self._came.put((asked, None))
         )
         try:

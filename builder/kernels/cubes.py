@@ -53,7 +53,8 @@ def take_cubes(xyz, origin, step, voxel_steps, chosen, table, known, picked, slo
             # By multiplication it may be one off.
             voxel += np.int64(left >= voxel_steps) - np.int64(left < 0)
             at[axis] = steps - voxel * voxel_steps
-            key = (key << 21) | (min(max(voxel, -_MOST), _MOST) + _MOST)
+            clipped = min(max(int(voxel), -_MOST), _MOST)
+            key = (key << 21) | np.int64(clipped + _MOST)
         if key != last:
             if 4 * known[0] >= 3 * table.shape[0]:
                 return count, i

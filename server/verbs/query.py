@@ -100,7 +100,7 @@ def query(
             printed = len(found)
         _check_answered(client, asked, op)
         whole = joined(found)
-        said = whole.answers
+        said: Any = whole.answers  # every kind has verdict and outside
         outside = _outside(client, whole.places, said.outside, said.verdict, word_of(said))
     if as_json:
         print_json(answers_json(whole.times, said, outside))

@@ -113,6 +113,7 @@ TESTS: dict[str, tuple[str, ...]] = {
     "builder/kernels/nearest.py": (BUILDER + "test_nearest.py",),
     "builder/kernels/records.py": (BUILDER + "test_records.py",),
     "builder/kernels/boxes.py": (BUILDER + "test_boxes.py",),
+    "builder/kernels/cubes.py": (BUILDER + "test_cubes.py",),
     "builder/kernels/lzf.py": (BUILDER + "test_lzf.py",),
     "builder/kernels/normals.py": (
         BUILDER + "test_normals.py::test_codes_are_those_of_the_definition",

@@ -1,0 +1,1 @@
+"""What scripts/chaos does to a server, and who judges its answers."""

@@ -1,0 +1,147 @@
+"""What came of a chaos run: figures, what of them breaks a promise, and a table."""
+
+import json
+from collections import Counter
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from .lives import Lives
+from .storm import Storm
+
+STOP_SECONDS = 2.0
+SLOPE = 1.0  # [MB a minute]
+
+
+class Limits(NamedTuple):
+    """What is allowed. recovery: seconds until right answers.  stop: seconds of a SIGTERM."""
+
+    recovery: float = 2.0
+    stop: float = STOP_SECONDS
+
+
+def make_report(storm: Storm, folder: Path, seconds: float, limits: Limits) -> dict[str, Any]:
+    """Return the figures of a run; `violations`: sentences, none where all promises held."""
+    lives = storm.lives
+    totals = storm.board.totals()
+    slope = lives.slope()
+    log = (folder / "server.log").read_text(errors="replace")
+    report = {
+        "seconds": round(seconds, 1),
+        "seed": storm.seed,
+        **totals,
+        "done": dict(sorted(storm.done.items())),
+        "causes": _causes(folder),
+        "servers": lives.number,
+        "servers that ended by themselves": lives.died,
+        "seconds from serving to right, of each client": _spread(storm.recovery),
+        "seconds of SIGTERM": _spread([stop.seconds for stop in lives.stops]),
+        "exit codes of SIGTERM": sorted({stop.code for stop in lives.stops}),
+        "memory": _memory(lives),
+        "MB a minute, last server, after two minutes": None if slope is None else round(slope[0], 3),
+        "minutes seen of it": None if slope is None else round(slope[1], 1),
+        "quiet points": [quiet._asdict() for quiet in lives.quiet],
+        "tracebacks in the server's log": log.count("Traceback (most recent call last)"),
+        "stuck": storm.stuck,
+        "wrong answers": _notes(folder),
+    }
+    report["violations"] = _violations(report, lives, limits)
+    return report
+
+
+def _violations(report: dict[str, Any], lives: Lives, limits: Limits) -> list[str]:
+    """Return which promises were broken."""
+    found = [
+        f"{report[name]} {words}"
+        for name, words in (
+            ("wrong", "answers are wrong"),
+            ("clear_away", "times clear while no server was up"),
+            ("errors", "questions were refused with other errors than busy"),
+            ("tracebacks in the server's log", "tracebacks in the server's log"),
+        )
+        if report[name]
+    ]
+    found += report["stuck"]
+    if not report["right"]:
+        found.append("no answer was right: nothing was tested")
+    if lives.died:
+        found.append(f"{len(lives.died)} servers ended by themselves, with {lives.died}")
+    worst = report["seconds from serving to right, of each client"]
+    if worst and worst["longest"] > limits.recovery:
+        found.append(f"right again after {worst['longest']} s, at most {limits.recovery:g} expected")
+    for stop in lives.stops:
+        if stop.code or stop.seconds > limits.stop:
+            found.append(
+                f"SIGTERM: exit code {stop.code} after {stop.seconds:.2f} s, 0 within {limits.stop:g} expected"
+            )
+    rate = report["MB a minute, last server, after two minutes"]
+    if rate is not None and rate > SLOPE:
+        found.append(f"memory grows by {rate} MB a minute, under {SLOPE:g} expected")
+    # The first look of a life may be before something was first used.
+    last = [quiet for quiet in lives.quiet if quiet.life == lives.number][1:]
+    for what in ("threads", "files"):
+        counts = [getattr(quiet, what) for quiet in last]
+        if counts and max(counts) > min(counts):
+            found.append(f"{what} at quiet points are {counts}, a constant number expected")
+    return found
+
+
+def _spread(values: list[float]) -> dict[str, Any] | None:
+    """Return how many, their median and the longest."""
+    if not values:
+        return None
+    ordered = sorted(values)
+    return {
+        "count": len(values),
+        "median": round(ordered[len(values) // 2], 3),
+        "longest": round(ordered[-1], 3),
+    }
+
+
+def _memory(lives: Lives) -> list[dict[str, Any]]:
+    """Return each life's memory every ten seconds [MB]."""
+    found: dict[tuple[int, int], float] = {}
+    begins: dict[int, float] = {}
+    for life, at, rss in lives.memory:
+        since = at - begins.setdefault(life, at)
+        found[life, int(since // 10) * 10] = round(rss / 1e6, 1)
+    return [{"life": life, "seconds": since, "MB": size} for (life, since), size in found.items()]
+
+
+def _causes(folder: Path) -> dict[str, int]:
+    """Return what was said to questions that were refused."""
+    total: Counter[str] = Counter()
+    for path in folder.glob("causes-*.json"):
+        try:
+            total.update(json.loads(path.read_text()))
+        except ValueError:  # killed while it wrote
+            continue
+    return dict(total.most_common(20))
+
+
+def _notes(folder: Path) -> list[Any]:
+    """Return the first of what clients found wrong."""
+    lines = [line for path in sorted(folder.glob("wrong-*.jsonl")) for line in path.read_text().splitlines()]
+    return [json.loads(line) for line in lines[:20] if line.endswith("}")]
+
+
+def table(report: dict[str, Any]) -> str:
+    """Return the figures for a reader."""
+    away = report["seconds from serving to right, of each client"] or {}
+    stops = report["seconds of SIGTERM"] or {}
+    rows = [
+        ("questions asked", f"{report['asked']:,}"),
+        ("rows right / unknown", f"{report['right']:,} / {report['unknown']:,}"),
+        ("unknown: nobody there / voxels missing", f"{report['nobody']:,} / {report['missing']:,}"),
+        ("busy", f"{report['busy']:,}"),
+        ("wrong, of them false clears", f"{report['wrong']}, {report['false_clear']}"),
+        ("clear while no server was up", f"{report['clear_away']}"),
+        ("other errors", f"{report['errors']}"),
+        ("servers", f"{report['servers']}"),
+        ("serving to right again, median and longest", f"{away.get('median')}, {away.get('longest')} s"),
+        ("SIGTERM, median and longest", f"{stops.get('median')}, {stops.get('longest')} s"),
+        ("memory", f"{report['MB a minute, last server, after two minutes']} MB a minute"),
+        ("threads at quiet points", str([quiet["threads"] for quiet in report["quiet points"]])),
+        ("files at quiet points", str([quiet["files"] for quiet in report["quiet points"]])),
+        ("tracebacks in the server's log", str(report["tracebacks in the server's log"])),
+    ]
+    return "\n".join(f"{name:<44} {value}" for name, value in rows)

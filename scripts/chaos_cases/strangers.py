@@ -1,0 +1,168 @@
+"""Processes that do harm for a few seconds each: rogues, floods, heavy requests, invented ids.
+
+They speak zenoh themselves, as a client that is not ours would.
+"""
+
+import itertools
+import os
+import threading
+import time
+from collections.abc import Callable
+from contextlib import ExitStack, suppress
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import zenoh
+from solidcloud.schemas import keys
+from solidcloud.schemas.answers import (
+    CollideAnswers,
+    DistanceAnswers,
+    RaycastAnswers,
+    SweepAnswers,
+    WithinAnswers,
+)
+from solidcloud.schemas.columns import unknown
+from solidcloud.schemas.messages import MSGPACK, AddAvatarRequest, CollideRequest, ContactsRequest, encode
+from solidcloud.schemas.requests import make_poses
+from solidcloud.server.transport import session_config
+
+from .ground import SCENE
+
+ENCODING = zenoh.Encoding(MSGPACK)
+# Twelve widths of a key that meets the questions of all clients of the scene, or their states.
+WIDE = (
+    "**", "solidcloud/**", "solidcloud/*/**", "solidcloud/1/**", "*/1/scene/**", "solidcloud/1/scene/**",
+    f"solidcloud/1/scene/{SCENE}/*/*", f"solidcloud/*/scene/{SCENE}/*/*", f"solidcloud/1/*/{SCENE}/*/*",
+    "solidcloud/1/scene/*/*/collide", "solidcloud/1/sc$*/**", f"**/{SCENE}/*/*",
+)  # fmt: skip
+_KINDS = {
+    "collide": CollideAnswers, "distance": DistanceAnswers, "sweep": SweepAnswers, "raycast": RaycastAnswers,
+    "within": WithinAnswers,
+}  # fmt: skip
+
+
+def _open(endpoint: str, mode: str) -> zenoh.Session:
+    """Open a session that is connected to the server and obeys nobody."""
+    config = session_config(connect=endpoint)
+    config.insert_json5("mode", f'"{mode}"')
+    return zenoh.open(config)
+
+
+def _lie(query: Any) -> None:
+    """Answer a question with zeros: clear, whatever was asked."""
+    with query:
+        op = str(query.key_expr).rsplit("/", 1)[-1]
+        kind = _KINDS.get(op)
+        if kind is None or query.payload is None:
+            return
+        asked = msgspec.msgpack.decode(query.payload.to_bytes())
+        rows = next((len(asked[name]) // size for name, size in _SIZES.items() if name in asked), 1)
+        answers = unknown(kind, rows, bounded=False)
+        lie = msgspec.structs.replace(answers, verdict=np.zeros(rows, np.uint8), engine_seconds=1e-3)
+        query.reply(query.key_expr, encode(lie), encoding=ENCODING)
+
+
+_SIZES = {"poses": 128, "pose_from": 128, "origins": 24, "points": 24}
+
+
+def rogue(folder: Path, endpoint: str, seed: int, seconds: float) -> None:
+    """Declare queryables under wide keys that answer `clear`, tokens of others, and publish states and wishes."""
+    rng = np.random.default_rng(seed)
+    mode = str(rng.choice(["client", "peer"]))
+    try:
+        session = _open(endpoint, mode)
+    except zenoh.ZError:
+        return  # a client does not open while the server is away
+    with session, ExitStack() as stack:
+
+        def declare(what: Callable[..., Any], *arguments: Any, **options: Any) -> None:
+            with suppress(zenoh.ZError):
+                stack.enter_context(what(*arguments, **options))
+
+        for key in rng.permutation(WIDE)[:6].tolist():
+            declare(session.declare_queryable, key, _lie, complete=bool(rng.integers(2)))
+            declare(session.liveliness().declare_token, key)
+            declare(session.declare_subscriber, key, lambda _: None)
+        declare(session.liveliness().declare_token, f"solidcloud/1/alive/{SCENE}/rogue")
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            for what in ("state", "refused", "wish"):
+                for key in (f"solidcloud/1/{what}/{SCENE}/*/*", f"solidcloud/1/{what}/**"):
+                    with suppress(zenoh.ZError):
+                        session.put(key, os.urandom(64), encoding=ENCODING)
+            time.sleep(0.05)
+
+
+def flood(folder: Path, endpoint: str, seed: int, seconds: float) -> None:
+    """Keep 1,000 questions of one client in flight."""
+    client = f"flood{seed}"
+    poses = make_poses(np.tile(np.eye(4), (20, 1, 1)))
+    with (
+        _open(endpoint, "peer") as session,
+        session.liveliness().declare_token(keys.client_alive_key(SCENE, client)),
+    ):
+        add = encode(AddAvatarRequest("ball", np.zeros((1, 3)), 0.1))
+        list(
+            session.get(
+                keys.question_key(SCENE, client, "add_avatar"), payload=add, encoding=ENCODING, timeout=2.0
+            )
+        )
+        request = encode(CollideRequest(avatar="ball", poses=poses))
+        free = threading.Semaphore(1000)
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            if free.acquire(timeout=0.1):
+                handler = zenoh.handlers.Callback(lambda _: None, free.release)
+                key = keys.question_key(SCENE, client, "collide")
+                session.get(key, handler, payload=request, encoding=ENCODING, timeout=5.0)
+
+
+def heavy(folder: Path, endpoint: str, seed: int, seconds: float) -> None:
+    """Ask for all contacts of 200,000 points at a margin of 3 m, under two ids, and go before the answer."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-1, 1, (200_000, 3))
+    poses = make_poses(np.tile(np.eye(4), (2000, 1, 1)))
+    with _open(endpoint, "peer") as session, ExitStack() as stack:
+        for number in range(2):
+            client = f"heavy{seed}-{number}"
+            stack.enter_context(session.liveliness().declare_token(keys.client_alive_key(SCENE, client)))
+            for op, request in (
+                ("add_avatar", AddAvatarRequest("crowd", points, 0.01)),
+                ("contacts", ContactsRequest(avatar="crowd", poses=poses, margin=3.0)),
+            ):
+                handler = zenoh.handlers.Callback(lambda _: None, lambda: None)
+                key = keys.question_key(SCENE, client, op)
+                session.get(key, handler, payload=encode(request), encoding=ENCODING, timeout=5.0)
+                time.sleep(1.0)
+        time.sleep(seconds)
+
+
+def invented(folder: Path, endpoint: str, seed: int, seconds: float) -> None:
+    """Add avatars under one invented id after the other, and declare no token."""
+    rng = np.random.default_rng(seed)
+    request = encode(AddAvatarRequest("body", rng.uniform(-1, 1, (2000, 3)), 0.01))
+    with _open(endpoint, "peer") as session:
+        end = time.monotonic() + seconds
+        for number in itertools.count():
+            if time.monotonic() > end:
+                return
+            key = keys.question_key(SCENE, f"nobody-{seed}-{number}", "add_avatar")
+            list(session.get(key, payload=request, encoding=ENCODING, timeout=1.0))
+
+
+def usurper(folder: Path, endpoint: str, seed: int, seconds: float) -> None:
+    """Listen where the server did, while it is away, and answer `clear` to whoever connects."""
+    config = session_config(listen=endpoint)
+    config.insert_json5("access_control/enabled", "false")
+    with zenoh.open(config) as session, session.declare_queryable("solidcloud/**", _lie, complete=True):
+        time.sleep(seconds)
+
+
+STRANGERS = {"rogue": rogue, "flood": flood, "heavy": heavy, "invented": invented}
+
+
+def main(kind: str, folder: Path, endpoint: str, seed: int, seconds: float) -> None:
+    """Be one of them, or what takes a dead server's place."""
+    (STRANGERS | {"usurper": usurper})[kind](folder, endpoint, seed, seconds)

@@ -1,0 +1,20 @@
+"""Twenty seconds of scripts/chaos, with its judge; what depends on how fast a machine is has generous limits here."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+SCRIPTS = Path(__file__).parents[2] / "scripts"
+
+
+def test_no_answer_is_wrong_whatever_is_done_to_server_and_clients() -> None:
+    command = [sys.executable, SCRIPTS / "chaos", "--seconds", "20", "--points", "20000", "--requests", "180"]
+    done = subprocess.run(
+        [*command, "--recovery", "60", "--stop", "30"], capture_output=True, text=True, check=False
+    )
+    assert done.returncode in (0, 1), done.stderr
+    found = json.loads(done.stdout)
+    assert done.returncode == 0, json.dumps(found, indent=1) + done.stderr
+    assert found["violations"] == [] and found["wrong"] == found["clear_away"] == 0
+    assert found["right"] > 1000 and found["servers"] >= 1

@@ -1,0 +1,113 @@
+"""The judge of scripts/chaos: what is unknown is never wrong, and every kind of wrong answer is found out."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from msgspec.structs import replace
+from solidcloud.schemas.answers import CollideAnswers, ContactsAnswers, DistanceAnswers, Verdict
+from solidcloud.schemas.columns import unknown
+from solidcloud.schemas.moves import Moved
+
+# Appended, so that nothing of scripts/ hides a module of the tests.
+sys.path.append(str(Path(__file__).parents[3] / "scripts"))
+
+from chaos_cases import board as b
+from chaos_cases.ground import AVATARS, ask, make_pool
+from chaos_cases.judge import judge
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory):
+    """A floor, opened in this process."""
+    import cases
+    from solidcloud.server.scene import Scene
+
+    x, y = np.meshgrid(np.arange(-2, 2, 0.1), np.arange(-2, 2, 0.1))
+    points = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
+    case = cases.build(tmp_path_factory.mktemp("floor"), points, voxel=1.0, resolution=1e-3)
+    with Scene.open(case.archive) as scene:
+        yield scene, points
+
+
+def test_every_question_is_right_by_its_own_truth(scene, rng) -> None:
+    opened, points = scene
+    pool = make_pool((opened, opened), 18, points, rng)
+    assert {request.op for request in pool} >= {"collide", "contacts", "path", "move", "objects"}
+    assert set(AVATARS) <= {"figure", "ball"}
+    for request in pool:
+        got = ask(opened, request.op, request.arguments, request.parameters)
+        found = judge(got, request.truths)
+        assert not found.faults and found.right and not found.false_clear, request.op
+
+
+def collided(*verdicts: Verdict) -> CollideAnswers:
+    k = len(verdicts)
+    none = np.zeros(k, np.uint32)
+    return CollideAnswers(np.array(verdicts, np.uint8), np.zeros(k, bool), none, none, none)
+
+
+def test_a_false_clear_is_told_from_a_false_contact() -> None:
+    truth = collided(Verdict.CONTACT, Verdict.CLEAR, Verdict.CONTACT)
+    found = judge(collided(Verdict.CLEAR, Verdict.CONTACT, Verdict.UNKNOWN), [truth])
+    assert (len(found.faults), found.false_clear, found.right, found.unknown) == (2, 1, 0, 1)
+    assert not judge(unknown(CollideAnswers, 3, bounded=False), [truth]).faults
+
+
+def test_an_answer_may_be_that_of_any_generation_that_may_be_served() -> None:
+    old, new = collided(Verdict.CLEAR), collided(Verdict.CONTACT)
+    assert not judge(old, [old, new]).faults and not judge(new, [old, new]).faults
+    assert judge(old, [new]).false_clear == 1
+
+
+def test_figures_and_bounds_are_compared(scene) -> None:
+    opened, _ = scene
+    opened.add_avatar("judged", np.zeros((1, 3)), 0.05)
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    poses[:, :3, 3] = [[0.02, 0.03, 0.3], [0.0, 0.0, 0.4]]
+    truth = opened.distance("judged", poses, 1.0)
+    assert isinstance(truth, DistanceAnswers) and not judge(truth, [truth]).faults
+    one_bit = truth.signed_distance.copy()
+    one_bit[1] = np.nextafter(one_bit[1], 9)
+    assert "row 1: signed_distance" in judge(replace(truth, signed_distance=one_bit), [truth]).faults[0]
+    never = np.zeros(2, bool)
+    loose = replace(
+        truth, exact=never, lower=truth.lower - 0.1, upper=truth.upper + 0.1, signed_distance=one_bit
+    )
+    assert not judge(loose, [truth]).faults
+    wrong = replace(loose, upper=truth.signed_distance - 0.01)
+    assert "is not within" in judge(wrong, [truth]).faults[0]
+
+
+def test_lists_of_contacts_are_compared(scene) -> None:
+    opened, _ = scene
+    opened.add_avatar("listed", np.zeros((1, 3)), 0.05)
+    truth = opened.contacts("listed", np.eye(4)[None], margin=0.3)
+    assert isinstance(truth, ContactsAnswers) and truth.pairs_found[0] > 3
+    shifted = truth.cloud_point.copy()
+    shifted[2, 0] += 1e-9
+    (fault,) = judge(replace(truth, cloud_point=shifted), [truth]).faults
+    assert "cloud_point" in fault
+
+
+def test_a_frame_that_is_not_simulated_whole_says_nothing() -> None:
+    pose = np.eye(4)[None]
+    truth = Moved(pose=pose, simulated=["stop"])
+    elsewhere = pose + 1e-9
+    assert judge(Moved(pose=elsewhere, simulated=["stop"]), [truth]).faults
+    assert not judge(Moved(pose=elsewhere, simulated=["stop"], skipped=["slide"]), [truth]).faults
+    assert judge(Moved(pose=pose, verdict=2), [truth]).unknown == 1
+
+
+def test_an_answer_of_another_length_is_wrong() -> None:
+    assert judge(collided(Verdict.CLEAR), [collided(Verdict.CLEAR, Verdict.CLEAR)]).faults
+
+
+def test_the_board_is_one_for_all(tmp_path: Path) -> None:
+    driver = b.Board(tmp_path / "board", 3)
+    client = b.Board(tmp_path / "board")
+    driver.driver[b.SERVED], driver.driver[b.UP] = 2, 1
+    assert client.now() == b.Now(2, True, 0)
+    client.client(2)[b.WRONG] += 4
+    assert driver.totals()["wrong"] == 4

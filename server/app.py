@@ -45,6 +45,7 @@ from ..schemas.messages import (
 from ..schemas.requests import Question
 from .config import ServerConfig
 from .frames import Frames
+from .heap import give_back_large_blocks
 from .served import Answer, SceneLike
 from .stop import NEVER, Stop
 from .transport import Transport
@@ -306,6 +307,7 @@ def serve(
     ready: called once all is warm and reachable.
     SIGHUP: what is in the archives' folders now is served from then on, see `Scene.reload`.
     """
+    give_back_large_blocks()
     # A thread in pure Python may keep the interpreter for 5 ms by default while a reply waits for it.
     sys.setswitchinterval(0.0005)
     if config.insecure:

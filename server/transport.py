@@ -6,6 +6,7 @@ one of its callbacks. What these threads do is in lanes.py.
 
 import json
 import logging
+import os
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -36,6 +37,10 @@ _CHANNEL = 1024
 # How long a stop waits, twice, for threads whose work was given up [s]. Kernels look at a stop every few milliseconds;
 # a reply to a client that takes none waits for `wait_before_close`.
 _GIVE_UP_SECONDS = 0.4
+
+# zenoh's threads that send, of which it has one by default. The one that closes the link of a client that takes no
+# replies is held for `wait_before_close`, and with one thread all other clients wait meanwhile.
+_RUNTIME = "(tx: (worker_threads: 16))"
 
 
 class ServiceLike(Sessions, Questions, Protocol):
@@ -135,6 +140,7 @@ class Transport:
 
     def _open(self) -> zenoh.Session:
         """A session that listens; SolidcloudError when it cannot."""
+        os.environ.setdefault("ZENOH_RUNTIME", _RUNTIME)  # read when the process opens its first session
         try:
             return zenoh.open(session_config(listen=self._config.listen))
         except zenoh.ZError as error:

@@ -136,6 +136,7 @@ class Service:
         self._scenes = {scene.name: scene for scene in scenes}
         self._config = config
         self._frames: dict[str, Frames] = {}
+        self.left_at_work = False  # once it is served no more: whether a request did not end in time
         for scene in scenes:
             scene.limit_avatars(config.avatar_limits)
 
@@ -295,15 +296,20 @@ def serving(scenes: Sequence[SceneLike], config: ServerConfig) -> Iterator[Servi
     """
     service = Service(scenes, config)
     service.warm()
-    with Transport([scene.name for scene in scenes], service, config):
-        yield service
+    transport = Transport([scene.name for scene in scenes], service, config)
+    try:
+        with transport:
+            yield service
+    finally:
+        service.left_at_work = transport.left_at_work
 
 
 def serve(
     scenes: Sequence[SceneLike], config: ServerConfig, ready: Callable[[], object] = lambda: None
-) -> None:
+) -> bool:
     """Serve scenes until SIGTERM or SIGINT, then answer what was accepted and return. Main thread only.
 
+    Returns whether all requests have ended; where one has not, closing its scene waits for it.
     ready: called once all is warm and reachable.
     SIGHUP: what is in the archives' folders now is served from then on, see `Scene.reload`.
     """
@@ -323,6 +329,7 @@ def serve(
         print(f"serving {names} at {config.listen}", flush=True)
         while signals.recv(1)[0] == signal.SIGHUP:
             wanted.set()
+    return not service.left_at_work
 
 
 @contextmanager

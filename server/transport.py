@@ -94,6 +94,7 @@ class Transport:
         self._lock = threading.Lock()
         self._declared: list[Any] = []
         self._lanes: list[Lane] = []
+        self.left_at_work = False  # once it was left: whether threads did not end in time
 
     def __enter__(self) -> Self:
         with ExitStack() as stack:
@@ -125,6 +126,7 @@ class Transport:
         # Closing the session ends what waits for a client that takes nothing. A thread that is still at work when the
         # interpreter ends, inside zenoh, would abort the process.
         if not self._wait(_GIVE_UP_SECONDS):
+            self.left_at_work = True
             log.error("stopped with threads at work")
 
     def _wait(self, seconds: float) -> bool:

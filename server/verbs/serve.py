@@ -57,6 +57,7 @@ def serve(
 ) -> None:
     """Serve an archive, which stops who touches it, or a scene over zenoh until told to stop."""
     import logging
+    import os
     from contextlib import ExitStack
 
     from ...schemas.kernels.compiling import kernel_files
@@ -92,4 +93,7 @@ def serve(
         )
         if log is not None:
             stack.enter_context(recorded(scene, what, log))
-        serve_scenes([scene], config, ready=start.close)
+        if not serve_scenes([scene], config, ready=start.close):
+            # Nothing is left to write, and the archive would only be closed once the request ends.
+            logging.shutdown()
+            os._exit(0)

@@ -26,7 +26,7 @@ class State(Enum):
     WAITING = "in its turn's queue"
     WORKING = "holds a worker and its turn"
     SLOW = "holds its turn and a place among the slow ones"
-    SENDING = "holds its turn; its answer is on the way"
+    WAITS = "holds its turn; it waits for something, or its answer is on the way"
     DETACHED = "holds nothing but its bytes"
     DONE = "answered, or dropped"
 
@@ -34,14 +34,14 @@ class State(Enum):
 class Bounds(NamedTuple):
     """The bounds of the queues.
 
-    workers: quick requests at work.  slow: slow requests at work.  sending: requests that hold no worker because their
-    client takes no reply.  requests, size: requests accepted and not yet answered, and their bytes.  by_turn: requests
-    of one turn.
+    workers: quick requests at work.  slow: slow requests at work.  waits: requests that hold no worker because they
+    wait, for their client to take the reply for instance.  requests, size: requests accepted and not yet answered, and
+    their bytes.  by_turn: requests of one turn.
     """
 
     workers: int
     slow: int
-    sending: int
+    waits: int
     requests: int
     size: int
     by_turn: int
@@ -99,7 +99,7 @@ class FairQueues:
         self._clients: dict[str, tuple[str, int]] = {}  # client: its turn, its requests in flight
         # Turns with something waiting and nothing at work, by what the first one needs.
         self._ready: dict[bool, deque[str]] = {False: deque(), True: deque()}
-        self._at_work = dict.fromkeys((State.WORKING, State.SLOW, State.SENDING), 0)
+        self._at_work = dict.fromkeys((State.WORKING, State.SLOW, State.WAITS), 0)
         self._requests = self._bytes = 0
 
     def offer(self, ticket: Ticket, *, always: bool = False) -> Offer:
@@ -146,26 +146,27 @@ class FairQueues:
             return self._start_waiting()
 
     def slow(self, ticket: Ticket) -> list[Ticket] | None:
-        """Take the worker of a request that has been at work for long; it keeps its turn.
+        """Have a request that has been computing for long hold a slow place, and no worker; it keeps its turn.
 
-        Returns the tickets to be started; None: it holds no worker, or all slow places are taken.
+        Returns the tickets to be started; None: it has one, or is not at work, or all slow places are taken.
         """
         with self._lock:
-            if ticket.state is not State.WORKING or self._at_work[State.SLOW] >= self._bounds.slow:
+            held = ticket.state in (State.WORKING, State.WAITS)
+            if not held or self._at_work[State.SLOW] >= self._bounds.slow:
                 return None
             self._move(ticket, State.SLOW)
             return self._start_waiting()
 
-    def sending(self, ticket: Ticket) -> list[Ticket] | None:
-        """Take the worker, or the slow place, of a request whose answer is on the way; it keeps its turn.
+    def waits(self, ticket: Ticket) -> list[Ticket] | None:
+        """Take the worker, or the slow place, of a request that only waits; it keeps its turn.
 
-        Returns the tickets to be started; None: it holds neither, or too many answers are on the way.
+        Returns the tickets to be started; None: it holds neither, or too many requests wait like this.
         """
         with self._lock:
             held = ticket.state in (State.WORKING, State.SLOW)
-            if not held or self._at_work[State.SENDING] >= self._bounds.sending:
+            if not held or self._at_work[State.WAITS] >= self._bounds.waits:
                 return None
-            self._move(ticket, State.SENDING)
+            self._move(ticket, State.WAITS)
             return self._start_waiting()
 
     def detach(self, ticket: Ticket) -> list[Ticket]:

@@ -12,23 +12,18 @@ from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator
 from typing import Any, NamedTuple, Protocol
 
-from ..schemas import keys
-from ..schemas.encoding import JSON
-from ..schemas.errors import BadRequestError
 from .config import ServerConfig
 from .fair_queues import Bounds, FairQueues, Offer, State, Ticket
+from .jobs import SLOW_SECONDS, Job, Request, Wire
 from .served import Answer
 from .stop import Stop
 from .watchdog import Watchdog, lower_priority
 
 log = logging.getLogger(__name__)
 
-# How long a request may hold a worker [s]. More than nearly all take, and what others may have to wait for it.
-SLOW_SECONDS = 0.01
-# Payloads that are slow for sure [bytes]: building an avatar of 5,000 points takes 20 ms, reading JSON 50 ns a byte.
-_SLOW_BYTES, _SLOW_AVATAR_BYTES, _SLOW_JSON_BYTES = 1 << 20, 1 << 17, 1 << 17
-# Threads that wait for a client to take a reply; zenoh closes the client's link after `wait_before_close`.
-_MOST_SENDING = 64
+# Threads that wait without a worker: for a client to take a reply (zenoh closes its link after `wait_before_close`), or
+# for a voxel.
+_MOST_WAITING = 64
 # How often avatars that nobody uses are looked for [s].
 _DROP_SECONDS = 5.0
 # The turn of all clients without a liveliness token; no client's name. zenoh does not tell which session a query comes
@@ -47,79 +42,10 @@ class Questions(Protocol):
     def drop_unused(self, scene: str, alive: Collection[str]) -> None: ...
 
 
-class Wire(NamedTuple):
-    """How a lane reads and answers queries.
-
-    sealer: returns what seals the replies to a query, of its key expression and payload.  reply: sends an answer under
-    a key, sealed, with its number among the replies; False where that fails.
-    """
-
-    encoding: Callable[[Any], str | None]
-    sealer: Callable[[Any, str, bytes], Any]
-    reply: Callable[[Any, Any, Answer, Any, int], bool]
-
-
 class _Gone(NamedTuple):
     """Takes a request's place in a client's queue: the client went, after all it had asked before."""
 
     client: str
-
-
-class _Request:
-    """A query on its way, and what was read of it: each property of a query is a copy that costs."""
-
-    __slots__ = ("client", "encoding", "key", "key_expr", "operation", "payload", "query", "sealer")
-
-    def __init__(self, query: Any, wire: Wire) -> None:
-        """Read a query."""
-        self.query, self.encoding = query, wire.encoding(query)
-        self.key_expr = query.key_expr
-        self.key = str(self.key_expr)
-        try:
-            route = keys.parse_question(self.key)
-            self.client, self.operation = route.client, route.operation
-        except BadRequestError:
-            self.client = self.operation = ""  # nobody's: the service will refuse it
-        payload = query.payload
-        self.payload = b"" if payload is None else payload.to_bytes()
-        self.sealer = wire.sealer(query, self.key, self.payload)
-
-    @property
-    def slow(self) -> bool:
-        """Whether the request is slow by its size."""
-        size = len(self.payload)
-        if size < _SLOW_AVATAR_BYTES:
-            return False
-        return size >= _SLOW_BYTES or self.operation == "add_avatar" or self.encoding == JSON
-
-
-class _Job:
-    """What one thread does at present.
-
-    ticket: of the request it carries out; None: it refuses one.  takes: whether the thread takes queries from the
-    channel, so that another must take its place.  begun: when it began, or began to send [s].  again: the request is
-    to be carried out again.  ended: nobody wants the answer.  left: of a refusal, whether its thread was replaced.
-    """
-
-    __slots__ = ("again", "begun", "ended", "left", "sending", "stop", "takes", "thread_id", "ticket")
-
-    def __init__(self, ticket: Ticket | None, takes: bool, *, sending: bool = False) -> None:
-        """Begin."""
-        self.ticket, self.takes, self.sending = ticket, takes, sending
-        self.begun = time.monotonic()
-        self.thread_id = threading.get_native_id()
-        self.stop = Stop()
-        self.again = self.ended = self.left = False
-
-    @property
-    def client(self) -> str:
-        """The client whose request it is."""
-        return "" if self.ticket is None else self.ticket.client
-
-    def end(self, reason: str) -> None:
-        """Stop the request for good."""
-        self.ended = True
-        self.stop.set(reason)
 
 
 class Lane:
@@ -145,7 +71,7 @@ class Lane:
             Bounds(
                 config.workers,
                 config.max_slow,
-                _MOST_SENDING,
+                _MOST_WAITING,
                 config.max_in_flight,
                 config.max_in_flight_bytes,
                 config.max_in_flight_by_client,
@@ -153,8 +79,8 @@ class Lane:
         )
         self._lock = threading.Lock()
         self._alive: set[str] = set()  # clients with a liveliness token
-        self._jobs: set[_Job] = set()  # at work now
-        self._streaming: dict[_Request, _Job] = {}  # whose answers are on their way in parts
+        self._jobs: set[Job] = set()  # at work now
+        self._streaming: dict[Request, Job] = {}  # whose answers are on their way in parts
         self._to_start: deque[Ticket] = deque()
         self._given_up = False
         self._dropped = 0.0  # when unused avatars were looked for
@@ -188,7 +114,7 @@ class Lane:
         """Stop and drop all requests of a client whose liveliness token went, then have the service forget it."""
         self._alive.discard(client)
         for ticket in self._queues.drop(client):
-            if isinstance(ticket.request, _Request):
+            if isinstance(ticket.request, Request):
                 self._drop(ticket.request)
         for job in [*self._jobs, *self._streaming.values()]:
             if job.client == client:
@@ -232,7 +158,7 @@ class Lane:
 
     def _take(self, query: Any) -> bool:
         """Answer a query, or leave it to a thread that is at work. Returns whether this thread is still a worker."""
-        request = _Request(query, self._wire)
+        request = Request(query, self._wire)
         client = request.client
         turn = client if client in self._alive else _ANONYMOUS
         ticket = Ticket(client, request, len(request.payload), turn=turn, slow=request.slow)
@@ -245,10 +171,10 @@ class Lane:
             return self._refuse(request, offer)
         return True
 
-    def _refuse(self, request: _Request, offer: Offer) -> bool:
+    def _refuse(self, request: Request, offer: Offer) -> bool:
         """Answer that there is no room. Returns whether this thread is still a worker."""
         busy = self._service.busy(request.encoding, offer is Offer.FULL_TURN)
-        job = _Job(None, takes=True, sending=True)
+        job = Job(None, takes=True, sending=True)
         self._enter(job)
         try:
             with request.query as query:
@@ -258,7 +184,7 @@ class Lane:
                 self._jobs.discard(job)
         return not job.left
 
-    def _drop(self, request: _Request) -> None:
+    def _drop(self, request: Request) -> None:
         """Leave a query without an answer."""
         with request.query:
             pass
@@ -282,7 +208,7 @@ class Lane:
 
     def _carry_out(self, ticket: Ticket, takes: bool) -> tuple[bool, list[Ticket]]:
         """Carry out one request. Returns whether it gave up its worker, and the tickets to be started."""
-        job = _Job(ticket, takes)
+        job = Job(ticket, takes)
         self._enter(job)
         parts = None
         try:
@@ -299,19 +225,20 @@ class Lane:
                 started = self._queues.detach(ticket)
                 self._start_thread(f"{self._scene}-parts", self._stream, ticket, parts, job)
             elif job.again:
-                return False, self._queues.put_back(ticket)
+                left = ticket.left
+                return left, self._queues.put_back(ticket)
             else:
                 started = self._queues.finished(ticket)
         return ticket.left, started
 
-    def _enter(self, job: _Job) -> None:
+    def _enter(self, job: Job) -> None:
         """Have a job watched."""
         with self._lock:
             self._jobs.add(job)
         if self._watchdog.asleep:
             self._watchdog.wake()
 
-    def _answer(self, request: _Request, job: _Job) -> Iterator[Answer] | None:
+    def _answer(self, request: Request, job: Job) -> Iterator[Answer] | None:
         """Have one query answered. What comes in parts is returned, to be sent by a thread of its own."""
         if self._given_up:
             self._drop(request)
@@ -331,13 +258,13 @@ class Lane:
                 return answer
             answer = self._service.busy(request.encoding)
         if job.ticket is not None and job.ticket.left:
-            self._hand_over(self._queues.sending(job.ticket) or [])
+            self._hand_over(self._queues.waits(job.ticket) or [])
         # Leaving `with query` tells the client that no more will come.
         with request.query as query:
             self._wire.reply(query, request.key_expr, answer, request.sealer, 0)
         return None
 
-    def _stream(self, ticket: Ticket, answers: Iterator[Answer], job: _Job) -> None:
+    def _stream(self, ticket: Ticket, answers: Iterator[Answer], job: Job) -> None:
         """Send an answer's parts. A thread's work."""
         request = ticket.request
         try:
@@ -367,7 +294,7 @@ class Lane:
             self._service.drop_unused(self._scene, frozenset(self._alive))
         return bool(jobs)
 
-    def _look_at(self, job: _Job, now: float) -> None:
+    def _look_at(self, job: Job, now: float) -> None:
         """Take the worker of a job that has been at work for long, and stop one whose time is up."""
         most = self._config.max_request_seconds
         if job.ticket is None:
@@ -377,22 +304,29 @@ class Lane:
             if replace and job.takes:
                 self._start_taker()
             return
-        if not job.ticket.left:
+        if not job.low:
             self._replace(job, job.ticket)
         if not job.sending and now - job.begun >= most:
             job.stop.set(f"the request took longer than {most:g} s, the most that this server spends on one")
 
-    def _replace(self, job: _Job, ticket: Ticket) -> None:
-        """Have a fresh thread go on in the place of a job's."""
-        sending = job.sending
-        started = self._queues.sending(ticket) if sending else self._queues.slow(ticket)
+    def _replace(self, job: Job, ticket: Ticket) -> None:
+        """Have a fresh thread go on in the place of a job's.
+
+        A job that waits, for a voxel, a client or a processor, takes up nothing but its thread; one that works takes up
+        a slow place.
+        """
+        left, works = ticket.left, not job.sending and job.works
+        if left and not works:
+            return
+        started = self._queues.slow(ticket) if works else self._queues.waits(ticket)
         if started is not None:
-            if not sending:
+            if works:
+                job.low = True
                 lower_priority(job.thread_id)
-            if job.takes:
+            if job.takes and not left:
                 self._start_taker()
             self._start(started)
-        elif not sending and not job.stop and ticket.state is State.WORKING:
+        elif works and not job.stop and ticket.state in (State.WORKING, State.WAITS):
             # All slow places are taken: the request waits for one without a worker, and begins anew.
             with self._lock:
                 job.again = not job.sending

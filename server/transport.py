@@ -23,8 +23,9 @@ from ..schemas.seals import Sealer
 from .access import access_control, state_priority
 from .config import ServerConfig
 from .endpoints import zenoh_words
+from .jobs import Wire
 from .key_files import published_key
-from .lanes import Lane, Questions, Wire
+from .lanes import Lane, Questions
 from .replies import sealer_of, send_reply
 from .served import Answer
 from .session_transport import SceneSessions, Sessions

@@ -1,12 +1,14 @@
 """A thread that looks, every few milliseconds, at what is at work. No zenoh here."""
 
 import logging
+import math
 import os
 import sys
 import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from pathlib import Path
 
 log = logging.getLogger(__name__)
 
@@ -71,6 +73,17 @@ class Watchdog:
         except Exception:  # of this look alone
             log.exception("a look at what is at work")
             return True
+
+
+def cpu_seconds(thread_id: int) -> float:
+    """Return the processor time that a thread has taken so far [s]; inf where the system does not say.
+
+    thread_id: as `threading.get_native_id` returns it.
+    """
+    try:
+        return int(Path(f"/proc/self/task/{thread_id}/schedstat").read_text().split()[0]) * 1e-9
+    except (OSError, ValueError, IndexError):  # the thread has ended, or this is no Linux
+        return math.inf
 
 
 def lower_priority(thread_id: int) -> None:

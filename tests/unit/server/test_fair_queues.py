@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 from solidcloud.server.fair_queues import Bounds, FairQueues, Offer, State, Ticket
 
-BOUNDS = Bounds(workers=2, slow=1, sending=4, requests=100, size=1000, by_turn=50)
+BOUNDS = Bounds(workers=2, slow=1, waits=4, requests=100, size=1000, by_turn=50)
 
 
 def make(**bounds):
@@ -127,15 +127,27 @@ def test_what_is_put_back_comes_before_what_its_client_asked_after():
 
 
 def test_an_answer_on_its_way_holds_neither_worker_nor_slow_place():
-    queues = make(workers=1, slow=1, sending=2)
+    queues = make(workers=1, slow=1, waits=2)
     first, _ = offered(queues, "a", 1)
-    assert queues.sending(first) == []
+    assert queues.waits(first) == []
     second, _ = offered(queues, "b", 2, slow=True)
     third, _ = offered(queues, "c", 3, slow=True)
-    assert queues.sending(second) == [third]
-    assert queues.sending(third) is None, "bounded"
+    assert queues.waits(second) == [third]
+    assert queues.waits(third) is None, "bounded"
     assert offered(queues, "a", 4)[1] is Offer.WAIT, "the turn is kept"
     assert [ticket.request for ticket in queues.finished(first)] == [4]
+
+
+def test_a_request_that_waited_takes_a_slow_place_once_it_computes():
+    queues = make(workers=1, slow=1)
+    first, _ = offered(queues, "a", 1)
+    assert queues.waits(first) == []
+    assert queues.slow(first) == [] and first.state is State.SLOW
+    second, _ = offered(queues, "b", 2)
+    assert queues.waits(second) == []
+    assert queues.slow(second) is None, "no place"
+    assert queues.put_back(second) == [] and second.state is State.WAITING
+    assert queues.finished(first) == [second]
 
 
 def test_clients_that_share_a_turn_are_answered_one_at_a_time():
@@ -195,7 +207,7 @@ class AnyOrder(RuleBasedStateMachine):
 
     def __init__(self):
         super().__init__()
-        self.bounds = Bounds(workers=2, slow=2, sending=2, requests=12, size=40, by_turn=4)
+        self.bounds = Bounds(workers=2, slow=2, waits=2, requests=12, size=40, by_turn=4)
         self.queues = FairQueues(self.bounds)
         self.at_work, self.detached, self.waiting = [], [], {}
         self.number = 0
@@ -247,15 +259,13 @@ class AnyOrder(RuleBasedStateMachine):
     @precondition(lambda self: self.at_work)
     @rule(data=st.data())
     def send(self, data):
-        started = self.queues.sending(data.draw(st.sampled_from(self.at_work)))
+        started = self.queues.waits(data.draw(st.sampled_from(self.at_work)))
         self.started(started or [])
 
-    @precondition(lambda self: any(not ticket.left or ticket.slow for ticket in self.at_work))
+    @precondition(lambda self: self.at_work)
     @rule(data=st.data())
     def put_back(self, data):
         ticket = data.draw(st.sampled_from(self.at_work))
-        if ticket.state is State.SENDING:
-            return
         self.at_work.remove(ticket)
         self.waiting.setdefault(ticket.client, []).insert(0, ticket)
         self.started(self.queues.put_back(ticket))
@@ -281,7 +291,7 @@ class AnyOrder(RuleBasedStateMachine):
         states = [ticket.state for ticket in self.at_work]
         assert states.count(State.WORKING) <= self.bounds.workers
         assert states.count(State.SLOW) <= self.bounds.slow
-        assert states.count(State.SENDING) <= self.bounds.sending
+        assert states.count(State.WAITS) <= self.bounds.waits
         turns = [ticket.turn for ticket in self.at_work]
         assert len(turns) == len(set(turns)), "one of each turn"
         waiting = list(chain(*self.waiting.values()))
@@ -337,7 +347,7 @@ def test_nothing_is_forgotten_by_several_threads(seed):
             if ticket.request % 5 == 0:
                 start(queues.slow(ticket) or [])
             if ticket.request % 11 == 0:
-                start(queues.sending(ticket) or [])
+                start(queues.waits(ticket) or [])
             with lock:
                 at_work.remove(ticket.turn)
             if ticket.request % 7 == 0:  # its answer goes on in a thread of its own

@@ -6,7 +6,7 @@ import threading
 import time
 
 import pytest
-from solidcloud.server.watchdog import Watchdog, lower_priority
+from solidcloud.server.watchdog import Watchdog, cpu_seconds, lower_priority
 
 DEADLINE = 20.0
 
@@ -80,3 +80,14 @@ def test_the_priority_of_one_thread_is_lowered():
     thread.join(DEADLINE)
     assert found[1] == min(19, before + 10) and os.getpriority(os.PRIO_PROCESS, 0) == before
     lower_priority(2**22 + 1)  # of no thread
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="times of threads")
+def test_the_processor_time_of_a_thread_is_told():
+    before = cpu_seconds(threading.get_native_id())
+    begin = time.thread_time()
+    while time.thread_time() < begin + 0.05:
+        pass
+    assert 0.04 < cpu_seconds(threading.get_native_id()) - before < DEADLINE
+    assert abs(cpu_seconds(threading.get_native_id()) - time.thread_time()) < 1.0
+    assert cpu_seconds(2**22 + 1) == float("inf")

@@ -181,16 +181,19 @@ class FairQueues:
             ticket.state = State.DONE
             self._forget(ticket)
 
-    def drop(self, client: str) -> list[Ticket]:
-        """Forget the waiting requests of a client, and return them."""
+    def drop(self, client: str) -> tuple[list[Ticket], list[Ticket]]:
+        """Forget the waiting requests of a client.
+
+        Returns them, and the tickets to be started: those of others of its turn may have waited behind them.
+        """
         with self._lock:
             if client not in self._clients:
-                return []
+                return [], []
             name = self._clients[client][0]
             turn = self._turns[name]
             dropped = [ticket for ticket in turn.waiting if ticket.client == client]
             if not dropped:
-                return []
+                return [], []
             if not turn.busy:
                 self._ready[turn.waiting[0].slow].remove(name)
             turn.waiting = deque(ticket for ticket in turn.waiting if ticket.client != client)
@@ -199,7 +202,7 @@ class FairQueues:
             for ticket in dropped:
                 ticket.state = State.DONE
                 self._forget(ticket)
-            return dropped
+            return dropped, self._start_waiting()
 
     def __len__(self) -> int:
         """Return the number of requests accepted and not yet answered."""

@@ -113,7 +113,9 @@ class Lane:
     def client_gone(self, client: str) -> None:
         """Stop and drop all requests of a client whose liveliness token went, then have the service forget it."""
         self._alive.discard(client)
-        for ticket in self._queues.drop(client):
+        dropped, started = self._queues.drop(client)
+        self._start(started)
+        for ticket in dropped:
             if isinstance(ticket.request, Request):
                 self._drop(ticket.request)
         for job in [*self._jobs, *self._streaming.values()]:

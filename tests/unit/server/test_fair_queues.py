@@ -177,11 +177,20 @@ def test_waiting_requests_of_a_client_that_is_gone_are_dropped():
     first, _ = offered(queues, "x", 1, turn="")
     dropped = [offered(queues, "x", number, turn="")[0] for number in (2, 3)]
     other, _ = offered(queues, "y", 4, turn="")
-    assert queues.drop("x") == dropped and queues.drop("nobody") == []
+    assert queues.drop("x") == (dropped, []) and queues.drop("nobody") == ([], [])
     assert queues.finished(first) == [other]
     waiting, _ = offered(queues, "z", 5)
-    assert queues.drop("z") == [waiting], "with nothing at work"
+    assert queues.drop("z") == ([waiting], []), "with nothing at work"
     assert queues.finished(other) == [] and len(queues) == 0
+
+
+def test_what_waited_behind_a_dropped_request_begins():
+    queues = make(workers=1, slow=1)
+    slow, _ = offered(queues, "a", 1, slow=True)
+    first, _ = offered(queues, "x", 2, turn="", slow=True)
+    second, _ = offered(queues, "y", 3, turn="")
+    assert queues.drop("x") == ([first], [second]) and second.state is State.WORKING
+    assert queues.finished(second) == queues.finished(slow) == []
 
 
 def test_a_detached_request_takes_up_neither_a_worker_nor_its_clients_turn():
@@ -284,7 +293,9 @@ class AnyOrder(RuleBasedStateMachine):
 
     @rule(client=st.sampled_from("abcdef"))
     def drop(self, client):
-        assert self.queues.drop(client) == self.waiting.pop(client, [])
+        dropped, started = self.queues.drop(client)
+        assert dropped == self.waiting.pop(client, [])
+        self.started(started)
 
     @invariant()
     def bounds_hold(self):
@@ -322,7 +333,7 @@ class AnyOrder(RuleBasedStateMachine):
         assert not self.queues._turns and not self.queues._clients
 
 
-AnyOrder.TestCase.settings = settings(max_examples=300, stateful_step_count=60, deadline=None)
+AnyOrder.TestCase.settings = settings(max_examples=500, stateful_step_count=60, deadline=None)
 TestAnyOrder = AnyOrder.TestCase
 
 

@@ -66,6 +66,8 @@ def unknown_line(answers: Any, unanswered: int) -> str:
     if answers.faults:
         more = len(answers.faults) - 1
         why = answers.faults[0] + (f" (and {more} more)" if more else "")
+    elif answers.stopped:
+        why = answers.stopped
     elif answers.late:
         why = f"{len(answers.late)} voxels were not loaded in time"
     else:

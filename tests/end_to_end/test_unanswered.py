@@ -163,8 +163,13 @@ class Doubts(FloorScene):
     def collide(self, name: str, poses: Any, *what: Any, **effort: Any) -> Any:
         found = super().collide(name, poses, *what, **effort)
         found.verdict[:2] = Verdict.UNKNOWN
-        columns = {field: getattr(found, field) for field in CollideAnswers.__struct_fields__}
-        return CollideAnswers(**columns | {"faults": (self.fault,) if self.fault else ()})
+        columns = {
+            field: getattr(found, field)
+            for field in CollideAnswers.__struct_fields__
+            if field not in ("faults", "stopped")
+        }
+        why = {"stopped": self.fault} if "server time" in self.fault else {"faults": (self.fault,)}
+        return CollideAnswers(**columns, **(why if self.fault else {}))
 
     def move(self, name: str, pose_from: Any, pose_to: Any, *what: Any, **fields: Any) -> Any:
         super().move(name, pose_from, pose_to, *what, **fields)
@@ -175,6 +180,7 @@ class Doubts(FloorScene):
     ("fault", "why"),
     [
         ("hall.h5: voxel 3 is broken", "hall.h5: voxel 3 is broken"),
+        ("2 s of server time are over", "2 s of server time are over"),
         ("", "the budget was spent, or a scan that the build left out is in reach"),
     ],
 )

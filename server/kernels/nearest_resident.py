@@ -50,7 +50,7 @@ def nearest_resident(poses, avatar, radius, radius_units, reach_units, reach, sc
     Writes rows (capacity,) int64, the voxels in reach, and said (COLUMNS,) float64: signed distance and what it is at
     least [m], normal, witness of the avatar, of the cloud, world [m]; inf and NaN where no pair is within reach.
     Returns (fault, pose, figure found) as `check_poses` does, how many rows, -1: not answered, for something has to be
-    loaded or the rows do not fit; outside, node visits, point tests.
+    loaded, the rows do not fit, or scene.stop was set; outside, node visits, point tests.
     """
     outside = np.zeros(1, np.bool_)
     scales, units = np.empty(1), np.empty(1, np.int64)
@@ -72,5 +72,7 @@ def nearest_resident(poses, avatar, radius, radius_units, reach_units, reach, sc
         nearest_poses(
             poses, avatar, scene, index, around, reach_units, np.zeros(1, np.int64), nearest, counts
         )
+        if nearest.gap[0] < np.inf:  # all is resident, so the search was stopped
+            return fault, pose, found, -1, False, 0, 0
     _say(nearest.square[0], nearest.pair[0], nearest.drop[0], units[0] - reach_units, reach, scene, said)
     return fault, pose, found, needed, outside[0], np.int64(counts[1, 0]), np.int64(counts[2, 0])

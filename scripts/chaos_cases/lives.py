@@ -33,8 +33,9 @@ class Quiet(NamedTuple):
 
 
 class Stop(NamedTuple):
-    """One SIGTERM. seconds: until it ended.  code: that it ended with."""
+    """One SIGTERM. begin: when [s].  seconds: until it ended.  code: that it ended with."""
 
+    begin: float
     seconds: float
     code: int
 
@@ -104,7 +105,7 @@ class Lives:
         except subprocess.TimeoutExpired:
             self._process.kill()
             code = self._process.wait()
-        self.stops.append(Stop(time.monotonic() - begin, code))
+        self.stops.append(Stop(begin, time.monotonic() - begin, code))
         self._gone()
 
     def hang_up(self) -> None:
@@ -123,8 +124,9 @@ class Lives:
     def slope(self) -> tuple[float, float] | None:
         """Return the slope of the last life's memory once settled [MB a minute], and the minutes it was seen for."""
         begin = next((at for life, at, _ in self.memory if life == self.number), 0.0)
+        end = self.stops[-1].begin if self.stops else time.monotonic()
         seen = np.array(
-            [(at, rss) for life, at, rss in self.memory if life == self.number and at > begin + SETTLED]
+            [(at, rss) for life, at, rss in self.memory if life == self.number and begin + SETTLED < at < end]
         )
         if len(seen) < 2 or seen[-1, 0] - seen[0, 0] < 60:
             return None
@@ -149,7 +151,8 @@ class Lives:
             process = self._process
             if process is not None:
                 with suppress(OSError, ValueError, IndexError):  # it has just ended
-                    self.memory.append((self.number, time.monotonic(), _rss(process.pid)))
+                    if rss := _rss(process.pid):  # 0: it has ended
+                        self.memory.append((self.number, time.monotonic(), rss))
             time.sleep(WATCH_PERIOD)
 
 

@@ -211,11 +211,14 @@ def show_kept(change: Change, files: list[tuple[str, int]], new: set[str]) -> No
 
 @contextmanager
 def reading_back(change: Change, new: set[str]) -> Iterator[None]:
-    """Say of a CorruptError whether it is of what was written just now, or of what stays; new: names of shards."""
+    """Say of an error whether it is of what was written just now, or of what stays; new: names of shards.
+
+    An index that cannot be read was written just now.
+    """
     try:
         yield
-    except CorruptError as error:
-        if not {path.name for path in error.paths} & new:
+    except FormatError as error:
+        if isinstance(error, CorruptError) and not {path.name for path in error.paths} & new:
             # It was read by a link in the hidden folder, which is gone when this is read.
             raise CorruptError(str(error).replace(str(change.folder), str(change.target))) from error
         raise CorruptError(

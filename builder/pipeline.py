@@ -17,11 +17,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..schemas.archive import Archive
-from ..schemas.errors import BadRequestError, CorruptError, ScanError, SolidcloudError
+from ..schemas.errors import BadRequestError, CorruptError, FormatError, ScanError, SolidcloudError
 from ..schemas.index import Header
 from ..schemas.index_file import write_index
 from ..schemas.interrupts import check
 from ..schemas.os_errors import os_error_words
+from ..schemas.shard import SHARD_FOLDER
 from ..schemas.voxel_grid import Lattice
 from ..schemas.vtkhdf import PREVIEW_NAME
 from .coincident import coincident_sources, coincident_text
@@ -226,15 +227,18 @@ def _read_back(folder: Path, points: int, spool: Spool, executor: Executor, stag
     fault = ""
     paths: tuple[Path, ...] = ()
     try:
-        with stages.stage("preview", points, "points"):
-            write_preview(folder, executor, stages.progress)
-    except CorruptError as error:
-        fault, paths = str(error), error.paths
-    with stages.timed("verify"):
-        report = verify_archive(folder, progress=stages.progress, executor=executor, places=spool.places)
-    if report.faults:
-        fault = report.faults[0]
-        paths = (*map(Path, report.damaged), *((spool.folder,) if report.others else ()))
+        try:
+            with stages.stage("preview", points, "points"):
+                write_preview(folder, executor, stages.progress)
+        except CorruptError as error:
+            fault, paths = str(error), error.paths
+        with stages.timed("verify"):
+            report = verify_archive(folder, progress=stages.progress, executor=executor, places=spool.places)
+        if report.faults:
+            fault = report.faults[0]
+            paths = (*map(Path, report.damaged), *((spool.folder,) if report.others else ()))
+    except FormatError as error:  # the index: what it is made of cannot be told, so all of it is made anew
+        fault, paths = str(error), (*sorted((folder / SHARD_FOLDER).iterdir()), spool.folder)
     if fault:
         raise CorruptError(
             f"{fault}: what was written is not what reads back: check disk and memory; the same command makes anew "

@@ -79,7 +79,7 @@ class Play(NamedTuple):
 
     def body(self, avatar: AvatarModel, pose: Points) -> Body:
         """A body there."""
-        return Body("client/avatar", avatar, pose.copy())
+        return Body("client/avatar", avatar, pose.copy(), user=("client", "avatar"))
 
     def go(self, body: Body, way: Any, turn: Points | None = None, seconds: float = 1 / 30) -> Moved:
         """A frame of a body that wishes to go by a way (3,) and to turn to a rotation (3, 3)."""

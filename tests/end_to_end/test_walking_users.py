@@ -307,6 +307,6 @@ def test_query_asks_for_moves(
             "--margin does not go with --op move: it takes --avatar, --poses, --radius"
             in capsys.readouterr().err
         )
-    assert run(ask) == 0
+    assert run(ask) == 1
     captured = capsys.readouterr()
-    assert "unknown at 0.0000" in captured.out and "no server of scene 'room' answered" in captured.err
+    assert captured.out == "" and "no server of scene 'room'" in captured.err

@@ -26,7 +26,7 @@ def test_case_30_a_budget_takes_nothing_back(tmp_path: Path, rng: np.random.Gene
     known = np.full(len(poses), UNKNOWN)
     with Scene.open(case.archive) as scene:
         scene.add_avatar("avatar", avatar, 0.01)
-        data, model = scene._data, scene._avatars["", "avatar"]
+        data, model = scene._data, scene.avatar("avatar", "")
         told = []
         for visits in (0, 3, 10, 30, 100, 300, NO_LIMIT - 1):
             verdict = collide_bounded(data, model, poses, 0.0, Effort(visits=visits)).verdict
@@ -47,7 +47,7 @@ def test_case_30_early_by_at_most_the_tolerance(tmp_path: Path) -> None:
     poses = np.array([cases.pose_of(np.eye(3), np.array([0.0, 0.0, z])) for z in away])
     with Scene.open(case.archive) as scene:
         scene.add_avatar("ball", np.zeros((1, 3)), 0.25)
-        data, model = scene._data, scene._avatars["", "ball"]
+        data, model = scene._data, scene.avatar("ball", "")
         answers = collide_bounded(data, model, poses, 0.0, Effort(tolerance=0.125))
         near = distance_bounded(data, model, poses, 1.0, Effort(tolerance=0.125))
     assert answers.verdict[0] == CONTACT
@@ -67,7 +67,7 @@ def test_case_30_what_is_not_resident_by_the_deadline_is_unknown(tmp_path: Path)
     poses = np.array([cases.pose_of(np.eye(3), np.array(place)) for place in places])
     with Scene.open(case.archive) as scene:
         scene.add_avatar("ball", np.zeros((1, 3)), 0.1)
-        data, model = scene._data, scene._avatars["", "ball"]
+        data, model = scene._data, scene.avatar("ball", "")
         over = Effort(deadline=0.0)
         answers = collide_bounded(data, model, poses, 0.4, over)
         assert answers.verdict.tolist() == [UNKNOWN, UNKNOWN, CLEAR] and answers.misses == 2

@@ -46,7 +46,7 @@ def test_bounds_hold_and_a_larger_budget_never_gives_worse(
         with Scene.open(case.archive) as scene:
             info = scene.info()
             scene.add_avatar("avatar", avatar, 0.02)
-            data, model = scene._data, scene._avatars["", "avatar"]
+            data, model = scene._data, scene.avatar("avatar", "")
             scan = (points, info.origin, info.lattice_step, info.radius)
             signed = _signed(naive_distance.distance(*scan, avatar, 0.02, poses, 5.0))
             within = np.where(signed <= reach, signed, np.inf)
@@ -98,7 +98,7 @@ def test_in_pieces_and_in_slices_the_bounds_hold_as_well(seed: int, kind: str, t
         for options in ({}, {"budget_bytes": budget}):
             with Scene.open(case.archive, **options) as scene:
                 scene.add_avatar("avatar", avatar, 0.02)
-                data, model = scene._data, scene._avatars["", "avatar"]
+                data, model = scene._data, scene.avatar("avatar", "")
                 for visits in (0, 40, 300, NO_LIMIT - 1):
                     for deadline in (math.inf, 1e12, 0.0):
                         effort = Effort(0.01, visits, deadline)

@@ -119,7 +119,7 @@ def test_what_was_done_is_not_done_again(
         counted(name)
     with monkeypatch.context() as patch:
         patch.setattr(pipeline, "verify_archive", lambda *_, **__: (_ for _ in ()).throw(OSError(5, "lost")))
-        with pytest.raises(Exception, match="lost"):
+        with pytest.raises(Exception, match="does not read or write"):
             build(tmp_path / "hall", scans)
     everything = ["hash_file"] * 2 + ["survey_range"] * 4 + ["spool_range"] * 4 + ["build_shard"] * 2
     assert calls == everything
@@ -238,7 +238,7 @@ def test_a_scan_that_changes_while_it_is_read_is_no_archive(
 @pytest.mark.parametrize(
     ("failure", "said"),
     [
-        (OSError(5, "Input/output error"), r"Input/output error: '.*b\.xyz'.*same command again"),
+        (OSError(5, "Input/output error"), r"b\.xyz.*does not read or write.*same command again"),
         (MemoryError(), r"b\.xyz: out of memory.*fewer --jobs.*same command again"),
     ],
 )

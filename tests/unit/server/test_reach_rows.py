@@ -24,6 +24,7 @@ class Lattice(NamedTuple):
     step: float
     units_per_step: float
     voxel_steps: int
+    stop: NDArray[np.int64]
 
 
 class Root(NamedTuple):
@@ -33,7 +34,7 @@ class Root(NamedTuple):
     radius: NDArray[np.float64]
 
 
-SCENE = Lattice(np.array([10.0, -20.0, 30.0]), STEP, UNITS_PER_STEP, VOXEL_STEPS)
+SCENE = Lattice(np.array([10.0, -20.0, 30.0]), STEP, UNITS_PER_STEP, VOXEL_STEPS, np.zeros(1, np.int64))
 AVATAR = Root(np.array([[0.25, 0.5, -0.125]]), np.array([0.03]))
 
 

@@ -12,6 +12,7 @@ from halves import BODY, COUNT, OPTIONS, RADIUS, STEP, Built, exact_pose, near, 
 from msgspec import structs
 from solidcloud.schemas.archive import Archive
 from solidcloud.schemas.errors import BadRequestError, BadTransformError, FormatError, UnknownAvatarError
+from solidcloud.schemas.keys import public_id
 from solidcloud.server.app import Service
 from solidcloud.server.config import ServerConfig
 from solidcloud.server.posed import archive_pose, inverse_of, moved, under
@@ -128,7 +129,9 @@ def test_info_stats_and_reload_speak_of_all_archives(built: Built, rng: np.rando
         assert stats.voxels == info.voxels and stats.misses == stats.resident == len(stats.keys) > 2
         assert stats.load_seconds.count == stats.resident and stats.load_seconds.p50 > 0
         assert sum(stats.load_seconds.buckets) == stats.resident
-        assert [(user.client, user.avatar, user.requests) for user in stats.users] == [("me", "al", 2)]
+        assert [(user.client, user.avatar, user.requests) for user in stats.users] == [
+            (public_id("me"), "al", 2)
+        ]
         answer = scene.reload()
         assert (answer.scene, answer.generation_after, answer.points) == ("hall", 0, info.points)
         assert scene.collide("al", poses).verdict.tolist() == scene.collide("al", poses).verdict.tolist()

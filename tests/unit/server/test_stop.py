@@ -209,7 +209,7 @@ def test_loads_are_not_waited_for_beyond_the_time_of_a_request(
         type(scene.residency), "hold", lambda self, rows, until=np.inf, **o: watched(rows, until, **o)
     )
     until = time.perf_counter() + 1000.0
-    for op in ("collide", "distance", "contacts", "sweep", "raycast", "within"):
+    for op in ("collide", "distance", "contacts", "sweep", "within"):
         untils.clear()
         ask(scene, op, 2, stop=Stop(until))
         assert untils and max(untils) == until, op

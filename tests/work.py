@@ -253,7 +253,10 @@ def told(answers: Any) -> tuple[Answers, Answers]:
 
 @contextmanager
 def counted_calls() -> Iterator[Counter[str]]:
-    """Counts the calls of functions of server/kernels, as "file.function", while it is entered."""
+    """Count the calls of functions of server/kernels, as "file.function", while it is entered.
+
+    Looks at the stop flag are not counted: they are no work, and there is one at nearly every node.
+    """
     calls: Counter[str] = Counter()
     names: dict[Any, str] = {}
 
@@ -262,7 +265,7 @@ def counted_calls() -> Iterator[Counter[str]]:
             code = frame.f_code
             if code not in names:
                 path = Path(code.co_filename)
-                own = path.parts[-3:-1] == ("server", "kernels")
+                own = path.parts[-3:-1] == ("server", "kernels") and path.stem != "stopping"
                 names[code] = f"{path.stem}.{code.co_name}" if own else ""
             calls[names[code]] += 1
 

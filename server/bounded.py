@@ -22,6 +22,7 @@ from .kernels.reach import Reach
 from .request import SceneData, as_held, check_request, in_unknown, kernel_poses, pieces, to_units
 from .signed import distance_columns, signed_bound, signed_from_square, unknown_gaps
 from .spent import Spent
+from .stop import Stop
 
 # Pairs the heap holds before the search turns depth first: half a megabyte a request.
 HEAP_PAIRS = 1 << 14
@@ -59,7 +60,7 @@ def _search_until(
     for done, pose in enumerate(which.tolist()):
         now = time.perf_counter()
         if effort.spent:
-            _leave_open(data, part, which[done:], known, counts)
+            _leave_open(data, part, which[done:], effort.stop, known, counts)
             return
         share = now + (deadline - now) / (len(which) - done)
         fresh, until = True, SLICE_VISITS
@@ -76,12 +77,20 @@ def _search_until(
 
 
 def _leave_open(
-    data: SceneData, part: Reach, left: NDArray[np.int64], known: Known, counts: NDArray[np.uint32]
+    data: SceneData,
+    part: Reach,
+    left: NDArray[np.int64],
+    stop: Stop,
+    known: Known,
+    counts: NDArray[np.uint32],
 ) -> None:
     """Give up the poses `left`, all at once: a kernel call for each took a deadline of 5 ms to half a second.
 
-    Their bounds are what the index alone says: box to box, as in `unknown_gaps`.
+    Their bounds are what the index alone says: box to box, as in `unknown_gaps`. Once the stop is set, nothing is said.
     """
+    if stop:
+        known.lower[left] = 0.0
+        return
     lengths = part.starts[left + 1] - part.starts[left]
     poses = np.repeat(left, lengths)
     behind = np.concatenate([[0], np.cumsum(lengths)])
@@ -89,6 +98,9 @@ def _leave_open(
     own = (part.units / data.arrays.units_per_step)[:, None]
     low, high = part.boxes[:, 0] + own, part.boxes[:, 1] - own
     for begin in range(0, len(at), LEFT_AT_A_TIME):
+        if stop:
+            known.lower[poses[begin:]] = 0.0
+            return
         pose, voxel = poses[begin : begin + LEFT_AT_A_TIME], part.rows[at[begin : begin + LEFT_AT_A_TIME]]
         apart = np.maximum(data.broad.low[voxel] - high[pose], low[pose] - data.broad.high[voxel])
         np.maximum(apart, 0.0, out=apart)
@@ -107,12 +119,14 @@ def _gather(
     )  # fmt: skip
     counts = np.zeros((3, k), np.uint32)
     residency, spent = data.residency, Spent(time.perf_counter())
-    for which, rows, part in pieces(reach, residency, effort.share) if len(avatar.points) else ():
+    for which, rows, part in (
+        pieces(reach, residency, effort.share, effort.stop) if len(avatar.points) else ()
+    ):
         if effort.stop:
-            _leave_open(data, part, which, known, counts)
+            _leave_open(data, part, which, effort.stop, known, counts)
             continue
         heap = max(HEAP_PAIRS, int(np.diff(part.starts).max(initial=0)))
-        with residency.hold(rows, effort.loads_until(), scan=effort.scan) as held:
+        with residency.hold(rows, effort.loads_until(), scan=effort.scan, stop=effort.stop) as held:
             seen = as_held(data, held)
             if effort.deadline < math.inf:
                 _search_until(seen, avatar, array, part, which, heap, goal, effort, known, counts)

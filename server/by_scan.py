@@ -44,11 +44,11 @@ def gaps_by_scan(
         return ScanGaps({}, True)
     nearer = Nearer(np.full(scans + 1, np.inf), np.full(scans + 1, reach.units[0]))
     counts, exact = np.zeros(3, np.int64), True
-    for _, rows, part in pieces(reach, data.residency, effort.share):
+    for _, rows, part in pieces(reach, data.residency, effort.share, effort.stop):
         if effort.spent:
             exact = False
             break
-        with data.residency.hold(rows, effort.loads_until(), scan=effort.scan) as held:
+        with data.residency.hold(rows, effort.loads_until(), scan=effort.scan, stop=effort.stop) as held:
             arrays = as_held(data, held).arrays
             exact &= bool(
                 nearest_by_scan(

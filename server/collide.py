@@ -11,7 +11,7 @@ from ..schemas.voxel_grid import UNITS_PER_METRE
 from .avatar import AvatarModel
 from .bounded import collide_bounded
 from .coarse import settle
-from .effort import EXACT, Effort
+from .effort import EXACT, NO_LIMIT, Effort
 from .kernels.overlap import CLEAR, CONTACT, UNKNOWN, answer_resident, overlap_poses
 from .request import SceneData, as_held, check_request, in_unknown, kernel_poses, pieces, refuse, to_units
 from .spent import Spent
@@ -84,13 +84,15 @@ def collide(
     verdict, counts = np.zeros(k, np.uint8), np.zeros((3, k), np.uint32)
     residency, spent = data.residency, Spent(begin)
     # An empty avatar is clear, whatever is unknown here.
-    for which, rows, part in pieces(reach, residency, effort.share) if len(avatar.points) else ():
+    for which, rows, part in (
+        pieces(reach, residency, effort.share, effort.stop) if len(avatar.points) else ()
+    ):
         if effort.stop:
             verdict[which[verdict[which] == CLEAR]] = UNKNOWN
             continue
-        with residency.hold(rows, effort.loads_until(), scan=effort.scan) as held:
+        with residency.hold(rows, effort.loads_until(), scan=effort.scan, stop=effort.stop) as held:
             seen = as_held(data, held)
-            overlap_poses(array, avatar.arrays, seen.arrays, part, which, verdict, counts)
+            overlap_poses(array, avatar.arrays, seen.arrays, part, which, NO_LIMIT, verdict, counts)
         spent.add(held)
     if (data.nothing_clear or unseen) and len(avatar.points):  # a load may have found the index wrong
         lost = in_unknown(reach.boxes, data.unknown, data.nothing_clear)

@@ -20,6 +20,7 @@ from .avatar import AvatarModel
 from .distance import signed_from_square
 from .effort import EXACT, Effort
 from .kernels.clusters import (
+    CELLS,
     CENTER,
     CLUSTER,
     CLUSTERS,
@@ -38,10 +39,12 @@ from .kernels.clusters import (
     make_cells,
 )
 from .kernels.contacts import Asked, Tally, gather_contacts
+from .kernels.layout import LANES
 from .kernels.overlap import STACK
 from .kernels.reach import Reach
 from .request import SceneData, as_held, check_request, in_unknown, kernel_poses, pieces, to_units
 from .spent import Spent
+from .stop import NEVER
 
 # Pairs and clusters that one request may list, all poses together [bytes]; some three times as much is needed for a
 # moment, to make columns of them. The wire's largest message holds an eighth of it.
@@ -49,8 +52,9 @@ MOST_BYTES = 256 << 20
 # Node visits between two looks at the clock, about a millisecond; and at what is listed, where there is no deadline.
 SLICE_VISITS = 1 << 15
 SIZE_VISITS = 1 << 19
-# Cells there is room for at first, a power of two and LANES or more; a kernel doubles them as it needs.
-FIRST_CELLS = 256
+# Cells there is room for at first, a power of two and LANES or more; a kernel doubles them as it needs, up to
+# MOST_CELLS, which take 200 MB.
+FIRST_CELLS, MOST_CELLS = 256, 1 << 20
 
 
 def contacts(
@@ -91,8 +95,8 @@ def contacts(
     spent = Spent(begin)
     if len(avatar.points):
         edges = _edges(reach, edge_units, data.arrays.units_per_step)
-        asked = Asked(avatar.rows, edges, data.keeps_scan, limit, effort.visits)
-        parts = list(pieces(reach, data.residency, effort.share))
+        asked = Asked(avatar.rows, edges, data.keeps_scan, limit, effort.visits, MOST_CELLS)
+        parts = list(pieces(reach, data.residency, effort.share, effort.stop))
         for number, (which, rows, part) in enumerate(parts):
             # A pose in several pieces is alone in each of them, and they follow one another.
             closes = (
@@ -101,7 +105,7 @@ def contacts(
             if effort.spent:
                 memory = _gather(data, avatar, array, part, which, asked, closes, effort, memory, tally)
                 continue
-            with data.residency.hold(rows, effort.loads_until(), scan=effort.scan) as held:
+            with data.residency.hold(rows, effort.loads_until(), scan=effort.scan, stop=effort.stop) as held:
                 seen = as_held(data, held)
                 memory = _gather(seen, avatar, array, part, which, asked, closes, effort, memory, tally)
             spent.add(held)
@@ -135,8 +139,9 @@ def _edges(reach: Reach, edge_units: int | None, units_per_step: float) -> NDArr
 def _empty_memory(limit: int) -> Memory:
     """Nothing found yet, nothing begun."""
     return Memory(
-        make_cells(FIRST_CELLS), np.empty((limit, RECORD), np.int64), np.array([0, 0, 0, 0, -1]), np.zeros(3, np.int64),
-        np.empty((STACK, 2), np.int64), np.empty((0, RECORD), np.int64), np.empty((0, CLUSTER), np.int64),
+        make_cells(FIRST_CELLS, NEVER.flag), np.empty((limit, RECORD), np.int64), np.array([0, 0, 0, 0, -1]),
+        np.zeros(3, np.int64), np.empty((STACK, 2), np.int64), np.empty((0, RECORD), np.int64),
+        np.empty((0, CLUSTER), np.int64),
     )  # fmt: skip
 
 
@@ -166,7 +171,12 @@ def _gather(
 
 
 def _check_room(memory: Memory) -> None:
-    """TooLargeError where more is listed than a request may list."""
+    """TooLargeError where more is listed than a request may list, or a pose touches more cells than there may be."""
+    if memory.sizes[CELLS] + LANES > MOST_CELLS:
+        raise TooLargeError(
+            f"a pose touches {memory.sizes[CELLS]} cells or more, {MOST_CELLS - LANES} is the most: ask for "
+            "a larger cluster_distance"
+        )
     pairs, clusters = int(memory.sizes[LISTED]), int(memory.sizes[CLUSTERS])
     if 8 * (pairs * RECORD + clusters * CLUSTER) > MOST_BYTES:
         raise TooLargeError(

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from ..schemas.answers import DistanceAnswers
 from .avatar import AvatarModel
 from .bounded import distance_bounded
-from .effort import EXACT, Effort
+from .effort import EXACT, NO_LIMIT, Effort
 from .kernels.closest import Nearest
 from .kernels.nearest import nearest_poses
 from .request import SceneData, as_held, check_request, kernel_poses, pieces, to_units
@@ -42,14 +42,23 @@ def distance(
     counts = np.zeros((3, k), np.uint32)
     residency, spent = data.residency, Spent(begin)
     if len(avatar.points):
-        for which, rows, part in pieces(around, residency, effort.share):
+        for which, rows, part in pieces(around, residency, effort.share, effort.stop):
             if effort.stop:
                 nearest.gap[which] = 0.0
                 continue
-            with residency.hold(rows, effort.loads_until(), scan=effort.scan) as held:
+            with residency.hold(rows, effort.loads_until(), scan=effort.scan, stop=effort.stop) as held:
                 seen = as_held(data, held)
                 nearest_poses(
-                    array, avatar.arrays, seen.arrays, data.broad, part, reach_units, which, nearest, counts
+                    array,
+                    avatar.arrays,
+                    seen.arrays,
+                    data.broad,
+                    part,
+                    reach_units,
+                    which,
+                    NO_LIMIT,
+                    nearest,
+                    counts,
                 )
             spent.add(held)
         np.minimum(nearest.gap, unknown_gaps(data, around), out=nearest.gap)

@@ -10,12 +10,16 @@ from typing import NamedTuple
 
 from ..schemas.errors import BadRequestError
 from ..schemas.requests import QuestionOptions
+from .deadlines import stop_at
 from .stop import NEVER, Stop
 
 # No budget: more node visits than any request could make.
 NO_LIMIT = 1 << 62
 # Of the time left, what loads may take: what is resident is to be searched as well.
 LOAD_SHARE = 0.5
+# After the deadline of a budget, searches that look at the clock have so long to end by themselves, with what they know
+# by then; after that the stop flag ends everything [s].
+GRACE = 0.05
 
 
 class Effort(NamedTuple):
@@ -53,9 +57,9 @@ class Effort(NamedTuple):
     def loads_until(self) -> float:
         """Until when loads that begin now may go on, on the same clock [s]; inf: until they are done."""
         if self.deadline == math.inf:
-            return self.stop.until
+            return math.inf
         now = time.perf_counter()
-        return min(now + (self.deadline - now) * LOAD_SHARE, self.stop.until)
+        return now + (self.deadline - now) * LOAD_SHARE
 
 
 EXACT = Effort()
@@ -76,8 +80,9 @@ def make_effort(
     """The effort of a request that starts now.
 
     tolerance: [m], finite and >= 0.  budget_ms: waiting for loads and work together; None: no limit.
-    budget_visits: its twin that needs no clock, node visits a pose; None: no limit.  stop: the request's stop flag.
-    Raises BadRequestError.
+    budget_visits: its twin that needs no clock, node visits a pose; None: no limit.  stop: the request's stop flag. A
+    budget of time sets it `GRACE` after its end, for kernels that do not look at the clock; where it is NEVER, the
+    effort has one of its own. Raises BadRequestError.
     """
     if not 0 <= tolerance < math.inf:
         raise BadRequestError(f"tolerance is {tolerance}: expected a finite number of metres, 0 or more")
@@ -85,6 +90,10 @@ def make_effort(
         raise BadRequestError(f"budget_ms is {budget_ms}: expected milliseconds, 0 or more, or none")
     if budget_visits is not None and not 0 <= budget_visits <= NO_LIMIT:
         raise BadRequestError(f"budget_visits is {budget_visits}: expected node visits, 0 or more, or none")
-    deadline = math.inf if budget_ms is None else time.perf_counter() + budget_ms / 1e3
+    deadline = math.inf
+    if budget_ms is not None:
+        deadline = time.perf_counter() + budget_ms / 1e3
+        stop = Stop() if stop is NEVER else stop
+        stop_at(stop, deadline + GRACE, f"the request's budget of {budget_ms:g} ms was spent")
     visits = NO_LIMIT if budget_visits is None else int(budget_visits)
     return Effort(float(tolerance), visits, deadline, stop=stop)

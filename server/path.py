@@ -23,7 +23,7 @@ from .contacts import contacts
 from .distance import distance
 from .effort import make_effort
 from .kernels.placing import check_poses
-from .request import SceneData, kernel_poses, refuse, to_units
+from .request import SceneData, kernel_poses, refuse, to_units, with_stop
 from .stop import NEVER, Stop
 from .stopped_answers import ask_until_stopped, unknown_part
 from .sweep import sweep
@@ -53,9 +53,9 @@ def path_question(
 ) -> tuple[Ask, int]:
     """What answers [start, stop) of a path, and how many answers there are. The budget's time begins now.
 
-    poses: (k, 4, 4) float64.  stop: ends the path early.  parameters: of `op`,
-    tolerance and budgets included. All poses are checked here, so that
-    an error names one by its place on the path. BadRequestError, BadTransformError, TooLargeError.
+    poses: (k, 4, 4) float64.  parameters: of `op`, tolerance and budgets included.  stop: ends the path early. All
+    poses are checked here, so that an error names one by its place on the path. BadRequestError, BadTransformError,
+    TooLargeError.
     """
     given = {name: value for name, value in parameters.items() if value is not None}
     check_path_parameters(op, given)
@@ -63,6 +63,7 @@ def path_question(
     tolerance = given.pop("tolerance", 1e-6 if op == "sweep" else 0.0)
     # Nobody stays along a path; what users stand in, at most half of the cache (prefetch.py), can stay beside it.
     effort = make_effort(tolerance, **budgets, stop=stop)._replace(scan=True, share=0.5)
+    data = with_stop(data, effort.stop)
     poses = kernel_poses(poses)  # copied once if at all, or every part would copy its own
     other = (
         to_units(given["reach"], "reach")

@@ -22,6 +22,8 @@ from .stop import NEVER, Stop, StoppedError
 # Voxels in reach of all poses of one request: 128 MB of row numbers. The index would make gigabytes of them for 100,000
 # poses whose reach covers thousands of voxels.
 MOST_ROWS = 1 << 24
+# Rows looked at between two looks at the stop flag.
+_ROWS_AT_ONCE = 1 << 18
 
 _POSE_FAULTS: dict[int, tuple[type[SolidcloudError], str]] = {
     placing.NOT_FINITE: (BadRequestError, "holds {}: expected finite numbers"),
@@ -146,8 +148,10 @@ def with_radius_model(data: SceneData, archive: Archive, text: str | None) -> Sc
 
 
 def with_stop(data: SceneData, stop: Stop) -> SceneData:
-    """Return the same scene for a request that `stop` ends early."""
-    return data if stop is NEVER else data._replace(arrays=data.arrays._replace(stop=stop.flag))
+    """Return the same scene for a request that `stop` ends early, and no other stop."""
+    return (
+        data if data.arrays.stop is stop.flag else data._replace(arrays=data.arrays._replace(stop=stop.flag))
+    )
 
 
 def _empty_reach(k: int, rows: int) -> Reach:
@@ -192,19 +196,19 @@ def check_request(
 
 
 def pieces(
-    reach: Reach, residency: Residency, share: float = 1.0
+    reach: Reach, residency: Residency, share: float = 1.0, stop: Stop = NEVER
 ) -> Iterator[tuple[NDArray[np.int64], list[int], Reach]]:
     """Cut a request into pieces whose voxels fit the budget: (pose numbers, voxel rows, reach) each.
 
-    share: of the budget, what a piece may take, but for a voxel that alone takes more.
+    share: of the budget, what a piece may take, but for a voxel that alone takes more.  stop: once it is set, the last
+    piece has all poses that are left, and no voxels.
 
     Nearly always one piece. A pose that alone reaches more than the budget is looked at voxel by voxel run
     (NUMERICS.md case 23), and so appears in several pieces.
     """
     k = len(reach.scales)
     rows = reach.rows[: reach.starts[k]]
-    # A sort in numpy lets other threads run meanwhile; of a list, it would not.
-    everything = (np.unique(rows) if k > 1 else rows).tolist()
+    everything = (_distinct(rows, len(residency.where), stop) if k > 1 else rows).tolist()
     budget = int(residency.buffer.total_bytes * share)
     if residency.bytes_of(everything) <= budget:
         yield np.arange(k), everything, reach
@@ -213,6 +217,9 @@ def pieces(
     held: dict[int, None] = {}
     held_bytes = 0
     for pose in range(k):
+        if stop:
+            yield np.concatenate([np.array(which, np.int64), np.arange(pose, k)]), [], reach
+            return
         own = reach.rows[reach.starts[pose] : reach.starts[pose + 1]].tolist()
         fresh = [row for row in own if row not in held]
         if which and held_bytes + residency.bytes_of(fresh) > budget:
@@ -231,6 +238,18 @@ def pieces(
             part.append(row)
     if which:
         yield np.array(which), list(held), reach
+
+
+def _distinct(rows: NDArray[np.int64], voxels: int, stop: Stop) -> NDArray[np.int64]:
+    """Return the distinct values of `rows`, ascending; not all of them where the stop is set meanwhile."""
+    if len(rows) <= _ROWS_AT_ONCE:
+        return np.unique(rows)  # a sort in numpy lets other threads run meanwhile
+    met = np.zeros(voxels, bool)
+    for begin in range(0, len(rows), _ROWS_AT_ONCE):
+        if stop:
+            break
+        met[rows[begin : begin + _ROWS_AT_ONCE]] = True
+    return np.flatnonzero(met)
 
 
 def _only(reach: Reach, pose: int, rows: list[int]) -> Reach:

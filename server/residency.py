@@ -27,6 +27,7 @@ from .accounts import Accounts
 from .arena import ArenaBuffer
 from .policies import Policy, make_policy
 from .room import Room
+from .stop import NEVER, Stop
 from .store import Store
 
 # Voxels that are looked at to find room for one that nobody waits for.
@@ -47,6 +48,10 @@ class Held(NamedTuple):
     waited: float = 0.0
 
 
+# How often a request that waits looks whether it is stopped [s].
+_LOOK_SECONDS = 0.005
+
+
 class Ahead(Enum):
     """What became of a load that nobody waited for."""
 
@@ -58,26 +63,33 @@ class Ahead(Enum):
 class Hold:
     """A hold on voxels, for a `with`; a class and not a generator, which costs a request twice as much."""
 
-    __slots__ = ("_deadline", "_residency", "_rows", "_scan")
+    __slots__ = ("_deadline", "_residency", "_rows", "_scan", "_stop")
 
-    def __init__(self, residency: "Residency", rows: Sequence[int], deadline: float, scan: bool) -> None:
+    def __init__(
+        self, residency: "Residency", rows: Sequence[int], deadline: float, scan: bool, stop: Stop
+    ) -> None:
         """Use `Residency.hold`."""
         self._residency, self._rows, self._deadline, self._scan = residency, rows, deadline, scan
+        self._stop = stop
 
     def __enter__(self) -> Held:
         """Wait until all that can be read is resident, or the deadline."""
-        return self._residency.acquire(self._rows, self._deadline, scan=self._scan)
+        return self._residency.acquire(self._rows, self._deadline, scan=self._scan, stop=self._stop)
 
     def __exit__(self, *_: object) -> None:
         """Let the voxels go."""
         self._residency.release(self._rows)
 
 
-def _seconds_to(deadline: float) -> float | None:
-    """Seconds left, 0 when there are none and never more than a lock can be waited for; None: no deadline."""
-    if deadline == math.inf:
-        return None
-    return min(max(0.0, deadline - time.perf_counter()), threading.TIMEOUT_MAX)
+def _seconds_to(deadline: float, stop: Stop) -> float | None:
+    """Return the seconds to wait before the next look: 0 when the time is up or the stop is set, at most the time
+    left, and at most `_LOOK_SECONDS` for a request that can be stopped. None: no limit."""
+    if stop:
+        return 0.0
+    most = math.inf if stop is NEVER else _LOOK_SECONDS
+    if deadline < math.inf:
+        most = min(most, max(0.0, deadline - time.perf_counter()))
+    return None if most == math.inf else min(most, threading.TIMEOUT_MAX)
 
 
 class Residency:
@@ -178,15 +190,18 @@ class Residency:
 
     # --- what a request does ------------------------------------------------------------------------------
 
-    def hold(self, rows: Sequence[int], deadline: float = math.inf, *, scan: bool = False) -> "Hold":
+    def hold(
+        self, rows: Sequence[int], deadline: float = math.inf, *, scan: bool = False, stop: Stop = NEVER
+    ) -> "Hold":
         """Make the voxels of distinct index rows resident and keep them so inside a `with`, which gives a `Held`.
 
         Together they must fit the budget. Voxels that cannot be read stay at -1 in `where` and are named in
         the result's faults; everything else is resident. deadline: on time.perf_counter()'s clock [s]; what is not
         resident by then is `late`. No load is begun after it, one that has begun is finished.  scan: these are passed
-        by, not stayed with: they had better not take the place of what others stay with (policies.py).
+        by, not stayed with: they had better not take the place of what others stay with (policies.py).  stop: once it
+        is set the deadline has come.
         """
-        return Hold(self, rows, deadline, scan)
+        return Hold(self, rows, deadline, scan, stop)
 
     def still(self) -> AbstractContextManager[bool]:
         """For a `with` inside which what is resident stays so, and nobody else goes on: for tens of microseconds."""
@@ -198,19 +213,23 @@ class Residency:
             self.policy.used(row, scan=scan)
         self._accounts.found(rows)
 
-    def acquire(self, rows: Sequence[int], deadline: float = math.inf, *, scan: bool = False) -> Held:
+    def acquire(
+        self, rows: Sequence[int], deadline: float = math.inf, *, scan: bool = False, stop: Stop = NEVER
+    ) -> Held:
         """Begin a hold; `release` must follow, unless this raises."""
         begin = time.perf_counter()
-        mine, hits, waits, settled = self._reserve(rows, deadline, scan)
+        mine, hits, waits, settled = self._reserve(rows, deadline, scan, stop)
         if settled:
             return Held(len(rows), 0, ())  # all resident and pinned: nothing can change that
         try:
             wanted = mine
             while True:
-                self._load(wanted, deadline)
+                self._load(wanted, deadline, stop)
                 with self._changed:
-                    self._changed.wait_for(lambda: self._settled(rows), _seconds_to(deadline))
-                    wanted = [row for row in rows if row in self._left] if _seconds_to(deadline) != 0 else []
+                    while not self._settled(rows) and (left := _seconds_to(deadline, stop)) != 0:
+                        self._changed.wait(left)
+                    late_now = _seconds_to(deadline, stop) == 0
+                    wanted = [] if late_now else [row for row in rows if row in self._left]
                     if not wanted:
                         faults = tuple(fault for row in rows if (fault := self._fault(row)))
                         late = tuple(row for row in rows if not self._fault(row) and not self._there(row))
@@ -247,7 +266,9 @@ class Residency:
             self._unpin(rows)
             self._changed.notify_all()
 
-    def _reserve(self, rows: Sequence[int], deadline: float, scan: bool) -> tuple[list[int], int, bool, bool]:
+    def _reserve(
+        self, rows: Sequence[int], deadline: float, scan: bool, stop: Stop
+    ) -> tuple[list[int], int, bool, bool]:
         """Pin all rows and make room for those to be loaded by this caller; none where there is no room in time.
 
         Returns these, how many of the others are resident or being loaded (a voxel with a fault is neither), whether
@@ -266,7 +287,7 @@ class Residency:
             if not settled:
                 self._demands += 1
                 try:
-                    mine = self._make_room(rows, mine, deadline, scan)
+                    mine = self._make_room(rows, mine, deadline, scan, stop)
                 except BaseException:
                     self._demands -= 1
                     self._changed.notify_all()
@@ -290,7 +311,9 @@ class Residency:
             return False
         return not (self._faults or self._passing) or not any(map(self._fault, rows))
 
-    def _make_room(self, rows: Sequence[int], mine: list[int], deadline: float, scan: bool) -> list[int]:
+    def _make_room(
+        self, rows: Sequence[int], mine: list[int], deadline: float, scan: bool, stop: Stop
+    ) -> list[int]:
         """Room for `mine`, of `rows` that are pinned by this caller; returns those it is to load. It may wait.
 
         None of them where the deadline comes before there is room. The rows are not pinned where this raises.
@@ -304,7 +327,8 @@ class Residency:
                 raise
             self._unpin(rows)
             if self._pins or self._loading:
-                roomy = self._changed.wait(_seconds_to(deadline))
+                self._changed.wait(_seconds_to(deadline, stop))
+                roomy = _seconds_to(deadline, stop) != 0
             else:
                 # Nobody else holds anything, and yet the room is in pieces between our own voxels.
                 self._room.leave_only(set(rows), self._accounts.evicted)
@@ -380,10 +404,10 @@ class Residency:
 
     # --- loads --------------------------------------------------------------------------------------------
 
-    def _load(self, rows: list[int], deadline: float) -> None:
+    def _load(self, rows: list[int], deadline: float, stop: Stop) -> None:
         """Load what this caller reserved; every row leaves `_loading`, loaded or with a fault, or is left to others."""
         for number, row in enumerate(rows):
-            if _seconds_to(deadline) == 0:
+            if _seconds_to(deadline, stop) == 0:
                 self._leave(rows[number:])
                 return
             try:

@@ -126,8 +126,9 @@ def look(
             rows = _next_rows(data, lists, cursor, open_)
             held = np.zeros(len(looked), bool)
             held[rows] = True
-            until = min(effort.deadline, effort.stop.until)
-            with data.residency.hold(rows.tolist(), until, scan=effort.scan) as found:
+            with data.residency.hold(
+                rows.tolist(), effort.deadline, scan=effort.scan, stop=effort.stop
+            ) as found:
                 held[list(found.late)] = False  # they may be written to just now
                 kernel(begin, end, lists, cursor, held, part)
             spent.add(found, int(looked[rows].sum()))

@@ -262,7 +262,7 @@ class Scene(Simulated):
         """What a question with these options reads, and what it may cost."""
         effort = make_effort(tolerance, budget_ms, budget_visits, stop)
         data = opened.data if radius_model is None else opened.radius_model(radius_model)
-        return with_stop(data, stop), effort
+        return with_stop(data, effort.stop), effort
 
     def _ask(
         self,
@@ -432,7 +432,7 @@ class Scene(Simulated):
         """
         opened = self.take()
         try:
-            data, avatar = with_stop(opened.radius_model(radius_model), stop), self.avatar(name, client)
+            data, avatar = opened.radius_model(radius_model), self.avatar(name, client)
             ask, total = path_question(data, avatar, make_poses(poses), op, parameters, stop)
 
             def ask_held(start: int, end: int) -> Cost:

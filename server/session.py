@@ -11,11 +11,14 @@ from numpy.typing import ArrayLike, NDArray
 from ..schemas.answers import CollideAnswers
 from .avatar import AvatarModel
 from .collide import collide
+from .effort import EXACT, NO_LIMIT, Effort
 from .kernels.memory import KNOWN, make_memory
 from .kernels.walking import walk_poses, walk_resident
 from .neighbourhood import User
-from .request import SceneData, check_request, kernel_poses, refuse, to_units
+from .request import SceneData, check_request, kernel_poses, refuse, to_units, with_stop
 from .spent import Spent
+from .stop import NEVER, Stop
+from .stopped_answers import ask_until_stopped
 
 
 class Readable(Protocol):
@@ -64,8 +67,11 @@ class Walker:
         """Start afresh."""
         self._memory.state[KNOWN] = 0.0
 
-    def collide(self, poses: ArrayLike) -> CollideAnswers:
-        """Whether the avatar touches the scene under each of the poses (k, 4, 4), in their order; see `collide`."""
+    def collide(self, poses: ArrayLike, stop: Stop = NEVER) -> CollideAnswers:
+        """Whether the avatar touches the scene under each of the poses (k, 4, 4), in their order; see `collide`.
+
+        stop: ends the work early once it is set; what was not reached then is unknown.
+        """
         begin = time.perf_counter()
         array = kernel_poses(poses)
         with self._take() as opened:
@@ -74,12 +80,17 @@ class Walker:
                 self._number = opened.number
             if self._user is not None:
                 opened.saw(self._user, self._avatar, array, self._margin)
-            return self._collide(opened.radius_model(self._model), array, begin)
+            effort, data = EXACT._replace(stop=stop), with_stop(opened.radius_model(self._model), stop)
+            return ask_until_stopped(
+                collide, len(array), effort, lambda: self._collide(data, array, effort, begin)
+            )
 
-    def _collide(self, data: SceneData, poses: NDArray[np.float64], begin: float) -> CollideAnswers:
+    def _collide(
+        self, data: SceneData, poses: NDArray[np.float64], effort: Effort, begin: float
+    ) -> CollideAnswers:
         """`collide` of the archive that is current."""
         if not self._front or data.nothing_clear or len(data.unknown):
-            return collide(data, self._avatar, poses, self._margin)
+            return collide(data, self._avatar, poses, self._margin, effort)
         if len(poses) == 1:
             answers = self._collide_at_once(data, poses, begin)
             if answers is not None:
@@ -88,13 +99,15 @@ class Walker:
         reach = check_request(data, self._avatar, poses, data.radius_units + self._margin_units)
         rows = np.unique(reach.rows[: reach.starts[-1]]).tolist()
         if residency.bytes_of(rows) > residency.buffer.total_bytes:
-            return self._collide_afresh(data, poses)
+            return self._collide_afresh(data, poses, effort)
         verdict, counts = np.zeros(len(poses), np.uint8), np.zeros((3, len(poses)), np.uint32)
-        with residency.hold(rows) as held:
-            if not held.faults:
-                walk_poses(poses, self._avatar.arrays, data.arrays, reach, verdict, counts, self._memory)
-        if held.faults:
-            return self._collide_afresh(data, poses)
+        with residency.hold(rows, stop=effort.stop) as held:
+            if not held.faults and not held.late:
+                walk_poses(
+                    poses, self._avatar.arrays, data.arrays, reach, NO_LIMIT, verdict, counts, self._memory
+                )
+        if held.faults or held.late:
+            return self._collide_afresh(data, poses, effort)
         spent = Spent(begin)
         spent.add(held)
         return CollideAnswers(verdict, reach.outside, counts[0], counts[1], counts[2], **spent.cost(data))
@@ -122,7 +135,7 @@ class Walker:
             hits=needed, resident=residency.resident, resident_bytes=residency.resident_bytes,
         )  # fmt: skip
 
-    def _collide_afresh(self, data: SceneData, poses: NDArray[np.float64]) -> CollideAnswers:
+    def _collide_afresh(self, data: SceneData, poses: NDArray[np.float64], effort: Effort) -> CollideAnswers:
         """Answer without memory, and keep none."""
         self.forget()
-        return collide(data, self._avatar, poses, self._margin)
+        return collide(data, self._avatar, poses, self._margin, effort)

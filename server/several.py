@@ -196,7 +196,7 @@ class SeveralScenes(Simulated):
         first = 0
         for archive in self._archives:
             with archive.scene.take() as opened:
-                data = with_stop(opened.radius_model(radius_model), stop)
+                data = with_stop(opened.radius_model(radius_model), effort.stop)
                 ask, scan = prepare(archive, opened)
                 own = effort._replace(scan=scan)
                 found = ask_until_stopped(question, k, own, partial(in_budget, ask, data, own, visits))
@@ -377,7 +377,7 @@ class SeveralScenes(Simulated):
             firsts = [0, *np.cumsum([sources_asked(opened) for opened in taken]).tolist()]
             legs = [
                 Leg(
-                    with_stop(opened.radius_model(radius_model), stop),
+                    opened.radius_model(radius_model),
                     archive.pose,
                     first,
                     archive.poses_in(array),

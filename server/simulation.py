@@ -74,7 +74,7 @@ class Bodies(Protocol):
 
     def __setitem__(self, user: User, body: Body) -> None: ...
     def pop(self, user: User, default: None = None) -> Any: ...
-    def tell(self, poses: dict[str, list[list[float]]]) -> Callable[[], None]: ...
+    def tell(self, poses: dict[str, list[list[float]]], stop: Stop) -> Callable[[], None]: ...
 
 
 class Recorder(Protocol):
@@ -256,7 +256,7 @@ class Simulation:
             if wish.objects:
                 if self._bodies is None:
                     raise BadRequestError(f"{self.name}: a wish moves objects: this scene has none")
-                refused.callback(self._bodies.tell(wish.objects))
+                refused.callback(self._bodies.tell(wish.objects, stop))
             moved = self._pipeline.run(present.body, aim, seconds, Effort(stop=stop), skip=skip)
             refused.pop_all()
         present.time = wish.time

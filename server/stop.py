@@ -4,9 +4,6 @@ Whoever watches a request sets the flag: its time is up, its client is gone, the
 read it every few microseconds and return; what they had not looked at then is `unknown`.
 """
 
-import math
-import time
-
 import numpy as np
 
 
@@ -14,16 +11,14 @@ class Stop:
     """A flag that the kernels of one request read and any thread may set. Thread-safe; never cleared.
 
     flag: (1,) int64, 0 until it is set; kernels read it without a lock.  reason: why it was set, for the answer.
-    until: when the request's time is up, on the clock of `time.perf_counter` [s]: no load is waited for longer.
     """
 
-    __slots__ = ("flag", "reason", "until")
+    __slots__ = ("__weakref__", "flag", "reason")
 
-    def __init__(self, until: float = math.inf) -> None:
+    def __init__(self) -> None:
         """Make a flag that is not set."""
         self.flag = np.zeros(1, np.int64)
         self.reason = ""
-        self.until = until
 
     def set(self, reason: str) -> None:
         """Set the flag. The first reason is kept."""
@@ -33,16 +28,23 @@ class Stop:
 
     def __bool__(self) -> bool:
         """Return whether the flag is set."""
-        return bool(self.flag[0])
+        return self.flag.item(0) != 0
 
-    @property
-    def late(self) -> bool:
-        """Whether the time is up, though nobody set the flag yet."""
-        return self.until < math.inf and time.perf_counter() >= self.until
+
+class _Never(Stop):
+    """A flag that cannot be set: all requests that nobody watches share it."""
+
+    __slots__ = ()
+
+    def set(self, reason: str) -> None:
+        """Refuse."""
+        raise RuntimeError(
+            f"the stop flag of all requests was to be set ({reason}): make a Stop for the request"
+        )
 
 
 # Of requests that nobody watches.
-NEVER = Stop()
+NEVER: Stop = _Never()
 
 
 class StoppedError(Exception):

@@ -31,7 +31,7 @@ def _check(
     """Check the poses of k motions. Returns, each (k,), the larger scale and reach of either end, the latter in exact
     units and to the scan's largest sphere, and by how many units the reach may differ on the way."""
     k = len(first)
-    scales, units = np.empty((2, k)), np.empty((2, k), np.int64)
+    scales, units = np.ones((2, k)), np.zeros((2, k), np.int64)  # a stop may leave some as they are
     for end, poses in enumerate((first, last)):
         fault, pose, found = check_poses(
             poses, avatar.arrays.radius, avatar.radius, other_units, data.arrays, scales[end], units[end]
@@ -154,12 +154,12 @@ def sweep(
         progress.lower[which] = progress.end[which]
         boxes = np.empty((k, 2, 3))  # of no use here
         around = Reach(scales, units, starts, rows, boxes, outside)
-        for part, held_rows, reach in pieces(around, residency, effort.share):
+        for part, held_rows, reach in pieces(around, residency, effort.share, effort.stop):
             chunk = len(part) if effort.deadline == np.inf else _PER_CALL
             if effort.stop:
                 progress.lower[part] = np.minimum(progress.lower[part], progress.at[part])
                 continue
-            with residency.hold(held_rows, effort.loads_until(), scan=effort.scan) as held:
+            with residency.hold(held_rows, effort.loads_until(), scan=effort.scan, stop=effort.stop) as held:
                 seen = as_held(data, held)
                 for at in range(0, len(part), chunk):
                     if effort.spent:

@@ -18,6 +18,7 @@ from ...schemas.voxel_grid import UNITS_PER_METRE
 from ..avatar import AvatarModel, make_avatar
 from ..kernels.meeting import sweep_bodies
 from ..kernels.near_bodies import find_near
+from ..stop import NEVER, Stop
 from ..vectors import dot, level, size, turned_by
 from .bodies import USER, Bodies, Shape
 from .frame import Body, Frame, Hit, Pose, Vec
@@ -41,15 +42,16 @@ class Blocking:
 
     def __init__(
         self, name: str, bodies: Bodies, wanted: int, mover: str, model: AvatarModel, start: Pose,
-        *, user: bool = True, margin_units: int = 0, skip: str = "",
+        *, user: bool = True, margin_units: int = 0, skip: str = "", stop: Stop = NEVER,
     ) -> None:  # fmt: skip
         """name: of the effect.  wanted: kinds, bits.  mover: its name; user: whether it is one, or an object.
 
         start: where it is when the frame begins.  margin_units: apart, exact units.  skip: a user that does not block.
+        stop: of the frame; once it is set, what is said is of no use.
         """
         self.name = name
         self._bodies, self._wanted, self._margin_units = bodies, wanted, margin_units
-        self._mover, self._user, self._skip = mover, user, skip
+        self._mover, self._user, self._skip, self._stop = mover, user, skip, stop
         self._model, self._start = model, start.copy()
         self._layout = bodies.layout
         self._overlapped: dict[int, bool] = {}
@@ -97,7 +99,7 @@ class Blocking:
             there = self._from_origin(pose)
             rows = self._near(shape, there, there)
             if len(rows):
-                rows = rows[bodies.touching(shape, pose, rows, self._margin_units)]
+                rows = rows[bodies.touching(shape, pose, rows, self._margin_units, self._stop)]
             for row in rows.tolist():
                 if not self._is_overlapped(row):
                     return self._hit_at(shape, pose, row)
@@ -110,7 +112,7 @@ class Blocking:
             shape = bodies.shape_of(avatar)
             there = self._from_origin(pose)
             rows = self._in_reach(shape, there, there)
-            return bool(len(rows) and bodies.touching(shape, pose, rows, 0).any())
+            return bool(len(rows) and bodies.touching(shape, pose, rows, 0, self._stop).any())
 
     def give_way(self, frame: Frame, hit: Hit, to: Pose) -> bool:
         """Nothing here does."""
@@ -159,7 +161,7 @@ class Blocking:
                 row, fraction = sweep_bodies(
                     shape.model.arrays, shape.box, shape.units, *ends, other.model.arrays, bodies.poses,
                     other.units, rows[same], bodies.origin, self._margin_units, tolerance, until, witness, named,
-                    bodies.scratch,
+                    bodies.scratch, self._stop.flag,
                 )  # fmt: skip
                 if row >= 0:
                     best, until = (
@@ -184,7 +186,7 @@ class Blocking:
         if found is None:
             bodies = self._bodies
             shape = bodies.shape_of(self._model)
-            touching = bodies.touching(shape, self._start, np.array([row]), self._margin_units)
+            touching = bodies.touching(shape, self._start, np.array([row]), self._margin_units, self._stop)
             found = self._overlapped[row] = bool(touching[0])
         return found
 

@@ -20,7 +20,7 @@ from ..kernels.near_bodies import bound_body
 from ..kernels.pairs import CONTACT, touch_pairs
 from ..kernels.placing import MAX_REACH_UNITS, SIMILARITY_TOLERANCE
 from ..request import kernel_poses, to_units
-from ..stop import NEVER
+from ..stop import NEVER, Stop
 from ..vectors import level, turned_back, turned_by
 from .frame import Body, Pose, Vec
 
@@ -201,6 +201,19 @@ class Bodies:
 
     # --- where they are -----------------------------------------------------------------------------------
 
+    def standing(self) -> tuple[int, NDArray[np.float64]]:
+        """Return the layout and the poses (n, 4, 4) of all bodies now, for `put_back`."""
+        with self.lock:
+            return self.layout, self.poses.copy()
+
+    def put_back(self, standing: tuple[int, NDArray[np.float64]]) -> None:
+        """Have all bodies where they stood, if they are the same ones."""
+        layout, poses = standing
+        with self.lock:
+            if layout == self.layout:
+                for row in np.flatnonzero((poses != self.poses).any(axis=(1, 2))).tolist():
+                    self._put(row, poses[row])
+
     def put(self, row: int, pose: Pose) -> None:
         """A body is somewhere else now."""
         with self.lock:
@@ -220,11 +233,11 @@ class Bodies:
             self.clock += 1
             self.changed[row] = self.clock
 
-    def tell(self, poses: Mapping[str, Sequence[Sequence[float]]]) -> Callable[[], None]:
+    def tell(self, poses: Mapping[str, Sequence[Sequence[float]]], stop: Stop = NEVER) -> Callable[[], None]:
         """Objects are where a wish puts them, whatever is there: a user that is, starts its next frame in contact.
 
         poses: (4, 4) row-major by name. All are checked before any is put: BadRequestError, BadTransformError.
-        Returns what puts them back, for a wish that is refused after all.
+        Returns what puts them back, for a wish that is refused, or stopped, after all.
         """
         with self.lock:
             self.begin()
@@ -232,7 +245,7 @@ class Bodies:
             came_from, stood = dict(self._came_from), [(row, self.poses[row].copy()) for row, _ in checked]
             for (row, pose), (_, before) in zip(checked, stood, strict=True):
                 self._put(row, pose)
-                self._remember_way(row, before)
+                self._remember_way(row, before, stop)
 
         def put_back() -> None:
             with self.lock:
@@ -253,15 +266,15 @@ class Bodies:
             )
         return row
 
-    def _remember_way(self, thing: int, before: Pose) -> None:
+    def _remember_way(self, thing: int, before: Pose, stop: Stop) -> None:
         """Where from, in its own frame, an object that was told to move has come into users; `way_out` asks."""
         bounds, now = self.bounds, self.poses[thing]
         apart = (bounds[:, 0] > bounds[thing, 1]) | (bounds[:, 1] < bounds[thing, 0])
         near = np.flatnonzero((self.kinds == USER) & ~apart.any(axis=1))
         if not len(near):
             return
-        touching = self.touching(self.shapes[thing], now, near, 0)
-        touching &= ~self.touching(self.shapes[thing], before, near, 0)
+        touching = self.touching(self.shapes[thing], now, near, 0, stop)
+        touching &= ~self.touching(self.shapes[thing], before, near, 0, stop)
         for row in near[touching].tolist():
             center = self.shapes[row].center(self.poses[row])
             own = [turned_back(pose, center - pose[:3, 3]) for pose in (before, now)]
@@ -279,9 +292,10 @@ class Bodies:
         return level(way, self.up)
 
     def touching(
-        self, shape: Shape, pose: Pose, rows: NDArray[np.int64], margin_units: int
+        self, shape: Shape, pose: Pose, rows: NDArray[np.int64], margin_units: int, stop: Stop = NEVER
     ) -> NDArray[np.bool_]:
-        """Whether an avatar at a pose touches the bodies of each of rows (m,), by the definition."""
+        """Whether an avatar at a pose touches the bodies of each of rows (m,), by the definition; of no use once the
+        stop is set."""
         found = np.zeros(len(rows), bool)
         if not len(shape.model.points):
             return found
@@ -298,7 +312,7 @@ class Bodies:
             verdict = np.empty(len(at), np.uint8)
             touch_pairs(
                 shape.model.arrays, model.arrays, poses, scales, units, pairs, margin_units, self.origin, _EVER,
-                NEVER.flag, verdict, self.scratch.counters,
+                stop.flag, verdict, self.scratch.counters,
             )  # fmt: skip
             found[at] = verdict == CONTACT
         return found

@@ -13,7 +13,7 @@ from ...schemas.moves import CrowdReport
 from ..request import to_units
 from .blocking import Blocking, warm
 from .bodies import USER, Bodies
-from .frame import Body, Frame, Hit, Pose
+from .frame import Frame, Hit, Pose
 
 # Users farther apart than this do not meet [m].
 _MOST_MARGIN = 8.0
@@ -42,15 +42,18 @@ class CrowdRunner:
         """Add the others to what blocks; the report counts those that do."""
         self.bodies.begin()
         frame.reports[self.name] = CrowdReport()
-        frame.obstacles.append(Others(self.name, self.bodies, frame.body, self._margin_units))
+        frame.obstacles.append(Others(self.name, self.bodies, frame, self._margin_units))
 
 
 class Others(Blocking):
     """The other users; counts those that ended a motion."""
 
-    def __init__(self, name: str, bodies: Bodies, body: Body, margin_units: int) -> None:
-        """body: whose frame it is."""
-        super().__init__(name, bodies, USER, body.name, body.avatar, body.pose, margin_units=margin_units)
+    def __init__(self, name: str, bodies: Bodies, frame: Frame, margin_units: int) -> None:
+        """frame: whose way they are in."""
+        body, stop = frame.body, frame.effort.stop
+        super().__init__(
+            name, bodies, USER, body.name, body.avatar, body.pose, margin_units=margin_units, stop=stop
+        )
         self._met: set[str] = set()
 
     def give_way(self, frame: Frame, hit: Hit, to: Pose) -> bool:

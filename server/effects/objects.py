@@ -17,10 +17,11 @@ from ...schemas.answers import Verdict
 from ...schemas.effects import Objects
 from ...schemas.moves import ObjectsReport
 from ...schemas.scene import ObjectItem
+from ..effort import Effort
 from ..vectors import dot, level, size
 from .blocking import Blocking, warm
 from .bodies import PUSHED, TOLD, USER, Bodies
-from .frame import Body, Frame, Hit, Pose, Vec, moved_by
+from .frame import Frame, Hit, Pose, Vec, moved_by
 
 # A pushed object keeps so far from what stops it, along its way [m], as `stop` has it of users.
 _SKIN = 0.002
@@ -68,10 +69,10 @@ class ObjectsRunner:
         with bodies.lock:
             bodies.begin()
             since, frame.kept[self.name] = frame.body.kept.get(self.name, 0), bodies.clock
-            frame.obstacles.append(Things(self, frame.body, since))
-            frame.reports[self.name] = self.report(since)
+            frame.obstacles.append(Things(self, frame, since))
+            frame.reports[self.name] = self.report(since, frame.effort)
 
-    def report(self, since: int) -> ObjectsReport:
+    def report(self, since: int, effort: Effort) -> ObjectsReport:
         """What moved since a count of moves, and what touches."""
         bodies = self.bodies
         poses = {
@@ -80,13 +81,15 @@ class ObjectsRunner:
             if bodies.changed[row] > since
         }
         names = {-1: ""} | dict(enumerate(bodies.names))
-        return ObjectsReport(poses, [(names[one], names[other]) for one, other in self._find_touching()])
+        return ObjectsReport(
+            poses, [(names[one], names[other]) for one, other in self._find_touching(effort)]
+        )
 
     def _objects(self) -> list[int]:
         """The objects' rows: they came first."""
         return np.flatnonzero(self.bodies.kinds != USER).tolist()
 
-    def _find_touching(self) -> list[tuple[int, int]]:
+    def _find_touching(self, effort: Effort) -> list[tuple[int, int]]:
         """What touches, by rows; asked of what has moved since it was asked last."""
         bodies, rows, archives = self.bodies, self._objects(), self._world.generations()
         for row in rows:
@@ -95,20 +98,21 @@ class ObjectsRunner:
                 continue
             shape, pose = bodies.shapes[row], bodies.poses[row]
             self._touching = {pair for pair in self._touching if row not in pair}
-            verdict = self._world.collide(shape.model, pose)
+            verdict = self._world.collide(shape.model, pose, effort)
             if verdict == Verdict.CONTACT:
                 self._touching.add((-1, row))
             apart = (bodies.bounds[:, 0] > bodies.bounds[row, 1]) | (
                 bodies.bounds[:, 1] < bodies.bounds[row, 0]
             )
             near = np.array([other for other in rows if other != row and not apart[other].any()], np.int64)
-            for other in near[bodies.touching(shape, pose, near, 0)].tolist():
+            for other in near[bodies.touching(shape, pose, near, 0, effort.stop)].tolist():
                 self._touching.add((min(row, other), max(row, other)))
-            if verdict != Verdict.UNKNOWN:  # else it is asked again, once what is missing may be there
-                self._asked[row] = now
+            if verdict == Verdict.UNKNOWN or effort.stop:
+                continue  # it is asked again, once what is missing may be there
+            self._asked[row] = now
         return sorted(self._touching)
 
-    def push(self, name: str, way: Vec, user: str) -> bool:
+    def push(self, name: str, way: Vec, user: str, effort: Effort) -> bool:
         """Move an object along a level way, as far as nothing is touched; whether it moved.
 
         user: who pushes, and follows: it does not stand in the way.
@@ -119,9 +123,11 @@ class ObjectsRunner:
             return False
         model, pose = bodies.shapes[row].model, bodies.poses[row].copy()
         to = moved_by(pose, way)
-        swept = self._world.sweep(model, pose, to, _TOLERANCE)
+        swept = self._world.sweep(model, pose, to, _TOLERANCE, effort)
         clear = 1.0 if swept.verdict == Verdict.CLEAR else swept.lower
-        others = Blocking(self.name, bodies, USER | TOLD | PUSHED, name, model, pose, user=False, skip=user)
+        others = Blocking(
+            self.name, bodies, USER | TOLD | PUSHED, name, model, pose, user=False, skip=user, stop=effort.stop
+        )  # fmt: skip
         hit = others.sweep(model, pose, to, _TOLERANCE)
         if hit is not None:
             clear = min(clear, hit.fraction)
@@ -130,6 +136,8 @@ class ObjectsRunner:
             if clear * length < _LEAST:
                 return False
             to = moved_by(pose, way * clear)
+        if effort.stop:
+            return False  # what was found may be too little
         bodies.put(row, to)
         return True
 
@@ -137,9 +145,12 @@ class ObjectsRunner:
 class Things(Blocking):
     """The objects, for one user's frame. Those that are pushed give way."""
 
-    def __init__(self, runner: ObjectsRunner, body: Body, since: int) -> None:
-        """body: whose frame it is.  since: the moves it was told of."""
-        super().__init__(runner.name, runner.bodies, TOLD | PUSHED, body.name, body.avatar, body.pose)
+    def __init__(self, runner: ObjectsRunner, frame: Frame, since: int) -> None:
+        """frame: whose it is.  since: the moves it was told of."""
+        body, stop = frame.body, frame.effort.stop
+        super().__init__(
+            runner.name, runner.bodies, TOLD | PUSHED, body.name, body.avatar, body.pose, stop=stop
+        )
         self._runner, self._since = runner, since
 
     def give_way(self, frame: Frame, hit: Hit, to: Pose) -> bool:
@@ -157,7 +168,7 @@ class Things(Blocking):
             inward = level(hit.cloud - hit.avatar, bodies.up)
             if not dot(left, inward) > _HEAD_ON * size(left) * size(inward):
                 return False
-            if not self._runner.push(hit.what, left, frame.body.name):
+            if not self._runner.push(hit.what, left, frame.body.name, frame.effort):
                 return False
-            frame.reports[self._runner.name] = self._runner.report(self._since)
+            frame.reports[self._runner.name] = self._runner.report(self._since, frame.effort)
             return True

@@ -7,7 +7,8 @@ Those that come later in ORDER, and take less, may still find room. Effects that
 
 import importlib
 import time
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from ...schemas.errors import BadRequestError
 from ...schemas.moves import FRAME_SECONDS, Moved, Touched
 from ...schemas.scene import SceneFile, effect_name
 from ..effort import EXACT, Effort
-from ..stop import StoppedError
+from ..stop import NEVER, StoppedError
 from ..vectors import size
 from ..world import World
 from . import NEVER_SKIPPED, ORDER
@@ -110,7 +111,7 @@ class Pipeline:
         frame = Frame(body, wish, seconds, self.world, effort, body.pose)
         frame.fall_speed, frame.on_ground = body.fall_speed, body.on_ground
         self.world.stop_by(effort.stop)
-        with self.world as seen:
+        with self._undone_if_stopped(body, effort), self.world as seen:
             frame.generations = tuple([each.opened.number for each in seen])
             for runner in self._beginners:
                 runner.begin(frame)
@@ -118,6 +119,8 @@ class Pipeline:
                 frame.pose = frame.wish
             since = self.world.visits
             for runner in self.runners:
+                if effort.stop:
+                    raise StoppedError
                 if self._free and not skip:
                     runner.run(frame)
                     frame.simulated.append(runner.name)
@@ -128,13 +131,27 @@ class Pipeline:
             # What came into it, an object say, blocks nobody: then the verdict alone says so.
             if any(each.overlaps(body.avatar, frame.pose) for each in frame.obstacles):
                 frame.verdict = Verdict.CONTACT
+            if effort.stop:  # what the effects made of unfinished answers counts for nothing
+                raise StoppedError
             self.world.saw(body.user, body.avatar, frame.pose)
-        if effort.stop:  # what the effects made of unfinished answers counts for nothing
-            raise StoppedError
         body.pose, body.clear, body.generations = frame.pose, frame.clear, frame.generations
         body.fall_speed, body.on_ground = frame.fall_speed, frame.on_ground
         body.kept.update(frame.kept)
         return _moved(frame)
+
+    @contextmanager
+    def _undone_if_stopped(self, body: Body, effort: Effort) -> Iterator[None]:
+        """Have objects that a frame pushed stand where they stood before, where it is stopped: a clock decides when it
+        is, and no pose is to depend on one."""
+        if effort.stop is NEVER or self.bodies is None or not self.bodies.remembers(body):
+            yield
+            return
+        standing = self.bodies.standing()
+        try:
+            yield
+        except StoppedError:
+            self.bodies.put_back(standing)
+            raise
 
     def _run_one(
         self, runner: Runner, frame: Frame, begin: float, since: int, skip: Collection[str] | None

@@ -22,6 +22,7 @@ from .lanes import list_squares
 from .layout import LANES, point_class
 from .placed import ONE_SLACK, SLACK, U32, make_limits
 from .placing import lattice_to_units, place, to_units
+from .stopping import NO_LIMIT
 
 U = np.uint64  # see front.py
 # Pairs that float32 cannot tell from the best; ties are legion on coarse lattices, so a full list is settled.
@@ -54,7 +55,7 @@ class Best(NamedTuple):
     point of an avatar's block; keep8: keep as uint64, eight at a time.  listed: (LANES,) float32, a square for each
     point of a scene's block.
     units: (2,) int64, the reach, and what is known to be no less than the least |a - b| + drop, exact units.
-    counters: (3,) int64, node visits, point tests, candidates.
+    counters: (4,) int64, node visits, point tests, candidates, and the most visits of a pose.
     candidates: (MOST_CANDIDATES, 5) int64, points of the avatar that may be of the nearest pair, and where in the
     scene: block, lane, block_at, lane_at, class of the leaf node.  nearly: (MOST_CANDIDATES,) float32, their least
     squares there.
@@ -84,7 +85,7 @@ def make_best(drop):
     return Best(
         np.empty(8, np.int64), np.empty(n, np.float32), np.empty(n, np.float32), drop, np.uint64(n - 1), np.empty(5),
         np.empty(3, np.int64), keep, keep.view(np.uint64), np.empty(LANES, np.float32), np.empty(LANES, np.float32),
-        np.empty(2, np.int64), np.zeros(3, np.int64), np.empty((MOST_CANDIDATES, 5), np.int64),
+        np.empty(2, np.int64), np.array([0, 0, 0, NO_LIMIT]), np.empty((MOST_CANDIDATES, 5), np.int64),
         np.empty(MOST_CANDIDATES, np.float32),
     )  # fmt: skip
 

@@ -16,7 +16,7 @@ from ...schemas.kernels import compiling as nb
 from .closer import compare_gaps
 from .compiled import borrowing
 from .placed import U32
-from .stopping import stopped
+from .stopping import ROWS_AT_ONCE, copy_rows, stopped
 
 # Columns of a record; the first ORDER of them say which pair is deeper: |a - b|^2 [exact units^2] and by how much the
 # scan point's sphere is smaller than the largest [exact units]; where the gaps of two are equal, compared in turn: scan
@@ -99,7 +99,10 @@ def _sift_down(rows, n, at):
 
 @nb.njit(nogil=True, cache=True)
 def sort_rows(rows, n, stop):
-    """Sort rows[:n] deepest first, in place (Williams, heapsort), until the stop flag is set."""
+    """Sort rows[:n] deepest first, in place (Williams, heapsort), until the stop flag is set.
+
+    Once it is set, not even the first row is touched: there may be fewer than n.
+    """
     for at in range(n // 2 - 1, -1, -1):
         if stopped(stop):
             return
@@ -160,9 +163,13 @@ def listing_bound(heap, kept, units_per_step, error):
 
 
 @nb.njit(nogil=True, cache=True)
-def make_cells(count):
-    """Room for `count` cells, a power of two."""
-    slots = np.full(2 * count, -1, np.int64)
+def make_cells(count, stop):
+    """Room for `count` cells, a power of two; of no use once the stop flag is set."""
+    slots = np.empty(2 * count, np.int64)
+    for at in range(2 * count):
+        if at % (64 * ROWS_AT_ONCE) == 0 and stopped(stop):
+            break
+        slots[at] = -1
     return Cells(np.empty((count, CELL), np.int64), np.empty(count), slots)
 
 
@@ -216,23 +223,27 @@ def cell_of(cells, sizes, record, edge):
 
 
 @nb.njit(nogil=True, cache=True)
-def grow_cells(cells, used):
-    """The same `used` cells with twice the room."""
-    grown = make_cells(2 * cells.table.shape[0])
-    grown.table[:used] = cells.table[:used]
-    grown.bound[:used] = cells.bound[:used]
+def grow_cells(cells, used, stop):
+    """The same `used` cells with twice the room; the cells as they are once the stop flag is set."""
+    grown = make_cells(2 * cells.table.shape[0], stop)
+    copy_rows(cells.table, grown.table, used, stop)
     for row in range(used):
+        if row % ROWS_AT_ONCE == 0 and stopped(stop):
+            return cells
         table = grown.table
+        grown.bound[row] = cells.bound[row]
         grown.slots[find_slot(grown, table[row, PLACE], table[row, PLACE + 1], table[row, PLACE + 2])] = row
     return grown
 
 
 @nb.njit(nogil=True, cache=True)
-def empty_cells(cells, used):
-    """Forget all `used` cells, in time that grows with them and not with the room."""
+def empty_cells(cells, used, stop):
+    """Forget all `used` cells, in time that grows with them and not with the room; not all once the stop is set."""
     table = cells.table
     # Last come, first gone: what lies between a cell's hash and its slot came before it.
     for row in range(used - 1, -1, -1):
+        if row % ROWS_AT_ONCE == 0 and stopped(stop):
+            return
         cells.slots[find_slot(cells, table[row, PLACE], table[row, PLACE + 1], table[row, PLACE + 2])] = -1
 
 
@@ -268,13 +279,13 @@ def _join_neighbours(cells, used, parent, stop):
 
 
 @nb.njit(nogil=True, cache=True)
-def _with_room(rows, used, more):
-    """`rows` with room for `more` behind those used."""
+def _with_room(rows, used, more, stop):
+    """`rows` with room for `more` behind those used; the rows as they are once the stop flag is set."""
     if used + more <= rows.shape[0]:
         return rows
     grown = np.empty((2 * (used + more), rows.shape[1]), np.int64)
-    grown[:used] = rows[:used]
-    return grown
+    copy_rows(rows, grown, used, stop)
+    return rows if stopped(stop) else grown
 
 
 @nb.njit(nogil=True, cache=True)
@@ -290,11 +301,11 @@ def list_pose(memory, runs, stop):
     _join_neighbours(cells, used, parent, stop)
     for row in range(used):
         found += 1 if parent[row] == row else 0
-    clusters = _with_room(memory.clusters, sizes[CLUSTERS], found)
+    clusters = _with_room(memory.clusters, sizes[CLUSTERS], found, stop)
     own = clusters[sizes[CLUSTERS] :]
     rank, at = np.empty(used, np.int64), 0
     for row in range(used):  # a root comes before all that hang below it
-        if stopped(stop):
+        if stopped(stop):  # then there may be no room, too
             break
         root = _root(parent, row)
         if root == row:
@@ -315,7 +326,7 @@ def list_pose(memory, runs, stop):
         for at in range(found):
             rank[own[at, TAG]] = at
     sort_rows(heap, kept, stop)
-    pairs = _with_room(memory.pairs, sizes[LISTED], kept)
+    pairs = _with_room(memory.pairs, sizes[LISTED], kept, stop)
     if stopped(stop):  # what stands above may be in any order
         runs[0], runs[1], runs[2], runs[3] = sizes[LISTED], 0, sizes[CLUSTERS], 0
         sizes[CELLS], sizes[KEPT], sizes[LAST] = 0, 0, -1
@@ -326,6 +337,6 @@ def list_pose(memory, runs, stop):
     runs[0], runs[1], runs[2], runs[3] = sizes[LISTED], kept, sizes[CLUSTERS], found
     sizes[LISTED] += kept
     sizes[CLUSTERS] += found
-    empty_cells(cells, used)
+    empty_cells(cells, used, stop)
     sizes[CELLS], sizes[KEPT], sizes[LAST] = 0, 0, -1
     return Memory(cells, heap, sizes, memory.cursor, memory.stack, pairs, clusters), True

@@ -62,7 +62,7 @@ class Asked(NamedTuple):
 
     rows: (b, LANES) int32, the row of the avatar's point in each lane.  edges: (k,) int64, edge of a cell [steps].
     kept: whether the arena holds scan numbers.  limit: pairs to list a pose.  visits: node visits a pose, -1: the time
-    is up, look at nothing more.
+    is up, look at nothing more.  cells: how far the table of cells may grow, a power of two.
     """
 
     rows: NDArray[np.int32]
@@ -70,6 +70,7 @@ class Asked(NamedTuple):
     kept: bool
     limit: int
     visits: int
+    cells: int
 
 
 class Tally(NamedTuple):
@@ -323,6 +324,15 @@ def _set_thresholds(units, extent, farthest, scene, work):
     set_by_class(work.by_class, scene.drop, units, per_step, extent, farthest, steps)
 
 
+@borrowing
+def _cut_rest(reach, which, cursor, tally):
+    """Cut the pose at hand and those that are left."""
+    for number in range(cursor[0], which.shape[0]):
+        i = which[number]
+        tally.cut[i] |= reach.starts[i + 1] > reach.starts[i]
+    cursor[0] = which.shape[0]
+
+
 @nb.njit(nogil=True, cache=True)
 def gather_contacts(poses, avatar, scene, reach, which, asked, closes, pause, memory, tally):
     """Answer `contacts` for the poses numbered in `which`: nearly always one call a request.
@@ -330,8 +340,8 @@ def gather_contacts(poses, avatar, scene, reach, which, asked, closes, pause, me
     poses: (k, 4, 4), checked.  avatar: not empty.  reach: Reach of these poses; a voxel in it that is not resident is
     counted as missing.  closes: whether this call sees the last voxels of its poses; they are listed then.
     pause: node visits after which the call returns with the work as it stands, 1 or more. It is done when
-    memory.cursor[0] == len(which); until then it is called again with the memory it returned. A pose that has
-    cost `asked.visits` with something left is cut. Adds to `tally`.
+    memory.cursor[0] == len(which); until then it is called again with the memory it returned, unless that has no room
+    for LANES more of `asked.cells`. A pose that has cost `asked.visits` with something left is cut. Adds to `tally`.
     """
     placed = make_placed(avatar)
     work = Work(
@@ -341,6 +351,9 @@ def gather_contacts(poses, avatar, scene, reach, which, asked, closes, pause, me
     )  # fmt: skip
     cursor, left = memory.cursor, np.int64(pause)
     while cursor[0] < which.shape[0]:
+        if stopped(scene.stop):
+            _cut_rest(reach, which, cursor, tally)
+            break
         i = which[cursor[0]]
         end = reach.starts[i + 1]
         if cursor[1] < 0:
@@ -362,15 +375,17 @@ def gather_contacts(poses, avatar, scene, reach, which, asked, closes, pause, me
                 # Over the budget, and not only stopped for want of room?
                 if before >= asked.visits and not (short and cursor[2] > 0):
                     break
-                if left <= 0 or stopped(scene.stop):
+                if stopped(scene.stop):
+                    break
+                if left <= 0 or (short and memory.cells.table.shape[0] >= asked.cells):
                     return memory
                 stop = min(np.int64(asked.visits), before + left)
                 if short:
                     # Here and not in the descent: a loop that changes a tuple of arrays counts their references in
                     # every turn, which took a third of the time.
                     memory = Memory(
-                        grow_cells(memory.cells, memory.sizes[CELLS]), memory.heap, memory.sizes, cursor, memory.stack,
-                        memory.pairs, memory.clusters,
+                        grow_cells(memory.cells, memory.sizes[CELLS], scene.stop), memory.heap, memory.sizes, cursor,
+                        memory.stack, memory.pairs, memory.clusters,
                     )  # fmt: skip
                 _gather_voxel(avatar, poses[i], i, placed, scene, voxel, asked, memory, work, tally, stop)
                 left -= tally.counts[1, i] - before

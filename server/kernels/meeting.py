@@ -30,6 +30,7 @@ from .meeting_placed import (
 from .moments import INFINITE, pair_times
 from .motion import make_motion, pose_at
 from .placing import largest_term, place, to_units
+from .stopping import stopped
 
 # As in sweep.py, advance.py: what is not worth halving; of a first chord; advances that settled nothing.
 _LEAST_SAGITTA = 0.25
@@ -185,7 +186,7 @@ def _descend(meeting, chord):
     place_moving_nodes(meeting, a.center.shape[0])
     stack[0, 0], stack[0, 1] = 0, 0
     depth = 1
-    while depth > 0:
+    while depth > 0 and not stopped(meeting.stop):
         depth -= 1
         i, j = stack[depth, 0], stack[depth, 1]
         if _nearest(scratch, chord.room, i, j) == INFINITE:
@@ -247,6 +248,8 @@ def _advance(meeting, size, until, tolerance):
     while True:
         after = until if t + length >= until else t + length
         final = _search(meeting, t, after)
+        if stopped(meeting.stop):
+            return INFINITE
         if first[0] == INFINITE:
             if after >= until:
                 return INFINITE
@@ -264,7 +267,7 @@ def _advance(meeting, size, until, tolerance):
 @nb.njit(nogil=True, cache=True)
 def sweep_bodies(
     a, box, units_a, first, last, b, poses, units_b, rows, origin, margin_units, tolerance, until, witness, named,
-    scratch,
+    scratch, stop,
 ):  # fmt: skip
     """Which of some bodies that stand, all of avatar b, ends a motion of avatar a first; neither avatar empty.
 
@@ -273,7 +276,7 @@ def sweep_bodies(
     until: what comes no sooner is of no interest; inf: all.  Returns (row, fraction): nothing of these touches before,
     and the row's body does, or all but, at most `tolerance` [m] of the fastest point's way later; (-1, until) if none
     does. Writes witness (2, 3): the centres of the two spheres there, world [m]; named (2,) int64: block and lane of
-    the body's. Adds to scratch.counters.
+    the body's. Adds to scratch.counters.  stop: (1,) int64, a stop flag; once it is set, what is said is of no use.
     """
     motion = make_motion(first, last, box, np.zeros(3))
     shift, shifts = np.empty(3), scratch.shifts
@@ -290,17 +293,18 @@ def sweep_bodies(
         largest_a = max(largest_a, term + a.radius[0])
     best, found = -1, until
     for at in range(rows.shape[0]):
+        if stopped(stop):
+            break
         row = rows[at]
         for r in range(3):
             shifts[2, r] = poses[row, r, 3] - origin[r]
         largest = largest_term(poses[row], shifts[2], b.center[0, 0], b.center[0, 1], b.center[0, 2])
         error = max(largest_a, largest + b.radius[0]) * 2.0**-49
         units = np.int64(units_a + units_b + margin_units)
-        meeting = Meeting(motion, a, b, poses[row], units, error, scratch)
+        meeting = Meeting(motion, a, b, poses[row], units, error, scratch, stop)
         scratch.turns[1] += 1
         place_standing_nodes(meeting, b.center.shape[0])
-        stop = min(found, 1.0)
-        since = _advance(meeting, size, stop, tolerance)
+        since = _advance(meeting, size, min(found, 1.0), tolerance)
         if since >= found or since == INFINITE:
             continue
         best, found = row, since

@@ -52,7 +52,7 @@ def make_scratch(nodes: int, blocks: int) -> Scratch:
 
 class Meeting(NamedTuple):
     """One motion against one body. motion: Motion of avatar a.  pose: (4, 4) of b.  units: of both radii and margin.
-    error: of a distance of two placed centres, and of what rounds to units [m]."""
+    error: of a distance of two placed centres, and of what rounds to units [m].  stop: (1,) int64, a stop flag."""
 
     motion: Motion
     a: Avatar
@@ -61,6 +61,7 @@ class Meeting(NamedTuple):
     units: np.int64
     error: float
     scratch: Scratch
+    stop: NDArray[np.int64]
 
 
 class Chord(NamedTuple):

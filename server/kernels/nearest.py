@@ -27,7 +27,7 @@ from .layout import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, node_class
 from .overlap import BROAD, FLAT, STACK
 from .placed import ONE_SLACK, SLACK, make_placed, node_reach, place_lanes, place_root
 from .placing import place
-from .stopping import stopped
+from .stopping import is_over, stopped
 
 U = np.uint64  # see front.py
 
@@ -121,7 +121,7 @@ def _search_below(avatar, m, pose, a, row, placed, scene, spot, best, descent):
     of_class = node_class(scene.ints, row, best.mask)
     below[0], keys[0] = a, np.float32(-1.0)
     depth = 1
-    while depth > 0 and not stopped(scene.stop):
+    while depth > 0 and not is_over(scene.stop, best.counters[0], best.counters[3]):
         depth -= 1
         a, within = below[depth], cut[of_class]
         if keys[depth] > within:
@@ -172,7 +172,7 @@ def _nearest_voxel(avatar, m, pose, placed, scene, voxel, front, count, descent,
     bounds, which, listed, listed8 = front.bounds, front.which, front.keep, front.keep8
     firsts, front_first, points = avatar.first, avatar.front_first, avatar.points
     stack, mask = descent.stack, best.mask
-    shift, frame, step, stop = placed.shift, placed.frame, scene.step, scene.stop
+    shift, frame, step, stop, most = placed.shift, placed.frame, scene.step, scene.stop, counters[3]
     spot = (scene.where[voxel, 0], scene.where[voxel, 1], scene.where[voxel, 2])
     for r in range(3):
         corner[r] = scene.coordinates[voxel, r] * scene.voxel_steps
@@ -185,7 +185,7 @@ def _nearest_voxel(avatar, m, pose, placed, scene, voxel, front, count, descent,
         return
     stack[0, 0], stack[0, 1], stack[0, 2] = spot[0], 0, count
     depth = 1
-    while depth > 0 and not stopped(stop):
+    while depth > 0 and not is_over(stop, counters[0], most):
         depth -= 1
         row, at, count = stack[U(depth), 0], stack[U(depth), 1], stack[U(depth), 2]
         first = np.int64(ints[U(row + FIRST)])
@@ -280,13 +280,13 @@ def _widen(
             for other in range(last - first):
                 if 0.0 <= gaps[other] <= min(least, np.float64(cut[classes[other]])):
                     at, least = other, gaps[other]
-            if at < 0 or stopped(scene.stop):
+            if at < 0 or is_over(scene.stop, best.counters[0], best.counters[3]):
                 break
             gaps[at] = -1.0 - least
             _nearest_voxel(
                 avatar, m, pose, placed, scene, reach.rows[first + at], front, count, descent, best
             )
-        if units[1] < bound or bound == limit or stopped(scene.stop):
+        if units[1] < bound or bound == limit or is_over(scene.stop, best.counters[0], best.counters[3]):
             break
         near *= 4
         for at in range(last - first):
@@ -295,17 +295,18 @@ def _widen(
 
 
 @nb.njit(nogil=True, cache=True)
-def nearest_poses(poses, avatar, scene, index, reach, beyond, which, nearest, counts):
+def nearest_poses(poses, avatar, scene, index, reach, beyond, which, most_visits, nearest, counts):
     """Answer `distance` for the poses numbered in `which`: one call a request, all its poses and voxels.
 
     poses: (k, 4, 4), checked.  avatar: not empty.  reach: Reach of these poses (reach.py), to the farthest distance of
     interest; a voxel in it that is not resident is counted as missing.  beyond: how much of it is not the radii, exact
     units.
     Adds to what `nearest` and counts (3, k) uint32 (voxels missing, node visits, point tests) hold, -1, inf and 0 to
-    begin with, so that a pose may be answered in pieces. Once the scene's stop flag is set, what was not looked at is
-    in `gap` as though it were missing.
+    begin with, so that a pose may be answered in pieces. Once the scene's stop flag is set, or a pose has cost more
+    than `most_visits`, what was not looked at is in `gap` as though it were missing.
     """
     placed, best = make_placed(avatar), make_best(scene.drop)
+    best.counters[3] = most_visits
     front, descent = make_front(avatar), make_descent()
     most = 0
     for number in range(which.shape[0]):
@@ -353,7 +354,7 @@ def _nearest_poses(
         _widen(
             poses[i], i, avatar, placed, scene, reach, beyond, first, last, front, count, descent, best, gaps, classes
         )  # fmt: skip
-        if stopped(scene.stop):
+        if is_over(scene.stop, best.counters[0], best.counters[3]):
             # The gap of no voxel is below 0; any of them may be looked at in part.
             nearest.gap[i] = 0.0
         nearest.square[i] = best.found[0]

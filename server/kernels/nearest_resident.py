@@ -15,6 +15,7 @@ from .compiled import borrowing
 from .nearest import nearest_poses
 from .placing import GOOD, lattice_to_units
 from .reach import Reach, find_reach
+from .stopping import MOST_QUICK_VISITS
 
 # Columns of what is written.
 SIGNED, LOWER, NORMAL, AVATAR, CLOUD, COLUMNS = 0, 1, 2, 5, 8, 11
@@ -50,7 +51,8 @@ def nearest_resident(poses, avatar, radius, radius_units, reach_units, reach, sc
     Writes rows (capacity,) int64, the voxels in reach, and said (COLUMNS,) float64: signed distance and what it is at
     least [m], normal, witness of the avatar, of the cloud, world [m]; inf and NaN where no pair is within reach.
     Returns (fault, pose, figure found) as `check_poses` does, how many rows, -1: not answered, for something has to be
-    loaded, the rows do not fit, or scene.stop was set; outside, node visits, point tests.
+    loaded, the rows do not fit, or the search ended early (scene.stop, MOST_QUICK_VISITS); outside, node visits, point
+    tests.
     """
     outside = np.zeros(1, np.bool_)
     scales, units = np.empty(1), np.empty(1, np.int64)
@@ -70,9 +72,9 @@ def nearest_resident(poses, avatar, radius, radius_units, reach_units, reach, sc
     counts = np.zeros((3, 1), np.uint32)
     if needed > 0:
         nearest_poses(
-            poses, avatar, scene, index, around, reach_units, np.zeros(1, np.int64), nearest, counts
-        )
-        if nearest.gap[0] < np.inf:  # all is resident, so the search was stopped
+            poses, avatar, scene, index, around, reach_units, np.zeros(1, np.int64), MOST_QUICK_VISITS, nearest, counts
+        )  # fmt: skip
+        if nearest.gap[0] < np.inf:  # all is resident: the search ended early
             return fault, pose, found, -1, False, 0, 0
     _say(nearest.square[0], nearest.pair[0], nearest.drop[0], units[0] - reach_units, reach, scene, said)
     return fault, pose, found, needed, outside[0], np.int64(counts[1, 0]), np.int64(counts[2, 0])

@@ -37,7 +37,7 @@ from .placed import (
 )
 from .placing import GOOD, place
 from .reach import Reach, find_reach
-from .stopping import stopped
+from .stopping import MOST_QUICK_VISITS, NO_LIMIT, is_over, stopped
 
 # A pair is pushed for each child of one of its nodes, so at most 15 a level stay behind on the stack: this holds
 # two trees of MOST_LEVELS.
@@ -56,7 +56,8 @@ class Work(NamedTuple):
     """Scratch of one call. stack: (STACK, 3) int64: scene row, where its list begins, length.
 
     below: (STACK,) int64: avatar nodes below its front; one element where the front is leaf nodes.
-    keep: (LANES,) bool, and keep8: the same as uint64, eight at a time.  counters: (2,) int64, visits, point tests.
+    keep: (LANES,) bool, and keep8: the same as uint64, eight at a time.  counters: (3,) int64, visits, point tests, and
+    the most visits of a pose, beyond which its search ends.
     """
 
     stack: NDArray[np.int64]
@@ -82,7 +83,8 @@ def make_work(avatar):
     """Scratch for one avatar (not empty)."""
     below = STACK if avatar.first[avatar.front_first] >= 0 else 1
     keep = np.zeros(LANES, np.bool_)
-    stack, counters = np.empty((STACK, 3), np.int64), np.zeros(2, np.int64)
+    stack, counters = np.empty((STACK, 3), np.int64), np.zeros(3, np.int64)
+    counters[2] = NO_LIMIT
     return Work(stack, np.empty(below, np.int64), keep, keep.view(np.uint64), counters)
 
 
@@ -212,7 +214,7 @@ def _below_touches(avatar, m, scale, extent, pose, placed, scene, voxel, spot, a
     steps = scale / scene.step
     below[0] = a
     depth = 1
-    while depth > 0 and not stopped(scene.stop):
+    while depth > 0 and not is_over(scene.stop, work.counters[0], work.counters[2]):
         depth -= 1
         a = below[depth]
         a_first = avatar.first[a]
@@ -267,11 +269,11 @@ def _overlap_voxel(avatar, m, scale, extent, pose, placed, scene, voxel, spot, b
     shift, frame, step = placed.shift, placed.frame, scene.step
     off_x, off_y, off_z = spot.x, spot.y, spot.z
     rooms, mask = by_class.room, by_class.mask
-    some_smaller, room, stop = mask > U(0), rooms[0], scene.stop
+    some_smaller, room, stop, most = mask > U(0), rooms[0], scene.stop, counters[2]
     x, y, z, radius = nodes[0, 0] - off_x, nodes[1, 0] - off_y, nodes[2, 0] - off_z, nodes[3, 0]
     stack[0, 0], stack[0, 1], stack[0, 2] = spot.rows, 0, count
     depth = 1
-    while depth > 0 and not stopped(stop):
+    while depth > 0 and not is_over(stop, counters[0], most):
         depth -= 1
         row, at, count = stack[U(depth), 0], stack[U(depth), 1], stack[U(depth), 2]
         first = np.int64(ints[U(row + FIRST)])
@@ -304,6 +306,8 @@ def _overlap_voxel(avatar, m, scale, extent, pose, placed, scene, voxel, spot, b
                                 avatar, m, block, placed, scene, voxel, spot, row, by_class, work
                             ):
                                 return True
+                            if stopped(stop):  # as many blocks as the front has may take milliseconds
+                                return False
                             continue
                     elif first < 0:
                         if _below_touches(
@@ -346,17 +350,19 @@ def make_spot(scene, voxel, placed):
 
 
 @nb.njit(nogil=True, cache=True)
-def overlap_poses(poses, avatar, scene, reach, which, verdict, counts):
+def overlap_poses(poses, avatar, scene, reach, which, most, verdict, counts):
     """Answer `collide` for the poses numbered in `which`: one call a request, all its poses and voxels.
 
     poses: (k, 4, 4), checked.  avatar: not empty.  reach: Reach of these poses (reach.py); a voxel in it that is not
-    resident is counted as missing.
+    resident is counted as missing.  most: node visits of a pose, beyond which its search ends.
     Adds to what verdict (k,) uint8 and counts (3, k) uint32 (voxels missing, node visits, point tests) hold, CLEAR
     and 0 to begin with, so that a pose may be answered in pieces: a contact wins over anything missing, and
-    that over CLEAR. Once the scene's stop flag is set, poses without a contact so far become UNKNOWN.
+    that over CLEAR. Once the scene's stop flag is set, poses without a contact so far become UNKNOWN; so does a pose
+    whose search ends.
     """
     placed, front, work = make_placed(avatar), make_front(avatar), make_work(avatar)
     by_class = make_by_class(scene.drop)
+    work.counters[2] = most
     _overlap_poses(poses, avatar, scene, reach, which, verdict, counts, placed, front, by_class, work)
 
 
@@ -397,7 +403,7 @@ def _overlap_poses(poses, avatar, scene, reach, which, verdict, counts, placed, 
             ):
                 verdict[i] = CONTACT
                 break
-            if stopped(scene.stop):
+            if is_over(scene.stop, work.counters[0], work.counters[2]):
                 verdict[i] = UNKNOWN
                 break
         counts[1, i] += np.uint32(work.counters[0])
@@ -411,7 +417,8 @@ def answer_resident(poses, avatar, radius, other_units, scene, index, rows, outs
     Writes rows (capacity,) int64, the voxels in reach, pose by pose; outside (k,) bool; and, as `overlap_poses` does,
     verdict and counts. The rest of `Reach` stays in here: arrays made here cost a tenth of arrays handed over.
     Returns (fault, pose, figure found) as `check_poses` does, and how many rows; -1: not answered, for something has
-    to be loaded or the rows do not fit, and verdict and counts are untouched.
+    to be loaded, the rows do not fit, or a search ended early (scene.stop, MOST_QUICK_VISITS); verdict and counts are
+    as they were.
     """
     k = poses.shape[0]
     reach = Reach(
@@ -424,5 +431,11 @@ def answer_resident(poses, avatar, radius, other_units, scene, index, rows, outs
         if scene.where[rows[at], 0] < 0:
             return fault, pose, found, -1
     if avatar.radius.shape[0] > 0:
-        overlap_poses(poses, avatar, scene, reach, np.arange(k), verdict, counts)
+        overlap_poses(poses, avatar, scene, reach, np.arange(k), MOST_QUICK_VISITS, verdict, counts)
+    for i in range(k):
+        if verdict[i] == UNKNOWN:  # all is resident: the search ended early
+            needed = -1
+    if needed < 0:
+        verdict[:] = CLEAR
+        counts[:] = 0
     return fault, pose, found, needed

@@ -26,16 +26,19 @@ STRETCH = 1.0 + 1e-8
 
 
 @nb.njit(nogil=True, cache=True)
-def sweep_and_prune(order, low, high, groups, masks, pairs):
+def sweep_and_prune(order, low, high, groups, masks, stop, pairs):
     """Pairs of objects whose boxes meet and whose groups and masks let them, by a sweep along the first axis.
 
     order: (n,) int64, objects by ascending low[:, 0].  low, high: (n, 3) float64.  groups, masks: (n,) uint32: a pair
     is let when each one's group has a bit of the other's mask.  pairs: (capacity, 2) int32, lesser object first.
     Returns how many there are, and how many more were not let; those beyond the capacity are not written.
+    stop: (1,) int64, the request's stop flag; once it is set, what is returned is of no use.
     After Cohen, Lin, Manocha and Ponamgi, I-COLLIDE (1995), one axis sorted anew a request.
     """
     found, filtered = 0, 0
     for at in range(order.shape[0]):
+        if stopped(stop):
+            break
         i = order[at]
         for after in range(at + 1, order.shape[0]):
             j = order[after]

@@ -173,7 +173,7 @@ def _begin(poses, avatar, scene, index, reach, i, search, goal, known, counts):
     best.units[0] = reach.units[i] + min(goal.early, MAX_REACH_UNITS - reach.units[i])
     best.found[0], best.found[7] = known.square[i], known.drop[i]
     best.found[1:7] = known.pair[i]
-    best.counters[:] = 0
+    best.counters[:3] = 0
     set_cut(best.cut, best.far, best.frame, best.drop, reach.units[i])
     search.bounds[0], search.bounds[1], search.bounds[2], search.bounds[3] = 0.0, np.inf, 0.0, best.frame[4]
     within = best.units[0] if best.found[0] < 0 else found_units(best.found)

@@ -13,7 +13,7 @@ from .advance import Progress, avatar_box, look_around, plan_segments, sweep_seg
 from .layout import SceneArrays
 from .motion import make_motion, pose_at
 from .placing import GOOD, SIMILARITY_TOLERANCE, check_poses
-from .stopping import stopped
+from .stopping import MOST_QUICK_VISITS, stopped
 
 _CLEAR, _CONTACT, _UNKNOWN = int(Verdict.CLEAR), int(Verdict.CONTACT), int(Verdict.UNKNOWN)
 
@@ -21,8 +21,6 @@ _CLEAR, _CONTACT, _UNKNOWN = int(Verdict.CLEAR), int(Verdict.CONTACT), int(Verdi
 _LEFT = (-1, _UNKNOWN, 0, 0, 0)
 # Columns of what is said of a motion: fractions, how far any point goes at most [m], the witness's centres, world [m].
 LOWER, UPPER, SPEED, AVATAR, CLOUD, COLUMNS = 0, 1, 2, 3, 6, 9
-# Node visits of a motion that is answered so, while nobody else can use the residency: a few milliseconds at most.
-MOST_VISITS = 1 << 16
 
 
 @nb.njit(nogil=True, cache=True)
@@ -73,7 +71,7 @@ def sweep_resident(
     )  # fmt: skip
     progress = Progress(
         np.zeros(1), np.ones(1), np.ones(1), np.full(1, np.inf), np.zeros(1), np.full((1, 2, 3), np.nan),
-        np.full(1, MOST_VISITS, np.int64),
+        np.full(1, MOST_QUICK_VISITS, np.int64),
     )  # fmt: skip
     counts, outside, lost = np.zeros((4, 1), np.uint32), np.zeros(1, np.bool_), np.empty(1)
     starts, which = np.zeros(2, np.int64), np.zeros(1, np.int64)

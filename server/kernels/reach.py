@@ -13,6 +13,9 @@ from .compiled import borrowing
 from .placing import GOOD, check_poses, largest_term, place
 from .stopping import stopped
 
+# Cells or voxels looked at between two looks at the stop flag.
+CELLS_AT_ONCE = 1024
+
 
 class SceneIndex(NamedTuple):
     """What the broad phase reads of a scene's v voxels.
@@ -126,8 +129,11 @@ def voxels_in_reach(poses, avatar, scene, index, reach):
             continue
         listed = cells > keys.shape[0]  # cheaper to go through the voxels than through the grid
         ix, iy, iz = first[0], first[1], first[2]
-        row = -1
+        row, looked = -1, 0
         while True:
+            looked += 1
+            if looked % CELLS_AT_ONCE == 0 and stopped(scene.stop):
+                return -1
             if listed:
                 row += 1
                 if row == keys.shape[0]:

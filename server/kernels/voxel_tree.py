@@ -14,6 +14,8 @@ from ...schemas.kernels import compiling as nb
 from .stopping import stopped
 
 FAN = 8
+# Entries moved between two looks at the stop flag.
+ROWS_AT_ONCE = 1024
 # FAN - 1 siblings stay behind on each level; 2^63 rows have 21 levels.
 STACK = 22 * FAN
 
@@ -86,13 +88,15 @@ def _apart(at, low, high, grow, limit):
 
 
 @nb.njit(nogil=True, cache=True)
-def _sort(rows, near, begin, end):
-    """Sort entries [begin, end) by near, then row (Shell 1959, gaps after Knuth)."""
+def _sort(rows, near, begin, end, stop):
+    """Sort entries [begin, end) by near, then row (Shell 1959, gaps after Knuth); not to the end once `stop` is set."""
     gap = 1
     while gap < (end - begin) // 3:
         gap = 3 * gap + 1
     while gap > 0:
         for i in range(begin + gap, end):
+            if i % ROWS_AT_ONCE == 0 and stopped(stop):
+                return
             row, key = rows[i], near[i]
             j = i
             while j >= begin + gap and (near[j - gap], rows[j - gap]) > (key, row):
@@ -142,6 +146,9 @@ def list_voxels(tree, at_units, direction, along, reach_units, radius_units, uni
             here[0], level_of[0] = 0, top
             depth = 1
         while depth > 0:
+            if stopped(stop):
+                lists.unseen[i] = 0.0
+                break
             depth -= 1
             number, level = here[depth], level_of[depth]
             box = tree.levels[level] + number
@@ -161,6 +168,8 @@ def list_voxels(tree, at_units, direction, along, reach_units, radius_units, uni
                 here[depth], level_of[depth] = child, level - 1
                 depth += 1
         if needed <= lists.rows.shape[0]:
-            _sort(lists.rows, lists.near, lists.starts[i], needed)
+            _sort(lists.rows, lists.near, lists.starts[i], needed, stop)
+            if stopped(stop):  # in no order
+                lists.unseen[i] = 0.0
     lists.starts[at_units.shape[0]] = needed
     return needed

@@ -43,15 +43,25 @@ from .memory import (
     travelled,
     turn_points,
 )
-from .overlap import CONTACT, lanes_meet, leaves_touch, make_spot, make_work, overlap_poses
+from .overlap import (
+    CLEAR,
+    CONTACT,
+    UNKNOWN,
+    lanes_meet,
+    leaves_touch,
+    make_spot,
+    make_work,
+    overlap_poses,
+)
 from .placed import make_by_class, make_placed, place_lanes, place_root, set_by_class
 from .placing import GOOD, place
 from .reach import Reach, find_reach
+from .stopping import MOST_QUICK_VISITS, is_over, stopped
 
 # An inner node stays where it is good for so many steps like the last, and for this way [m].
 STEPS_AHEAD, LEAST_WAY = 1.0, 0.01
 
-FULL, NOTHING, TOUCHES = range(3)
+FULL, NOTHING, TOUCHES, LEFT = range(4)
 
 
 class Hands(NamedTuple):
@@ -105,8 +115,8 @@ def _look_again(
     """Look at the entries that are marked in `used`, and at what they give way to, at pose m.
 
     rows[begin:end]: the voxels in reach.  step_way: travelled since the last pose.  x0, y0, z0: the root's center from
-    the frame. Returns NOTHING, TOUCHES, or FULL: no room for more entries. Whenever it returns, all entries together
-    hold all that could be touched, and what is known of each is true.
+    the frame. Returns NOTHING, TOUCHES, FULL: no room for more entries, or LEFT: scene.stop is set, or the visits are
+    spent. Whenever it returns, all entries together hold all that could be touched, and what is known of each is true.
 
     Long, for what `_overlap_voxel` is: every call of a function that takes tuples of arrays costs as much as the work.
     Inlined where it is called, once: a walker then takes 0.6 times as long a pose.
@@ -144,6 +154,8 @@ def _look_again(
         if not used[k] or not _held(rows, begin, end, nodes[k, 0]):
             i += 1
             continue
+        if is_over(scene.stop, counters[0], counters[2]):
+            return LEFT
         voxel, g = nodes[k, 0], nodes[k, 2]
         row = where[U(voxel), 0] + nodes[k, 1]
         w = U(row)
@@ -336,16 +348,19 @@ def _walk_on(poses, begin_at, avatar, scene, reach, verdict, counts, memory, pla
                 return i
         if found == TOUCHES:
             verdict[i] = CONTACT
+        elif found == LEFT or stopped(scene.stop):
+            state[KNOWN] = 0.0
+            verdict[i] = UNKNOWN
         counts[1, i], counts[2, i] = np.uint32(work.counters[0]), np.uint32(work.counters[1])
     return poses.shape[0]
 
 
 @nb.njit(nogil=True, cache=True)
-def walk_poses(poses, avatar, scene, reach, verdict, counts, memory):
+def walk_poses(poses, avatar, scene, reach, most, verdict, counts, memory):
     """Answer `collide` for the poses of one walk in their order, with what is known of the pose before each.
 
     poses: (k, 4, 4), checked.  avatar: not empty, its front leaf nodes.  reach: Reach of these poses; all voxels in it
-    are resident.
+    are resident.  most: node visits of a pose, beyond which it is UNKNOWN and nothing is remembered.
     Writes verdict (k,) uint8 and counts (3, k) uint32, all 0 before, as `overlap_poses` does, and memory.
     """
     f = memory.body.shape[1]
@@ -356,11 +371,12 @@ def walk_poses(poses, avatar, scene, reach, verdict, counts, memory):
         np.empty((3, LANES), np.float32),
     )  # fmt: skip
     placed, by_class, work = make_placed(avatar), make_by_class(scene.drop), make_work(avatar)
+    work.counters[2] = most
     at = 0
     while at < poses.shape[0]:
         at = _walk_on(poses, at, avatar, scene, reach, verdict, counts, memory, placed, by_class, work, hands)
         if at < poses.shape[0]:
-            overlap_poses(poses, avatar, scene, reach, np.full(1, at), verdict, counts)
+            overlap_poses(poses, avatar, scene, reach, np.full(1, at), most, verdict, counts)
             at += 1
 
 
@@ -368,17 +384,23 @@ def walk_poses(poses, avatar, scene, reach, verdict, counts, memory):
 def walk_resident(poses, avatar, radius, other_units, scene, index, rows, outside, verdict, counts, memory):
     """A whole request in one call, where all voxels in its reach are resident: as `answer_resident`, with memory.
 
-    Returns what that does; where it answers -1, memory is as it was.
+    Returns what that does; where it answers -1, memory is as it was, or says that nothing is known.
     """
     k = poses.shape[0]
     reach = Reach(
         np.empty(k), np.empty(k, np.int64), np.zeros(k + 1, np.int64), rows, np.empty((k, 2, 3)), outside
     )
     fault, pose, found, needed = find_reach(poses, avatar, radius, other_units, scene, index, reach)
-    if fault != GOOD or needed > rows.shape[0]:
+    if fault != GOOD or needed < 0 or needed > rows.shape[0]:
         return fault, pose, found, -1
     for at in range(needed):
         if scene.where[rows[at], 0] < 0:
             return fault, pose, found, -1
-    walk_poses(poses, avatar, scene, reach, verdict, counts, memory)
+    walk_poses(poses, avatar, scene, reach, MOST_QUICK_VISITS, verdict, counts, memory)
+    for i in range(k):
+        if verdict[i] == UNKNOWN:  # all is resident: the search ended early
+            needed = -1
+    if needed < 0:
+        verdict[:] = CLEAR
+        counts[:] = 0
     return fault, pose, found, needed

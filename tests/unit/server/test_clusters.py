@@ -81,19 +81,19 @@ def test_a_cell_is_found_again_through_growth_and_after_emptying(rng: np.random.
             rng.integers(-(1 << 50), 1 << 50, (9, 3)),
         ]
     )
-    cells = make_cells(32)
+    cells = make_cells(32, NEVER.flag)
     for _ in range(2):
         rows: dict[tuple[int, ...], int] = {}
         for place in map(tuple, places.tolist()):
             if len(rows) == len(cells.table):
-                cells = grow_cells(cells, len(rows))
+                cells = grow_cells(cells, len(rows), NEVER.flag)
             row = enter_cell(cells, len(rows), *place)
             assert row == rows.setdefault(place, len(rows))
         for place, row in rows.items():
             assert cells.slots[find_slot(cells, *place)] == row
             assert tuple(cells.table[row, PLACE:].tolist()) == place
         assert len(cells.slots) == 2 * len(cells.table) < 4 * max(32, len(rows))
-        empty_cells(cells, len(rows))
+        empty_cells(cells, len(rows), NEVER.flag)
         assert (cells.slots == -1).all()
 
 
@@ -101,7 +101,7 @@ def test_a_cell_is_found_again_through_growth_and_after_emptying(rng: np.random.
 def test_neighbouring_cells_are_one_cluster(rng: np.random.Generator, spread: int) -> None:
     """One pair a cell; three poses in turn, so that nothing of one is left for the next."""
     memory = Memory(
-        make_cells(64), np.empty((10, RECORD), np.int64), np.array([0, 0, 0, 0, -1]), np.zeros(3, np.int64),
+        make_cells(64, NEVER.flag), np.empty((10, RECORD), np.int64), np.array([0, 0, 0, 0, -1]), np.zeros(3, np.int64),
         np.empty((1, 2), np.int64), np.empty((0, RECORD), np.int64), np.empty((0, CLUSTER), np.int64),
     )  # fmt: skip
     for _ in range(3):

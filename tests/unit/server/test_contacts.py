@@ -22,6 +22,7 @@ from solidcloud.server.avatar import make_avatar
 from solidcloud.server.contacts import contacts
 from solidcloud.server.describe import describe
 from solidcloud.server.effort import Effort, make_effort
+from solidcloud.server.kernels.layout import LANES
 from solidcloud.server.request import make_scene_data
 from solidcloud.server.residency import Residency
 from solidcloud.server.store import Store
@@ -307,6 +308,20 @@ def test_an_avatar_in_another_order_names_the_same_points(tmp_path: Path, rng: n
     for name in ("node_visits", "point_tests"):  # of another tree
         del first[name], second[name]
     assert first == second
+
+
+def test_more_cells_than_there_may_be_are_refused(row: ScanCase, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each scan point is in a cell of its own; before each voxel there must be room for another LANES."""
+    avatar, poses = make_avatar(row_of_points(1), 5.0), at((0.0, 0.0, 0.0))
+    whole = contacts(row.data, avatar, poses, 0, 0.0, 0.0)
+    assert whole.pairs_found[0] > LANES
+    for name in ("FIRST_CELLS", "MOST_CELLS"):
+        monkeypatch.setattr(contacts_module, name, LANES)
+    with pytest.raises(TooLargeError, match="larger cluster_distance"):
+        contacts(row.data, avatar, poses, 0, 0.0, 0.0)
+    monkeypatch.setattr(contacts_module, "MOST_CELLS", 2 * LANES)
+    assert contacts(row.data, avatar, poses, 0, 0.0, 0.0).pairs_found.tolist() == whole.pairs_found.tolist()
+    row.data.residency.check()
 
 
 def test_more_than_a_request_may_list_is_refused_before_it_is_kept(

@@ -13,6 +13,7 @@ from solidcloud.server.avatar import AvatarModel, make_avatar
 from solidcloud.server.kernels import meeting as kernel
 from solidcloud.server.kernels import meeting_placed as placed
 from solidcloud.server.kernels import near_bodies
+from solidcloud.server.stop import NEVER
 from swept import turned
 
 pytestmark = pytest.mark.interpreted
@@ -63,6 +64,7 @@ def ask(
     row, fraction = kernel.sweep_bodies(
         a.arrays, box_of(a), units_of(a), *ends, b.arrays, poses, units_of(b), np.arange(len(poses)), ORIGIN,
         int(np.rint(margin * naive.UNITS)), TOLERANCE, until, witness, named, scratch or scratch_of(a, b),
+        NEVER.flag,
     )  # fmt: skip
     if row >= 0:
         point = b.points[b.rows[named[0], named[1]]]

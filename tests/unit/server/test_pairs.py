@@ -44,7 +44,7 @@ def test_pairs_of_boxes_are_those_of_all_pairs(seed: int) -> None:
     order = np.argsort(low[:, 0], kind="stable")
     for room in (len(meet) + 1, len(meet), 1, 0):
         pairs = np.full((room, 2), -1, np.int32)
-        found = kernel.sweep_and_prune(order, low, high, groups, masks, pairs)
+        found = kernel.sweep_and_prune(order, low, high, groups, masks, NEVER.flag, pairs)
         assert found == (len(meet), stopped)
         written = [row for row in pairs.tolist() if row != [-1, -1]]
         assert len(written) == min(room, len(meet)) and all(row in meet for row in written)

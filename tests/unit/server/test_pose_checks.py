@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from solidcloud.server.kernels import placing
+from solidcloud.server.stop import NEVER
 
 pytestmark = pytest.mark.interpreted
 
@@ -18,9 +19,10 @@ class Lattice(NamedTuple):
 
     step: float
     voxel_steps: int
+    stop: NDArray[np.int64]
 
 
-LATTICE = Lattice(2.0**-13, 65_536)
+LATTICE = Lattice(2.0**-13, 65_536, NEVER.flag)
 
 
 def check(

@@ -15,6 +15,7 @@ from solidcloud.schemas.requests import QuestionOptions
 from solidcloud.server.policies import POLICIES
 from solidcloud.server.residency import Held, Residency
 from solidcloud.server.scene import Scene
+from solidcloud.server.stop import NEVER
 
 pytestmark = pytest.mark.interpreted
 DEADLINE = 20.0  # [s], for what takes microseconds when it is right
@@ -279,9 +280,8 @@ def test_a_load_that_two_could_not_wait_for_is_owed_until_it_is_done() -> None:
     residency = Residency(store, 2 * BLOCK)
     told: list[None] = []
     residency.owed = lambda: told.append(None)
-    residency._reserve(
-        [1], float("inf"), False
-    )  # reserved by one whose deadline comes before the load begins
+    # Reserved by one whose deadline comes before the load begins.
+    residency._reserve([1], float("inf"), False, NEVER)
     residency._pin([1])  # another waits for it
     residency._leave([1])
     residency._owed[1] = None

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from solidcloud.schemas.radius_model import LOCAL_CLASSES
 from solidcloud.server.avatar import make_avatar
 from solidcloud.server.coarse import Coarse, settle
+from solidcloud.server.effort import NO_LIMIT
 from solidcloud.server.kernels.coarse import any_to_settle
 from solidcloud.server.kernels.overlap import CLEAR, CONTACT, overlap_poses
 
@@ -66,7 +67,7 @@ def test_feet_above_a_floor_are_settled_by_their_points(tmp_path: Path) -> None:
     assert made.settled(BODY, poses) == ([[0], [0]], [[0], []])
     verdict, counts = np.zeros(2, np.uint8), np.zeros((3, 2), np.uint32)
     reach = made.reach(BODY, poses)
-    overlap_poses(poses, BODY.arrays, made.resident(0).arrays, reach, np.arange(2), verdict, counts)
+    overlap_poses(poses, BODY.arrays, made.resident(0).arrays, reach, np.arange(2), NO_LIMIT, verdict, counts)
     assert verdict.tolist() == [CLEAR, CONTACT]
 
 
@@ -116,7 +117,7 @@ def test_what_is_settled_of_a_long_avatar_is_clear(made: Made, rng: np.random.Ge
         starts = np.cumsum([0, *map(len, gone)])
         reach = made.reach(rod, poses)._replace(starts=starts, rows=np.array(list(chain(*gone)), np.int64))
         verdict, counts = np.zeros(30, np.uint8), np.zeros((3, 30), np.uint32)
-        overlap_poses(poses, rod.arrays, everything.arrays, reach, np.arange(30), verdict, counts)
+        overlap_poses(poses, rod.arrays, everything.arrays, reach, np.arange(30), NO_LIMIT, verdict, counts)
         assert (verdict == CLEAR).all()
 
 

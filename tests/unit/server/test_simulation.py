@@ -159,7 +159,7 @@ def test_the_bodies_that_may_meet_are_kept_up_to_date():
     class Bodies(dict):
         put_back = 0
 
-        def tell(self, poses):
+        def tell(self, poses, stop):
             self.told = poses
             return lambda: setattr(self, "put_back", self.put_back + 1)
 

@@ -15,6 +15,9 @@ from solidcloud.schemas.scene import ObjectItem
 from solidcloud.server.avatar import make_avatar
 from solidcloud.server.effects.bodies import Bodies
 from solidcloud.server.effects.frame import Body
+from solidcloud.server.effort import EXACT
+from solidcloud.server.stop import Stop as Ending
+from solidcloud.server.stop import StoppedError
 
 COARSE = INTERPRETED
 USER = ball(0.2, 12 if COARSE else 60)
@@ -79,6 +82,43 @@ def test_a_pushed_crate_stops_at_the_wall_and_the_user_behind_it(tmp_path: Path)
             moved = stage.go("c/u", body.pose.copy())
             assert np.array_equal(where(stage, "crate"), stood), "nobody pushes: it stands"
         assert moved.objects is not None and moved.objects.poses == {}
+
+
+@pytest.mark.interpreted
+def test_a_stopped_frame_leaves_what_it_pushed_where_it_stood(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The frames after it are those of a log's replay, where it is stopped before it begins."""
+    after: list[list[Any]] = []
+    put = Bodies.put
+    for first in (True, False):
+        (tmp_path / str(first)).mkdir()
+        objects = (item("crate", at(1.0)), item("other", at(1.65)))
+        with staged(tmp_path / str(first), MOVING, avatars=AVATARS, objects=objects) as stage:
+            body, stop, pushed = stage.enter("c/u", USER, at(0)), Ending(), []
+            stage.go("c/u", at(0.1))
+            stood, begun = where(stage, "crate"), body.pose.copy()
+
+            def ended(bodies: Bodies, *what: Any, stop: Ending = stop, pushed: list[int] = pushed) -> None:
+                put(bodies, *what)
+                pushed.append(1)
+                stop.set("ended")
+
+            if first:
+                stop.set("ended")
+            monkeypatch.setattr(Bodies, "put", ended)
+            with pytest.raises(StoppedError):
+                stage.pipeline.run(body, at(0.9), 1 / 30, EXACT._replace(stop=stop))
+            monkeypatch.setattr(Bodies, "put", put)
+            assert bool(pushed) is not first
+            assert np.array_equal(where(stage, "crate"), stood) and np.array_equal(body.pose, begun)
+            moved = [stage.go("c/u", at(0.1 + 0.1 * i)) for i in range(1, 12)]
+            assert where(stage, "crate")[0, 3] > stood[0, 3]
+            after.append(
+                [(each.pose.tolist(), each.verdict, each.objects and each.objects.touching) for each in moved]
+                + [where(stage, name).tolist() for name in ("crate", "other")]
+            )
+    assert after[0] == after[1]
 
 
 @pytest.mark.interpreted

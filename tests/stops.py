@@ -1,0 +1,135 @@
+"""What the tests of stops share: each question as a call, and whether an answer cut short says nothing wrong."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from solidcloud.schemas.answers import ContactsAnswers, ObjectsAnswers, SweepAnswers, Verdict
+from solidcloud.server.avatar import AvatarModel
+from solidcloud.server.by_scan import gaps_by_scan
+from solidcloud.server.collide import collide
+from solidcloud.server.contacts import contacts
+from solidcloud.server.distance import distance
+from solidcloud.server.effort import Effort
+from solidcloud.server.near import near
+from solidcloud.server.objects import objects
+from solidcloud.server.rays import raycast
+from solidcloud.server.request import SceneData, with_stop
+from solidcloud.server.session import Walker
+from solidcloud.server.stopped_answers import ask_until_stopped
+from solidcloud.server.sweep import sweep
+from solidcloud.server.within import within
+
+CLEAR, CONTACT, UNKNOWN = Verdict
+# A budget of visits that is not spent: what is bounded has kernels of its own.
+PLENTY = 1 << 50
+
+
+class Asked(NamedTuple):
+    """What a question is asked of. poses: (k, 4, 4).  margin, reach: [m]."""
+
+    data: SceneData
+    avatar: AvatarModel
+    poses: NDArray[np.float64]
+    margin: float = 0.0
+    reach: float = 0.5
+
+
+class _Always:
+    """An archive that a walker takes."""
+
+    def __init__(self, data: SceneData) -> None:
+        self.number, self._data = 0, data
+
+    def __enter__(self) -> "_Always":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def radius_model(self, _: str | None) -> SceneData:
+        return self._data
+
+
+def _ask(question: Any, k: int, a: Asked, effort: Effort, *what: Any) -> Any:
+    data = with_stop(a.data, effort.stop)
+    return ask_until_stopped(question, k, effort, lambda: question(data, *what, effort=effort))
+
+
+def _objects(a: Asked, effort: Effort) -> ObjectsAnswers:
+    n, both = len(a.poses), np.full(len(a.poses), 0xFFFFFFFF, np.uint32)
+    found: ObjectsAnswers = _ask(objects, n, a, effort, [a.avatar] * n, a.poses, both, both, a.margin)
+    return found
+
+
+def _collide(a: Asked, effort: Effort, **more: Any) -> Any:
+    return _ask(collide, len(a.poses), a, effort._replace(**more), a.avatar, a.poses, a.margin)
+
+
+def _distance(a: Asked, effort: Effort, **more: Any) -> Any:
+    return _ask(distance, len(a.poses), a, effort._replace(**more), a.avatar, a.poses, a.reach)
+
+
+def _near(a: Asked, effort: Effort) -> Any:
+    data = with_stop(a.data, effort.stop)
+    return ask_until_stopped(distance, 1, effort, lambda: near(data, a.avatar, a.poses[0], a.reach, effort))
+
+
+def _places(a: Asked) -> NDArray[np.float64]:
+    return np.ascontiguousarray(a.poses[:, :3, 3])
+
+
+def _walk(a: Asked, effort: Effort) -> Any:
+    walker = Walker(lambda: _Always(a.data), a.avatar, a.margin)  # type: ignore[arg-type,return-value]
+    return walker.collide(a.poses, effort.stop)
+
+
+QUESTIONS: dict[str, Callable[[Asked, Effort], Any]] = {
+    "collide": _collide,
+    "collide of one pose": lambda a, e: _collide(a._replace(poses=a.poses[:1]), e),
+    "collide bounded": lambda a, e: _collide(a, e, visits=PLENTY),
+    "collide timed": lambda a, e: _collide(a, e, deadline=1e18),
+    "walk": _walk,
+    "distance": _distance,
+    "distance of one pose": _near,
+    "distance bounded": lambda a, e: _distance(a, e, visits=PLENTY),
+    "contacts": lambda a, e: _ask(contacts, len(a.poses), a, e, a.avatar, a.poses, 20, a.margin + 0.02),
+    "sweep": lambda a, e: _ask(sweep, len(a.poses) - 1, a, e, a.avatar, a.poses[:-1], a.poses[1:], a.margin),
+    "raycast": lambda a, e: _ask(raycast, len(a.poses), a, e, _places(a), a.poses[:, :3, 0].copy(), 4.0),
+    "within": lambda a, e: _ask(within, len(a.poses), a, e, _places(a), a.reach),
+    "objects": _objects,
+}
+
+
+def gaps(a: Asked, effort: Effort) -> Any:
+    """`gaps_by_scan` of the first pose."""
+    return gaps_by_scan(with_stop(a.data, effort.stop), a.avatar, a.poses[0], a.reach, 2, effort)
+
+
+def assert_not_wrong(found: Any, truth: Any) -> None:
+    """Assert that an answer cut short says nothing that the whole one does not."""
+    assert type(found) is type(truth) and len(found) == len(truth)
+    known = found.verdict != UNKNOWN
+    assert (found.verdict[known] == truth.verdict[known]).all()
+    if isinstance(found, ObjectsAnswers):
+        said = dict(zip(map(tuple, found.pairs.tolist()), found.pair_verdict.tolist(), strict=True))
+        true = set(map(tuple, truth.pairs.tolist()))
+        assert {pair for pair, verdict in said.items() if verdict == CONTACT} <= true <= set(said)
+        return
+    if isinstance(found, ContactsAnswers):
+        assert (found.pairs_found <= truth.pairs_found).all()
+        assert (found.exact <= truth.exact).all()
+        assert (found.pairs_found[found.exact] == truth.pairs_found[found.exact]).all()
+        assert found.pair_starts[-1] == len(found.signed_distance)
+        return
+    value = next((name for name in ("signed_distance", "distance") if hasattr(found, name)), None)
+    if value is not None:
+        true = getattr(truth, value)
+        assert (found.lower <= np.minimum(true, truth.lower) + 1e-9).all() and (
+            found.upper >= truth.lower - 1e-9
+        ).all()
+        assert (getattr(found, value)[found.exact] == true[found.exact]).all()
+    if isinstance(found, SweepAnswers):
+        first = np.where(truth.verdict == CONTACT, truth.upper, 1.0)
+        assert (found.lower <= first + 1e-9).all() and (found.upper >= truth.lower - 1e-9).all()

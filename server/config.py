@@ -31,7 +31,7 @@ class ServerConfig:
     insecure: allow an endpoint that other hosts reach; there is no authentication yet.
     workers: requests answered at the same time. 2: one client that does not take its replies holds one.
     max_slow: requests at work for longer than some 10 ms; they hold no worker. More of them wait for one to end.
-    max_request_seconds: server time for one request; what was not reached by then is `unknown`.
+    max_request_seconds: server time for one request, or one part of a path; what was not reached by then is `unknown`.
     max_in_flight: requests accepted and not yet answered, over all clients; one more is answered `busy`.
     max_in_flight_by_client: the same for one client; all clients without a liveliness token count as one.
     max_in_flight_bytes: bytes of the payloads of all requests in flight.

@@ -1,5 +1,6 @@
 """A query on its way, and what one thread does with it at present. No zenoh here."""
 
+import math
 import threading
 import time
 from collections.abc import Callable
@@ -83,12 +84,14 @@ class Job:
         "ticket",
     )
 
-    def __init__(self, ticket: Ticket | None, takes: bool, *, sending: bool = False) -> None:
-        """Begin."""
+    def __init__(
+        self, ticket: Ticket | None, takes: bool, *, sending: bool = False, part_seconds: float = math.inf
+    ) -> None:
+        """Begin. part_seconds: see `Stop`."""
         self.ticket, self.takes, self.sending = ticket, takes, sending
         self.begun = time.monotonic()
         self.thread_id = threading.get_native_id()
-        self.stop = Stop()
+        self.stop = Stop(part_seconds)
         self.cpu = time.thread_time()
         self.again = self.ended = self.left = False
         self.low = ticket is not None and ticket.slow

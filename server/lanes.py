@@ -210,7 +210,7 @@ class Lane:
 
     def _carry_out(self, ticket: Ticket, takes: bool) -> tuple[bool, list[Ticket]]:
         """Carry out one request. Returns whether it gave up its worker, and the tickets to be started."""
-        job = Job(ticket, takes)
+        job = Job(ticket, takes, part_seconds=self._config.max_request_seconds)
         self._enter(job)
         parts = None
         try:

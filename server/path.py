@@ -5,6 +5,8 @@ follows from how long they took so far, so that the first part comes soon and no
 What is answered does not depend on it, cost counters of a part apart.
 """
 
+import math
+import time
 from collections import deque
 from collections.abc import Callable, Generator
 from concurrent.futures import Executor, Future
@@ -20,6 +22,7 @@ from ..schemas.requests import check_path_parameters
 from .avatar import AvatarModel
 from .collide import collide
 from .contacts import contacts
+from .deadlines import stop_at
 from .distance import distance
 from .effort import make_effort
 from .kernels.placing import check_poses
@@ -53,9 +56,9 @@ def path_question(
 ) -> tuple[Ask, int]:
     """What answers [start, stop) of a path, and how many answers there are. The budget's time begins now.
 
-    poses: (k, 4, 4) float64.  parameters: of `op`, tolerance and budgets included.  stop: ends the path early. All
-    poses are checked here, so that an error names one by its place on the path. BadRequestError, BadTransformError,
-    TooLargeError.
+    poses: (k, 4, 4) float64.  parameters: of `op`, tolerance and budgets included.  stop: ends the path early; a part
+    that takes longer than its `part_seconds` ends alone. All poses are checked here, so that an error names one by its
+    place on the path. BadRequestError, BadTransformError, TooLargeError.
     """
     given = {name: value for name, value in parameters.items() if value is not None}
     check_path_parameters(op, given)
@@ -63,7 +66,6 @@ def path_question(
     tolerance = given.pop("tolerance", 1e-6 if op == "sweep" else 0.0)
     # Nobody stays along a path; what users stand in, at most half of the cache (prefetch.py), can stay beside it.
     effort = make_effort(tolerance, **budgets, stop=stop)._replace(scan=True, share=0.5)
-    data = with_stop(data, effort.stop)
     poses = kernel_poses(poses)  # copied once if at all, or every part would copy its own
     other = (
         to_units(given["reach"], "reach")
@@ -73,7 +75,7 @@ def path_question(
     scales, units = np.empty(len(poses)), np.empty(len(poses), np.int64)
     other += data.radius_units
     fault, pose, found = check_poses(
-        poses, avatar.arrays.radius, avatar.radius, other, data.arrays, scales, units
+        poses, avatar.arrays.radius, avatar.radius, other, with_stop(data, effort.stop).arrays, scales, units
     )
     refuse(fault, pose, found)
 
@@ -85,11 +87,25 @@ def path_question(
         if effort.spent:
             return unknown_part(PATH_ANSWERS[op], end - start, effort)
         what = [poses[start:end], poses[start + 1 : end + 1]] if op == "sweep" else [poses[start:end]]
+        own = effort._replace(stop=_part_stop(effort.stop, stop.part_seconds))
         return ask_until_stopped(
-            question, end - start, effort, lambda: question(data, avatar, *what, **given, effort=effort)
+            question,
+            end - start,
+            own,
+            lambda: question(with_stop(data, own.stop), avatar, *what, **given, effort=own),
         )
 
     return ask, max(0, len(poses) - 1) if op == "sweep" else len(poses)
+
+
+def _part_stop(stop: Stop, seconds: float) -> Stop:
+    """Return the flag of a part that begins now: set with the path's, or once the part has taken so many seconds."""
+    if seconds == math.inf:
+        return stop
+    part = stop.part()
+    reason = f"a part took longer than {seconds:g} s, the most that this server spends on one"
+    stop_at(part, time.perf_counter() + seconds, reason)
+    return part
 
 
 def largest_part(op: str, parameters: dict[str, Any]) -> int:

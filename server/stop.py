@@ -4,27 +4,51 @@ Whoever watches a request sets the flag: its time is up, its client is gone, the
 read it every few microseconds and return; what they had not looked at then is `unknown`.
 """
 
+import math
+import threading
+import weakref
+
 import numpy as np
+
+_PARTS = threading.Lock()
 
 
 class Stop:
     """A flag that the kernels of one request read and any thread may set. Thread-safe; never cleared.
 
     flag: (1,) int64, 0 until it is set; kernels read it without a lock.  reason: why it was set, for the answer.
+    part_seconds: the most that one part of an answer in parts may take [s].
     """
 
-    __slots__ = ("__weakref__", "flag", "reason")
+    __slots__ = ("__weakref__", "_parts", "flag", "part_seconds", "reason")
 
-    def __init__(self) -> None:
+    def __init__(self, part_seconds: float = math.inf) -> None:
         """Make a flag that is not set."""
         self.flag = np.zeros(1, np.int64)
         self.reason = ""
+        self.part_seconds = part_seconds
+        self._parts: list[weakref.ref[Stop]] = []
 
     def set(self, reason: str) -> None:
-        """Set the flag. The first reason is kept."""
-        if not self.flag[0]:
-            self.reason = reason
-            self.flag[0] = 1
+        """Set the flag, and those of its parts. The first reason is kept."""
+        if self.flag[0]:
+            return
+        self.reason = reason
+        self.flag[0] = 1
+        with _PARTS:
+            parts = [part for each in self._parts if (part := each()) is not None]
+        for part in parts:
+            part.set(reason)
+
+    def part(self) -> "Stop":
+        """Return a flag for a part of the work: it is set with this one, or alone."""
+        part = Stop()
+        with _PARTS:
+            self._parts = [each for each in self._parts if each() is not None]
+            self._parts.append(weakref.ref(part))
+        if self:
+            part.set(self.reason)
+        return part
 
     def __bool__(self) -> bool:
         """Return whether the flag is set."""
@@ -41,6 +65,10 @@ class _Never(Stop):
         raise RuntimeError(
             f"the stop flag of all requests was to be set ({reason}): make a Stop for the request"
         )
+
+    def part(self) -> Stop:
+        """Return a flag of its own: this one is never set."""
+        return Stop()
 
 
 # Of requests that nobody watches.

@@ -38,7 +38,8 @@ def serve(
         typer.Option(help="New file for the frames of all users, for solidcloud replay; it only grows."),
     ] = None,
     max_request_seconds: Annotated[
-        float, typer.Option(help="Server time for one request; what was not reached is unknown.")
+        float,
+        typer.Option(help="Server time for one request or part of a path; what was not reached is unknown."),
     ] = 2.0,
     max_slow: Annotated[int, typer.Option(help="Requests at work for longer than 10 ms, at a time.")] = 4,
     max_in_flight_by_client: Annotated[

@@ -11,6 +11,7 @@ import pytest
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import build_archive
 from solidcloud.schemas.answers import Verdict
+from solidcloud.server import path
 from solidcloud.server.effort import EXACT
 from solidcloud.server.scene import Scene
 from solidcloud.server.stop import NEVER, Stop
@@ -180,6 +181,45 @@ def test_a_stopped_frame_leaves_the_avatar_where_it_was(scene: Scene) -> None:
 
 
 @pytest.mark.interpreted
+@pytest.mark.parametrize("threads", [1, 2])
+def test_a_part_of_a_path_that_takes_too_long_ends_alone(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch, threads: int
+) -> None:
+    poses = poses_above(300)
+    truth = [part.verdict for part in scene.path("corner", poses, "collide")]
+    late: list[str] = []
+
+    def at_once(stop: Stop, when: float, reason: str) -> None:
+        assert when <= time.perf_counter() + 30.0
+        late.append(reason)
+        if len(late) == 1:
+            stop.set(reason)
+
+    monkeypatch.setattr(path, "stop_at", at_once)
+    stop = Stop(part_seconds=30.0)
+    parts = list(scene.path("corner", poses, "collide", threads=threads, stop=stop))
+    assert [part.stopped for part in parts].count(late[0]) == 1 and "30 s" in late[0]
+    for part in parts:
+        if part.stopped:
+            assert (part.verdict == UNKNOWN).all()
+        else:
+            assert (part.verdict != UNKNOWN).all()
+    assert len(late) == len(parts) > 1 and not stop
+    assert sum(len(part.verdict) for part in parts) == sum(map(len, truth)) == 300
+
+
+@pytest.mark.interpreted
+def test_a_flag_sets_those_of_its_parts() -> None:
+    stop = Stop()
+    parts = [stop.part(), stop.part()]
+    parts[0].set("of one part")
+    assert not stop and not parts[1]
+    stop.set(WHY)
+    assert [part.reason for part in [*parts, stop.part()]] == ["of one part", WHY, WHY]
+    assert not NEVER.part()
+
+
+@pytest.mark.interpreted
 def test_the_first_reason_is_kept() -> None:
     stop = Stop()
     assert not stop
@@ -194,22 +234,20 @@ def test_nobody_sets_the_flag_of_requests_that_are_not_watched(scene: Scene) -> 
     assert not NEVER
 
 
-def test_loads_are_not_waited_for_beyond_the_time_of_a_request(
+def test_loads_are_not_waited_for_once_a_request_is_stopped(
     scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A disk that does not answer: the request ends, what was not read is unknown."""
-    untils: list[float] = []
+    stops: list[Stop] = []
     hold = scene.residency.hold
 
-    def watched(rows: list[int], until: float = np.inf, **options: Any) -> Any:
-        untils.append(until)
-        return hold(rows, until, **options)
+    def watched(_: Any, *what: Any, stop: Stop, **options: Any) -> Any:
+        stops.append(stop)
+        return hold(*what, stop=stop, **options)
 
-    monkeypatch.setattr(
-        type(scene.residency), "hold", lambda self, rows, until=np.inf, **o: watched(rows, until, **o)
-    )
-    until = time.perf_counter() + 1000.0
+    monkeypatch.setattr(type(scene.residency), "hold", watched)
     for op in ("collide", "distance", "contacts", "sweep", "within"):
-        untils.clear()
-        ask(scene, op, 2, stop=Stop(until))
-        assert untils and max(untils) == until, op
+        stops.clear()
+        stop = Stop()
+        ask(scene, op, 2, stop=stop)
+        assert stops and all(each is stop for each in stops), op

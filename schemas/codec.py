@@ -315,7 +315,7 @@ def open_tree(
     cell_planes = unpack(cells, CELL_DTYPE, shape.cell_rows, f"{name}, cells")
     identity = np.frombuffer(archive_id + key.to_bytes(8, "little"), np.uint8)
     if (cell_planes[: len(identity)] != identity[:, None]).any():  # archive and voxel come first in a row
-        raise CorruptError(f"{name}: the record found is another voxel's or another archive's")
+        raise MisleadingIndexError(f"{name}: the record found is another voxel's or another archive's")
     cell_columns = Cells(*(column_of(cell_planes, CELL_DTYPE, field) for field in Cells._fields))
     check_cell_nodes(name, cell_columns, shape.node_rows)
     check_cell_points(name, cell_columns, shape.point_rows)

@@ -110,7 +110,8 @@ class CorruptError(FormatError):
 
 
 class MisleadingIndexError(CorruptError):
-    """A record that contradicts what questions believed of the index before they read it: where its points are.
+    """A record that contradicts what questions believed of the index before they read it: which cell it is of, where in
+    it its points are, how large their spheres.
 
     An index that is wrong once may be wrong about any voxel that was never read, so nothing is known to be clear.
     """

@@ -19,7 +19,8 @@ from .kernels.closest import Nearest
 from .kernels.placing import MAX_REACH_UNITS
 from .kernels.priority import OPEN, Goal, Known, end_search, go_on, make_search, search_poses
 from .kernels.reach import Reach
-from .request import SceneData, as_held, check_request, in_unknown, kernel_poses, pieces, to_units
+from .proving import find_proved_reach
+from .request import SceneData, as_held, in_unknown, kernel_poses, pieces, to_units
 from .signed import distance_columns, signed_bound, signed_from_square, unknown_gaps
 from .spent import Spent
 from .stop import Stop
@@ -109,16 +110,22 @@ def _leave_open(
 
 
 def _gather(
-    data: SceneData, avatar: AvatarModel, array: NDArray[np.float64], reach: Reach, goal: Goal, effort: Effort
+    data: SceneData,
+    avatar: AvatarModel,
+    array: NDArray[np.float64],
+    reach: Reach,
+    goal: Goal,
+    effort: Effort,
+    spent: Spent,
 ) -> _Gathered:
-    """Search for all poses, piece by piece."""
+    """Search for all poses, piece by piece. What it takes is added to `spent`."""
     k = len(array)
     known = Known(
         np.full(k, -1, np.int64), np.zeros((k, 6), np.int64), np.zeros(k, np.int64), np.full(k, math.inf),
         np.full(k, math.inf), np.full(k, math.inf), np.zeros(k, bool),
     )  # fmt: skip
     counts = np.zeros((3, k), np.uint32)
-    residency, spent = data.residency, Spent(time.perf_counter())
+    residency = data.residency
     for which, rows, part in (
         pieces(reach, residency, effort.share, effort.stop) if len(avatar.points) else ()
     ):
@@ -164,10 +171,11 @@ def distance_bounded(
     """
     array = kernel_poses(poses)
     reach_units = to_units(reach, "reach")
-    around = check_request(data, avatar, array, data.radius_units + reach_units)
+    spent = Spent(time.perf_counter())
+    around = find_proved_reach(data, avatar, array, data.radius_units + reach_units, effort, spent)
     tolerance = max(0.0, effort.tolerance - TOLERANCE_SLACK / UNITS_PER_METRE) / data.arrays.step
     goal = Goal(False, 0, np.zeros(len(array)), tolerance, effort.visits)
-    known, counts, cost = _gather(data, avatar, array, around, goal, effort)
+    known, counts, cost = _gather(data, avatar, array, around, goal, effort, spent)
     if len(avatar.points):
         np.minimum(known.gap, unknown_gaps(data, around), out=known.gap)
     # What was left open is as what is missing: somewhere, no nearer than that.
@@ -188,14 +196,15 @@ def collide_bounded(
     """
     array = kernel_poses(poses)
     margin_units = to_units(margin, "margin")
-    around = check_request(data, avatar, array, data.radius_units + margin_units)
+    spent = Spent(time.perf_counter())
+    around = find_proved_reach(data, avatar, array, data.radius_units + margin_units, effort, spent)
     radii = around.units - margin_units
     early = math.floor(min(effort.tolerance * UNITS_PER_METRE, float(MAX_REACH_UNITS)))
     # Sums of float64 on both sides of a comparison: some units of slack make it one of the true numbers.
     certain = (around.units - TOLERANCE_SLACK) / data.arrays.units_per_step
     enough = np.asarray((around.units + early - TOLERANCE_SLACK) / data.arrays.units_per_step, np.float64)
     goal = Goal(True, early, enough, 0.0, effort.visits)
-    known, counts, cost = _gather(data, avatar, array, around, goal, effort)
+    known, counts, cost = _gather(data, avatar, array, around, goal, effort, spent)
     upper = _upper(data, known, radii)
     found = known.square >= 0
     truly = (found & (known.square <= (around.units - known.drop) ** 2)) | (known.upper <= certain)

@@ -1,5 +1,6 @@
 """How near each scan of an archive comes to an avatar under one pose: what noise of scans is asked of."""
 
+import time
 from typing import NamedTuple
 
 import numpy as np
@@ -8,7 +9,9 @@ from numpy.typing import ArrayLike
 from .avatar import AvatarModel
 from .effort import EXACT, Effort
 from .kernels.by_scan import Nearer, nearest_by_scan
-from .request import SceneData, as_held, check_request, in_unknown, kernel_poses, pieces, to_units
+from .proving import find_proved_reach
+from .request import SceneData, as_held, in_unknown, kernel_poses, pieces, to_units
+from .spent import Spent
 
 # The number of a point's scan where the archive does not keep it.
 ANY_SCAN = -1
@@ -39,7 +42,8 @@ def gaps_by_scan(
     """
     poses = kernel_poses(np.asarray(pose)[None])
     margin_units = to_units(margin, "margin")
-    reach = check_request(data, avatar, poses, data.radius_units + margin_units)
+    units = data.radius_units + margin_units
+    reach = find_proved_reach(data, avatar, poses, units, effort, Spent(time.perf_counter()))
     if not len(avatar.points):
         return ScanGaps({}, True)
     nearer = Nearer(np.full(scans + 1, np.inf), np.full(scans + 1, reach.units[0]))

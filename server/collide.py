@@ -13,7 +13,9 @@ from .bounded import collide_bounded
 from .coarse import settle
 from .effort import EXACT, NO_LIMIT, Effort
 from .kernels.overlap import CLEAR, CONTACT, UNKNOWN, answer_resident, overlap_poses
-from .request import SceneData, as_held, check_request, in_unknown, kernel_poses, pieces, refuse, to_units
+from .kernels.reach import Reach
+from .proving import find_proved_reach
+from .request import SceneData, as_held, in_unknown, kernel_poses, pieces, refuse, to_units
 from .spent import Spent
 
 # An avatar up to this size is answered under the residency's lock when a request holds one pose: 20 µs for the
@@ -78,11 +80,15 @@ def collide(
         answers = _answer_at_once(data, avatar, array, other_units, begin)
         if answers is not None:
             return answers
-    reach = check_request(data, avatar, array, other_units)
-    if data.coarse is not None and len(avatar.points):
-        reach, _ = settle(data.arrays, data.coarse.arrays, avatar.arrays, array, reach)
-    verdict, counts = np.zeros(k, np.uint8), np.zeros((3, k), np.uint32)
     residency, spent = data.residency, Spent(begin)
+
+    def settled(reach: Reach) -> Reach:
+        if data.coarse is None or not len(avatar.points):
+            return reach
+        return settle(data.arrays, data.coarse.arrays, avatar.arrays, array, reach)[0]
+
+    reach = find_proved_reach(data, avatar, array, other_units, effort, spent, settled)
+    verdict, counts = np.zeros(k, np.uint8), np.zeros((3, k), np.uint32)
     # An empty avatar is clear, whatever is unknown here.
     for which, rows, part in (
         pieces(reach, residency, effort.share, effort.stop) if len(avatar.points) else ()

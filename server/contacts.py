@@ -42,7 +42,8 @@ from .kernels.contacts import Asked, Tally, gather_contacts
 from .kernels.layout import LANES
 from .kernels.overlap import STACK
 from .kernels.reach import Reach
-from .request import SceneData, as_held, check_request, in_unknown, kernel_poses, pieces, to_units
+from .proving import find_proved_reach
+from .request import SceneData, as_held, in_unknown, kernel_poses, pieces, to_units
 from .spent import Spent
 from .stop import NEVER
 
@@ -86,13 +87,13 @@ def contacts(
     limit = _checked_limit(limit)
     margin_units = to_units(margin, "margin")
     edge_units = None if cluster_distance is None else to_units(cluster_distance, "cluster_distance")
-    reach = check_request(data, avatar, array, data.radius_units + margin_units)
+    spent = Spent(begin)
+    reach = find_proved_reach(data, avatar, array, data.radius_units + margin_units, effort, spent)
     k = len(array)
     tally = Tally(
         np.zeros((3, k), np.int64), np.zeros(k, np.int64), np.zeros(k, bool), np.zeros((k, 4), np.int64)
     )
     memory = _empty_memory(limit)
-    spent = Spent(begin)
     if len(avatar.points):
         edges = _edges(reach, edge_units, data.arrays.units_per_step)
         asked = Asked(avatar.rows, edges, data.keeps_scan, limit, effort.visits, MOST_CELLS)

@@ -12,7 +12,8 @@ from .bounded import distance_bounded
 from .effort import EXACT, NO_LIMIT, Effort
 from .kernels.closest import Nearest
 from .kernels.nearest import nearest_poses
-from .request import SceneData, as_held, check_request, kernel_poses, pieces, to_units
+from .proving import find_proved_reach
+from .request import SceneData, as_held, kernel_poses, pieces, to_units
 from .signed import distance_columns, signed_from_square, unknown_gaps
 from .spent import Spent
 
@@ -35,12 +36,12 @@ def distance(
     array = kernel_poses(poses)
     reach_units = to_units(reach, "reach")
     k = len(array)
-    around = check_request(data, avatar, array, data.radius_units + reach_units)
+    residency, spent = data.residency, Spent(begin)
+    around = find_proved_reach(data, avatar, array, data.radius_units + reach_units, effort, spent)
     nearest = Nearest(
         np.full(k, -1, np.int64), np.zeros((k, 6), np.int64), np.zeros(k, np.int64), np.full(k, math.inf)
     )
     counts = np.zeros((3, k), np.uint32)
-    residency, spent = data.residency, Spent(begin)
     if len(avatar.points):
         for which, rows, part in pieces(around, residency, effort.share, effort.stop):
             if effort.stop:

@@ -5,7 +5,7 @@ archive's pose, server/posed.py), are within low to high on each axis, both incl
 
 The few voxels that a box cuts are built anew by the builder's code when the archive is opened, and their records kept
 in a temporary file without a name: a load costs what it always does, no memory is taken that nobody counts, and the
-bytes a voxel takes are known before it is loaded. Voxels that lie in a box whole, by the index, are gone unread, so
+bytes a voxel takes are known before it is loaded. Voxels whose cell lies in a box whole are gone unread, so
 however large a box, what it costs is what its borders cut; while it is built, a voxel takes 90 bytes a point. All else
 stays: the header stays the archive's, its bounds (`outside`), counts and radius with it, and so do regions of scans
 left out, which are unknown inside a box too.
@@ -17,7 +17,6 @@ import os
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -58,7 +57,7 @@ class LeftOut(Archive):
         self._file: io.FileIO | None = None
         self._end = 0
         self._anew: dict[int, _Place] = {}
-        self._corrupt: dict[int, tuple[str, tuple[Path, ...]]] = {}
+        self._corrupt: dict[int, CorruptError] = {}
         super().__init__(folder)
         try:
             self._leave_out()
@@ -76,13 +75,13 @@ class LeftOut(Archive):
         """Build anew what a box cuts, and make the index say so."""
         voxels = self.voxels.copy()
         anew: dict[int, _Place] = {}
-        corrupt: dict[int, tuple[str, tuple[Path, ...]]] = {}
+        corrupt: dict[int, CorruptError] = {}
         cut, gone = self._met()
         for row, boxes in self._telling(cut):
             try:
                 points = read_points(self, row)
             except CorruptError as error:
-                corrupt[row] = (str(error), error.paths)
+                corrupt[row] = error
                 continue
             except OSError as error:
                 raise FormatError(
@@ -111,23 +110,33 @@ class LeftOut(Archive):
     def _met(self) -> tuple[dict[int, list[NDArray[np.float64]]], NDArray[np.bool_]]:
         """The rows of voxels that boxes cut, and these; and which voxels (v,) lie in one whole.
 
-        Both by the bounds of their points in the index, which the broad phase trusts as well.
+        A box cuts a voxel by the bounds of its points in the index. What lies in a box whole is never read, so that
+        goes by the voxel's cell, which no index can make smaller (server/proof.py).
         """
-        base = self.coordinates * self.header.lattice.voxel_steps
-        low, high = (self.header.lattice.to_world(base + self.voxels[side]) for side in ("low", "high"))
-        if self._pose is not None and len(base):
-            far = max(float(np.abs(side).max()) for side in (low, high, self._pose[:3, 3]))
-            low, high = moved_boxes(self._pose, low, high)
-            low, high = low - far * _ROUNDING, high + far * _ROUNDING
+        steps = self.header.lattice.voxel_steps
+        base = self.coordinates * steps
+        low, high = self._world_boxes(base + self.voxels["low"], base + self.voxels["high"])
+        cell_low, cell_high = self._world_boxes(base, base + (steps - 1))
         whole = np.zeros(len(base), bool)
         met: dict[int, list[NDArray[np.float64]]] = {}
         for box in self._boxes:
             least, greatest = box
             meets = np.flatnonzero(((low <= greatest) & (high >= least)).all(axis=1))
-            whole[meets] |= ((low[meets] >= least) & (high[meets] <= greatest)).all(axis=1)
+            whole[meets] |= ((cell_low[meets] >= least) & (cell_high[meets] <= greatest)).all(axis=1)
             for row in meets.tolist():
                 met.setdefault(row, []).append(box)
         return {row: met[row] for row in sorted(met) if not whole[row]}, whole
+
+    def _world_boxes(
+        self, low: NDArray[np.int64], high: NDArray[np.int64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Boxes (v, 3) each [steps] as boxes that hold them in the world [m]."""
+        world = self.header.lattice.to_world(low), self.header.lattice.to_world(high)
+        if self._pose is None or not len(low):
+            return world
+        far = max(float(np.abs(side).max()) for side in (*world, self._pose[:3, 3]))
+        least, greatest = moved_boxes(self._pose, *world)
+        return least - far * _ROUNDING, greatest + far * _ROUNDING
 
     def _telling(
         self, cut: dict[int, list[NDArray[np.float64]]]
@@ -176,8 +185,8 @@ class LeftOut(Archive):
         """The frame of dataset `i` of a voxel; of one built anew that of its new record."""
         if row in self._corrupt:
             # Not read again: mended meanwhile, it would be served with the points in the boxes.
-            text, paths = self._corrupt[row]
-            raise CorruptError(text, paths)
+            error = self._corrupt[row]
+            raise type(error)(str(error), error.paths)
         place = self._anew.get(row)
         if place is None or self._file is None or self._file.closed:
             return super()._read_frame(row, i)

@@ -28,8 +28,9 @@ from .neighbourhood import Neighbourhood, User
 from .objects import objects as ask_objects
 from .policies import make_policy, prefetches
 from .prefetch import Prefetcher
+from .proof import Bounds
 from .rays import raycast
-from .request import SceneData, check_request, make_scene_data, make_scene_index, with_radius_model
+from .request import SceneData, check_request, make_scene_data, with_radius_model
 from .residency import Residency
 from .session import Walker
 from .store import Store
@@ -79,8 +80,8 @@ class Opened:
         self.store, self.number = store, number
         self.kept: dict[str, Any] = {}
         self.ended = threading.Event()
-        index, lattice = make_scene_index(store.archive), store.archive.header.lattice
-        around = Neighbourhood(index, lattice.voxel_steps, lattice.origin, lattice.step)
+        bounds, lattice = Bounds(store.archive), store.archive.header.lattice
+        around = Neighbourhood(bounds.index, lattice.voxel_steps, lattice.origin, lattice.step)
         ahead = prefetches(policy)
         coarse = _make_coarse(store, budget_bytes) if ahead else None
         if coarse is not None:
@@ -93,7 +94,7 @@ class Opened:
         # Where there is not room for all, it is for those that somebody came near.
         fill = Filling(coarse, store) if coarse is not None and coarse.holds_all else None
         self.prefetcher = Prefetcher(residency, around, ahead=ahead, idle=fill)
-        figure = make_scene_data(store.archive, residency, index, coarse)
+        figure = make_scene_data(store.archive, residency, bounds, coarse)
         data = figure if radius_model is None else with_radius_model(figure, store.archive, radius_model)
         self.data = data
 

@@ -16,6 +16,7 @@ from .coarse import Coarse
 from .kernels import placing
 from .kernels.layout import SceneArrays, block_words
 from .kernels.reach import Reach, SceneIndex, find_reach
+from .proof import Bounds
 from .residency import Held, Residency
 from .stop import NEVER, Stop, StoppedError
 
@@ -53,14 +54,15 @@ _POSE_FAULTS: dict[int, tuple[type[SolidcloudError], str]] = {
 class SceneData(NamedTuple):
     """What every question about one scene reads; made once, by `make_scene_data`.
 
-    arrays: what the kernels read.  broad: what the broad phase reads.  radius_units: of the largest sphere of a scan
-    point, exact units.  unknown: (u, 2, 3) int64, lattice boxes of scans left out; unknown_everywhere: also elsewhere.
-    keeps_scan: whether the arena holds the scan each point came from.  coarse: what is known of voxels that are not in
-    memory; None: nothing is.
+    arrays: what the kernels read.  bounds: boxes around the points of each voxel; broad: its index, which the broad
+    phase reads.  radius_units: of the largest sphere of a scan point, exact units.  unknown: (u, 2, 3) int64, lattice
+    boxes of scans left out; unknown_everywhere: also elsewhere.  keeps_scan: whether the arena holds the scan each
+    point came from.  coarse: what is known of voxels that are not in memory; None: nothing is.
     """
 
     residency: Residency
     arrays: SceneArrays
+    bounds: Bounds
     broad: SceneIndex
     radius_units: int
     unknown: NDArray[np.int64]
@@ -87,26 +89,15 @@ def to_units(metres: float, what: str) -> int:
     return round(metres * UNITS_PER_METRE)  # half to even
 
 
-def make_scene_index(archive: Archive) -> SceneIndex:
-    """What the broad phase reads of an archive."""
-    header = archive.header
-    base = archive.coordinates * header.lattice.voxel_steps
-    return SceneIndex(
-        archive.voxels["key"].astype(np.uint64),
-        base + archive.voxels["low"],
-        base + archive.voxels["high"],
-        header.low,
-        header.high,
-    )
-
-
 def make_scene_data(
-    archive: Archive, residency: Residency, index: SceneIndex | None = None, coarse: Coarse | None = None
+    archive: Archive, residency: Residency, bounds: Bounds | None = None, coarse: Coarse | None = None
 ) -> SceneData:
     """What the questions read of an archive whose voxels `residency` holds; radii are the archive's one figure.
 
-    index: `make_scene_index` of it, where somebody else has use for it too.
+    bounds: those of its voxels, where somebody else has use for them too. Loads prove them from now on.
     """
+    bounds = Bounds(archive) if bounds is None else bounds
+    residency.proved = bounds.prove
     header = archive.header
     lattice = header.lattice
     arrays = SceneArrays(
@@ -124,7 +115,8 @@ def make_scene_data(
     return SceneData(
         residency,
         arrays,
-        make_scene_index(archive) if index is None else index,
+        bounds,
+        bounds.index,
         to_units(header.radius, "radius of the archive"),
         header.unknown,
         header.unknown_everywhere,

@@ -99,6 +99,7 @@ class Residency:
     kept: rows that users stand in: they go only when a request would not fit otherwise.  owed: called when a load is
     owed to somebody who could not wait for it, see `take_owed`.  loaded: called with the row and where it is of each
     voxel that was loaded, by the thread that did, before others know of it; took: then, with the seconds it took.
+    proved: called with the row of each voxel that was loaded, before others know of it.
     misled: whether a record that was loaded has points that the index places elsewhere. Voxels are chosen by the index,
     so after that it is not known what else was not chosen.
     """
@@ -121,6 +122,7 @@ class Residency:
         self.owed: Callable[[], None] | None = None
         self.loaded: Callable[[int, NDArray[np.int64]], None] | None = None
         self.took: Callable[[float], None] | None = None
+        self.proved: Callable[[int], None] | None = None
         self.misled = False
         self._store = store
         self._sizes = [ArenaBuffer.rounded(int(size)) for size in store.sizes]
@@ -424,6 +426,8 @@ class Residency:
         begin, where, fault, corrupt = time.perf_counter(), None, "", False
         try:
             where = self._store.load(row, self.buffer.arena, self._room.offsets[row])
+            if self.proved is not None:
+                self.proved(row)
             if self.loaded is not None:
                 self.loaded(row, where)  # now, for it may go as soon as others know of it
         except CorruptError as error:

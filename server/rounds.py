@@ -8,7 +8,6 @@ hit in the first voxel loads no second one. What is held at a time stays within 
 import math
 from collections.abc import Callable
 from typing import Any
-from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,26 +17,15 @@ from ..schemas.requests import make_vectors
 from ..schemas.voxel_grid import MAX_COORDINATE, UNITS_PER_METRE
 from .effort import Effort
 from .kernels.rays import Nearest
-from .kernels.voxel_tree import Lists, VoxelTree, list_voxels, make_voxel_tree
+from .kernels.voxel_tree import Lists, VoxelTree, list_voxels
+from .proving import prove
 from .request import SceneData
-from .residency import Residency
 from .spent import Spent
 
 # Rays or points whose lists are in memory together.
 BATCH = 1 << 14
 # The same where there is a deadline, which is looked at between batches and rounds: some 10 ms of work.
 TIMED_BATCH = 1 << 11
-
-_trees: WeakKeyDictionary[Residency, VoxelTree] = WeakKeyDictionary()
-
-
-def voxel_tree(data: SceneData) -> VoxelTree:
-    """The tree over a scene's voxels, made at the first question."""
-    tree = _trees.get(data.residency)
-    if tree is None:
-        tree = make_voxel_tree(data.broad.low, data.broad.high, data.unknown)
-        _trees[data.residency] = tree
-    return tree
 
 
 def make_origins(
@@ -91,30 +79,20 @@ def look(
     """
     k = len(at_units)
     best = make_best(k)
-    capacity = 64
+    tree, said = data.bounds.trees()
     batch = BATCH if effort.deadline == math.inf else TIMED_BATCH
     for begin in range(0, k, batch):
         end = min(begin + batch, k)
         if effort.spent:
             best.unseen[begin:] = 0.0
             break
-        capacity = max(capacity, 8 * (end - begin))
         part = _part(best, begin, end)
-        directions = np.empty((0, 3)) if direction is None else direction[begin:end]
-        while True:
-            lists = Lists(
-                np.zeros(end - begin + 1, np.int64),
-                np.empty(capacity, np.int64),
-                np.empty(capacity),
-                part.unseen,
-            )
-            needed = list_voxels(
-                voxel_tree(data), at_units[begin:end], directions, direction is not None, reach_units, radius_units,
-                data.arrays.units_per_step, data.arrays.stop, lists,
-            )  # fmt: skip
-            if needed <= capacity:
-                break
-            capacity = needed
+        ways = at_units[begin:end], None if direction is None else direction[begin:end]
+        lists = _list(data, tree, *ways, reach_units, radius_units, part)
+        doubts = None
+        if data.bounds.left and not data.bounds.proved[lists.rows[: lists.starts[-1]]].all():
+            doubts = lists
+            lists = _list(data, said, *ways, reach_units, radius_units, part)
         if data.nothing_clear:
             part.unseen[:] = 0.0
         cursor = lists.starts[:-1].copy()
@@ -133,10 +111,62 @@ def look(
                 kernel(begin, end, lists, cursor, held, part)
             spent.add(found, int(looked[rows].sum()))
             looked |= held
+        if doubts is not None:
+            _settle_doubts(data, doubts, part, reach_units, effort, spent)
         best.counts[:, begin:end] = part.counts
     if data.nothing_clear:  # a load may have found the index wrong
         best.unseen[:] = 0.0
     return best
+
+
+def _list(
+    data: SceneData,
+    tree: VoxelTree,
+    at_units: NDArray[np.int64],
+    direction: NDArray[np.float64] | None,
+    reach_units: int,
+    radius_units: int,
+    part: Nearest,
+) -> Lists:
+    """List the voxels that k rays or points reach, by the boxes of a tree. The lists share `unseen` with `part`."""
+    k = len(at_units)
+    directions = np.empty((0, 3)) if direction is None else direction
+    capacity = max(64, 8 * k)
+    while True:
+        lists = Lists(
+            np.zeros(k + 1, np.int64), np.empty(capacity, np.int64), np.empty(capacity), part.unseen
+        )
+        needed = list_voxels(
+            tree, at_units, directions, direction is not None, reach_units, radius_units, data.arrays.units_per_step,
+            data.arrays.stop, lists,
+        )  # fmt: skip
+        if needed <= capacity:
+            return lists
+        capacity = needed
+
+
+def _settle_doubts(
+    data: SceneData, doubts: Lists, part: Nearest, reach_units: int, effort: Effort, spent: Spent
+) -> None:
+    """Load the voxels that the index places out of the way, where nothing was found before their cells.
+
+    doubts: what rays or points reach by proved bounds and cells. Those that cannot be read are missing: `part` says so.
+    """
+    proved = data.bounds.proved
+    found = np.where(part.square >= 0, np.sqrt(np.maximum(part.square, 0)), part.value)
+    until = np.minimum(np.minimum(found, part.unseen), reach_units)
+    ray = np.repeat(np.arange(len(until)), np.diff(doubts.starts))
+    rows, near = doubts.rows[: doubts.starts[-1]], doubts.near[: doubts.starts[-1]]
+    open_ = np.flatnonzero(~proved[rows] & (near <= until[ray]))
+    if not len(open_):
+        return
+    first = np.full(len(proved), math.inf)
+    np.minimum.at(first, rows[open_], near[open_])
+    wanted = np.unique(rows[open_])
+    prove(data, wanted[np.argsort(first[wanted], kind="stable")].tolist(), effort, spent)
+    open_ = open_[~proved[rows[open_]]]
+    np.minimum.at(part.unseen, ray[open_], near[open_])
+    np.add.at(part.counts[0], ray[open_], np.uint32(1))
 
 
 def _next_rows(

@@ -15,7 +15,8 @@ from .effort import EXACT, NO_LIMIT, Effort
 from .kernels.memory import KNOWN, make_memory
 from .kernels.walking import walk_poses, walk_resident
 from .neighbourhood import User
-from .request import SceneData, check_request, kernel_poses, refuse, to_units, with_stop
+from .proving import find_proved_reach
+from .request import SceneData, kernel_poses, refuse, to_units, with_stop
 from .spent import Spent
 from .stop import NEVER, Stop
 from .stopped_answers import ask_until_stopped
@@ -95,8 +96,9 @@ class Walker:
             answers = self._collide_at_once(data, poses, begin)
             if answers is not None:
                 return answers
-        residency = data.residency
-        reach = check_request(data, self._avatar, poses, data.radius_units + self._margin_units)
+        residency, spent = data.residency, Spent(begin)
+        units = data.radius_units + self._margin_units
+        reach = find_proved_reach(data, self._avatar, poses, units, effort, spent)
         rows = np.unique(reach.rows[: reach.starts[-1]]).tolist()
         if residency.bytes_of(rows) > residency.buffer.total_bytes:
             return self._collide_afresh(data, poses, effort)
@@ -106,9 +108,8 @@ class Walker:
                 walk_poses(
                     poses, self._avatar.arrays, data.arrays, reach, NO_LIMIT, verdict, counts, self._memory
                 )
-        if held.faults or held.late:
+        if held.faults or held.late or data.nothing_clear:
             return self._collide_afresh(data, poses, effort)
-        spent = Spent(begin)
         spent.add(held)
         return CollideAnswers(verdict, reach.outside, counts[0], counts[1], counts[2], **spent.cost(data))
 

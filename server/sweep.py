@@ -14,6 +14,7 @@ from .effort import EXACT, Effort
 from .kernels.advance import Progress, avatar_box, look_around, plan_segments, sweep_segments
 from .kernels.placing import SIMILARITY_TOLERANCE, check_poses
 from .kernels.reach import Reach
+from .proving import prove
 from .request import SceneData, as_held, kernel_poses, pieces, refuse, to_units
 from .spent import Spent
 
@@ -131,26 +132,32 @@ def sweep(
     residency, spent, box = data.residency, Spent(begin), avatar_box(avatar.arrays)
     starts, rows = np.zeros(k + 1, np.int64), np.empty(16 * k + 64, np.int64)
     which = np.arange(k)
+    asked: set[int] = set()  # rows that were loaded to prove the index
     while len(which):
-        needed = plan_segments(
-            box,
-            first,
-            last,
-            avatar.arrays,
-            scales,
-            units,
-            data.arrays,
-            data.broad,
-            which,
-            progress,
-            starts,
-            rows,
-        )
+        begun = progress.at.copy()
+        planned = box, first, last, avatar.arrays, scales, units, data.arrays
+        needed = plan_segments(*planned, data.broad, which, progress, starts, rows)
         if needed < 0:
             break
         if needed > len(rows):
             rows = np.empty(2 * needed, np.int64)
             continue
+        if data.bounds.left and not data.bounds.proved[rows[:needed]].all():
+            # By the index alone some may be out of reach, and segments are then others.
+            by_index = progress._replace(
+                at=begun.copy(), end=progress.end.copy(), speed=progress.speed.copy()
+            )
+            said_starts, said = starts.copy(), np.empty_like(rows)
+            count = plan_segments(*planned, data.bounds.said, which, by_index, said_starts, said)
+            known = _pairs(said_starts, said, len(data.broad.keys)) if 0 <= count <= len(said) else []
+            pairs = np.setdiff1d(_pairs(starts, rows, len(data.broad.keys)), known)
+            doubted = np.unique(pairs % len(data.broad.keys))
+            new = set(doubted[~data.bounds.proved[doubted]].tolist()) - asked
+            if new:
+                asked |= new
+                prove(data, sorted(new), effort, spent)
+                progress.at[:] = begun
+                continue
         progress.lower[which] = progress.end[which]
         boxes = np.empty((k, 2, 3))  # of no use here
         around = Reach(scales, units, starts, rows, boxes, outside)
@@ -200,6 +207,12 @@ def sweep(
     progress.witness[:] += origin
     answers = _answers(progress, proved, counts, outside, tolerance)
     return msgspec.structs.replace(answers, **spent.cost(data))
+
+
+def _pairs(starts: NDArray[np.int64], rows: NDArray[np.int64], voxels: int) -> NDArray[np.int64]:
+    """Motion and voxel of each row that starts (k + 1,) tells of, as one number: motion * voxels + voxel."""
+    motions = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
+    return np.asarray(motions * voxels + rows[: starts[-1]], np.int64)
 
 
 def _next_round(

@@ -14,7 +14,7 @@ from .moments import INFINITE, scan_coordinate, touches_at
 from .motion import make_motion, pose_at
 from .moving import Job, make_moving
 from .placing import largest_term, place
-from .reach import find_key
+from .reach import find_key, grid_high, grid_low
 from .stopping import stopped
 from .sweep import search
 
@@ -144,8 +144,8 @@ def _list_rows(begin, end, span, still, scene, index, rows, count):
     first, last = np.empty(3, np.int64), np.empty(3, np.int64)
     cells = 1.0
     for r in range(3):
-        least = max(min(begin[r], end[r]) - span, np.float64(index.scene_low[r]))
-        most = min(max(begin[r], end[r]) + span, np.float64(index.scene_high[r]))
+        least = max(min(begin[r], end[r]) - span, grid_low(index.scene_low[r], scene.voxel_steps))
+        most = min(max(begin[r], end[r]) + span, grid_high(index.scene_high[r], scene.voxel_steps))
         if least > most:
             return count
         first[r] = np.int64(math.floor(least / scene.voxel_steps))
@@ -212,7 +212,11 @@ def plan_segments(box, first, last, avatar, scales, units, scene, index, which, 
             span = _root_at(motion, t, avatar, scales[i], units[i], scene, pose, shift, begin)
             span = max(span, _root_at(motion, stop, avatar, scales[i], units[i], scene, pose, shift, end))
             span += _strays(motion, stop - t, scene)
-            if _enters(begin, end, span, index.scene_low, index.scene_high) < INFINITE:
+            # Outside the scene's bounds there are only cells of voxels whose own bounds are not proven.
+            if (
+                _enters(begin, end, span, index.scene_low, index.scene_high) < INFINITE
+                or _list_rows(begin, end, span, motion.speed == 0.0, scene, index, rows, count) > count
+            ):
                 if length > segment * (1.0 + 1e-9):
                     length = length * 0.5
                     continue

@@ -12,7 +12,7 @@ from ...schemas.kernels import compiling as nb
 from ...schemas.kernels.morton import morton_code
 from ...schemas.voxel_grid import KEY_BIAS
 from .compiled import borrowing
-from .reach import find_key
+from .reach import find_key, grid_high, grid_low
 
 # Of poses that look like a walk: what they scatter by, clock and place together [m], and the speeds [m/s] and
 # accelerations [m/s²] of people. The fit leans on them where poses are few or near in time, and needs no special cases.
@@ -165,8 +165,8 @@ def _cells(low, high, index, voxel_steps, first, counts):
     """
     cells = 1.0
     for k in range(3):
-        least = max(low[k], np.float64(index.scene_low[k]))
-        most = min(high[k], np.float64(index.scene_high[k]))
+        least = max(low[k], grid_low(index.scene_low[k], voxel_steps))
+        most = min(high[k], grid_high(index.scene_high[k], voxel_steps))
         if not least <= most:
             return 0.0
         first[k] = np.int64(math.floor(least / voxel_steps))

@@ -1,4 +1,4 @@
-"""The broad phase: which voxels a placed avatar could touch, from the index alone."""
+"""The broad phase: which voxels a placed avatar could touch, from boxes around their points (server/proof.py)."""
 
 import math
 from typing import NamedTuple
@@ -20,8 +20,9 @@ CELLS_AT_ONCE = 1024
 class SceneIndex(NamedTuple):
     """What the broad phase reads of a scene's v voxels.
 
-    keys: (v,) uint64, sorted.  low, high: (v, 3) int64, least and greatest lattice coordinates of a voxel's points.
-    scene_low, scene_high: (3,) int64, those of all points.
+    keys: (v,) uint64, sorted.  low, high: (v, 3) int64, least and greatest lattice coordinates of a box around a
+    voxel's points: of its cell, until its record proves what the index says.  scene_low, scene_high: (3,) int64, those
+    of all points, as the index says; they decide what lies outside, and which cells there are, and no more.
     """
 
     keys: NDArray[np.uint64]
@@ -58,6 +59,18 @@ def find_key(keys, key):
         else:
             hi = mid
     return lo if lo < keys.shape[0] and keys[lo] == key else -1
+
+
+@borrowing
+def grid_low(scene_low, voxel_steps):
+    """Lowest lattice coordinate along an axis of the cells of the grid that hold points, float64, exact."""
+    return np.float64(scene_low // voxel_steps * voxel_steps)
+
+
+@borrowing
+def grid_high(scene_high, voxel_steps):
+    """Highest lattice coordinate along an axis of the cells of the grid that hold points, float64, exact."""
+    return np.float64((scene_high // voxel_steps + 1) * voxel_steps - 1)
 
 
 @borrowing
@@ -119,8 +132,8 @@ def voxels_in_reach(poses, avatar, scene, index, reach):
             center[r] = place(m, shift, r, x, y, z) / step
             boxes[i, 0, r], boxes[i, 1, r] = center[r] - span, center[r] + span
             outside[i] |= boxes[i, 0, r] < scene_low[r] or boxes[i, 1, r] > scene_high[r]
-            least = max(boxes[i, 0, r], np.float64(scene_low[r]))
-            most = min(boxes[i, 1, r], np.float64(scene_high[r]))
+            least = max(boxes[i, 0, r], grid_low(scene_low[r], voxel_steps))
+            most = min(boxes[i, 1, r], grid_high(scene_high[r], voxel_steps))
             first[r] = np.int64(math.floor(least / voxel_steps))
             last[r] = np.int64(math.floor(most / voxel_steps))
             cells *= max(0.0, np.float64(last[r] - first[r] + 1)) if least <= most else 0.0

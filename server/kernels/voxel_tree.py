@@ -59,6 +59,28 @@ def make_voxel_tree(low: NDArray[np.int64], high: NDArray[np.int64], unknown: ND
 
 
 @nb.njit(nogil=True, cache=True)
+def tighten(tree, row, low, high):
+    """Make the box of one voxel smaller, and the boxes that hold it, but for the one that holds all.
+
+    low, high: (3,) int64 [steps], inside the voxel's box. Who reads the tree meanwhile reads boxes that hold
+    the points. The box that holds all stays, and with it the slack of `list_voxels`.
+    """
+    for r in range(3):
+        tree.low[row, r], tree.high[row, r] = low[r], high[r]
+    number = row
+    for level in range(1, tree.levels.shape[0] - 2):
+        number //= FAN
+        begin = tree.levels[level - 1] + number * FAN
+        end = min(begin + FAN, tree.levels[level])
+        for r in range(3):
+            least, most = np.inf, -np.inf
+            for child in range(begin, end):
+                least, most = min(least, tree.low[child, r]), max(most, tree.high[child, r])
+            tree.low[tree.levels[level] + number, r] = least
+            tree.high[tree.levels[level] + number, r] = most
+
+
+@nb.njit(nogil=True, cache=True)
 def _enter(at, direction, low, high, grow, limit):
     """Where a ray enters the box [low, high] grown by `grow`, 0 when it starts inside, inf when not before `limit`."""
     first, last = 0.0, limit

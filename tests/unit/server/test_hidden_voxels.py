@@ -1,0 +1,155 @@
+"""An index that hides voxels: bounds smaller than their points, which no question would ever make the server read."""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cases
+import numpy as np
+import pytest
+import scans
+from forged import Columns, forge
+from solidcloud.schemas.answers import Verdict
+from solidcloud.schemas.archive import Archive
+from solidcloud.schemas.voxel_grid import voxel_coordinates
+from solidcloud.server.scene import Scene
+
+BALL = np.zeros((1, 3))
+RADIUS = 0.001
+
+
+class Hidden(NamedTuple):
+    """An archive whose index says of every voxel that its points are at one place.
+
+    hidden: points (n, 3) [m], of each voxel the one farthest from that place.  rows: (n,) of the index, of each.
+    """
+
+    folder: Path
+    hidden: np.ndarray
+    rows: np.ndarray
+
+
+def points_of(archive: Archive, row: int) -> np.ndarray:
+    """The points of a voxel (n, 3) [voxel steps]."""
+    from solidcloud.builder.radius import voxel_points
+
+    return voxel_points(*archive.read_voxel(row)).astype(np.int64)
+
+
+def shrink(folder: Path, chosen: Callable[[int], bool]) -> Hidden:
+    """Forge an index: voxels of the rows that are chosen shrink to one of their points."""
+    hidden, rows, places = [], [], {}
+    with Archive(folder) as archive:
+        steps = archive.header.lattice.voxel_steps
+        for row in range(len(archive.voxels)):
+            local = points_of(archive, row)
+            far = np.argmax(np.abs(local - local[0]).max(axis=1))
+            if not chosen(row) or np.abs(local[far] - local[0]).max() < 300:
+                continue
+            places[row] = local[0]
+            hidden.append(archive.header.lattice.to_world(local[far] + archive.coordinates[row] * steps))
+            rows.append(row)
+
+    def change(columns: Columns) -> None:
+        voxels = columns["voxels"]
+        for row, place in places.items():
+            voxels["low"][row] = voxels["high"][row] = place
+        base = voxel_coordinates(voxels["key"]) * int(columns["voxel_steps"][0])
+        columns["bounds"][0] = (base + voxels["low"]).min(axis=0)
+        columns["bounds"][1] = (base + voxels["high"]).max(axis=0)
+
+    forge(folder, change)
+    return Hidden(folder, np.array(hidden).reshape(-1, 3), np.array(rows))
+
+
+@pytest.fixture(scope="module")
+def every(tmp_path_factory: pytest.TempPathFactory) -> Hidden:
+    """An archive all of whose voxels are hidden."""
+    folder = tmp_path_factory.mktemp("hidden")
+    found = shrink(cases.build(folder, scans.make_scan("noise", 3, 2000)).archive, lambda _: True)
+    assert len(found.rows) > 5
+    return found
+
+
+def poses_at(places: np.ndarray) -> np.ndarray:
+    """Poses (n, 4, 4) at some places."""
+    poses = np.tile(np.eye(4), (len(places), 1, 1))
+    poses[:, :3, 3] = places
+    return poses
+
+
+def walked(scene: Scene, at: np.ndarray) -> Any:
+    """The answers of a walker that has come from where it is clear."""
+    walker = scene.walker("ball")
+    return [walker.collide(poses_at(at + away)) for away in (1e3, 0.0)][1]
+
+
+OneQuestion = Callable[[Scene, np.ndarray], Any]
+QUESTIONS: dict[str, OneQuestion] = {
+    "collide": lambda s, at: s.collide("ball", poses_at(at)),
+    "collide in the dark": lambda s, at: s.collide("ball", poses_at(at), budget_ms=0.0),
+    "collide bounded": lambda s, at: s.collide("ball", poses_at(at), budget_visits=1 << 30),
+    "walker": walked,
+    "distance": lambda s, at: s.distance("ball", poses_at(at), RADIUS),
+    "distance far": lambda s, at: s.distance("ball", poses_at(at), 0.1),
+    "distance bounded": lambda s, at: s.distance("ball", poses_at(at), RADIUS, budget_visits=1 << 30),
+    "contacts": lambda s, at: s.contacts("ball", poses_at(at)),
+    "sweep": lambda s, at: s.sweep("ball", poses_at(at), poses_at(at + 1e-4)),
+    "sweep from afar": lambda s, at: s.sweep("ball", poses_at(at + 5.0), poses_at(at)),
+    "sweep in place": lambda s, at: s.sweep("ball", poses_at(at), poses_at(at)),
+    "raycast": lambda s, at: s.raycast(at, np.tile([1.0, 0.0, 0.0], (len(at), 1)), RADIUS),
+    "raycast from afar": lambda s, at: s.raycast(at - [9.0, 0, 0], np.tile([1.0, 0, 0], (len(at), 1)), 10.0),
+    "within": lambda s, at: s.within(at, RADIUS),
+    "within in the dark": lambda s, at: s.within(at, RADIUS, budget_ms=0.0),
+    "objects": lambda s, at: s.objects([("ball", pose) for pose in poses_at(at)]),
+}
+
+
+@pytest.fixture(params=["lru", "lru+prefetch"])
+def opened(request: pytest.FixtureRequest) -> Callable[[Path], Scene]:
+    """Open a scene with an avatar of one point."""
+
+    def open_(folder: Path, **options: Any) -> Scene:
+        scene = Scene.open(folder, policy=request.param, **options)
+        scene.add_avatar("ball", BALL, RADIUS)
+        return scene
+
+    return open_
+
+
+@pytest.mark.parametrize("name", QUESTIONS)
+def test_no_hidden_voxel_is_clear(name: str, every: Hidden, opened: Callable[[Path], Scene]) -> None:
+    for place in every.hidden:
+        with opened(every.folder) as scene:
+            answers = QUESTIONS[name](scene, place[None])
+            assert (answers.verdict != Verdict.CLEAR).all(), place
+            if "dark" not in name:
+                assert scene.residency.misled
+    with opened(every.folder) as scene:
+        assert (QUESTIONS[name](scene, every.hidden).verdict != Verdict.CLEAR).all()
+
+
+def test_a_path_is_clear_of_no_hidden_voxel(every: Hidden) -> None:
+    for place in every.hidden:
+        with Scene.open(every.folder) as scene:
+            scene.add_avatar("ball", BALL, RADIUS)
+            parts = list(scene.path("ball", poses_at(np.linspace(place + 5.0, place, 40))))
+            assert (parts[-1].verdict[-1:] != Verdict.CLEAR).all()
+
+
+@pytest.mark.parametrize("name", ["collide", "distance", "sweep", "raycast", "within"])
+def test_one_hidden_voxel_among_others_is_not_clear(name: str, tmp_path: Path) -> None:
+    """In turn: an archive in which one voxel alone is hidden, asked from afar first."""
+    points = scans.make_scan("noise", 3, 2000)
+    hidden = 0
+    for number in range(0, 40, 5):
+        case = tmp_path / str(number)
+        case.mkdir()
+        found = shrink(cases.build(case, points).archive, lambda row, number=number: row == number)
+        for place in found.hidden:
+            with Scene.open(found.folder) as scene:
+                scene.add_avatar("ball", BALL, RADIUS)
+                assert (QUESTIONS[name](scene, place[None] + 50.0).verdict == Verdict.CLEAR).all()
+                assert (QUESTIONS[name](scene, place[None]).verdict != Verdict.CLEAR).all()
+                hidden += 1
+    assert hidden > 2

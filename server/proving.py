@@ -54,4 +54,6 @@ def find_proved_reach(
     if not doubted:
         return reach
     prove(data, doubted, effort, spent)
-    return settled(check_request(data, avatar, poses, other_units))
+    reach = settled(check_request(data, avatar, poses, other_units))
+    spent.loaded += len(np.intersect1d(doubted, reach.rows[: reach.starts[-1]]))
+    return reach

@@ -112,7 +112,7 @@ def look(
             spent.add(found, int(looked[rows].sum()))
             looked |= held
         if doubts is not None:
-            _settle_doubts(data, doubts, part, reach_units, effort, spent)
+            _settle_doubts(data, doubts, lists, part, reach_units, effort, spent)
         best.counts[:, begin:end] = part.counts
     if data.nothing_clear:  # a load may have found the index wrong
         best.unseen[:] = 0.0
@@ -146,13 +146,20 @@ def _list(
 
 
 def _settle_doubts(
-    data: SceneData, doubts: Lists, part: Nearest, reach_units: int, effort: Effort, spent: Spent
+    data: SceneData,
+    doubts: Lists,
+    lists: Lists,
+    part: Nearest,
+    reach_units: int,
+    effort: Effort,
+    spent: Spent,
 ) -> None:
     """Load the voxels that the index places out of the way, where nothing was found before their cells.
 
-    doubts: what rays or points reach by proved bounds and cells. Those that cannot be read are missing: `part` says so.
+    doubts: what rays or points reach by proved bounds and cells.  lists: by the index, and looked at. Voxels that
+    cannot be read are missing: `part` says so.
     """
-    proved = data.bounds.proved
+    proved, v = data.bounds.proved, len(data.bounds.proved)
     found = np.where(part.square >= 0, np.sqrt(np.maximum(part.square, 0)), part.value)
     until = np.minimum(np.minimum(found, part.unseen), reach_units)
     ray = np.repeat(np.arange(len(until)), np.diff(doubts.starts))
@@ -166,6 +173,9 @@ def _settle_doubts(
     prove(data, wanted[np.argsort(first[wanted], kind="stable")].tolist(), effort, spent)
     open_ = open_[~proved[rows[open_]]]
     np.minimum.at(part.unseen, ray[open_], near[open_])
+    # Those that the index has in reach were counted when they were looked at.
+    known = np.repeat(np.arange(len(until)), np.diff(lists.starts)) * v + lists.rows[: lists.starts[-1]]
+    open_ = open_[~np.isin(ray[open_] * v + rows[open_], known)]
     np.add.at(part.counts[0], ray[open_], np.uint32(1))
 
 

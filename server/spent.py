@@ -12,19 +12,21 @@ from .residency import Held
 class Spent:
     """A request that began at `begin`, and what it took since. Not thread-safe."""
 
-    __slots__ = ("begin", "faults", "hits", "late", "misses", "waited")
+    __slots__ = ("begin", "faults", "hits", "late", "loaded", "misses", "waited")
 
     def __init__(self, begin: float) -> None:
         """begin: on time.perf_counter()'s clock [s]."""
         self.begin = begin
         self.hits = self.misses = 0
+        self.loaded = 0  # voxels of holds to come that the request itself has loaded: they are no hits
         self.waited = 0.0
         self.faults: dict[str, None] = {}
         self.late: dict[int, None] = {}
 
     def add(self, held: Held, again: int = 0) -> None:
         """One more hold. again: of its hits, those of voxels that the request has held before."""
-        self.hits += max(0, held.hits - again)
+        found = held.hits - again - self.loaded
+        self.hits, self.loaded = self.hits + max(0, found), max(0, -found)
         self.misses += held.misses
         self.waited += held.waited
         self.faults.update(dict.fromkeys(held.faults))

@@ -1,6 +1,6 @@
 """An index that hides voxels: bounds smaller than their points, which no question would ever make the server read."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 

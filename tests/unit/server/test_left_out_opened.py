@@ -137,8 +137,9 @@ def test_voxels_that_lie_in_a_box_whole_are_not_read(
         return read_points(archive, row)
 
     with Archive(whole) as before:
+        steps = before.header.lattice.voxel_steps
         bounds = before.header.lattice.to_world(
-            np.stack([before.voxels["low"], before.voxels["high"]])
+            np.stack([np.zeros_like(before.coordinates), np.full_like(before.coordinates, steps - 1)])
             + before.coordinates * before.header.lattice.voxel_steps
         )
         every = np.concatenate(
@@ -153,14 +154,14 @@ def test_voxels_that_lie_in_a_box_whole_are_not_read(
     monkeypatch.setattr(left_out, "read_points", counted)
     if pose is not None:
         middle = moved(pose, np.array([[0.8, 0.8, 0.8]]))[0]
-        low, high = tuple((middle - 0.7).tolist()), tuple((middle + 0.7).tolist())
+        low, high = tuple((middle - 0.8).tolist()), tuple((middle + 0.8).tolist())
     # Another box cuts what lies in the first whole.
     middle = np.mean([low, high], axis=0) if posed else np.full(3, 0.75)
     with LeftOut(whole, [(low, high), (middle, middle + 0.01)], pose) as archive:
         rows = archive.voxels["rows"][:, 2].sum()
     world = every if pose is None else moved(pose, every)
     assert rows == (~in_boxes(world, (ThroughBox("box", low, high),))).sum()
-    # Of eight corners all in the box, a voxel's points are.
+    # Where a cell's eight corners are in the box, so are its points, whatever the index says of them.
     corners = np.array([bounds[[i & 1, i >> 1 & 1, i >> 2], :, [0, 1, 2]].T for i in range(8)])
     carried = corners if pose is None else moved(pose, corners.reshape(-1, 3)).reshape(corners.shape)
     inside = ((carried >= low) & (carried <= high)).all(axis=(0, 2))

@@ -75,8 +75,7 @@ class Bounds:
         reach: of `index`. That a row is left out here costs some node visits; it is looked at all the same.
         """
         rows = reach.rows[: reach.starts[-1]]
-        at = np.flatnonzero(~self.proved[rows]) if self.left else []
-        if not len(at):
+        if not self.left or not len(at := np.flatnonzero(~self.proved[rows])):
             return []
         pose = np.searchsorted(reach.starts, at, side="right") - 1
         center, span = reach.boxes.mean(axis=1)[pose], (reach.boxes[:, 1] - reach.boxes[:, 0])[pose, 0] / 2

@@ -149,9 +149,10 @@ def sweep(
             )
             said_starts, said = starts.copy(), np.empty_like(rows)
             count = plan_segments(*planned, data.bounds.said, which, by_index, said_starts, said)
-            known = _pairs(said_starts, said, len(data.broad.keys)) if 0 <= count <= len(said) else []
-            pairs = np.setdiff1d(_pairs(starts, rows, len(data.broad.keys)), known)
-            doubted = np.unique(pairs % len(data.broad.keys))
+            if not 0 <= count <= len(said):
+                said_starts[:] = 0
+            v = len(data.broad.keys)
+            doubted = np.unique(np.setdiff1d(_pairs(starts, rows, v), _pairs(said_starts, said, v)) % v)
             new = set(doubted[~data.bounds.proved[doubted]].tolist()) - asked
             if new:
                 asked |= new

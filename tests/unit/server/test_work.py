@@ -47,7 +47,9 @@ def test_answers_and_work_are_what_they_were(
 def test_every_question_is_kept_and_decides_both_ways() -> None:
     assert set(GOLDEN) == {f"{question}, {kind}" for question in work.QUESTIONS for kind in work.KINDS}
     for name, kept in GOLDEN.items():
-        assert {0, 1} <= {verdict for says in kept["verdicts"] for verdict in says}, name
+        found = {verdict for says in kept["verdicts"] for verdict in says}
+        # Of voxels that cannot be read the whole cells are unknown: hardly a pose is clear.
+        assert 1 in found and (0 in found or (name.endswith("broken") and 2 in found)), name
 
 
 @pytest.mark.parametrize("kind", ["fine", "flat"])

@@ -1,7 +1,9 @@
 """An index that hides voxels: bounds smaller than their points, which no question would ever make the server read."""
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import cases
@@ -12,7 +14,16 @@ from forged import Columns, forge
 from solidcloud.schemas.answers import Verdict
 from solidcloud.schemas.archive import Archive
 from solidcloud.schemas.voxel_grid import voxel_coordinates
+from solidcloud.server.avatar import make_avatar
+from solidcloud.server.collide import collide
+from solidcloud.server.effort import EXACT
+from solidcloud.server.left_out import LeftOut
+from solidcloud.server.near import near
+from solidcloud.server.probe import Probe
+from solidcloud.server.request import make_scene_data
+from solidcloud.server.residency import Residency
 from solidcloud.server.scene import Scene
+from solidcloud.server.store import Store
 
 BALL = np.zeros((1, 3))
 RADIUS = 0.001
@@ -21,12 +32,12 @@ RADIUS = 0.001
 class Hidden(NamedTuple):
     """An archive whose index says of every voxel that its points are at one place.
 
-    hidden: points (n, 3) [m], of each voxel the one farthest from that place.  rows: (n,) of the index, of each.
+    hidden: points (n, 3) [m], of each voxel the one farthest from that place.  said: (n, 3) [m], that place.
     """
 
     folder: Path
     hidden: np.ndarray
-    rows: np.ndarray
+    said: np.ndarray
 
 
 def points_of(archive: Archive, row: int) -> np.ndarray:
@@ -38,7 +49,7 @@ def points_of(archive: Archive, row: int) -> np.ndarray:
 
 def shrink(folder: Path, chosen: Callable[[int], bool]) -> Hidden:
     """Forge an index: voxels of the rows that are chosen shrink to one of their points."""
-    hidden, rows, places = [], [], {}
+    hidden, said, places = [], [], {}
     with Archive(folder) as archive:
         steps = archive.header.lattice.voxel_steps
         for row in range(len(archive.voxels)):
@@ -47,8 +58,8 @@ def shrink(folder: Path, chosen: Callable[[int], bool]) -> Hidden:
             if not chosen(row) or np.abs(local[far] - local[0]).max() < 300:
                 continue
             places[row] = local[0]
-            hidden.append(archive.header.lattice.to_world(local[far] + archive.coordinates[row] * steps))
-            rows.append(row)
+            for found, place in ((hidden, local[far]), (said, local[0])):
+                found.append(archive.header.lattice.to_world(place + archive.coordinates[row] * steps))
 
     def change(columns: Columns) -> None:
         voxels = columns["voxels"]
@@ -59,7 +70,7 @@ def shrink(folder: Path, chosen: Callable[[int], bool]) -> Hidden:
         columns["bounds"][1] = (base + voxels["high"]).max(axis=0)
 
     forge(folder, change)
-    return Hidden(folder, np.array(hidden).reshape(-1, 3), np.array(rows))
+    return Hidden(folder, np.array(hidden).reshape(-1, 3), np.array(said).reshape(-1, 3))
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +78,7 @@ def every(tmp_path_factory: pytest.TempPathFactory) -> Hidden:
     """An archive all of whose voxels are hidden."""
     folder = tmp_path_factory.mktemp("hidden")
     found = shrink(cases.build(folder, scans.make_scan("noise", 3, 2000)).archive, lambda _: True)
-    assert len(found.rows) > 5
+    assert len(found.hidden) > 5
     return found
 
 
@@ -82,6 +93,22 @@ def walked(scene: Scene, at: np.ndarray) -> Any:
     """The answers of a walker that has come from where it is clear."""
     walker = scene.walker("ball")
     return [walker.collide(poses_at(at + away)) for away in (1e3, 0.0)][1]
+
+
+def probed(scene: Scene, at: np.ndarray, question: str) -> Any:
+    """What a frame of a simulation asks about one avatar, pose by pose."""
+    probe, data = Probe(scene.avatar("ball", "")), scene._data
+    verdicts = []
+    for pose in poses_at(at):
+        if question == "collide":
+            verdicts.append(probe.collide(data, pose, EXACT)[0])
+        elif question == "sweep":
+            before = pose.copy()
+            before[:3, 3] += 0.3
+            verdicts.append(probe.sweep(data, before, pose, 1e-6, EXACT).verdict)
+        else:
+            verdicts.append(near(data, scene.avatar("ball", ""), pose, 0.05).verdict[0])
+    return SimpleNamespace(verdict=np.array(verdicts))
 
 
 OneQuestion = Callable[[Scene, np.ndarray], Any]
@@ -101,6 +128,9 @@ QUESTIONS: dict[str, OneQuestion] = {
     "raycast from afar": lambda s, at: s.raycast(at - [9.0, 0, 0], np.tile([1.0, 0, 0], (len(at), 1)), 10.0),
     "within": lambda s, at: s.within(at, RADIUS),
     "within in the dark": lambda s, at: s.within(at, RADIUS, budget_ms=0.0),
+    "frame, collide": lambda s, at: probed(s, at, "collide"),
+    "frame, sweep": lambda s, at: probed(s, at, "sweep"),
+    "frame, distance": lambda s, at: probed(s, at, "distance"),
     "objects": lambda s, at: s.objects([("ball", pose) for pose in poses_at(at)]),
 }
 
@@ -153,3 +183,15 @@ def test_one_hidden_voxel_among_others_is_not_clear(name: str, tmp_path: Path) -
                 assert (QUESTIONS[name](scene, place[None]).verdict != Verdict.CLEAR).all()
                 hidden += 1
     assert hidden > 2
+
+
+def test_a_box_that_is_passed_through_takes_no_voxel_whole_that_the_index_places_in_it(every: Hidden) -> None:
+    for place, said in list(zip(every.hidden, every.said, strict=True))[:8]:
+        boxes = [np.stack([said - 0.001, said + 0.001])]
+        store = Store(every.folder, partial(LeftOut, boxes=boxes))
+        try:
+            data = make_scene_data(store.archive, Residency(store, 1 << 26))
+            answers = collide(data, make_avatar(BALL, RADIUS), poses_at(place[None]))
+            assert answers.verdict.tolist() == [Verdict.UNKNOWN] and data.residency.misled
+        finally:
+            store.close()

@@ -61,6 +61,11 @@ def _part(best: Nearest, begin: int, end: int) -> Nearest:
     )
 
 
+def _forget(best: Nearest) -> None:
+    """Make it what `make_best` makes, but for what was not seen."""
+    best.value[:], best.square[:], best.lattice[:], best.counts[:] = np.inf, -1, 0, 0
+
+
 def look(
     data: SceneData,
     at_units: NDArray[np.int64],
@@ -90,9 +95,6 @@ def look(
         ways = at_units[begin:end], None if direction is None else direction[begin:end]
         lists = _list(data, tree, *ways, reach_units, radius_units, part)
         doubts = None
-        if data.bounds.left and not data.bounds.proved[lists.rows[: lists.starts[-1]]].all():
-            doubts = lists
-            lists = _list(data, said, *ways, reach_units, radius_units, part)
         if data.nothing_clear:
             part.unseen[:] = 0.0
         cursor = lists.starts[:-1].copy()
@@ -102,6 +104,15 @@ def look(
                 part.unseen[open_] = np.minimum(part.unseen[open_], lists.near[cursor[open_]])
                 break
             rows = _next_rows(data, lists, cursor, open_)
+            if doubts is None and data.bounds.left and not data.bounds.proved[rows].all():
+                # By the index alone they may be out of the way: afresh by that, and what it hides at the end.
+                doubts = lists
+                _forget(part)
+                lists = _list(data, said, *ways, reach_units, radius_units, part)
+                if data.nothing_clear:
+                    part.unseen[:] = 0.0
+                cursor = lists.starts[:-1].copy()
+                continue
             held = np.zeros(len(looked), bool)
             held[rows] = True
             with data.residency.hold(

@@ -29,7 +29,7 @@ def prove(data: SceneData, rows: Sequence[int], effort: Effort, spent: Spent) ->
         if part and (row < 0 or residency.bytes_of([*part, row]) > budget):
             if effort.spent:
                 return
-            with residency.hold(part, effort.loads_until(), scan=True) as held:
+            with residency.hold(part, effort.loads_until(), scan=True, stop=effort.stop) as held:
                 pass
             spent.add(held._replace(late=()))
             part = []

@@ -37,6 +37,8 @@ log = logging.getLogger(__name__)
 _KEPT = 1024
 # Numbers beyond this are not followed: a wish's is an int64 in most programs.
 _MOST_NUMBER = 1 << 62
+# How long a wish may be without a state before it is sent once more, and how long it is worth sending [s].
+_PATIENCE, _MOST_PATIENCE = 1.0, 5.0
 # Refusals in a row that a server is told of an avatar again for: one that refuses it all the same is at fault.
 _MOST_AGAIN = 100
 
@@ -96,6 +98,9 @@ class ClientSession:
         self._aim: Any = None  # the pose last wished, until a velocity goes on from a state
         self._time = 0.0
         self._wished = -math.inf  # when, on the monotonic clock
+        self._last: Wish | None = None  # as it was sent
+        self._sent = -math.inf  # when, for the first time
+        self._answered = 0  # the number of the last wish that the server said something of
         self._changed = threading.Condition()
         self._kept: deque[State | SolidcloudError] = deque(maxlen=_KEPT)
         self._latest: State | None = None
@@ -156,7 +161,8 @@ class ClientSession:
         Returns the number of the wish, which its state has as `seq`. turn: with a velocity, about the scene's up axis
         [rad/s].  objects: poses of the scene's objects that this user moves.  time: of the wish, on a clock of the
         caller's that does not go back [s]; None: this process's. What no server hears is lost, and nothing says so but
-        that no states come: wish on. BadRequestError: what is no wish, or the session is closed.
+        that no states come: wish on. The last wish is sent again each second, for 5 s at most, until a state of it
+        comes. BadRequestError: what is no wish, or the session is closed.
         """
         array = np.empty((0, 4, 4)) if pose is None else np.asarray(pose, np.float64).reshape(-1, 4, 4)
         speed = None if velocity is None else tuple(float(part) for part in velocity)
@@ -172,7 +178,7 @@ class ClientSession:
                 objects=objects or {},
             )
             self._publish(wish)
-            self._time = wish.time
+            self._sent, self._time = self._wished, wish.time
             if len(wish.pose):
                 self._aim = wish.pose
             elif self._latest is not None:
@@ -184,7 +190,19 @@ class ClientSession:
         if self._stack is None:
             raise BadRequestError("this session is closed: wish inside `with client.session(...) as session`")
         self._publisher.put(encode(wish))
-        self._wished = monotonic()
+        self._wished, self._last = monotonic(), wish
+
+    def _wish_again(self) -> None:
+        """Send the last wish once more where nothing came of it: it, or its state, was dropped on the way."""
+        with self._publishing:
+            last, now = self._last, monotonic()
+            if last is None or last.seq <= self._answered or self._stack is None:
+                return
+            if now - self._wished >= _PATIENCE and now - self._sent < _MOST_PATIENCE:
+                try:
+                    self._publish(last)
+                except zenoh.ZError as error:  # the client was closed before
+                    log.debug("wishing again: %s", error)
 
     def latest(self) -> Latest | None:
         """The last state that came, and its age; None: none came yet. Raises, once, what the server refused since."""
@@ -250,13 +268,18 @@ class ClientSession:
                     self._keep(said)
             if unknown is not None:
                 self._begin_again(unknown)
+            self._wish_again()
 
     def _keep(self, said: State | SolidcloudError) -> None:
         """Have what the server says where it is asked for."""
         with self._changed:
             if isinstance(said, SolidcloudError):
                 self._error = said
+                self._answered = 0 if self._last is None else self._last.seq
+            elif self._latest is not None and _same(said, self._latest):
+                return  # sent once more
             else:
+                self._answered = max(self._answered, said.seq)
                 self._latest, self._error = said, None
                 self._numbers.follow(said.seq)
                 self._when, self._again = monotonic(), 0
@@ -289,6 +312,11 @@ class ClientSession:
         if self._aim is not None:
             return self._aim
         return None if self._latest is None else self._latest.pose.copy()
+
+
+def _same(one: State, other: State) -> bool:
+    """Return whether two states are of the same frame of the same wish."""
+    return (one.seq, one.time, one.frame) == (other.seq, other.time, other.frame)
 
 
 def _error_of(payload: bytes) -> SolidcloudError:

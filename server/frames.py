@@ -66,10 +66,10 @@ class Mailboxes:
         self._closed = False
         self._changed = threading.Condition()
 
-    def put(self, user: User, wish: Wish, encoding: str = MSGPACK) -> None:
-        """A wish came: it takes the place of one that waits. One no newer than the latest is dropped, and counted.
+    def put(self, user: User, wish: Wish, encoding: str = MSGPACK) -> bool:
+        """Take a wish in: it replaces one that waits. One that is older than the latest is dropped, and counted.
 
-        BusyError: no room for one more user.
+        Return whether it is the latest one once more. Raise BusyError where there is no room for one more user.
         """
         with self._changed:
             box = self._boxes.get(user)
@@ -81,14 +81,17 @@ class Mailboxes:
                         f"{len(self._boxes)} users wish to walk this scene, {own} of this client: come again later"
                     )
                 box = self._boxes[user] = _Box()
-            if wish.seq <= box.seq:
+            if wish.seq == box.seq:
+                return True
+            if wish.seq < box.seq:
                 box.late += 1
-                return
+                return False
             if box.wish is not None:
                 box.late += 1
             box.seq, box.wish, box.encoding = wish.seq, wish, encoding
             self._waiting[user] = None
             self._changed.notify()
+            return False
 
     def leave(self, user: User) -> None:
         """A user leaves; what it wished before is dropped. Who has no mailbox is not there."""
@@ -166,15 +169,16 @@ class Frames:
         self.most_users = simulation.most_users
         self._boxes = Mailboxes(_BOXES_A_USER * simulation.most_users)
 
-    def wish(self, user: User, payload: bytes, encoding: str | None) -> None:
-        """A wish came. What is none is refused at once."""
+    def wish(self, user: User, payload: bytes, encoding: str | None) -> bool:
+        """Take a wish in, or refuse it at once. Return whether it is the user's latest one once more."""
         try:
             stated = wire_encoding(encoding)
             if len(payload) > _MOST_BYTES:
                 raise TooLargeError(f"a wish of {len(payload)} bytes: at most {_MOST_BYTES}")
-            self._boxes.put(user, decode_request(Wish, payload, stated), stated)
+            return self._boxes.put(user, decode_request(Wish, payload, stated), stated)
         except SolidcloudError as error:
             self._send(user, error, encoding)
+            return False
 
     def leave(self, user: User) -> None:
         """A user leaves the scene."""

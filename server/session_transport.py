@@ -129,5 +129,6 @@ class SceneSessions:
             return
         if sample.kind == zenoh.SampleKind.DELETE:
             self._frames.leave(user)
-        else:
-            self._frames.wish(user, sample.payload.to_bytes(), str(sample.encoding))
+            self._streams.forget(user)
+        elif self._frames.wish(user, sample.payload.to_bytes(), str(sample.encoding)):
+            self._streams.send_again(user)

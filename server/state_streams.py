@@ -7,7 +7,6 @@ wildcard includes every client's key, and would tell its holder the ids in them.
 import threading
 import time
 from collections import OrderedDict
-from typing import Any
 
 import zenoh
 
@@ -23,17 +22,22 @@ _KEPT_SECONDS = 5.0
 
 
 class _Stream:
-    """One open query. used: when it was opened or last replied to, on the monotonic clock [s].  number: of replies."""
+    """One open query. used: when it was opened or last replied to, on the monotonic clock [s].  number: of replies.
 
-    __slots__ = ("_key", "_sealer", "number", "query", "used")
+    last: the answer sent last.
+    """
+
+    __slots__ = ("_key", "_sealer", "last", "number", "query", "used")
 
     def __init__(self, query: zenoh.Query, sealer: Sealer | None) -> None:
         self.query, self._key, self._sealer = query, query.key_expr, sealer
         self.used = time.monotonic()
         self.number = 0
+        self.last: Answer | None = None
 
     def reply(self, answer: Answer) -> bool:
         """Send one reply; return False where the client is gone."""
+        self.last = answer
         sent = send_reply(self.query, self._key, answer, self._sealer, self.number)
         self.number += 1
         return sent
@@ -58,8 +62,9 @@ class StateStreams:
         with self._lock:
             if self._closed or not self._make_room(user):
                 return False
-            self._end(user)
+            before = self._end(user)
             self._streams[user] = stream = _Stream(query, sealer)
+            stream.last = None if before is None else before.last
             when, answer = self._kept.pop(user, (0.0, None))
             if answer is not None and time.monotonic() - when < _KEPT_SECONDS:
                 stream.reply(answer)
@@ -76,6 +81,19 @@ class StateStreams:
             self._streams.move_to_end(user)
             if not stream.reply(answer):
                 self._end(user)
+
+    def send_again(self, user: User) -> None:
+        """Send what was said to a user last once more: it may have been dropped on the way."""
+        with self._lock:
+            stream = self._streams.get(user)
+            if stream is not None and stream.last is not None and not stream.reply(stream.last):
+                self._end(user)
+
+    def forget(self, user: User) -> None:
+        """Forget what was said to a user, who left."""
+        with self._lock:
+            if (stream := self._streams.get(user)) is not None:
+                stream.last = None
 
     def end_client(self, client: str) -> None:
         """End the queries of a client that is gone."""
@@ -115,8 +133,9 @@ class StateStreams:
         if len(self._kept) > self._most:
             self._kept.popitem(last=False)
 
-    def _end(self, user: User) -> None:
-        """Tell a client that no more replies come to its query."""
-        stream: Any = self._streams.pop(user, None)
+    def _end(self, user: User) -> _Stream | None:
+        """Tell a client that no more replies come to its query. Return what was its stream."""
+        stream = self._streams.pop(user, None)
         if stream is not None:
             stream.query.drop()
+        return stream

@@ -19,6 +19,7 @@ from solidcloud.schemas.errors import (
 )
 from solidcloud.schemas.messages import ErrorReply
 from solidcloud.schemas.moves import State, Wish
+from solidcloud.server import state_streams
 from solidcloud.server.app import serving
 from solidcloud.server.client import Client
 from solidcloud.server.config import ServerConfig
@@ -329,6 +330,54 @@ def test_a_large_number_locks_nobody_out(served, endpoint):
         with client.session("al") as session:
             state = session.wait(session.wish(pose_at(0.0, 3.0)), DEADLINE)
             assert (state.seq, state.pose[0, 2, 3]) == (1, 3.0)
+
+
+@pytest.mark.parametrize("lost", [1, 2])
+def test_a_state_that_was_dropped_is_sent_once_more(served, endpoint, monkeypatch, lost):
+    sent = []
+
+    def dropping(*arguments):
+        sent.append(arguments)
+        return True if len(sent) <= lost else send_reply(*arguments)
+
+    send_reply = state_streams.send_reply
+    monkeypatch.setattr(state_streams, "send_reply", dropping)
+    with walking(endpoint) as session:
+        state = session.wait(session.wish(pose_at(0.0, 1.0)), DEADLINE)
+        assert state.late == 0 and len(sent) > lost
+        assert [each.seq for each in session.states(0.0)] == [state.seq]
+        assert session.wait(session.wish(pose_at(0.0, 2.0)), DEADLINE).frame == 2, "it was simulated once"
+
+
+def test_a_wish_that_was_dropped_is_sent_once_more(served, endpoint):
+    class Dropping:
+        """A publisher whose first sample is lost."""
+
+        def __init__(self, publisher):
+            self.publisher, self.lost = publisher, []
+
+        def put(self, payload):
+            self.publisher.put(payload) if self.lost else self.lost.append(payload)
+
+        def delete(self):
+            self.publisher.delete()
+
+    with walking(endpoint) as session:
+        session._publisher = publisher = Dropping(session._publisher)
+        state = session.wait(session.wish(pose_at(0.0, 1.0)), DEADLINE)
+        assert (state.pose[0, 2, 3], state.frame, len(publisher.lost)) == (1.0, 1, 1)
+
+
+def test_a_user_who_comes_again_hears_nothing_of_before(served, endpoint):
+    with Client(endpoint, scene="floor", timeout=DEADLINE) as client:
+        client.add_avatar("al", POINTS, 0.125)
+        for z in (1.0, 2.0):
+            client._numbers.clear()
+            with client.session("al") as session:
+                assert session.latest() is None
+                state = session.wait(session.wish(pose_at(0.0, z)), DEADLINE)
+                assert (state.seq, state.pose[0, 2, 3]) == (1, z)
+            eventually(lambda: not served.users)
 
 
 def test_others_are_told_of_by_another_name_than_their_id(served, endpoint):

@@ -14,10 +14,11 @@ from ..schemas.messages import make_positions
 from ..schemas.stats import AvatarStats
 from .avatar import AvatarModel, make_avatar
 from .config import AvatarLimits
-from .served import EVERYBODY
+from .served import EVERYBODY, THIS_PROCESS
 
 # What the arrays of an avatar take, at most [bytes]: 53.5 a point were measured, and one block for a few points.
 _BYTES_A_POINT, _LEAST_BYTES = 56, 1200
+_OWN = (EVERYBODY, THIS_PROCESS)
 # Avatars of more points are built one at a time: while one is built it takes three times its bytes.
 _LARGE = 50_000
 
@@ -45,7 +46,8 @@ class _Entry:
 class Avatars:
     """Avatars by client and name. Thread-safe.
 
-    limits: None: no limits. The scene's own avatars, those of `EVERYBODY`, are neither limited nor counted.
+    limits: None: no limits. The avatars of the scene and those of this process (`EVERYBODY`, `THIS_PROCESS`) stay, and
+    are neither limited nor counted.
     """
 
     def __init__(self, limits: AvatarLimits | None = None) -> None:
@@ -98,7 +100,7 @@ class Avatars:
         before = time.monotonic() - seconds
         with self._changed:
             for client, entries in list(self._clients.items()):
-                if client == EVERYBODY or client in alive:
+                if client in _OWN or client in alive:
                     continue
                 for name in [n for n, e in entries.items() if e.model is not None and e.used < before]:
                     del entries[name]
@@ -122,7 +124,7 @@ class Avatars:
         )
 
     def _held(self) -> _Held:
-        own = [entries for client, entries in self._clients.items() if client != EVERYBODY]
+        own = [entries for client, entries in self._clients.items() if client not in _OWN]
         each = [entry.bytes for entries in own for entry in entries.values()]
         return _Held(sum(each), len(each), len(own))
 
@@ -138,7 +140,7 @@ class Avatars:
                 self._changed.wait()  # another request builds it
             if entry is None:
                 entry = _Entry(len(points), radius)
-                if client != EVERYBODY:
+                if client not in _OWN:
                     self._check(name, len(points), entry.bytes, client)
                 self._clients.setdefault(client, entries)[name] = entry
         try:

@@ -23,7 +23,8 @@ class Bounds:
 
     index: what the broad phase reads. Its boxes only ever become smaller, a number at a time: who reads them without a
     lock while a voxel is proved reads a box between the two.  said: the same by the index alone, proved or not.
-    proved: (v,) bool, the voxels whose box is that of the index.  left: how many are not.
+    proved: (v,) bool, the voxels whose box is that of the index.  left: how many are not; it changes once a box has
+    become what the index says, so a reader that finds it unchanged knows of every box that it may have read half.
     """
 
     def __init__(self, archive: Archive) -> None:
@@ -52,8 +53,8 @@ class Bounds:
             self.index.low[row], self.index.high[row] = low, high
             if self._trees is not None:
                 tighten(self._trees[0], row, low, high)
+            self.left -= 1  # first: `doubted` reads them the other way round
             self.proved[row] = True
-            self.left -= 1
 
     def trees(self) -> tuple[VoxelTree, VoxelTree]:
         """Trees over the boxes, for rays and loose points: of `index`, and of `said`. Made when first asked for."""
@@ -69,13 +70,18 @@ class Bounds:
                     self._trees = trees
         return trees
 
-    def doubted(self, reach: Reach) -> list[int]:
-        """The rows, each once, that are in reach of a pose, but would not be by the index: whose cells alone are.
+    def doubted(self, reach: Reach, left: int) -> list[int]:
+        """Return the rows, each once, that are in reach of a pose, but would not be by the index.
 
-        reach: of `index`. That a row is left out here costs some node visits; it is looked at all the same.
+        reach: of `index`.  left: as it was before the reach was computed.
         """
+        if not left:
+            return []
         rows = reach.rows[: reach.starts[-1]]
-        if not self.left or not len(at := np.flatnonzero(~self.proved[rows])):
+        at = np.flatnonzero(~self.proved[rows])
+        if left != self.left:  # a voxel was proved meanwhile: its box may have been read half
+            at = np.arange(len(rows))
+        if not len(at):
             return []
         pose = np.searchsorted(reach.starts, at, side="right") - 1
         center, span = reach.boxes.mean(axis=1)[pose], (reach.boxes[:, 1] - reach.boxes[:, 0])[pose, 0] / 2

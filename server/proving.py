@@ -49,11 +49,12 @@ def find_proved_reach(
 
     settled: leaves out of a reach what need not be looked at. Raises as `check_request`.
     """
+    left = data.bounds.left
     reach = settled(check_request(data, avatar, poses, other_units))
-    doubted = data.bounds.doubted(reach)
+    doubted = data.bounds.doubted(reach, left)
     if not doubted:
         return reach
-    prove(data, doubted, effort, spent)
+    prove(data, [row for row in doubted if not data.bounds.proved[row]], effort, spent)
     reach = settled(check_request(data, avatar, poses, other_units))
     spent.loaded += len(np.intersect1d(doubted, reach.rows[: reach.starts[-1]]))
     return reach

@@ -93,7 +93,9 @@ def look(
             break
         part = _part(best, begin, end)
         ways = at_units[begin:end], None if direction is None else direction[begin:end]
+        left = data.bounds.left
         lists = _list(data, tree, *ways, reach_units, radius_units, part)
+        half = left != data.bounds.left  # a box may have been read half
         doubts = None
         if data.nothing_clear:
             part.unseen[:] = 0.0
@@ -104,7 +106,7 @@ def look(
                 part.unseen[open_] = np.minimum(part.unseen[open_], lists.near[cursor[open_]])
                 break
             rows = _next_rows(data, lists, cursor, open_)
-            if doubts is None and data.bounds.left and not data.bounds.proved[rows].all():
+            if doubts is None and left and (half or not data.bounds.proved[rows].all()):
                 # By the index alone they may be out of the way: afresh by that, and what it hides at the end.
                 doubts = lists
                 _forget(part)

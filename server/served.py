@@ -22,6 +22,8 @@ from .stop import Stop
 
 # The client whose avatars every client may ask about; no key can name it.
 EVERYBODY = "*"
+# The client of avatars that were added in the process that serves, by no client.
+THIS_PROCESS = ""
 
 
 class Answer(NamedTuple):

@@ -135,6 +135,7 @@ def sweep(
     asked: set[int] = set()  # rows that were loaded to prove the index
     while len(which):
         begun = progress.at.copy()
+        left = data.bounds.left
         planned = box, first, last, avatar.arrays, scales, units, data.arrays
         needed = plan_segments(*planned, data.broad, which, progress, starts, rows)
         if needed < 0:
@@ -142,7 +143,7 @@ def sweep(
         if needed > len(rows):
             rows = np.empty(2 * needed, np.int64)
             continue
-        if data.bounds.left and not data.bounds.proved[rows[:needed]].all():
+        if left and (left != data.bounds.left or not data.bounds.proved[rows[:needed]].all()):
             # By the index alone some may be out of reach, and segments are then others.
             by_index = progress._replace(
                 at=begun.copy(), end=progress.end.copy(), speed=progress.speed.copy()
@@ -153,10 +154,10 @@ def sweep(
                 said_starts[:] = 0
             v = len(data.broad.keys)
             doubted = np.unique(np.setdiff1d(_pairs(starts, rows, v), _pairs(said_starts, said, v)) % v)
-            new = set(doubted[~data.bounds.proved[doubted]].tolist()) - asked
+            new = set(doubted.tolist()) - asked
             if new:
                 asked |= new
-                prove(data, sorted(new), effort, spent)
+                prove(data, sorted(row for row in new if not data.bounds.proved[row]), effort, spent)
                 progress.at[:] = begun
                 continue
         progress.lower[which] = progress.end[which]

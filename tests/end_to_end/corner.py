@@ -150,7 +150,7 @@ def opened(folder):
 def served(scene):
     """A server of the scene; its endpoint."""
     endpoint = f"tcp/127.0.0.1:{free_port()}"
-    with serving([scene], ServerConfig(listen=endpoint)):
+    with serving([scene], ServerConfig(listen=endpoint, avatar_seconds=600.0)):
         yield endpoint
 
 

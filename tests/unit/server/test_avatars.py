@@ -147,7 +147,7 @@ def test_unused_avatars_of_clients_without_a_token_are_dropped(monkeypatch):
     now = [100.0]
     monkeypatch.setattr(avatars_module.time, "monotonic", lambda: now[0])
     avatars = Avatars(LIMITS)
-    for client, name in (("gone", "al"), ("gone", "bo"), ("here", "al"), (EVERYBODY, "own")):
+    for client, name in (("gone", "al"), ("gone", "bo"), ("here", "al"), (EVERYBODY, "own"), ("", "ours")):
         avatars.add(name, BODY[:2], 0.01, client)
     now[0] += 59
     avatars.get("bo", "gone")
@@ -161,6 +161,7 @@ def test_unused_avatars_of_clients_without_a_token_are_dropped(monkeypatch):
     avatars.drop_unused((), 60.0)
     assert avatars.stats().clients == 0
     avatars.get("own", "anybody")
+    avatars.get("ours", "")
 
 
 def test_nothing_is_limited_in_process():

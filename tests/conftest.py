@@ -4,6 +4,7 @@ import atexit
 import json
 import os
 import shutil
+import signal
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,10 @@ import numpy as np
 import pytest
 
 SEED = 2012
+
+# Under nohup SIGINT is ignored, which processes that tests start, and interrupt, would inherit.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # Before anything imports numba: compiled kernels are kept in a new folder, for this process and for those it starts, so
 # that every run compiles all of them. Set NUMBA_CACHE_DIR to keep them: what an edit changes is compiled anew.

@@ -100,6 +100,11 @@ class Lane:
         self._watchdog.close()
         self._watching.join()
 
+    @property
+    def in_flight(self) -> int:
+        """Return the number of requests that were accepted and are neither answered nor dropped."""
+        return len(self._queues)
+
     def give_up(self) -> None:
         """Stop what is at work, and drop what waits: its clients take it for unknown."""
         self._given_up = True

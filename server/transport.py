@@ -38,6 +38,8 @@ _CHANNEL = 1024
 # How long a stop waits, twice, for threads whose work was given up [s]. Kernels look at a stop every few milliseconds;
 # a reply to a client that takes none waits for `wait_before_close`.
 _GIVE_UP_SECONDS = 0.4
+# How often it looks whether a thread has begun that is about to [s].
+_NEXT_SECONDS = 0.001
 
 # zenoh's threads that send, of which it has one by default. The one that closes the link of a client that takes no
 # replies is held for `wait_before_close`, and with one thread all other clients wait meanwhile.
@@ -131,15 +133,21 @@ class Transport:
             log.error("stopped with threads at work")
 
     def _wait(self, seconds: float) -> bool:
-        """Wait for all threads, for so long at most; whether they have ended."""
+        """Wait for all requests and threads, for so long at most; return whether they have ended."""
         deadline = time.monotonic() + seconds
-        # One may have started another, for a path, before it ended.
-        while alive := [thread for thread in list(self._threads) if thread.is_alive()]:
+        while True:
+            # One may have started another, for a path, before it ended. Where none is left and requests are in flight,
+            # a watchdog is about to start the next.
+            alive = [thread for thread in list(self._threads) if thread.is_alive()]
+            if not alive and not any(lane.in_flight for lane in self._lanes):
+                return True
             left = deadline - time.monotonic()
             if left <= 0:
                 return False
-            alive[0].join(left)
-        return True
+            if alive:
+                alive[0].join(left)
+            else:
+                time.sleep(_NEXT_SECONDS)
 
     def _open(self) -> zenoh.Session:
         """A session that listens; SolidcloudError when it cannot."""

@@ -177,8 +177,11 @@ def lay_out(voxel, links, arena, at_bytes, block_words, where):
         # The next float32 up, what np.nextafter gives of a number that is not negative; a call of it costs 5 ns.
         length = np.float32(np.sqrt(np.float64(square)))
         ints[row + np.uint64(7)] = length.view(np.int32) + np.int32(1)
-        words[row + np.uint64(8)] = _outward(nodes.slab[np.uint64(0), i], False)
-        words[row + np.uint64(9)] = _outward(nodes.slab[np.uint64(1), i], True)
+        # A node whose normal is zero has no slab: numbers that a record holds there must not cut anything off.
+        least = nodes.slab[np.uint64(0), i] if square > 0 else np.int32(0)
+        most = nodes.slab[np.uint64(1), i] if square > 0 else np.int32(0)
+        words[row + np.uint64(8)] = _outward(least, False)
+        words[row + np.uint64(9)] = _outward(most, True)
         ints[row + np.uint64(FIRST)] = ~block if is_leaf[i] else first[i]
         ints[row + np.uint64(COUNT)] = np.int32(nodes.count[i])
         row += np.uint64(ROW_WORDS)

@@ -101,3 +101,24 @@ def _points_below(node: int, links: object, count: np.ndarray) -> list[int]:
 def test_a_lane_each_is_room_for_a_figure_a_class() -> None:
     # kernels/priority.py keeps thresholds by radius class in a scratch of as many floats as a block has lanes.
     assert RADIUS_CLASSES <= LANES
+
+
+def test_a_node_without_a_normal_is_cut_by_no_slab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever its record holds there: a forged one cut off points, and contacts were clear."""
+    case = cases.build(
+        tmp_path, scans.make_scan("duplicates", 7, 120), voxel=0.5, resolution=1e-3, with_slab=False
+    )
+    store = Store(case.archive)
+    buffer = ArenaBuffer(int(store.sizes.max()) + 128)
+    opened = Archive.open_voxel
+
+    def forged(archive: Archive, *arguments):
+        record = opened(archive, *arguments)
+        record.nodes.slab[:] = 7
+        return record
+
+    monkeypatch.setattr(Archive, "open_voxel", forged)
+    rows, _, _ = store.load(0, buffer.arena, 64).tolist()
+    assert not buffer.arena.words[rows + 4 : rows + 7].any(), "it has no normal"
+    least, most = buffer.arena.words[rows + 8 : rows + 10]
+    assert least <= 0.0 <= most

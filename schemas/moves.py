@@ -152,7 +152,8 @@ class Moved(msgspec.Struct, frozen=True, eq=False, kw_only=True, omit_defaults=T
     pose: (1, 4, 4) float64, where the avatar is now.  verdict: of that pose, a value of `Verdict`; UNKNOWN too where
     the way on is not known to be clear, and the avatar went no farther than it is.  left: of the motion wished, not
     gone [m].  touched: what stopped it.  simulated: effects, in the order they ran.  skipped: effects that the frame's
-    budget had no room for.  The rest: what each effect says.
+    budget had no room for.  stepped to crowd: what each effect says.  unknown: something that the frame asked could not
+    be looked at: had it been, all of this might differ.
     """
 
     pose: Poses
@@ -168,6 +169,7 @@ class Moved(msgspec.Struct, frozen=True, eq=False, kw_only=True, omit_defaults=T
     uncertainty: UncertaintyReport | None = None
     objects: ObjectsReport | None = None
     crowd: CrowdReport | None = None
+    unknown: bool = False
 
 
 class State(Moved, frozen=True, eq=False, kw_only=True, omit_defaults=True):

@@ -9,6 +9,7 @@ from collections import OrderedDict
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..schemas.errors import CorruptError
 from ..schemas.kernels.normals import NONE, decode_normal
 from ..schemas.normals import normal_reach
 from .kernels.layout import LANES
@@ -63,8 +64,8 @@ class Normals:
 
         cloud: (3,) the point, world [m], within half a lattice step.  toward: (3,) any length; where it lies in the
         surface or is 0 the side is as it comes.  reach: points so near the point make its surface [m].
-        None: no point is there, its voxel cannot be read, or the points make no surface (schemas/kernels/normals.py).
-        Raises BadRequestError for a reach that is none.
+        None: no point is there, or the points make no surface (schemas/kernels/normals.py).
+        Raises BadRequestError for a reach that is none, CorruptError for a voxel that cannot be read.
         """
         code = self.code(cloud, reach)
         if code == NONE:
@@ -75,7 +76,7 @@ class Normals:
         return np.array([side * x, side * y, side * z])
 
     def code(self, cloud: ArrayLike, reach: float) -> int:
-        """The code of the normal, as schemas/kernels/normals.py has it; NONE for none."""
+        """Return the code of the normal, as schemas/kernels/normals.py has it; NONE for none. Raises CorruptError."""
         square = self._squares.get(reach)
         if square is None:
             square = normal_reach(reach, self._data.arrays.step, self._most_points)
@@ -94,7 +95,7 @@ class Normals:
                 return self._look(row, x, y, z, square)
         with residency.hold([row]) as held:
             if held.faults:
-                return int(NONE)
+                raise CorruptError(held.faults[0])
             with residency.still():
                 return self._look(row, x, y, z, square)
 

@@ -36,7 +36,7 @@ class Swept(NamedTuple):
 
     avatar, cloud: (3,) the witness's centres, world [m]; None where the verdict is not CONTACT.  archive: which of a
     scene's archives is touched.  exact: nothing else may be touched before: no point goes farther than the tolerance
-    between `lower` and `upper`.  visits: node visits.
+    between `lower` and `upper`.  visits: node visits.  missing: voxels that could not be looked at.
     """
 
     verdict: Verdict
@@ -47,6 +47,7 @@ class Swept(NamedTuple):
     archive: int = 0
     exact: bool = True
     visits: int = 0
+    missing: int = 0
 
 
 class Probe:
@@ -111,6 +112,7 @@ class Probe:
             0,
             bool(answers.exact[0]),
             int(answers.node_visits[0]),
+            int(answers.voxels_missing[0]),
         )
 
     def _use(self, residency: Residency, rows: list[int]) -> None:

@@ -219,7 +219,7 @@ class Questions:
             self._note_unanswered(1)
             way = request.pose_to[0, :3, 3] - request.pose_from[0, :3, 3]
             left = float(np.linalg.norm(way))
-            return Moved(pose=request.pose_from, verdict=int(Verdict.UNKNOWN), left=left)
+            return Moved(pose=request.pose_from, verdict=int(Verdict.UNKNOWN), left=left, unknown=True)
         return decode_answer(Moved, payload)
 
     def _question(

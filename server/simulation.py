@@ -188,7 +188,7 @@ class Simulation:
             return self._pipeline.run(body, wish, asked.seconds, Effort(stop=stop))
         except StoppedError:
             left = size(wish[:3, 3] - begin[:3, 3])
-            return Moved(pose=begin[None], verdict=int(Verdict.UNKNOWN), left=left)
+            return Moved(pose=begin[None], verdict=int(Verdict.UNKNOWN), left=left, unknown=True)
 
     def step(
         self,

@@ -12,7 +12,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from ..schemas.answers import ContactsAnswers, DistanceAnswers, Verdict
+from ..schemas.answers import ContactsAnswers, DistanceAnswers, Verdict, WithinAnswers
+from ..schemas.errors import CorruptError
 from ..schemas.index import MAX_NORMAL_REACH
 from ..schemas.scene import SceneFile
 from ..schemas.voxel_grid import UNITS_PER_METRE
@@ -62,6 +63,7 @@ class _Held(threading.local):
     depth = 0
     visits = 0
     stop: Stop = NEVER
+    unknown = False
 
     def __init__(self) -> None:
         self.seen: list[Seen] = []
@@ -106,9 +108,23 @@ class World:
         held.depth += 1
         return held.seen
 
-    def stop_by(self, stop: Stop) -> None:
-        """Have `stop` end early what this thread asks from the next hold on."""
-        self._held.stop = stop
+    def begin(self, stop: Stop) -> None:
+        """Begin a frame of this thread's. stop: ends early what it asks from the next hold on."""
+        self._held.stop, self._held.unknown = stop, False
+
+    @property
+    def unknown(self) -> bool:
+        """Return whether something that this thread's frame asked could not be looked at."""
+        return self._held.unknown
+
+    def count(self, visits: int, missing: int = 0) -> None:
+        """Add what a question took that this thread asked of the archives it holds.
+
+        visits: of nodes.  missing: voxels that could not be looked at.
+        """
+        self._held.visits += visits
+        if missing:
+            self._held.unknown = True
 
     def __exit__(self, *_: object) -> None:
         """Let them go."""
@@ -129,9 +145,10 @@ class World:
         """Node visits of all that this thread has asked."""
         return self._held.visits
 
-    def count(self, visits: int) -> None:
-        """Add node visits of what this thread asked of the archives it holds, and not through here."""
-        self._held.visits += visits
+    def _count_of(self, answers: ContactsAnswers | DistanceAnswers | WithinAnswers) -> None:
+        """Add what one row of answers took."""
+        unknown = answers.verdict[0] == Verdict.UNKNOWN
+        self.count(int(answers.node_visits[0]), int(answers.voxels_missing[0]) or unknown)
 
     def generations(self) -> tuple[int, ...]:
         """What tells the archives held now from those before a reload."""
@@ -164,7 +181,7 @@ class World:
         with self as seen:
             for each in seen:
                 verdict, visits = probe.collide(each.data, _into(each, pose), effort)
-                self._held.visits += visits
+                self.count(visits, verdict == Verdict.UNKNOWN)
                 if verdict == Verdict.CONTACT:
                     return verdict
                 if verdict == Verdict.UNKNOWN:
@@ -186,7 +203,7 @@ class World:
         probe, held = self._probe(avatar), self._held
         if self._alone and held.depth:
             swept = probe.sweep(held.seen[0].data, pose_from, pose_to, tolerance, effort)
-            held.visits += swept.visits
+            self.count(swept.visits, swept.missing or not swept.exact)
             return swept
         with self as seen:
             found: Swept | None = None
@@ -194,7 +211,7 @@ class World:
                 swept = probe.sweep(
                     each.data, _into(each, pose_from), _into(each, pose_to), tolerance, effort
                 )
-                held.visits += swept.visits
+                self.count(swept.visits, swept.missing or not swept.exact)
                 if not self._alone:
                     swept = _carried(swept, each, number)
                 found = swept if found is None else _earlier(found, swept)
@@ -231,7 +248,7 @@ class World:
         with self as seen:
             for number, each in enumerate(seen):
                 answers = contacts(each.data, avatar, _into(each, pose)[None], 1, effort=effort)
-                self._held.visits += int(answers.node_visits[0])
+                self._count_of(answers)
                 if len(answers.signed_distance) and answers.signed_distance[0] < depth:
                     depth = float(answers.signed_distance[0])
                     own, cloud = (
@@ -248,7 +265,7 @@ class World:
             for number, each in enumerate(seen):
                 there = place if each.placed.inverse is None else moved(each.placed.inverse, place[None])[0]
                 answers = within(each.data, there[None], reach, effort)
-                self._held.visits += int(answers.node_visits[0])
+                self._count_of(answers)
                 if answers.distance[0] < least:
                     least = float(answers.distance[0])
                     cloud = _out(each, answers.cloud_point[0])
@@ -263,7 +280,7 @@ class World:
         with self as seen:
             for each in seen:
                 answers = near(each.data, avatar, _into(each, pose), reach, effort)
-                self._held.visits += int(answers.node_visits[0])
+                self._count_of(answers)
                 if each.placed.pose is not None:
                     answers = msgspec.structs.replace(
                         answers,
@@ -291,7 +308,7 @@ class World:
                 answers = contacts(
                     each.data, avatar, _into(each, pose)[None], limit, margin, cluster_distance, effort
                 )
-                self._held.visits += int(answers.node_visits[0])
+                self._count_of(answers)
                 if each.placed.pose is not None:
                     columns = ("avatar_point", "cloud_point", "cluster_avatar", "cluster_cloud")
                     carried = {name: moved(each.placed.pose, getattr(answers, name)) for name in columns}
@@ -307,6 +324,7 @@ class World:
         """
         if hit.cloud is None or hit.avatar is None or hit.archive < 0:
             return hit.normal  # what is none of the scene's brings its own
+        held = self._held
         with self as seen:
             each = seen[hit.archive]
             kept = each.opened.kept
@@ -321,9 +339,13 @@ class World:
             place = hit.cloud
             if inverse is not None:
                 place, way = moved(inverse, place[None])[0], turned(inverse, way[None])[0]
-            found: Vec | None = normals.at(place, way, reach)
-            if found is None:
-                found = normals.at(place, way, min(SPARSE * reach, MAX_NORMAL_REACH))
+            try:
+                found: Vec | None = normals.at(place, way, reach)
+                if found is None:
+                    found = normals.at(place, way, min(SPARSE * reach, MAX_NORMAL_REACH))
+            except CorruptError:
+                held.unknown = True
+                return None
             return found if found is None or pose is None else turned(pose, found[None])[0]
 
 

@@ -34,9 +34,9 @@ class Counting:
         """As the world's."""
         return self._world.generations()
 
-    def count(self, visits: int) -> None:
+    def count(self, visits: int, missing: int = 0) -> None:
         """As the world's."""
-        self._world.count(visits)
+        self._world.count(visits, missing)
 
     def distance(self, avatar: AvatarModel, pose: Any, reach: float, **how: Any) -> Any:
         """Counted."""

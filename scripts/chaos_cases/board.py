@@ -4,6 +4,7 @@ Each client writes its own row and nobody else's; the driver writes the first. T
 one clock for all processes of a machine [s].
 """
 
+import time
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 # Of the driver: alive at; everybody is to stop; to pause; which generations may be served, as bits; whether a server
-# may be up; a count of its starts and ends.
-HEARTBEAT, STOP, PAUSE, SERVED, UP, EPOCH = range(6)
+# may be up; a count of its starts and ends; and until when each generation was served that is not any more.
+HEARTBEAT, STOP, PAUSE, SERVED, UP, EPOCH, UNTIL = range(7)
 # Of a client: counts of questions and rows; when it last heard a right answer; whether it is still.
 (
     ASKED,
@@ -48,7 +49,6 @@ ORPHANED = 30.0
 class Now(NamedTuple):
     """What the driver says at a moment."""
 
-    served: int
     up: bool
     epoch: int
 
@@ -74,7 +74,22 @@ class Board:
     def now(self) -> Now:
         """Return what the driver says."""
         row = self._all[0]
-        return Now(int(row[SERVED]), bool(row[UP]), int(row[EPOCH]))
+        return Now(bool(row[UP]), int(row[EPOCH]))
+
+    def serve(self, generations: int) -> None:
+        """Tell which generations may be served from now on, as bits."""
+        row = self._all[0]
+        for generation in range(COLUMNS - UNTIL):
+            if int(row[SERVED]) & ~generations & 1 << generation:
+                row[UNTIL + generation] = time.monotonic()
+        row[SERVED] = generations
+
+    def served_since(self, begin: float) -> int:
+        """Return which generations may have been served at any time since `begin`, as bits."""
+        row = self._all[0]
+        served = int(row[SERVED])  # first: what ends meanwhile is in it
+        ended = [g for g in range(COLUMNS - UNTIL) if row[UNTIL + g] >= begin]
+        return served | sum(1 << generation for generation in ended if not served >> generation & 1)
 
     def totals(self) -> dict[str, int]:
         """Return the counts of all clients together."""

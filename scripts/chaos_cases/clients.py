@@ -13,7 +13,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from solidcloud.schemas.answers import Verdict
 from solidcloud.schemas.errors import BusyError
+from solidcloud.schemas.moves import Moved
 from solidcloud.server.client import Client
 
 from . import board as b
@@ -37,6 +39,7 @@ class Asker:
         self.said: Counter[str] = Counter()
         self.causes: Counter[str] = Counter()
         self._log = (folder / f"wrong-{slot}.jsonl").open("a")
+        self._claims = (folder / f"claims-{slot}.jsonl").open("a")
         self._causes = folder / f"causes-{slot}-{os.getpid()}.json"
         self._lock = threading.Lock()
 
@@ -72,8 +75,8 @@ class Asker:
 
     def _ask(self, client: Any, request: Request) -> None:
         """Ask one question, judge the answer and count it."""
-        before = self.board.now()
         begin = time.monotonic()
+        before = self.board.now()
         try:
             got = ask(client, request.op, request.arguments, request.parameters)
         except BusyError as error:
@@ -81,11 +84,13 @@ class Asker:
             time.sleep(PAUSE_AWAY)
             return
         after = self.board.now()
-        served = before.served | after.served
+        served = self.board.served_since(begin)
         truths = [truth for generation, truth in enumerate(request.truths) if served >> generation & 1]
         found = judge(got, truths)
         away = not (before.up or after.up) and before.epoch == after.epoch
         nobody = self._silent(got)
+        if isinstance(got, Moved) and found.unknown and got.verdict == Verdict.CLEAR:
+            self._claim(request.arguments[0], got, served)
         with self._lock:
             row = self.row
             row[b.ASKED] += 1
@@ -109,6 +114,14 @@ class Asker:
         if hasattr(got, "engine_seconds"):
             return len(got) > 0 and got.engine_seconds == 0.0
         return not got.simulated
+
+    def _claim(self, avatar: str, got: Moved, served: int) -> None:
+        """Write down a frame that ended clear, but not where it would have if all were known: judged in the end."""
+        with self._lock:
+            self._claims.write(
+                json.dumps({"avatar": avatar, "pose": got.pose.tolist(), "served": served}) + "\n"
+            )
+            self._claims.flush()
 
     def _note(
         self, request: Request, found: Any, served: int, before: b.Now, after: b.Now, begin: float

@@ -3,6 +3,7 @@
 Truths are answered in this process, of private copies of the archives with room for all of them in memory.
 """
 
+import json
 import os
 import pickle
 import shutil
@@ -18,6 +19,7 @@ from solidcloud.builder.generation import add_scans
 from solidcloud.builder.made.figure import figure_points
 from solidcloud.builder.made.scenes import make_facade
 from solidcloud.builder.pipeline import build_archive
+from solidcloud.schemas.answers import Verdict
 from solidcloud.schemas.index_file import INDEX_NAME
 from solidcloud.server.report.points import read_thinned
 from solidcloud.server.scene import Scene
@@ -102,6 +104,30 @@ def make_ground(folder: Path, points: int, requests: int, seed: int) -> Ground:
     ground.pool.write_bytes(pickle.dumps(pool))
     assert made.points == points
     return ground._replace(cache=int(size * CACHE_SHARE))
+
+
+def judge_claims(folder: Path) -> tuple[int, int]:
+    """Return how many frames were said to end clear though something was unknown, and how many of them do not."""
+    claims = [json.loads(line) for path in folder.glob("claims-*.jsonl") for line in whole_lines(path)]
+    touching = []
+    for name in ("first", "second"):
+        with Scene.open(folder / name, budget_bytes=ROOM) as scene, with_avatars(scene):
+            touching.append(
+                [
+                    scene.collide(claim["avatar"], np.array(claim["pose"])).verdict[0] == Verdict.CONTACT
+                    for claim in claims
+                ]
+            )
+    false = [
+        all(touches[row] for generation, touches in enumerate(touching) if claim["served"] >> generation & 1)
+        for row, claim in enumerate(claims)
+    ]
+    return len(claims), sum(false)
+
+
+def whole_lines(path: Path) -> list[str]:
+    """Return the lines of a file of JSON objects; the last one may be cut, by a kill."""
+    return [line for line in path.read_text().splitlines() if line.endswith("}")]
 
 
 def _wall() -> Arrays:

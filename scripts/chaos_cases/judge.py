@@ -156,9 +156,9 @@ def _bounds(got: Any, truth: Any, rows: Any) -> list[str]:
 
 
 def _judge_moved(got: Moved, truth: Moved) -> Judgement:
-    """Judge one frame; one that was not simulated whole, or stopped before what is not known, says nothing."""
-    stopped = any(touched.unknown for touched in got.touched) and got.verdict != Verdict.CLEAR
-    if got.verdict == Verdict.UNKNOWN or got.skipped or stopped or not got.simulated:
+    """Judge one frame; one that was not simulated whole, or that something unknown may have led elsewhere, says
+    nothing of where the avatar would be."""
+    if got.unknown or got.skipped or not got.simulated:
         return Judgement(0, 1, 0, [])
     faults = []
     if got.verdict != truth.verdict:

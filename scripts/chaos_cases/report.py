@@ -5,6 +5,7 @@ from collections import Counter
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from .ground import judge_claims, whole_lines
 from .lives import Lives
 from .storm import Storm
 
@@ -24,11 +25,14 @@ def make_report(storm: Storm, folder: Path, seconds: float, limits: Limits) -> d
     lives = storm.lives
     totals = storm.board.totals()
     slope = lives.slope()
+    claims, false_claims = judge_claims(folder)
     log = (folder / "server.log").read_text(errors="replace")
     report = {
         "seconds": round(seconds, 1),
         "seed": storm.seed,
         **totals,
+        "frames clear though something was unknown": claims,
+        "of them in contact": false_claims,
         "done": dict(sorted(storm.done.items())),
         "causes": _causes(folder),
         "servers": lives.number,
@@ -54,6 +58,7 @@ def _violations(report: dict[str, Any], lives: Lives, limits: Limits) -> list[st
         f"{report[name]} {words}"
         for name, words in (
             ("wrong", "answers are wrong"),
+            ("of them in contact", "frames are clear in contact"),
             ("clear_away", "times clear while no server was up"),
             ("errors", "questions were refused with other errors than busy"),
             ("tracebacks in the server's log", "tracebacks in the server's log"),
@@ -120,8 +125,8 @@ def _causes(folder: Path) -> dict[str, int]:
 
 def _notes(folder: Path) -> list[Any]:
     """Return the first of what clients found wrong."""
-    lines = [line for path in sorted(folder.glob("wrong-*.jsonl")) for line in path.read_text().splitlines()]
-    return [json.loads(line) for line in lines[:20] if line.endswith("}")]
+    lines = [line for path in sorted(folder.glob("wrong-*.jsonl")) for line in whole_lines(path)]
+    return [json.loads(line) for line in lines[:20]]
 
 
 def table(report: dict[str, Any]) -> str:
@@ -134,6 +139,10 @@ def table(report: dict[str, Any]) -> str:
         ("unknown: nobody there / voxels missing", f"{report['nobody']:,} / {report['missing']:,}"),
         ("busy", f"{report['busy']:,}"),
         ("wrong, of them false clears", f"{report['wrong']}, {report['false_clear']}"),
+        (
+            "frames clear, with something unknown",
+            f"{report['frames clear though something was unknown']}, {report['of them in contact']} in contact",
+        ),
         ("clear while no server was up", f"{report['clear_away']}"),
         ("other errors", f"{report['errors']}"),
         ("servers", f"{report['servers']}"),

@@ -180,11 +180,11 @@ class Storm:
     def _serve(self, generation: int) -> None:
         """Tell that this generation, and no other, is served."""
         self.generation = generation
-        self.board.driver[b.SERVED] = 1 << generation
+        self.board.serve(1 << generation)
 
     def _offer(self, generation: int) -> None:
         """Put a generation into the folder, which may be served from now on."""
-        self.board.driver[b.SERVED] = 1 << generation | 1 << self.generation
+        self.board.serve(1 << generation | 1 << self.generation)
         self.ground.put(generation)
         self.generation = generation
 

@@ -110,7 +110,7 @@ class Pipeline:
             )
         frame = Frame(body, wish, seconds, self.world, effort, body.pose)
         frame.fall_speed, frame.on_ground = body.fall_speed, body.on_ground
-        self.world.stop_by(effort.stop)
+        self.world.begin(effort.stop)
         with self._undone_if_stopped(body, effort), self.world as seen:
             frame.generations = tuple([each.opened.number for each in seen])
             for runner in self._beginners:
@@ -137,7 +137,7 @@ class Pipeline:
         body.pose, body.clear, body.generations = frame.pose, frame.clear, frame.generations
         body.fall_speed, body.on_ground = frame.fall_speed, frame.on_ground
         body.kept.update(frame.kept)
-        return _moved(frame)
+        return _moved(frame, self.world.unknown)
 
     @contextmanager
     def _undone_if_stopped(self, body: Body, effort: Effort) -> Iterator[None]:
@@ -191,8 +191,8 @@ def _touched(hits: list[Hit], there: Vec) -> list[Touched]:
     return list(found.values())[:_MOST_TOUCHED]
 
 
-def _moved(frame: Frame) -> Moved:
-    """What came of a frame."""
+def _moved(frame: Frame, unknown: bool) -> Moved:
+    """Return what came of a frame. unknown: as `Moved` has it."""
     x, y, z = frame.left.tolist()
     return Moved(
         pose=frame.pose[None].copy(),
@@ -202,6 +202,7 @@ def _moved(frame: Frame) -> Moved:
         simulated=frame.simulated,
         skipped=frame.skipped,
         **frame.reports,
+        unknown=unknown,
     )
 
 

@@ -174,9 +174,9 @@ class UncertaintyRunner:
         pose = frame.pose if inverse is None else under(inverse, frame.pose[None])[0]
         if scans.one is None:
             found = gaps_by_scan(each.data, avatar, pose, margin, len(scans.names), frame.effort)
-            frame.world.count(found.node_visits)
+            frame.world.count(found.node_visits, not found.exact)
             return found.gaps, found.exact
         answers = near(each.data, avatar, pose, margin, frame.effort)
-        frame.world.count(int(answers.node_visits[0]))
+        frame.world.count(int(answers.node_visits[0]), int(answers.voxels_missing[0]))
         gap = float(answers.signed_distance[0])
         return {scans.one: gap} if gap <= margin else {}, bool(answers.exact[0])

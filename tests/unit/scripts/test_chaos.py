@@ -1,8 +1,11 @@
 """The judge of scripts/chaos: what is unknown is never wrong, and every kind of wrong answer is found out."""
 
+import json
 import sys
+import time
 from pathlib import Path
 
+import cases
 import numpy as np
 import pytest
 from msgspec.structs import replace
@@ -14,14 +17,13 @@ from solidcloud.schemas.moves import Moved
 sys.path.append(str(Path(__file__).parents[3] / "scripts"))
 
 from chaos_cases import board as b
-from chaos_cases.ground import AVATARS, ask, make_pool
+from chaos_cases.ground import AVATARS, ask, judge_claims, make_pool
 from chaos_cases.judge import judge
 
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory):
     """A floor, opened in this process."""
-    import cases
     from solidcloud.server.scene import Scene
 
     x, y = np.meshgrid(np.arange(-2, 2, 0.1), np.arange(-2, 2, 0.1))
@@ -98,6 +100,19 @@ def test_a_frame_that_is_not_simulated_whole_says_nothing() -> None:
     assert judge(Moved(pose=elsewhere, simulated=["stop"]), [truth]).faults
     assert not judge(Moved(pose=elsewhere, simulated=["stop"], skipped=["slide"]), [truth]).faults
     assert judge(Moved(pose=pose, verdict=2), [truth]).unknown == 1
+    assert not judge(Moved(pose=elsewhere, simulated=["stop"], unknown=True), [truth]).faults
+
+
+def test_a_frame_said_to_be_clear_with_something_unknown_is_judged_by_where_it_ends(scene, tmp_path) -> None:
+    _, points = scene
+    for name in ("first", "second"):
+        cases.build(tmp_path, points, voxel=1.0, resolution=1e-3).archive.rename(tmp_path / name)
+    above, on = np.eye(4)[None], np.eye(4)[None]
+    above[0, 2, 3] = 1.0
+    claims = [{"avatar": "ball", "pose": pose.tolist(), "served": 3} for pose in (above, on, above)]
+    lines = [json.dumps(claim) for claim in claims]
+    (tmp_path / "claims-0.jsonl").write_text("\n".join([*lines, lines[0][:40]]))
+    assert judge_claims(tmp_path) == (3, 1)
 
 
 def test_an_answer_of_another_length_is_wrong() -> None:
@@ -107,7 +122,18 @@ def test_an_answer_of_another_length_is_wrong() -> None:
 def test_the_board_is_one_for_all(tmp_path: Path) -> None:
     driver = b.Board(tmp_path / "board", 3)
     client = b.Board(tmp_path / "board")
-    driver.driver[b.SERVED], driver.driver[b.UP] = 2, 1
-    assert client.now() == b.Now(2, True, 0)
+    driver.driver[b.UP] = 1
+    assert client.now() == b.Now(True, 0)
     client.client(2)[b.WRONG] += 4
     assert driver.totals()["wrong"] == 4
+
+
+def test_a_generation_that_was_served_while_a_question_was_under_way_is_remembered(tmp_path: Path) -> None:
+    driver = b.Board(tmp_path / "board", 1)
+    client = b.Board(tmp_path / "board")
+    driver.serve(1)
+    asked = time.monotonic()
+    for generations in (3, 2, 3, 1):  # to the other and back, while a client is frozen
+        driver.serve(generations)
+    assert client.served_since(asked) == 3
+    assert client.served_since(time.monotonic()) == 1

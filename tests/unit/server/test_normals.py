@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import scans
 from numpy.typing import NDArray
-from solidcloud.schemas.errors import BadRequestError
+from solidcloud.schemas.errors import BadRequestError, CorruptError
 from solidcloud.schemas.kernels.normals import LINE, NONE, THICK, decode_normal
 from solidcloud.server.kernels.normals import code_at, find_voxel, stored_code_at
 from solidcloud.server.left_out import LeftOut
@@ -228,7 +228,7 @@ def test_where_no_point_is_there_is_no_normal(tmp_path: Path) -> None:
         assert normals.estimated == before
 
 
-def test_a_voxel_that_cannot_be_read_has_no_normals(tmp_path: Path) -> None:
+def test_normals_of_a_voxel_that_cannot_be_read_are_unknown(tmp_path: Path) -> None:
     case = build(tmp_path, "plane")
     with serving(case.archive) as opened:
         places = [place for place, *_ in judged(opened, case.points)]
@@ -239,7 +239,9 @@ def test_a_voxel_that_cannot_be_read_has_no_normals(tmp_path: Path) -> None:
                 data[int(archive.voxels["frame_offset"][row][2]) + 9] ^= 0xFF
         shard.write_bytes(data)
     with asked(case.archive) as (opened, normals):
-        assert [normals.at(place, UP, REACH) for place in places[:20]] == [None] * 20
+        for place in places[:20]:
+            with pytest.raises(CorruptError, match="damaged frame"):
+                normals.at(place, UP, REACH)
         assert normals.used_bytes == 0 == normals.estimated
 
 

@@ -119,11 +119,15 @@ def test_what_cannot_be_read_stops_and_is_said(
     with play(case.archive, *effects) as game:
         body = game.body(BALL, at(-1, 0, 0))
         moved = game.go(body, (0.9, 0, 0))
-        assert moved.verdict == Verdict.UNKNOWN and moved.touched[0].unknown
+        assert moved.verdict == Verdict.UNKNOWN and moved.touched[0].unknown and moved.unknown
         assert -1 <= body.pose[0, 3] <= -0.2
         assert game.world.collide(BALL, body.pose) == Verdict.CLEAR
         moved = game.go(body, (-0.2, 0, 0))
-        assert moved.verdict == Verdict.CLEAR and not moved.touched
+        assert moved.verdict == Verdict.CLEAR and not moved.touched and not moved.unknown
+        # Whether it is touched where it begins is unknown: it ends somewhere clear, and says that this is why.
+        lost = game.body(BALL, at(-0.1, 0, 0))
+        moved = game.go(lost, (-0.4, 0, 0))
+        assert moved.verdict == Verdict.CLEAR and moved.unknown
 
 
 @pytest.mark.interpreted

@@ -48,6 +48,7 @@ from .frames import Frames
 from .heap import give_back_large_blocks
 from .served import Answer, SceneLike
 from .stop import NEVER, Stop
+from .threads import start_thread
 from .transport import Transport
 
 log = logging.getLogger(__name__)
@@ -356,7 +357,7 @@ def _reloader(service: Service) -> Iterator[threading.Event]:
             service.reload()
 
     # A reload that is under way at the end is given up when its scene is closed (`Scene.close` waits for that).
-    threading.Thread(target=run, name="solidcloud-reload", daemon=True).start()
+    start_thread("reload", run)
     try:
         yield wanted
     finally:

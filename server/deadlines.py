@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from .stop import Stop
+from .threads import start_thread
 
 # Entries whose request has ended stay until their time comes, or until they outnumber the others by this factor.
 _DEAD_SHARE = 2
@@ -45,8 +46,7 @@ class Deadlines:
             if len(self._heap) > self._compact_at:
                 self._compact()
             if self._thread is None:
-                self._thread = threading.Thread(target=self._run, name="solidcloud-deadlines", daemon=True)
-                self._thread.start()
+                self._thread = start_thread("deadlines", self._run)
             elif self._heap[0][0] == when:
                 self._changed.notify()
 

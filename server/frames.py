@@ -18,6 +18,7 @@ from ..schemas.messages import ErrorReply
 from ..schemas.moves import State, Wish
 from .served import Answer, Outcome, Simulates, Turn
 from .stop import Stop
+from .threads import start_thread
 from .watchdog import Watchdog
 
 log = logging.getLogger(__name__)
@@ -190,8 +191,7 @@ class Frames:
 
     def run(self) -> None:
         """Simulate frames until `close`. A thread's work."""
-        watching = threading.Thread(target=self._watchdog.run, name="solidcloud-frames-watchdog", daemon=True)
-        watching.start()
+        watching = start_thread("frames-watchdog", self._watchdog.run)
         try:
             while (post := self._boxes.take()) is not None:
                 try:

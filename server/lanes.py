@@ -17,6 +17,7 @@ from .fair_queues import Bounds, FairQueues, Offer, State, Ticket
 from .jobs import SLOW_SECONDS, Job, Request, Wire
 from .served import Answer
 from .stop import Stop
+from .threads import start_thread
 from .watchdog import Watchdog, lower_priority
 
 log = logging.getLogger(__name__)
@@ -89,9 +90,7 @@ class Lane:
     def start(self) -> None:
         """Start the threads."""
         # Not one of those that a stop waits for: it watches them.
-        name = f"solidcloud-{self._scene}-watchdog"
-        self._watching = threading.Thread(target=self._watchdog.run, name=name, daemon=True)
-        self._watching.start()
+        self._watching = start_thread(f"{self._scene}-watchdog", self._watchdog.run)
         for _ in range(self._config.workers):
             self._start_taker()
 

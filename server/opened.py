@@ -35,6 +35,7 @@ from .residency import Residency
 from .session import Walker
 from .store import Store
 from .sweep import sweep
+from .threads import start_thread
 from .within import within
 
 # A user is where the last of so many poses is; more are looked over, not walked.
@@ -123,8 +124,7 @@ class Opened:
                 return
         if self.prefetcher.running:
             # Its thread is waited for, which nobody may do who is collecting garbage, and so may hold any lock.
-            self._ending = threading.Thread(target=self._end, name="solidcloud-end", daemon=True)
-            self._ending.start()
+            self._ending = start_thread("end", self._end)
         else:
             self._end()
 

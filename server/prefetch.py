@@ -15,6 +15,7 @@ from typing import Self
 
 from .neighbourhood import Neighbourhood, User
 from .residency import Ahead, Residency
+from .threads import start_thread
 
 log = logging.getLogger(__name__)
 
@@ -130,8 +131,7 @@ class Prefetcher:
     def _start(self) -> None:
         with self._lock:
             if self._thread is None and not self._stopped:
-                self._thread = threading.Thread(target=self._run, name="solidcloud-prefetch", daemon=True)
-                self._thread.start()
+                self._thread = start_thread("prefetch", self._run)
 
     def _run(self) -> None:
         """The thread's work."""

@@ -29,6 +29,7 @@ from .lanes import Lane, Questions
 from .replies import sealer_of, send_reply
 from .served import Answer
 from .session_transport import SceneSessions, Sessions
+from .threads import start_thread
 
 log = logging.getLogger(__name__)
 
@@ -207,8 +208,7 @@ class Transport:
 
     def _start(self, name: str, run: Callable[..., None], *arguments: Any) -> None:
         """A thread that is waited for at the end."""
-        thread = threading.Thread(target=run, args=arguments, name=f"solidcloud-{name}", daemon=True)
-        thread.start()
+        thread = start_thread(name, run, *arguments)
         with self._lock:
             self._threads = [other for other in self._threads if other.is_alive()] + [thread]
 

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections import Counter
 from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
@@ -23,13 +24,17 @@ SETTLED = 120.0
 
 
 class Quiet(NamedTuple):
-    """What a server holds while nobody asks. life: which.  at: when [s]."""
+    """What a server holds while nobody asks. life: which.  at: when [s].  threads: by name.  files: by kind or name.
+
+    rss: bytes resident.  of_files: those of them that are a file's, so that the system may take them back.
+    """
 
     life: int
     at: float
-    threads: int
-    files: int
+    threads: dict[str, int]
+    files: dict[str, int]
     rss: int
+    of_files: int
 
 
 class Stop(NamedTuple):
@@ -115,11 +120,14 @@ class Lives:
     def look(self) -> None:
         """Note what the server holds; for moments when nobody asks."""
         folder = Path("/proc") / str(self.pid)
-        found = Quiet(
-            self.number, time.monotonic(), len(list((folder / "task").iterdir())),
-            len(list((folder / "fd").iterdir())), _rss(self.pid),
-        )  # fmt: skip
-        self.quiet.append(found)
+        threads = Counter((task / "comm").read_text().strip() for task in (folder / "task").iterdir())
+        files: Counter[str] = Counter()
+        for entry in (folder / "fd").iterdir():
+            with suppress(OSError):  # closed meanwhile
+                files[entry.readlink().name.partition(":")[0]] += 1
+        self.quiet.append(
+            Quiet(self.number, time.monotonic(), dict(threads), dict(files), *_resident(self.pid))
+        )
 
     def slope(self) -> tuple[float, float] | None:
         """Return the slope of the last life's memory once settled [MB a minute], and the minutes it was seen for."""
@@ -151,11 +159,13 @@ class Lives:
             process = self._process
             if process is not None:
                 with suppress(OSError, ValueError, IndexError):  # it has just ended
-                    if rss := _rss(process.pid):  # 0: it has ended
+                    if rss := _resident(process.pid)[0]:  # 0: it has ended
                         self.memory.append((self.number, time.monotonic(), rss))
             time.sleep(WATCH_PERIOD)
 
 
-def _rss(process: int) -> int:
-    """Return the memory that a process has resident [bytes]."""
-    return int(Path(f"/proc/{process}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+def _resident(process: int) -> tuple[int, int]:
+    """Return the memory that a process has resident, and that of it that is files' [bytes]."""
+    _, resident, shared, *_ = Path(f"/proc/{process}/statm").read_text().split()
+    page = os.sysconf("SC_PAGE_SIZE")
+    return int(resident) * page, int(shared) * page

@@ -84,9 +84,11 @@ def _violations(report: dict[str, Any], lives: Lives, limits: Limits) -> list[st
     # The first look of a life may be before something was first used.
     last = [quiet for quiet in lives.quiet if quiet.life == lives.number][1:]
     for what in ("threads", "files"):
-        counts = [getattr(quiet, what) for quiet in last]
-        if counts and max(counts) > min(counts):
-            found.append(f"{what} at quiet points are {counts}, a constant number expected")
+        counts: list[dict[str, int]] = [getattr(quiet, what) for quiet in last]
+        for name in sorted({name for count in counts for name in count}):
+            seen = [count.get(name, 0) for count in counts]
+            if max(seen) > min(seen):
+                found.append(f"{what} named {name!r} at quiet points: {seen}, a constant number expected")
     return found
 
 
@@ -149,8 +151,13 @@ def table(report: dict[str, Any]) -> str:
         ("serving to right again, median and longest", f"{away.get('median')}, {away.get('longest')} s"),
         ("SIGTERM, median and longest", f"{stops.get('median')}, {stops.get('longest')} s"),
         ("memory", f"{report['MB a minute, last server, after two minutes']} MB a minute"),
-        ("threads at quiet points", str([quiet["threads"] for quiet in report["quiet points"]])),
-        ("files at quiet points", str([quiet["files"] for quiet in report["quiet points"]])),
+        *(
+            (
+                f"{what} at quiet points",
+                str([sum(quiet[what].values()) for quiet in report["quiet points"]]),
+            )
+            for what in ("threads", "files")
+        ),
         ("tracebacks in the server's log", str(report["tracebacks in the server's log"])),
     ]
     return "\n".join(f"{name:<44} {value}" for name, value in rows)

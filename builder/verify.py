@@ -205,8 +205,13 @@ def voxel_faults(archive: Archive, row: int, record: OpenRecord, deep: bool) -> 
     if not measure_points(leaves, np.int64(record.voxel_steps), low, high):
         raise CorruptError(f"voxel {record.key:#x}: a point outside its cell")
     record.check_bounds(np.stack([low, high]))
+    # An archive may have no slabs at all; a reader takes a node without a normal for one.
+    nodes = record.nodes
+    stray = np.flatnonzero(nodes.slab.any(axis=0) & ~nodes.normal.any(axis=0))
+    if len(stray):
+        faults.append(f"{archive.where(row)}: node {stray[0]} has a slab and no normal: rebuild the archive")
     if deep:
-        node = last_loose_node(leaves, spheres_of(record), record.nodes.normal, record.nodes.slab)
+        node = last_loose_node(leaves, spheres_of(record), nodes.normal, nodes.slab)
         if node >= 0:
             faults.append(_loose(archive, row, node))
     return faults

@@ -5,6 +5,7 @@ import json
 import os
 import shutil
 import signal
+import sys
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,8 @@ import numpy as np
 import pytest
 
 SEED = 2012
+# What scripts/ consist of is tested too. Appended, so that nothing there hides a module of the tests.
+sys.path.append(str(Path(__file__).parents[1] / "scripts"))
 
 # Under nohup SIGINT is ignored, which processes that tests start, and interrupt, would inherit.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:

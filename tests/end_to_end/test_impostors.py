@@ -2,14 +2,13 @@
 
 import os
 import struct
-import sys
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
 import zenoh
 from floor import DEADLINE, PATH, POINTS, TRUTH, eventually, heights, joined, server_process
+from rogues.tools import Impostor
 from solidcloud.schemas import keys
 from solidcloud.schemas.answers import Verdict
 from solidcloud.schemas.encoding import MSGPACK, encode
@@ -22,11 +21,6 @@ from solidcloud.server.client import Client, scenes_at
 from solidcloud.server.config import ServerConfig
 from solidcloud.server.key_files import find_key, key_paths
 from walkers import pose_at
-
-# Appended, so that nothing of scripts/ hides a module of the tests.
-sys.path.append(str(Path(__file__).parents[2] / "scripts"))
-
-from rogues.tools import Impostor
 
 POSES = heights([-1.0, -2.0])
 CONTACTS = [Verdict.CONTACT] * 2

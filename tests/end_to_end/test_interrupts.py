@@ -13,13 +13,11 @@ from typing import Any
 import numpy as np
 import pytest
 import scans
+from kills.reading import FORMATS
 from solidcloud.schemas.archive import Archive
 from solidcloud.server.cli import run
 
 SCRIPTS = Path(__file__).parents[2] / "scripts"
-sys.path.append(str(SCRIPTS))
-
-from kills.reading import FORMATS  # noqa: E402
 
 
 @pytest.fixture(autouse=True)

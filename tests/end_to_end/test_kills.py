@@ -10,10 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-
-# Appended, so that nothing of scripts/ hides a module of the tests.
-sys.path.append(str(Path(__file__).parents[2] / "scripts"))
-
 from kills.calls import Call, has_strace, one_of_each
 from kills.case import NAME, Case, Tally, content, difference
 

@@ -8,16 +8,12 @@ from pathlib import Path
 import pytest
 from fake_server import floor_simulation
 from floor import eventually
+from rogues.tools import AVATAR, DEADLINE, MODES, POINTS, TOOLS, Rogue, Victim, attempt, widths
 from solidcloud.server.app import serving
 from solidcloud.server.client import Client
 from solidcloud.server.config import ServerConfig
 from solidcloud.server.served import EVERYBODY
 from walkers import pose_at
-
-# Appended, so that nothing of scripts/ hides a module of the tests.
-sys.path.append(str(Path(__file__).parents[2] / "scripts"))
-
-from rogues.tools import AVATAR, DEADLINE, MODES, POINTS, TOOLS, Rogue, Victim, attempt, widths
 
 SCRIPTS = Path(__file__).parents[2] / "scripts"
 

@@ -1,7 +1,5 @@
 """The table of hard cases names the tests there are, and they cover every row of NUMERICS.md."""
 
-import importlib.machinery
-import importlib.util
 import json
 import re
 import subprocess
@@ -11,6 +9,7 @@ from types import ModuleType
 from typing import Any
 
 import pytest
+from project_scripts import load_script
 
 ROOT = Path(__file__).resolve().parents[2]
 ROWS = 31
@@ -19,14 +18,7 @@ ROWS = 31
 @pytest.fixture(scope="module")
 def script() -> ModuleType:
     """scripts/make_hard_cases as a module."""
-    loader = importlib.machinery.SourceFileLoader(
-        "make_hard_cases", str(ROOT / "scripts" / "make_hard_cases")
-    )
-    spec = importlib.util.spec_from_loader(loader.name, loader)
-    assert spec is not None
-    module = importlib.util.module_from_spec(spec)
-    loader.exec_module(module)
-    return module
+    return load_script("make_hard_cases")
 
 
 @pytest.fixture(scope="module")

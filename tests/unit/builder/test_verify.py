@@ -137,6 +137,17 @@ def test_a_loose_bound_is_found_by_the_checks_of_bounds_alone(name: str, check: 
     assert run(["validate", str(copy), f"--{check}"]) == 3
 
 
+def test_a_slab_without_a_normal_is_found(copy: Path) -> None:
+    def without_normal(voxel: VoxelData) -> VoxelData:
+        normal = voxel.nodes.normal.copy()
+        normal[3] = 0
+        return voxel._replace(nodes=voxel.nodes._replace(normal=normal))
+
+    rewrite(copy, without_normal)
+    (fault,) = verify_archive(copy).faults
+    assert "node 3 has a slab and no normal" in fault
+
+
 def test_a_bound_one_step_too_small_is_found_by_the_exact_check(copy: Path) -> None:
     """The least a bound can be wrong: of every node in turn whose radius a step less would not enclose."""
     with Archive(copy) as archive:

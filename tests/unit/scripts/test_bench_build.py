@@ -7,16 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.pipeline import build_archive
-from solidcloud.builder.plan import Stage
-
-# Appended, so that nothing of scripts/ hides a module of the tests.
-sys.path.append(str(Path(__file__).parents[3] / "scripts"))
-
 from bench import build_limits, build_picture, build_rates, build_runs, build_sizes, build_watch
 from bench.build_watch import Sample, Watched
 from bench.results import Part
+from solidcloud.builder.config import BuildConfig
+from solidcloud.builder.pipeline import build_archive
+from solidcloud.builder.plan import Stage
 
 ROLLUP = """55b859773000-7ffce90ef000 ---p 00000000 00:00 0                          [rollup]
 Rss:                1672 kB

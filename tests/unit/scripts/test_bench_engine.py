@@ -3,23 +3,18 @@
 import csv
 import json
 import math
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 
 import naive
 import numpy as np
 import pytest
-from scipy.spatial import cKDTree
-from solidcloud.builder.made.facade import build_facade
-from solidcloud.builder.made.walk import walk_poses
-
-# Appended, so that nothing of scripts/ hides a module of the tests.
-sys.path.append(str(Path(__file__).parents[3] / "scripts"))
-
 from bench import machine, picture, poses, results, sides
 from bench.definition import Judge, least_distance
 from bench.machine import Clock
+from scipy.spatial import cKDTree
+from solidcloud.builder.made.facade import build_facade
+from solidcloud.builder.made.walk import walk_poses
 
 PLANE = np.array([[x, y, 0.0] for x in np.arange(0, 2, 0.05) for y in np.arange(0, 2, 0.05)])
 BODY = np.array([[0.0, 0, 0.1], [0.1, 0, 0.1], [0, 0, 1.0]])

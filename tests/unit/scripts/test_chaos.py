@@ -1,24 +1,19 @@
 """The judge of scripts/chaos: what is unknown is never wrong, and every kind of wrong answer is found out."""
 
 import json
-import sys
 import time
 from pathlib import Path
 
 import cases
 import numpy as np
 import pytest
+from chaos_cases import board as b
+from chaos_cases.ground import AVATARS, ask, judge_claims, make_pool
+from chaos_cases.judge import judge
 from msgspec.structs import replace
 from solidcloud.schemas.answers import CollideAnswers, ContactsAnswers, DistanceAnswers, Verdict
 from solidcloud.schemas.columns import unknown
 from solidcloud.schemas.moves import Moved
-
-# Appended, so that nothing of scripts/ hides a module of the tests.
-sys.path.append(str(Path(__file__).parents[3] / "scripts"))
-
-from chaos_cases import board as b
-from chaos_cases.ground import AVATARS, ask, judge_claims, make_pool
-from chaos_cases.judge import judge
 
 
 @pytest.fixture(scope="module")

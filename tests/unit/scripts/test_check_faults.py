@@ -1,25 +1,15 @@
 """scripts/check_faults: the addresses at which a process listens."""
 
-import importlib.util
 import os
 import socket
-import sys
-from importlib.machinery import SourceFileLoader
-from pathlib import Path
 
 import pytest
-
-SCRIPTS = Path(__file__).parents[3] / "scripts"
-# Appended, so that nothing of scripts/ hides a module of the tests.
-sys.path.append(str(SCRIPTS))
+from project_scripts import load_script
 
 
 @pytest.fixture(scope="module")
 def check_faults():
-    loader = SourceFileLoader("check_faults_script", str(SCRIPTS / "check_faults"))
-    module = importlib.util.module_from_spec(importlib.util.spec_from_loader("check_faults_script", loader))
-    loader.exec_module(module)
-    return module
+    return load_script("check_faults")
 
 
 @pytest.mark.parametrize(

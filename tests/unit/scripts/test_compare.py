@@ -1,24 +1,13 @@
 """scripts/compare: intervals of ratios, and what they say of a limit."""
 
-import importlib.util
-import sys
-from importlib.machinery import SourceFileLoader
-from pathlib import Path
-
 import numpy as np
 import pytest
-
-SCRIPTS = Path(__file__).parents[3] / "scripts"
-# Appended, so that nothing of scripts/ hides a module of the tests.
-sys.path.append(str(SCRIPTS))
+from project_scripts import load_script
 
 
 @pytest.fixture(scope="module")
 def compare():
-    loader = SourceFileLoader("compare_script", str(SCRIPTS / "compare"))
-    module = importlib.util.module_from_spec(importlib.util.spec_from_loader("compare_script", loader))
-    loader.exec_module(module)
-    return module
+    return load_script("compare")
 
 
 def test_interval_of_equal_ratios_is_that_ratio(compare):

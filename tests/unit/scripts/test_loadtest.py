@@ -10,13 +10,6 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from numpy.typing import NDArray
-from solidcloud.schemas.answers import Verdict
-from solidcloud.schemas.stats import StatsAnswer
-
-# Appended, so that nothing of scripts/ hides a module of the tests.
-sys.path.append(str(Path(__file__).parents[3] / "scripts"))
-
 from bench.results import MET, MISSED, Part, goal_rows
 from load import cases, check, drive, frames, pace, page, pictures, server, town
 from load.adversary import Adversary, LruModel
@@ -25,6 +18,9 @@ from load.frames import ANSWERED, NOTHING, REFUSED, Frames
 from load.server import Memory
 from load.traces import Trace
 from load.voxels import Voxels
+from numpy.typing import NDArray
+from solidcloud.schemas.answers import Verdict
+from solidcloud.schemas.stats import StatsAnswer
 
 CLEAR, CONTACT, UNKNOWN = (int(v) for v in (Verdict.CLEAR, Verdict.CONTACT, Verdict.UNKNOWN))
 

@@ -1,21 +1,16 @@
 """Traces of scripts/load: speeds, floors, bounds, smooth turns, and the same bits for the same arguments."""
 
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from load import motion, places, traces
+from load.traces import KINDS, Trace
 from numpy.typing import NDArray
 from solidcloud.builder.made.figure import figure_points
 from solidcloud.builder.made.town import POINTS_PER_FACADE, town_lots
 from solidcloud.builder.made.truth import SceneTruth
 from solidcloud.server.avatar import make_avatar
-
-# Appended, so that nothing of scripts/ hides a module of the tests.
-sys.path.append(str(Path(__file__).parents[3] / "scripts"))
-
-from load import motion, places, traces
-from load.traces import KINDS, Trace
 
 MOVING = ("stroll", "run", "tour", "crowd")
 SECONDS, USERS = 40.0, 4

@@ -8,9 +8,6 @@ import pytest
 
 pytest.importorskip("cosmic_ray", reason="scripts/mutation_cases/requirements.txt is not installed")
 
-# Appended, so that nothing of scripts/ hides a module of the tests.
-sys.path.append(str(Path(__file__).parents[3] / "scripts"))
-
 from mutation_cases import document, results, trial
 from mutation_cases.mutants import Mutant, draw
 from mutation_cases.plan import NONE, TESTS

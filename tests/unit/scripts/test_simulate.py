@@ -4,8 +4,6 @@ import argparse
 import csv
 import json
 import sys
-from importlib.machinery import SourceFileLoader
-from importlib.util import module_from_spec, spec_from_loader
 from pathlib import Path
 from types import ModuleType
 
@@ -13,15 +11,6 @@ import cases
 import numpy as np
 import pytest
 import scans
-from numpy.typing import NDArray
-from solidcloud.schemas.voxel_grid import voxel_keys
-from solidcloud.server.kernels.reach import SceneIndex
-from solidcloud.server.neighbourhood import AHEAD
-from solidcloud.server.policies import POLICIES
-
-# Appended, so that nothing of scripts/ hides a module of the tests.
-sys.path.append(str(Path(__file__).parents[3] / "scripts"))
-
 from load.simulate import (
     NOBODY,
     SWEEP_SECONDS,
@@ -34,6 +23,12 @@ from load.simulate import (
     with_sweeps,
 )
 from load.traces import Centers, Trace, save
+from numpy.typing import NDArray
+from project_scripts import load_script
+from solidcloud.schemas.voxel_grid import voxel_keys
+from solidcloud.server.kernels.reach import SceneIndex
+from solidcloud.server.neighbourhood import AHEAD
+from solidcloud.server.policies import POLICIES
 
 SCRIPTS = Path(__file__).parents[3] / "scripts"
 STEP, VOXEL_STEPS, EDGE = 0.01, 200, 2.0
@@ -267,12 +262,7 @@ def test_a_budget_below_one_request_is_refused() -> None:
 @pytest.fixture(scope="module")
 def script() -> ModuleType:
     """scripts/simulate_cache as a module."""
-    loader = SourceFileLoader("simulate_cache", str(SCRIPTS / "simulate_cache"))
-    spec = spec_from_loader(loader.name, loader)
-    assert spec is not None
-    module = module_from_spec(spec)
-    loader.exec_module(module)
-    return module
+    return load_script("simulate_cache")
 
 
 def test_counted_in_voxels_all_are_one_size_and_load_in_the_time_of_the_mean(script: ModuleType) -> None:

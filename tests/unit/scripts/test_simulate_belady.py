@@ -1,13 +1,7 @@
 """Belady's optimum, against every order of eviction there is."""
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
-
-sys.path.append(str(Path(__file__).parents[3] / "scripts"))
-
 from load.belady import next_uses, optimum
 
 

@@ -169,11 +169,14 @@ class Storm:
         """Note how long after `since` each of the clients heard its first right answer."""
         slots = [slot for slot in self._clients if slot not in self._frozen] if slots is None else slots
         self._until(lambda: all(self._client_row(slot)[b.RIGHT_AT] > since for slot in slots), RIGHT_SECONDS)
+        took: list[float] = []
         for slot in slots:
             at = float(self._client_row(slot)[b.RIGHT_AT])
-            self.recovery.append(max(0.0, at - since) if at > since else RIGHT_SECONDS)
+            took.append(max(0.0, at - since) if at > since else RIGHT_SECONDS)
             if at <= since:
                 self.stuck.append(f"client {slot}: no right answer within {RIGHT_SECONDS:g} s of {since:.1f}")
+        self.say("         right again after " + " ".join(f"{seconds:.1f}" for seconds in sorted(took)) + " s")
+        self.recovery += took
 
     # Generations
 

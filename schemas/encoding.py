@@ -134,11 +134,19 @@ def _array_from_raw(name: str, raw: msgspec.Raw, of: ArrayType, request: bool) -
 
 
 def _pieces(text: bytes, depth: int) -> Iterator[list[Any]]:
-    """A list in JSON, some of its elements at a time. depth: of the lists that its elements are; 0: numbers."""
+    """Yield a list in JSON, some of its elements at a time. depth: of the lists that its elements are; 0: numbers.
+
+    ValueError where an element is longer than a piece: nothing else could run while it is decoded.
+    """
     ends = re.compile(rb"\]\s*" * depth + b",")
     begin, last = 1, len(text) - 1
     while True:
-        end = ends.search(text, begin + _JSON_PIECE, last)
+        end = ends.search(text, begin + _JSON_PIECE, min(last, begin + 2 * _JSON_PIECE))
+        if end is None and last > begin + 2 * _JSON_PIECE:
+            raise ValueError(
+                f"no end of an element in {2 * _JSON_PIECE} bytes of JSON from byte {begin} of the array, "
+                f"expected elements that are {depth}-fold lists, of less than {_JSON_PIECE} bytes each"
+            )
         stop = last if end is None else end.end() - 1
         yield _LIST_DECODER.decode(b"[" + text[begin:stop] + b"]")
         if end is None:

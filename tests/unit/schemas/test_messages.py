@@ -3,6 +3,7 @@
 import json
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import msgspec
 import numpy as np
@@ -388,6 +389,31 @@ def test_large_malformed_json_is_bad_request(change):
     text = encode(CollideRequest("al", np.full((20_000, 4, 4), 1.5)), JSON)
     with pytest.raises(BadRequestError):
         decode_request(CollideRequest, change(text), JSON)
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        b"[[[" + b"0," * 400_000 + b"0]]]",  # one row
+        b"[" + b"0," * 400_000 + b"0]",
+        b"[" * 400 + b"0," * 400_000 + b"0" + b"]" * 400,
+        b"[[[0]]" + b" " * 800_000 + b",[[0]]]",
+        b'["' + b"x" * 800_000 + b'"]',
+    ],
+    ids=["one row", "numbers", "deep", "spaces", "text"],
+)
+def test_json_that_cannot_be_cut_is_refused_before_it_is_decoded(value, monkeypatch):
+    decoded = []
+    real = msgspec.json.Decoder(list)
+    monkeypatch.setattr(
+        "solidcloud.schemas.encoding._LIST_DECODER",
+        SimpleNamespace(decode=lambda text: decoded.append(len(text)) or real.decode(text)),
+    )
+    with pytest.raises(
+        BadRequestError, match=r"no end of an element in 131072 bytes .* expected .* - at `\$\.poses`"
+    ):
+        decode_request(CollideRequest, b'{"avatar":"al","poses":%s}' % value, JSON)
+    assert not decoded
 
 
 def test_a_large_bin_is_writable_and_the_same():

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..schemas.codec import encode_voxel
+from ..schemas.errors import ScanError
 from ..schemas.interrupts import check
 from ..schemas.voxel_grid import Lattice
 from .config import BuildConfig
@@ -50,6 +51,15 @@ class Packed(NamedTuple):
     points: int
     share: float
     voxels: int | None
+
+
+class BrokenScanError(ScanError):
+    """A scan that cannot be read. scan: which."""
+
+    def __init__(self, scan: Scan, cause: ScanError) -> None:
+        """Say what the cause says."""
+        super().__init__(str(cause))
+        self.scan = scan
 
 
 class _Gathered(NamedTuple):
@@ -162,13 +172,19 @@ class _Reader:
 
 
 def _usable_blocks(scan: Scan, start: int, stop: int | None) -> Iterator[Block]:
-    """Yield the usable points of a piece of a scan; of one that cannot seek, from its beginning."""
+    """Yield the usable points of a piece of a scan; of one that cannot seek, from its beginning.
+
+    Raises BrokenScanError where the scan cannot be read.
+    """
     seen = 0
-    for block in scan.blocks(start=start, stop=stop) if scan.seekable else scan.blocks():
-        yield usable(block)
-        seen += len(block.xyz)
-        if stop is not None and seen >= stop - start:
-            return
+    try:
+        for block in scan.blocks(start=start, stop=stop) if scan.seekable else scan.blocks():
+            yield usable(block)
+            seen += len(block.xyz)
+            if stop is not None and seen >= stop - start:
+                return
+    except ScanError as error:
+        raise BrokenScanError(scan, error) from error
 
 
 def _joined(parts: Sequence[_Gathered]) -> _Gathered:
@@ -187,7 +203,7 @@ def packed_sample(
     """Pack some blocks of scans. counts: points of each, about.  density: points a square metre, about.
 
     some: (m, 3) [m], points from all over all scans; None where there are only those of their beginnings.
-    Returns None where no point was found.
+    Returns None where no point was found. Raises BrokenScanError for a scan that cannot be read.
     """
     total = sum(counts)
     if total <= ALL_POINTS:

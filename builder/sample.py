@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ..schemas.errors import ScanError
 from ..schemas.voxel_grid import MAX_COORDINATE, MAX_VOXEL_STEPS, MIN_STEP, make_lattice
 from .config import DEFAULT_STEP, BuildConfig
-from .packed_sample import Packed, packed_sample
+from .packed_sample import BrokenScanError, Packed, packed_sample
 from .plan import Plan, Rates, Scene, estimate, load_rates
 from .scan_list import Input, inputs
 from .sources import Scan
@@ -35,6 +35,8 @@ FIRST_POINTS = 1 << 17
 SECONDS = 10.0
 # A file whose header says nothing of its points, text mostly, has one in so many bytes, or as its beginning shows.
 TEXT_BYTES = 30
+# Scans left out that are named.
+MOST_NAMED = 5
 
 
 class _Look(NamedTuple):
@@ -89,6 +91,10 @@ class _Seen(NamedTuple):
     all_over: bool
 
 
+# A scan that cannot be read is left out.
+_LOST = _Seen(0, [], True)
+
+
 def _see(scan: Scan, looks: int, grid: _Grid) -> _Seen:
     """Look at a scan: its header's number of points, and some of them."""
     count = scan.declared_count
@@ -124,10 +130,10 @@ def seen_scene(
     quick: look at a few points alone, and pack none.  rates: None: those of the package.
     Raises ScanError where no scan has a point, and for a broken one unless `skip_bad`.
     """
-    faults = [each.fault for each in inputs if each.fault]
+    lost = [each.fault for each in inputs if each.fault]
     scans = [scan for each in inputs for scan in each.scans]
-    if faults and not config.skip_bad:
-        raise ScanError(f"{faults[0]} (--skip-bad leaves such scans out)")
+    if lost and not config.skip_bad:
+        raise ScanError(f"{lost[0]} (--skip-bad leaves such scans out)")
     bounds = _bounds(scans)
     # Where headers say nothing the lattice's origin is not known, and voxels are cut elsewhere than they will be.
     grid = _Grid(config.voxel, np.zeros(3) if bounds is None else bounds[0])
@@ -140,18 +146,25 @@ def seen_scene(
             continue
         try:
             seen.append(_see(scan, max(4, LOOKS // len(scans)), grid))
-        except ScanError:
+        except ScanError as error:
             if not config.skip_bad:
                 raise
-            seen.append(_Seen(0, [], True))
-    points = sum(each.points for each in seen)
-    if not points:
-        raise ScanError("no scan holds a point, expected some: check the files")
-    voxels = _total(seen, config.voxel)
-    for edge in CUBES:
-        area = max(1.0, _total(seen, edge)) * edge**2
-        if area * POINTS_A_CUBE <= points * edge**2:
+            lost.append(str(error))
+            seen.append(_LOST)
+    packed = None
+    while True:
+        points, area = _points_and_area(seen)
+        if quick:
             break
+        try:
+            packed = _packed(scans, seen, bounds, points / area, config, rates or load_rates())
+            break
+        except BrokenScanError as error:
+            if not config.skip_bad:
+                raise
+            lost.append(str(error))
+            seen[[scan is error.scan for scan in scans].index(True)] = _LOST
+    voxels = _total(seen, config.voxel)
     looked = sum(look.points for each in seen for look in each.looks)
     formats: Counter[str] = Counter()
     for scan, each in zip(scans, seen, strict=True):
@@ -163,7 +176,9 @@ def seen_scene(
         assumed.append(
             f"{unsaid:,} files do not say how many points they hold: a point in {TEXT_BYTES} bytes"
         )
-    packed = None if quick else _packed(scans, seen, bounds, points / area, config, rates or load_rates())
+    assumed += [f"without a scan that cannot be read: {fault}" for fault in lost[:MOST_NAMED]]
+    if len(lost) > MOST_NAMED:
+        assumed.append(f"without {len(lost) - MOST_NAMED:,} more scans that cannot be read")
     if packed is not None:
         assumed.append(
             f"bytes as {packed.points:,} points take, packed as a build packs them; {packed.share:.0%} of all were read"
@@ -183,6 +198,18 @@ def seen_scene(
         assumed=tuple(assumed),
         packed=None if packed is None else packed.bytes_a_point,
     )
+
+
+def _points_and_area(seen: Sequence[_Seen]) -> tuple[int, float]:
+    """Return how many points scans have, and over how much surface [m^2]. Raises ScanError where there are none."""
+    points = sum(each.points for each in seen)
+    if not points:
+        raise ScanError("no scan holds a point, expected some: check the files")
+    for edge in CUBES:
+        area = max(1.0, _total(seen, edge)) * edge**2
+        if area * POINTS_A_CUBE <= points * edge**2:
+            break
+    return points, area
 
 
 def _packed(

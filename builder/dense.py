@@ -21,7 +21,9 @@ from numpy.typing import NDArray
 
 from ..schemas.codec import (
     CELL_DTYPE,
+    CELL_EXPANSION,
     NODE_DTYPE,
+    NODE_EXPANSION,
     OPTIONAL_COLUMNS,
     Record,
     cell_rows,
@@ -306,7 +308,7 @@ class _Layout:
         top_rows = 0 if self.top is None else len(self.top.count)
         total, nodes_total = int(counts.sum()), top_rows + int(self.cells.nodes.sum(dtype=np.int64))
         points = RowStream(self.scratch, spill.dtype, total)
-        nodes = RowStream(self.scratch, NODE_DTYPE, nodes_total)
+        nodes = RowStream(self.scratch, NODE_DTYPE, nodes_total, NODE_EXPANSION)
         at_point, at_node = 0, top_rows + c
         for first, past in _windows(counts):
             stored, is_root = self._nodes(first, past)
@@ -319,7 +321,7 @@ class _Layout:
                 at_point += len(rows)
         if self.top is not None:
             nodes.put(0, node_rows(self.top.rows()))
-        cells = RowStream(self.scratch, CELL_DTYPE, c)
+        cells = RowStream(self.scratch, CELL_DTYPE, c, CELL_EXPANSION)
         cells.put(0, cell_rows(self.key, self.archive_id, self.cells))
         leaves = int((-(-counts // self.config.leaf)).sum())
         record = Record(cells.frame(), nodes.frame(), points.frame(), c, nodes_total, total, leaves)

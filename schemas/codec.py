@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import CorruptError, MisleadingIndexError
-from .frames import Frame, column_of, pack, unpack
+from .frames import Expansion, Frame, column_of, pack, unpack
 from .kernels.rows import delta_along, lanes_to_points, leaf_bytes, leaf_column
 from .radius_model import RADIUS_CLASSES
 from .voxel import (
@@ -52,6 +52,10 @@ NODE_DTYPE = np.dtype(
     ]
 )
 
+# The most bytes that a frame of cells or nodes stands for. Points follow from the nodes: at most 32 a leaf node.
+# Scanners give many points in one place where nothing reflects. Their nodes are all alike: 16 MB are free.
+CELL_EXPANSION = Expansion(1 << 20, 256)
+NODE_EXPANSION = Expansion(1 << 24, 256)
 
 # The optional columns of the points, in the order of their fields in a row.
 OPTIONAL_COLUMNS = ("scan_index", "intensity", "radius_class", "normal")
@@ -113,7 +117,8 @@ def encode_voxel(voxel: VoxelData, archive_id: bytes) -> Record:
     nodes = node_rows(voxel.nodes)
     points = point_rows(voxel.points, leaf_runs, columns)
     leaves = len(leaf_runs[0])
-    return Record(pack(cells), pack(nodes), pack(points), len(cells), len(nodes), len(points), leaves)
+    frames = pack(cells, CELL_EXPANSION), pack(nodes, NODE_EXPANSION), pack(points)
+    return Record(*frames, len(cells), len(nodes), len(points), leaves)
 
 
 def cell_rows(key: int, archive_id: bytes, cells: Cells) -> NDArray:

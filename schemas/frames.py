@@ -6,7 +6,8 @@ followed by the registered zstd filter 32015, so that any HDF5 tool reads typed 
 
 import mmap
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from typing import NamedTuple
 
 import numpy as np
 import zstandard
@@ -34,6 +35,23 @@ _OF_THREAD = threading.local()
 
 # A zstd frame: held, or in a file that goes with the mapping.
 Frame = bytes | mmap.mmap
+# A block of zstd takes at least 3 bytes of header and 1 of content.
+_LEAST_BLOCK = 4
+
+
+class Expansion(NamedTuple):
+    """A limit of the bytes that a frame stands for: `free`, or `ratio` for each byte of the frame if that is more."""
+
+    free: int
+    ratio: int
+
+    def allows(self, size: int, frame: int) -> bool:
+        """Return whether a frame of so many bytes may stand for `size` bytes."""
+        return size <= max(self.free, self.ratio * frame)
+
+
+# The limit of zstd itself: a block takes at least 4 bytes and stands for at most 2^17.
+ANY_EXPANSION = Expansion(0, 1 << 15)
 
 
 def new_compressor() -> zstandard.ZstdCompressor:
@@ -41,9 +59,29 @@ def new_compressor() -> zstandard.ZstdCompressor:
     return zstandard.ZstdCompressor(compression_params=_PARAMETERS)
 
 
-def pack(rows: NDArray) -> bytes:
-    """Byte planes (HDF5's shuffle) of a packed array, as one zstd frame with checksum and declared size."""
-    return new_compressor().compress(planes_of(rows).data)
+def pack(rows: NDArray, expansion: Expansion = ANY_EXPANSION) -> bytes:
+    """Byte planes (HDF5's shuffle) of a packed array, as one zstd frame with checksum and declared size.
+
+    expansion: limit that the frame keeps; rows that compress to less than it allows are packed less densely.
+    """
+    planes = planes_of(rows)
+    frame = new_compressor().compress(planes.data)
+    if expansion.allows(planes.size, len(frame)):
+        return frame
+    return b"".join(sparse_frame([memoryview(planes.reshape(-1))], planes.size, expansion.ratio))
+
+
+def sparse_frame(parts: Iterable[bytes | memoryview], size: int, ratio: int) -> Iterator[bytes]:
+    """Yield the bytes of a zstd frame that stands for at most `ratio` bytes a byte: its blocks are kept short.
+
+    parts: the content, `size` bytes in all.
+    """
+    stream = new_compressor().compressobj(size=size)
+    for part in parts:
+        for begin in range(0, len(part), _LEAST_BLOCK * ratio):
+            yield stream.compress(part[begin : begin + _LEAST_BLOCK * ratio])
+            yield stream.flush(zstandard.COMPRESSOBJ_FLUSH_BLOCK)
+    yield stream.flush()
 
 
 def planes_of(rows: NDArray) -> NDArray[np.uint8]:

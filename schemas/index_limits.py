@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .codec import CELL_DTYPE, NODE_DTYPE
+from .codec import CELL_DTYPE, CELL_EXPANSION, NODE_DTYPE, NODE_EXPANSION
+from .frames import ANY_EXPANSION
 from .index import VOXEL_DTYPE
 from .radius_model import RADIUS_CLASSES
 from .voxel import MAX_DEGREE, MAX_LEAF, MAX_LEVELS, MIN_DEGREE
@@ -57,8 +58,6 @@ _MOST_LATTICE = 1 << 61
 _MOST_SAMPLE = 1 << 53
 # Links are int32 (schemas/voxel.py).
 _MOST_ROWS = (1 << 31) - 1
-# zstd: a block takes at least 4 bytes and stands for at most 2^17.
-_MOST_RATIO = 1 << 15
 # zstd: magic number, header, one block and checksum.
 _LEAST_FRAME = 13
 
@@ -242,9 +241,16 @@ def _check_rows(columns: dict[str, NDArray], point_bytes: int) -> None:
             f"{_at(voxels, wrong)} rows and leaves", found, "cells, nodes, points and leaf nodes of trees"
         )
     widths = np.array([CELL_DTYPE.itemsize, NODE_DTYPE.itemsize, point_bytes])
-    huge = rows * widths > voxels["frame_bytes"].astype(np.int64) * _MOST_RATIO
+    free, ratio = np.array([CELL_EXPANSION, NODE_EXPANSION, ANY_EXPANSION]).T
+    most = np.maximum(free, voxels["frame_bytes"].astype(np.int64) * ratio)
+    huge = rows * widths > most
     if huge.any():
-        _refuse(f"{_at(voxels, huge)} rows", "of more bytes than its frames can hold", "rows that are there")
+        row, i = np.argwhere(huge)[0]
+        _refuse(
+            f"voxel {voxels['key'][row]:#x} rows",
+            f"of {rows[row, i] * widths[i]} bytes of {('cells', 'nodes', 'points')[i]}, more than its frames can hold",
+            f"at most {most[row, i]}",
+        )
     if int(points.sum()) != int(columns["points"][0]):
         _refuse("points", int(columns["points"][0]), f"{int(points.sum())}, those of all voxels")
 

@@ -3,13 +3,14 @@
 import mmap
 import os
 import tempfile
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .errors import BadRequestError, CorruptError
-from .frames import new_compressor, planes_of
+from .frames import ANY_EXPANSION, Expansion, new_compressor, planes_of, sparse_frame
 
 # What is compressed at a time of a frame that is not held. The frame's bytes may depend on it.
 STREAM_BYTES = 1 << 20
@@ -24,9 +25,11 @@ class RowStream:
     those that `encode_voxel` finds, which has all of them at once. Its files have no name and go with the process.
     """
 
-    def __init__(self, scratch: Path, dtype: np.dtype, rows: int) -> None:
-        """Make room in the folder `scratch` for so many rows."""
-        self._scratch, self._dtype, self._rows = scratch, dtype, rows
+    def __init__(
+        self, scratch: Path, dtype: np.dtype, rows: int, expansion: Expansion = ANY_EXPANSION
+    ) -> None:
+        """Make room in the folder `scratch` for so many rows. expansion: limit that the frame keeps."""
+        self._scratch, self._dtype, self._rows, self._expansion = scratch, dtype, rows, expansion
         self._planes = tempfile.TemporaryFile(dir=scratch, buffering=0)  # noqa: SIM115  `frame` closes it
 
     def put(self, first: int, rows: NDArray) -> None:
@@ -41,23 +44,45 @@ class RowStream:
         """
         with self._planes as planes, tempfile.TemporaryFile(dir=self._scratch, buffering=0) as file:
             size = self._rows * self._dtype.itemsize
-            stream = new_compressor().compressobj(size=size)
-            written = 0
-            for at in range(0, size, STREAM_BYTES):
-                wanted = min(STREAM_BYTES, size - at)
-                part = os.pread(planes.fileno(), wanted, at)
-                if len(part) != wanted:
-                    raise CorruptError(
-                        f"the planes of {self._rows} rows end at byte {at + len(part)}, expected {size}: check the disk"
-                    )
-                written += pwrite_all(file.fileno(), stream.compress(part), written)
-            written += pwrite_all(file.fileno(), stream.flush(), written)
+            written = _write_pieces(file.fileno(), _dense_frame(self._parts(planes.fileno()), size))
+            if not self._expansion.allows(size, written):
+                file.truncate(0)
+                pieces = sparse_frame(self._parts(planes.fileno()), size, self._expansion.ratio)
+                written = _write_pieces(file.fileno(), pieces)
             if written > MAX_FRAME_BYTES:
                 raise BadRequestError(
                     f"a voxel of {self._rows} rows takes {written} bytes, a record holds {MAX_FRAME_BYTES}: "
                     "give a smaller --voxel"
                 )
             return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+
+    def _parts(self, planes: int) -> Iterator[bytes]:
+        """Yield the planes from the file descriptor, some bytes at a time. CorruptError where they end early."""
+        size = self._rows * self._dtype.itemsize
+        for at in range(0, size, STREAM_BYTES):
+            wanted = min(STREAM_BYTES, size - at)
+            part = os.pread(planes, wanted, at)
+            if len(part) != wanted:
+                raise CorruptError(
+                    f"the planes of {self._rows} rows end at byte {at + len(part)}, expected {size}: check the disk"
+                )
+            yield part
+
+
+def _dense_frame(parts: Iterable[bytes], size: int) -> Iterator[bytes]:
+    """Yield the bytes of a zstd frame of parts, `size` bytes in all."""
+    stream = new_compressor().compressobj(size=size)
+    for part in parts:
+        yield stream.compress(part)
+    yield stream.flush()
+
+
+def _write_pieces(descriptor: int, pieces: Iterable[bytes]) -> int:
+    """Write pieces one after the other from a file's beginning; return how many bytes they are."""
+    written = 0
+    for piece in pieces:
+        written += pwrite_all(descriptor, piece, written)
+    return written
 
 
 def pwrite_all(descriptor: int, data: bytes | NDArray, at: int) -> int:

@@ -261,6 +261,26 @@ def forged_bomb(folder: Path, frame: bytes, forged: str) -> None:
     if forged == "nodes":
         row["rows"][1] = BOMB_ROWS // 12
         put_frame(folder, columns, 0, 1, bomb(27 * int(row["rows"][1])))
+    if forged == "cells":
+        columns["points"][0] = columns["source_count"][0] = row["leaves"] = row["rows"][:] = MOST_CELLS
+        row["rows"][1] += 1
+        for i, width in enumerate((45, 27, 6)):
+            put_frame(folder, columns, 0, i, bomb(width * int(row["rows"][i])))
+    write_index(folder, index)
+
+
+MOST_CELLS = 60_000_000
+
+
+def forged_small_bomb(folder: Path) -> None:
+    """Points that take 57 MB, and nodes of 16 MB, as many as the index may say; the cells are those of 400 points."""
+    index = read_index(folder)
+    columns, row = index.columns, index.columns["voxels"][0]
+    row["leaves"] = 600_000
+    columns["points"][0] = columns["source_count"][0] = row["rows"][2] = 16 * 600_000
+    row["rows"][1] = 620_000
+    for i, width in ((1, 27), (2, 6)):
+        put_frame(folder, columns, 0, i, bomb(width * int(row["rows"][i])))
     write_index(folder, index)
 
 
@@ -287,11 +307,24 @@ def test_a_bomb_is_refused_when_the_archive_is_opened(forged: str, tmp_path: Pat
     assert peak_of(refused) < 1 << 20
 
 
+@pytest.mark.parametrize("forged", ["cells", "nodes"])
+def test_a_bomb_of_cells_or_nodes_is_refused_by_its_frame(forged: str, tmp_path: Path, frame: bytes) -> None:
+    folder = one_voxel(tmp_path)
+    forged_bomb(folder, frame, forged)
+
+    def refused() -> None:
+        for read in (Archive, lambda path: verify_archive(path, deep=True)):
+            with pytest.raises(FormatError, match=rf"bytes of {forged}, more than its frames can hold"):
+                read(folder)
+
+    assert peak_of(refused) < 1 << 20
+
+
 def test_a_bomb_that_the_index_agrees_with_is_refused_by_the_cells_before_it_is_decompressed(
-    tmp_path: Path, frame: bytes
+    tmp_path: Path,
 ) -> None:
     folder = one_voxel(tmp_path)
-    forged_bomb(folder, frame, "nodes")
+    forged_small_bomb(folder)
 
     def refused() -> None:
         with Archive(folder) as archive, pytest.raises(CorruptError, match=r"do not add up|cells claim"):

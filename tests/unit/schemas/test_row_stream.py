@@ -9,6 +9,7 @@ import pytest
 import zstandard
 from solidcloud.schemas import row_stream
 from solidcloud.schemas.errors import BadRequestError, CorruptError
+from solidcloud.schemas.frames import Expansion, pack, unpack
 from solidcloud.schemas.row_stream import RowStream, pwrite_all
 
 
@@ -35,6 +36,18 @@ def test_rows_that_come_in_parts_are_one_frame_of_their_byte_planes(
     planes = np.frombuffer(zstandard.ZstdDecompressor().decompress(frame), np.uint8).reshape(10, 1000)
     assert planes.T.tobytes() == rows.tobytes()
     assert not list(tmp_path.iterdir())
+
+
+def test_a_frame_keeps_its_limit_of_expansion_and_holds_the_same_rows(tmp_path: Path) -> None:
+    rows = np.zeros(50_000, [("x", "<u2"), ("y", "u1")])
+    limit = Expansion(1 << 16, 64)
+    stream = RowStream(tmp_path, rows.dtype, len(rows), limit)
+    stream.put(0, rows)
+    for frame in (bytes(stream.frame()), pack(rows, limit)):
+        assert rows.nbytes / 80 < len(frame) and limit.allows(rows.nbytes, len(frame))
+        assert not unpack(frame, rows.dtype, len(rows), "rows").any()
+    assert len(pack(rows)) < 100
+    assert pack(rows, Expansion(rows.nbytes, 64)) == pack(rows)
 
 
 def test_planes_that_end_too_soon_are_seen(tmp_path: Path) -> None:

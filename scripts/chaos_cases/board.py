@@ -4,6 +4,7 @@ Each client writes its own row and nobody else's; the driver writes the first. T
 one clock for all processes of a machine [s].
 """
 
+import threading
 import time
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 # Of the driver: alive at; everybody is to stop; to pause; which generations may be served, as bits; whether a server
 # may be up; a count of its starts and ends; and until when each generation was served that is not any more.
 HEARTBEAT, STOP, PAUSE, SERVED, UP, EPOCH, UNTIL = range(7)
-# Of a client: counts of questions and rows; when it last heard a right answer; whether it is still.
+# Of a client: counts of questions and rows; when it last heard a right answer; whether all its ids are still.
 (
     ASKED,
     RIGHT,
@@ -51,6 +52,23 @@ class Now(NamedTuple):
 
     up: bool
     epoch: int
+
+
+class Stillness:
+    """Tells on a client's row whether all of its ids are still."""
+
+    def __init__(self, row: NDArray[Any], ids: int) -> None:
+        """None of them is still."""
+        self._row, self._ids = row, ids
+        self._still: set[int] = set()
+        self._lock = threading.Lock()
+        row[IDLE] = 0
+
+    def set(self, number: int, still: bool) -> None:
+        """Tell of one of the ids, from 0."""
+        with self._lock:
+            (self._still.add if still else self._still.discard)(number)
+            self._row[IDLE] = len(self._still) == self._ids
 
 
 class Board:

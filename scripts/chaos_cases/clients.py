@@ -50,22 +50,25 @@ class Asker:
 
     def run(self, ids: int) -> None:
         """Ask under so many ids until told to stop."""
-        threads = [threading.Thread(target=self._run, args=(number,)) for number in range(ids)]
+        still = b.Stillness(self.row, ids)
+        threads = [threading.Thread(target=self._run, args=(number, still)) for number in range(ids)]
         for thread in threads:
             thread.start()
         for thread in threads:
             thread.join()
 
-    def _run(self, number: int) -> None:
+    def _run(self, number: int, still: b.Stillness) -> None:
         """Ask under one id."""
         rng = np.random.default_rng([self.seed, number])
         with Client(self.endpoint, scene=SCENE, timeout=TIMEOUT) as client, with_avatars(client):
             while not self.ended():
                 if self.board.driver[b.PAUSE]:
-                    self.row[b.IDLE] = 1
+                    still.set(number, True)
                     time.sleep(0.01)
                     continue
-                self.row[b.IDLE] = 0
+                still.set(number, False)
+                if self.board.driver[b.PAUSE]:
+                    continue  # the driver may have taken it for still
                 try:
                     self._ask(client, self.requests[int(rng.integers(len(self.requests)))])
                 except Exception as error:  # a client that crashes is a fault as well

@@ -88,7 +88,7 @@ def rogue(folder: Path, endpoint: str, seed: int, seconds: float) -> None:
         declare(session.liveliness().declare_token, f"solidcloud/1/alive/{SCENE}/rogue")
         end = time.monotonic() + seconds
         while time.monotonic() < end:
-            for what in ("state", "refused", "wish"):
+            for what in ("state", "wish"):
                 for key in (f"solidcloud/1/{what}/{SCENE}/*/*", f"solidcloud/1/{what}/**"):
                     with suppress(zenoh.ZError):
                         session.put(key, os.urandom(64), encoding=ENCODING)

@@ -3,6 +3,7 @@
 import json
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import cases
 import numpy as np
@@ -10,6 +11,8 @@ import pytest
 from chaos_cases import board as b
 from chaos_cases.ground import AVATARS, ask, judge_claims, make_pool
 from chaos_cases.judge import judge
+from chaos_cases.lives import Quiet
+from chaos_cases.report import Limits, _violations
 from msgspec.structs import replace
 from solidcloud.schemas.answers import CollideAnswers, ContactsAnswers, DistanceAnswers, Verdict
 from solidcloud.schemas.columns import unknown
@@ -121,6 +124,64 @@ def test_the_board_is_one_for_all(tmp_path: Path) -> None:
     assert client.now() == b.Now(True, 0)
     client.client(2)[b.WRONG] += 4
     assert driver.totals()["wrong"] == 4
+
+
+def test_a_client_is_still_once_all_its_ids_are(tmp_path: Path) -> None:
+    board = b.Board(tmp_path / "board", 1)
+    row = board.client(0)
+    row[b.IDLE] = 1  # of a process that was killed
+    still = b.Stillness(row, 6)
+    seen = [row[b.IDLE]]
+    for number in (*range(5), 0):
+        still.set(number, True)
+        seen.append(row[b.IDLE])
+    assert not any(seen)
+    still.set(5, True)
+    assert row[b.IDLE]
+    still.set(3, False)
+    assert not row[b.IDLE]
+
+
+def violations(threads: list[dict[str, int]], files: list[dict[str, int]]) -> list[str]:
+    """What of a run is broken whose last life has held this at quiet points."""
+    quiet = [Quiet(1, 0.0, {"odd": 7}, {"odd": 7}, 0, 0)]  # of a life before
+    quiet += [Quiet(2, 0.0, *held, 0, 0) for held in zip(threads, files, strict=True)]
+    report = dict.fromkeys(
+        ("wrong", "of them in contact", "clear_away", "errors", "tracebacks in the server's log",
+         "seconds from serving to right, of each client", "MB a minute, last server, after two minutes")
+    ) | {"stuck": [], "right": 1}  # fmt: skip
+    return _violations(report, SimpleNamespace(died=[], stops=[], quiet=quiet, number=2), Limits())
+
+
+def pools(*counts: int) -> list[dict[str, int]]:
+    """Threads at quiet points with so many of zenoh's pool, and some of ours."""
+    return [{"worker-0": 1, "chaos-parts": 2, "app-0": 1, f"rx-{i}": n - 1} for i, n in enumerate(counts)]
+
+
+def test_threads_of_ours_must_be_as_many_at_each_quiet_point_but_the_first() -> None:
+    none: list[dict[str, int]] = [{}] * 4
+    assert not violations([{"reload": 3}, {"reload": 1}, {"reload": 1}, {"reload": 1}], none)
+    for more in ({"reload": 1, "chaos-parts": 1}, {"reload": 2}, {}):
+        (found,) = violations([{"reload": 1}, {"reload": 1}, more, {"reload": 1}], none)
+        assert found.startswith("threads named") and "a constant number expected" in found
+
+
+def test_the_pool_of_zenoh_may_come_and_go_but_not_grow() -> None:
+    assert not violations(pools(1, 9, 4, 7, 11, 3, 11), [{}] * 7)
+    assert not violations(pools(5, 9), [{}] * 2)
+    (found,) = violations(pools(1, 9, 4, 7, 3, 12, 3), [{}] * 7)
+    assert "zenoh's pool at quiet points: [9, 4, 7, 3, 12, 3]" in found
+
+
+def test_shards_may_be_opened_later_once_each_and_other_files_not() -> None:
+    base = {"socket": 5, "index.h5": 1}
+    lazy = [base, base, base | {"0-000000.h5": 1}, base | {"1-000003.h5": 1}]
+    assert not violations([{}] * 4, lazy)
+    (found,) = violations([{}] * 4, [*lazy[:3], base | {"0-000000.h5": 2}])
+    assert "'0-000000.h5' at quiet points: open [0, 1, 2] times, at most once" in found
+    for changed in ({"socket": 6}, {"index.h5": 2}, {"0-000000.h5.tmp": 1}):
+        (found,) = violations([{}] * 4, [*lazy[:3], base | changed])
+        assert found.startswith("files named") and "a constant number expected" in found
 
 
 def test_a_generation_that_was_served_while_a_question_was_under_way_is_remembered(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ ALIGNMENT = 64  # a cache line, so that a row never straddles two more than it m
 
 
 class ArenaBuffer:
-    """A buffer of fixed size, given out in runs, first fit.
+    """A buffer of fixed size, given out in runs, best fit: of the shortest free runs that suffice, the first.
 
     arena: the views the kernels read. The system commits its pages when they are first written, so a large
     budget costs nothing until it is used.
@@ -23,9 +23,10 @@ class ArenaBuffer:
         start = -raw.ctypes.data % ALIGNMENT
         buffer = raw[start : start + self.total_bytes]
         self.arena = Arena(buffer.view(np.float32), buffer.view(np.int32), buffer.view(np.uint16))
-        self._free = (
-            [(0, self.total_bytes)] if self.total_bytes else []
-        )  # (offset, bytes), ascending, never adjacent
+        self._free: list[tuple[int, int]] = []  # (offset, bytes), ascending, never adjacent
+        self._by_size: list[tuple[int, int]] = []  # the same as (bytes, offset), ascending
+        if self.total_bytes:
+            self._put(0, 0, self.total_bytes)
 
     @staticmethod
     def rounded(size: int) -> int:
@@ -33,37 +34,53 @@ class ArenaBuffer:
         return -(-size // ALIGNMENT) * ALIGNMENT
 
     def allocate(self, size: int) -> int | None:
-        """The offset of a free run of `size` bytes, now taken; None when there is none."""
+        """Take a free run of `size` bytes and return its offset; None when there is none."""
         size = self.rounded(size)
-        for i, (offset, free) in enumerate(self._free):
-            if free >= size:
-                if free == size:
-                    del self._free[i]
-                else:
-                    self._free[i] = (offset + size, free - size)
-                return offset
-        return None
+        at = bisect.bisect_left(self._by_size, (size, -1))
+        if at == len(self._by_size):
+            return None
+        offset = self._by_size[at][1]
+        self.take(offset, size)
+        return offset
 
     def take(self, offset: int, size: int) -> None:
         """Take a run of `size` bytes from `offset` on, all of which is free."""
         size = self.rounded(size)
         i = bisect.bisect_right(self._free, (offset, self.total_bytes)) - 1
-        start, free = self._free[i]
-        before, behind = offset - start, start + free - offset - size
-        left = [(start, before)] if before else []
-        self._free[i : i + 1] = [*left, (offset + size, behind)] if behind else left
+        start, free = self._drop(i)
+        behind = start + free - offset - size
+        if behind:
+            self._put(i, offset + size, behind)
+        if offset > start:
+            self._put(i, start, offset - start)
 
     def release(self, offset: int, size: int) -> None:
         """Give back a run that `allocate` gave out, joining it to its free neighbours."""
         size = self.rounded(size)
         i = bisect.bisect_left(self._free, (offset, 0))
         if i < len(self._free) and offset + size == self._free[i][0]:
-            size += self._free.pop(i)[1]
+            size += self._drop(i)[1]
         if i > 0 and sum(self._free[i - 1]) == offset:
             i -= 1
-            offset, before = self._free.pop(i)
+            offset, before = self._drop(i)
             size += before
+        self._put(i, offset, size)
+
+    def _put(self, i: int, offset: int, size: int) -> None:
+        """Insert a free run at place `i` in the order of offsets."""
         self._free.insert(i, (offset, size))
+        bisect.insort(self._by_size, (size, offset))
+
+    def _drop(self, i: int) -> tuple[int, int]:
+        """Remove the free run at place `i` in the order of offsets, and return it."""
+        offset, size = self._free.pop(i)
+        del self._by_size[bisect.bisect_left(self._by_size, (size, offset))]
+        return offset, size
+
+    def largest_run(self) -> tuple[int, int]:
+        """Return the longest free run (offset, bytes), of equals the last; (-1, 0) where nothing is free."""
+        size, offset = self._by_size[-1] if self._by_size else (0, -1)
+        return offset, size
 
     def free_runs(self) -> list[tuple[int, int]]:
         """The free runs (offset, bytes), ascending."""

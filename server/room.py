@@ -16,9 +16,14 @@ from .policies import Policy
 
 Which = Callable[[int], bool]
 
-# Voxels to either side of where room was made that are looked at before all are: some tenths of a millisecond. Of a
-# stretch that is short enough to be moved there is one there nearly always.
-AROUND = 512
+# Runs to either side of a place that are looked at to join free room. A load costs the same then however many voxels
+# are resident: the search of 64 runs takes some 20 us.
+AROUND = 32
+# The same in bytes, as multiples of what is asked for: small voxels around a large one are many, and so is the work of
+# loading it.
+AROUND_SIZES = 16
+# Of the buffer, what may go beyond the bytes that are asked for before all runs are looked at.
+SLACK = 1 / 32
 
 
 class Room:
@@ -51,31 +56,50 @@ class Room:
         """Room for a voxel that has none, at the cost of voxels that may go, in the policy's order.
 
         may_go, may_move: of a row.  gone: told each row that went.  most: rows looked at to find those; None: all.
-        Where what may go is too little, nothing goes; where what stays lies in between, some may have gone for nothing.
+        Where what may go is too little, nothing goes. Where the free room is in pieces far apart, more go than the
+        bytes need; where what stays lies in between, some may have gone for nothing.
         """
         size = self.sizes[row]
         offset = self.buffer.allocate(size)
         if offset is None:
-            victims = self._enough(size, may_go, most)
-            if victims is None:
-                return False
-            near = 0
-            for victim in victims:
-                near = self.offsets[victim]
-                self._evict(victim, gone)
-            offset = self._whole_run(size, may_move, near)
-            while offset is None:  # what is pinned lies in between
-                victim = next(filter(may_go, islice(self.policy.victims(), most)), -1)
-                if victim < 0:
-                    return False
-                near = self.offsets[victim]
-                self._evict(victim, gone)
-                offset = self._whole_run(size, may_move, near)
+            offset = self._clear(size, may_go, may_move, gone, most)
+        if offset is None:
+            return False
         self.offsets[row] = offset
         bisect.insort(self._runs, (offset, row))
         self.used_bytes += size
         self.policy.added(row, size, scan=scan)
         return True
+
+    def _clear(
+        self, size: int, may_go: Which, may_move: Which, gone: Callable[[int], None], most: int | None
+    ) -> int | None:
+        """Take a run of `size` bytes, see `make`; None where there is none.
+
+        Free room is joined around the last victim and around the largest free run. While that is in vain, more voxels
+        go, up to SLACK of the buffer; then all runs are looked at.
+        """
+        victims = self._enough(size, may_go, most)
+        if victims is None:
+            return None
+        near, slack = -1, int(self.buffer.total_bytes * SLACK)
+        all_at = size + slack  # the free bytes from which on all runs are looked at
+        for victim in victims:
+            near = self.offsets[victim]
+            self._evict(victim, gone)
+        while True:
+            offset = self._join_around(size, may_move, near)
+            if offset is not None:
+                return offset
+            victim = next(filter(may_go, islice(self.policy.victims(), most)), -1)
+            free = self.buffer.total_bytes - self.used_bytes
+            if victim < 0 or free >= all_at:
+                all_at = free + slack
+                offset = self._join(size, may_move, slice(0, len(self._runs)))
+                if offset is not None or victim < 0:
+                    return offset
+            near = self.offsets[victim]  # what is pinned may lie in between
+            self._evict(victim, gone)
 
     def _enough(self, size: int, may_go: Which, most: int | None) -> list[int] | None:
         """The voxels to go for a run of `size` bytes, in order; None where all that may are too little."""
@@ -89,19 +113,25 @@ class Room:
             free += self.sizes[row]
         return found
 
-    def _whole_run(self, size: int, may_move: Which, near: int) -> int | None:
-        """A run of `size` bytes, for which voxels are moved together if need be; None where pins prevent it.
-
-        near: where room was made just now: the voxels around it are looked at first.
-        """
+    def _join_around(self, size: int, may_move: Which, near: int) -> int | None:
+        """Take a run of `size` bytes, for which voxels near the offset `near`, or near the largest free run, are moved
+        together if need be; None where there is too little room there."""
         offset = self.buffer.allocate(size)
-        if offset is not None or self.buffer.total_bytes - self.used_bytes < size:
+        if offset is not None:
             return offset
-        at = bisect.bisect_left(self._runs, (near, -1))
-        some = slice(max(0, at - AROUND), at + AROUND)
-        if len(self._runs) > 2 * AROUND:
-            offset = self._join(size, may_move, some)
-        return self._join(size, may_move, slice(0, len(self._runs))) if offset is None else offset
+        looked = slice(0, 0)
+        largest, _ = self.buffer.largest_run()
+        for place in (near, largest) if near >= 0 else (largest,):
+            at = bisect.bisect_left(self._runs, (place, -1))
+            low = bisect.bisect_left(self._runs, (place - AROUND_SIZES * size, -1))
+            high = bisect.bisect_left(self._runs, (place + AROUND_SIZES * size, -1))
+            some = slice(max(0, min(at - AROUND, low)), min(len(self._runs), max(at + AROUND, high)))
+            if some == looked:
+                continue
+            offset, looked = self._join(size, may_move, some), some
+            if offset is not None:
+                return offset
+        return None
 
     def _join(self, size: int, may_move: Which, some: slice) -> int | None:
         """The same among some of the runs alone, in order of place.

@@ -1,5 +1,6 @@
 """The arena: runs that never overlap, never leave the buffer, and join again."""
 
+import re
 from itertools import pairwise
 
 import numpy as np
@@ -26,7 +27,7 @@ def test_a_budget_below_a_cache_line_holds_nothing(budget: int) -> None:
     assert buffer.free_runs() == [] and buffer.allocate(1) is None
 
 
-def test_runs_are_taken_first_fit_and_joined() -> None:
+def test_runs_are_taken_best_fit_and_joined() -> None:
     buffer = ArenaBuffer(64 * 6)
     a, b, c = buffer.allocate(64), buffer.allocate(65), buffer.allocate(1)
     assert (a, b, c) == (0, 64, 192)
@@ -37,7 +38,12 @@ def test_runs_are_taken_first_fit_and_joined() -> None:
     assert buffer.allocate(64 * 4) is None, "256 bytes are free, but not in one run"
     buffer.release(64, 65)  # joins both sides
     assert buffer.free_runs() == [(0, 384)]
+    assert buffer.largest_run() == (0, 384)
     assert buffer.allocate(384) == 0 and buffer.free_runs() == []
+    assert buffer.largest_run() == (-1, 0)
+    buffer.release(0, 128)
+    buffer.release(256, 64)
+    assert buffer.allocate(64) == 256, "the run that just suffices, though another comes first"
 
 
 def test_random_use_against_a_model(rng: np.random.Generator) -> None:
@@ -54,11 +60,13 @@ def test_random_use_against_a_model(rng: np.random.Generator) -> None:
             taken = buffer.rounded(size) // ALIGNMENT
             offset = buffer.allocate(size)
             free = "".join("." if owner == 0 else "x" for owner in owners)
-            at = free.find("." * taken)
+            fits = [(len(run[0]), run.start()) for run in re.finditer(r"\.+", free) if len(run[0]) >= taken]
+            at = min(fits)[1] if fits else -1
             assert (offset if offset is not None else -ALIGNMENT) == at * ALIGNMENT
             if offset is not None:
                 owners[at : at + taken] = number
                 held[number] = (offset, size)
         runs = buffer.free_runs()
+        assert buffer.largest_run()[1] == max((size for _, size in runs), default=0)
         assert sum(size for _, size in runs) == (owners == 0).sum() * ALIGNMENT
         assert all(a + size < b for (a, size), (b, _) in pairwise(runs))

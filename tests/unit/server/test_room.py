@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from solidcloud.server.arena import ALIGNMENT as BLOCK
 from solidcloud.server.arena import ArenaBuffer
 from solidcloud.server.policies import make_policy
-from solidcloud.server.room import Room
+from solidcloud.server.room import AROUND, Room
 
 pytestmark = pytest.mark.interpreted
 
@@ -83,6 +83,35 @@ def test_only_some_are_left_and_stand_together() -> None:
     assert sorted(filled.gone) == [0, 2]
     filled.check()
     assert filled.buffer.free_runs() == [(2 * BLOCK, 4 * BLOCK)]
+
+
+@pytest.mark.parametrize("resident", [500, 4000])
+def test_a_load_costs_the_same_however_many_voxels_are_resident(
+    resident: int, rng: np.random.Generator
+) -> None:
+    """Voxels of 1 to 20 blocks are asked for at random, four times as many as fit."""
+    sizes = rng.integers(1, 21, 4 * resident).tolist()
+    filled = Filled(sizes, resident * 10)
+    room, asked, loads = filled.room, 0, 0
+
+    def may(_: int) -> bool:
+        nonlocal asked
+        asked += 1
+        return True
+
+    for row in rng.integers(0, len(sizes), 6 * resident).tolist():
+        if row in room.offsets:
+            room.policy.used(row, scan=False)
+            continue
+        assert room.make(row, may, may, filled.gone.append, scan=False)
+        filled.where[row] = room.offsets[row] // 4
+        loads += 1
+    room.check()
+    assert asked < 8 * AROUND * loads, f"{asked / loads:.0f} runs looked at for a load"
+    assert room.moved_bytes < 100 * BLOCK * loads
+    # Little more goes than the bytes need.
+    assert room.evictions < loads - 0.95 * resident
+    assert room.used_bytes > 0.95 * filled.buffer.total_bytes
 
 
 @given(

@@ -97,7 +97,7 @@ class Residency:
 
     where: (v, 3) int64, a voxel's runs in the arena, -1 when not resident; the kernels read it directly.
     kept: rows that users stand in: they go only when a request would not fit otherwise.  owed: called when a load is
-    owed to somebody who could not wait for it, see `take_owed`.  loaded: called with the row and where it is of each
+    owed to a request whose deadline came first, see `take_owed`.  loaded: called with the row and where it is of each
     voxel that was loaded, by the thread that did, before others know of it; took: then, with the seconds it took.
     proved: called with the row of each voxel that was loaded, before others know of it.
     misled: whether a record that was loaded has points that the index places elsewhere. Voxels are chosen by the index,
@@ -228,8 +228,8 @@ class Residency:
             while True:
                 self._load(wanted, deadline, stop)
                 with self._changed:
-                    while not self._settled(rows) and (left := _seconds_to(deadline, stop)) != 0:
-                        self._changed.wait(left)
+                    while not self._settled(rows) and self._wait(deadline, stop):
+                        pass
                     late_now = _seconds_to(deadline, stop) == 0
                     wanted = [] if late_now else [row for row in rows if row in self._left]
                     if not wanted:
@@ -237,7 +237,9 @@ class Residency:
                         late = tuple(row for row in rows if not self._fault(row) and not self._there(row))
                         self._demands -= 1
                         self._accounts.late += len(late)
-                        if self.owed is not None:
+                        owed = self.owed
+                        # A request that is stopped before its deadline needs nothing more.
+                        if owed is not None and time.perf_counter() >= deadline:
                             self._owed.update(dict.fromkeys(late))
                         self._changed.notify_all()
                         break
@@ -247,7 +249,7 @@ class Residency:
                 self._demands -= 1
             self.release(rows)
             raise
-        if late and (owed := self.owed) is not None:
+        if late and owed is not None:
             owed()
         # Where all that is not there has long been known not to be readable, nothing was waited for.
         waited = time.perf_counter() - begin if mine or waits or late else 0.0
@@ -329,8 +331,7 @@ class Residency:
                 raise
             self._unpin(rows)
             if self._pins or self._loading:
-                self._changed.wait(_seconds_to(deadline, stop))
-                roomy = _seconds_to(deadline, stop) != 0
+                roomy = self._wait(deadline, stop)
             else:
                 # Nobody else holds anything, and yet the room is in pieces between our own voxels.
                 self._room.leave_only(set(rows), self._accounts.evicted)
@@ -339,6 +340,13 @@ class Residency:
             mine = [row for row in rows if row not in self._room.offsets and not self._fault(row)]
             if not roomy:
                 return []
+
+    def _wait(self, deadline: float, stop: Stop) -> bool:
+        """Wait until another thread has changed something; return False when the time is up or the stop is set."""
+        while (left := _seconds_to(deadline, stop)) != 0:
+            if self._changed.wait(left):
+                break
+        return _seconds_to(deadline, stop) != 0
 
     def _pin(self, rows: Sequence[int]) -> None:
         for row in rows:

@@ -10,8 +10,9 @@ import pytest
 import scans
 from fake_store import BLOCK, FakeStore
 from solidcloud.server.request import as_held
-from solidcloud.server.residency import Held, Residency
+from solidcloud.server.residency import _LOOK_SECONDS, Held, Residency
 from solidcloud.server.scene import Scene
+from solidcloud.server.stop import Stop
 
 pytestmark = pytest.mark.interpreted
 PATIENCE = 20.0  # [s], for what takes microseconds when it is right
@@ -103,6 +104,47 @@ def test_who_waits_for_room_waits_until_the_deadline() -> None:
         residency.check()
     assert store.loads == {0: 1, 1: 1}
     assert take(residency, [1, 2], soon(PATIENCE)).late == ()
+
+
+def test_a_stopped_request_is_owed_nothing() -> None:
+    """Its client is gone, or the server stops: only a deadline leaves loads to the prefetcher."""
+    residency = Residency(FakeStore([1] * 4), 4 * BLOCK)
+    told: list[str] = []
+    residency.owed = lambda: told.append("owed")
+    stop = Stop()
+    stop.set("the client is gone")
+    with residency.hold([0, 1], stop=stop) as held:
+        assert held.late == (0, 1)
+    assert residency.take_owed() is None
+    with residency.hold([2], 0.0, stop=stop) as held:
+        assert held.late == (2,)
+    assert residency.take_owed() == 2
+    residency.check()
+
+
+def test_who_waits_for_room_tries_again_only_when_something_changed(monkeypatch: pytest.MonkeyPatch) -> None:
+    residency = Residency(FakeStore([1, 1, 1]), 2 * BLOCK)
+    tries: list[list[int]] = []
+    allocate = residency._allocate_all
+    monkeypatch.setattr(
+        residency, "_allocate_all", lambda rows, scan: tries.append(rows) or allocate(rows, scan)
+    )
+    stop = Stop()
+    with ThreadPoolExecutor(1) as pool:
+        with residency.hold([0, 1]):
+            waiter = pool.submit(lambda: residency.acquire([2], stop=stop))
+            time.sleep(20 * _LOOK_SECONDS)
+            assert tries.count([2]) <= 1
+        assert waiter.result(PATIENCE).late == ()
+    assert tries.count([2]) == 2
+    residency.release([2])
+    with ThreadPoolExecutor(1) as pool, residency.hold([0, 1]):
+        waiter = pool.submit(lambda: residency.acquire([2], stop=stop))
+        time.sleep(4 * _LOOK_SECONDS)
+        stop.set("the client is gone")
+        assert waiter.result(PATIENCE).late == (2,)
+        residency.release([2])
+    residency.check()
 
 
 def test_what_is_corrupt_is_a_fault_and_not_late() -> None:

@@ -46,7 +46,7 @@ from ..schemas.requests import Question
 from .config import ServerConfig
 from .frames import Frames
 from .heap import give_back_large_blocks
-from .served import Answer, SceneLike
+from .served import Answer, Full, SceneLike
 from .stop import NEVER, Stop
 from .threads import start_thread
 from .transport import Transport
@@ -194,16 +194,22 @@ class Service:
             encoding, ErrorCode.INTERNAL, f"{type(error).__name__} in the server: its log says more"
         )
 
-    def busy(self, encoding: str | None, own: bool = False) -> Answer:
-        """Return the answer to a question there is no room for. own: its client has too many in flight."""
-        if own:
-            most = self._config.max_in_flight_by_client
-            message = (
-                f"{most} requests of this client are in flight, the most that this server takes (all clients without a "
-                "liveliness token count as one): wait for answers"
-            )
-        else:
-            message = f"up to {self._config.max_in_flight} requests are in flight here: ask again later"
+    def busy(self, encoding: str | None, full: Full) -> Answer:
+        """Return the answer to a question that there is no room for. full: which limit was reached."""
+        as_one = "(all clients without a liveliness token count as one)"
+        config = self._config
+        message = {
+            Full.REQUESTS: f"up to {config.max_in_flight} requests are in flight here: ask again later",
+            Full.OWN_REQUESTS: (
+                f"{config.max_in_flight_by_client} requests of this client are in flight, the most that this server "
+                f"takes {as_one}: wait for answers"
+            ),
+            Full.PATHS: (
+                f"this server answers up to {config.max_paths} paths at a time, {max(1, config.max_paths // 2)} of one "
+                f"client {as_one}: ask again when one has ended"
+            ),
+            Full.STATES: "as many queries for states are open as this scene has room for: ask again later",
+        }[full]
         return self._error(encoding, ErrorCode.BUSY, message)
 
     def client_gone(self, scene: str, client: str) -> None:
@@ -216,12 +222,21 @@ class Service:
         """Forget avatars that were not used for long, but for those of clients in `alive`."""
         self._scenes[scene].drop_unused_avatars(alive, self._config.avatar_seconds)
 
-    def frames(self, scene: str, publish: Callable[[keys.User, Answer], None]) -> Frames | None:
-        """The sessions of a scene, whose states are sent by `publish`; None: it simulates nothing."""
+    def frames(
+        self,
+        scene: str,
+        publish: Callable[[keys.User, Answer], None],
+        turn: Callable[[str], str] = str,
+    ) -> Frames | None:
+        """Return the sessions of a scene, whose states are sent by `publish`; None: it simulates nothing.
+
+        turn: returns the turn of a client (tokens.py); by default each has its own.
+        """
         simulation = self._scenes[scene].simulation
         if simulation is None:
             return None
-        return self._frames.setdefault(scene, Frames(simulation, publish, self._config.max_request_seconds))
+        frames = Frames(simulation, publish, self._config.max_request_seconds, turn)
+        return self._frames.setdefault(scene, frames)
 
     def warm(self) -> None:
         """Warm every scene, so that the first client does not wait for compilers."""

@@ -32,7 +32,8 @@ class ServerConfig:
     workers: requests answered at the same time. 2: one client that does not take its replies holds one.
     max_slow: requests at work for longer than some 10 ms; they hold no worker. More of them wait for one to end.
     max_request_seconds: server time for one request, or one part of a path; what was not reached by then is `unknown`.
-    max_in_flight: requests accepted and not yet answered, over all clients; one more is answered `busy`.
+    max_in_flight: requests accepted and not yet answered, over all clients; one more is answered `busy`, unless its
+    client has none in flight and it is small. As many liveliness tokens are heeded.
     max_in_flight_by_client: the same for one client; all clients without a liveliness token count as one.
     max_in_flight_bytes: bytes of the payloads of all requests in flight.
     max_paths: paths answered at the same time, each by a thread that sends its parts, half of them of one client; one

@@ -36,7 +36,8 @@ class Bounds(NamedTuple):
 
     workers: quick requests at work.  slow: slow requests at work.  waits: requests that hold no worker because they
     wait, for their client to take the reply for instance.  requests, size: requests accepted and not yet answered, and
-    their bytes.  by_turn: requests of one turn.
+    their bytes.  by_turn: requests of one turn.  first: bytes that a turn's only request may have to be accepted
+    always, so that nobody can keep a newcomer out.
     """
 
     workers: int
@@ -45,6 +46,7 @@ class Bounds(NamedTuple):
     requests: int
     size: int
     by_turn: int
+    first: int
 
 
 class Ticket:
@@ -84,7 +86,8 @@ class FairQueues:
     """A queue for each turn: one request of each at work, the turns in order, the whole bounded. Thread-safe.
 
     A turn is a client's own, or shared by several clients. The requests of one client stay in order: while it has
-    requests in flight, new ones take the same turn.
+    requests in flight, new ones take the same turn. The caller bounds the number of turns: a small request of a turn
+    that has nothing in flight is always accepted.
 
     Methods that make room return the tickets to be started. Each of them, and each that was offered with RUN or START,
     is followed by one call of `finished`, or of `put_back`, or of `detach` and later `release`. So nothing that waits
@@ -107,7 +110,7 @@ class FairQueues:
         with self._lock:
             ticket.turn, own = self._clients.get(ticket.client, (ticket.turn, 0))
             turn = self._turns.get(ticket.turn)
-            if not always and self._requests:
+            if not always and self._requests and (turn is not None or ticket.size > self._bounds.first):
                 if turn is not None and turn.count >= self._bounds.by_turn:
                     return Offer.FULL_TURN
                 if self._requests >= self._bounds.requests or self._bytes + ticket.size > self._bounds.size:
@@ -134,15 +137,16 @@ class FairQueues:
             return self._start_waiting()
 
     def put_back(self, ticket: Ticket) -> list[Ticket]:
-        """Put a request at work back, as a slow one, before all others of its turn.
+        """Put a request at work back, as a slow one under a new ticket, before all others of its turn.
 
-        Returns the tickets to be started.
+        The old ticket is over: nothing takes its place any more, and its `left` stays as it is. Returns the tickets to
+        be started.
         """
+        again = Ticket(ticket.client, ticket.request, ticket.size, turn=ticket.turn, slow=True)
         with self._lock:
-            self._leave(ticket, State.WAITING, ready=False)
-            ticket.slow, ticket.left = True, False
-            self._turns[ticket.turn].waiting.appendleft(ticket)
-            self._ready[True].append(ticket.turn)
+            self._leave(ticket, State.DONE, ready=False)
+            self._turns[again.turn].waiting.appendleft(again)
+            self._ready[True].append(again.turn)
             return self._start_waiting()
 
     def slow(self, ticket: Ticket) -> list[Ticket] | None:

@@ -27,6 +27,7 @@ log = logging.getLogger(__name__)
 _BOXES_A_USER = 2
 # How often the thread that ends long frames looks [s].
 _LOOK_SECONDS = 0.05
+_STOPS = "the server stops"
 # Of a wish: 2,048 objects take a fifth of it. What is more is not read, and comes into no log.
 _MOST_BYTES = 2 << 20
 
@@ -55,11 +56,11 @@ class _Box:
 
 
 class Mailboxes:
-    """The latest wish of each user. Thread-safe; bounded, and so is each client's share."""
+    """The latest wish of each user. Thread-safe; bounded, and so is the share of each turn."""
 
-    def __init__(self, most: int) -> None:
-        """most: mailboxes, at a time."""
-        self._most = most
+    def __init__(self, most: int, turn: Callable[[str], str] = str) -> None:
+        """most: mailboxes, at a time.  turn: returns the turn of a client (tokens.py); by default each has its own."""
+        self._most, self._turn = most, turn
         self._boxes: dict[User, _Box] = {}
         self._waiting: dict[User, None] = {}  # with a wish, in the order they came
         self._left: dict[User, None] = {}  # each once, however often it says so
@@ -75,11 +76,13 @@ class Mailboxes:
         with self._changed:
             box = self._boxes.get(user)
             if box is None:
-                # One client may take half of the room, so that there is always some for another.
-                own = sum(other.client == user.client for other in self._boxes)
+                # One turn may take half of the room, so that there is always some for another.
+                turn = self._turn(user.client)
+                own = sum(self._turn(other.client) == turn for other in self._boxes)
                 if len(self._boxes) >= self._most or own >= max(1, self._most // 2):
                     raise BusyError(
-                        f"{len(self._boxes)} users wish to walk this scene, {own} of this client: come again later"
+                        f"{len(self._boxes)} users wish to walk this scene, {own} of this client (all clients without "
+                        "a liveliness token count as one): come again later"
                     )
                 box = self._boxes[user] = _Box()
             if wish.seq == box.seq:
@@ -158,17 +161,19 @@ class Frames:
         simulation: Simulates,
         publish: Callable[[User, Answer], None],
         max_seconds: float = math.inf,
+        turn: Callable[[str], str] = str,
     ) -> None:
         """Make mailboxes for the users of a simulation.
 
         publish: sends a user's state, or why there is none; must not block.  max_seconds: what one frame of all users
-        may take; users that it did not come to by then stay where they were.
+        may take; users that it did not come to by then stay where they were.  turn: as in `Mailboxes`.
         """
         self._simulation, self._publish, self._max_seconds = simulation, publish, max_seconds
         self._at_work: tuple[float, Stop] | None = None  # since when, and what ends it
         self._watchdog = Watchdog(self._look, period=_LOOK_SECONDS)
         self.most_users = simulation.most_users
-        self._boxes = Mailboxes(_BOXES_A_USER * simulation.most_users)
+        self._boxes = Mailboxes(_BOXES_A_USER * simulation.most_users, turn)
+        self._given_up = False
 
     def wish(self, user: User, payload: bytes, encoding: str | None) -> bool:
         """Take a wish in, or refuse it at once. Return whether it is the user's latest one once more."""
@@ -229,6 +234,8 @@ class Frames:
         """Simulate one frame, which the watchdog ends if it takes too long."""
         stop, now = Stop(), time.monotonic()
         self._at_work = now, stop
+        if self._given_up:  # read after the flag is there for `give_up` to set
+            stop.set(_STOPS)
         if self._watchdog.asleep:
             self._watchdog.wake()
         try:
@@ -254,5 +261,14 @@ class Frames:
     def close(self) -> None:
         """End `run` once what came is done; a frame that is at work is ended early."""
         self._boxes.close()
+        self._stop_frame()
+
+    def give_up(self) -> None:
+        """End the frame at work early, and each one after it."""
+        self._given_up = True
+        self._stop_frame()
+
+    def _stop_frame(self) -> None:
+        """End the frame at work early, if there is one."""
         if (at_work := self._at_work) is not None:
-            at_work[1].set("the server stops")
+            at_work[1].set(_STOPS)

@@ -102,6 +102,11 @@ class Job:
         return "" if self.ticket is None else self.ticket.client
 
     @property
+    def turn(self) -> str:
+        """The turn that the request takes."""
+        return "" if self.ticket is None else self.ticket.turn
+
+    @property
     def works(self) -> bool:
         """Whether its thread has been computing for long, and not waiting."""
         return cpu_seconds(self.thread_id) - self.cpu >= SLOW_SECONDS

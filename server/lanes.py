@@ -15,9 +15,10 @@ from typing import Any, NamedTuple, Protocol
 from .config import ServerConfig
 from .fair_queues import Bounds, FairQueues, Offer, State, Ticket
 from .jobs import SLOW_SECONDS, Job, Request, Wire
-from .served import Answer
+from .served import Answer, Full
 from .stop import Stop
 from .threads import start_thread
+from .tokens import ANONYMOUS, Tokens
 from .watchdog import Watchdog, lower_priority
 
 log = logging.getLogger(__name__)
@@ -27,9 +28,12 @@ log = logging.getLogger(__name__)
 _MOST_WAITING = 64
 # How often avatars that nobody uses are looked for [s].
 _DROP_SECONDS = 5.0
-# The turn of all clients without a liveliness token; no client's name. zenoh does not tell which session a query comes
-# from: `Query.source_info` holds what the asker put there, by default nothing.
-_ANONYMOUS = ""
+# How often a worker that does not wait for queries queues all that are at hand [s], and how many at a time. Where it
+# took them one by one, a newcomer's would wait in the channel for all that came before it.
+_EMPTY_SECONDS = 0.002
+_MOST_AT_HAND = 256
+# A request of so many bytes is always accepted from a client that has nothing in flight.
+_FIRST_BYTES = 1 << 16
 
 
 class Questions(Protocol):
@@ -38,7 +42,7 @@ class Questions(Protocol):
     def answer(
         self, key: str, payload: bytes, encoding: str | None, stop: Stop
     ) -> Answer | Iterator[Answer]: ...
-    def busy(self, encoding: str | None, own: bool = False) -> Answer: ...
+    def busy(self, encoding: str | None, full: Full) -> Answer: ...
     def client_gone(self, scene: str, client: str) -> None: ...
     def drop_unused(self, scene: str, alive: Collection[str]) -> None: ...
 
@@ -52,7 +56,8 @@ class _Gone(NamedTuple):
 class Lane:
     """The questions about one scene, from the channel to the service and back.
 
-    queries: the channel.  start: starts a thread of a name that runs a function with arguments.
+    queries: the channel.  at_hand: takes a query from it without waiting; None where there is none.  start: starts a
+    thread of a name that runs a function with arguments.  tokens: those of the scene's clients.
     """
 
     def __init__(
@@ -61,12 +66,15 @@ class Lane:
         scene: str,
         config: ServerConfig,
         queries: Iterable[Any],
+        at_hand: Callable[[], Any | None],
         start: Callable[..., None],
         wire: Wire,
+        tokens: Tokens,
     ) -> None:
         """Make a lane that does not take queries yet."""
+        self._tokens = tokens
         self._service, self._scene, self._config = service, scene, config
-        self._queries, self._wire = queries, wire
+        self._queries, self._at_hand, self._wire = queries, at_hand, wire
         self._start_thread = start
         self._queues = FairQueues(
             Bounds(
@@ -76,14 +84,15 @@ class Lane:
                 config.max_in_flight,
                 config.max_in_flight_bytes,
                 config.max_in_flight_by_client,
+                _FIRST_BYTES,
             )
         )
         self._lock = threading.Lock()
-        self._alive: set[str] = set()  # clients with a liveliness token
         self._jobs: set[Job] = set()  # at work now
         self._streaming: dict[Request, Job] = {}  # whose answers are on their way in parts
-        self._to_start: deque[Ticket] = deque()
+        self._to_start: deque[tuple[str, Callable[..., object], tuple[Any, ...]]] = deque()
         self._given_up = False
+        self._emptied = 0.0  # when a worker queued all queries at hand
         self._dropped = 0.0  # when unused avatars were looked for
         self._watchdog = Watchdog(self._look)
 
@@ -101,8 +110,8 @@ class Lane:
 
     @property
     def in_flight(self) -> int:
-        """Return the number of requests that were accepted and are neither answered nor dropped."""
-        return len(self._queues)
+        """Return the number of requests that are neither answered nor dropped, and of threads about to be started."""
+        return len(self._queues) + len(self._to_start)
 
     def give_up(self) -> None:
         """Stop what is at work, and drop what waits: its clients take it for unknown."""
@@ -110,13 +119,8 @@ class Lane:
         for job in [*self._jobs, *self._streaming.values()]:
             job.end("the server stops")
 
-    def client_here(self, client: str) -> None:
-        """Give a client a turn of its own: its liveliness token is there."""
-        self._alive.add(client)
-
     def client_gone(self, client: str) -> None:
         """Stop and drop all requests of a client whose liveliness token went, then have the service forget it."""
-        self._alive.discard(client)
         dropped, started = self._queues.drop(client)
         self._start(started)
         for ticket in dropped:
@@ -142,9 +146,12 @@ class Lane:
         for ticket in tickets:
             self._start_thread(self._scene, self._run, ticket)
 
-    def _hand_over(self, tickets: Iterable[Ticket]) -> None:
-        """Have the watchdog start requests: threads that a slow thread starts would have its low priority."""
-        self._to_start.extend(tickets)
+    def _hand_over(self, name: str, run: Callable[..., object], *arguments: Any) -> None:
+        """Have the watchdog start a thread: one that a slow thread starts would have its low priority.
+
+        The watchdog tries again where the system has no thread left.
+        """
+        self._to_start.append((name, run, arguments))
         self._watchdog.wake()
 
     def _take_all(self) -> None:
@@ -164,22 +171,52 @@ class Lane:
 
     def _take(self, query: Any) -> bool:
         """Answer a query, or leave it to a thread that is at work. Returns whether this thread is still a worker."""
+        ticket, takes = self._accept(query)
+        return takes if ticket is None else self._work(ticket, takes)
+
+    def _accept(self, query: Any) -> tuple[Ticket | None, bool]:
+        """Queue a query, or refuse it.
+
+        Returns its ticket where this thread is to carry it out, and whether this thread is still a worker.
+        """
         request = Request(query, self._wire)
         client = request.client
-        turn = client if client in self._alive else _ANONYMOUS
+        turn = self._tokens.turn(client)
         ticket = Ticket(client, request, len(request.payload), turn=turn, slow=request.slow)
         offer = self._queues.offer(ticket)
         if offer is Offer.RUN:
-            return self._work(ticket, takes=True)
+            return ticket, True
         if offer is Offer.START:
             self._start([ticket])
         elif offer is not Offer.WAIT:
-            return self._refuse(request, offer)
-        return True
+            return None, self._refuse(request, offer)
+        return None, True
+
+    def _empty(self, following: Ticket | None) -> tuple[Ticket | None, bool]:
+        """Queue the queries that are at hand.
+
+        following: what this thread carries out next; None: nothing yet. Returns that, and whether this thread is still
+        a worker.
+        """
+        takes, number = True, 0
+        while takes and number < _MOST_AT_HAND and (query := self._at_hand()) is not None:
+            number += 1
+            try:
+                ticket, takes = self._accept(query)
+            except Exception:  # of this query alone
+                log.exception("a query of scene %s", self._scene)
+                continue
+            if following is None:
+                following = ticket
+            elif ticket is not None:
+                self._start([ticket])
+        self._emptied = time.monotonic()
+        return following, takes
 
     def _refuse(self, request: Request, offer: Offer) -> bool:
         """Answer that there is no room. Returns whether this thread is still a worker."""
-        busy = self._service.busy(request.encoding, offer is Offer.FULL_TURN)
+        full = Full.OWN_REQUESTS if offer is Offer.FULL_TURN else Full.REQUESTS
+        busy = self._service.busy(request.encoding, full)
         job = Job(None, takes=True, sending=True)
         self._enter(job)
         try:
@@ -200,17 +237,20 @@ class Lane:
     def _work(self, ticket: Ticket, takes: bool) -> bool:
         """Carry out a request, and then what waits, until nothing does.
 
-        Returns whether this thread is still a worker.
+        takes: whether this thread is a worker, which takes queries. Returns whether it is still one.
         """
         following: Ticket | None = ticket
         while following is not None:
             left, started = self._carry_out(following, takes)
             if left:
-                self._hand_over(started)
+                for each in started:
+                    self._hand_over(self._scene, self._run, each)
                 return False
             following = next((each for each in started if not each.slow), None)
             self._start(each for each in started if each is not following)
-        return True
+            if takes and time.monotonic() - self._emptied >= _EMPTY_SECONDS:
+                following, takes = self._empty(following)
+        return takes
 
     def _carry_out(self, ticket: Ticket, takes: bool) -> tuple[bool, list[Ticket]]:
         """Carry out one request. Returns whether it gave up its worker, and the tickets to be started."""
@@ -229,10 +269,9 @@ class Lane:
                 self._jobs.discard(job)
             if parts is not None:
                 started = self._queues.detach(ticket)
-                self._start_thread(f"{self._scene}-parts", self._stream, ticket, parts, job)
+                self._hand_over(f"{self._scene}-parts", self._stream, ticket, parts)
             elif job.again:
-                left = ticket.left
-                return left, self._queues.put_back(ticket)
+                started = self._queues.put_back(ticket)
             else:
                 started = self._queues.finished(ticket)
         return ticket.left, started
@@ -256,21 +295,28 @@ class Lane:
             job.again = False
             job.begun, job.sending = time.monotonic(), True
         if not isinstance(answer, Answer):
-            # One client may take half of the room, so that there is always some for another.
-            most = self._config.max_paths
-            own = sum(other.client == request.client for other in list(self._streaming))
-            if len(self._streaming) < most and own < max(1, most // 2):
+            if self._has_room(job):
                 self._streaming[request] = job
                 return answer
-            answer = self._service.busy(request.encoding)
+            answer = self._service.busy(request.encoding, Full.PATHS)
         if job.ticket is not None and job.ticket.left:
-            self._hand_over(self._queues.waits(job.ticket) or [])
+            for ticket in self._queues.waits(job.ticket) or []:
+                self._hand_over(self._scene, self._run, ticket)
         # Leaving `with query` tells the client that no more will come.
         with request.query as query:
             self._wire.reply(query, request.key_expr, answer, request.sealer, 0)
         return None
 
-    def _stream(self, ticket: Ticket, answers: Iterator[Answer], job: Job) -> None:
+    def _has_room(self, job: Job) -> bool:
+        """Return whether one more answer may come in parts.
+
+        One turn may take half of the room, so that there is always some for another.
+        """
+        most, streaming = self._config.max_paths, list(self._streaming.values())
+        own = sum(other.turn == job.turn for other in streaming)
+        return len(streaming) < most and own < max(1, most // 2)
+
+    def _stream(self, ticket: Ticket, answers: Iterator[Answer]) -> None:
         """Send an answer's parts. A thread's work."""
         request = ticket.request
         try:
@@ -290,15 +336,30 @@ class Lane:
     def _look(self, now: float) -> bool:
         """Look at all jobs; returns whether there are any."""
         while self._to_start:
-            self._start([self._to_start.popleft()])
+            name, run, arguments = self._to_start[0]
+            self._start_thread(name, run, *arguments)
+            self._to_start.popleft()
         jobs = list(self._jobs)
         for job in jobs:
             if now - job.begun >= SLOW_SECONDS:
                 self._look_at(job, now)
+        for job in list(self._streaming.values()):
+            self._end_unheard(job, now)
         if now - self._dropped >= _DROP_SECONDS:
             self._dropped = now
-            self._service.drop_unused(self._scene, frozenset(self._alive))
+            self._service.drop_unused(self._scene, self._tokens.heeded)
         return bool(jobs)
+
+    def _end_unheard(self, job: Job, now: float) -> None:
+        """Stop a path of a client without a token once it has taken as long as an avatar is kept for such a client.
+
+        Nothing tells that such a client is gone: zenoh takes replies for a link that is closed.
+        """
+        most = self._config.avatar_seconds
+        if now - job.begun >= most and self._tokens.turn(job.client) == ANONYMOUS:
+            job.stop.set(
+                f"the path took longer than {most:g} s, the most for a client without a liveliness token"
+            )
 
     def _look_at(self, job: Job, now: float) -> None:
         """Take the worker of a job that has been at work for long, and stop one whose time is up."""

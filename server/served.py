@@ -1,6 +1,7 @@
 """What is served: what a service asks its questions of, and what simulates its frames."""
 
 from collections.abc import Collection, Iterator, Sequence
+from enum import Enum
 from typing import Any, NamedTuple, Protocol
 
 from ..schemas.answers import (
@@ -24,6 +25,15 @@ from .stop import Stop
 EVERYBODY = "*"
 # The client of avatars that were added in the process that serves, by no client.
 THIS_PROCESS = ""
+
+
+class Full(Enum):
+    """What a server has no more room for."""
+
+    REQUESTS = "requests in flight, of all clients"
+    OWN_REQUESTS = "requests in flight, of one client"
+    PATHS = "paths"
+    STATES = "queries for states"
 
 
 class Answer(NamedTuple):

@@ -15,8 +15,9 @@ from ..schemas.errors import BadRequestError
 from ..schemas.seals import Sealer
 from .frames import Frames
 from .replies import send_reply
-from .served import Answer
+from .served import Answer, Full
 from .state_streams import StateStreams
+from .tokens import Tokens
 
 log = logging.getLogger(__name__)
 
@@ -36,8 +37,10 @@ FRAME_QOS: dict[str, Any] = {
 class Sessions(Protocol):
     """What has the frames of a scene simulated."""
 
-    def frames(self, scene: str, publish: Callable[[keys.User, Answer], None]) -> Frames | None: ...
-    def busy(self, encoding: str | None, own: bool = False) -> Answer: ...
+    def frames(
+        self, scene: str, publish: Callable[[keys.User, Answer], None], turn: Callable[[str], str]
+    ) -> Frames | None: ...
+    def busy(self, encoding: str | None, full: Full) -> Answer: ...
 
 
 class SceneSessions:
@@ -50,26 +53,34 @@ class SceneSessions:
         service: Sessions,
         start: Callable[..., None],
         sealer: Callable[[zenoh.Query, str, bytes], Sealer | None],
+        tokens: Tokens,
     ) -> None:
         """Declare them.
 
-        start: starts a thread of a name that runs a function with arguments.  sealer: as in `Wire`.
+        start: starts a thread of a name that runs a function with arguments.  sealer: as in `Wire`.  tokens: those of
+        the scene's clients.
         """
         self.declared: list[Any] = []
         self._service, self._sealer = service, sealer
-        frames = service.frames(scene, self._send)
-        self._streams = StateStreams(0 if frames is None else _STREAMS_A_USER * frames.most_users)
+        self._frames = frames = service.frames(scene, self._send, tokens.turn)
+        self._streams = StateStreams(
+            0 if frames is None else _STREAMS_A_USER * frames.most_users, tokens.turn
+        )
         if frames is None:
             return
-        self._frames = frames
         queryable = session.declare_queryable(
             keys.states_key(scene), zenoh.handlers.FifoChannel(_CHANNEL), complete=True
         )
         wishes = session.declare_subscriber(keys.wishes_key(scene), zenoh.handlers.FifoChannel(_CHANNEL))
         self.declared += [queryable, wishes]
         start(f"{scene}-states", self._open_streams, queryable.handler)
-        start(f"{scene}-wishes", self._take_wishes, wishes.handler)
-        start(f"{scene}-frames", self._run_frames)
+        start(f"{scene}-wishes", self._take_wishes, wishes.handler, frames)
+        start(f"{scene}-frames", self._run_frames, frames)
+
+    def give_up(self) -> None:
+        """Stop the frame at work, and those of the wishes that wait."""
+        if self._frames is not None:
+            self._frames.give_up()
 
     def client_gone(self, client: str) -> None:
         """End what a client that is gone has asked for."""
@@ -78,10 +89,10 @@ class SceneSessions:
     def _send(self, user: keys.User, answer: Answer) -> None:
         self._streams.send(user, answer)
 
-    def _run_frames(self) -> None:
+    def _run_frames(self, frames: Frames) -> None:
         """Simulate until there are no more wishes, then end the streams. A thread's work."""
         try:
-            self._frames.run()
+            frames.run()
         finally:
             self._streams.close()
 
@@ -107,20 +118,20 @@ class SceneSessions:
         if not self._streams.open(user, query, sealer):
             with query:
                 encoding = None if query.encoding is None else str(query.encoding)
-                send_reply(query, query.key_expr, self._service.busy(encoding), sealer)
+                send_reply(query, query.key_expr, self._service.busy(encoding, Full.STATES), sealer)
 
-    def _take_wishes(self, samples: Any) -> None:
+    def _take_wishes(self, samples: Any, frames: Frames) -> None:
         """Take wishes in until there are no more, then end the frames. A thread's work."""
         try:
             for sample in samples:
                 try:
-                    self._take_wish(sample)
+                    self._take_wish(sample, frames)
                 except Exception:  # of this wish alone
                     log.exception("a wish")
         finally:
-            self._frames.close()
+            frames.close()
 
-    def _take_wish(self, sample: zenoh.Sample) -> None:
+    def _take_wish(self, sample: zenoh.Sample, frames: Frames) -> None:
         """Take in one wish, or that a user leaves."""
         try:
             user = keys.parse_wish(str(sample.key_expr))
@@ -128,7 +139,7 @@ class SceneSessions:
             log.debug("a wish of nobody: %s", error)
             return
         if sample.kind == zenoh.SampleKind.DELETE:
-            self._frames.leave(user)
+            frames.leave(user)
             self._streams.forget(user)
-        elif self._frames.wish(user, sample.payload.to_bytes(), str(sample.encoding)):
+        elif frames.wish(user, sample.payload.to_bytes(), str(sample.encoding)):
             self._streams.send_again(user)

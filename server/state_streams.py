@@ -7,6 +7,7 @@ wildcard includes every client's key, and would tell its holder the ids in them.
 import threading
 import time
 from collections import OrderedDict
+from collections.abc import Callable
 
 import zenoh
 
@@ -46,9 +47,12 @@ class _Stream:
 class StateStreams:
     """The open queries of one scene. Thread-safe; no method blocks, since states are dropped and never wait."""
 
-    def __init__(self, most: int) -> None:
-        """most: queries that are open at a time; one client has half of them at most."""
-        self._most = most
+    def __init__(self, most: int, turn: Callable[[str], str] = str) -> None:
+        """most: queries that are open at a time; one turn has half of them at most.
+
+        turn: returns the turn of a client (tokens.py); by default each has its own.
+        """
+        self._most, self._turn = most, turn
         self._streams: OrderedDict[User, _Stream] = OrderedDict()  # the one used last comes last
         self._kept: OrderedDict[User, tuple[float, Answer]] = OrderedDict()
         self._closed = False
@@ -108,16 +112,12 @@ class StateStreams:
             for user in list(self._streams):
                 self._end(user)
 
-    def __len__(self) -> int:
-        """Return the number of open queries."""
-        with self._lock:
-            return len(self._streams)
-
     def _make_room(self, user: User) -> bool:
-        """End queries until one of this user has room. A client's own oldest goes first, then one that is idle."""
+        """End queries until one of this user has room. The oldest of its turn goes first, then one that is idle."""
         if user in self._streams:
             return True
-        own = [other for other in self._streams if other.client == user.client]
+        turn = self._turn(user.client)
+        own = [other for other in self._streams if self._turn(other.client) == turn]
         if len(own) >= max(1, self._most // 2):
             self._end(own[0])
         if len(self._streams) >= self._most:

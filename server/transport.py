@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
+from functools import partial
 from types import TracebackType
 from typing import Any, Protocol, Self
 
@@ -30,6 +31,7 @@ from .replies import sealer_of, send_reply
 from .served import Answer
 from .session_transport import SceneSessions, Sessions
 from .threads import start_thread
+from .tokens import Tokens
 
 log = logging.getLogger(__name__)
 
@@ -98,6 +100,7 @@ class Transport:
         self._lock = threading.Lock()
         self._declared: list[Any] = []
         self._lanes: list[Lane] = []
+        self._sessions: list[SceneSessions] = []
         self.left_at_work = False  # once it was left: whether threads did not end in time
 
     def __enter__(self) -> Self:
@@ -124,8 +127,8 @@ class Transport:
                 declared.undeclare()
             if not self._wait(self._config.stop_seconds):
                 log.warning("not all is answered after %g s: the rest is given up", self._config.stop_seconds)
-                for lane in self._lanes:
-                    lane.give_up()
+                for each in (*self._lanes, *self._sessions):
+                    each.give_up()
                 self._wait(_GIVE_UP_SECONDS)
         # Closing the session ends what waits for a client that takes nothing. A thread that is still at work when the
         # interpreter ends, inside zenoh, would abort the process.
@@ -171,18 +174,22 @@ class Transport:
             keys.questions_key(scene), zenoh.handlers.FifoChannel(_CHANNEL), complete=True
         )
         self._declared.append(queryable)
+        tokens = Tokens(self._config.max_in_flight)
         lane = Lane(
             self._service,
             scene,
             self._config,
             queryable.handler,
+            partial(_at_hand, queryable.handler),
             self._start,
             Wire(_encoding, self._sealer, send_reply),
+            tokens,
         )
         self._lanes.append(lane)
-        sessions = SceneSessions(session, scene, self._service, self._start, self._sealer)
+        sessions = SceneSessions(session, scene, self._service, self._start, self._sealer, tokens)
+        self._sessions.append(sessions)
         self._declared += sessions.declared
-        self._start(f"{scene}-watch", _watch, watch.handler, lane, sessions)
+        self._start(f"{scene}-watch", _watch, watch.handler, tokens, lane, sessions)
         lane.start()
         return lane
 
@@ -213,7 +220,7 @@ class Transport:
             self._threads = [other for other in self._threads if other.is_alive()] + [thread]
 
 
-def _watch(samples: Any, lane: Lane, sessions: SceneSessions) -> None:
+def _watch(samples: Any, tokens: Tokens, lane: Lane, sessions: SceneSessions) -> None:
     """Tell a lane and the sessions of its scene which clients come and go. A thread's work."""
     for sample in samples:
         try:
@@ -223,12 +230,22 @@ def _watch(samples: Any, lane: Lane, sessions: SceneSessions) -> None:
             continue
         try:
             if sample.kind == zenoh.SampleKind.DELETE:
+                tokens.gone(client)
                 sessions.client_gone(client)
                 lane.client_gone(client)
             else:
-                lane.client_here(client)
+                tokens.here(client)
         except Exception:  # of this client alone
             log.exception("client %s", client)
+
+
+def _at_hand(queries: Any) -> zenoh.Query | None:
+    """Take a query from a channel without waiting; return None where there is none, or the channel has ended."""
+    try:
+        query: zenoh.Query | None = queries.try_recv()
+    except zenoh.ZError:
+        return None
+    return query
 
 
 def _encoding(query: zenoh.Query) -> str | None:

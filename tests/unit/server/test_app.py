@@ -46,6 +46,7 @@ from solidcloud.schemas.requests import ObjectItem
 from solidcloud.server import app as app_module
 from solidcloud.server.app import Service
 from solidcloud.server.config import ServerConfig
+from solidcloud.server.served import Full
 from solidcloud.server.stop import Stop
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "end_to_end"))
@@ -298,8 +299,13 @@ def test_warming_warms_every_scene(service, scene):
 
 
 def test_busy_says_how_many(service):
-    assert error(service.busy(JSON), JSON).code == "busy"
-    assert "7" in error(service.busy(None)).message
+    assert error(service.busy(JSON, Full.REQUESTS), JSON).code == "busy"
+    assert "7 requests" in error(service.busy(None, Full.REQUESTS)).message
+    config = ServerConfig()
+    said = {full: error(Service([FloorScene()], config).busy(None, full)).message for full in Full}
+    assert "64 requests of this client" in said[Full.OWN_REQUESTS]
+    assert "16 paths" in said[Full.PATHS] and "8 of one client" in said[Full.PATHS]
+    assert "queries for states" in said[Full.STATES]
 
 
 def test_two_scenes_of_one_name_are_refused():

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 from solidcloud.server.fair_queues import Bounds, FairQueues, Offer, State, Ticket
 
-BOUNDS = Bounds(workers=2, slow=1, waits=4, requests=100, size=1000, by_turn=50)
+BOUNDS = Bounds(workers=2, slow=1, waits=4, requests=100, size=1000, by_turn=50, first=0)
 
 
 def make(**bounds):
@@ -58,13 +58,27 @@ def test_what_is_over_the_bounds_is_refused():
     assert offered(queues, "b", 2, 60)[1] is Offer.FULL, "bytes"
     second, offer = offered(queues, "b", 2, 40)
     assert offer is Offer.WAIT
-    assert offered(queues, "c", 3, 0)[1] is Offer.FULL, "requests"
-    third = Ticket("c", 4, 0)
+    assert offered(queues, "c", 3, 1)[1] is Offer.FULL, "requests"
+    third = Ticket("c", 4, 1)
     assert queues.offer(third, always=True) is Offer.WAIT
     assert queues.finished(first) == [second]
     assert queues.finished(second) == [third]
     assert queues.finished(third) == []
     assert offered(queues, "a", 5, 1000)[1] is Offer.RUN, "one alone is never refused"
+
+
+def test_a_turn_with_nothing_in_flight_always_has_room():
+    """However many turns have filled the queues; but for what is large."""
+    queues = make(workers=1, requests=4, size=100, first=10)
+    first, _ = offered(queues, "a", 1, 60)
+    for number in range(2, 5):
+        assert offered(queues, "a", number, 10)[1] is Offer.WAIT
+    assert offered(queues, "a", 5)[1] is Offer.FULL
+    assert offered(queues, "b", 6, 11)[1] is Offer.FULL, "large"
+    newcomer, offer = offered(queues, "b", 7, 10)
+    assert offer is Offer.WAIT
+    assert offered(queues, "b", 8)[1] is Offer.FULL, "it has one in flight"
+    assert queues.finished(first) == [newcomer]
 
 
 def test_only_the_client_with_too_many_requests_is_refused():
@@ -97,9 +111,12 @@ def test_slow_requests_are_bounded():
     assert queues.put_back(second) == [], "it waits for a place and holds no worker"
     third, offer = offered(queues, "c", 3)
     assert offer is Offer.RUN
-    assert queues.finished(first) == [second] and second.state is State.SLOW and second.left
-    assert queues.finished(third) == queues.finished(second) == []
-    assert queues.slow(second) is None, "it is answered"
+    assert second.state is State.DONE and not second.left
+    [again] = queues.finished(first)
+    assert again.request == 2 and again.state is State.SLOW and again.left
+    assert queues.waits(second) is None and again.state is State.SLOW, "the old ticket is over"
+    assert queues.finished(third) == queues.finished(again) == []
+    assert queues.slow(again) is None, "it is answered"
     assert len(queues) == 0
 
 
@@ -121,8 +138,8 @@ def test_what_is_put_back_comes_before_what_its_client_asked_after():
     heavy, _ = offered(queues, "b", 2)
     after, _ = offered(queues, "b", 3)
     assert queues.put_back(heavy) == []
-    assert queues.finished(slow) == [heavy]
-    assert queues.finished(heavy) == [after]
+    [again] = queues.finished(slow)
+    assert again.request == 2 and queues.finished(again) == [after]
     assert after.state is State.WORKING
 
 
@@ -146,8 +163,8 @@ def test_a_request_that_waited_takes_a_slow_place_once_it_computes():
     second, _ = offered(queues, "b", 2)
     assert queues.waits(second) == []
     assert queues.slow(second) is None, "no place"
-    assert queues.put_back(second) == [] and second.state is State.WAITING
-    assert queues.finished(first) == [second]
+    assert queues.put_back(second) == [] and second.left, "whoever carried it out has no worker"
+    assert [ticket.request for ticket in queues.finished(first)] == [2]
 
 
 def test_clients_that_share_a_turn_are_answered_one_at_a_time():
@@ -216,7 +233,7 @@ class AnyOrder(RuleBasedStateMachine):
 
     def __init__(self):
         super().__init__()
-        self.bounds = Bounds(workers=2, slow=2, waits=2, requests=12, size=40, by_turn=4)
+        self.bounds = Bounds(workers=2, slow=2, waits=2, requests=12, size=40, by_turn=4, first=2)
         self.queues = FairQueues(self.bounds)
         self.at_work, self.detached, self.waiting = [], [], {}
         self.number = 0
@@ -224,7 +241,7 @@ class AnyOrder(RuleBasedStateMachine):
     def started(self, tickets):
         for ticket in tickets:
             assert ticket.state is (State.SLOW if ticket.slow else State.WORKING)
-            assert self.waiting[ticket.client].pop(0) is ticket, "the order of the client"
+            assert self.waiting[ticket.client].pop(0).request == ticket.request, "the order of the client"
             self.at_work.append(ticket)
 
     @rule(
@@ -245,7 +262,7 @@ class AnyOrder(RuleBasedStateMachine):
             if offer is Offer.FULL_TURN:
                 assert len(own) >= self.bounds.by_turn
             else:
-                assert everything
+                assert own or size > self.bounds.first
                 assert len(everything) >= self.bounds.requests or total + size > self.bounds.size
             return
         self.waiting.setdefault(client, []).append(ticket)
@@ -276,7 +293,8 @@ class AnyOrder(RuleBasedStateMachine):
     def put_back(self, data):
         ticket = data.draw(st.sampled_from(self.at_work))
         self.at_work.remove(ticket)
-        self.waiting.setdefault(ticket.client, []).insert(0, ticket)
+        again = Ticket(ticket.client, ticket.request, ticket.size, turn=ticket.turn, slow=True)
+        self.waiting.setdefault(ticket.client, []).insert(0, again)
         self.started(self.queues.put_back(ticket))
 
     @precondition(lambda self: self.at_work)
@@ -294,7 +312,8 @@ class AnyOrder(RuleBasedStateMachine):
     @rule(client=st.sampled_from("abcdef"))
     def drop(self, client):
         dropped, started = self.queues.drop(client)
-        assert dropped == self.waiting.pop(client, [])
+        expected = [ticket.request for ticket in self.waiting.pop(client, [])]
+        assert [ticket.request for ticket in dropped] == expected
         self.started(started)
 
     @invariant()
@@ -322,7 +341,7 @@ class AnyOrder(RuleBasedStateMachine):
 
     def is_first(self, ticket):
         """Whether nothing of the same turn waits before it; within a turn the lowest number that was not put back."""
-        return self.queues._turns[ticket.turn].waiting[0] is ticket
+        return self.queues._turns[ticket.turn].waiting[0].request == ticket.request
 
     def teardown(self):
         while self.at_work:

@@ -1,6 +1,7 @@
 """Mailboxes: the latest wish wins, what is dropped is counted. Frames: states go to who wished, errors too."""
 
 import threading
+import time
 
 import numpy as np
 import pytest
@@ -85,6 +86,15 @@ def test_a_client_of_many_avatars_leaves_room_for_others():
             assert number >= 3 and "3 of this client" in str(error)
     boxes.put(BO, wish(1))
     assert taken(boxes) == [(User("a", str(number)), 1, 0) for number in range(3)] + [(BO, 1, 0)]
+
+
+def test_all_clients_without_a_token_leave_room_for_others():
+    boxes = Mailboxes(4, lambda client: client if client == "b" else "")
+    for number in range(2):
+        boxes.put(User(f"invented-{number}", "al"), wish(1))
+    with pytest.raises(BusyError, match="2 of this client"):
+        boxes.put(User("invented-2", "al"), wish(1))
+    boxes.put(BO, wish(1))
 
 
 def test_who_leaves_has_its_wishes_dropped_and_may_count_from_the_start_again():
@@ -236,6 +246,49 @@ def test_a_state_that_cannot_be_sent_stops_nobody(floor, caplog):
     frames.wish(BO, encode(wish(1)), None)
     run(frames)
     assert sent == [BO] and "the link is gone" in caplog.text
+
+
+class LongFrames:
+    """A simulation whose frames last until they are stopped. reasons: why each one was."""
+
+    most_users, users = 2, ()
+
+    def __init__(self):
+        self.begun, self.reasons = threading.Event(), []
+
+    def step(self, turns, now, *, stops):
+        self.begun.set()
+        deadline = time.monotonic() + DEADLINE
+        while not stops[0]:
+            assert time.monotonic() < deadline, "nobody stopped it"
+            time.sleep(0.001)
+        self.reasons.append(stops[0].reason)
+        return []
+
+
+def test_wishes_that_wait_are_given_up_too():
+    simulation = LongFrames()
+    frames = Frames(simulation, lambda user, answer: None)
+    frames.wish(AL, encode(wish(1)), None)
+    thread = threading.Thread(target=frames.run)
+    thread.start()
+    assert simulation.begun.wait(DEADLINE)
+    frames.wish(BO, encode(wish(1)), None)
+    simulation.begun.clear()
+    frames.close()
+    assert simulation.begun.wait(DEADLINE), "what waited when it was closed is still simulated"
+    frames.give_up()
+    thread.join(DEADLINE)
+    assert not thread.is_alive() and simulation.reasons == ["the server stops"] * 2
+
+
+def test_a_frame_that_begins_after_all_is_given_up_is_stopped():
+    simulation = LongFrames()
+    frames = Frames(simulation, lambda user, answer: None)
+    frames.wish(AL, encode(wish(1)), None)
+    frames.give_up()
+    run(frames)
+    assert simulation.reasons == ["the server stops"]
 
 
 def test_whatever_bytes_come_each_is_answered(floor, caplog):

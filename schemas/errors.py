@@ -68,7 +68,7 @@ class BusyError(SolidcloudError):
 
 
 class ExpiredError(SolidcloudError):
-    """The request waited for longer than the client said it would."""
+    """A frame of a session took longer than the server spends on one."""
 
     code = ErrorCode.EXPIRED
 

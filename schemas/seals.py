@@ -1,7 +1,7 @@
-"""Seals: keyed hashes by which a client knows that a reply is its server's, and to its own question.
+"""Seals: keyed hashes by which a client knows that a reply is its server's, to its own question, about its own avatars.
 
 A client sends a nonce with its query. Whoever has the server's key can hash nonce, key expression and request together
-with the reply; nobody else can. WIRE.md ("Seals") has the layout and a worked example.
+with the reply and the avatars that it is about; nobody else can. WIRE.md ("Seals") has the layout and a worked example.
 """
 
 import hashlib
@@ -9,15 +9,20 @@ import hmac
 import re
 import struct
 
+import numpy as np
+from numpy.typing import NDArray
+
 from .errors import BadRequestError
 
 KEY_BYTES = 32
 NONCE_BYTES = 16
 _HASH_BYTES = 32
-# In a reply: which of the replies to its query it is, and the hash.
+# In a reply: which of the replies to its query it is, the SHA-256 of the digests of its avatars, and the keyed hash.
 _NUMBER = struct.Struct("<Q")
-SEAL_BYTES = _NUMBER.size + _HASH_BYTES
+_ABOUT = slice(_NUMBER.size, _NUMBER.size + _HASH_BYTES)
+SEAL_BYTES = _ABOUT.stop + _HASH_BYTES
 _REPLY = struct.Struct("<QBQ")
+_RADIUS = struct.Struct("<d")
 
 _HEX_KEY = re.compile(rf"[0-9a-fA-F]{{{2 * KEY_BYTES}}}")
 
@@ -32,30 +37,51 @@ class Sealer:
         self._key, self._name = key, key_expression.encode()
         self._begun = nonce + request
 
-    def seal(self, number: int, ok: bool, encoding: str, payload: bytes) -> bytes:
-        """Return the seal of a reply, SEAL_BYTES. number: of the replies to its query, from 0 on.  ok: no error."""
-        return _NUMBER.pack(number) + self._hash(number, ok, encoding, payload)
+    def seal(self, number: int, ok: bool, encoding: str, payload: bytes, about: bytes = b"") -> bytes:
+        """Return the seal of a reply, SEAL_BYTES.
+
+        number: of the replies to its query, from 0 on.  ok: whether it is no error.  about: the digests of the client's
+        own avatars that answered (`avatar_digest`), in the request's order, joined.
+        """
+        hashed = hash_of(about)
+        return _NUMBER.pack(number) + hashed + self._hash(number, ok, encoding, payload, hashed)
 
     def number_of(self, seal: bytes, ok: bool, encoding: str, payload: bytes) -> int:
         """Return the number in a seal; -1 where the seal is not that of this reply."""
         if len(seal) != SEAL_BYTES:
             return -1
         number: int = _NUMBER.unpack_from(seal)[0]
-        right = hmac.compare_digest(seal[_NUMBER.size :], self._hash(number, ok, encoding, payload))
-        return number if right else -1
+        expected = self._hash(number, ok, encoding, payload, seal[_ABOUT])
+        return number if hmac.compare_digest(seal[_ABOUT.stop :], expected) else -1
 
-    def _hash(self, number: int, ok: bool, encoding: str, payload: bytes) -> bytes:
-        """Hash one reply."""
+    def _hash(self, number: int, ok: bool, encoding: str, payload: bytes, about: bytes) -> bytes:
+        """Hash one reply. about: SHA-256 of the digests of its avatars."""
         text = b"".join(
             (
                 self._begun,
                 _REPLY.pack(number, ok, len(self._name)),
                 self._name,
                 hash_of(payload),
+                about,
                 encoding.encode(),
             )
         )
         return hashlib.blake2b(text, key=self._key, digest_size=_HASH_BYTES).digest()
+
+
+def is_about(seal: bytes, about: bytes) -> bool:
+    """Return whether a seal of the right length names these avatars. about: as in `Sealer.seal`."""
+    return seal[_ABOUT] == hash_of(about)
+
+
+def avatar_digest(points: NDArray[np.float64], radius: float) -> bytes:
+    """Return the SHA-256 that tells an avatar from others. points: (n, 3) [m].  radius: of each point's sphere [m].
+
+    Of the points, row by row, and the radius, each number as a little-endian float64; a zero has no sign.
+    """
+    found = hashlib.sha256(np.ascontiguousarray(points + 0.0, "<f8"))
+    found.update(_RADIUS.pack(radius + 0.0))
+    return found.digest()
 
 
 def hash_of(payload: bytes) -> bytes:

@@ -18,6 +18,7 @@ from ..schemas.errors import (
     ErrorCode,
     SolidcloudError,
     TooLargeError,
+    UnknownAvatarError,
     UnknownSceneError,
 )
 from ..schemas.messages import (
@@ -43,6 +44,7 @@ from ..schemas.messages import (
     wire_encoding,
 )
 from ..schemas.requests import Question
+from .answering_avatars import noted
 from .config import ServerConfig
 from .frames import Frames
 from .heap import give_back_large_blocks
@@ -158,24 +160,27 @@ class Service:
 
         stop: ends the work early once it is set; what was not reached then is unknown.
         """
+        avatars: list[bytes] = []
         try:
             stated = wire_encoding(encoding)
-            found = self._ask(key, payload, stated, NEVER if stop is None else stop)
+            with noted(avatars):
+                found = self._ask(key, payload, stated, NEVER if stop is None else stop)
+            about = b"".join(avatars)
             if isinstance(found, Iterator):
-                return self._parts(key, found, stated)
-            return self._encoded(found, stated)
+                return self._parts(key, found, stated, about)
+            return self._encoded(found, stated, about)
         except Exception as error:
-            return self._failed(key, encoding, error)
+            return self._failed(key, encoding, error, b"".join(avatars))
 
-    def _parts(self, key: str, parts: Iterator[Any], encoding: str) -> Iterator[Answer]:
+    def _parts(self, key: str, parts: Iterator[Any], encoding: str, about: bytes) -> Iterator[Answer]:
         """Parts as answers; an error is the last one."""
         try:
             for part in parts:
-                yield self._encoded(part, encoding)
+                yield self._encoded(part, encoding, about)
         except Exception as error:
-            yield self._failed(key, encoding, error)
+            yield self._failed(key, encoding, error, about)
 
-    def _encoded(self, message: Any, encoding: str) -> Answer:
+    def _encoded(self, message: Any, encoding: str, about: bytes) -> Answer:
         """A message as an answer. TooLargeError: its receiver would drop it unread."""
         payload = encode(message, encoding)
         # zenoh's own part of the message takes some of it, far less than this.
@@ -183,16 +188,21 @@ class Service:
             raise TooLargeError(
                 f"the answer takes {len(payload)} bytes, a message holds {MAX_MESSAGE_BYTES}: ask for less at a time"
             )
-        return Answer(payload, encoding, True)
+        return Answer(payload, encoding, True, about)
 
-    def _failed(self, key: str, encoding: str | None, error: Exception) -> Answer:
-        """What went wrong as an answer; what is no SolidcloudError is logged, and told by its kind alone."""
+    def _failed(self, key: str, encoding: str | None, error: Exception, about: bytes) -> Answer:
+        """What went wrong as an answer; what is no SolidcloudError is logged, and told by its kind alone.
+
+        about: of the avatars that were looked up; where one is not known, the answer is about none.
+        """
         if isinstance(error, SolidcloudError):
-            return self._error(encoding, error.code, str(error))
+            answer = self._error(encoding, error.code, str(error))
+            return answer if isinstance(error, UnknownAvatarError) else answer._replace(about=about)
         log.error("a request failed for no reason of its own: %s", key, exc_info=error)
-        return self._error(
+        answer = self._error(
             encoding, ErrorCode.INTERNAL, f"{type(error).__name__} in the server: its log says more"
         )
+        return answer._replace(about=about)
 
     def busy(self, encoding: str | None, full: Full) -> Answer:
         """Return the answer to a question that there is no room for. full: which limit was reached."""

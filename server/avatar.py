@@ -22,12 +22,14 @@ class AvatarModel(NamedTuple):
 
     points: (n, 3) float64, avatar frame [m], as given.  radius: of each point's sphere [m].
     arrays: what the kernels read.  rows: (b, LANES) int32, the row of `points` that each lane of a block is.
+    digest: `avatar_digest` of an avatar that a client added; empty for one of the scene's own.
     """
 
     points: NDArray[np.float64]
     radius: float
     arrays: Avatar
     rows: NDArray[np.int32]
+    digest: bytes = b""
 
     @property
     def bounding_radius(self) -> float:

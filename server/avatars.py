@@ -7,11 +7,13 @@ from contextlib import contextmanager, nullcontext
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ..schemas.errors import BadRequestError, TooLargeError, UnknownAvatarError
 from ..schemas.messages import make_positions
+from ..schemas.seals import avatar_digest
 from ..schemas.stats import AvatarStats
+from .answering_avatars import note
 from .avatar import AvatarModel, make_avatar
 from .config import AvatarLimits
 from .served import EVERYBODY, THIS_PROCESS
@@ -58,37 +60,60 @@ class Avatars:
         self._clients: dict[str, dict[str, _Entry]] = {}
 
     def get(self, name: str, client: str) -> AvatarModel:
-        """Return a client's avatar, or the scene's own. Raises UnknownAvatarError."""
+        """Return a client's avatar, or the scene's own, and note it. Raises UnknownAvatarError."""
         with self._changed:
             for owner in (client, EVERYBODY):
                 entry = self._clients.get(owner, {}).get(name)
                 if entry is not None and entry.model is not None:
                     entry.used = time.monotonic()
+                    note(entry.model.digest)
                     return entry.model
         raise UnknownAvatarError(f"avatar {name!r} is not known: add it with add_avatar first")
 
     def add(self, name: str, points: ArrayLike, radius: float | None, client: str) -> AvatarModel:
         """Build an avatar of points (n, 3) [m] and keep it; the same one again is not built again.
 
-        Raises BadRequestError where the name is taken by another avatar, TooLargeError where it is over the limits.
+        One named as one of the scene's own must be it, and shares its arrays. Raises BadRequestError where the name is
+        taken by another avatar, TooLargeError where it is over the limits.
         """
         array = make_positions(points)
-        with self._reserved(name, client, array, radius) as entry:
+        shared = None if client == EVERYBODY else self._scene_avatar(name)
+        if shared is not None:
+            self._check_same(name, shared, array, radius)
+        entry = _Entry(len(array) if shared is None else 0, radius)
+        with self._reserved(name, client, len(array), entry) as entry:
             if entry.model is None:
-                with self._large if len(array) > _LARGE else nullcontext():
-                    model = make_avatar(array, radius)
+                model = _built(self._large, array, radius) if shared is None else shared.model
+                assert model is not None, "the scene's own avatars are complete"
+                digest = b"" if client == EVERYBODY else avatar_digest(model.points, model.radius)
                 with self._changed:
-                    entry.model, entry.bytes, entry.used = model, bytes_of(model), time.monotonic()
+                    entry.model, entry.used = model._replace(digest=digest), time.monotonic()
+                    if shared is None:
+                        entry.bytes = bytes_of(model)
             known = entry.model
-        # Without a radius given the same points may still make another avatar: only building it tells.
-        same = np.array_equal(known.points, array) and (
-            radius in (entry.asked, known.radius) or make_avatar(array, radius).radius == known.radius
-        )
-        if not same:
+        self._check_same(name, entry, array, radius)
+        return known
+
+    def _scene_avatar(self, name: str) -> _Entry | None:
+        """Return the entry of one of the scene's own avatars; None where there is none of this name."""
+        with self._changed:
+            entry = self._clients.get(EVERYBODY, {}).get(name)
+            return None if entry is None or entry.model is None else entry
+
+    def _check_same(
+        self, name: str, entry: _Entry, points: NDArray[np.float64], radius: float | None
+    ) -> None:
+        """Raise BadRequestError unless an avatar that is known is that of these points and radius."""
+        known = entry.model
+        assert known is not None
+        same = np.array_equal(known.points, points)
+        if same and radius is None and entry.asked is not None:
+            # The radius that the points make may be the one that was asked for: only building the avatar tells.
+            radius = _built(self._large, points, None).radius
+        if not same or (radius is not None and radius != known.radius):
             raise BadRequestError(
                 f"avatar {name!r} exists with other points or another radius: use another name"
             )
-        return known
 
     def drop_client(self, client: str) -> None:
         """Forget the avatars of a client."""
@@ -129,8 +154,11 @@ class Avatars:
         return _Held(sum(each), len(each), len(own))
 
     @contextmanager
-    def _reserved(self, name: str, client: str, points: np.ndarray, radius: float | None) -> Iterator[_Entry]:
-        """Yield the entry of a name: one that is known, or a new one, counted while it is built and kept if it was."""
+    def _reserved(self, name: str, client: str, count: int, new: _Entry) -> Iterator[_Entry]:
+        """Yield the entry of a name: one that is known, or a new one, counted while it is built and kept if it was.
+
+        count: of the avatar's points.
+        """
         with self._changed:
             while True:
                 entries = self._clients.get(client, {})
@@ -139,9 +167,9 @@ class Avatars:
                     break
                 self._changed.wait()  # another request builds it
             if entry is None:
-                entry = _Entry(len(points), radius)
+                entry = new
                 if client not in _OWN:
-                    self._check(name, len(points), entry.bytes, client)
+                    self._check(name, count, entry.bytes, client)
                 self._clients.setdefault(client, entries)[name] = entry
         try:
             yield entry
@@ -184,6 +212,12 @@ class Avatars:
                     f"avatar {name!r} of {count} points: {found} {what} are there, this one makes it {found + more}, "
                     f"at most {most} are allowed: {then}"
                 )
+
+
+def _built(large: threading.Lock, points: NDArray[np.float64], radius: float | None) -> AvatarModel:
+    """Build an avatar. large: held while it is, if it is a large one."""
+    with large if len(points) > _LARGE else nullcontext():
+        return make_avatar(points, radius)
 
 
 def bytes_of(model: AvatarModel) -> int:

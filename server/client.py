@@ -8,14 +8,13 @@ import logging
 import queue
 import threading
 import time
-import uuid
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
-import numpy as np
 import zenoh
 
 from ..schemas import keys
@@ -35,11 +34,9 @@ from ..schemas.messages import (
     MAX_POSES,
     MSGPACK,
     WIRE_VERSION,
-    AddAvatarRequest,
     AvatarInfo,
     ErrorReply,
     PathRequest,
-    Positions,
     ReloadAnswer,
     SceneInfo,
     ScenesAnswer,
@@ -54,37 +51,24 @@ from ..schemas.requests import (
     make_poses,
     make_positions,
 )
+from .added_avatars import Added, AddedAvatars
 from .client_session import ClientSession, WishNumbers
 from .endpoints import DEFAULT_ENDPOINT, check_endpoint, zenoh_words
+from .identity import OPEN_SECONDS, Identity
 from .questions import Questions
-from .replies import Anchor, Asked
+from .replies import Anchor, Asked, OtherAvatarError
 from .transport import session_config
 
 log = logging.getLogger(__name__)
 
-# How long some queries are kept open [s]. Of a path; how long a part of it may take is the client's timeout. A reload
-# opens an archive and fills a cache, at some 100 MB/s.
-_SECONDS = {"path": 3600.0, "reload": 600.0}
-
-# Of that time, how much must have passed for a silence to be a server's that is slow: clocks differ by a little.
+# Of the time that a query is kept open, how much must have passed for a silence to be a server's that is slow: clocks
+# differ by a little.
 _NEARLY = 0.9
 
+# How often a question about avatars is asked, in all, where the server does not know them.
+_MOST_TRIES = 3
+
 _ENCODING = zenoh.Encoding(MSGPACK)
-
-
-class _Avatar(NamedTuple):
-    """An avatar as it was added, to be added again where a server does not know it (any more)."""
-
-    points: Positions
-    radius: float | None
-
-    def request(self, name: str) -> bytes:
-        """The request that adds it."""
-        return encode(AddAvatarRequest(name, self.points, self.radius))
-
-    def is_same(self, other: "_Avatar") -> bool:
-        """Whether two avatars are one, bit for bit."""
-        return self.radius == other.radius and np.array_equal(self.points, other.points)
 
 
 class Client(Questions):
@@ -97,7 +81,9 @@ class Client(Questions):
 
     Entering asks which scenes are served: UnknownSceneError names them if this one is not among them. With
     no server there, entering succeeds all the same: `collide` says `UNKNOWN`, and right answers come once
-    a server does. Avatars are remembered, and added again to a server that does not know them.
+    a server does. Avatars are remembered, and added again to a server that does not know them. Where a server with a
+    key answers about other avatars than those that were added, the answer is as none, and the client goes on under
+    another id, which nobody knows.
 
     unanswered: how many poses, rays, points, motions and objects nobody answered so far, and are `UNKNOWN` for that.
     """
@@ -115,14 +101,10 @@ class Client(Questions):
             raise BadRequestError(f"timeout is {timeout}: expected seconds above 0")
         self._endpoint, self._timeout = endpoint, timeout
         self._anchor = Anchor(endpoint, key_file)
-        # A secret: whoever knows it may ask and wish in our name. 122 random bits.
-        self._id = uuid.uuid4().hex
-        self._keys = {
-            operation: keys.question_key(self.name, self._id, operation) for operation in keys.OPERATIONS
-        }
-        self._avatars: dict[str, _Avatar] = {}
+        self._added = AddedAvatars()
         self._numbers: dict[str, WishNumbers] = {}  # by avatar
         self._lock = threading.Lock()
+        self._renewing = threading.Lock()
         self.unanswered = 0
         self._seen = False  # whether a server of this scene ever answered
         self._stack: ExitStack | None = None
@@ -130,21 +112,8 @@ class Client(Questions):
     def __enter__(self) -> Self:
         with ExitStack() as stack:
             self._session = stack.enter_context(_session(self._endpoint))
-            # Gone with this process, however it ends: then the server forgets our avatars.
-            token = keys.client_alive_key(self.name, self._id)
-            stack.enter_context(self._session.liveliness().declare_token(token))
-            # Declared once: a querier's route is known, an ad hoc `get` looks for it every time.
-            self._queriers = {
-                operation: stack.enter_context(
-                    self._session.declare_querier(
-                        key,
-                        # By default zenoh keeps a reply back until the server has said that no other comes.
-                        consolidation=zenoh.ConsolidationMode.NONE,
-                        timeout=max(self._timeout, _SECONDS.get(operation, 0.0)),
-                    )
-                )
-                for operation, key in self._keys.items()
-            }
+            self._identity = Identity(self._session, self.name, self._timeout)
+            stack.callback(self._leave)
             self._check_served()
             self._stack = stack.pop_all()
         return self
@@ -160,6 +129,16 @@ class Client(Questions):
         if stack is not None:
             stack.close()
 
+    def _leave(self) -> None:
+        """Have the server forget this client."""
+        with self._renewing:
+            self._identity.close()
+
+    @property
+    def _id(self) -> str:
+        """Return the id under which this client asks at present."""
+        return self._identity.id
+
     def info(self) -> SceneInfo:
         """What the scene is. BusyError: nobody answered."""
         return decode_answer(SceneInfo, self._answered("info", self._timeout))
@@ -170,7 +149,9 @@ class Client(Questions):
         BusyError: nobody answered, or the server still answers of the generation before the one served. FormatError
         and others: what is there cannot be served; the server serves on what it did.
         """
-        return decode_answer(ReloadAnswer, self._answered("reload", max(self._timeout, _SECONDS["reload"])))
+        return decode_answer(
+            ReloadAnswer, self._answered("reload", max(self._timeout, OPEN_SECONDS["reload"]))
+        )
 
     def stats(self, keys: bool = False) -> StatsAnswer:
         """What the server keeps of the scene in memory, and how it did. keys: name the resident voxels, too.
@@ -222,27 +203,20 @@ class Client(Questions):
         `bounding_radius` None. BadRequestError, TooLargeError: the avatar is refused, or the name is taken
         by another one.
         """
-        avatar = _Avatar(make_positions(points).copy(), None if radius is None else float(radius))
+        avatar = Added(make_positions(points).copy(), None if radius is None else float(radius))
         request = avatar.request(name)
-        with self._lock:
-            known = self._avatars.get(name)
-            if known is not None and not known.is_same(avatar):
-                raise BadRequestError(
-                    f"avatar {name!r} was added with other points or another radius: choose another name"
-                )
-            self._avatars[name] = avatar
+        new = self._added.add(name, avatar)
         try:
             payload = self._ask("add_avatar", request)
         except BusyError:
             payload = None  # remembered, and added with the first question about it
         except SolidcloudError:
-            with self._lock:
-                if known is None:
-                    self._avatars.pop(name, None)
+            if new:
+                self._added.remove(name)
             raise
         if payload is None:
             return AvatarInfo(name, len(avatar.points), avatar.radius)
-        return decode_answer(AvatarInfo, payload)
+        return self._added.accepted(name, payload)
 
     def path(self, name: str, poses: Any, op: str = "collide", **parameters: Any) -> Iterator[Part]:
         """Ask `op` (collide, distance, contacts, sweep) along up to 100,000 poses, in one request.
@@ -293,12 +267,17 @@ class Client(Questions):
 
     def _replies(self, request: bytes, name: str) -> Iterator[bytes]:
         """The replies to a path until there are no more, or none came in time; errors are raised."""
-        try:
-            yield from self._stream("path", request)
-        except UnknownAvatarError as unknown:
-            # Said before the first part, if at all: nothing was taken yet.
-            if self._add_again([name], unknown):
-                yield from self._stream("path", request)
+        for tried in range(1, _MOST_TRIES + 1):
+            taken = False
+            try:
+                for payload in self._stream("path", request, [name]):
+                    taken = True
+                    yield payload
+                return
+            except UnknownAvatarError as unknown:
+                # Said before the first part, if at all.
+                if taken or not self._go_on([name], unknown, tried):
+                    return
 
     def session(self, avatar: str) -> ClientSession:
         """A session of an avatar, this client's or one of the scene's own: `with` it, wish and hear where it gets to.
@@ -306,15 +285,16 @@ class Client(Questions):
         avatar: 1 to 64 of A-Z, a-z, 0-9, '.', '_' and '-'.  The scene's server simulates the effects that it calls for.
         """
         self._check_open()
-        user = keys.User(self._id, keys.check_name(avatar, "avatar of a session"))
+        keys.check_name(avatar, "avatar of a session")
         with self._lock:
             numbers = self._numbers.setdefault(avatar, WishNumbers())
         return ClientSession(
             self._session,
             self.name,
-            user,
+            lambda: keys.User(self._id, avatar),
             numbers,
             self._anchor,
+            lambda: self._added.about([avatar]),
             lambda unknown: self._add_again([avatar], unknown),
         )
 
@@ -325,26 +305,78 @@ class Client(Questions):
 
     def _ask_about(self, operation: str, request: bytes, names: Sequence[str]) -> bytes | None:
         """Ask about avatars, adding them again where the server does not know them; None: nobody answered."""
-        try:
-            return self._ask(operation, request)
-        except UnknownAvatarError as unknown:
-            return self._ask(operation, request) if self._add_again(names, unknown) else None
+        for tried in range(1, _MOST_TRIES + 1):
+            try:
+                return self._ask(operation, request, names)
+            except UnknownAvatarError as unknown:
+                if not self._go_on(names, unknown, tried):
+                    break
+        return None
+
+    def _go_on(self, names: Sequence[str], unknown: UnknownAvatarError, tried: int) -> bool:
+        """Return whether to ask once more about avatars, which are then known to the server.
+
+        unknown: what the server says; raised where it still does not know them.  tried: how often it was asked.
+        """
+        if tried < _MOST_TRIES:
+            return self._add_again(names, unknown)
+        if isinstance(unknown, OtherAvatarError):
+            return False
+        raise unknown
 
     def _add_again(self, names: Sequence[str], unknown: UnknownAvatarError) -> bool:
         """Add avatars to a server that was restarted, or that took us for gone; False: nobody answered.
 
-        unknown: what the server says; raised again if we do not know one either.
+        unknown: what the server says; raised again if we do not know one either. Where the server has others under
+        their names, this client begins anew, under a fresh id.
         """
-        with self._lock:
-            known = [(name, self._avatars[name]) for name in names if name in self._avatars]
-        if len(known) < len(names):
+        added = self._added.known(names)
+        if isinstance(unknown, OtherAvatarError):
+            # Without all digests the avatars may be ours: their radius is not known here before they are added.
+            if self._added.about(names) is not None:
+                self._begin_anew(unknown.key_expression)
+        elif len(added) < len(set(names)):
             raise unknown
-        return all(self._ask("add_avatar", avatar.request(name)) is not None for name, avatar in known)
+        asked = self._identity
+        try:
+            return self._add(added)
+        except TooLargeError:
+            raise
+        except BadRequestError:  # perhaps somebody else was first to add one of that name
+            self._begin_anew(asked.keys["add_avatar"])
+            return self._add(added)
 
-    def _ask(self, operation: str, request: bytes) -> bytes | None:
-        """Ask, and wait for the answer; None: nobody answered in time. Raises what an error reply says."""
-        querier = self._querier(operation)
-        asked = Asked(self._anchor, self._keys[operation], request)
+    def _add(self, added: dict[str, Added]) -> bool:
+        """Add avatars to the server; return whether it answered."""
+        for name, avatar in added.items():
+            payload = self._ask("add_avatar", avatar.request(name))
+            if payload is None:
+                return False
+            self._added.accepted(name, payload)
+        return True
+
+    def _begin_anew(self, key_expression: str) -> None:
+        """Take a fresh id, if the present one is that of a key expression: somebody else knows that."""
+        with self._renewing:
+            self._check_open()
+            before = self._identity
+            if not before.asked(key_expression):
+                return
+            log.warning(
+                "scene %s at %s: the server has other avatars under this client's id than it added: another program "
+                "knows the id; going on under a fresh one",
+                self.name,
+                self._endpoint,
+            )
+            self._identity = Identity(self._session, self.name, self._timeout)
+            before.close()
+
+    def _ask(self, operation: str, request: bytes, names: Sequence[str] = ()) -> bytes | None:
+        """Ask, and wait for the answer; None: nobody answered in time. Raises what an error reply says.
+
+        names: the avatars that the answer is about, in the request's order.
+        """
+        querier, asked = self._asked(operation, request, names)
         replies = querier.get(payload=request, encoding=_ENCODING, attachment=asked.nonce)
         asked.sent()
         for reply in replies:
@@ -356,33 +388,36 @@ class Client(Questions):
             self._check_served()
         return None
 
-    def _stream(self, operation: str, request: bytes) -> Iterator[bytes]:
-        """Ask, and yield every reply as it comes, until there are no more or none came for `timeout`."""
+    def _stream(self, operation: str, request: bytes, names: Sequence[str]) -> Iterator[bytes]:
+        """Ask, and yield every reply as it comes, until there are no more or no believed one for `timeout`."""
         # Without bound: a channel that is full would hold up all that comes over this session.
         came: queue.SimpleQueue[Any] = queue.SimpleQueue()
         handler = zenoh.handlers.Callback(came.put, lambda: came.put(None))
-        asked = Asked(self._anchor, self._keys[operation], request)
-        self._querier(operation).get(handler, payload=request, encoding=_ENCODING, attachment=asked.nonce)
+        querier, asked = self._asked(operation, request, names)
+        cancel = zenoh.CancellationToken()
+        querier.get(
+            handler, payload=request, encoding=_ENCODING, attachment=asked.nonce, cancellation_token=cancel
+        )
         answered = False
-        while True:
-            try:
-                reply = came.get(timeout=self._timeout)
-            except queue.Empty:
-                log.debug("no part for %g s", self._timeout)
-                break
-            if reply is None:
-                break
-            payload = _answer_of(reply, asked)
-            if payload is not None:
-                self._seen = answered = True
-                yield payload
+        until = time.monotonic() + self._timeout
+        try:
+            while (reply := _next(came, until)) is not None:
+                payload = _answer_of(reply, asked)
+                if payload is not None:
+                    self._seen = answered = True
+                    yield payload
+                    until = time.monotonic() + self._timeout
+        finally:
+            cancel.cancel()
         if not answered and not self._seen:
             self._check_served()
 
-    def _querier(self, operation: str) -> zenoh.Querier:
-        """What asks one operation."""
+    def _asked(self, operation: str, request: bytes, names: Sequence[str]) -> tuple[zenoh.Querier, Asked]:
+        """Return what asks one operation under the present id, and what reads the replies."""
         self._check_open()
-        return self._queriers[operation]
+        identity = self._identity
+        asked = Asked(self._anchor, identity.keys[operation], request, partial(self._added.about, names))
+        return identity.queriers[operation], asked
 
     def _check_open(self) -> None:
         """BadRequestError where this client is closed."""
@@ -451,6 +486,15 @@ def _ask_scenes(session: zenoh.Session, timeout: float, anchor: Anchor) -> tuple
             served.update(answer.scenes)
             versions.add(answer.wire_version)
     return served, versions
+
+
+def _next(came: "queue.SimpleQueue[Any]", until: float) -> Any:
+    """Wait for the next of what comes; None: no more does, or none by `until`, on the monotonic clock [s]."""
+    left = until - time.monotonic()
+    try:
+        return came.get(timeout=left) if left > 0 else None
+    except queue.Empty:
+        return None
 
 
 def _answer_of(reply: zenoh.Reply, asked: Asked) -> bytes | None:

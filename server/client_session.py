@@ -27,7 +27,8 @@ from ..schemas.errors import (
 )
 from ..schemas.messages import ErrorReply
 from ..schemas.moves import State, Wish
-from .replies import Anchor
+from .endpoints import zenoh_words
+from .replies import Anchor, OtherAvatarError
 from .session_transport import FRAME_QOS
 from .state_query import StateQuery
 
@@ -84,16 +85,21 @@ class ClientSession:
         self,
         session: zenoh.Session,
         scene: str,
-        user: keys.User,
+        user: Callable[[], keys.User],
         numbers: "WishNumbers",
         anchor: Anchor,
+        about: Callable[[], bytes | None],
         add_again: Callable[[UnknownAvatarError], bool],
     ) -> None:
-        """numbers: of wishes, growing over all sessions of this user.  add_again: adds the avatar to a server that does
-        not know it; False: nobody answered; raises what it is given where this client has not added it either."""
-        self._session, self._scene, self._user = session, scene, user
+        """Make a session; entering it begins it.
+
+        user: returns who wishes: the client may take another id.  numbers: of wishes, growing over all sessions of this
+        user.  about: as in `Asked`.  add_again: adds the avatar to a server that does not know it; False: nobody
+        answered; raises what it is given where this client has not added it either.
+        """
+        self._session, self._scene, self._user_now, self._user = session, scene, user, user()
         self._numbers, self._add_again = numbers, add_again
-        self._states = StateQuery(session, keys.state_key(scene, user), anchor)
+        self._states = StateQuery(session, keys.state_key(scene, self._user), anchor, about)
         self._publishing = threading.Lock()  # so that wishes leave in the order of their numbers
         self._aim: Any = None  # the pose last wished, until a velocity goes on from a state
         self._time = 0.0
@@ -110,23 +116,55 @@ class ClientSession:
         self._stack: ExitStack | None = None
 
     def __enter__(self) -> Self:
+        thread = threading.Thread(
+            target=self._hear, name=f"solidcloud-session-{self._user.avatar}", daemon=True
+        )
         with ExitStack() as stack:
-            # First, so that it is undone last: the thread ends when nothing more comes.
-            thread = threading.Thread(
-                target=self._hear, name=f"solidcloud-session-{self._user.avatar}", daemon=True
-            )
-            stack.callback(self._states.close)
-            stack.callback(thread.join)
-            self._states.open()
-            stack.callback(self._states.end)
-            self._publisher = stack.enter_context(
-                self._session.declare_publisher(
-                    keys.wish_key(self._scene, self._user), encoding=MSGPACK, **FRAME_QOS
-                )
-            )
+            try:
+                self._states.open()
+                stack.callback(self._states.close)
+                self._publisher = self._declare_publisher()
+                stack.callback(self._undeclare_publisher)
+            except zenoh.ZError as error:
+                raise BadRequestError(
+                    f"session of avatar {self._user.avatar!r} in scene {self._scene!r}: {zenoh_words(error)}: expected "
+                    "an open client: begin it inside `with Client(...) as scene`"
+                ) from None
             thread.start()
+            # The thread ends once it has heard what came until the end.
+            stack.callback(thread.join)
+            stack.callback(self._states.end)
             self._stack = stack.pop_all()
         return self
+
+    def _declare_publisher(self) -> zenoh.Publisher:
+        """Return what publishes the wishes of the present user."""
+        return self._session.declare_publisher(
+            keys.wish_key(self._scene, self._user), encoding=MSGPACK, **FRAME_QOS
+        )
+
+    def _undeclare_publisher(self) -> None:
+        try:
+            self._publisher.undeclare()
+        except zenoh.ZError as error:  # the client was closed before
+            log.debug("leaving: %s", error)
+
+    def _follow_client(self) -> None:
+        """Wish and hear under the client's id, where it took another. Work of the thread that hears."""
+        user = self._user_now()
+        if user == self._user:
+            return
+        try:
+            with self._publishing:
+                if self._stack is None:
+                    return
+                self._publisher.delete()  # others may walk where the avatar stood
+                self._undeclare_publisher()
+                self._user = user
+                self._publisher = self._declare_publisher()
+            self._states.move(keys.state_key(self._scene, user))
+        except zenoh.ZError as error:  # the client is being closed
+            log.debug("following: %s", error)
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -257,17 +295,15 @@ class ClientSession:
         """Take what comes. A thread's work."""
         while (came := self._states.take(lambda: self._wished)) is not None:
             unknown: UnknownAvatarError | None = None
-            for ok, payload in came:
-                try:
-                    said = decode_answer(State, payload) if ok else _error_of(payload)
-                except SolidcloudError as error:
-                    said = error
+            for each in came:
+                said = _said(each)
                 if isinstance(said, UnknownAvatarError):
                     unknown = said
                 else:
                     self._keep(said)
             if unknown is not None:
                 self._begin_again(unknown)
+            self._follow_client()
             self._wish_again()
 
     def _keep(self, said: State | SolidcloudError) -> None:
@@ -287,13 +323,16 @@ class ClientSession:
             self._changed.notify_all()
 
     def _begin_again(self, unknown: UnknownAvatarError) -> None:
-        """Come to a server that does not know the avatar, or where it is: it was restarted, took us for gone, or a
-        velocity took the place of the pose that was to be the first wish."""
+        """Come to a server that does not know the avatar, or where it is, or that has another of its name.
+
+        It was restarted, took us for gone, or a velocity took the place of the pose that was to be the first wish.
+        """
         self._again += 1
         try:
             try:
                 if not self._add_again(unknown):
                     return  # nobody answered; the next wish asks again
+                self._follow_client()
             except UnknownAvatarError:
                 if self._latest is None:  # neither this client's nor the scene's
                     raise
@@ -317,6 +356,17 @@ class ClientSession:
 def _same(one: State, other: State) -> bool:
     """Return whether two states are of the same frame of the same wish."""
     return (one.seq, one.time, one.frame) == (other.seq, other.time, other.frame)
+
+
+def _said(came: tuple[bool, bytes] | OtherAvatarError) -> State | SolidcloudError:
+    """Return what the server says; an error where it cannot be read."""
+    if isinstance(came, OtherAvatarError):
+        return came
+    ok, payload = came
+    try:
+        return decode_answer(State, payload) if ok else _error_of(payload)
+    except SolidcloudError as error:
+        return error
 
 
 def _error_of(payload: bytes) -> SolidcloudError:

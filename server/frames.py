@@ -225,7 +225,7 @@ class Frames:
         if post.turns:
             outcomes = self._step(post.turns)
             for outcome, encoding in zip(outcomes, post.encodings, strict=True):
-                self._send(outcome.user, outcome.state, encoding)
+                self._send(outcome.user, outcome.state, encoding, outcome.about)
         users = self._simulation.users
         if len(self._boxes) > len(users):
             self._boxes.keep(users)
@@ -243,8 +243,13 @@ class Frames:
         finally:
             self._at_work = None
 
-    def _send(self, user: User, said: State | SolidcloudError, encoding: str | None) -> None:
-        """Publish what is said to a user; what cannot be sent is logged, for nobody waits for it."""
+    def _send(
+        self, user: User, said: State | SolidcloudError, encoding: str | None, about: bytes = b""
+    ) -> None:
+        """Publish what is said to a user; what cannot be sent is logged, for nobody waits for it.
+
+        about: as in `Answer`.
+        """
         try:
             stated = wire_encoding(encoding)
         except BadRequestError:
@@ -252,9 +257,9 @@ class Frames:
         try:
             if isinstance(said, SolidcloudError):
                 reply = ErrorReply(said.code, str(said))
-                self._publish(user, Answer(encode(reply, stated), stated, False))
+                self._publish(user, Answer(encode(reply, stated), stated, False, about))
             else:
-                self._publish(user, Answer(encode(said, stated), stated, True))
+                self._publish(user, Answer(encode(said, stated), stated, True, about))
         except Exception:
             log.exception("the state of %s of client %s", user.avatar, user.client)
 

@@ -70,7 +70,10 @@ class Questions:
     """
 
     def _ask_about(self, operation: str, request: bytes, names: Sequence[str]) -> bytes | None:
-        """Ask about avatars of these names; None: nobody answered. Raises what an error reply says."""
+        """Ask about avatars of these names, in the request's order; None: nobody answered.
+
+        Raises what an error reply says.
+        """
         raise NotImplementedError
 
     def _note_unanswered(self, count: int) -> None:
@@ -200,7 +203,7 @@ class Questions:
         def request(_: slice, left: QuestionOptions) -> ObjectsRequest:
             return ObjectsRequest(items, poses, float(margin), **left)
 
-        names = list(dict.fromkeys(item.avatar for item in items))
+        names = [item.avatar for item in items]
         return self._question(ObjectsAnswers, request, len(items), options, names, batch=max(1, len(items)))
 
     def move(self, name: str, pose_from: Any, pose_to: Any, seconds: float = FRAME_SECONDS) -> Moved:

@@ -2,13 +2,15 @@
 
 import logging
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import zenoh
 
 from ..schemas.encoding import JSON, MSGPACK
-from ..schemas.seals import NONCE_BYTES, Sealer, hash_of
+from ..schemas.errors import UnknownAvatarError
+from ..schemas.seals import NONCE_BYTES, Sealer, hash_of, is_about
 from .key_files import KeyFile, find_key, read_given_key
 from .served import Answer
 
@@ -35,8 +37,8 @@ def send_reply(
 
     number: of the replies to this query, growing.
     """
-    payload, encoding, ok = answer
-    seal = None if sealer is None else sealer.seal(number, ok, encoding, payload)
+    payload, encoding, ok, about = answer
+    seal = None if sealer is None else sealer.seal(number, ok, encoding, payload, about)
     try:
         if ok:
             query.reply(key, payload, encoding=_ENCODINGS[encoding], attachment=seal)
@@ -49,6 +51,22 @@ def send_reply(
         log.warning("reply to %s: %s", query.key_expr, error)
         return False
     return True
+
+
+class OtherAvatarError(UnknownAvatarError):
+    """The server's reply is about another avatar than the client added: somebody else asks under the client's id.
+
+    key_expression: of the query, with the id.
+    """
+
+    def __init__(self, key_expression: str) -> None:
+        super().__init__("the server answered about another avatar of this name than the one that was added")
+        self.key_expression = key_expression
+
+
+def _no_avatars() -> bytes:
+    """Return the digests of no avatar."""
+    return b""
 
 
 class Anchor:
@@ -106,11 +124,32 @@ class Anchor:
 class Asked:
     """One query of a client, and the reading of its replies."""
 
-    __slots__ = ("_anchor", "_hash", "_key", "_key_expression", "_last", "_request", "_sealer", "nonce")
+    __slots__ = (
+        "_about",
+        "_anchor",
+        "_hash",
+        "_key",
+        "_key_expression",
+        "_last",
+        "_request",
+        "_sealer",
+        "nonce",
+    )
 
-    def __init__(self, anchor: Anchor, key_expression: str, request: bytes = b"") -> None:
-        """nonce: to be sent as the query's attachment."""
+    def __init__(
+        self,
+        anchor: Anchor,
+        key_expression: str,
+        request: bytes = b"",
+        about: Callable[[], bytes | None] = _no_avatars,
+    ) -> None:
+        """Make a nonce, which is to be sent as the query's attachment.
+
+        about: returns the digests, joined, of the avatars that this client added and asks about; None where it does not
+        know one. With a key, a reply about others is not believed.
+        """
         self._anchor, self._key_expression, self._request = anchor, key_expression, request
+        self._about = about
         self.nonce = os.urandom(NONCE_BYTES)
         self._hash: bytes | None = None  # of the request
         self._key: bytes | None = None  # of `_sealer`
@@ -124,7 +163,8 @@ class Asked:
     def read(self, reply: zenoh.Reply) -> tuple[bool, bytes] | None:
         """Return whether a reply is an answer or an error, and its bytes; None where the server did not send it.
 
-        A reply under any other key than the one asked, a wider one included, is none of the server's.
+        A reply under any other key than the one asked, a wider one included, is none of the server's. Raises
+        OtherAvatarError for the server's reply about other avatars; an error may also be about none.
         """
         sample: Any = reply.ok
         if sample is None:
@@ -145,28 +185,31 @@ class Asked:
                 return None
             attachment = sample.attachment
             seal = b"" if attachment is None else attachment.to_bytes()
-        return (
-            (sample is not None, payload)
-            if self._trusted(seal, sample is not None, encoding, payload)
-            else None
-        )
+        ok = sample is not None
+        if not self._has_key_and_seal(seal, ok, encoding, payload):
+            if self._anchor.key is not None:
+                self._anchor.refused(self._key_expression)
+                return None
+            self._anchor.unsealed()
+        elif not self._is_about_ours(seal, ok):
+            raise OtherAvatarError(self._key_expression)
+        return ok, payload
 
-    def _trusted(self, seal: bytes, ok: bool, encoding: str, payload: bytes) -> bool:
-        """Whether a reply is to be believed."""
+    def _has_key_and_seal(self, seal: bytes, ok: bool, encoding: str, payload: bytes) -> bool:
+        """Return whether there is a key and the reply has its seal; the key is looked for again where it has not."""
         key = self._anchor.key
         if key is not None and self._is_sealed(key, seal, ok, encoding, payload):
             return True
         fresh = self._anchor.look_again()
-        if fresh is None:
-            self._anchor.unsealed()
-            return True
-        if fresh != key and self._is_sealed(fresh, seal, ok, encoding, payload):
-            return True
-        self._anchor.refused(self._key_expression)
-        return False
+        return fresh is not None and fresh != key and self._is_sealed(fresh, seal, ok, encoding, payload)
+
+    def _is_about_ours(self, seal: bytes, ok: bool) -> bool:
+        """Return whether a sealed reply is about the avatars that this client added; an error may be about none."""
+        about = self._about()
+        return (about is not None and is_about(seal, about)) or (not ok and is_about(seal, b""))
 
     def _is_sealed(self, key: bytes, seal: bytes, ok: bool, encoding: str, payload: bytes) -> bool:
-        """Whether a reply has its seal, and is none that came before."""
+        """Return whether a reply has its seal, and is none that came before."""
         if self._sealer is None or key is not self._key:
             if self._hash is None:
                 self.sent()

@@ -37,11 +37,15 @@ class Full(Enum):
 
 
 class Answer(NamedTuple):
-    """What is sent: its bytes, their encoding, and whether it is an answer or an error."""
+    """What is sent: its bytes, their encoding, and whether it is an answer or an error.
+
+    about: the digests of the client's own avatars that answered, joined; its seal names them.
+    """
 
     payload: bytes
     encoding: str
     ok: bool
+    about: bytes = b""
 
 
 class Turn(NamedTuple):
@@ -53,10 +57,11 @@ class Turn(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """What came of a turn. state: where the user is now, or why that was not said."""
+    """What came of a turn. state: where the user is now, or why that was not said.  about: as in `Answer`."""
 
     user: User
     state: State | SolidcloudError
+    about: bytes = b""
 
 
 class Simulates(Protocol):
@@ -81,7 +86,8 @@ class Simulates(Protocol):
 class SceneLike(Protocol):
     """What a service asks its questions of; thread-safe. Raises SolidcloudErrors for what it refuses.
 
-    The questions take what those of `Scene` do. simulation: of its users' frames; None: it has none.
+    The questions take what those of `Scene` do. Each notes the avatars that answer it (answering_avatars.py) in the
+    thread that calls it, before it returns. simulation: of its users' frames; None: it has none.
     """
 
     name: str

@@ -31,12 +31,13 @@ from ..schemas.messages import AvatarInfo, ReloadAnswer, SceneInfo, StatsAnswer
 from ..schemas.moves import FRAME_SECONDS, Moved, MoveRequest, State, Wish
 from ..schemas.requests import make_poses
 from ..schemas.scene import SceneFile
+from .answering_avatars import noted
 from .avatar import AvatarModel
 from .config import AvatarLimits
 from .describe import describe_scene
 from .effects.frame import Body
 from .effort import EXACT, Effort
-from .served import EVERYBODY, Outcome, SceneLike, Turn
+from .served import Outcome, SceneLike, Turn
 from .stop import NEVER, Stop, StoppedError
 from .vectors import size, unit
 from .wishes import Pose, check_rigid, first_pose, frame_seconds, wished_pose
@@ -108,7 +109,7 @@ class Simulation:
     """A scene and its frames. Thread-safe; a context manager.
 
     served: what answers the questions.  file: what the scene calls for.  pipeline: its effects.  avatars: the scene's
-    own, which every user finds: `served` knows them as those of EVERYBODY.  bodies: kept up to date, where users meet.
+    own, which every user finds: `served` has them as those of EVERYBODY.  bodies: kept up to date, where users meet.
     place: of some scan point, (3,) world [m].
     """
 
@@ -213,8 +214,12 @@ class Simulation:
             for number, turn in enumerate(turns):
                 skip = None if skips is None else skips[number]
                 stop = NEVER if stops is None else stops[number]
-                outcomes.append(Outcome(turn.user, self._turn(turn, now, skip, stop)))
+                used: list[bytes] = []
+                with noted(used):
+                    said = self._turn(turn, now, skip, stop)
                 there = self._present.get(turn.user)
+                about = b"".join(used) if there is None else there.body.avatar.digest
+                outcomes.append(Outcome(turn.user, said, about))
                 opened.append(() if there is None else there.body.generations)
             if self._recorder is not None:
                 self._recorder.frame(self._frames, turns, outcomes, opened)
@@ -317,9 +322,8 @@ class Simulation:
     def add_avatar(
         self, name: str, points: Any, radius: float | None = None, *, client: str = ""
     ) -> AvatarInfo:
-        """Add an avatar; see `Scene.add_avatar`. One named as one of the scene's own must be it."""
-        own = any(avatar.name == name for avatar in self._own)
-        return self.served.add_avatar(name, points, radius, client=EVERYBODY if own else client)
+        """Add an avatar; see `Scene.add_avatar`."""
+        return self.served.add_avatar(name, points, radius, client=client)
 
     def info(self) -> SceneInfo:
         """What is served, and which effects its frames simulate."""

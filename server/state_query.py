@@ -9,7 +9,7 @@ from typing import Any
 import zenoh
 
 from ..schemas.encoding import MSGPACK
-from .replies import Anchor, Asked
+from .replies import Anchor, Asked, OtherAvatarError
 
 log = logging.getLogger(__name__)
 
@@ -24,9 +24,11 @@ _QUERY_SECONDS = 3600.0
 class StateQuery:
     """The query for one user's states. One thread takes what comes; `end` may be called by another."""
 
-    def __init__(self, session: zenoh.Session, key: str, anchor: Anchor) -> None:
-        """key: of the user's states."""
-        self._session, self._key, self._anchor = session, key, anchor
+    def __init__(
+        self, session: zenoh.Session, key: str, anchor: Anchor, about: Callable[[], bytes | None]
+    ) -> None:
+        """Ask nothing yet. key: of the user's states.  about: as in `Asked`."""
+        self._session, self._key, self._anchor, self._about = session, key, anchor, about
         # Without bound: what is heard is taken at once, but for the moments in which an avatar is added again.
         self._came: queue.SimpleQueue[tuple[Asked, Any] | None] = queue.SimpleQueue()
         self._asked_now: Asked | None = None  # the query that is open, or was last
@@ -37,6 +39,17 @@ class StateQuery:
 
     def open(self) -> None:
         """Ask for the first time."""
+        self._declare()
+        self._ask()
+
+    def move(self, key: str) -> None:
+        """Ask for the states of another user from now on. key: of them."""
+        self.close()
+        self._key, self._pause = key, _PAUSE
+        self._declare()
+        self._ask()
+
+    def _declare(self) -> None:
         self._querier = self._session.declare_querier(
             self._key,
             consolidation=zenoh.ConsolidationMode.NONE,
@@ -45,7 +58,6 @@ class StateQuery:
             priority=zenoh.Priority.INTERACTIVE_HIGH,
             express=True,
         )
-        self._ask()
 
     def end(self) -> None:
         """Have `take` return None once it has returned what came so far."""
@@ -59,9 +71,10 @@ class StateQuery:
         except zenoh.ZError as error:  # the zenoh session was closed before
             log.debug("closing %s: %s", self._key, error)
 
-    def take(self, wished: Callable[[], float]) -> list[tuple[bool, bytes]] | None:
+    def take(self, wished: Callable[[], float]) -> list[tuple[bool, bytes] | OtherAvatarError] | None:
         """Wait a while for replies; return states as (True, payload), errors as (False, payload); None: it is over.
 
+        A state of another avatar is returned as OtherAvatarError.
         wished: returns when the user wished last, on the monotonic clock [s].
         """
         if self._over:
@@ -75,7 +88,7 @@ class StateQuery:
             return []
         while not self._came.empty():
             came.append(self._came.get())
-        found = []
+        found: list[tuple[bool, bytes] | OtherAvatarError] = []
         for item in came:
             if item is None:
                 self._over = True
@@ -85,9 +98,13 @@ class StateQuery:
                 continue  # of a query before this one
             if reply is None:
                 self._open = False
-            elif (said := asked.read(reply)) is not None:
+            elif (said := _read(asked, reply)) is not None:
                 found.append(said)
-                self._heard, self._pause = monotonic(), _PAUSE
+                self._heard = monotonic()
+                if not isinstance(said, OtherAvatarError) and said[0]:
+                    self._pause = (
+                        _PAUSE  # after an error, `busy` say, the server is not asked faster than before
+                    )
         return found
 
     def _patience(self) -> float:
@@ -96,7 +113,7 @@ class StateQuery:
 
     def _ask(self) -> None:
         """Ask, in place of an earlier query."""
-        self._asked_now = asked = Asked(self._anchor, self._key)
+        self._asked_now = asked = Asked(self._anchor, self._key, about=self._about)
         self._pause = min(2 * self._pause, _MOST_PAUSE)
         self._asked, self._open = monotonic(), True
         # zenoh calls these: they may not block, nor use zenoh.
@@ -112,3 +129,11 @@ class StateQuery:
         except zenoh.ZError as error:  # the zenoh session is closed
             self._open = False
             log.debug("asking %s: %s", self._key, error)
+
+
+def _read(asked: Asked, reply: Any) -> tuple[bool, bytes] | OtherAvatarError | None:
+    """Return what a reply says; None where the server did not send it."""
+    try:
+        return asked.read(reply)
+    except OtherAvatarError as error:
+        return error

@@ -24,6 +24,7 @@ DOORS = {
         "server/state_query.py",
         "server/replies.py",
         "server/client_session.py",
+        "server/identity.py",
     ),
     "numba": ("schemas/kernels/compiling.py",),
     "llvmlite": ("schemas/kernels/compiling.py",),

@@ -162,7 +162,7 @@ def _token(rogue: Rogue, width: str, victim: Victim) -> list[str]:
     time.sleep(0.005)  # the server hears of tokens on a channel of its own
     request = encode(CollideRequest(AVATAR, pose_at(0.0, -1.0)[None]))
     try:
-        victim.client._ask("collide", request)
+        victim.client._ask("collide", request, [AVATAR])
     except SolidcloudError as error:
         _asked(victim)  # the avatar is added again
         return [f"{type(error).__name__}: {error}"]
@@ -218,6 +218,7 @@ class Impostor:
         config = session_config()
         config.insert_json5("listen/endpoints", json.dumps([endpoint]))
         self.asked: list[str] = []
+        self.keys: set[str] = set()
         self._seal = seal or (lambda query, payload: None)
         self._states: list[zenoh.Query] = []
         self._session = zenoh.open(config)
@@ -234,6 +235,7 @@ class Impostor:
 
     def _answer(self, query: zenoh.Query) -> None:
         key = str(query.key_expr)
+        self.keys.add(key)
         self.asked.append(key.rpartition("/")[2] if "/scene/" in key else key.split("/")[2])
         if "/state/" in key:
             self._states.append(query)

@@ -30,6 +30,8 @@ from solidcloud.schemas.messages import (
 )
 from solidcloud.schemas.moves import Moved, Touched
 from solidcloud.schemas.scene import Limits, SceneFile, scene_of
+from solidcloud.schemas.seals import avatar_digest
+from solidcloud.server.answering_avatars import note
 from solidcloud.server.app import serve
 from solidcloud.server.avatar import make_avatar
 from solidcloud.server.config import ServerConfig
@@ -129,18 +131,21 @@ class FloorScene:
         return StatsAnswer(scene=self.name, hits=len(self.asked), keys=[3, 5] if keys else None)
 
     def add_avatar(self, name, points, radius=None, *, client=""):
-        known = self.avatars.get((client, name))
+        known = self.avatars.get((client, name)) or self.avatars.get(("*", name))
         if known is not None and not np.array_equal(known[0], points):
             raise BadRequestError(f"avatar {name!r} has other points")
         radius = 0.05 if radius is None else radius
-        self.avatars[client, name] = (points, radius)
+        self.avatars[client, name] = (np.asarray(points, np.float64), radius)
         return AvatarInfo(name, len(points), radius, 1.0)
 
     def avatar(self, name, client):
-        found = self.avatars.get((client, name)) or self.avatars.get(("*", name))
+        own = self.avatars.get((client, name))
+        found = own or self.avatars.get(("*", name))
         if found is None:
             raise UnknownAvatarError(f"avatar {name!r}")
-        return make_avatar(*found)
+        digest = b"" if own is None or client == "*" else avatar_digest(*own)
+        note(digest)
+        return make_avatar(*found)._replace(digest=digest)
 
     def move(self, name, pose_from, pose_to, seconds, *, client="", **options):
         self.check(name, pose_from, client)
@@ -179,7 +184,7 @@ class FloorScene:
 
     def sweep(self, name, pose_from, pose_to, margin, *, client="", **effort):
         self.check(name, pose_from, client)
-        self.check(name, pose_to, client)
+        self.check_poses(pose_to)
         return self.keep(SweepAnswers, len(pose_from), "sweep", (name, margin), effort)
 
     def raycast(self, origins, directions, reach, **effort):
@@ -224,6 +229,10 @@ class FloorScene:
     def check(self, name, poses, client):
         if (client, name) not in self.avatars:
             raise UnknownAvatarError(f"avatar {name!r}")
+        note(avatar_digest(*self.avatars[client, name]))
+        self.check_poses(poses)
+
+    def check_poses(self, poses):
         if not np.array_equal(poses[:, 3], np.tile([0.0, 0, 0, 1], (len(poses), 1))):
             raise BadTransformError("last row")
 

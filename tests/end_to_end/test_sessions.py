@@ -362,6 +362,9 @@ def test_a_wish_that_was_dropped_is_sent_once_more(served, endpoint):
         def delete(self):
             self.publisher.delete()
 
+        def undeclare(self):
+            self.publisher.undeclare()
+
     with walking(endpoint) as session:
         session._publisher = publisher = Dropping(session._publisher)
         state = session.wait(session.wish(pose_at(0.0, 1.0)), DEADLINE)

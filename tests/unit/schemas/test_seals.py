@@ -5,20 +5,31 @@ import re
 import struct
 from pathlib import Path
 
+import numpy as np
 import pytest
 import solidcloud.schemas
-from solidcloud.schemas.seals import Sealer, hash_of
+from solidcloud.schemas.seals import Sealer, avatar_digest, hash_of, is_about
 
 KEY, NONCE = bytes(range(32)), bytes(range(100, 116))
 NAME = "solidcloud/1/scene/hall/c1/collide"
 REQUEST, PAYLOAD = b"\x80", b"\x81\xa1a\x01"
+POINTS = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.75]])
+ABOUT = avatar_digest(POINTS, 0.875)
 MSGPACK = "application/msgpack"
 
 
 def sealed(
-    number=3, ok=True, encoding=MSGPACK, payload=PAYLOAD, key=KEY, nonce=NONCE, name=NAME, request=REQUEST
+    number=3,
+    ok=True,
+    encoding=MSGPACK,
+    payload=PAYLOAD,
+    about=ABOUT,
+    key=KEY,
+    nonce=NONCE,
+    name=NAME,
+    request=REQUEST,
 ):
-    return Sealer(key, nonce, name, hash_of(request)).seal(number, ok, encoding, payload)
+    return Sealer(key, nonce, name, hash_of(request)).seal(number, ok, encoding, payload, about)
 
 
 def number_of(seal, ok=True, encoding=MSGPACK, payload=PAYLOAD):
@@ -29,9 +40,28 @@ def test_a_seal_is_a_plain_keyed_hash():
     """As the document has it, without the code."""
     name, encoding = NAME.encode(), MSGPACK.encode()
     text = NONCE + hashlib.sha256(REQUEST).digest() + struct.pack("<QBQ", 3, 1, len(name)) + name
-    text += hashlib.sha256(PAYLOAD).digest() + encoding
-    assert sealed() == struct.pack("<Q", 3) + hashlib.blake2b(text, key=KEY, digest_size=32).digest()
+    about = hashlib.sha256(ABOUT).digest()
+    text += hashlib.sha256(PAYLOAD).digest() + about + encoding
+    assert sealed() == struct.pack("<Q", 3) + about + hashlib.blake2b(text, key=KEY, digest_size=32).digest()
     assert number_of(sealed()) == 3
+
+
+def test_a_seal_says_which_avatars_a_reply_is_about():
+    other = avatar_digest(POINTS, 0.5)
+    assert number_of(sealed(about=other)) == 3, "the seal is right"
+    for about in (b"", ABOUT, other, ABOUT + other, other + ABOUT, ABOUT + ABOUT):
+        seal = sealed(about=about)
+        assert is_about(seal, about) and number_of(seal) == 3
+        assert not [each for each in (b"", ABOUT, other) if each != about and is_about(seal, each)]
+
+
+def test_an_avatars_digest_is_of_its_numbers():
+    numbers = struct.pack("<7d", 0, 0, 0, 0, 0, 1.75, 0.875)
+    assert hashlib.sha256(numbers).digest() == ABOUT
+    assert avatar_digest(np.asfortranarray(-POINTS * -1.0), 0.875) == ABOUT
+    assert avatar_digest(POINTS * [1.0, -1.0, 1.0], 0.875) == ABOUT, "a zero has no sign"
+    assert avatar_digest(np.empty((0, 3)), -0.0) == hashlib.sha256(bytes(8)).digest()
+    assert ABOUT not in (avatar_digest(POINTS[::-1], 0.875), avatar_digest(POINTS, np.nextafter(0.875, 1)))
 
 
 @pytest.mark.parametrize(
@@ -65,7 +95,7 @@ def test_the_example_of_the_document():
     section = text.split("## Seals\n", 1)[1].split("\n## ", 1)[0]
     found = dict(
         re.findall(
-            r"^\| (key|nonce|key expression|request|number|encoding|payload|seal) \| `([^`]*)` \|$",
+            r"^\| (key|nonce|key expression|request|number|encoding|payload|points|radius|about|seal) \| `([^`]*)` \|$",
             section,
             re.M,
         )
@@ -76,5 +106,8 @@ def test_the_example_of_the_document():
         found["key expression"],
         hash_of(bytes.fromhex(found["request"])),
     )
-    seal = sealer.seal(int(found["number"]), True, found["encoding"], bytes.fromhex(found["payload"]))
+    points = np.array([float(text) for text in found["points"].split()]).reshape(-1, 3)
+    about = avatar_digest(points, float(found["radius"]))
+    assert hash_of(about).hex() == found["about"]
+    seal = sealer.seal(int(found["number"]), True, found["encoding"], bytes.fromhex(found["payload"]), about)
     assert seal.hex() == found["seal"]

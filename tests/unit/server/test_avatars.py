@@ -5,7 +5,9 @@ import threading
 import numpy as np
 import pytest
 from solidcloud.schemas.errors import BadRequestError, TooLargeError, UnknownAvatarError
+from solidcloud.schemas.seals import avatar_digest
 from solidcloud.server import avatars as avatars_module
+from solidcloud.server.answering_avatars import noted
 from solidcloud.server.avatar import make_avatar
 from solidcloud.server.avatars import Avatars, bytes_of
 from solidcloud.server.config import AvatarLimits
@@ -114,6 +116,51 @@ def test_the_same_avatar_again_is_the_same_and_another_is_refused():
         with pytest.raises(BadRequestError, match="other points or another radius"):
             avatars.add("al", points, radius, "a")
     assert avatars.stats().avatars == 2
+
+
+def test_only_a_radius_that_is_not_given_is_made_again_and_in_its_turn(monkeypatch):
+    avatars, made = Avatars(LIMITS), []
+    first = avatars.add("al", BODY, 0.01, "a")
+
+    def making(points, radius):
+        made.append((radius, avatars._large.locked()))
+        return make_avatar(points, radius)
+
+    monkeypatch.setattr(avatars_module, "make_avatar", making)
+    monkeypatch.setattr(avatars_module, "_LARGE", 100)
+    with pytest.raises(BadRequestError, match="another radius"):
+        avatars.add("al", BODY, 0.02, "a")
+    assert avatars.add("al", BODY, 0.01, "a") is first and made == []
+    with pytest.raises(BadRequestError, match="another radius"):
+        avatars.add("al", BODY, None, "a")
+    assert made == [(None, True)]
+
+
+def test_the_avatars_that_answer_are_noted_as_they_are_handed_out():
+    avatars = Avatars(LIMITS)
+    al = avatars.add("al", BODY, None, "a")
+    avatars.add("own", BODY, 0.01, EVERYBODY)
+    found = []
+    with noted(found):
+        assert avatars.get("al", "a") is al
+        avatars.drop_client("a")
+        other = avatars.add("al", BODY[:9], 0.5, "a")
+        avatars.get("al", "a"), avatars.get("own", "a")
+    avatars.get("al", "a")
+    assert found == [avatar_digest(BODY, al.radius), avatar_digest(BODY[:9], 0.5)]
+    assert (al.digest, other.digest) == tuple(found)
+
+
+def test_a_client_may_add_one_of_the_scenes_own_avatars_as_it_is():
+    avatars = Avatars(LIMITS)
+    own = avatars.add("own", BODY, 0.01, EVERYBODY)
+    shared = avatars.add("own", BODY, 0.01, "a")
+    assert shared.arrays is own.arrays and own.digest == b"" and avatars.get("own", "a") is shared
+    assert shared.digest == avatar_digest(BODY, 0.01) and avatars.get("own", "b") is own
+    assert avatars.stats().bytes < BODY.nbytes
+    for points, radius in ((BODY[:9], 0.01), (BODY, 0.5)):
+        with pytest.raises(BadRequestError, match="'own' exists with other points or another radius"):
+            avatars.add("own", points, radius, "b")
 
 
 def test_what_is_being_built_counts_and_is_waited_for(monkeypatch):

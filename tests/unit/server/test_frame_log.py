@@ -139,7 +139,7 @@ def test_a_log_that_can_grow_no_more_stops_nobody(tmp_path, caplog):
     log._file.close()
     log._file = Full()
     for seq in (2, 3):
-        ((_, state),) = simulation.step([Turn(AL, wish(seq, 0.5))])
+        ((_, state, _),) = simulation.step([Turn(AL, wish(seq, 0.5))])
         assert state.seq == seq
     assert caplog.text.count("No space left on device") == 1
     assert len(list(read_log(tmp_path / "log"))) == 4

@@ -48,21 +48,21 @@ def floor():
 
 
 def test_a_frame_goes_on_from_where_the_last_one_ended(floor):
-    ((_, first),) = floor.step([Turn(AL, wish(1, 0.5))])
+    ((_, first, _),) = floor.step([Turn(AL, wish(1, 0.5))])
     assert isinstance(first, State) and np.array_equal(first.pose, pose_at(0.5))
-    ((user, second),) = floor.step([Turn(AL, wish(2, velocity=(2.0, 0.0, -1.0), time=1.0625), late=7)])
+    ((user, second, _),) = floor.step([Turn(AL, wish(2, velocity=(2.0, 0.0, -1.0), time=1.0625), late=7)])
     assert user == AL and np.array_equal(second.pose, pose_at(0.4375, 0.125))
     assert (second.seq, second.time, second.frame, second.late) == (2, 1.0625, 2, 7)
-    ((_, third),) = floor.step([Turn(AL, wish(3, velocity=(0.0, 0.0, -1e3), time=1.125))])
+    ((_, third, _),) = floor.step([Turn(AL, wish(3, velocity=(0.0, 0.0, -1e3), time=1.125))])
     assert third.pose[0, 2, 3] == np.nextafter(-0.375, 1.0), "stopped by the floor"
-    ((_, fourth),) = floor.step([Turn(AL, wish(4, velocity=(1.0, 0.0, 0.0), time=1.25))])
+    ((_, fourth, _),) = floor.step([Turn(AL, wish(4, velocity=(1.0, 0.0, 0.0), time=1.25))])
     assert fourth.pose[0, 2, 3] == third.pose[0, 2, 3], "from where it was stopped"
 
 
 def test_users_begin_at_the_spawn():
     simulation = floor_simulation(spawn=Spawn(position=(3.0, 4.0, 5.0)))
     simulation.add_avatar("al", POINTS, 0.125, client="a")
-    ((_, state),) = simulation.step([Turn(AL, wish(1, velocity=(3.0, 0.0, 0.0)))])
+    ((_, state, _),) = simulation.step([Turn(AL, wish(1, velocity=(3.0, 0.0, 0.0)))])
     assert np.array_equal(state.pose[0, :3, 3], [3.0 + 3.0 * FRAME_SECONDS, 4.0, 5.0])
 
 
@@ -92,7 +92,7 @@ def test_a_refused_wish_is_its_users_alone_and_changes_nothing(floor):
     assert kinds == [BadTransformError, InternalError, UnknownAvatarError, State]
     assert "secret" not in str(outcomes[1].state)
     assert floor.users == [AL, BO], "who was refused at first is not there"
-    ((_, state),) = floor.step([Turn(AL, wish(3, velocity=(0.0, 0.0, 1.0), time=1.0625))])
+    ((_, state, _),) = floor.step([Turn(AL, wish(3, velocity=(0.0, 0.0, 1.0), time=1.0625))])
     assert np.array_equal(state.pose, pose_at(0.5625)), "its clock and its pose are as before"
 
 
@@ -131,7 +131,7 @@ def test_a_move_is_remembered_by_nobody(floor):
     floor.step([Turn(AL, wish(1, 0.5))])
     moved = floor.move("al", pose_at(0.0), pose_at(-1.0), 0.25, client="a")
     assert type(moved) is Moved and moved.pose[0, 2, 3] == np.nextafter(-0.375, 1.0)
-    ((_, state),) = floor.step([Turn(AL, wish(2, velocity=(0.0, 0.0, 0.0)))])
+    ((_, state, _),) = floor.step([Turn(AL, wish(2, velocity=(0.0, 0.0, 0.0)))])
     assert np.array_equal(state.pose, pose_at(0.5)) and state.frame == 2
     poses = pose_at(0.0)
     assert floor.move("al", poses, poses, client="a").pose is not poses
@@ -151,7 +151,7 @@ def test_a_move_that_is_none_is_refused(floor):
 
 def test_wishes_for_objects_where_there_are_none_are_refused(floor):
     objects = {"door": np.eye(4).tolist()}
-    ((_, error),) = floor.step([Turn(AL, wish(1, 0.5, objects=objects))])
+    ((_, error, _),) = floor.step([Turn(AL, wish(1, 0.5, objects=objects))])
     assert isinstance(error, BadRequestError) and "objects" in str(error)
 
 
@@ -173,7 +173,7 @@ def test_the_bodies_that_may_meet_are_kept_up_to_date():
     assert list(bodies) == [AL] and np.array_equal(bodies[AL].pose, pose_at(0.5)[0])
     assert bodies.told == objects and not bodies.put_back
     simulation._pipeline.run = None
-    ((_, error),) = simulation.step([Turn(AL, wish(2, 0.5, objects=objects))])
+    ((_, error, _),) = simulation.step([Turn(AL, wish(2, 0.5, objects=objects))])
     assert isinstance(error, InternalError) and bodies.put_back == 1
     simulation.end(AL)
     assert not bodies

@@ -79,7 +79,7 @@ def avatar_digest(points: NDArray[np.float64], radius: float) -> bytes:
 
     Of the points, row by row, and the radius, each number as a little-endian float64; a zero has no sign.
     """
-    found = hashlib.sha256(np.ascontiguousarray(points + 0.0, "<f8"))
+    found = hashlib.sha256(np.asarray(points + 0.0, "<f8").tobytes())
     found.update(_RADIUS.pack(radius + 0.0))
     return found.digest()
 

@@ -46,6 +46,7 @@ from ..schemas.messages import (
 from ..schemas.requests import Question
 from .answering_avatars import noted
 from .config import ServerConfig
+from .deadlines import start_deadlines
 from .frames import Frames
 from .heap import give_back_large_blocks
 from .served import Answer, Full, SceneLike
@@ -250,6 +251,7 @@ class Service:
 
     def warm(self) -> None:
         """Warm every scene, so that the first client does not wait for compilers."""
+        start_deadlines()
         for scene in self._scenes.values():
             log.info("warming %s: the first start on a machine compiles, for a minute or two", scene.name)
             (scene.simulation or scene).warm()

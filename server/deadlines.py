@@ -1,8 +1,8 @@
 """Deadlines of requests: one thread sets the stop flag of each request whose time is up.
 
-The thread starts with the first deadline and runs for the life of the process. It waits outside the interpreter's lock
-and wakes when the earliest deadline comes, so that thousands of deadlines that are met in time cost a heap operation
-each.
+The thread runs for the life of the process: a server starts it before it answers, anything else with the first
+deadline. It waits outside the interpreter's lock and wakes when the earliest deadline comes, so that thousands of
+deadlines that are met in time cost a heap operation each.
 """
 
 import heapq
@@ -10,8 +10,6 @@ import itertools
 import threading
 import time
 import weakref
-from collections.abc import Iterator
-from contextlib import contextmanager
 
 from .stop import Stop
 from .threads import start_thread
@@ -28,16 +26,17 @@ class Deadlines:
     """
 
     def __init__(self) -> None:
-        """Start without a thread; the first deadline starts it."""
+        """Start without a thread."""
         self._changed = threading.Condition()
         self._heap: list[tuple[float, int, weakref.ref[Stop], str]] = []
         self._numbers = itertools.count()
         self._compact_at = _LEAST_ENTRIES
         self._thread: threading.Thread | None = None
 
-    def __len__(self) -> int:
-        """Return the number of entries, those of requests that ended included."""
-        return len(self._heap)
+    def start(self) -> None:
+        """Start the thread, unless it runs. It keeps the priority of the thread that starts it."""
+        with self._changed:
+            self._start()
 
     def add(self, stop: Stop, when: float, reason: str) -> None:
         """Set `stop` with this reason at `when`, on time.perf_counter()'s clock [s]."""
@@ -45,10 +44,14 @@ class Deadlines:
             heapq.heappush(self._heap, (when, next(self._numbers), weakref.ref(stop), reason))
             if len(self._heap) > self._compact_at:
                 self._compact()
-            if self._thread is None:
-                self._thread = start_thread("deadlines", self._run)
-            elif self._heap[0][0] == when:
+            self._start()
+            if self._heap[0][0] == when:
                 self._changed.notify()
+
+    def _start(self) -> None:
+        """Start the thread, unless it runs. Where that raises, the next deadline tries again."""
+        if self._thread is None:
+            self._thread = start_thread("deadlines", self._run)
 
     def _compact(self) -> None:
         """Drop the entries whose flag is gone or set."""
@@ -77,9 +80,6 @@ def stop_at(stop: Stop, when: float, reason: str) -> None:
     _DEADLINES.add(stop, when, reason)
 
 
-@contextmanager
-def deadline(seconds: float, reason: str) -> Iterator[Stop]:
-    """Give a `with` a flag that is set after so many seconds; afterwards it is not set any more."""
-    stop = Stop()
-    stop_at(stop, time.perf_counter() + seconds, reason)
-    yield stop
+def start_deadlines() -> None:
+    """Start the thread now, so that no slow request does, whose low priority it would have."""
+    _DEADLINES.start()

@@ -10,7 +10,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Generator
 from concurrent.futures import Executor, Future
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -46,6 +46,12 @@ _CONTACT_BYTES = 184
 Ask = Callable[[int, int], Cost]
 
 
+class AskPart(Protocol):
+    """Answers [start, end) of a path. part: the flag of the part that they are in; None: they are a part."""
+
+    def __call__(self, start: int, end: int, part: Stop | None = None) -> Cost: ...
+
+
 def path_question(
     data: SceneData,
     avatar: AvatarModel,
@@ -53,12 +59,12 @@ def path_question(
     op: str,
     parameters: dict[str, Any],
     stop: Stop = NEVER,
-) -> tuple[Ask, int]:
-    """What answers [start, stop) of a path, and how many answers there are. The budget's time begins now.
+) -> tuple[AskPart, int]:
+    """Return what answers [start, stop) of a path, and how many answers there are. The budget's time begins now.
 
     poses: (k, 4, 4) float64.  parameters: of `op`, tolerance and budgets included.  stop: ends the path early; a part
-    that takes longer than its `part_seconds` ends alone. All poses are checked here, so that an error names one by its
-    place on the path. BadRequestError, BadTransformError, TooLargeError.
+    that takes longer than its `part_seconds` ends alone, see `AskPart`. All poses are checked here, so that an error
+    names one by its place on the path. BadRequestError, BadTransformError, TooLargeError.
     """
     given = {name: value for name, value in parameters.items() if value is not None}
     check_path_parameters(op, given)
@@ -83,11 +89,11 @@ def path_question(
     if op == "sweep":
         given["tolerance"] = tolerance
 
-    def ask(start: int, end: int) -> Cost:
+    def ask(start: int, end: int, part: Stop | None = None) -> Cost:
         if effort.spent:
             return unknown_part(PATH_ANSWERS[op], end - start, effort)
         what = [poses[start:end], poses[start + 1 : end + 1]] if op == "sweep" else [poses[start:end]]
-        own = effort._replace(stop=_part_stop(effort.stop, stop.part_seconds))
+        own = effort._replace(stop=part_stop(effort.stop, stop.part_seconds) if part is None else part)
         return ask_until_stopped(
             question,
             end - start,
@@ -98,7 +104,7 @@ def path_question(
     return ask, max(0, len(poses) - 1) if op == "sweep" else len(poses)
 
 
-def _part_stop(stop: Stop, seconds: float) -> Stop:
+def part_stop(stop: Stop, seconds: float) -> Stop:
     """Return the flag of a part that begins now: set with the path's, or once the part has taken so many seconds."""
     if seconds == math.inf:
         return stop

@@ -4,7 +4,7 @@ import os
 import threading
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence, Sized
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeVar, Unpack
@@ -39,6 +39,7 @@ from .metrics import Metrics
 from .objects import objects as ask_objects
 from .opened import HeldParts, Opened
 from .path import PATH_THREADS, largest_part, path_parts, path_question
+from .path_threads import PathThreads
 from .rays import raycast
 from .request import SceneData, with_stop
 from .residency import Residency
@@ -82,7 +83,7 @@ class Scene(Simulated):
         self._before: Opened | None = None  # swapped out; perhaps not ended yet
         self._info = describe_scene(describe(store, name), scene_of(name))
         self._avatars = Avatars()
-        self._pool: ThreadPoolExecutor | None = None
+        self._path_threads = PathThreads(name, max(PATH_THREADS, os.cpu_count() or 1))
         self._closed = False
         self._lock = threading.Lock()
         self._reloading = threading.Lock()
@@ -125,9 +126,7 @@ class Scene(Simulated):
         """Close the archive's files, once no part of a path is being computed and no reload is under way."""
         with self._lock:
             closed, self._closed = self._closed, True
-            pool, self._pool = self._pool, None
-        if pool is not None:
-            pool.shutdown(cancel_futures=True)
+        self._path_threads.close()
         if not closed:
             with self._reloading:
                 self._opened.release()
@@ -185,13 +184,9 @@ class Scene(Simulated):
             if opened is self._opened:  # nobody swapped it: it was closed
                 return opened.taken()
 
-    def pool_of_threads(self) -> ThreadPoolExecutor:
-        """The threads that compute parts of paths, one a core; started when first needed, shared by all paths."""
-        with self._lock:
-            if self._pool is None:
-                workers = max(PATH_THREADS, os.cpu_count() or 1)
-                self._pool = ThreadPoolExecutor(workers, thread_name_prefix=f"solidcloud-{self.name}-path")
-            return self._pool
+    def path_threads(self, client: str) -> Executor:
+        """Return what computes the parts of a client's paths: threads, one a core, that all clients share in turn."""
+        return self._path_threads.of(client)
 
     def avatar(self, name: str, client: str) -> AvatarModel:
         """Return a client's avatar, or the scene's own. Raises UnknownAvatarError."""
@@ -208,7 +203,8 @@ class Scene(Simulated):
         return self._data.residency
 
     def warm(self) -> None:
-        """Ask one of everything, a load included, so that nobody waits for compilers after."""
+        """Ask one of everything, a load included, so that nobody waits for compilers after; start the threads."""
+        self._path_threads.start()
         with self.take() as opened:
             opened.warm()
 
@@ -442,7 +438,7 @@ class Scene(Simulated):
                 return part
 
             most = largest_part(op, parameters)
-            ahead = (self.pool_of_threads(), 2 * threads) if threads > 1 else (None, 1)
+            ahead = (self.path_threads(client), 2 * threads) if threads > 1 else (None, 1)
             return HeldParts(path_parts(ask_held, total, most, *ahead), opened)
         except BaseException:
             opened.release()

@@ -395,7 +395,7 @@ class SeveralScenes(Simulated):
                 return part
 
             most = largest_part(op, parameters)
-            ahead = (self._first.pool_of_threads(), 2 * threads) if threads > 1 else (None, 1)
+            ahead = (self._first.path_threads(client), 2 * threads) if threads > 1 else (None, 1)
             parts: Any = path_parts(ask_held, total, most, *ahead)
         except BaseException:
             for opened in taken:

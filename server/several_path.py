@@ -1,5 +1,6 @@
 """A path through several archives, and budgets of visits that several archives share."""
 
+import math
 import time
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, TypeVar
@@ -12,7 +13,7 @@ from ..schemas.columns import join
 from .avatar import AvatarModel
 from .effort import NO_LIMIT, Effort
 from .merged import carried, limited, merged
-from .path import path_question
+from .path import part_stop, path_question
 from .posed import Pose
 from .request import SceneData
 from .stop import NEVER, Stop
@@ -58,15 +59,18 @@ def in_budget(ask: Ask[_A], data: SceneData, effort: Effort, visits: NDArray[np.
 def along(
     legs: Sequence[Leg], avatar: AvatarModel, op: str, parameters: dict[str, Any], stop: Stop = NEVER
 ) -> tuple[Callable[[int, int], Cost], int]:
-    """What answers [start, stop) of a path through all archives, and how many answers there are."""
+    """Return what answers [start, stop) of a path through all archives, and how many answers there are.
+
+    The time of a part, `stop.part_seconds`, is that of all archives together.
+    """
     begin = time.perf_counter()
     # All poses are checked here, so that an error names one by its place on the path.
     asks = [path_question(leg.data, avatar, leg.poses, op, parameters, stop) for leg in legs]
     visits, budget_ms = parameters.get("budget_visits"), parameters.get("budget_ms")
     limit = parameters.get("limit")
 
-    def ask_bounded(leg: Leg, start: int, spent: NDArray[np.int64]) -> Cost:
-        """With what is left of the visits of each answer from `start` on, and of the time."""
+    def ask_bounded(leg: Leg, start: int, spent: NDArray[np.int64], part: Stop | None) -> Cost:
+        """Ask with what is left of the visits of each answer from `start` on, and of the time."""
 
         def ask(data: SceneData, effort: Effort, k: slice) -> Cost:
             # The motions of a path end where the next begin.
@@ -74,18 +78,20 @@ def along(
             options = parameters | {"budget_visits": effort.visits}
             if budget_ms is not None:
                 options["budget_ms"] = max(0.0, budget_ms - (time.perf_counter() - begin) * 1e3)
-            return path_question(data, avatar, own, op, options, stop)[0](0, k.stop - k.start)
+            return path_question(data, avatar, own, op, options, stop)[0](0, k.stop - k.start, part)
 
         return in_budget(ask, leg.data, Effort(visits=int(visits or 0)), spent)
 
     def ask(start: int, end: int) -> Cost:
         spent = np.zeros(end - start, np.int64)
+        # Without a limit each archive's own flag remains, which a budget may set.
+        part = None if stop.part_seconds == math.inf else part_stop(stop, stop.part_seconds)
         answers: list[Cost] = []
         for leg, (ask_all, _) in zip(legs, asks, strict=True):
             if visits is None or end == start:
-                found = ask_all(start, end)
+                found = ask_all(start, end, part)
             else:
-                found = ask_bounded(leg, start, spent)
+                found = ask_bounded(leg, start, spent, part)
                 spent += found.node_visits  # type: ignore[attr-defined]  # all answers have them
             answers.append(carried(found, leg.pose, leg.first_source))
         together = merged(answers)

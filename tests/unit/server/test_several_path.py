@@ -1,0 +1,49 @@
+"""A path through several archives: what its parts share."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from solidcloud.server import several_path
+from solidcloud.server.stop import NEVER, Stop
+
+pytestmark = pytest.mark.interpreted
+
+
+@pytest.fixture
+def flags(monkeypatch):
+    """The flags that each archive was asked with, part by part; three archives of fakes."""
+    asked = []
+
+    def question(data, avatar, poses, op, parameters, stop):
+        def ask(start, end, part=None):
+            asked.append(part)
+            return SimpleNamespace(node_visits=np.ones(end - start, np.int64))
+
+        return ask, len(poses)
+
+    monkeypatch.setattr(several_path, "path_question", question)
+    monkeypatch.setattr(several_path, "carried", lambda found, *_: found)
+    monkeypatch.setattr(several_path, "merged", lambda answers: answers)
+    return asked
+
+
+def asked_along(stop, **parameters):
+    legs = [several_path.Leg(None, None, 0, np.zeros((8, 4, 4))) for _ in range(3)]
+    return several_path.along(legs, None, "collide", parameters, stop)[0]
+
+
+@pytest.mark.parametrize("parameters", [{}, {"budget_visits": 100}])
+def test_all_archives_share_the_time_of_a_part(flags, parameters):
+    ask = asked_along(Stop(part_seconds=30.0), **parameters)
+    ask(0, 4)
+    ask(4, 8)
+    first, second = flags[0], flags[-1]
+    assert first is not None and second is not None and first is not second
+    assert [flag is first for flag in flags] == [True] * (len(flags) // 2) + [False] * (len(flags) // 2)
+    assert len(flags) >= 6
+
+
+def test_without_a_limit_each_archive_keeps_its_own_flag(flags):
+    asked_along(NEVER)(0, 4)
+    assert flags == [None] * 3

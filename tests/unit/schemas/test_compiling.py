@@ -29,6 +29,38 @@ print(json.dumps({
     "compiled": sum(sum(kernel.stats.cache_misses.values()) for kernel in (morton_encode, morton_decode)),
 }))
 """
+# Starts with each cache, twice each: children of one process that has imported numba, and nothing of solidcloud.
+STARTS = f"""
+import json, os, sys, tempfile, traceback
+import numba, numpy
+from numba.core import config
+numba.njit(lambda a: a + 1)(1)
+
+def start(cache):
+    with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as error:
+        child = os.fork()
+        if child == 0:
+            code = 1
+            try:
+                os.dup2(out.fileno(), 1)
+                os.dup2(error.fileno(), 2)
+                os.environ["NUMBA_CACHE_DIR"] = cache
+                config.reload_config()
+                exec({CODE!r}, {{"__name__": "__main__"}})
+                code = 0
+            except BaseException:
+                traceback.print_exc()
+            finally:
+                sys.stdout.flush()
+                sys.stderr.flush()
+                os._exit(code)
+        code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+        out.seek(0)
+        error.seek(0)
+        return code, out.read().decode(), error.read().decode()
+
+print(json.dumps({{cache: [start(cache), start(cache)] for cache in sys.argv[1:]}}))
+"""
 # Interleaved by hand: bits of x, y, z from the lowest.
 ANSWER = {"codes": [53, 333], "decoded": [[1, 2, 3], [7, 0, 5]]}
 
@@ -114,15 +146,33 @@ DAMAGES: dict[str, Callable[[list[Path]], object]] = {
 }
 
 
+@pytest.fixture(scope="module")
+def damaged(warm: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[tuple[int, str, str]]]:
+    """Exit code, output and errors of two starts with each damaged copy of the cache, by the copy's path."""
+    caches = [tmp_path_factory.mktemp("damaged") / damage.replace(" ", "-") for damage in DAMAGES]
+    for cache, damage in zip(caches, DAMAGES.values(), strict=True):
+        shutil.copytree(warm, cache)
+        paths = kernels(cache)
+        assert len(paths) == 2
+        damage(paths)
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", STARTS, *map(str, caches)], capture_output=True, text=True, timeout=600
+    )
+    assert done.returncode == 0, done.stderr
+    found: dict[str, list[tuple[int, str, str]]] = json.loads(done.stdout)
+    return found
+
+
 @pytest.mark.parametrize("damage", DAMAGES)
-def test_a_damaged_kernel_is_compiled_again(cache: Path, damage: str) -> None:
-    paths = kernels(cache)
-    assert len(paths) == 2
-    DAMAGES[damage](paths)
-    found, said = start(cache)
-    assert found == ANSWER | {"compiled": 1 if damage == "other name" else 2}
-    assert len(said) == 1 and "is damaged" in said[0] and str(cache) in said[0]
-    assert start(cache) == (ANSWER | {"compiled": 0}, [])
+def test_a_damaged_kernel_is_compiled_again(
+    damaged: dict[str, list[tuple[int, str, str]]], damage: str
+) -> None:
+    (cache,) = (cache for cache in damaged if Path(cache).name == damage.replace(" ", "-"))
+    (code, out, said), again = damaged[cache]
+    assert code == 0, said
+    assert json.loads(out) == ANSWER | {"compiled": 1 if damage == "other name" else 2}
+    assert len(said.splitlines()) == 1 and "is damaged" in said and cache in said
+    assert (again[0], json.loads(again[1]), again[2]) == (0, ANSWER | {"compiled": 0}, "")
 
 
 def test_other_settings_have_kernels_of_their_own(cache: Path) -> None:

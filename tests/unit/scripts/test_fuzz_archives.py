@@ -10,18 +10,18 @@ SCRIPT = Path(__file__).parents[3] / "scripts" / "fuzz_archives"
 
 def test_flipped_archives_are_refused_or_answered_right() -> None:
     """A share of what `scripts/fuzz_archives --flips` does."""
-    command = [sys.executable, str(SCRIPT), "--flips", "--cases", "300", "--seed", "3", "--jobs", "1"]
+    command = [sys.executable, str(SCRIPT), "--flips", "--cases", "150", "--seed", "3", "--jobs", "1"]
     done = subprocess.run([*command, "--seconds", "10"], capture_output=True, text=True, check=False)
     assert done.stdout, done.stderr
     found = json.loads(done.stdout)
     assert found["faults"] == [] and done.returncode == 0
-    assert found["outcomes"]["refused"] > 60 and found["outcomes"]["right"] > 60
-    assert found["with_unknown"] > 30 and set(found["by_field"]) == {"index", "shard"}
+    assert found["outcomes"]["refused"] > 30 and found["outcomes"]["right"] > 30
+    assert found["with_unknown"] > 15 and set(found["by_field"]) == {"index", "shard"}
 
 
 def test_forged_archives_are_refused_or_answered_right() -> None:
     """A share of the 100,000 of scripts/fuzz_archives, which is where to look for more."""
-    command = [sys.executable, str(SCRIPT), "--cases", "300", "--seed", "3", "--jobs", "1", "--seconds", "10"]
+    command = [sys.executable, str(SCRIPT), "--cases", "160", "--seed", "3", "--jobs", "1", "--seconds", "10"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.stdout, done.stderr
     found = json.loads(done.stdout)

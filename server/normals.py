@@ -14,7 +14,8 @@ from ..schemas.kernels.normals import NONE, decode_normal
 from ..schemas.normals import normal_reach
 from .kernels.layout import LANES
 from .kernels.normals import UNASKED, code_at, find_voxel, stored_code_at
-from .request import SceneData
+from .request import SceneData, with_stop
+from .stop import NEVER, Stop, StoppedError
 from .store import Store
 
 # Of the budget for voxels, what normals may take besides.
@@ -47,7 +48,8 @@ class Normals:
         rows = store.archive.voxels
         self.most_bytes = int(data.residency.budget_bytes * SHARE) if most_bytes is None else most_bytes
         self.used_bytes = self.estimated = self.visits = 0
-        self._data, self._leaves = data, rows["leaves"]
+        # Kept for all requests: the stop of the one that asks first is not theirs.
+        self._data, self._leaves = with_stop(data, NEVER), rows["leaves"]
         self._most_points = int(rows["rows"][:, 2].max(initial=0))
         self._origin = tuple(data.arrays.origin.tolist())
         self._codes: OrderedDict[tuple[int, int], NDArray[np.uint16]] = OrderedDict()
@@ -59,15 +61,18 @@ class Normals:
                 store.archive.header.normal_reach, data.arrays.step, self._most_points
             )
 
-    def at(self, cloud: ArrayLike, toward: ArrayLike, reach: float) -> NDArray[np.float64] | None:
-        """The unit normal (3,) of the surface at a scan point, on the side that `toward` points to.
+    def at(
+        self, cloud: ArrayLike, toward: ArrayLike, reach: float, stop: Stop = NEVER
+    ) -> NDArray[np.float64] | None:
+        """Return the unit normal (3,) of the surface at a scan point, on the side that `toward` points to.
 
         cloud: (3,) the point, world [m], within half a lattice step.  toward: (3,) any length; where it lies in the
         surface or is 0 the side is as it comes.  reach: points so near the point make its surface [m].
-        None: no point is there, or the points make no surface (schemas/kernels/normals.py).
-        Raises BadRequestError for a reach that is none, CorruptError for a voxel that cannot be read.
+        None: no point is there, or the points make no surface (schemas/kernels/normals.py).  stop: ends a wait for a
+        load. Raises BadRequestError for a reach that is none, CorruptError for a voxel that cannot be read,
+        StoppedError.
         """
-        code = self.code(cloud, reach)
+        code = self.code(cloud, reach, stop)
         if code == NONE:
             return None
         x, y, z = decode_normal(code)
@@ -75,8 +80,11 @@ class Normals:
         side = -1.0 if x * a + y * b + z * c < 0.0 else 1.0
         return np.array([side * x, side * y, side * z])
 
-    def code(self, cloud: ArrayLike, reach: float) -> int:
-        """Return the code of the normal, as schemas/kernels/normals.py has it; NONE for none. Raises CorruptError."""
+    def code(self, cloud: ArrayLike, reach: float, stop: Stop = NEVER) -> int:
+        """Return the code of the normal, as schemas/kernels/normals.py has it; NONE for none.
+
+        stop: ends a wait for a load. Raises CorruptError, and StoppedError.
+        """
         square = self._squares.get(reach)
         if square is None:
             square = normal_reach(reach, self._data.arrays.step, self._most_points)
@@ -93,7 +101,9 @@ class Normals:
             if self._data.arrays.where[row, 0] >= 0:
                 residency.use([row])
                 return self._look(row, x, y, z, square)
-        with residency.hold([row]) as held:
+        with residency.hold([row], stop=stop) as held:
+            if held.late:
+                raise StoppedError
             if held.faults:
                 raise CorruptError(held.faults[0])
             with residency.still():

@@ -186,6 +186,7 @@ class Opened:
     def warm(self) -> None:
         """Ask one of everything, a load included, so that nobody waits for compilers after."""
         data, archive = self.data, self.store.archive
+        data.bounds.trees()  # before the first load, which tightens them
         row = int(np.argmin(self.store.sizes))
         corner = archive.coordinates[row] * archive.header.lattice.voxel_steps + archive.voxels["low"][row]
         pose = np.eye(4)[None]

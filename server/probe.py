@@ -36,7 +36,8 @@ class Swept(NamedTuple):
 
     avatar, cloud: (3,) the witness's centres, world [m]; None where the verdict is not CONTACT.  archive: which of a
     scene's archives is touched.  exact: nothing else may be touched before: no point goes farther than the tolerance
-    between `lower` and `upper`.  visits: node visits.  missing: voxels that could not be looked at.
+    between `lower` and `upper`.  visits: node visits.  missing: voxels that could not be looked at.  unknown: whether
+    something there could not be looked at, or was not; a contact that is not exact may be a graze, all looked at.
     """
 
     verdict: Verdict
@@ -48,6 +49,12 @@ class Swept(NamedTuple):
     exact: bool = True
     visits: int = 0
     missing: int = 0
+    unknown: bool = False
+
+
+def _has_unknown(data: SceneData) -> bool:
+    """Return whether a scan was left out anywhere, or a load found the index wrong."""
+    return data.nothing_clear or len(data.unknown) > 0
 
 
 class Probe:
@@ -97,22 +104,28 @@ class Probe:
             if needed >= 0:
                 lower, upper, speed = said[:AVATAR].tolist()
                 if verdict != Verdict.CONTACT:
-                    return Swept(_VERDICTS[verdict], lower, upper, None, None, 0, verdict == _CLEAR, visits)
+                    clear = verdict == _CLEAR
+                    return Swept(_VERDICTS[verdict], lower, upper, None, None, 0, clear, visits, 0, not clear)
                 own, cloud = said[AVATAR:CLOUD].copy(), said[CLOUD:].copy()
                 exact = upper == lower or speed * (upper - lower) <= max(tolerance, effort.tolerance)
-                return Swept(Verdict.CONTACT, lower, upper, own, cloud, 0, exact, visits)
+                unknown = not exact and _has_unknown(data)
+                return Swept(Verdict.CONTACT, lower, upper, own, cloud, 0, exact, visits, 0, unknown)
         answers = sweep(data, self.avatar, pose_from[None], pose_to[None], tolerance=tolerance, effort=effort)
-        touches = answers.verdict[0] == Verdict.CONTACT
+        verdict, exact = _VERDICTS[answers.verdict[0]], bool(answers.exact[0])
+        touches, missing = verdict == Verdict.CONTACT, int(answers.voxels_missing[0])
+        # A budget, too, leaves places that were not looked at.
+        partial = effort.limited or bool(data.arrays.stop.item(0)) or _has_unknown(data)
         return Swept(
-            _VERDICTS[answers.verdict[0]],
+            verdict,
             float(answers.lower[0]),
             float(answers.upper[0]),
             answers.witness_avatar[0] if touches else None,
             answers.witness_cloud[0] if touches else None,
             0,
-            bool(answers.exact[0]),
+            exact,
             int(answers.node_visits[0]),
-            int(answers.voxels_missing[0]),
+            missing,
+            missing > 0 or verdict == Verdict.UNKNOWN or (not exact and partial),
         )
 
     def _use(self, residency: Residency, rows: list[int]) -> None:

@@ -14,50 +14,73 @@ from numpy.typing import NDArray
 from ..schemas.archive import Archive
 from .kernels.reach import Reach, SceneIndex
 from .kernels.voxel_tree import VoxelTree, make_voxel_tree, tighten
+from .stop import NEVER, Stop
 
 _Int64 = NDArray[np.int64]
+
+# Entries of a reach between two looks at the stop: some milliseconds of work, and 200 bytes each.
+ENTRIES_AT_ONCE = 1 << 15
 
 
 class Bounds:
     """Boxes around the points of each of the v voxels of an opened archive. Thread-safe.
 
-    index: what the broad phase reads. Its boxes only ever become smaller, a number at a time: who reads them without a
-    lock while a voxel is proved reads a box between the two.  said: the same by the index alone, proved or not.
-    proved: (v,) bool, the voxels whose box is that of the index.  left: how many are not; it changes once a box has
-    become what the index says, so a reader that finds it unchanged knows of every box that it may have read half.
+    index: the boxes that the broad phase reads: of a voxel that is not proved its cell, of one that is proved the box
+    in the index. A box only becomes smaller, one number at a time; a reader without the lock may see some of its
+    numbers before the change and some after.
+    index_boxes: the boxes in the index, proved or not.
+    proved: (v,) bool, the voxels whose record has the points where the index places them.
+    unproved: how many are not proved. Read it before `index`, and give it to `unsettled` afterwards.
     """
 
     def __init__(self, archive: Archive) -> None:
-        """Nothing is proved yet."""
+        """Begin with no voxel proved."""
         header = archive.header
         steps = header.lattice.voxel_steps
         base = archive.coordinates * steps
         keys = archive.voxels["key"].astype(np.uint64)
-        said = (base + archive.voxels["low"], base + archive.voxels["high"])
+        boxes = (base + archive.voxels["low"], base + archive.voxels["high"])
         self.index = SceneIndex(keys, base, base + (steps - 1), header.low, header.high)
-        self.said = SceneIndex(keys, *said, header.low, header.high)
+        self.index_boxes = SceneIndex(keys, *boxes, header.low, header.high)
         self.proved: NDArray[np.bool_] = np.zeros(len(keys), bool)
-        self.left = len(keys)
+        self.unproved = len(keys)
+        self._order = np.empty(len(keys), np.int64)  # rows in the order in which they were proved
         self._unknown = header.unknown
         self._lock = threading.Lock()
         self._trees: tuple[VoxelTree, VoxelTree] | None = None
 
     def prove(self, row: int) -> None:
-        """The record of a voxel has been read, and its points are where the index says."""
+        """Note that the record of a voxel was read and has its points where the index places them."""
         if self.proved[row]:
             return
-        low, high = self.said.low[row], self.said.high[row]
+        low, high = self.index_boxes.low[row], self.index_boxes.high[row]
         with self._lock:
             if self.proved[row]:
                 return
             self.index.low[row], self.index.high[row] = low, high
             if self._trees is not None:
                 tighten(self._trees[0], row, low, high)
-            self.left -= 1  # first: `doubted` reads them the other way round
-            self.proved[row] = True
+            self._order[len(self._order) - self.unproved] = row
+            self.unproved -= 1
+            self.proved[row] = True  # last: `unsettled` reads it first
+
+    def unsettled(self, rows: _Int64, unproved: int) -> NDArray[np.bool_]:
+        """Return (n,) bool: which of n rows may have been read with a box other than that of the index.
+
+        unproved: as it was before the boxes were read. A voxel proved since then counts: its box may have been read
+        while it changed.
+        """
+        found = ~self.proved[rows]
+        # A voxel that was found proved has left `unproved` before.
+        voxels = len(self._order)
+        since = self._order[voxels - unproved : voxels - self.unproved]
+        if len(since):
+            found |= np.isin(rows, since)
+        return found
 
     def trees(self) -> tuple[VoxelTree, VoxelTree]:
-        """Trees over the boxes, for rays and loose points: of `index`, and of `said`. Made when first asked for."""
+        """Return trees over the boxes of `index` and of `index_boxes`, for rays and loose points; the first call makes
+        them."""
         trees = self._trees
         if trees is None:
             with self._lock:
@@ -65,27 +88,31 @@ class Bounds:
                 if trees is None:
                     trees = (
                         make_voxel_tree(self.index.low, self.index.high, self._unknown),
-                        make_voxel_tree(self.said.low, self.said.high, self._unknown),
+                        make_voxel_tree(self.index_boxes.low, self.index_boxes.high, self._unknown),
                     )
                     self._trees = trees
         return trees
 
-    def doubted(self, reach: Reach, left: int) -> list[int]:
-        """Return the rows, each once, that are in reach of a pose, but would not be by the index.
+    def rows_to_prove(self, reach: Reach, unproved: int, stop: Stop = NEVER) -> list[int]:
+        """Return the distinct rows, ascending, that `reach` holds, but would not hold by the boxes of the index.
 
-        reach: of `index`.  left: as it was before the reach was computed.
+        reach: of k poses, by `index`.  unproved: as it was before the reach was computed.  stop: once it is set, some
+        may be left out.
         """
-        if not left:
-            return []
-        rows = reach.rows[: reach.starts[-1]]
-        at = np.flatnonzero(~self.proved[rows])
-        if left != self.left:  # a voxel was proved meanwhile: its box may have been read half
-            at = np.arange(len(rows))
-        if not len(at):
-            return []
-        pose = np.searchsorted(reach.starts, at, side="right") - 1
-        center, span = reach.boxes.mean(axis=1)[pose], (reach.boxes[:, 1] - reach.boxes[:, 0])[pose, 0] / 2
-        low, high = self.said.low[rows[at]], self.said.high[rows[at]]
-        gap = np.maximum(np.maximum(low - center, center - high), 0.0)
-        found: list[int] = np.unique(rows[at][(gap * gap).sum(axis=1) > span * span]).tolist()
+        hidden = np.zeros(len(self.proved), bool)
+        entries = int(reach.starts[-1]) if unproved else 0
+        for begin in range(0, entries, ENTRIES_AT_ONCE):
+            if stop:
+                break
+            rows = reach.rows[begin : min(begin + ENTRIES_AT_ONCE, entries)]
+            at = np.flatnonzero(self.unsettled(rows, unproved) & ~hidden[rows])
+            if not len(at):
+                continue
+            rows = rows[at]
+            boxes = reach.boxes[np.searchsorted(reach.starts, begin + at, side="right") - 1]
+            center, span = boxes.mean(axis=1), (boxes[:, 1, 0] - boxes[:, 0, 0]) / 2
+            low, high = self.index_boxes.low[rows], self.index_boxes.high[rows]
+            gap = np.maximum(np.maximum(low - center, center - high), 0.0)
+            hidden[rows[(gap * gap).sum(axis=1) > span * span]] = True
+        found: list[int] = np.flatnonzero(hidden).tolist()
         return found

@@ -1,8 +1,8 @@
-"""Voxels in reach by their cells alone: their records are read before anything is said to be clear.
+"""Proof of the index before an answer relies on it: voxels in reach by their cells alone are loaded first.
 
-By the index such a voxel is out of reach. If its record proves the index (proof.py) it is not looked at, and every
-answer and every count of work is what the index alone would have given. If the record cannot be read, the voxel stays
-in reach, and is missing there. So a voxel costs one load more in all, where nothing ever comes near its points.
+By the boxes of the index such a voxel is out of reach. If its record agrees with the index (proof.py), it is not looked
+at, and every answer and every count of work is that of the index. If the record cannot be read, the voxel stays in
+reach and is missing there. So each voxel costs at most one load more, even where nothing comes near its points.
 """
 
 from collections.abc import Callable, Sequence
@@ -13,27 +13,23 @@ from numpy.typing import NDArray
 from .avatar import AvatarModel
 from .effort import Effort
 from .kernels.reach import Reach
-from .request import SceneData, check_request
+from .request import SceneData, check_request, distinct_rows
 from .spent import Spent
 
 
 def prove(data: SceneData, rows: Sequence[int], effort: Effort, spent: Spent) -> None:
-    """Load the voxels of distinct rows, as many at a time as fit, until the effort's time is up.
+    """Load the voxels of distinct rows in their order, as many at a time as fit, until the effort's time is up.
 
-    They are not kept for the request. What it takes is added to `spent`; what is late the request will find out.
+    The voxels are not kept for the request. Add the cost to `spent`, without late voxels: the request finds those
+    itself.
     """
     residency = data.residency
-    budget = int(residency.buffer.total_bytes * effort.share)
-    part: list[int] = []
-    for row in [*rows, -1]:
-        if part and (row < 0 or residency.bytes_of([*part, row]) > budget):
-            if effort.spent:
-                return
-            with residency.hold(part, effort.loads_until(), scan=True, stop=effort.stop) as held:
-                pass
-            spent.add(held._replace(late=()))
-            part = []
-        part.append(row)
+    for part in residency.parts_that_fit(rows, int(residency.buffer.total_bytes * effort.share)):
+        if effort.spent:
+            return
+        with residency.hold(part, effort.loads_until(), scan=True, stop=effort.stop) as held:
+            pass
+        spent.add(held._replace(late=()))
 
 
 def find_proved_reach(
@@ -45,16 +41,36 @@ def find_proved_reach(
     spent: Spent,
     settled: Callable[[Reach], Reach] = lambda reach: reach,
 ) -> Reach:
-    """`check_request`, where voxels are in reach by their points' boxes, or cannot be read.
+    """Return the reach of poses (k, 4, 4) as `check_request` does, of voxels that are proved or cannot be read.
 
-    settled: leaves out of a reach what need not be looked at. Raises as `check_request`.
+    settled: takes out of a reach what need not be looked at. Raises as `check_request`.
     """
-    left = data.bounds.left
+    bounds, stop = data.bounds, effort.stop
+    unproved = bounds.unproved
     reach = settled(check_request(data, avatar, poses, other_units))
-    doubted = data.bounds.doubted(reach, left)
+    doubted = bounds.rows_to_prove(reach, unproved, stop)
     if not doubted:
         return reach
-    prove(data, [row for row in doubted if not data.bounds.proved[row]], effort, spent)
+    likely = _likely(data, reach, doubted, effort)
+    prove(data, [*likely, *(row for row in doubted if not bounds.proved[row])], effort, spent)
     reach = settled(check_request(data, avatar, poses, other_units))
-    spent.loaded += len(np.intersect1d(doubted, reach.rows[: reach.starts[-1]]))
+    left = distinct_rows(reach.rows[: reach.starts[-1]], len(bounds.proved), stop)
+    loaded = [*doubted, *(row for row in likely if data.residency.is_resident(row))]
+    spent.loaded += len(np.intersect1d(loaded, left))
     return reach
+
+
+def _likely(data: SceneData, reach: Reach, doubted: list[int], effort: Effort) -> list[int]:
+    """Return the rows to load before the doubted ones: where there is a deadline, those in reach by the index.
+
+    Proofs may take half of the time, and what is likely to be touched is worth more. Where all together do not fit, the
+    likely ones are loaded later, piece by piece: none are returned.
+    """
+    if effort.deadline == np.inf:
+        return []
+    residency = data.residency
+    rows = distinct_rows(reach.rows[: reach.starts[-1]], len(data.bounds.proved), effort.stop)
+    if residency.bytes_of(rows.tolist()) > residency.buffer.total_bytes * effort.share:
+        return []
+    likely: list[int] = np.setdiff1d(rows, doubted, assume_unique=True).tolist()
+    return [row for row in likely if not residency.is_resident(row)]

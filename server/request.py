@@ -24,7 +24,7 @@ from .stop import NEVER, Stop, StoppedError
 # poses whose reach covers thousands of voxels.
 MOST_ROWS = 1 << 24
 # Rows looked at between two looks at the stop flag.
-_ROWS_AT_ONCE = 1 << 18
+_MARKED_AT_ONCE = 1 << 18
 
 _POSE_FAULTS: dict[int, tuple[type[SolidcloudError], str]] = {
     placing.NOT_FINITE: (BadRequestError, "holds {}: expected finite numbers"),
@@ -200,7 +200,7 @@ def pieces(
     """
     k = len(reach.scales)
     rows = reach.rows[: reach.starts[k]]
-    everything = (_distinct(rows, len(residency.where), stop) if k > 1 else rows).tolist()
+    everything = (distinct_rows(rows, len(residency.where), stop) if k > 1 else rows).tolist()
     budget = int(residency.buffer.total_bytes * share)
     if residency.bytes_of(everything) <= budget:
         yield np.arange(k), everything, reach
@@ -222,25 +222,21 @@ def pieces(
             held.update(dict.fromkeys(fresh))
             held_bytes += residency.bytes_of(fresh)
             continue
-        part: list[int] = []
-        for row in [*own, -1]:
-            if part and (row < 0 or residency.bytes_of([*part, row]) > budget):
-                yield np.array([pose]), part, _only(reach, pose, part)
-                part = []
-            part.append(row)
+        for part in residency.parts_that_fit(own, budget):
+            yield np.array([pose]), part, _only(reach, pose, part)
     if which:
         yield np.array(which), list(held), reach
 
 
-def _distinct(rows: NDArray[np.int64], voxels: int, stop: Stop) -> NDArray[np.int64]:
+def distinct_rows(rows: NDArray[np.int64], voxels: int, stop: Stop) -> NDArray[np.int64]:
     """Return the distinct values of `rows`, ascending; not all of them where the stop is set meanwhile."""
-    if len(rows) <= _ROWS_AT_ONCE:
+    if len(rows) <= _MARKED_AT_ONCE:
         return np.unique(rows)  # a sort in numpy lets other threads run meanwhile
     met = np.zeros(voxels, bool)
-    for begin in range(0, len(rows), _ROWS_AT_ONCE):
+    for begin in range(0, len(rows), _MARKED_AT_ONCE):
         if stop:
             break
-        met[rows[begin : begin + _ROWS_AT_ONCE]] = True
+        met[rows[begin : begin + _MARKED_AT_ONCE]] = True
     return np.flatnonzero(met)
 
 

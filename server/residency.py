@@ -13,7 +13,7 @@ import math
 import threading
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from enum import Enum
 from typing import NamedTuple
@@ -189,6 +189,20 @@ class Residency:
     def bytes_of(self, rows: Sequence[int]) -> int:
         """Bytes these voxels take when resident."""
         return sum(self._sizes[row] for row in rows)
+
+    def parts_that_fit(self, rows: Sequence[int], budget_bytes: int) -> Iterator[list[int]]:
+        """Cut rows, in their order, into parts that take at most so many bytes, but for a row that alone takes more."""
+        part: list[int] = []
+        taken = 0
+        for row in rows:
+            size = self._sizes[row]
+            if part and taken + size > budget_bytes:
+                yield part
+                part, taken = [], 0
+            part.append(row)
+            taken += size
+        if part:
+            yield part
 
     # --- what a request does ------------------------------------------------------------------------------
 

@@ -18,9 +18,11 @@ from ..schemas.voxel_grid import MAX_COORDINATE, UNITS_PER_METRE
 from .effort import Effort
 from .kernels.rays import Nearest
 from .kernels.voxel_tree import Lists, VoxelTree, list_voxels
+from .proof import ENTRIES_AT_ONCE
 from .proving import prove
 from .request import SceneData
 from .spent import Spent
+from .stop import Stop
 
 # Rays or points whose lists are in memory together.
 BATCH = 1 << 14
@@ -84,7 +86,8 @@ def look(
     """
     k = len(at_units)
     best = make_best(k)
-    tree, said = data.bounds.trees()
+    bounds = data.bounds
+    tree, index_tree = bounds.trees()
     batch = BATCH if effort.deadline == math.inf else TIMED_BATCH
     for begin in range(0, k, batch):
         end = min(begin + batch, k)
@@ -93,9 +96,8 @@ def look(
             break
         part = _part(best, begin, end)
         ways = at_units[begin:end], None if direction is None else direction[begin:end]
-        left = data.bounds.left
+        unproved = bounds.unproved
         lists = _list(data, tree, *ways, reach_units, radius_units, part)
-        half = left != data.bounds.left  # a box may have been read half
         doubts = None
         if data.nothing_clear:
             part.unseen[:] = 0.0
@@ -106,11 +108,12 @@ def look(
                 part.unseen[open_] = np.minimum(part.unseen[open_], lists.near[cursor[open_]])
                 break
             rows = _next_rows(data, lists, cursor, open_)
-            if doubts is None and left and (half or not data.bounds.proved[rows].all()):
-                # By the index alone they may be out of the way: afresh by that, and what it hides at the end.
+            if doubts is None and unproved and bounds.unsettled(rows, unproved).any():
+                # By the boxes of the index they may be out of the way: begin again with those, and look at the end
+                # at what they hide.
                 doubts = lists
                 _forget(part)
-                lists = _list(data, said, *ways, reach_units, radius_units, part)
+                lists = _list(data, index_tree, *ways, reach_units, radius_units, part)
                 if data.nothing_clear:
                     part.unseen[:] = 0.0
                 cursor = lists.starts[:-1].copy()
@@ -169,27 +172,51 @@ def _settle_doubts(
 ) -> None:
     """Load the voxels that the index places out of the way, where nothing was found before their cells.
 
-    doubts: what rays or points reach by proved bounds and cells.  lists: by the index, and looked at. Voxels that
-    cannot be read are missing: `part` says so.
+    doubts: what rays or points reach by proved bounds and cells.  lists: by the index, and looked at. A voxel that
+    cannot be read is missing: `part` says so. Where the effort's stop is set, nothing is known in `part`.
     """
     proved, v = data.bounds.proved, len(data.bounds.proved)
     found = np.where(part.square >= 0, np.sqrt(np.maximum(part.square, 0)), part.value)
     until = np.minimum(np.minimum(found, part.unseen), reach_units)
-    ray = np.repeat(np.arange(len(until)), np.diff(doubts.starts))
-    rows, near = doubts.rows[: doubts.starts[-1]], doubts.near[: doubts.starts[-1]]
-    open_ = np.flatnonzero(~proved[rows] & (near <= until[ray]))
+    open_ = _open_doubts(doubts, until, proved, effort.stop)
+    if effort.stop:
+        part.unseen[:] = 0.0
+        return
     if not len(open_):
         return
-    first = np.full(len(proved), math.inf)
-    np.minimum.at(first, rows[open_], near[open_])
-    wanted = np.unique(rows[open_])
+    rows, near = doubts.rows[open_], doubts.near[open_]
+    first = np.full(v, math.inf)
+    np.minimum.at(first, rows, near)
+    wanted = np.flatnonzero(first < math.inf)
     prove(data, wanted[np.argsort(first[wanted], kind="stable")].tolist(), effort, spent)
-    open_ = open_[~proved[rows[open_]]]
-    np.minimum.at(part.unseen, ray[open_], near[open_])
+    open_ = open_[~proved[rows]]
+    if not len(open_):
+        return
+    rows, near = doubts.rows[open_], doubts.near[open_]
+    ray = np.searchsorted(doubts.starts, open_, side="right") - 1
+    np.minimum.at(part.unseen, ray, near)
     # Those that the index has in reach were counted when they were looked at.
     known = np.repeat(np.arange(len(until)), np.diff(lists.starts)) * v + lists.rows[: lists.starts[-1]]
-    open_ = open_[~np.isin(ray[open_] * v + rows[open_], known)]
-    np.add.at(part.counts[0], ray[open_], np.uint32(1))
+    hidden = ~np.isin(ray * v + rows, known)
+    np.add.at(part.counts[0], ray[hidden], np.uint32(1))
+
+
+def _open_doubts(
+    doubts: Lists, until: NDArray[np.float64], proved: NDArray[np.bool_], stop: Stop
+) -> NDArray[np.int64]:
+    """Return the numbers, ascending, of the entries of `doubts` whose voxel is not proved and not beyond `until`.
+
+    until: (k,) of each ray [exact units].  stop: once it is set, some may be left out.
+    """
+    entries, found = int(doubts.starts[-1]), [np.empty(0, np.int64)]
+    for begin in range(0, entries, ENTRIES_AT_ONCE):
+        if stop:
+            break
+        end = min(begin + ENTRIES_AT_ONCE, entries)
+        at = begin + np.flatnonzero(~proved[doubts.rows[begin:end]])
+        ray = np.searchsorted(doubts.starts, at, side="right") - 1
+        found.append(at[doubts.near[at] <= until[ray]])
+    return np.concatenate(found)
 
 
 def _next_rows(

@@ -14,9 +14,11 @@ from .effort import EXACT, Effort
 from .kernels.advance import Progress, avatar_box, look_around, plan_segments, sweep_segments
 from .kernels.placing import SIMILARITY_TOLERANCE, check_poses
 from .kernels.reach import Reach
+from .proof import ENTRIES_AT_ONCE
 from .proving import prove
 from .request import SceneData, as_held, kernel_poses, pieces, refuse, to_units
 from .spent import Spent
+from .stop import Stop
 
 # Motions of one kernel call where there is a deadline: it is looked at between calls.
 _PER_CALL = 64
@@ -129,13 +131,13 @@ def sweep(
     proved = np.ones(k)
     if not len(avatar.points) or not k:
         return _answers(progress, proved, counts, outside, tolerance)
-    residency, spent, box = data.residency, Spent(begin), avatar_box(avatar.arrays)
+    bounds, residency, spent, box = data.bounds, data.residency, Spent(begin), avatar_box(avatar.arrays)
     starts, rows = np.zeros(k + 1, np.int64), np.empty(16 * k + 64, np.int64)
     which = np.arange(k)
     asked: set[int] = set()  # rows that were loaded to prove the index
     while len(which):
         begun = progress.at.copy()
-        left = data.bounds.left
+        unproved = bounds.unproved
         planned = box, first, last, avatar.arrays, scales, units, data.arrays
         needed = plan_segments(*planned, data.broad, which, progress, starts, rows)
         if needed < 0:
@@ -143,21 +145,22 @@ def sweep(
         if needed > len(rows):
             rows = np.empty(2 * needed, np.int64)
             continue
-        if left and (left != data.bounds.left or not data.bounds.proved[rows[:needed]].all()):
-            # By the index alone some may be out of reach, and segments are then others.
+        if unproved and bounds.unsettled(rows[:needed], unproved).any():
+            # By the boxes of the index some may be out of reach, and segments are then others.
             by_index = progress._replace(
                 at=begun.copy(), end=progress.end.copy(), speed=progress.speed.copy()
             )
-            said_starts, said = starts.copy(), np.empty_like(rows)
-            count = plan_segments(*planned, data.bounds.said, which, by_index, said_starts, said)
-            if not 0 <= count <= len(said):
-                said_starts[:] = 0
-            v = len(data.broad.keys)
-            doubted = np.unique(np.setdiff1d(_pairs(starts, rows, v), _pairs(said_starts, said, v)) % v)
-            new = set(doubted.tolist()) - asked
+            index_starts, index_rows = starts.copy(), np.empty_like(rows)
+            count = plan_segments(*planned, bounds.index_boxes, which, by_index, index_starts, index_rows)
+            if not 0 <= count <= len(index_rows):
+                index_starts[:] = 0
+            doubted = _hidden_rows(
+                (starts, rows), (index_starts, index_rows), len(bounds.proved), effort.stop
+            )
+            new = set(doubted) - asked
             if new:
                 asked |= new
-                prove(data, sorted(row for row in new if not data.bounds.proved[row]), effort, spent)
+                prove(data, sorted(row for row in new if not bounds.proved[row]), effort, spent)
                 progress.at[:] = begun
                 continue
         progress.lower[which] = progress.end[which]
@@ -211,10 +214,35 @@ def sweep(
     return msgspec.structs.replace(answers, **spent.cost(data))
 
 
-def _pairs(starts: NDArray[np.int64], rows: NDArray[np.int64], voxels: int) -> NDArray[np.int64]:
-    """Motion and voxel of each row that starts (k + 1,) tells of, as one number: motion * voxels + voxel."""
-    motions = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
-    return np.asarray(motions * voxels + rows[: starts[-1]], np.int64)
+def _hidden_rows(
+    planned: tuple[NDArray[np.int64], NDArray[np.int64]],
+    by_index: tuple[NDArray[np.int64], NDArray[np.int64]],
+    voxels: int,
+    stop: Stop,
+) -> list[int]:
+    """Return the distinct rows, ascending, that a motion has in reach as planned and not by the index.
+
+    planned, by_index: starts (k + 1,) and rows of k motions.  stop: once it is set, some may be left out.
+    """
+    hidden: NDArray[np.bool_] = np.zeros(voxels, bool)
+    starts, _ = planned
+    begin, k = 0, len(starts) - 1
+    while begin < k and not stop:
+        end = int(np.searchsorted(starts, starts[begin] + ENTRIES_AT_ONCE, side="right")) - 1
+        end = min(max(end, begin + 1), k)
+        own, known = (_pairs(*lists, begin, end, voxels) for lists in (planned, by_index))
+        hidden[np.setdiff1d(own, known) % voxels] = True
+        begin = end
+    found: list[int] = np.flatnonzero(hidden).tolist()
+    return found
+
+
+def _pairs(
+    starts: NDArray[np.int64], rows: NDArray[np.int64], begin: int, end: int, voxels: int
+) -> NDArray[np.int64]:
+    """Return motion and voxel of each row of motions [begin, end) as one number: motion * voxels + voxel."""
+    motions = np.repeat(np.arange(begin, end), np.diff(starts[begin : end + 1]))
+    return np.asarray(motions * voxels + rows[starts[begin] : starts[end]], np.int64)
 
 
 def _next_round(

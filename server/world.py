@@ -203,7 +203,7 @@ class World:
         probe, held = self._probe(avatar), self._held
         if self._alone and held.depth:
             swept = probe.sweep(held.seen[0].data, pose_from, pose_to, tolerance, effort)
-            self.count(swept.visits, swept.missing or not swept.exact)
+            self.count(swept.visits, swept.unknown)
             return swept
         with self as seen:
             found: Swept | None = None
@@ -211,7 +211,7 @@ class World:
                 swept = probe.sweep(
                     each.data, _into(each, pose_from), _into(each, pose_to), tolerance, effort
                 )
-                self.count(swept.visits, swept.missing or not swept.exact)
+                self.count(swept.visits, swept.unknown)
                 if not self._alone:
                     swept = _carried(swept, each, number)
                 found = swept if found is None else _earlier(found, swept)
@@ -340,9 +340,9 @@ class World:
             if inverse is not None:
                 place, way = moved(inverse, place[None])[0], turned(inverse, way[None])[0]
             try:
-                found: Vec | None = normals.at(place, way, reach)
+                found: Vec | None = normals.at(place, way, reach, held.stop)
                 if found is None:
-                    found = normals.at(place, way, min(SPARSE * reach, MAX_NORMAL_REACH))
+                    found = normals.at(place, way, min(SPARSE * reach, MAX_NORMAL_REACH), held.stop)
             except CorruptError:
                 held.unknown = True
                 return None
@@ -376,7 +376,13 @@ def _earlier(one: Swept, other: Swept) -> Swept:
     if first.upper < np.inf:
         verdict = Verdict.CONTACT
     exact = first.exact and lower >= first.lower
-    return first._replace(verdict=verdict, lower=lower, exact=exact, visits=one.visits + other.visits)
+    return first._replace(
+        verdict=verdict,
+        lower=lower,
+        exact=exact,
+        visits=one.visits + other.visits,
+        unknown=one.unknown or other.unknown,
+    )
 
 
 def _nearer(one: DistanceAnswers, other: DistanceAnswers) -> DistanceAnswers:

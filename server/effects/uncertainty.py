@@ -177,6 +177,6 @@ class UncertaintyRunner:
             frame.world.count(found.node_visits, not found.exact)
             return found.gaps, found.exact
         answers = near(each.data, avatar, pose, margin, frame.effort)
-        frame.world.count(int(answers.node_visits[0]), int(answers.voxels_missing[0]))
+        frame.world.count(int(answers.node_visits[0]), not answers.exact[0])
         gap = float(answers.signed_distance[0])
         return {scans.one: gap} if gap <= margin else {}, bool(answers.exact[0])

@@ -22,6 +22,8 @@ from solidcloud.server.kernels.normals import code_at, find_voxel, stored_code_a
 from solidcloud.server.left_out import LeftOut
 from solidcloud.server.normals import Normals, warm
 from solidcloud.server.opened import Opened
+from solidcloud.server.request import with_stop
+from solidcloud.server.stop import Stop, StoppedError
 from solidcloud.server.store import Store
 
 pytestmark = pytest.mark.interpreted
@@ -243,6 +245,21 @@ def test_normals_of_a_voxel_that_cannot_be_read_are_unknown(tmp_path: Path) -> N
             with pytest.raises(CorruptError, match="damaged frame"):
                 normals.at(place, UP, REACH)
         assert normals.used_bytes == 0 == normals.estimated
+
+
+def test_a_stop_ends_a_wait_for_a_voxel_and_no_request_has_that_of_another(tmp_path: Path) -> None:
+    case = build(tmp_path, "plane")
+    with serving(case.archive) as opened:
+        places = [place for place, *_ in judged(opened, case.points)]
+        stop = Stop()
+        stop.set("the client is gone")
+        normals = Normals(opened.store, with_stop(opened.data, stop))
+        with pytest.raises(StoppedError):
+            normals.at(places[0], UP, REACH, stop)
+        assert opened.data.residency.resident == 0
+        expected = Normals(opened.store, opened.data)
+        for place in places[:20]:
+            assert normals.code(place, REACH) == expected.code(place, REACH)
 
 
 def test_nobody_imports_it_but_who_asks() -> None:

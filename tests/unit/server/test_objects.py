@@ -15,6 +15,7 @@ from solidcloud.server.effort import Effort
 from solidcloud.server.objects import SCENE_GROUP, objects
 from solidcloud.server.request import SceneData, make_scene_data
 from solidcloud.server.residency import Residency
+from solidcloud.server.stop import Stop
 from solidcloud.server.store import Store
 
 CLEAR, CONTACT, UNKNOWN = Verdict
@@ -49,6 +50,32 @@ def test_a_pair_needs_each_group_in_the_other_mask(data: SceneData) -> None:
         assert answers.pairs.tolist() == ([[0, 1]] if touch else [])
         assert (answers.pairs_tested, answers.pairs_filtered) == ((1, 0) if touch else (0, 1))
     assert objects(data, [BALL, BALL], at(0, 1.5), [1, 1], [1, 1]).pairs_tested == 0
+
+
+class Counting(Stop):
+    """A stop that counts how often it is looked at."""
+
+    looks = 0
+
+    def __bool__(self) -> bool:
+        """Count a look."""
+        self.looks += 1
+        return super().__bool__()
+
+
+def test_stopped_only_pairs_that_could_touch_are_listed_and_none_is_looked_for(data: SceneData) -> None:
+    models = [make_avatar([[0.0, 0, 0]], 0.5) for _ in range(40)]
+    places = [0.01 * i for i in range(20)] + [100.0 + 0.01 * i for i in range(20)]
+    groups = np.array([1, 2] * 20, np.uint32)
+    stop = Counting()
+    stop.set("the client is gone")
+    found = objects(data, models, at(*places), groups, groups, effort=Effort(stop=stop))
+    expected = [
+        [i, j] for i in range(40) for j in range(i + 1, 40) if (i - j) % 2 == 0 and (i < 20) == (j < 20)
+    ]
+    assert found.pairs.tolist() == expected and (found.pair_verdict == UNKNOWN).all()
+    assert found.pairs_tested == 0 and found.pairs_filtered == 200
+    assert stop.looks < 100, "180 kinds of pairs are gone through"
 
 
 def test_pairs_cut_off_by_a_budget_are_listed_as_unknown(data: SceneData, rng: np.random.Generator) -> None:

@@ -35,6 +35,8 @@ def same(probe: Probe, data: SceneData, first: Poses, last: Poses, tolerance: fl
         one = probe.sweep(data, first[i], last[i], tolerance, EXACT)
         assert one.verdict == answers.verdict[i] and one.visits == answers.node_visits[i]
         assert (one.lower, one.upper, one.exact) == (answers.lower[i], answers.upper[i], answers.exact[i])
+        if not data.nothing_clear and not len(data.unknown):
+            assert one.unknown == (one.verdict == Verdict.UNKNOWN or one.missing > 0)
         if one.verdict == Verdict.CONTACT:
             np.testing.assert_array_equal(one.avatar, answers.witness_avatar[i])
             np.testing.assert_array_equal(one.cloud, answers.witness_cloud[i])

@@ -13,7 +13,9 @@ from solidcloud.schemas.answers import Verdict
 from solidcloud.schemas.scene import ArchiveItem, SceneFile
 from solidcloud.server.avatar import make_avatar
 from solidcloud.server.effects.frame import Hit
+from solidcloud.server.probe import Probe, Swept
 from solidcloud.server.scene import Scene
+from solidcloud.server.stop import NEVER
 from solidcloud.server.world import World
 
 BALL = make_avatar([[0.0, 0, 0]], 0.2)
@@ -107,6 +109,22 @@ def test_what_is_held_stays_through_a_reload_and_no_longer(tmp_path: Path) -> No
         assert opened.ended.wait(10)
         assert world.generations() != before
         assert world.collide(BALL, at(0.1, 0, 0)) == Verdict.CONTACT
+
+
+@pytest.mark.interpreted
+@pytest.mark.parametrize("unknown", [False, True])
+def test_a_contact_that_is_not_exact_is_unknown_only_where_something_was_not_looked_at(
+    tmp_path: Path, unknown: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A graze just before the contact: all was looked at."""
+    case = pushed.build(tmp_path, pushed.plane((0, -0.4, -0.4), (0, 0.4, 0.4)))
+    found = Swept(Verdict.CONTACT, 0.2, 0.6, exact=False, unknown=unknown)
+    monkeypatch.setattr(Probe, "sweep", lambda *_: found)
+    with Scene.open(case.archive) as scene:
+        for world in (world_of((scene, None)), world_of((scene, None), (scene, THERE))):
+            world.begin(NEVER)
+            world.sweep(BALL, at(1, 0, 0), at(0, 0, 0))
+            assert world.unknown == unknown
 
 
 @pytest.mark.interpreted

@@ -21,8 +21,10 @@ from solidcloud.schemas.effects import Uncertainty
 from solidcloud.schemas.errors import BadRequestError
 from solidcloud.schemas.moves import UncertaintyReport
 from solidcloud.server.avatar import make_avatar
+from solidcloud.server.effects import uncertainty as module
 from solidcloud.server.effects.uncertainty import check, make, scan_names
 from solidcloud.server.scene import Scene
+from solidcloud.server.stop import NEVER
 
 RADIUS = 0.01
 BODY = np.array([[x, 0.0, z] for x in (-0.1, 0.0, 0.1) for z in (0.0, 0.2)])
@@ -148,6 +150,26 @@ def test_what_could_not_be_read_is_unknown(tmp_path: Path) -> None:
         assert not near.unknown and near.probability == 0.0, "out of reach of what is missing"
         found = said(scene, at(0.06), sigma=0.005)
     assert found.unknown
+
+
+@pytest.mark.interpreted
+def test_a_frame_whose_distance_is_not_exact_is_unknown(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No voxel is missing; the search of one of two archives ended before the nearest point was known."""
+    near = module.near
+    monkeypatch.setattr(module, "near", lambda *asked: structs.replace(near(*asked), exact=np.zeros(1, bool)))
+    for name in ("one", "other"):
+        (tmp_path / name).mkdir()
+    with (
+        opened(tmp_path / "one", floor(0.0)) as scene,
+        opened(tmp_path / "other", floor(-0.004)) as other,
+    ):
+        world = world_of(scene, other)
+        runner, body = make(Uncertainty(sigma=0.005), world), body_of(MODEL)
+        world._world.begin(NEVER)
+        found = report(runner, world, body, at(0.06))
+        assert found.unknown and world._world.unknown
 
 
 @pytest.mark.interpreted

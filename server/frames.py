@@ -28,8 +28,8 @@ _BOXES_A_USER = 2
 # How often the thread that ends long frames looks [s].
 _LOOK_SECONDS = 0.05
 _STOPS = "the server stops"
-# Of a wish: 2,048 objects take a fifth of it. What is more is not read, and comes into no log.
-_MOST_BYTES = 2 << 20
+# Of a wish: 2,048 objects take less as MessagePack. What is more is not read, and comes into no log.
+_MOST_BYTES = 512 << 10
 
 
 class Post(NamedTuple):
@@ -178,13 +178,19 @@ class Frames:
     def wish(self, user: User, payload: bytes, encoding: str | None) -> bool:
         """Take a wish in, or refuse it at once. Return whether it is the user's latest one once more."""
         try:
+            if not self.fits(user, len(payload), encoding):
+                return False
             stated = wire_encoding(encoding)
-            if len(payload) > _MOST_BYTES:
-                raise TooLargeError(f"a wish of {len(payload)} bytes: at most {_MOST_BYTES}")
             return self._boxes.put(user, decode_request(Wish, payload, stated), stated)
         except SolidcloudError as error:
             self._send(user, error, encoding)
             return False
+
+    def fits(self, user: User, size: int, encoding: str | None) -> bool:
+        """Return whether a wish of so many bytes is taken; refuse it otherwise."""
+        if size > _MOST_BYTES:
+            self._send(user, TooLargeError(f"a wish of {size} bytes: at most {_MOST_BYTES}"), encoding)
+        return size <= _MOST_BYTES
 
     def leave(self, user: User) -> None:
         """A user leaves the scene."""

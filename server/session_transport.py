@@ -18,6 +18,7 @@ from .replies import send_reply
 from .served import Answer, Full
 from .state_streams import StateStreams
 from .tokens import Tokens
+from .waiting_wishes import WaitingWishes
 
 log = logging.getLogger(__name__)
 
@@ -61,7 +62,7 @@ class SceneSessions:
         the scene's clients.
         """
         self.declared: list[Any] = []
-        self._service, self._sealer = service, sealer
+        self._service, self._sealer, self._tokens = service, sealer, tokens
         self._frames = frames = service.frames(scene, self._send, tokens.turn)
         self._streams = StateStreams(
             0 if frames is None else _STREAMS_A_USER * frames.most_users, tokens.turn
@@ -121,25 +122,53 @@ class SceneSessions:
                 send_reply(query, query.key_expr, self._service.busy(encoding, Full.STATES), sealer)
 
     def _take_wishes(self, samples: Any, frames: Frames) -> None:
-        """Take wishes in until there are no more, then end the frames. A thread's work."""
+        """Take wishes in until there are no more, then end the frames. A thread's work.
+
+        What has come is sorted by turns before a wish is read: reading a large one takes milliseconds.
+        """
+        waiting = WaitingWishes(self._tokens.turn)
         try:
             for sample in samples:
-                try:
-                    self._take_wish(sample, frames)
-                except Exception:  # of this wish alone
-                    log.exception("a wish")
+                self._sort(sample, waiting, frames)
+                while (following := waiting.take()) is not None:
+                    self._take_wish(*following, frames)
+                    for _ in range(_CHANNEL):
+                        if (more := _at_hand(samples)) is None:
+                            break
+                        self._sort(more, waiting, frames)
         finally:
             frames.close()
 
-    def _take_wish(self, sample: zenoh.Sample, frames: Frames) -> None:
-        """Take in one wish, or that a user leaves."""
+    def _sort(self, sample: zenoh.Sample, waiting: WaitingWishes, frames: Frames) -> None:
+        """Have a wish wait for its client's turn; refuse one that is too large, unread."""
         try:
             user = keys.parse_wish(str(sample.key_expr))
         except BadRequestError as error:
             log.debug("a wish of nobody: %s", error)
             return
-        if sample.kind == zenoh.SampleKind.DELETE:
-            frames.leave(user)
-            self._streams.forget(user)
-        elif frames.wish(user, sample.payload.to_bytes(), str(sample.encoding)):
-            self._streams.send_again(user)
+        try:
+            size = len(sample.payload)
+            if sample.kind == zenoh.SampleKind.DELETE or frames.fits(user, size, str(sample.encoding)):
+                waiting.put(user, sample, size)
+        except Exception:  # of this wish alone
+            log.exception("a wish")
+
+    def _take_wish(self, user: keys.User, sample: zenoh.Sample, frames: Frames) -> None:
+        """Take in one wish, or that a user leaves."""
+        try:
+            if sample.kind == zenoh.SampleKind.DELETE:
+                frames.leave(user)
+                self._streams.forget(user)
+            elif frames.wish(user, sample.payload.to_bytes(), str(sample.encoding)):
+                self._streams.send_again(user)
+        except Exception:  # of this wish alone
+            log.exception("a wish")
+
+
+def _at_hand(samples: Any) -> zenoh.Sample | None:
+    """Take a sample from a channel without waiting; return None where there is none, or the channel has ended."""
+    try:
+        sample: zenoh.Sample | None = samples.try_recv()
+    except zenoh.ZError:
+        return None
+    return sample

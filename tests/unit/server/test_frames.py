@@ -194,16 +194,16 @@ def test_what_is_no_wish_is_refused_and_changes_nothing(floor):
     assert floor.users == [BO]
 
 
-def test_a_wish_of_megabytes_is_refused_unread(floor):
+def test_a_wish_that_is_too_large_is_refused_unread(floor):
     sent = []
     frames = Frames(floor, lambda user, answer: sent.append((user, answer)))
-    frames.wish(AL, b"\xc1" * ((2 << 20) + 1), None)
+    frames.wish(AL, b"\xc1" * ((512 << 10) + 1), None)
     frames.wish(
         BO, encode(wish(1, objects={f"{n:064}": np.eye(4).tolist() for n in range(2048)}), JSON), JSON
     )
     run(frames)
     assert [said(answer).code for _, answer in sent] == ["too_large", "bad_request"]
-    assert "2097153 bytes" in said(sent[0][1]).message and "has none" in said(sent[1][1]).message
+    assert "524289 bytes" in said(sent[0][1]).message and "has none" in said(sent[1][1]).message
 
 
 def test_a_user_too_many_is_busy_and_the_others_go_on(floor):

@@ -127,8 +127,10 @@ class Transport:
                 declared.undeclare()
             if not self._wait(self._config.stop_seconds):
                 log.warning("not all is answered after %g s: the rest is given up", self._config.stop_seconds)
-                for each in (*self._lanes, *self._sessions):
-                    each.give_up()
+                for lane in self._lanes:
+                    lane.give_up()
+                for sessions in self._sessions:
+                    sessions.give_up()
                 self._wait(_GIVE_UP_SECONDS)
         # Closing the session ends what waits for a client that takes nothing. A thread that is still at work when the
         # interpreter ends, inside zenoh, would abort the process.

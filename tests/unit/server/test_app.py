@@ -293,9 +293,12 @@ def test_avatars_are_their_clients(service, scene):
     assert error(ask(service, "collide", pose, client="one")).code == "unknown_avatar"
 
 
-def test_warming_warms_every_scene(service, scene):
+def test_warming_warms_every_scene(service, scene, monkeypatch):
+    """It starts the deadlines' thread too: a slow request that started it would give it its low priority."""
+    started = []
+    monkeypatch.setattr(app_module, "start_deadlines", lambda: started.append(1))
     service.warm()
-    assert scene.warmed == 1 and not scene.avatars
+    assert scene.warmed == 1 and not scene.avatars and started == [1]
 
 
 def test_busy_says_how_many(service):

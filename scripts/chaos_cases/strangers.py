@@ -12,18 +12,10 @@ from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 import zenoh
+from rogues.tools import widths, zeros
 from solidcloud.schemas import keys
-from solidcloud.schemas.answers import (
-    CollideAnswers,
-    DistanceAnswers,
-    RaycastAnswers,
-    SweepAnswers,
-    WithinAnswers,
-)
-from solidcloud.schemas.columns import unknown
 from solidcloud.schemas.messages import MSGPACK, AddAvatarRequest, CollideRequest, ContactsRequest, encode
 from solidcloud.schemas.requests import make_poses
 from solidcloud.server.transport import session_config
@@ -31,16 +23,8 @@ from solidcloud.server.transport import session_config
 from .ground import SCENE
 
 ENCODING = zenoh.Encoding(MSGPACK)
-# Twelve widths of a key that meets the questions of all clients of the scene, or their states.
-WIDE = (
-    "**", "solidcloud/**", "solidcloud/*/**", "solidcloud/1/**", "*/1/scene/**", "solidcloud/1/scene/**",
-    f"solidcloud/1/scene/{SCENE}/*/*", f"solidcloud/*/scene/{SCENE}/*/*", f"solidcloud/1/*/{SCENE}/*/*",
-    "solidcloud/1/scene/*/*/collide", "solidcloud/1/sc$*/**", f"**/{SCENE}/*/*",
-)  # fmt: skip
-_KINDS = {
-    "collide": CollideAnswers, "distance": DistanceAnswers, "sweep": SweepAnswers, "raycast": RaycastAnswers,
-    "within": WithinAnswers,
-}  # fmt: skip
+# Keys that meet the questions of all clients of the scene, or their states.
+WIDE = widths(SCENE, "*")
 
 
 def _open(endpoint: str, mode: str) -> zenoh.Session:
@@ -53,18 +37,8 @@ def _open(endpoint: str, mode: str) -> zenoh.Session:
 def _lie(query: Any) -> None:
     """Answer a question with zeros: clear, whatever was asked."""
     with query:
-        op = str(query.key_expr).rsplit("/", 1)[-1]
-        kind = _KINDS.get(op)
-        if kind is None or query.payload is None:
-            return
-        asked = msgspec.msgpack.decode(query.payload.to_bytes())
-        rows = next((len(asked[name]) // size for name, size in _SIZES.items() if name in asked), 1)
-        answers = unknown(kind, rows, bounded=False)
-        lie = msgspec.structs.replace(answers, verdict=np.zeros(rows, np.uint8), engine_seconds=1e-3)
-        query.reply(query.key_expr, encode(lie), encoding=ENCODING)
-
-
-_SIZES = {"poses": 128, "pose_from": 128, "origins": 24, "points": 24}
+        if query.payload is not None:
+            query.reply(query.key_expr, zeros(query), encoding=ENCODING)
 
 
 def rogue(folder: Path, endpoint: str, seed: int, seconds: float) -> None:

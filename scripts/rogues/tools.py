@@ -9,12 +9,22 @@ import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import msgspec
 import numpy as np
 import zenoh
-from solidcloud.schemas.answers import CollideAnswers, CollidePart, Verdict
+from solidcloud.schemas.answers import (
+    CollideAnswers,
+    CollidePart,
+    DistanceAnswers,
+    RaycastAnswers,
+    SweepAnswers,
+    Verdict,
+    WithinAnswers,
+)
+from solidcloud.schemas.columns import unknown
 from solidcloud.schemas.encoding import decode_request, encode
 from solidcloud.schemas.errors import SolidcloudError
-from solidcloud.schemas.messages import AvatarInfo, CollideRequest, ErrorReply, PathRequest, ScenesAnswer
+from solidcloud.schemas.messages import AvatarInfo, CollideRequest, ErrorReply, ScenesAnswer
 from solidcloud.schemas.moves import State, Wish
 from solidcloud.server.client import Client
 from solidcloud.server.client_session import ClientSession
@@ -98,7 +108,7 @@ def _queryable(rogue: Rogue, width: str, victim: Victim) -> list[str]:
         with query:
             heard.append(str(query.key_expr))
             if query.payload is not None:
-                query.reply(query.key_expr, _zeros(query), encoding=MSGPACK)
+                query.reply(query.key_expr, zeros(query), encoding=MSGPACK)
 
     with rogue.session.declare_queryable(width, lie, complete=True):
         rogue.settle()
@@ -107,17 +117,28 @@ def _queryable(rogue: Rogue, width: str, victim: Victim) -> list[str]:
     return found + state + [f"asked {key}" for key in heard if victim.id in key]
 
 
-def _zeros(query: zenoh.Query) -> bytes:
-    """An answer that says `clear` of everything."""
-    payload, path = query.payload.to_bytes(), str(query.key_expr).endswith("/path")
+def zeros(query: zenoh.Query) -> bytes:
+    """Return an answer to a question that says `clear` of everything; to what is no question a state far away."""
+    operation = str(query.key_expr).rpartition("/")[2]
     try:
-        count = len(decode_request(PathRequest if path else CollideRequest, payload, MSGPACK).poses)
-    except SolidcloudError:
+        asked = msgspec.msgpack.decode(query.payload.to_bytes())
+        rows = next(len(asked[name]) // size for name, size in _ROW_BYTES.items() if name in asked)
+    except (msgspec.DecodeError, StopIteration, TypeError):
+        rows = 0
+    if operation == "path":
+        none = np.zeros(rows, np.uint32)
+        return encode(CollidePart(none.astype(np.uint8), none > 0, none, none, none, first=0, total=rows))
+    if operation not in _ANSWERS:
         return encode(State(pose=pose_at(9.0, 9.0)[None], seq=10**9, time=0.0, frame=1))
-    none = np.zeros(count, np.uint32)
-    if path:
-        return encode(CollidePart(none.astype(np.uint8), none > 0, none, none, none, first=0, total=count))
-    return encode(CollideAnswers(none.astype(np.uint8), none > 0, none, none, none))
+    answers = unknown(_ANSWERS[operation], rows, bounded=False)
+    return encode(msgspec.structs.replace(answers, verdict=np.zeros(rows, np.uint8), engine_seconds=1e-3))
+
+
+_ROW_BYTES = {"poses": 128, "pose_from": 128, "origins": 24, "points": 24}
+_ANSWERS: dict[str, Any] = {
+    "collide": CollideAnswers, "distance": DistanceAnswers, "sweep": SweepAnswers, "raycast": RaycastAnswers,
+    "within": WithinAnswers,
+}  # fmt: skip
 
 
 def _asked(victim: Victim) -> list[str]:
@@ -246,7 +267,7 @@ class Impostor:
             elif key.endswith("/add_avatar"):
                 self._reply(query, encode(AvatarInfo(AVATAR, 3, 0.125, 1.0)))
             elif query.payload is not None:
-                self._reply(query, _zeros(query))
+                self._reply(query, zeros(query))
 
     def _wished(self, sample: zenoh.Sample) -> None:
         if sample.kind != zenoh.SampleKind.PUT:

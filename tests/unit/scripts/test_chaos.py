@@ -14,8 +14,17 @@ from chaos_cases.judge import judge
 from chaos_cases.lives import Quiet
 from chaos_cases.report import Limits, _violations
 from msgspec.structs import replace
-from solidcloud.schemas.answers import CollideAnswers, ContactsAnswers, DistanceAnswers, Verdict
-from solidcloud.schemas.columns import unknown
+from rogues.tools import zeros
+from solidcloud.schemas.answers import (
+    CollideAnswers,
+    ContactsAnswers,
+    DistanceAnswers,
+    Verdict,
+    WithinAnswers,
+)
+from solidcloud.schemas.columns import check_answers, unknown
+from solidcloud.schemas.encoding import decode_answer, encode
+from solidcloud.schemas.messages import CollideRequest, WithinRequest
 from solidcloud.schemas.moves import Moved
 
 
@@ -124,6 +133,22 @@ def test_the_board_is_one_for_all(tmp_path: Path) -> None:
     assert client.now() == b.Now(True, 0)
     client.client(2)[b.WRONG] += 4
     assert driver.totals()["wrong"] == 4
+
+
+@pytest.mark.parametrize(
+    ("request_", "kind"),
+    [
+        (CollideRequest("al", np.tile(np.eye(4), (5, 1, 1))), CollideAnswers),
+        (WithinRequest(np.zeros((5, 3)), 0.1), WithinAnswers),
+    ],
+)
+def test_a_lie_is_an_answer_that_a_client_would_take(request_, kind) -> None:
+    operation = "collide" if kind is CollideAnswers else "within"
+    payload = SimpleNamespace(to_bytes=lambda: encode(request_))
+    query = SimpleNamespace(key_expr=f"solidcloud/1/scene/hall/me/{operation}", payload=payload)
+    answers = decode_answer(kind, zeros(query))
+    check_answers(answers, 5)
+    assert (answers.verdict == Verdict.CLEAR).all()
 
 
 def test_a_client_is_still_once_all_its_ids_are(tmp_path: Path) -> None:

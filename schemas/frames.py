@@ -68,7 +68,7 @@ def pack(rows: NDArray, expansion: Expansion = ANY_EXPANSION) -> bytes:
     frame = new_compressor().compress(planes.data)
     if expansion.allows(planes.size, len(frame)):
         return frame
-    return b"".join(sparse_frame([memoryview(planes.reshape(-1))], planes.size, expansion.ratio))
+    return b"".join(sparse_frame([planes.data.cast("B")], planes.size, expansion.ratio))
 
 
 def sparse_frame(parts: Iterable[bytes | memoryview], size: int, ratio: int) -> Iterator[bytes]:

@@ -11,10 +11,9 @@ from typing import NamedTuple
 from ..schemas.errors import BadRequestError
 from ..schemas.requests import QuestionOptions
 from .deadlines import stop_at
+from .kernels.stopping import NO_LIMIT as NO_LIMIT  # no budget: more node visits than any request could make
 from .stop import NEVER, Stop
 
-# No budget: more node visits than any request could make.
-NO_LIMIT = 1 << 62
 # Of the time left, what loads may take: what is resident is to be searched as well.
 LOAD_SHARE = 0.5
 # After the deadline of a budget, searches that look at the clock have so long to end by themselves, with what they know

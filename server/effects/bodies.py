@@ -19,13 +19,13 @@ from ..kernels.meeting_placed import make_scratch
 from ..kernels.near_bodies import bound_body
 from ..kernels.pairs import CONTACT, touch_pairs
 from ..kernels.placing import MAX_REACH_UNITS, SIMILARITY_TOLERANCE
+from ..kernels.stopping import NO_LIMIT
 from ..request import kernel_poses, to_units
 from ..stop import NEVER, Stop
 from ..vectors import level, turned_back, turned_by
 from .frame import Body, Pose, Vec
 
 USER, TOLD, PUSHED = 1, 2, 4  # kinds, one bit each
-_EVER = 1 << 62  # node visits: no budget
 # Points so near one another make a body's surface [m], as `slide` and `ground` have it of scans.
 _SURFACE = 0.08
 # Shapes kept of avatars that are of no body, before they are forgotten.
@@ -311,7 +311,7 @@ class Bodies:
             pairs = np.stack([np.zeros(len(at), np.int64), at + 1], axis=1)
             verdict = np.empty(len(at), np.uint8)
             touch_pairs(
-                shape.model.arrays, model.arrays, poses, scales, units, pairs, margin_units, self.origin, _EVER,
+                shape.model.arrays, model.arrays, poses, scales, units, pairs, margin_units, self.origin, NO_LIMIT,
                 stop.flag, verdict, self.scratch.counters,
             )  # fmt: skip
             found[at] = verdict == CONTACT

@@ -376,14 +376,14 @@ def look_around(box, first, last, avatar, scales, units, scene, index, unknown, 
     lost (k,) float64, when it first meets one of the boxes unknown (u, 2, 3) int64 [steps], inf: never.
 
     The reach is the cube around the avatar's root sphere, as `collide` has it, along chords; neither depends on voxels.
-    Once the scene's stop flag is set, motions are outside and lost from their beginning.
+    Once the scene's stop flag is set, motions are lost from their beginning.
     """
     pose, shift, begin, end = np.empty((4, 4)), np.empty(3), np.empty(3), np.empty(3)
     for i in range(first.shape[0]):
         motion = make_motion(first[i], last[i], box, scene.origin)
         outside[i], lost[i] = False, INFINITE
         if stopped(scene.stop):
-            outside[i], lost[i] = True, 0.0
+            lost[i] = 0.0
             continue
         size = _size_of(box, scales[i], units[i])
         parts = int(min(1024.0, math.ceil(math.sqrt(motion.bend / size) * until[i]))) + 1

@@ -411,6 +411,20 @@ def _overlap_poses(poses, avatar, scene, reach, which, verdict, counts, placed, 
 
 
 @nb.njit(nogil=True, cache=True)
+def rows_or_undone(needed, verdict, counts):
+    """Return `needed`, the rows of a request all of whose voxels are resident; -1 where a search ended early.
+
+    Then verdict (k,) and counts (3, k) become as they were before the request.
+    """
+    for i in range(verdict.shape[0]):
+        if verdict[i] == UNKNOWN:  # nothing is missing: the search ended early
+            verdict[:] = CLEAR
+            counts[:] = 0
+            return -1
+    return needed
+
+
+@nb.njit(nogil=True, cache=True)
 def answer_resident(poses, avatar, radius, other_units, scene, index, rows, outside, verdict, counts):
     """A whole request in one call, where all voxels in its reach are resident: `find_reach`, then `overlap_poses`.
 
@@ -432,10 +446,4 @@ def answer_resident(poses, avatar, radius, other_units, scene, index, rows, outs
             return fault, pose, found, -1
     if avatar.radius.shape[0] > 0:
         overlap_poses(poses, avatar, scene, reach, np.arange(k), MOST_QUICK_VISITS, verdict, counts)
-    for i in range(k):
-        if verdict[i] == UNKNOWN:  # all is resident: the search ended early
-            needed = -1
-    if needed < 0:
-        verdict[:] = CLEAR
-        counts[:] = 0
-    return fault, pose, found, needed
+    return fault, pose, found, rows_or_undone(needed, verdict, counts)

@@ -37,7 +37,7 @@ from .nearest import box_gap
 from .overlap import STACK
 from .placed import SLACK, Placed, make_placed, place_block, place_nodes
 from .placing import MAX_REACH_UNITS
-from .stopping import stopped
+from .stopping import NO_LIMIT, stopped
 
 # The search goes on; nothing is open; what was asked is known; the budget of visits is spent.
 OPEN, DONE, ENOUGH, SPENT = range(4)
@@ -383,5 +383,5 @@ def search_poses(poses, avatar, scene, index, reach, which, heap, goal, known, c
             known.lower[which[number]] = 0.0
             continue
         go_on(
-            poses, avatar, scene, index, reach, which[number], True, np.int64(1) << 62, search, goal, known, counts
+            poses, avatar, scene, index, reach, which[number], True, np.int64(NO_LIMIT), search, goal, known, counts
         )  # fmt: skip

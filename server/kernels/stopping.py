@@ -12,7 +12,7 @@ NO_LIMIT = 1 << 62
 # Node visits of a pose, or a motion, that is answered while nobody else can use the residency: a few milliseconds at
 # most. What takes more is answered the ordinary way.
 MOST_QUICK_VISITS = 1 << 16
-# Rows copied or forgotten between two looks at the stop flag: some hundred microseconds.
+# Rows copied, sorted or forgotten between two looks at the stop flag: some hundred microseconds.
 ROWS_AT_ONCE = 512
 
 

@@ -11,11 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas.kernels import compiling as nb
-from .stopping import stopped
+from .stopping import ROWS_AT_ONCE, stopped
 
 FAN = 8
-# Entries moved between two looks at the stop flag.
-ROWS_AT_ONCE = 1024
 # FAN - 1 siblings stay behind on each level; 2^63 rows have 21 levels.
 STACK = 22 * FAN
 

@@ -44,7 +44,6 @@ from .memory import (
     turn_points,
 )
 from .overlap import (
-    CLEAR,
     CONTACT,
     UNKNOWN,
     lanes_meet,
@@ -52,6 +51,7 @@ from .overlap import (
     make_spot,
     make_work,
     overlap_poses,
+    rows_or_undone,
 )
 from .placed import make_by_class, make_placed, place_lanes, place_root, set_by_class
 from .placing import GOOD, place
@@ -397,10 +397,4 @@ def walk_resident(poses, avatar, radius, other_units, scene, index, rows, outsid
         if scene.where[rows[at], 0] < 0:
             return fault, pose, found, -1
     walk_poses(poses, avatar, scene, reach, MOST_QUICK_VISITS, verdict, counts, memory)
-    for i in range(k):
-        if verdict[i] == UNKNOWN:  # all is resident: the search ended early
-            needed = -1
-    if needed < 0:
-        verdict[:] = CLEAR
-        counts[:] = 0
-    return fault, pose, found, needed
+    return fault, pose, found, rows_or_undone(needed, verdict, counts)

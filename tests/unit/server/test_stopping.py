@@ -21,6 +21,7 @@ from solidcloud.server.objects import find_pairs
 from solidcloud.server.request import with_stop
 from solidcloud.server.residency import Residency
 from solidcloud.server.stop import NEVER, Stop, StoppedError
+from solidcloud.server.sweep import sweep
 from stops import CLEAR, CONTACT, UNKNOWN, Asked
 
 INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
@@ -72,6 +73,17 @@ def test_pairs_of_stopped_objects_that_could_touch_are_listed_as_unknown(asked: 
     assert found.pairs_tested == 0 < len(found.pairs) == whole.pairs_tested
     assert {*map(tuple, whole.pairs.tolist())} <= {*map(tuple, found.pairs.tolist())}
     assert (found.pair_verdict == UNKNOWN).all()
+
+
+@pytest.mark.interpreted
+def test_a_stopped_motion_inside_is_not_said_to_leave(asked: Asked) -> None:
+    data, ball, pose = asked.data, make_avatar([[0.0, 0, 0]], 0.001), np.eye(4)[None]
+    middle = (data.broad.scene_low + data.broad.scene_high) // 2
+    pose[0, :3, 3] = data.arrays.origin + data.arrays.step * middle
+    for stop in (NEVER, stopped_already(WHY)):
+        found = sweep(with_stop(data, stop), ball, pose, pose, effort=effort_of(stop))
+        assert found.outside.tolist() == [False]
+    assert found.lower.tolist() == [0.0] and found.verdict.tolist() == [UNKNOWN]
 
 
 @pytest.mark.interpreted

@@ -419,6 +419,11 @@ class Client(Questions):
         asked = Asked(self._anchor, identity.keys[operation], request, partial(self._added.about, names))
         return identity.queriers[operation], asked
 
+    def _querier(self, operation: str) -> zenoh.Querier:
+        """Return what asks one operation under the present id."""
+        self._check_open()
+        return self._identity.queriers[operation]
+
     def _check_open(self) -> None:
         """BadRequestError where this client is closed."""
         if self._stack is None:

@@ -9,8 +9,9 @@ import socket
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from functools import lru_cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from ..schemas.errors import BadRequestError
 from ..schemas.seals import KEY_BYTES, parse_key
@@ -31,15 +32,21 @@ def key_paths(endpoint: str) -> list[Path]:
 
     Both folders are the user's own. The host's name is in the file's: a home folder may be that of many hosts.
     """
-    text = f"{socket.gethostname()} {canonical(endpoint)}"
-    plain = re.sub(r"[^A-Za-z0-9.-]+", "_", text)[:80]
-    name = f"{plain}-{hashlib.sha256(text.encode()).hexdigest()[:8]}.key"
+    name = _file_name(socket.gethostname(), endpoint)
     folders = []
     if runtime := os.environ.get("XDG_RUNTIME_DIR"):
         folders.append(Path(runtime))
     with suppress(RuntimeError):  # nobody's home
         folders.append(Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"))
     return [folder / "solidcloud" / name for folder in folders]
+
+
+@lru_cache(maxsize=256)
+def _file_name(host: str, endpoint: str) -> str:
+    """Return the name of the key file of a server. Remembered: it is looked for with each reply that has no seal."""
+    text = f"{host} {canonical(endpoint)}"
+    plain = re.sub(r"[^A-Za-z0-9.-]+", "_", text)[:80]
+    return f"{plain}-{hashlib.sha256(text.encode()).hexdigest()[:8]}.key"
 
 
 @contextmanager
@@ -70,28 +77,31 @@ def published_key(endpoint: str, key_file: Path | None) -> Iterator[bytes]:
             written.unlink(missing_ok=True)
 
 
-def find_key(endpoint: str, known: KeyFile | None = None) -> KeyFile | None:
-    """Return the key of the server at an endpoint of this host, the newest that its user left; None: there is none.
+def find_key(endpoint: str, known: KeyFile | None = None, unusable: set[Any] | None = None) -> KeyFile | None:
+    """Return the key of the server at an endpoint of this host, the newest that its user left; None: no usable one.
 
-    known: returned where its file is still the newest. A file that others can read or write is left alone.
+    known: returned where its file is still the newest.  unusable: files that were found unusable before and are not
+    read again; others are added. A file that others can read or write is left alone, with a warning.
     """
-    best: tuple[tuple[int, int, int], Path] | None = None
+    unusable = set() if unusable is None else unusable
+    found = []
     for path in key_paths(endpoint):
-        try:
+        with suppress(OSError):
             status = os.stat(path, follow_symlinks=False)
-        except OSError:
+            # The time of a change of mode or owner too: it may make a file usable.
+            found.append((_version(status), status.st_ctime_ns, path))
+    for each in sorted(found, reverse=True):
+        version, _, path = each
+        if known is not None and known.version == version:
+            return known
+        if each in unusable:
             continue
-        if best is None or _version(status) > best[0]:
-            best = (_version(status), path)
-    if best is None:
-        return None
-    if known is not None and known.version == best[0]:
-        return known
-    try:
-        return _read(best[1], private=True)
-    except (OSError, BadRequestError) as error:
-        log.warning("%s is not used: %s", best[1], error)
-        return None
+        try:
+            return _read(path, private=True)
+        except (OSError, BadRequestError) as error:
+            unusable.add(each)
+            log.warning("%s is not used: %s", path, error)
+    return None
 
 
 def read_given_key(path: Path) -> bytes:

@@ -83,8 +83,9 @@ class Anchor:
         self._given = None if key_file is None else Path(key_file)
         self._known: KeyFile | None = None
         self._said: set[str] = set()
+        self._unusable: set[Any] = set()  # key files
         if self._given is None:
-            self._known = find_key(endpoint)
+            self._known = find_key(endpoint, None, self._unusable)
         else:
             self._known = KeyFile(read_given_key(self._given), (0, 0, 0))
 
@@ -96,7 +97,7 @@ class Anchor:
     def look_again(self) -> bytes | None:
         """Return the key after a look at its file, where a new server may have left another."""
         if self._given is None:
-            self._known = find_key(self._endpoint, self._known) or self._known
+            self._known = find_key(self._endpoint, self._known, self._unusable) or self._known
         return self.key
 
     def unsealed(self) -> None:

@@ -204,10 +204,13 @@ class Transport:
 
         def take(queries: Any) -> None:
             for query in queries:
-                with query:
-                    # Under its own key: a wider one that matches is no server's.
-                    sealer = self._sealer(query, keys.scenes_key(), b"")
-                    send_reply(query, keys.scenes_key(), self._service.scenes(_encoding(query)), sealer)
+                try:
+                    with query:
+                        # Under its own key: a wider one that matches is no server's.
+                        sealer = self._sealer(query, keys.scenes_key(), b"")
+                        send_reply(query, keys.scenes_key(), self._service.scenes(_encoding(query)), sealer)
+                except Exception:  # of this query alone
+                    log.exception("a query for the scenes")
 
         self._start("scenes", take, queryable.handler)
 

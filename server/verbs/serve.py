@@ -64,6 +64,7 @@ def serve(
     from ...schemas.kernels.compiling import kernel_files
     from ..app import serve as serve_scenes
     from ..config import ServerConfig
+    from ..key_files import read_given_key
     from ..replay import recorded
     from ..report.points import read_avatar
     from ..scene_file import open_scene
@@ -85,6 +86,8 @@ def serve(
         max_avatar_clients=max_avatar_clients,
     )
     budget = parse_bytes(cache, "--cache")
+    if key_file is not None:
+        read_given_key(key_file)  # refused now, and not once the archive is warm
     files = kernel_files()
     with ExitStack() as stack, ExitStack() as start:
         if start.enter_context(files.starting()):

@@ -2,6 +2,7 @@
 
 import os
 import struct
+import threading
 import time
 
 import numpy as np
@@ -20,6 +21,7 @@ from solidcloud.server.app import serving
 from solidcloud.server.client import Client, scenes_at
 from solidcloud.server.config import ServerConfig
 from solidcloud.server.key_files import find_key, key_paths
+from solidcloud.server.transport import session_config
 from walkers import pose_at
 
 POSES = heights([-1.0, -2.0])
@@ -162,8 +164,6 @@ def test_a_state_that_was_heard_before_is_ignored(endpoint, tmp_path):
     (tmp_path / "key").chmod(0o600)
     config = ServerConfig(listen=endpoint)  # for its check alone
     open_queries = []
-    from solidcloud.server.transport import session_config
-
     with zenoh.open(session_config(listen=config.listen)) as session:
         session.declare_queryable("solidcloud/1/state/floor/*/*", open_queries.append, complete=True)
         with (
@@ -194,3 +194,60 @@ def test_a_state_that_was_heard_before_is_ignored(endpoint, tmp_path):
             assert walker.wait(5, DEADLINE).seq == 5, "no error was heard"
             open_queries.clear()
             del query
+
+
+def test_replies_that_are_refused_do_not_keep_a_path_open(endpoint, tmp_path):
+    (tmp_path / "key").write_text("ab" * 32)
+    (tmp_path / "key").chmod(0o600)
+    held, over = [], threading.Event()
+
+    def drip(query):
+        held.append(query)
+        for number in range(400):
+            query.reply(query.key_expr, b"\x80", encoding=MSGPACK)
+            if over.wait(0.05) or number == 399:
+                break
+
+    with zenoh.open(session_config(listen=endpoint)) as session:
+        session.declare_queryable("solidcloud/1/scene/floor/*/path", drip, complete=True)
+        with Client(endpoint, scene="floor", timeout=0.5, key_file=tmp_path / "key") as client:
+            begin = time.monotonic()
+            verdicts = [part.verdict for part in client.path("al", PATH)]
+            took = time.monotonic() - begin
+            over.set()
+    assert held and np.all(np.concatenate(verdicts) == Verdict.UNKNOWN)
+    assert took < 10, "twenty seconds of replies were not waited for"
+
+
+def test_errors_do_not_have_states_asked_for_faster(endpoint):
+    asked = []
+
+    def refuse(query):
+        with query:
+            asked.append(time.monotonic())
+            query.reply_err(encode(ErrorReply("busy", "no room")), encoding=MSGPACK)
+
+    with zenoh.open(session_config(listen=endpoint)) as session:
+        session.declare_queryable("solidcloud/1/state/floor/*/*", refuse, complete=True)
+        with Client(endpoint, scene="floor", timeout=0.5) as client, client.session("al"):
+            eventually(lambda: len(asked) >= 1)
+            time.sleep(2.0)
+    # At most each 0.2 s after the first few; without a pause that grows, each 0.02 s.
+    assert 2 <= len(asked) <= 30
+
+
+def test_a_session_of_a_closed_client_says_so(scene, endpoint):
+    with serving([scene], ServerConfig(listen=endpoint)):
+        with Client(endpoint, scene="floor") as client:
+            session = client.session("al")
+        with pytest.raises(BadRequestError, match="expected an open client"), session:
+            pass
+
+
+def test_a_query_for_the_scenes_that_fails_is_the_only_one(scene, endpoint, monkeypatch):
+    with serving([scene], ServerConfig(listen=endpoint)) as service:
+        with monkeypatch.context() as broken:
+            broken.setattr(service, "scenes", None)
+            with pytest.raises(BusyError):
+                scenes_at(endpoint, timeout=0.5)
+        assert scenes_at(endpoint, timeout=DEADLINE) == ["floor"]

@@ -6,6 +6,7 @@ import stat
 import pytest
 from solidcloud.schemas.errors import BadRequestError
 from solidcloud.server.key_files import find_key, key_paths, published_key, read_given_key
+from solidcloud.server.verbs.serve import serve
 
 ENDPOINT = "tcp/127.0.0.1:7447"
 
@@ -58,6 +59,29 @@ def test_a_found_file_that_others_have_access_to_is_not_used(mode, caplog):
     with published_key(ENDPOINT, None):
         key_paths(ENDPOINT)[0].chmod(mode)
         assert find_key(ENDPOINT) is None and "chmod 600" in caplog.text
+
+
+def test_a_newest_file_that_is_not_usable_does_not_hide_an_older_one(monkeypatch, caplog):
+    with published_key(ENDPOINT, None) as key:
+        with monkeypatch.context() as other:
+            other.delenv("XDG_RUNTIME_DIR")
+            server = published_key(ENDPOINT, None)
+            newer = server.__enter__()
+        os.utime(key_paths(ENDPOINT)[0], (1, 1))
+        path = key_paths(ENDPOINT)[1]
+        path.chmod(0o644)
+        unusable = set()
+        known = find_key(ENDPOINT, None, unusable)
+        assert known.key == key and find_key(ENDPOINT, known, unusable) is known
+        assert caplog.text.count("is not used") == 1, "said once"
+        path.chmod(0o600)
+        assert find_key(ENDPOINT, known, unusable).key == newer
+        server.__exit__(None, None, None)
+
+
+def test_a_key_file_that_does_not_do_is_refused_before_the_archive_is_opened(folders):
+    with pytest.raises(BadRequestError, match=r"key file .*No such file"):
+        serve(folders / "no archive", key_file=folders / "none")
 
 
 def test_a_found_link_is_not_used(folders):

@@ -175,7 +175,9 @@ class Storm:
             took.append(max(0.0, at - since) if at > since else RIGHT_SECONDS)
             if at <= since:
                 self.stuck.append(f"client {slot}: no right answer within {RIGHT_SECONDS:g} s of {since:.1f}")
-        self.say("         right again after " + " ".join(f"{seconds:.1f}" for seconds in sorted(took)) + " s")
+        self.say(
+            "         right again after " + " ".join(f"{seconds:.1f}" for seconds in sorted(took)) + " s"
+        )
         self.recovery += took
 
     # Generations

@@ -73,8 +73,16 @@ class PathThreads:
 
     def _run(self) -> None:
         """Compute parts until closed. A thread's work."""
-        while (work := self._next()) is not None:
-            _compute(*work)
+        while self._compute_next():
+            pass
+
+    def _compute_next(self) -> bool:
+        """Compute one part; return False once closed. What it was of is not kept while the next is waited for."""
+        work = self._next()
+        if work is None:
+            return False
+        _compute(*work)
+        return True
 
 
 def _compute(future: Future[Any], run: Callable[..., Any], arguments: tuple[Any, ...]) -> None:

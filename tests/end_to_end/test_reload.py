@@ -20,11 +20,11 @@ from numpy.typing import NDArray
 from solidcloud.schemas.answers import Verdict
 from solidcloud.schemas.errors import BusyError, FormatError, UnknownSceneError
 from solidcloud.schemas.messages import ReloadAnswer
-from solidcloud.server import client as client_module
 from solidcloud.server.app import serving
 from solidcloud.server.cli import run
 from solidcloud.server.client import Client
 from solidcloud.server.config import ServerConfig
+from solidcloud.server.identity import OPEN_SECONDS
 from solidcloud.server.scene import Scene
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -227,7 +227,7 @@ def server(generations: Generations, endpoint: str, tmp_path: Path) -> Iterator[
 def test_a_server_that_is_slow_is_told_from_one_that_is_gone(
     endpoint: str, server: subprocess.Popen[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(client_module._SECONDS, "reload", 1.5)
+    monkeypatch.setitem(OPEN_SECONDS, "reload", 1.5)
     with Client(endpoint, scene="hall", timeout=1.5) as client:
         client.reload()
         os.kill(server.pid, signal.SIGSTOP)
@@ -237,7 +237,7 @@ def test_a_server_that_is_slow_is_told_from_one_that_is_gone(
             f"the server of scene 'hall' at {endpoint} has not answered 'reload' within 1.5 s: it may still be at "
             "work, and its log says when it is done: ask again, or start it anew"
         )
-    monkeypatch.setitem(client_module._SECONDS, "reload", DEADLINE)
+    monkeypatch.setitem(OPEN_SECONDS, "reload", DEADLINE)
     os.kill(server.pid, signal.SIGCONT)
     with Client(endpoint, scene="hall") as client:
         client.reload()

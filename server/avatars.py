@@ -120,17 +120,19 @@ class Avatars:
         with self._changed:
             self._clients.pop(client, None)
 
-    def drop_unused(self, alive: Collection[str], seconds: float) -> None:
-        """Forget avatars that were not used for so long [s], but for those of clients in `alive`."""
-        before = time.monotonic() - seconds
+    def drop_unused(self, alive: Collection[str], seconds: float) -> int:
+        """Forget avatars that were not used for so long [s], but for those of clients in `alive`; return how many."""
+        before, dropped = time.monotonic() - seconds, 0
         with self._changed:
             for client, entries in list(self._clients.items()):
                 if client in _OWN or client in alive:
                     continue
                 for name in [n for n, e in entries.items() if e.model is not None and e.used < before]:
                     del entries[name]
+                    dropped += 1
                 if not entries:
                     del self._clients[client]
+        return dropped
 
     def stats(self) -> AvatarStats:
         """Return what the avatars of all clients take, and the limits."""

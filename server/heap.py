@@ -11,6 +11,16 @@ _MMAP_THRESHOLD, _ARENA_MAX = -3, -8
 _LARGE_BYTES, _ARENAS = 4 << 20, 2
 
 
+def give_back_freed_memory() -> None:
+    """Give the memory that was freed back to the system, where the allocator is glibc's.
+
+    By itself it keeps what lies below the last block in use: all of a thousand avatars of 100 KB that were forgotten.
+    """
+    if sys.platform == "linux":
+        with suppress(OSError, AttributeError):  # another allocator
+            ctypes.CDLL(None).malloc_trim(0)
+
+
 def give_back_large_blocks() -> None:
     """Have large blocks of memory given back to the system when they are freed, where the allocator is glibc's."""
     if sys.platform != "linux":

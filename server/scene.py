@@ -35,6 +35,7 @@ from .contacts import contacts
 from .describe import describe, describe_scene, make_stats
 from .distance import distance
 from .effort import Effort, EngineOptions, make_effort
+from .heap import give_back_freed_memory
 from .metrics import Metrics
 from .objects import objects as ask_objects
 from .opened import HeldParts, Opened
@@ -232,7 +233,8 @@ class Scene(Simulated):
 
     def drop_unused_avatars(self, alive: Collection[str], seconds: float) -> None:
         """Forget avatars that were not used for so long [s], but for those of clients in `alive`."""
-        self._avatars.drop_unused(alive, seconds)
+        if self._avatars.drop_unused(alive, seconds):
+            give_back_freed_memory()
 
     def add_avatar(
         self, name: str, points: ArrayLike, radius: float | None = None, *, client: str = ""

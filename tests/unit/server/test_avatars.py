@@ -199,13 +199,13 @@ def test_unused_avatars_of_clients_without_a_token_are_dropped(monkeypatch):
     now[0] += 59
     avatars.get("bo", "gone")
     now[0] += 2
-    avatars.drop_unused({"here"}, 60.0)
+    assert avatars.drop_unused({"here"}, 60.0) == 1
     with pytest.raises(UnknownAvatarError):
         avatars.get("al", "gone")
     for name, client in (("bo", "gone"), ("al", "here"), ("own", "gone")):
         avatars.get(name, client)
     now[0] += 61
-    avatars.drop_unused((), 60.0)
+    assert avatars.drop_unused((), 60.0) == 2
     assert avatars.stats().clients == 0
     avatars.get("own", "anybody")
     avatars.get("ours", "")

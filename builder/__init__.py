@@ -1,1 +1,1 @@
-"""Offline: scans in, one archive out."""
+"""Offline builder: turns scans into one archive."""

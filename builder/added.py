@@ -1,4 +1,4 @@
-"""What is added to an archive: new scans surveyed, held against those that are in, and spooled on its lattice."""
+"""Preparation of scans that are added to an archive: check for duplicates, survey and spool."""
 
 import os
 from collections.abc import Iterable, Mapping, Sequence
@@ -24,16 +24,18 @@ from .sources import Scan
 from .spool import Spool
 from .survey import Survey, hash_file, joined, ranges, survey_range, unopened
 
-# Scans that an error names.
+# Most scans that an error message names.
 MOST_NAMED = 10
-# Rows of a voxel that are held at once while its box is found.
+# Most rows of a voxel in memory at once while its box is computed.
 BOX_POINTS = 1 << 18
 
 
 class Wanted(NamedTuple):
-    """Which scans are added. again: those too that are in already.  new_only: those that are in are left out.
+    """Selection of the scans to add.
 
-    strict: a scan with points that are not finite is refused.
+    again: also add scans that the archive already contains.
+    new_only: skip scans that the archive already contains.
+    strict: refuse a scan with non-finite points.
     """
 
     again: bool = False
@@ -42,7 +44,11 @@ class Wanted(NamedTuple):
 
 
 def survey_added(change: Change, inputs: Sequence[Input], wanted: Wanted) -> list[Survey]:
-    """The scans of `inputs` that are to be added, all usable. What is in already is told before points are read."""
+    """Return the surveys of the scans of `inputs` to add, all of them usable.
+
+    Scans that the archive already contains are reported before any points are read.
+    Raise ScanError for unusable scans, BadRequestError for scans that cannot be added.
+    """
     if faults := [unopened(item.path, item.fault).fault for item in inputs if not item.scans]:
         raise ScanError("\n  ".join(faults))
     scans = [scan for item in inputs for scan in item.scans]
@@ -58,7 +64,7 @@ def survey_added(change: Change, inputs: Sequence[Input], wanted: Wanted) -> lis
     count = len(change.archive.header.sources) + len(scans)
     if change.archive.header.scan_index and count > MAX_SCANS:
         raise BadRequestError(
-            f"{change.target}: {count} scans with those removed, --keep scan holds {MAX_SCANS}: build again"
+            f"{change.target}: {count} scans including removed ones, --keep scan holds {MAX_SCANS}: build again"
         )
     about = sum(scan.declared_count or 0 for scan in scans)
     cut = [ranges(scan, about) for scan in scans]
@@ -77,14 +83,17 @@ def survey_added(change: Change, inputs: Sequence[Input], wanted: Wanted) -> lis
 
 
 def _not_in(change: Change, scans: list[Scan], hashes: Mapping[Path, str], new_only: bool) -> list[Scan]:
-    """The scans that are not in yet, by what is in their files. BadRequestError names those that are in, and refuses
-    them unless only new ones are wanted, and then to add none."""
+    """Return the scans whose contents are not yet in the archive.
+
+    Raise BadRequestError, naming the scans that are already there, if there are any and `new_only`
+    is not set, or if no new scan remains.
+    """
     known = {(s.sha256, s.index): scan_name(s) for s in change.archive.header.sources if not s.fault}
     new, there = [], []
     for scan in scans:
         key, name = (hashes[scan.path], scan.index), f"{scan.path}[{scan.index}]"
         if key in known and key[0]:
-            there.append(f"{name} is in already, as {known[key]}")
+            there.append(f"{name} is already in the archive, as {known[key]}")
             continue
         known[key] = name
         new.append(scan)
@@ -93,7 +102,7 @@ def _not_in(change: Change, scans: list[Scan], hashes: Mapping[Path, str], new_o
         advice = (
             "nothing is new"
             if new_only
-            else "leave out what is in, or give --new, or --again to have it twice"
+            else "leave out those already in the archive, or give --new, or --again to add them twice"
         )
         raise BadRequestError(
             "\n  ".join([f"{len(there)} of {len(scans)} scans: {advice}", *there[:MOST_NAMED], *more])
@@ -102,7 +111,10 @@ def _not_in(change: Change, scans: list[Scan], hashes: Mapping[Path, str], new_o
 
 
 def spool_added(change: Change, surveys: list[Survey]) -> tuple[float, int]:
-    """Spool the new scans; returns the farthest that quantising moved a point [m], and the `places_sum` (spool.py)."""
+    """Spool the new scans.
+
+    Return the largest distance that quantising moved a point [m] and the `places_sum` (spool.py).
+    """
     header, dtype, folder = change.archive.header, change.dtype, change.folder / "spool"
     most, first = run_points(change.share, dtype), len(change.archive.header.sources)
     change.check_room(sum(survey.count for survey in surveys) * (dtype.itemsize + ARCHIVE_BYTES_A_POINT))
@@ -121,7 +133,7 @@ def spool_added(change: Change, surveys: list[Survey]) -> tuple[float, int]:
 
 
 def source_of(survey: Survey) -> Source:
-    """What the index says of a scan that was added."""
+    """Return the index entry of a scan that was added."""
     scan = survey.scan
     assert scan is not None
     return Source(
@@ -131,13 +143,16 @@ def source_of(survey: Survey) -> Source:
 
 
 def no_longer_unknown(header: Header, surveys: Sequence[Survey]) -> Header:
-    """The header without the regions of scans that a build left out and that are added now, by their paths."""
+    """Remove the unknown regions of scans that a build skipped and that are added now.
+
+    The scans are matched by path. Return the new header.
+    """
     added = {(os.path.realpath(s.path), s.scan.index) for s in surveys if s.scan is not None}
     files = {path for path, _ in added}
     sources, gone = [], set()
     for source in header.sources:
         path = os.path.realpath(source.path)
-        # A file that could not be opened stands for all scans in it.
+        # The entry of a file that could not be opened stands for all scans in it.
         here = (path, source.index) in added or (not source.format and path in files)
         if source.unknown is not None and here:
             gone.add(source.unknown)
@@ -158,7 +173,10 @@ def no_longer_unknown(header: Header, surveys: Sequence[Survey]) -> Header:
 
 
 def box_of(key: int, spool: Spool) -> NDArray[np.int64]:
-    """The box (2, 3) of a voxel's rows, lattice coordinates. Of a large voxel a few rows are held at a time."""
+    """Return the bounding box (2, 3) of a voxel's rows in lattice coordinates.
+
+    At most about BOX_POINTS rows of a large voxel are in memory at a time.
+    """
     if spool.count(key) <= BOX_POINTS:
         parts: Iterable[NDArray] = spool.rows(key)
     else:

@@ -1,7 +1,7 @@
-"""What a build that goes on believes of the runs it finds: those that are, byte for byte, what was written.
+"""Verification, when a build resumes, that its runs still are byte for byte as written.
 
-A build may go on weeks later, and no pass could tell: a row of a run has no checksum of its own, and what is made of a
-bit that changed is a sound archive of other points.
+A build may resume weeks later, and no later pass would detect corruption: the rows of a run have no
+checksum. A flipped bit in a run would produce a valid archive of different points.
 """
 
 from collections.abc import Mapping
@@ -12,9 +12,10 @@ from .workplace import Workplace
 
 
 def check_runs(place: Workplace, stages: Stages) -> None:
-    """Read each run that a note speaks of, once; forget what is not what was written, and what was made of it.
+    """Read each run named by a journal entry once, before any run is used.
 
-    Asked before any of them is used. One that is missing is left to whoever reads the note (partition.py `RunsHold`).
+    Forget the entries of runs that differ from what was written, and everything that was made from
+    them. A missing run is left to the code that reads the entry (partition.py `RunsHold`).
     """
     noted = {folder: _noted_runs(place, folder) for folder in RUN_FOLDERS}
     total = sum(
@@ -30,15 +31,16 @@ def check_runs(place: Workplace, stages: Stages) -> None:
                     others.append(note)
                 stages.progress.advance(sum(sum(sums[::2]) for sums in runs.values()))
             if others:
-                # First: killed in between, the next build finds the runs as they are, and comes here again.
+                # This must come first: after a kill in between, the next build finds the same runs
+                # and returns here.
                 place.distrust_made_of(folder)
                 for note in others:
                     place.journal.forget(note)
-                return  # what comes after is forgotten
+                return  # the later folders are already forgotten
 
 
 def _noted_runs(place: Workplace, folder: str) -> dict[str, Mapping[str, RunSums]]:
-    """Note -> the runs it speaks of, of all notes in a folder of runs."""
+    """Return the runs that each journal entry of a folder of runs names, by entry."""
     names = sorted(f"{folder}/{path.stem}" for path in (place.folder / folder).glob("*.json"))
     notes = {name: place.journal.recall(name) for name in names}
     return {name: noted["runs"] for name, noted in notes.items() if noted}

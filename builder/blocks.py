@@ -1,7 +1,8 @@
-"""Points of voxels in blocks that memory holds, and what lies around a block, whatever voxels it is in.
+"""Blocks of points that fit in memory, and the points around a block, in whatever voxels they are.
 
-For rules that ask what is near a point, see filter.py. What is near is handed out in pieces: a voxel may have any
-number of points. Positions are int32 lattice steps from a corner of a box around the block.
+The filter rules that examine the neighbourhood of a point use them (filter.py). A voxel may have
+any number of points, so neighbours are delivered in pieces. Positions are int32 lattice steps from
+a corner of a box around the block.
 """
 
 from collections import OrderedDict
@@ -17,17 +18,22 @@ from ..schemas.voxel_grid import KEY_BIAS, voxel_coordinates, voxel_keys
 from .kernels.filter import cell_numbers
 from .spool import Spool
 
-# Points held at a time, of a voxel and of what lies around it: memory, not results, depends on it.
+# Most points in memory at a time, of a voxel and of its surroundings. Memory depends on it; results
+# do not.
 BLOCK_POINTS = 1 << 19
-# Voxels of more are read in cubes of at most so many where only their border is wanted; smaller ones whole, and kept
-# while a unit works its way along, for they are neighbours of the next voxel too.
+# Where only the border of a voxel is needed: a voxel with more points is read in cubes of at most
+# this many. A smaller voxel is read whole and cached while a unit proceeds, because it is a
+# neighbour of the next voxel too.
 BORDER_POINTS = 1 << 17
 
 Box = tuple[NDArray[np.int64], NDArray[np.int64]]
 
 
 class Block(NamedTuple):
-    """Points of one cube of a voxel. low: (3,) int64 lattice, the voxel's.  corner, size: the cube's, in the voxel."""
+    """Points of one cube of a voxel.
+
+    low: (3,) int64 low corner of the voxel [lattice].  corner, size: of the cube, in the voxel.
+    """
 
     key: int
     low: NDArray[np.int64]
@@ -36,13 +42,16 @@ class Block(NamedTuple):
     rows: NDArray
 
     def bounds(self) -> Box:
-        """The least and greatest position (3,) in the lattice."""
+        """Return the least and greatest position (3,) in the lattice."""
         local = self.rows["local"]
         return self.low + local.min(axis=0), self.low + local.max(axis=0)
 
 
 class NearPoints(NamedTuple):
-    """Points near a block. positions: (n, 3) int32 from a base.  scans: (n,) int64.  intensities: (n,) float32."""
+    """Points near a block.
+
+    positions: (n, 3) int32 from a base.  scans: (n,) int64.  intensities: (n,) float32.
+    """
 
     positions: NDArray[np.int32]
     scans: NDArray[np.int64]
@@ -50,7 +59,7 @@ class NearPoints(NamedTuple):
 
     @classmethod
     def of(cls, rows: NDArray, shift: NDArray[np.int64]) -> "NearPoints":
-        """Rows, `shift` (3,) added to their position in the voxel."""
+        """Make points of rows, with `shift` (3,) added to their positions in the voxel."""
         names = rows.dtype.names or ()
         return cls(
             rows["local"] + shift.astype(np.int32),
@@ -59,17 +68,17 @@ class NearPoints(NamedTuple):
         )
 
     def taken(self, which: NDArray) -> "NearPoints":
-        """Some of them."""
+        """Return the selected points."""
         return NearPoints(*(column[which] for column in self))
 
     @classmethod
     def joined(cls, parts: Sequence["NearPoints"]) -> "NearPoints":
-        """All of some."""
+        """Concatenate several sets of points."""
         return cls(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
 
 class BlockReader:
-    """Reads blocks of voxels, and what lies around them; keeps small voxels that it read last."""
+    """Reader of blocks of voxels and of their surroundings; caches the small voxels read last."""
 
     def __init__(self, spool: Spool) -> None:
         self.spool = spool
@@ -78,9 +87,10 @@ class BlockReader:
         self._held = 0
 
     def blocks(self, key: int, box: Box | None = None) -> Iterator[Block]:
-        """A voxel's points in cubes of at most BLOCK_POINTS, in Morton order.
+        """Read a voxel's points in cubes of at most BLOCK_POINTS, in Morton order.
 
-        Of a voxel of which only a box (in the lattice) is wanted, the cubes that it reaches, of at most BORDER_POINTS.
+        box: if given (lattice), read only the cubes that the box overlaps, of at most BORDER_POINTS
+        each.
         """
         most = BLOCK_POINTS if box is None else BORDER_POINTS
         low = voxel_coordinates(np.array([key], np.uint64))[0] * self.spool.lattice.voxel_steps
@@ -101,7 +111,7 @@ class BlockReader:
                 yield Block(key, low, corner, size, rows)
 
     def _whole(self, key: int) -> NDArray:
-        """The rows of a voxel; small ones are kept, all together as many as a block."""
+        """Read all rows of a voxel; cache small voxels, together at most BLOCK_POINTS rows."""
         if key in self._kept:
             self._kept.move_to_end(key)
             return self._kept[key]
@@ -114,9 +124,9 @@ class BlockReader:
         return rows
 
     def around(self, block: Block, box: Box) -> Iterator[NearPoints]:
-        """All points in a box (inclusive, lattice) but those of the block, in pieces, from the box's low corner.
+        """Read all points in a box (inclusive, lattice) except those of the block, in pieces.
 
-        A position's points are in one piece, all of them.
+        Positions are from the box's low corner. All points at one position are in the same piece.
         """
         voxel_steps = self.spool.lattice.voxel_steps
         held: list[NearPoints] = []
@@ -141,7 +151,7 @@ class BlockReader:
 
 
 class Grid(NamedTuple):
-    """Cells of one length over a box: `cell_numbers` with these."""
+    """Uniform grid over a box; holds the arguments of `cell_numbers`."""
 
     edge: int
     across: int
@@ -149,10 +159,10 @@ class Grid(NamedTuple):
 
     @classmethod
     def over(cls, box: Box, edge: int) -> "Grid":
-        """Cells of `edge` over a box (inclusive)."""
+        """Lay a grid of cells of length `edge` over a box (inclusive)."""
         cells = (box[1] - box[0]) // edge + 3
         return cls(edge, int(cells[1]), int(cells[2]))
 
     def cells(self, positions: NDArray[np.int32]) -> NDArray[np.uint64]:
-        """The cell of each position, from the box's low corner."""
+        """Return the cell number of each position; positions are from the box's low corner."""
         return np.asarray(cell_numbers(positions, *self))

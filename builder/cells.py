@@ -1,7 +1,7 @@
-"""The cells of a voxel, or of a part of one: points in canonical order -> each cell's hierarchy and what the top needs.
+"""Hierarchies of the cells of a voxel, or of a part of a voxel.
 
-A part is whole cells, so what is made of it is the same whether the voxel is built at once (octree.py) or part by part
-(dense.py).
+A part consists of whole cells. Its hierarchies are therefore the same whether the voxel is built at
+once (octree.py) or part by part (dense.py).
 """
 
 from typing import NamedTuple
@@ -20,11 +20,14 @@ HIGHEST = (1 << CELL_BITS) - 1
 
 
 class CellTrees(NamedTuple):
-    """The hierarchies of c cells, one after the other, n points and m nodes in all.
+    """Hierarchies of c cells, concatenated, with n points and m nodes in total.
 
-    low: (c, 3) int64 corners [voxel steps].  log2_size: (c,) uint8.  starts: (c + 1,) int64, first point of each cell.
-    rows: (c + 1,) int64, first node of each.  nodes: m rows, cell by cell, level by level.  xyz: (3, n) uint16, points
-    in leaf-node order from their cell's corner.  rank: (n,) int32, which of the points given each is.
+    low: (c, 3) int64 corners [voxel steps].  log2_size: (c,) uint8.
+    starts: (c + 1,) int64, index of the first point of each cell.
+    rows: (c + 1,) int64, index of the first node of each cell.
+    nodes: m rows, cell by cell, level by level.
+    xyz: (3, n) uint16, points in leaf-node order, from their cell's corner.
+    rank: (n,) int32, index of each point among the input points.
     spreads: (c, SPREAD) float64 and extremes: (c, EXTREMES, 3) int32, see kernels/trees.py.
     """
 
@@ -45,7 +48,11 @@ def build_trees(
     log2_size: NDArray[np.uint8],
     config: BuildConfig,
 ) -> CellTrees:
-    """Build the hierarchies of the cells that begin at `starts` (c,) among points (n, 3) [voxel steps], n >= 1."""
+    """Build the hierarchies of cells of points in canonical order.
+
+    points: (n, 3) [voxel steps], n >= 1.  starts: (c,) index of the first point of each cell.
+    log2_size: (c,) log2 of the edge of each cell's cube.
+    """
     n, c = len(points), len(starts)
     size = np.int64(1) << log2_size.astype(np.int64)
     low = points[starts] // size[:, None] * size[:, None]
@@ -71,13 +78,13 @@ def build_trees(
 
 
 def run_indices(starts: NDArray[np.int64], lengths: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The numbers of the runs starts[i] to starts[i] + lengths[i], one behind the other."""
+    """Return the integers of the ranges [starts[i], starts[i] + lengths[i]), concatenated."""
     ends = np.cumsum(lengths)
     return np.repeat(starts - ends + lengths, lengths) + np.arange(int(ends[-1]))
 
 
 def take_cells(trees: CellTrees, order: NDArray[np.int64]) -> CellTrees:
-    """The cells in another order, c of them."""
+    """Return the c cells in another order."""
     points, held = np.diff(trees.starts)[order], np.diff(trees.rows)[order]
     of_nodes = run_indices(trees.rows[order], held)
     xyz, rank = np.empty_like(trees.xyz), np.empty((1, len(trees.rank)), np.int32)
@@ -97,7 +104,10 @@ def take_cells(trees: CellTrees, order: NDArray[np.int64]) -> CellTrees:
 
 
 def block_points(trees: CellTrees, leaf: int) -> NDArray[np.uint16]:
-    """The points (n, 3) from the corners of their leaf nodes' boxes. leaf: most points of a leaf node."""
+    """Return the points (n, 3), relative to the corners of their leaf nodes' boxes.
+
+    leaf: most points of a leaf node.
+    """
     points = np.empty((trees.xyz.shape[1], 3), np.uint16)
     first = trees.rows[1:] - _leaves(trees, leaf)
     leaf_rows(trees.xyz, trees.starts, first, trees.nodes.count, trees.nodes.block_low, points)
@@ -105,12 +115,12 @@ def block_points(trees: CellTrees, leaf: int) -> NDArray[np.uint16]:
 
 
 def _leaves(trees: CellTrees, leaf: int) -> NDArray[np.int64]:
-    """How many leaf nodes each cell has (c,): as few as hold its points (kernels/pack.py)."""
+    """Return how many leaf nodes each cell has (c,): the fewest that hold its points (pack.py)."""
     return np.asarray(-(-np.diff(trees.starts) // leaf))
 
 
 def stored_cells(trees: CellTrees) -> Cells:
-    """The cells as stored."""
+    """Return the cells in their stored form."""
     return Cells(
         trees.low.astype(np.int32),
         trees.log2_size,
@@ -120,17 +130,20 @@ def stored_cells(trees: CellTrees) -> Cells:
 
 
 def take_rows(nodes: Nodes, which: NDArray) -> Nodes:
-    """Some of the nodes."""
+    """Return the selected nodes."""
     return Nodes._make(column[which] for column in nodes)
 
 
 def join_rows(parts: list[Nodes]) -> Nodes:
-    """Nodes, one part behind the other."""
+    """Concatenate nodes."""
     return Nodes._make(map(np.concatenate, zip(*parts, strict=True)))
 
 
 def leaf_runs(trees: CellTrees, leaf: int) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """First point, number of points and sort axis of every leaf node. leaf: most points of one."""
+    """Return the first point, number of points and sort axis of every leaf node.
+
+    leaf: most points of a leaf node.
+    """
     leaves = _leaves(trees, leaf)
     which = run_indices(trees.rows[1:] - leaves, leaves)
     count = trees.nodes.count[which].astype(np.int64)

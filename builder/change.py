@@ -1,8 +1,8 @@
-"""An archive that is being changed: locked, what is made of it in a hidden folder, put in its place in one rename.
+"""Transaction that changes an archive: lock it, build the change in a hidden folder, publish it.
 
-New shards stand beside the old ones under names of their own, and the index that names them replaces the old one: so
-there is never anything but the old archive or the new one. A shard that no index names any more is deleted after, and
-what a killed run left goes with the next one.
+New shards stand beside the old ones under new names, and a new index replaces the old one in one
+rename. At every moment there is therefore either the old archive or the new one. Shards that no
+index names any more are deleted afterwards. The next change deletes what a killed one left behind.
 """
 
 import os
@@ -36,16 +36,19 @@ from .spool import spool_dtype
 from .verify import voxel_faults
 from .workplace import locked
 
-# Points of a unit that reads stored voxels: a few records at a time, whatever the machine.
+# Points of a unit that reads stored voxels: a few records at a time, on every machine.
 UNIT_POINTS = 1 << 21
-# How the advice for a voxel that is too large to be read back ends: nothing is kept of a change.
+# End of the advice for a voxel that is too large to be read back: nothing of a change is kept.
 OTHERWISE = ", or build again with a smaller --voxel; the archive is what it was"
 
 _OURS = re.compile(r"[0-9]{1,9}-[0-9]{1,9}\.h5(\..*\.?tmp|\.tmp)?")
 
 
 class Change:
-    """A change on its way. archive: as it is.  target: its folder.  folder: the hidden one."""
+    """Change in progress. archive: its old state.  target: its folder.
+
+    folder: the hidden folder.
+    """
 
     def __init__(
         self,
@@ -61,37 +64,41 @@ class Change:
         self.dtype = spool_dtype(config)
         self.begin = time.perf_counter()
         self.seconds: dict[str, float] = {}
-        self.published = False  # whether the archive is the new one
+        self.published = False  # the new index has replaced the old one
 
     @property
     def share(self) -> int:
-        """The bytes of data that each job may hold."""
+        """Return the bytes of data that each job may hold."""
         return memory_share(self.executor.jobs, self.config)
 
     @property
     def with_classes(self) -> bool:
-        """Whether points have radius classes."""
+        """Return whether points have radius classes."""
         return self.archive.header.radius_class
 
     @property
     def points(self) -> NDArray[np.int64]:
-        """(v,) the points of each voxel of the archive as it is."""
+        """Return the number of points (v,) of each voxel of the old archive."""
         return self.archive.voxels["rows"][:, 2].astype(np.int64)
 
     @property
     def reads_all(self) -> bool:
-        """Whether in the end every record is read: for the figure of now, or for a preview."""
+        """Return whether the change ends by reading all records, for `radius_now` or a preview."""
         return self.archive.header.radius_model == "mean" or (self.target / PREVIEW_NAME).exists()
 
     def readers(self, counts: NDArray[np.int64]) -> int:
-        """How many jobs may read back voxels of so many points at a time; SolidcloudError where one has no room."""
+        """Return the number of jobs that may read back voxels of `counts` points at a time.
+
+        Raise SolidcloudError if the memory does not suffice for one job.
+        """
         return readers_that_fit(counts, self.executor.jobs, self.config, OTHERWISE)
 
     @contextmanager
     def reading(self, counts: NDArray[np.int64]) -> Iterator[int]:
-        """Meanwhile no more jobs are at work than may read back voxels of so many points.
+        """Limit the jobs at work to the number that may read back voxels of `counts` points.
 
-        Gives the bytes that each may hold beside the record of a voxel. Raises as `readers`.
+        Yield the number of bytes that each may hold beside the record of a voxel. Raise as
+        `readers` does.
         """
         readers = self.readers(counts)
         self.executor.at_once = readers
@@ -102,7 +109,7 @@ class Change:
 
     @contextmanager
     def stage(self, name: str, total: int, unit: str) -> Iterator[None]:
-        """Time a stage, and tell who listens."""
+        """Time a stage and report it to the progress display."""
         begin = time.perf_counter()
         self.progress.start(name, total, unit)
         try:
@@ -112,11 +119,11 @@ class Change:
             self.seconds[name] = time.perf_counter() - begin
 
     def run(self, function: Callable[[Any], Any], units: Sequence[Any]) -> list[Any]:
-        """function(unit) of each unit, which has `points`, in order; progress goes by them."""
+        """Return function(unit) of each unit, in order; progress advances by `unit.points`."""
         return list(self.executor.map(function, units, self.progress, lambda unit: unit.points))
 
     def check_room(self, needed: int) -> None:
-        """Refuse, while nothing is lost by it, to write about so many bytes more than are free."""
+        """Refuse a change that needs more bytes than are free, before anything is written."""
         free = shutil.disk_usage(self.target.parent).free
         if needed > free:
             raise SolidcloudError(
@@ -125,7 +132,10 @@ class Change:
             )
 
     def units_of(self, rows: NDArray[np.int64]) -> list[tuple[tuple[int, ...], int]]:
-        """Rows of the index in runs of about UNIT_POINTS: (rows, points) each."""
+        """Group rows of the index into units of about UNIT_POINTS points.
+
+        Return (rows, points) of each.
+        """
         points = self.points[rows]
         if not len(rows):
             return []
@@ -139,7 +149,10 @@ class Change:
 
 @contextmanager
 def changing(target: Path, jobs: int, memory_bytes: int, progress: Progress | None) -> Iterator[Change]:
-    """An archive locked and opened to be changed, and a hidden folder to do it in, which goes in the end."""
+    """Lock an archive and open it for a change.
+
+    Provide a hidden folder, which is deleted at the end.
+    """
     target = target.resolve()
     if not (target / INDEX_NAME).is_file():
         raise FormatError(
@@ -164,20 +177,23 @@ def changing(target: Path, jobs: int, memory_bytes: int, progress: Progress | No
 
 @contextmanager
 def _machine_errors(change: Change) -> Iterator[None]:
-    """Say what the archive is where the disk or the memory failed, and what to do."""
+    """Turn a disk or memory failure into an error that tells the state of the archive."""
     try:
         yield
     except (MemoryError, OSError) as error:
-        state = "changed all the same" if change.published else "what it was"
+        state = "changed nevertheless" if change.published else "what it was"
         found, advice = str(error), "make room, or check the disk"
         if isinstance(error, MemoryError):
-            found = f"out of memory ({error or 'no more is said'})"
+            found = f"out of memory ({error or 'no details'})"
             advice = "give fewer --jobs or a smaller --memory, or stop other programs"
         raise SolidcloudError(f"{change.target}: {found}: the archive is {state}: {advice}") from error
 
 
 def config_of(header: Header, target: Path, jobs: int, memory_bytes: int) -> BuildConfig:
-    """The options an archive was built with. BadRequestError for those under which a scan cannot be added later."""
+    """Return the options that an archive was built with.
+
+    Raise BadRequestError for options under which no scan can be added later.
+    """
     stored = dict(header.options)
     known = set(BuildConfig().identity()) | {"cells", "models", "normal_reach"}
     if others := sorted(set(stored) - known):
@@ -191,19 +207,19 @@ def config_of(header: Header, target: Path, jobs: int, memory_bytes: int) -> Bui
 
 
 def delete_orphans(target: Path, named: set[str]) -> None:
-    """Delete the shards that an archive's index does not name, and what was being written when a run was killed."""
+    """Delete shards that the index does not name, and temporary files of an interrupted run."""
     for path in (target / SHARD_FOLDER).iterdir():
         if path.name not in named and _OURS.fullmatch(path.name):
             path.unlink()
 
 
 def scan_name(source: Source) -> str:
-    """A scan as messages name it."""
+    """Return the name of a scan in messages."""
     return f"{source.path}[{source.index}]"
 
 
 def show_kept(change: Change, files: list[tuple[str, int]], new: set[str]) -> None:
-    """Show the shards that stay in the hidden folder too, so that it is read as an archive."""
+    """Link the shards that stay into the hidden folder, which makes it readable as an archive."""
     for name, _ in files:
         if name not in new:
             (change.folder / SHARD_FOLDER / name).symlink_to(change.target / SHARD_FOLDER / name)
@@ -211,24 +227,25 @@ def show_kept(change: Change, files: list[tuple[str, int]], new: set[str]) -> No
 
 @contextmanager
 def reading_back(change: Change, new: set[str]) -> Iterator[None]:
-    """Say of an error whether it is of what was written just now, or of what stays; new: names of shards.
+    """Say in a reading error whether the damaged file is new or an unchanged shard.
 
-    An index that cannot be read was written just now.
+    new: names of the new shards. An index that cannot be read is new.
     """
     try:
         yield
     except FormatError as error:
         if isinstance(error, CorruptError) and not {path.name for path in error.paths} & new:
-            # It was read by a link in the hidden folder, which is gone when this is read.
+            # The error names the path through a link in the hidden folder, which no longer exists
+            # when a user reads it.
             raise CorruptError(str(error).replace(str(change.folder), str(change.target))) from error
         raise CorruptError(
-            f"{error}: what was written is not what reads back: check disk and memory, and give the command again; "
-            "the archive is what it was"
+            f"{error}: the data read back differ from the data written: check disk and memory, and give the command "
+            "again; the archive is what it was"
         ) from error
 
 
 class _ReadUnit(NamedTuple):
-    """New voxels to be read back. rows: of the index in `folder`.  points: in them."""
+    """New voxels to read back. rows: of the index in `folder`.  points: their total."""
 
     folder: Path
     rows: tuple[int, ...]
@@ -236,9 +253,11 @@ class _ReadUnit(NamedTuple):
 
 
 def _read_back(unit: _ReadUnit) -> int:
-    """Check voxels as verify.py does, all their columns read; returns the `places_sum` of their points (spool.py).
+    """Check voxels as verify.py does, reading all their columns.
 
-    Raises CorruptError.
+    Return the `places_sum` (spool.py).
+
+    Raise CorruptError if a voxel has a fault.
     """
     places = 0
     with Archive(unit.folder) as archive:
@@ -251,15 +270,16 @@ def _read_back(unit: _ReadUnit) -> int:
                 places += int(sum_places(leaves_of(record), corner, SEEDS[0]))
             if faults:
                 raise CorruptError(faults[0], (archive.shard_path(int(archive.voxels["shard"][row])),))
-            del record  # before the next is read
+            del record  # free it before the next one is read
     return places
 
 
 def verify_new(change: Change, new: set[str], places: int) -> None:
-    """Read back every voxel that was built; those that were not touched stand where they stood.
+    """Read back every voxel that was built; unaffected voxels have not moved.
 
-    places: what the `places_sum` of their points must be (spool.py). Raises CorruptError where records are broken, or
-    sound and of other points: runs have no checksums.
+    places: the `places_sum` that their points must have (spool.py). The sum detects what damaged
+    runs cause, since runs have no checksums. Raise CorruptError if a record is broken, or if the
+    records are valid but hold other points.
     """
     with Archive(change.folder) as archive:
         fresh = np.array([name in new for name, _ in archive.shards()], bool)
@@ -271,17 +291,19 @@ def verify_new(change: Change, new: set[str], places: int) -> None:
         found = sum(change.run(_read_back, units))
     if (found - places) % (1 << 64):
         raise CorruptError(
-            f"{change.target}: the points built anew are not those that were stored and read: what was written is not "
-            "what reads back: check disk and memory, and give the command again; the archive is what it was"
+            f"{change.target}: the points built anew are not those that were stored and read: the data read back "
+            "differ from the data written: check disk and memory, and give the command again; "
+            "the archive is what it was"
         )
 
 
 def publish(change: Change, new: list[str], named: set[str]) -> None:
-    """Give the new shards their place, then the new index its name, and delete what it does not name.
+    """Move the new shards into the archive, replace its index and delete shards it does not name.
 
-    Killed before the index is renamed, the archive is the old one, and the shards it does not name are deleted by the
-    next run; killed after, it is the new one, and so are those that are not named any more. A preview, where there is
-    one, is the old one for that moment, and says so: it names its generation.
+    If the process is killed before the index is renamed, the archive is the old one, and the next
+    run deletes the new shards. If it is killed afterwards, the archive is the new one, and the next
+    run deletes the old shards. A preview, if there is one, is still the old one for a moment; it
+    names its generation.
     """
     shards, preview = change.target / SHARD_FOLDER, change.folder / PREVIEW_NAME
     if (change.target / PREVIEW_NAME).exists():
@@ -294,8 +316,9 @@ def publish(change: Change, new: list[str], named: set[str]) -> None:
         os.replace(change.folder / INDEX_NAME, change.target / INDEX_NAME)
         change.published = True
     except BaseException:
-        # The disk says whether the index was renamed: an interruption is told once the call is done, and a call that
-        # a file server did may still fail. Renamed, it names these shards.
+        # The disk tells whether the index was renamed: an interrupt is raised after the call has
+        # returned, and a call may report failure although a file server has done it. A renamed
+        # index names these shards.
         change.published = not (change.folder / INDEX_NAME).exists()
         if not change.published:
             for name in new:

@@ -1,8 +1,9 @@
-"""The radius class of every point: what the radius models `local` and `border` need to know of its neighbours.
+"""Radius classes of points.
 
-A class is a function of the distinct points within reach of the point and of nothing else: not of voxels, trees, files
-or jobs. So a voxel's are found among its own points and those of the voxels around that lie near enough, as the spool
-has them.
+A class holds what the radius models `local` and `border` need of the neighbours of a point. A class
+is a function of the distinct points within reach of the point and of nothing else: not of voxels,
+trees, files or jobs. The classes of a voxel are therefore computed from its own points and from the
+points of the surrounding voxels that lie near enough, read from the spool.
 """
 
 import math
@@ -21,31 +22,38 @@ from .kernels.neighbours import bound_boxes, box_starts
 from .kernels.octree import voxel_codes
 from .spool import Spool
 
-# Neighbours farther than this do not count [m]: so it is known which voxels have a say.
+# Neighbours farther away than this do not count [m]. The bound determines which voxels must be
+# read.
 REACH = 0.362
-# The local radius is the distance of neighbour number LOCAL_NEIGHBOUR over this.
+# The local radius is the distance of neighbour number LOCAL_NEIGHBOUR divided by this.
 LOCAL_SHARE = 13
-# Bits an axis of a Morton code.
+# Bits per axis of a Morton code.
 CODE_BITS = 21
-# Of all points of a voxel.
+# The Morton codes of all points of a voxel.
 ALL_CODES = range(1 << 63)
-# Points of a voxel around that are read at once.
+# Most points of a surrounding voxel that are read at once.
 READ_POINTS = 1 << 18
-# Points that are not parted to save memory: what lies around fewer is not much less.
+# Sets of at most this many points are not split to save memory: halving them hardly reduces their
+# neighbourhood.
 LEAST_TOGETHER = 64
 
 
 class Classes(NamedTuple):
-    """Radius classes. of_point: (n,) uint8.  few: points that have too few neighbours for a local class."""
+    """Radius classes.
+
+    of_point: (n,) uint8.  few: number of points with too few neighbours for a local class.
+    """
 
     of_point: NDArray[np.uint8]
     few: int
 
 
 class Limits(NamedTuple):
-    """Squared distances [steps]. reach2: up to which a point is a neighbour.
+    """Squared distance limits [steps^2].
 
-    local2: (15,) int64, of neighbour number LOCAL_NEIGHBOUR, up to which each local class but the last goes.
+    reach2: limit up to which a point is a neighbour.
+    local2: (15,) int64, upper limits of all local classes except the last, for the distance of
+    neighbour number LOCAL_NEIGHBOUR.
     """
 
     reach2: int
@@ -53,7 +61,10 @@ class Limits(NamedTuple):
 
 
 def class_limits(step: float) -> Limits:
-    """The limits on a lattice of this step [m], which counts as its decimal text: 10 steps of 0.1 mm are 1 mm."""
+    """Return the limits on a lattice of step `step` [m].
+
+    The step is taken as its decimal text: 10 steps of 0.1 mm are exactly 1 mm.
+    """
     steps_a_metre = 1 / Fraction(repr(step))
     radii = [Fraction(radius, 1_000_000) for radius in LOCAL_RADII[:-1]]
     local2 = [int((LOCAL_SHARE * radius * steps_a_metre) ** 2) for radius in radii]
@@ -68,13 +79,16 @@ def voxel_classes(
     most_near: int,
     codes: range = ALL_CODES,
 ) -> Classes:
-    """The class of each point of a voxel, local (n, 3) [voxel steps], n >= 1; equal points have the same.
+    """Compute the class of each point of a voxel; equal points have the same class.
 
-    most_near: points around those that are asked which may be held, as long as asking fewer helps.  codes: of a voxel
-    that is built in parts, the Morton codes of the part that is asked; `local` are all points that have them.
+    local: (n, 3) [voxel steps], n >= 1.
+    most_near: most points around the queried points that may be in memory, as long as a smaller
+    query helps.
+    codes: for a voxel that is built in parts, the Morton codes of the queried part; `local` holds
+    all points with these codes.
     """
     _, first, back = np.unique(voxel_codes(local), return_index=True, return_inverse=True)
-    own = local[first]  # in Morton order: a part of them is a part of space
+    own = local[first]  # in Morton order: a contiguous range is a region of space
     limits = class_limits(spool.lattice.step)
     reach = math.isqrt(limits.reach2)
     found = np.empty(len(own), np.uint8)
@@ -97,9 +111,9 @@ def voxel_classes(
 def _points_near(
     around: Iterable[NDArray[np.int32]], box: NDArray[np.int64], most: int | None
 ) -> NDArray[np.int32] | None:
-    """The points (m, 3) of several sets that lie in a box (2, 3); None: too many.
+    """Return the points (m, 3) of several sets that lie in a box (2, 3); None if too many do.
 
-    most: how many are too many; None: any number is held.
+    most: largest number returned; None: no limit.
     """
     held = 0
     found: list[NDArray[np.int32]] = []
@@ -113,14 +127,15 @@ def _points_near(
 
 
 def _inside(points: NDArray[np.int32], box: NDArray[np.int64]) -> NDArray[np.int32]:
-    """Those of the points (n, 3) that lie in a box (2, 3), corners inclusive."""
+    """Return the points (n, 3) that lie in a box (2, 3), corners inclusive."""
     return points[((points >= box[0]) & (points <= box[1])).all(axis=1)]
 
 
 def _around(key: int, box: NDArray[np.int64], spool: Spool, codes: range) -> Iterator[NDArray[np.int32]]:
-    """The distinct points in a box, frame and box the voxel's, of all voxels; of this one those of no code in `codes`.
+    """Yield the distinct points of all voxels in a box.
 
-    Several sets (m, 3), with no point in two of them.
+    Points of this voxel with codes in `codes` are left out. Points and box are in the frame of the
+    voxel `key`. Yields disjoint sets (m, 3).
     """
     steps = spool.lattice.voxel_steps
     home = voxel_coordinates(np.array([key], np.uint64))[0]
@@ -131,7 +146,7 @@ def _around(key: int, box: NDArray[np.int64], spool: Spool, codes: range) -> Ite
         keys = voxel_keys(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3))
         at = np.minimum(np.searchsorted(spool.keys, keys), len(spool.keys) - 1)
         keys = keys[spool.keys[at] == keys]
-    else:  # voxels so small that there are fewer of them than places for them
+    else:  # small voxels: fewer voxels exist than fit in the box
         voxels = voxel_coordinates(spool.keys)
         keys = spool.keys[((voxels >= low) & (voxels <= high)).all(axis=1)]
     for other in keys.tolist():
@@ -146,10 +161,12 @@ def _around(key: int, box: NDArray[np.int64], spool: Spool, codes: range) -> Ite
 
 
 def _points_in(key: int, box: NDArray[np.int64], spool: Spool, without: range) -> Iterator[NDArray[np.int32]]:
-    """The points of a voxel in a box, frame and box the voxel's, (m, 3) of one cube of its octree after the other.
+    """Yield the points of a voxel in a box, as one set (m, 3) for each cube of its octree.
 
-    Read are cubes of at most READ_POINTS; of a lattice position of more one point is given, and none is read: distinct
-    ones are wanted. Cubes whose codes are all in `without` are left out; points of these codes may be among others.
+    Points and box are in the voxel's frame. Cubes of at most READ_POINTS points are read. A lattice
+    position with more points yields one point without reading any, because only distinct points are
+    needed. Cubes whose codes all lie in `without` are skipped; other cubes may still yield points
+    with these codes.
     """
     root = int(spool.lattice.voxel_steps - 1).bit_length()
     waiting = [(0, root, np.zeros(3, np.int64))]
@@ -180,10 +197,14 @@ def _points_in(key: int, box: NDArray[np.int64], spool: Spool, without: range) -
 
 
 def _classify(asked: NDArray[np.int32], near: NDArray[np.int32], limits: Limits) -> NDArray[np.uint8]:
-    """The classes (q,) of points (q, 3), among themselves and those near (m, 3), all distinct, FEW among the bits."""
+    """Compute the classes (q,) of points, with the FEW bit, from each other and from points nearby.
+
+    asked: (q, 3).  near: (m, 3).  All points are distinct.
+    """
     points = np.concatenate([asked, near])
     points -= points.min(axis=0)
-    # A voxel and what is around it may take more bits than a code has; only neighbours are wanted in order.
+    # A voxel with its surroundings may need more bits than a code has. The order only has to keep
+    # neighbours close.
     shift = max(0, int(points.max()).bit_length() - CODE_BITS)
     order = np.argsort(voxel_codes(points >> shift), kind="stable")
     points = points[order]

@@ -1,8 +1,11 @@
-"""Runs pure work units on a dask cluster: one that is there, or one started here. The only user of distributed.
+"""Execution of pure work units on a dask cluster, existing or started here.
 
-Who runs what, what happens when a worker dies, and how often a unit is tried again is dask's: a unit is pure, and
-written under a temporary name of its own, so that one which was killed half-way, or runs twice, changes nothing.
-Results come in the order of the units, as from `executor.py`.
+The only user of distributed.
+
+dask decides which worker runs a unit, what happens when a worker dies, and how often a unit is
+retried. A unit is pure and writes under its own temporary name. A unit that is killed half-way or
+that runs twice therefore changes nothing. Results come in the order of the units, as from
+`executor.py`.
 """
 
 import asyncio
@@ -46,12 +49,14 @@ except ModuleNotFoundError as missing:
 
 Answer = TypeVar("Answer")
 
-# For a scheduler to answer, and to show its first worker.
+# Time limit for a scheduler to answer and to show its first worker.
 REACH_SECONDS = 10
-# A cluster without any worker for so long is given up: a batch system may take a while to start others in their place,
-# dask a second. One that is killed while it starts dask does not always start anew.
+# A cluster without any worker for this long is given up. A batch system may take a while to replace
+# workers; dask takes a second. A worker that is killed while it starts dask is not always
+# restarted.
 LONELY_SECONDS, LONELY_LOCAL_SECONDS = 300, 60
-# How often it is looked whether there is any worker while a unit is waited for, and whether the builder is interrupted.
+# How often a wait for a unit checks whether any worker exists and whether the builder is
+# interrupted.
 LOOK_SECONDS = 5.0
 
 LOCAL = "local:"
@@ -59,7 +64,10 @@ _START_WORKERS = "start its workers as `dask worker tcp://HOST:PORT --nthreads 1
 
 
 def local_workers(address: str) -> int | None:
-    """N of "local:N", None of "tcp://HOST:PORT"; BadRequestError for anything else."""
+    """Return N of "local:N" and None of "tcp://HOST:PORT".
+
+    Raise BadRequestError for anything else.
+    """
     if address.startswith(LOCAL):
         number = address.removeprefix(LOCAL)
         if number.isascii() and number.isdigit() and int(number):
@@ -74,14 +82,19 @@ def local_workers(address: str) -> int | None:
 
 
 def _run_unit(work: bytes, expected: dict[str, str], folder: str) -> Any:
-    """Run one unit, pickled with its function, in a worker, which may have joined since the others were looked at."""
+    """Run one unit, pickled with its function, in a worker.
+
+    The worker may have joined after the initial check of the workers. It is therefore checked here
+    too.
+    """
     worker = get_worker()
     try:
         _check_worker(worker.address, software(), expected, worker.state.nthreads)
     except BadRequestError as error:
-        raise SolidcloudError(str(error)) from None  # what was asked for was possible when the build began
+        raise SolidcloudError(str(error)) from None  # not the request: the build could begin as requested
     try:
-        # Relative paths mean what they mean to the builder. A worker runs one unit at a time, so nobody else is moved.
+        # Relative paths must mean the same as in the builder. A worker runs one unit at a time, so
+        # no other unit is affected.
         if os.getcwd() != folder:
             os.chdir(folder)
     except OSError as error:
@@ -94,12 +107,15 @@ def _run_unit(work: bytes, expected: dict[str, str], folder: str) -> Any:
 
 
 def _look(dask_worker: Worker) -> tuple[dict[str, str], int]:
-    """What a worker runs, and how many units at a time; asked of each before any work is handed out."""
+    """Return the software and the number of threads of a worker.
+
+    Called before work is handed out.
+    """
     return software(), dask_worker.state.nthreads
 
 
 def _check_worker(address: str, found: dict[str, str], expected: dict[str, str], threads: int) -> None:
-    """Refuse a worker whose bytes could be others, or that would run units side by side in one process."""
+    """Refuse a worker that has several threads, or other software, which may write other bytes."""
     for name, version in expected.items():
         if found.get(name) != version:
             raise BadRequestError(
@@ -113,9 +129,12 @@ def _check_worker(address: str, found: dict[str, str], expected: dict[str, str],
 
 
 class ClusterExecutor:
-    """Maps a picklable function over work units on dask workers. A context manager, like `executor.Executor`.
+    """Map a picklable function over work units on dask workers.
 
-    jobs: workers, as they were when this was made; others may come and go.  at_once: see `Executor`.
+    A context manager, like `executor.Executor`.
+
+    jobs: number of workers at construction; workers may come and go later.  at_once: see
+    `Executor`.
     """
 
     def __init__(
@@ -123,9 +142,11 @@ class ClusterExecutor:
     ) -> None:
         """Reach the scheduler at `address`, or start N workers here for "local:N".
 
-        memory_bytes: what N workers may hold together; those of a scheduler have limits of their own.  say: told the
-        dashboard's address; standard error where left out.  Raises BadRequestError for a scheduler that is not there
-        and for workers that are not as the builder is, naming them.
+        memory_bytes: memory of the N workers together; the workers of a scheduler have their own
+        limits.
+        say: receives the dashboard's address; standard error by default.
+        Raise BadRequestError if the scheduler cannot be reached, or if a worker's software or
+        number of threads differs from what the builder requires; the error names the worker.
         """
         number = local_workers(address)
         self._say = say or _say
@@ -147,10 +168,10 @@ class ClusterExecutor:
             raise
 
     def _check_workers(self, number: int | None) -> int:
-        """Wait for the workers and look at each; returns how many there are."""
+        """Wait for the workers and check each; return their number."""
         address = self._address
         try:
-            # Those started here load Python first: on a busy machine that takes a while.
+            # Workers started here first load Python, which takes a while on a busy machine.
             self._client.wait_for_workers(number or 1, REACH_SECONDS if number is None else 60)
         except TimeoutError:
             raise BadRequestError(
@@ -164,23 +185,29 @@ class ClusterExecutor:
             ) from None
         for worker, (found, threads) in looks.items():
             _check_worker(worker, found, software(), threads)
-        return max(1, len(looks))  # those that were seen may be gone
+        return max(1, len(looks))  # workers seen before may be gone
 
     def _say_dashboard(self) -> None:
-        """Where to watch the cluster; one started here has nothing to show without bokeh."""
+        """Report the dashboard's address.
+
+        Without bokeh, a cluster started here has no dashboard.
+        """
         if self._cluster is not None and importlib.util.find_spec("bokeh") is None:
             self._say(
-                f"cluster: {self.jobs} workers; no dashboard, for bokeh is not installed: pip install bokeh"
+                f"cluster: {self.jobs} workers; no dashboard, because bokeh is not installed: pip install bokeh"
             )
         else:
             self._say(f"cluster: {self.jobs} workers; dashboard {self._client.dashboard_link}")
 
     def __enter__(self) -> "ClusterExecutor":
-        """The executor itself."""
+        """Return the executor itself."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Take back what waits, and stop what was started here. What others' workers run just now runs to its end."""
+        """Cancel the waiting units and stop what was started here.
+
+        Units that workers of an external scheduler are running continue to their end.
+        """
         self._close()
 
     def _close(self) -> None:
@@ -191,7 +218,7 @@ class ClusterExecutor:
             self._cluster.close()
 
     def _take_back(self) -> None:
-        """Cancel whatever was handed out and not taken."""
+        """Cancel all units whose results have not been fetched."""
         if self._given and self._client.status == "running":
             self._client.cancel(list(self._given), force=True)
         self._given.clear()
@@ -203,9 +230,9 @@ class ClusterExecutor:
         progress: Progress,
         size: Callable[[Unit], int],
     ) -> Iterator[Result]:
-        """See `Executor`, and `results_in_order` in executor.py; what waits is cancelled in the end, however that is.
+        """Yield the results as `Executor.map` does; cancel waiting units at the end.
 
-        SolidcloudError where the cluster is lost, or a unit's worker died each time it was tried.
+        Raise SolidcloudError if the cluster is lost, or if a unit's worker died at every attempt.
         """
         try:
             yield from results_in_order(self, function, units, progress, size)
@@ -213,34 +240,41 @@ class ClusterExecutor:
             self._take_back()
 
     def hand_out(self, function: Callable[[Unit], Result], unit: Unit) -> Future:
-        """See `Hands`. Not `pure` in dask's sense: the same unit asked for again is to be done again."""
-        work = pickle.dumps((function, unit))  # dask would look into a unit for tasks, through all its keys
+        """Submit a unit, as `Hands` describes.
+
+        Not `pure` in dask's sense: an equal unit must run again.
+        """
+        # dask would search an unpickled unit for tasks, through all its keys.
+        work = pickle.dumps((function, unit))
         future = self._client.submit(_run_unit, work, software(), os.getcwd(), pure=False, key=_key(function))
         self._given.add(future)
         return future
 
     def done(self, tickets: Sequence[Future]) -> Iterable[Future]:
-        """See `Hands`."""
+        """Wait until units are done, as `Hands` describes."""
         with self._client.as_current():
             return self._patiently(
                 lambda: wait(list(tickets), timeout=ASK_SECONDS, return_when="FIRST_COMPLETED").done
             )
 
     def result(self, ticket: Future) -> Any:
-        """See `Hands`."""
+        """Return the result of a unit, as `Hands` describes."""
         try:
-            # A worker that dies before its result is fetched has it made again.
+            # If a worker dies before its result is fetched, dask runs the unit again.
             result = self._patiently(lambda: ticket.result(timeout=ASK_SECONDS), ticket)
         except KilledWorker as error:
             raise SolidcloudError(
-                f"a unit's worker died {error.allowed_failures + 1} times, at last {error.last_worker.address}: "
+                f"a unit's worker died {error.allowed_failures + 1} times, last {error.last_worker.address}: "
                 "out of memory? give a larger --memory or fewer workers, or look at its log"
             ) from None
         self._given.discard(ticket)  # the worker forgets the result with the last reference
         return result
 
     def _patiently(self, ask: Callable[[], Answer], future: Future | None = None) -> Answer:
-        """Ask again for as long as there is anybody to give an answer. future: what is asked, where it may raise."""
+        """Retry `ask` after each timeout for as long as the cluster has workers.
+
+        future: the awaited future, if its function may itself raise TimeoutError.
+        """
         alone_since: float | None = None
         looked = time.monotonic()
         while True:
@@ -248,13 +282,14 @@ class ClusterExecutor:
             try:
                 return ask()
             except (FutureCancelledError, FuturesCancelledError):
-                check()  # its processes may have had the signal too
+                check()  # the cluster's processes may have received the signal too
                 raise SolidcloudError(
                     f"{self._address}: the scheduler was lost, expected it to last as long as the build: start it, "
-                    "then the same command again goes on where it was"
+                    "then give the same command again to resume"
                 ) from None
             except TimeoutError:
-                # Of waiting; or of the function itself, which then has been heard.
+                # Either the wait timed out, or the function itself raised TimeoutError and the
+                # future is done.
                 if future is not None and future.status == "error":
                     raise
             if time.monotonic() - looked < LOOK_SECONDS:
@@ -267,45 +302,52 @@ class ClusterExecutor:
             patience = LONELY_SECONDS if self._cluster is None else LONELY_LOCAL_SECONDS
             if time.monotonic() - alone_since > patience:
                 raise SolidcloudError(
-                    f"{self._address}: no worker left for {patience} s: start some, then the same command again goes "
-                    "on where it was"
+                    f"{self._address}: no worker left for {patience} s: start some, then give the same command again "
+                    "to resume"
                 )
 
 
 def _key(function: Callable[..., object]) -> str:
-    """A name nobody else has; the dashboard groups by what stands before the dash."""
+    """Return a unique key for a unit; the dashboard groups units by the part before the dash."""
     inner = function.func if isinstance(function, functools.partial) else function
     return f"{getattr(inner, '__name__', 'unit')}-{os.urandom(16).hex()}"
 
 
 def _say(text: str) -> None:
-    """Where nobody else listens. The stream is asked for each time: bars on a terminal put their own in its place."""
+    """Print to standard error.
+
+    The stream is looked up each time, because progress bars on a terminal replace it by their own.
+    """
     print(text, file=sys.stderr, flush=True)
 
 
 class _Watch(SchedulerPlugin):
-    """Says of a worker started here that it died: dask starts another and runs the units again, and is silent then."""
+    """Plugin that reports the death of a worker started here.
+
+    dask itself starts another worker and runs the units again without a message.
+    """
 
     def __init__(self, say: Callable[[str], None]) -> None:
         self.say = say
         self.closing = False
 
     def remove_worker(self, scheduler: Scheduler, worker: str, *, stimulus_id: str, **_: object) -> None:
-        """Called by the scheduler, in its thread."""
+        """Report a removed worker; the scheduler calls this in its own thread."""
         if not self.closing:
             self.say(f"cluster: worker {worker} died; its units are run again")
 
 
 def dask_setup(_: Worker) -> None:
-    """Leave Ctrl-C to the builder, as in `executor.py`; dask calls this in each worker started here."""
+    """Ignore SIGINT in a worker; dask calls this in each worker started here."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _start_local(number: int, memory_bytes: int, watch: _Watch) -> LocalCluster:
-    """A scheduler in this process and `number` workers of one thread, all on the loopback interface alone."""
+    """Start a scheduler in this process and `number` single-threaded workers on the loopback."""
     settings = dask.config.set(
         {
-            # Results are small. A worker that is over its limit is killed; paused, it would wait for ever.
+            # Results are small. A worker over its limit is killed; a paused worker would wait
+            # forever.
             "distributed.worker.memory.target": False,
             "distributed.worker.memory.spill": False,
             "distributed.worker.memory.pause": False,
@@ -322,19 +364,20 @@ def _start_local(number: int, memory_bytes: int, watch: _Watch) -> LocalCluster:
             memory_limit=cluster_worker_limit(number, memory_bytes),
             preload=[__name__],
             scheduler_kwargs={"plugins": [watch]},
-            # A unit that fails is reported here, by one line; dask would show its call stack besides.
+            # The builder reports a failed unit in one line; dask would also print its call stack.
             silence_logs=logging.CRITICAL,
         )
 
 
 def _reach(address: str) -> Client:
-    """A client of the scheduler at `address`."""
+    """Connect a client to the scheduler at `address`."""
 
     async def knock() -> None:
         (await connect(address, timeout=REACH_SECONDS)).abort()
 
     try:
-        # A Client that reached nobody takes 20 s more to be thrown away.
+        # A Client that cannot reach a scheduler takes 20 s more to be discarded. Try a bare
+        # connection first.
         asyncio.run(knock())
         return Client(address, timeout=REACH_SECONDS, set_as_default=False)
     except (OSError, ValueError) as error:

@@ -241,7 +241,7 @@ def _read_back(folder: Path, points: int, spool: Spool, executor: Executor, stag
         fault, paths = str(error), (*sorted((folder / SHARD_FOLDER).iterdir()), spool.folder)
     if fault:
         raise CorruptError(
-            f"{fault}: what was written is not what reads back: check disk and memory; the same command makes anew "
+            f"{fault}: the data read back differ from the data written: check disk and memory; the same command makes anew "
             "what is damaged",
             paths,
         )

@@ -49,7 +49,7 @@ def test_scans_are_added_and_removed(hall: Path, capsys: pytest.CaptureFixture[s
     found = told(["add", str(hall), chair], capsys)
     assert (found["generation"], found["points_before"], found["points"]) == (1, 402, 602)
     assert run(["add", str(hall), chair]) == 2
-    assert "is in already" in capsys.readouterr().err
+    assert "is already in the archive" in capsys.readouterr().err
     assert run(["add", str(hall), chair, "--again"]) == 0
     assert "802, were 602" in capsys.readouterr().out
     info = told(["info", str(hall)], capsys)

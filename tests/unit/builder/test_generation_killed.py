@@ -170,7 +170,7 @@ def test_an_error_told_once_the_index_is_renamed_leaves_the_new_archive(
         if Path(to) == target / INDEX_NAME:
             raise error
 
-    told = "Input/output.*: the archive is changed all the same" if isinstance(error, OSError) else None
+    told = "Input/output.*: the archive is changed nevertheless" if isinstance(error, OSError) else None
     with monkeypatch.context() as patch:
         patch.setattr(os, "replace", renamed_and_broken)
         expected = SolidcloudError if told else KeyboardInterrupt

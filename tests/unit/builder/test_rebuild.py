@@ -16,7 +16,7 @@ from solidcloud.schemas.archive import Archive
 from solidcloud.schemas.errors import CorruptError
 from solidcloud.schemas.shard import SHARD_FOLDER
 
-ADVICE = "what was written is not what reads back: check disk and memory.*the archive is what it was"
+ADVICE = "the data read back differ from the data written: check disk and memory.*the archive is what it was"
 OTHERS = f"the points built anew are not those that were stored and read: {ADVICE}"
 # The bits of a coordinate: the least moves a point in its voxel, a high one out of it.
 BITS = [(0, OTHERS), (20, rf"(shards/1-000000|index)\.h5: .*voxel .*: {ADVICE}")]

@@ -32,7 +32,6 @@ from .proof import Bounds
 from .rays import raycast
 from .request import SceneData, check_request, make_scene_data, with_radius_model
 from .residency import Residency
-from .session import Walker
 from .store import Store
 from .sweep import sweep
 from .threads import start_thread
@@ -198,8 +197,6 @@ class Opened:
         both = np.full(2, 0xFFFFFFFF, np.uint32)
         # Budgets that are hardly ever spent: what is bounded has kernels of its own, and so have deadlines.
         later = time.perf_counter() + 3600.0
-        for poses in (pose, np.concatenate([pose, pose])):
-            Walker(self.taken, avatar).collide(poses)
         if data.coarse is not None:  # of the voxel that was just loaded, as if it were not
             reach = check_request(data, avatar, pose, data.radius_units)
             nowhere = data.arrays._replace(where=np.full_like(data.arrays.where, -1))

@@ -44,7 +44,6 @@ from .path_threads import PathThreads
 from .rays import raycast
 from .request import SceneData, with_stop
 from .residency import Residency
-from .session import Walker
 from .simulated import Simulated
 from .stop import NEVER, Stop
 from .stopped_answers import ask_until_stopped
@@ -303,12 +302,6 @@ class Scene(Simulated):
         scene was opened.
         """
         return self._ask(collide, name, client, poses, (poses, margin), margin, options)
-
-    def walker(
-        self, name: str, margin: float = 0.0, *, radius_model: str | None = None, client: str = ""
-    ) -> Walker:
-        """A session of avatar `name`: its `collide` remembers the last pose; see server/session.py."""
-        return Walker(self.take, self.avatar(name, client), margin, radius_model, (client, name))
 
     def distance(
         self,

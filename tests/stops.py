@@ -16,7 +16,6 @@ from solidcloud.server.near import near
 from solidcloud.server.objects import objects
 from solidcloud.server.rays import raycast
 from solidcloud.server.request import SceneData, with_stop
-from solidcloud.server.session import Walker
 from solidcloud.server.stopped_answers import ask_until_stopped
 from solidcloud.server.sweep import sweep
 from solidcloud.server.within import within
@@ -34,22 +33,6 @@ class Asked(NamedTuple):
     poses: NDArray[np.float64]
     margin: float = 0.0
     reach: float = 0.5
-
-
-class _Always:
-    """An archive that a walker takes."""
-
-    def __init__(self, data: SceneData) -> None:
-        self.number, self._data = 0, data
-
-    def __enter__(self) -> "_Always":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        pass
-
-    def radius_model(self, _: str | None) -> SceneData:
-        return self._data
 
 
 def _ask(question: Any, k: int, a: Asked, effort: Effort, *what: Any) -> Any:
@@ -80,17 +63,11 @@ def _places(a: Asked) -> NDArray[np.float64]:
     return np.ascontiguousarray(a.poses[:, :3, 3])
 
 
-def _walk(a: Asked, effort: Effort) -> Any:
-    walker = Walker(lambda: _Always(a.data), a.avatar, a.margin)  # type: ignore[arg-type,return-value]
-    return walker.collide(a.poses, effort.stop)
-
-
 QUESTIONS: dict[str, Callable[[Asked, Effort], Any]] = {
     "collide": _collide,
     "collide of one pose": lambda a, e: _collide(a._replace(poses=a.poses[:1]), e),
     "collide bounded": lambda a, e: _collide(a, e, visits=PLENTY),
     "collide timed": lambda a, e: _collide(a, e, deadline=1e18),
-    "walk": _walk,
     "distance": _distance,
     "distance of one pose": _near,
     "distance bounded": lambda a, e: _distance(a, e, visits=PLENTY),

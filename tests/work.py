@@ -76,15 +76,6 @@ def poses() -> NDArray[np.float64]:
     return np.array([cases.pose_of(turned(*q, s), np.array(at)) for *q, at, s in places])
 
 
-def walk() -> NDArray[np.float64]:
-    """Poses (k, 4, 4) a few millimetres from each other, above the floor into the wall, and one far step."""
-    found = [
-        cases.pose_of(turned(40, 0, 0, i), np.array([0.6 - i * 0.015625, 0.8 + i * 0.0078125, 0.40625 - 0.0078125 * i]))
-        for i in range(14)
-    ]  # fmt: skip
-    return np.array([*found, cases.pose_of(turned(1, 0, 0, 1), np.array([1.5, 1.5, 1.0])), found[3]])
-
-
 def motions() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """First and last poses (k, 4, 4): onto the floor, along it, through the wall, past it, standing still, turning."""
     pairs = [
@@ -165,13 +156,6 @@ AVATARS = {"small": (shell(20, 0.25), 0.02), "large": (shell(200, 0.25), 0.01)}
 DEEP = (shell(300, 0.3), 0.01)
 
 
-def walked(scene: Scene, options: Options, name: str, margin: float) -> list[Any]:
-    """A walker's answers, pose by pose; and once more three in one request."""
-    walker = scene.walker(name, margin, **options)
-    found = [walker.collide(pose[None]) for pose in walk()]
-    return [*found, walker.collide(walk()[2:5])]
-
-
 def about_objects(scene: Scene, options: Options) -> list[Any]:
     """Objects against one another and the scene."""
     places, names = poses()[:7], ["small", "large", "small", "small", "large", "small", "large"]
@@ -202,7 +186,6 @@ QUESTIONS: dict[str, Callable[[Scene, Options], list[Any]]] = {
         s.distance("deep", poses()[:6], 1.0, tolerance=0.001, budget_visits=400, **o),
     ],
     "contacts deep": lambda s, o: [s.contacts("deep", poses()[:7], 20, m, **o) for m in (0.0, 0.03)],
-    "walker": lambda s, o: [*walked(s, o, "small", 0.1), *walked(s, o, "large", 0.09)],
     "distance": lambda s, o: [s.distance(a, poses(), r, **o) for a in AVATARS for r in (0.1, 3.0)],
     "distance bounded": lambda s, o: [
         s.distance("small", poses(), 3.0, budget_ms=0.0, **o),

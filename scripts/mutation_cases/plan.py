@@ -161,7 +161,6 @@ TESTS: dict[str, tuple[str, ...]] = {
     ),
     "server/kernels/moments.py": (*work("sweep", "sweep bounded"), *SWEEPS),
     "server/kernels/moving.py": (SERVER + "test_moving.py", *work("sweep", "sweep bounded")),
-    "server/kernels/memory.py": work("walker"),
     "server/kernels/by_scan.py": (SERVER + "test_by_scan.py",),
     "server/kernels/nearest.py": work("distance", "distance deep"),
     "server/kernels/nearest_resident.py": (
@@ -182,7 +181,6 @@ TESTS: dict[str, tuple[str, ...]] = {
     "server/kernels/rays.py": work("raycast", "raycast bounded"),
     "server/kernels/sweep.py": work("sweep", "sweep bounded"),
     "server/kernels/voxel_tree.py": (SERVER + "test_voxel_tree.py",),
-    "server/kernels/walking.py": (*work("walker"), *tangent("walker")),
     "server/kernels/walks.py": (SERVER + "test_neighbourhood.py",),
     "server/kernels/within.py": (*work("within", "within bounded"), SERVER + "test_within_exact.py"),
     "server/kernels/clusters.py": (

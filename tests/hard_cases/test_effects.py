@@ -194,7 +194,7 @@ def test_case_31_what_is_not_declared_is_not_imported(tmp_path: Path) -> None:
 
 @pytest.mark.case(
     31,
-    "beside other avatars, walkers and questions, and every effect, collide replies the same bytes at the same cost",
+    "beside other avatars and questions, and every effect, collide replies the same bytes at the same cost",
 )
 @pytest.mark.interpreted
 def test_case_31_what_else_a_scene_holds_costs_a_question_nothing(
@@ -210,7 +210,7 @@ def test_case_31_what_else_a_scene_holds_costs_a_question_nothing(
             if beside == "others":
                 for name in ("other", "third"):
                     scene.add_avatar(name, other, 0.02, client="c")
-                scene.walker("other", client="c").collide(poses)
+                scene.collide("other", poses, client="c")
                 scene.contacts("third", poses, 5, client="c")
                 scene.objects([("other", pose) for pose in poses], client="c")
                 scene.raycast(poses[:, :3, 3], poses[:, :3, 0], 1.0)

@@ -54,7 +54,6 @@ def questions(scene: Scene, shift: NDArray[np.float64], seed: int) -> dict[str, 
     return {
         "collide": scene.collide("body", poses),
         "collide within a tolerance": scene.collide("body", poses, 0.002, tolerance=1e-3, budget_visits=200),
-        "walker": scene.walker("body").collide(poses),
         "distance": scene.distance("body", poses, 0.1),
         "contacts": scene.contacts("box", poses, 20, 0.02, 0.05),
         "sweep": scene.sweep("body", poses[:count], ends),

@@ -78,27 +78,6 @@ def test_contact_begins_where_the_definition_says(
             assert together.tolist() == alone
 
 
-@pytest.mark.parametrize("model", [*classes.MODELS, "local", "border:0"])
-def test_a_walker_says_what_collide_does(tmp_path: Path, rng: np.random.Generator, model: str | None) -> None:
-    points = cloud(rng, "plane", 4000) * [1, 1, 1e-3]
-    avatar = cloud(rng, "sphere", 300) * 0.1
-    with classes.any_classes():
-        case = cases.build(tmp_path, points, models=classes.STORED, leaf=7)
-    poses = np.tile(np.eye(4), (400, 1, 1))
-    along = np.linspace(0, 1, 400)
-    poses[:, :3, 3] = np.column_stack([along - 0.5, 0.3 * np.sin(7 * along), 0.25 * np.cos(9 * along)])
-    with Scene.open(case.archive) as scene:
-        scene.add_avatar("avatar", avatar, 0.002)
-        right = scene.collide("avatar", poses, radius_model=model).verdict
-        for rate in (1, 30):
-            walker = scene.walker("avatar", radius_model=model)
-            found = np.concatenate(
-                [walker.collide(poses[i : i + rate]).verdict for i in range(0, len(poses), rate)]
-            )
-            assert found.tolist() == right.tolist()
-        assert 0 < right.sum() < len(right)
-
-
 @pytest.mark.interpreted
 def test_a_model_the_archive_does_not_hold_is_refused(tmp_path: Path) -> None:
     case = cases.build(tmp_path, np.zeros((1, 3)), models=frozenset({"mean", "local"}))

@@ -89,12 +89,6 @@ def poses_at(places: np.ndarray) -> np.ndarray:
     return poses
 
 
-def walked(scene: Scene, at: np.ndarray) -> Any:
-    """The answers of a walker that has come from where it is clear."""
-    walker = scene.walker("ball")
-    return [walker.collide(poses_at(at + away)) for away in (1e3, 0.0)][1]
-
-
 def probed(scene: Scene, at: np.ndarray, question: str) -> Any:
     """What a frame of a simulation asks about one avatar, pose by pose."""
     probe, data = Probe(scene.avatar("ball", "")), scene._data
@@ -116,7 +110,6 @@ QUESTIONS: dict[str, OneQuestion] = {
     "collide": lambda s, at: s.collide("ball", poses_at(at)),
     "collide in the dark": lambda s, at: s.collide("ball", poses_at(at), budget_ms=0.0),
     "collide bounded": lambda s, at: s.collide("ball", poses_at(at), budget_visits=1 << 30),
-    "walker": walked,
     "distance": lambda s, at: s.distance("ball", poses_at(at), RADIUS),
     "distance far": lambda s, at: s.distance("ball", poses_at(at), 0.1),
     "distance bounded": lambda s, at: s.distance("ball", poses_at(at), RADIUS, budget_visits=1 << 30),

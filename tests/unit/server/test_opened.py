@@ -82,20 +82,6 @@ def test_every_question_is_asked_of_the_new_one(place: Path, replace: Replace) -
         assert scene.collide("al", AT_ALONE, radius_model="fixed:0.01").verdict.tolist() == [1]
 
 
-def test_a_walker_goes_on_and_forgets(place: Path, replace: Replace) -> None:
-    with Scene.open(place) as scene:
-        scene.add_avatar("al", BODY, 0.01)
-        walker = scene.walker("al")
-        for _ in range(3):
-            assert walker.collide(AT_ALONE).verdict.tolist() == [0]
-        replace(1)
-        scene.reload()
-        assert walker.collide(AT_ALONE).verdict.tolist() == [1]
-        replace(0)
-        scene.reload()
-        assert walker.collide(AT_ALONE).verdict.tolist() == [0]
-
-
 def files_open() -> int:
     """Files that this process has open."""
     return len(os.listdir("/proc/self/fd"))
@@ -105,8 +91,6 @@ def test_the_old_one_goes_with_its_last_reader(place: Path, replace: Replace) ->
     with Scene.open(place) as scene:
         scene.add_avatar("al", BODY, 0.01)
         scene.collide("al", ELSEWHERE)
-        walker = scene.walker("al")
-        walker.collide(ELSEWHERE)
         before = files_open()
         memory = weakref.ref(scene.residency.buffer)
         path = scene.path("al", np.repeat(AT_ALONE, 3000, axis=0))
@@ -117,12 +101,12 @@ def test_the_old_one_goes_with_its_last_reader(place: Path, replace: Replace) ->
         rest = list(path)
         verdicts = np.concatenate([part.verdict for part in (first, *rest)])
         assert len(verdicts) == 3000 and not verdicts.any(), "one answer, of one generation"
-        # Who loads ahead for the walker is waited for by a thread of its own.
+        # A thread of its own waits for the prefetcher to end.
         until = time.monotonic() + 20.0
         while (memory() is not None or files_open() != before) and time.monotonic() < until:
             time.sleep(0.001)
-        assert memory() is None and files_open() == before, "an idle walker holds nothing"
-        assert walker.collide(AT_ALONE).verdict.tolist() == [1]
+        assert memory() is None and files_open() == before
+        assert scene.collide("al", AT_ALONE).verdict.tolist() == [1]
 
 
 @pytest.mark.parametrize("begun", [False, True])
@@ -235,13 +219,11 @@ def test_only_what_fits_is_loaded_before(place: Path) -> None:
 def test_a_closed_scene_says_so(place: Path) -> None:
     scene = Scene.open(place)
     scene.add_avatar("al", BODY, 0.01)
-    walker = scene.walker("al")
     scene.close()
     scene.close()
     for ask in (
         lambda: scene.collide("al", AT_ALONE),
         lambda: scene.path("al", AT_ALONE),
-        lambda: walker.collide(AT_ALONE),
         scene.reload,
     ):
         with pytest.raises(SolidcloudError, match="closed"):

@@ -1,4 +1,4 @@
-"""A walk through a scene larger than its cache: voxels come before the walker does, and every answer is the same."""
+"""A walk through a scene larger than its cache: voxels are loaded early, and every answer is the same."""
 
 import time
 from pathlib import Path
@@ -48,8 +48,6 @@ def test_a_walk_is_answered_as_with_everything_in_memory(
         for pose, verdict in zip(poses, expected, strict=True):
             answers = scene.collide("al", pose[None])
             assert answers.verdict[0] == verdict and answers.verdict[0] != Verdict.UNKNOWN
-        walker = scene.walker("al")
-        assert [int(walker.collide(pose[None]).verdict[0]) for pose in poses] == expected.tolist()
         scene.residency.check()
         stats = scene.stats()
         assert stats.evicted > 0 and stats.resident_bytes + stats.coarse_bytes <= budget

@@ -131,5 +131,4 @@ def test_a_scan_so_thin_that_its_radius_is_large_answers_every_way(tmp_path: Pat
         expected = scene.collide("al", poses).verdict.tolist()
         assert expected == [1, 0]
         assert scene.collide("al", poses, radius_model="mean").verdict.tolist() == expected
-        assert scene.walker("al").collide(poses).verdict.tolist() == expected
         assert [v for part in scene.path("al", poses) for v in part.verdict.tolist()] == expected

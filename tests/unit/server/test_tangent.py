@@ -45,12 +45,6 @@ def verdict(scene: Scene, question: str, name: str, pose: NDArray[np.float64], m
         return int(scene.collide(name, pose, margin).verdict[0])
     if question == "bounded":
         return int(scene.collide(name, pose, margin, tolerance=1e-9, budget_visits=1 << 40).verdict[0])
-    if question == "walker":
-        walker = scene.walker(name, margin)
-        near = pose.copy()
-        near[0, 0, 3] += 0.002
-        walker.collide(near)
-        return int(walker.collide(pose).verdict[0])
     answers = scene.contacts(name, pose, 5, margin)
     assert (answers.pairs_found[0] > 0) == (answers.verdict[0] == Verdict.CONTACT)
     return int(answers.verdict[0])
@@ -58,7 +52,7 @@ def verdict(scene: Scene, question: str, name: str, pose: NDArray[np.float64], m
 
 @pytest.mark.parametrize("kind", ["fine", "flat"])
 @pytest.mark.parametrize("name", ["small", "deep"])
-@pytest.mark.parametrize("question", ["collide", "bounded", "walker", "contacts"])
+@pytest.mark.parametrize("question", ["collide", "bounded", "contacts"])
 def test_contact_begins_at_the_unit_of_the_definition(
     archive_of: Callable[[str], Path], question: str, name: str, kind: str
 ) -> None:

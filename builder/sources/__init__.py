@@ -1,4 +1,7 @@
-"""One reader a scan format, all behind open_scans(): each gives scans, and a scan gives blocks of points."""
+"""Readers of scan formats, one file per format, all behind open_scans().
+
+Each reader returns Scan objects; a Scan yields its points in blocks.
+"""
 
 from .files import header_bounds, open_scans, scan_files
 from .placed import METRES, TURNS, placed

@@ -1,7 +1,7 @@
-"""Blocks of rows in text whose number is declared before them: what PTX and PTS files are made of.
+"""Text blocks of rows whose count is declared before them, as in PTX and PTS files.
 
-Where the second block of a file begins is not written anywhere, so opening such a file reads it through once,
-counting line ends and holding nothing (about 1 GB a second).
+Such a file does not say where its second block begins. Opening it therefore reads it once, counting
+line ends in bounded memory (about 1 GB a second).
 """
 
 from collections.abc import Iterator
@@ -15,14 +15,16 @@ from ...schemas.interrupts import check
 from .rows import CHUNK_BYTES, LONGEST_LINE, NEWLINE, is_number, number_rows, split_row
 from .scan import NO_RETURN, Block, Scan, apply_pose, scan_error
 
-# The shortest row of three numbers, "0 0 0" and a line end: a count is held against what is left of the file.
+# Bytes of the shortest row of three numbers, "0 0 0" and a line end. A declared count is checked
+# against the bytes left in the file.
 LEAST_ROW_BYTES = 6
-# Of all readers: the archive numbers scans by 16 bits (schemas/FORMAT.md), and a scan of no points takes two bytes.
+# Maximum scans in one file, for all readers: the archive numbers scans with 16 bits
+# (schemas/FORMAT.md), and a scan without points takes only two bytes of text.
 MOST_SCANS = 1 << 16
 
 
 class CountedRows(Scan):
-    """One block of rows: x, y, z, and perhaps an intensity and colours."""
+    """One block of rows: x, y, z, and optionally an intensity and a colour."""
 
     def __init__(
         self,
@@ -37,8 +39,12 @@ class CountedRows(Scan):
         pose: NDArray[np.float64] | None = None,
         zeros_are_no_return: bool = False,
     ) -> None:
-        """start, line: byte and line number of the first row.  columns: of each row; with 4 or 7 of them the fourth
-        is an intensity (x y z i, x y z i r g b), with 6 it is red."""
+        """Describe a block of `count` rows.
+
+        start, line: byte and line number of the first row.
+        columns: numbers in each row. With 4 or 7 columns the fourth is an intensity (x y z i, x y z
+        i r g b); with 6 it is red.
+        """
         super().__init__(path, format, index=index, declared_count=count, pose=pose)
         self._start, self._line, self._columns = start, line, columns
         self._zeros_are_no_return = zeros_are_no_return
@@ -73,10 +79,11 @@ class CountedRows(Scan):
 
 
 def skip_rows(file: BufferedReader, path: Path, index: int, count: int, first_line: int) -> int:
-    """Go past `count` rows from where a file stands; returns how many columns the first of them has, 0 of none.
+    """Advance the file past `count` rows; return the number of columns of the first row, 0 where count is 0.
 
-    index: of the scan, for messages.  first_line: the number of the line the file stands at.
-    Raises ScanError where there are fewer lines, or the first is no point.
+    index: number of the scan, for messages.
+    first_line: number of the line at the current file position.
+    Raises ScanError where there are fewer lines, or where the first row is not a point.
     """
     if not count:
         return 0
@@ -91,7 +98,7 @@ def skip_rows(file: BufferedReader, path: Path, index: int, count: int, first_li
         raise scan_error(
             path,
             f"line {first_line} is {' '.join(fields)[:60]!r}",
-            "x y z, with an intensity, a colour or both behind them",
+            "x y z, optionally followed by an intensity, a colour or both",
             "check what wrote this file",
         )
     wanted, last = count - 1, NEWLINE
@@ -99,7 +106,7 @@ def skip_rows(file: BufferedReader, path: Path, index: int, count: int, first_li
         check()
         data = file.read(CHUNK_BYTES)
         if not data:
-            # A last row without a line end is one too.
+            # A last row without a line end counts too.
             if wanted > 1 or last == NEWLINE:
                 raise _too_few(path, index, count - wanted, count)
             break
@@ -113,9 +120,9 @@ def skip_rows(file: BufferedReader, path: Path, index: int, count: int, first_li
 
 
 def next_line(file: BufferedReader, line: int) -> tuple[str, int]:
-    """The next line that is not blank, without blanks around it, and its number; "" at the end of the file.
+    """Return the next non-blank line, stripped, and its number; "" at the end of the file.
 
-    line: the number of the line the file stands at.
+    line: number of the line at the current file position.
     """
     while raw := file.readline(LONGEST_LINE):
         text = raw.decode("latin-1").strip()

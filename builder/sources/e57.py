@@ -1,7 +1,7 @@
-"""E57, by pye57's binding of libE57Format, read record block by record block.
+"""E57 reader: pye57's binding of libE57Format, read in blocks of records.
 
-pye57's own read_scan() takes a scan at once, as the header sizes it; the reader under it fills buffers of
-any size as often as it is asked to.
+pye57's own read_scan() reads a whole scan at once, of the size that the header claims. The
+underlying reader fills buffers of any size repeatedly; this module uses it.
 """
 
 from collections.abc import Iterator
@@ -32,11 +32,11 @@ CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 INVALID_STATE = "invalid state"
 SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
 
-LONGEST_CRS = 1 << 16  # longer than any real one, several times; more is cut
+LONGEST_CRS = 1 << 16  # several times longer than any real text; a longer one is truncated
 
 
 class Fields(NamedTuple):
-    """Which fields of the records to read."""
+    """Names of the record fields to read."""
 
     coordinates: tuple[str, ...]
     invalid_state: str | None
@@ -63,7 +63,7 @@ class E57Scan(Scan):
             return
         libe57 = _libe57(self.path)
         with _image_file(self.path) as image:
-            # The arrays must outlive the reader, which writes into them behind Python's back.
+            # The arrays must outlive the reader: it writes into them through raw pointers.
             arrays = {name: np.empty(block_points, np.float64) for name in self._fields.coordinates}
             if self._fields.intensity:
                 arrays[self._fields.intensity] = np.empty(block_points, np.float32)
@@ -71,7 +71,8 @@ class E57Scan(Scan):
                 arrays[self._fields.invalid_state] = np.empty(block_points, np.int8)
             buffers = libe57.VectorSourceDestBuffer()
             for name, array in arrays.items():
-                # True, True: convert the stored type to the array's, and scaled integers to what they mean.
+                # True, True: convert the stored type to the array's type, and scaled integers to
+                # their values.
                 buffers.append(libe57.SourceDestBuffer(image, name, array, block_points, True, True))
             reader = image.root()["data3D"][self.index]["points"].reader(buffers)
             seen = 0
@@ -90,11 +91,12 @@ class E57Scan(Scan):
             )
 
     def _block(self, columns: dict[str, NDArray[Any]]) -> Block:
-        """One block: invalid records left out and counted, spherical made cartesian, the pose applied."""
+        """Build a block: drop and count invalid records, convert spherical coordinates, apply the pose."""
         fields = self._fields
         valid: Any = slice(None)
         if fields.invalid_state:
-            # 0: valid; 1: a direction without a range; 2: nothing [ASTM E2807, 8.4.4]. No point in either.
+            # 0: valid; 1: a direction without a range; 2: nothing [ASTM E2807, 8.4.4]. Neither 1
+            # nor 2 is a point.
             valid = columns[fields.invalid_state] == 0
             left_out = len(valid) - int(np.count_nonzero(valid))
             if left_out:
@@ -102,26 +104,26 @@ class E57Scan(Scan):
         xyz = np.stack([columns[name][valid] for name in fields.coordinates], axis=1)
         if fields.coordinates == SPHERICAL:
             xyz = _cartesian(xyz)
-        # A copy of the intensity: the reader fills the same array again.
+        # Copy the intensity: the reader fills the same array again.
         return Block(
             apply_pose(self.pose, xyz), columns[fields.intensity][valid].copy() if fields.intensity else None
         )
 
 
 def _cartesian(spherical: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Range [m], azimuth and elevation [rad] to x, y, z [m], (n, 3) both [ASTM E2807, 8.4.4]."""
+    """Convert range [m], azimuth and elevation [rad] to x, y, z [m], (n, 3) both [ASTM E2807, 8.4.4]."""
     distance, azimuth, elevation = spherical.T
-    with np.errstate(over="ignore", invalid="ignore"):  # angles that are not finite give no finite point
+    with np.errstate(over="ignore", invalid="ignore"):  # non-finite angles give non-finite points
         level = distance * np.cos(elevation)
         x, y, z = level * np.cos(azimuth), level * np.sin(azimuth), distance * np.sin(elevation)
     return np.stack([x, y, z], axis=1)
 
 
 def open_e57(path: Path) -> list[Scan]:
-    """The scans of an E57 file, in its order; none where it holds images only. Reads headers only.
+    """Return the scans of an E57 file, in file order; an empty list where it holds images only.
 
-    One whose header is broken is a BrokenScan, where others are not. Raises ScanError, also where a page's checksum
-    does not fit.
+    Reads headers only. A scan with a broken header becomes a BrokenScan where another scan of the
+    file is readable. Raises ScanError, also for a page whose checksum is wrong.
     """
     with library_errors(path):
         check_e57(path)
@@ -149,7 +151,7 @@ def _libe57(path: Path) -> Any:
 
 @contextmanager
 def _image_file(path: Path) -> Iterator[Any]:
-    """The file as libE57Format opens it, closed at the end."""
+    """Open the file with libE57Format and close it at the end."""
     image = _libe57(path).ImageFile(str(path), "r")
     try:
         yield image
@@ -158,7 +160,7 @@ def _image_file(path: Path) -> Iterator[Any]:
 
 
 def _open_scan(path: Path, index: int, node: Any) -> Scan:
-    """One scan out of its node in the XML."""
+    """Return one scan from its XML node. Raises ScanError."""
     if not node.isDefined("points"):
         raise scan_error(
             path, f"scan {index} without points", "a 'points' vector", "check what wrote this file"
@@ -183,7 +185,8 @@ def _open_scan(path: Path, index: int, node: Any) -> Scan:
     numbers = {name: _number(node, *name.split("/")) for name in (*_POSE_NUMBERS, *_BOUNDS_NUMBERS)}
     pose = _pose(path, index, numbers)
     count = int(points.childCount())
-    # A record of constants takes no bit; no scan is of those alone, and a count of them could be anything.
+    # A record of constants takes no bits, and a hostile file could claim any number of them. A real
+    # scan has at least one bit per record.
     if count > 8 * path.stat().st_size:
         raise scan_error(
             path,
@@ -201,7 +204,7 @@ _BOUNDS_NUMBERS = tuple(f"cartesianBounds/{axis}{end}" for end in ("Minimum", "M
 
 
 def _number(node: Any, *names: str) -> float | None:
-    """The number at a path below a node, None where there is none."""
+    """Return the number at a path below a node, or None where there is none."""
     for name in names:
         if not hasattr(node, "isDefined") or not node.isDefined(name):
             return None
@@ -210,19 +213,20 @@ def _number(node: Any, *names: str) -> float | None:
 
 
 def _pose(path: Path, index: int, numbers: dict[str, float | None]) -> NDArray[np.float64]:
-    """The pose of a scan, (4, 4); the identity for what it does not state. Raises ScanError."""
+    """Return the pose (4, 4) of a scan; the identity for parts it does not state. Raises ScanError."""
     return quaternion_pose(
         path, index, [numbers[name] for name in _QUATERNION], [numbers[name] for name in _TRANSLATION]
     )
 
 
 def _bounds(numbers: dict[str, float | None], pose: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    """A box in the world that holds the scan by its declared bounds, (2, 3) [m]; None where it has none.
+    """Return a world-frame box (2, 3) [m] that encloses the scan by its declared bounds, or None.
 
-    The standard puts cartesianBounds in the scan's frame. pye57 writes two corners moved by the pose
-    instead, which hold nothing once the scan is turned. Who wrote the file is not known, so the box covers
-    both readings: as it is and moved; and where the scan is turned, as the box's bounding sphere, which
-    turns into itself.
+    The standard defines cartesianBounds in the scan's frame. pye57 instead writes two corners moved
+    by the pose, which enclose nothing once the scan is rotated. The writer of the file is unknown.
+    The box therefore covers both interpretations: the declared box as it is and the box moved by
+    the pose. For a rotated scan each box is replaced by the cube around its bounding sphere,
+    because a sphere is invariant under rotation.
     """
     corners = [numbers[name] for name in _BOUNDS_NUMBERS]
     if None in corners:
@@ -240,10 +244,11 @@ def _bounds(numbers: dict[str, float | None], pose: NDArray[np.float64]) -> NDAr
 
 
 def e57_bounds(path: Path) -> NDArray[np.float64] | None:
-    """The bounds of all scans that an E57 file's XML declares, checksums not looked at; may raise anything.
+    """Return the bounds of all scans that an E57 file's XML declares, (2, 3) world frame [m].
 
-    (2, 3) world frame [m]; None where one scan of them has none, for the points may then be anywhere.
-    Reads the XML by itself: libE57Format will not open a file with a broken page.
+    Returns None where one scan has no bounds, because its points may then be anywhere. Ignores
+    checksums and reads the XML without libE57Format, which refuses a file with a broken page. May
+    raise anything.
     """
     with path.open("rb") as file:
         xml = xml_of(file)
@@ -266,7 +271,10 @@ def e57_bounds(path: Path) -> NDArray[np.float64] | None:
 
 
 def _xml_number(element: ElementTree.Element, names: list[str]) -> float | None:
-    """The number at a path below an element; a number written without its text is 0 [ASTM E2807, 8.3]."""
+    """Return the number at a path below an element, or None.
+
+    An element without text is 0 [ASTM E2807, 8.3].
+    """
     found = element.find("/".join(names))
     if found is None:
         return None

@@ -1,7 +1,8 @@
-"""A check of an E57 file's header and XML before libE57Format sees them.
+"""Check of an E57 file's header and XML before libE57Format reads them.
 
-The library's time grows with the square of how deep elements lie in each other: 30,000 deep, in a file of 0.7 MB, take
-it 2 s, ten times as many minutes. And it makes a node of every element, however many there are.
+The library's time grows with the square of the nesting depth of elements: 30,000 levels, in a file
+of 0.7 MB, take 2 s; ten times as many take minutes. The library also creates a node for every
+element, however many there are.
 """
 
 import struct
@@ -11,20 +12,21 @@ from xml.parsers import expat
 
 from .scan import scan_error
 
-# The XML of 700 scans, each with a pose and bounds, is about 4 MiB; more than this is not looked at.
+# Maximum bytes of XML that are read. The XML of 700 scans, each with a pose and bounds, takes about
+# 4 MiB.
 LONGEST_XML = 16 << 20
-PAGE_BYTES = 1024  # the last four are the page's checksum [ASTM E2807, 7]
-# A scan has about 60 elements, nine deep at most; extensions add some.
+PAGE_BYTES = 1024  # the last four bytes are the page's checksum [ASTM E2807, 7]
+# A scan has about 60 elements, nested at most nine deep; extensions add some.
 MOST_ELEMENTS = 1 << 18
 DEEPEST = 64
 
 
 class TooMuchError(ValueError):
-    """What the XML holds that no scan needs."""
+    """Content of the XML that no scan needs."""
 
 
 def check_e57(path: Path) -> None:
-    """Hold an E57 file's header against its size, and its XML against bounds. Raises ScanError."""
+    """Check an E57 file's header against its size, and its XML against limits. Raises ScanError."""
     with path.open("rb") as file:
         head = file.read(48)
         size = file.seek(0, 2)
@@ -39,8 +41,8 @@ def check_e57(path: Path) -> None:
         if length != size or offset + xml_length > size or xml_length > LONGEST_XML:
             raise _damaged(
                 path,
-                f"{size} bytes, {xml_length} of XML from byte {offset} on, {length} declared",
-                f"all of them, and at most {LONGEST_XML} of XML",
+                f"{size} bytes, {xml_length} of XML from byte {offset} on, {length} bytes declared",
+                f"all declared bytes, and at most {LONGEST_XML} bytes of XML",
             )
         xml = xml_of(file)
     try:
@@ -48,19 +50,23 @@ def check_e57(path: Path) -> None:
     except TooMuchError as error:
         raise _damaged(path, str(error), "the description of some scans") from None
     except expat.ExpatError:
-        # What it reads up to there is within bounds; libE57Format has the last word, checksums first.
+        # The XML up to the error is within the limits. libE57Format checks the checksums first and
+        # then reports the error.
         pass
 
 
 def look_through(xml: bytes) -> None:
-    """Raise TooMuchError for what is too deep, too much, or an entity, which may stand for any amount of either."""
+    """Raise TooMuchError for excessive depth, too many elements, or a document type.
+
+    A document type may define entities, which can expand to any depth and number of elements.
+    """
     depth = count = 0
 
     def begin(name: str, attributes: dict[str, str]) -> None:
         nonlocal depth, count
         depth, count = depth + 1, count + 1
         if depth > DEEPEST or count > MOST_ELEMENTS:
-            raise TooMuchError(f"XML of over {MOST_ELEMENTS} elements, or over {DEEPEST} in each other")
+            raise TooMuchError(f"XML of over {MOST_ELEMENTS} elements, or nested over {DEEPEST} deep")
 
     def end(name: str) -> None:
         nonlocal depth
@@ -77,7 +83,10 @@ def look_through(xml: bytes) -> None:
 
 
 def xml_of(file: BufferedReader) -> bytes:
-    """The XML section, the checksum that ends each page taken out; checksums are not looked at. ValueError for none."""
+    """Return the XML section without the page checksums, which are not verified.
+
+    Raises ValueError where the file has no E57 header.
+    """
     file.seek(0)
     signature, _, _, _, offset, length, page = struct.unpack("<8sIIQQQQ", file.read(48))
     if signature != b"ASTM-E57" or page != PAGE_BYTES or length > LONGEST_XML:

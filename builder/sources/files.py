@@ -1,4 +1,4 @@
-"""Which files are scans, and which reader opens which."""
+"""Registry of scan formats by file suffix, and functions that find and open scan files."""
 
 import math
 import os
@@ -22,7 +22,7 @@ from .scan import Scan, library_errors, scan_error
 from .surface import SurfaceSamples
 from .text import open_text
 
-# By suffix, in lower case. A COPC file ends in ".copc.laz" and is a LAZ file.
+# Reader by suffix, in lower case. A COPC file ends in ".copc.laz" and is a LAZ file.
 READERS: dict[str, Callable[[Path], list[Scan]]] = {
     ".las": open_las,
     ".laz": open_las,
@@ -38,9 +38,11 @@ READERS: dict[str, Callable[[Path], list[Scan]]] = {
     ".stl": open_stl,
     ".glb": open_glb,
 }
-# Taken from a folder. Text of any name may be notes, which would stop a build: it is read when named.
+# Suffixes collected from a folder. A text file of any other kind may hold notes, which would stop a
+# build; it is read only when named.
 IN_FOLDERS = frozenset(READERS) - {".txt", ".csv"}
-# Scans that nothing here reads: in a folder they are no more left out in silence than broken ones are.
+# Suffixes of scan formats without a reader. In a folder they are reported as errors, like broken
+# scans, and not skipped silently.
 UNREAD = frozenset(
     [
         ".fls",
@@ -64,13 +66,14 @@ MESHES = frozenset({".obj", ".stl", ".ply", ".glb"})
 
 
 def open_scans(path: Path, *, spacing: float | None = None) -> list[Scan]:
-    """The scans of one file, headers read and checked, points not yet.
+    """Open the scans of one file: read and check the headers, but no points.
 
-    spacing: sample the surface of a mesh (OBJ, STL, PLY, GLB) with about this distance between points [m],
-    instead of taking its vertices; other formats are not touched by it.
-    An E57, PTX or PTS file may hold many scans, an E57 none. A valid file without points gives a scan without blocks.
-    Raises ScanError for what is missing, empty, of no known format, truncated or inconsistent, and
-    BadRequestError for a spacing that is no positive number.
+    spacing: sample the surface of a mesh (OBJ, STL, PLY, GLB) with about this distance between
+    points [m] instead of returning its vertices; other formats ignore it.
+    An E57, PTX or PTS file may hold many scans; an E57 file may hold none. A valid file without
+    points gives a scan without blocks.
+    Raises ScanError for a file that is missing, empty, of unknown format, truncated or
+    inconsistent, and BadRequestError for a spacing that is not a positive number.
     """
     path = Path(path)
     if spacing is not None and not (math.isfinite(spacing) and spacing > 0):
@@ -89,17 +92,17 @@ def open_scans(path: Path, *, spacing: float | None = None) -> list[Scan]:
         if path.stat().st_size == 0:
             raise scan_error(path, "an empty file", "a scan", "fetch the file again, or leave it out")
         scans = READERS[suffix](path)
-        # The vertices' reader has checked the header by now, and trimesh is not asked about a broken one.
+        # The vertex reader has checked the header by now; trimesh never sees a broken one.
         return [SurfaceSamples(scans[0], spacing)] if spacing is not None and suffix in MESHES else scans
 
 
 def scan_files(paths: Iterable[Path]) -> list[Path]:
-    """The files that some paths stand for: files as they are, folders with all scans at any depth below, those of
-    formats that open_scans() will refuse among them.
+    """Expand paths to scan files: files stay as they are, folders are searched at any depth.
 
-    A folder's files are sorted by path, so that the order does not depend on the file system; files given
-    by name keep their place, whatever their suffix. Links to folders are not followed below a folder.
-    Raises ScanError for a path that does not exist and a folder with no known scan in it.
+    A folder's files are sorted by path; the order does not depend on the file system. They include
+    files of formats that open_scans() refuses. Files given by name keep their position, whatever
+    their suffix. Links to folders below a folder are not followed.
+    Raises ScanError for a path that does not exist and for a folder without scan files.
     """
     files: list[Path] = []
     for path in map(Path, paths):
@@ -125,10 +128,10 @@ def scan_files(paths: Iterable[Path]) -> list[Path]:
 
 
 def header_bounds(path: Path) -> NDArray[np.float64] | None:
-    """Where the points of a scan file lie as far as its header tells, though it cannot be read.
+    """Return the bounds that the header of an unreadable scan file declares.
 
-    Returns (2, 3) world frame [m], low and high corner, or None where nothing is known; only LAS, LAZ and
-    E57 state bounds. Never raises, and reads no more than the header, whatever that claims.
+    Returns (2, 3) world frame [m], low and high corner, or None where they are unknown; only LAS,
+    LAZ and E57 declare bounds. Never raises, and reads no more than the header, whatever it claims.
     """
     readers = {".las": las_bounds, ".laz": las_bounds, ".e57": e57_bounds}
     try:
@@ -136,7 +139,8 @@ def header_bounds(path: Path) -> NDArray[np.float64] | None:
         return reader(Path(path)) if reader else None
     except Exception:
         check()
-        # Best effort on a file known to be broken; its own error was raised by open_scans() or blocks().
+        # Best effort on a file known to be broken; open_scans() or blocks() has already raised its
+        # error.
         return None
 
 

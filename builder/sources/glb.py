@@ -1,7 +1,8 @@
-"""GLB, the binary form of glTF 2: the vertices of what its scene shows, each where its node puts it.
+"""GLB reader (binary glTF 2): the vertices of the file's scene, each transformed by its node.
 
-Read here and in blocks, header and all: a general loader would hold the file whole, open what other files it names, and
-make arrays as large as it is told to. glTF is in metres with y up [glTF 2.0, 3.4]; coordinates stay as they are here.
+The header and the vertices are read here, in blocks. A general loader would hold the file whole,
+open other files that it names, and allocate arrays of any size that it claims. glTF uses metres
+with y up [glTF 2.0, 3.4]; this reader does not convert coordinates.
 """
 
 import json
@@ -17,15 +18,19 @@ from numpy.typing import NDArray
 from ...schemas.interrupts import check
 from .scan import BLOCK_BYTES, Block, Scan, apply_pose, library_errors, quaternion_pose, scan_error
 
-# The words of a scene of ten thousand parts take about 4 MiB; parsed they take thirty times that.
+# Maximum bytes of JSON. The JSON of a scene of ten thousand parts takes about 4 MiB; parsed it
+# takes thirty times that.
 LONGEST_JSON = 8 << 20
-# Nodes may share a mesh, so that parts take no words of the document: as many are three times what it has words for
-# of meshes of their own. Told where they are they take 15 us and half a kilobyte each.
+# Maximum nodes, and maximum primitives at nodes. Nodes may share a mesh, and a shared part takes no
+# JSON. This limit is three times the number of parts that the JSON has room for as separate meshes.
+# Resolving a part takes 15 us and half a kilobyte.
 MOST_PARTS = 1 << 16
-# Corners of a triangle take 72 bytes while a mesh is sampled, which holds all of them: 1.2 GB for these.
+# Maximum triangles to sample. The corners of a triangle take 72 bytes, and sampling holds the whole
+# mesh: 1.2 GB for this many.
 MOST_TRIANGLES = 1 << 24
 
-# Extensions that say nothing of where vertices are. Others that a file requires may: instances, compression.
+# Extensions that do not affect the positions of vertices. Other required extensions may:
+# instancing, compression.
 HARMLESS = ("KHR_lights_", "KHR_materials_", "KHR_texture_", "EXT_texture_", "MSFT_texture_")
 
 FLOAT = 5126
@@ -34,7 +39,10 @@ TRIANGLES, STRIP, FAN = 4, 5, 6
 
 
 class Column(NamedTuple):
-    """An accessor: `rows` rows of a type, `stride` bytes apart from byte `start` of the file on."""
+    """An accessor: `rows` rows of `width` values, `stride` bytes apart, from byte `start` of the file.
+
+    type: numpy type of a value.
+    """
 
     start: int
     stride: int
@@ -44,7 +52,10 @@ class Column(NamedTuple):
 
 
 class _Primitive(NamedTuple):
-    """A primitive of a mesh, wherever it is. indices: of the corners; None: in order."""
+    """A primitive of a mesh, before a node places it.
+
+    indices: vertex numbers of the corners; None: vertices in order.
+    """
 
     vertices: Column
     mode: int
@@ -52,7 +63,11 @@ class _Primitive(NamedTuple):
 
 
 class Part(NamedTuple):
-    """A primitive of a mesh at a node. pose: (4, 4), to the scene.  indices: of the corners; None: in order."""
+    """A primitive of a mesh at a node.
+
+    pose: (4, 4), mesh frame -> scene.
+    indices: vertex numbers of the corners; None: vertices in order.
+    """
 
     vertices: Column
     pose: NDArray[np.float64]
@@ -66,7 +81,7 @@ class GlbScan(Scan):
     up = "y"
 
     def __init__(self, path: Path, parts: list[Part]) -> None:
-        # Parts of a mesh share vertices as a rule, and differ in material and triangles.
+        # Parts of a mesh usually share vertices and differ in material and triangles.
         at_nodes = {(part.vertices, part.pose.tobytes()): part for part in parts}
         self._shown = list(at_nodes.values())
         self._parts = parts
@@ -79,7 +94,10 @@ class GlbScan(Scan):
                     yield Block(apply_pose(part.pose, rows.astype(np.float64)), None)
 
     def triangles(self) -> NDArray[np.float64]:
-        """The corners of all triangles, (n, 3, 3). Raises ScanError for more than MOST_TRIANGLES."""
+        """Return the corners of all triangles, (n, 3, 3).
+
+        Raises ScanError for more than MOST_TRIANGLES.
+        """
         total = sum(part.indices.rows if part.indices else part.vertices.rows for part in self._parts)
         if total > 3 * MOST_TRIANGLES:
             raise scan_error(
@@ -103,7 +121,7 @@ class GlbScan(Scan):
 
 
 def _corners(file: BufferedReader, path: Path, part: Part) -> NDArray[np.int64]:
-    """The numbers of the vertices of a part's triangles, (n, 3)."""
+    """Return the vertex numbers of a part's triangles, (n, 3)."""
     if part.mode not in (TRIANGLES, STRIP, FAN):
         return np.empty((0, 3), np.int64)
     order = np.arange(part.vertices.rows, dtype=np.int64)
@@ -119,30 +137,30 @@ def _corners(file: BufferedReader, path: Path, part: Part) -> NDArray[np.int64]:
 
 
 def _rows(file: BufferedReader, path: Path, column: Column, block_rows: int) -> Iterator[NDArray[Any]]:
-    """The rows of an accessor, (n, width) of its type, in blocks of bounded memory."""
+    """Yield the rows of an accessor, (n, width) of its type, in blocks of bounded memory."""
     item = np.dtype(column.type).itemsize
     step = max(1, min(block_rows, BLOCK_BYTES // column.stride))
     for begin in range(0, column.rows, step):
         count = min(step, column.rows - begin)
-        # The last row may end before its stride does, and the file with it.
+        # The last row, and the file with it, may end before the row's full stride.
         wanted = (count - 1) * column.stride + column.width * item
         file.seek(column.start + begin * column.stride)
         check()
         data = file.read(wanted)
         if len(data) < wanted:
-            raise _damaged(path, "a file that ends within its vertices", "all of them")
+            raise _damaged(path, "a file that ends within its vertices", "all its vertices")
         yield np.ndarray((count, column.width), column.type, data, strides=(column.stride, item))
 
 
 def open_glb(path: Path) -> list[Scan]:
-    """The one scan of a GLB file; reads its header only. Raises ScanError."""
+    """Return the one scan of a GLB file; reads its header only. Raises ScanError."""
     with library_errors(path), path.open("rb") as file:
         document, start, size = _read_header(file, path)
         return [GlbScan(path, _Document(path, document, start, size).parts())]
 
 
 def _read_header(file: BufferedReader, path: Path) -> tuple[dict[str, Any], int, int]:
-    """The JSON, and where the binary chunk begins and how long it is (0 where there is none)."""
+    """Return the JSON, and the offset and size of the binary chunk (size 0 where there is none)."""
     held = path.stat().st_size
     head = file.read(20)
     magic, version, length, words, kind = struct.unpack("<4sIII4s", head.ljust(20, b"\0"))
@@ -152,7 +170,7 @@ def _read_header(file: BufferedReader, path: Path) -> tuple[dict[str, Any], int,
         raise _damaged(
             path,
             f"{length} bytes with {words} of JSON in a file of {held}",
-            f"no more than it has, and {LONGEST_JSON} of JSON",
+            f"at most the file's size, and at most {LONGEST_JSON} of JSON",
         )
     document = json.loads(file.read(words))
     head = file.read(8)
@@ -167,23 +185,23 @@ def _read_header(file: BufferedReader, path: Path) -> tuple[dict[str, Any], int,
 
 
 class _Document:
-    """The JSON of a GLB file: what it shows, every figure checked. Its methods may raise anything."""
+    """The JSON of a GLB file, resolved to parts and checked. Its methods may raise anything."""
 
     def __init__(self, path: Path, document: dict[str, Any], start: int, size: int) -> None:
-        """start, size: of the binary chunk [bytes]."""
+        """Hold the parsed JSON. start, size: of the binary chunk [bytes]."""
         self.path, self.document, self.start, self.size = path, document, start, size
 
     def parts(self) -> list[Part]:
-        """Every primitive where the scene's nodes put it; the tree is walked once, a node at a time.
+        """Return every primitive at each node of the scene, in one depth-first walk of the node tree.
 
-        ScanError for more than MOST_PARTS nodes or primitives at nodes.
+        Raises ScanError for more than MOST_PARTS nodes or primitives at nodes.
         """
         required = [str(name) for name in self.document.get("extensionsRequired", [])]
         if others := [name for name in required if not name.startswith(HARMLESS)]:
             raise scan_error(
                 self.path,
                 f"a file that requires the extension {others[0]}",
-                "plain meshes, wherever nodes put them",
+                "plain meshes at nodes",
                 "write it without compression and instancing",
             )
         nodes = self.document.get("nodes", [])
@@ -222,12 +240,15 @@ class _Document:
             )
 
     def _mesh(self, number: int) -> list["_Primitive"]:
-        """The primitives of a mesh that have positions."""
+        """Return the primitives of a mesh that have positions."""
         primitives = [self._primitive(primitive) for primitive in self._at("meshes", number)["primitives"]]
         return [primitive for primitive in primitives if primitive is not None]
 
     def _pose(self, number: int, node: dict[str, Any]) -> NDArray[np.float64]:
-        """Where a node is in its parent, (4, 4): a matrix by columns, or scale, then rotation, then translation."""
+        """Return the transform (4, 4) from a node to its parent.
+
+        A node states a matrix by columns, or a scale, then a rotation, then a translation.
+        """
         if "matrix" in node:
             pose = np.array(node["matrix"], np.float64).reshape(4, 4).T
         else:
@@ -241,7 +262,7 @@ class _Document:
         return pose
 
     def _primitive(self, primitive: dict[str, Any]) -> "_Primitive | None":
-        """A primitive's accessors; None where it has no positions."""
+        """Return a primitive's accessors, or None where it has no positions."""
         if primitive.get("extensions", {}).get("KHR_draco_mesh_compression") is not None:
             raise _damaged(
                 self.path, "a mesh compressed by Draco", "plain vertices (write it without compression)"
@@ -255,7 +276,7 @@ class _Document:
         return _Primitive(vertices, int(primitive.get("mode", TRIANGLES)), indices)
 
     def _column(self, number: int, shape: str, types: dict[int, str]) -> Column:
-        """An accessor, held against its buffer view and that against the binary chunk."""
+        """Return an accessor, checked against its buffer view, and the view against the binary chunk."""
         accessor = self._at("accessors", number)
         if accessor["type"] != shape or accessor["componentType"] not in types or "sparse" in accessor:
             raise _damaged(
@@ -283,21 +304,21 @@ class _Document:
             raise _damaged(
                 self.path,
                 f"accessor {number}: {count} rows of {row} bytes, {stride} apart, from byte {offset} of {length}",
-                f"it within its buffer view, and that within the {self.size} bytes of the file's",
+                f"an accessor within its buffer view, and the view within the binary part of {self.size} bytes",
             )
         return Column(self.start + begin + offset, stride, count, type_, width)
 
     def _at(self, name: str, number: Any) -> dict[str, Any]:
-        """One entry of a list of the document."""
+        """Return one entry of a list of the document. Raises ScanError for an invalid index."""
         entries = self.document.get(name, [])
         if not isinstance(number, int) or not 0 <= number < len(entries):
-            raise _damaged(self.path, f"number {number!r} of {len(entries)} {name}", "one of them")
+            raise _damaged(self.path, f"number {number!r} of {len(entries)} {name}", "an existing number")
         found: dict[str, Any] = entries[number]
         return found
 
     def _whole(self, number: Any) -> int:
         if not isinstance(number, int) or number < 0:
-            raise _damaged(self.path, f"the number {number!r}", "a whole one, 0 or more")
+            raise _damaged(self.path, f"the number {number!r}", "a whole number, 0 or more")
         return number
 
 

@@ -1,8 +1,9 @@
-"""LAS, LAZ and COPC (which is LAZ with an index that is not needed to read every point), the latter two by lazrs.
+"""LAS, LAZ and COPC readers; lazrs decompresses the latter two.
 
-The header is read here: laspy 2.7, told of 10^9 variable length records in a file of 14 kB, makes an object
-for each of them and never returns. Of a point no more is looked at than its coordinates and intensity, which
-stand first in every format of records.
+COPC is LAZ with an index, which is not needed to read every point. The header is read here: laspy
+2.7, given a file of 14 kB that claims 10^9 variable length records, creates an object for each of
+them and never returns. Only the coordinates and the intensity of a point are read; they come first
+in every point record format.
 """
 
 import struct
@@ -29,35 +30,39 @@ from .scan import (
     scan_error,
 )
 
-# The public header of LAS 1.0 to 1.2; later versions put more behind it [LAS 1.4 R15, table 3].
+# Size of the public header of LAS 1.0 to 1.2; later versions append fields [LAS 1.4 R15, table 3].
 HEADER_BYTES = 227
-# Sizes of the point record formats 0 to 10 [LAS 1.4 R15, tables 7 to 17]; extra bytes may follow each.
+# Sizes of the point record formats 0 to 10 [LAS 1.4 R15, tables 7 to 17]; extra bytes may follow
+# each.
 RECORD_BYTES = (20, 28, 26, 34, 57, 63, 30, 36, 38, 59, 67)
-# Real files have kilobytes before the points (a coordinate system, names of extra bytes); waveform tables,
-# the largest known, stay below 16 KiB.
+# Maximum bytes before the points. Real files have kilobytes there (a coordinate system, names of
+# extra bytes); waveform tables, the largest known content, stay below 16 KiB.
 LONGEST_PREAMBLE = 16 << 20
 
 
 class Header(NamedTuple):
-    """The fields of a LAS header that say where the points are and how they are coded."""
+    """The fields of a LAS header that locate the points and describe their encoding."""
 
     header_size: int
     offset_to_points: int
     vlr_count: int
-    point_format: int  # 0 to 10, the mark of compression removed
+    point_format: int  # 0 to 10, compression bits removed
     compressed: bool
     record_bytes: int
     points: int
     lattice: Lattice
     bounds: NDArray[np.float64] | None
-    evlrs: tuple[int, int]  # byte of the first record behind the points, and their number
+    evlrs: tuple[int, int]  # offset of the first record after the points, and the number of such records
 
 
 class LasScan(SeekableScan):
     """One LAS or LAZ file."""
 
     def __init__(self, path: Path, header: Header, laszip: bytes) -> None:
-        """laszip: the record by which lazrs decompresses, of a file with points that is compressed."""
+        """Create the scan.
+
+        laszip: the LASzip record that lazrs needs, for a compressed file with points.
+        """
         super().__init__(
             path,
             "laz" if header.compressed else "las",
@@ -90,9 +95,9 @@ class LasScan(SeekableScan):
     def _decompressed(
         self, file: BinaryIO, block_points: int, start: int, stop: int
     ) -> Iterator[NDArray[np.void]]:
-        """The records [start, stop) of a LAZ file, (n,), overwritten by the next."""
+        """Yield the records [start, stop) of a LAZ file, (n,); the next block overwrites them."""
         lazrs = reader_library("lazrs", self.path)
-        # Layers that nobody asks for are skipped (formats 6 to 10): colours, times, angles.
+        # Skip unused layers (formats 6 to 10): colours, times, angles.
         wanted = lazrs.DecompressionSelection(
             lazrs.SELECTIVE_DECOMPRESS_XY_RETURNS_CHANNEL
             | lazrs.SELECTIVE_DECOMPRESS_Z
@@ -100,16 +105,16 @@ class LasScan(SeekableScan):
         )
         with kept_back():
             source: Any = ChunksFrom(lazrs, file, self._start, self._laszip, start) if start else file
-            # Serial decompression: one process a core is what the builder runs already.
+            # Decompress serially: the builder already runs one process per core.
             decompressor = lazrs.LasZipDecompressor(source, self._laszip, wanted)
         step = max(1, min(block_points, BLOCK_BYTES // self._record.itemsize))
         buffer = np.empty(step, self._record)
         raw = buffer.view(np.uint8)
-        # The points of the first chunk before `start`: 50,000 at most, as a rule.
+        # Discard the points of the first chunk before `start`, usually at most 50,000.
         before = source.skip if start else 0
         while before:
             count = min(step, before)
-            with kept_back():  # lazrs reads by way of Python
+            with kept_back():  # lazrs calls back into Python to read
                 decompressor.decompress_many(raw[: count * self._record.itemsize])
             before -= count
         for seen in range(start, stop, step):
@@ -119,13 +124,17 @@ class LasScan(SeekableScan):
             yield buffer[:count]
 
     def _block(self, record: NDArray[np.void]) -> Block:
-        """One block out of point records: raw * scale + offset, in that order, as laspy and others do."""
+        """Build a block from point records.
+
+        Coordinates are raw * scale + offset, in that order, as laspy and others compute them.
+        """
         lattice = self.lattice
         assert lattice is not None
         xyz = np.empty((len(record), 3))
-        with np.errstate(over="ignore"):  # a scale of 1e300 gives infinities, which the caller counts
-            # Axis by axis, from the records straight to where they belong: 2.7 ns a point against 8.4 for a copy
-            # that is multiplied and added to as a whole (2^18 records of 20 bytes, one core).
+        with np.errstate(over="ignore"):  # a scale of 1e300 gives infinities; the caller counts them
+            # Axis by axis, from the records directly to the result: 2.7 ns a point against 8.4 for
+            # a copy that is multiplied and added to as a whole (2^18 records of 20 bytes, one
+            # core).
             for axis, name in enumerate("xyz"):
                 column = xyz[:, axis]
                 np.multiply(record[name], lattice.scale[axis], out=column)
@@ -134,7 +143,7 @@ class LasScan(SeekableScan):
 
 
 def open_las(path: Path) -> list[Scan]:
-    """The one scan of a LAS, LAZ or COPC file; reads its header only. Raises ScanError."""
+    """Return the one scan of a LAS, LAZ or COPC file; reads its header only. Raises ScanError."""
     with library_errors(path), path.open("rb") as file:
         header = _read_header(file, path)
         _check_header(header, path, path.stat().st_size)
@@ -156,19 +165,19 @@ def open_las(path: Path) -> list[Scan]:
 
 
 def las_bounds(path: Path) -> NDArray[np.float64] | None:
-    """The bounds a LAS header declares, (2, 3) [m], of a file that may be truncated; may raise anything.
+    """Return the bounds that the header of a possibly truncated LAS file declares, (2, 3) [m].
 
-    A header at odds with itself is not believed: a scan skipped at a place it was not would leave the place
-    where it was to be called clear.
+    May raise anything. An inconsistent header is rejected: if a skipped scan were recorded at a
+    wrong place, queries would report its real place as clear.
     """
     with path.open("rb") as file:
         header = _read_header(file, path)
-    _check_header(header, path, size=1 << 62)  # all but where the file ends
+    _check_header(header, path, size=1 << 62)  # every check but the one against the file's size
     return header.bounds
 
 
 def _read_header(file: BinaryIO, path: Path) -> Header:
-    """Read the fields of the public header block, unchecked but for what reading them needs."""
+    """Read the fields of the public header block; check only what reading them requires."""
     start = file.read(375)
     if start[:4] != b"LASF" or len(start) < HEADER_BYTES:
         raise scan_error(
@@ -192,7 +201,7 @@ def _read_header(file: BinaryIO, path: Path) -> Header:
         )
     if minor >= 4:
         (count,) = struct.unpack_from("<Q", start, 247)
-    # LASzip marks a compressed file in bit 7 of the format, and older ones in bit 6 as well.
+    # LASzip marks a compressed file in bit 7 of the format; older versions set bit 6 as well.
     return Header(
         header_size,
         offset_to_points,
@@ -208,13 +217,13 @@ def _read_header(file: BinaryIO, path: Path) -> Header:
 
 
 def _bounds_of(start: bytes) -> NDArray[np.float64] | None:
-    """Bounds out of the header's bytes (max x, min x, max y, ...), None where they are no box."""
+    """Return the bounds in the header (max x, min x, max y, ...), or None where they form no box."""
     bounds = np.array(struct.unpack_from("<6d", start, 179)).reshape(3, 2).T[::-1].copy()
     return checked_bounds(bounds)
 
 
 def _check_header(header: Header, path: Path, size: int) -> None:
-    """Hold every figure of the header against the file's size and against each other. Raises ScanError."""
+    """Check all header values against the file's size and against each other. Raises ScanError."""
 
     def refuse(found: str, expected: str) -> None:
         raise scan_error(path, found, expected, "fetch the file again, it is truncated or damaged")
@@ -223,7 +232,7 @@ def _check_header(header: Header, path: Path, size: int) -> None:
     if not header.header_size <= preamble <= min(size, LONGEST_PREAMBLE):
         refuse(
             f"points that begin at byte {preamble} of {size}",
-            f"a place from {header.header_size} on, within the file and {LONGEST_PREAMBLE} bytes",
+            f"an offset from {header.header_size} on, within the file and its first {LONGEST_PREAMBLE} bytes",
         )
     room = (preamble - header.header_size) // VLR_HEADER_BYTES
     if header.vlr_count > room:

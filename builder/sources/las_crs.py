@@ -1,14 +1,14 @@
-"""The coordinate reference system that a LAS file names: its WKT, or its GeoTIFF keys as text. For people to read."""
+"""Coordinate reference system that a LAS file names, as text for people: its WKT or its GeoTIFF keys."""
 
 import struct
 from typing import BinaryIO
 
 PROJECTION = b"LASF_Projection"
 WKT, GEO_KEYS, GEO_TEXTS = 2112, 34735, 34737
-# Longer than any real one, several times; more is cut.
+# Maximum bytes of a text, several times longer than any real one; a longer one is truncated.
 LONGEST_CRS = 1 << 16
 
-# GeoTIFF keys that say which system it is [OGC 19-008r4, 7]; others refine it.
+# GeoTIFF keys that identify the system [OGC 19-008r4, 7]; other keys refine it.
 KEY_NAMES = {
     1024: "model",
     1026: "citation",
@@ -24,9 +24,11 @@ KEY_NAMES = {
 
 
 def las_crs(file: BinaryIO, header_size: int, vlr_count: int, start: int, evlrs: tuple[int, int]) -> str:
-    """The text of the system that a LAS file names, "" where it names none or its records are broken. Never raises.
+    """Return the text of the system that a LAS file names. Never raises.
 
-    start: byte where the points begin, so where the records end.  evlrs: (byte, number) of those behind the points.
+    start: offset of the points, where the records before them end.
+    evlrs: (offset, number) of the records after the points.
+    Returns "" where the file names none or its records are broken.
     """
     try:
         found = _records(file, header_size, vlr_count, start, "<2x16sHH32x")
@@ -41,7 +43,7 @@ def las_crs(file: BinaryIO, header_size: int, vlr_count: int, start: int, evlrs:
 
 
 def _records(file: BinaryIO, at: int, count: int, end: int, form: str) -> dict[int, bytes]:
-    """The records of projections among `count` from byte `at` on, up to LONGEST_CRS bytes of each."""
+    """Return the projection records among `count` from offset `at`, up to LONGEST_CRS bytes of each."""
     head = struct.Struct(form)
     found: dict[int, bytes] = {}
     file.seek(at)
@@ -58,7 +60,7 @@ def _records(file: BinaryIO, at: int, count: int, end: int, form: str) -> dict[i
 
 
 def _geo_text(keys: bytes, texts: bytes) -> str:
-    """The keys that say which system it is: "projected EPSG 26915; citation NAD83 / UTM zone 15N"."""
+    """Format the identifying keys: "projected EPSG 26915; citation NAD83 / UTM zone 15N"."""
     words = struct.unpack(f"<{len(keys) // 2}H", keys[: len(keys) // 2 * 2])
     parts = []
     for k in range(1, 1 + min(words[3] if len(words) > 3 else 0, len(words) // 4 - 1)):

@@ -1,8 +1,9 @@
-"""A check of a LAZ file's chunks before lazrs sees them.
+"""Check of a LAZ file's chunks before lazrs reads them, and a view of a LAZ file from a later chunk on.
 
-lazrs allocates what a chunk claims before it reads it, and a failed allocation in Rust aborts the process:
-two runs of random damage to a file of 2.5 kB both ended so, at 3.6 and 4.3 GB. The layout is that of LASzip
-3.4, whose chunks of point formats 6 to 10 are written layer by layer.
+lazrs allocates the size that a chunk claims before it reads the chunk, and a failed allocation in
+Rust aborts the process: two runs of random damage to a file of 2.5 kB both ended like this, at 3.6
+and 4.3 GB. The layout is that of LASzip 3.4, which writes chunks of point formats 6 to 10 layer by
+layer.
 """
 
 import io
@@ -15,11 +16,12 @@ from .scan import scan_error
 LASZIP_VLR = (b"laszip encoded", 22204)
 VLR_HEADER_BYTES = 54
 CHUNKED = 2  # the compressor of point formats 0 to 5
-VARIABLE = 0xFFFFFFFF  # in place of the points a chunk: each chunk has its own number of them
+VARIABLE = 0xFFFFFFFF  # special value of points per chunk: each chunk has its own point count
 LAYERED = 3  # the compressor of point formats 6 to 10: each chunk is split into layers
 
-# Item type -> its layers in a layered chunk; each has its size written before the chunk's data.
-# 10: point (9 layers); 11: colour; 12: colour and infrared; 13: wave packet; 14: extra bytes, a layer each.
+# Item type -> number of its layers in a layered chunk; each layer's size precedes the chunk's data.
+# 10: point (9 layers); 11: colour; 12: colour and infrared; 13: wave packet; 14: extra bytes, one
+# layer per byte.
 LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}
 EXTRA_BYTES = 14
 
@@ -34,11 +36,12 @@ def check_chunks(
     record_bytes: int,
     points: int,
 ) -> bytes:
-    """Check that a LAZ file's chunks and the table of them lie in the file, and hold all its points.
+    """Check that a LAZ file's chunks and chunk table lie within the file and hold all its points.
 
-    start: byte where the points begin.  record_bytes, points: of the uncompressed records, as declared.
-    Reads some bytes a chunk (50,000 points as a rule). Returns the record by which the points are decompressed.
-    Raises ScanError.
+    start: offset of the point data.
+    record_bytes, points: size and count of the uncompressed records, as declared.
+    Reads a few bytes per chunk (usually 50,000 points). Returns the LASzip record, which the
+    decompressor needs. Raises ScanError.
     """
     size = file.seek(0, 2)
     laszip, items = _laszip_record(file, path, header_size, vlr_count)
@@ -57,7 +60,8 @@ def check_chunks(
         raise _damaged(path, f"{chunks} chunks of {chunk_points} points", "at least one of each")
     if chunk_points != VARIABLE and points > chunks * chunk_points:
         raise _damaged(path, f"{points} points in {chunks} chunks of {chunk_points}", "as many as they hold")
-    # lazrs makes room for the whole table. A chunk begins with a point, raw; an empty one may be behind the last.
+    # lazrs allocates the whole table. Each chunk begins with one raw point; an empty chunk may
+    # follow the last.
     if (chunks - 1) * record_bytes > table - start - 8:
         raise _damaged(
             path, f"{chunks} chunks in {table - start - 8} bytes", f"a point of {record_bytes} bytes in each"
@@ -78,24 +82,29 @@ def check_chunks(
             )
         seen += count
         number += 1
-    # Writers that end each chunk by hand leave an empty one behind the last.
+    # Writers that end each chunk explicitly leave an empty chunk after the last.
     if seen != points or not number <= chunks <= number + 1:
         raise _damaged(path, f"{seen} points in {number} chunks", f"{points} in {chunks} chunks")
     return laszip
 
 
 class ChunksFrom(io.RawIOBase):
-    """A LAZ file's points from one of its chunks on, as lazrs reads them from a file that begins there.
+    """A LAZ file's points from one of its chunks on, presented to lazrs as a file that begins there.
 
-    lazrs 0.8 can seek, but not where chunks differ in size (COPC): its `seek` takes the point's number modulo the
-    size of its own chunk, and delivers others. So it is given a file without the chunks before: the place of the
-    table, the chunks, and a table of those.
+    lazrs 0.8 cannot seek correctly where chunks differ in size (COPC): its `seek` takes the point's
+    number modulo the size of its own chunk and delivers other points. This file object omits the
+    earlier chunks. It consists of the offset of the chunk table, the remaining chunks, and a table
+    of those.
     """
 
     def __init__(self, lazrs: Any, file: BinaryIO, start: int, laszip: bytes, point: int) -> None:
-        """file: the LAZ file, open; its position is used.  start: byte where its points begin.  laszip: its record.
+        """Find the chunk that holds a point.
 
-        point: the point whose chunk is the first here; `skip` is how many others stand before it in there.
+        file: the open LAZ file; its position is used.
+        start: offset of its point data.
+        laszip: its LASzip record.
+        point: number of the point whose chunk is the first here; `skip` is the number of points
+        before it in that chunk.
         """
         vlr = lazrs.LazVlr(laszip)
         file.seek(start)
@@ -106,7 +115,7 @@ class ChunksFrom(io.RawIOBase):
                 break
             at, self.skip, first = at + size, self.skip - points, first + 1
         if first == len(chunks):
-            raise ValueError(f"point {point} lies behind the last chunk")
+            raise ValueError(f"point {point} lies after the last chunk")
         table = io.BytesIO()
         lazrs.write_chunk_table(table, chunks[first:], vlr)
         self._file, self._from = file, at
@@ -125,7 +134,7 @@ class ChunksFrom(io.RawIOBase):
         return self._at
 
     def readinto(self, buffer: Any) -> int:
-        """Fill as much of the buffer as comes from one of the three parts; returns the number of bytes."""
+        """Fill the buffer from one of the three parts, as far as it goes; return the number of bytes."""
         view = memoryview(buffer).cast("B")
         if 8 <= self._at < self._past:
             self._file.seek(self._from + self._at - 8)
@@ -141,7 +150,7 @@ class ChunksFrom(io.RawIOBase):
 def _laszip_record(
     file: BinaryIO, path: Path, header_size: int, vlr_count: int
 ) -> tuple[bytes, list[tuple[int, int]]]:
-    """The LASzip record, and (type, bytes) of each item of a point that it names."""
+    """Return the LASzip record, and (type, bytes) of each item of a point that it lists."""
     file.seek(header_size)
     for _ in range(vlr_count):
         user, record_id, length = struct.unpack_from(
@@ -155,14 +164,16 @@ def _laszip_record(
             items = [struct.unpack_from("<HH", record, 34 + 6 * k) for k in range(count)]
             return record, items
         file.seek(length, 1)
-    raise _damaged(path, "no whole record 22204 of 'laszip encoded'", "it before the points of a LAZ file")
+    raise _damaged(
+        path, "no whole record 22204 of 'laszip encoded'", "this record before the points of a LAZ file"
+    )
 
 
 def _chunk_table(file: BinaryIO, path: Path, start: int, size: int) -> tuple[int, int]:
-    """The byte where the chunk table begins, and the number of chunks.
+    """Return the offset of the chunk table and the number of chunks. Raises ScanError.
 
-    The points begin with the table's place (int64); where a writer could not know it, it is -1 there and
-    right in the file's last 8 bytes.
+    The point data begins with the offset of the table (int64). A writer that cannot know it yet
+    writes -1 there, and the right value in the last 8 bytes of the file.
     """
     for place in (start, size - 8):
         file.seek(place)
@@ -173,10 +184,10 @@ def _chunk_table(file: BinaryIO, path: Path, start: int, size: int) -> tuple[int
     file.seek(max(0, min(table, size)))
     raw = file.read(8)
     chunks = struct.unpack("<II", raw)[1] if len(raw) == 8 else size
-    # A chunk holds at least its first point, raw, so there are fewer chunks than bytes.
+    # A chunk holds at least its first point, raw: there are fewer chunks than bytes.
     if table < start + 8 or chunks >= size:
         raise _damaged(
-            path, f"a chunk table at byte {table} of {size}", "it behind the points, within the file"
+            path, f"a chunk table at byte {table} of {size}", "a table after the points, within the file"
         )
     return table, chunks
 

@@ -1,4 +1,4 @@
-"""LZF as a stream of bounded memory, which may be split: PCD stores one column behind the other."""
+"""LZF decompression as a forkable stream of bounded memory; PCD stores its columns one after the other."""
 
 import copy
 from io import BufferedReader
@@ -15,27 +15,31 @@ PIECE_BYTES = 1 << 18
 
 
 class LzfStream:
-    """What some bytes of a file decode to, read from the front.
+    """Decompressed content of a byte range of a file, read from the start.
 
-    A copy made by `fork` goes on from the same place, by itself: so that columns that lie one behind the other can be
-    read side by side. It holds one piece of the file and one of the result, 1/2 MiB together.
+    A copy made by `fork` continues from the same position independently. This allows columns stored
+    one after the other to be read side by side. A stream holds one piece of the file and one of the
+    result, 1/2 MiB together.
     """
 
     def __init__(self, path: Path, start: int, past: int) -> None:
-        """start, past: bytes of the file, compressed."""
+        """Open the compressed bytes [start, past) of the file."""
         self._path, self._at, self._past = path, start, past
         self._source = np.empty(0, np.uint8)
         self._out = np.empty(FARTHEST_BACK + PIECE_BYTES + LONGEST_COPY, np.uint8)
         self._have = self._given = 0
 
     def fork(self) -> "LzfStream":
-        """Another stream at the same place."""
+        """Return an independent stream at the same position."""
         other = copy.copy(self)
         other._out = self._out.copy()
         return other
 
     def read(self, file: BufferedReader, count: int) -> NDArray[np.uint8]:
-        """The next `count` bytes, (count,). file: the file, open; its position is used. Raises ScanError."""
+        """Return the next `count` bytes, (count,). Raises ScanError.
+
+        file: the open file; its position is used.
+        """
         result = np.empty(count, np.uint8)
         seen = 0
         while seen < count:
@@ -45,12 +49,12 @@ class LzfStream:
         return result
 
     def skip(self, file: BufferedReader, count: int) -> None:
-        """Go past the next `count` bytes; the rest as `read`."""
+        """Skip the next `count` bytes. Parameters and errors as in `read`."""
         while count:
             count -= len(self._next(file, count))
 
     def _next(self, file: BufferedReader, most: int) -> NDArray[np.uint8]:
-        """Some of the next bytes, at least one and at most `most`; a view that the next call overwrites."""
+        """Return a view of 1 to `most` of the next bytes; the next call overwrites it."""
         if self._given == self._have:
             self._decode(file)
         begin = self._given
@@ -58,7 +62,7 @@ class LzfStream:
         return self._out[begin : self._given]
 
     def _decode(self, file: BufferedReader) -> None:
-        """Decode on, with what a reference may go back to kept in front."""
+        """Decode the next piece, keeping the bytes that a back-reference can reach before it."""
         check()
         kept = min(self._have, FARTHEST_BACK)
         self._out[:kept] = self._out[self._have - kept : self._have]
@@ -74,7 +78,7 @@ class LzfStream:
         if not right or self._have == kept:
             raise scan_error(
                 self._path,
-                "compressed data that ends too soon, or refers to what was before its beginning",
+                "compressed data that ends too soon, or refers to bytes before its beginning",
                 "LZF of as many bytes as its header declares",
                 "fetch the file again, it is truncated or damaged",
             )

@@ -1,7 +1,8 @@
-"""OBJ and STL meshes as point sources: their vertices, as the file has them, duplicates too.
+"""OBJ and STL readers: the vertices of meshes as points, in file order, duplicates included.
 
-They are read here and in blocks. trimesh, which samples surfaces (surface.py), holds the whole mesh, and
-its OBJ loader leaves out what no face uses and splits what two texture coordinates share.
+The vertices are read here, in blocks. trimesh, which surface.py uses for sampling, holds the whole
+mesh; its OBJ loader omits vertices that no face uses and splits vertices that have two texture
+coordinates.
 """
 
 import struct
@@ -20,7 +21,7 @@ STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("att
 
 
 class VertexLines(Scan):
-    """The vertices of an OBJ or an ASCII STL: three numbers after a keyword."""
+    """The vertices of an OBJ or ASCII STL file: three numbers after a keyword."""
 
     def __init__(self, path: Path, keyword: str) -> None:
         super().__init__(path, "mesh")
@@ -56,16 +57,19 @@ class BinaryStl(SeekableScan):
 
 
 def open_obj(path: Path) -> list[Scan]:
-    """The vertices of an OBJ file. Raises ScanError."""
+    """Return the one scan of an OBJ file, its vertices. Raises ScanError."""
     return [VertexLines(path, "v")]
 
 
 def open_stl(path: Path) -> list[Scan]:
-    """The corners of an STL file, binary or ASCII; reads its first and last bytes only. Raises ScanError."""
+    """Return the one scan of an STL file, the corners of its triangles, binary or ASCII.
+
+    Reads the first and last bytes of the file only. Raises ScanError.
+    """
     size = path.stat().st_size
     with library_errors(path), path.open("rb") as file:
         start = file.read(1024)
-        # Many binary files begin with "solid" too, in the 80 bytes that may hold anything.
+        # Many binary files begin with "solid" too: their first 80 bytes may hold anything.
         if start.lstrip().startswith(b"solid") and (b"facet" in start or b"endsolid" in start):
             _check_ascii_end(file, path, size)
             return [VertexLines(path, "vertex")]

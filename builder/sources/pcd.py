@@ -1,7 +1,9 @@
-"""PCD, the point cloud library's format: in text, binary, or compressed; any fields, of which x, y, z and intensity
-are read. Points that are not a number are directions without a return, which organised clouds keep in their grid.
+"""PCD reader, the format of the Point Cloud Library: ASCII, binary or compressed.
 
-VIEWPOINT is taken as the scan's pose, as the library's own viewer takes it.
+Only the fields x, y, z and intensity are read. Organised clouds store directions without a return
+as NaN points in their grid; these are dropped as NO_RETURN.
+
+VIEWPOINT is applied as the scan's pose, as the library's own viewer does.
 """
 
 import struct
@@ -29,16 +31,22 @@ from .scan import (
     scan_error,
 )
 
-# A header is some hundred bytes; with no DATA line in these it is not one.
+# Maximum bytes of a header. A real one has a few hundred bytes; a file without a DATA line in this
+# range is not a PCD file.
 LONGEST_HEADER = 1 << 16
 KINDS = ("ascii", "binary", "binary_compressed")
 TYPES = {("F", 4): "<f4", ("F", 8): "<f8", **{(t, n): f"<{t.lower()}{n}" for t in "IU" for n in (1, 2, 4, 8)}}
-# A reference of three bytes stands for at most 264 [LZF].
+# Maximum decompressed bytes per compressed byte: a reference of three bytes stands for at most 264
+# [LZF].
 MOST_EXPANSION = 88
 
 
 class Field(NamedTuple):
-    """One field that is read. offset: bytes from the record's begin.  column: the number of its first value."""
+    """One field to read.
+
+    offset: bytes from the start of the record.
+    column: number of its first value in a text row.
+    """
 
     offset: int
     column: int
@@ -46,7 +54,7 @@ class Field(NamedTuple):
 
 
 class Header(NamedTuple):
-    """What the header of a PCD file says. fields: x, y, z, and the intensity where there is one."""
+    """Header of a PCD file. fields: x, y, z, and the intensity where there is one."""
 
     fields: tuple[Field, ...]
     record_bytes: int
@@ -55,11 +63,11 @@ class Header(NamedTuple):
     pose: NDArray[np.float64]
     kind: str
     start: int  # byte offset of the data
-    lines: int  # lines of the header
+    lines: int  # number of header lines
 
 
 def _block(scan: Scan, columns: list[NDArray[Any]]) -> Block:
-    """A block out of the columns of x, y, z and perhaps intensity, (n,) each."""
+    """Build a block from the columns x, y, z and optionally intensity, (n,) each; drops NaN points."""
     xyz = np.stack(columns[:3], axis=1, dtype=np.float64, casting="unsafe")
     intensity = columns[3].astype(np.float32) if len(columns) > 3 else None
     hit = np.asarray(~np.isnan(xyz).any(axis=1))
@@ -71,7 +79,7 @@ def _block(scan: Scan, columns: list[NDArray[Any]]) -> Block:
 
 
 class BinaryPcd(SeekableScan):
-    """The points of one PCD file whose records lie one behind the other."""
+    """The points of a binary PCD file, stored record by record."""
 
     def __init__(self, path: Path, header: Header) -> None:
         super().__init__(path, "pcd", declared_count=header.points, pose=header.pose)
@@ -95,21 +103,23 @@ class BinaryPcd(SeekableScan):
 
 
 class CompressedPcd(Scan):
-    """The points of one compressed PCD file: a column lies behind the other, all in one stream."""
+    """The points of a compressed PCD file: one stream with the columns one after the other."""
 
     def __init__(self, path: Path, header: Header, past: int) -> None:
-        """past: byte behind the compressed data."""
+        """Create the scan; past is the offset of the first byte after the compressed data."""
         super().__init__(path, "pcd", declared_count=header.points, pose=header.pose)
         self._header, self._past = header, past
 
     def _read(self, block_points: int) -> Iterator[Block]:
         header = self._header
         with self.path.open("rb") as file:
-            # Decoded once to find where the last column begins, and again from each column's begin, side by side.
+            # Decode once to find where the last column begins, then decode all columns side by
+            # side, each from its start.
             streams: dict[int, LzfStream] = {}
             stream, at = LzfStream(self.path, header.start + 8, self._past), 0
             for field in sorted(header.fields):
-                # A field of several values has those of a point together: the first of each is read.
+                # A field of several values stores the values of one point together: read the first
+                # of each.
                 stream.skip(file, field.offset * header.points - at)
                 at = field.offset * header.points
                 streams[field.offset] = stream.fork()
@@ -126,7 +136,7 @@ class CompressedPcd(Scan):
 
 
 class AsciiPcd(Scan):
-    """The points of one PCD file in text."""
+    """The points of an ASCII PCD file."""
 
     def __init__(self, path: Path, header: Header) -> None:
         super().__init__(path, "pcd", declared_count=header.points, pose=header.pose)
@@ -151,7 +161,7 @@ class AsciiPcd(Scan):
 
 
 def open_pcd(path: Path) -> list[Scan]:
-    """The one scan of a PCD file; reads its header only. Raises ScanError."""
+    """Return the one scan of a PCD file; reads its header only. Raises ScanError."""
     with library_errors(path), path.open("rb") as file:
         header = _read_header(file, path)
         left = file.seek(0, 2) - header.start
@@ -164,7 +174,7 @@ def open_pcd(path: Path) -> list[Scan]:
 
 
 def _compressed_end(file: BufferedReader, path: Path, header: Header, left: int) -> int:
-    """The byte behind the compressed data; checks both of its sizes."""
+    """Return the offset of the first byte after the compressed data; checks both of its sizes."""
     file.seek(header.start)
     packed, unpacked = struct.unpack("<II", file.read(8).ljust(8, b"\0"))
     if 8 + packed > left:
@@ -183,7 +193,7 @@ def _truncated(path: Path, found: str, expected: str) -> Exception:
 
 
 def _read_header(file: BufferedReader, path: Path) -> Header:
-    """Read and check the header."""
+    """Read and check the header. Raises ScanError."""
     entries: dict[str, list[str]] = {}
     lines = 0
     while "DATA" not in entries:

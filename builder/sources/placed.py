@@ -1,4 +1,4 @@
-"""A scan where somebody says it is: its lengths in metres, z up, at a pose. float64 throughout."""
+"""Scan placed in the world: converted to metres, turned to z up, moved by a pose, in float64."""
 
 import copy
 from collections.abc import Iterator
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from .scan import BOUNDS_MARGIN, Block, Lattice, Scan, apply_pose, checked_bounds
 
-# What one of a file's lengths is [m]. "us-ft": the foot of US surveys, which older state plane coordinates are in.
+# Length units [m]. "us-ft": the US survey foot, which older state plane coordinates use.
 METRES = {
     "m": 1.0,
     "mm": 1e-3,
@@ -20,7 +20,8 @@ METRES = {
     "us-ft": 1200 / 3937,
     "yd": 0.9144,
 }
-# Which axis is up -> which of a file's axes are the world's x, y and z, and which way: turned, never mirrored.
+# Up axis -> source axis of the world's x, y and z, and the sign of each: rotations, never
+# reflections.
 TURNS: dict[str, tuple[tuple[int, int, int], tuple[int, int, int]]] = {
     "z": ((0, 1, 2), (1, 1, 1)),
     "y": ((0, 2, 1), (1, -1, 1)),
@@ -37,10 +38,13 @@ def placed(
     up: str | None = None,
     scale: float = 1.0,
 ) -> Scan:
-    """A scan at a pose, in metres, with z up; the scan itself where that changes no number of it.
+    """Return a scan at a pose, in metres, with z up; the scan itself where no coordinate changes.
 
-    pose: (4, 4), the scan in metres with z up -> world; None, or the scan's own: as the scan has it.  units: a key of
-    METRES, up: of TURNS; None: as the scan says.  scale: besides, above 0.
+    pose: (4, 4), scan in metres with z up -> world; None or the scan's own pose: keep the scan's
+    pose.
+    units: a key of METRES; None: the scan's own.
+    up: a key of TURNS; None: the scan's own.
+    scale: an additional factor, above 0.
     """
     units, up = units or scan.units, up or scan.up
     if pose is not None and np.array_equal(pose, scan.pose):
@@ -54,11 +58,12 @@ def placed(
 
 
 class PlacedScan(Scan):
-    """A scan scaled to metres, turned so that z is up, and at the pose given, in this order.
+    """A scan scaled to metres, turned to z up, and moved by the given pose, in this order.
 
-    Without a pose given the scan keeps its own, which is applied first, in the file's own units and axes; one that is
-    given takes its place. Each number is multiplied once, axes are exchanged exactly, then `apply_pose`: a point has
-    the same bits in whatever block it comes. `pose` says all of it, the scale too.
+    Without a given pose the scan keeps its own, which is applied first, in the file's own units and
+    axes. A given pose replaces the scan's own. Each number is multiplied once, axes are exchanged
+    exactly, then `apply_pose` runs: a point gets the same bits in any block. `pose` combines all
+    steps, including the scale.
     """
 
     def __init__(
@@ -66,7 +71,8 @@ class PlacedScan(Scan):
     ) -> None:
         bounds = inner.bounds
         if given is not None and not np.array_equal(inner.pose, _IDENTITY):
-            # Readers apply the pose that a scan has: a copy without one. Its bounds were the world's, and are no more.
+            # Readers apply the scan's own pose: use a copy without one. Its bounds were in the
+            # world frame and no longer apply.
             inner, bounds = copy.copy(inner), None
             inner.pose, inner.bounds = _IDENTITY, None
         self._inner = inner
@@ -96,15 +102,15 @@ class PlacedScan(Scan):
         self.dropped = self._inner.dropped
 
     def _turned(self, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Points in metres with z up, (n, 3); a sign is exact, so all of it rounds once."""
+        """Return the points in metres with z up, (n, 3); changing a sign is exact, hence one rounding."""
         turned = np.empty_like(xyz)
-        with np.errstate(over="ignore"):  # what is beyond float64 is infinite, which the caller counts
+        with np.errstate(over="ignore"):  # values beyond float64 become infinite; the caller counts them
             for axis, (source, sign) in enumerate(zip(self._axes, self._signs, strict=True)):
                 np.multiply(xyz[:, source], sign * self._factor, out=turned[:, axis])
         return turned
 
     def _lattice(self) -> Lattice | None:
-        """The source's lattice with its axes exchanged; None where points are moved off it."""
+        """Return the source's lattice with its axes exchanged; None where points are moved off it."""
         inner = self._inner.lattice
         if inner is None or self._factor != 1 or not np.array_equal(self._given, _IDENTITY):
             return None
@@ -113,7 +119,7 @@ class PlacedScan(Scan):
         return Lattice((scale[i], scale[j], scale[k]), (a * offset[i], b * offset[j], c * offset[k]))
 
     def _bounds(self, bounds: NDArray[np.float64]) -> NDArray[np.float64] | None:
-        """The box that holds the box `bounds`, (2, 3) both, of which no point can be outside."""
+        """Return a box (2, 3) that encloses every point of the box `bounds` (2, 3) once placed."""
         corners = np.array(
             [[bounds[k, 0], bounds[m, 1], bounds[n, 2]] for k in (0, 1) for m in (0, 1) for n in (0, 1)]
         )

@@ -1,7 +1,7 @@
-"""PLY: the vertices of one file, ASCII or binary of either byte order.
+"""PLY reader: the vertices of one file, ASCII or binary of either byte order.
 
-plyfile reads the header. The body is read here, in blocks: plyfile would read faces one by one and ASCII
-vertices into one array of the size the header claims.
+plyfile reads the header. This module reads the body in blocks, because plyfile reads faces one by
+one and ASCII vertices into one array of the size that the header claims.
 """
 
 import io
@@ -24,18 +24,18 @@ from .scan import (
     scan_error,
 )
 
-# A header is some hundred bytes; with no end in this many it is not one.
+# Maximum bytes of a header. A real one has a few hundred bytes.
 LONGEST_HEADER = 1 << 20
 
 
 class Header(NamedTuple):
-    """What the header of a PLY file says about its vertices."""
+    """Description of a PLY file's vertices, from its header."""
 
-    record: np.dtype[np.void]  # one vertex as it lies in a binary file
+    record: np.dtype[np.void]  # layout of one vertex in a binary file
     points: int
     start: int  # byte offset of the body
-    skip: int  # what lies before the vertices: bytes in a binary file, lines in an ASCII one
-    lines: int  # lines of the header
+    skip: int  # size of the data before the vertices: bytes in a binary file, lines in an ASCII one
+    lines: int  # number of header lines
     ascii: bool
     intensity: str | None  # the property's name
 
@@ -58,7 +58,7 @@ class BinaryPly(SeekableScan):
 
 
 def _skip_lines(file: BinaryIO, lines: int) -> None:
-    """Read past lines, of any length, in bounded memory; to the end where there are fewer."""
+    """Read past lines of any length, in bounded memory; stops at the end of the file."""
     while lines and (piece := file.readline(LONGEST_LINE)):
         lines -= piece.endswith(b"\n")
 
@@ -74,7 +74,8 @@ class AsciiPly(Scan):
         header = self._header
         if not header.points:
             return
-        # Rows are handed on as float64 under the vertex's own names, as the records of a binary file are.
+        # Rows become float64 records with the vertex's property names, like the records of a binary
+        # file.
         names = header.record.names or ()
         row = np.dtype([(name, np.float64) for name in names])
         seen = 0
@@ -97,7 +98,7 @@ class AsciiPly(Scan):
 
 
 def _block(record: NDArray[np.void], intensity: str | None) -> Block:
-    """One block out of vertices as they lie in the file."""
+    """Convert vertex records to a block."""
     xyz = np.empty((len(record), 3))
     for axis, name in enumerate("xyz"):
         xyz[:, axis] = record[name]
@@ -105,12 +106,12 @@ def _block(record: NDArray[np.void], intensity: str | None) -> Block:
 
 
 def open_ply(path: Path) -> list[Scan]:
-    """The one scan of a PLY file; reads its header only. Raises ScanError."""
+    """Return the one scan of a PLY file; reads its header only. Raises ScanError."""
     with library_errors(path), path.open("rb") as file:
         header = _read_header(file, path)
         least = 2 * len(header.record.names or ()) if header.ascii else header.record.itemsize
         left = path.stat().st_size - header.start - (0 if header.ascii else header.skip)
-        # The last ASCII row may lack its line end, hence the one byte more.
+        # The last ASCII row may lack its line end; allow one byte for it.
         if header.points * least > left + header.ascii:
             raise _truncated(path, max(0, left // least), header.points)
         return [(AsciiPly if header.ascii else BinaryPly)(path, header)]
@@ -126,12 +127,12 @@ def _truncated(path: Path, found: int, declared: int) -> Exception:
 
 
 def _read_header(file: BinaryIO, path: Path) -> Header:
-    """Read and check the header; leaves the file at the start of the body."""
+    """Read and check the header; leaves the file position at the start of the body."""
     lines: list[str] = []
     counts: list[int] = []
     while not lines or lines[-1] != "end_header":
         raw = file.readline(LONGEST_HEADER)
-        # Some writers leave blanks at the ends of lines ("ply "), which plyfile does not take.
+        # Some writers leave blanks at the ends of lines ("ply "), which plyfile refuses.
         line = raw.decode("ascii", "replace").strip()
         if (not lines and line != "ply") or not raw or file.tell() > LONGEST_HEADER:
             raise scan_error(
@@ -143,7 +144,7 @@ def _read_header(file: BinaryIO, path: Path) -> Header:
         words = line.split()
         if len(words) == 3 and words[0] == "element" and words[2].isdecimal():
             counts.append(int(words[2]))
-            # plyfile reads as many records as it is told to: none, it is the header alone that we want.
+            # plyfile reads the declared number of records. Declare none: only the header is needed.
             line = f"element {words[1]} 0"
         lines.append(line)
     start = file.tell()

@@ -1,6 +1,7 @@
-"""PTS: a line with the number of points, then as many rows of x y z, intensity and colour; and so on.
+"""PTS reader: blocks of a point count and as many rows of x y z, intensity and colour.
 
-Each such block is a scan. A file of that suffix without a count before its rows is read as any other text.
+Each block is one scan. A file with this suffix but without a count before its rows is read as any
+other text scan.
 """
 
 from pathlib import Path
@@ -11,7 +12,10 @@ from .text import open_text
 
 
 def open_pts(path: Path) -> list[Scan]:
-    """The scans of a PTS file, in its order; reads through it to find them (counted.py). Raises ScanError."""
+    """Return the scans of a PTS file, in file order. Raises ScanError.
+
+    Reads the whole file to find the blocks (counted.py).
+    """
     scans: list[Scan] = []
     with library_errors(path), path.open("rb") as file:
         text, line = next_line(file, 1)
@@ -21,7 +25,7 @@ def open_pts(path: Path) -> list[Scan]:
             if not _is_count(text):
                 raise scan_error(
                     path,
-                    f"line {line} is {text[:60]!r} behind the last of {scans[-1].declared_count} points",
+                    f"line {line} is {text[:60]!r} after the last of {scans[-1].declared_count} points",
                     "the end of the file, or the number of points that follow",
                     "correct the count before them",
                 )
@@ -35,5 +39,5 @@ def open_pts(path: Path) -> list[Scan]:
 
 
 def _is_count(text: str) -> bool:
-    """Whether a line is a number of points; 18 digits are enough, and Python refuses to read thousands."""
+    """Return whether a line is a point count of at most 18 digits; Python cannot convert thousands."""
     return text.isdecimal() and len(text) <= 18

@@ -1,8 +1,9 @@
-"""PTX: scans of a terrestrial scanner, one behind the other in text, each with the scanner's pose.
+"""PTX reader: scans of a terrestrial scanner in text, one after the other, each with its pose.
 
-A scan begins with two numbers, columns and rows of its grid; the scanner's position and axes, four lines that the
-matrix says again; and that matrix, four lines of four, for points as rows: x' = (x y z 1) M. Then one line a cell of
-the grid, column by column: x y z, intensity (0 to 1) and perhaps a colour. Directions without a return are 0 0 0.
+A scan begins with two numbers, the columns and rows of its grid. Four lines give the scanner's
+position and axes; the matrix repeats them. Four lines of four numbers give that matrix, for points
+as rows: x' = (x y z 1) M. Then follows one line per grid cell, column by column: x y z, intensity
+(0 to 1) and optionally a colour. A direction without a return is 0 0 0.
 """
 
 from io import BufferedReader
@@ -15,12 +16,15 @@ from .counted import MOST_SCANS, CountedRows, next_line, skip_rows
 from .rows import LONGEST_LINE, is_number
 from .scan import FARTHEST, Scan, library_errors, scan_error
 
-# Numbers in each line of the head, behind the two of the grid's size.
+# Numbers in each header line after the two lines of the grid's size.
 HEAD = (3, 3, 3, 3, 4, 4, 4, 4)
 
 
 def open_ptx(path: Path) -> list[Scan]:
-    """The scans of a PTX file, in its order; reads through it to find them (counted.py). Raises ScanError."""
+    """Return the scans of a PTX file, in file order. Raises ScanError.
+
+    Reads the whole file to find the scans (counted.py).
+    """
     scans: list[Scan] = []
     with library_errors(path), path.open("rb") as file:
         text, line = next_line(file, 1)
@@ -46,7 +50,7 @@ def open_ptx(path: Path) -> list[Scan]:
 
 
 def _size(path: Path, line: int, text: str) -> int:
-    """The columns or the rows of a grid."""
+    """Return the column or row count of a grid. Raises ScanError."""
     if not text.isdecimal() or len(text) > 9:
         raise scan_error(
             path,
@@ -58,9 +62,11 @@ def _size(path: Path, line: int, text: str) -> int:
 
 
 def _pose(file: BufferedReader, path: Path, line: int) -> NDArray[np.float64]:
-    """The pose out of a scan's head, (4, 4), from its first line behind the grid's size, number `line`.
+    """Read the pose (4, 4) of a scan's header. Raises ScanError.
 
-    The matrix need not be rigid: files are seen that stretch an axis, and it is what says where points are.
+    line: number of the first line after the grid's size, at the current file position.
+    The matrix need not be rigid: files exist that stretch an axis, and the matrix determines where
+    the points are.
     """
     found: list[list[float]] = []
     for number, expected in enumerate(HEAD, line):

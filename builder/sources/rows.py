@@ -1,4 +1,4 @@
-"""Rows of numbers in text, read in bounded blocks: what text scans, ASCII PLY, OBJ and ASCII STL share."""
+"""Rows of numbers in text, read in bounded blocks: shared by text scans, ASCII PLY, OBJ and ASCII STL."""
 
 import io
 import re
@@ -14,10 +14,11 @@ from ...schemas.errors import ScanError
 from ...schemas.interrupts import check
 from .scan import scan_error
 
-# 4 MiB of text is about 130,000 rows of three numbers. At worst ("1 1 1 ...") it is 2 M numbers, 16 MiB.
+# 4 MiB of text is about 130,000 rows of three numbers. In the worst case ("1 1 1 ...") it is 2 M
+# numbers, 16 MiB.
 CHUNK_BYTES = 4 << 20
 
-# The longest line accepted; a file without line ends would otherwise be read whole to find one.
+# Longest accepted line; without this limit a file without line ends would be read whole.
 LONGEST_LINE = 1 << 20
 
 NEWLINE = b"\n"
@@ -26,16 +27,18 @@ NEWLINE = b"\n"
 def text_chunks(file: BinaryIO, path: Path, first_line: int = 1) -> Iterator[tuple[int, bytes]]:
     """Read the rest of a file as chunks of whole lines.
 
-    file: open for reading bytes, at the start of a line.  first_line: the number of that line, for messages.
-    Yields (number of the chunk's first line, its bytes). Raises ScanError for a line over LONGEST_LINE and
-    for a zero byte.
+    file: open in binary mode, at the start of a line.
+    first_line: the number of that line, for messages.
+    Yields (number of the chunk's first line, its bytes). Raises ScanError for a line longer than
+    LONGEST_LINE and for a zero byte.
     """
     rest = b""
     line = first_line
     while data := file.read(CHUNK_BYTES):
-        check()  # an OBJ may have nothing but faces for gigabytes
+        check()  # an OBJ may hold gigabytes of faces only, and yield no block meanwhile
         data = rest + data
-        # A file system that lost a part of a file gives zeros in its place; OBJ would skip them as no vertex.
+        # A file system that lost part of a file returns zeros in its place; OBJ would skip them as
+        # a line without a vertex.
         if b"\0" in data:
             at = line + data.count(NEWLINE, 0, data.index(b"\0"))
             raise scan_error(
@@ -58,13 +61,13 @@ def text_chunks(file: BinaryIO, path: Path, first_line: int = 1) -> Iterator[tup
 
 
 def split_row(line: str, delimiter: str | None) -> list[str]:
-    """The fields of one line, as numpy.loadtxt would split it: "#" starts a comment, blanks around go."""
+    """Split one line into stripped fields as numpy.loadtxt does; "#" starts a comment."""
     line = line.split("#", 1)[0].strip()
     return [field.strip() for field in line.split(delimiter)] if line else []
 
 
 def is_number(field: str) -> bool:
-    """Whether a field of a row is a number; Python's "1_000" is none to the readers of other programs."""
+    """Return whether a field is a number; Python's "1_000" is not, because other programs refuse it."""
     try:
         float(field)
     except ValueError:
@@ -73,10 +76,11 @@ def is_number(field: str) -> bool:
 
 
 def _parse(lines: io.BytesIO | list[bytes], delimiter: str | None, **options: object) -> NDArray[np.float64]:
-    """The rows of some lines by numpy's own reader, (n, columns); ValueError for a line it cannot read."""
+    """Parse lines with numpy.loadtxt into (n, columns); raises ValueError for a line it cannot read."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # "input contained no data": blank lines are no fault
-        # Latin-1 takes any byte, so that a stray one is reported as a broken line and not as a codec's error.
+        warnings.simplefilter("ignore", UserWarning)  # "input contained no data": blank lines are valid
+        # Latin-1 decodes any byte: a stray byte is reported as a broken line and not as a codec
+        # error.
         return np.loadtxt(lines, delimiter=delimiter, encoding="latin-1", ndmin=2, **options)  # type: ignore[call-overload, no-any-return]
 
 
@@ -91,18 +95,20 @@ def number_rows(
 ) -> Iterator[NDArray[np.float64]]:
     """Read rows of `columns` numbers each, in blocks of at most CHUNK_BYTES of text.
 
-    file: open for reading bytes, at the start of line number `first_line`.
-    delimiter: "," or ";", or None for any run of blanks.  limit: stop after that many rows.
-    Yields (n, columns) float64, n > 0. Blank lines and what follows "#" are skipped. Numbers are rounded
-    correctly (David Gay's algorithm, by way of CPython). Raises ScanError with the number of the first line
-    that is not `columns` numbers.
-    Parsed by numpy.loadtxt: 3 to 4.7 million rows a second in a trial, against 1.3 for bytes.split().
+    file: open in binary mode, at the start of line number `first_line`.
+    delimiter: "," or ";", or None for any run of blanks.
+    limit: stop after that many rows.
+    Yields (n, columns) float64, n > 0. Blank lines and text after "#" are skipped. Numbers are
+    rounded correctly (David Gay's algorithm, by way of CPython). Raises ScanError with the number
+    of the first line that is not `columns` numbers.
+    numpy.loadtxt parses 3 to 4.7 million rows a second in a trial, against 1.3 million for
+    bytes.split().
     """
     for line, chunk in text_chunks(file, path, first_line):
         most = None
         if limit is not None:
-            # loadtxt makes room at once for as many rows as it is told to read at most, of as many numbers as the first
-            # has: for no more than these bytes can hold.
+            # loadtxt allocates max_rows rows at once, with as many columns as the first row has.
+            # Bound both by what these bytes can hold.
             if _first_width(chunk, delimiter) not in (None, columns):
                 raise _broken_row(path, line, chunk, columns, delimiter, limit)
             most = min(limit, chunk.count(NEWLINE) + 1, len(chunk) // (2 * columns) + 1)
@@ -122,7 +128,7 @@ def number_rows(
 
 
 def _first_width(chunk: bytes, delimiter: str | None) -> int | None:
-    """How many fields the first row of some lines has; None where there is no row."""
+    """Return the number of fields of the first row in a chunk, or None where there is no row."""
     for raw in io.BytesIO(chunk):
         if fields := split_row(raw.decode("latin-1"), delimiter):
             return len(fields)
@@ -132,7 +138,7 @@ def _first_width(chunk: bytes, delimiter: str | None) -> int | None:
 def _broken_row(
     path: Path, first_line: int, chunk: bytes, columns: int, delimiter: str | None, limit: int | None
 ) -> ScanError:
-    """The error for the first line of a chunk that is not `columns` numbers; slow, and called once."""
+    """Build the error for the first line of a chunk that is not `columns` numbers; slow, called once."""
     expected = f"{columns} numbers like the first row"
     rows = 0
     for number, raw in enumerate(io.BytesIO(chunk), first_line):
@@ -142,7 +148,8 @@ def _broken_row(
         rows += bool(fields)
         if rows == limit:
             break
-    # loadtxt and is_number() differ on what a number is: name the chunk, it is all we know.
+    # loadtxt and is_number() differ on what a number is: the failing line is unknown, report the
+    # chunk.
     return _broken_line(path, first_line, b"(here or below)", expected)
 
 
@@ -153,9 +160,9 @@ def _broken_line(path: Path, number: int, raw: bytes, expected: str) -> ScanErro
 
 
 def keyword_rows(file: BinaryIO, path: Path, keyword: str) -> Iterator[NDArray[np.float64]]:
-    """Read the three numbers after a keyword ("v" in OBJ, "vertex" in STL), other lines skipped.
+    """Read the three numbers after a keyword ("v" in OBJ, "vertex" in STL); other lines are skipped.
 
-    Yields (n, 3) float64, n > 0; further numbers on the line (a weight, a colour) are left out.
+    Yields (n, 3) float64, n > 0; further numbers on the line (a weight, a colour) are ignored.
     Raises ScanError with the number of the first line whose three numbers cannot be read.
     """
     lines_of = re.compile(rb"^[ \t]*" + keyword.encode() + rb"(?:[ \t]+(.*))?$", re.MULTILINE)
@@ -163,7 +170,7 @@ def keyword_rows(file: BinaryIO, path: Path, keyword: str) -> Iterator[NDArray[n
         found = lines_of.findall(chunk)
         try:
             rows = _parse(found, None, usecols=(0, 1, 2)) if found else np.empty((0, 3))
-            broken = len(rows) != len(found)  # loadtxt skips a keyword with nothing behind it
+            broken = len(rows) != len(found)  # loadtxt skips a keyword with nothing after it
         except ValueError:
             broken = True
         if broken:
@@ -175,7 +182,7 @@ def keyword_rows(file: BinaryIO, path: Path, keyword: str) -> Iterator[NDArray[n
 def _broken_keyword(
     path: Path, first_line: int, chunk: bytes, lines_of: re.Pattern[bytes], keyword: str
 ) -> ScanError:
-    """The error for the first line of a chunk whose keyword is not followed by three numbers."""
+    """Build the error for the first line of a chunk whose keyword lacks three numbers after it."""
     expected = f"{keyword!r} and three numbers"
     for number, raw in enumerate(io.BytesIO(chunk), first_line):
         match = lines_of.match(raw.rstrip(b"\r\n"))

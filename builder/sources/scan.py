@@ -1,7 +1,8 @@
-"""What every scan reader gives: a scan, its blocks of points, and the errors it ends in.
+"""Base class of all scans, blocks of points, and the errors that readers raise.
 
-A reader is a subclass of Scan that implements `_read`. It holds no open file, only what the header said,
-so that scans can be listed by the thousand and sent to other processes.
+A reader is a subclass of Scan that implements `_read`. It holds no open file, only what the header
+declares. A scan is therefore small and can be pickled: thousands can be listed and sent to other
+processes.
 """
 
 import errno
@@ -21,34 +22,34 @@ from numpy.typing import NDArray
 from ...schemas.errors import ScanError, SolidcloudError
 from ...schemas.interrupts import check
 
-# A block of 2^18 points is 6 MiB of float64: large enough that the cost of a Python loop round is lost in
-# it, small enough that a few of them count as nothing beside any --memory.
+# A block of 2^18 points is 6 MiB of float64: large enough to hide the cost of one round of the
+# Python loop, small enough that a few blocks are negligible beside any --memory.
 BLOCK_POINTS = 1 << 18
 
-# Bytes of raw records held at once. A hostile header may claim records of 65,535 bytes (LAS) or a thousand
-# properties (PLY); without this bound a block of them would be gigabytes.
+# Maximum bytes of raw records held at once. A hostile header may claim records of 65,535 bytes
+# (LAS) or a thousand properties (PLY); without this bound a block of them would take gigabytes.
 BLOCK_BYTES = 64 << 20
 
-# Bytes of a file that are hashed at a time.
+# Bytes of a file hashed per read.
 HASHED_BYTES = 1 << 20
 
-# No coordinate is farther from the origin than this [m] (NUMERICS.md, case 16).
+# Largest valid distance of a coordinate from the origin [m] (NUMERICS.md, case 16).
 FARTHEST = 1e9
 
-# The reason under which points are counted that are not finite, or beyond FARTHEST.
+# Drop reason of points that are not finite or lie beyond FARTHEST.
 NOT_FINITE = "not finite"
 
-# The reason under which directions are counted that a scanner measured nothing in.
+# Drop reason of directions in which the scanner measured nothing.
 NO_RETURN = "no return"
 
-# How far a quaternion's length may be from 1 (NUMERICS.md, case 4): float32 rounding passes, |q| = 1.01,
-# which would stretch space by 1.5 %, does not.
+# Maximum deviation of a quaternion's length from 1 (NUMERICS.md, case 4). float32 rounding passes;
+# |q| = 1.01, which would stretch space by 1.5 %, does not.
 QUATERNION_SLACK = 1e-6
 
-# Added to bounds that were computed and not read [m]: covers float64 rounding up to 1e9 m (0.12 um a step).
+# Margin added to computed bounds [m]: covers float64 rounding up to 1e9 m (0.12 um per operation).
 BOUNDS_MARGIN = 1e-6
 
-# Names a column of intensities goes by, in lower case; CloudCompare writes "scalar_" before its own.
+# Column names of intensity, in lower case; CloudCompare prefixes its own with "scalar_".
 INTENSITY_NAMES = ("intensity", "scalar_intensity")
 
 
@@ -56,7 +57,7 @@ _IDENTITY = np.eye(4)
 
 
 class Lattice(NamedTuple):
-    """The grid a source's own coordinates lie on, world frame: x = offset + k * scale [m]."""
+    """Grid on which a source stores its coordinates, world frame: x = offset + k * scale [m]."""
 
     scale: tuple[float, float, float]
     offset: tuple[float, float, float]
@@ -65,7 +66,7 @@ class Lattice(NamedTuple):
 class Block(NamedTuple):
     """Some points of a scan.
 
-    xyz: (n, 3) float64, world frame [m], the scan's pose applied; may hold non-finite values.
+    xyz: (n, 3) float64, world frame [m], with the scan's pose applied; may hold non-finite values.
     intensity: (n,) float32 in the source's own unit, or None where the source has none.
     """
 
@@ -74,19 +75,25 @@ class Block(NamedTuple):
 
 
 class Scan(ABC):
-    """One posed cloud in one file, read in blocks.
+    """One posed point cloud in one file, read in blocks.
 
-    path, index: the file, and which of its scans this is, from 0.
+    path, index: the file, and the number of this scan in it, from 0.
     format: "las", "laz", "e57", "ply", "pcd", "ptx", "pts", "text", "mesh" or "glb".
-    declared_count: points the header says there are, invalid ones included; None where it says nothing.
-    pose: (4, 4) float64, scan frame -> world frame, the identity where the file has none.
-    lattice: the grid of the source's coordinates, None where there is none.
-    bounds: (2, 3) float64 world frame [m], low and high corner as the header declares them, or None.
-    dropped: reason -> points left out by the reader; filled while blocks() is iterated, reset when it starts.
-    seekable: blocks() can begin and end anywhere, at the cost of what it reads (`SeekableScan`).
-    units: what one of its lengths is, a key of METRES (placed.py); up: its axis that is up, "z", "y" or "x"; as the
-    format prescribes or, usual, nobody says. blocks() gives coordinates as they are.  crs: the coordinate reference
-    system's text, or "".  fault: what is wrong with it by its header, though others of its file can be read; or "".
+    declared_count: number of points the header declares, invalid ones included; None where it
+    declares none.
+    pose: (4, 4) float64, scan frame -> world frame; the identity where the file has none.
+    lattice: the grid of the source's coordinates, or None.
+    bounds: (2, 3) float64 world frame [m], low and high corner as the header declares them, or
+    None.
+    dropped: reason -> number of points the reader left out; reset when blocks() starts, filled
+    while it is iterated.
+    seekable: True where blocks() can begin and end at any point and reads only that range
+    (`SeekableScan`).
+    units: length unit of the coordinates, a key of METRES (placed.py). up: the axis that points up,
+    "z", "y" or "x". Both are what the format prescribes, or the usual value where it prescribes
+    none. blocks() does not convert coordinates.
+    crs: the coordinate reference system's text, or "".
+    fault: error found in this scan's header while other scans of the file are readable; or "".
     """
 
     seekable = False
@@ -118,11 +125,12 @@ class Scan(ABC):
     def blocks(
         self, block_points: int = BLOCK_POINTS, start: int = 0, stop: int | None = None
     ) -> Iterator[Block]:
-        """Read the points, in the order of the file, at most `block_points` at a time.
+        """Read the points in file order, at most `block_points` at a time.
 
-        start, stop: which of the declared points to read, those that are dropped counted too; only a seekable scan
-        takes other than 0 and None. Memory is bounded by the block, whatever the file claims. Each call starts anew.
-        Raises ScanError when the file is broken or ends before its header said.
+        start, stop: range of declared points to read, dropped points counted too. Only a seekable
+        scan accepts values other than 0 and None.
+        Memory is bounded by the block size, whatever the file claims. Each call starts a new pass.
+        Raises ScanError when the file is broken or ends before the declared count.
         """
         if block_points < 1:
             raise ValueError(f"block_points is {block_points}, expected at least 1")
@@ -134,18 +142,18 @@ class Scan(ABC):
                 yield block
 
     def _read_range(self, block_points: int, start: int, stop: int | None) -> Iterator[Block]:
-        """The blocks of a range; refuses any but the whole, which SeekableScan does not."""
+        """Return the blocks of a range. Only the whole range is allowed; SeekableScan overrides this."""
         if (start, stop) != (0, None):
             raise ValueError(f"points {start} to {stop} of a scan that cannot seek, expected 0 to None")
         return self._read(block_points)
 
     @abstractmethod
     def _read(self, block_points: int) -> Iterator[Block]:
-        """Yield the blocks; may raise anything, blocks() converts it."""
+        """Yield all blocks. blocks() converts any exception."""
 
 
 class SeekableScan(Scan):
-    """A scan of records that can be found without reading those before: `_read_between` in place of `_read`."""
+    """A scan with directly addressable records; subclasses implement `_read_between`, not `_read`."""
 
     seekable = True
 
@@ -161,11 +169,11 @@ class SeekableScan(Scan):
 
     @abstractmethod
     def _read_between(self, block_points: int, start: int, stop: int) -> Iterator[Block]:
-        """Yield the blocks of points [start, stop), start < stop; may raise anything, blocks() converts it."""
+        """Yield the blocks of points [start, stop), start < stop. blocks() converts any exception."""
 
 
 class BrokenScan(Scan):
-    """A scan that cannot be read, of a file in which others can: reading it raises its fault."""
+    """An unreadable scan in a file with other, readable scans; reading it raises its fault."""
 
     def __init__(self, path: Path, format: str, index: int, fault: str) -> None:
         super().__init__(path, format, index=index)
@@ -178,18 +186,20 @@ class BrokenScan(Scan):
 def read_records(
     file: BufferedReader, path: Path, record: np.dtype[Any], count: int, block_points: int, what: str
 ) -> Iterator[NDArray[Any]]:
-    """Read `count` records of one size from where the file stands, in blocks of bounded memory.
+    """Read `count` records of one size from the current file position, in blocks of bounded memory.
 
-    what: of the records, for the message.  Yields (n,) of `record`, n > 0, overwritten by the next.
-    Raises ScanError where the file ends before.
+    what: plural noun for the records, used in the error message.
+    Yields (n,) of `record`, n > 0; the next block overwrites it. Raises ScanError where the file
+    ends early.
     """
     step = max(1, min(block_points, count, BLOCK_BYTES // record.itemsize))
-    # One buffer for all blocks: fresh memory a block costs as much in page faults as the copy into it.
+    # One buffer serves all blocks: page faults of fresh memory per block cost as much as the copy
+    # into it.
     buffer = np.empty(step, record)
     raw = buffer.view(np.uint8).data
     for seen in range(0, count, step):
         wanted = min(step, count - seen)
-        # readinto() of a buffered file reads on until it has all, or the file ends.
+        # readinto() of a buffered file returns less than requested only at the end of the file.
         got = file.readinto(raw[: wanted * record.itemsize]) // record.itemsize
         if got < wanted:
             raise scan_error(
@@ -202,15 +212,16 @@ def read_records(
 
 
 def scan_error(path: Path, found: str, expected: str, what_to_do: str) -> ScanError:
-    """The error for a scan that cannot be read; every reader's message has this one form."""
+    """Build the error for an unreadable scan, in the one message form all readers use."""
     return ScanError(f"{path}: {found}, expected {expected}: {what_to_do}")
 
 
 @contextmanager
 def library_errors(path: Path) -> Iterator[None]:
-    """Turn whatever a format's library or the file system raises into a ScanError.
+    """Convert exceptions of a format's library or of the file system to ScanError.
 
-    What is raised once the command is interrupted is Interrupted, and that memory ran out is a SolidcloudError.
+    After the command is interrupted, any exception becomes Interrupted. Exhausted memory becomes a
+    SolidcloudError.
     """
     try:
         yield
@@ -221,14 +232,14 @@ def library_errors(path: Path) -> Iterator[None]:
     except BaseException as error:
         if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM):
             raise SolidcloudError(
-                f"{path}: out of memory while it was read, expected a few blocks of points to fit: give fewer --jobs "
-                "or stop other programs, then the same command again; where that does not help, leave it out"
+                f"{path}: out of memory while reading, expected a few blocks of points to fit: give fewer --jobs "
+                "or stop other programs, then repeat the command; if that does not help, leave this file out"
             ) from error
-        # A panic inside lazrs (Rust) is a BaseException of its own and not an Exception.
+        # A Rust panic inside lazrs is a BaseException subclass, not an Exception.
         if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
             raise
         check()
-        # libe57 appends a page of debugging text to its message; the first line says it all.
+        # libe57 appends a page of debugging text to its message; the first line is sufficient.
         first_line = next(iter(str(error).strip().splitlines()), "")
         raise scan_error(
             path,
@@ -239,9 +250,9 @@ def library_errors(path: Path) -> Iterator[None]:
 
 
 def reader_library(name: str, path: Path) -> ModuleType:
-    """Import a format's library on first use, so that nobody pays for readers they do not use.
+    """Import a format's library on first use; unused readers cost no import time.
 
-    Raises ScanError where it is not installed.
+    Raises ScanError where the library is not installed.
     """
     try:
         return importlib.import_module(name)
@@ -255,9 +266,10 @@ def reader_library(name: str, path: Path) -> ModuleType:
 
 
 def checked_bounds(bounds: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    """Bounds out of a header, (2, 3) [m], or None where they are no box a point could be in.
+    """Return header bounds (2, 3) [m], or None where no point could lie in them.
 
-    Writers that do not know them leave zeros, infinities or the largest float64 (high below low in some).
+    Writers that do not know the bounds leave zeros, infinities or the largest float64 (some with
+    high below low).
     """
     believable = np.isfinite(bounds).all() and (np.abs(bounds) <= FARTHEST).all()
     if believable and (bounds[0] <= bounds[1]).all() and (bounds[0] < bounds[1]).any():
@@ -266,17 +278,20 @@ def checked_bounds(bounds: NDArray[np.float64]) -> NDArray[np.float64] | None:
 
 
 def apply_pose(pose: NDArray[np.float64], xyz: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Move points by a pose: R·p + t, float64.
+    """Transform points by a pose: R·p + t, float64.
 
-    pose: (4, 4).  xyz: (n, 3) [m], scan frame.  Returns (n, 3) [m], world frame.
-    Summed in one order, ((x + y) + z) + t, and not by a matrix product: BLAS chooses its order by the
-    number of rows, so the same point would come out with other bits in a block of another size.
+    pose: (4, 4).
+    xyz: (n, 3) [m], scan frame.
+    Returns (n, 3) [m], world frame.
+    The sum has a fixed order, ((x + y) + z) + t. A matrix product is unsuitable: BLAS chooses its
+    order by the number of rows, and the same point would get different bits in a block of another
+    size.
     """
     x, y, z = xyz[:, 0], xyz[:, 1], xyz[:, 2]
     if np.array_equal(pose, _IDENTITY):
         return xyz
     moved = np.empty_like(xyz)
-    with np.errstate(over="ignore", invalid="ignore"):  # points that are not finite stay so
+    with np.errstate(over="ignore", invalid="ignore"):  # non-finite points stay non-finite
         for axis in range(3):
             r = pose[axis]
             moved[:, axis] = ((x * r[0] + y * r[1]) + z * r[2]) + r[3]
@@ -286,9 +301,10 @@ def apply_pose(pose: NDArray[np.float64], xyz: NDArray[np.float64]) -> NDArray[n
 def quaternion_pose(
     path: Path, index: int, quaternion: Sequence[float | None], translation: Sequence[float | None]
 ) -> NDArray[np.float64]:
-    """A pose (4, 4) of a rotation w, x, y, z and a translation x, y, z [m]; the identity for what is None.
+    """Return the pose (4, 4) of a rotation w, x, y, z and a translation x, y, z [m].
 
-    index: of the scan, for the message. Raises ScanError for numbers that are no pose.
+    A part that is None becomes the identity. index: number of the scan, for the message.
+    Raises ScanError for values that form no pose.
     """
     pose = np.eye(4)
     given = [number for number in (*quaternion, *translation) if number is not None]
@@ -322,7 +338,7 @@ def quaternion_pose(
 
 
 def sha256_of(path: Path) -> str:
-    """Return the SHA-256 of a file's bytes in hexadecimal, read as a stream. Raises ScanError."""
+    """Return the SHA-256 of a file's bytes in hexadecimal, reading it as a stream. Raises ScanError."""
     with library_errors(path), path.open("rb", buffering=0) as file:
         digest, buffer = hashlib.sha256(), memoryview(bytearray(HASHED_BYTES))
         while size := file.readinto(buffer):

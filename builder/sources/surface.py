@@ -1,4 +1,4 @@
-"""Points spread over the triangles of a mesh (OBJ, STL, PLY with faces, by trimesh; GLB)."""
+"""Points spread over the triangles of a mesh: OBJ, STL and PLY with faces (by trimesh), and GLB."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,42 +10,51 @@ from numpy.typing import NDArray
 from .glb import GlbScan
 from .scan import NOT_FINITE, Block, Scan, reader_library, scan_error
 
-# Steps of the additive sequence in two dimensions with the plastic number 1.3247...: of all such known the
-# one whose points keep farthest apart (Roberts 2018, "The unreasonable effectiveness of quasirandom
-# sequences"). Any other pair of irrationals is correct too, and clumps more.
+# Steps of the additive sequence in two dimensions with the plastic number 1.3247...: the known
+# sequence of this kind whose points keep farthest apart (Roberts 2018, "The unreasonable
+# effectiveness of quasirandom sequences"). Any other pair of irrationals is correct too, but clumps
+# more.
 STEP_U = 0.7548776662466927
 STEP_V = 0.5698402909980532
 
-# A vertex that is damaged makes a surface of any size: few triangles that come to more points than these are taken for
-# that. A triangle of a binary STL, the longest there is, may have 800; and a hall of a dozen ten millions.
+# A damaged vertex makes a surface of any size. More points than SAMPLES_ANYWAY + SAMPLES_A_BYTE per
+# byte of the file are taken as damage. This allows 800 points per triangle of a binary STL (50
+# bytes), and ten million for a hall of a dozen triangles.
 SAMPLES_A_BYTE = 16
 SAMPLES_ANYWAY = 10**7
 
-# trimesh holds a mesh whole: an OBJ takes about five times its file while it is read.
+# Maximum file size that trimesh loads [bytes]. It holds a mesh whole: reading an OBJ takes about
+# five times its file size.
 LARGEST_MESH = 512 << 20
 
 
 class SurfaceSamples(Scan):
-    """A mesh's surface as points, area / spacing**2 of them."""
+    """Sample points of a mesh's surface, area / spacing**2 of them."""
 
     def __init__(self, vertices: Scan, spacing: float) -> None:
-        """vertices: the same file as points.  spacing: side of the square that one point stands for [m]."""
+        """Create the scan.
+
+        vertices: the same file as points.
+        spacing: side of the square that one point represents [m].
+        """
         super().__init__(vertices.path, "mesh")
         self.up = vertices.up
         self._vertices = vertices
         self._spacing = spacing
 
     def _read(self, block_points: int) -> Iterator[Block]:
-        """Sample k lies where k + 1/2 of the samples' area has gone by, at the k-th place of the sequence.
+        """Yield the samples.
 
-        So the number of points of a triangle follows its area within one, no random number is drawn, and
-        nothing is held but the mesh and the running sum of its areas.
+        Sample k lies in the triangle at which the cumulative area reaches k + 1/2 samples, at the
+        k-th point of the sequence. The number of points in a triangle therefore follows its area
+        within one, no random number is drawn, and only the mesh and the cumulative sum of its areas
+        are held.
         """
         corners = self._triangles()
         area = (
             np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
         )
-        # A triangle with a corner that is not finite has no area to sample.
+        # A triangle with a non-finite corner has no area to sample.
         lost = int(np.count_nonzero(~np.isfinite(area)))
         if lost:
             self.dropped[NOT_FINITE] = lost
@@ -58,8 +67,8 @@ class SurfaceSamples(Scan):
             raise scan_error(
                 self.path,
                 f"a surface of {total[-1]:.3g} square lengths, {wanted:.3g} points",
-                f"at most {most} of a file of {size} bytes",
-                "check the mesh and its units, or give a larger --spacing, or cut its triangles up",
+                f"at most {most} points from a file of {size} bytes",
+                "check the mesh and its units, give a larger --spacing, or subdivide its triangles",
             )
         count = int(np.ceil(wanted))
         for start in range(0, count, block_points):
@@ -71,11 +80,11 @@ class SurfaceSamples(Scan):
             yield Block(a + u[:, None] * (b - a) + v[:, None] * (c - a), None)
 
     def _triangles(self) -> NDArray[np.float64]:
-        """The corners of all triangles, (n, 3, 3)."""
+        """Return the corners of all triangles, (n, 3, 3). Raises ScanError."""
         corners = (
             self._vertices.triangles() if isinstance(self._vertices, GlbScan) else _by_trimesh(self.path)
         )
-        # Of a file without faces trimesh gives nothing, vertices or not.
+        # trimesh returns nothing for a file without faces, whether it has vertices or not.
         if not len(corners) and any(len(block.xyz) for block in self._vertices.blocks()):
             raise scan_error(
                 self.path, "vertices and no faces", "a mesh to sample", "build it without --spacing"
@@ -84,7 +93,7 @@ class SurfaceSamples(Scan):
 
 
 def _by_trimesh(path: Path) -> NDArray[np.float64]:
-    """The corners of all triangles of an OBJ, STL or PLY file, (n, 3, 3). Raises ScanError."""
+    """Return the corners of all triangles of an OBJ, STL or PLY file, (n, 3, 3). Raises ScanError."""
     size = path.stat().st_size
     if size > LARGEST_MESH:
         raise scan_error(
@@ -94,7 +103,7 @@ def _by_trimesh(path: Path) -> NDArray[np.float64]:
             "split it, or build it without --spacing",
         )
     trimesh = reader_library("trimesh", path)
-    # Materials would make trimesh open whatever files the OBJ names.
+    # With materials, trimesh would open any file that the OBJ names.
     mesh = trimesh.load_mesh(path, process=False, skip_materials=True)
     faces = np.asarray(mesh.faces) if hasattr(mesh, "faces") else np.empty((0, 3), np.int64)
     vertices = np.asarray(mesh.vertices, np.float64)
@@ -111,8 +120,8 @@ def _by_trimesh(path: Path) -> NDArray[np.float64]:
 def _unit_triangle(u: Any, v: Any) -> tuple[Any, Any]:
     """Map the unit square onto the triangle u + v <= 1, areas kept in proportion.
 
-    u, v: (n,) float64 in [0, 1).  Returns the same. After Heitz 2019, "A low-distortion map between
-    triangle and square": folding the square along its diagonal would lay two point sets over each other.
+    u, v: (n,) float64 in [0, 1). Returns the same. After Heitz 2019, "A low-distortion map between
+    triangle and square": folding the square along its diagonal would overlay two point sets.
     """
     upper = v > u
     half_u, half_v = u / 2, v / 2

@@ -1,15 +1,17 @@
-"""Text scans: XYZ, TXT and CSV, and PTS without counts, one point a line.
+"""Text scans, one point a line: XYZ, TXT, CSV, and PTS without counts.
 
-What a file may look like, all of it read from its first lines:
-- comments ("#" or "//" first) and blank lines, then perhaps a header row of names, then rows of numbers
-  separated by blanks, commas or semicolons; LF or CRLF;
-- a first line that is one whole number is the count of points. It is held against
-  the rows: fewer of them is a truncated file, more of them a broken one.
-- x, y and z are the columns the header (a row, or a comment with as many names as there are columns) calls
-  so, else the first three.
-- intensity is the column a header calls intensity or scalar_intensity. A PTS file needs no header: its
-  fourth column is the intensity where its rows have 4 or 7 numbers (x y z i, x y z i r g b); with 6 the
-  fourth is red. In any other file without a header a fourth column may mean anything, and is left out.
+The first lines of the file determine the layout:
+- The file begins with optional comments ("#" or "//" first) and blank lines, then an optional
+  header row of names. Rows of numbers follow, separated by blanks, commas or semicolons, with LF or
+  CRLF.
+- A first line that is one whole number is the count of points. It is checked against the rows:
+  fewer rows mean a truncated file, more rows a broken one.
+- x, y and z are the columns with these names in the header (a row, or a comment with as many
+  names as there are columns), else the first three.
+- The intensity is the column that the header names intensity or scalar_intensity. A PTS file
+  needs no header: its fourth column is the intensity where its rows have 4 or 7 numbers (x y z i, x
+  y z i r g b); with 6 the fourth is red. In any other file without a header a fourth column may
+  mean anything and is ignored.
 """
 
 from collections.abc import Iterator
@@ -21,12 +23,12 @@ import numpy as np
 from .rows import LONGEST_LINE, is_number, number_rows, split_row
 from .scan import INTENSITY_NAMES, Block, Scan, library_errors, scan_error
 
-# Lines looked at before the first row of numbers; a file that has more of a preamble is not a point list.
+# Maximum lines before the first row of numbers; a file with a longer preamble is not a point list.
 LONGEST_PREAMBLE = 1000
 
 
 class Layout(NamedTuple):
-    """Where the numbers of a text scan are."""
+    """Positions of the numbers in a text scan."""
 
     start: int  # byte offset of the first row
     line: int  # its line number
@@ -34,14 +36,14 @@ class Layout(NamedTuple):
     delimiter: str | None
     xyz: tuple[int, int, int]  # column numbers
     intensity: int | None
-    points: int | None  # as the first line declares it
+    points: int | None  # the count that the first line declares
 
 
 class TextScan(Scan):
-    """One text scan."""
+    """The points of one text file."""
 
     def __init__(self, path: Path, layout: Layout | None) -> None:
-        """layout: None for a file that has no rows."""
+        """Create the scan; layout is None for a file without rows."""
         super().__init__(path, "text", declared_count=layout.points if layout else 0)
         self._layout = layout
 
@@ -74,13 +76,13 @@ class TextScan(Scan):
 
 
 def open_text(path: Path) -> list[Scan]:
-    """The one scan of a text file; reads its first lines only. Raises ScanError."""
+    """Return the one scan of a text file; reads its first lines only. Raises ScanError."""
     with library_errors(path), path.open("rb") as file:
         return [TextScan(path, _find_layout(file, path))]
 
 
 def _find_layout(file: BinaryIO, path: Path) -> Layout | None:
-    """Read the first lines up to the first row of numbers; None where there is no row."""
+    """Read the file up to the first row of numbers; None where there is no such row."""
     names: tuple[int, str] | None = None  # the header row: its line number and text
     comment = ""  # the last comment, which may name the columns
     count: int | None = None
@@ -125,7 +127,7 @@ def _layout_of(
     names: tuple[int, str] | None,
     comment: str,
 ) -> Layout:
-    """Complete the layout from the first row of numbers and the header."""
+    """Complete the layout from the first row of numbers and the header. Raises ScanError."""
     if len(fields) < 3 or not all(map(is_number, fields)):
         raise scan_error(
             path,
@@ -151,6 +153,6 @@ def _layout_of(
 
 
 def _split_names(text: str) -> list[str]:
-    """The names of a header row, in lower case, without quotes."""
+    """Return the names of a header row, in lower case, without quotes."""
     delimiter = ";" if ";" in text else "," if "," in text else None
     return [name.strip().strip("\"'").lower() for name in text.split(delimiter)]

@@ -193,8 +193,8 @@ def nested(depth: int) -> str:
 
 
 XML_LIES = {
-    "deep": (nested(1000), "", "over 64 in each other"),
-    "deep, and then broken": (nested(1000) + "<", "", "over 64 in each other"),
+    "deep": (nested(1000), "", "nested over 64 deep"),
+    "deep, and then broken": (nested(1000) + "<", "", "nested over 64 deep"),
     "many": ("<vectorChild type='Structure'/>" * (1 << 18), "", "over 262144 elements"),
     "an entity": ("<a>&x;</a>", f'<!DOCTYPE e57Root [<!ENTITY x "{"y" * 9}">]>', "with a document type"),
     "another file": (

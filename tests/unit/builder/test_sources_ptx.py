@@ -117,7 +117,7 @@ def test_a_pts_whose_counts_do_not_fit_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.pts"
     rows = text_rows(points(1, 5)[0])
     for count, message in (
-        (4, "line 6 is .* behind the last of 4 points"),
+        (4, "line 6 is .* after the last of 4 points"),
         (6, "5 rows at most, expected the 6"),
     ):
         path.write_text(f"{count}\n{rows}")

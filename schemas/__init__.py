@@ -1,1 +1,1 @@
-"""The shared core: what the bytes of an archive and of a message mean."""
+"""Shared definitions of the archive format, the wire protocol and the scene file."""

@@ -1,7 +1,7 @@
-"""What a question is answered with: a struct of arrays, one element a pose, ray, point or motion.
+"""Answer types: structs of arrays with one element per pose, ray, point or motion.
 
-No zenoh, no numba and no wire encoding here: `Scene` makes these, `Client` receives them, and both hand
-out the same types.
+No zenoh, no numba and no wire encoding here: `Scene` makes these, `Client` receives them, and both
+return the same types.
 """
 
 from collections.abc import Iterator
@@ -16,7 +16,7 @@ from .arrays import IndexPairs, Positions
 
 
 class Verdict(IntEnum):
-    """What is said of one pose. `CLEAR` only when all in reach was looked at (NUMERICS.md case 21)."""
+    """Verdict on one pose. `CLEAR` only if everything in reach was examined (NUMERICS.md case 21)."""
 
     CLEAR = 0
     CONTACT = 1
@@ -24,15 +24,17 @@ class Verdict(IntEnum):
 
 
 class Cost(msgspec.Struct, frozen=True, eq=False, kw_only=True):
-    """What a whole request cost, and what it left in memory. Every answer has these fields.
+    """Cost of a whole request, and its effect on the cache. Every answer has these fields.
 
     engine_seconds: time between request and answer inside the engine, loads included [s].
-    hits, misses: voxels in reach that were resident, and that had to be loaded, of this request.
+    hits, misses: voxels in reach that were resident, and that had to be loaded, for this request.
     resident, resident_bytes: voxels decoded in memory after this request, and their bytes.
-    faults: one sentence for each voxel that could not be read, where and why; empty when all is well.
-    wait_seconds: of engine_seconds, those that voxels were waited for [s].  late: keys of the voxels that were not
-    there in time, which a budget does not wait for: what depends on them is `UNKNOWN`, and they are being loaded.
-    stopped: why the request was ended before all was looked at; empty: it was not.
+    faults: one sentence for each voxel that could not be read, with place and reason; empty if
+    there was none.
+    wait_seconds: the part of engine_seconds spent waiting for voxels [s].
+    late: keys of the voxels that missed the deadline of the budget. Answers that depend on them are
+    `UNKNOWN`; their loads continue.
+    stopped: why the request was ended before everything was examined; empty: it was not.
     """
 
     engine_seconds: float = 0.0
@@ -47,7 +49,7 @@ class Cost(msgspec.Struct, frozen=True, eq=False, kw_only=True):
 
 
 class CollideAnswer(NamedTuple):
-    """The answer for one pose; see `CollideAnswers` for the fields."""
+    """Answer for one pose; see `CollideAnswers` for the fields."""
 
     verdict: Verdict
     outside: bool
@@ -57,14 +59,18 @@ class CollideAnswer(NamedTuple):
 
 
 class CollideAnswers(Cost, frozen=True, eq=False):
-    """The answers of `collide` for k poses, in their order. Iterating yields one `CollideAnswer` a pose.
+    """Answers of `collide` for k poses, in their order.
 
-    verdict: (k,) uint8, values of `Verdict`.  outside: (k,) bool, the reach leaves the dataset's bounds.
-    voxels_missing: (k,) uint32, voxels in reach that could not be looked at.
-    node_visits: (k,) uint32, pairs of bounding spheres tested.  point_tests: (k,) uint32, pairs of points.
-    lower, upper: (k,) float64, the signed distance lies between them [m]; exact: (k,) bool, the verdict is that of
-    tolerance 0. All three are empty where neither a tolerance nor a budget was given: then every verdict but
-    `UNKNOWN` is exact.
+    Iteration yields one `CollideAnswer` per pose.
+    verdict: (k,) uint8, values of `Verdict`.
+    outside: (k,) bool, the reach extends beyond the dataset's bounds.
+    voxels_missing: (k,) uint32, voxels in reach that could not be examined.
+    node_visits: (k,) uint32, pairs of bounding spheres tested.
+    point_tests: (k,) uint32, pairs of points tested.
+    lower, upper: (k,) float64, bounds of the signed distance [m].
+    exact: (k,) bool, the verdict is that of tolerance 0.
+    The last three are empty if neither a tolerance nor a budget was given: every verdict but
+    `UNKNOWN` is exact then.
     """
 
     verdict: NDArray[np.uint8]
@@ -77,29 +83,31 @@ class CollideAnswers(Cost, frozen=True, eq=False):
     exact: NDArray[np.bool_] = msgspec.field(default_factory=lambda: np.empty(0, bool))
 
     def __len__(self) -> int:
-        """The number of poses answered."""
+        """Return the number of poses answered."""
         return len(self.verdict)
 
     def __iter__(self) -> Iterator[CollideAnswer]:
-        """One answer a pose, in order."""
+        """Yield one answer per pose, in order."""
         columns = (self.verdict, self.outside, self.voxels_missing, self.node_visits, self.point_tests)
         for verdict, outside, missing, visits, tests in zip(*columns, strict=True):
             yield CollideAnswer(Verdict(int(verdict)), bool(outside), int(missing), int(visits), int(tests))
 
 
 class DistanceAnswers(Cost, frozen=True, eq=False):
-    """The answers of `distance` for k poses, in their order.
+    """Answers of `distance` for k poses, in their order.
 
-    signed_distance: (k,) float64, least |a - b| - r_a - r_b of a pair within reach [m], negative when overlapping, inf
-    where no pair is within reach; of the best pair found, where not exact.
-    lower, upper: (k,) float64, the true signed distance lies between them; where it is beyond reach, `lower` is the
-    reach and `upper` inf.  exact: (k,) bool: `signed_distance` is the true one, or truly beyond reach.
-    verdict: (k,) uint8: CONTACT where `upper` <= 0, CLEAR where the pair's integers or `lower` say that nothing
-    touches, else UNKNOWN.
-    witness_avatar, witness_cloud: (k, 3) float64, the centres of the nearest pair, world [m]; NaN where there is none.
-    Of pairs at equal distance, that with the least scan point (x, y, z), then the least avatar centre.
-    normal: (k, 3) float64, unit vector from `witness_cloud` to `witness_avatar`, the way out; zero where they
-    coincide, NaN where there is none.
+    signed_distance: (k,) float64, least |a - b| - r_a - r_b of a pair within reach [m]; negative
+    when overlapping; inf if no pair is within reach; that of the best pair found where not exact.
+    lower, upper: (k,) float64, bounds of the true signed distance; if it is beyond reach, `lower`
+    is the reach and `upper` inf.
+    exact: (k,) bool: `signed_distance` is the true one, or it is truly beyond reach.
+    verdict: (k,) uint8: CONTACT if `upper` <= 0; CLEAR if the pair's integers or `lower` prove that
+    nothing touches; else UNKNOWN.
+    witness_avatar, witness_cloud: (k, 3) float64, the centres of the nearest pair, world [m]; NaN
+    if there is none. Among pairs at equal distance, the one with the least scan point (x, y, z),
+    then the least avatar centre.
+    normal: (k, 3) float64, contact normal: unit vector from `witness_cloud` to `witness_avatar`;
+    zero if they coincide, NaN if there is no pair.
     outside, voxels_missing, node_visits, point_tests: as in `CollideAnswers`.
     """
 
@@ -117,23 +125,29 @@ class DistanceAnswers(Cost, frozen=True, eq=False):
     point_tests: NDArray[np.uint32]
 
     def __len__(self) -> int:
-        """The number of poses answered."""
+        """Return the number of poses answered."""
         return len(self.verdict)
 
 
 class ContactsAnswers(Cost, frozen=True, eq=False):
-    """The answers of `contacts` for k poses: pairs in contact, and their clusters.
+    """Answers of `contacts` for k poses: pairs in contact, and their clusters.
 
-    verdict, exact, outside, voxels_missing, node_visits, point_tests: (k,), as elsewhere; exact: all pairs in contact
-    were counted.  pairs_found: (k,) int64, pairs in contact, listed or not.
-    pair_starts: (k + 1,) int64: the pairs listed for pose i are rows [pair_starts[i], pair_starts[i + 1]) of the pair
-    columns, deepest first, ties by scan point (x, y, z), then by avatar centre: avatar_point, cloud_point (p, 3)
-    float64 centres, world [m]; signed_distance (p,) float64 [m]; avatar_index (p,) int32, row of the avatar's points
-    as added; scan_index (p,) int32, the scan it came from (`SceneInfo.sources`), -1 where not kept;
-    cluster (p,) int32, row among the pose's clusters.
-    cluster_starts: (k + 1,) int64, rows of the cluster columns, deepest first: cluster_count (c,) int64 pairs in it,
-    all of them; cluster_deepest (c,) float64 signed distance; cluster_avatar, cluster_cloud (c, 3) the deepest pair's
-    centres; cluster_scan (c,) int32; cluster_low, cluster_high (c, 3) float64, the box of its scan points, world [m].
+    verdict, exact, outside, voxels_missing, node_visits, point_tests: (k,), as in other answers;
+    exact: all pairs in contact were counted.
+    pairs_found: (k,) int64, pairs in contact, listed or not.
+    pair_starts: (k + 1,) int64. The pairs listed for pose i are rows [pair_starts[i], pair_starts[i
+    + 1]) of the pair columns, deepest first, ties by scan point (x, y, z), then by avatar centre:
+    avatar_point, cloud_point: (p, 3) float64, centres, world [m].
+    signed_distance: (p,) float64 [m].
+    avatar_index: (p,) int32, row of the avatar's points as added.
+    scan_index: (p,) int32, scan of the scan point (`SceneInfo.sources`), -1 if not kept.
+    cluster: (p,) int32, row among the pose's clusters.
+    cluster_starts: (k + 1,) int64, rows of the cluster columns, deepest first:
+    cluster_count: (c,) int64, pairs in the cluster, listed or not.
+    cluster_deepest: (c,) float64, signed distance of the deepest pair.
+    cluster_avatar, cluster_cloud: (c, 3) float64, centres of the deepest pair.
+    cluster_scan: (c,) int32, scan of the deepest pair.
+    cluster_low, cluster_high: (c, 3) float64, bounding box of the cluster's scan points, world [m].
     """
 
     verdict: NDArray[np.uint8]
@@ -160,20 +174,25 @@ class ContactsAnswers(Cost, frozen=True, eq=False):
     point_tests: NDArray[np.uint32]
 
     def __len__(self) -> int:
-        """The number of poses answered."""
+        """Return the number of poses answered."""
         return len(self.verdict)
 
 
 class SweepAnswers(Cost, frozen=True, eq=False):
-    """The answers of `sweep` for k motions, in their order.
+    """Answers of `sweep` for k motions, in their order.
 
-    verdict: (k,) uint8: CONTACT, the first contact lies in [lower, upper]; CLEAR, none on the whole motion; UNKNOWN,
-    none before `lower`, and beyond it could not be told: grazing, a budget, or something missing.
-    lower, upper: (k,) float64, fractions of the motion, 0 to 1: nothing touches before `lower`; the pose at `upper` is
-    in contact, inf where none was found.  A motion without contact has lower 1.
-    exact: (k,) bool: clear, or no avatar point moves more than the tolerance between `lower` and `upper`.
-    witness_avatar, witness_cloud: (k, 3) float64, centres of a pair in contact at `upper`, world [m]; NaN where none.
-    steps: (k,) uint32, advances.  outside, voxels_missing, node_visits, point_tests: as in `CollideAnswers`.
+    verdict: (k,) uint8. CONTACT: the first contact lies in [lower, upper]. CLEAR: no contact on the
+    whole motion. UNKNOWN: no contact before `lower`, and undecided beyond it, because of grazing, a
+    budget or missing data.
+    lower, upper: (k,) float64, fractions of the motion, 0 to 1. Nothing touches before `lower`; the
+    pose at `upper` is in contact; `upper` is inf if no contact was found. A motion without contact
+    has lower 1.
+    exact: (k,) bool: clear, or no avatar point moves more than the tolerance between `lower` and
+    `upper`.
+    witness_avatar, witness_cloud: (k, 3) float64, centres of a pair in contact at `upper`, world
+    [m]; NaN if there is none.
+    steps: (k,) uint32, advances.
+    outside, voxels_missing, node_visits, point_tests: as in `CollideAnswers`.
     """
 
     verdict: NDArray[np.uint8]
@@ -189,19 +208,24 @@ class SweepAnswers(Cost, frozen=True, eq=False):
     point_tests: NDArray[np.uint32]
 
     def __len__(self) -> int:
-        """The number of motions answered."""
+        """Return the number of motions answered."""
         return len(self.verdict)
 
 
 class RaycastAnswers(Cost, frozen=True, eq=False):
-    """The answers of `raycast` for k rays, in their order.
+    """Answers of `raycast` for k rays, in their order.
 
-    verdict: (k,) uint8: CONTACT, the ray hits a scan point's sphere within reach; CLEAR, it hits none; UNKNOWN.
-    distance: (k,) float64, along the ray to the first hit [m], 0 where the ray starts inside, inf where none.
-    lower, upper: (k,) float64, the true distance lies between them; beyond reach: the reach, and inf.
-    exact: (k,) bool.
-    hit: (k, 3) float64, where, world [m].  cloud_point: (k, 3), the centre of the sphere that is hit, of several at
-    equal distance the least (x, y, z).  normal: (k, 3) unit vector from it to `hit`. All NaN where there is no hit.
+    verdict: (k,) uint8. CONTACT: the ray hits a scan point's sphere within reach. CLEAR: it hits
+    none. UNKNOWN.
+    distance: (k,) float64, along the ray to the first hit [m]; 0 if the ray starts inside a sphere;
+    inf if there is no hit.
+    lower, upper: (k,) float64, bounds of the true distance; beyond reach: the reach, and inf.
+    exact: (k,) bool, `distance` is the true one, or it is truly beyond reach.
+    hit: (k, 3) float64, the point where the ray hits, world [m].
+    cloud_point: (k, 3) float64, centre of the sphere hit; among several at equal distance, the
+    least (x, y, z).
+    normal: (k, 3) float64, unit vector from `cloud_point` to `hit`. All three are NaN if there is
+    no hit.
     outside, voxels_missing, node_visits, point_tests: as in `CollideAnswers`.
     """
 
@@ -219,18 +243,19 @@ class RaycastAnswers(Cost, frozen=True, eq=False):
     point_tests: NDArray[np.uint32]
 
     def __len__(self) -> int:
-        """The number of rays answered."""
+        """Return the number of rays answered."""
         return len(self.verdict)
 
 
 class WithinAnswers(Cost, frozen=True, eq=False):
-    """The answers of `within` for k loose points, in their order.
+    """Answers of `within` for k points, in their order.
 
-    verdict: (k,) uint8: CONTACT, a scan point lies within reach; CLEAR, none does; UNKNOWN.
-    distance: (k,) float64, to the nearest scan point's centre [m], inf where none is within reach.
-    lower, upper: (k,) float64, the true distance lies between them; beyond reach: the reach, and inf.
-    exact: (k,) bool.
-    cloud_point: (k, 3) float64, the nearest scan point, world [m], of several the least (x, y, z); NaN where none.
+    verdict: (k,) uint8. CONTACT: a scan point lies within reach. CLEAR: none does. UNKNOWN.
+    distance: (k,) float64, to the nearest scan point's centre [m]; inf if none is within reach.
+    lower, upper: (k,) float64, bounds of the true distance; beyond reach: the reach, and inf.
+    exact: (k,) bool, `distance` is the true one, or it is truly beyond reach.
+    cloud_point: (k, 3) float64, the nearest scan point, world [m]; among several, the least (x, y,
+    z); NaN if there is none.
     outside, voxels_missing, node_visits, point_tests: as in `CollideAnswers`.
     """
 
@@ -246,18 +271,20 @@ class WithinAnswers(Cost, frozen=True, eq=False):
     point_tests: NDArray[np.uint32]
 
     def __len__(self) -> int:
-        """The number of points answered."""
+        """Return the number of points answered."""
         return len(self.verdict)
 
 
 class ObjectsAnswers(Cost, frozen=True, eq=False):
-    """The answer of `objects` for n avatars at once.
+    """Answer of `objects` for n avatars tested together.
 
-    verdict: (n,) uint8, of each object against the scene; CLEAR where its mask leaves the scene out.
+    verdict: (n,) uint8, of each object against the scene; CLEAR if its mask excludes the scene.
     outside, voxels_missing, node_visits, point_tests: (n,), against the scene.
-    pairs: (p, 2) int32, rows of the objects that touch one another, first < second, in ascending order.
-    pairs_tested: pairs whose trees were compared; pairs_filtered: left out by groups and masks.
-    pair_verdict: (p,) uint8: CONTACT, or UNKNOWN where the budget ended first.
+    pairs: (p, 2) int32, rows of the objects that touch each other, or may where the budget ended
+    first; first < second, in ascending order.
+    pair_verdict: (p,) uint8: CONTACT, or UNKNOWN if the budget ended first.
+    pairs_tested: pairs whose trees were compared.  pairs_filtered: pairs excluded by groups and
+    masks.
     pair_visits, pair_tests: of all pairs together.
     """
 
@@ -274,33 +301,33 @@ class ObjectsAnswers(Cost, frozen=True, eq=False):
     pair_tests: int = 0
 
     def __len__(self) -> int:
-        """The number of objects."""
+        """Return the number of objects."""
         return len(self.verdict)
 
 
 class CollidePart(CollideAnswers, frozen=True, eq=False, kw_only=True):
-    """The answers of `collide` for [first, first + n) of the `total` poses of a path; see CollideAnswers."""
+    """Answers of `collide` for poses [first, first + n) of the `total` poses of a path."""
 
     first: int
     total: int
 
 
 class DistancePart(DistanceAnswers, frozen=True, eq=False, kw_only=True):
-    """The answers of `distance` for [first, first + n) of the `total` poses of a path; see DistanceAnswers."""
+    """Answers of `distance` for poses [first, first + n) of the `total` poses of a path."""
 
     first: int
     total: int
 
 
 class ContactsPart(ContactsAnswers, frozen=True, eq=False, kw_only=True):
-    """The answers of `contacts` for [first, first + n) of the `total` poses of a path; see ContactsAnswers."""
+    """Answers of `contacts` for poses [first, first + n) of the `total` poses of a path."""
 
     first: int
     total: int
 
 
 class SweepPart(SweepAnswers, frozen=True, eq=False, kw_only=True):
-    """The answers of `sweep` for [first, first + n) of the `total` motions of a path; see SweepAnswers."""
+    """Answers of `sweep` for motions [first, first + n) of the `total` motions of a path."""
 
     first: int
     total: int
@@ -308,7 +335,7 @@ class SweepPart(SweepAnswers, frozen=True, eq=False, kw_only=True):
 
 Part = CollidePart | DistancePart | ContactsPart | SweepPart
 
-# By the kind of answer.
+# Part type of each answer type.
 PARTS: dict[type, Any] = {
     CollideAnswers: CollidePart,
     DistanceAnswers: DistancePart,
@@ -316,7 +343,7 @@ PARTS: dict[type, Any] = {
     SweepAnswers: SweepPart,
 }
 
-# What an operation along a path is answered with.
+# Answer type of each operation along a path.
 PATH_ANSWERS: dict[str, type[Cost]] = {
     "collide": CollideAnswers,
     "distance": DistanceAnswers,

@@ -1,4 +1,4 @@
-"""Arrays in messages: their dtype and the lengths of all axes but the first are part of the field's type."""
+"""Array types of message fields. A type states the dtype and all axis lengths but the first."""
 
 import math
 from functools import cache
@@ -6,14 +6,14 @@ from typing import Any, Literal, NamedTuple, get_args, get_origin, get_type_hint
 
 import numpy as np
 
-# The shape is part of the type: an int is any length, a Literal is that length.
+# The shape is part of the type: `int` is any length, a Literal is exactly that length.
 Poses = np.ndarray[tuple[int, Literal[4], Literal[4]], np.dtype[np.float64]]
 Positions = np.ndarray[tuple[int, Literal[3]], np.dtype[np.float64]]
 IndexPairs = np.ndarray[tuple[int, Literal[2]], np.dtype[np.int32]]
 
 
 class ArrayType(NamedTuple):
-    """What an array's type says: its dtype, little-endian, and the lengths of all axes but the first."""
+    """Dtype (little-endian), fixed axis lengths and bytes per row of an array field."""
 
     dtype: np.dtype
     tail: tuple[int, ...]
@@ -22,7 +22,7 @@ class ArrayType(NamedTuple):
 
 @cache
 def array_type(hint: Any) -> ArrayType:
-    """What an array's type says."""
+    """Parse the dtype and the fixed axis lengths from an array's type annotation."""
     shape, of = get_args(hint)
     tail = tuple(get_args(axis)[0] for axis in get_args(shape)[1:] if get_origin(axis) is Literal)
     dtype = np.dtype(get_args(of)[0]).newbyteorder("<")
@@ -31,7 +31,7 @@ def array_type(hint: Any) -> ArrayType:
 
 @cache
 def array_fields(kind: type) -> dict[str, ArrayType]:
-    """The fields of a message that are arrays, in their order."""
+    """Return the array fields of a message type by name, in declaration order."""
     return {
         name: array_type(hint)
         for name, hint in get_type_hints(kind).items()

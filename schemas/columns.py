@@ -1,4 +1,4 @@
-"""What answers of all kinds have in common: their columns. Unknown ones, joined ones, parts of a path, checked ones."""
+"""Operations on the columns of answers: fill with unknown, join, split into parts of a path, check."""
 
 from collections.abc import Iterator, Sequence
 from typing import Any, TypeVar
@@ -25,25 +25,28 @@ _LAST_VERDICT = int(max(Verdict))
 _A = TypeVar("_A", bound=Cost)
 
 _BOUNDS = frozenset(("lower", "upper", "exact"))
-# Of ContactsAnswers: columns of one row a pair, and of one a cluster.
+# Columns of ContactsAnswers with one row per pair, and with one row per cluster.
 PAIR_COLUMNS = ("avatar_point", "cloud_point", "signed_distance", "avatar_index", "scan_index", "cluster")
 CLUSTER_COLUMNS = (
     "cluster_count", "cluster_deepest", "cluster_avatar", "cluster_cloud", "cluster_scan", "cluster_low",
     "cluster_high",
 )  # fmt: skip
-# Of the columns that have not one element an answer: the column of starts that says how many.
+# Columns that do not have one element per answer -> the column of starts that gives their row
+# ranges.
 _ROWS = {
     **dict.fromkeys(PAIR_COLUMNS, "pair_starts"),
     **dict.fromkeys(CLUSTER_COLUMNS, "cluster_starts"),
 }
-# What `upper`, distances and vectors are where nothing is known; `lower` is a fraction or a length along a ray in some.
+# Values that mean "nothing is known". `lower` is treated apart: in some answers it is a fraction or
+# a length along a ray, where that value is 0.
 _UNKNOWN = {"verdict": float(Verdict.UNKNOWN), "upper": np.inf, "distance": np.inf, "signed_distance": np.inf}
 
 
 def unknown(kind: type[_A], k: int, *, bounded: bool = True) -> _A:
-    """The answers of one kind for k poses (rays, points, motions, objects) when nobody answered: all `UNKNOWN`.
+    """Return answers of one type for k poses (rays, points, motions, objects), all `UNKNOWN`.
 
-    bounded: whether `CollideAnswers` state bounds, as they do where a tolerance or a budget was given.
+    They stand for a request that nobody answered.
+    bounded: whether `CollideAnswers` state bounds, as they do if a tolerance or a budget was given.
     """
     columns: dict[str, Any] = {}
     for name, (dtype, tail, _) in array_fields(kind).items():
@@ -63,7 +66,10 @@ def unknown(kind: type[_A], k: int, *, bounded: bool = True) -> _A:
 
 
 def join(parts: Sequence[_A]) -> _A:
-    """The answers of several requests as those of one, in order. Residency is that after the last answer."""
+    """Join the answers of several requests, in order, into the answers of one.
+
+    Residency is that after the last answered request.
+    """
     if len(parts) == 1:
         return parts[0]
     kind = type(parts[0])
@@ -87,9 +93,9 @@ def join(parts: Sequence[_A]) -> _A:
 
 
 def in_pieces(answers: ContactsAnswers, most_bytes: int) -> Iterator[ContactsAnswers]:
-    """The same answers in pieces whose pairs and clusters take at most so many bytes, or are those of one pose.
+    """Split answers into pieces of one pose, or of at most `most_bytes` of pairs and clusters.
 
-    `join` makes them one again; what the request cost is said of the first.
+    `join` undoes the split. The first piece carries the cost of the request.
     """
     fields = array_fields(ContactsAnswers)
     ends = np.zeros(len(answers) + 1, np.int64)
@@ -116,19 +122,19 @@ def in_pieces(answers: ContactsAnswers, most_bytes: int) -> Iterator[ContactsAns
 
 
 def as_part(answers: Cost, first: int, total: int) -> Any:
-    """The same answers as those for [first, first + n) of the `total` along a path."""
+    """Return answers as the part [first, first + n) of `total` along a path."""
     return PARTS[type(answers)](**asdict(answers), first=first, total=total)
 
 
 def without_part(kind: type[_A], part: Any) -> _A:
-    """The answers of a part, of their own kind again."""
+    """Return the answers of a part as an instance of their own type, without `first` and `total`."""
     fields = asdict(part)
     del fields["first"], fields["total"]
     return kind(**fields)
 
 
 def check_answers(answers: _A, k: int) -> _A:
-    """The same answers, if they are the answers to k poses; InternalError if not, never a guess."""
+    """Return the answers if they are valid answers to k poses; raise InternalError otherwise."""
     kind = type(answers)
     contacts = isinstance(answers, ContactsAnswers)
     unbounded = isinstance(answers, CollideAnswers) and len(answers.exact) == 0
@@ -160,12 +166,12 @@ def check_answers(answers: _A, k: int) -> _A:
 
 
 def _last(starts: NDArray[np.int64]) -> int:
-    """How many rows a column of starts tells of."""
+    """Return the total number of rows that a column of starts describes."""
     return int(starts[-1]) if len(starts) else 0
 
 
 def _joined_starts(columns: list[NDArray[np.int64]]) -> NDArray[np.int64]:
-    """Columns of starts, each from 0, as one."""
+    """Join columns of starts, each rising from 0, into one."""
     total, joined = 0, [np.zeros(1, np.int64)]
     for column in columns:
         joined.append(column[1:] + total)

@@ -1,8 +1,9 @@
-"""The two encodings of a message: bytes to types and back.
+"""Encoding and decoding of messages: MessagePack and JSON.
 
-An array is a little-endian, C-ordered bin in MessagePack and nested lists in JSON; its dtype and shape are those of
-the field's type, so neither travels. Requests hold finite numbers only. Answers may hold infinities and NaN: as they
-are in MessagePack, as null in JSON, read back by what the field is (`_of_null`).
+An array is a little-endian, C-ordered bin in MessagePack and nested lists in JSON. Its dtype and
+shape come from the field's type and are not transmitted. Requests contain finite numbers only.
+Answers may contain infinities and NaN: as such in MessagePack, as null in JSON. A reader restores
+them from the meaning of the field (`_of_null`).
 """
 
 import inspect
@@ -24,22 +25,24 @@ from .requests import Request, check_finite
 MSGPACK = "application/msgpack"
 JSON = "application/json"
 
-# What is larger is read and written in pieces, between which other threads may take the interpreter: a whole message in
-# JSON would keep it for half a second. Bytes of a bin; bytes of a message in JSON, and of a piece; numbers of a piece.
+# Larger data is read and written in pieces, so that other threads can take the interpreter in
+# between: a whole message in JSON would hold it for half a second. The limits are bytes of a bin;
+# bytes of a message in JSON, and of a piece; numbers per piece.
 _LARGE_BIN = 1 << 18
 _LARGE_JSON, _JSON_PIECE = 1 << 17, 1 << 16
 _LISTED = 1 << 13
 
-# Raised, a peer of version 1 would drop the larger messages unread.
+# If this were raised, a peer of version 1 would drop the larger messages unread.
 MAX_MESSAGE_BYTES = 32 << 20
 
 _M = TypeVar("_M")
 
 
 def wire_encoding(stated: str | None) -> str:
-    """The encoding that a message's stated one asks for: `MSGPACK` when none is stated, or `JSON`.
+    """Return the encoding for a stated encoding: `MSGPACK` if none is stated, or `JSON`.
 
-    zenoh states `zenoh/bytes` where the sender stated nothing. Anything else: BadRequestError.
+    zenoh states `zenoh/bytes` if the sender stated nothing. Raises BadRequestError for any other
+    encoding.
     """
     if stated == MSGPACK:
         return MSGPACK
@@ -52,12 +55,15 @@ def wire_encoding(stated: str | None) -> str:
 
 
 def encode(message: Any, encoding: str = MSGPACK) -> bytes:
-    """The bytes of one message. Arrays must already have the dtype of their field."""
+    """Encode one message. Arrays must already have the dtype of their field."""
     return (_JSON_ENCODER if encoding == JSON else _MSGPACK_ENCODER).encode(message)
 
 
 def decode_request(kind: type[_M], payload: bytes, encoding: str = MSGPACK) -> _M:
-    """A request from its bytes; BadRequestError says which field is wrong, what was found and expected."""
+    """Decode a request.
+
+    Raises BadRequestError saying which field is wrong, what was found and what was expected.
+    """
     try:
         return _decoder(kind, encoding).decode(payload)  # type: ignore[arg-type, no-any-return]
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
@@ -65,7 +71,10 @@ def decode_request(kind: type[_M], payload: bytes, encoding: str = MSGPACK) -> _
 
 
 def decode_answer(kind: type[_M], payload: bytes, encoding: str = MSGPACK) -> _M:
-    """An answer from its bytes; unknown fields are left out. InternalError: not what WIRE.md says."""
+    """Decode an answer. Unknown fields are ignored.
+
+    Raises InternalError if the payload is not what WIRE.md specifies.
+    """
     try:
         return _decoder(kind, encoding).decode(payload)  # type: ignore[arg-type, no-any-return]
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
@@ -73,24 +82,28 @@ def decode_answer(kind: type[_M], payload: bytes, encoding: str = MSGPACK) -> _M
 
 
 def _of_null(name: str, tail: tuple[int, ...]) -> float:
-    """What null stands for in an answer's field: NaN in vectors, else the bound that says least."""
+    """Return the value that null stands for in an answer's field.
+
+    NaN in vectors, otherwise the weakest bound: -inf for `lower`, +inf for all others.
+    """
     if tail:
         return math.nan
     return -math.inf if name == "lower" else math.inf
 
 
 def _array_from_bin(name: str, value: bytes, of: ArrayType, request: bool) -> np.ndarray:
-    """An array from its bytes; ValueError says what is wrong with them."""
+    """Make an array from its bytes. Raises ValueError saying what is wrong with them."""
     dtype, tail, row_bytes = of
     rows, rest = divmod(len(value), row_bytes)
     if rest:
         raise ValueError(f"{len(value)} bytes, expected a multiple of {row_bytes}")
     if dtype.kind == "b" and value.translate(None, b"\0\1"):
         raise ValueError("a byte that is neither 0 nor 1, expected truth values")
-    # A request's of a copy: bytes are read-only, and numba compiles another kernel for a read-only array.
+    # A request's array is a copy: bytes are read-only, and numba compiles another kernel for a
+    # read-only array.
     if request and len(value) > _LARGE_BIN:
         array = np.empty((rows, *tail), dtype)
-        np.copyto(array, np.ndarray(array.shape, dtype, value))  # lets other threads have the interpreter
+        np.copyto(array, np.ndarray(array.shape, dtype, value))  # lets other threads take the interpreter
     else:
         array = np.ndarray((rows,) + tail, dtype, bytearray(value) if request else value)  # noqa: RUF005
     if request and dtype.kind == "f":
@@ -99,7 +112,7 @@ def _array_from_bin(name: str, value: bytes, of: ArrayType, request: bool) -> np
 
 
 def _array_from_lists(name: str, value: list[Any], of: ArrayType, request: bool) -> np.ndarray:
-    """An array from the nested lists it is in JSON; ValueError says what is wrong with them."""
+    """Make an array from JSON's nested lists. Raises ValueError saying what is wrong with them."""
     dtype, tail, _ = of
     if not value:
         return np.zeros((0, *tail), dtype)
@@ -125,7 +138,10 @@ def _array_from_lists(name: str, value: list[Any], of: ArrayType, request: bool)
 
 
 def _array_from_raw(name: str, raw: msgspec.Raw, of: ArrayType, request: bool) -> np.ndarray:
-    """An array from the text of its nested lists in JSON, piece by piece; ValueError says what is wrong with them."""
+    """Make an array from the JSON text of its nested lists, piece by piece.
+
+    Raises ValueError saying what is wrong with the text.
+    """
     text = bytes(raw).strip()
     if not text.startswith(b"["):
         raise ValueError("expected nested lists")
@@ -134,9 +150,11 @@ def _array_from_raw(name: str, raw: msgspec.Raw, of: ArrayType, request: bool) -
 
 
 def _pieces(text: bytes, depth: int) -> Iterator[list[Any]]:
-    """Yield a list in JSON, some of its elements at a time. depth: of the lists that its elements are; 0: numbers.
+    """Yield a JSON list, some of its elements at a time.
 
-    ValueError where an element is longer than a piece: nothing else could run while it is decoded.
+    depth: nesting depth of the elements; 0: numbers.
+    Raises ValueError if an element is longer than a piece: no other thread could run while it is
+    decoded.
     """
     ends = re.compile(rb"\]\s*" * depth + b",")
     begin, last = 1, len(text) - 1
@@ -155,7 +173,7 @@ def _pieces(text: bytes, depth: int) -> Iterator[list[Any]]:
 
 
 def _filled(found: np.ndarray, of_null: float) -> np.ndarray:
-    """An array of numbers and None with the None replaced; as it was where it holds anything else."""
+    """Replace None in an array of numbers and None; return any other array unchanged."""
     values = found.ravel().tolist()
     if not all(value is None or type(value) in (int, float) for value in values):
         return found
@@ -165,19 +183,22 @@ def _filled(found: np.ndarray, of_null: float) -> np.ndarray:
 
 
 def _array_to_bin(value: Any) -> Any:
-    """The bytes of an array, for MessagePack; a number of numpy's as one of Python's."""
+    """Convert an array to bytes for MessagePack, and a numpy number to a Python number."""
     if isinstance(value, np.generic):
         return value.item()
     if not isinstance(value, np.ndarray):
         raise NotImplementedError(f"a message cannot hold {type(value).__name__}")
     if not value.dtype.isnative or sys.byteorder == "big":
         value = value.astype(value.dtype.newbyteorder("<"))
-    # Not its `data`: exporting a buffer takes longer than copying one of this size.
+    # Not `value.data`: exporting a buffer takes longer than copying an array of this size.
     return value.tobytes()
 
 
 def _array_to_lists(value: Any) -> Any:
-    """The nested lists of an array, or a number of numpy's, for JSON; msgspec writes what is not finite as null."""
+    """Convert an array to nested lists for JSON, and a numpy number to a Python number.
+
+    msgspec writes non-finite numbers as null.
+    """
     if not isinstance(value, np.ndarray | np.generic):
         raise NotImplementedError(f"a message cannot hold {type(value).__name__}")
     if isinstance(value, np.generic) or value.size <= _LISTED:
@@ -187,7 +208,7 @@ def _array_to_lists(value: Any) -> Any:
     return msgspec.Raw(b"[" + b",".join(_JSON_ENCODER.encode(piece)[1:-1] for piece in pieces) + b"]")
 
 
-# Encoders and decoders are made once: making one costs more than a whole message does.
+# Encoders and decoders are made once: making one costs more than encoding a whole message.
 _MSGPACK_ENCODER = msgspec.msgpack.Encoder(enc_hook=_array_to_bin)
 _JSON_ENCODER = msgspec.json.Encoder(enc_hook=_array_to_lists)
 _LIST_DECODER = msgspec.json.Decoder(list)
@@ -195,15 +216,16 @@ _LIST_DECODER = msgspec.json.Decoder(list)
 
 @cache
 def _decoder(kind: type, encoding: str) -> "_Decoder":
-    """The decoder of one type in one encoding."""
+    """Return the cached decoder of one type in one encoding."""
     return _Decoder(kind, encoding)
 
 
 class _Decoder:
-    """Decodes one type: msgspec reads bins or lists into a twin of it, which become arrays here in one loop.
+    """Decoder of one type.
 
-    Not in msgspec's `dec_hook`: called for each array of an answer, in the middle of the decoding, it made decoding one
-    three times as slow, and it is not told which field it is called for.
+    msgspec decodes bins or lists into a twin type; one loop here converts them to arrays. A
+    `dec_hook` of msgspec would be called for each array in the middle of decoding: that made
+    decoding an answer three times as slow, and the hook is not told for which field it is called.
     """
 
     def __init__(self, kind: type, encoding: str) -> None:
@@ -213,12 +235,15 @@ class _Decoder:
         self._convert: Any = _array_from_lists if encoding == JSON else _array_from_bin
         module = msgspec.json if encoding == JSON else msgspec.msgpack
         self._decoder: Any = module.Decoder(self._twin(encoding) if self._arrays else kind)
-        # Of a large message in JSON the arrays stay text at first.
+        # In a large message in JSON the arrays stay text at first.
         in_pieces = encoding == JSON and self._arrays
         self._raw_decoder: Any = module.Decoder(self._twin(encoding, raw=True)) if in_pieces else None
 
     def _twin(self, encoding: str, raw: bool = False) -> type:
-        """The same fields, with bytes or lists for arrays; raw: with the text of lists."""
+        """Make a type with the same fields, but bytes or lists in place of arrays.
+
+        raw: hold the text of lists instead.
+        """
         held: Any
         held, empty = (list, []) if encoding == JSON else (bytes, b"")
         if raw:
@@ -231,13 +256,13 @@ class _Decoder:
                 fields.append((name, held, *((empty,) if default else ())))
             else:
                 fields.append((name, hint, *default))
-        refuse = self._request  # fields that are not known
+        refuse = self._request  # refuse unknown fields
         return msgspec.defstruct(
             self._kind.__name__, fields, kw_only=True, forbid_unknown_fields=refuse, gc=False
         )
 
     def decode(self, payload: bytes) -> Any:
-        """The message. msgspec.DecodeError, with what it names, where the payload is not one."""
+        """Decode a message. Raises msgspec.DecodeError, naming the field, for an invalid payload."""
         large = self._raw_decoder is not None and len(payload) > _LARGE_JSON
         message = (self._raw_decoder if large else self._decoder).decode(payload)
         if not self._arrays:
@@ -253,11 +278,11 @@ class _Decoder:
 
 
 def _wrong(name: str, text: str) -> msgspec.ValidationError:
-    """An error in one field, worded as msgspec words its own."""
+    """Return an error about one field, worded like msgspec's own."""
     return msgspec.ValidationError(f"{text} - at `$.{name}`")
 
 
 def _default(kind: type, name: str) -> tuple[Any, ...]:
-    """The default of a field of a message, if it has one."""
+    """Return the default of a message's field as a 1-tuple, or () if it has none."""
     default = inspect.signature(kind).parameters[name].default
     return () if default is inspect.Parameter.empty else (default,)

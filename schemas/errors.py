@@ -1,7 +1,8 @@
-"""The exception tree, and the closed set of error codes sent on the wire.
+"""Exception hierarchy, and the closed set of error codes sent on the wire.
 
-Every message says where, what was found, what was expected and what to do. `code` is what a client on
-the wire receives beside that sentence (WIRE.md, "Errors"); `exit_code` is what the command line returns.
+Every message says where the error is, what was found, what was expected and what to do.
+A client on the wire receives `code` beside that sentence (WIRE.md, "Errors"). The command line
+returns `exit_code`.
 """
 
 from enum import StrEnum
@@ -9,7 +10,7 @@ from pathlib import Path
 
 
 class ErrorCode(StrEnum):
-    """The codes an error reply may carry; closed, so that a client can branch on them."""
+    """Codes that an error reply may carry. The set is closed, so that a client can branch on them."""
 
     BAD_REQUEST = "bad_request"
     BAD_TRANSFORM = "bad_transform"
@@ -24,96 +25,100 @@ class ErrorCode(StrEnum):
 
 
 class SolidcloudError(Exception):
-    """The root of every error this project raises on purpose."""
+    """Base class of every error that this project raises on purpose."""
 
     code = ErrorCode.INTERNAL
     exit_code = 1
 
 
 class BadRequestError(SolidcloudError):
-    """A request that cannot be understood, or that holds a number no answer exists for."""
+    """Request that cannot be parsed, or that contains a number for which no answer is defined."""
 
     code = ErrorCode.BAD_REQUEST
     exit_code = 2
 
 
 class BadTransformError(BadRequestError):
-    """A pose that is neither rigid nor rigid with a uniform scale (NUMERICS.md N6)."""
+    """Pose that is neither rigid nor rigid with a uniform scale (NUMERICS.md N6)."""
 
     code = ErrorCode.BAD_TRANSFORM
 
 
 class UnknownSceneError(SolidcloudError):
-    """No server that was reached serves a scene of this name."""
+    """Scene name that none of the servers reached serves."""
 
     code = ErrorCode.UNKNOWN_SCENE
 
 
 class UnknownAvatarError(SolidcloudError):
-    """This client has added no avatar of this name."""
+    """Avatar name that this client has not added."""
 
     code = ErrorCode.UNKNOWN_AVATAR
 
 
 class TooLargeError(BadRequestError):
-    """A request over a stated cap."""
+    """Request that exceeds a stated limit."""
 
     code = ErrorCode.TOO_LARGE
 
 
 class BusyError(SolidcloudError):
-    """The server has as much work as it accepts; ask again later."""
+    """Server at its work limit. The client should repeat the request later."""
 
     code = ErrorCode.BUSY
 
 
 class ExpiredError(SolidcloudError):
-    """A frame of a session took longer than the server spends on one."""
+    """Session frame that exceeded the server's time limit for one frame."""
 
     code = ErrorCode.EXPIRED
 
 
 class DeniedError(SolidcloudError):
-    """The server does not allow this to this client."""
+    """Operation that the server does not allow to this client."""
 
     code = ErrorCode.DENIED
 
 
 class InternalError(SolidcloudError):
-    """A fault of the server's own; its log has the rest."""
+    """Fault inside the server. The server's log has the details."""
 
     code = ErrorCode.INTERNAL
 
 
 class BadDataError(SolidcloudError):
-    """A file that is not what it should be: a scan or an archive."""
+    """Scan or archive file with invalid content."""
 
     code = ErrorCode.CORRUPT
     exit_code = 3
 
 
 class ScanError(BadDataError):
-    """A scan that cannot be read: missing, broken, empty or of no known format."""
+    """Scan that cannot be read: missing, damaged, empty or of an unknown format."""
 
 
 class FormatError(BadDataError):
-    """An archive that cannot be read: not one, of another version, truncated or inconsistent."""
+    """Archive that cannot be read: not an archive, of another version, truncated or inconsistent."""
 
 
 class CorruptError(FormatError):
-    """A record whose bytes are not those that were written. paths: the files, or folders, where they lie, if known."""
+    """Record whose bytes differ from those that were written.
+
+    paths: the files or folders that hold the record, where known.
+    """
 
     def __init__(self, message: str = "", paths: tuple[Path, ...] = ()) -> None:
-        """Say `message`, which names the files for a reader."""
+        """Store the message, which names the files for a human reader, and the paths."""
         super().__init__(message)
         self.paths = paths
 
 
 class MisleadingIndexError(CorruptError):
-    """A record that contradicts what questions believed of the index before they read it: which cell it is of, where in
-    it its points are, how large their spheres.
+    """Record that contradicts the index.
 
-    An index that is wrong once may be wrong about any voxel that was never read, so nothing is known to be clear.
+    Queries have already relied on the index for the voxel's identity, the bounds of its points and
+    the largest radius class. An index that is wrong once may be wrong about any voxel that has not
+    been read, so nothing is known to be clear.
     """
 
 
@@ -135,7 +140,10 @@ _BY_CODE: dict[ErrorCode, type[SolidcloudError]] = {
 
 
 def error_from_code(code: str, message: str) -> SolidcloudError:
-    """The exception that a reply with this code stands for; an unknown code is refused, not guessed."""
+    """Return the exception for an error reply with this code.
+
+    An unknown code gives an InternalError; its meaning is never guessed.
+    """
     try:
         return _BY_CODE[ErrorCode(code)](message)
     except ValueError:

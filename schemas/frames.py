@@ -1,7 +1,8 @@
-"""Packed rows <-> one zstd frame of their byte planes; pure, lossless, the only user of zstandard.
+"""Compression of packed rows to one zstd frame of their byte planes; pure, lossless.
 
-The frame has a checksum, and lies over the byte planes of a packed compound array: HDF5's standard shuffle filter
-followed by the registered zstd filter 32015, so that any HDF5 tool reads typed rows.
+This is the only module that uses zstandard. The frame has a checksum and contains the byte planes
+of a packed compound array: HDF5's standard shuffle filter followed by the registered zstd filter
+32015, so that any HDF5 tool reads typed rows.
 """
 
 import mmap
@@ -16,8 +17,9 @@ from numpy.typing import NDArray
 from .errors import CorruptError
 from .kernels.rows import join_planes
 
-# The entropy is in the low bytes, which nothing compresses; what repeats in the high ones repeats at length. Longer and
-# fewer matches than level 3 looks for decode the paper's voxel in 0.6 ms less, from 2 % fewer bytes.
+# The entropy is in the low bytes, which do not compress; repetitions in the high bytes are long.
+# Longer and fewer matches than those of level 3 decode the paper's voxel 0.6 ms faster, from 2 %
+# fewer bytes.
 _PARAMETERS = zstandard.ZstdCompressionParameters(
     compression_level=3,
     strategy=zstandard.STRATEGY_LAZY2,
@@ -33,36 +35,37 @@ _PARAMETERS = zstandard.ZstdCompressionParameters(
 
 _OF_THREAD = threading.local()
 
-# A zstd frame: held, or in a file that goes with the mapping.
+# A zstd frame in memory, or in a file that is deleted with the mapping.
 Frame = bytes | mmap.mmap
 # A block of zstd takes at least 3 bytes of header and 1 of content.
 _LEAST_BLOCK = 4
 
 
 class Expansion(NamedTuple):
-    """A limit of the bytes that a frame stands for: `free`, or `ratio` for each byte of the frame if that is more."""
+    """Limit of the content size of a frame: `free` bytes, or `ratio` per byte of the frame if more."""
 
     free: int
     ratio: int
 
     def allows(self, size: int, frame: int) -> bool:
-        """Return whether a frame of so many bytes may stand for `size` bytes."""
+        """Return True if a frame of `frame` bytes may decompress to `size` bytes."""
         return size <= max(self.free, self.ratio * frame)
 
 
-# The limit of zstd itself: a block takes at least 4 bytes and stands for at most 2^17.
+# The limit of zstd itself: a block takes at least 4 bytes and decompresses to at most 2^17.
 ANY_EXPANSION = Expansion(0, 1 << 15)
 
 
 def new_compressor() -> zstandard.ZstdCompressor:
-    """A compressor as all frames are made with; of one thread."""
+    """Return a compressor with the parameters of all frames, for use by one thread."""
     return zstandard.ZstdCompressor(compression_params=_PARAMETERS)
 
 
 def pack(rows: NDArray, expansion: Expansion = ANY_EXPANSION) -> bytes:
-    """Byte planes (HDF5's shuffle) of a packed array, as one zstd frame with checksum and declared size.
+    """Compress the byte planes of a packed array (HDF5's shuffle) to one zstd frame.
 
-    expansion: limit that the frame keeps; rows that compress to less than it allows are packed less densely.
+    The frame has a checksum and declares its content size.
+    expansion: limit that the frame keeps; rows that compress further are packed less densely.
     """
     planes = planes_of(rows)
     frame = new_compressor().compress(planes.data)
@@ -72,7 +75,7 @@ def pack(rows: NDArray, expansion: Expansion = ANY_EXPANSION) -> bytes:
 
 
 def sparse_frame(parts: Iterable[bytes | memoryview], size: int, ratio: int) -> Iterator[bytes]:
-    """Yield the bytes of a zstd frame that stands for at most `ratio` bytes a byte: its blocks are kept short.
+    """Yield the bytes of a zstd frame that expands at most `ratio` times, by short blocks.
 
     parts: the content, `size` bytes in all.
     """
@@ -85,17 +88,18 @@ def sparse_frame(parts: Iterable[bytes | memoryview], size: int, ratio: int) -> 
 
 
 def planes_of(rows: NDArray) -> NDArray[np.uint8]:
-    """The byte planes (itemsize, n) of packed rows (n,)."""
+    """Return the byte planes (itemsize, n) of packed rows (n,)."""
     return np.ascontiguousarray(rows.view(np.uint8).reshape(len(rows), rows.dtype.itemsize).T)
 
 
 def unpack(
     frame: bytes, dtype: np.dtype, count: int, what: str, kept: np.dtype | None = None
 ) -> NDArray[np.uint8]:
-    """The byte planes (itemsize, count) that `pack` compressed, read-only; of the fields of `kept` alone.
+    """Return the byte planes (itemsize, count) that `pack` compressed, read-only.
 
-    Raises CorruptError, naming `what`, for a frame that is damaged or not of `count` rows; one that declares another
-    size is refused before anything is allocated for it.
+    kept: if given, only the planes of its fields are returned.
+    Raises CorruptError, naming `what`, for a frame that is damaged or does not hold `count` rows. A
+    frame that declares another size is refused before memory is allocated for it.
     """
     expected = count * dtype.itemsize
     try:
@@ -114,9 +118,12 @@ def unpack(
 
 
 def _unpack_fields(frame: bytes, dtype: np.dtype, count: int, kept: np.dtype) -> NDArray[np.uint8]:
-    """The byte planes of the fields of `kept`, the others read past in pieces: a checksum is of all of a frame.
+    """Return the byte planes of the fields of `kept`.
 
-    Raises ZstdError. Its declared size has been checked, and its last bytes, which a stream could do without.
+    The other fields are decompressed in pieces and discarded, because the checksum covers the whole
+    frame. The caller has checked the declared size and the last bytes, which a stream could do
+    without.
+    Raises ZstdError.
     """
     planes = np.empty((kept.itemsize, count), np.uint8)
     past = np.empty(min(count, 1 << 16), np.uint8)
@@ -136,13 +143,13 @@ def _unpack_fields(frame: bytes, dtype: np.dtype, count: int, kept: np.dtype) ->
 
 
 def _pieces(scratch: NDArray[np.uint8], size: int) -> Iterator[NDArray[np.uint8]]:
-    """`scratch`, or its beginning, as often as it takes for `size` bytes."""
+    """Yield `scratch`, or its beginning, as often as needed for `size` bytes."""
     for begin in range(0, size, len(scratch)):
         yield scratch[: size - begin]
 
 
 def _fill(stream: zstandard.ZstdDecompressionReader, out: NDArray[np.uint8]) -> None:
-    """Read so many bytes; ZstdError where there are not as many."""
+    """Read exactly len(out) bytes; raise ZstdError if the stream ends early."""
     begin = 0
     while begin < len(out):
         read = stream.readinto(out[begin:].data)
@@ -152,7 +159,10 @@ def _fill(stream: zstandard.ZstdDecompressionReader, out: NDArray[np.uint8]) -> 
 
 
 def _decompressor() -> zstandard.ZstdDecompressor:
-    """This thread's own: making one costs 0.1 ms, and none may be used by two threads at once."""
+    """Return this thread's decompressor.
+
+    Making one costs 0.1 ms, and two threads must not use one at once.
+    """
     found: zstandard.ZstdDecompressor | None = getattr(_OF_THREAD, "decompressor", None)
     if found is None:
         found = _OF_THREAD.decompressor = zstandard.ZstdDecompressor()
@@ -160,7 +170,10 @@ def _decompressor() -> zstandard.ZstdDecompressor:
 
 
 def column_of(planes: NDArray[np.uint8], dtype: np.dtype, field: str) -> NDArray:
-    """One field of packed rows from their byte planes (itemsize, n): (n,), or (3, n) where it has three components."""
+    """Return one field of packed rows from their byte planes (itemsize, n).
+
+    The shape is (n,), or (3, n) for a field of three components.
+    """
     kind, at = dtype.fields[field][:2]  # type: ignore[index]  # compound, all of them
     n, size = planes.shape[1], kind.base.itemsize
     words = np.empty((kind.itemsize // size, n), f"u{size}")

@@ -1,6 +1,7 @@
-"""What is said on the wire: requests and answers as types, and their JSON Schemas.
+"""Message types of the wire protocol, gathered from their modules, and their JSON Schemas.
 
-WIRE.md is this file, requests.py, answers.py, moves.py, stats.py and encoding.py in prose. No zenoh here.
+WIRE.md documents this file, requests.py, answers.py, moves.py, stats.py and encoding.py. No zenoh
+here.
 """
 
 import inspect
@@ -53,7 +54,7 @@ from .requests import (
 )
 from .stats import StatsAnswer, StatsRequest, UserStats
 
-# What a reader of messages needs, wherever it is defined.
+# Everything that a reader of messages needs, regardless of the module that defines it.
 __all__ = [
     "JSON",
     "MAX_AVATAR_POINTS",
@@ -102,7 +103,7 @@ WIRE_VERSION = 1
 
 
 class ScenesAnswer(msgspec.Struct, frozen=True):
-    """What one server serves."""
+    """Scenes that one server serves."""
 
     scenes: list[str]
     wire_version: int = WIRE_VERSION
@@ -110,10 +111,11 @@ class ScenesAnswer(msgspec.Struct, frozen=True):
 
 
 class AvatarInfo(msgspec.Struct, frozen=True):
-    """An avatar as the server holds it.
+    """Avatar as the server stores it.
 
-    points: how many.  radius: of every point [m].  bounding_radius: of a sphere around the avatar's points
-    and their radii [m].  Both null in what a `Client` returns while no server has answered yet.
+    points: number of points.  radius: of every point [m].
+    bounding_radius: radius of a sphere around the avatar's points and their radii [m].
+    Both radii are null in what a `Client` returns as long as no server has answered.
     """
 
     name: str
@@ -125,9 +127,10 @@ class AvatarInfo(msgspec.Struct, frozen=True):
 class SourceInfo(msgspec.Struct, frozen=True):
     """One scan that was built into the archive.
 
-    index: which scan inside the file.  sha256: of the file, hexadecimal.  count: points taken.
-    pose: 4x4 row-major, scan to world.  skipped: points left out, by reason.  fault: why none of it is in the archive
-    (any more), or "".
+    index: index of the scan inside its file.  sha256: of the file, hexadecimal.
+    count: points stored.  pose: 4x4 row-major, scan to world.
+    skipped: points left out, by reason.
+    fault: why none of the scan is in the archive (any more), or "".
     """
 
     path: str
@@ -141,16 +144,21 @@ class SourceInfo(msgspec.Struct, frozen=True):
 
 
 class SpawnInfo(msgspec.Struct, frozen=True):
-    """Where users of a scene begin. position: of the avatar's origin, world [m].  heading: about `up` [degrees]."""
+    """Start of a scene's users.
+
+    position: of the avatar's origin, world [m].  heading: about `up` [degrees].
+    """
 
     position: tuple[float, float, float]
     heading: float = 0.0
 
 
 class ObjectInfo(msgspec.Struct, frozen=True):
-    """A dynamic object of a scene. avatar: its shape, of the scene's avatars.  pose: 4x4 row-major, where it begins.
+    """Dynamic object of a scene.
 
-    kind: `kinematic`: where it is told to be; `pushed`: users push it. A reader takes others for kinematic.
+    avatar: its shape, one of the scene's avatars.  pose: 4x4 row-major, the initial pose.
+    kind: `kinematic`: a user sets its pose; `pushed`: users push it. A reader treats any other
+    value as kinematic.
     """
 
     name: str
@@ -160,21 +168,26 @@ class ObjectInfo(msgspec.Struct, frozen=True):
 
 
 class SceneInfo(msgspec.Struct, frozen=True):
-    """What a scene is: counts, bounds, lattice, radius, and what went into it.
+    """Description of a scene: counts, bounds, lattice, radius and sources.
 
     bounds: [[x, y, z] low, [x, y, z] high], world [m].  origin: of the lattice, world [m].
-    lattice_step, voxel_size, radius, radius_error (standard error of `radius`) [m].
-    lattice_source: "sources", "given" or "default".  moved_max: farthest a point moved onto the lattice [m].
-    radius_sample: points the mean closest-point distance was taken of.  degree, leaf: of the hierarchies.
-    skipped: scans left out with `--skip-bad`.  record_bytes: of all records on disk.
-    resident_bytes: of the whole archive, decoded.  effects: what its frames simulate; what is not there is not.
-    unknown: boxes like `bounds` of scans left out, where nothing is called clear; unknown_everywhere: of one of
-    them not even the bounds are known.  radius_models: stored, so that a question may ask for them.
-    generation: how often scans were added or removed since the build.  radius_now: what `radius` would be, were it
-    measured of the points of this generation; radius_now_error: its standard error [m]; null: not known.
-    avatars: the scene's own, which every client may ask about by their names.  up: unit vector against gravity.
-    spawn: where users begin; null: where they say.  objects: that move, and where they begin.  default_radius_model:
-    what a question that names none is asked under; null: `radius`.
+    lattice_step, voxel_size, radius, radius_error (standard error of `radius`): [m].
+    lattice_source: "sources", "given" or "default".
+    moved_max: farthest distance that a point moved onto the lattice [m].
+    radius_sample: number of points over which the closest-point distance was averaged.
+    degree, leaf: of the hierarchies.  skipped: scans left out with `--skip-bad`.
+    record_bytes: of all records on disk.  resident_bytes: of the whole archive, decoded.
+    effects: effects that the scene's frames simulate; no others are simulated.
+    unknown: boxes (like `bounds`) of scans left out, where nothing is called clear.
+    unknown_everywhere: true if the bounds of one of these scans are not known.
+    radius_models: models that are stored and that a query may request.
+    generation: how often scans were added or removed since the build.
+    radius_now: what `radius` would be if it were measured over the points of this generation [m];
+    radius_now_error: its standard error [m]; null: not known.
+    avatars: the scene's own avatars, which every client may use by name.
+    up: unit vector against gravity.  spawn: where users start; null: each user chooses.
+    objects: dynamic objects and their initial poses.
+    default_radius_model: model of a query that names none; null: `radius`.
     """
 
     scene: str
@@ -213,10 +226,10 @@ class SceneInfo(msgspec.Struct, frozen=True):
 
 
 class ReloadAnswer(msgspec.Struct, frozen=True):
-    """What a scene serves since it was reloaded.
+    """Result of a reload: the generation that the scene serves now.
 
-    generation_before, generation_after: of the archive, the same where nothing was added or removed meanwhile.
-    points: in it now.  seconds: from the request until it was swapped in.
+    generation_before, generation_after: of the archive; equal if nothing was added or removed.
+    points: in the archive now.  seconds: from the request until the new generation was swapped in.
     """
 
     scene: str
@@ -227,7 +240,7 @@ class ReloadAnswer(msgspec.Struct, frozen=True):
 
 
 class ErrorReply(msgspec.Struct, frozen=True):
-    """Why a request was not answered. A code this reader does not know is an `internal` error to it."""
+    """Reason why a request was not answered. A reader treats an unknown code as `internal`."""
 
     code: Annotated[str, msgspec.Meta(extra_json_schema={"enum": [str(code) for code in ErrorCode]})]
     message: str
@@ -269,12 +282,16 @@ MESSAGES: tuple[type, ...] = (
 
 
 def json_schemas() -> dict[str, str]:
-    """The JSON Schema of every message, by the name of its type: what `schemas/json/` holds."""
+    """Return the JSON Schema of every message by the name of its type.
+
+    `schemas/json/` holds the same texts.
+    """
     texts = {}
     for kind in MESSAGES:
         components = msgspec.json.schema(kind, schema_hook=lambda _: {"type": "array"})
         for definition in components["$defs"].values():
-            # Python 3.13 strips a docstring's indentation, earlier ones do not: the same text from all.
+            # Python 3.13 strips a docstring's indentation, earlier versions do not; cleandoc gives
+            # the same text on all.
             definition["description"] = inspect.cleandoc(definition["description"])
         properties = components["$defs"][kind.__name__]["properties"]
         for name, of in array_fields(kind).items():
@@ -286,7 +303,7 @@ def json_schemas() -> dict[str, str]:
 
 
 def _array_schema(of: ArrayType, nullable: bool) -> dict[str, Any]:
-    """The JSON Schema of an array: nested lists, and how many bytes a row has in MessagePack."""
+    """Return the JSON Schema of an array: nested lists, and the bytes per row in MessagePack."""
     dtype, tail, row_bytes = of
     schema: dict[str, Any] = {
         "type": {"f": "number", "u": "integer", "i": "integer", "b": "boolean"}[dtype.kind]

@@ -1,6 +1,8 @@
-"""One frame of one avatar: what is wished, and what came of it. WIRE.md says when each is sent.
+"""Messages of one frame of one avatar: the motion command, and the resulting motion.
 
-What an effect says is a field of `Moved` that is left out where the scene does not call for the effect.
+WIRE.md says when each is sent.
+What an effect reports is a field of `Moved` that is omitted if the scene does not declare the
+effect.
 """
 
 import math
@@ -17,15 +19,16 @@ from .requests import Count, Length, Name, Request, check_one_pose, make_poses
 Vector = tuple[float, float, float]
 
 LONGEST_SECONDS = 10.0
-# Of one frame, 30 of which make a second, for whoever does not say [s].
+# Default duration of a frame, 30 of which make a second [s].
 FRAME_SECONDS = 1 / 30
 
 
 class MoveRequest(Request, frozen=True, kw_only=True):
-    """Ask where an avatar gets that goes from one pose towards another, and what it meets; nothing is remembered.
+    """Compute where an avatar gets from one pose towards another, and what it touches; stateless.
 
-    avatar: the name it was added under.  pose_from, pose_to: (1, 4, 4) float64, avatar to world, rigid.
-    seconds: the frame lasts, which gravity asks for, at most 10 [s].
+    avatar: the name under which it was added.
+    pose_from, pose_to: (1, 4, 4) float64, avatar to world, rigid.
+    seconds: duration of the frame, which gravity depends on, at most 10 [s].
     """
 
     avatar: Name
@@ -42,12 +45,15 @@ class MoveRequest(Request, frozen=True, kw_only=True):
 
 
 class Wish(Request, frozen=True, kw_only=True):
-    """Where a user wants to be, or how fast to go; published 30 to 90 times a second. One of pose and velocity.
+    """Motion command: the pose or the velocity that a user wants; sent 30 to 90 times a second.
 
-    seq: greater in every wish; one that is no greater than the last is dropped.  time: of the wish on the client's
-    clock, which does not go back [s].  pose: (1, 4, 4) float64, avatar to world, rigid.  velocity: world [m/s].
-    turn: about the scene's up axis [rad/s], with velocity.  objects: poses (4, 4) row-major of the scene's objects
-    that this user moves.
+    It has either `pose` or `velocity`.
+    seq: greater in every command; a command whose seq is not greater than the last one's is
+    dropped.
+    time: time of the command on the client's clock, which must not go backwards [s].
+    pose: (1, 4, 4) float64, avatar to world, rigid.  velocity: world [m/s].
+    turn: about the scene's up axis [rad/s], with velocity.
+    objects: poses (4, 4) row-major of the scene's objects that this user moves.
     """
 
     seq: Count
@@ -72,16 +78,18 @@ class Wish(Request, frozen=True, kw_only=True):
 
 
 def _check_finite(what: str, numbers: Iterable[float]) -> None:
-    """BadRequestError for a number no answer exists for (NUMERICS.md N7)."""
+    """Raise BadRequestError for NaN or infinity, for which no answer is defined (NUMERICS.md N7)."""
     for number in numbers:
         if not math.isfinite(number):
             raise BadRequestError(f"{what} holds {number}: expected finite numbers")
 
 
 class Touched(msgspec.Struct, frozen=True, omit_defaults=True):
-    """One thing that stopped a motion. place: of the scan point, world [m].  normal: the way out, where estimated.
+    """One obstacle that stopped a motion.
 
-    what: "" the scene; else the object or user. unknown: nothing was touched: the way on is not known to be clear.
+    place: of the scan point, world [m].  normal: the contact normal, where estimated.
+    what: "" for the scene, else the object or user.
+    unknown: nothing was touched, but the way ahead is not known to be clear.
     """
 
     place: Vector
@@ -91,7 +99,11 @@ class Touched(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 class GroundReport(msgspec.Struct, frozen=True, omit_defaults=True):
-    """Of `ground`. on_ground: standing.  speed: of falling [m/s].  normal: of what is stood on."""
+    """Report of the effect `ground`.
+
+    on_ground: the avatar is standing.  speed: of falling [m/s].
+    normal: of the surface on which the avatar stands.
+    """
 
     on_ground: bool
     speed: float = 0.0
@@ -99,7 +111,10 @@ class GroundReport(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 class ProximityReport(msgspec.Struct, frozen=True, omit_defaults=True):
-    """Of `proximity`: as `distance` answers. distance: signed [m]; null: beyond reach."""
+    """Report of the effect `proximity`, as an answer of `distance`.
+
+    distance: signed [m]; null: beyond reach.
+    """
 
     distance: float | None = None
     avatar: Vector | None = None
@@ -109,7 +124,11 @@ class ProximityReport(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 class ContactCluster(msgspec.Struct, frozen=True):
-    """Of `contacts`, one place that is touched: pairs, the deepest pair's signed distance [m] and ends, world [m]."""
+    """One cluster of contacts, in the report of the effect `contacts`.
+
+    count: pairs.  deepest: signed distance of the deepest pair [m].
+    avatar, cloud: centres of that pair, world [m].
+    """
 
     count: int
     deepest: float
@@ -118,7 +137,10 @@ class ContactCluster(msgspec.Struct, frozen=True):
 
 
 class ContactsReport(msgspec.Struct, frozen=True, omit_defaults=True):
-    """Of `contacts`. clusters: deepest first.  total: of them, those not listed too."""
+    """Report of the effect `contacts`.
+
+    clusters: deepest first.  total: number of clusters, listed or not.
+    """
 
     clusters: list[ContactCluster] = []
     total: int = 0
@@ -126,7 +148,11 @@ class ContactsReport(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 class UncertaintyReport(msgspec.Struct, frozen=True, omit_defaults=True):
-    """Of `uncertainty`. probability: of contact.  scans: of each scan alone, by its file; those that matter."""
+    """Report of the effect `uncertainty`.
+
+    probability: of contact.
+    scans: probability for each scan alone, by its file; only scans that matter.
+    """
 
     probability: float
     scans: dict[str, float] = {}
@@ -134,26 +160,37 @@ class UncertaintyReport(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 class ObjectsReport(msgspec.Struct, frozen=True, omit_defaults=True):
-    """Of `objects`. poses: row-major, of those that moved.  touching: pairs; "" is the scene, names are of objects."""
+    """Report of the effect `objects`.
+
+    poses: row-major, of the objects that moved.
+    touching: pairs that touch; "" is the scene, other names are of objects.
+    """
 
     poses: dict[str, list[list[float]]] = {}
     touching: list[tuple[str, str]] = []
 
 
 class CrowdReport(msgspec.Struct, frozen=True, omit_defaults=True):
-    """Of `crowd`. met: how many other users stopped this one."""
+    """Report of the effect `crowd`.
+
+    met: number of other users that stopped this one.
+    """
 
     met: int = 0
 
 
 class Moved(msgspec.Struct, frozen=True, eq=False, kw_only=True, omit_defaults=True):
-    """What came of one frame.
+    """Result of one frame.
 
-    pose: (1, 4, 4) float64, where the avatar is now.  verdict: of that pose, a value of `Verdict`; UNKNOWN too where
-    the way on is not known to be clear, and the avatar went no farther than it is.  left: of the motion wished, not
-    gone [m].  touched: what stopped it.  simulated: effects, in the order they ran.  skipped: effects that the frame's
-    budget had no room for.  stepped to crowd: what each effect says.  unknown: something that the frame asked could not
-    be looked at: had it been, all of this might differ.
+    pose: (1, 4, 4) float64, the avatar's pose now.
+    verdict: of that pose, a value of `Verdict`; also UNKNOWN if the way ahead is not known to be
+    clear, and the avatar went no farther than it is.
+    left: part of the commanded motion not carried out [m].  touched: obstacles that stopped it.
+    simulated: effects, in the order in which they ran.
+    skipped: effects for which the frame's budget was too small.
+    stepped to crowd: report of each effect.
+    unknown: the frame needed data that could not be examined; with it, any of these fields might
+    differ.
     """
 
     pose: Poses
@@ -173,9 +210,11 @@ class Moved(msgspec.Struct, frozen=True, eq=False, kw_only=True, omit_defaults=T
 
 
 class State(Moved, frozen=True, eq=False, kw_only=True, omit_defaults=True):
-    """`Moved`, as the user who wished it is told. seq, time: of the wish.  frame: the server's, growing.
+    """`Moved`, as sent to the user who sent the motion command.
 
-    late: wishes dropped so far because a newer one had come.  seconds: the frame took in the server.
+    seq, time: of the motion command.  frame: the server's frame number, increasing.
+    late: motion commands dropped so far because a newer one had arrived.
+    seconds: time that the frame took in the server.
     """
 
     seq: int

@@ -1,4 +1,4 @@
-"""Surface normals: how far the points reach that one is estimated of. What a normal is, see kernels/normals.py."""
+"""Surface normals: conversion of the estimation reach. kernels/normals.py defines the normal."""
 
 import math
 from fractions import Fraction
@@ -8,10 +8,12 @@ from .index import MAX_NORMAL_REACH
 
 
 def normal_reach(reach: float, step: float, points: int) -> int:
-    """The greatest square of a distance within `reach` [m], in squared steps; BadRequestError for one that is none.
+    """Return the greatest squared distance within `reach` [m], in squared steps.
 
-    Both lengths count as their decimal texts: 800 steps of 0.1 mm are 8 cm.  points: of the largest voxel, whose sums
-    must fit 63 bits, also those taken from a place a diameter off and moved (builder/kernels/normals.py).
+    Both lengths count as their decimal texts: 800 steps of 0.1 mm are 8 cm.
+    points: number of points in the largest voxel, whose sums must fit 63 bits, also when they are
+    taken about a place one diameter away and shifted (builder/kernels/normals.py).
+    Raises BadRequestError for an invalid reach.
     """
     if not 0 < reach <= MAX_NORMAL_REACH:
         raise BadRequestError(

@@ -1,6 +1,6 @@
-"""What may be asked: a type for each request, and the checks that make one a request.
+"""Request types, and the checks that they pass when they are made.
 
-A request is checked when it is made, so a client is refused before it sends what a server would refuse.
+A request is checked when it is made, so a client fails before it sends what a server would refuse.
 """
 
 import math
@@ -16,13 +16,14 @@ from .arrays import Poses, Positions
 from .errors import BadRequestError, TooLargeError
 from .radius_model import parse_radius_model
 
-# Caps of the protocol. They bound what one request can cost a server: 24 MB of points, 12.8 MB of poses (a sweep's
-# twice that), all under the largest message. Raised, a server of version 1 would drop the larger messages unanswered.
+# Limits of the protocol. They bound what one request can cost a server: 24 MB of points, 12.8 MB of
+# poses (a sweep's twice that), all below the largest message. If they were raised, a server of
+# version 1 would drop the larger messages unanswered.
 MAX_AVATAR_POINTS = 1_000_000
 MAX_POSES = 100_000
-# All pairs of so many objects fit one answer: 19 MB.
+# All pairs of this many objects fit into one answer: 19 MB.
 MAX_OBJECTS = 2048
-# Pairs listed for a pose: of so many, one pose's answer is 7 MB.
+# Pairs listed for a pose. With this many, one pose's answer is 7 MB.
 MAX_CONTACTS = 10_000
 
 ALL_GROUPS = 0xFFFFFFFF
@@ -35,7 +36,8 @@ Bits = Annotated[int, msgspec.Meta(ge=0, le=ALL_GROUPS)]
 ModelName = Annotated[str, msgspec.Meta(min_length=1, max_length=64)]
 PathOperation = Literal["collide", "distance", "contacts", "sweep"]
 
-# What each operation takes along a path, beside the avatar, the poses, the tolerance and the budgets.
+# Parameters of each operation along a path, besides the avatar, the poses, the tolerance and the
+# budgets.
 PATH_PARAMETERS: dict[str, tuple[str, ...]] = {
     "collide": ("margin",),
     "distance": ("reach",),
@@ -47,7 +49,10 @@ _FLOAT64 = np.dtype("<f8")
 
 
 class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A request refuses fields it does not know: one that was ignored could have changed the answer."""
+    """Base class of requests. Unknown fields are refused.
+
+    An ignored field could have changed the answer.
+    """
 
     def __post_init__(self) -> None:
         for name, check in _checks(type(self)):
@@ -57,10 +62,11 @@ class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class AddAvatarRequest(Request, frozen=True):
-    """Give this client an avatar.
+    """Add an avatar for this client.
 
-    name: 1 to 64 characters.  points: (n, 3) float64, the avatar's frame [m].
-    radius: of every point [m], finite and >= 0; null: half the mean closest-point distance of `points`.
+    name: 1 to 64 characters.  points: (n, 3) float64, in the avatar's frame [m].
+    radius: of every point [m], finite and >= 0; null: half the mean closest-point distance of
+    `points`.
     """
 
     name: Name
@@ -69,13 +75,13 @@ class AddAvatarRequest(Request, frozen=True):
 
 
 class Question(Request, frozen=True, kw_only=True):
-    """What every question takes.
+    """Parameters that every query takes.
 
-    tolerance: how early contact may be called and how far bounds may lie apart [m]; 0: exact.
-    budget_ms: time for loads and work together [ms]; null: none.  budget_visits: node visits a pose (ray, point,
-    motion); null: none.
-    radius_model: how large the scan's spheres are: mean, local, border or local+border, each with a factor as in
-    local:0.8 if wanted, or fixed:METRES; null: the scene's one figure.
+    tolerance: how early contact may be reported, and how far apart bounds may lie [m]; 0: exact.
+    budget_ms: time for loading and computing together [ms]; null: no limit.
+    budget_visits: node visits per pose (ray, point, motion); null: no limit.
+    radius_model: sizes of the scan's spheres: mean, local, border or local+border, each with an
+    optional factor as in local:0.8, or fixed:METRES; null: the scene's default.
     """
 
     tolerance: Length = 0.0
@@ -85,7 +91,7 @@ class Question(Request, frozen=True, kw_only=True):
 
 
 class QuestionOptions(TypedDict, total=False):
-    """The fields of `Question` as keyword arguments, here and in every method that asks one."""
+    """Fields of `Question` as keyword arguments, for this module and every query method."""
 
     tolerance: float
     budget_ms: float | None
@@ -94,17 +100,18 @@ class QuestionOptions(TypedDict, total=False):
 
 
 def is_bounded(options: Mapping[str, Any]) -> bool:
-    """Whether options of a question allow anything but an exact answer."""
+    """Return True if the options of a query allow anything but an exact answer."""
     return bool(options.get("tolerance")) or any(
         options.get(name) is not None for name in ("budget_ms", "budget_visits")
     )
 
 
 class CollideRequest(Question, frozen=True):
-    """Ask, for each pose, whether an avatar touches the scene.
+    """Test, for each pose, if an avatar touches the scene.
 
-    avatar: the name it was added under.  poses: (k, 4, 4) float64, avatar to world, row-major, metres.
-    margin: distance below which two spheres are called in contact [m], finite and >= 0.
+    avatar: the name under which it was added.
+    poses: (k, 4, 4) float64, avatar to world, row-major, metres.
+    margin: distance below which two spheres count as in contact [m], finite and >= 0.
     """
 
     avatar: Name
@@ -113,9 +120,10 @@ class CollideRequest(Question, frozen=True):
 
 
 class DistanceRequest(Question, frozen=True):
-    """Ask, for each pose, how far an avatar is from the scene, and between which points.
+    """Measure, for each pose, the distance from an avatar to the scene, and its nearest points.
 
-    avatar, poses: as in CollideRequest.  reach: farthest distance worth reporting [m], finite and >= 0.
+    avatar, poses: as in CollideRequest.
+    reach: farthest distance worth reporting [m], finite and >= 0.
     """
 
     avatar: Name
@@ -124,10 +132,12 @@ class DistanceRequest(Question, frozen=True):
 
 
 class ContactsRequest(Question, frozen=True):
-    """Ask, for each pose, which pairs of points are in contact.
+    """List, for each pose, the pairs of points in contact.
 
-    avatar, poses, margin: as in CollideRequest.  limit: pairs listed for a pose, the deepest, at most 10,000.
-    cluster_distance: scan points at most this far apart belong to one cluster [m]; null: the server's choice.
+    avatar, poses, margin: as in CollideRequest.
+    limit: maximum number of pairs listed per pose, deepest first; at most 10,000.
+    cluster_distance: scan points at most this far apart belong to one cluster [m]; null: the
+    server's default.
     """
 
     avatar: Name
@@ -138,10 +148,11 @@ class ContactsRequest(Question, frozen=True):
 
 
 class SweepRequest(Question, frozen=True, kw_only=True):
-    """Ask, for each motion, when an avatar that moves from one pose to another first touches the scene.
+    """Find, for each motion between two poses, the first contact of an avatar with the scene.
 
-    avatar, margin: as in CollideRequest.  pose_from, pose_to: (k, 4, 4) float64, avatar to world, as many of each.
-    tolerance: how far a point of the avatar may move inside the interval that is answered [m].
+    avatar, margin: as in CollideRequest.
+    pose_from, pose_to: (k, 4, 4) float64, avatar to world, equally many.
+    tolerance: how far a point of the avatar may move within the reported interval [m].
     """
 
     avatar: Name
@@ -156,9 +167,10 @@ class SweepRequest(Question, frozen=True, kw_only=True):
 
 
 class RaycastRequest(Question, frozen=True):
-    """Ask, for each ray, which scan point's sphere it hits first.
+    """Find, for each ray, the first scan point whose sphere it hits.
 
-    origins, directions: (k, 3) float64, world [m], as many of each; a direction of any length but 0.
+    origins, directions: (k, 3) float64, world [m], equally many; a direction may have any length
+    but 0.
     reach: length of the rays [m], finite and >= 0.
     """
 
@@ -172,9 +184,10 @@ class RaycastRequest(Question, frozen=True):
 
 
 class WithinRequest(Question, frozen=True):
-    """Ask, for each loose point, which scan point is nearest.
+    """Find, for each given point, the nearest scan point.
 
-    points: (k, 3) float64, world [m].  reach: farthest distance worth reporting [m], finite and >= 0.
+    points: (k, 3) float64, world [m].
+    reach: farthest distance worth reporting [m], finite and >= 0.
     """
 
     points: Positions
@@ -182,9 +195,10 @@ class WithinRequest(Question, frozen=True):
 
 
 class ObjectItem(Request, frozen=True):
-    """One of several avatars at once.
+    """One avatar among several in an ObjectsRequest.
 
-    avatar: the name it was added under.  group: bits of the groups it belongs to.  mask: bits of those it meets.
+    avatar: the name under which it was added.
+    group: bits of the groups to which it belongs.  mask: bits of the groups with which it collides.
     """
 
     avatar: Name
@@ -193,10 +207,10 @@ class ObjectItem(Request, frozen=True):
 
 
 class ObjectsRequest(Question, frozen=True):
-    """Ask which of several avatars touch the scene, and which of them touch one another.
+    """Test several avatars against the scene and against each other.
 
-    objects: at most 2,048; an avatar may be named more than once.  poses: (n, 4, 4) float64, one an object.
-    margin: as in CollideRequest.
+    objects: at most 2,048; an avatar may be named more than once.
+    poses: (n, 4, 4) float64, one per object.  margin: as in CollideRequest.
     """
 
     objects: list[ObjectItem]
@@ -210,12 +224,13 @@ class ObjectsRequest(Question, frozen=True):
 
 
 class PathRequest(Request, frozen=True):
-    """Ask one thing along a path; the answers come in parts.
+    """Run one query along a path; the answers arrive in parts.
 
-    avatar: the name it was added under.  poses: (k, 4, 4) float64, at most 100,000.
-    op: "collide", "distance", "contacts" or "sweep", the last of the k - 1 motions from each pose to the next.
-    The rest is null where `op` does not take it, or for its default; `reach` is needed for "distance". `budget_ms` is
-    for the whole path.
+    avatar: the name under which it was added.  poses: (k, 4, 4) float64, at most 100,000.
+    op: "collide", "distance", "contacts" or "sweep"; a sweep has k - 1 motions, each from one pose
+    to the next.
+    The other parameters are null where `op` does not take them, or for their default. "distance"
+    requires `reach`. `budget_ms` is for the whole path.
     """
 
     avatar: Name
@@ -235,7 +250,10 @@ class PathRequest(Request, frozen=True):
         self.parameters()
 
     def parameters(self) -> dict[str, Any]:
-        """What was given for `op`; BadRequestError for what it does not take, or lacks."""
+        """Return the parameters given for `op`.
+
+        Raises BadRequestError for a parameter that `op` does not take, or for a missing one.
+        """
         names = [name for name in self.__struct_fields__ if name not in ("avatar", "poses", "op")]
         given = {name: value for name in names if (value := getattr(self, name)) is not None}
         check_path_parameters(self.op, given)
@@ -243,7 +261,10 @@ class PathRequest(Request, frozen=True):
 
 
 def check_path_parameters(op: str, parameters: dict[str, Any]) -> None:
-    """BadRequestError unless these are parameters that `op` takes along a path, with all that it needs."""
+    """Check that `op` takes these parameters along a path and has all that it requires.
+
+    Raises BadRequestError otherwise.
+    """
     if op not in PATH_PARAMETERS:
         raise BadRequestError(f"op {op!r} along a path: expected one of {', '.join(PATH_PARAMETERS)}")
     taken = (*PATH_PARAMETERS[op], *Question.__struct_fields__)
@@ -255,7 +276,10 @@ def check_path_parameters(op: str, parameters: dict[str, Any]) -> None:
 
 
 def make_positions(points: Any, what: str = "points") -> Positions:
-    """An avatar's points as the wire has them: (n, 3) float64, finite [m]. BadRequestError, TooLargeError."""
+    """Return an avatar's points as the wire has them: (n, 3) float64, finite [m].
+
+    Raises BadRequestError or TooLargeError.
+    """
     array = make_vectors(points, what)
     if len(array) > MAX_AVATAR_POINTS:
         raise TooLargeError(f"avatar of {len(array)} points: at most {MAX_AVATAR_POINTS}: thin it out first")
@@ -263,7 +287,10 @@ def make_positions(points: Any, what: str = "points") -> Positions:
 
 
 def make_vectors(vectors: Any, what: str) -> Positions:
-    """Vectors as the wire has them: (n, 3) float64, finite. BadRequestError says what `what` is instead."""
+    """Return vectors as the wire has them: (n, 3) float64, finite.
+
+    what: name of the vectors for the BadRequestError raised otherwise.
+    """
     array = _as_float64(what, vectors)
     if array.ndim != 2 or array.shape[1] != 3:
         raise BadRequestError(f"{what} of shape {array.shape}: expected (n, 3)")
@@ -275,7 +302,10 @@ def make_vectors(vectors: Any, what: str) -> Positions:
 
 
 def make_poses(poses: Any, what: str = "poses") -> Poses:
-    """Poses as the wire has them: (k, 4, 4) float64. Only the shape is checked: the server judges them."""
+    """Return poses as the wire has them: (k, 4, 4) float64.
+
+    Only the shape is checked here; the server checks that poses are rigid.
+    """
     array = _as_float64(what, poses)
     if array.ndim != 3 or array.shape[1:] != (4, 4):
         raise BadRequestError(f"{what} of shape {array.shape}: expected (k, 4, 4), avatar to world")
@@ -283,15 +313,16 @@ def make_poses(poses: Any, what: str = "poses") -> Poses:
 
 
 def check_one_pose(what: str, poses: Poses) -> None:
-    """BadRequestError unless there is one pose."""
+    """Raise BadRequestError unless there is exactly one pose."""
     if poses.shape != (1, 4, 4):
         raise BadRequestError(f"{what} of shape {poses.shape}: expected (1, 4, 4), avatar to world")
 
 
 def make_objects(objects: Sequence[Sequence[Any]]) -> tuple[list[ObjectItem], Poses]:
-    """Objects (name, pose, group = 1, mask = all groups), poses (4, 4) float64, as the wire has them.
+    """Return objects and their poses as the wire has them.
 
-    BadRequestError says which is none. TooLargeError: more than `MAX_OBJECTS`.
+    objects: (name, pose, group = 1, mask = all groups), poses (4, 4) float64.
+    Raises BadRequestError naming an invalid object, TooLargeError for more than `MAX_OBJECTS`.
     """
     _check_count(objects)
     items = []
@@ -307,13 +338,13 @@ def make_objects(objects: Sequence[Sequence[Any]]) -> tuple[list[ObjectItem], Po
 
 
 def _check_count(objects: Sequence[Any]) -> None:
-    """TooLargeError for more objects than one request may hold."""
+    """Raise TooLargeError for more objects than one request may hold."""
     if len(objects) > MAX_OBJECTS:
         raise TooLargeError(f"{len(objects)} objects: at most {MAX_OBJECTS}: ask in groups")
 
 
 def _as_bits(number: int, value: Any) -> int:
-    """A group or mask as an integer; BadRequestError for what is none."""
+    """Return a group or mask as an integer, or raise BadRequestError."""
     try:
         return operator.index(value)
     except TypeError:
@@ -321,15 +352,15 @@ def _as_bits(number: int, value: Any) -> int:
 
 
 def check_finite(name: str, array: np.ndarray) -> None:
-    """ValueError for a number no answer exists for (NUMERICS.md N7)."""
-    # Of one pose this takes a third of the time that `np.isfinite(array).all()` does.
+    """Raise ValueError for NaN or infinity, for which no answer is defined (NUMERICS.md N7)."""
+    # For one pose this takes a third of the time of `np.isfinite(array).all()`.
     if 0 in np.isfinite(array).tobytes():
         where = [int(i) for i in np.argwhere(~np.isfinite(array))[0]]
         raise ValueError(f"{name}{where} is {array[tuple(where)]}, expected finite numbers")
 
 
 def _as_float64(name: str, values: Any) -> np.ndarray:
-    """Numbers as a C-ordered little-endian float64 array; BadRequestError for what is not numbers."""
+    """Return numbers as a C-ordered little-endian float64 array, or raise BadRequestError."""
     try:
         return np.ascontiguousarray(values, _FLOAT64)
     except (TypeError, ValueError) as error:
@@ -337,30 +368,30 @@ def _as_float64(name: str, values: Any) -> np.ndarray:
 
 
 def _check_name(_: str, name: str) -> None:
-    """BadRequestError for an avatar's name that is empty or too long."""
+    """Raise BadRequestError for an avatar name that is empty or too long."""
     if not 1 <= len(name) <= 64:
         raise BadRequestError(f"avatar {name[:64]!r} of {len(name)} characters: expected 1 to 64")
 
 
 def _check_model(_: str, text: str) -> None:
-    """BadRequestError for what is no radius model."""
+    """Raise BadRequestError for an invalid radius model."""
     parse_radius_model(text)
 
 
 def _check_length(what: str, value: float) -> None:
-    """BadRequestError for a length no answer exists for (NUMERICS.md N7, cases 14 and 15)."""
+    """Raise BadRequestError for a negative or non-finite length (NUMERICS.md N7, cases 14, 15)."""
     if not 0 <= value < math.inf:
         raise BadRequestError(f"{what} is {value}: expected a finite number of metres, 0 or more")
 
 
 def _check_duration(what: str, value: float) -> None:
-    """BadRequestError for what is no duration."""
+    """Raise BadRequestError for a negative or non-finite duration."""
     if not 0 <= value < math.inf:
         raise BadRequestError(f"{what} is {value}: expected milliseconds, 0 or more")
 
 
 def _check_integer(what: str, value: int, most: int) -> None:
-    """BadRequestError for what is no integer from 0 to `most`."""
+    """Raise BadRequestError for anything but an integer from 0 to `most`."""
     try:
         fits = 0 <= operator.index(value) <= most
     except TypeError:
@@ -370,7 +401,7 @@ def _check_integer(what: str, value: int, most: int) -> None:
 
 
 def _same_length(request: Request, first: str, second: str) -> None:
-    """BadRequestError unless two fields have as many elements each."""
+    """Raise BadRequestError unless two fields have equally many elements."""
     a, b = len(getattr(request, first)), len(getattr(request, second))
     if a != b:
         raise BadRequestError(f"{a} {first} and {b} {second}: expected as many of each")
@@ -378,7 +409,10 @@ def _same_length(request: Request, first: str, second: str) -> None:
 
 @cache
 def _checks(kind: type[Request]) -> tuple[tuple[str, Any], ...]:
-    """The checks of a request's fields, by what their types say; an array's are made where it is read."""
+    """Return the checks of a request's fields, derived from their types.
+
+    Arrays are checked where they are read.
+    """
     found: list[tuple[str, Any]] = []
     for name, hint in get_type_hints(kind, include_extras=True).items():
         kinds = {hint, *getattr(hint, "__args__", ())}

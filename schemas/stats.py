@@ -1,4 +1,4 @@
-"""What a server says of its memory and its users: the messages of `stats`."""
+"""Messages of `stats`: the state of a scene's cache, and what its users had to wait for."""
 
 import math
 from itertools import accumulate
@@ -7,26 +7,28 @@ import msgspec
 
 from .requests import Request
 
-# Upper ends of `Times.buckets` [s]: 1, 2 and 5 of every decade from a microsecond to 100 s. Changed, what a reader
-# keeps of a server over months no longer adds up.
+# Upper bounds of `Times.buckets` [s]: 1, 2 and 5 of every decade from a microsecond to 100 s. If
+# they change, statistics that a monitoring system collects over months no longer add up.
 TIME_BOUNDS = (*(float(f"{m}e{e}") for e in range(-6, 2) for m in (1, 2, 5)), 100.0)
 
 
 class StatsRequest(Request, frozen=True):
-    """Ask what is resident and what users had to wait for. It may be left out: then all is as by default.
+    """Ask for cache and user statistics. An omitted payload means the defaults.
 
-    keys: whether to name the resident voxels.
+    keys: also list the resident voxels.
     """
 
     keys: bool = False
 
 
 class Times(msgspec.Struct, frozen=True):
-    """How long something took, many times [s].
+    """Distribution of a repeatedly measured duration [s].
 
-    count, sum: of all.  p50, p90, p99: so many percent took no longer, said up to a tenth too long.  max: the longest.
-    buckets: how many took no longer than each of 1, 2 and 5 µs, 10, 20 and 50 µs, and so on to 100 s, and longer than
-    the one before; at the end those that took longer than all.  None of these: [].
+    count, sum: over all measurements.
+    p50, p90, p99: percentiles, overestimated by at most a tenth.  max: the longest.
+    buckets: number of measurements at most 1, 2 and 5 µs, 10, 20 and 50 µs, and so on to 100 s, and
+    above the bound before; the last bucket counts those above all bounds. [] if there are no
+    measurements.
     """
 
     count: int = 0
@@ -38,15 +40,17 @@ class Times(msgspec.Struct, frozen=True):
     buckets: list[int] = []
 
     def at_most(self) -> list[tuple[float, int]]:
-        """(bound [s], how many took no longer) for each of TIME_BOUNDS, and infinity at the end."""
+        """Return (bound [s], cumulative count) for each of TIME_BOUNDS and for infinity."""
         counts = self.buckets or [0] * (len(TIME_BOUNDS) + 1)
         return list(zip((*TIME_BOUNDS, math.inf), accumulate(counts), strict=True))
 
 
 class UserStats(msgspec.Struct, frozen=True):
-    """What one user, an avatar of a client, asked and got since it was first seen; see StatsAnswer for the counts.
+    """Requests and waits of one user, an avatar of a client, since it was first seen.
 
-    avatar: "" for what is asked of none.  stall_p50, stall_p99, stall_max: waited for voxels, a request [s].
+    See StatsAnswer for the counts.
+    avatar: "" for queries without an avatar.
+    stall_p50, stall_p99, stall_max: time that a request waited for voxels [s].
     silent_seconds: since its last answer.
     """
 
@@ -66,11 +70,12 @@ class UserStats(msgspec.Struct, frozen=True):
 
 
 class AvatarStats(msgspec.Struct, frozen=True):
-    """What the avatars of a scene's clients take of memory, and how much they may.
+    """Memory that the avatars of a scene's clients take, and its limits.
 
-    bytes, avatars, clients: of their arrays; their number, those being built included; how many clients have any.
-    max_bytes, max_avatars, max_clients: the limits of these; max_bytes_by_client, max_avatars_by_client: those of one
-    client. 0: no limit.
+    bytes: of their arrays.  avatars: their number, including those being built.
+    clients: number of clients that have any.
+    max_bytes, max_avatars, max_clients: limits of these.
+    max_bytes_by_client, max_avatars_by_client: limits per client. 0: no limit.
     """
 
     bytes: int = 0
@@ -84,12 +89,17 @@ class AvatarStats(msgspec.Struct, frozen=True):
 
 
 class Counters(msgspec.Struct, frozen=True, kw_only=True):
-    """What a memory for voxels did so far; voxels but where bytes are said.
+    """Counters of a voxel cache; they count voxels unless the name says bytes.
 
-    hits: asked for and there, or being loaded; waits: of them being loaded.  misses: asked for and not there.
-    late: asked for and not there in time.  prefetched: loads begun before anybody asked; used: of them asked for since;
-    wasted: of them failed, or gone again without.  evicted: gone for others; too_soon: of them asked for again shortly
-    after.  moved_bytes: of voxels moved to join free room.  failed: loads that failed.
+    hits: requested and resident, or being loaded.  waits: those of them that were being loaded.
+    misses: requested and not resident.
+    late: deadlines missed: requested and not resident in time.
+    prefetched: loads started before any request.  used: prefetched voxels requested since.
+    wasted: wasted prefetches: the load failed, or the voxel was evicted without having been
+    requested.
+    evicted: evicted to make room for others.
+    too_soon: evicted voxels that were requested again shortly after.
+    moved_bytes: of voxels moved to join free memory.  failed: loads that failed.
     """
 
     hits: int = 0
@@ -108,20 +118,24 @@ class Counters(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class StatsAnswer(Counters, frozen=True, kw_only=True):
-    """What a scene keeps in memory, and how it did so far.
+    """Statistics of a scene's cache and of its users.
 
-    generation: of the archive.  policy: which voxel goes first.  budget_bytes: for decoded voxels and coarse tops;
-    resident_bytes: taken of it by decoded voxels, `resident` of the `voxels`; coarse_bytes: by coarse tops.
-    kept: voxels that users stand in.
+    generation: of the archive.  policy: name of the eviction policy.
+    budget_bytes: limit for decoded voxels and coarse bounds together.
+    resident_bytes: used by decoded voxels, `resident` of the `voxels` in the archive.
+    coarse_bytes: used by coarse bounds.  kept: voxels in which users stand.
+    The counters cover this generation, since it is served.
 
-    Counters are of this generation, since it is served.
-
-    Since the scene is served: requests, the parts of paths one by one; answers: poses (rays, points, motions, objects)
-    in them; unknown: of the answers; waited: requests that waited for voxels.
-    load_seconds: count, sum and buckets of all loads; the rest of the last ones.  stall_seconds: what each request
-    waited for voxels.  engine_seconds: what each took in the engine, waits included.
-    users: those heard of last, the most recent first.  keys: of the resident voxels, ascending; null: not asked for.
-    avatars: what clients' avatars take.
+    The following cover the time since the scene is served.
+    requests: the parts of a path count one by one.
+    answers: poses (rays, points, motions, objects) in them.
+    unknown: answers that were unknown.  waited: requests that waited for voxels.
+    load_seconds: count, sum and buckets of all loads; percentiles and max of the last ones.
+    stall_seconds: time that each request waited for voxels.
+    engine_seconds: time that each request took in the engine, waits included.
+    users: users heard of last, the most recent first.
+    keys: of the resident voxels, ascending; null: not requested.
+    avatars: memory of the clients' avatars.
     """
 
     scene: str

@@ -1,1 +1,1 @@
-"""Compiled functions that both sides need."""
+"""Compiled functions that both builder and server need."""

@@ -1,7 +1,7 @@
-"""The command `solidcloud`: what its verbs are, and the code it exits with.
+"""The command `solidcloud`: its subcommands (verbs) and its exit codes.
 
-Every verb imports what it needs inside itself: `--help` is to be answered before numpy could be loaded.
-Exit codes: 0; 1 failed; 2 a request that cannot be understood; 3 bad data; 130 interrupted.
+Every verb imports its dependencies inside its function: `--help` must print without loading numpy.
+Exit codes: 0 success; 1 failure; 2 invalid request; 3 invalid data; 130 interrupted.
 """
 
 import contextlib
@@ -32,20 +32,22 @@ from .verbs import (
 )
 from .verbs.options import complain
 
-# Without rich's markup: importing it doubles the time --help takes, to over the 0.3 s it may.
+# Rich markup is off: importing it doubles the time of --help, to more than the 0.3 s allowed.
 app = typer.Typer(
-    help="Makes scanned point clouds solid: build an archive, serve it, ask what touches it.",
+    help="Collision queries on scanned point clouds: build an archive, serve it, query it.",
     add_completion=False,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
-makers = typer.Typer(help="Make scenes with known truth, and what walks through them.", rich_markup_mode=None)
+makers = typer.Typer(
+    help="Generate test scans with known ground truth, avatars and walks.", rich_markup_mode=None
+)
 app.add_typer(makers, name="make")
 makers.command("facade")(make.make_facade)
 makers.command("town")(make.make_town)
 makers.command("figure")(make.make_figure)
 makers.command("walk")(make.make_walk)
-scenes = typer.Typer(help="Begin a scene file, or check one.", rich_markup_mode=None)
+scenes = typer.Typer(help="Create a scene file, or check one.", rich_markup_mode=None)
 app.add_typer(scenes, name="scene")
 scenes.command("new")(scene.new)
 scenes.command("check")(scene.check)
@@ -71,19 +73,23 @@ for verb in (
 ):
     app.command()(verb)
 
-# Verbs that wait, for others or for people: an interrupt ends them at once. All others work, and end where they check.
+# Verbs that wait for a server or for a user: an interrupt ends them immediately. All other verbs
+# compute, and end at their next interrupt check.
 WAITING = frozenset({"serve", "query", "reload", "top"})
 
 
 def main() -> None:
     """Run the command and exit."""
     code = run(sys.argv[1:])
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # all is said: what is left is Python's own end
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # all output is printed: only Python's shutdown remains
     sys.exit(code)
 
 
 def run(arguments: Sequence[str]) -> int:
-    """Run the command with these arguments and return its exit code; an error is one line, not a traceback."""
+    """Run the command with these arguments and return its exit code.
+
+    An error is printed as one line, not as a traceback.
+    """
     try:
         command, name, rest = _find_verb(arguments or ["--help"])
         with contextlib.nullcontext() if name.split()[-1] in WAITING else taken():
@@ -100,7 +106,7 @@ def run(arguments: Sequence[str]) -> int:
         print(": ".join(filter(None, ("interrupted", str(error)))), file=sys.stderr)
         return 130
     except BrokenPipeError:
-        # Whoever read the output has had enough. Python would complain again when it flushes at exit.
+        # The reader of the output closed the pipe. Python would raise again when it flushes at exit.
         sys.stdout = None
         return 1
     except OSError as error:
@@ -110,7 +116,7 @@ def run(arguments: Sequence[str]) -> int:
 
 
 def _run(command: Any, name: str, arguments: list[str]) -> int:
-    """Run one verb and return its exit code. typer's own `main` would end an interrupted one without a word."""
+    """Run one verb and return its exit code. typer's own `main` prints nothing on an interrupt."""
     try:
         with command.make_context(name, arguments) as context:
             code = command.invoke(context)
@@ -120,10 +126,10 @@ def _run(command: Any, name: str, arguments: list[str]) -> int:
 
 
 def _find_verb(arguments: Sequence[str]) -> tuple[Any, str, list[str]]:
-    """The command that the first arguments name, its full name, and the arguments left for it.
+    """Return the command that the first arguments name, its full name, and the remaining arguments.
 
-    Left to itself, typer would look at the options of `solidcloud` first, of which there are none, and load
-    pydantic for it: half of the time that `solidcloud build --help` takes.
+    typer would parse the options of `solidcloud` first and load pydantic for it, although there are
+    none: half of the time that `solidcloud build --help` takes.
     """
     command: Any = typer.main.get_command(app)
     name, rest = "solidcloud", list(arguments)

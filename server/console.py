@@ -1,4 +1,4 @@
-"""How results look on a terminal: on standard output. How work goes on meanwhile is `progress.py`'s."""
+"""Terminal output of results, on standard output. Progress of running work is in `progress.py`."""
 
 from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING
@@ -8,7 +8,7 @@ from rich.table import Table
 from rich.text import Text
 
 if TYPE_CHECKING:
-    # Numba and HDF5 come with these; a table needs neither.
+    # These modules load numba and HDF5; a table needs neither.
     from ..builder.pipeline import BuildSummary
     from ..schemas.index import RadiusDistribution
     from ..schemas.messages import SceneInfo
@@ -20,13 +20,13 @@ def print_facts(facts: Iterable[tuple[str, str]]) -> None:
     table.add_column(style="bold")
     table.add_column(overflow="fold")
     for name, value in facts:
-        # As text: a path with brackets in it is no markup.
+        # As Text: brackets in a path are not markup.
         table.add_row(name, Text(value))
     Console().print(table)
 
 
 def print_build(summary: "BuildSummary") -> None:
-    """What a build says of itself when it is done."""
+    """Print the summary of a completed build."""
     print_facts(_build_facts(summary))
 
 
@@ -35,12 +35,16 @@ def print_info(
     classes: "RadiusDistribution | None" = None,
     more: Iterable[tuple[str, str]] = (),
 ) -> None:
-    """What an archive says of itself; classes: of its points, where they have any.  more: names and values besides."""
+    """Print the facts about an archive.
+
+    classes: the distribution of its points' radius classes, None if it stores none.
+    more: additional names and values.
+    """
     print_facts((*_info_facts(found), *more, *(_class_facts(classes, found.points) if classes else ())))
 
 
 def bytes_text(count: float) -> str:
-    """A count of bytes for a reader: 1536 -> "1.5 kB"; steps of 1024, as the options take them."""
+    """Format a number of bytes: 1536 -> "1.5 kB". Units are powers of 1024, as in the options."""
     for unit in ("bytes", "kB", "MB"):
         if count < 1024:
             return f"{count:.0f} bytes" if unit == "bytes" else f"{count:.1f} {unit}"
@@ -49,7 +53,7 @@ def bytes_text(count: float) -> str:
 
 
 def length_text(metres: float) -> str:
-    """A small length for a reader, in millimetres; under a picometre it is rounding, and 0."""
+    """Format a small length in millimetres. Below one picometre it is rounding error and prints as 0."""
     return f"{metres * 1e3 if metres >= 1e-12 else 0.0:.4g} mm"
 
 
@@ -57,7 +61,7 @@ def _build_facts(summary: "BuildSummary") -> Iterator[tuple[str, str]]:
     each = summary.bytes / max(summary.points, 1)
     rate = summary.points / max(summary.seconds, 1e-9)
     stages = ", ".join(f"{stage} {seconds:.1f}" for stage, seconds in summary.stages.items())
-    yield "archive", f"{summary.archive}, {bytes_text(summary.bytes)}, {each:.2f} bytes a point"
+    yield "archive", f"{summary.archive}, {bytes_text(summary.bytes)}, {each:.2f} bytes per point"
     if summary.preview_bytes:
         yield "preview", f"preview.vtkhdf for ParaView, {bytes_text(summary.preview_bytes)}"
     yield "points", f"{summary.points:,} in {summary.voxels:,} voxels, {summary.shards} shards"
@@ -75,7 +79,7 @@ def _build_facts(summary: "BuildSummary") -> Iterator[tuple[str, str]]:
 
 
 def _class_facts(classes: "RadiusDistribution", points: int) -> Iterator[tuple[str, str]]:
-    """A histogram of the local radii, how many points have no better one, and how many are on a rim."""
+    """Yield a histogram of the local radii, the number of capped points and of points on a rim."""
     most = max((held.points for held in classes.local), default=0)
     for held in classes.local:
         bar = "█" * round(30 * held.points / most) or "▏"
@@ -83,7 +87,7 @@ def _class_facts(classes: "RadiusDistribution", points: int) -> Iterator[tuple[s
     if classes.capped is not None:
         yield (
             "local capped",
-            f"{classes.capped:>13,} {classes.capped / points:>6.1%} with too few neighbours near",
+            f"{classes.capped:>13,} {classes.capped / points:>6.1%} with too few near neighbours",
         )
     if classes.rim is not None:
         yield "border", f"{classes.rim:>13,} {classes.rim / points:>6.1%} on the rim of a surface"
@@ -104,8 +108,11 @@ def _info_facts(found: "SceneInfo") -> Iterator[tuple[str, str]]:
     )
     if found.radius_now is not None:
         change = 100 * (found.radius_now / found.radius - 1) if found.radius else 0.0
-        yield "radius now", f"{length_text(found.radius_now)} ({change:+.1f} %), if it were measured again"
-    yield "hierarchy", f"degree {found.degree}, up to {found.leaf} points a leaf node"
+        yield (
+            "radius now",
+            f"{length_text(found.radius_now)} ({change:+.1f} %), measured on the present points",
+        )
+    yield "hierarchy", f"degree {found.degree}, up to {found.leaf} points per leaf node"
     yield "size", f"{bytes_text(found.record_bytes)} of records, {bytes_text(found.resident_bytes)} decoded"
     for number, source in enumerate(found.sources):
         if source.fault:
@@ -120,4 +127,4 @@ def _info_facts(found: "SceneInfo") -> Iterator[tuple[str, str]]:
     for low, high in found.unknown:
         yield "unknown", f"{' '.join(f'{v:.3f}' for v in low)} .. {' '.join(f'{v:.3f}' for v in high)} m"
     if found.unknown_everywhere:
-        yield "unknown", "everywhere: of a scan left out not even the bounds are known"
+        yield "unknown", "everywhere: a scan was left out whose bounds are not known"

@@ -1,1 +1,4 @@
-"""The verbs of the command `solidcloud`, a file a subject. Each imports what it needs inside itself."""
+"""Verbs of the command `solidcloud`, one file per subject.
+
+Each function imports its dependencies inside itself, which keeps `--help` fast.
+"""

@@ -1,4 +1,4 @@
-"""`solidcloud accuracy`: what accuracy costs in time."""
+"""`solidcloud accuracy`: measure accuracy against query time."""
 
 from pathlib import Path
 from typing import Annotated
@@ -11,17 +11,17 @@ from .options import needs_extra
 
 def accuracy(
     archive: Annotated[
-        Path | None, typer.Argument(help="Folder of an archive; left out: a façade is made.")
+        Path | None, typer.Argument(help="Folder of an archive; default: one built from a generated façade.")
     ] = None,
     avatar: Annotated[
-        Path | None, typer.Option(help="Points of the avatar; left out: a made figure.")
+        Path | None, typer.Option(help="Points of the avatar; default: a generated human figure.")
     ] = None,
-    output: Annotated[Path, typer.Option("-o", "--output", help="Folder to write.")] = Path("report"),
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder of the report.")] = Path("report"),
     full: Annotated[bool, typer.Option("--full", help="More settings, poses and repetitions.")] = False,
 ) -> None:
-    """Measure what accuracy costs.
+    """Measure what accuracy costs in query time.
 
-    Each knob is turned by itself. Writes a table, a page and charts.
+    Varies one setting at a time. Writes a table, an HTML page and charts.
     """
     import tempfile
 
@@ -45,4 +45,4 @@ def accuracy(
         *findings(report.rows, report.facts["poses_judged_by_every_pair"]),
     ):
         print(line)
-    print(f"{output / 'accuracy.html'}, beside it accuracy.csv, accuracy.json and the charts")
+    print(f"wrote {output / 'accuracy.html'}, accuracy.csv, accuracy.json and charts")

@@ -1,4 +1,4 @@
-"""`solidcloud info`, `validate`: what an archive holds, and whether it is whole."""
+"""`solidcloud info` and `validate`: describe and check an archive."""
 
 from typing import Annotated
 
@@ -8,7 +8,7 @@ from .options import ArchivePath, AsJson, complain, print_json
 
 
 def info(archive: ArchivePath, as_json: AsJson = False) -> None:
-    """Say what an archive holds."""
+    """Describe an archive: scans, points, bounds, radius, size."""
     import msgspec
 
     from ...schemas.index import radius_distribution
@@ -30,15 +30,20 @@ def info(archive: ArchivePath, as_json: AsJson = False) -> None:
 
 def validate(
     archive: ArchivePath,
-    deep: Annotated[bool, typer.Option("--deep", help="Also measure every bound again.")] = False,
-    exact: Annotated[bool, typer.Option("--exact", help="Also prove bounds in Python's integers.")] = False,
+    deep: Annotated[bool, typer.Option("--deep", help="Also compute every bound again.")] = False,
+    exact: Annotated[
+        bool, typer.Option("--exact", help="Also prove bounds in exact integer arithmetic.")
+    ] = False,
     sample: Annotated[
-        int | None, typer.Option(help="With --exact: only so many bounds, of all over it.")
+        int | None,
+        typer.Option(help="With --exact: prove only this number of bounds, spread over the archive."),
     ] = None,
-    jobs: Annotated[int, typer.Option(min=0, help="Processes; 0: one a core, where it is worth one.")] = 0,
+    jobs: Annotated[
+        int, typer.Option(min=0, help="Worker processes; 0: one per core, fewer for a small archive.")
+    ] = 0,
     as_json: AsJson = False,
 ) -> None:
-    """Check every record; exit code 3 if one is broken."""
+    """Check every record of an archive. Exit code 3 if one is broken."""
     from ...builder.executor import ProcessExecutor
     from ...builder.verify import verify_archive, verify_jobs
     from ..progress import progress_listener

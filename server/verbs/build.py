@@ -1,4 +1,4 @@
-"""`solidcloud build`: scans to an archive."""
+"""`solidcloud build`: build an archive from scans."""
 
 import sys
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 Scans = Annotated[
     list[Path],
     typer.Argument(
-        help="Scans, folders of scans, or a scans.toml: LAS LAZ E57 PLY PTX PTS XYZ PCD OBJ STL GLB."
+        help="Scans, folders of scans, or a scans.toml. Formats: LAS LAZ E57 PLY PTX PTS XYZ PCD OBJ STL GLB."
     ),
 ]
 
@@ -28,68 +28,81 @@ def build(
     voxel: Annotated[float, typer.Option(help="Edge of a voxel [m].")] = 8.0,
     resolution: Annotated[
         float | None,
-        typer.Option(help="Lattice step [m]; left out: the scans' own where they share one, else 0.0001."),
+        typer.Option(help="Lattice step [m]; default: the step that all scans share, else 0.0001."),
     ] = None,
-    degree: Annotated[int, typer.Option(help="Children of a node.")] = 8,
-    leaf: Annotated[int, typer.Option(help="Points of a leaf node, at most.")] = 32,
+    degree: Annotated[int, typer.Option(help="Maximum number of children of a node.")] = 8,
+    leaf: Annotated[int, typer.Option(help="Maximum number of points of a leaf node.")] = 32,
     cells: Annotated[
-        str, typer.Option(help="octree, or balanced: cells merged too, so that all trees have one height.")
+        str,
+        typer.Option(help="octree, or balanced: also merge octree cells, so that all trees have one height."),
     ] = "octree",
-    jobs: Annotated[int, typer.Option(help="Worker processes; 0: one a core.")] = 0,
-    memory: Annotated[
-        str, typer.Option(help="What the build may hold in memory, all processes together.")
-    ] = "2GB",
+    jobs: Annotated[int, typer.Option(help="Worker processes; 0: one per core.")] = 0,
+    memory: Annotated[str, typer.Option(help="Memory bound of the build, all processes together.")] = "2GB",
     spacing: Annotated[
-        float | None, typer.Option(help="Sample meshes this far apart [m] instead of at vertices.")
+        float | None,
+        typer.Option(help="Sample meshes at this spacing [m]; default: take their vertices."),
     ] = None,
-    keep: Annotated[str, typer.Option(help="Columns to keep: scan, intensity, normal, by comma.")] = "",
+    keep: Annotated[
+        str, typer.Option(help="Columns to keep, separated by commas: scan, intensity, normal.")
+    ] = "",
     normal_reach: Annotated[
-        float, typer.Option(help="A normal is estimated of the points so near [m], where normals are kept.")
+        float,
+        typer.Option(
+            help="Radius [m] of the neighbourhood from which a normal is estimated, with --keep normal."
+        ),
     ] = 0.08,
     radius: Annotated[
         str,
         typer.Option(
-            help="Radius models to store, by comma: mean, local, border; fixed:METRES, or a number, in place of mean."
+            help="Radius models to store, separated by commas: mean, local, border; fixed:METRES, or a number, "
+            "replaces mean."
         ),
     ] = "mean",
-    thin: Annotated[float | None, typer.Option(help="Keep one point a cell of this size [m].")] = None,
+    thin: Annotated[float | None, typer.Option(help="Keep one point per cube of this size [m].")] = None,
     outliers: Annotated[
-        str | None, typer.Option(help="METRES,COUNT: leave out points with fewer others than that so near.")
+        str | None,
+        typer.Option(help="METRES,COUNT: leave out points with fewer than COUNT other points within METRES."),
     ] = None,
     moving: Annotated[
         str | None,
-        typer.Option(help="METRES,SCANS: leave out what fewer other scans saw so near than saw the place."),
+        typer.Option(
+            help="METRES,SCANS: leave out moving objects: points with fewer than SCANS other scans within METRES, "
+            "where at least SCANS other scans cover the place (have points within 8 times METRES)."
+        ),
     ] = None,
     scheduler: Annotated[
         str | None,
-        typer.Option(help="Address of a dask scheduler whose workers do the work: tcp://HOST:PORT."),
+        typer.Option(help="Address of a dask scheduler whose workers run the build: tcp://HOST:PORT."),
     ] = None,
     cluster: Annotated[
-        str | None, typer.Option(help="local:N: a dask cluster of N workers, started for this build.")
+        str | None, typer.Option(help="local:N: start a dask cluster of N workers for this build.")
     ] = None,
     strict: Annotated[bool, typer.Option("--strict", help="Fail on a point that is not finite.")] = False,
     skip_bad: Annotated[
-        bool, typer.Option("--skip-bad", help="Leave out broken scans; their region is unknown.")
+        bool,
+        typer.Option("--skip-bad", help="Leave out broken scans; queries answer unknown in their region."),
     ] = False,
     overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace the archive once the new one is whole.")
+        bool,
+        typer.Option("--overwrite", help="Replace an existing archive, once the new one is complete."),
     ] = False,
     fresh: Annotated[
-        bool, typer.Option("--fresh", help="Start over, where a build that was interrupted could go on.")
+        bool, typer.Option("--fresh", help="Start over instead of resuming an interrupted build.")
     ] = False,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Say what it would take: time, disk, memory; build nothing.")
+        bool, typer.Option("--dry-run", help="Estimate time, disk space and memory; build nothing.")
     ] = False,
     log_json: Annotated[
-        bool, typer.Option("--log-json", help="Say how it goes as one JSON object a line, on standard error.")
+        bool,
+        typer.Option("--log-json", help="Report progress on standard error as one JSON object per line."),
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Build one archive from scans; the same command again goes on where it was interrupted."""
+    """Build one archive from scans. The same command resumes an interrupted build."""
     from ...builder.lock import check_free
 
     if not dry_run:
-        check_free(output)  # before a second is spent on loading numba
+        check_free(output)  # before loading numba, which takes a second
     from ...builder.config import BuildConfig, parse_radius, parse_rule
 
     fixed, models = parse_radius(radius)
@@ -123,14 +136,14 @@ def build(
 
 
 def _build(scans: list[Path], output: Path, config: "BuildConfig", log_json: bool, as_json: bool) -> None:
-    """Build, and say what was built."""
+    """Build the archive and print its summary."""
     from ...builder.pipeline import build_archive
     from ...schemas.os_errors import writing
     from ..console import print_build
     from ..progress import progress_listener
 
     built: list[BuildSummary] = []
-    whole = f"{output} is whole: all was done"
+    whole = f"{output} is complete: the build had finished"
     with (
         interruptible(lambda: whole if built else _kept(output)),
         writing(output),
@@ -144,8 +157,8 @@ def _build(scans: list[Path], output: Path, config: "BuildConfig", log_json: boo
         print_build(summary)
     if summary.already:
         print(
-            f"{output}: whole already, of these scans with these options: nothing was built. Its index says so: its "
-            "records were not read, which `solidcloud validate` does; --overwrite builds it anew",
+            f"{output}: already complete, with these scans and these options: nothing was built. Only its index was "
+            "checked; `solidcloud validate` reads its records, --overwrite builds it again",
             file=sys.stderr,
         )
     for warning in summary.warnings:
@@ -155,17 +168,17 @@ def _build(scans: list[Path], output: Path, config: "BuildConfig", log_json: boo
 
 
 def _kept(output: Path) -> str:
-    """Say what is left of a build that was interrupted."""
+    """Return a sentence about the files that an interrupted build leaves."""
     from ...builder.workplace import building_folder
 
     folder = building_folder(output)
     if folder.exists():
-        return f"what is done is kept in {folder}: the same command goes on where it was, --fresh starts over"
-    return "nothing was done"
+        return f"completed work is kept in {folder}: the same command resumes the build, --fresh starts over"
+    return "nothing was written"
 
 
 def _estimate(scans: Sequence[Path], output: Path, config: "BuildConfig", as_json: bool) -> None:
-    """Say what a build would take."""
+    """Print the estimated cost of a build."""
     from ...builder.plan import estimate, load_rates
     from ...builder.sample import seen_scene
     from ...builder.scan_list import inputs

@@ -1,4 +1,4 @@
-"""`solidcloud export`: points back out of an archive."""
+"""`solidcloud export`: write the points of an archive to a file."""
 
 from pathlib import Path
 from typing import Annotated
@@ -17,19 +17,19 @@ def export(
     box: Annotated[
         tuple[float, float, float, float, float, float] | None,
         typer.Option(
-            help="Only points in x0 y0 z0 x1 y1 z1 [m], each low <= coordinate < high; left out: all.",
+            help="Export only points with low <= coordinate < high on each axis [m]; default: all points.",
             metavar="X0 Y0 Z0 X1 Y1 Z1",
         ),
     ] = None,
     form: Annotated[
-        str | None, typer.Option("--format", help="laz, las, ply or vtkhdf; left out: by the file's suffix.")
+        str | None, typer.Option("--format", help="laz, las, ply or vtkhdf; default: from the file's suffix.")
     ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a file that is there.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")] = False,
     as_json: AsJson = False,
 ) -> None:
     """Write an archive's points to a file.
 
-    Coordinates are the archive's own, to the last bit; intensity and scan where they are stored.
+    Coordinates equal those in the archive, bit for bit. Intensity and scan number are written if stored.
     """
     from ...builder.export import export_archive
     from ...schemas.os_errors import writing

@@ -1,4 +1,7 @@
-"""What archives and exports say of themselves, in two columns: of an archive, what a scene does not say."""
+"""Names and values that describe archives and exports, for printing in two columns.
+
+Of an archive, these are the details beyond those in `SceneInfo`.
+"""
 
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
@@ -6,14 +9,14 @@ from typing import TYPE_CHECKING, Any
 from ..console import bytes_text, print_facts
 
 if TYPE_CHECKING:
-    # Numba and HDF5 come with these; a table needs neither.
+    # These modules load numba and HDF5; a table needs neither.
     from ...builder.export import Exported
     from ...schemas.index import Source
     from ..store import Store
 
 
 def print_export(done: "Exported") -> None:
-    """What an export says of itself when it is done."""
+    """Print the summary of a completed export."""
     print_facts(_export_facts(done))
 
 
@@ -28,11 +31,13 @@ def _export_facts(done: "Exported") -> Iterator[tuple[str, str]]:
 
 
 def archive_details(store: "Store") -> dict[str, Any]:
-    """What `info` says of an archive beyond what a server says of a scene; JSON's own types alone.
+    """Return the details that `info` adds to a scene's description, in JSON types.
 
-    densest: the voxel with the most points, their number and what it takes decoded.  scans: of each source that has
-    any of it, by its number: scanner (its origin [m]), crs, units, up.  preview: bytes of the file for ParaView, None
-    where there is none.  warnings: sentences about scans that look wrong.
+    densest: the voxel with the most points, their number and its decoded size in bytes.
+    scans: for each source that declares any of them, its number and: scanner (origin [m]), crs,
+    units, up.
+    preview: size of the ParaView file in bytes; None if it does not exist.
+    warnings: sentences about scans that look wrong.
     """
     from ...builder.coincident import coincident_sources
     from ...schemas.vtkhdf import PREVIEW_NAME
@@ -58,7 +63,7 @@ def archive_details(store: "Store") -> dict[str, Any]:
 
 
 def _of_source(source: "Source") -> dict[str, Any]:
-    """Where the scanner stood, of a scan with a pose of its own, and in what system and units it was."""
+    """Return a scan's scanner position, coordinate system, units and up axis, where not the default."""
     scanner = source.pose[:3, 3].tolist()
     return {
         **({"scanner": scanner} if any(scanner) else {}),
@@ -69,7 +74,7 @@ def _of_source(source: "Source") -> dict[str, Any]:
 
 
 def detail_facts(details: dict[str, Any]) -> Iterator[tuple[str, str]]:
-    """The same in words."""
+    """Yield the result of `archive_details` as names and texts."""
     densest = details["densest"]
     decoded = bytes_text(densest["resident_bytes"])
     yield "densest", f"voxel {tuple(densest['voxel'])}, {densest['points']:,} points, {decoded} decoded"
@@ -77,7 +82,7 @@ def detail_facts(details: dict[str, Any]) -> Iterator[tuple[str, str]]:
         if "scanner" in scan:
             yield f"scan {scan['number']}", f"scanner at {' '.join(f'{v:.3f}' for v in scan['scanner'])} m"
         if "units" in scan or "up" in scan:
-            yield f"scan {scan['number']}", f"taken for {scan.get('units', 'm')}, {scan.get('up', 'z')} up"
+            yield f"scan {scan['number']}", f"read as {scan.get('units', 'm')}, {scan.get('up', 'z')} up"
     for crs in sorted({scan["crs"] for scan in details["scans"] if "crs" in scan}):
         scans = sum(scan.get("crs") == crs for scan in details["scans"])
         yield "system", f"{' '.join(crs.split())[:300]} ({scans} of the scans)"

@@ -1,4 +1,4 @@
-"""`solidcloud add`, `remove`, `reload`: one generation more of an archive, and a server that is told of it."""
+"""`solidcloud add`, `remove` and `reload`: write a new generation of an archive and hot-reload it."""
 
 import sys
 from pathlib import Path
@@ -12,28 +12,32 @@ from .options import ArchivePath, AsJson, KeyFile, parse_bytes, print_json
 if TYPE_CHECKING:
     from ...builder.rebuild import ChangeSummary
 
-Jobs = Annotated[int, typer.Option(help="Worker processes; 0: one a core where it pays.")]
-Memory = Annotated[str, typer.Option(help="Bound on what the passes hold.")]
+Jobs = Annotated[int, typer.Option(help="Worker processes; 0: one per core, fewer for little work.")]
+Memory = Annotated[str, typer.Option(help="Memory bound of the build, all processes together.")]
 
 
 def add(
     archive: ArchivePath,
     scans: Annotated[
-        list[Path], typer.Argument(help="Scans or folders of scans, or scans.toml, as build takes them.")
+        list[Path], typer.Argument(help="Scans, folders of scans, or a scans.toml, as for solidcloud build.")
     ],
-    again: Annotated[bool, typer.Option("--again", help="Also scans that are in already.")] = False,
+    again: Annotated[
+        bool, typer.Option("--again", help="Also add scans that the archive already contains.")
+    ] = False,
     new_only: Annotated[
         bool,
-        typer.Option("--new", help="Leave out scans that are in already, as of a folder that has grown."),
+        typer.Option(
+            "--new", help="Skip scans that the archive already contains, for a folder that has grown."
+        ),
     ] = False,
     strict: Annotated[bool, typer.Option("--strict", help="Fail on a point that is not finite.")] = False,
     jobs: Jobs = 0,
     memory: Memory = "2GB",
     as_json: AsJson = False,
 ) -> None:
-    """Add scans to an archive: what they touch is built anew.
+    """Add scans to an archive. Only the voxels that they touch are built again.
 
-    As a new generation, that a running server serves when it is told to reload.
+    The result is a new generation, which a running server serves after solidcloud reload.
     """
     from ...builder.generation import add_scans
     from ...schemas.os_errors import writing
@@ -56,15 +60,16 @@ def add(
 def remove(
     archive: ArchivePath,
     scans: Annotated[
-        list[str], typer.Argument(help="Paths of scans as info prints them, or their numbers in the index.")
+        list[str], typer.Argument(help="Paths or numbers of scans, as solidcloud info prints them.")
     ],
     jobs: Jobs = 0,
     memory: Memory = "2GB",
     as_json: AsJson = False,
 ) -> None:
-    """Remove scans from an archive that was built with --keep scan: what they touch is built anew.
+    """Remove scans from an archive that was built with --keep scan.
 
-    As a new generation, that a running server serves when it is told to reload.
+    Only the voxels that the scans touch are built again. The result is a new generation, which a
+    running server serves after solidcloud reload.
     """
     from ...builder.generation import remove_scans
     from ...schemas.os_errors import writing
@@ -78,19 +83,19 @@ def remove(
 
 
 def _as_it_is(archive: Path) -> str:
-    """What an archive is after a change of it was interrupted."""
+    """Return a sentence about the state of an archive after a change to it was interrupted."""
     from ...schemas.archive import Archive
     from ...schemas.errors import FormatError
 
     try:
         with Archive(archive) as held:
-            return f"{archive} is whole, of generation {held.header.generation}"
+            return f"{archive} is complete, at generation {held.header.generation}"
     except FormatError as error:
         return str(error)
 
 
 def _print(summary: "ChangeSummary", what: str, as_json: bool) -> None:
-    """Say what was done."""
+    """Print the summary of a change, with its warnings on standard error."""
     for warning in summary.warnings:
         print(f"warning: {warning}", file=sys.stderr)
     now = summary.radius_now
@@ -107,16 +112,16 @@ def _print(summary: "ChangeSummary", what: str, as_json: bool) -> None:
     from ..console import bytes_text, length_text, print_facts
 
     stages = ", ".join(f"{stage} {seconds:.1f}" for stage, seconds in summary.stages.items())
-    dead = f", {bytes_text(summary.dead_bytes)} left behind in older ones" if summary.dead_bytes else ""
+    dead = f", {bytes_text(summary.dead_bytes)} unused in older shards" if summary.dead_bytes else ""
     radius = length_text(summary.radius)
     if now is not None:
         change = 100 * (now.radius / summary.radius - 1) if summary.radius else 0.0
-        radius += f" as it was; of the points now {length_text(now.radius)} ({change:+.1f} %)"
+        radius += f", unchanged; measured on the present points: {length_text(now.radius)} ({change:+.1f} %)"
     print_facts(
         (
             ("archive", f"{summary.archive}, generation {summary.generation}"),
             *((what, scan) for scan in summary.scans),
-            ("points", f"{summary.points:,}, were {summary.points_before:,}"),
+            ("points", f"{summary.points:,}, before {summary.points_before:,}"),
             ("voxels", f"{summary.built:,} of {summary.voxels:,} built, {summary.gone:,} emptied"),
             ("written", f"{bytes_text(summary.bytes)} in new shards{dead}"),
             ("radius", radius),
@@ -128,11 +133,11 @@ def _print(summary: "ChangeSummary", what: str, as_json: bool) -> None:
 
 def reload(
     scene: Annotated[str, typer.Option(help="Name of the scene.")],
-    connect: Annotated[str, typer.Option(help="zenoh endpoint of the server.")] = "tcp/127.0.0.1:7447",
+    connect: Annotated[str, typer.Option(help="Zenoh endpoint of the server.")] = "tcp/127.0.0.1:7447",
     key_file: KeyFile = None,
     as_json: AsJson = False,
 ) -> None:
-    """Have a server serve what is in the archive's folder now, without losing a question."""
+    """Make a running server load the archive's present generation without dropping requests."""
     import msgspec
 
     from ..client import Client
@@ -143,6 +148,6 @@ def reload(
         print_json(msgspec.to_builtins(answer))
     else:
         print(
-            f"{answer.scene}: generation {answer.generation_after}, was {answer.generation_before}; "
+            f"{answer.scene}: generation {answer.generation_after}, before {answer.generation_before}; "
             f"{answer.points:,} points, {answer.seconds:.1f} s"
         )

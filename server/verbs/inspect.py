@@ -1,4 +1,4 @@
-"""`solidcloud inspect`: what scans there are, by their headers, and the list of them for a build."""
+"""`solidcloud inspect`: list scans by their headers, and write a scan list for a build."""
 
 import sys
 from pathlib import Path
@@ -19,15 +19,15 @@ def inspect(
     scans: Annotated[list[Path], typer.Argument(help="Scans or folders of scans.")],
     output: Annotated[
         Path | None,
-        typer.Option("-o", "--output", help="List to write, for solidcloud build; else scans.toml here."),
+        typer.Option("-o", "--output", help="Scan list to write, for solidcloud build; default: scans.toml."),
     ] = None,
     with_sha256: Annotated[
-        bool, typer.Option("--sha256", help="Also hash every file, which reads it whole.")
+        bool, typer.Option("--sha256", help="Also hash every file, which reads the whole file.")
     ] = False,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a list of that name.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing scan list.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Say what scans are, by their headers, and write a list of them to edit; exit code 3 if one is broken."""
+    """Describe scans by their headers and write an editable list of them. Exit code 3 if one is broken."""
     from ...builder.scan_list import inspect as inspect_scans
     from ...builder.scan_list import write_scan_list
     from ...schemas.errors import BadRequestError
@@ -42,10 +42,11 @@ def inspect(
         print_json([_plain(entry) for entry in entries])
     else:
         print("\n".join(_lines(entries)))
-    # Without a name for it the list is a convenience, and one that is there may have been edited for hours.
+    # Without --output the list is only a convenience, and an existing list may hold hours of edits.
     if not as_json and not output and DEFAULT_LIST.exists() and not overwrite:
         print(
-            f"{DEFAULT_LIST}: exists and stays as it is; -o writes another, --overwrite this", file=sys.stderr
+            f"{DEFAULT_LIST}: exists and was not changed; -o writes another list, --overwrite replaces this one",
+            file=sys.stderr,
         )
     elif output or not as_json:
         with interruptible(), writing(output or DEFAULT_LIST):
@@ -61,7 +62,7 @@ def inspect(
 
 
 def _plain(entry: "ScanEntry") -> dict[str, Any]:
-    """An entry as JSON has it."""
+    """Convert an entry to JSON types."""
     return {
         "path": str(entry.path),
         "index": entry.index,
@@ -81,7 +82,7 @@ def _plain(entry: "ScanEntry") -> dict[str, Any]:
 
 
 def _lines(entries: "list[ScanEntry]") -> list[str]:
-    """A table: a line each, numbers to the right, the path last, for it may be long."""
+    """Format entries as a table, one line each. The path is last because it may be long."""
     head = ("format", "points", "low corner", "high corner", "scanner at", "", "scan")
     rows = [head, *(_row(entry) for entry in entries)]
     widths = [max(len(row[k]) for row in rows) for k in range(len(head))]
@@ -97,13 +98,13 @@ def _lines(entries: "list[ScanEntry]") -> list[str]:
     open_ended = sum(entry.count is None and not entry.fault for entry in entries)
     files = len({entry.path for entry in entries})
     broken = sum(bool(entry.fault) for entry in entries)
-    more = f" and those of {open_ended} scans that do not say" if open_ended else ""
+    more = f" and those of {open_ended} scans that do not declare a count" if open_ended else ""
     faults = f", {broken} broken" if broken else ""
     return [*lines, f"{len(entries)} scans in {files} files{faults}: {known:,} points{more}"]
 
 
 def _row(entry: "ScanEntry") -> tuple[str, ...]:
-    """One line of the table."""
+    """Return the cells of one line of the table."""
     low, high = ("", "") if entry.bounds is None else (_place(corner) for corner in entry.bounds.tolist())
     other = [entry.units] if entry.units != "m" else []
     other += [f"{entry.up} up"] if entry.up != "z" else []

@@ -1,4 +1,4 @@
-"""What a command says of its work when it is interrupted."""
+"""Context manager that reports the state of a command's work when it is interrupted."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -8,9 +8,10 @@ from ...schemas.interrupts import Interrupted, came, check, leave, taken
 
 @contextmanager
 def interruptible(left: Callable[[], str] | None = None) -> Iterator[None]:
-    """Let SIGINT and SIGTERM end this work. left: says what is there of it then; None: nothing is.
+    """Let SIGINT and SIGTERM end the work in this block.
 
-    Raises Interrupted, whose text that is.
+    left: returns a sentence about what the work has left behind; None: it leaves nothing.
+    Raises Interrupted with that sentence as its text.
     """
     with taken():
         try:

@@ -1,4 +1,4 @@
-"""`solidcloud make`: scenes with known truth, and what walks through them."""
+"""`solidcloud make`: test scans with known ground truth, avatars and walks."""
 
 from pathlib import Path
 from typing import Annotated
@@ -10,20 +10,22 @@ from .options import needs_extra
 
 ScanOutput = Annotated[
     Path,
-    typer.Option("-o", "--output", help=".laz, .las or .e57 file, or a folder for a LAZ file a station."),
+    typer.Option(
+        "-o", "--output", help=".laz, .las or .e57 file, or a folder for one LAZ file per scanner station."
+    ),
 ]
-Seed = Annotated[int, typer.Option(help="The same seed gives the same points.")]
+Seed = Annotated[int, typer.Option(help="Random seed; the same seed gives the same points.")]
 
 
 def make_facade(
     output: ScanOutput,
-    points: Annotated[int, typer.Option(help="Points of the scan, exactly.")] = 587_923,
+    points: Annotated[int, typer.Option(help="Exact number of points of the scan.")] = 587_923,
     seed: Seed = 2012,
     door: Annotated[float, typer.Option(help="Clear width of the main door [m].")] = 1.60,
 ) -> None:
-    """Make a Gothic façade, scanned by casting rays.
+    """Make a scan of a Gothic façade by casting rays.
 
-    Its truth is written beside the scan, as NAME.truth.json.
+    Its ground truth is written beside the scan, as NAME.truth.json.
     """
     with needs_extra("made"):
         from ...builder.made.scenes import make_facade as make_it
@@ -32,17 +34,19 @@ def make_facade(
 
     with interruptible(), writing(output), progress_listener() as bars:
         made = make_it(output, points=points, seed=seed, door=door, progress=bars.made)
-    print(f"{made.points:,} points in {output}, the truth in {made.truth}")
+    print(f"{made.points:,} points in {output}, ground truth in {made.truth}")
 
 
 def make_town(
     output: ScanOutput,
-    points: Annotated[int, typer.Option(help="Points of all scans, exactly; as many façades as that takes.")],
+    points: Annotated[
+        int, typer.Option(help="Exact number of points of all scans; it determines the number of façades.")
+    ],
     seed: Seed = 2012,
 ) -> None:
-    """Make a town of façades, each as dense as one.
+    """Make scans of a town of façades, each as dense as that of make facade.
 
-    Its truth is written beside the scan, as NAME.truth.json.
+    The ground truth is written beside the scans, as NAME.truth.json.
     """
     with needs_extra("made"):
         from ...builder.made.scenes import make_town as make_it
@@ -51,16 +55,16 @@ def make_town(
 
     with interruptible(), writing(output), progress_listener() as bars:
         made = make_it(output, points=points, seed=seed, progress=bars.made)
-    print(f"{made.points:,} points in {output}, the truth in {made.truth}")
+    print(f"{made.points:,} points in {output}, ground truth in {made.truth}")
 
 
 def make_figure(
     output: Annotated[Path, typer.Option("-o", "--output", help=".obj or .ply file to write.")],
-    points: Annotated[int, typer.Option(help="Points of the figure, exactly.")] = 3617,
+    points: Annotated[int, typer.Option(help="Exact number of points of the figure.")] = 3617,
     seed: Seed = 2012,
     height: Annotated[float, typer.Option(help="Height of the figure [m].")] = 1.75,
 ) -> None:
-    """Make a human figure in mid-walk: an avatar."""
+    """Make an avatar: a human figure in mid-stride."""
     from ...builder.made.figure import figure_points, write_figure
     from ...schemas.os_errors import writing
 
@@ -70,13 +74,13 @@ def make_figure(
 
 
 def make_walk(
-    truth: Annotated[Path, typer.Argument(help="The NAME.truth.json of a made façade.")],
+    truth: Annotated[Path, typer.Argument(help="NAME.truth.json, as make facade writes it.")],
     output: Annotated[Path, typer.Option("-o", "--output", help="CSV file of poses to write.")],
-    frames: Annotated[int, typer.Option(min=2, help="Poses, 30 a second.")] = 1200,
+    frames: Annotated[int, typer.Option(min=2, help="Number of poses, 30 per second.")] = 1200,
 ) -> None:
-    """Write the walk through a made façade as poses.
+    """Write the poses of a walk through a façade of make facade.
 
-    Columns t,x,y,z,qw,qx,qy,qz, as query takes them.
+    The columns are t,x,y,z,qw,qx,qy,qz, as solidcloud query reads them.
     """
     from ...builder.made.truth import read_truth
     from ...builder.made.walk import walk_poses

@@ -1,4 +1,4 @@
-"""What the verbs of the command line have in common: options that several take, sizes, missing libraries, JSON."""
+"""Helpers that the verbs share: common options, sizes in bytes, missing libraries, errors, JSON."""
 
 import json
 import re
@@ -15,15 +15,16 @@ from ...schemas.errors import BadRequestError, SolidcloudError
 ArchivePath = Annotated[Path, typer.Argument(help="Folder of an archive.")]
 KeyFile = Annotated[
     Path | None,
-    typer.Option(
-        help="File with the server's key; left out: the one that a server of this user has left is found."
-    ),
+    typer.Option(help="File with the server's key; default: the key that a server of this user has stored."),
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")]
 
 
 def parse_bytes(text: str, option: str) -> int:
-    """A size such as 512MB or 2GB in bytes, in steps of 1024; BadRequestError names the option."""
+    """Parse a size such as 512MB or 2GB into bytes (powers of 1024).
+
+    Raises BadRequestError, which names the option.
+    """
     match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([KMGT]?)i?B?", text.strip(), re.IGNORECASE)
     if not match:
         raise BadRequestError(f"{option} {text!r}: expected a size such as 512MB or 2GB")
@@ -32,7 +33,7 @@ def parse_bytes(text: str, option: str) -> int:
 
 @contextmanager
 def needs_extra(name: str) -> Iterator[None]:
-    """Say which extra to install where a library of it is missing."""
+    """Raise SolidcloudError naming the extra to install if one of its libraries is missing."""
     try:
         yield
     except ModuleNotFoundError as error:
@@ -44,7 +45,10 @@ def needs_extra(name: str) -> Iterator[None]:
 
 
 def complain(message: str, code: int) -> int:
-    """Print one line on standard error, and one more for each that is indented, as lists are; returns the exit code."""
+    """Print an error on standard error and return the exit code.
+
+    The message becomes one line; only indented lines, as in lists, stay on lines of their own.
+    """
     print("error: " + re.sub(r"\s*\n(?!  )", " ", message.rstrip()), file=sys.stderr)
     return code
 

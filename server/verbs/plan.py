@@ -1,4 +1,4 @@
-"""`solidcloud plan`: what a build will take, before it is begun."""
+"""`solidcloud plan`: estimate the cost of a build without running it."""
 
 import math
 from collections.abc import Iterator
@@ -22,33 +22,43 @@ def plan(
         str | None, typer.Option(help="Instead of scans: a number of points, such as 1e9 or 1000000000.")
     ] = None,
     density: Annotated[
-        float | None, typer.Option(help="With --points: points a square metre of surface; else a façade's.")
+        float | None,
+        typer.Option(help="With --points: points per square metre of surface; default: that of make facade."),
     ] = None,
     number_of_scans: Annotated[
         int | None,
-        typer.Option("--scans", min=1, help="With --points: scans; else of 1.4 million points each."),
+        typer.Option(
+            "--scans", min=1, help="With --points: number of scans; default: one per 1.4 million points."
+        ),
     ] = None,
     output: Annotated[
-        Path, typer.Option("-o", "--output", help="Where the archive would go: for the room on its disk.")
+        Path,
+        typer.Option("-o", "--output", help="Folder of the archive, to check the free space of its disk."),
     ] = Path("."),
     voxel: Annotated[float, typer.Option(help="Edge of a voxel [m].")] = 8.0,
     resolution: Annotated[float | None, typer.Option(help="Lattice step [m].")] = None,
-    jobs: Annotated[int, typer.Option(help="Worker processes; 0: one a core.")] = 0,
-    memory: Annotated[str, typer.Option(help="What the build may hold in memory.")] = "2GB",
-    keep: Annotated[str, typer.Option(help="Columns to keep: scan, intensity, normal, by comma.")] = "",
+    jobs: Annotated[int, typer.Option(help="Worker processes; 0: one per core.")] = 0,
+    memory: Annotated[str, typer.Option(help="Memory bound of the build, all processes together.")] = "2GB",
+    keep: Annotated[
+        str, typer.Option(help="Columns to keep, separated by commas: scan, intensity, normal.")
+    ] = "",
     skip_bad: Annotated[bool, typer.Option("--skip-bad", help="Leave out broken scans.")] = False,
     measure: Annotated[
-        bool, typer.Option("--measure", help="Measure this machine first, some seconds, and go by that.")
+        bool,
+        typer.Option(
+            "--measure", help="First measure the speed of this machine for a few seconds, and use it."
+        ),
     ] = False,
     quick: Annotated[
         bool,
         typer.Option(
-            "--quick", help="Look at few points and pack none: bytes are a guess, and a range is said."
+            "--quick",
+            help="Read few points and compress none: the archive's size is a rough estimate, printed as a range.",
         ),
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Estimate what a build takes: bytes, memory, time by stage, and the limits that would stop it."""
+    """Estimate a build: bytes, memory, time by stage, and the limits that would stop it."""
     from ...builder.config import BuildConfig
     from ...builder.plan import estimate, imagined, load_rates
     from ...schemas.errors import BadRequestError
@@ -56,11 +66,11 @@ def plan(
     from ..progress import progress_listener
 
     if bool(scans) == (points is not None):
-        raise BadRequestError("expected scans to look at, or --points and a number, one of them")
+        raise BadRequestError("expected either scans or --points with a number")
     if points is None and (density is not None or number_of_scans is not None):
-        raise BadRequestError("--density and --scans go with --points: scans say themselves")
+        raise BadRequestError("--density and --scans need --points: with scans, both are measured")
     if density is not None and not 0 < density < math.inf:
-        raise BadRequestError(f"--density {density}: expected a positive number of points a square metre")
+        raise BadRequestError(f"--density {density}: expected a positive number of points per square metre")
     config = BuildConfig(
         voxel=voxel,
         resolution=resolution,
@@ -88,7 +98,7 @@ def plan(
 
 
 def _number(text: str) -> int:
-    """A number of points, as 1e9 or 1_000_000; BadRequestError for anything else."""
+    """Parse a number of points, such as 1e9 or 1_000_000. Raises BadRequestError for anything else."""
     from ...schemas.errors import BadRequestError
 
     try:
@@ -101,15 +111,15 @@ def _number(text: str) -> int:
 
 
 def plan_facts(plan: "Plan") -> Iterator[tuple[str, str]]:
-    """What a plan says, for people."""
+    """Yield the names and values that describe a plan."""
     from ..console import bytes_text
 
-    yield "points", f"{plan.points:,} of {plan.scans:,} scans, {plan.density:,.0f} on a square metre"
+    yield "points", f"{plan.points:,} of {plan.scans:,} scans, {plan.density:,.0f} per square metre"
     yield (
         "archive",
-        f"{bytes_text(plan.archive_bytes)}, {plan.bytes_a_point:.2f} bytes a point at {plan.lattice_step * 1e3:g} mm; "
-        f"{plan.shards:,} shards; from {bytes_text(plan.archive_bytes / plan.archive_within)} to "
-        f"{bytes_text(plan.archive_bytes * plan.archive_within)}",
+        f"{bytes_text(plan.archive_bytes)}, {plan.bytes_a_point:.2f} bytes per point at "
+        f"{plan.lattice_step * 1e3:g} mm; {plan.shards:,} shards; "
+        f"from {bytes_text(plan.archive_bytes / plan.archive_within)} to {bytes_text(plan.archive_bytes * plan.archive_within)}",
     )
     yield (
         "voxels",
@@ -118,9 +128,9 @@ def plan_facts(plan: "Plan") -> Iterator[tuple[str, str]]:
     yield "preview", f"{bytes_text(plan.preview_bytes)} beside it, for ParaView"
     yield (
         "disk",
-        f"{bytes_text(plan.disk_bytes)} while it is built, {bytes_text(plan.spool_bytes)} of it the spool",
+        f"{bytes_text(plan.disk_bytes)} during the build, of which {bytes_text(plan.spool_bytes)} are the spool",
     )
-    yield "memory", f"{bytes_text(plan.memory_bytes)}, {plan.jobs} jobs and all"
+    yield "memory", f"{bytes_text(plan.memory_bytes)}, including {plan.jobs} worker processes"
     stages = ", ".join(f"{name} {time_text(seconds)}" for name, seconds in plan.stages.items())
     rate = plan.points / plan.seconds
     yield "time", f"{time_text(plan.seconds)} ({stages}), {rate:,.0f} points/s"
@@ -133,7 +143,7 @@ def plan_facts(plan: "Plan") -> Iterator[tuple[str, str]]:
 
 
 def _limit_text(limit: "Limit") -> str:
-    """A limit, and what to do where it binds."""
+    """Format a limit, with advice if it binds."""
     from ..console import bytes_text
 
     found, most = (
@@ -143,7 +153,7 @@ def _limit_text(limit: "Limit") -> str:
 
 
 def time_text(seconds: float) -> str:
-    """A time for people: 0.4 s, 90 s, 12 min, 5.1 h, 3.2 days."""
+    """Format a duration: 0.4 s, 90 s, 12 min, 5.1 h, 3.2 days."""
     for most, divisor, unit in ((120, 1, "s"), (120 * 60, 60, "min"), (48 * 3600, 3600, "h")):
         if seconds < most:
             value = seconds / divisor

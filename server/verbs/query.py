@@ -1,4 +1,4 @@
-"""`solidcloud query`: ask a server what something touches."""
+"""`solidcloud query`: send collision queries to a server."""
 
 import sys
 from pathlib import Path
@@ -11,7 +11,7 @@ from .options import AsJson, KeyFile, complain, print_json
 if TYPE_CHECKING:
     from ..client import Client
 
-# Options that are not parameters of what is asked.
+# Options that are not parameters of the query.
 _NOT_OF_THE_QUESTION = ("scene", "op", "connect", "key_file", "as_json")
 
 
@@ -20,63 +20,70 @@ def query(
     op: Annotated[
         str,
         typer.Option(
-            help="collide, distance, contacts, sweep, raycast, within, objects, move, or path in parts."
+            help="collide, distance, contacts, sweep, raycast, within, objects, move, or path (answered in parts)."
         ),
     ] = "collide",
     avatar: Annotated[
-        Path | None, typer.Option(help="Points of the avatar: OBJ PLY XYZ and what build reads.")
+        Path | None, typer.Option(help="Points of the avatar: a file in any format that build reads.")
     ] = None,
     poses: Annotated[
         Path | None,
         typer.Option(
-            help="CSV file of poses: t,x,y,z,qw,qx,qy,qz; a sweep or move goes from each to the next."
+            help="CSV file of poses: t,x,y,z,qw,qx,qy,qz; sweep and move use each pose and the next as a motion."
         ),
     ] = None,
     rays: Annotated[Path | None, typer.Option(help="CSV file of rays: x,y,z,dx,dy,dz.")] = None,
-    points: Annotated[Path | None, typer.Option(help="Loose points: PLY XYZ and what build reads.")] = None,
+    points: Annotated[
+        Path | None, typer.Option(help="Points of within: a file in any format that build reads.")
+    ] = None,
     objects: Annotated[
         Path | None, typer.Option(help="CSV file of objects: avatar,x,y,z,qw,qx,qy,qz,group,mask.")
     ] = None,
     along: Annotated[
-        str | None, typer.Option(help="What path asks: collide (default), distance, contacts or sweep.")
+        str | None, typer.Option(help="Query along a path: collide (default), distance, contacts or sweep.")
     ] = None,
-    connect: Annotated[str, typer.Option(help="zenoh endpoint of the server.")] = "tcp/127.0.0.1:7447",
+    connect: Annotated[str, typer.Option(help="Zenoh endpoint of the server.")] = "tcp/127.0.0.1:7447",
     margin: Annotated[
-        float | None, typer.Option(help="Distance below which it is contact [m]; default 0.")
+        float | None, typer.Option(help="Distance up to which it is contact [m]; default 0.")
     ] = None,
-    reach: Annotated[float | None, typer.Option(help="Farthest distance worth reporting [m].")] = None,
+    reach: Annotated[float | None, typer.Option(help="Maximum distance to report [m].")] = None,
     limit: Annotated[
-        int | None, typer.Option(help="Contacts listed for a pose, the deepest; default 100.")
+        int | None, typer.Option(help="Contacts listed per pose, deepest first; default 100.")
     ] = None,
     cluster_distance: Annotated[
-        float | None, typer.Option(help="How far apart points of one cluster may lie [m].")
+        float | None, typer.Option(help="Maximum distance between neighbouring points of one cluster [m].")
     ] = None,
     radius: Annotated[
         float | None,
-        typer.Option(help="Radius of an avatar point [m]; left out: half the mean closest-point distance."),
+        typer.Option(help="Radius of an avatar point [m]; default: half the mean closest-point distance."),
     ] = None,
     tolerance: Annotated[
-        float | None, typer.Option(help="How early contact may be called [m]; default 0, of a sweep 1e-6.")
+        float | None,
+        typer.Option(help="Distance by which contact may be reported early [m]; default 0, for sweep 1e-6."),
     ] = None,
-    budget_ms: Annotated[float | None, typer.Option(help="Time for it all [ms]; default none.")] = None,
-    budget_visits: Annotated[int | None, typer.Option(help="Node visits a pose; default none.")] = None,
+    budget_ms: Annotated[
+        float | None, typer.Option(help="Time limit of the whole query [ms]; default: none.")
+    ] = None,
+    budget_visits: Annotated[
+        int | None, typer.Option(help="Maximum number of node visits per pose; default: none.")
+    ] = None,
     radius_model: Annotated[
         str | None,
         typer.Option(
-            help="Radii of the scan's points: mean, local, border, local+border, each with a factor as in "
-            "local:0.8 if wanted, or fixed:METRES; default: the scene's one figure."
+            help="Radii of the scan's points: mean, local, border or local+border, each with an optional factor as "
+            "in local:0.8, or fixed:METRES; default: the one radius stored with the scene."
         ),
     ] = None,
     key_file: KeyFile = None,
     as_json: AsJson = False,
 ) -> int:
-    """Ask a server what poses of an avatar, rays, points or objects touch.
+    """Query a server for what poses of an avatar, rays, points or objects touch.
 
-    Those that lie outside the scan's bounds, reach included, are counted, and said on standard error.
+    Items that lie outside the scan's bounds, even with their reach, are counted in a warning on standard error.
 
-    Exit code 1: nobody answered; then nothing is printed but the error. Where only some answers did not come, what came
-    is printed, the rest is unknown, and the exit code is 1 too. What the server itself calls unknown (its budget was
-    spent, or what is in reach could not be looked at) is said on standard error, with exit code 0.
+    Exit code 1: no answer arrived; only the error is printed. If only some answers arrived, they are printed, the
+    others are unknown, and the exit code is also 1. Answers that the server itself calls unknown (the budget was
+    spent, or data in reach could not be read) are counted on standard error, with exit code 0.
     """
     options = {name: value for name, value in locals().items() if name not in _NOT_OF_THE_QUESTION}
     from ..answer_text import answer_lines, answers_json, summary_line, unknown_line, word_of
@@ -93,14 +100,14 @@ def query(
             found.append(part)
             asked += len(part.labels)
             if as_json or client.unanswered == asked:
-                continue  # printed once an answer comes
+                continue  # printed once an answer arrives
             for each in found[printed:]:
                 for line in answer_lines(each.labels, each.times, each.answers):
                     print(line, flush=op == "path")
             printed = len(found)
         _check_answered(client, asked, op)
         whole = joined(found)
-        said: Any = whole.answers  # every kind has verdict and outside
+        said: Any = whole.answers  # every answer type has verdict and outside
         outside = _outside(client, whole.places, said.outside, said.verdict, word_of(said))
     if as_json:
         print_json(answers_json(whole.times, said, outside))
@@ -110,7 +117,7 @@ def query(
 
 
 def _check_answered(client: "Client", asked: int, op: str) -> None:
-    """BusyError: nobody answered anything of what was asked."""
+    """Raise BusyError if no part of the query was answered."""
     from ...schemas.errors import BusyError
 
     if asked and client.unanswered == asked:
@@ -118,7 +125,10 @@ def _check_answered(client: "Client", asked: int, op: str) -> None:
 
 
 def _say_unknown(client: "Client", op: str, word: str, asked: int, line: str) -> int:
-    """Say on standard error what nobody answered, or else `line` of what is unknown; return the exit code."""
+    """Print the number of unanswered items on standard error, or else `line`, a count of unknown answers.
+
+    Returns the exit code.
+    """
     if client.unanswered:
         return complain(f"{client.unanswered} of {asked} {word} were not answered: {client.silence(op)}", 1)
     if line:
@@ -127,7 +137,10 @@ def _say_unknown(client: "Client", op: str, word: str, asked: int, line: str) ->
 
 
 def _outside(client: "Client", places: Any, leaves: Any, verdicts: Any, word: str) -> Any:
-    """Say on standard error how many places lie outside the scan; return which, or None where that is not known."""
+    """Warn on standard error about places outside the scan.
+
+    Returns a mask of them, or None if the server no longer answers.
+    """
     from ...schemas.errors import BusyError
     from ..scan_bounds import lying_outside, outside_line
 
@@ -135,7 +148,7 @@ def _outside(client: "Client", places: Any, leaves: Any, verdicts: Any, word: st
         return leaves
     try:
         info = client.info()
-    except BusyError:  # the server has gone since
+    except BusyError:  # the server has stopped since
         return None
     outside = lying_outside(places, leaves, verdicts, info)
     if outside.any():
@@ -144,7 +157,7 @@ def _outside(client: "Client", places: Any, leaves: Any, verdicts: Any, word: st
 
 
 def _ask_moves(connect: str, scene: str, question: Any, as_json: bool, key_file: Path | None) -> int:
-    """Ask frame after frame and print a line each, or all as JSON; return the exit code."""
+    """Send one move per frame and print one line each, or all as JSON; return the exit code."""
     import numpy as np
     from msgspec import json
 
@@ -172,9 +185,5 @@ def _ask_moves(connect: str, scene: str, question: Any, as_json: bool, key_file:
         lie = [None] * len(found) if outside is None else outside.tolist()
         print_json([{**moved, "outside_scan": lies} for moved, lies in zip(found, lie, strict=True)])
     count = int((verdicts == Verdict.UNKNOWN).sum())
-    line = (
-        f"{count} of {len(found)} motions are unknown: what is in reach could not be looked at"
-        if count
-        else ""
-    )
+    line = f"{count} of {len(found)} motions are unknown: data in reach could not be read" if count else ""
     return _say_unknown(client, "move", "motions", len(found), line)

@@ -1,9 +1,10 @@
-"""A trial of compiled kernels in a process of its own, before a server that did not come up the last time uses them.
+"""Trial of the compiled kernels in a child process, after a server start that did not complete.
 
-A digest shows that a kernel is what was written. It cannot show that what was written is right for this machine. So
-a server marks its start (`KernelFiles.starting`), and where the start before did not come to its end, everything that
-a start does is tried in a child process first. If the child crashes, hangs or gives a wrong answer, all compiled
-kernels are removed, and compiled again. A start that follows a complete one pays nothing for this.
+A digest shows that a kernel file holds what was written. It cannot show that its contents are right
+for this machine. Therefore a server marks its start (`KernelFiles.starting`). If the previous start
+did not complete, a child process first performs everything that a start does. If the child crashes,
+hangs or computes a wrong answer, all compiled kernels are removed and compiled again. A start that
+follows a complete one skips the trial.
 """
 
 import logging
@@ -29,30 +30,34 @@ _RADIUS, _REACH = 0.05, 0.5
 
 
 def rehearse(what: Path, files: KernelFiles, seconds: float = SECONDS) -> None:
-    """Start `what`, an archive or a scene file, in a child process; remove all compiled kernels if that fails."""
+    """Open and warm `what`, an archive or a scene file, in a child process.
+
+    Removes all compiled kernels if the child fails or takes longer than `seconds`.
+    """
     command = [sys.executable, "-P", "-m", __name__, str(what)]
     try:
         code = subprocess.run(command, capture_output=True, timeout=seconds).returncode
     except subprocess.TimeoutExpired:
-        fault = f"was not done within {seconds:g} s"
+        fault = f"did not finish within {seconds:g} s"
     else:
         if code == 0:
             return
         fault = f"ended with {signal.Signals(-code).name if code < 0 else f'exit code {code}'}"
     files.wipe()
     log.warning(
-        "compiled kernels in %s: the last start did not come to its end, and a trial of them %s: "
-        "removed; all are compiled again",
+        "compiled kernels in %s: the last server start did not complete, and a trial of the kernels %s: "
+        "all were removed and are compiled again",
         files.folder,
         fault,
     )
 
 
 def check_answers(scene: SceneLike) -> None:
-    """Ask questions whose answers are known. AssertionError: a kernel computes what is not so.
+    """Make queries whose answers are known. Raises AssertionError if a kernel computes a wrong one.
 
-    `collide` and `distance`, which descend by different kernels, agree at the corners and the centre of the scene's
-    bounds; a sphere around a scan point is in contact; far from the bounds there is no point.
+    Checks that `collide` and `distance`, which use different kernels, agree at the corners and the
+    centre of the scene's bounds; that a sphere around a scan point is in contact; and that there is
+    no point far outside the bounds.
     """
     low, high = (np.array(bound) for bound in scene.info().bounds)
     scene.add_avatar(_CLIENT, [[0.0, 0.0, 0.0]], _RADIUS, client=_CLIENT)
@@ -69,20 +74,20 @@ def check_answers(scene: SceneLike) -> None:
 
 
 def _poses(places: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return poses (k, 4, 4) that stand upright at places (k, 3), world [m]."""
+    """Return upright poses (k, 4, 4) at places (k, 3), world frame [m]."""
     poses = np.tile(np.eye(4), (len(places), 1, 1))
     poses[:, :3, 3] = places
     return poses
 
 
 def _require(holds: bool, fault: str) -> None:
-    """Raise an AssertionError, with -O too."""
+    """Raise AssertionError with this message unless `holds`; unlike `assert`, also under -O."""
     if not holds:
         raise AssertionError(fault)
 
 
 def main(path: str) -> int:
-    """Do what a start does; 0 where kernels are not at fault."""
+    """Open, warm and check the scene as a server start does. Return 0 unless the kernels fail."""
     from ..report.points import read_avatar
     from ..scene_file import open_scene
 
@@ -91,7 +96,7 @@ def main(path: str) -> int:
             (scene.simulation or scene).warm()
             check_answers(scene)
     except SolidcloudError:
-        return 0  # of the archive or the scene file, which the start says itself
+        return 0  # a fault of the archive or scene file, which the server start itself reports
     return 0
 
 

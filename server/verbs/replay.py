@@ -1,4 +1,4 @@
-"""`solidcloud replay`: a log's frames once more, compared bit for bit."""
+"""`solidcloud replay`: simulate the frames of a log again and compare them bit for bit."""
 
 import sys
 from pathlib import Path
@@ -10,15 +10,18 @@ from .options import AsJson, parse_bytes, print_json
 
 
 def replay(
-    log: Annotated[Path, typer.Argument(help="A log that serve --log wrote.")],
+    log: Annotated[Path, typer.Argument(help="Log written by solidcloud serve --log.")],
     what: Annotated[
         Path | None,
-        typer.Argument(metavar="[ARCHIVE|SCENE.toml]", help="What was served; left out: where it was then."),
+        typer.Argument(
+            metavar="[ARCHIVE|SCENE.toml]",
+            help="The archive or scene file that was served; default: the path in the log.",
+        ),
     ] = None,
-    cache: Annotated[str, typer.Option(help="Decoded voxels kept in memory, at most.")] = "512MB",
+    cache: Annotated[str, typer.Option(help="Memory bound of decoded voxels.")] = "512MB",
     as_json: AsJson = False,
 ) -> int:
-    """Simulate a log's frames again and compare their poses bit for bit. Exit code 1: some differ."""
+    """Simulate a log's frames again and compare their poses bit for bit. Exit code 1 if any differ."""
     from ..frame_log import Begin, read_log
     from ..replay import check_same
     from ..replay import replay as replay_log
@@ -27,7 +30,7 @@ def replay(
 
     records = read_log(log)
     begin = next(records)
-    assert isinstance(begin, Begin), "read_log sees to it"
+    assert isinstance(begin, Begin), "read_log checks this"
     path = Path(begin.path) if what is None else what
     with open_scene(
         path, read_points=read_avatar, name=begin.scene, budget_bytes=parse_bytes(cache, "--cache")
@@ -44,5 +47,5 @@ def replay(
     if found.first is not None:
         print(f"first: {found.first}")
     if found.reloaded is not None:
-        print(f"ends before frame {found.reloaded}: the scene had been reloaded")
+        print(f"stopped before frame {found.reloaded}: the scene was reloaded there")
     return int(found.different > 0)

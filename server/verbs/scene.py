@@ -1,4 +1,4 @@
-"""`solidcloud scene new`, `scene check`: a scene file to begin with, and whether one is right."""
+"""`solidcloud scene new` and `scene check`: create a scene file and check one."""
 
 from pathlib import Path
 from typing import Annotated
@@ -10,20 +10,20 @@ from .options import AsJson, print_json
 
 def new(
     archives: Annotated[list[Path], typer.Argument(help="Folders of archives.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="The file to write.")] = Path("scene.toml"),
+    out: Annotated[Path, typer.Option("--out", "-o", help="Scene file to write.")] = Path("scene.toml"),
     name: Annotated[
-        str | None, typer.Option(help="Scene name for clients; left out: the file's, without suffix.")
+        str | None, typer.Option(help="Scene name for clients; default: the file name without suffix.")
     ] = None,
     avatar: Annotated[
         list[Path] | None,
         typer.Option(
-            help="Points of an avatar that every user finds, named nearly as the file; may be repeated."
+            help="Points of an avatar that all users may use; its name derives from the file name; may be repeated."
         ),
     ] = None,
     effects: Annotated[
-        str, typer.Option(help="What is simulated, with commas between; the others are commented out.")
+        str, typer.Option(help="Effects to enable, separated by commas; the others are commented out.")
     ] = "stop",
-    force: Annotated[bool, typer.Option("--force", help="Replace the file if it is there.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
 ) -> None:
     """Write a scene file with every field explained."""
     import shlex
@@ -36,10 +36,13 @@ def new(
 
 
 def check(
-    file: Annotated[Path, typer.Argument(help="A scene file.")],
+    file: Annotated[Path, typer.Argument(help="Scene file.")],
     as_json: AsJson = False,
 ) -> None:
-    """Say what a scene is and which effects run, in which order; exit code 2 where it is wrong, 3 for bad data."""
+    """Check a scene file and describe the scene and its effects in their order.
+
+    Exit code 2: the file is invalid. Exit code 3: an archive or avatar it names is invalid.
+    """
     from ..console import print_facts
     from ..report.points import read_avatar
     from ..scene_check import check_scene_file, scene_facts, scene_json

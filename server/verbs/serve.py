@@ -1,4 +1,4 @@
-"""`solidcloud serve`: an archive or a scene over zenoh."""
+"""`solidcloud serve`: serve an archive or a scene over zenoh."""
 
 from pathlib import Path
 from typing import Annotated
@@ -13,50 +13,70 @@ def serve(
         Path, typer.Argument(metavar="ARCHIVE|SCENE.toml", help="Folder of an archive, or a scene file.")
     ],
     name: Annotated[
-        str | None, typer.Option(help="Scene name for clients; left out: the scene file's, or the folder's.")
+        str | None,
+        typer.Option(help="Scene name for clients; default: the name in the scene file, or of the folder."),
     ] = None,
-    listen: Annotated[str, typer.Option(help="zenoh endpoint.")] = "tcp/127.0.0.1:7447",
-    cache: Annotated[str, typer.Option(help="Decoded voxels kept in memory, at most.")] = "512MB",
+    listen: Annotated[str, typer.Option(help="Zenoh endpoint to listen on.")] = "tcp/127.0.0.1:7447",
+    cache: Annotated[str, typer.Option(help="Memory bound of decoded voxels.")] = "512MB",
     policy: Annotated[
         str,
         typer.Option(
-            help="Which voxel goes for another: lru, lru+prefetch, distance or s3fifo. All but lru load ahead."
+            help="Eviction policy of the voxel cache: lru, lru+prefetch, distance or s3fifo. All but lru prefetch."
         ),
     ] = "lru+prefetch",
     metrics_port: Annotated[
-        int, typer.Option(help="TCP port of Prometheus' text, at http://127.0.0.1:PORT/metrics; 0: none.")
+        int, typer.Option(help="TCP port of Prometheus metrics, at http://127.0.0.1:PORT/metrics; 0: none.")
     ] = 0,
     key_file: Annotated[
         Path | None,
         typer.Option(
-            help="File with the key that replies are sealed with, 64 hex digits, for clients that have it too; left "
-            "out: a new one, which clients of this user find by themselves."
+            help="File with the key that authenticates replies, 64 hex digits, shared with the clients; default: a "
+            "new key, which clients of the same user find automatically."
         ),
     ] = None,
     log: Annotated[
         Path | None,
-        typer.Option(help="New file for the frames of all users, for solidcloud replay; it only grows."),
+        typer.Option(
+            help="New log file of all users' frames, for solidcloud replay; it grows without bound."
+        ),
     ] = None,
     max_request_seconds: Annotated[
         float,
-        typer.Option(help="Server time for one request or part of a path; what was not reached is unknown."),
+        typer.Option(
+            help="Time limit of one request or one part of a path [s]; what was not computed by then is unknown."
+        ),
     ] = 2.0,
-    max_slow: Annotated[int, typer.Option(help="Requests at work for longer than 10 ms, at a time.")] = 4,
+    max_slow: Annotated[
+        int, typer.Option(help="Maximum number of simultaneous requests that run longer than 10 ms.")
+    ] = 4,
     max_in_flight_by_client: Annotated[
-        int, typer.Option(help="Requests of one client at a time; all without a liveliness token are one.")
+        int,
+        typer.Option(
+            help="Maximum number of simultaneous requests of one client; all clients without a liveliness token "
+            "count as one."
+        ),
     ] = 64,
     max_avatar_bytes: Annotated[
-        str, typer.Option(help="Memory for the avatars of all clients, some 54 bytes a point.")
+        str, typer.Option(help="Memory bound of the avatars of all clients, about 54 bytes per point.")
     ] = "512MB",
-    max_avatar_bytes_by_client: Annotated[str, typer.Option(help="The same for one client.")] = "256MB",
-    max_avatars: Annotated[int, typer.Option(help="Avatars of all clients.")] = 16384,
-    max_avatars_by_client: Annotated[int, typer.Option(help="Avatars of one client.")] = 4096,
-    max_avatar_clients: Annotated[int, typer.Option(help="Clients that have avatars.")] = 1024,
+    max_avatar_bytes_by_client: Annotated[
+        str, typer.Option(help="Memory bound of the avatars of one client.")
+    ] = "256MB",
+    max_avatars: Annotated[int, typer.Option(help="Maximum number of avatars of all clients.")] = 16384,
+    max_avatars_by_client: Annotated[
+        int, typer.Option(help="Maximum number of avatars of one client.")
+    ] = 4096,
+    max_avatar_clients: Annotated[
+        int, typer.Option(help="Maximum number of clients that have avatars.")
+    ] = 1024,
     insecure: Annotated[
-        bool, typer.Option("--insecure", help="Allow an endpoint that other hosts reach.")
+        bool, typer.Option("--insecure", help="Allow an endpoint that other hosts can reach.")
     ] = False,
 ) -> None:
-    """Serve an archive, which stops who touches it, or a scene over zenoh until told to stop."""
+    """Serve an archive or a scene over zenoh until interrupted.
+
+    An archive is served with the effect stop: an avatar that touches the scan is stopped.
+    """
     import logging
     import os
     from contextlib import ExitStack
@@ -87,7 +107,7 @@ def serve(
     )
     budget = parse_bytes(cache, "--cache")
     if key_file is not None:
-        read_given_key(key_file)  # refused now, and not once the archive is warm
+        read_given_key(key_file)  # raises before the archive is opened and warmed
     files = kernel_files()
     with ExitStack() as stack, ExitStack() as start:
         if start.enter_context(files.starting()):
@@ -98,6 +118,7 @@ def serve(
         if log is not None:
             stack.enter_context(recorded(scene, what, log))
         if not serve_scenes([scene], config, ready=start.close):
-            # Nothing is left to write, and the archive would only be closed once the request ends.
+            # A request is still running. Nothing is left to write, and closing the archive would
+            # wait for that request.
             logging.shutdown()
             os._exit(0)

@@ -1,4 +1,4 @@
-"""`solidcloud top`: what a server keeps in memory and how its users fare, live."""
+"""`solidcloud top`: live statistics of a server's cache and users."""
 
 from contextlib import ExitStack
 from typing import Annotated
@@ -9,16 +9,14 @@ from .options import AsJson, KeyFile, print_json
 
 
 def top(
-    scene: Annotated[
-        str | None, typer.Option(help="Name of the scene; left out: all that are served.")
-    ] = None,
-    connect: Annotated[str, typer.Option(help="zenoh endpoint of the server.")] = "tcp/127.0.0.1:7447",
-    interval: Annotated[float, typer.Option(help="Seconds between two looks.")] = 1.0,
-    once: Annotated[bool, typer.Option("--once", help="Print one table and end.")] = False,
+    scene: Annotated[str | None, typer.Option(help="Name of the scene; default: all served scenes.")] = None,
+    connect: Annotated[str, typer.Option(help="Zenoh endpoint of the server.")] = "tcp/127.0.0.1:7447",
+    interval: Annotated[float, typer.Option(help="Seconds between two updates.")] = 1.0,
+    once: Annotated[bool, typer.Option("--once", help="Print one table and exit.")] = False,
     key_file: KeyFile = None,
     as_json: AsJson = False,
 ) -> None:
-    """Show what a server keeps in memory, and how its users fare, until Ctrl-C."""
+    """Show live statistics of a server's cache and users until Ctrl-C."""
     import msgspec
 
     from ...schemas.errors import BadRequestError
@@ -36,4 +34,4 @@ def top(
         try:
             watch(clients, interval, once=once)
         except KeyboardInterrupt:
-            return  # how it is ended
+            return  # Ctrl-C is the regular way to end

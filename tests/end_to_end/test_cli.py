@@ -166,7 +166,7 @@ def test_build_says_what_it_made(scan: Path, tmp_path: Path, capsys: pytest.Capt
     assert "--overwrite" in errors(capsys)[0]
     assert run(["build", str(scan), "-o", str(target), "--overwrite", "--jobs", "1"]) == 0
     shown = capsys.readouterr()
-    assert "points/s" in shown.out and "bytes a point" in shown.out
+    assert "points/s" in shown.out and "bytes per point" in shown.out
     assert re.search(r"preview +preview\.vtkhdf for ParaView, \d", shown.out)
 
 

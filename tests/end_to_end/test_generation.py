@@ -51,14 +51,14 @@ def test_scans_are_added_and_removed(hall: Path, capsys: pytest.CaptureFixture[s
     assert run(["add", str(hall), chair]) == 2
     assert "is already in the archive" in capsys.readouterr().err
     assert run(["add", str(hall), chair, "--again"]) == 0
-    assert "802, were 602" in capsys.readouterr().out
+    assert "802, before 602" in capsys.readouterr().out
     info = told(["info", str(hall)], capsys)
     assert (info["format_version"], info["generation"], info["points"]) == (3, 2, 802)
     assert run(["info", str(hall)]) == 0
     assert "generation 2" in (shown := capsys.readouterr().out) and "scan 2" in shown
     assert run(["validate", str(hall), "--deep"]) == 0
     assert run(["remove", str(hall), chair]) == 0
-    assert "402, were 802" in capsys.readouterr().out
+    assert "402, before 802" in capsys.readouterr().out
     assert run(["remove", str(hall), "0"]) == 2
     assert "nothing would be left" in capsys.readouterr().err
     assert run(["add", str(hall), str(hall.parent / "none.ply")]) == 3
@@ -98,7 +98,7 @@ def test_nothing_is_left_of_a_change_that_is_told_to_end(hall: Path) -> None:
     with start_adding(hall) as process:
         process.terminate()
         _, said = process.communicate(timeout=120)
-    assert process.returncode == 130 and f"interrupted: {hall} is whole, of generation 0" in said
+    assert process.returncode == 130 and f"interrupted: {hall} is complete, at generation 0" in said
     assert sorted(hall.parent.iterdir()) == before
     assert run(["validate", str(hall), "--deep"]) == 0
 

@@ -275,7 +275,7 @@ def test_the_command_and_the_signal_reload(
             text=True,
             check=True,
         )
-        assert ran.stdout.startswith("hall: generation 0, was 0; 1,002 points")
+        assert ran.stdout.startswith("hall: generation 0, before 0; 1,002 points")
         assert now() == {1}
         put(generations.archives[0], place)
         os.kill(server.pid, signal.SIGHUP)

@@ -197,7 +197,7 @@ def test_what_the_server_itself_does_not_know_is_said(
         shown = capsys.readouterr()
         assert len(shown.out.splitlines()) == 5
         (line,) = [line for line in shown.err.splitlines() if "unknown" in line]
-        assert line == "warning: 5 of 5 motions are unknown: what is in reach could not be looked at"
+        assert line == "warning: 5 of 5 motions are unknown: data in reach could not be read"
 
 
 def test_a_path_that_stops_after_its_first_part(

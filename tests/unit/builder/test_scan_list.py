@@ -337,7 +337,7 @@ def test_the_command_writes_a_list_and_names_broken_files(
     edit(folder / "scans.toml", {"use": False}, 3)
     before = (folder / "scans.toml").read_bytes()
     assert run(["inspect", "a.las"]) == 0
-    assert (folder / "scans.toml").read_bytes() == before and "stays as it is" in capsys.readouterr().err
+    assert (folder / "scans.toml").read_bytes() == before and "was not changed" in capsys.readouterr().err
     assert run(["inspect", "a.las", "-o", "scans.toml"]) == 2
     assert run(["inspect", "a.las", "-o", "scans.toml", "--overwrite"]) == 0
     assert len(read_scan_list(folder / "scans.toml")) == 1

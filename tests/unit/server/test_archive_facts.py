@@ -66,7 +66,7 @@ def test_info_says_it_in_words(archive: Path, capsys: pytest.CaptureFixture[str]
     words = " ".join(capsys.readouterr().out.split())
     for said in (
         "scanner at 1.500 -2.250 100.000 m",
-        "taken for ft, y up",
+        "read as ft, y up",
         'PROJCS["UTM", UNIT["metre",1]] (1 of the scans)',
         "densest voxel (",
         "preview preview.vtkhdf for ParaView",

@@ -85,7 +85,7 @@ def test_who_interrupts_is_told_how_to_go_on(
             raise SystemExit(run(build))
     assert stopped.value.code == 130
     said = capsys.readouterr().err
-    assert f"interrupted: what is done is kept in {tmp_path}/.hall.building: the same command goes on" in said
+    assert f"interrupted: completed work is kept in {tmp_path}/.hall.building: the same command resumes" in said
     assert said.count("interrupted") == 1
     assert signal.getsignal(signal.SIGTERM) == before
     assert run(build) == 0
@@ -94,8 +94,8 @@ def test_who_interrupts_is_told_how_to_go_on(
     assert run([*build, "--json"]) == 0
     told = capsys.readouterr()
     assert json.loads(told.out)["already"] is True
-    assert "whole already, of these scans with these options: nothing was built" in told.err
-    assert "Its index says so: its records were not read, which `solidcloud validate` does" in told.err
+    assert "already complete, with these scans and these options: nothing was built" in told.err
+    assert "Only its index was checked; `solidcloud validate` reads its records" in told.err
 
 
 def test_progress_is_json_where_asked_for(

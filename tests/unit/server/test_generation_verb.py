@@ -33,7 +33,7 @@ def test_who_interrupts_a_change_is_told_what_the_archive_is(
         patch.setattr(rebuild, stage, lambda *_: os.kill(os.getpid(), number))
         assert run(["add", hall, str(tmp_path / "b.xyz"), "--jobs", "1"]) == 130
     said = capsys.readouterr().err
-    assert f"interrupted: {hall} is whole, of generation {now}" in said and said.count("interrupted") == 1
+    assert f"interrupted: {hall} is complete, at generation {now}" in said and said.count("interrupted") == 1
     assert signal.getsignal(signal.SIGTERM) == before
     assert [path.name for path in folder.iterdir()] == ["hall"]
     assert run(["add", hall, str(tmp_path / "b.xyz"), "--jobs", "1", "--new"]) == 2 * now

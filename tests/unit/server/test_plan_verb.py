@@ -23,7 +23,7 @@ def test_what_binds_is_said_with_what_to_do(capsys: pytest.CaptureFixture[str]) 
     assert run(["plan", "--points", "1_000_000_000_000", "--memory", "1GB", "--density", "330"]) == 0
     # Lines are folded where the terminal ends.
     out = " ".join(capsys.readouterr().out.split())
-    assert "1,000,000,000,000 of 714,286 scans, 330 on a square metre" in out
+    assert "1,000,000,000,000 of 714,286 scans, 330 per square metre" in out
     assert "BINDS index, held by build and server" in out and "give a larger --voxel" in out
     assert (
         "rests on builds of made façades" in out
@@ -43,11 +43,11 @@ def test_scans_are_planned_for_and_left_alone(tmp_path: Path, capsys: pytest.Cap
 @pytest.mark.parametrize(
     ("arguments", "code", "said"),
     [
-        ([], 2, "expected scans to look at, or --points"),
+        ([], 2, "expected either scans or --points"),
         (["--points", "many"], 2, "--points 'many': expected a number"),
         (["--points", "0"], 2, "--points '0': expected a number"),
-        (["--points", "1e9", "somewhere"], 2, "one of them"),
-        (["somewhere", "--density", "3"], 2, "--density and --scans go with --points"),
+        (["--points", "1e9", "somewhere"], 2, "expected either scans or --points"),
+        (["somewhere", "--density", "3"], 2, "--density and --scans need --points"),
         (["--points", "1e9", "--density", "0"], 2, "--density 0.0: expected a positive number"),
         (["--points", "1e9", "--voxel", "-1"], 2, "--voxel -1.0"),
         (["no-such-folder"], 3, "no-such-folder"),

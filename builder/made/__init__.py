@@ -1,1 +1,1 @@
-"""Scenes that are made, with known truth."""
+"""Generated test scenes with known ground truth: meshes, simulated scans, and reference figures."""

@@ -1,9 +1,9 @@
-"""A procedural Gothic façade: its mesh, and its truth.
+"""A procedural Gothic façade: its mesh and its ground truth.
 
-After the scenario of [Fig12], section 3: a monastery's façade with an open door to walk through, walls to
-walk alongside and columns to walk around, a forecourt before it and the first bays of a nave behind it. It
-measures 18.7 m by 28 m by about 15.5 m, so that all of it fits the paper's one voxel (32 m here).
-The frame is that of `truth.py`. Everything follows from the seed and the door's width.
+After the scenario of [Fig12], section 3: a monastery's façade with an open door to walk through,
+walls to walk alongside and columns to walk around, a forecourt before it and the first bays of a
+nave behind it. It measures 18.7 m by 28 m by about 15.5 m and fits the paper's single voxel (32 m
+here). The frame is that of `truth.py`. The seed and the door's width determine the result.
 """
 
 from itertools import pairwise
@@ -17,7 +17,8 @@ from ...schemas.errors import BadRequestError
 from .shapes import Opening, Parts, arch, circle, level
 from .truth import ColumnTruth, DoorTruth, FacadeTruth, StepTruth, WallTruth
 
-# The narrowest is narrower than the made figure, so that one it does not pass can be made.
+# The narrowest door is narrower than the generated figure: a door that the figure cannot pass is
+# possible.
 NARROWEST_DOOR, WIDEST_DOOR = 0.50, 2.40
 SILL = 0.45
 RISER = SILL / 3
@@ -43,14 +44,16 @@ class Facade(NamedTuple):
 def build_facade(
     seed: int = 2012, door: float = 1.60, origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
 ) -> Facade:
-    """Build the façade of this seed. door: clear width of the main door [m]; side doors: 0.90 and 0.70 m.
+    """Build the façade of this seed, in its own frame.
 
-    The mesh is in the façade's own frame; `origin` only goes into the truth.
+    door: clear width of the main door [m]; the side doors are 0.90 and 0.70 m wide.
+    origin: stored in the truth only; it does not move the mesh.
+    Raises BadRequestError for a door width outside NARROWEST_DOOR to WIDEST_DOOR.
     """
     if not NARROWEST_DOOR <= door <= WIDEST_DOOR:
         raise BadRequestError(
-            f"door of {door} m: expected {NARROWEST_DOOR} to {WIDEST_DOOR} m, for the portal has room for no "
-            "other: choose a width between"
+            f"door of {door} m: expected {NARROWEST_DOOR} to {WIDEST_DOOR} m, the widths that fit the portal: "
+            "choose a width in this range"
         )
     rng = np.random.default_rng([seed, 0xFACADE])
     doors = (
@@ -59,7 +62,7 @@ def build_facade(
         _door("right", 6.35, 0.70, 2.1),
     )
     parts = Parts()
-    # The stairs stop where the lane between the façade and its forecourt columns begins.
+    # The stairs end before the lane between the façade and its forecourt columns.
     steps = (
         *_stair("main", 0.0, 3.2, -ORDERS * ORDER_DEPTH - 0.4),
         *_stair("left", -6.35, 1.0, -0.5),
@@ -87,7 +90,10 @@ def build_facade(
 
 
 def _door(name: str, centre: float, width: float, height: float) -> DoorTruth:
-    """A door's figures: the arch is equilateral, so its apex is sqrt(3) half widths above the springing."""
+    """Return a door's figures.
+
+    The arch is equilateral: its apex is sqrt(3) half widths above the springing.
+    """
     half = width / 2
     springing = SILL + height
     apex = springing + 3**0.5 * half
@@ -95,7 +101,7 @@ def _door(name: str, centre: float, width: float, height: float) -> DoorTruth:
 
 
 def _stair(name: str, centre: float, half: float, y_landing: float) -> tuple[StepTruth, ...]:
-    """Three steps up to the sill, lowest first; the last tread is the landing, up to the wall at y = 0."""
+    """Return three steps up to the sill, lowest first; the last tread extends to the wall at y = 0."""
     fronts = (y_landing - 2 * TREAD, y_landing - TREAD, y_landing)
     backs = (*fronts[1:], 0.0)
     return tuple(
@@ -105,7 +111,7 @@ def _stair(name: str, centre: float, half: float, y_landing: float) -> tuple[Ste
 
 
 def _front(parts: Parts, doors: tuple[DoorTruth, ...]) -> None:
-    """The wall itself: an outer layer with every opening, an inner one with those that go right through."""
+    """Add the front wall: an outer layer with all openings, an inner layer with the through openings."""
     through = [
         Opening(
             d.x_left,
@@ -125,22 +131,22 @@ def _front(parts: Parts, doors: tuple[DoorTruth, ...]) -> None:
         parts.wall((-4.1, 4.1), y, 0.0, lambda x: 15.2 - 0.45 * np.abs(x), openings, (0.0,))
         for side in ((-HALF_WIDTH, -4.1), (4.1, HALF_WIDTH)):
             parts.wall(side, y, 0.0, lambda x: 11.6 - 0.3 * (np.abs(x) - 4.1), openings)
-    # String courses: mouldings that run along the wall between the buttresses.
+    # String courses: mouldings along the wall between the buttresses.
     for z in (4.1, 7.6):
         for x in ((-8.2, -4.5), (4.5, 8.2)):
             parts.box(x, (-0.08, 0.0), (z, z + 0.16))
 
 
 def _lancet(centre: float, half: float, low: float, springing: float) -> Opening:
-    """A window with a pointed arch."""
+    """Return a window opening with a pointed arch."""
     return Opening(centre - half, centre + half, level(low), arch(centre, half, springing), 16)
 
 
 def _portal(parts: Parts, door: DoorTruth, rng: np.random.Generator) -> None:
-    """The portal's recessed orders: each stands ORDER_DEPTH before the last and is ORDER_STEP wider a side.
+    """Add the portal's recessed orders: each ORDER_DEPTH before the last and ORDER_STEP wider a side.
 
-    Shafts stand in the corners of the jambs, bosses are strewn along the archivolts; none comes nearer to the
-    door's axis than its own order, so the clear width stays that of the door.
+    Shafts stand in the corners of the jambs; bosses lie along the archivolts. None comes nearer to
+    the door's axis than its own order, and the clear width remains that of the door.
     """
 
     def gable(x: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -164,7 +170,8 @@ def _portal(parts: Parts, door: DoorTruth, rng: np.random.Generator) -> None:
             parts.cylinder(x, y[1] - 0.07, 0.06, (SILL, door.springing), 24)
             parts.box((x - 0.09, x + 0.09), (y[1] - 0.16, y[1]), (door.springing - 0.2, door.springing))
         for angle in np.linspace(0.12, 1.0, 9):
-            # On the right arc, whose centre is the left springing; the apex is at 60 degrees.
+            # A point of the right arc, whose centre is the left springing; the apex is at 60
+            # degrees.
             turn = angle * np.pi / 3
             reach = 2 * half
             x, z = reach * np.cos(turn) - half, door.springing + reach * np.sin(turn)
@@ -179,7 +186,7 @@ def _portal(parts: Parts, door: DoorTruth, rng: np.random.Generator) -> None:
 
 
 def _rose(parts: Parts, rng: np.random.Generator) -> None:
-    """The rose window's tracery: a proud ring, a hub and spokes in the blind disc of `_front`."""
+    """Add the rose window's tracery to the blind disc of `_front`: a raised ring, a hub and spokes."""
     spokes = int(rng.integers(5, 8)) * 2
     centre = np.array([0.0, 11.4])
 
@@ -201,7 +208,7 @@ def _rose(parts: Parts, rng: np.random.Generator) -> None:
 
 
 def _buttresses(parts: Parts, rng: np.random.Generator) -> None:
-    """Four stepped buttresses, each set back twice on its way up, with a pinnacle of seeded height."""
+    """Add four stepped buttresses with two setbacks each and a pinnacle of seeded height."""
     for x in (-8.6, -4.1, 4.1, 8.6):
         tall = 12.6 if abs(x) < 5 else 10.6
         setbacks = ((0.0, 4.6, 1.5), (4.6, 8.6, 1.1), (8.6, tall, 0.7))
@@ -214,7 +221,7 @@ def _buttresses(parts: Parts, rng: np.random.Generator) -> None:
 
 
 def _nave(parts: Parts) -> None:
-    """The first bays of a nave and its two aisles: one section, extruded along y, cut off at NAVE_Y."""
+    """Add the first bays of a nave and its two aisles: one section, extruded along y up to NAVE_Y."""
     section = (
         Opening(-NAVE_X, -3.7, level(SILL), arch(-5.6, 1.9, 4.8, 1.3), 20),
         Opening(-3.7, -3.3, level(SILL), level(4.6), 1),
@@ -225,13 +232,13 @@ def _nave(parts: Parts) -> None:
     parts.wall((-8.1, 8.1), (THICKNESS, NAVE_Y), 0.0, level(9.8), section)
     for x in (-NAVE_X, NAVE_X):
         for y in (2.6, 4.8, 7.6, 10.2):
-            # Shafts on corbels, above anybody's head, so that one can slide along the wall below.
+            # Shafts on corbels, above head height: a visitor can slide along the wall below.
             parts.cylinder(x, y, 0.12, (2.6, 4.8), 24)
             parts.frustum(x, y, 0.03, 0.16, (2.3, 2.6), 12)
 
 
 def _columns(parts: Parts) -> tuple[ColumnTruth, ...]:
-    """Six columns of the nave's arcades and two that stand free on the forecourt."""
+    """Add six columns of the nave's arcades and two free-standing columns on the forecourt."""
     spots = [
         (f"nave {'left' if x < 0 else 'right'} {k}", x, y)
         for x in (-3.5, 3.5)

@@ -1,7 +1,8 @@
-"""A human figure in mid-walk, as points on its surface: the avatar of the made scenes.
+"""Points on the surface of a walking human figure: the avatar of the generated scenes.
 
-The paper's avatar is a polygonal figure taken as 3,617 points ([Fig12], section 3). Ours is put together from
-capsules and ellipsoids. Frame: metres, z up, origin on the floor between the feet, facing +y.
+The paper's avatar is a polygonal figure taken as 3,617 points ([Fig12], section 3). This figure
+consists of capsules and ellipsoids. Frame: metres, z up, origin on the floor between the feet,
+facing +y.
 """
 
 from pathlib import Path
@@ -12,15 +13,16 @@ from numpy.typing import NDArray
 
 from ...schemas.errors import BadRequestError
 
-# Proportions are for this height; other heights scale all of it.
+# Height that the proportions are given for [m]; other heights scale the whole figure.
 HEIGHT = 1.75
-# Candidates for each point kept: more is more even and slower. With 10 the least spacing is 0.86 of the mean.
+# Candidates per kept point: more give a more even spacing and take longer. With 10 the least
+# spacing is 0.86 of the mean.
 CANDIDATES = 10
 Vector = tuple[float, float, float]
 
 
 class Capsule(NamedTuple):
-    """A round limb: a segment from `a` to `b` [m] with radius tapering from `radius_a` to `radius_b`."""
+    """A round limb: a segment from `a` to `b` [m], its radius tapering from `radius_a` to `radius_b`."""
 
     a: Vector
     b: Vector
@@ -29,14 +31,14 @@ class Capsule(NamedTuple):
 
 
 class Ellipsoid(NamedTuple):
-    """An ellipsoid along the axes: centre and half axes [m]."""
+    """An axis-aligned ellipsoid: centre and half axes [m]."""
 
     centre: Vector
     half: Vector
 
 
 def _body() -> tuple[Capsule | Ellipsoid, ...]:
-    """The parts, for HEIGHT; left leg and right arm forward."""
+    """Return the parts, for HEIGHT; left leg and right arm forward."""
     parts: list[Capsule | Ellipsoid] = [
         Ellipsoid((0, 0.01, 1.640), (0.076, 0.098, 0.110)),
         Capsule((0, -0.01, 1.46), (0, 0.0, 1.55), 0.058, 0.055),
@@ -54,23 +56,24 @@ def _body() -> tuple[Capsule | Ellipsoid, ...]:
         hip, ankle = (side * 0.090, 0.0, 0.900), (side * 0.085, leg - 0.05, 0.085)
         knee = (side * 0.092, 0.55 * leg + 0.03, 0.490)
         parts += [Capsule(hip, knee, 0.086, 0.058), Capsule(knee, ankle, 0.057, 0.040)]
-        # The heel and the toes; the sole is cut flat at z = 0 by `_surface`.
+        # Heel and toes; `_surface` flattens the sole at z = 0.
         heel, toes = (side * 0.085, leg - 0.075, 0.035), (side * 0.095, leg + 0.115, 0.025)
         parts.append(Capsule(heel, toes, 0.042, 0.035))
     return tuple(parts)
 
 
 def figure_points(points: int = 3617, seed: int = 2012, height: float = HEIGHT) -> NDArray[np.float64]:
-    """Exactly `points` points (n, 3) [m], spread evenly over the union's surface.
+    """Return exactly `points` points (n, 3) [m], spread evenly over the surface of the figure.
 
-    Candidates are drawn by area from every part and those buried in another are dropped; of the rest, the one
-    farthest from all chosen so far is chosen next, so spacing is even and any prefix covers the whole figure.
-    The lowest point is at z = 0, the highest at `height`.
+    Candidates are drawn by area from every part; those inside another part are dropped. The
+    candidate farthest from all chosen points is chosen next: spacing is even, and any prefix covers
+    the whole figure. The lowest point is at z = 0, the highest at `height`. Raises BadRequestError
+    for a number of points or a height out of range.
     """
     if not 1 <= points <= 100_000 or not 0.1 <= height <= 10:
         raise BadRequestError(
             f"figure of {points} points, {height} m tall: expected 1 to 100000 points and 0.1 to 10 m: "
-            "ask for one within"
+            "choose values in these ranges"
         )
     rng = np.random.default_rng([seed, 0xF16])
     candidates = _surface(max(CANDIDATES * points, 20_000), rng)
@@ -80,12 +83,12 @@ def figure_points(points: int = 3617, seed: int = 2012, height: float = HEIGHT) 
 
 
 def half_width(points: NDArray[np.float64]) -> float:
-    """How far the figure reaches to its sides, from its axis [m]."""
+    """Return the largest distance of the points from the figure's axis to its sides [m]."""
     return float(np.abs(points[:, 0]).max())
 
 
 def write_figure(path: Path, points: NDArray[np.float64]) -> None:
-    """Write points as the vertices of an OBJ or an ASCII PLY file; the digits read back to the same bits."""
+    """Write points as the vertices of an OBJ or ASCII PLY file; the digits read back to the same bits."""
     suffix = path.suffix.lower()
     if suffix == ".obj":
         head, lead = "# points of a figure, metres, z up\n", "v "
@@ -106,10 +109,10 @@ def write_figure(path: Path, points: NDArray[np.float64]) -> None:
 
 
 def _surface(count: int, rng: np.random.Generator) -> NDArray[np.float64]:
-    """About `count` points on the union's surface, even by area."""
+    """Return about `count` points on the surface of the union, even by area."""
     parts = _body()
     areas = np.array([_area(part) for part in parts])
-    # A third or so is buried at the joints: draw more.
+    # About a third lies inside other parts at the joints: draw more.
     draws = np.ceil(1.4 * count * areas / areas.sum()).astype(int)
     kept = []
     for k, (part, n) in enumerate(zip(parts, draws, strict=True)):
@@ -119,13 +122,13 @@ def _surface(count: int, rng: np.random.Generator) -> NDArray[np.float64]:
             buried |= _inside(other, drawn)
         kept.append(drawn[~buried])
     cloud = np.concatenate(kept)
-    # Soles: what is below the floor is pressed flat onto it.
+    # Soles: project points below the floor onto it.
     cloud[:, 2] = np.maximum(cloud[:, 2], 0.0)
     return cloud
 
 
 def _area(part: Capsule | Ellipsoid) -> float:
-    """The area of a part [m2]; an ellipsoid's by Thomsen's formula, within 1.1 %."""
+    """Return the area of a part [m2]; an ellipsoid's by Thomsen's formula, within 1.1 %."""
     if isinstance(part, Ellipsoid):
         a, b, c = (h**1.6075 for h in part.half)
         return float(4 * np.pi * ((a * b + a * c + b * c) / 3) ** (1 / 1.6075))
@@ -136,12 +139,13 @@ def _area(part: Capsule | Ellipsoid) -> float:
 
 
 def _sample(part: Capsule | Ellipsoid, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
-    """`count` points of a part's surface, even by area."""
+    """Draw `count` points on a part's surface, even by area."""
     ball: NDArray[np.float64] = rng.normal(size=(count, 3))
     ball /= np.linalg.norm(ball, axis=1)[:, None]
     if isinstance(part, Ellipsoid):
         half = np.asarray(part.half)
-        # Directions on the unit ball are stretched unevenly: keep each by its share of the area there.
+        # Scaling the unit ball stretches areas unevenly: keep each direction in proportion to its
+        # local area.
         weight = np.linalg.norm(ball / half, axis=1) * half.min()
         kept = rng.choice(count, count, p=weight / weight.sum())
         stretched: NDArray[np.float64] = (ball * half)[kept] + np.asarray(part.centre)
@@ -165,7 +169,7 @@ def _sample(part: Capsule | Ellipsoid, count: int, rng: np.random.Generator) -> 
 
 
 def _inside(part: Capsule | Ellipsoid, cloud: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which points lie inside a part, by more than the thickness of a hair."""
+    """Return which points lie inside a part, by more than 0.1 mm."""
     hair = 1e-4
     inside: NDArray[np.bool_]
     if isinstance(part, Ellipsoid):
@@ -179,7 +183,7 @@ def _inside(part: Capsule | Ellipsoid, cloud: NDArray[np.float64]) -> NDArray[np
 
 
 def _spread(cloud: NDArray[np.float64], count: int) -> NDArray[np.float64]:
-    """`count` of the cloud's points, each the farthest from those before it."""
+    """Choose `count` points of the cloud, each the farthest from those before it."""
     chosen = np.empty(count, np.int64)
     nearest = np.full(len(cloud), np.inf)
     columns = np.ascontiguousarray(cloud.T)

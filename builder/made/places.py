@@ -1,7 +1,8 @@
-"""Places on the walls of a made façade, and how densely its stations scan each: from the truth, not from the scan.
+"""Sample places on the walls of a generated façade, with the scan density there, from the truth alone.
 
-A wall is scanned more and more thinly from near to far and from square to grazing incidence. `wall_places` draws places
-so that thin and dense ones count alike, and leaves out what no station sees: no radius closes a shadow.
+The density on a wall decreases from near to far and from perpendicular to grazing incidence.
+`wall_places` draws places with sparse and dense ones equally represented, and omits places that no
+station sees: no radius closes a shadow.
 """
 
 from typing import NamedTuple
@@ -14,22 +15,29 @@ from .facade import build_facade
 from .scanner import GRAZING, HIGHEST, LOWEST, Place, RayScene
 from .truth import FacadeTruth, SceneTruth, StationTruth, WallTruth
 
-# Spacings from the densest place's to this many times it: 24 to 96 mm on the façade of the paper's size. What is
-# sparser there is seen through the doors alone, at a grazing angle.
+# Ratio of the largest to the smallest spacing: 24 to 96 mm on the façade of the paper's size.
+# Sparser places are seen only through the doors, at a grazing angle.
 SPREAD = 4.0
-# A wall is seen where all around, this far off [m], it is: a probe of 5 cm meets this wall and nothing else.
+# A wall counts as seen where it is visible all around at this distance [m]: a probe of 5 cm then
+# meets this wall and nothing else.
 AROUND = 0.15
-# Places tried on each wall for their density: enough for 2,000 distinct ones among the few that are sparsest.
+# Places drawn on each wall to compute their density: enough for 2,000 distinct ones among the few
+# sparsest.
 TRIED = 40_000
-# For each place wanted so many are drawn, as around some of them the wall is hidden.
+# Candidates per wanted place, because the wall is hidden around some of them.
 DRAWN = 3
-# How far a ray may end from the place it was sent to [m]: it is cast in float32.
+# Maximum distance between a ray's hit and the place it is cast at [m]: rays are cast in float32.
 NEAR = 0.003
 
 
 class WallPlaces(NamedTuple):
-    """Places on walls, world frame: points (k, 3) on the true surface [m], normals (k, 3) out of it, and the spacing
-    (k,) that the scanner's geometry makes there [m]: 1 over the root of the points per square metre."""
+    """Places on walls, world frame.
+
+    points: (k, 3) on the true surface [m].
+    normals: (k, 3), outward.
+    spacing: (k,) the spacing of scan points that the scanner's geometry gives there [m]: 1 over the
+    square root of the points per square metre.
+    """
 
     points: NDArray[np.float64]
     normals: NDArray[np.float64]
@@ -37,9 +45,11 @@ class WallPlaces(NamedTuple):
 
 
 def wall_places(truth: SceneTruth, places: int = 2000, seed: int = 2012) -> WallPlaces:
-    """Exactly `places` places on the walls of the first façade, their spacings even by logarithm up to SPREAD.
+    """Return exactly `places` places on the walls of the first façade.
 
-    The same truth and seed draw the same places. BadDataError: its stations see none of its walls.
+    Their spacings are distributed evenly by logarithm, up to SPREAD times the least. The same truth
+    and seed give the same places. Raises BadDataError where the stations see too few places on the
+    walls.
     """
     facade = truth.facades[0]
     rays = RayScene(build_facade(facade.seed, facade.door("main").width).mesh)
@@ -50,7 +60,7 @@ def wall_places(truth: SceneTruth, places: int = 2000, seed: int = 2012) -> Wall
     if len(order):
         wanted = spacing[order[0]] * SPREAD ** rng.uniform(size=DRAWN * places)
         drawn = order[np.searchsorted(spacing[order], wanted, side="right") - 1]
-        # Each of them once, in the order they were drawn.
+        # Each once, in the order drawn.
         drawn = drawn[np.sort(np.unique(drawn, return_index=True)[1])]
         ring = points[drawn, None] + _ring(normals[drawn])
         axes = np.abs(normals[drawn]).argmax(axis=1)[:, None]
@@ -60,7 +70,7 @@ def wall_places(truth: SceneTruth, places: int = 2000, seed: int = 2012) -> Wall
         order = drawn[(around > 0).all(axis=1)][:places]
     if len(order) < places:
         raise BadDataError(
-            f"the stations of the made façade see {len(order)} places on its walls: expected {places}: ask for fewer"
+            f"the stations of the made façade see {len(order)} places on its walls: expected {places}: request fewer"
         )
     return WallPlaces(points[order] + np.asarray(facade.origin), normals[order], spacing[order])
 
@@ -72,7 +82,7 @@ def _tried(
     wall: WallTruth,
     rng: np.random.Generator,
 ) -> WallPlaces:
-    """Places drawn evenly over one wall, the façade's frame; of them those that are seen."""
+    """Draw places evenly over one wall, in the façade's frame; return those that a station sees."""
     axis = "xy".index(wall.axis)
     points = np.empty((TRIED, 3))
     points[:, axis] = wall.offset
@@ -88,7 +98,7 @@ def _tried(
 
 
 def _ring(normals: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Eight offsets (k, 8, 3) [m], AROUND long, in the upright planes of normals (k, 3) along x or y."""
+    """Return eight offsets (k, 8, 3) [m] of length AROUND in the planes of normals (k, 3) along x or y."""
     turn = np.arange(8) * np.pi / 4
     level = np.stack([-normals[:, 1], normals[:, 0], np.zeros(len(normals))], axis=1)
     up = np.array([0.0, 0.0, 1.0])
@@ -102,9 +112,9 @@ def _density(
     points: NDArray[np.float64],
     axes: NDArray[np.int64],
 ) -> NDArray[np.float64]:
-    """Points per square metre (c, e) that one station makes at points (c, e, 3); 0 where it does not see them.
+    """Return the points per square metre (c, e) of a station at points (c, e, 3); 0 where hidden.
 
-    axes: (c, 1) or (1, 1), which axis the plane of a point is square to.
+    axes: (c, 1) or (1, 1), the axis perpendicular to the plane of a point.
     """
     position = np.subtract(station.position, facade.origin)
     x, y, z = position.tolist()
@@ -116,5 +126,6 @@ def _density(
     cosine = np.abs(np.take_along_axis(way, axes[..., None], axis=2)[..., 0]) / reach
     seen = (np.abs(returns.range - reach) < NEAR) & (cosine > GRAZING)
     seen &= (elevation > LOWEST) & (elevation < HIGHEST)
-    # A ray has step² cos(elevation) of solid angle to itself, and a square metre there cosine / reach² of it.
+    # A ray covers a solid angle of step² cos(elevation); a square metre at this place covers cosine
+    # / reach² of it.
     return np.where(seen, cosine / (reach * reach * station.step**2 * np.cos(elevation)), 0.0)

@@ -1,4 +1,4 @@
-"""Makes scenes: a façade, or a town of them, scanned and written, with the truth beside the scan."""
+"""Generation of scenes: a façade or a town of façades, scanned and written with its ground truth."""
 
 import os
 from collections.abc import Callable, Iterable
@@ -15,16 +15,23 @@ from .truth import FacadeTruth, SceneTruth, StationTruth, write_truth
 from .write import check_target, open_target
 
 FEWEST, MOST = 1_000, 1_000_000_000
-# A station is held in memory while it is scanned (about 100 bytes a point): more points, more stations.
+# Maximum points of a station, which is held in memory while it is scanned (about 100 bytes a
+# point). More points need more stations.
 MOST_PER_STATION = 1_000_000
-# x, y and ground of the five stations of [Fig12]'s scene: four outside, from far to near, one in the nave.
+# x, y and ground height of the five stations of [Fig12]'s scene: four outside, from far to near,
+# one in the nave.
 STATIONS = ((0.8, -13.0, 0.0), (-6.0, -8.6, 0.0), (5.6, -7.4, 0.0), (0.5, -3.4, 0.0), (0.4, 5.2, SILL))
 
 Progress = Callable[[int, int], None]
 
 
 class MadeScene(NamedTuple):
-    """What was written: the scan's files in the order of their stations, the truth, the count of points."""
+    """Result of a generation.
+
+    paths: the scan files, in the order of their stations.
+    truth: the truth file.
+    points: the number of points.
+    """
 
     paths: tuple[Path, ...]
     truth: Path
@@ -32,7 +39,7 @@ class MadeScene(NamedTuple):
 
 
 class _Job(NamedTuple):
-    """One façade to scan: what rays may hit, where to stand, how many points it owes."""
+    """One façade to scan: the lot to cast rays at, the scanner's poses, and the number of points."""
 
     lot: Lot
     places: tuple[Place, ...]
@@ -47,12 +54,15 @@ def make_facade(
     door: float = 1.60,
     progress: Progress | None = None,
 ) -> MadeScene:
-    """Make the façade and scan it into exactly `points` points, from five stations (more above 5 million).
+    """Generate the façade and scan it into exactly `points` points.
 
-    out: `.laz`, `.las` or `.e57` for one file, no suffix for a folder with a LAZ file a station; the truth is
-    written beside it as `<name>.truth.json`.  door: clear width of the main door [m].
-    The step between rays is chosen so that hits slightly exceed the count; a seeded choice thins them evenly.
-    The same arguments give the same coordinates. progress(points written, points in all) after each station.
+    Five stations scan it, more above 5 million points. The step between rays is chosen for slightly
+    more hits than the count; a seeded choice thins them evenly. The same arguments give the same
+    coordinates.
+    out: `.laz`, `.las` or `.e57` for one file, no suffix for a folder with one LAZ file per
+    station; the truth is written beside it as `<name>.truth.json`.
+    door: clear width of the main door [m].
+    progress: called as progress(points written, points in total) after each station.
     """
     out = Path(out)
     _check(out, points)
@@ -63,9 +73,10 @@ def make_facade(
 
 
 def make_town(out: Path, *, points: int, seed: int = 2012, progress: Progress | None = None) -> MadeScene:
-    """Make a town of façades as dense as the paper's, as many as the count asks for, and scan each.
+    """Generate a town of façades, each as dense as the paper's, and scan each from five stations.
 
-    `out`, truth and progress as in `make_facade`. Five stations a façade; rays see the neighbours too.
+    `points` determines the number of façades. Rays also hit the neighbouring façades. `out`, the
+    truth file and `progress` are as in `make_facade`.
     """
     out = Path(out)
     _check(out, points)
@@ -76,14 +87,17 @@ def make_town(out: Path, *, points: int, seed: int = 2012, progress: Progress | 
 
 
 def _check(out: Path, points: int) -> None:
-    """Refuse, before any work, what cannot be made."""
+    """Refuse invalid arguments before any work. Raises BadRequestError."""
     check_target(out)
     if not FEWEST <= points <= MOST:
-        raise BadRequestError(f"{points} points: expected {FEWEST} to {MOST}: ask for a count between")
+        raise BadRequestError(f"{points} points: expected {FEWEST} to {MOST}: choose a count in this range")
 
 
 def _places(count: int, seed: int) -> tuple[Place, ...]:
-    """The first five stations, then as many as are wanted: two on the open forecourt to one in the nave."""
+    """Return `count` scanner poses: the first five stations, then seeded ones.
+
+    Of the latter, two stand on the forecourt for each one in the nave.
+    """
     rng = np.random.default_rng([seed, 0x57A7])
     spots = list(STATIONS)
     while len(spots) < count:
@@ -99,7 +113,10 @@ def _places(count: int, seed: int) -> tuple[Place, ...]:
 
 
 def _make(out: Path, points: int, seed: int, jobs: Iterable[_Job], progress: Progress | None) -> MadeScene:
-    """Scan job after job, station after station, and write; memory is bounded by one station and its mesh."""
+    """Scan each job, station by station, and write the files.
+
+    Memory is bounded by one station and its mesh.
+    """
     truth_path = out.with_name(f"{out.stem}.truth.json")
     truth_temporary = truth_path.with_name(f".{truth_path.name}.tmp")
     stations: list[StationTruth] = []
@@ -130,7 +147,7 @@ def _make(out: Path, points: int, seed: int, jobs: Iterable[_Job], progress: Pro
 
 
 def _moved(made: Scan, origin: tuple[float, float, float]) -> Scan:
-    """The scan moved from a façade's frame into the world, on the lattice again."""
+    """Return the scan moved from a façade's frame into the world, on the lattice again."""
     x, y, z = np.add(made.place.position, origin).tolist()
     xyz = np.rint((made.xyz + np.asarray(origin)) / LATTICE) * LATTICE
     return made._replace(place=made.place._replace(position=(x, y, z)), xyz=xyz)

@@ -1,7 +1,7 @@
-"""Solids that a façade is put together from, collected as one triangle mesh.
+"""Solids that a façade consists of, collected as one triangle mesh.
 
-Every solid is closed and convex, and solids may touch or overlap: rays from outside never see the faces
-between them. Lengths in metres, z up.
+Every solid is closed and convex. Solids may touch or overlap, because rays from outside never see
+the faces between them. Lengths in metres, z up.
 """
 
 from collections.abc import Callable
@@ -17,7 +17,7 @@ Curve = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 
 class Opening(NamedTuple):
-    """A hole through a wall: x_left to x_right, `lower` to `upper`, its curves cut into `slices` chords."""
+    """A hole through a wall from x_left to x_right, between two curves cut into `slices` chords."""
 
     x_left: float
     x_right: float
@@ -27,7 +27,7 @@ class Opening(NamedTuple):
 
 
 class Parts:
-    """Collects triangles; `mesh()` hands them out as one mesh."""
+    """Collector of triangles; `mesh()` returns them as one mesh."""
 
     def __init__(self) -> None:
         self._vertices: list[NDArray[np.float64]] = []
@@ -97,10 +97,11 @@ class Parts:
         openings: tuple[Opening, ...] = (),
         breaks: tuple[float, ...] = (),
     ) -> None:
-        """Add a wall along x with holes in it: upright strips, each a stack of trapezia between the holes.
+        """Add a wall along x with holes: upright strips, each a stack of trapezia between the holes.
 
-        `breaks` are further positions to cut at, where `top` bends. Jambs lie exactly at an opening's x_left
-        and x_right. Openings above one another are fine; they must not cross.
+        breaks: further positions to cut at, where `top` bends.
+        Jambs lie exactly at an opening's x_left and x_right. Openings may lie above one another but
+        must not cross.
         """
         cuts = [np.array([*x, *breaks])]
         for hole in openings:
@@ -125,7 +126,7 @@ class Parts:
                 floor = upper
 
     def mesh(self) -> trimesh.Trimesh:
-        """All of it, faces that have no area left out."""
+        """Return all triangles as one mesh, without faces of zero area."""
         vertices, faces = np.concatenate(self._vertices), np.concatenate(self._faces)
         a, b, c = (vertices[faces[:, k]] for k in range(3))
         area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
@@ -133,12 +134,12 @@ class Parts:
 
 
 def level(height: float) -> Curve:
-    """The curve of one height."""
+    """Return the curve of constant height."""
     return lambda x: np.full_like(x, height)
 
 
 def arch(centre: float, half: float, springing: float, pointed: float = 2.0) -> Curve:
-    """A pointed arch of two arcs, each of radius `pointed` * half: 2 is equilateral, 1 a semicircle."""
+    """Return a pointed arch of two arcs of radius `pointed` * half: 2 is equilateral, 1 a semicircle."""
     radius = pointed * half
 
     def height(x: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -149,5 +150,5 @@ def arch(centre: float, half: float, springing: float, pointed: float = 2.0) -> 
 
 
 def circle(centre: float, height: float, radius: float, side: int) -> Curve:
-    """The upper (side +1) or lower (-1) half of a circle about (centre, height)."""
+    """Return the upper (side +1) or lower (-1) half of a circle about (centre, height)."""
     return lambda x: height + side * np.sqrt(np.maximum(radius * radius - (x - centre) ** 2, 0))

@@ -1,7 +1,8 @@
-"""A sheet without thickness with a door in it: a surface that ends at the jambs, of known spacing, noise and width.
+"""A sheet without thickness with a door in it: a surface of known spacing that ends at the jambs.
 
-The doors of the façade are set in a wall 1.2 m deep: their jambs are planes, and no point of a jamb's middle is on a
-rim. Here the rim is all there is, so that what a radius model does to rims can be told from what it does to planes.
+The façade's doors are set in a wall 1.2 m deep: their jambs are planes, and points in the middle of
+a jamb are not on a rim. This sheet has rims only, which separates the effect of a radius model on
+rims from its effect on planes. The noise and the clear width are known too.
 """
 
 from pathlib import Path
@@ -16,21 +17,27 @@ from .places import WallPlaces
 from .scanner import JITTER, LATTICE
 from .truth import DoorTruth, FacadeTruth, WallTruth
 
-# The sheet stands on z = 0 in the plane y = 0, symmetric about the door's middle [m].
+# The sheet stands on z = 0 in the plane y = 0, symmetric about the door's centre [m].
 HALF_WIDTH, HEIGHT = 3.0, 3.0
 DOOR = 1.0
-# Three stations' grids lie over one another: each one's spacing over the sheet's, and how much wider than high its
-# meshes are, as its station is farther off and looks at a smaller angle. Together 0.95 points a square of the spacing.
+# Superposed grids of three stations: each one's spacing relative to the sheet's, and its cells'
+# ratio of width to height, which grows as the station is farther away and sees the sheet at a
+# smaller angle. Together they give 0.95 points per square of the spacing.
 GRIDS = ((1.46, 1.0), (1.95, 1.6), (2.14, 2.2))
-# Along the normal [m]: what 2 mm of range are at 40 degrees.
+# Noise along the normal [m]: that of 2 mm in range at 40 degrees.
 NOISE = 0.0015
-# Probes keep this far from the rim and from the other edges [m]: a probe of 5 cm cannot get around them.
+# Distance of probes from the rim and from the other edges [m]: a probe of 5 cm cannot pass around
+# them.
 MARGIN = 0.10
 THINNEST, WIDEST = 0.005, 0.2
 
 
 class Sheet(NamedTuple):
-    """A sheet that was written. truth: its door `main` and the wall to either side.  places: to probe, evenly."""
+    """A sheet that was written.
+
+    truth: its door `main` and the wall on either side.
+    places: probe places, spread evenly.
+    """
 
     path: Path
     truth: FacadeTruth
@@ -40,10 +47,13 @@ class Sheet(NamedTuple):
 def make_sheet(
     path: Path, *, spacing: float = 0.03, places: int = 2000, seed: int = 2012, door: float = DOOR
 ) -> Sheet:
-    """Write the points of a sheet as OBJ or ASCII PLY; `spacing`: 1 over the root of the points per square metre [m].
+    """Write the points of a sheet as OBJ or ASCII PLY. The same arguments give the same coordinates.
 
-    door: its clear width [m]. The same arguments give the same coordinates. BadRequestError: a spacing outside 0.5 to
-    20 cm, a door as wide as the sheet.
+    spacing: 1 over the square root of the points per square metre [m].
+    places: number of probe places.
+    door: its clear width [m].
+    Raises BadRequestError for a spacing outside 0.5 to 20 cm and for a door of half the sheet's
+    width or more.
     """
     if not 0.0 < door < HALF_WIDTH:
         raise BadRequestError(f"door of {door} m: expected more than 0 and less than {HALF_WIDTH} m")
@@ -73,7 +83,7 @@ def make_sheet(
 
 
 def _grid(spacing: float, aspect: float, rng: np.random.Generator) -> NDArray[np.float64]:
-    """One station's points (n, 2) on the sheet, x and z [m]: a jittered grid that begins anywhere in its mesh."""
+    """Return one station's points (n, 2) on the sheet, x and z [m]: a jittered, randomly offset grid."""
     wide, high = spacing * aspect**0.5, spacing / aspect**0.5
     x, z = np.meshgrid(
         np.arange(-HALF_WIDTH, HALF_WIDTH, wide) + rng.uniform(0, wide),

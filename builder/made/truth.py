@@ -1,7 +1,8 @@
-"""What is known of a scene that is made: the figures a test may hold a scan, or an engine, against.
+"""Ground truth of a generated scene: reference figures for tests of scans and of the engine.
 
-Frame: the façade's own, metres, z up, x along the façade, the visitor's side at negative y, ground at z = 0;
-`FacadeTruth.origin` moves it into the world. Numbers are those the mesh was built from, before any noise.
+Frame: the façade's own, metres, z up, x along the façade, the visitor's side at negative y, ground
+at z = 0; `FacadeTruth.origin` moves it into the world. The figures are those the mesh was built
+from, before any noise.
 """
 
 from dataclasses import dataclass
@@ -14,9 +15,10 @@ from ...schemas.errors import ScanError
 
 @dataclass(frozen=True, slots=True)
 class DoorTruth:
-    """An open door: two vertical jambs from sill to springing, a pointed arch above, clear through the wall.
+    """An open door through the wall: two vertical jambs from sill to springing, a pointed arch above.
 
-    x_left, x_right: the jamb planes; their difference is the clear width.  y_front, y_back: the wall's faces.
+    x_left, x_right: the jamb planes; their difference is the clear width.
+    y_front, y_back: the wall's faces.
     """
 
     name: str
@@ -30,13 +32,13 @@ class DoorTruth:
 
     @property
     def width(self) -> float:
-        """The clear width [m]."""
+        """Return the clear width [m]."""
         return self.x_right - self.x_left
 
 
 @dataclass(frozen=True, slots=True)
 class StepTruth:
-    """One step of a stair: its tread at height z, from its riser at y_front to the next one or the wall."""
+    """One step of a stair: a tread at height z, from its riser at y_front to the next riser or wall."""
 
     stair: str
     x_left: float
@@ -63,7 +65,8 @@ class ColumnTruth:
 class WallTruth:
     """A plane piece of wall: coordinate `axis` equals `offset`, seen from the side `facing` (+1 or -1).
 
-    low, high: the extent along the other horizontal axis.  z_low, z_high: the extent in height.
+    low, high: the extent along the other horizontal axis.
+    z_low, z_high: the extent in height.
     """
 
     name: str
@@ -78,7 +81,7 @@ class WallTruth:
 
 @dataclass(frozen=True, slots=True)
 class FacadeTruth:
-    """One façade: every figure in its own frame; world = own + origin."""
+    """One façade: all figures in its own frame; world = own + origin."""
 
     seed: int
     origin: tuple[float, float, float]
@@ -89,23 +92,24 @@ class FacadeTruth:
     walls: tuple[WallTruth, ...]
 
     def door(self, name: str) -> DoorTruth:
-        """The door of this name: `main`, `left` or `right`."""
+        """Return the door of this name: `main`, `left` or `right`."""
         return next(door for door in self.doors if door.name == name)
 
     def column(self, name: str) -> ColumnTruth:
-        """The column of this name."""
+        """Return the column of this name."""
         return next(column for column in self.columns if column.name == name)
 
     def wall(self, name: str) -> WallTruth:
-        """The wall of this name."""
+        """Return the wall of this name."""
         return next(wall for wall in self.walls if wall.name == name)
 
 
 @dataclass(frozen=True, slots=True)
 class StationTruth:
-    """Where one scan was taken from, world frame, and how many points it gave.
+    """Position of one scan, world frame, and the number of its points.
 
-    number: from 1; the point_source_id in LAZ.  yaw: rotation of the scanner about z [rad].
+    number: from 1; the point_source_id in LAZ.
+    yaw: rotation of the scanner about z [rad].
     step: angle between neighbouring rays [rad].
     """
 
@@ -118,7 +122,7 @@ class StationTruth:
 
 @dataclass(frozen=True, slots=True)
 class SceneTruth:
-    """What is written beside the scan as `<name>.truth.json`."""
+    """Content of the file `<name>.truth.json` beside a scan."""
 
     seed: int
     points: int
@@ -133,7 +137,7 @@ def write_truth(path: Path, truth: SceneTruth) -> None:
 
 
 def read_truth(path: Path) -> SceneTruth:
-    """Read what `write_truth` wrote; `ScanError` says what is wrong with a file that is something else."""
+    """Read a file of `write_truth`. Raises ScanError where the file is something else."""
     try:
         return msgspec.json.decode(path.read_bytes(), type=SceneTruth)
     except OSError as error:

@@ -1,9 +1,10 @@
-"""The path of the paper's walkthrough, on a façade of known figures: 40 seconds, 30 poses a second.
+"""Path of the paper's walkthrough on a generated façade: 40 seconds, 30 poses a second.
 
-[Fig12], section 3 and figure 2: the avatar walks alongside walls, around a column and through the open door.
-Here, in order: along the cloister's wall, around the free column of the forecourt, up the steps, through
-the middle of the door, along the nave's wall, back, out of the door brushing a jamb, and down the steps. It
-brushes walls, column and jamb on purpose, by a centimetre or so; feet are 3 cm above the floor.
+[Fig12], section 3 and figure 2: the avatar walks alongside walls, around a column and through the
+open door. This path runs along the cloister's wall, around the free column of the forecourt, up the
+steps, through the centre of the door, along the nave's wall and back, out of the door touching a
+jamb, and down the steps. It overlaps walls, column and jamb on purpose, by about a centimetre; the
+feet are 3 cm above the floor.
 """
 
 import numpy as np
@@ -12,25 +13,25 @@ from numpy.typing import NDArray
 from .truth import DoorTruth, FacadeTruth
 
 SOLE = 0.03
-# Half the figure's width (figure.py, 1.75 m): what "alongside" is measured from.
+# Half the figure's width (figure.py, 1.75 m): the distance of a path alongside a wall.
 SIDE = 0.256
-# How near the figure's side passes a surface [m]: brushing overlaps it, passing is clear of noise and radii.
+# Distance of the figure's side from a surface [m]: BRUSH overlaps it, PASS clears noise and radii.
 BRUSH, PASS = -0.01, 0.06
-# Corners are rounded by a moving average over this length of path.
+# Length of the moving average that rounds the path's corners [m].
 ROUNDING = 0.40
 SPACING = 0.005
-# The figure's hands and feet reach 0.39 m before and behind it. The floor is taken that far and further, so
-# that the ramp, rounded over RAMP, is up before the foot is over the step.
+# The figure's hands and feet reach 0.39 m before and behind it. STRIDE, the range of the highest
+# floor, is larger: the ramp, rounded over RAMP, is complete before the foot is over the step.
 STRIDE, RAMP = 0.60, 0.40
 
 
 def walk_poses(
     truth: FacadeTruth, frames: int = 1200, rate: float = 30.0
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Times (k,) [s] and poses (k, 4, 4), avatar to world, at a constant speed along the path.
+    """Return times (k,) [s] and poses (k, 4, 4), avatar to world, at a constant speed along the path.
 
-    Rotation is about z alone, +y of the avatar along the direction of travel. About 55 m: at 1,200 frames and
-    30 a second, 1.4 m/s.
+    Rotation is about z only, with +y of the avatar along the direction of travel. The path is about
+    55 m long: at 1,200 frames and 30 a second, 1.4 m/s.
     """
     path = _rounded(_corners(truth))
     length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
@@ -40,7 +41,8 @@ def walk_poses(
     turned = _average(np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0])), int(ROUNDING / SPACING) | 1)
     heading = np.interp(at, length, turned)
     height = np.interp(at, length, _heights(truth, path, length))
-    # The avatar faces +y: turned by heading - 90 degrees, its cosine is the heading's sine.
+    # The avatar faces +y: it is rotated by heading - 90 degrees, whose cosine is the sine of the
+    # heading.
     c, s = np.sin(heading), -np.cos(heading)
     poses = np.zeros((frames, 4, 4))
     poses[:, 0, 0], poses[:, 0, 1] = c, -s
@@ -52,7 +54,10 @@ def walk_poses(
 
 
 def floor_height(truth: FacadeTruth, xy: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Height of the floor [m] below positions (k, 2) in the façade's frame: forecourt, steps or nave."""
+    """Return the height of the floor [m] below positions (k, 2) in the façade's frame.
+
+    The floor is the forecourt, a step or the nave.
+    """
     x, y = xy[:, 0], xy[:, 1]
     floor = np.where(y >= 0.0, truth.floor, 0.0)
     for step in truth.steps:
@@ -62,16 +67,16 @@ def floor_height(truth: FacadeTruth, xy: NDArray[np.float64]) -> NDArray[np.floa
 
 
 def _corners(truth: FacadeTruth) -> NDArray[np.float64]:
-    """The path's corners (n, 2), in the façade's frame."""
+    """Return the path's corners (n, 2), in the façade's frame."""
     wall = truth.wall("cloister").offset + SIDE
     nave = truth.wall("nave right").offset - SIDE
     column = truth.column("forecourt left")
     door: DoorTruth = truth.door("main")
-    # Out of the door the figure faces -y and keeps to the jamb at x_right.
+    # On the way out the figure faces -y and keeps to the jamb at x_right.
     jamb = door.x_right - SIDE
     around = column.radius + SIDE
     turn = np.linspace(np.pi, 2 * np.pi, 60)
-    # Rounding draws a circle inwards by about ROUNDING²/24/radius: 1 cm.
+    # Rounding shrinks a circle by about ROUNDING²/24/radius: 1 cm.
     ring = around + ROUNDING**2 / 24 / around
     gap = np.where(np.abs(turn - 1.5 * np.pi) < 0.8, BRUSH, PASS)
     circle = np.column_stack([column.x + (ring + gap) * np.cos(turn), column.y + (ring + gap) * np.sin(turn)])
@@ -98,7 +103,7 @@ def _corners(truth: FacadeTruth) -> NDArray[np.float64]:
 
 
 def _rounded(corners: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The path through the corners, rounded, a point every SPACING: straight stretches stay as they are."""
+    """Return the rounded path with a point every SPACING; straight stretches stay unchanged."""
     lengths = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
     at = np.linspace(0.0, lengths[-1], int(lengths[-1] / SPACING))
     path = np.column_stack([np.interp(at, lengths, corners[:, k]) for k in range(2)])
@@ -109,7 +114,10 @@ def _rounded(corners: NDArray[np.float64]) -> NDArray[np.float64]:
 def _heights(
     truth: FacadeTruth, path: NDArray[np.float64], length: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Heights of the soles along the path [m]: the highest floor within a stride, ramped, plus SOLE."""
+    """Return the heights of the soles along the path [m].
+
+    A height is the highest floor within a stride, ramped, plus SOLE.
+    """
     even = np.arange(0.0, length[-1], SPACING)
     xy = np.column_stack([np.interp(even, length, path[:, k]) for k in range(2)])
     reach = int(STRIDE / SPACING)
@@ -119,6 +127,6 @@ def _heights(
 
 
 def _average(values: NDArray[np.float64], width: int) -> NDArray[np.float64]:
-    """Moving average over an odd width, ends held."""
+    """Return the moving average over an odd width, with the end values repeated."""
     padded = np.pad(values, width // 2, mode="edge")
     return np.convolve(padded, np.full(width, 1 / width), mode="valid")

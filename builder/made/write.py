@@ -1,7 +1,7 @@
-"""Scans that are made, written station by station: LAZ or LAS, E57, or a folder of LAZ files.
+"""Writers of simulated scans, station by station: LAZ or LAS, E57, or a folder of LAZ files.
 
-Written under a temporary name beside the target and renamed when complete: nothing half-written is left.
-Memory: one station.
+The output is written under a temporary name beside the target and renamed when complete; an aborted
+write leaves nothing. Memory: one station.
 """
 
 import os
@@ -19,12 +19,12 @@ from ...schemas.errors import BadRequestError
 from .scanner import LATTICE, Scan
 
 SUFFIXES = (".laz", ".las", ".e57")
-# A fixed date, so that the same seed gives the same file: the year of [Fig12].
+# A fixed date, the year of [Fig12]: the same seed gives the same file.
 SCANNED_ON = date(2012, 1, 1)
 
 
 class LasFile:
-    """One LAZ or LAS file of any number of stations; point_source_id tells the station, from 1."""
+    """One LAZ or LAS file of any number of stations; point_source_id is the station's number, from 1."""
 
     def __init__(self, path: Path, compressed: bool) -> None:
         header = laspy.LasHeader(point_format=0, version="1.2")
@@ -54,7 +54,7 @@ class LasFile:
 
 
 class LasFolder:
-    """A folder with one LAZ file a station."""
+    """A folder with one LAZ file per station."""
 
     def __init__(self, path: Path) -> None:
         path.mkdir()
@@ -69,11 +69,11 @@ class LasFolder:
             file.close()
 
     def close(self) -> None:
-        """Nothing is open."""
+        """Do nothing; no file is open."""
 
 
 class E57File:
-    """One E57 file with a posed scan a station: coordinates in the scanner's own frame.
+    """One E57 file with one posed scan per station, coordinates in the scanner's own frame.
 
     pye57 stores them as float32, which moves a point by at most 1 um at 16 m, 1/100 of the lattice.
     """
@@ -105,12 +105,15 @@ class E57File:
 
 
 def station_name(number: int) -> str:
-    """The name of a station's file in a folder."""
+    """Return the file name of a station in a folder."""
     return f"station_{number:04d}.laz"
 
 
 def check_target(out: Path) -> None:
-    """Refuse a suffix that is not known, and a folder that already holds something."""
+    """Check the output path.
+
+    Raises BadRequestError for an unknown suffix and for a folder that is not empty.
+    """
     suffix = out.suffix.lower()
     if suffix and suffix not in SUFFIXES:
         raise BadRequestError(
@@ -119,15 +122,15 @@ def check_target(out: Path) -> None:
         )
     if not suffix and out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise BadRequestError(
-            f"{out}: is there already: expected a new or an empty folder: remove it or name another"
+            f"{out}: already exists: expected a new or an empty folder: remove it or choose another name"
         )
     if suffix and out.is_dir():
-        raise BadRequestError(f"{out}: is a folder: expected a file's name: name another")
+        raise BadRequestError(f"{out}: is a folder: expected a file name: choose another name")
 
 
 @contextmanager
 def open_target(out: Path) -> Iterator[LasFile | LasFolder | E57File]:
-    """A writer for `out`, renamed into place when the block ends well, and removed when it does not."""
+    """Yield a writer for `out`; rename the result into place on success and remove it on failure."""
     check_target(out)
     out.parent.mkdir(parents=True, exist_ok=True)
     temporary = out.with_name(f".{out.name}.tmp")

@@ -1,4 +1,4 @@
-"""The options of a build, frozen; each default with its reason."""
+"""Build options, with the reason for each default."""
 
 import math
 import re
@@ -9,13 +9,13 @@ from ..schemas.index import MAX_NORMAL_REACH, NORMAL_REACH
 from ..schemas.radius_model import MAX_RADIUS, STORED_MODELS
 from ..schemas.voxel import MAX_DEGREE, MAX_LEAF, MIN_DEGREE
 
-# Closest-point distances are measured at about this many points; of fewer, at all.
+# Closest-point distances are measured at about this many points; at all points if there are fewer.
 RADIUS_SAMPLE = 1_000_000
 
-# Points in a work unit, one shard, see `shard_points`: large enough that opening a file is noise, small enough that a
-# worker that is killed loses a few seconds.
+# Points in a work unit (one shard), see `shard_points`: large enough that the cost of opening a
+# file is negligible, small enough that a killed worker loses only a few seconds.
 SHARD_POINTS = 1 << 22
-# A server opens all shards of an archive, and a process may open 1,024 files on most systems.
+# A server opens all shards of an archive, and most systems limit a process to 1,024 open files.
 MOST_SHARDS = 512
 
 DEFAULT_STEP = 1e-4
@@ -23,23 +23,27 @@ CELL_KINDS = ("octree", "balanced")
 
 
 def shard_points(points: int) -> int:
-    """Points in a shard of a dataset of so many: a function of nothing else, or bytes would depend on jobs.
+    """Return the number of points per shard of a dataset of `points` points.
 
-    A quarter of SHARD_POINTS for few, so that two workers have many each, and end at about the same time: 10^7 points
-    in 3 shards kept one of them idle for a quarter of the time.
+    It depends on nothing else, or the bytes of the archive would depend on the number of jobs.
+    Small datasets get a quarter of SHARD_POINTS, which gives each of two workers many shards and
+    lets them end at about the same time: with 10^7 points in 3 shards, one of them was idle for a
+    quarter of the time.
     """
-    # Voxels are not cut, so a shard may stay half empty; two that follow each other hold more than this together.
+    # Voxels are not cut, so a shard may stay half empty. Two consecutive shards together hold more
+    # than this.
     return max(SHARD_POINTS // 4, min(SHARD_POINTS, points // 64), 2 * points // MOST_SHARDS)
 
 
 def parse_radius(text: str) -> tuple[float | None, frozenset[str]]:
-    """The stored figure [m], None for the mean, and the models of `--radius mean,local` or `fixed:0.01,border`.
+    """Parse `--radius`, such as `mean,local` or `fixed:0.01,border`.
 
-    A number alone is a figure. Raises BadRequestError for anything else.
+    Return the stored radius [m], None for the mean, and the set of radius models. A number alone is
+    a stored radius. Raise BadRequestError for anything else.
     """
     radius, models = None, {"mean"}
     parts = [part.strip() for part in text.split(",")]
-    wrong = f"--radius {text!r}: expected mean, local, border by comma, or fixed:METRES in place of mean"
+    wrong = f"--radius {text!r}: expected mean, local, border, separated by commas, or fixed:METRES in place of mean"
     for part in parts:
         if part in STORED_MODELS:
             models.add(part)
@@ -49,13 +53,16 @@ def parse_radius(text: str) -> tuple[float | None, frozenset[str]]:
         except ValueError:
             raise BadRequestError(wrong) from None
         if radius is not None or "mean" in parts:
-            raise BadRequestError(f"{wrong}: one figure is stored")
+            raise BadRequestError(f"{wrong}: only one radius is stored")
         radius = metres
     return radius, frozenset(models)
 
 
 def parse_rule(text: str | None, option: str) -> tuple[float, int] | None:
-    """`0.1,5` -> (0.1, 5), a distance [m] and a count; None for None. Raises BadRequestError for anything else."""
+    """Parse `0.1,5` to (0.1, 5), a distance [m] and a count; return None for None.
+
+    Raise BadRequestError for anything else.
+    """
     if text is None:
         return None
     try:
@@ -68,41 +75,55 @@ def parse_rule(text: str | None, option: str) -> tuple[float, int] | None:
 
 
 def _is_rule(rule: tuple[float, int] | None) -> bool:
-    """Whether this is a distance and a count, or None."""
+    """Return whether `rule` is a valid distance and count, or None."""
     return rule is None or (0 < rule[0] < math.inf and rule[1] >= 1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BuildConfig:
-    """How an archive is built.
+    """Options of a build.
 
-    voxel: edge of a voxel [m]; 8: a few to a few hundred in reach of a walk, a few MB each.
-    resolution: lattice step [m]; None: the sources' own where all share one, else 0.1 mm, a twentieth of
-    a terrestrial scanner's range noise: 1 mm saves a third of the archive and no time, and moves distances by up to
-    0.7 mm (`solidcloud accuracy`, as the next two).
-    degree: children a node, 2 to 16 ([Fig12] table 1 tries 4 to 16); 8: all of 4 to 16 take the same time within 3 %.
-    leaf: points a leaf node, up to 32, the width of the vector test: 16 takes 4 % less time, for 12 % more archive.
-    cell_points: an octree cell above this is split. 1024: octants part surfaces better than packing does, so `collide`
-    takes 3 % less time than with 4096 where a voxel is 32 m and 16 % where it is 8 m, for 4 % more memory and 1 % more
-    archive; with 256 it gains little more, for 16 % more memory (scripts/bench_engine --only cells).
-    cells: "octree", or "balanced": cells are merged too, so that all trees have one height (balance.py).
-    models: radius models stored, "mean" always and "local", "border" where asked: those need a byte a point. "mean"
-    alone: `local` leaks 14 mm where it leaks 16, for a seventh more time, and makes narrow doors narrower, whose jambs
-    are scanned thinly; `border` pays only on thin sheets (`solidcloud accuracy`; builder/DESIGN.md).
-    radius: the figure that stands for `mean` [m]; None: half the mean closest-point distance.
-    spacing: meshes are sampled about this far apart [m]; None: their vertices are taken.
-    with_slab: cut each sphere by a slab; False is the paper's structure, for comparison, five times as slow.
-    jobs: worker processes; 0: one a core.  memory_bytes: bound on what the passes hold.
-    keep: extra columns, among "scan", "intensity" and "normal".  normal_reach: how near the points are that a normal
-    is estimated of [m] (schemas/kernels/normals.py), where it is kept.  strict: a non-finite point fails the build.
+    voxel: edge of a voxel [m]. 8: between a few and a few hundred voxels are in reach of a walk, of
+    a few MB each.
+    resolution: lattice step [m]; None: the sources' common step if they share one, otherwise 0.1
+    mm, a twentieth of a terrestrial scanner's range noise. 1 mm saves a third of the archive and no
+    time, and moves distances by up to 0.7 mm (measured with `solidcloud accuracy`, as are the next
+    two).
+    degree: children per node, 2 to 16 ([Fig12] table 1 tries 4 to 16). 8: all values of 4 to 16
+    take the same time within 3 %.
+    leaf: points per leaf node, up to 32, the width of the vector test. 16 takes 4 % less time, for
+    12 % more archive.
+    cell_points: an octree cell with more points is split. 1024: octants separate surfaces better
+    than packing does. Compared with 4096, `collide` therefore takes 3 % less time with voxels of 32
+    m and 16 % less with voxels of 8 m, for 4 % more memory and 1 % more archive. 256 gains little
+    more, for 16 % more memory (scripts/bench_engine --only cells).
+    cells: "octree", or "balanced", which also merges cells until all trees have the same height
+    (balance.py).
+    models: stored radius models: always "mean", optionally "local" and "border", which need one
+    byte per point. Default "mean" alone: `local` leaks 14 mm where "mean" leaks 16, takes a seventh
+    more time, and narrows narrow doors, whose jambs are scanned thinly. `border` pays off only on
+    thin sheets (`solidcloud accuracy`; builder/DESIGN.md).
+    radius: radius used for `mean` [m]; None: half the mean closest-point distance.
+    spacing: meshes are sampled at about this spacing [m]; None: their vertices are used.
+    with_slab: bound each node by a sphere cut by a slab; False is the structure of the paper, for
+    comparison, five times as slow.
+    jobs: number of worker processes; 0: one per core.  memory_bytes: bound on the memory of the
+    passes.
+    keep: extra columns, among "scan", "intensity" and "normal".
+    normal_reach: radius of the neighbourhood from which a normal is estimated [m]
+    (schemas/kernels/normals.py), if normals are kept.
+    strict: a non-finite point fails the build.
     skip_bad: leave out scans that cannot be read and mark their region as unknown.
-    overwrite: replace an archive of the same name, once the new one is whole.
-    fresh: forget what a build of the same name that was interrupted has done.
-    thin: keep one point a cell of this size [m]; None: all.
-    outliers: leave out points with fewer than the second number of others within the first [m]; None: none.
-    moving: leave out points that other scans saw through (builder/filter_rules.py): (distance [m], scans); None: none.
-    scheduler: the address of a dask scheduler whose workers do the work; cluster: "local:N", one that is started for
-    the build. Both None: processes of this one.
+    overwrite: replace an archive of the same name, once the new one is complete.
+    fresh: discard the work of an interrupted build of the same name.
+    thin: keep one point per cell of this size [m]; None: keep all.
+    outliers: (distance [m], count): leave out points with fewer than `count` other points within
+    the distance; None: keep all.
+    moving: (distance [m], scans): leave out points that other scans saw through
+    (builder/filter_rules.py); None: keep all.
+    scheduler: address of a dask scheduler whose workers do the work.
+    cluster: "local:N", a cluster of N workers that is started for the build. If both are None,
+    processes on this machine do the work.
     """
 
     voxel: float = 8.0
@@ -130,7 +151,7 @@ class BuildConfig:
     cluster: str | None = None
 
     def __post_init__(self) -> None:
-        """Refuse options outside what the format and the kernels hold."""
+        """Refuse options outside the range that the format and the kernels support."""
         checks = [
             (
                 MIN_DEGREE <= self.degree <= MAX_DEGREE,
@@ -183,7 +204,7 @@ class BuildConfig:
             (
                 self.scheduler is None or self.cluster is None,
                 "--scheduler and --cluster",
-                "one of them: the workers of a scheduler that runs, or some that are started",
+                "only one of them: the workers of a running scheduler, or workers that are started",
             ),
             (
                 self.cluster is None or re.fullmatch(r"local:[1-9][0-9]{0,3}", self.cluster) is not None,
@@ -196,11 +217,11 @@ class BuildConfig:
                 raise BadRequestError(f"{found}: expected {expected}")
 
     def stored_models(self) -> tuple[str, ...]:
-        """The radius models stored, in the order of STORED_MODELS."""
+        """Return the stored radius models, in the order of STORED_MODELS."""
         return tuple(name for name in STORED_MODELS if name in self.models)
 
     def identity(self) -> dict[str, float | int | bool | str | None]:
-        """The options that the archive's bytes depend on, for the index."""
+        """Return the options that the archive's bytes depend on, for the index."""
         return {
             "voxel": self.voxel,
             "resolution": self.resolution,
@@ -211,7 +232,7 @@ class BuildConfig:
             "radius": self.radius,
             "with_slab": self.with_slab,
             "keep": ",".join(sorted(self.keep)),
-            # Named only where it is not the default: archives without it stay what they were, byte for byte.
+            # Named only if not the default: archives without it stay byte for byte unchanged.
             **({} if self.cells == "octree" else {"cells": self.cells}),
             **({} if self.models == {"mean"} else {"models": ",".join(self.stored_models())}),
             **({"normal_reach": self.normal_reach} if "normal" in self.keep else {}),

@@ -1,13 +1,19 @@
-"""Voxels of more points than are held at once: built part by part, ordered and compressed from files.
+"""Construction of voxels that do not fit in memory.
 
-A cell of the octree is split by what is in it alone, and every cube of more than `cell_points` is split; so cubes that
-the spool says hold few enough points can be built one after the other, and give the cells that the whole voxel would.
-What they give is spilled in their order. Then the top hierarchy is packed over the cells, and they pass once more, in
-its order: bounding it, and becoming the record's rows. The voxel is the one that octree.py builds of the same points,
-row for row (tests/unit/builder/test_dense.py); only its frames are compressed as streams.
+Such a voxel is built part by part, then ordered and compressed from files.
 
-Held are a part of DENSE_POINTS, and of each cell some 300 bytes at most. Points of one lattice position are one cell,
-however many: of a heap of more than a part only the nodes are held (heap.py).
+Whether the octree splits a cell depends on the contents of the cell alone, and every cube of more
+than `cell_points` points is split. Cubes that hold few enough points according to the spool can
+therefore be built one after the other; they give the same cells as the whole voxel.
+
+The cells are spilled to files in this order. Then the top hierarchy is packed over the cells. In
+the order of the top hierarchy, the cells are read once more to bound it and to write the rows of
+the record. The resulting voxel equals the one that octree.py builds of the same points, row for row
+(tests/unit/builder/test_dense.py); only its frames are compressed as streams.
+
+Memory holds a part of DENSE_POINTS and at most some 300 bytes per cell. All points at one lattice
+position form one cell, however many there are. If there are more than a part holds (a heap), only
+the nodes are held in memory (heap.py).
 """
 
 import os
@@ -45,19 +51,25 @@ from .octree import VoxelPoints, canonical, gather_voxel
 from .spool import Spool
 from .top import Top, pack_top
 
-# Voxels of more are built in parts of at most so many, always, so that no archive depends on the memory it was built
-# with. Work of a part takes some 60 bytes a point.
+# Voxels with more points are always built in parts of at most this many, so that no archive depends
+# on the memory of its builder. Building a part takes some 60 bytes per point.
 DENSE_POINTS = 1 << 20
-# Points of cells that pass at once on the way into the record: fewer than DENSE_POINTS, so that a heap passes alone.
+# Most points of cells that are read together on the way into the record. Fewer than DENSE_POINTS,
+# which makes a heap a window of its own.
 WINDOW_POINTS = 1 << 17
 
-# All points (n, 3) of a voxel whose Morton codes are in a range, the range, and how many times each is there, as a heap
-# is asked by one point -> the radius class of each, (n,).
+# Maps all points (n, 3) of a voxel whose Morton codes lie in a range, the range, and the number of
+# times that each point occurs (a heap passes a single point) to the radius class of each point,
+# (n,).
 Classify = Callable[[NDArray[np.int32], range, int], NDArray[np.uint8]]
 
 
 class Cube(NamedTuple):
-    """A cube of the octree: the Morton codes of its points, from `code` on, its edge 2^log2 steps; how many points."""
+    """Cube of the octree.
+
+    code: first Morton code of the cube.  log2: log2 of its edge [steps].  points: number of its
+    points.
+    """
 
     code: int
     log2: int
@@ -65,13 +77,14 @@ class Cube(NamedTuple):
 
     @property
     def past(self) -> int:
-        """The first code behind it."""
+        """Return the first code after the cube."""
         return self.code + (1 << 3 * self.log2)
 
 
 class BuiltVoxel(NamedTuple):
-    """A voxel built, as `write_shard` takes it. voxel: at least its key and which columns it has.
+    """Finished voxel, as `write_shard` takes it.
 
+    voxel: at least its key and the columns it has.
     low, high: (3,) int64, least and greatest coordinates of its points [voxel steps].
     """
 
@@ -82,23 +95,32 @@ class BuiltVoxel(NamedTuple):
 
 
 def is_dense(points: int, config: BuildConfig) -> bool:
-    """Whether a voxel of so many points is built in parts. Balanced cells, kept to compare, want the whole voxel."""
+    """Return whether a voxel of so many points is built in parts.
+
+    Balanced cells, an option kept for comparison, require the whole voxel.
+    """
     return points > DENSE_POINTS and config.cells == "octree"
 
 
 def check_normals(counts: NDArray[np.int64], config: BuildConfig) -> None:
-    """Refuse normals where a voxel, of `counts` (v,) points, is built in parts: neighbours may be in another."""
+    """Refuse normals if a voxel is built in parts, because neighbours may be in another part.
+
+    counts: (v,) points of each voxel.
+    """
     most = int(counts.max(initial=0))
     if "normal" in config.keep and is_dense(most, config):
         raise BadRequestError(
-            f"--keep normal: a voxel of {config.voxel:g} m holds {most} points, more than are held at once: give a "
-            "smaller --voxel, or leave it out: a server finds the normals it needs"
+            f"--keep normal: a voxel of {config.voxel:g} m holds {most} points, too many to be held in memory: give a "
+            "smaller --voxel, or leave it out: a server estimates the normals it needs"
         )
 
 
 def plan_parts(spool: Spool, key: int, config: BuildConfig) -> Iterator[list[Cube]]:
-    """Cut a voxel into parts, in Morton order: cubes side by side that hold at most DENSE_POINTS together, or one cube
-    that cannot be cut."""
+    """Cut a voxel into parts, in Morton order.
+
+    A part is either consecutive cubes of together at most DENSE_POINTS points, or one cube that
+    cannot be cut further.
+    """
     most = max(DENSE_POINTS, config.cell_points)
     root = Cube(0, int(spool.lattice.voxel_steps - 1).bit_length(), spool.count(key))
     waiting, part = [root], list[Cube]()
@@ -127,10 +149,10 @@ def build_dense(
     scratch: Path,
     classify: Classify | None = None,
 ) -> BuiltVoxel:
-    """Build a voxel and its record, as octree.py and codec.py do together, holding a part of it at a time.
+    """Build a voxel and its record, as octree.py and codec.py do together, one part at a time.
 
-    scratch: a folder for files without names, of about 9 bytes a point and 12 more in turn.  classify: of a part; None:
-    no radius classes.
+    scratch: folder for unnamed files, of about 9 bytes per point and 12 more at times.
+    classify: computes the radius classes of a part; None: no radius classes.
     """
     names = [name for name in OPTIONAL_COLUMNS[:2] if name in (spool.dtype.names or ())]
     dtype = point_dtype(
@@ -152,7 +174,7 @@ def build_dense(
 def _build_part(
     points: VoxelPoints, codes: NDArray[np.uint64], part: list[Cube], config: BuildConfig
 ) -> CellTrees:
-    """The cells of cubes side by side, and their hierarchies."""
+    """Build the cells of consecutive cubes, and their hierarchies."""
     starts, sizes, at = [], [], 0
     for cube in part:
         found = split_octree(codes[at : at + cube.points], cube.log2, CELL_BITS, config.cell_points)
@@ -163,19 +185,22 @@ def _build_part(
 
 
 def is_heap(part: list[Cube]) -> bool:
-    """Whether a part is one lattice position of more points than are held at once."""
+    """Return whether a part is one lattice position with more points than fit in memory."""
     return len(part) == 1 and part[0].log2 == 0 and part[0].points > DENSE_POINTS
 
 
 def _put_heap(
     spill: "_Spill", cube: Cube, spool: Spool, key: int, config: BuildConfig, classify: Classify | None
 ) -> None:
-    """Spill the cell of a cube of one step, as `build_trees` makes it of its points, which are never held at once."""
+    """Spill the cell of a one-step cube as `build_trees` makes it.
+
+    Its points are never all in memory.
+    """
     codes, kind = range(cube.code, cube.past), np.uint8(0)
     if classify is not None:
         kind = classify(heap_place(cube.code), codes, cube.points)[0]
     if spill.names:
-        # Two windows of each run are held, and what is merged of them, sorted.
+        # Memory holds two windows of each run, and the rows merged from them, sorted.
         windows = spool.block_windows(key, codes.start, codes.stop, DENSE_POINTS // 4)
         for rows in merge_runs(windows):
             columns = np.empty(len(rows), spill.columns)
@@ -186,10 +211,10 @@ def _put_heap(
 
 
 class _Spill:
-    """The cells made so far, on disk in Morton order; in memory their corners, sizes and how much they hold."""
+    """Cells made so far, on disk in Morton order; memory holds their corners, sizes and counts."""
 
     def __init__(self, scratch: Path, dtype: np.dtype) -> None:
-        """Spill into the folder `scratch` what is wanted for points of rows of `dtype`."""
+        """Open spill files in the folder `scratch`, for points with the columns of `dtype`."""
         self.names = [name for name in dtype.names or () if name != "xyz"]
         self.dtype = dtype
         self.columns = np.dtype([(name, dtype[name]) for name in self.names])
@@ -198,33 +223,34 @@ class _Spill:
         self._cells: list[tuple[NDArray[Any], ...]] = []
 
     def __enter__(self) -> "_Spill":
-        """The spill itself."""
+        """Return the spill itself."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Close the files, and so lose them."""
+        """Close the files, which deletes them."""
         for file in self._files:
             file.close()
 
     def put(self, trees: CellTrees, points: VoxelPoints) -> None:
-        """Take the cells of a part and the points that they were made of."""
+        """Append the cells of a part and the points that they were made of."""
         columns = np.empty(len(trees.rank) if self.names else 0, self.columns)
         for name in self.names:
             columns[name] = getattr(points, name)[trees.rank]
         self.put_cells(trees, by_cell(trees.xyz, trees.starts), columns)
 
     def put_columns(self, columns: NDArray) -> None:
-        """Take columns of the cells that are put next, before them."""
+        """Append columns of the cells that the next `put_cells` adds."""
         self._ends[1] += pwrite_all(self._files[1].fileno(), columns.view(np.uint8), self._ends[1])
 
     def put_cells(self, trees: CellTrees, flat: NDArray[np.uint16] | None, columns: NDArray) -> None:
-        """Take cells, their points as `by_cell` gives them, and their columns; None: all points are on their corner.
+        """Append cells, their points in the layout of `by_cell`, and their columns.
 
-        columns: of those points of which `put_columns` has not had them.
+        flat: the points; None: all points are at the corner of their cell.
+        columns: of the points that `put_columns` has not received.
         """
         stats = [trees.spreads.tobytes(), trees.extremes.tobytes()]
         if flat is None:
-            self._ends[0] += 6 * int(trees.starts[-1])  # a hole, and nobody reads it
+            self._ends[0] += 6 * int(trees.starts[-1])  # leaves a hole that is never read
         for i, data in enumerate(
             [
                 b"" if flat is None else flat,
@@ -244,12 +270,12 @@ class _Spill:
         )
 
     def cells(self) -> Cells:
-        """The cells as stored, in Morton order."""
+        """Return the cells in their stored form, in Morton order."""
         low, log2_size, points, nodes = (np.concatenate(column) for column in zip(*self._cells, strict=True))
         return Cells(low, log2_size, nodes, points)
 
     def stats(self) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
-        """The spreads and extremes of all cells, in Morton order."""
+        """Return the spreads and extremes of all cells, in Morton order."""
         spreads, extremes, at = [], [], 0
         for low, *_ in self._cells:
             c = len(low)
@@ -260,7 +286,10 @@ class _Spill:
         return np.concatenate(spreads), np.concatenate(extremes)
 
     def take(self, which: int, starts: NDArray[np.int64], counts: NDArray[np.int64], size: int) -> NDArray:
-        """The bytes of some cells, one behind the other: their items of `size` bytes in file `which`."""
+        """Return the items of some cells, of `size` bytes each, in file `which`.
+
+        They are concatenated.
+        """
         taken = np.empty(int(counts.sum()) * size, np.uint8)
         view, at = taken.data, 0
         descriptor = self._files[which].fileno()
@@ -272,14 +301,14 @@ class _Spill:
         return taken
 
     def take_columns(self, starts: NDArray[np.int64], counts: NDArray[np.int64]) -> NDArray:
-        """The columns of some cells' points, one cell behind the other."""
+        """Return the columns of some cells' points, concatenated."""
         if not self.names:
             return np.empty(0, self.columns)
         return self.take(1, starts, counts, self.columns.itemsize).view(self.columns)
 
 
 class _Layout:
-    """The cells of a spill, put into the order of the top hierarchy over them, and into the rows of a record."""
+    """Writer of the record: orders the spilled cells as the top hierarchy over them."""
 
     def __init__(
         self, key: int, spill: _Spill, voxel_steps: int, config: BuildConfig, archive_id: bytes, scratch: Path
@@ -302,7 +331,7 @@ class _Layout:
         self.cells = Cells._make(column[order] for column in cells)
 
     def write(self) -> BuiltVoxel:
-        """Let the cells pass, and compress their rows."""
+        """Read the cells in order and compress their rows."""
         spill, c = self.spill, len(self.cells.nodes)
         counts = self.cells.points.astype(np.int64)
         top_rows = 0 if self.top is None else len(self.top.count)
@@ -328,7 +357,7 @@ class _Layout:
         return BuiltVoxel(self._shell(), record, self.low, self.high)
 
     def _nodes(self, first: int, past: int) -> tuple[NDArray, NDArray[np.bool_]]:
-        """The node rows of some cells of the top hierarchy's order, and which of them are roots."""
+        """Return the node rows of cells [first, past) in stored order, and a mask of the roots."""
         held = self.cells.nodes[first:past].astype(np.int64)
         stored = self.spill.take(2, self.first_node[first:past], held, NODE_DTYPE.itemsize).view(NODE_DTYPE)
         is_root = np.zeros(len(stored), bool)
@@ -336,7 +365,12 @@ class _Layout:
         return stored, is_root
 
     def _points(self, first: int, past: int, stored: NDArray) -> Iterator[NDArray]:
-        """The point rows of some cells, whose node rows are given; the top hierarchy grows around them."""
+        """Yield the point rows of a range of cells.
+
+        Enlarge the bounds of the top hierarchy around them.
+
+        stored: node rows of these cells.
+        """
         of = slice(first, past)
         cells = Cells._make(column[of] for column in self.cells)
         held = cells.points.astype(np.int64)
@@ -361,7 +395,10 @@ class _Layout:
         yield point_rows(block_points(trees, self.config.leaf), leaf_runs(trees, self.config.leaf), kept)
 
     def _heap(self, cell: int) -> Iterator[NDArray]:
-        """The point rows of a cell whose points are all of one place: nothing but columns."""
+        """Yield the point rows of a cell whose points are all at one position.
+
+        They hold columns only.
+        """
         if self.top is not None:
             low = self.cells.low[cell : cell + 1].astype(np.int64)
             self.top.grow(np.zeros((3, 1), np.uint16), np.array([0, 1]), low, cell)
@@ -375,7 +412,7 @@ class _Layout:
             yield rows
 
     def _shell(self) -> VoxelData:
-        """The voxel without rows: its key, and which columns it has."""
+        """Return the voxel without rows: its key, and empty columns that tell which it has."""
         nodes = np.empty(0, NODE_DTYPE)
         return VoxelData(
             self.key,
@@ -388,7 +425,10 @@ class _Layout:
 
 
 def _windows(counts: NDArray[np.int64]) -> Iterator[tuple[int, int]]:
-    """Cut cells of so many points (c,) into runs, first and past, of about WINDOW_POINTS, and at least one cell."""
+    """Cut cells into consecutive ranges of about WINDOW_POINTS points, and at least one cell.
+
+    counts: (c,) points of each cell. Yields (first, past).
+    """
     ends = np.cumsum(counts)
     first = 0
     while first < len(counts):

@@ -1,6 +1,7 @@
-"""Enclosure proved node by node in Python's integers: the judge of the bounds that kernels measured.
+"""Exact verification, node by node in Python integers, of the bounds that the kernels measured.
 
-Slow, and on purpose: no compiled code, no number of a fixed width, and of the archive's rules only what FORMAT.md says.
+It is slow on purpose: it uses no compiled code and no fixed-width numbers, and it knows only the
+rules of FORMAT.md.
 """
 
 from collections.abc import Iterable, Iterator
@@ -10,16 +11,18 @@ from numpy.typing import NDArray
 
 from ..schemas.voxel import Links, VoxelData
 
-# The same nodes of the same archive every time, so that a fault found once is found again.
+# A fixed seed selects the same nodes of an archive every time. A fault can thus be reproduced.
 SAMPLE_SEED = 2012
-# Leaf nodes whose points are Python's integers at a time: a node may have all points of a voxel below it.
+# Leaf nodes whose points are converted to Python integers at a time; a node may have all points of
+# a voxel below it.
 _LEAVES = 1 << 10
 
 
 def sample_nodes(counts: NDArray[np.int64], sample: int | None) -> list[NDArray[np.int64]]:
-    """Which nodes are asked: an array of node numbers for each voxel; all where sample is None or as many.
+    """Select the nodes to verify: an array of node numbers for each voxel.
 
-    counts: (v,) nodes of each voxel. Every node of the archive is as likely as any other; none is drawn twice.
+    counts: (v,) nodes of each voxel.  sample: number of nodes to draw; None, or at least the total:
+    all nodes. Every node of the archive is equally likely; none is drawn twice.
     """
     ends = np.cumsum(counts)
     total = int(ends[-1]) if len(ends) else 0
@@ -31,19 +34,24 @@ def sample_nodes(counts: NDArray[np.int64], sample: int | None) -> list[NDArray[
 
 
 def loose_nodes(voxel: VoxelData, links: Links, nodes: Iterable[int]) -> list[int]:
-    """Those of `nodes` whose sphere or slab does not enclose every point below them.
+    """Return those of `nodes` whose sphere or slab does not enclose every point below them.
 
-    A node's numbers are whole lattice steps, or whole multiples of the top unit (schemas/FORMAT.md), so that both
-    tests are of integers: |p - c|^2 <= r^2, and least <= normal . (p - c) <= greatest.
+    The numbers of a node are whole lattice steps, or whole multiples of the top unit
+    (schemas/FORMAT.md). Both tests are therefore integer tests: |p - c|^2 <= r^2, and least <=
+    normal . (p - c) <= greatest.
     """
     leaves = np.flatnonzero(links.is_leaf)
-    # By first point: a cell that is one leaf node stands among the roots, before the others' leaf nodes.
+    # Sort by first point: a cell that is a single leaf node stands among the roots, before the leaf
+    # nodes of other cells.
     leaves = leaves[np.argsort(links.first[leaves], kind="stable")]
     return [int(node) for node in nodes if not _encloses(voxel, links, int(node), leaves)]
 
 
 def _encloses(voxel: VoxelData, links: Links, node: int, leaves: NDArray[np.int64]) -> bool:
-    """Whether one node's bound holds; leaves: the leaf nodes in the order of their points."""
+    """Return whether the bounds of one node hold.
+
+    Leaves: the leaf nodes in the order of their points.
+    """
     cell = int(links.cell[node])
     low = [0, 0, 0] if cell < 0 else voxel.cells.low[cell].tolist()
     unit = 1 << voxel.top_shift if cell < 0 else 1
@@ -65,7 +73,10 @@ def _encloses(voxel: VoxelData, links: Links, node: int, leaves: NDArray[np.int6
 def _points(
     voxel: VoxelData, links: Links, leaves: NDArray[np.int64], begin: int, end: int
 ) -> Iterator[list[int]]:
-    """The points of the leaf nodes from the one whose first is `begin` to the one that ends at `end` [voxel steps]."""
+    """Yield the points [begin, end) of the stored order [voxel steps].
+
+    `begin` is the first point of a leaf node, `end` follows the last point of one.
+    """
     a, b = np.searchsorted(links.first[leaves], [begin, end]).tolist()
     for at in range(a, b, _LEAVES):
         some = leaves[at : min(at + _LEAVES, b)]
@@ -77,7 +88,7 @@ def _points(
 
 
 def _run(voxel: VoxelData, links: Links, node: int) -> tuple[int, int]:
-    """The points below a node, as a run of the stored order: from its first leaf node's to its last one's."""
+    """Return the range of points below a node in the stored order."""
     first = last = node
     while not links.is_leaf[first]:
         first = int(links.first[first])

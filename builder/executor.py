@@ -1,4 +1,7 @@
-"""Runs pure work units: in this process, in a pool of processes, or on a cluster. Results come in the units' order."""
+"""Execution of pure work units in this process, in a process pool, or on a cluster.
+
+Results come in the order of the units.
+"""
 
 import multiprocessing
 import os
@@ -20,31 +23,33 @@ Unit = TypeVar("Unit")
 Result = TypeVar("Result")
 Ticket = TypeVar("Ticket")
 
-# Below this many points a second process costs more (1 to 2 s to start and to load the kernels) than it saves.
+# With fewer points, a second process costs more (1 to 2 s to start and to load the kernels) than it
+# saves.
 POINTS_WORTH_A_PROCESS = 4_000_000
-# Units handed out and not done, and results that wait for those before them, a process.
+# Per process: most units handed out and not done, and most results that wait for earlier ones.
 WAITING, AHEAD = 4, 64
-# How often whoever waits for a unit looks whether it is interrupted.
+# How often a wait for a unit checks for an interrupt.
 ASK_SECONDS = 0.1
 
 
 class Executor(Protocol):
-    """Maps a picklable function over work units. A context manager.
+    """Map a picklable function over work units. A context manager.
 
-    jobs: units that run at a time.  at_once: so many that do, where that is fewer, for want of memory.
+    jobs: number of units that can run at a time.  at_once: number that do run at a time, lower than
+    `jobs` if memory is short.
     """
 
     jobs: int
     at_once: int
 
     def __enter__(self) -> Self:
-        """The executor itself."""
+        """Return the executor itself."""
         ...
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Stop; after a failure, without starting what still waits."""
+        """Stop the executor; after a failure, without starting the waiting units."""
         ...
 
     def map(
@@ -54,32 +59,34 @@ class Executor(Protocol):
         progress: Progress,
         size: Callable[[Unit], int],
     ) -> Iterator[Result]:
-        """function(unit) for each unit, in order; progress advances by size(unit) as units are done.
+        """Yield function(unit) for each unit, in order.
 
-        What a unit raises is raised here, and ends all.
+        Progress advances by size(unit) as units finish.
+
+        An exception of a unit is raised here and ends the iteration.
         """
         ...
 
 
 class Hands(Protocol[Ticket]):
-    """Who does units somewhere else. A ticket stands for a unit that was handed out.
+    """Remote execution of units. A ticket represents a unit that was handed out.
 
-    jobs, at_once: as of `Executor`.
+    jobs, at_once: as for `Executor`.
     """
 
     jobs: int
     at_once: int
 
     def hand_out(self, function: Callable[[Any], Any], unit: Any) -> Ticket:
-        """Have function(unit) done."""
+        """Start function(unit) and return its ticket."""
         ...
 
     def done(self, tickets: Sequence[Ticket]) -> Iterable[Ticket]:
-        """Those of the tickets whose units are done, once one is."""
+        """Wait until at least one unit is done; return the tickets of those that are."""
         ...
 
     def result(self, ticket: Ticket) -> Any:
-        """The result of a unit that is done; raises what it raised."""
+        """Return the result of a unit that is done; raise the exception that it raised."""
         ...
 
 
@@ -90,11 +97,12 @@ def results_in_order(
     progress: Progress,
     size: Callable[[Unit], int],
 ) -> Iterator[Result]:
-    """function(unit) for each unit, in order, done by others; progress advances by size(unit) as each is done.
+    """Yield function(unit) for each unit, in order, executed by `hands`.
 
-    Some units are handed out ahead, so that no process waits for another's long one; results that wait their turn
-    stay bounded by AHEAD a process. A unit that fails ends all when it does. With `at_once` fewer than `jobs`, so
-    many are handed out at a time.
+    Progress advances by size(unit) as units finish. Some units are handed out ahead, which keeps
+    processes from waiting for a long unit of another. The number of results that wait for their
+    turn is bounded by AHEAD per process. A unit that fails ends the iteration at once. If `at_once`
+    is less than `jobs`, only that many units are handed out at a time.
     """
     most = WAITING * hands.jobs if hands.at_once >= hands.jobs else hands.at_once
     running: dict[Ticket, int] = {}
@@ -113,32 +121,41 @@ def results_in_order(
 
 
 def worker_count(jobs: int, points: int) -> int:
-    """Processes to use: as asked, or, for 0, one a core where the points are worth it."""
+    """Return the number of processes: `jobs`, or for 0 one per core if there are enough points."""
     if jobs:
         return jobs
     return min(os.cpu_count() or 1, max(1, points // POINTS_WORTH_A_PROCESS))
 
 
 def make_executor(config: BuildConfig, jobs: int) -> Executor:
-    """What runs the units: a cluster where one is named, else `jobs` processes, one of which is this one alone."""
+    """Make the executor: a cluster if the options name one, otherwise `jobs` processes.
+
+    One job runs in this process.
+    """
     address = config.scheduler or config.cluster
     if address is None:
         return ProcessExecutor(jobs)
-    # Loads dask, which nobody else needs.
+    # This import loads dask, which nothing else needs.
     from .cluster import ClusterExecutor
 
     return ClusterExecutor(address, config.memory_bytes)
 
 
 def _begin_worker() -> None:
-    """Leave Ctrl-C to the builder: it stops its workers, and they say nothing. If it is killed, they end with it."""
+    """Ignore SIGINT, because the builder stops its workers.
+
+    End this worker if the builder is killed.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})  # blocked since it was started
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})  # blocked since the process started
     threading.Thread(target=_end_with_builder, daemon=True).start()
 
 
 def _end_with_builder() -> None:
-    """Wait for the builder to end, and end: a worker would wait for its next unit for ever, holding its memory."""
+    """Wait for the builder to end, then exit.
+
+    Otherwise a worker would wait for its next unit forever and keep its memory.
+    """
     builder = multiprocessing.parent_process()
     if builder is not None:
         builder.join()
@@ -146,30 +163,36 @@ def _end_with_builder() -> None:
 
 
 class ProcessExecutor:
-    """Maps a picklable function over work units in processes of its own; with one job nothing is started."""
+    """Map a picklable function over work units in child processes; one job starts none."""
 
     def __init__(self, jobs: int) -> None:
-        """Use `jobs` processes."""
+        """Start `jobs` processes, or none for a single job."""
         self.jobs = jobs
         self.at_once = jobs
-        # Spawned, not forked: a fork copies locks that other threads hold, such as a progress bar's.
+        # Spawn, not fork: a fork copies locks that other threads hold, such as those of a progress
+        # bar.
         context = multiprocessing.get_context("spawn")
         self._pool = (
             ProcessPoolExecutor(jobs, mp_context=context, initializer=_begin_worker) if jobs > 1 else None
         )
 
     def __enter__(self) -> Self:
-        """The executor itself."""
+        """Return the executor itself."""
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Stop the processes; after a failure, without starting what still waits; when interrupted, at once."""
+        """Stop the processes.
+
+        After a failure the waiting units are not started; after an interrupt the processes end at
+        once.
+        """
         if self._pool is None:
             return
         if kind is not None and not issubclass(kind, Exception):
-            # What they were doing is done again: a unit may take a minute, and who pressed Ctrl-C waits.
+            # The running units are repeated later. A unit may take a minute, too long to wait after
+            # Ctrl-C.
             for process in list((self._pool._processes or {}).values()):
                 process.terminate()
         self._pool.shutdown(wait=True, cancel_futures=kind is not None)
@@ -181,7 +204,7 @@ class ProcessExecutor:
         progress: Progress,
         size: Callable[[Unit], int],
     ) -> Iterator[Result]:
-        """See `Executor`, and `results_in_order`."""
+        """Yield the results, as `Executor` and `results_in_order` describe."""
         if self._pool is None:
             for unit in units:
                 check()
@@ -193,32 +216,32 @@ class ProcessExecutor:
         yield from results_in_order(self, function, units, progress, size)
 
     def hand_out(self, function: Callable[[Unit], Result], unit: Unit) -> Future[Result]:
-        """See `Hands`."""
+        """Submit a unit, as `Hands` describes."""
         assert self._pool is not None
         with _worker_deaths(), children_ignore():
             return self._pool.submit(function, unit)
 
     def done(self, tickets: Sequence[Future[Any]]) -> Iterable[Future[Any]]:
-        """See `Hands`."""
+        """Wait until units are done, as `Hands` describes."""
         while True:
             check()
             if done := wait(tickets, ASK_SECONDS, FIRST_COMPLETED).done:
                 return done
 
     def result(self, ticket: Future[Any]) -> Any:
-        """See `Hands`."""
+        """Return the result of a unit, as `Hands` describes."""
         with _worker_deaths():
             return ticket.result()
 
 
 @contextmanager
 def _worker_deaths() -> Iterator[None]:
-    """Say what it may be that ended a worker, noticed when a unit is handed out or when it should be done."""
+    """Turn the death of a worker, noticed when submitting or waiting, into a helpful error."""
     try:
         yield
     except BrokenProcessPool:
-        check()  # a signal to the whole group ends the workers too
+        check()  # a signal to the whole process group also ends the workers
         raise SolidcloudError(
-            "a worker process ended at once: out of memory, or an error that cannot be sent here? give fewer --jobs or "
-            "a smaller --memory; the same command goes on where it was"
+            "a worker process ended abruptly: out of memory, or an error that cannot be sent here? give fewer "
+            "--jobs or a smaller --memory; the same command resumes the build"
         ) from None

@@ -1,8 +1,11 @@
-"""Points back out of an archive: LAS, LAZ, PLY or VTKHDF, voxel by voxel, in the memory that one voxel takes.
+"""Export of points from an archive to LAS, LAZ, PLY or VTKHDF.
 
-A box is half open, low <= coordinate < high on each axis, as voxels are, so that boxes side by side share no point.
-Coordinates are the archive's, world = lattice * step + origin in float64, to the last bit in PLY and VTKHDF and as a
-LAS reader computes them (export_las.py). A file is given its name once it is whole.
+The export proceeds voxel by voxel, in the memory of one voxel.
+
+A box is half open, low <= coordinate < high on each axis, as voxels are. Adjacent boxes therefore
+share no point. Coordinates are the archive's, world = lattice * step + origin in float64, exact to
+the last bit in PLY and VTKHDF, and as a LAS reader computes them (export_las.py). A file gets its
+name once it is complete.
 """
 
 import os
@@ -27,9 +30,9 @@ FORMATS = ("laz", "las", "ply", "vtkhdf")
 
 
 class Exported(NamedTuple):
-    """What was written. low, high: (3,) least and greatest coordinates [m]; None of no points.
+    """Result of an export. low, high: (3,) least and greatest coordinates [m]; None without points.
 
-    notes: what is not in the file though one might think so.
+    notes: sentences about what the file does not contain, although a user might expect it.
     """
 
     file: Path
@@ -42,9 +45,11 @@ class Exported(NamedTuple):
 
 
 class Contents(NamedTuple):
-    """What is to be written, known before. low, high: (3,) int64 [lattice]; 0 of no points.
+    """Properties of the points to write, known in advance.
 
-    columns: name -> type, of those stored.  whole_intensity: every intensity is an integer that 16 bits hold.
+    low, high: (3,) int64 [lattice]; 0 without points.  columns: name -> type, of the stored
+    columns.
+    whole_intensity: every intensity is an integer that 16 bits hold.
     """
 
     points: int
@@ -55,12 +60,12 @@ class Contents(NamedTuple):
 
 
 class Writer(Protocol):
-    """Takes points (m, 3) int64 [lattice], the same as float64 [m], and their columns (m,)."""
+    """Writer of points (m, 3) int64 [lattice], the same as float64 [m], and their columns (m,)."""
 
     def append(
         self, lattice: NDArray[np.int64], world: NDArray[np.float64], columns: dict[str, NDArray]
     ) -> None:
-        """Write so many more."""
+        """Append points to the file."""
         ...
 
 
@@ -73,19 +78,20 @@ def export_archive(
     overwrite: bool = False,
     progress: Progress | None = None,
 ) -> Exported:
-    """Write the points of the archive in `folder` that are in `box` (x0, y0, z0, x1, y1, z1) [m] to the file `output`.
+    """Write the points of the archive in `folder` that lie in `box` to the file `output`.
 
-    box: half open; None: all points.  form: one of FORMATS; None: by the suffix of `output`. A file of no points is
-    whole, too. Raises BadRequestError for a box, format or output that cannot be, and where the format cannot hold the
-    points; CorruptError, FormatError, OSError. An archive that is changed meanwhile is written as it was at first.
+    box: (x0, y0, z0, x1, y1, z1) [m], half open; None: all points.  form: one of FORMATS; None: by
+    the suffix of `output`. A file without points is also valid. An archive that changes during the
+    export is written in its initial state. Raise BadRequestError for an invalid box, format or
+    output, or if the format cannot hold the points; CorruptError, FormatError, OSError.
     """
     output, progress = Path(output), progress or Silent()
     form = _format_of(output, form)
     if output.is_dir() or (output.exists() and not overwrite):
-        raise BadRequestError(f"{output}: is there already: give another name, or --overwrite")
+        raise BadRequestError(f"{output}: already exists: give another name, or --overwrite")
     if Path(folder).resolve() in output.resolve().parents:
         raise BadRequestError(
-            f"{output}: within the archive itself, expected a place outside: give another name"
+            f"{output}: inside the archive itself, expected a path outside: give another name"
         )
     if not output.parent.is_dir():
         found = "a file, expected a folder: give another name"
@@ -120,8 +126,11 @@ def export_archive(
 
 
 def lattice_box(lattice: Lattice, box: tuple[float, ...] | None) -> NDArray[np.int64]:
-    """The lattice coordinates, both corners inclusive (2, 3), of the points whose world coordinates are in a half-open
-    box (x0, y0, z0, x1, y1, z1) [m]; None: of all. Raises BadRequestError for a box that is none."""
+    """Convert a half-open box to lattice coordinates (2, 3), both corners inclusive.
+
+    box: (x0, y0, z0, x1, y1, z1) [m]; None: everything. The result holds exactly the points whose
+    world coordinates lie in the box. Raise BadRequestError for an invalid box.
+    """
     if box is None:
         return np.array([[-(1 << 62)] * 3, [1 << 62] * 3])
     low, high = np.array(box[:3], np.float64), np.array(box[3:], np.float64)
@@ -132,17 +141,21 @@ def lattice_box(lattice: Lattice, box: tuple[float, ...] | None) -> NDArray[np.i
 
 
 def _first_from(lattice: Lattice, corner: NDArray[np.float64]) -> NDArray[np.int64]:
-    """On each axis the least lattice coordinate whose world coordinate, as rounded, is `corner` (3,) [m] or more."""
+    """Return the least lattice coordinate of each axis whose world coordinate reaches `corner`.
+
+    corner: (3,) [m]. World coordinates are compared as rounded.
+    """
     corner = np.clip(corner, -4 * MAX_COORDINATE, 4 * MAX_COORDINATE)
     guess = np.floor((corner - np.array(lattice.origin)) / lattice.step).astype(np.int64) - 4
-    # World coordinates of lattice points never descend; the guess is off by their rounding, few steps at most.
+    # World coordinates of lattice points never decrease. Their rounding shifts the guess by a few
+    # steps at most.
     window = guess + np.arange(9)[:, None]
     world = lattice.to_world(window)
     return guess + (world < corner).sum(axis=0)
 
 
 def _format_of(output: Path, form: str | None) -> str:
-    """The format asked for."""
+    """Return the requested format; raise BadRequestError for an unknown one."""
     found = (form or output.suffix.removeprefix(".")).lower()
     if found not in FORMATS:
         raise BadRequestError(f"{output}: format {found!r}, expected {', '.join(FORMATS)}: give --format")
@@ -152,7 +165,7 @@ def _format_of(output: Path, form: str | None) -> str:
 def _blocks(
     archive: Archive, row: int, base: NDArray[np.int64], box: NDArray[np.int64], columns: dict[str, np.dtype]
 ) -> Iterator[tuple[Taken, dict[str, NDArray]]]:
-    """The points of one voxel in a box, with columns, a block at a time."""
+    """Yield the points of one voxel in a box, with columns, a block at a time."""
     record = archive.open_voxel(row, columns=record_columns(columns))
     with archive.locating(row):
         for block in taken(record, base[row], box=box):
@@ -166,7 +179,10 @@ def _look(
     box: NDArray[np.int64],
     progress: Progress,
 ) -> Contents:
-    """Go over the points to be written once: 10 ns each, where LAS takes 80 and LAZ 300."""
+    """Scan the points to be written once. This takes 10 ns per point.
+
+    Writing LAS takes 80, LAZ 300.
+    """
     columns = stored_columns(archive.header)
     looked = {name: kind for name, kind in columns.items() if name == "intensity"}
     points, whole = 0, True
@@ -196,7 +212,6 @@ def _write(
     writer: Writer,
     progress: Progress,
 ) -> None:
-    """Write all blocks of all voxels."""
     lattice = archive.header.lattice
     for row in rows.tolist():
         for block, columns in _blocks(archive, row, base, box, contents.columns):
@@ -206,7 +221,7 @@ def _write(
 
 
 class _Vtk:
-    """A file of vtkhdf.py as a `Writer`; a context manager."""
+    """VTKHDF file (vtkhdf.py) as a `Writer`; a context manager."""
 
     def __init__(self, path: Path, contents: Contents) -> None:
         self._file = vtk_file(path, contents.columns)
@@ -216,17 +231,17 @@ class _Vtk:
         return self
 
     def __exit__(self, *error: object) -> None:
-        self._file.__exit__(*error)  # type: ignore[arg-type]  # as it was given
+        self._file.__exit__(*error)  # type: ignore[arg-type]  # passed on unchanged
 
     def append(
         self, lattice: NDArray[np.int64], world: NDArray[np.float64], columns: dict[str, NDArray]
     ) -> None:
-        """Write so many more."""
+        """Append points to the file."""
         self._points.append(world, columns)
 
 
 class _Ply:
-    """A binary PLY of doubles; a context manager. How many vertices there are is known before."""
+    """Binary PLY file of doubles; a context manager. The number of vertices is known in advance."""
 
     _TYPES = {"<f4": "float", "<u2": "ushort"}  # noqa: RUF012  never changed
 
@@ -247,7 +262,7 @@ class _Ply:
     def append(
         self, lattice: NDArray[np.int64], world: NDArray[np.float64], columns: dict[str, NDArray]
     ) -> None:
-        """Write so many more."""
+        """Append points to the file."""
         rows = np.empty(len(world), self._dtype)
         for axis, name in enumerate("xyz"):
             rows[name] = world[:, axis]
@@ -259,7 +274,7 @@ class _Ply:
 def _writer(
     form: str, path: Path, header: Header, contents: Contents, notes: list[str]
 ) -> AbstractContextManager[Writer]:
-    """What writes the format; appends to `notes` what it cannot hold."""
+    """Return the writer of a format; append to `notes` what the format cannot hold."""
     if form in ("las", "laz"):
         from .export_las import LasOut, wkt_of
 

@@ -1,8 +1,9 @@
-"""LAS and LAZ out of an archive, version 1.4, point format 6: coordinates as integers of the lattice's own step.
+"""Export to LAS and LAZ, version 1.4, point format 6.
 
-A reader computes X * scale + offset. With the step for scale and the origin for offset that is how an archive's world
-coordinates are computed, to the last bit. Where 32 bits do not hold the lattice coordinates, the offset is moved along
-by whole steps: then a coordinate may be another in its last bits, and is still that of the same lattice point.
+Coordinates are integers of the lattice step. A reader computes X * scale + offset. With the step as
+scale and the origin as offset, this is how the world coordinates of an archive are computed, exact
+to the last bit. If 32 bits do not hold the lattice coordinates, the offset is shifted by whole
+steps. A coordinate may then differ in its last bits, but it still rounds to the same lattice point.
 """
 
 import re
@@ -19,23 +20,26 @@ from ..schemas.index import Source
 from ..schemas.voxel_grid import Lattice
 from .export import Contents
 
-# The words that well-known texts begin with, in both of their versions [OGC 01-009, 18-010r7].
+# Keywords that begin well-known text, in both of its versions [OGC 01-009, 18-010r7].
 _WKT = re.compile(
     r"\s*(PROJ|GEOG|GEOC|GEOD|COMPD?|COMPOUND|BOUND|LOCAL|ENG|VERT|FITTED)\w*\s*[\[(]", re.IGNORECASE
 )
-# A record before the points is at most so long, a zero at its end included.
+# Longest payload of a variable-length record before the points, including a terminating zero.
 _LONGEST_WKT = 65534
-# The field of intensities that 16 bits do not hold.
+# Extra field for intensities that 16 bits do not hold.
 EXACT_INTENSITY = "intensity_float"
 
 
 class LasOut:
-    """One LAS or LAZ file being written; a context manager. notes: what a reader should know of it."""
+    """LAS or LAZ file being written; a context manager. notes: facts that a reader should know."""
 
     def __init__(
         self, path: Path, lattice: Lattice, contents: Contents, crs: str, *, compressed: bool
     ) -> None:
-        """crs: well-known text, or "". Raises BadRequestError where 32 bits cannot hold the coordinates."""
+        """Open the file. crs: well-known text, or "".
+
+        Raise BadRequestError if 32 bits cannot hold the coordinates.
+        """
         self.notes: list[str] = []
         self._lattice, self._first = lattice, _first_steps(lattice, contents)
         header = laspy.LasHeader(point_format=6, version="1.4")
@@ -43,14 +47,14 @@ class LasOut:
         header.offsets = lattice.to_world(self._first[None])[0]
         header.generating_software = "solidcloud export"
         header.system_identifier = "EXTRACTION"  # [LAS 1.4 R15, table 3]
-        header.global_encoding.wkt = True  # as formats from 6 on must say, text or none
+        header.global_encoding.wkt = True  # required for point formats from 6 on, with or without text
         if crs:
             header.vlrs.append(WktCoordinateSystemVlr(crs))
         self._float = "intensity" in contents.columns and not contents.whole_intensity
         if self._float:
             header.add_extra_dim(laspy.ExtraBytesParams(EXACT_INTENSITY, "float32"))
             self.notes.append(
-                f"intensities are no whole numbers up to 65535: they are in the field {EXACT_INTENSITY}"
+                f"intensities are not all whole numbers up to 65535: they are in the field {EXACT_INTENSITY}"
             )
         self._writer = laspy.open(
             path.open("wb"), mode="w", header=header, do_compress=compressed, closefd=True
@@ -65,7 +69,7 @@ class LasOut:
     def append(
         self, lattice: NDArray[np.int64], world: NDArray[np.float64], columns: dict[str, NDArray]
     ) -> None:
-        """Write so many more points."""
+        """Append points to the file."""
         record = laspy.ScaleAwarePointRecord.zeros(len(lattice), header=self._writer.header)
         for name, column in zip("XYZ", (lattice - self._first).T, strict=True):
             record[name] = column.astype(np.int32)
@@ -81,9 +85,10 @@ class LasOut:
 
 
 def wkt_of(sources: Sequence[Source]) -> tuple[str, str]:
-    """The well-known text of the coordinate system that all scans of an archive are in, or ""; and a note, or "".
+    """Return the well-known text of the coordinate system of all scans, or "", and a note, or "".
 
-    Only of scans in metres and z up: those of others were turned into what their text does not say.
+    The text applies only to scans in metres with z up: scans in other units or axes were converted,
+    so their text no longer describes the points.
     """
     held = [s for s in sources if s.count]
     texts = {s.crs for s in held}
@@ -91,19 +96,19 @@ def wkt_of(sources: Sequence[Source]) -> tuple[str, str]:
         return "", ""
     (text, *others) = sorted(texts)
     if others:
-        return "", "the scans name several coordinate systems, or some none: none is in the file"
+        return "", "the scans name different coordinate systems, or some name none: the file has none"
     if not _WKT.match(text) or len(text.encode()) > _LONGEST_WKT:
         return (
             "",
-            f"the scans' coordinate system is not given as well-known text ({text[:60]}): it is not in the file",
+            f"the scans' coordinate system is not given as well-known text ({text[:60]}): the file has none",
         )
     if any((s.units, s.up) != ("m", "z") for s in held):
-        return "", "the scans' coordinate system is not that of metres with z up: it is not in the file"
+        return "", "the scans' coordinate system is not in metres with z up: the file has none"
     return text, ""
 
 
 def _first_steps(lattice: Lattice, contents: Contents) -> NDArray[np.int64]:
-    """The lattice coordinates (3,) that the file's offset stands for: 0 where 32 bits hold the points' own."""
+    """Return the lattice coordinates (3,) of the offset: 0 on axes where 32 bits suffice."""
     least, most = -(1 << 31), (1 << 31) - 1
     far = (contents.low < least) | (contents.high > most)
     middle = (contents.low + contents.high) // 2
@@ -114,7 +119,8 @@ def _first_steps(lattice: Lattice, contents: Contents) -> NDArray[np.int64]:
             f"points {extent:g} m apart in steps of {lattice.step:g} m: more than the 32 bits of LAS hold: "
             "export a smaller --box, or --format ply"
         )
-    # The offset is rounded: lattice points must still be told apart, and come back as what they are.
+    # The offset is rounded. Lattice points must remain distinct, and must convert back to
+    # themselves.
     ends = np.stack([contents.low, contents.high])
     world = (ends - first) * lattice.step + lattice.to_world(first[None])[0]
     if not np.array_equal(lattice.to_lattice(world), ends):

@@ -1,8 +1,9 @@
-"""The optional stage between spool and shards: points are left out, and counted, as filter_rules.py says.
+"""Optional filter pass between spool and shards.
 
-A unit is consecutive voxels; it writes one run. Memory a job: about 150 bytes a point of 2^19, for a voxel with more
-is taken in cubes by Morton range, and what lies around one is read piece by piece. A single lattice position is held
-whole, however many points are there.
+It leaves out points as filter_rules.py defines and counts them. A unit is a sequence of consecutive
+voxels; it writes one run. Memory per job is about 150 bytes per point of 2^19 points: a voxel with
+more is processed in cubes by Morton range, and the surroundings of a cube are read piece by piece.
+All points at a single lattice position are held at once, however many there are.
 """
 
 from pathlib import Path
@@ -36,12 +37,12 @@ from .spool import (
 # Points in a work unit.
 UNIT_POINTS = 1 << 21
 
-# Reason -> scan -> points left out.
+# Reason -> scan -> number of points left out.
 Counts = dict[str, dict[int, int]]
 
 
 class FilterUnit(NamedTuple):
-    """Voxels to be filtered. keys: ascending.  dtype: of the rows written.  path: of the run written."""
+    """Voxels to filter. keys: ascending.  dtype: of the rows written.  path: of the run written."""
 
     keys: tuple[int, ...]
     points: int
@@ -52,9 +53,9 @@ class FilterUnit(NamedTuple):
 
 
 class Filtered(NamedTuple):
-    """What one unit left. runs: name of its run -> what was written of it; none where nothing was left.
+    """Result of one unit. runs: name of its run -> sums of the run; empty if no point remains.
 
-    places_before, places: the `places_sum` of what it read and of what it left.
+    places_before, places: the `places_sum` of the points read and of the points kept.
     """
 
     runs: dict[str, RunSums]
@@ -66,10 +67,12 @@ class Filtered(NamedTuple):
 def filtered_spool(
     spool: Spool, config: BuildConfig, folder: Path, executor: Executor, progress: Progress, journal: Journal
 ) -> tuple[Spool, Counts]:
-    """Leave out what the options say, into new runs below `folder`; also what was left out of each scan, by reason.
+    """Filter the points of a spool into new runs below `folder`, as the options say.
 
-    spool: its rows are of `filter_dtype`; those of the result are of `spool_dtype`. A pass that was interrupted goes on
-    where its notes say. Raises BadRequestError for rules that the lattice cannot do, and where no point is left.
+    Return the new spool and the number of points left out of each scan, by reason.
+    spool: its rows have `filter_dtype`; those of the result have `spool_dtype`. An interrupted pass
+    resumes from its journal. Raise BadRequestError for rules that are impossible on the lattice,
+    and if no point remains.
     """
     rules = make_rules(config, spool.lattice)
     passes = []
@@ -90,20 +93,20 @@ def filtered_spool(
             _add(left_out, result.left_out)
         if spool.places not in (None, sum(r.places_before for r in results) % (1 << 64)):
             raise CorruptError(
-                f"{spool.folder}: points that are not those of the scans: check disk and memory",
+                f"{spool.folder}: the points are not those of the scans: check disk and memory",
                 (spool.folder,),
             )
         runs, places = [name for r in results for name in r.runs], sum(r.places for r in results) % (1 << 64)
         spool = Spool(target, dtype, spool.lattice, runs, places)
         if not len(spool.keys):
             raise BadRequestError(
-                "no point is left: expected some: give --thin, --outliers or --moving other figures"
+                "no point is left, expected some: change the figures of --thin, --outliers or --moving"
             )
     return spool, left_out
 
 
 def _units(spool: Spool, rules: Rules, dtype: np.dtype, folder: Path) -> list[FilterUnit]:
-    """Consecutive voxels of together about UNIT_POINTS."""
+    """Group consecutive voxels into units of about UNIT_POINTS points."""
     units: list[FilterUnit] = []
     all_keys, counts = spool.keys, spool.counts
     groups = np.cumsum(counts) // UNIT_POINTS
@@ -115,18 +118,18 @@ def _units(spool: Spool, rules: Rules, dtype: np.dtype, folder: Path) -> list[Fi
 
 
 def _dump(result: Filtered) -> dict[str, Any]:
-    """A result as JSON holds it."""
+    """Convert a result to what JSON holds."""
     return result._asdict()
 
 
 def _load(noted: dict[str, Any]) -> Filtered:
-    """A result from what JSON made of it: its scans became text."""
+    """Convert a result from JSON, where scan numbers became text."""
     counts = {reason: {int(scan): n for scan, n in of.items()} for reason, of in noted["left_out"].items()}
     return Filtered(**{**noted, "left_out": counts})
 
 
 def _add(total: Counts, more: Counts) -> None:
-    """Add up what was left out."""
+    """Add counts of points left out to a total."""
     for reason, scans in more.items():
         held = total.setdefault(reason, {})
         for scan, count in scans.items():
@@ -134,7 +137,10 @@ def _add(total: Counts, more: Counts) -> None:
 
 
 def filter_voxels(unit: FilterUnit) -> Filtered:
-    """Write what stays of the unit's voxels as one run. Pure and idempotent; run in any process."""
+    """Write the remaining points of the unit's voxels as one run. Pure and idempotent.
+
+    Runs in any process.
+    """
     left_out: Counts = {}
     reader = BlockReader(unit.spool)
     keys: list[int] = []
@@ -158,14 +164,16 @@ def filter_voxels(unit: FilterUnit) -> Filtered:
                 keys.append(key)
                 starts.append(starts[-1] + kept)
     if not keys:
-        unit.path.unlink(missing_ok=True)  # the same unit, given up and still running, may be before us
+        unit.path.unlink(
+            missing_ok=True
+        )  # a second run of this unit, given up but alive, may have removed it
         return Filtered({}, left_out, before, after)
     directory = write_directory(unit.path, np.array(keys, np.uint64), np.array(starts, np.int64))
     return Filtered({unit.path.name: [*file.sums, *directory]}, left_out, before, after)
 
 
 def _counted(rows: NDArray, verdict: NDArray[np.uint8]) -> Counts:
-    """What was left out of each scan."""
+    """Count the points left out of each scan, by reason."""
     found: Counts = {}
     for number, reason in enumerate(REASONS, 1):
         scans, counts = np.unique(rows["scan_index"][verdict == number], return_counts=True)
@@ -175,7 +183,7 @@ def _counted(rows: NDArray, verdict: NDArray[np.uint8]) -> Counts:
 
 
 def _narrowed(rows: NDArray, dtype: np.dtype) -> NDArray:
-    """The columns of rows that `dtype` has."""
+    """Keep only the columns of rows that `dtype` has."""
     found = np.empty(len(rows), dtype)
     for name in dtype.names or ():
         found[name] = rows[name]

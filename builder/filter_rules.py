@@ -1,23 +1,26 @@
-"""The rules of the filter stage, in lattice steps: which points are left out. Off unless asked for.
+"""Rules of the filter pass, in lattice steps: which points are left out. All are off by default.
 
 Three rules, each exact in integers of the lattice:
 
-- `moving (R, SCANS)`: a point is left out where fewer than SCANS other scans have a point within R of it, although
-  SCANS other scans have points within 8 R: they saw the place, and not it. What moved while scans that overlap were
-  made is seen by one of them only. Where fewer than SCANS others came within 8 R it stays: none could have seen it.
-- `outliers (R, COUNT)`: a point is left out where fewer than COUNT other distinct points lie within R.
-- `thin STEP`: of each cube of STEP, rounded to whole lattice steps, one point stays: the one nearest to its middle, of
-  equally near ones the first in Morton order within the cube, then by scan and intensity. With the lattice step itself
-  exact duplicates become one. Whatever is left out lies less than sqrt(3) STEP from what stays of its cube.
+- `moving (R, SCANS)`: leave out a point if fewer than SCANS other scans have a point within R of
+  it, although SCANS other scans have points within 8 R. Those scans saw the place, but not the
+  point. Whatever moved while overlapping scans were made is seen by one of them only. If fewer than
+  SCANS other scans have points within 8 R, the point stays: no other scan could have seen it.
+- `outliers (R, COUNT)`: leave out a point if fewer than COUNT other distinct points lie within R.
+- `thin STEP`: of each cube of STEP, rounded to whole lattice steps, keep one point: the one nearest
+  to the centre of the cube; among equally near ones the first in Morton order within the cube, then
+  by scan and intensity. If STEP is the lattice step, exact duplicates become one point. Every point
+  left out lies less than sqrt(3) STEP from the point kept in its cube.
 
-`moving` and `outliers` both look at all points as they were scanned, so that neither depends on the other; what both
-leave out is counted as moving. `thin` then chooses among what they leave.
+`moving` and `outliers` both examine all points as scanned, so neither depends on the other. A point
+that both leave out is counted as moving. `thin` then selects among the remaining points.
 
-Distances are inclusive, compared as integers: R is taken as the decimal number it is written as, over the step written
-as one. Cubes are counted from the lattice's origin and may lie across voxels: who lives on the border is looked up in
-the voxels around. So which points stay is a function of the points, their scans and the options; not of the voxels'
-size, the order of scans, jobs or memory. No more than a voxel's edge around a point is looked at: a rule that needs
-more is refused by name.
+Distances are inclusive and compared as integers: R is taken as the decimal number as written,
+divided by the step as a decimal number. Cubes are counted from the origin of the lattice and may
+span voxels; points in the surrounding voxels are then included. The selection is therefore a
+function of the points, their scans and the options, not of the voxel size, the order of scans, jobs
+or memory. At most one voxel edge around a point is examined: a rule that needs more is refused by
+name.
 """
 
 from fractions import Fraction
@@ -31,17 +34,22 @@ from ..schemas.voxel_grid import Lattice
 from .config import BuildConfig
 from .spool import spool_dtype
 
-# Why a point was left out, as `info` says it.
+# Reasons why a point was left out, as `info` shows them.
 MOVING, OUTLIER, THINNED = "moving", "outliers", "thinned"
 
-# How far from a point `moving` asks whether others saw the place, in its distance.
+# Radius within which `moving` checks whether other scans saw the place, as a multiple of its
+# distance.
 SEEN = 8
-# Scans that `moving` remembers of a point: 16 bytes each.
+# Most scans that `moving` counts per point: 16 bytes each.
 MAX_SCANS_ASKED = 16
 
 
 class Reach(NamedTuple):
-    """A distance and a number. squared: of the distance [steps^2].  steps: of it, whole.  number: see the rule."""
+    """Distance and number of a rule.
+
+    squared: squared distance [steps^2].  steps: the distance, rounded down [steps].  number: see
+    the rule.
+    """
 
     squared: int
     steps: int
@@ -49,7 +57,10 @@ class Reach(NamedTuple):
 
 
 class Rules(NamedTuple):
-    """What is left out, in lattice steps; None: not asked for. seen: `moving`'s wider reach.  thin: a cube's edge."""
+    """Rules in lattice steps; None: off. seen: wider distance of `moving`.
+
+    thin: edge of a cube.
+    """
 
     moving: Reach | None
     seen: Reach | None
@@ -58,12 +69,15 @@ class Rules(NamedTuple):
 
 
 def is_filtered(config: BuildConfig) -> bool:
-    """Whether any rule is asked for."""
+    """Return whether any rule is enabled."""
     return not (config.thin is None and config.outliers is None and config.moving is None)
 
 
 def filter_dtype(config: BuildConfig) -> np.dtype:
-    """A row of the spool that the filters read: with the scan, which they need, and count by, whatever is kept."""
+    """Return the dtype of spool rows that the filters read.
+
+    It always has the scan number, which the filters need and count by, whatever columns are kept.
+    """
     names = spool_dtype(config).names or ()
     fields: list[tuple[Any, ...]] = [("local", "<i4", (3,)), ("scan_index", "<u2")]
     if "intensity" in names:
@@ -72,12 +86,18 @@ def filter_dtype(config: BuildConfig) -> np.dtype:
 
 
 def filter_passes(config: BuildConfig) -> int:
-    """How often all points are gone through: progress counts up to this many times their number."""
+    """Return the number of passes over all points.
+
+    Progress counts up to this multiple of their number.
+    """
     return (config.moving is not None or config.outliers is not None) + (config.thin is not None)
 
 
 def _reach(option: str, metres: float, number: int, lattice: Lattice, wider: int = 1) -> Reach:
-    """`wider` times a distance. Raises BadRequestError where it is under a lattice step or over a voxel."""
+    """Convert `wider` times a distance to lattice steps.
+
+    Raise BadRequestError if the distance is less than a lattice step or more than a voxel.
+    """
     ratio = Fraction(repr(metres)) / Fraction(repr(lattice.step)) * wider
     squared = int(ratio * ratio)
     if squared < 1:
@@ -85,7 +105,7 @@ def _reach(option: str, metres: float, number: int, lattice: Lattice, wider: int
             f"{option} {metres:g}: expected at least the lattice step, {lattice.step:g} m: give a larger distance"
         )
     if isqrt(squared) > lattice.voxel_steps:
-        around = f", looks {metres * wider:g} m around each point" if wider > 1 else ""
+        around = f", examines {metres * wider:g} m around each point" if wider > 1 else ""
         raise BadRequestError(
             f"{option} {metres:g}{around}: expected at most a voxel, {lattice.voxel_size:g} m: give a smaller distance "
             "or a larger --voxel"
@@ -94,7 +114,10 @@ def _reach(option: str, metres: float, number: int, lattice: Lattice, wider: int
 
 
 def make_rules(config: BuildConfig, lattice: Lattice) -> Rules:
-    """The rules in lattice steps. Raises BadRequestError for what cannot be done on this lattice."""
+    """Convert the rules to lattice steps.
+
+    Raise BadRequestError for rules impossible on this lattice.
+    """
     moving = seen = outliers = thin = None
     if config.moving is not None:
         distance, scans = config.moving

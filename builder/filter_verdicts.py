@@ -1,4 +1,4 @@
-"""What the filters' rules (filter_rules.py) make of the points of one block, with all that lies around them."""
+"""Application of the filter rules (filter_rules.py) to one block and its surroundings."""
 
 from collections.abc import Iterator
 
@@ -10,13 +10,13 @@ from .filter_rules import MOVING, OUTLIER, THINNED, Reach, Rules
 from .kernels.filter import best_of_cells, count_others, other_scans
 from .spool import row_codes
 
-# Verdicts of a point; REASONS[v - 1] for the others.
+# Verdict of a kept point. A verdict v > 0 means left out for REASONS[v - 1].
 KEPT = 0
 REASONS = (MOVING, OUTLIER, THINNED)
 
 
 def near_verdicts(block: Block, reader: BlockReader, rules: Rules) -> NDArray[np.uint8]:
-    """Verdicts of `moving` and `outliers`."""
+    """Return the verdicts of `moving` and `outliers`."""
     verdict = np.full(len(block.rows), KEPT, np.uint8)
     if rules.outliers is not None:
         verdict[_is_outlier(block, reader, rules.outliers)] = 1 + REASONS.index(OUTLIER)
@@ -34,10 +34,11 @@ def near_verdicts(block: Block, reader: BlockReader, rules: Rules) -> NDArray[np
 def _pieces(
     block: Block, reader: BlockReader, reach: Reach, left: NDArray[np.bool_]
 ) -> Iterator[tuple[NearPoints, NDArray[np.int64], NDArray[np.int32], Grid]]:
-    """What lies within reach of the points that are `left` (n,), piece by piece, as long as some are.
+    """Yield the points within reach of the query points that are `left` (n,), until none is left.
 
-    Each time: a piece, the queries left in the order of their cells, their positions, and the grid. The block's own
-    points come first: in dense places they settle all of it.
+    Each item: a piece of the surroundings, the indices of the remaining query points in the order
+    of their cells, their positions, and the grid. The block's own points come first: in dense
+    places they settle every query.
     """
     low, high = block.bounds()
     box = low - reach.steps, high + reach.steps
@@ -65,7 +66,7 @@ def _pieces(
 
 
 def _is_outlier(block: Block, reader: BlockReader, reach: Reach) -> NDArray[np.bool_]:
-    """Which points have too few others around."""
+    """Return a mask of the points with too few others around them."""
     counts = np.zeros(len(block.rows), np.int64)
     left = np.ones(len(block.rows), np.bool_)
     for piece, which, queries, grid in _pieces(block, reader, reach, left):
@@ -95,7 +96,10 @@ def _is_outlier(block: Block, reader: BlockReader, reach: Reach) -> NDArray[np.b
 def _scans_around(
     block: Block, reader: BlockReader, reach: Reach, asked: NDArray[np.bool_]
 ) -> NDArray[np.int64]:
-    """How many other scans, up to `reach.number`, have a point within reach of each point; 0 where not asked."""
+    """Count the other scans, up to `reach.number`, with a point within reach of each point.
+
+    asked: mask of the points to count for; the result is 0 for all others.
+    """
     counts = np.zeros(len(block.rows), np.int64)
     found = np.full((len(block.rows), reach.number), -1, np.int64)
     scans = block.rows["scan_index"].astype(np.int64)
@@ -116,7 +120,7 @@ def _scans_around(
 
 
 def thin_verdicts(block: Block, reader: BlockReader, edge: int) -> NDArray[np.uint8]:
-    """Verdicts of `thin`: the best of each cube of the lattice stays, of all voxels' points in it."""
+    """Return the verdicts of `thin`. Each cube keeps the best of its points, of whatever voxel."""
     low, high = block.bounds()
     box = low // edge * edge, high // edge * edge + (edge - 1)
     grid = Grid.over(box, edge)
@@ -129,8 +133,8 @@ def thin_verdicts(block: Block, reader: BlockReader, edge: int) -> NDArray[np.ui
             rival = piece.taken(np.isin(grid.cells(piece.positions), cells))
             if len(rival.scans):
                 candidates.append(rival.taken(_best(rival, grid, edge)))
-    # The block's own come first, so that of equal points one of them is found here, and by nobody else: others that
-    # are equal are at the same place, and so in the same block.
+    # The block's own points come first, so that one of several equal points is found here and in no
+    # other block: points equal to it are at the same position and therefore in the same block.
     chosen = _best(NearPoints.joined(candidates), grid, edge)
     verdict = np.full(len(block.rows), 1 + REASONS.index(THINNED), np.uint8)
     verdict[best[chosen[chosen < len(best)]]] = KEPT
@@ -138,14 +142,14 @@ def thin_verdicts(block: Block, reader: BlockReader, edge: int) -> NDArray[np.ui
 
 
 def _lies_across(block: Block, box: Box, voxel_steps: int) -> bool:
-    """Whether cubes of a block's points reach out of it."""
+    """Return whether lattice cubes of a block's points reach beyond the block."""
     low = block.low + block.corner
     high = np.minimum(low + block.size, block.low + voxel_steps)
     return bool((box[0] < low).any() or (box[1] >= high).any())
 
 
 def _best(points: NearPoints, grid: Grid, edge: int) -> NDArray[np.int64]:
-    """The index of the best point of each cube, by cube."""
+    """Return the index of the best point of each cube, ordered by cube."""
     cells = grid.cells(points.positions)
     inside = points.positions % edge
     away = (2 * inside.astype(np.int64) - (edge - 1)) ** 2
@@ -162,7 +166,7 @@ def _best(points: NearPoints, grid: Grid, edge: int) -> NDArray[np.int64]:
 
 
 def _codes_of(positions: NDArray[np.int32]) -> NDArray[np.uint64]:
-    """Morton codes (n,) of positions (n, 3) in a cube of at most a voxel."""
+    """Return the Morton codes (n,) of positions (n, 3) in a cube no larger than a voxel."""
     rows = np.empty(len(positions), [("local", "<i4", (3,))])
     rows["local"] = positions
     return row_codes(rows)

@@ -1,7 +1,7 @@
-"""One generation more of an archive: scans added or removed, and only the voxels built that this touches.
+"""Adding and removing scans: makes a new generation of an archive.
 
-What is added is added.py's, what is removed removed.py's; both are built by rebuild.py, and put in the old one's place
-by change.py.
+Only the affected voxels are rebuilt. added.py prepares what is added, removed.py what is removed.
+rebuild.py builds both, and change.py publishes the result.
 """
 
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ from .removed import find_removed, rows_of
 from .resume import changed_inputs, described
 from .spool import Spool
 
-# What removing a scan leaves in its place, so that the numbers of the others stay.
+# Marks a removed scan, which keeps its row, so that the numbers of the others stay the same.
 REMOVED = "removed"
 
 
@@ -33,31 +33,34 @@ def add_scans(
     memory_bytes: int = 2 << 30,
     progress: Progress | None = None,
 ) -> ChangeSummary:
-    """Add scans to the archive in `target`: on its lattice, with its options, `radius` as it is stored.
+    """Add scans to the archive in `target`, with its lattice, options and stored `radius`.
 
-    again: also scans that are in already; new_only: leave those out instead.  strict: refuse a scan with points that
-    are not finite. The records are those that a build of all scans would have, on the same lattice and but for the
-    numbers of scans, which go on from those there are. ScanError for a scan that cannot be used, BadRequestError for
-    one that is in already, FormatError and CorruptError for an archive that cannot be read, or records that read back
-    otherwise than they were written; the archive is then what it was.
+    again: also add scans that the archive already contains.  new_only: skip those instead.
+    strict: refuse a scan with non-finite points.
+
+    The records equal those of a build of all scans on the same lattice, except for the numbers of
+    the new scans, which follow the existing ones. Raise ScanError for an unusable scan,
+    BadRequestError for a scan that the archive already contains, FormatError and CorruptError if
+    the archive cannot be read or if the data read back differ from the data written. After an error
+    the archive is unchanged.
     """
     if again and new_only:
         raise BadRequestError(
-            "--new and --again together: expected one: is a scan that is in left out, or had twice?"
+            "--new and --again together: expected one of them: skip scans already in the archive, or add them twice?"
         )
     with changing(Path(target), jobs, memory_bytes, progress) as change:
         inputs = open_inputs(paths, change.config)
         what = described(inputs, change.config)
 
         def check_unchanged() -> None:
-            """A scan's hash need not go with the points that were read of it later."""
+            """Raise ScanError if a file changed: its hash may not match the points read later."""
             if changed := changed_inputs(inputs, change.config, what):
                 raise ScanError(
                     f"{changed}: changed while it was read, expected files that stay as they are: add it again"
                 )
 
         if change.reads_all:
-            change.readers(change.points)  # voxels that are too large now do not get smaller
+            change.readers(change.points)  # refuses now: voxels that are too large do not get smaller
         surveys = survey_added(change, inputs, Wanted(again, new_only, strict))
         try:
             moved, places = spool_added(change, surveys)
@@ -85,16 +88,17 @@ def remove_scans(
 ) -> ChangeSummary:
     """Remove scans from the archive in `target`, which must have been built with `keep` of "scan".
 
-    scans: each a source's path as the index has it (all scans of a file of several), or PATH[INDEX], or its row. A
-    source stays in its row, with no points, so that the numbers of the others stay. BadRequestError for a scan that is
-    not in, and for the last ones; FormatError and CorruptError for an archive that cannot be read; the archive is then
-    what it was.
+    scans: each is the path of a source as the index has it (all scans of a file with several), or
+    PATH[INDEX], or its row. A removed source keeps its row, with no points, so that the numbers of
+    the others stay the same. Raise BadRequestError for a scan that is not in the archive and for
+    removing all remaining scans, FormatError and CorruptError if the archive cannot be read. After
+    an error the archive is unchanged.
     """
     with changing(Path(target), jobs, memory_bytes, progress) as change:
         header = change.archive.header
         if not header.scan_index:
             raise BadRequestError(
-                f"{target}: built without --keep scan, so no point says which scan it is of: build again with "
+                f"{target}: built without --keep scan, so the points do not record their scan: build again with "
                 "it, or of the scans that are to stay"
             )
         rows = rows_of(header.sources, scans, target)

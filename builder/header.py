@@ -1,4 +1,4 @@
-"""What the index says of a dataset as a whole, put together from the survey, the spool and the shards."""
+"""Index header of a dataset, assembled from the survey, the spool and the shards."""
 
 import hashlib
 import json
@@ -20,7 +20,7 @@ from .survey import Survey
 
 
 def archive_id(spooled: Sequence[Spooled], lattice: Lattice, config: BuildConfig) -> bytes:
-    """16 bytes that name the points, the lattice and the options, and no order."""
+    """Compute the 16-byte identifier of points, lattice and options. Order does not affect it."""
     content = [sum(s.content[i] for s in spooled) % (1 << 64) for i in range(2)]
     identity = json.dumps(config.identity(), sort_keys=True).encode()
     origin = np.array([*lattice.origin, lattice.step], "<f8").tobytes()
@@ -38,9 +38,10 @@ def make_header(
     shards: Sequence[Shard],
     config: BuildConfig,
 ) -> Header:
-    """All but the radius, which is measured later. identity: `archive_id`.
+    """Make the header, except for the radius, which is measured later.
 
-    filtered: reason -> points taken out of each scan of `surveys` by filters.
+    identity: `archive_id`.  filtered: for each scan of `surveys`, reason -> points left out by
+    filters.
     """
     low, high = _bounds(np.concatenate([s.rows for s in shards]), lattice)
     lost = [s for s in faulty if not s.empty]
@@ -82,13 +83,13 @@ def make_header(
 
 
 def _bounds(rows: NDArray, lattice: Lattice) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """The lowest and highest lattice coordinates of all points, by the index's rows."""
+    """Return the bounds of all points in lattice coordinates, from the rows of the index."""
     base = voxel_coordinates(rows["key"]) * lattice.voxel_steps
     return (base + rows["low"]).min(axis=0), (base + rows["high"]).max(axis=0)
 
 
 def _good_source(survey: Survey, filtered: dict[str, int]) -> Source:
-    """What is said of a scan that was built."""
+    """Return the source entry of a scan that was built."""
     scan = survey.scan
     assert scan is not None
     kept = survey.count - sum(filtered.values())
@@ -100,13 +101,16 @@ def _good_source(survey: Survey, filtered: dict[str, int]) -> Source:
 
 
 def _unknown_rows(faulty: Sequence[Survey]) -> list[int | None]:
-    """Of each scan that was left out, the box where it may have had points; -1: not known; None: it had none."""
+    """Return, for each scan left out, the row of the box where it may have had points.
+
+    -1: the box is not known; None: the scan had no points.
+    """
     boxes = count()
     return [None if s.empty else -1 if s.region is None else next(boxes) for s in faulty]
 
 
 def _bad_source(survey: Survey, unknown: int | None) -> Source:
-    """What is said of a scan that was left out. unknown: see `Source`."""
+    """Return the source entry of a scan that was left out. unknown: see `Source`."""
     scan: Scan | None = survey.scan
     return Source(
         str(survey.path),

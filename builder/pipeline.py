@@ -241,8 +241,8 @@ def _read_back(folder: Path, points: int, spool: Spool, executor: Executor, stag
         fault, paths = str(error), (*sorted((folder / SHARD_FOLDER).iterdir()), spool.folder)
     if fault:
         raise CorruptError(
-            f"{fault}: the data read back differ from the data written: check disk and memory; the same command makes anew "
-            "what is damaged",
+            f"{fault}: the data read back differ from the data written: check disk and memory; the same command "
+            "rebuilds what is damaged",
             paths,
         )
 

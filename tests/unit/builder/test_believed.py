@@ -164,7 +164,7 @@ def test_a_run_that_changes_while_it_is_built_of_costs_no_third_command(
     function = pipeline.filter_points
     with monkeypatch.context() as patch:
         patch.setattr(pipeline, "filter_points", during(lambda run: flip(run, bit)))
-        with pytest.raises(CorruptError, match="the same command makes anew"):
+        with pytest.raises(CorruptError, match="the same command rebuilds"):
             build(tmp_path / "hall", scans)
     surveyed = counted(monkeypatch, "survey_range")
     build(tmp_path / "hall", scans)

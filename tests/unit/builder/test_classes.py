@@ -299,7 +299,9 @@ def test_radius_texts(text: str, radius: float | None, models: set[str]) -> None
     "text", ["", "median", "mean,0.01", "0.01,fixed:0.02", "fixed:", "fixed:x", "local:2", "mean,"]
 )
 def test_other_radius_texts_are_refused(text: str) -> None:
-    with pytest.raises(BadRequestError, match=r"--radius .*expected mean, local, border by comma"):
+    with pytest.raises(
+        BadRequestError, match=r"--radius .*expected mean, local, border, separated by commas"
+    ):
         parse_radius(text)
 
 

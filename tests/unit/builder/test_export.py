@@ -188,13 +188,13 @@ def test_outputs_that_cannot_be_are_refused(georeferenced: Path, tmp_path: Path)
         with pytest.raises(BadRequestError, match=said):
             export_archive(georeferenced, tmp_path / name)
     (tmp_path / "a.ply").write_text("mine")
-    with pytest.raises(BadRequestError, match="is there already"):
+    with pytest.raises(BadRequestError, match="already exists"):
         export_archive(georeferenced, tmp_path / "a.ply")
     assert (tmp_path / "a.ply").read_text() == "mine"
     export_archive(georeferenced, tmp_path / "a.ply", overwrite=True, form="vtkhdf")
     assert len(read_points(tmp_path / "a.ply").points) == 1000
     (tmp_path / "folder.las").mkdir()
-    with pytest.raises(BadRequestError, match="is there already"):
+    with pytest.raises(BadRequestError, match="already exists"):
         export_archive(georeferenced, tmp_path / "folder.las", overwrite=True)
 
 
@@ -270,12 +270,12 @@ def set_sources(folder: Path, **changes: list[Any]) -> None:
     [
         ({"crs": [WKT, WKT]}, WKT, ""),
         ({"crs": ["", ""]}, "", ""),
-        ({"crs": [WKT, ""]}, "", "several coordinate systems, or some none"),
-        ({"crs": [WKT, WKT.replace("32N", "33N")]}, "", "several coordinate systems, or some none"),
+        ({"crs": [WKT, ""]}, "", "different coordinate systems, or some name none"),
+        ({"crs": [WKT, WKT.replace("32N", "33N")]}, "", "different coordinate systems, or some name none"),
         ({"crs": ["EPSG:25832"] * 2}, "", "not given as well-known text (EPSG:25832)"),
         ({"crs": [WKT + " " * 66_000] * 2}, "", "not given as well-known text"),
-        ({"crs": [WKT, WKT], "units": ["ft", "ft"]}, "", "not that of metres with z up"),
-        ({"crs": [WKT, WKT], "up": ["z", "y"]}, "", "not that of metres with z up"),
+        ({"crs": [WKT, WKT], "units": ["ft", "ft"]}, "", "not in metres with z up"),
+        ({"crs": [WKT, WKT], "up": ["z", "y"]}, "", "not in metres with z up"),
     ],
 )
 def test_the_coordinate_system_that_all_scans_share_is_written(

@@ -288,7 +288,7 @@ def test_a_place_with_more_duplicates_than_are_held_is_one_block(
         ({"outliers": (0.065, 2)}, r"--outliers 0\.065: expected at most a voxel, 0\.064 m"),
         (
             {"moving": (0.009, 1)},
-            r"--moving 0\.009, looks 0\.072 m around each point: expected at most a voxel",
+            r"--moving 0\.009, examines 0\.072 m around each point: expected at most a voxel",
         ),
         ({"moving": (0.002, 17)}, r"--moving 0\.002,17: expected 1 to 16 scans"),
         ({"thin": 0.0646}, r"--thin 0\.0646: expected at most a voxel"),

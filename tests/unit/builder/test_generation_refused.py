@@ -35,7 +35,12 @@ def test_a_scan_that_is_in_is_refused_unless_again(built: Build, files: Files, t
             lambda p=path: add_scans(target, [p], jobs=1),
         )
     other = Path(shutil.copy(files.c, tmp_path / "other.ply"))
-    refused(target, BadRequestError, "is already in the archive", lambda: add_scans(target, [files.c, other], jobs=1))
+    refused(
+        target,
+        BadRequestError,
+        "is already in the archive",
+        lambda: add_scans(target, [files.c, other], jobs=1),
+    )
     refused(target, BadRequestError, "named twice", lambda: add_scans(target, [files.c, files.c], jobs=1))
     add_scans(target, [files.b], again=True, jobs=1)
     assert np.array_equal(all_points(target), sort_points(A, B, B))
@@ -56,7 +61,10 @@ def test_scans_that_are_in_are_named_or_left_out_before_points_are_read(
 
     monkeypatch.setattr(added_module, "survey_range", noted)
     everything = files.a.parent
-    named = r"2 of 3 scans: .*--new.*\n  .*a\.ply\[0\] is already in the archive, as .*a\.ply\[0\]\n  .*b\.ply\[0\] is already in the archive"
+    named = (
+        r"2 of 3 scans: .*--new.*\n  .*a\.ply\[0\] is already in the archive, as .*a\.ply\[0\]"
+        r"\n  .*b\.ply\[0\] is already in the archive"
+    )
     refused(target, BadRequestError, named, lambda: add_scans(target, [everything], jobs=1))
     assert not surveyed
     added = add_scans(target, [everything], new_only=True, jobs=1)

@@ -235,7 +235,9 @@ def test_a_record_that_does_not_read_back_fails_the_build_and_is_made_again(
 
     with monkeypatch.context() as patch:
         patch.setattr(pipeline, "_measure_radius", damage)
-        with pytest.raises(CorruptError, match="the data read back differ from the data written: check disk and memory"):
+        with pytest.raises(
+            CorruptError, match="read back differ from the data written: check disk and memory"
+        ):
             build(scans, out / "a")
     assert not (out / "a").exists()
     # Of several shards only the one that is damaged is made again.

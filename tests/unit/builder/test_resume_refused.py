@@ -210,7 +210,7 @@ LATE_REFUSALS: dict[str, tuple[list[str], np.ndarray, str, list[str]]] = {
     "no point": (
         ["--outliers", "0.001,5"],
         make_scan("noise", 3, 100),
-        "give --thin, --outliers or --moving other figures",
+        "change the figures of --thin, --outliers or --moving",
         ["--outliers", "0.8,1"],
     ),
 }

@@ -96,6 +96,6 @@ def test_errors_of_one_archive_are_what_they_are(archive: Path) -> None:
 def test_an_export_into_the_archive_itself_is_refused(archive: Path, tmp_path: Path) -> None:
     (tmp_path / "link").symlink_to(archive)
     for output in (archive / "index.h5", tmp_path / "link" / "shards" / "0-000000.h5", archive / "new.ply"):
-        with pytest.raises(BadRequestError, match="within the archive itself"):
+        with pytest.raises(BadRequestError, match="inside the archive itself"):
             export_archive(archive, output, form="ply", overwrite=True)
     assert not verify_archive(archive).faults

@@ -1,8 +1,9 @@
-"""Which of two pairs of spheres is closer: the gap between them, sqrt(D) - R, compared exactly (NUMERICS.md N5).
+"""Exact comparison of two pairs of spheres by their separation, sqrt(D) - R (NUMERICS.md N5).
 
-D is the square of the distance of the centres and R the sum of the radii, integers of exact units, so gaps are as a
-rule no numbers that a machine holds. Where all radii are the same the squares alone tell; where they are not, float64
-tells nearly always, and where it does not, the roots are squared away and integers of 128 bits are compared.
+D is the squared distance of the centres and R the sum of the radii, both integers in exact units;
+most separations are therefore irrational. Where all radii are the same, the squares alone decide.
+Where they differ, float64 nearly always decides. Where it cannot, the roots are eliminated by
+squaring and integers of 128 bits are compared.
 """
 
 import math
@@ -11,9 +12,10 @@ import numpy as np
 
 from .compiled import borrowing
 
-# Two gaps that float64 finds farther apart than this are in that order. Squares are below 2^62, so a root is off by at
-# most half of 2^-22 in rounding and 2^-54 of itself for the square's: 2.3e-7; two of them and a sum: below 6e-7. The
-# last difference is exact where it is small.
+# Two separations whose float64 values differ by more than this are in that order. Squares are below
+# 2^62, so a root is off by at most half of 2^-22 for its rounding and 2^-54 of itself for that of
+# the square: 2.3e-7. Two of them and a sum stay below 6e-7. The last difference is exact where it
+# is small.
 CERTAIN = 2.0**-19
 _LOW = np.uint64(0xFFFFFFFF)
 _HALF = np.uint64(32)
@@ -21,7 +23,7 @@ _HALF = np.uint64(32)
 
 @borrowing
 def _product(a, b):
-    """The product of two uint64 as its high and low 64 bits."""
+    """Return the product of two uint64 as its high and low 64 bits."""
     a_high, a_low, b_high, b_low = a >> _HALF, a & _LOW, b >> _HALF, b & _LOW
     # None of these exceeds 64 bits: (2^32 - 1)^2 + 2 (2^32 - 1) = 2^64 - 1.
     low = a_low * b_low
@@ -32,10 +34,11 @@ def _product(a, b):
 
 @borrowing
 def _compare_roots(square, other, more):
-    """The sign of sqrt(square) - (sqrt(other) + more), for more >= 0, the difference within 1; int64.
+    """Return the sign of sqrt(square) - (sqrt(other) + more), int64.
 
-    Both sides squared: of s - 2 more sqrt(other), with s = square - other - more^2; where s is not negative, squared
-    again. All of it fits, for `more` is no larger than the root of `square` and a little.
+    more: >= 0. The difference is within 1. Squaring both sides leaves the sign of s - 2 more
+    sqrt(other), with s = square - other - more^2; where s is not negative, both sides are squared
+    again. All terms fit, because `more` is at most slightly larger than the root of `square`.
     """
     s = square - other - more * more
     if s < 0:
@@ -52,10 +55,12 @@ def _compare_roots(square, other, more):
 
 @borrowing
 def compare_gaps(square, radius, other_square, other_radius):
-    """-1, 0 or 1: the gap sqrt(square) - radius is less than, equal to or greater than the other; exactly.
+    """Compare the gaps sqrt(square) - radius of two pairs exactly.
 
-    square, other_square: int64, 0 to 3 * 2^60, as `pair_square` has them.  radius, other_radius: int64, -2^31 to 2^31,
-    exact units; may leave out what is the same in both, so `-drop` is as good as the radius.
+    Returns -1, 0 or 1: the first gap is less than, equal to or greater than the other.
+    square, other_square: int64, 0 to 3 * 2^60, from `pair_square`.  radius, other_radius: int64,
+    -2^31 to 2^31, exact units. Terms common to both radii may be omitted: `-drop` serves as well as
+    the radius.
     """
     more = radius - other_radius
     apart = (math.sqrt(np.float64(square)) - math.sqrt(np.float64(other_square))) - np.float64(more)

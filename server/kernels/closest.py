@@ -1,12 +1,15 @@
-"""The nearest pair of points so far, and what it rules out: what `distance` and the bounded search share.
+"""Nearest pair of points so far, and what it rules out.
 
-Nearest is the pair with the least gap between its spheres, |a - b| - (r_a + r_b). r_a is the same for all, and the
-scan point's radius is less than the largest by the `drop` of its class: so what is compared is |a - b| + drop, and a
-bound on it, less the drop of a class, is one on |a - b| of the pairs of that class.
+`distance` and the bounded search share this module.
 
-Float32 tells nearly all pairs of points from the best; those that it cannot tell are squared in integers (NUMERICS.md
-N5) and compared by closer.py. So the least gap, and which pair has it, are those of the definition, whatever the trees
-and the order.
+The nearest pair is the one with the least separation of its spheres, |a - b| - (r_a + r_b). r_a is
+the same for all pairs, and the scan point's radius is the largest radius minus the `drop` of its
+class. The search therefore compares |a - b| + drop. A bound on it, minus the drop of a class, is a
+bound on |a - b| of the pairs of that class.
+
+Float32 separates nearly all pairs of points from the best one. The pairs it cannot separate are
+squared in integers (NUMERICS.md N5) and compared by closer.py. The least separation, and the pair
+that has it, are therefore those of the definition, for every tree and order.
 """
 
 import math
@@ -25,17 +28,20 @@ from .placing import lattice_to_units, place, to_units
 from .stopping import NO_LIMIT
 
 U = np.uint64  # see front.py
-# Pairs that float32 cannot tell from the best; ties are legion on coarse lattices, so a full list is settled.
+# Pairs that float32 cannot separate from the best. Coarse lattices have many ties; a full list is
+# settled.
 MOST_CANDIDATES = 64
 
 
 class Nearest(NamedTuple):
-    """The nearest pair of each of k poses, among what was looked at.
+    """Nearest pair of each of k poses, among the voxels searched.
 
-    square: (k,) int64, |a - b|^2, exact units; -1: none within reach.  pair: (k, 6) int64, the scan point's lattice
-    x, y, z, then the avatar's placed centre [exact units].  drop: (k,) int64, how much smaller than the largest the
-    scan point's radius is, exact units.  gap: (k,) float64, what missing voxels hold is at least so far from the
-    avatar's centres [steps]; inf: nothing is missing.
+    square: (k,) int64, |a - b|^2, exact units; -1: none within reach.
+    pair: (k, 6) int64, the scan point's lattice x, y, z, then the avatar's placed centre [exact
+    units].
+    drop: (k,) int64, the largest radius minus the scan point's radius, exact units.
+    gap: (k,) float64, a lower bound of the distance of the avatar's centres from what missing
+    voxels hold [steps]; inf: nothing is missing.
     """
 
     square: NDArray[np.int64]
@@ -45,20 +51,24 @@ class Nearest(NamedTuple):
 
 
 class Best(NamedTuple):
-    """The nearest pair of one pose so far, and what it rules out; scratch of one call.
+    """Nearest pair of one pose so far, and what it rules out; scratch of one call.
 
-    found: (8,) int64, square or -1, a row of `Nearest.pair`, drop.  cut, far: (n,) float32, by radius class: no node
-    pair whose `lower_bound` is above cut[c] [steps] and no points whose square is above far[c] can be nearer, or tie.
-    drop: (n,) int64, of SceneArrays.  mask: one less than there are classes, uint64.
-    frame: (5,) float64, extent and farthest of `make_limits`, units per step, voxel steps; the error of a distance
-    [steps].  corner: (3,) int64, of the voxel looked at [steps].  keep, squares: (LANES,), a mark and a square for each
-    point of an avatar's block; keep8: keep as uint64, eight at a time.  listed: (LANES,) float32, a square for each
-    point of a scene's block.
-    units: (2,) int64, the reach, and what is known to be no less than the least |a - b| + drop, exact units.
-    counters: (4,) int64, node visits, point tests, candidates, and the most visits of a pose.
-    candidates: (MOST_CANDIDATES, 5) int64, points of the avatar that may be of the nearest pair, and where in the
-    scene: block, lane, block_at, lane_at, class of the leaf node.  nearly: (MOST_CANDIDATES,) float32, their least
-    squares there.
+    found: (8,) int64, square or -1, a row of `Nearest.pair`, drop.
+    cut, far: (n,) float32, by radius class: no node pair whose `lower_bound` is above cut[c]
+    [steps] and no pair of points whose square is above far[c] can be nearer, or tie.
+    drop: (n,) int64, of SceneArrays.  mask: the number of classes minus one, uint64.
+    frame: (5,) float64, extent and farthest of `make_limits`, units per step, voxel steps; the
+    error of a distance [steps].
+    corner: (3,) int64, low corner of the current voxel [steps].
+    keep, squares: (LANES,), a mark and a square for each point of an avatar's block.
+    keep8: the memory of keep as uint64, eight marks each.
+    listed: (LANES,) float32, a square for each point of a scene block.
+    units: (2,) int64, exact units: the reach, and an upper bound of the least |a - b| + drop.
+    counters: (4,) int64, node visits, point tests, candidates, and the largest number of visits of
+    a pose.
+    candidates: (MOST_CANDIDATES, 5) int64, points of the avatar that may belong to the nearest
+    pair, and their place in the scene: block, lane, block_at, lane_at, class of the leaf node.
+    nearly: (MOST_CANDIDATES,) float32, their least squares there.
     """
 
     found: NDArray[np.int64]
@@ -80,7 +90,7 @@ class Best(NamedTuple):
 
 @nb.njit(nogil=True, cache=True)
 def make_best(drop):
-    """Scratch for the radius classes of `SceneArrays.drop`, nothing found."""
+    """Allocate scratch for the radius classes of `SceneArrays.drop`; no pair is found yet."""
     keep, n = np.zeros(LANES, np.bool_), drop.shape[0]
     return Best(
         np.empty(8, np.int64), np.empty(n, np.float32), np.empty(n, np.float32), drop, np.uint64(n - 1), np.empty(5),
@@ -92,25 +102,26 @@ def make_best(drop):
 
 @borrowing
 def lower_bound(words, row, x, y, z, radius):
-    """How far a sphere's points (float32, from the voxel's low corner) are from a node's at least [steps].
+    """Return a lower bound of the distance of a sphere's points from a node's points [steps].
 
-    The larger of the sphere's and the slab's bound, less all that float32 rounds here; negative where it says
-    nothing. The errors of placed coordinates are not in it: they are in `Best.cut`.
+    x, y, z: float32, relative to the voxel's low corner. The bound is the larger of the sphere's
+    and the slab's, minus all float32 rounding of this function; a negative bound says nothing. It
+    does not include the errors of placed coordinates: `Best.cut` does.
     """
-    at = U(row)  # not negative: spares a comparison for every index
+    at = U(row)  # not negative: saves a comparison for every index
     dx, dy, dz = x - words[at], y - words[at + U(1)], z - words[at + U(2)]
     apart = np.sqrt(dx * dx + dy * dy + dz * dz)
     both = words[at + U(3)] + radius
     along = words[at + U(4)] * dx + words[at + U(5)] * dy + words[at + U(6)] * dz
     gap = max(along - words[at + U(9)], words[at + U(8)] - along)
-    # Without a slab gap is 0; its length is never 0, and rounded up.
+    # Without a slab, gap is 0. The slab's length is never 0, and is rounded up.
     bound = max(apart - both, gap / words[at + U(7)] - radius)
     return bound - SLACK * (apart + both)
 
 
 @borrowing
 def set_cut(cut, far, frame, drop, units):
-    """Rule out what has |a - b| + drop above `units`; see `Best`."""
+    """Rule out pairs whose |a - b| + drop is above `units`; see `Best`."""
     limits = make_limits(units, frame[2], frame[0], frame[1], frame[3])
     error = np.float64(limits.error)
     frame[4] = error
@@ -119,7 +130,8 @@ def set_cut(cut, far, frame, drop, units):
             cut[c] = (limits.reach + limits.error) * ONE_SLACK
             far[c] = limits.far
         else:
-            # As `make_limits` has it, all slack in one: 45 ns for 32 classes in the place of 370.
+            # As in `make_limits`, with all slack in one factor: 45 ns for 32 classes instead of
+            # 370.
             above = (np.float64(max(units - drop[c], 0)) / frame[2] + error) * (1.0 + 2e-6)
             cut[c] = np.float32(above)
             far[c] = np.float32(above * above)
@@ -127,7 +139,10 @@ def set_cut(cut, far, frame, drop, units):
 
 @borrowing
 def found_units(found):
-    """What |a - b| + drop of the pair found is at most, exact units: nothing that ties is ruled out by it."""
+    """Return an upper bound of |a - b| + drop of the pair found, exact units.
+
+    A bound at this value excludes no pair that ties.
+    """
     return np.int64(math.sqrt(np.float64(found[0]))) + 2 + found[7]
 
 
@@ -135,10 +150,12 @@ def found_units(found):
 def _consider(
     points, m, shift, block, lane, ints, halves, corner, block_at, lane_at, j, units_per_step, units, drop, found
 ):  # fmt: skip
-    """Take a pair as the best one if it is: nearer, or as near with the lesser scan point, then avatar's centre.
+    """Replace the best pair by this pair if it is nearer, or as near and first in order.
 
-    points, shift: of Avatar and Placed.  corner: (3,) int64, of the voxel [steps].  drop: of the scan point's class.
-    The square is that of `pair_square`. Returns whether it is nearer.
+    Ties go to the lesser scan point, then to the lesser avatar centre.
+    points, shift: of Avatar and Placed.  corner: (3,) int64, of the voxel [steps].  drop: of the
+    scan point's class.
+    The square is that of `pair_square`. Returns whether the pair is nearer.
     """
     square = np.int64(0)
     units -= drop
@@ -175,7 +192,7 @@ def _consider(
             if value > found[1 + r]:
                 return False
             lesser = value < found[1 + r]
-        # While all before are equal this writes what is there.
+        # While all earlier values are equal, this writes the value already stored.
         found[1 + r] = value
     found[0], found[7] = square, drop
     return nearer
@@ -186,10 +203,11 @@ def search_lanes(
     points, m, shift, block, lane, ints, halves, corner, block_at, lane_at, c, x, y, z, frame, units, squares, found,
     cut, far, drop, mask,
 ):  # fmt: skip
-    """Take the best of the pairs of one avatar point (float32 x, y, z from the block's low corner) and a scene block.
+    """Update the best pair with the pairs of one avatar point and a scene block.
 
-    The nearest first: it shrinks the cut, and few of the others are asked in integers after it.
-    c: class of the scene's leaf node.  From frame on: of `Best`.
+    x, y, z: the avatar point, float32, relative to the block's low corner. The nearest pair comes
+    first: it shrinks the cut, and few of the others then need integers.
+    c: class of the scene's leaf node.  Arguments from frame on: of `Best`.
     """
     list_squares(halves, lane_at, x, y, z, squares)
     first = 0
@@ -210,16 +228,20 @@ def search_lanes(
 
 @borrowing
 def _no_farther(square, frame):
-    """What a distance is at most whose square float32 has [exact units, float64]: as `make_limits` has it."""
+    """Return an upper bound of a distance whose square float32 holds [exact units, float64].
+
+    The error is that of `make_limits`.
+    """
     return (math.sqrt(np.float64(square)) * (1.0 + 8.0 * U32) + frame[4]) * frame[2]
 
 
 @borrowing
 def _list_by_class(c, block, block_at, lane_at, off, best, ints, halves, lanes):
-    """Unmark the points of an avatar's block that are near no point of a scene's block for its own class.
+    """Unmark the points of an avatar's block that are near no point of a scene block, by class.
 
-    c: class of the scene's leaf node; other arguments as of `take_candidates`. Returns what the least |a - b| + drop
-    is at most, exact units, float64; inf: none is near.
+    The radius class of each scene point decides.  c: class of the scene's leaf node.  Other
+    arguments as for `take_candidates`. Returns an upper bound of the least |a - b| + drop, exact
+    units, float64; inf: no point is near.
     """
     keep, squares, listed, far, drop = best.keep, best.squares, best.listed, best.far, best.drop
     low_x = off[0] + np.float32(ints[block_at])
@@ -244,10 +266,11 @@ def _list_by_class(c, block, block_at, lane_at, off, best, ints, halves, lanes):
 
 @borrowing
 def take_candidates(least, c, block, block_at, lane_at, off, best, points, m, shift, ints, halves, lanes):
-    """Take up what `least_squares` found, `least` of it within the cut: shrinks the cut, without integers.
+    """Add the points that `least_squares` found to the candidates, and shrink the cut.
 
-    Those are for `settle`, at the end: where the cut shrinks as points come, ten or twenty are the nearest for a while.
-    c: class of the scene's leaf node.
+    This uses no integers; `settle` does the integer work at the end: while the cut shrinks, ten or
+    twenty points are the nearest for a while.
+    least: the least square, within the cut.  c: class of the scene's leaf node.
     """
     far, units, counters, nearly = best.far, best.units, best.counters, best.nearly
     candidates, keep, squares = best.candidates, best.keep, best.squares
@@ -257,7 +280,7 @@ def take_candidates(least, c, block, block_at, lane_at, off, best, points, m, sh
         within = _list_by_class(c, block, block_at, lane_at, off, best, ints, halves, lanes)
         if within == np.inf:
             return
-    nearer = np.int64(within) + 2  # a unit for rounding up
+    nearer = np.int64(within) + 2  # one unit for rounding up
     if nearer < units[1]:
         units[1] = nearer
         set_cut(best.cut, far, best.frame, best.drop, nearer)
@@ -283,9 +306,10 @@ def take_candidates(least, c, block, block_at, lane_at, off, best, points, m, sh
 
 @borrowing
 def settle(best, points, m, shift, ints, halves, lanes, off):
-    """Square the candidates of one voxel in integers and keep the nearest pair; leaves no candidates.
+    """Square the candidates of one voxel in integers and keep the nearest pair; clear the list.
 
-    points: (b, 3, LANES) of Avatar.  lanes: of Placed.  off: (3,) float32, from the frame to the voxel's low corner.
+    points: (b, 3, LANES) of Avatar.  lanes: of Placed.  off: (3,) float32, from the frame to the
+    voxel's low corner.
     """
     far, frame, found, squares, units = best.far, best.frame, best.found, best.listed, best.units
     for i in range(best.counters[2]):

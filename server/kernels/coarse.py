@@ -1,8 +1,9 @@
-"""The coarse top of a voxel's hierarchy: which nodes it is, and which pairs of pose and voxel it proves clear.
+"""Coarse bounds: the top nodes of a voxel's hierarchy, and the pairs they prove clear.
 
-A slot holds nodes that together enclose all points of one voxel, laid out as the arena's rows are (layout.py), with
-nothing below them. What they prove is what a descent would have found: the bounds, the float32 tests, their slack and
-the rooms by radius class are those of overlap.py, so a pair that is settled here is clear by the definition.
+A slot holds nodes that together enclose all points of one voxel. They have the layout of the
+arena's rows (layout.py) and no children. They prove what a descent would have found: the bounds,
+the float32 tests, their slack and the thresholds by radius class are those of overlap.py. A pair
+settled here is therefore clear by the definition.
 """
 
 from typing import NamedTuple
@@ -18,22 +19,24 @@ from .overlap import lanes_meet, make_spot, nodes_meet
 from .placed import make_by_class, make_placed, place_block, place_root, set_by_class
 from .stopping import stopped
 
-# Nodes of a slot, 48 bytes each. Of the pairs of pose and voxel that are clear on the walk through a made town of 10^7
-# points (voxels of 8 m, 282 KB decoded in the mean) 32 nodes settle 14 %, 64 35 %, 96 45 %, 128 52 %, 192 59 %; on the
-# walk through the façade in voxels of 4 m (63 KB) 32 settle 67 %, 64 77, 96 82, 128 83; in voxels of 8 m 128 do 59 %,
-# and 20 % where the avatar's points are not held against the bounds. To open the thickest node, or that of the most
-# volume, instead of that of the largest radius gives or takes a tenth.
+# Nodes of a slot, 48 bytes each. On the walk through a generated town of 10^7 points (voxels of
+# 8 m, mean 282 KB decoded), 32 nodes settle 14 % of the clear pairs of pose and voxel, 64 35 %, 96
+# 45 %, 128 52 %, 192 59 %. On the walk through the façade in voxels of 4 m (63 KB), 32 settle 67 %,
+# 64 77 %, 96 82 %, 128 83 %. In voxels of 8 m, 128 settle 59 %, and 20 % if the avatar's points are
+# not tested against the bounds. Opening the thickest node, or that of the largest volume, instead
+# of that of the largest radius changes this by about a tenth.
 MOST_NODES = 128
 SLOT_WORDS = MOST_NODES * ROW_WORDS
 
 
 class CoarseArrays(NamedTuple):
-    """The coarse tops of a scene's v voxels, s slots.
+    """Coarse bounds of a scene's v voxels in s slots.
 
-    words, ints: (s * SLOT_WORDS,) float32 and int32, two views of one buffer: MOST_NODES rows a slot, layout.py; only
-    the radius class is left of COUNT, and FIRST is -1.  slot: (v,) int32, which slot a voxel has, -1: none.
-    count: (s,) int32, rows in a slot.
-    Who finds a slot in `slot` may read it without a lock: it was written before, and never is again.
+    words, ints: (s * SLOT_WORDS,) float32 and int32, two views of one buffer: MOST_NODES rows a
+    slot, layout.py. COUNT holds the radius class only, and FIRST is -1.
+    slot: (v,) int32, the slot of a voxel, -1: none.  count: (s,) int32, rows in a slot.
+    A thread that finds a slot in `slot` may read it without a lock: the slot was written before and
+    is never written again.
     """
 
     words: NDArray[np.float32]
@@ -44,12 +47,13 @@ class CoarseArrays(NamedTuple):
 
 @nb.njit(nogil=True, cache=True)
 def take_top(words, ints, root, assumed, out, number):
-    """Write the coarse top of a voxel that `lay_out` wrote into slot `number` of `out`, the ints of CoarseArrays.
+    """Write the coarse bounds of a voxel that `lay_out` wrote into slot `number` of `out`.
 
-    words, ints: of the arena.  root: the voxel's first row.  assumed: radius class, shifted as in COUNT, of rows that
-    have none yet; 0: as they are.
-    From the root on, the node of the largest radius is replaced by its children, as long as they all find room; the
-    first of equals. So where there are MOST_NODES leaf nodes or fewer, it is these. Returns how many rows.
+    words, ints: of the arena.  root: the voxel's first row.  out: the ints of CoarseArrays.
+    assumed: radius class, shifted as in COUNT, for rows without a class so far; 0: take their own.
+    Beginning with the root, the node of the largest radius (the first of equals) is replaced by its
+    children as long as all of them fit. Where there are MOST_NODES leaf nodes or fewer, the result
+    is therefore the leaf nodes. Returns the number of rows.
     """
     taken, radius = np.empty(MOST_NODES, np.int64), np.empty(MOST_NODES, np.float32)
     taken[0], radius[0] = root, words[root + 3]
@@ -59,7 +63,7 @@ def take_top(words, ints, root, assumed, out, number):
         for i in range(1, count):
             if radius[i] > radius[widest]:
                 widest = i
-        if radius[widest] < 0:  # none is left to be opened
+        if radius[widest] < 0:  # no node is left to open
             break
         row = taken[widest]
         first, children = int(ints[row + FIRST]), int(ints[row + COUNT] & COUNTED)
@@ -84,7 +88,7 @@ def take_top(words, ints, root, assumed, out, number):
 
 @nb.njit(nogil=True, cache=True)
 def any_to_settle(where, slot, rows, count):
-    """Whether one of the first `count` of the voxel rows is not resident and has a slot."""
+    """Return whether one of the first `count` voxel rows is not resident and has a slot."""
     for row in rows[:count]:  # noqa: SIM110  `any` of a generator is not compiled
         if where[row, 0] < 0 and slot[row] >= 0:
             return True
@@ -93,11 +97,12 @@ def any_to_settle(where, slot, rows, count):
 
 @nb.njit(nogil=True, cache=True)
 def settle_pairs(poses, avatar, scene, coarse, reach, starts, rows):
-    """Copy starts and rows of `reach` without the pairs of pose and voxel that coarse tops prove clear.
+    """Copy starts and rows of `reach` without the pairs that coarse bounds prove clear.
 
-    poses: (k, 4, 4), checked.  avatar: not empty.  reach: Reach of these poses (reach.py). Writes starts (k + 1,)
-    and rows, as long as those in `reach`, in the same order. Left out is a voxel that is not resident, has a slot, and
-    has no node in it whose bound comes within reach. Returns how many were left out.
+    poses: (k, 4, 4), checked.  avatar: not empty.  reach: Reach of these poses (reach.py).
+    A pair is a pose and a voxel. Writes starts (k + 1,) and rows, which are as long as those in
+    `reach` and in the same order. It omits a voxel that is not resident, has a slot, and has no
+    node there whose bound comes within reach. Returns how many were omitted.
     """
     placed, by_class = make_placed(avatar), make_by_class(scene.drop)
     bounds = np.empty((4, MAX_FRONT), np.float32)
@@ -109,12 +114,12 @@ def settle_pairs(poses, avatar, scene, coarse, reach, starts, rows):
 
 @borrowing
 def _settle_pairs(poses, avatar, scene, coarse, reach, starts, rows, placed, by_class, bounds, met, keep):
-    """`settle_pairs`, with its scratch."""
+    """Implement `settle_pairs` with its scratch passed in."""
     left = 0
     for i in range(poses.shape[0]):
         m, scale = poses[i], reach.scales[i]
         starts[i] = left
-        front = 0  # how long it is; not placed, as most poses never need it
+        front = 0  # its length; not placed yet, as most poses never need it
         for at in range(reach.starts[i], reach.starts[i + 1]):
             voxel = reach.rows[at]
             number = np.int64(coarse.slot[voxel])
@@ -143,10 +148,10 @@ def _settle_pairs(poses, avatar, scene, coarse, reach, starts, rows, placed, by_
 
 @borrowing
 def _apart(avatar, m, pose, scene, coarse, voxel, number, placed, by_class, bounds, front, met, keep):
-    """Whether no point of the avatar comes within reach of any node of slot `number`, which is of `voxel`.
+    """Return whether no point of the avatar comes within reach of any node of slot `number`.
 
-    placed, by_class, bounds: of this pose; front: how many nodes there are in `bounds`.  pose: its number, for the
-    blocks' stamps.  met: (MAX_FRONT,) and keep: (LANES,) bool, scratch.
+    placed, by_class, bounds: of this pose.  front: the number of nodes in `bounds`.  pose: its
+    number, for the blocks' stamps.  met: (MAX_FRONT,) and keep: (LANES,) bool, scratch.
     """
     words, nodes = coarse.words, placed.nodes
     spot = make_spot(scene, voxel, placed)
@@ -162,7 +167,7 @@ def _apart(avatar, m, pose, scene, coarse, voxel, number, placed, by_class, boun
                 if not met[i]:
                     continue
                 first = np.int64(avatar.first[avatar.front_first + i])
-                if first >= 0:  # of an avatar whose front is not its leaf nodes
+                if first >= 0:  # an avatar whose front is not its leaf nodes
                     return False
                 block = ~first
                 if placed.stamp[block] != pose:

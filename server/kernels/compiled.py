@@ -1,23 +1,27 @@
-"""How kernels are compiled.
+"""Compilation options of the kernels.
 
-A kernel that is handed tuples of arrays counts references: an atomic increment and decrement for each array it takes
-out of a tuple or hands on, in the middle of its loops, though whoever called it holds the arrays all the while. In the
-descents that was a fifth to a half of the time (scripts/bench_engine: collide 5.0 us a pose with, 4.1 without).
-`borrowing` leaves the counting out. It is for functions that make no array: slices are as good as elements, but
-np.empty and its like, and assignments of whole arrays, are refused by the compiler.
+A kernel that receives tuples of arrays counts references: numba increments and decrements an atomic
+counter for each array that is taken out of a tuple or passed on, inside the kernel's loops,
+although the caller holds the arrays for the whole call. In the descents this took between a fifth
+and a half of the time (scripts/bench_engine: collide 5.0 us a pose with counting, 4.1 without).
+
+`borrowing` disables the counting. It is for functions that create no array. Slices are as cheap as
+elements there, but the compiler refuses np.empty and similar calls, and assignments of whole
+arrays.
 """
 
 from typing import Any
 
 from ...schemas.kernels import compiling as nb
 
-# By name, because numba's own types leave the option out: its underscore says that it may change. Without it kernels
-# are slower and as right.
+# Given by name, because numba's own types omit this option: its underscore marks it as subject to
+# change. Without it, kernels are slower and equally correct.
 _NO_COUNTING: dict[str, Any] = {"_nrt": False}
 
 borrowing = nb.njit(nogil=True, cache=True, **_NO_COUNTING)
 
-# For functions of arrays that are called from one or two places, ten times a pose and more: a call hands over six words
-# for each array, on the stack. distance took 8.0 us a pose in the place of 8.8 with keep_near and three more inlined,
-# collide 3.5 in the place of 4.0 with sift, take_kept and lanes_meet.
+# For functions that take arrays, have one or two callers and run ten or more times a pose: a call
+# passes six words for each array on the stack. With keep_near and three more inlined, distance took
+# 8.0 us a pose instead of 8.8; with sift, take_kept and lanes_meet inlined, collide took 3.5
+# instead of 4.0.
 inlined = nb.njit(nogil=True, cache=True, forceinline=True, **_NO_COUNTING)

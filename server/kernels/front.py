@@ -1,11 +1,13 @@
-"""The avatar's front: one level of its tree as a flat list, tested against a scene node all at once.
+"""Front of the avatar: one level of its tree as a flat list, tested against a scene node.
 
-A descent through two trees tests one pair of nodes at a time, and a branch is taken after each. The scene's tree alone
-is descended here, and each of its nodes is tested against the list of those front nodes that met its parent: 32 in a
-vector step, in the time of one or two single tests. For the figure of 3,617 points the front is its 114 leaf nodes.
+A descent of two trees tests one pair of nodes at a time and branches after each test. Here only the
+scene's tree is descended. Each of its nodes is tested against the list of those front nodes that
+met its parent: 32 in a vector step, in the time of one or two single tests. For the figure of
+3,617 points the front is its 114 leaf nodes.
 
-Indices are np.uint64 wherever a vector step is wanted: a signed index may be negative as far as LLVM knows, and then
-each lane gets an address of its own and is loaded alone (six times slower, scripts/bench_engine's `collide`).
+Indices are np.uint64 wherever vectorisation matters. LLVM assumes that a signed index may be
+negative; it then computes an address for each lane and loads each lane separately (six times
+slower, scripts/bench_engine's `collide`).
 """
 
 from typing import NamedTuple
@@ -20,20 +22,22 @@ from .layout import LANES
 from .placed import ONE_SLACK, SLACK, node_reach
 
 U = np.uint64
-# Larger avatars have a front of inner nodes. 256 are eight vector steps.
+# The front of a larger avatar consists of inner nodes. 256 are eight vector steps.
 MAX_FRONT = 256
 MOST_LEVELS = MAX_LEVELS
-# A list is written for each level that is descended, none longer than the one above.
+# One list is written for each level of the descent; none is longer than the list above it.
 POOL = MAX_FRONT * (MOST_LEVELS + 2)
-# Fills a list up to whole vector steps; so far away, and of radius 0, that no test keeps it.
+# Coordinate that pads a list to whole vector steps: so far away that, with radius 0, no test keeps
+# it.
 NOWHERE = np.float32(1e30)
 
 
 class Front(NamedTuple):
     """Lists of placed front nodes, one after another; scratch of one call.
 
-    bounds: (4, POOL) float32: x[], y[], z[] from the frame, radius[] [steps], rounded outward.  which: (POOL,) int32,
-    numbers in the front.  keep: (MAX_FRONT,) bool, and keep8: the same as uint64, eight at a time.
+    bounds: (4, POOL) float32: x[], y[], z[] from the frame, radius[] [steps], rounded outward.
+    which: (POOL,) int32, numbers in the front.
+    keep: (MAX_FRONT,) bool, marks; keep8: the same memory as uint64, eight marks each.
     """
 
     bounds: NDArray[np.float32]
@@ -44,7 +48,7 @@ class Front(NamedTuple):
 
 @nb.njit(nogil=True, cache=True)
 def make_front(avatar):
-    """Scratch for one avatar (not empty), nothing placed yet."""
+    """Allocate scratch for one avatar (not empty); nothing is placed yet."""
     which = np.empty(POOL, np.int32)
     for i in range(avatar.front.shape[1]):
         which[i] = i
@@ -54,7 +58,7 @@ def make_front(avatar):
 
 @borrowing
 def pad(bounds, begin, end):
-    """Fill places [begin, end) of the lists with nodes that no test keeps."""
+    """Fill entries [begin, end) of the lists with nodes that no test keeps."""
     for i in range(begin, end):
         bounds[0, U(i)] = NOWHERE
         bounds[1, U(i)] = np.float32(0.0)
@@ -73,7 +77,7 @@ def place_front(avatar, m, scale, placed, scene, extent, bounds):
         base = np.float64(placed.frame[r]) * step
         m0, m1, m2, shift = m[r, 0], m[r, 1], m[r, 2], placed.shift[r]
         for i in range(n):
-            # As placing.place has it.
+            # The formula of placing.place.
             world = ((m0 * front[0, i] + m1 * front[1, i]) + m2 * front[2, i]) + shift
             bounds[r, i] = np.float32((world - base) * per_step)
     for i in range(n):
@@ -84,10 +88,11 @@ def place_front(avatar, m, scale, placed, scene, extent, bounds):
 
 @inlined
 def sift(words, row, bounds, at, steps, off_x, off_y, off_z, room, keep):
-    """Mark in `keep` which nodes of a list meet the scene node `row`: the sphere, then the slab, as in `nodes_meet`.
+    """Mark in `keep` the nodes of a list that meet the scene node `row`.
 
-    at: where the list begins.  steps: how many times LANES nodes it takes.  off: from the frame to the voxel's low
-    corner.  room: reach and error together. Returns whether any meets.
+    The test is that of `nodes_meet`: the sphere, then the slab.
+    at: the start of the list.  steps: its length in units of LANES nodes.  off: from the frame to
+    the voxel's low corner.  room: reach plus error. Returns whether any node meets.
     """
     w = U(row)
     cx, cy, cz = words[w] + off_x, words[w + U(1)] + off_y, words[w + U(2)] + off_z
@@ -118,7 +123,7 @@ def sift(words, row, bounds, at, steps, off_x, off_y, off_z, room, keep):
 
 @inlined
 def take_kept(bounds, which, keep, keep8, at, steps, to):
-    """Write the nodes of the list at `at` that are marked as a new list at `to`. Returns its length."""
+    """Write the marked nodes of the list at `at` as a new list at `to`. Returns its length."""
     n = U(to)
     for eight in range(4 * steps):
         if keep8[U(eight)] == U(0):

@@ -1,7 +1,7 @@
-"""The points of two leaf nodes against each other, all LANES of a block in a vector step; float32, for `closest.py`.
+"""Distances between the points of two leaf nodes, all LANES of a block in one vector step; float32.
 
-Points of the avatar are placed, from the frame or the block's low corner; those of the scene are whole steps from the
-low corner of their block.
+closest.py uses these functions. Avatar points are placed: their coordinates are relative to the
+frame or to the block's low corner. Scene points are whole steps from the low corner of their block.
 """
 
 import numpy as np
@@ -15,9 +15,9 @@ U = np.uint64  # see front.py
 
 @inlined
 def keep_near(lanes, block, words, row, off_x, off_y, off_z, cut, keep):
-    """Which points of an avatar's block (LANES) may be within `cut` [steps] of a scene node; writes keep (LANES,).
+    """Mark the points of an avatar's block that may be within `cut` [steps] of a scene node.
 
-    Returns whether any may.
+    Writes keep (LANES,). Returns whether any point is marked.
     """
     at = U(row)
     cx, cy, cz = words[at] + off_x, words[at + U(1)] + off_y, words[at + U(2)] + off_z
@@ -39,8 +39,12 @@ def keep_near(lanes, block, words, row, off_x, off_y, off_z, cut, keep):
 
 @borrowing
 def any_near(halves, lane_at, x, y, z, far):
-    """Whether any of a scene block's points is within a square of a point, both from the block's low corner."""
-    # Unsigned: an index that may be negative, as numba sees it, is not vectorised, 70 ns for 32 lanes and not 5.
+    """Return whether any point of a scene block has a squared distance of at most `far` to a point.
+
+    x, y, z, and the block's points: relative to the block's low corner.
+    """
+    # Unsigned: numba does not vectorise an index that may be negative (70 ns instead of 5 for 32
+    # lanes).
     at_x = U(lane_at)
     at_y, at_z = at_x + U(LANES), at_x + U(2 * LANES)
     near = False
@@ -54,7 +58,7 @@ def any_near(halves, lane_at, x, y, z, far):
 
 @borrowing
 def list_squares(halves, lane_at, x, y, z, squares):
-    """The squares (LANES,) of the distances of a scene block's points to a point."""
+    """Write the squared distances (LANES,) of a scene block's points to a point."""
     at_x = U(lane_at)
     at_y, at_z = at_x + U(LANES), at_x + U(2 * LANES)
     for lane in range(LANES):
@@ -66,10 +70,11 @@ def list_squares(halves, lane_at, x, y, z, squares):
 
 @inlined
 def keep_in_box(halves, lane_at, low_x, low_y, low_z, lanes, block, far, keep):
-    """Unmark, of the marked points of an avatar's block, those that the box of a scene's block alone shows to be beyond
-    `far`, a square; arguments as of `least_squares`.
+    """Unmark the points of an avatar's block that are beyond `far` from a scene block's box.
 
-    Nothing is added for rounding: it is monotonic, so each difference here is no larger than those of the points.
+    far: a squared distance. Other arguments as for `least_squares`.
+    No slack is added for rounding: rounding is monotonic, therefore each difference computed here
+    is no larger than those of the points.
     """
     h, b = U(lane_at), U(block)
     high_x, high_y, high_z = np.int32(0), np.int32(0), np.int32(0)
@@ -90,9 +95,10 @@ def keep_in_box(halves, lane_at, low_x, low_y, low_z, lanes, block, far, keep):
 
 @inlined
 def least_squares(halves, lane_at, low_x, low_y, low_z, lanes, block, keep, keep8, squares):
-    """The least square of the distances of each marked point of an avatar's block to a scene's block; writes squares.
+    """Compute the least squared distance of each marked point of an avatar to a scene block.
 
-    lane_at: the scene's block in `halves`; low: its corner from the frame. Returns (least of all, points tested).
+    lane_at: the scene block in `halves`.  low: its corner, relative to the frame. Writes squares.
+    Returns (least of all, points tested).
     """
     h, b = U(lane_at), U(block)
     best, tested = np.float32(np.inf), 0
@@ -104,8 +110,8 @@ def least_squares(halves, lane_at, low_x, low_y, low_z, lanes, block, keep, keep
                 continue
             tested += 1
             x, y, z = lanes[b, 0, U(lane)] - low_x, lanes[b, 1, U(lane)] - low_y, lanes[b, 2, U(lane)] - low_z
-            # The bits of numbers that are not negative are in the order of the numbers, and the least of integers is
-            # taken in vector steps, where that of floats is not: there may be a NaN, as far as LLVM knows.
+            # The bits of non-negative floats sort like the numbers. The minimum of integers is
+            # vectorised; that of floats is not, because LLVM must allow for a NaN.
             least = np.int32(0x7F800000)
             for j in range(LANES):
                 i = h + U(j)

@@ -1,14 +1,16 @@
-"""The nearest pair of two bounding sphere hierarchies under a pose: [Fig12] figures 5 and 6, made to measure.
+"""Nearest pair of two bounding sphere hierarchies under a pose, after [Fig12] figures 5 and 6.
 
-Branch and bound, with the best pair so far as the bound: the scene's tree is descended with a list of those nodes of
-the avatar's front that may hold a nearer pair, as overlap.py does with the reach for a bound. Nothing is left alone but
-what its lower bound, less what float32 may have lost, puts above the best, a node by the radius class of the largest
-sphere below it. closest.py says what nearest means, and has what is done with points.
+This is branch and bound, with the best pair so far as the bound. The scene's tree is descended with
+a list of those nodes of the avatar's front that may hold a nearer pair, as in overlap.py, where the
+reach is the bound. A node is pruned only if its lower bound, minus the largest float32 error,
+exceeds the best; the radius class of the largest sphere below a node sets its bound. closest.py
+defines nearest and handles the points.
 
-The first bound is a narrow one, and is widened where nothing is found within it. That comes to as many node visits as
-though the distance had been known beforehand and a tenth more. One way down both trees, the nearest child each time,
-is no way to a first bound: it ended ten times as far as the nearest pair, and the search took twice as long; so did
-children in the order of their bounds, which are all alike over a floor, a tenth longer than in the order they come in.
+The first bound is narrow and is widened while nothing is found within it. This costs a tenth more
+node visits than knowing the distance beforehand. Two alternatives are slower. A single descent of
+both trees, taking the nearest child each time, gives a poor first bound: it ended ten times as far
+as the nearest pair, and the search took twice as long. Visiting children in the order of their
+bounds, which are nearly equal over a floor, took a tenth longer than visiting them in stored order.
 (scripts/bench_engine, distance on the walk.)
 """
 
@@ -33,9 +35,10 @@ U = np.uint64  # see front.py
 
 
 class Descent(NamedTuple):
-    """Scratch of one call, beside `Best`.
+    """Scratch of one call, in addition to `Best`.
 
-    stack: (STACK, 3) int64, scene nodes to look into: row, where its list of front nodes begins, length.
+    stack: (STACK, 3) int64, scene nodes still to examine: row, start of the list of front nodes,
+    length.
     below: (STACK,) int64, avatar nodes below its front; keys: (STACK,) float32, their lower bounds.
     off: (3,) float32, from the frame to the voxel's low corner.
     """
@@ -48,7 +51,7 @@ class Descent(NamedTuple):
 
 @nb.njit(nogil=True, cache=True)
 def make_descent():
-    """Scratch."""
+    """Allocate the scratch."""
     return Descent(
         np.empty((STACK, 3), np.int64),
         np.empty(STACK, np.int64),
@@ -59,14 +62,15 @@ def make_descent():
 
 @borrowing
 def place_all(avatar, m, scale, placed, scene, bounds):
-    """Place an avatar: its root and what is below its front into placed.nodes, the front as the first list of `bounds`.
+    """Place an avatar: root and nodes below its front into placed.nodes, the front in `bounds`.
 
-    Fills placed.frame and shift. Returns (extent, farthest) for `make_limits` and the length of the list.
+    The front becomes the first list of `bounds`. Fills placed.frame and shift. Returns (extent,
+    farthest) for `make_limits` and the length of the list.
     """
     extent, farthest = place_root(avatar, m, scale, placed, scene)
     count = place_front(avatar, m, scale, placed, scene, extent, bounds)
     if avatar.first[avatar.front_first] < 0:
-        return extent, farthest, count  # nothing is below but points
+        return extent, farthest, count  # only points are below
     center, radius, nodes, shift = avatar.center, avatar.radius, placed.nodes, placed.shift
     per_step = 1.0 / scene.step
     for a in range(avatar.front_first, center.shape[0]):
@@ -79,8 +83,7 @@ def place_all(avatar, m, scale, placed, scene, bounds):
 
 @inlined
 def _search_leaves(m, a, row, avatar, placed, scene, spot, best, off):
-    """Take up what is nearer than the best of the points of an avatar's leaf node that are marked and those of a
-    scene's leaf node."""
+    """Update the best pair from an avatar's leaf node (its marked points) and a scene's."""
     ints, lanes, keep, block = scene.ints, placed.lanes, best.keep, ~np.int64(avatar.first[U(a)])
     for lane in range(avatar.count[U(a)], LANES):
         keep[U(lane)] = False  # repeats the last point
@@ -104,7 +107,7 @@ def _search_leaves(m, a, row, avatar, placed, scene, spot, best, off):
 
 @borrowing
 def _push(below, keys, begin, depth, a, key):
-    """Put a node into below[begin:depth], which descends by key; the least lies on top."""
+    """Insert a node into below[begin:depth], sorted by descending key; the least key is on top."""
     at = depth
     while at > begin and keys[at - 1] < key:
         below[at], keys[at] = below[at - 1], keys[at - 1]
@@ -114,8 +117,11 @@ def _push(below, keys, begin, depth, a, key):
 
 @borrowing
 def _search_below(avatar, m, pose, a, row, placed, scene, spot, best, descent):
-    """Search a leaf node of the scene for a point nearer to one below a node of the avatar's front, which is descended,
-    depth first, the nearest child first. For avatars whose front is not their leaf nodes."""
+    """Search a scene leaf node for a point nearer to a point below a node of the avatar's front.
+
+    The avatar's node is descended depth first, the nearest child first. This is for avatars whose
+    front is not their leaf nodes.
+    """
     words, nodes, firsts, held = scene.words, placed.nodes, avatar.first, avatar.count
     below, keys, off, cut = descent.below, descent.keys, descent.off, best.cut
     of_class = node_class(scene.ints, row, best.mask)
@@ -149,8 +155,11 @@ def _search_below(avatar, m, pose, a, row, placed, scene, spot, best, descent):
 
 @borrowing
 def node_near(words, row, x, y, z, span):
-    """Whether a scene node may hold a point within `span` of a place (float32, from the voxel's low corner), the error
-    included: the sphere, then the slab, as in `nodes_meet`."""
+    """Return whether a scene node may hold a point within `span` of a position.
+
+    x, y, z: float32, relative to the voxel's low corner. span: includes the error. Tests the
+    sphere, then the slab, as in `nodes_meet`.
+    """
     w = U(row)
     dx, dy, dz = x - words[w], y - words[w + U(1)], z - words[w + U(2)]
     both = words[w + U(3)] + span
@@ -165,7 +174,10 @@ def node_near(words, row, x, y, z, span):
 
 @borrowing
 def _nearest_voxel(avatar, m, pose, placed, scene, voxel, front, count, descent, best):
-    """Search one resident voxel for a nearer pair; a descent as overlap.py has it, and as long for the same reason."""
+    """Search one resident voxel for a nearer pair.
+
+    The descent is that of overlap.py, and the function is long for the same reason.
+    """
     words, ints = scene.words, scene.ints
     nodes, lanes, stamp = placed.nodes, placed.lanes, placed.stamp
     cut, keep, counters, corner, off = best.cut, best.keep, best.counters, best.corner, descent.off
@@ -220,7 +232,7 @@ def _nearest_voxel(avatar, m, pose, placed, scene, voxel, front, count, descent,
                         continue
                     move_node(bounds, which, U(i), U(left))
                     left += 1
-                if left == at:  # always so at a leaf
+                if left == at:  # always true at a leaf
                     continue
                 pad(bounds, left, at + (count + LANES - 1) // LANES * LANES)
                 count = left - at
@@ -237,16 +249,17 @@ def _nearest_voxel(avatar, m, pose, placed, scene, voxel, front, count, descent,
 
 @borrowing
 def box_gap(root, placed, farthest, scene, index, voxel):
-    """How far the avatar's centres are from all points of a voxel at least [steps], from the index; not below 0.
+    """Return a lower bound of the distance of the avatar's centres from a voxel's points.
 
-    root: radius of the avatar's root sphere, scaled [m].  farthest: of `place_nodes`.
+    In steps, at least 0, from the index alone.  root: radius of the avatar's root sphere, scaled
+    [m].  farthest: of `place_nodes`.
     """
     square = 0.0
     for r in range(3):
         center = placed.frame[r]  # the root's centre, to half a step an axis
         gap = np.float64(max(index.low[voxel, r] - center, center - index.high[voxel, r], 0))
         square += gap * gap
-    # One step for the frame's rounding; for the others see `make_limits`.
+    # One step for the frame's rounding; for the other terms see `make_limits`.
     error = 1.0 + 2.0 / scene.units_per_step + farthest * 2.0**-46
     return max(math.sqrt(square) * (1.0 - 1e-9) - root / scene.step * (1.0 + 1e-9) - error, 0.0)
 
@@ -255,17 +268,19 @@ def box_gap(root, placed, farthest, scene, index, voxel):
 def _widen(
     m, pose, avatar, placed, scene, reach, beyond, first, last, front, count, descent, best, gaps, classes
 ):
-    """Search the voxels reach.rows[first:last] for the nearest pair, within ever wider bounds until there is one.
+    """Search the voxels reach.rows[first:last] for the nearest pair, within widening bounds.
 
-    Where nothing is near, to have looked for it costs little: nearly all nodes are far, too.
-    gaps: of each voxel, see `box_gap`; inf: not resident.  classes: of their root nodes.
+    The bounds widen until a pair is found. A search that finds nothing costs little: nearly all
+    nodes are far.
+    gaps: for each voxel, see `box_gap`; inf: not resident.  classes: of their root nodes.
     """
     units, found, drop, cut = best.units, best.found, best.drop, best.cut
-    # No sphere here is larger than the largest by a model, less this.
+    # Under the radius model, no sphere here is larger than the largest minus this.
     base = drop[classes[0]]
     for other in range(1, last - first):
         base = min(base, drop[classes[other]])
-    # Twice the radii: a distance of the size of the spheres. Of spheres without size, a share of the reach.
+    # Twice the radii: a distance of the size of the spheres. For spheres of radius 0, a share of
+    # the reach.
     near = max(2 * (units[0] - base - beyond), (units[0] - base) >> 6, 1)
     while True:
         limit = units[0]
@@ -275,7 +290,7 @@ def _widen(
         units[1] = bound
         set_cut(cut, best.far, best.frame, drop, bound)
         while True:
-            # The nearest voxel first. Few are looked into, so they are not sorted.
+            # The nearest voxel first. Few are searched, therefore they are not sorted.
             at, least = -1, np.inf
             for other in range(last - first):
                 if 0.0 <= gaps[other] <= min(least, np.float64(cut[classes[other]])):
@@ -296,14 +311,15 @@ def _widen(
 
 @nb.njit(nogil=True, cache=True)
 def nearest_poses(poses, avatar, scene, index, reach, beyond, which, most_visits, nearest, counts):
-    """Answer `distance` for the poses numbered in `which`: one call a request, all its poses and voxels.
+    """Answer `distance` for the poses numbered in `which`: one call a request, with all voxels.
 
-    poses: (k, 4, 4), checked.  avatar: not empty.  reach: Reach of these poses (reach.py), to the farthest distance of
-    interest; a voxel in it that is not resident is counted as missing.  beyond: how much of it is not the radii, exact
-    units.
-    Adds to what `nearest` and counts (3, k) uint32 (voxels missing, node visits, point tests) hold, -1, inf and 0 to
-    begin with, so that a pose may be answered in pieces. Once the scene's stop flag is set, or a pose has cost more
-    than `most_visits`, what was not looked at is in `gap` as though it were missing.
+    poses: (k, 4, 4), checked.  avatar: not empty.  reach: Reach of these poses (reach.py), to the
+    largest distance requested; a voxel in it that is not resident is counted as missing.  beyond:
+    the part of the reach that is not the radii, exact units.
+    Accumulates into `nearest` and counts (3, k) uint32 (voxels missing, node visits, point tests),
+    whose initial values are -1, inf and 0. A pose may therefore be answered in pieces. Once the
+    scene's stop flag is set, or a pose has cost more than `most_visits`, voxels that were not
+    searched count in `gap` as though they were missing.
     """
     placed, best = make_placed(avatar), make_best(scene.drop)
     best.counters[3] = most_visits
@@ -322,7 +338,7 @@ def nearest_poses(poses, avatar, scene, index, reach, beyond, which, most_visits
 def _nearest_poses(
     poses, avatar, scene, index, reach, beyond, which, nearest, counts, placed, best, front, descent, gaps, classes
 ):  # fmt: skip
-    """`nearest_poses`, with its scratch."""
+    """Implement `nearest_poses` with its scratch passed in."""
     for number in range(which.shape[0]):
         i = which[number]
         first, last = reach.starts[i], reach.starts[i + 1]
@@ -355,7 +371,7 @@ def _nearest_poses(
             poses[i], i, avatar, placed, scene, reach, beyond, first, last, front, count, descent, best, gaps, classes
         )  # fmt: skip
         if is_over(scene.stop, best.counters[0], best.counters[3]):
-            # The gap of no voxel is below 0; any of them may be looked at in part.
+            # The gap of no voxel is below 0, and any of them may have been searched only in part.
             nearest.gap[i] = 0.0
         nearest.square[i] = best.found[0]
         for r in range(6):

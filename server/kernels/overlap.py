@@ -1,17 +1,19 @@
-"""Do two bounding sphere hierarchies touch under a pose? [Fig12] section 6, figures 5 and 6, corrected.
+"""Contact of two bounding sphere hierarchies under a pose: [Fig12] section 6, corrected.
 
-As printed, the figures descend into "all children A[i] and B[j]" when A is a leaf and B is not: a leaf has no
-children, the loop runs zero times, and the contact is lost. Here an inner node is descended, whichever side it is on,
-and a leaf never is.
+As printed, figures 5 and 6 descend into "all children A[i] and B[j]" when A is a leaf and B is not:
+a leaf has no children, the loop runs zero times, and the contact is lost. Here inner nodes are
+descended, whichever side they are on, and leaves never are.
 
-The scene's tree is descended with the whole front of the avatar's (front.py). Where a scene node is a leaf, or flat
-compared with the avatar's leaf nodes, the avatar's points themselves are held against its bound, LANES in a vector
-step: a slab over a floor then clears a foot that stands a centimetre above it, where the foot's sphere would not.
+The scene's tree is descended with the whole front of the avatar's tree (front.py). Where a scene
+node is a leaf, or flat compared with the avatar's leaf nodes, the avatar's points themselves are
+tested against its bound, LANES in a vector step. The slab of a floor then clears a foot that stands
+a centimetre above it, while the foot's sphere would not.
 
-What decides is an inequality of integers (NUMERICS.md N5). A float32 pass finds nearly all there is to know:
-distances are in lattice steps from a lattice point near the avatar, where scene coordinates are whole numbers
-below 2^24 and so exact, and the placed avatar carries an error `error` that is added to every bound. Pairs of
-points below `near` touch, above `far` do not; only between them are the integers asked.
+An inequality of integers decides (NUMERICS.md N5). A float32 pass settles nearly all pairs. Its
+distances are in lattice steps from a lattice point near the avatar; relative to it, scene
+coordinates are integers below 2^24 and therefore exact. The placed avatar carries an error `error`,
+which is added to every bound. Pairs of points below `near` touch; pairs above `far` do not; only
+pairs between them need the integers.
 """
 
 from typing import NamedTuple
@@ -39,25 +41,29 @@ from .placing import GOOD, place
 from .reach import Reach, find_reach
 from .stopping import MOST_QUICK_VISITS, NO_LIMIT, is_over, stopped
 
-# A pair is pushed for each child of one of its nodes, so at most 15 a level stay behind on the stack: this holds
-# two trees of MOST_LEVELS.
+# A pair is pushed for each child of one of its nodes: at most 15 a level stay behind on the stack.
+# This size holds two trees of MOST_LEVELS.
 STACK = 2 * MOST_LEVELS * 15 + 16
 CLEAR, CONTACT, UNKNOWN = 0, 1, 2  # schemas/answers.py Verdict
 
 U = np.uint64  # see front.py
-# A scene node whose slab is thinner than this many radii of an avatar's leaf node is called flat: the avatar's points
-# are tested against it at once. 0.5 to 2 take the same time on the walk, 8 takes a fifth more.
+# A scene node is called flat if its slab is thinner than this many radii of an avatar's leaf node;
+# the avatar's points are then tested against it at once. Values from 0.5 to 2 take the same time on
+# the walk; 8 takes a fifth more.
 FLAT = np.float32(1.0)
-# Scene nodes of more than this many radii of the avatar's root are met by most of its front: the root alone is tested.
+# Most of the avatar's front meets a scene node of more than this many radii of the avatar's root;
+# only the root is tested against it.
 BROAD = np.float32(2.0)
 
 
 class Work(NamedTuple):
-    """Scratch of one call. stack: (STACK, 3) int64: scene row, where its list begins, length.
+    """Scratch of one call.
 
+    stack: (STACK, 3) int64: scene row, start of its list, length.
     below: (STACK,) int64: avatar nodes below its front; one element where the front is leaf nodes.
-    keep: (LANES,) bool, and keep8: the same as uint64, eight at a time.  counters: (3,) int64, visits, point tests, and
-    the most visits of a pose, beyond which its search ends.
+    keep: (LANES,) bool, marks; keep8: the same memory as uint64, eight marks each.
+    counters: (3,) int64, node visits, point tests, and the largest number of visits of a pose,
+    beyond which its search ends.
     """
 
     stack: NDArray[np.int64]
@@ -68,7 +74,11 @@ class Work(NamedTuple):
 
 
 class Spot(NamedTuple):
-    """Where the arena holds one voxel: its first row, block and lane, and float32 offsets from the frame."""
+    """Location of one voxel.
+
+    rows, blocks, lanes: its first row, block and lane in the arena.
+    x, y, z: its low corner relative to the frame, float32.
+    """
 
     rows: int
     blocks: int
@@ -80,7 +90,7 @@ class Spot(NamedTuple):
 
 @nb.njit(nogil=True, cache=True)
 def make_work(avatar):
-    """Scratch for one avatar (not empty)."""
+    """Allocate scratch for one avatar (not empty)."""
     below = STACK if avatar.first[avatar.front_first] >= 0 else 1
     keep = np.zeros(LANES, np.bool_)
     stack, counters = np.empty((STACK, 3), np.int64), np.zeros(3, np.int64)
@@ -90,16 +100,20 @@ def make_work(avatar):
 
 @borrowing
 def nodes_meet(words, row, x, y, z, radius, room):
-    """Whether a sphere (float32, from the voxel's low corner) comes within `room`, reach and error together, of a
-    node's points, as far as its bound can tell: the sphere test of [Fig12] line 2, then the slab."""
+    """Return whether a sphere may come within `room` of a node's points, by the node's bounds.
+
+    x, y, z: float32, relative to the voxel's low corner.  room: reach plus error. Tests the sphere
+    as in [Fig12] line 2, then the slab.
+    """
     w = U(row)
     dx, dy, dz = x - words[w], y - words[w + U(1)], z - words[w + U(2)]
     span = radius + room
     both = words[w + U(3)] + span
     along = words[w + U(4)] * dx + words[w + U(5)] * dy + words[w + U(6)] * dz
-    # Beyond `both` the sphere has answered, so rounding of `along` is SLACK of that at most.
+    # The sphere test decides beyond `both`; the rounding of `along` is therefore at most SLACK of
+    # it.
     wide = words[w + U(7)] * (span + SLACK * both + SLACK * both)
-    # One branch on all three costs less than three that are hard to foresee.
+    # One branch on all three costs less than three branches that are hard to predict.
     return (
         (dx * dx + dy * dy + dz * dz <= both * both * ONE_SLACK)
         & (along <= words[w + U(9)] + wide)
@@ -109,8 +123,11 @@ def nodes_meet(words, row, x, y, z, radius, room):
 
 @inlined
 def lanes_meet(words, row, lanes, block, off_x, off_y, off_z, room, keep):
-    """Mark in `keep` which points of an avatar's block (from the frame) come within `room`, reach and error together,
-    of the bound of the scene node `row`. Returns whether any does."""
+    """Mark in `keep` the points of an avatar's block that come within `room` of the bounds of a node.
+
+    lanes: relative to the frame.  room: reach plus error.  row: a scene node. Returns whether any
+    point is marked.
+    """
     w = U(row)
     cx, cy, cz = words[w] + off_x, words[w + U(1)] + off_y, words[w + U(2)] + off_z
     nx, ny, nz = words[w + U(4)], words[w + U(5)], words[w + U(6)]
@@ -131,10 +148,11 @@ def lanes_meet(words, row, lanes, block, off_x, off_y, off_z, room, keep):
 
 @borrowing
 def next_near(halves, lane_at, low_x, low_y, low_z, lanes, block, far, keep, keep8, begin):
-    """The first marked point, from `begin` on, of an avatar's block that may be near a point of a scene's block.
+    """Find the first marked point, from `begin` on, that may be near a point of a scene block.
 
-    lane_at: the scene's block in `halves`; low: its corner from the frame.  far: a square, see `Limits`.
-    Returns (lane or -1, how many were tested against the block).
+    The points are those of an avatar's block.  lane_at: the scene block in `halves`.  low: its
+    corner, relative to the frame.  far: a square, see `Limits`. Returns (lane or -1, number of
+    points tested against the block).
     """
     h, b = U(lane_at), U(block)
     tested = 0
@@ -160,7 +178,7 @@ def next_near(halves, lane_at, low_x, low_y, low_z, lanes, block, far, keep, kee
 
 @borrowing
 def leaves_touch(avatar, m, block, placed, scene, voxel, spot, row, by_class, work):
-    """Whether a marked point of an avatar's block touches a point of the scene's leaf node `row`."""
+    """Return whether a marked point of an avatar's block touches a point of scene leaf node `row`."""
     halves, lanes, ints, mask = scene.halves, placed.lanes, scene.ints, by_class.mask
     number = ~np.int64(ints[U(row + FIRST)])
     block_at = spot.blocks + number * scene.block_words
@@ -168,7 +186,7 @@ def leaves_touch(avatar, m, block, placed, scene, voxel, spot, row, by_class, wo
     low_x = spot.x + np.float32(ints[U(block_at)])
     low_y = spot.y + np.float32(ints[U(block_at + 1)])
     low_z = spot.z + np.float32(ints[U(block_at + 2)])
-    far = by_class.far[node_class(ints, row, mask)]  # of the largest sphere in the block
+    far = by_class.far[node_class(ints, row, mask)]  # for the largest sphere in the block
     begin = 0
     while begin < LANES:
         lane, tested = next_near(
@@ -207,8 +225,11 @@ def _block_placed(avatar, m, pose, block, placed, scene):
 
 @borrowing
 def _below_touches(avatar, m, scale, extent, pose, placed, scene, voxel, spot, a, row, by_class, work):
-    """Whether a leaf node of the scene holds a point in contact with one below a node of the avatar's front, which is
-    descended, depth first. For avatars whose front is not their leaf nodes."""
+    """Return whether a point of a scene leaf node touches a point below an avatar's front node.
+
+    The avatar's node is descended depth first. This is for avatars whose front is not their leaf
+    nodes.
+    """
     words, below = scene.words, work.below
     room = by_class.room[node_class(scene.ints, row, by_class.mask)]
     steps = scale / scene.step
@@ -238,7 +259,7 @@ def _below_touches(avatar, m, scale, extent, pose, placed, scene, voxel, spot, a
 
 @borrowing
 def _place_node(avatar, m, a, placed, scene):
-    """Place one node of the avatar: x, y, z from the frame [steps], float32."""
+    """Place one node of the avatar: return x, y, z from the frame [steps], float32."""
     per_step = 1.0 / scene.step
     x, y, z = avatar.center[a, 0], avatar.center[a, 1], avatar.center[a, 2]
     return (
@@ -256,11 +277,12 @@ def _place_node(avatar, m, a, placed, scene):
 
 @borrowing
 def _overlap_voxel(avatar, m, scale, extent, pose, placed, scene, voxel, spot, by_class, front, count, work):
-    """Whether the placed avatar touches one resident voxel, whose root it meets: the scene's tree descended, depth
-    first, each node with a list of those front nodes that met its parent.
+    """Return whether the placed avatar touches one resident voxel, whose root it meets.
 
-    Long, because each of its inner steps takes some ten nanoseconds: a call that hands over tuples of arrays, or takes
-    arrays out of them, costs as much again (all of them in functions: 11 us a pose instead of 4).
+    The scene's tree is descended depth first, each node with a list of those front nodes that met
+    its parent. The function is long because each of its inner steps takes some ten nanoseconds: a
+    call that passes tuples of arrays, or takes arrays out of them, costs the same again (11 us a
+    pose instead of 4 with each step in a function).
     """
     words, ints, stack, counters = scene.words, scene.ints, work.stack, work.counters
     bounds, which, nodes, lanes, stamp = front.bounds, front.which, placed.nodes, placed.lanes, placed.stamp
@@ -306,7 +328,7 @@ def _overlap_voxel(avatar, m, scale, extent, pose, placed, scene, voxel, spot, b
                                 avatar, m, block, placed, scene, voxel, spot, row, by_class, work
                             ):
                                 return True
-                            if stopped(stop):  # as many blocks as the front has may take milliseconds
+                            if stopped(stop):  # the blocks of a whole front may take milliseconds
                                 return False
                             continue
                     elif first < 0:
@@ -317,7 +339,7 @@ def _overlap_voxel(avatar, m, scale, extent, pose, placed, scene, voxel, spot, b
                         continue
                     move_node(bounds, which, U(i), U(left))
                     left += 1
-                if left == at:  # always so at a leaf
+                if left == at:  # always true at a leaf
                     continue
                 pad(bounds, left, at + (count + LANES - 1) // LANES * LANES)
                 count = left - at
@@ -337,7 +359,7 @@ def _overlap_voxel(avatar, m, scale, extent, pose, placed, scene, voxel, spot, b
 
 @borrowing
 def make_spot(scene, voxel, placed):
-    """Where a resident voxel is, from the arena's start and from the frame."""
+    """Locate a resident voxel in the arena and relative to the frame."""
     coordinates, where, frame = scene.coordinates, scene.where, placed.frame
     return Spot(
         where[voxel, 0],
@@ -351,14 +373,16 @@ def make_spot(scene, voxel, placed):
 
 @nb.njit(nogil=True, cache=True)
 def overlap_poses(poses, avatar, scene, reach, which, most, verdict, counts):
-    """Answer `collide` for the poses numbered in `which`: one call a request, all its poses and voxels.
+    """Answer `collide` for the poses numbered in `which`: one call a request, with all voxels.
 
-    poses: (k, 4, 4), checked.  avatar: not empty.  reach: Reach of these poses (reach.py); a voxel in it that is not
-    resident is counted as missing.  most: node visits of a pose, beyond which its search ends.
-    Adds to what verdict (k,) uint8 and counts (3, k) uint32 (voxels missing, node visits, point tests) hold, CLEAR
-    and 0 to begin with, so that a pose may be answered in pieces: a contact wins over anything missing, and
-    that over CLEAR. Once the scene's stop flag is set, poses without a contact so far become UNKNOWN; so does a pose
-    whose search ends.
+    poses: (k, 4, 4), checked.  avatar: not empty.  reach: Reach of these poses (reach.py); a voxel
+    in it that is not resident is counted as missing.  most: node visits of a pose, beyond which its
+    search ends.
+    Accumulates into verdict (k,) uint8 and counts (3, k) uint32 (voxels missing, node visits, point
+    tests), whose initial values are CLEAR and 0. A pose may therefore be answered in pieces: a
+    contact overrides a missing voxel, and a missing voxel overrides CLEAR. Once the scene's stop
+    flag is set, poses without a contact so far become UNKNOWN; a pose whose search ends early does
+    too.
     """
     placed, front, work = make_placed(avatar), make_front(avatar), make_work(avatar)
     by_class = make_by_class(scene.drop)
@@ -368,7 +392,7 @@ def overlap_poses(poses, avatar, scene, reach, which, most, verdict, counts):
 
 @borrowing
 def _overlap_poses(poses, avatar, scene, reach, which, verdict, counts, placed, front, by_class, work):
-    """`overlap_poses`, with its scratch."""
+    """Implement `overlap_poses` with its scratch passed in."""
     nodes, ints = placed.nodes, scene.ints
     for number in range(which.shape[0]):
         i = which[number]
@@ -383,7 +407,7 @@ def _overlap_poses(poses, avatar, scene, reach, which, verdict, counts, placed, 
         set_by_class(
             by_class, scene.drop, reach.units[i], scene.units_per_step, extent, farthest, scene.voxel_steps
         )
-        count = 0  # of the front: not placed, as most far poses never need it
+        count = 0  # length of the front; not placed yet, as most far poses never need it
         for at in range(reach.starts[i], reach.starts[i + 1]):
             voxel = reach.rows[at]
             if scene.where[voxel, 0] < 0:
@@ -412,9 +436,10 @@ def _overlap_poses(poses, avatar, scene, reach, which, verdict, counts, placed, 
 
 @nb.njit(nogil=True, cache=True)
 def rows_or_undone(needed, verdict, counts):
-    """Return `needed`, the rows of a request all of whose voxels are resident; -1 where a search ended early.
+    """Return `needed`, or undo the request and return -1 where a search ended early.
 
-    Then verdict (k,) and counts (3, k) become as they were before the request.
+    needed: the rows of a request all of whose voxels are resident. Undoing resets verdict (k,) to
+    CLEAR and counts (3, k) to 0.
     """
     for i in range(verdict.shape[0]):
         if verdict[i] == UNKNOWN:  # nothing is missing: the search ended early
@@ -426,13 +451,14 @@ def rows_or_undone(needed, verdict, counts):
 
 @nb.njit(nogil=True, cache=True)
 def answer_resident(poses, avatar, radius, other_units, scene, index, rows, outside, verdict, counts):
-    """A whole request in one call, where all voxels in its reach are resident: `find_reach`, then `overlap_poses`.
+    """Answer a whole request in one call, where all voxels in its reach are resident.
 
-    Writes rows (capacity,) int64, the voxels in reach, pose by pose; outside (k,) bool; and, as `overlap_poses` does,
-    verdict and counts. The rest of `Reach` stays in here: arrays made here cost a tenth of arrays handed over.
-    Returns (fault, pose, figure found) as `check_poses` does, and how many rows; -1: not answered, for something has
-    to be loaded, the rows do not fit, or a search ended early (scene.stop, MOST_QUICK_VISITS); verdict and counts are
-    as they were.
+    This is `find_reach`, then `overlap_poses`. Writes rows (capacity,) int64, the voxels in reach,
+    pose by pose; outside (k,) bool; and verdict and counts, as `overlap_poses` does. The remaining
+    arrays of `Reach` are local: arrays created here cost a tenth of arrays passed in.
+    Returns (fault, pose, value found), as `check_poses` does, and the number of rows. -1 rows: not
+    answered, because a voxel has to be loaded, the rows do not fit, or a search ended early
+    (scene.stop, MOST_QUICK_VISITS); verdict and counts are then unchanged.
     """
     k = poses.shape[0]
     reach = Reach(

@@ -1,8 +1,9 @@
-"""An avatar under one pose, and the thresholds of one pose: what every descent through two hierarchies stands on.
+"""Avatar under one pose, and the thresholds of one pose: the basis of every descent.
 
-Distances are in lattice steps from a lattice point near the avatar, the frame, where scene coordinates are whole
-numbers below 2^24 and so exact in float32; the placed avatar carries an error that every bound adds. What float32
-cannot tell, the integers of NUMERICS.md N5 decide: `pair_square`.
+Distances are in lattice steps from the frame, a lattice point near the avatar. Relative to it,
+scene coordinates are integers below 2^24 and therefore exact in float32. The placed avatar carries
+an error, which every bound includes. Where float32 cannot decide, the integers of NUMERICS.md N5
+do: `pair_square`.
 """
 
 import math
@@ -17,16 +18,17 @@ from .layout import LANES
 from .placing import MAX_REACH_UNITS, largest_term, lattice_to_units, place, to_units
 
 U32 = 2.0**-24  # half a unit in the last place of 1, float32
-# Relative slack of a float32 test: over 16 U32, where the sums below take at most 8.
+# Relative slack of a float32 test: more than 16 U32, while the sums below need at most 8.
 SLACK = np.float32(1e-6)
 ONE_SLACK = np.float32(1.0 + 2e-6)
 
 
 class Placed(NamedTuple):
-    """An avatar under one pose, float32 steps from `frame`, a lattice point; scratch of one call.
+    """Avatar under one pose, float32 steps from `frame`, a lattice point; scratch of one call.
 
-    nodes: (4, a): x[], y[], z[], radius[], rounded outward.  lanes: (b, 3, LANES).  stamp: (b,) int64, the pose a
-    block was placed for: blocks are placed when first reached, most never are.
+    nodes: (4, a): x[], y[], z[], radius[], rounded outward.  lanes: (b, 3, LANES), points.
+    stamp: (b,) int64, the pose a block was placed for. Blocks are placed when first reached; most
+    are never reached.
     frame: (3,) int64.  shift: (3,) float64, t - O.
     """
 
@@ -38,8 +40,10 @@ class Placed(NamedTuple):
 
 
 class Limits(NamedTuple):
-    """The thresholds of one pose. reach, error: [steps], float32, rounded up.  near, far: squares, float32.
+    """Thresholds of one pose.
 
+    reach, error: [steps], float32, rounded up.  near, far: squares, float32. A pair below `near`
+    touches, a pair above `far` does not.
     units: r_a + r_b + margin, exact units, int64.
     """
 
@@ -51,10 +55,10 @@ class Limits(NamedTuple):
 
 
 class ByClass(NamedTuple):
-    """The thresholds of one pose by radius class; scratch of one call, as long as `SceneArrays.drop`.
+    """Thresholds of one pose by radius class; scratch of one call, as long as `SceneArrays.drop`.
 
-    room: reach and error together, float32 [steps].  near, far, units: as in `Limits`.  mask: one less than there are
-    classes, uint64, for `node_class` and `point_class`.
+    room: reach plus error, float32 [steps].  near, far, units: as in `Limits`.
+    mask: the number of classes minus one, uint64, for `node_class` and `point_class`.
     """
 
     room: NDArray[np.float32]
@@ -66,7 +70,7 @@ class ByClass(NamedTuple):
 
 @nb.njit(nogil=True, cache=True)
 def make_by_class(drop):
-    """Scratch for the radius classes of `SceneArrays.drop`."""
+    """Allocate scratch for the radius classes of `SceneArrays.drop`."""
     n = drop.shape[0]
     room, near, far = np.empty(n, np.float32), np.empty(n, np.float32), np.empty(n, np.float32)
     return ByClass(room, near, far, np.empty(n, np.int64), np.uint64(n - 1))
@@ -74,7 +78,10 @@ def make_by_class(drop):
 
 @borrowing
 def set_by_class(by_class, drop, units, units_per_step, extent, farthest, voxel_steps):
-    """Fill the thresholds of one pose; arguments as of `make_limits`, whose `units` are of the largest radius."""
+    """Compute the thresholds of one pose for each radius class.
+
+    Arguments as for `make_limits`; `units` is for the largest radius.
+    """
     for c in range(drop.shape[0]):
         limits = make_limits(units - drop[c], units_per_step, extent, farthest, voxel_steps)
         by_class.room[c] = limits.reach + limits.error
@@ -83,14 +90,18 @@ def set_by_class(by_class, drop, units, units_per_step, extent, farthest, voxel_
 
 @borrowing
 def make_limits(units, units_per_step, extent, farthest, voxel_steps):
-    """The thresholds for a reach of `units`.
+    """Compute the thresholds for a reach of `units`.
 
-    extent: how far placed avatar points lie from the frame.  farthest: the largest term of a placed coordinate.
-    Errors of a coordinate difference, in steps: rounding to exact units, half a unit for either point; the
-    float32 of the avatar's coordinate, U32 of its size, once from the frame and once from the voxel or block,
-    where a pair in reach is within the larger of voxel and block, and the reach (doubled, so that a pair beyond
-    cannot pass as near); float64 rounding far from the origin: 4 half units in the last place for a placed centre,
-    4 for a point below it, 1 for the frame, 1 for the lattice point, 10 * 2^-53 of the largest term.
+    extent: how far placed avatar points lie from the frame.  farthest: the largest term of a placed
+    coordinate.
+    Errors of a coordinate difference, in steps:
+    - rounding to exact units: half a unit for each of the two points;
+    - float32 of the avatar's coordinate: U32 of its size, once relative to the frame and once
+      relative to the voxel or block. There a pair in reach is within the larger of voxel and block,
+      plus the reach (doubled, so that a pair beyond reach cannot pass as near);
+    - float64 rounding far from the origin: 4 half units in the last place for a placed centre, 4
+      for a point below it, 1 for the frame, 1 for the lattice point: 10 * 2^-53 of the largest
+      term.
     """
     reach = np.float64(units) / units_per_step
     error = (
@@ -103,7 +114,7 @@ def make_limits(units, units_per_step, extent, farthest, voxel_steps):
     above = reach * (1.0 + 2.0 * U32) + around
     near = np.float32(below * below * (1.0 - 8.0 * U32))
     far = np.float32(above * above * (1.0 + 8.0 * U32))
-    # One float32 step outward covers the narrowing just done; at 0 nothing is certified near.
+    # One float32 step outward covers the rounding to float32. At 0, nothing is certified near.
     near = np.nextafter(near, np.float32(-1.0)) if below > 0.0 else np.float32(-1.0)
     return Limits(
         np.nextafter(np.float32(reach), np.float32(np.inf)),
@@ -116,7 +127,7 @@ def make_limits(units, units_per_step, extent, farthest, voxel_steps):
 
 @borrowing
 def place_root(avatar, m, scale, placed, scene):
-    """Choose the frame and place an avatar's root; fills placed.frame, shift and node 0.
+    """Choose the frame and place an avatar's root; fill placed.frame, shift and node 0.
 
     Returns (extent, farthest) for `make_limits`, of the whole avatar.
     """
@@ -134,16 +145,20 @@ def place_root(avatar, m, scale, placed, scene):
 
 @borrowing
 def node_reach(radius, steps, extent):
-    """The radius [steps] of a placed node, rounded outward. steps: lattice steps a metre of the avatar.
+    """Return the radius [steps] of a placed node, rounded outward.
 
-    1e-6: the float32 centre is off by at most U32 of `extent`, and the radius by U32 of itself.
+    steps: lattice steps a metre of the avatar. The slack of 1e-6 covers the float32 centre, which
+    is off by at most U32 of `extent`, and the radius, off by U32 of itself.
     """
     return np.float32(radius * steps * (1.0 + 1e-6) + extent * 1e-6)
 
 
 @borrowing
 def place_nodes(avatar, m, scale, placed, scene):
-    """Place all of an avatar's nodes; fills placed.frame, shift and nodes. Returns as `place_root` does."""
+    """Place all nodes of an avatar; fill placed.frame, shift and nodes.
+
+    Returns (extent, farthest), as `place_root` does.
+    """
     extent, farthest = place_root(avatar, m, scale, placed, scene)
     step = scene.step
     per_step = 1.0 / step
@@ -166,7 +181,10 @@ def place_block(avatar, m, block, placed, scene):
 
 @borrowing
 def place_lanes(points, m, block, lanes, shift, frame, step):
-    """`place_block` with the arrays themselves: to hand over three tuples of arrays takes as long as the work."""
+    """Place the points of one leaf node, given the arrays themselves.
+
+    Passing three tuples of arrays, as `place_block` does, takes as long as the work itself.
+    """
     per_step = 1.0 / step
     b = np.uint64(block)
     for r in range(3):
@@ -174,14 +192,14 @@ def place_lanes(points, m, block, lanes, shift, frame, step):
         m0, m1, m2, along = m[r, 0], m[r, 1], m[r, 2], shift[r]
         for lane in range(LANES):
             j = np.uint64(lane)
-            # As placing.place has it.
+            # The formula of placing.place.
             world = ((m0 * points[b, 0, j] + m1 * points[b, 1, j]) + m2 * points[b, 2, j]) + along
             lanes[b, r, j] = np.float32((world - base) * per_step)
 
 
 @nb.njit(nogil=True, cache=True)
 def make_placed(avatar):
-    """Scratch for one avatar (not empty), nothing placed yet."""
+    """Allocate scratch for one avatar (not empty); nothing is placed yet."""
     blocks = avatar.points.shape[0]
     return Placed(
         np.empty((4, avatar.center.shape[0]), np.float32),
@@ -194,10 +212,12 @@ def make_placed(avatar):
 
 @borrowing
 def pair_square(avatar, m, block, lane, placed, scene, voxel, lane_at, block_at, j):
-    """The definition (NUMERICS.md N5): |a - b|^2 of one pair in integers, exact units, int64.
+    """Compute |a - b|^2 of one pair by the definition (NUMERICS.md N5), int64, exact units.
 
-    block, lane: of the avatar's point.  block_at, lane_at, j: of the scan's point in `voxel`, see layout.py.
-    -1 where they are farther apart along an axis than any reach, MAX_REACH_UNITS, so that squares fit 63 bits.
+    block, lane: of the avatar's point.  block_at, lane_at, j: of the scan's point in `voxel`, see
+    layout.py.
+    Returns -1 where the points are farther apart along an axis than any reach, MAX_REACH_UNITS;
+    squares therefore fit 63 bits.
     """
     square = np.int64(0)
     points = avatar.points
@@ -216,6 +236,6 @@ def pair_square(avatar, m, block, lane, placed, scene, voxel, lane_at, block_at,
 
 @borrowing
 def pair_in_reach(avatar, m, block, lane, placed, scene, voxel, lane_at, block_at, j, units):
-    """Whether one pair is within `units`, tangency included."""
+    """Return whether one pair is within `units`, tangency included."""
     square = pair_square(avatar, m, block, lane, placed, scene, voxel, lane_at, block_at, j)
     return square >= 0 and square <= units * units

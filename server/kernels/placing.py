@@ -1,7 +1,8 @@
-"""Poses: what is admitted, and where a pose puts a point. The one formula of NUMERICS.md N5.
+"""Poses: which ones are valid, and where a pose places a point. The one formula of NUMERICS.md N5.
 
-A placed coordinate is ((r0 p0 + r1 p1) + r2 p2) + (t - O), float64, in this order, no contraction; times 2^26
-(exact) and rounded half to even it is the integer that decides. Compiled and interpreted agree bit for bit.
+A placed coordinate is ((r0 p0 + r1 p1) + r2 p2) + (t - O), float64, in this order, without
+contraction. Multiplied by 2^26 (exact) and rounded half to even, it is the integer that decides.
+Compiled and interpreted code agree bit for bit.
 """
 
 import math
@@ -14,13 +15,13 @@ from ...schemas.voxel_grid import MAX_COORDINATE, UNITS_PER_METRE
 from .compiled import borrowing
 from .stopping import stopped
 
-# Poses checked between two looks at the stop flag.
+# Poses checked between two checks of the stop flag.
 POSES_AT_ONCE = 64
 
 SIMILARITY_TOLERANCE = 1e-9  # NUMERICS.md N6
 SMALLEST_SCALE, LARGEST_SCALE = 1e-3, 1e3
 
-# Reach is compared in exact units whose squares must fit 63 bits (NUMERICS.md N5): 16 m.
+# Distances are compared in exact units whose squares must fit 63 bits (NUMERICS.md N5): 16 m.
 MAX_REACH_UNITS = 1 << 30
 # Coordinates near a pose must be exact in float32, with a bit to spare (overlap.py).
 MAX_FRAME_STEPS = 1 << 23
@@ -29,12 +30,14 @@ GOOD, NOT_FINITE, BAD_LAST_ROW, MIRRORED, SHEARED, BAD_SCALE, TOO_FAR, LONG_REAC
 
 
 class Avatar(NamedTuple):
-    """An avatar's BSH as the kernels read it; a nodes, b leaf nodes.
+    """BSH of an avatar as the kernels read it; a nodes, b leaf nodes.
 
-    center: (a, 3), radius: (a,) float64, avatar frame [m], rounded outward.  first: (a,) int32, first child, or
-    ~block for a leaf node.  count: (a,) int32, children or points.  points: (b, 3, LANES) float64 [m], as given
-    by the client, the last one repeated.
-    front: (4, f) float64, x[], y[], z[], radius[] of a level of the tree, see front.py.  front_first: its first node.
+    center: (a, 3), radius: (a,) float64, avatar frame [m], rounded outward.
+    first: (a,) int32, first child, or ~block for a leaf node.  count: (a,) int32, children or
+    points.
+    points: (b, 3, LANES) float64 [m], as the client sent them, the last one repeated.
+    front: (4, f) float64, x[], y[], z[], radius[] of one level of the tree, see front.py.
+    front_first: its first node.
     """
 
     center: NDArray[np.float64]
@@ -48,13 +51,16 @@ class Avatar(NamedTuple):
 
 @borrowing
 def check_poses(poses, node_radius, radius, other_units, scene, scales, units):
-    """Check poses (k, 4, 4) float64 to be similarities (N6), writing scales (k,) and reaches units (k,) int64.
+    """Check that poses (k, 4, 4) float64 are similarities (N6); compute scales and reaches.
 
-    node_radius: (a,) of the avatar's nodes, root first, may be empty; radius: of its points [m].  other_units: the
-    scan's radius and the margin, exact units.  scene: SceneArrays.
-    A scale within SIMILARITY_TOLERANCE of 1 is 1, so that the rounding of a rigid pose changes no radius.
-    Returns (GOOD, 0, 0.0), or the first fault, its pose and the figure found. Once scene.stop is set it is (GOOD, 0,
-    0.0) too, and not all is written: whoever has a stop flag looks at it then.
+    Writes scales (k,) and units (k,) int64, the reach of each pose in exact units.
+    node_radius: (a,) of the avatar's nodes, root first, may be empty.  radius: of its points [m].
+    other_units: the scan's radius plus the margin, exact units.  scene: SceneArrays.
+    A scale within SIMILARITY_TOLERANCE of 1 becomes 1, so that the rounding of a rigid pose changes
+    no radius.
+    Returns (GOOD, 0, 0.0), or the first fault, its pose and the value found. Once scene.stop is
+    set, it also returns (GOOD, 0, 0.0), with the output incomplete: a caller that has a stop flag
+    must check it after this call.
     """
     for i in range(poses.shape[0]):
         if i % POSES_AT_ONCE == 0 and stopped(scene.stop):
@@ -82,7 +88,7 @@ def check_poses(poses, node_radius, radius, other_units, scene, scales, units):
                 square += m[r, c] * m[r, c]
         square /= 3.0
         scale = math.sqrt(square)
-        # A scale of 1000 is one too when its square root comes out a rounding above.
+        # A scale of 1000 is valid, even if its square root is rounded up.
         least = SMALLEST_SCALE * (1.0 - SIMILARITY_TOLERANCE)
         if not least <= scale <= LARGEST_SCALE * (1.0 + SIMILARITY_TOLERANCE):
             return BAD_SCALE, i, scale
@@ -91,7 +97,8 @@ def check_poses(poses, node_radius, radius, other_units, scene, scales, units):
             for b in range(3):
                 dot = m[0, a] * m[0, b] + m[1, a] * m[1, b] + m[2, a] * m[2, b]
                 worst = max(worst, abs(dot - (square if a == b else 0.0)))
-        # Twice: an entry that is off by the tolerance moves a product of two by twice that.
+        # Factor 2: an entry that is off by the tolerance changes a product of two entries by twice
+        # that.
         if worst > 2.0 * SIMILARITY_TOLERANCE * square:
             return SHEARED, i, worst / square
         if volume < 0.0:
@@ -109,14 +116,20 @@ def check_poses(poses, node_radius, radius, other_units, scene, scales, units):
 
 @borrowing
 def place(m, shift, r, x, y, z):
-    """Coordinate r of an avatar point placed by pose m, from the dataset's origin [m]. shift: t - O (3,)."""
+    """Return coordinate r of an avatar point placed by pose m, from the dataset's origin [m].
+
+    shift: t - O (3,).
+    """
     return ((m[r, 0] * x + m[r, 1] * y) + m[r, 2] * z) + shift[r]
 
 
 @borrowing
 def largest_term(m, shift, x, y, z):
-    """The largest sum of sizes of the terms of a placed coordinate [m]: 2^-50 of it bounds the rounding of `place`
-    for this point and for one beside it, also where large terms cancel."""
+    """Return the largest sum of the absolute values of the terms of a placed coordinate [m].
+
+    2^-50 of it bounds the rounding of `place` for this point and for one next to it, also where
+    large terms cancel.
+    """
     largest = 0.0
     for r in range(3):
         size = abs(m[r, 0] * x) + abs(m[r, 1] * y) + abs(m[r, 2] * z) + abs(shift[r])
@@ -126,11 +139,11 @@ def largest_term(m, shift, x, y, z):
 
 @borrowing
 def to_units(metres):
-    """Exact units of a placed coordinate: times 2^26, half to even, int64."""
+    """Convert a placed coordinate to exact units: times 2^26, half to even, int64."""
     return np.int64(np.rint(metres * UNITS_PER_METRE))
 
 
 @borrowing
 def lattice_to_units(steps, units_per_step):
-    """Exact units of a lattice coordinate: one float64 product, half to even, int64."""
+    """Convert a lattice coordinate to exact units: one float64 product, half to even, int64."""
     return np.int64(np.rint(np.float64(steps) * units_per_step))

@@ -1,17 +1,20 @@
-"""The nearest pair by priority, within a budget: a search that can stop at any time and say what it knows.
+"""Nearest pair by priority, within a budget: a search that can stop at any time with a valid bound.
 
-Best first with a heap of node pairs, as in Hubbard, "Approximating polyhedra with spheres for time-critical collision
-detection" (1996), and Klein and Zachmann, "ADB-Trees: controlling the error of time-critical collision detection"
-(2003). How far an answer may be off is the distance between the best pair and the least lower bound of the open
-ones: so the pair of the least lower bound is opened next, and of those at equal bound the one whose points are surely
-nearest, for it is the likeliest to hold a contact.
+The search is best first, with a heap of node pairs, as in Hubbard, "Approximating polyhedra with
+spheres for time-critical collision detection" (1996), and Klein and Zachmann, "ADB-Trees:
+controlling the error of time-critical collision detection" (2003). The error of an answer is at
+most the distance of the best pair minus the least lower bound of the open pairs. The search
+therefore opens the pair of the least lower bound next. Among pairs of equal bound it opens the one
+with the least upper bound, which is the likeliest to hold a contact.
 
-The order of visits depends on the request alone, so a larger budget continues what a smaller one began, and no bound
-gets worse (NUMERICS.md case 30). All state lies in arrays: the search is left and resumed at will. What does not fit
-the heap is searched depth first, to its end, before the heap goes on: memory is bounded, and nothing is dropped.
+The order of visits depends on the request alone. A larger budget therefore continues what a smaller
+one began, and no bound gets worse (NUMERICS.md case 30). All state lies in arrays: the search can
+be suspended and resumed. Pairs that do not fit the heap are searched depth first, to the end,
+before the heap continues: memory is bounded, and no pair is dropped.
 
-Where scan points have spheres of several sizes, all bounds are of |a - b| + drop (closest.py): below a node no drop is
-less than that of its radius class, and some point's is at most its `sure` drop.
+Where scan points have spheres of several sizes, all bounds are bounds of |a - b| + drop
+(closest.py). Below a node, no drop is less than that of its radius class, and the drop of some
+point is at most the class's `sure` drop.
 """
 
 import math
@@ -39,18 +42,21 @@ from .placed import SLACK, Placed, make_placed, place_block, place_nodes
 from .placing import MAX_REACH_UNITS
 from .stopping import NO_LIMIT, stopped
 
-# The search goes on; nothing is open; what was asked is known; the budget of visits is spent.
+# The search continues; no pair is open; the answer is known to the requested accuracy; the budget
+# of visits is spent.
 OPEN, DONE, ENOUGH, SPENT = range(4)
-NO_VOXEL = -1  # in place of a row: the voxel has not been looked into
+NO_VOXEL = -1  # in place of a row: the voxel has not been visited
 
 
 class Known(NamedTuple):
-    """What is known of k poses, gathered over pieces of a request.
+    """Results for k poses, accumulated over the pieces of a request.
 
-    square, pair, drop, gap: of `Nearest`.  lower: (k,) float64, |a - b| + drop is nowhere less than that where
-    something was left open [steps]; inf: nothing was.  upper: (k,) float64, some pair's is at most that [steps].
-    spent: (k,) bool, the budget has ended a search: further pieces get none of it, or a larger one would see less of
-    them.
+    square, pair, drop, gap: of `Nearest`.
+    lower: (k,) float64 [steps], a lower bound of |a - b| + drop of everything left open; inf:
+    nothing was.
+    upper: (k,) float64 [steps], an upper bound of |a - b| + drop of some pair.
+    spent: (k,) bool, the budget has ended a search. Further pieces then get no budget; otherwise a
+    larger budget would see less of them.
     """
 
     square: NDArray[np.int64]
@@ -63,13 +69,18 @@ class Known(NamedTuple):
 
 
 class Search(NamedTuple):
-    """A search that may be resumed; scratch of one request.
+    """Search that can be resumed; scratch of one request.
 
-    keys: (h + STACK, 2) float32, lower and upper bound of a pair [steps], without the error of placing.  pairs:
-    (h + STACK, 3) int64: avatar node, row or NO_VOXEL, voxel. The first h are the heap, the others the stack of what
-    did not fit it.  sizes: (2,) int64, of heap and stack.  bounds: (4,) float64 [steps]: lower and upper bound of the
-    answer, lower bound of the stack, error of placing.  status: (1,) int64.  drops: (2, n) float32 [steps], by radius
-    class of a node: no point's drop below it is less, rounded down; some point's is no more, rounded up.
+    keys: (h + STACK, 2) float32, lower and upper bound of a pair [steps], without the error of
+    placing.
+    pairs: (h + STACK, 3) int64: avatar node, row or NO_VOXEL, voxel. The first h are the heap; the
+    others are the stack of pairs that did not fit the heap.
+    sizes: (2,) int64, of heap and stack.
+    bounds: (4,) float64 [steps]: lower and upper bound of the answer, lower bound of the stack,
+    error of placing.
+    status: (1,) int64.
+    drops: (2, n) float32 [steps], by radius class of a node: a lower bound of the drop of every
+    point below it, rounded down; an upper bound of the drop of some point, rounded up.
     """
 
     keys: NDArray[np.float32]
@@ -83,11 +94,14 @@ class Search(NamedTuple):
 
 
 class Goal(NamedTuple):
-    """When a search ends. first: at the first pair within reach and `early` (`collide`).
+    """Conditions that end a search.
 
-    early: exact units that a pair may be beyond reach and still be taken, for `first`.  enough: (k,) float64, for
-    `first`: a pair surely as near as this is one, though not known [steps].  tolerance: else, the bounds may lie so
-    far apart [steps].  visits: node visits a pose.
+    first: end at the first pair within reach plus `early` (`collide`).
+    early: exact units by which a pair may exceed the reach and still be accepted, with `first`.
+    enough: (k,) float64 [steps], with `first`: a pair whose upper bound is at most this is accepted
+    although the pair itself is not known.
+    tolerance: without `first`, the difference of the bounds at which the search ends [steps].
+    visits: node visits a pose.
     """
 
     first: bool
@@ -99,12 +113,13 @@ class Goal(NamedTuple):
 
 @nb.njit(nogil=True, cache=True)
 def make_search(avatar, scene, heap):
-    """Scratch for one avatar (not empty) and a heap of so many pairs."""
+    """Allocate scratch for one avatar (not empty) and a heap of `heap` pairs."""
     drop = scene.drop
     mask = drop.shape[0] - 1
     drops = np.empty((2, drop.shape[0]), np.float32)
     for c in range(drop.shape[0]):
-        # Some point has the node's local class, on a rim or not; where not all are on a rim, one that is not has any.
+        # Some point has the node's local class, on a rim or not; where not all are on a rim, one
+        # that is not on a rim may have any class.
         sure = min(drop[(c | RIM_BIT) & mask], drop[c & RIM_BIT & mask])
         drops[0, c] = np.float32(np.float64(drop[c]) / scene.units_per_step * (1.0 - 1e-6))
         drops[1, c] = np.float32(np.float64(sure) / scene.units_per_step * (1.0 + 1e-6))
@@ -116,7 +131,7 @@ def make_search(avatar, scene, heap):
 
 @borrowing
 def _sift_up(keys, pairs, at):
-    """Let the pair at the end of a heap rise to its place."""
+    """Move the pair at the end of a heap up to its place."""
     key, tie, a, row, voxel = keys[at, 0], keys[at, 1], pairs[at, 0], pairs[at, 1], pairs[at, 2]
     while at > 0:
         parent = (at - 1) // 2
@@ -152,13 +167,16 @@ def _drop_top(keys, pairs, size):
 
 @borrowing
 def _low(words, row, x, y, z, radius, drop):
-    """`lower_bound` with the drop; no two centres are nearer than 0."""
+    """Return `lower_bound`, at least 0, plus the drop. No two centres are nearer than 0."""
     return max(lower_bound(words, row, x, y, z, radius), np.float32(0.0)) + drop
 
 
 @borrowing
 def _upper_bound(words, row, x, y, z, radius):
-    """How far a sphere's points are from a node's at most, as `lower_bound`: both hold at least one point."""
+    """Return an upper bound of the distance of some sphere point from some node point.
+
+    Arguments as for `lower_bound`. The sphere and the node hold at least one point each.
+    """
     dx, dy, dz = x - words[row], y - words[row + 1], z - words[row + 2]
     both = np.sqrt(dx * dx + dy * dy + dz * dz) + (words[row + 3] + radius)
     return both + SLACK * both
@@ -166,7 +184,7 @@ def _upper_bound(words, row, x, y, z, radius):
 
 @nb.njit(nogil=True, cache=True)
 def _begin(poses, avatar, scene, index, reach, i, search, goal, known, counts):
-    """Set a search out for pose i: all voxels in reach, as the index bounds them; nothing visited yet."""
+    """Start a search for pose i: all voxels in reach, with bounds from the index."""
     best, placed = search.best, search.placed
     best.frame[0], best.frame[1] = place_nodes(avatar, poses[i], reach.scales[i], placed, scene)
     best.frame[2], best.frame[3] = scene.units_per_step, scene.voxel_steps
@@ -177,8 +195,9 @@ def _begin(poses, avatar, scene, index, reach, i, search, goal, known, counts):
     set_cut(best.cut, best.far, best.frame, best.drop, reach.units[i])
     search.bounds[0], search.bounds[1], search.bounds[2], search.bounds[3] = 0.0, np.inf, 0.0, best.frame[4]
     within = best.units[0] if best.found[0] < 0 else found_units(best.found)
-    # `collide` looks into nodes for what is in reach; a pair a little beyond is taken where one is met.
-    # `squares`, a scratch of LANES, holds a cut for each of at most RADIUS_CLASSES, as many.
+    # `collide` searches nodes for pairs within reach, and accepts a pair slightly beyond if it
+    # meets one. `squares`, a scratch of LANES, holds a cut for each of at most RADIUS_CLASSES,
+    # which are as many.
     set_cut(best.squares if goal.first else best.cut, best.far, best.frame, best.drop, within)
     search.sizes[0], search.sizes[1], search.status[0] = 0, 0, OPEN
     keys, pairs = search.keys, search.pairs
@@ -200,7 +219,7 @@ def _begin(poses, avatar, scene, index, reach, i, search, goal, known, counts):
 
 @borrowing
 def _enough(goal, enough, best, bounds):
-    """Whether what was asked is known."""
+    """Return whether the answer is known as accurately as requested."""
     if goal.first:
         return best.found[0] >= 0 or bounds[1] <= enough
     if best.found[0] < 0 or goal.tolerance <= 0.0:
@@ -211,12 +230,12 @@ def _enough(goal, enough, best, bounds):
 
 @borrowing
 def _put(keys, pairs, sizes, heap, spilling, cut, bounds, parent, low, high, a, row, voxel):
-    """Add a pair to the heap, or to the stack where spilling. low, high: its bounds; parent: the bound above it.
+    """Add a pair to the heap, or to the stack if spilling.
 
-    cut: above it no pair is of use.
+    low, high: its bounds.  parent: the lower bound of its parent.  cut: pairs above it are useless.
     """
     bounds[1] = min(bounds[1], np.float64(high) + bounds[3])
-    # What holds above holds below.
+    # A lower bound of the parent is one of the child.
     low = max(low, parent)
     if low > cut:
         return
@@ -232,7 +251,10 @@ def _put(keys, pairs, sizes, heap, spilling, cut, bounds, parent, low, high, a, 
 
 @borrowing
 def _go_on(m, pose, avatar, scene, search, goal, enough, budget, until):
-    """Visit node pairs until the search ends, or `until` are visited; budget: how many may be. Sets the status."""
+    """Visit node pairs until the search ends, or `until` pairs are visited; set the status.
+
+    budget: how many visits are allowed.
+    """
     words, ints, halves, where, coordinates = (
         scene.words,
         scene.ints,
@@ -281,7 +303,7 @@ def _go_on(m, pose, avatar, scene, search, goal, enough, budget, until):
         if counters[0] + cost > budget:
             search.status[0] = SPENT
             return
-        # What is on the stack may have been overtaken by a nearer pair; visits are counted all the same.
+        # A nearer pair may have overtaken a pair on the stack; visits are counted nevertheless.
         counters[0] += cost
         spilling = sizes[1] > 0 or sizes[0] - 1 + cost > heap
         if sizes[1] > 0:
@@ -345,7 +367,7 @@ def _go_on(m, pose, avatar, scene, search, goal, enough, budget, until):
 
 @nb.njit(nogil=True, cache=True)
 def end_search(search, i, known, counts):
-    """Add what a search has found out to what is known of pose i."""
+    """Add the results of a search to what is known of pose i."""
     best = search.best
     known.square[i], known.drop[i] = best.found[0], best.found[7]
     known.pair[i] = best.found[1:7]
@@ -359,11 +381,13 @@ def end_search(search, i, known, counts):
 
 @nb.njit(nogil=True, cache=True)
 def go_on(poses, avatar, scene, index, reach, i, fresh, until, search, goal, known, counts):
-    """Search for the nearest pair of pose i: from the start if `fresh`, else from where it was left.
+    """Search for the nearest pair of pose i: from the start if `fresh`, else from where it stopped.
 
-    poses: (k, 4, 4), checked.  avatar: not empty.  reach: Reach of the poses; a voxel in it that is not resident is
-    counted as missing.  until: the visits, of this piece, at which to leave off. Once it has ended its results are
-    added to known and counts (3, k) uint32; where it has not, `end_search` does that. Returns the status.
+    poses: (k, 4, 4), checked.  avatar: not empty.  reach: Reach of the poses; a voxel in it that is
+    not resident is counted as missing.  until: the number of visits, in this piece, at which to
+    suspend.
+    Once the search has ended, its results are added to known and counts (3, k) uint32; for a
+    suspended search, `end_search` does that. Returns the status.
     """
     if fresh:
         _begin(poses, avatar, scene, index, reach, i, search, goal, known, counts)
@@ -376,7 +400,10 @@ def go_on(poses, avatar, scene, index, reach, i, fresh, until, search, goal, kno
 
 @nb.njit(nogil=True, cache=True)
 def search_poses(poses, avatar, scene, index, reach, which, heap, goal, known, counts):
-    """`go_on` to the end for each of the poses numbered in `which`: one call for a request without a deadline."""
+    """Run `go_on` to the end for the poses numbered in `which`.
+
+    One call answers a request without a deadline.
+    """
     search = make_search(avatar, scene, heap)
     for number in range(which.shape[0]):
         if stopped(scene.stop):

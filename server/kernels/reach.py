@@ -1,4 +1,7 @@
-"""The broad phase: which voxels a placed avatar could touch, from boxes around their points (server/proof.py)."""
+"""Broad phase: the voxels a placed avatar could touch.
+
+The boxes around the points of voxels decide (server/proof.py).
+"""
 
 import math
 from typing import NamedTuple
@@ -13,16 +16,18 @@ from .compiled import borrowing
 from .placing import GOOD, check_poses, largest_term, place
 from .stopping import stopped
 
-# Cells or voxels looked at between two looks at the stop flag.
+# Cells or voxels examined between two checks of the stop flag.
 CELLS_AT_ONCE = 1024
 
 
 class SceneIndex(NamedTuple):
-    """What the broad phase reads of a scene's v voxels.
+    """Arrays of a scene's v voxels that the broad phase reads.
 
-    keys: (v,) uint64, sorted.  low, high: (v, 3) int64, least and greatest lattice coordinates of a box around a
-    voxel's points: of its cell, until its record proves what the index says.  scene_low, scene_high: (3,) int64, those
-    of all points, as the index says; they decide what lies outside, and which cells there are, and no more.
+    keys: (v,) uint64, sorted.
+    low, high: (v, 3) int64, least and greatest lattice coordinates of a box around a voxel's
+    points. It is the box of the voxel's cell until the voxel's record proves what the index states.
+    scene_low, scene_high: (3,) int64, those of all points, as the index states them. They decide
+    only what lies outside and which cells exist.
     """
 
     keys: NDArray[np.uint64]
@@ -33,11 +38,12 @@ class SceneIndex(NamedTuple):
 
 
 class Reach(NamedTuple):
-    """k poses and what they could touch.
+    """Voxels that k poses could touch.
 
-    scales: (k,) float64.  units: (k,) int64, r_a + r_b + margin in exact units.  starts: (k + 1,), rows: int64, the
-    voxel rows of pose i are rows[starts[i]:starts[i + 1]].  boxes: (k, 2, 3) float64, the box of the root sphere and
-    its reach [steps].  outside: (k,) bool, whether that box leaves the scene's.
+    scales: (k,) float64.  units: (k,) int64, r_a + r_b + margin in exact units.
+    starts: (k + 1,), rows: int64: the voxel rows of pose i are rows[starts[i]:starts[i + 1]].
+    boxes: (k, 2, 3) float64, the box of the root sphere and its reach [steps].
+    outside: (k,) bool, whether that box extends beyond the scene's box.
     """
 
     scales: NDArray[np.float64]
@@ -50,7 +56,7 @@ class Reach(NamedTuple):
 
 @borrowing
 def find_key(keys, key):
-    """Row of `key` in sorted keys (v,) uint64, or -1."""
+    """Return the row of `key` in sorted keys (v,) uint64, or -1."""
     lo, hi = 0, keys.shape[0]
     while lo < hi:
         mid = (lo + hi) // 2
@@ -63,19 +69,28 @@ def find_key(keys, key):
 
 @borrowing
 def grid_low(scene_low, voxel_steps):
-    """Lowest lattice coordinate along an axis of the cells of the grid that hold points, float64, exact."""
+    """Return the lowest lattice coordinate along an axis of the grid cells that hold points.
+
+    float64, exact.
+    """
     return np.float64(scene_low // voxel_steps * voxel_steps)
 
 
 @borrowing
 def grid_high(scene_high, voxel_steps):
-    """Highest lattice coordinate along an axis of the cells of the grid that hold points, float64, exact."""
+    """Return the highest lattice coordinate along an axis of the grid cells that hold points.
+
+    float64, exact.
+    """
     return np.float64((scene_high // voxel_steps + 1) * voxel_steps - 1)
 
 
 @borrowing
 def _near_box(center, reach, low, high):
-    """Whether a ball (center (3,), reach) touches the box [low, high] (3,) float64; all [steps]."""
+    """Return whether a ball (center (3,), reach) touches a box.
+
+    low, high: (3,) float64; all [steps].
+    """
     square = 0.0
     for k in range(3):
         gap = max(low[k] - center[k], center[k] - high[k], 0.0)
@@ -85,10 +100,11 @@ def _near_box(center, reach, low, high):
 
 @nb.njit(nogil=True, cache=True)
 def find_reach(poses, avatar, radius, other_units, scene, index, reach):
-    """Check poses and list the voxels in reach of each: `check_poses`, then `voxels_in_reach`, in one call.
+    """Check poses and list the voxels in reach of each: `check_poses`, then `voxels_in_reach`.
 
-    radius: of the avatar's points [m].  other_units: of the scan's points and the margin, exact units. Fills `reach`.
-    Returns (fault, pose, figure found) as `check_poses` does, and the rows needed.
+    radius: of the avatar's points [m].  other_units: radius of the scan's points plus the margin,
+    exact units. Fills `reach`.
+    Returns (fault, pose, value found), as `check_poses` does, and the number of rows needed.
     """
     fault, pose, found = check_poses(
         poses, avatar.radius, radius, other_units, scene, reach.scales, reach.units
@@ -100,13 +116,15 @@ def find_reach(poses, avatar, radius, other_units, scene, index, reach):
 
 @nb.njit(nogil=True, cache=True)
 def voxels_in_reach(poses, avatar, scene, index, reach):
-    """List, for each pose, the voxels whose points the avatar's root sphere could touch, in an order of place.
+    """List, for each pose, the voxels whose points the avatar's root sphere could touch.
 
-    poses: (k, 4, 4), checked.  avatar: not empty.  scene: SceneArrays. Fills starts, rows, boxes and outside of
-    `reach` from its scales and units. Returns how many rows are needed; those beyond the capacity are not written. -1:
-    the scene's stop flag is set, and `reach` is not filled.
-    The reach is widened by more than the rounding of this function: a millionth of itself, a step, and 2^-49 of the
-    largest term that was added up.
+    The order depends on the positions alone.
+    poses: (k, 4, 4), checked.  avatar: not empty.  scene: SceneArrays.
+    Fills starts, rows, boxes and outside of `reach` from its scales and units. Returns how many
+    rows are needed; those beyond the capacity are not written. Returns -1 when the scene's stop
+    flag is set; `reach` is then not filled.
+    The reach is widened by more than the rounding of this function: a millionth of itself, one
+    step, and 2^-49 of the largest term of the sums.
     """
     step, units_per_step, voxel_steps = scene.step, scene.units_per_step, scene.voxel_steps
     keys, scene_low, scene_high = index.keys, index.scene_low, index.scene_high
@@ -140,7 +158,7 @@ def voxels_in_reach(poses, avatar, scene, index, reach):
         reach.starts[i] = needed
         if cells == 0.0:
             continue
-        listed = cells > keys.shape[0]  # cheaper to go through the voxels than through the grid
+        listed = cells > keys.shape[0]  # cheaper to test every voxel than every cell of the grid
         ix, iy, iz = first[0], first[1], first[2]
         row, looked = -1, 0
         while True:

@@ -1,18 +1,18 @@
-"""The stop flag of a request, as kernels read it (server/stop.py).
+"""Stop flag of a request, as kernels read it (server/stop.py).
 
-Another thread sets the flag while a kernel runs. An ordinary load may be moved out of a loop by the compiler; an atomic
-one may not. It costs what an ordinary load costs.
+Another thread sets the flag while a kernel runs. The compiler may move an ordinary load out of a
+loop, but not an atomic one. An atomic load costs the same as an ordinary load.
 """
 
 from ...schemas.kernels import compiling as nb
 from .compiled import inlined
 
-# The most node visits of a search that has no budget.
+# Largest number of node visits, for a search without a budget.
 NO_LIMIT = 1 << 62
-# Node visits of a pose, or a motion, that is answered while nobody else can use the residency: a few milliseconds at
-# most. What takes more is answered the ordinary way.
+# Limit of node visits for a pose or a motion that is answered while the residency is locked: a few
+# milliseconds at most. A query that needs more is answered by the general path.
 MOST_QUICK_VISITS = 1 << 16
-# Rows copied, sorted or forgotten between two looks at the stop flag: some hundred microseconds.
+# Rows copied, sorted or cleared between two checks of the stop flag: some hundred microseconds.
 ROWS_AT_ONCE = 512
 
 
@@ -42,13 +42,16 @@ stopped = _stopped_interpreted if nb.config.DISABLE_JIT else _stopped
 
 @inlined
 def is_over(flag, visits, most):
-    """Return whether a search ends early: its request is stopped, or it has cost more than `most` node visits."""
+    """Return whether a search ends early.
+
+    It does once its request is stopped or it has cost more than `most` node visits.
+    """
     return stopped(flag) or visits > most
 
 
 @nb.njit(nogil=True, cache=True)
 def copy_rows(rows, to, count, flag):
-    """Copy the first `count` rows of a table; not all once the stop flag is set."""
+    """Copy the first `count` rows of a table; end early once the stop flag is set."""
     for begin in range(0, count, ROWS_AT_ONCE):
         if stopped(flag):
             return

@@ -1,7 +1,8 @@
-"""The voxels that rays and loose points reach, front to back, from the index alone: no voxel is read.
+"""Lists of the voxels that rays and single points reach, nearest first, from the index alone.
 
-The rows of the index lie in Morton order, so a tree of boxes over them is a matter of grouping FAN neighbours at a
-time. An entry of a list carries `near`, a distance no point of that voxel undercuts; it prunes, it never decides.
+No voxel is read. The rows of the index are in Morton order; a tree of boxes over them therefore
+groups FAN consecutive rows at a time. An entry of a list carries `near`, a lower bound of the
+distance to any point of that voxel. It serves pruning only and never decides an answer.
 """
 
 import math
@@ -14,15 +15,16 @@ from ...schemas.kernels import compiling as nb
 from .stopping import ROWS_AT_ONCE, stopped
 
 FAN = 8
-# FAN - 1 siblings stay behind on each level; 2^63 rows have 21 levels.
+# On each level, FAN - 1 siblings stay on the stack; 2^63 rows have 21 levels.
 STACK = 22 * FAN
 
 
 class VoxelTree(NamedTuple):
-    """Boxes over the v voxels of an index, level by level, the voxels themselves first.
+    """Boxes over the v voxels of an index, level by level, beginning with the voxels themselves.
 
-    low, high: (n, 3) float64 [steps].  levels: (l + 1,) int64, where each level begins; the last one is one box.
-    unknown: (u, 2, 3) float64 [steps], boxes of scans left out.
+    low, high: (n, 3) float64 [steps].  levels: (l + 1,) int64, the start of each level; the last
+    level is one box.
+    unknown: (u, 2, 3) float64 [steps], boxes of excluded scans.
     """
 
     low: NDArray[np.float64]
@@ -32,11 +34,13 @@ class VoxelTree(NamedTuple):
 
 
 class Lists(NamedTuple):
-    """What k rays or points reach, each its voxels by ascending `near`.
+    """Voxels that k rays or points reach, for each of them by ascending `near`.
 
-    starts: (k + 1,) int64: the entries of i are [starts[i], starts[i + 1]).  rows: int64, index rows.
-    near: float64, exact units, no hit in that voxel is nearer.  unseen: (k,) float64, exact units, the same of the
-    nearest region that cannot be looked at, inf where there is none.
+    starts: (k + 1,) int64: the entries of i are [starts[i], starts[i + 1]).  rows: int64, index
+    rows.
+    near: float64, exact units, a lower bound of the distance of any hit in that voxel.
+    unseen: (k,) float64, exact units, the same bound for the nearest region that cannot be
+    examined; inf where there is no such region.
     """
 
     starts: NDArray[np.int64]
@@ -46,7 +50,10 @@ class Lists(NamedTuple):
 
 
 def make_voxel_tree(low: NDArray[np.int64], high: NDArray[np.int64], unknown: NDArray[np.int64]) -> VoxelTree:
-    """The tree over voxels whose points lie in the boxes low, high (v, 3) [steps], rows in Morton order."""
+    """Build the tree over voxels whose points lie in the boxes low, high (v, 3) [steps].
+
+    Rows are in Morton order.
+    """
     lows, highs = [low.astype(np.float64)], [high.astype(np.float64)]
     while len(lows[-1]) > 1:
         groups = np.arange(0, len(lows[-1]), FAN)
@@ -58,10 +65,11 @@ def make_voxel_tree(low: NDArray[np.int64], high: NDArray[np.int64], unknown: ND
 
 @nb.njit(nogil=True, cache=True)
 def tighten(tree, row, low, high):
-    """Make the box of one voxel smaller, and the boxes that hold it, but for the one that holds all.
+    """Shrink the box of one voxel and the boxes that contain it, except the box of the whole scene.
 
-    low, high: (3,) int64 [steps], inside the voxel's box. Who reads the tree meanwhile reads boxes that hold
-    the points. The box that holds all stays, and with it the slack of `list_voxels`.
+    low, high: (3,) int64 [steps], inside the voxel's box. A thread that reads the tree at the same
+    time reads boxes that contain the points. The box of the whole scene stays as it is, and with it
+    the slack of `list_voxels`.
     """
     for r in range(3):
         tree.low[row, r], tree.high[row, r] = low[r], high[r]
@@ -80,7 +88,10 @@ def tighten(tree, row, low, high):
 
 @nb.njit(nogil=True, cache=True)
 def _enter(at, direction, low, high, grow, limit):
-    """Where a ray enters the box [low, high] grown by `grow`, 0 when it starts inside, inf when not before `limit`."""
+    """Return the distance at which a ray enters the box [low, high] grown by `grow`.
+
+    0 when it starts inside; inf when it does not enter before `limit`.
+    """
     first, last = 0.0, limit
     for r in range(3):
         below, above = low[r] - grow - at[r], high[r] + grow - at[r]
@@ -98,7 +109,10 @@ def _enter(at, direction, low, high, grow, limit):
 
 @nb.njit(nogil=True, cache=True)
 def _apart(at, low, high, grow, limit):
-    """How far a point is from the box [low, high], less `grow`, at least 0; inf when beyond `limit`."""
+    """Return the distance of a point from the box [low, high] minus `grow`, at least 0.
+
+    inf when it is beyond `limit`.
+    """
     square = 0.0
     for r in range(3):
         gap = max(low[r] - at[r], at[r] - high[r], 0.0)
@@ -109,7 +123,10 @@ def _apart(at, low, high, grow, limit):
 
 @nb.njit(nogil=True, cache=True)
 def _sort(rows, near, begin, end, stop):
-    """Sort entries [begin, end) by near, then row (Shell 1959, gaps after Knuth); not to the end once `stop` is set."""
+    """Sort entries [begin, end) by near, then row (Shell 1959, gaps after Knuth).
+
+    Ends early, unsorted, once `stop` is set.
+    """
     gap = 1
     while gap < (end - begin) // 3:
         gap = 3 * gap + 1
@@ -128,13 +145,17 @@ def _sort(rows, near, begin, end, stop):
 
 @nb.njit(nogil=True, cache=True)
 def list_voxels(tree, at_units, direction, along, reach_units, radius_units, units_per_step, stop, lists):
-    """Fill `lists` for k rays (along) or loose points: the voxels with a point that could be hit within reach.
+    """List the voxels with a point that could be hit within reach, for each of k rays or points.
 
-    at_units: (k, 3) int64, origins, exact units.  direction: (k, 3) float64, unit vectors, read of rays only.
-    reach_units: of all.  radius_units: of the scan's largest sphere, 0 for points.  Boxes are grown by it, a step,
-    and more than the rounding of this function: 2^-46 of the largest figure in it.
-    stop: the request's stop flag: once it is set, the rest is not listed, and unseen from the start.
-    Returns how many entries are needed; those beyond the capacity are not written.
+    along: whether these are rays.
+    at_units: (k, 3) int64, origins, exact units.  direction: (k, 3) float64, unit vectors, read for
+    rays only.
+    reach_units: the reach of all.  radius_units: radius of the scan's largest sphere; 0 for points.
+    Boxes grow by it, by one step, and by more than the rounding of this function: 2^-46 of the
+    largest number in it.
+    stop: the request's stop flag. Once it is set, the remaining voxels are not listed, and `unseen`
+    is 0 for these rays.
+    Fills `lists`. Returns how many entries are needed; those beyond the capacity are not written.
     """
     at, far = np.empty(3), 0.0
     top = tree.levels.shape[0] - 2
@@ -189,7 +210,7 @@ def list_voxels(tree, at_units, direction, along, reach_units, radius_units, uni
                 depth += 1
         if needed <= lists.rows.shape[0]:
             _sort(lists.rows, lists.near, lists.starts[i], needed, stop)
-            if stopped(stop):  # in no order
+            if stopped(stop):  # the entries are not sorted
                 lists.unseen[i] = 0.0
     lists.starts[at_units.shape[0]] = needed
     return needed

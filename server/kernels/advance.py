@@ -1,4 +1,7 @@
-"""Many motions through a scene, segment by segment: which voxels a segment reaches, and the advances along it."""
+"""Conservative advancement of many motions through a scene, segment by segment.
+
+It lists the voxels a segment reaches and advances the motions along it.
+"""
 
 import math
 from typing import NamedTuple
@@ -18,23 +21,27 @@ from .reach import find_key, grid_high, grid_low
 from .stopping import stopped
 from .sweep import search
 
-# What a segment covers, and with it what must be resident together: four avatars and 8 m more.
+# Extent of a segment, and thereby of what must be resident together: four avatars plus 8 m.
 _SEGMENT_SIZES, _SEGMENT_MORE = 4.0, 8.0
-# And no more than this many lattice steps: float32 is exact up to 2^24 (placed.py), an avatar may take 2^23.
+# Limit of a segment in lattice steps: float32 is exact up to 2^24 (placed.py), and an avatar may
+# take 2^23.
 _SEGMENT_STEPS = 2.0**21
-# The sagitta of a segment and of a first chord, in avatars: boxes and spheres grow by it.
+# Sagitta of a segment and of a first chord, in avatar sizes: boxes and spheres grow by it.
 _SEGMENT_BEND, _CHORD_BEND = 0.25, 1.0 / 16.0
-# Advances of one segment that settled nothing; beyond, what is undecided stays so. A full turn 1 um from a wall all the
-# way takes some hundreds.
+# Advances of one segment that settled nothing. Beyond this number, undecided parts stay undecided.
+# A full turn 1 um from a wall all the way takes some hundreds.
 MOST_REFUSED = 512
 
 
 class Progress(NamedTuple):
-    """How far each of k motions has come; all (k,).
+    """Progress of each of k motions; all arrays (k,) unless stated.
 
-    at, end: float64, the segment in hand.  lower: nothing touches on the segment before it, `end` to begin with; the
-    least over all pieces of the segment's voxels.  upper: the earliest contact found, inf: none.  speed: of the
-    fastest avatar point, at most [m per unit of t].  witness: (k, 2, 3) the pair's centres, avatar and scan, world [m].
+    at, end: float64, the current segment.
+    lower: nothing touches on the segment before it; initially `end`; the least over all pieces of
+    the segment's voxels.
+    upper: the earliest contact found, inf: none.
+    speed: upper bound of the speed of the fastest avatar point [m per unit of t].
+    witness: (k, 2, 3), the pair's centres, avatar and scan, world [m].
     visits: (k,) int64, node visits left.
     """
 
@@ -49,7 +56,7 @@ class Progress(NamedTuple):
 
 @nb.njit(nogil=True, cache=True)
 def avatar_box(avatar):
-    """Least and greatest coordinates (2, 3) of an avatar's points, not empty [m]."""
+    """Return the least and greatest coordinates (2, 3) of an avatar's points, not empty [m]."""
     box = np.empty((2, 3))
     for r in range(3):
         least, most = avatar.points[0, r, 0], avatar.points[0, r, 0]
@@ -63,7 +70,10 @@ def avatar_box(avatar):
 
 @borrowing
 def _size_of(box, scale, units):
-    """An avatar with its reach, across [m], whatever the order of its points and its tree."""
+    """Return the size of an avatar with its reach, across [m].
+
+    The result does not depend on the order of its points or on its tree.
+    """
     square = 0.0
     for r in range(3):
         square += (box[1, r] - box[0, r]) ** 2
@@ -72,7 +82,10 @@ def _size_of(box, scale, units):
 
 @borrowing
 def _longest(motion, most, sagitta):
-    """The longest part of a motion on which no point goes farther than `most` nor strays from its chord by more [m]."""
+    """Return the longest part of a motion within two limits.
+
+    No point moves farther than `most` on it, or strays from its chord by more than `sagitta` [m].
+    """
     length = 1.0
     if motion.speed > most:
         length = most / motion.speed
@@ -83,10 +96,10 @@ def _longest(motion, most, sagitta):
 
 @borrowing
 def _root_at(motion, t, avatar, scale, units, scene, pose, shift, center):
-    """Where the avatar's root sphere is under M(t): center (3,) [steps], pose and shift scratch.
+    """Place the avatar's root sphere under M(t): center (3,) [steps]; pose and shift are scratch.
 
-    Returns the radius with the reach, widened as in `voxels_in_reach`, so that a motion that stands still reaches
-    what a pose does.
+    Returns the radius with the reach, widened as in `voxels_in_reach`; a motion that stands still
+    therefore reaches what a pose reaches.
     """
     pose_at(motion, t, pose)
     x, y, z = avatar.center[0, 0], avatar.center[0, 1], avatar.center[0, 2]
@@ -100,7 +113,10 @@ def _root_at(motion, t, avatar, scale, units, scene, pose, shift, center):
 
 @borrowing
 def _strays(motion, length, scene):
-    """How far points stray from their chords on a part of the motion, at most [steps]; 0 for one that stands still."""
+    """Return how far points stray from their chords on a part of the motion, at most [steps].
+
+    0 for a motion that stands still.
+    """
     if motion.speed == 0.0:
         return 0.0
     return (motion.bend * length * length / 8.0 + 4.0 * motion.slip + 2.0 / UNITS_PER_METRE) / scene.step
@@ -108,8 +124,10 @@ def _strays(motion, length, scene):
 
 @borrowing
 def _enters(begin, end, span, low, high):
-    """When a cube (half edge span) on its way from begin to end (3,) meets the box [low, high]: a fraction, rounded
-    down, or inf."""
+    """Return the fraction at which a moving cube (half edge span) first meets the box [low, high].
+
+    begin, end: (3,), its centre. Rounded down; inf if it does not meet the box.
+    """
     least, most = 0.0, 1.0
     for r in range(3):
         way = end[r] - begin[r]
@@ -121,7 +139,8 @@ def _enters(begin, end, span, low, high):
         first, last = near / way, far / way
         if way < 0.0:
             first, last = last, first
-        # near and far are rounded to 2^-52 of terms, which `span` is wider by than need be (voxels_in_reach).
+        # near and far are rounded to 2^-52 of terms; `span` is wider than necessary by that much
+        # (voxels_in_reach).
         least, most = max(least, first), min(most, last)
     if least > most * (1.0 + 1e-12) + 1e-12:
         return INFINITE
@@ -130,7 +149,7 @@ def _enters(begin, end, span, low, high):
 
 @borrowing
 def _still_near(center, span, low, high):
-    """As voxels_in_reach asks: whether a ball touches a voxel's box."""
+    """Return whether a ball touches a voxel's box, by the test of voxels_in_reach."""
     square = 0.0
     for r in range(3):
         gap = max(np.float64(low[r]) - center[r], center[r] - np.float64(high[r]), 0.0)
@@ -140,7 +159,10 @@ def _still_near(center, span, low, high):
 
 @nb.njit(nogil=True, cache=True)
 def _list_rows(begin, end, span, still, scene, index, rows, count):
-    """Append the voxels that a moving cube meets to rows from `count` on; returns the count, beyond capacity too."""
+    """Append the voxels that a moving cube meets to rows, from `count` on.
+
+    Returns the new count, which may exceed the capacity.
+    """
     first, last = np.empty(3, np.int64), np.empty(3, np.int64)
     cells = 1.0
     for r in range(3):
@@ -181,14 +203,16 @@ def _list_rows(begin, end, span, still, scene, index, rows, count):
 
 @nb.njit(nogil=True, cache=True)
 def plan_segments(box, first, last, avatar, scales, units, scene, index, which, progress, starts, rows):
-    """The next segment of each motion numbered in `which` that reaches any voxel, and those voxels.
+    """Plan the next segment of each motion in `which` that reaches any voxel, and list its voxels.
 
-    box: `avatar_box`.  first, last: (k, 4, 4), checked.  scales, units: (k,), the larger of either end's.  Reads
-    progress.at and moves it on to where the segment begins, all before being out of reach of everything; writes end and
-    speed; `at` is 1 for a motion with nothing left in reach, which gets no rows. Fills starts (k + 1,) and rows
-    (capacity,) int64, with no rows for motions not in `which` (ascending). Returns how many rows there are; those
-    beyond the capacity are not written, and progress.at is then as it was. Returns -1, and progress.at as it was, when
-    the scene's stop flag is set.
+    box: `avatar_box`.  first, last: (k, 4, 4), checked.  scales, units: (k,), the larger value of
+    the two ends.
+    Reads progress.at and advances it to the start of the segment; everything before is out of reach
+    of all voxels. Writes end and speed. `at` becomes 1 for a motion with nothing left in reach,
+    which gets no rows. Fills starts (k + 1,) and rows (capacity,) int64, with no rows for motions
+    not in `which` (ascending).
+    Returns the number of rows; those beyond the capacity are not written, and progress.at is then
+    unchanged. Returns -1, with progress.at unchanged, when the scene's stop flag is set.
     """
     pose, shift, begin, end = np.empty((4, 4)), np.empty(3), np.empty(3), np.empty(3)
     moved = np.empty(which.shape[0])
@@ -206,13 +230,14 @@ def plan_segments(box, first, last, avatar, scales, units, scene, index, which, 
         segment = _longest(motion, most, _SEGMENT_BEND * size)
         t, length, before = progress.at[i], 1.0, count
         while t < 1.0 and count == before and not stopped(scene.stop):
-            # Far away the whole rest of the way is tried first, then half of it ...
+            # Far away, the whole remaining way is tried first, then half of it ...
             length = min(max(length, segment), 1.0 - t)
             stop = 1.0 if t + length >= 1.0 - 1e-12 else t + length
             span = _root_at(motion, t, avatar, scales[i], units[i], scene, pose, shift, begin)
             span = max(span, _root_at(motion, stop, avatar, scales[i], units[i], scene, pose, shift, end))
             span += _strays(motion, stop - t, scene)
-            # Outside the scene's bounds there are only cells of voxels whose own bounds are not proven.
+            # Outside the scene's bounds there are only cells of voxels whose own bounds are not
+            # proved.
             if (
                 _enters(begin, end, span, index.scene_low, index.scene_high) < INFINITE
                 or _list_rows(begin, end, span, motion.speed == 0.0, scene, index, rows, count) > count
@@ -242,11 +267,13 @@ def sweep_segments(
 ):  # fmt: skip
     """Advance the motions numbered in `which` along their segments: one call for all of a piece.
 
-    box, first, last, scales, units: as in `plan_segments`.  loose: (k,) what units may differ by on the way.  starts,
-    rows: the voxels of each motion's segment that this piece holds.  tolerance: [m].  Lowers progress.lower and upper,
-    names a witness with upper, and adds to counts (4, k): voxels missing, node visits, point tests, advances.
-    A voxel that is not resident is unknown from where the root sphere's cube reaches it. Once the scene's stop flag is
-    set, a motion is unknown from where it has come to.
+    box, first, last, scales, units: as in `plan_segments`.  loose: (k,), how much units may vary on
+    the way.  starts, rows: the voxels of each motion's segment that this piece holds.  tolerance:
+    [m].
+    Lowers progress.lower and upper, sets a witness with upper, and adds to counts (4, k): voxels
+    missing, node visits, point tests, advances.
+    A voxel that is not resident makes the motion unknown from where the root sphere's cube reaches
+    it. Once the scene's stop flag is set, a motion is unknown from its current position on.
     """
     moving = make_moving(avatar, scene.drop)
     begin, end = np.empty(3), np.empty(3)
@@ -298,10 +325,11 @@ def sweep_segments(
 
 @borrowing
 def _advance(job, start, stop, rows, size, tolerance):
-    """Advance one motion over [start, stop] through some voxels. Returns (lower, upper, advances).
+    """Advance one motion over [start, stop] through some voxels. Return (lower, upper, advances).
 
-    Nothing touches in [start, lower); upper: a contact, by the integers, inf when none was found; lower is `stop` when
-    nothing touches in [start, stop]. A graze fixes lower; what comes after it is searched for contacts all the same.
+    Nothing touches in [start, lower). upper: a contact, confirmed by the integers; inf when none
+    was found. lower is `stop` when nothing touches in [start, stop]. A graze fixes lower; the part
+    after it is still searched for contacts.
     """
     motion, moving = job.motion, job.moving
     t, lower, upper, refused, steps = start, -1.0, INFINITE, 0, 0
@@ -315,7 +343,7 @@ def _advance(job, start, stop, rows, size, tolerance):
         whole, final = search(job, t, after, rows)
         enters, certain = moving.first[0], moving.first[1]
         if enters == 0.0 and not final and t == 0.0 and not begun:
-            # It may touch where it stands: the search ended at the first doubt.
+            # It may touch at the start: the search ended at the first doubt.
             begun = True
             search(job, 0.0, 0.0, rows)
             certain = moving.first[1]
@@ -326,7 +354,7 @@ def _advance(job, start, stop, rows, size, tolerance):
                 upper, stop = sure, sure
                 for n in range(6):
                     best[n] = moving.pair[n]
-            else:  # the proof says that it does: nothing is claimed if it does not
+            else:  # the proof requires contact; without it nothing is claimed
                 sure, enters = INFINITE, 0.0
         since = t
         if enters < INFINITE:
@@ -359,7 +387,10 @@ def _advance(job, start, stop, rows, size, tolerance):
 
 @borrowing
 def _name_witness(job, t, witness):
-    """Write the centres (2, 3) of moving.pair under M(t), world [m]: the avatar's as placed, and the scan's."""
+    """Write the centres (2, 3) of moving.pair under M(t), world [m].
+
+    The avatar's centre as placed comes first, then the scan's.
+    """
     scene, moving, points = job.scene, job.moving, job.avatar.points
     pair = moving.pair
     pose_at(job.motion, t, moving.pose)
@@ -372,11 +403,13 @@ def _name_witness(job, t, witness):
 
 @nb.njit(nogil=True, cache=True)
 def look_around(box, first, last, avatar, scales, units, scene, index, unknown, until, outside, lost):
-    """What lies around the motions, for each over [0, until]: outside (k,) bool, the reach leaves the scene's bounds;
-    lost (k,) float64, when it first meets one of the boxes unknown (u, 2, 3) int64 [steps], inf: never.
+    """Find where motions leave the scene's bounds or meet unknown boxes, for each over [0, until].
 
-    The reach is the cube around the avatar's root sphere, as `collide` has it, along chords; neither depends on voxels.
-    Once the scene's stop flag is set, motions are lost from their beginning.
+    Writes outside (k,) bool, the reach leaves the scene's bounds; lost (k,) float64, when it first
+    meets one of the boxes unknown (u, 2, 3) int64 [steps], inf: never.
+    The reach is the cube around the avatar's root sphere, as in `collide`, along chords; neither
+    result depends on voxels. Once the scene's stop flag is set, motions are lost from their
+    beginning.
     """
     pose, shift, begin, end = np.empty((4, 4)), np.empty(3), np.empty(3), np.empty(3)
     for i in range(first.shape[0]):

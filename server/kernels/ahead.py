@@ -1,6 +1,7 @@
-"""Where a user will be, and which voxels that brings within reach: from the index alone.
+"""Prediction of a user's motion, and the voxels it brings within reach, from the index alone.
 
-A way is where the user's ball goes: m + 1 centres from the last pose on [steps of the lattice], m straight pieces.
+A way is the path of the user's ball: m + 1 centres, beginning with the last pose [lattice steps], m
+straight pieces.
 """
 
 import math
@@ -14,21 +15,25 @@ from ...schemas.voxel_grid import KEY_BIAS
 from .compiled import borrowing
 from .reach import find_key, grid_high, grid_low
 
-# Of poses that look like a walk: what they scatter by, clock and place together [m], and the speeds [m/s] and
-# accelerations [m/s²] of people. The fit leans on them where poses are few or near in time, and needs no special cases.
+# Typical values of poses that look like a walk: scatter of clock and position together [m], and
+# speeds [m/s] and accelerations [m/s²] of people. The fit relies on them where poses are few or
+# close in time, and needs no special cases.
 SCATTER, USUAL_SPEED, USUAL_ACCELERATION = 0.02, 3.0, 2.0
-# Bisections of a piece: the nearest point of it, then the moment of touching; 2^-12 of a piece is under a millisecond.
+# Bisections of a piece: first for its nearest point, then for the moment of touching; 2^-12 of a
+# piece is less than a millisecond.
 NEAREST_HALVINGS, TOUCH_HALVINGS = 40, 12
-# Cells of the grid one call looks up at most: a few milliseconds, only with voxels far smaller than the reach. What
-# comes last is then left out.
+# Largest number of grid cells one call looks up: a few milliseconds, reached only with voxels far
+# smaller than the reach. The last cells are then omitted.
 MOST_CELLS = 1 << 14
 
 
 class Motion(NamedTuple):
-    """What bounds a prediction.
+    """Limits of a prediction.
 
-    history: poses older than this before the last are ignored [s].  speed: at most [m/s].  acceleration: at most
-    [m/s²].  fade: the acceleration falls to 1/e in this time [s], so that what is far ahead goes straight.
+    history: poses older than this before the last are ignored [s].  speed: at most [m/s].
+    acceleration: at most [m/s²].
+    fade: the acceleration falls to 1/e in this time [s], which makes the far part of the way
+    straight.
     """
 
     history: float
@@ -39,7 +44,7 @@ class Motion(NamedTuple):
 
 @borrowing
 def _limit(vector, most):
-    """Shorten a vector (3,) to a length."""
+    """Shorten a vector (3,) to a length of at most `most`."""
     length = math.sqrt(vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2)
     if length > most:
         for k in range(3):
@@ -48,10 +53,11 @@ def _limit(vector, most):
 
 @nb.njit(nogil=True, cache=True)
 def fit_motion(poses, motion):
-    """Velocity [m/s] and acceleration [m/s²], (3,) each, at the last of poses (h, 4): time [s], place [m].
+    """Fit velocity [m/s] and acceleration [m/s²], (3,) each, at the last of poses (h, 4).
 
-    Least squares of p + v t + a t²/2 over the last `motion.history` seconds, with v and a drawn towards 0 as
-    SCATTER over USUAL_* says: of one pose, or of poses at one time, both are 0. h >= 1.
+    A pose: time [s], position [m]; h >= 1. Least squares of p + v t + a t²/2 over the last
+    `motion.history` seconds, with v and a drawn towards 0 by SCATTER over USUAL_*. For one pose, or
+    poses at one time, both are 0.
     """
     last = poses.shape[0] - 1
     s0, s1, s2, s3, s4 = 0.0, 0.0, 0.0, 0.0, 0.0
@@ -63,12 +69,12 @@ def fit_motion(poses, motion):
         h = t * t / 2
         s0, s1, s2, s3, s4 = s0 + 1.0, s1 + t, s2 + t * t, s3 + t * h, s4 + h * h
         for k in range(3):
-            # From the last place: far from the origin nothing is lost.
+            # Relative to the last position: no precision is lost far from the origin.
             away = poses[i, 1 + k] - poses[last, 1 + k]
             right[0, k] += away
             right[1, k] += away * t
             right[2, k] += away * h
-    # Normal equations [[s0, s1, s2/2], [s1, s2, s3], [s2/2, s3, s4]], the place eliminated.
+    # Normal equations [[s0, s1, s2/2], [s1, s2, s3], [s2/2, s3, s4]], the position eliminated.
     m11 = s2 - s1 * s1 / s0 + (SCATTER / USUAL_SPEED) ** 2
     m12 = s3 - s1 * s2 / 2 / s0
     m22 = s4 - s2 * s2 / 4 / s0 + (SCATTER / USUAL_ACCELERATION) ** 2
@@ -86,10 +92,11 @@ def fit_motion(poses, motion):
 
 @nb.njit(nogil=True, cache=True)
 def predict_way(poses, motion, seconds, way):
-    """Fill way (m + 1, 3) [m] with where the user is at even times from the last pose to `seconds` after it; m >= 1.
+    """Write predicted positions from the last pose to `seconds` after it into way (m + 1, 3) [m].
 
-    The acceleration fades (`Motion`) and never makes the user faster than `motion.speed`, so the way is at most
-    speed * seconds long. seconds 0 or less: the user stands.
+    The times are evenly spaced; m >= 1. The acceleration fades (`Motion`) and never makes the user
+    faster than `motion.speed`; the way is therefore at most speed * seconds long. With seconds of 0
+    or less, the user stands still.
     """
     last, pieces = poses.shape[0] - 1, way.shape[0] - 1
     velocity, acceleration = fit_motion(poses, motion)
@@ -98,7 +105,7 @@ def predict_way(poses, motion, seconds, way):
         way[0, k] = poses[last, 1 + k]
     step = max(seconds, 0.0) / pieces
     for i in range(pieces):
-        # The speed at the middle of a piece stands for all of it.
+        # The speed at the middle of a piece represents the whole piece.
         gained = motion.fade * (1.0 - math.exp(-(i + 0.5) * step / motion.fade))
         for k in range(3):
             now[k] = velocity[k] + acceleration[k] * gained
@@ -109,7 +116,10 @@ def predict_way(poses, motion, seconds, way):
 
 @borrowing
 def _square_gap(way, i, along, low, high):
-    """Square of the distance from a point of piece i, `along` in [0, 1], to box [low, high] (3,), and its slope."""
+    """Return the squared distance of a point of piece i from the box [low, high], and its slope.
+
+    along: position on the piece, in [0, 1].  low, high: (3,).
+    """
     square, slope = 0.0, 0.0
     for k in range(3):
         step = way[i + 1, k] - way[i, k]
@@ -122,9 +132,10 @@ def _square_gap(way, i, along, low, high):
 
 @borrowing
 def first_touch(way, i, low, high, reach):
-    """When a ball of this reach first touches a box as it goes along piece i: in [0, 1], or -1 where it does not.
+    """Return when a ball first touches a box as it moves along piece i: in [0, 1], or -1 if never.
 
-    The moment is never late. The distance is convex along a piece: its least is where the slope changes sign.
+    reach: of the ball. The moment is never late. The distance is convex along a piece; its minimum
+    is where the slope changes sign.
     """
     most = reach * reach
     square, slope = _square_gap(way, i, 0.0, low, high)
@@ -159,9 +170,10 @@ def first_touch(way, i, low, high, reach):
 
 @borrowing
 def _cells(low, high, index, voxel_steps, first, counts):
-    """Fill first and counts (3,) int64: the cells of the grid that meet the box low..high (3,) [steps] of the scene.
+    """Find the grid cells of the scene that meet the box [low, high] (3,) [steps].
 
-    Returns how many there are, as a float: more than an integer holds is possible.
+    Fills first and counts (3,) int64. Returns their number as a float, because it may exceed an
+    integer.
     """
     cells = 1.0
     for k in range(3):
@@ -177,7 +189,7 @@ def _cells(low, high, index, voxel_steps, first, counts):
 
 @borrowing
 def _cell_row(keys, number, first, counts):
-    """The row of the cell of this number among those that `_cells` found, x slowest; -1: no voxel there."""
+    """Return the row of cell `number` of those that `_cells` found, x slowest; -1: no voxel."""
     iz = first[2] + number % counts[2]
     number //= counts[2]
     iy = first[1] + number % counts[1]
@@ -189,7 +201,7 @@ def _cell_row(keys, number, first, counts):
 
 @borrowing
 def _known(rows, count, row):
-    """Whether a row is among the first `count`."""
+    """Return whether a row is among the first `count`."""
     at = 0
     while at < count and rows[at] != row:
         at += 1
@@ -205,7 +217,7 @@ def _box_of(index, row, low, high):
 
 @borrowing
 def _sort_by_need(rows, need, count):
-    """Sort the first `count`, soonest first, equals by row: they come nearly in order."""
+    """Sort the first `count` entries, soonest first, ties by row; they arrive nearly in order."""
     for i in range(1, count):
         row, when = rows[i], need[i]
         j = i - 1
@@ -217,12 +229,15 @@ def _sort_by_need(rows, need, count):
 
 @nb.njit(nogil=True, cache=True)
 def rows_ahead(way, reach, ring, index, voxel_steps, rows, need):
-    """Find what a ball touches on its way, and what is around where it starts.
+    """Find the voxels a ball touches on its way, then those around its start.
 
-    way: (m + 1, 3) float64.  reach: of the ball, inclusive.  ring: how far beyond the reach is around; all [steps].
-    Fills rows (n,) int64, each once, and need (n,) float64, soonest first: pieces of the way until it touches, 0 to
-    m; then, for those around that it does not touch, m + 1 + (what is between ball and box, over the ring).
-    Returns how many, n at most; where there are more, those on the pieces that came last, or around, are left out.
+    way: (m + 1, 3) float64.  reach: of the ball, inclusive.  ring: how far beyond the reach voxels
+    count as around; all [steps].
+    Fills rows (n,) int64, each once, and need (n,) float64, soonest first. need is the number of
+    pieces of the way until the ball touches, 0 to m. For voxels around the start that it does not
+    touch, need is m + 1 + (distance between ball and box) / ring.
+    Returns how many, at most n; where there are more, the voxels on the last pieces, or around, are
+    omitted.
     """
     pieces, capacity, voxels = way.shape[0] - 1, rows.shape[0], index.keys.shape[0]
     low, high, box_low, box_high = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
@@ -238,7 +253,7 @@ def rows_ahead(way, reach, ring, index, voxel_steps, rows, need):
             low[k] = min(way[a, k], way[b, k]) - wide
             high[k] = max(way[a, k], way[b, k]) + wide
         cells = _cells(low, high, index, voxel_steps, first, counts)
-        listed = cells > voxels  # cheaper to go through the voxels than through the grid
+        listed = cells > voxels  # cheaper to test every voxel than every cell of the grid
         for number in range(int(min(cells, np.float64(voxels)))):
             looked += 1
             if looked > MOST_CELLS or found == capacity:
@@ -267,8 +282,9 @@ def rows_ahead(way, reach, ring, index, voxel_steps, rows, need):
 def rows_in_reach(centers, reaches, index, voxel_steps, starts, rows):
     """List the voxels whose box of points each of k balls touches.
 
-    centers: (k, 3), reaches: (k,) float64 [steps]. Fills starts (k + 1,) and rows, int64: those of ball i are
-    rows[starts[i]:starts[i + 1]]. Returns how many there are; those beyond the capacity are not written.
+    centers: (k, 3), reaches: (k,) float64 [steps]. Fills starts (k + 1,) and rows, int64: those of
+    ball i are rows[starts[i]:starts[i + 1]]. Returns their number; those beyond the capacity are
+    not written.
     """
     low, high, box_low, box_high = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     first, counts = np.empty(3, np.int64), np.empty(3, np.int64)
@@ -298,7 +314,7 @@ def rows_in_reach(centers, reaches, index, voxel_steps, starts, rows):
 
 @borrowing
 def _square_between(low, high, other_low, other_high):
-    """Square of the distance between two boxes of corners (3,)."""
+    """Return the squared distance between two boxes of corners (3,)."""
     square = 0.0
     for k in range(3):
         gap = max(low[k] - other_high[k], other_low[k] - high[k], 0.0)
@@ -308,16 +324,16 @@ def _square_between(low, high, other_low, other_high):
 
 @nb.njit(nogil=True, cache=True)
 def distance_to_ways(ways, rows, index, far):
-    """Fill far (n,) with the least distance from the box of each of rows (n,) to the centres of u ways [steps].
+    """Write the least distance of each voxel's box to the centres of u ways [steps] to far (n,).
 
-    ways: (u, m, 3) float64. Infinite where u is 0.
+    rows: (n,), the voxels.  ways: (u, m, 3) float64. far is inf where u is 0.
     """
     low, high = np.empty(3), np.empty(3)
     users = ways.shape[0]
     boxes, apart = (
         np.empty((users, 2, 3)),
         np.empty(users),
-    )  # of whole ways, and how far, squared: no centre is nearer
+    )  # boxes of whole ways, and the squared distance to each: no centre is nearer
     for u in range(users):
         for k in range(3):
             boxes[u, 0, k], boxes[u, 1, k] = ways[u, :, k].min(), ways[u, :, k].max()

@@ -1,9 +1,10 @@
-"""The nearest pair of each scan: two hierarchies descended together, a scan's nearest pair so far bounding its next.
+"""Nearest pair of each scan: a joint descent, bounded by the nearest pair of each scan so far.
 
-The descent is that of contacts.py; what is nearer, and what a pair rules out, is that of closest.py, for every scan
-that has points here. A node does not know whose points it holds, so it is looked into as far as the margin; a leaf node
-does, and is left alone where it is farther than the nearest of each scan that it has points of: a wall that one scan
-saw costs no more than its nodes and the numbers of its points.
+The descent is that of contacts.py. What counts as nearer, and what a pair rules out, follows
+closest.py, for every scan with points here. An inner node does not hold the scans of its points; it
+is therefore searched up to the margin. A leaf node does, and is skipped where it is farther than
+the nearest pair of each scan it has points of. A wall that one scan saw therefore costs only its
+nodes and the scan numbers of its points.
 """
 
 import math
@@ -24,10 +25,10 @@ from .stopping import stopped
 
 
 class Nearer(NamedTuple):
-    """What is known of each of n scans; the last stands for numbers that no scan has.
+    """Results for each of n scans; the last entry stands for numbers that no scan has.
 
-    gaps: (n,) float64, least signed gap [m], inf: none within the margin.  units: (n,) int64, what |a - b| + drop of
-    its nearest pair is at most, exact units (closest.py).
+    gaps: (n,) float64, least signed separation [m], inf: none within the margin.
+    units: (n,) int64, upper bound of |a - b| + drop of its nearest pair, exact units (closest.py).
     """
 
     gaps: NDArray[np.float64]
@@ -35,9 +36,11 @@ class Nearer(NamedTuple):
 
 
 class Work(NamedTuple):
-    """Scratch of one call. cut, far: (n, classes) float32, see `closest.Best`, by scan.  frame: (5,), of `Best`.
+    """Scratch of one call.
 
-    by_class: thresholds of the margin.  stack: (STACK, 2) int64.  off: (3,) float32.  squares: (LANES,) float32.
+    cut, far: (n, classes) float32, see `closest.Best`, by scan.  frame: (5,), of `Best`.
+    by_class: thresholds of the margin.  stack: (STACK, 2) int64.  off: (3,) float32.  squares:
+    (LANES,) float32.
     keep: (LANES,) bool.  counts: (3,) int64, voxels missing, node visits, point tests.
     """
 
@@ -56,13 +59,16 @@ class Work(NamedTuple):
 def _measure(
     avatar, m, block, lane, placed, scene, voxel, lane_at, block_at, j, s, own, radii, most, nearer, work
 ):
-    """Take one pair as its scan's nearest if it is. radii: r_a + r_b of it, most: with the margin, exact units."""
+    """Replace the nearest pair of a scan by this pair if it is nearer.
+
+    radii: r_a + r_b of the pair.  most: the same plus the margin, exact units.
+    """
     square = pair_square(avatar, m, block, lane, placed, scene, voxel, lane_at, block_at, j)
     if square < 0 or square > most * most:
         return
     root = math.sqrt(np.float64(square))
     both = root + np.float64(radii)
-    # As signed.py has it.
+    # The formula of signed.py.
     gap = np.float64(square - radii * radii) / both / UNITS_PER_METRE if both > 0.0 else 0.0
     if gap < nearer.gaps[s]:
         nearer.gaps[s] = gap
@@ -74,7 +80,10 @@ def _measure(
 
 @borrowing
 def _search_leaves(avatar, m, a, block, placed, scene, voxel, row, reach_units, margin_units, nearer, work):
-    """Take up what is nearer, of each scan, of the points of an avatar's leaf node and of a scene's, at work.off."""
+    """Update the nearest pair of each scan from a leaf node of the avatar and one of the scene.
+
+    The voxel is at work.off.
+    """
     words, ints, halves, off = scene.words, scene.ints, scene.halves, work.off
     keep, squares, cut, far, mask = work.keep, work.squares, work.cut, work.far, work.by_class.mask
     nodes, lanes, last = placed.nodes, placed.lanes, nearer.gaps.shape[0] - 1
@@ -94,7 +103,8 @@ def _search_leaves(avatar, m, a, block, placed, scene, voxel, row, reach_units, 
     if placed.stamp[block] != 0:
         place_block(avatar, m, block, placed, scene)
         placed.stamp[block] = 0
-    # Of flat walls along flat avatars the avatar's sphere tells little, its points tell nearly all.
+    # For flat walls along flat avatars, the avatar's sphere excludes little and its points exclude
+    # nearly everything.
     if not keep_near(lanes, block, words, row, off[0], off[1], off[2], widest, keep):
         return
     low_x = off[0] + np.float32(ints[block_at])
@@ -130,7 +140,7 @@ def _search_leaves(avatar, m, a, block, placed, scene, voxel, row, reach_units, 
 
 @borrowing
 def _search_voxel(avatar, m, placed, scene, voxel, reach_units, margin_units, visits, nearer, work):
-    """Search one resident voxel for each scan's nearest pair. Returns whether it was looked at to the end."""
+    """Search one resident voxel for each scan's nearest pair; return whether to the end."""
     words, ints = scene.words, scene.ints
     base = scene.where[voxel, 0]
     nodes, off, stack, counts = placed.nodes, work.off, work.stack, work.counts
@@ -183,13 +193,14 @@ def _search_voxel(avatar, m, placed, scene, voxel, reach_units, margin_units, vi
 
 @nb.njit(nogil=True, cache=True)
 def nearest_by_scan(poses, avatar, scene, reach, margin_units, visits, nearer, counts):
-    """The least signed gap of each scan to an avatar under one pose, within a margin.
+    """Compute the least signed separation of each scan from an avatar, within a margin.
 
-    poses: (1, 4, 4), checked.  avatar: not empty.  scene: with scan numbers.  reach: Reach of the pose; a voxel in it
-    that is not resident is counted as missing.  margin_units: of it, what is not the radii.  visits: node visits after
-    which no node is looked into.  nearer: inf and reach.units to begin with, or as a call for other voxels left it.
-    counts: (3,) int64, voxels missing, node visits, point tests, added to.
-    Returns whether all resident voxels were looked at to the end.
+    poses: (1, 4, 4), one pose, checked.  avatar: not empty.  scene: with scan numbers.  reach:
+    Reach of the pose; a voxel in it that is not resident is counted as missing.  margin_units: the
+    part of the reach that is not the radii.  visits: node visits after which no further node is
+    opened.  nearer: initially inf and reach.units, or as a call for other voxels left it.  counts:
+    (3,) int64, voxels missing, node visits, point tests; added to.
+    Returns whether all resident voxels were searched completely.
     """
     m, units = poses[0], reach.units[0]
     placed, n, classes = make_placed(avatar), nearer.gaps.shape[0], scene.drop.shape[0]

@@ -1,10 +1,11 @@
-"""Pairs in contact, gathered: the deepest of them, and the connected regions of scan points they touch.
+"""Pairs in contact, accumulated: the deepest pairs, and the regions of scan points they touch.
 
-A pair is a record of whole numbers that say exactly which of two is deeper, the one with the smaller gap between its
-spheres, so that no tree and no order of visits can change what is listed. Touched scan points fall into cells of a
-uniform grid over the lattice; cells that share a face, an edge or a corner are one cluster, found by union-find
-(Tarjan, "Efficiency of a good but not linear set union algorithm", 1975). What is kept grows with the cells touched and
-with the pairs listed, never with the pairs found.
+A pair is a record of integers that determines exactly which of two pairs is deeper, namely the one
+with the smaller separation of its spheres. No tree and no order of visits can therefore change the
+result. Touched scan points fall into cells of a uniform grid over the lattice. Cells that share a
+face, an edge or a corner belong to one cluster, found by union-find (Tarjan, "Efficiency of a good
+but not linear set union algorithm", 1975). Memory grows with the cells touched and the pairs
+listed, never with the pairs found.
 """
 
 from typing import NamedTuple
@@ -18,23 +19,25 @@ from .compiled import borrowing
 from .placed import U32
 from .stopping import ROWS_AT_ONCE, copy_rows, stopped
 
-# Columns of a record; the first ORDER of them say which pair is deeper: |a - b|^2 [exact units^2] and by how much the
-# scan point's sphere is smaller than the largest [exact units]; where the gaps of two are equal, compared in turn: scan
-# point x, y, z [lattice], avatar centre x, y, z [exact units], row of the avatar's point, scan number.
+# Columns of a record. The first ORDER of them determine which pair is deeper: |a - b|^2 [exact
+# units^2], and the largest radius minus that of the scan point [exact units]. Pairs of equal
+# separation compare, in turn: scan point x, y, z [lattice], avatar centre x, y, z [exact units],
+# row of the avatar's point, scan number.
 SQUARE, DROP, POINT, CENTER, ROW, SCAN, ORDER, TAG, RECORD = 0, 1, 2, 5, 8, 9, 10, 10, 11
-# A cluster is its deepest pair's record, then pairs in it and the box of its touched points; so is a cell, and then
-# its place in the grid.
+# A cluster is the record of its deepest pair, then the number of its pairs and the box of its
+# touched points. A cell is the same, followed by its place in the grid.
 PAIRS, LOW, HIGH, CLUSTER, PLACE, CELL = 11, 12, 15, 18, 18, 21
-# Counters of `Memory.sizes`: cells, pairs kept, pairs listed, clusters listed, the cell met last.
+# Counters of `Memory.sizes`: cells, pairs kept, pairs listed, clusters listed, the last cell used.
 CELLS, KEPT, LISTED, CLUSTERS, LAST = range(5)
 
 
 class Cells(NamedTuple):
-    """The grid cells touched under one pose: an open-addressing hash.
+    """Grid cells touched under one pose: an open-addressing hash table.
 
-    table: (c, CELL) int64.  bound: (c,) float64 [steps], no pair farther apart, its sphere's drop added, is the cell's
-    deepest.
-    slots: (s,) int64, s a power of two, rows of `table` or -1; never more than half of them taken.
+    table: (c, CELL) int64.
+    bound: (c,) float64 [steps]: a pair farther apart, the drop of its sphere included, is not the
+    cell's deepest.
+    slots: (s,) int64, s a power of two, rows of `table` or -1; at most half of them are taken.
     """
 
     table: NDArray[np.int64]
@@ -43,13 +46,16 @@ class Cells(NamedTuple):
 
 
 class Memory(NamedTuple):
-    """What a request has found so far and where it stands, so that it can go on; grown by the kernels.
+    """Results and state of a request, so that it can be resumed; the kernels grow it.
 
-    cells: of the pose at hand.  heap: (limit, RECORD) int64, its deepest pairs, the least deep first.  sizes: (5,)
-    int64, see above.  cursor: (3,) int64, position among the poses, among the pose's voxels (-1: not begun), and
-    depth of the stack.  stack: (STACK, 2) int64.
-    pairs: (p, RECORD), clusters: (c, CLUSTER) int64: those of the poses done, with room behind; a pair's TAG is its row
-    among the pose's clusters.
+    cells: of the current pose.
+    heap: (limit, RECORD) int64, its deepest pairs, the least deep first.
+    sizes: (5,) int64, see above.
+    cursor: (3,) int64: position among the poses, position among the pose's voxels (-1: not begun),
+    depth of the stack.
+    stack: (STACK, 2) int64.
+    pairs: (p, RECORD), clusters: (c, CLUSTER) int64: those of the finished poses, followed by free
+    rows; a pair's TAG is its row among the pose's clusters.
     """
 
     cells: Cells
@@ -63,7 +69,7 @@ class Memory(NamedTuple):
 
 @borrowing
 def deeper(a, i, b, j):
-    """Whether record a[i] comes before record b[j]."""
+    """Return whether record a[i] precedes record b[j]: the deeper pair precedes."""
     if a[i, DROP] != b[j, DROP]:
         order = compare_gaps(a[i, SQUARE], -a[i, DROP], b[j, SQUARE], -b[j, DROP])
         if order != 0:
@@ -101,7 +107,7 @@ def _sift_down(rows, n, at):
 def sort_rows(rows, n, stop):
     """Sort rows[:n] deepest first, in place (Williams, heapsort), until the stop flag is set.
 
-    Once it is set, not even the first row is touched: there may be fewer than n.
+    Once it is set, this does not access even the first row: there may be fewer than n rows.
     """
     for at in range(n // 2 - 1, -1, -1):
         if stopped(stop):
@@ -123,7 +129,7 @@ def _copy(record, rows, at):
 
 @borrowing
 def keep_deepest(heap, kept, record):
-    """Take record[0] among the `kept` deepest pairs if it belongs there; returns how many are kept then."""
+    """Insert record[0] into the `kept` deepest pairs if it belongs there; return the new number."""
     if kept < heap.shape[0]:
         _copy(record, heap, kept)
         at = kept
@@ -139,22 +145,32 @@ def keep_deepest(heap, kept, record):
 
 @borrowing
 def bound_after(record, at, units_per_step, error):
-    """The bound, as in `Cells`, that record[at] sets: what is no deeper lies beyond it, whatever float32 rounds."""
+    """Return the bound, as in `Cells`, set by record[at].
+
+    Every pair that is not deeper lies beyond it, whatever float32 rounds.
+    """
     gap = np.sqrt(np.float64(record[at, SQUARE])) + np.float64(record[at, DROP])
     return gap / units_per_step * (1.0 + 2.0 * U32) + error
 
 
 @borrowing
 def square_below(bound, drop_steps):
-    """The float32 square above which no pair with that drop [steps] is within a bound: as `far` of make_limits."""
+    """Return the float32 square above which no pair with this drop is within a bound.
+
+    drop_steps: the drop [steps]. The counterpart is `far` of make_limits.
+    """
     above = bound - drop_steps
-    # 8 as there, 2 for the narrowing: np.nextafter is a call, and this is asked for every scan point in contact.
+    # 8 as there, plus 2 for the rounding to float32: np.nextafter is a call, and this runs for
+    # every scan point in contact.
     return np.float32(above * above * (1.0 + 10.0 * U32)) if above >= 0.0 else np.float32(-1.0)
 
 
 @borrowing
 def listing_bound(heap, kept, units_per_step, error):
-    """The bound, as in `Cells`, of pairs that may be among those listed; `kept` of them are."""
+    """Return the bound, as in `Cells`, of pairs that may be among those listed.
+
+    kept: how many are listed so far.
+    """
     if heap.shape[0] == 0:
         return -1.0
     if kept < heap.shape[0]:
@@ -164,7 +180,7 @@ def listing_bound(heap, kept, units_per_step, error):
 
 @nb.njit(nogil=True, cache=True)
 def make_cells(count, stop):
-    """Room for `count` cells, a power of two; of no use once the stop flag is set."""
+    """Allocate `count` cells, a power of two; the result is unusable once the stop flag is set."""
     slots = np.empty(2 * count, np.int64)
     for at in range(2 * count):
         if at % (64 * ROWS_AT_ONCE) == 0 and stopped(stop):
@@ -175,8 +191,8 @@ def make_cells(count, stop):
 
 @borrowing
 def find_slot(cells, x, y, z):
-    """The slot of cell (x, y, z), or the free slot where it would go."""
-    # 21 bits of each, so that no product leaves 63 bits.
+    """Return the slot of cell (x, y, z), or the free slot where it belongs."""
+    # 21 bits of each, so that every product fits 63 bits.
     h = ((x & 0x1FFFFF) * 73856093) ^ ((y & 0x1FFFFF) * 19349663) ^ ((z & 0x1FFFFF) * 83492791)
     last = cells.slots.shape[0] - 1
     slot = (h ^ (h >> 19)) & last
@@ -190,7 +206,10 @@ def find_slot(cells, x, y, z):
 
 @borrowing
 def enter_cell(cells, used, x, y, z):
-    """The row of cell (x, y, z), made when new: then it is row `used`, and there must be room."""
+    """Return the row of cell (x, y, z), created as row `used` if it is new.
+
+    There must be a free row.
+    """
     slot = find_slot(cells, x, y, z)
     row = cells.slots[slot]
     if row < 0:
@@ -198,7 +217,8 @@ def enter_cell(cells, used, x, y, z):
         cells.slots[slot] = row
         table = cells.table
         table[row, PLACE], table[row, PLACE + 1], table[row, PLACE + 2] = x, y, z
-        # Deeper than this is every pair: its root is 2^31.5, a reach and a drop together are below 2^31.
+        # Every pair is deeper than this one, whose root is 2^31.5: a reach plus a drop is below
+        # 2^31.
         table[row, SQUARE], table[row, DROP], table[row, PAIRS] = np.iinfo(np.int64).max, 0, 0
         for r in range(3):
             table[row, LOW + r], table[row, HIGH + r] = np.iinfo(np.int64).max, np.iinfo(np.int64).min
@@ -208,10 +228,13 @@ def enter_cell(cells, used, x, y, z):
 
 @borrowing
 def cell_of(cells, sizes, record, edge):
-    """The row of the cell that the record's scan point falls in; room for a new one must be there."""
+    """Return the row of the cell of the record's scan point.
+
+    There must be a free row for a new cell.
+    """
     table, last = cells.table, sizes[LAST]
     x, y, z = record[0, POINT], record[0, POINT + 1], record[0, POINT + 2]
-    if last >= 0:  # nearly always the last one, and divisions are slow
+    if last >= 0:  # nearly always the last cell, and divisions are slow
         x0, y0, z0 = table[last, PLACE] * edge, table[last, PLACE + 1] * edge, table[last, PLACE + 2] * edge
         if x0 <= x < x0 + edge and y0 <= y < y0 + edge and z0 <= z < z0 + edge:
             return last
@@ -224,7 +247,10 @@ def cell_of(cells, sizes, record, edge):
 
 @nb.njit(nogil=True, cache=True)
 def grow_cells(cells, used, stop):
-    """The same `used` cells with twice the room; the cells as they are once the stop flag is set."""
+    """Return the same `used` cells with twice the capacity.
+
+    Returns the cells unchanged once the stop flag is set.
+    """
     grown = make_cells(2 * cells.table.shape[0], stop)
     copy_rows(cells.table, grown.table, used, stop)
     for row in range(used):
@@ -238,9 +264,12 @@ def grow_cells(cells, used, stop):
 
 @nb.njit(nogil=True, cache=True)
 def empty_cells(cells, used, stop):
-    """Forget all `used` cells, in time that grows with them and not with the room; not all once the stop is set."""
+    """Remove all `used` cells, in time proportional to them and not to the capacity.
+
+    Ends early once the stop flag is set.
+    """
     table = cells.table
-    # Last come, first gone: what lies between a cell's hash and its slot came before it.
+    # Last in, first out: the entries between a cell's hash and its slot were inserted before it.
     for row in range(used - 1, -1, -1):
         if row % ROWS_AT_ONCE == 0 and stopped(stop):
             return
@@ -257,14 +286,17 @@ def _root(parent, row):
 
 @nb.njit(nogil=True, cache=True)
 def _join_neighbours(cells, used, parent, stop):
-    """Fill parent (used,): union-find over cells that share a face, an edge or a corner, until the stop flag is set."""
+    """Fill parent (used,) by union-find over cells that share a face, an edge or a corner.
+
+    Ends early once the stop flag is set.
+    """
     table = cells.table
     for row in range(used):
         parent[row] = row
     for row in range(used):
         if stopped(stop):
             return
-        # Half of the 26 neighbours: of two neighbours each other's, one looks.
+        # 13 of the 26 neighbours: of two neighbouring cells, only one looks for the other.
         for n in range(14, 27):
             slot = find_slot(
                 cells,
@@ -280,7 +312,10 @@ def _join_neighbours(cells, used, parent, stop):
 
 @nb.njit(nogil=True, cache=True)
 def _with_room(rows, used, more, stop):
-    """`rows` with room for `more` behind those used; the rows as they are once the stop flag is set."""
+    """Return `rows` with space for `more` rows after the used ones.
+
+    Returns the rows unchanged once the stop flag is set.
+    """
     if used + more <= rows.shape[0]:
         return rows
     grown = np.empty((2 * (used + more), rows.shape[1]), np.int64)
@@ -290,10 +325,11 @@ def _with_room(rows, used, more, stop):
 
 @nb.njit(nogil=True, cache=True)
 def list_pose(memory, runs, stop):
-    """List the pairs and clusters of the pose at hand, deepest first, and forget its cells.
+    """List the pairs and clusters of the current pose, deepest first, and remove its cells.
 
-    Writes runs (4,) int64: first pair, pairs, first cluster, clusters. Returns the memory, its lists grown, and whether
-    the pose is listed: when the stop flag (1,) is set it has no pairs and no clusters, and the memory takes no more.
+    Writes runs (4,) int64: first pair, pairs, first cluster, clusters. Returns the memory, its
+    lists grown, and whether the pose is listed. When the stop flag (1,) is set, the pose has no
+    pairs and no clusters, and the memory must not be used for further poses.
     """
     cells, heap, sizes = memory.cells, memory.heap, memory.sizes
     table, used, kept = cells.table, sizes[CELLS], sizes[KEPT]
@@ -304,8 +340,8 @@ def list_pose(memory, runs, stop):
     clusters = _with_room(memory.clusters, sizes[CLUSTERS], found, stop)
     own = clusters[sizes[CLUSTERS] :]
     rank, at = np.empty(used, np.int64), 0
-    for row in range(used):  # a root comes before all that hang below it
-        if stopped(stop):  # then there may be no room, too
+    for row in range(used):  # a root precedes all rows below it
+        if stopped(stop):  # there may then be too few rows
             break
         root = _root(parent, row)
         if root == row:
@@ -327,7 +363,7 @@ def list_pose(memory, runs, stop):
             rank[own[at, TAG]] = at
     sort_rows(heap, kept, stop)
     pairs = _with_room(memory.pairs, sizes[LISTED], kept, stop)
-    if stopped(stop):  # what stands above may be in any order
+    if stopped(stop):  # the rows above may be in any order
         runs[0], runs[1], runs[2], runs[3] = sizes[LISTED], 0, sizes[CLUSTERS], 0
         sizes[CELLS], sizes[KEPT], sizes[LAST] = 0, 0, -1
         return Memory(cells, heap, sizes, memory.cursor, memory.stack, pairs, clusters), False

@@ -1,11 +1,13 @@
-"""All pairs of points in contact under a pose: two hierarchies descended together, to the end.
+"""All pairs of points in contact under a pose: a complete joint descent of two hierarchies.
 
-The descent is that of overlap.py ([Fig12] section 6, corrected), but nothing ends it early: every pair of leaf nodes
-whose bounds meet is looked at. There a float32 pass certifies most pairs as near or far; integers (NUMERICS.md N5)
-decide the band between, and measure those pairs that may be the deepest of their cell or among the deepest listed.
+The descent is that of overlap.py ([Fig12] section 6, corrected), but it does not end early: it
+examines every pair of leaf nodes whose bounds meet. There a float32 pass certifies most pairs as
+near or far. Integers (NUMERICS.md N5) decide the pairs between, and measure those pairs that may be
+the deepest of their cell or among the deepest listed.
 
-Each scan point has the sphere of its radius class: its own reach says what is in contact, and the deepest pair is that
-with the least gap between its spheres, |a - b| - r_a - r_b. Nodes and blocks are pruned by the largest sphere below.
+Each scan point has the sphere of its radius class. Its own reach decides what is in contact, and
+the deepest pair is the one with the least separation of its spheres, |a - b| - r_a - r_b. Nodes and
+blocks are pruned by the largest sphere below.
 """
 
 from typing import NamedTuple
@@ -58,11 +60,14 @@ from .stopping import stopped
 
 
 class Asked(NamedTuple):
-    """What is asked beside the poses.
+    """Parameters of a request, in addition to the poses.
 
-    rows: (b, LANES) int32, the row of the avatar's point in each lane.  edges: (k,) int64, edge of a cell [steps].
-    kept: whether the arena holds scan numbers.  limit: pairs to list a pose.  visits: node visits a pose, -1: the time
-    is up, look at nothing more.  cells: how far the table of cells may grow, a power of two.
+    rows: (b, LANES) int32, the row of the avatar's point in each lane.
+    edges: (k,) int64, edge of a cell [steps].
+    kept: whether the arena holds scan numbers.
+    limit: number of pairs to list for each pose.
+    visits: node visits a pose; -1: time is up, examine nothing more.
+    cells: limit of the table of cells, a power of two.
     """
 
     rows: NDArray[np.int32]
@@ -74,9 +79,11 @@ class Asked(NamedTuple):
 
 
 class Tally(NamedTuple):
-    """What is known of k poses. counts: (3, k) int64, voxels missing, node visits, point tests.  pairs: (k,) int64.
+    """Results for k poses.
 
-    cut: (k,) bool, not all was looked at.  runs: (k, 4) int64, first pair listed, pairs, first cluster, clusters.
+    counts: (3, k) int64, voxels missing, node visits, point tests.  pairs: (k,) int64.
+    cut: (k,) bool, the search was incomplete.
+    runs: (k, 4) int64, first pair listed, pairs, first cluster, clusters.
     """
 
     counts: NDArray[np.int64]
@@ -86,9 +93,11 @@ class Tally(NamedTuple):
 
 
 class Work(NamedTuple):
-    """Scratch of one call. keep: (LANES,) bool.  mine: (3, LANES), squares: (LANES,), off: (3,) float32.
+    """Scratch of one call.
 
-    bound: (1,) float64, as in `Cells`, of the pairs listed.  error: (1,) float64, that of the pose's `Limits`.
+    keep: (LANES,) bool.  mine: (3, LANES), squares: (LANES,), off: (3,) float32.
+    bound: (1,) float64, as in `Cells`, of the pairs listed.  error: (1,) float64, that of the
+    pose's `Limits`.
     record: (1, RECORD) int64.  by_class: the pose's thresholds.
     """
 
@@ -104,9 +113,10 @@ class Work(NamedTuple):
 
 @borrowing
 def _measure(avatar, m, block, lane, placed, scene, record):
-    """Write |a - b|^2 and the avatar's centre of one pair, exact units, into `record`, which holds the scan's point.
+    """Write |a - b|^2 and the avatar's centre of one pair, exact units, into `record`.
 
-    Returns whether the square fits: False beyond any reach (`placed.pair_square`, which asks the same).
+    record: holds the scan's point. Returns whether the square fits: False beyond any reach
+    (`placed.pair_square` makes the same test).
     """
     square = np.int64(0)
     points = avatar.points
@@ -126,9 +136,10 @@ def _measure(avatar, m, block, lane, placed, scene, record):
 
 @borrowing
 def _gather_point(avatar, m, a, block, placed, scene, own, asked, edge, memory, work):
-    """Count the pairs of one scan point, in work.record, with a block's points, their float32 squares in work.squares.
+    """Count the pairs of one scan point with the points of a block.
 
-    own: the point's radius class. Returns how many are in contact.
+    The scan point is in work.record, the float32 squares of the block's points in work.squares.
+    own: the scan point's radius class. Returns how many are in contact.
     """
     record, squares, listing, rows = work.record, work.squares, work.bound, asked.rows
     cells, heap, sizes, per_step = memory.cells, memory.heap, memory.sizes, scene.units_per_step
@@ -181,10 +192,11 @@ def _gather_point(avatar, m, a, block, placed, scene, own, asked, edge, memory, 
 
 @borrowing
 def _gather_leaves(avatar, m, a, block, placed, scene, voxel, row, asked, edge, memory, work, i, tally):
-    """Gather the pairs in contact of a leaf node of the avatar and one of the scene, voxel `voxel` at work.off.
+    """Gather the pairs in contact of a leaf node of the avatar and one of the scene.
 
-    First all avatar points against the scene node's bound and all scan points against the avatar node's sphere, in
-    vector loops; then each scan point that remains against all of the avatar's.
+    voxel: the scene's voxel, at work.off. First, vector loops test all avatar points against the
+    scene node's bound and all scan points against the avatar node's sphere. Then each remaining
+    scan point is tested against all points of the avatar.
     """
     words, ints, halves = scene.words, scene.ints, scene.halves
     lanes, nodes, off, keep, mine = placed.lanes, placed.nodes, work.off, work.keep, work.mine
@@ -252,11 +264,11 @@ def _gather_leaves(avatar, m, a, block, placed, scene, voxel, row, asked, edge, 
 
 @borrowing
 def _gather_voxel(avatar, m, i, placed, scene, voxel, asked, memory, work, tally, stop):
-    """Gather all pairs in contact of the placed avatar and one resident voxel, the two trees descended together.
+    """Gather all pairs in contact of the placed avatar and one resident voxel by a joint descent.
 
-    Goes on where memory.cursor and its stack say. Stops, and then the cursor's depth is not 0, before a node test once
-    the pose has cost `stop` node visits, where the cells have no room for another LANES, and when the scene's stop
-    flag is set.
+    Continues from memory.cursor and its stack. Suspends, with a cursor depth other than 0, before a
+    node test once the pose has cost `stop` node visits, where the cells have no space for another
+    LANES, and when the scene's stop flag is set.
     """
     words, ints = scene.words, scene.ints
     base = scene.where[voxel, 0]
@@ -279,7 +291,7 @@ def _gather_voxel(avatar, m, i, placed, scene, voxel, asked, memory, work, tally
         a, row = stack[depth - 1, 0], stack[depth - 1, 1]
         a_first, b_first = first[a], ints[row + FIRST]
         leaves = a_first < 0 and b_first < 0
-        # A pair of leaf nodes costs no visits, but room.
+        # A pair of leaf nodes costs no visits, but cells.
         if sizes[CELLS] + LANES > most_cells if leaves else counts[1, i] >= stop:
             break
         if stopped(flag):
@@ -317,7 +329,10 @@ def _gather_voxel(avatar, m, i, placed, scene, voxel, asked, memory, work, tally
 
 @borrowing
 def _set_thresholds(units, extent, farthest, scene, work):
-    """Fill work.error and work.by_class for one pose; units: reach of the largest sphere, the rest of `place_nodes`."""
+    """Fill work.error and work.by_class for one pose.
+
+    units: reach of the largest sphere.  extent, farthest: of `place_nodes`.
+    """
     per_step, steps = scene.units_per_step, scene.voxel_steps
     # No class has a larger error.
     work.error[0] = make_limits(units, per_step, extent, farthest, steps).error
@@ -326,7 +341,7 @@ def _set_thresholds(units, extent, farthest, scene, work):
 
 @borrowing
 def _cut_rest(reach, which, cursor, tally):
-    """Cut the pose at hand and those that are left."""
+    """Mark the current pose and the remaining ones as cut."""
     for number in range(cursor[0], which.shape[0]):
         i = which[number]
         tally.cut[i] |= reach.starts[i + 1] > reach.starts[i]
@@ -335,13 +350,15 @@ def _cut_rest(reach, which, cursor, tally):
 
 @nb.njit(nogil=True, cache=True)
 def gather_contacts(poses, avatar, scene, reach, which, asked, closes, pause, memory, tally):
-    """Answer `contacts` for the poses numbered in `which`: nearly always one call a request.
+    """Answer `contacts` for the poses numbered in `which`, usually in one call a request.
 
-    poses: (k, 4, 4), checked.  avatar: not empty.  reach: Reach of these poses; a voxel in it that is not resident is
-    counted as missing.  closes: whether this call sees the last voxels of its poses; they are listed then.
-    pause: node visits after which the call returns with the work as it stands, 1 or more. It is done when
-    memory.cursor[0] == len(which); until then it is called again with the memory it returned, unless that has no room
-    for LANES more of `asked.cells`. A pose that has cost `asked.visits` with something left is cut. Adds to `tally`.
+    poses: (k, 4, 4), checked.  avatar: not empty.  reach: Reach of these poses; a voxel in it that
+    is not resident is counted as missing.  closes: whether this call sees the last voxels of its
+    poses; they are then listed.
+    pause: node visits after which the call returns with the work unfinished, 1 or more. The work is
+    finished when memory.cursor[0] == len(which). Until then, call again with the returned memory,
+    unless the memory has no space for LANES more of `asked.cells`. A pose that has cost
+    `asked.visits` with work left is cut. Adds to `tally`.
     """
     placed = make_placed(avatar)
     work = Work(
@@ -372,7 +389,7 @@ def gather_contacts(poses, avatar, scene, reach, which, asked, closes, pause, me
                     continue
                 before = tally.counts[1, i]
                 short = memory.sizes[CELLS] + LANES > memory.cells.table.shape[0]
-                # Over the budget, and not only stopped for want of room?
+                # Over the budget, and not merely suspended for lack of space?
                 if before >= asked.visits and not (short and cursor[2] > 0):
                     break
                 if stopped(scene.stop):
@@ -381,8 +398,8 @@ def gather_contacts(poses, avatar, scene, reach, which, asked, closes, pause, me
                     return memory
                 stop = min(np.int64(asked.visits), before + left)
                 if short:
-                    # Here and not in the descent: a loop that changes a tuple of arrays counts their references in
-                    # every turn, which took a third of the time.
+                    # Here and not in the descent: a loop that changes a tuple of arrays counts
+                    # their references in every iteration, which took a third of the time.
                     memory = Memory(
                         grow_cells(memory.cells, memory.sizes[CELLS], scene.stop), memory.heap, memory.sizes, cursor,
                         memory.stack, memory.pairs, memory.clusters,

@@ -1,13 +1,16 @@
-"""When does an avatar on its way first touch one that stands? Two trees of avatars, one of them moving.
+"""First contact of a moving avatar with a standing one: a joint descent of two avatar trees.
 
-The motion is that of kernels/motion.py, contact that of kernels/pairs.py: both bodies placed from the dataset's origin,
-in float64, each rounded once to exact units. The proof is that of kernels/sweep.py, whose scan point is here a point of
-the standing avatar, as rounded: over [t0, t1] every moving point is taken along its chord, within
-`band` = sqrt(3) / 2 + B (t1 - t0)^2 / 8 + 2 slip of where it is, and what may be early is halved and quartered until
-a sagitta no longer counts beside rounding. A translation has none: it takes one descent.
+The motion is that of kernels/motion.py, the contact that of kernels/pairs.py: both bodies are
+placed relative to the dataset's origin, in float64, and each centre is rounded once to exact units.
+The proof is that of kernels/sweep.py, with a rounded point of the standing avatar in place of the
+scan point. Over [t0, t1], every moving point is taken along its chord, within `band` = sqrt(3) / 2
++ B (t1 - t0)^2 / 8 + 2 slip of its true position. An interval that may contain an early contact is
+halved and quartered until its sagitta is negligible beside rounding. A translation has no sagitta
+and takes one descent.
 
-What is answered is only how far nothing touches: beyond is a contact, or a graze within 1.2 units, 18 nm, of one.
-All is float64: avatars are some thousand points, and few of them are near one another.
+The answer is only how far nothing touches. Beyond that lies a contact, or a graze within 1.2 units,
+18 nm, of one. All arithmetic is float64: avatars have some thousand points, few of which are near
+one another.
 """
 
 import math
@@ -32,7 +35,8 @@ from .motion import make_motion, pose_at
 from .placing import largest_term, place, to_units
 from .stopping import stopped
 
-# As in sweep.py, advance.py: what is not worth halving; of a first chord; advances that settled nothing.
+# As in sweep.py and advance.py: the sagitta below which halving is useless; the sagitta of a first
+# chord, in avatar sizes; the number of advances that may settle nothing.
 _LEAST_SAGITTA = 0.25
 _CHORD_BEND = 1.0 / 16.0
 _MOST_REFUSED = 512
@@ -40,14 +44,16 @@ _MOST_REFUSED = 512
 
 @borrowing
 def _latest(scratch):
-    """The fraction of a chord that still matters, rounded up."""
+    """Return the fraction of a chord that still matters, rounded up."""
     return min(scratch.first[0] * (1.0 + 1e-9) + 1e-30, 1.0)
 
 
 @borrowing
 def _goes_away(meeting, chord, x, y, z, block_b, lane_b):
-    """Whether a pair that is within the band where the motion begins, (x, y, z) and a point, does not touch there and
-    comes no nearer."""
+    """Return whether a pair within the band at the start does not touch there and comes no nearer.
+
+    x, y, z: the moving point.  block_b, lane_b: the standing point.
+    """
     scratch = meeting.scratch
     gap, way = scratch.gap, scratch.way
     if chord.t0 > 0.0 or not chord.final:
@@ -64,7 +70,7 @@ def _goes_away(meeting, chord, x, y, z, block_b, lane_b):
 
 @borrowing
 def _try_pair(meeting, chord, block_a, lane_a, block_b, lane_b):
-    """Take one pair of points into account; lanes are those of block_b."""
+    """Update scratch.first with one pair of points; lanes are those of block_b."""
     scratch, points = meeting.scratch, meeting.a.points
     gap, way, ends, first = scratch.gap, scratch.way, scratch.ends, scratch.first
     x, y, z = points[block_a, 0, lane_a], points[block_a, 1, lane_a], points[block_a, 2, lane_a]
@@ -85,7 +91,7 @@ def _try_pair(meeting, chord, block_a, lane_a, block_b, lane_b):
 
 @borrowing
 def _bounds_of(lane, room):
-    """The least and the greatest of some coordinates (LANES,), and `room` more on either side."""
+    """Return the least and the greatest of coordinates (LANES,), widened by `room` on each side."""
     least, most = lane[0], lane[0]
     for k in range(LANES):
         least, most = min(least, lane[k]), max(most, lane[k])
@@ -94,7 +100,10 @@ def _bounds_of(lane, room):
 
 @borrowing
 def _sift(scratch, block_a, block_b, j, room):
-    """Which points of a moving block come near a standing block's sphere, of node j, and box, into scratch.keep."""
+    """Mark in scratch.keep the points of a moving block that come near a standing block.
+
+    Near: within `room` of the sphere of its node j and of the box of its points.
+    """
     standing, ways, keep, latest = scratch.standing, scratch.ways, scratch.keep, _latest(scratch)
     bx, by, bz = standing[0, j], standing[1, j], standing[2, j]
     span = (standing[3, j] + room) * (1.0 + 1e-12)
@@ -120,10 +129,11 @@ def _sift(scratch, block_a, block_b, j, room):
 
 @borrowing
 def _leaves(meeting, chord, i, j):
-    """Take all pairs of two leaf nodes into account.
+    """Update scratch.first with all pairs of two leaf nodes.
 
-    Moving points against the standing one's bounds, then against its points, each in one vector loop: LANES is a
-    constant, so that what is beyond a node's count, its last point repeated, is looked at too.
+    Moving points are tested against the standing node's bounds, then against its points, each in
+    one vector loop. LANES is a constant; the loops therefore include the entries beyond a node's
+    count, which repeat its last point.
     """
     scratch = meeting.scratch
     lanes, ways, stamps, turns = scratch.lanes, scratch.ways, scratch.stamps, scratch.turns
@@ -158,8 +168,10 @@ def _leaves(meeting, chord, i, j):
 
 @borrowing
 def _nearest(scratch, room, i, j):
-    """The least square of how far apart the centres of two nodes come, inf where nothing below them can touch before
-    what was found."""
+    """Return the least squared distance that the centres of two nodes reach.
+
+    inf where nothing below them can touch before the contact found so far.
+    """
     moving, standing = scratch.moving, scratch.standing
     both = (moving[7, i] + standing[3, j] + room) * (1.0 + 1e-12)
     square = least_square(
@@ -171,9 +183,10 @@ def _nearest(scratch, room, i, j):
 
 @borrowing
 def _descend(meeting, chord):
-    """One descent of both trees for one chord, the larger inner node opened, a leaf never; fills scratch.first.
+    """Descend both trees once for one chord; fill scratch.first.
 
-    Of children the pair whose centres come nearest goes first: what touches early is found early, and prunes.
+    The larger inner node is opened, a leaf never is. Among children, the pair whose centres come
+    nearest is visited first: early contacts are then found early, and prune.
     """
     scratch, a, b = meeting.scratch, meeting.a, meeting.b
     stack, counters = scratch.stack, scratch.counters
@@ -219,7 +232,10 @@ def _descend(meeting, chord):
 
 @borrowing
 def _search(meeting, t0, t1):
-    """One descent over [t0, t1]. Fills scratch.first and pair; returns whether halving is of no use."""
+    """Descend once over [t0, t1]; fill scratch.first and pair.
+
+    Returns whether halving the interval is useless.
+    """
     motion, scratch = meeting.motion, meeting.scratch
     ends, shifts = scratch.ends, scratch.shifts
     pose_at(motion, t0, ends[0])
@@ -227,7 +243,8 @@ def _search(meeting, t0, t1):
     for r in range(3):
         shifts[0, r], shifts[1, r] = ends[0, r, 3], ends[1, r, 3]
     sagitta = motion.bend * (t1 - t0) * (t1 - t0) / 8.0 * UNITS_PER_METRE
-    # The standing point is a whole number but where float64 has none left for it: `error` holds that.
+    # The standing point is an integer, except far out where float64 cannot represent it; `error`
+    # covers that.
     loose = (2.0 * motion.slip + meeting.error) * UNITS_PER_METRE
     band = (0.8661 + sagitta + loose) * (1.0 + 1e-9)
     outer = np.float64(meeting.units) + band
@@ -239,7 +256,10 @@ def _search(meeting, t0, t1):
 
 @borrowing
 def _advance(meeting, size, until, tolerance):
-    """How far nothing touches, where that is before `until`; else inf. scratch.pair is then what comes first."""
+    """Return how far nothing touches, if that is before `until`; else inf.
+
+    scratch.pair is then the pair that touches first.
+    """
     motion, first = meeting.motion, meeting.scratch.first
     longest = 1.0
     if motion.bend > 8.0 * _CHORD_BEND * size:
@@ -269,14 +289,17 @@ def sweep_bodies(
     a, box, units_a, first, last, b, poses, units_b, rows, origin, margin_units, tolerance, until, witness, named,
     scratch, stop,
 ):  # fmt: skip
-    """Which of some bodies that stand, all of avatar b, ends a motion of avatar a first; neither avatar empty.
+    """Find the first of some standing bodies, all of avatar b, that ends a motion of avatar a.
 
-    box: (2, 3) of a.  first, last: (4, 4), checked, rigid, translations from the origin.  poses: (n, 4, 4), checked,
-    rigid, world.  units_a, units_b, margin_units: radii and margin, exact units.  rows: (m,) int64, of poses.
-    until: what comes no sooner is of no interest; inf: all.  Returns (row, fraction): nothing of these touches before,
-    and the row's body does, or all but, at most `tolerance` [m] of the fastest point's way later; (-1, until) if none
-    does. Writes witness (2, 3): the centres of the two spheres there, world [m]; named (2,) int64: block and lane of
-    the body's. Adds to scratch.counters.  stop: (1,) int64, a stop flag; once it is set, what is said is of no use.
+    Neither avatar is empty.
+    box: (2, 3) of a.  first, last: (4, 4), checked, rigid, translations relative to the origin.
+    poses: (n, 4, 4), checked, rigid, world.  units_a, units_b, margin_units: radii and margin,
+    exact units.  rows: (m,) int64, of poses.  until: contacts at or after it are ignored; inf: none
+    is.  stop: (1,) int64, a stop flag; once it is set, the result is meaningless.
+    Returns (row, fraction): none of these bodies touches before the fraction; the row's body
+    touches there or up to `tolerance` [m] of the fastest point's way later, or nearly does. (-1,
+    until) if none touches. Writes witness (2, 3): the centres of the two spheres there, world [m];
+    named (2,) int64: block and lane of the body's point. Adds to scratch.counters.
     """
     motion = make_motion(first, last, box, np.zeros(3))
     shift, shifts = np.empty(3), scratch.shifts

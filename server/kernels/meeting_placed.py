@@ -1,4 +1,7 @@
-"""Two avatars of which one moves along a chord and one stands: both placed from the dataset's origin, in float64."""
+"""Placement of two avatars, one moving along a chord and one standing.
+
+Both are placed relative to the dataset's origin, in float64.
+"""
 
 from typing import NamedTuple
 
@@ -13,14 +16,22 @@ from .placing import Avatar, place
 
 
 class Scratch(NamedTuple):
-    """Scratch of one thread, for avatars of so many nodes and blocks, by `make_scratch`.
+    """Scratch of one thread for avatars of limited numbers of nodes and blocks, by `make_scratch`.
 
-    stack: (s, 2) int64, pairs of nodes to be looked at.  moving: (8, nodes): where a node's centre begins, its way,
-    1 / its square, its radius; ways: (blocks, 7, LANES) likewise of points.  standing: (4, nodes) centres and radii;
-    lanes: (blocks, 3, LANES) points.  stamps: (2, blocks) int64: the chord and the body that a block was placed for;
-    turns: (2,) int64, chords and bodies so far.  keep: (LANES,).  ends: (2, 4, 4), shifts: (3, 3): the poses of a
-    chord's ends, their translations and the standing one's.  gap, way: (3,).  first: (2,) when anything could touch,
-    and when something must.  pair: (4,) int64 block, lane of either.  counters: (2,) node visits, point tests.
+    stack: (s, 2) int64, pairs of nodes still to examine.
+    moving: (8, nodes): a node's centre at the beginning, its displacement, 1 / its square, its
+    radius.
+    ways: (blocks, 7, LANES), the same of points, without a radius.
+    standing: (4, nodes), centres and radii.  lanes: (blocks, 3, LANES), points.
+    stamps: (2, blocks) int64: the chord and the body that a block was placed for.
+    turns: (2,) int64, chords and bodies so far.
+    keep: (LANES,).
+    ends: (2, 4, 4), shifts: (3, 3): the poses of a chord's ends, their translations and that of the
+    standing avatar.
+    gap, way: (3,).
+    first: (2,), when the first contact is possible, and when a contact is certain.
+    pair: (4,) int64, block and lane of either point.
+    counters: (2,), node visits, point tests.
     """
 
     stack: NDArray[np.int64]
@@ -41,7 +52,10 @@ class Scratch(NamedTuple):
 
 
 def make_scratch(nodes: int, blocks: int) -> Scratch:
-    """Scratch for `sweep_bodies` of avatars of at most so many nodes and blocks."""
+    """Allocate scratch for `sweep_bodies`.
+
+    nodes, blocks: the most that an avatar has.
+    """
     return Scratch(
         np.empty((STACK, 2), np.int64), np.empty((8, nodes)), np.empty((blocks, 7, LANES)), np.empty((4, nodes)),
         np.empty((blocks, 3, LANES)), np.full((2, blocks), -1, np.int64), np.zeros(2, np.int64),
@@ -51,8 +65,12 @@ def make_scratch(nodes: int, blocks: int) -> Scratch:
 
 
 class Meeting(NamedTuple):
-    """One motion against one body. motion: Motion of avatar a.  pose: (4, 4) of b.  units: of both radii and margin.
-    error: of a distance of two placed centres, and of what rounds to units [m].  stop: (1,) int64, a stop flag."""
+    """One motion against one body.
+
+    motion: Motion of avatar a.  pose: (4, 4) of b.  units: both radii plus the margin.
+    error: of a distance of two placed centres, and of their rounding to units [m].
+    stop: (1,) int64, a stop flag.
+    """
 
     motion: Motion
     a: Avatar
@@ -65,8 +83,12 @@ class Meeting(NamedTuple):
 
 
 class Chord(NamedTuple):
-    """One interval from t0 on. inner, outer: U - band, U + band, exact units.  room: outer with the error [m].
-    final: not worth halving."""
+    """One interval from t0 on.
+
+    inner, outer: U - band, U + band, exact units, where U is `Meeting.units`.  room: outer with the
+    error [m].
+    final: halving is useless.
+    """
 
     t0: float
     inner: float
@@ -77,7 +99,7 @@ class Chord(NamedTuple):
 
 @inlined
 def least_square(gx, gy, gz, wx, wy, wz, inverse, latest):
-    """The least square of a length that goes from g to g + latest w; inverse: 1 / w^2."""
+    """Return the least square of a vector that moves from g to g + latest w; inverse: 1 / w^2."""
     t = min(max(-(gx * wx + gy * wy + gz * wz) * inverse, 0.0), latest)
     ex, ey, ez = gx + t * wx, gy + t * wy, gz + t * wz
     return ex * ex + ey * ey + ez * ez
@@ -85,14 +107,14 @@ def least_square(gx, gy, gz, wx, wy, wz, inverse, latest):
 
 @borrowing
 def inverse_square(x, y, z):
-    """1 / (x^2 + y^2 + z^2), or 0 where that is too small to be divided by."""
+    """Return 1 / (x^2 + y^2 + z^2), or 0 where the sum is too small to divide by."""
     square = x * x + y * y + z * z
     return 1.0 / square if square > 1e-200 else 0.0
 
 
 @borrowing
 def place_moving(meeting, block):
-    """Place the points of a leaf node of the moving one at both ends of a chord."""
+    """Place the points of a leaf node of the moving avatar at both ends of a chord."""
     ways, ends, shifts = meeting.scratch.ways, meeting.scratch.ends, meeting.scratch.shifts
     points = meeting.a.points
     for r in range(3):
@@ -107,7 +129,7 @@ def place_moving(meeting, block):
 
 @borrowing
 def place_standing(meeting, block):
-    """Place the points of a leaf node of the standing one."""
+    """Place the points of a leaf node of the standing avatar."""
     lanes, points = meeting.scratch.lanes, meeting.b.points
     for r in range(3):
         for k in range(LANES):
@@ -117,7 +139,7 @@ def place_standing(meeting, block):
 
 @borrowing
 def place_moving_nodes(meeting, count):
-    """Place the first `count` nodes of the moving one at both ends of a chord."""
+    """Place the first `count` nodes of the moving avatar at both ends of a chord."""
     moving, center, ends, shifts = (
         meeting.scratch.moving,
         meeting.a.center,
@@ -136,7 +158,7 @@ def place_moving_nodes(meeting, count):
 
 @borrowing
 def place_standing_nodes(meeting, count):
-    """Place the first `count` nodes of the standing one."""
+    """Place the first `count` nodes of the standing avatar."""
     standing, center = meeting.scratch.standing, meeting.b.center
     for j in range(count):
         x, y, z = center[j, 0], center[j, 1], center[j, 2]

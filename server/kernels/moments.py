@@ -1,4 +1,7 @@
-"""When does one pair of points touch on its way along a chord? In float64 with a proof, by integers at the end."""
+"""Time of contact of one pair of points along a chord.
+
+Float64 with a proof of its bounds; integers decide at the end.
+"""
 
 import math
 
@@ -16,15 +19,17 @@ INFINITE = np.inf
 
 @borrowing
 def pair_times(gap, way, inner, outer):
-    """When a point that goes from `gap` by `way` (3,) comes within `outer` of 0, and within `inner`: fractions.
+    """Compute when a point moving from `gap` by `way` (3,) comes within `outer` and `inner` of 0.
 
-    Returns (enters, certain, closest): enters, rounded down, inf when it never does in [0, 1]; certain, rounded up, inf
-    likewise; the fraction of closest approach, within [0, 1].
+    Returns (enters, certain, closest), fractions. enters: when it comes within `outer`, rounded
+    down; inf when it never does in [0, 1]. certain: when it comes within `inner`, rounded up; inf
+    likewise. closest: the fraction of closest approach, within [0, 1].
     """
     dot = gap[0] * way[0] + gap[1] * way[1] + gap[2] * way[2]
     length = math.sqrt(way[0] * way[0] + way[1] * way[1] + way[2] * way[2])
     apart = math.sqrt(gap[0] * gap[0] + gap[1] * gap[1] + gap[2] * gap[2])
-    # Rounding of these lines: a few half units in the last place of the lengths. They are whole or far above 2^-500.
+    # Rounding of these lines: a few half units in the last place of the lengths, which are integers
+    # or far above 2^-500.
     slack = 2.0**-48 * (apart + length)
     outer, inner = outer + slack, inner - slack
     at = -dot / (length * length) if length > 1e-100 else 0.0
@@ -38,7 +43,7 @@ def pair_times(gap, way, inner, outer):
         if apart <= inner:
             return 0.0, 0.0, closest
     if length <= 1e-100 or at <= 0.0:
-        return enters, certain, closest  # never nearer than now, and now it is not certain
+        return enters, certain, closest  # never nearer than now, and contact is not certain now
     ex, ey, ez = gap[0] + at * way[0], gap[1] + at * way[1], gap[2] + at * way[2]
     square = ex * ex + ey * ey + ez * ez
     late = 2.0**-48 * (1.0 + apart / length)
@@ -53,13 +58,13 @@ def pair_times(gap, way, inner, outer):
 
 @borrowing
 def _drop_of(scene, pair):
-    """How much smaller than the scan's largest sphere that of a pair's scan point is, exact units."""
+    """Return the largest radius of the scan minus that of a pair's scan point, exact units."""
     return scene.drop[point_class(scene.ints, pair[4], pair[5], np.uint64(scene.drop.shape[0] - 1))]
 
 
 @borrowing
 def _scale_of(pose):
-    """The scale of a pose, as `check_poses` has it."""
+    """Return the scale of a pose, as `check_poses` computes it."""
     square = 0.0
     for r in range(3):
         for c in range(3):
@@ -70,7 +75,7 @@ def _scale_of(pose):
 
 @borrowing
 def touches_at(job, t, pair):
-    """Whether one pair (as in Moving) is in contact under M(t), by NUMERICS.md N5."""
+    """Return whether one pair (as in Moving) is in contact under M(t), by NUMERICS.md N5."""
     scene, moving = job.scene, job.moving
     pose_at(job.motion, t, moving.pose)
     for r in range(3):
@@ -84,14 +89,17 @@ def touches_at(job, t, pair):
 
 @borrowing
 def scan_coordinate(scene, pair, r):
-    """Lattice coordinate r of a pair's scan point [steps]."""
+    """Return lattice coordinate r of a pair's scan point [steps]."""
     low = scene.coordinates[pair[2], r] * scene.voxel_steps + np.int64(scene.ints[pair[4] + r])
     return low + np.int64(scene.halves[pair[3] + r * LANES + pair[5]])
 
 
 @borrowing
 def _comes_first(job, pair, other):
-    """Of two pairs that touch at the same moment, whether one is named first: by scan point, then avatar's."""
+    """Return whether `pair` precedes `other`, which touches at the same moment.
+
+    The scan point decides first, then the avatar's point.
+    """
     for r in range(3):
         one, two = scan_coordinate(job.scene, pair, r), scan_coordinate(job.scene, other, r)
         if one != two:
@@ -105,9 +113,10 @@ def _comes_first(job, pair, other):
 
 @borrowing
 def _certain_by_integers(job, chord, pair, enters, certain, closest):
-    """The fraction at which a pair is known to touch, where its integers are asked at two poses of a final chord.
+    """Return the fraction at which a pair is known to touch, tested by integers at two poses.
 
-    At the first pose of all, whose contacts are those of `collide`; and where the pair is closest.
+    The chord is final. The poses are the first pose of the whole motion, whose contacts are those
+    of `collide`, and the pose where the pair is closest.
     """
     if enters == 0.0 and chord.t0 == 0.0 and certain > 0.0 and touches_at(job, 0.0, pair):
         return 0.0
@@ -120,7 +129,7 @@ def _certain_by_integers(job, chord, pair, enters, certain, closest):
 
 @borrowing
 def try_pair(job, chord, pair):
-    """Take one pair into account, in float64: may lower moving.first and name another moving.pair."""
+    """Update moving.first and moving.pair with one pair, in float64."""
     scene, moving, points = job.scene, job.moving, job.avatar.points
     gap, way, first = moving.gap, moving.way, moving.first
     block, lane = pair[0], pair[1]

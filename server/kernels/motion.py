@@ -1,17 +1,21 @@
-"""Screw motions: the pose at a fraction of the way between two poses, and how fast and how curved the way is.
+"""Screw motions: the pose at a fraction of the way between two poses, and its speed and curvature.
 
-The definition. With R0, R1 the upper left 3x3 of the two poses (a scale is in both), p0, p1 their translations, and
-E(a) the turn by `a` about the axis u of the shorter turn that takes R0 to R1, by the angle A:
+Definition: R0, R1 are the upper left 3x3 of the two poses (both contain the scale), p0, p1 their
+translations, and E(a) is the rotation by `a` about the axis u of the shorter rotation that takes R0
+to R1, by the angle A:
 
-    R(t) = E(t A) (R0 + t F)          F = E(-A) R1 - R0, what rounding left the two poses to differ by
-    p(t) = p0 + t along + sin(t A/2) / sin(A/2) E(-(1 - t) A/2) across       p1 - p0 = along + across, along u
+    R(t) = E(t A) (R0 + t F)          F = E(-A) R1 - R0, the rounding difference of the two poses
+    p(t) = p0 + t along + sin(t A/2) / sin(A/2) E(-(1 - t) A/2) across       p1 - p0 = along +
+    across, along u
 
-which is M(t) = exp(t log(M1 M0^-1)) M0 where the poses are exact, written so that nothing cancels as A goes to 0 (then
-the ratio is t) nor as it goes to pi. M(0) and M(1) are the given bits. A turn by pi goes about the axis whose first
-component that is not 0 is positive; within rounding of pi, the sign of the quaternion computed here decides.
+This is M(t) = exp(t log(M1 M0^-1)) M0 for exact poses, written so that nothing cancels as A
+approaches 0 (then the ratio is t) or pi. M(0) and M(1) are the given bits. A rotation by pi is
+about the axis whose first non-zero component is positive; within rounding of pi, the sign of the
+quaternion computed here decides.
 
-All is float64 in one order with +, -, *, / and square roots only, sine and cosine by their series: the same bits on any
-machine, compiled and interpreted. No library's sine promises that.
+All arithmetic is float64 in one fixed order, with +, -, *, / and square roots only; sine and cosine
+are computed by their series. The bits are therefore the same on every machine, compiled and
+interpreted. No library's sine guarantees that.
 """
 
 import math
@@ -23,20 +27,24 @@ from numpy.typing import NDArray
 from ...schemas.kernels import compiling as nb
 from .compiled import borrowing
 
-# Of sin(x) / x and cos(x), by powers of x^2, highest first. Up to pi/2 what is left out is below 2^-58.
+# Coefficients of sin(x) / x and cos(x), by powers of x^2, highest first. Up to pi/2, the omitted
+# terms are below 2^-58.
 _SINE = tuple((-1.0) ** n / math.factorial(2 * n + 1) for n in range(10, -1, -1))
 _COSINE = tuple((-1.0) ** n / math.factorial(2 * n) for n in range(11, -1, -1))
 
-# A turn whose half has a smaller sine moves nothing within 1e9 m by a unit; squares of it could be denormal.
+# A rotation whose half angle has a smaller sine moves nothing within 1e9 m by a unit; its squares
+# could be denormal.
 _NO_TURN = 1e-30
 
 
 class Motion(NamedTuple):
-    """One motion. first, last: (4, 4) poses.  axis: (3,) unit u.  half: A / 2, in [0, pi/2].  sine: of it.
+    """One motion.
 
-    along, across: (3,) parts of the translation [m].  strain: (3, 3) F.  Rates hold for any avatar point on the whole
-    way, of the ideal motion, per unit of t: speed: at most so far [m].  bend: |second derivative| at most [m].
-    slip: how far a computed placed coordinate vector lies from the ideal motion, at most [m].
+    first, last: (4, 4) poses.  axis: (3,) unit u.  half: A / 2, in [0, pi/2].  sine: sin(A / 2).
+    along, across: (3,) parts of the translation [m].  strain: (3, 3) F.
+    The rates hold for every avatar point on the whole way of the ideal motion, per unit of t:
+    speed: upper bound of the speed [m].  bend: upper bound of |second derivative| [m].
+    slip: upper bound of the distance of a computed placed point from the ideal motion [m].
     """
 
     first: NDArray[np.float64]
@@ -54,7 +62,10 @@ class Motion(NamedTuple):
 
 @borrowing
 def sine_cosine(x):
-    """sin(x) and cos(x) for 0 <= x <= pi/2, within a few half units in the last place, the same on any machine."""
+    """Return sin(x) and cos(x) for 0 <= x <= pi/2.
+
+    The error is within a few half units in the last place; the result is the same on every machine.
+    """
     square = x * x
     s, c = 0.0, 0.0
     for k in _SINE:
@@ -66,9 +77,9 @@ def sine_cosine(x):
 
 @borrowing
 def angle_of(s, c):
-    """The angle in [0, pi/2] whose sine and cosine these are; s^2 + c^2 is 1 to rounding.
+    """Return the angle in [0, pi/2] with the given sine and cosine; s^2 + c^2 is 1 to rounding.
 
-    Each step takes an error e to about e^3 / 6, and the first guess is within 0.08.
+    Each step reduces an error e to about e^3 / 6; the first guess is within 0.08.
     """
     x = s if s <= c else 0.5 * math.pi - c
     for _ in range(3):
@@ -79,7 +90,7 @@ def angle_of(s, c):
 
 @borrowing
 def _turn(axis, s, c, x, y, z):
-    """(x, y, z) turned about `axis` by the angle whose HALF has sine s and cosine c."""
+    """Return (x, y, z) rotated about `axis` by the angle whose HALF has sine s and cosine c."""
     cx, cy, cz = axis[1] * z - axis[2] * y, axis[2] * x - axis[0] * z, axis[0] * y - axis[1] * x
     dx, dy, dz = axis[1] * cz - axis[2] * cy, axis[2] * cx - axis[0] * cz, axis[0] * cy - axis[1] * cx
     p, q = 2.0 * s * c, 2.0 * s * s
@@ -88,7 +99,7 @@ def _turn(axis, s, c, x, y, z):
 
 @nb.njit(nogil=True, cache=True)
 def _quaternion(first, last):
-    """The unit quaternion w, x, y, z of the turn from one pose's axes to the other's, w >= 0."""
+    """Return the unit quaternion w, x, y, z, w >= 0, of the rotation between two poses' axes."""
     turn = np.empty((3, 3))
     square0, square1 = 0.0, 0.0
     for r in range(3):
@@ -100,7 +111,7 @@ def _quaternion(first, last):
     for r in range(3):
         for c in range(3):
             turn[r, c] /= size
-    # By the largest of the four, so that no difference of near equals is divided by.
+    # Beginning with the largest of the four: no difference of nearly equal numbers is a divisor.
     a, b, c = turn[0, 0], turn[1, 1], turn[2, 2]
     if a + b + c >= max(a, b, c):
         w, x, y, z = 1 + a + b + c, turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]
@@ -119,14 +130,17 @@ def _quaternion(first, last):
 
 @nb.njit(nogil=True, cache=True)
 def make_motion(first, last, box, origin):
-    """The screw motion between two checked poses (4, 4) of one scale.
+    """Compute the screw motion between two checked poses (4, 4) of one scale.
 
-    box: (2, 3) least and greatest coordinates of the avatar's points [m].  origin: (3,) of the dataset, world [m].
+    box: (2, 3), least and greatest coordinates of the avatar's points [m].  origin: (3,) of the
+    dataset, world [m].
 
-    Speed and bend are convex functions of the point's place, so their greatest value over the box is at a corner; the
-    motion turns velocity and acceleration with it, so their value at t = 0, but for F, holds for the whole way.
-    slip: entries of E(t A) and p(t) - p0 are off by some 30 half units in the last place of s and |p1 - p0|, placing
-    and shifting by 4 of the largest term (tests/unit/server/test_motion.py measures it); twice that is said.
+    Speed and bend are convex functions of the point's position; their maximum over the box is
+    therefore at a corner. The motion rotates velocity and acceleration with it; their value at t =
+    0, apart from F, therefore holds for the whole way.
+    slip: entries of E(t A) and p(t) - p0 are off by some 30 half units in the last place of s and
+    |p1 - p0|; placing and shifting add 4 of the largest term (measured by
+    tests/unit/server/test_motion.py). The stated bound is twice that.
     """
     w, x, y, z = _quaternion(first, last)
     sine = math.sqrt(x * x + y * y + z * z)
@@ -175,7 +189,7 @@ def make_motion(first, last, box, origin):
         for c in range(3):
             largest = max(largest, abs(first[r, c]), abs(last[r, c]))
         place = max(place, abs(first[r, 3]) + abs(last[r, 3]) + abs(origin[r]))
-    # Rounding of these rates themselves: relative to the terms they are sums of, which may cancel.
+    # Rounding of these rates themselves, relative to the terms of their sums, which may cancel.
     loose = 2.0**-47 * (moved + angle * largest * far)
     speed = speed * (1.0 + 1e-12) + loose + (angle + 1.0) * uneven * far
     bend = bend * (1.0 + 1e-12) + angle * loose + (angle * angle + 2.0 * angle) * uneven * far
@@ -185,7 +199,7 @@ def make_motion(first, last, box, origin):
 
 @borrowing
 def _turn_back(axis, s, c, v):
-    """v (3,), square to the axis, turned back by the angle with sine s and cosine c."""
+    """Return v (3,), perpendicular to the axis, rotated back by the angle of sine s, cosine c."""
     return (
         c * v[0] - s * (axis[1] * v[2] - axis[2] * v[1]),
         c * v[1] - s * (axis[2] * v[0] - axis[0] * v[2]),
@@ -195,7 +209,7 @@ def _turn_back(axis, s, c, v):
 
 @borrowing
 def pose_at(motion, t, pose):
-    """Write M(t), the pose at fraction t in [0, 1], into pose (4, 4): the one formula."""
+    """Write M(t), the pose at fraction t in [0, 1], into pose (4, 4), by the definition."""
     if t <= 0.0 or t >= 1.0:
         given = motion.first if t <= 0.0 else motion.last
         for r in range(4):

@@ -1,4 +1,4 @@
-"""An avatar on its way along one chord: both ends placed, in float32 as placed.py has one pose."""
+"""Avatar moving along one chord: both ends placed in float32, as placed.py places one pose."""
 
 import math
 from typing import NamedTuple
@@ -13,27 +13,32 @@ from .motion import Motion
 from .overlap import STACK
 from .placing import Avatar, largest_term, place
 
-# Float32 sums along a chord: w + t d, with t from two dot products and a quotient, is off by under 24 U32 of |w| + |d|.
+# Error of float32 sums along a chord: w + t d, with t from two dot products and a quotient, is off
+# by less than 24 U32 of |w| + |d|.
 CHORD_ERROR = 32.0
 ONE = np.float32(1.0)
 ZERO = np.float32(0.0)
 
 
 class Moving(NamedTuple):
-    """An avatar along one chord, float32 steps from `frame`, a lattice point; scratch of one call.
+    """Avatar along one chord, float32 steps from `frame`, a lattice point; scratch of one call.
 
-    nodes: (8, a): x[], y[], z[] at the chord's beginning, radius[], the way to its end x[], y[], z[], and 1 / its
-    square.  lanes: (b, 3, LANES), ways: (b, 4, LANES) likewise of the points.  stamp: (b,) int64, the chord a block was
-    placed for.  frame: (3,) int64.  ends: (2, 4, 4), shifts: (2, 3), poses at the ends and t - O.
-    pose, shift: (4, 4), (3,) of the one pose that integers are asked about.
-    pair: (6,) int64, block, lane, voxel, lane_at, block_at, j of one pair of points (placed.py).  best: (6,) that of
-    the earliest contact found.
-    first: (3,) float64, fractions of the chord, inf: never: when anything could touch first; when `pair` is sure to;
-    that of the two which prunes. On a chord worth halving `pair` is the one that could touch first, else the first one
-    sure to.
-    limits: (2, c) float32, of the chord by radius class: reach and error together [steps], and `far` (placed.py). One
-    array, because a job is handed on whole: with the four of `ByClass` a motion of the walk took a quarter longer.
-    counters: (4,) int64, node visits, point tests, chords placed, most visits.  gap, way, keep, off, stack: scratch.
+    nodes: (8, a): x[], y[], z[] at the beginning of the chord, radius[], the displacement to its
+    end x[], y[], z[], and 1 / its square.
+    lanes: (b, 3, LANES), ways: (b, 4, LANES), the same of the points.
+    stamp: (b,) int64, the chord a block was placed for.  frame: (3,) int64.
+    ends: (2, 4, 4), shifts: (2, 3), poses at the ends and t - O.
+    pose, shift: (4, 4), (3,), the one pose that is tested with integers.
+    pair: (6,) int64, block, lane, voxel, lane_at, block_at, j of one pair of points (placed.py).
+    best: (6,), that of the earliest contact found.
+    first: (3,) float64, fractions of the chord, inf: never: when a contact is first possible; when
+    `pair` certainly touches; the one of the two that prunes. On a chord worth halving, `pair` is
+    the first that may touch; else it is the first that certainly touches.
+    limits: (2, c) float32, of the chord by radius class: reach plus error [steps], and `far`
+    (placed.py). It is one array because a job is passed on whole: with the four of `ByClass`, a
+    motion of the walk took a quarter longer.
+    counters: (4,) int64, node visits, point tests, chords placed, largest number of visits.
+    gap, way, keep, off, stack: scratch.
     """
 
     nodes: NDArray[np.float32]
@@ -58,11 +63,13 @@ class Moving(NamedTuple):
 
 
 class Job(NamedTuple):
-    """One motion of one avatar in one scene. motion: Motion.  avatar: Avatar.  scene: SceneArrays.  moving: Moving.
+    """One motion of one avatar in one scene.
 
-    radius: of the avatar's points [m].  scale: of the poses.  In exact units: other_units: the scan's largest radius
-    and the margin; units: these and the avatar's radius at either end, the larger; loose: what that may differ by on
-    the way. A pair reaches as much less as `SceneArrays.drop` says.
+    motion: Motion.  avatar: Avatar.  scene: SceneArrays.  moving: Moving.
+    radius: of the avatar's points [m].  scale: of the poses.
+    In exact units: other_units: the scan's largest radius plus the margin; units: these plus the
+    avatar's radius at either end, the larger; loose: how much that may vary on the way. The reach
+    of a pair is less by its `SceneArrays.drop`.
     """
 
     motion: Motion
@@ -77,8 +84,12 @@ class Job(NamedTuple):
 
 
 class Chord(NamedTuple):
-    """One interval. t0, t1: fractions.  inner, outer: U - band, U + band, exact units, U of the scan's largest sphere.
-    final: not worth halving."""
+    """One interval.
+
+    t0, t1: fractions.  inner, outer: U - band, U + band, exact units, with U of the scan's largest
+    sphere.
+    final: halving is useless.
+    """
 
     t0: float
     t1: float
@@ -89,7 +100,7 @@ class Chord(NamedTuple):
 
 @nb.njit(nogil=True, cache=True)
 def make_moving(avatar, drop):
-    """Scratch for one avatar, not empty, and the radius classes of `SceneArrays.drop`."""
+    """Allocate scratch for one avatar, not empty, and the radius classes of `SceneArrays.drop`."""
     blocks = avatar.points.shape[0]
     return Moving(
         np.empty((8, avatar.center.shape[0]), np.float32),
@@ -116,16 +127,20 @@ def make_moving(avatar, drop):
 
 @borrowing
 def _inverse(x, y, z):
-    """1 / (x^2 + y^2 + z^2), or 0 where that is too small to matter (a way of 10^-10 steps) or to be divided by."""
+    """Return 1 / (x^2 + y^2 + z^2), or 0 for a vector too short to matter or to divide by.
+
+    The limit is a length of 10^-10 steps.
+    """
     square = x * x + y * y + z * z
     return np.float32(ONE / square) if square > np.float32(1e-20) else ZERO
 
 
 @borrowing
 def place_nodes(avatar, scale, speed, moving, scene):
-    """Place an avatar's nodes at both ends of a chord; speed: the farthest any point goes on it [m].
+    """Place an avatar's nodes at both ends of a chord; fill shifts, frame and nodes.
 
-    Fills shifts, frame and nodes. Returns (extent, farthest) for `make_limits`.
+    speed: the farthest any point moves on the chord [m]. Returns (extent, farthest) for
+    `make_limits`.
     """
     per_step = 1.0 / scene.step
     nodes, frame = moving.nodes, moving.frame
@@ -153,7 +168,8 @@ def place_nodes(avatar, scale, speed, moving, scene):
     longest = math.sqrt(longest) * (1.0 + 1e-6)
     extent = avatar.radius[0] * scale * per_step + 1.0 + longest
     for i in range(count):
-        # + 1e-6 as in placed.py; it also covers a scale within 1e-9 of 1, or of the other end's.
+        # The added 1e-6 is that of placed.py; it also covers a scale within 1e-9 of 1, or of the
+        # other end's.
         nodes[3, i] = np.float32(avatar.radius[i] * scale * per_step * (1.0 + 1e-6) + extent * 1e-6)
     return extent + CHORD_ERROR * longest, farthest + extent
 

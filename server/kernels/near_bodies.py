@@ -1,4 +1,7 @@
-"""Which of some bodies could a motion meet at all? Their boxes are compared one by one: users are some hundreds."""
+"""Bodies that a motion could meet.
+
+Their boxes are compared one by one: there are some hundred users.
+"""
 
 import numpy as np
 
@@ -9,7 +12,10 @@ from .motion import make_motion
 
 @nb.njit(nogil=True, cache=True)
 def bound_body(box, pose, origin, more, bounds):
-    """Write bounds (2, 3), from the origin [m], of a body's box (2, 3), avatar frame, placed; `more` on all sides."""
+    """Write the bounds (2, 3) of a body's placed box, grown by `more` on all sides.
+
+    box: (2, 3), avatar frame.  bounds: relative to the origin [m].
+    """
     for r in range(3):
         middle, half, size = pose[r, 3] - origin[r], 0.0, abs(pose[r, 3]) + abs(origin[r])
         for c in range(3):
@@ -22,10 +28,12 @@ def bound_body(box, pose, origin, more, bounds):
 
 @nb.njit(nogil=True, cache=True)
 def find_near(box, first, last, more, bounds, kinds, wanted, skip, rows):
-    """Bodies whose bounds meet those of a motion, ascending into rows (n,) int64; returns how many.
+    """Write the bodies whose bounds meet those of a motion, ascending, to rows (n,) int64.
 
-    box: (2, 3) of the moving avatar.  first, last: (4, 4), translations from the origin.  more: its radius and the
-    margin [m].  bounds: (n, 2, 3), see `bound_body`.  kinds: (n,) uint8, one bit each; wanted: bits.  skip: a row.
+    Returns how many.
+    box: (2, 3) of the moving avatar.  first, last: (4, 4), translations relative to the origin.
+    more: its radius plus the margin [m].  bounds: (n, 2, 3), see `bound_body`.  kinds: (n,) uint8,
+    one bit each.  wanted: the bits of the kinds to find.  skip: a row to omit.
     """
     origin = np.zeros(3)
     begin, end = np.empty((2, 3)), np.empty((2, 3))

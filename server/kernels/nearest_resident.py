@@ -1,7 +1,9 @@
-"""`distance` of one pose in one kernel call, where all voxels in its reach are resident: see `near.py`.
+"""Resident path of `distance`: one pose in one kernel call (`near.py`).
 
-What the nearest pair comes to in metres is worked out here as well: `signed.py` has the formulas, in the same order of
-operations, so that the bits are the same. In columns of one element they took four times as long as the search.
+It applies where all voxels in the pose's reach are resident. The kernel also converts the nearest
+pair to metres, with the formulas of `signed.py` in the same order of operations; the bits are
+therefore the same. As numpy operations on columns of one element, this took four times as long as
+the search.
 """
 
 import math
@@ -17,13 +19,13 @@ from .placing import GOOD, lattice_to_units
 from .reach import Reach, find_reach
 from .stopping import MOST_QUICK_VISITS
 
-# Columns of what is written.
+# Columns of the output.
 SIGNED, LOWER, NORMAL, AVATAR, CLOUD, COLUMNS = 0, 1, 2, 5, 8, 11
 
 
 @borrowing
 def _say(square, pair, drop, radii, reach, scene, said):
-    """Write what one pair found comes to, or that there is none (square -1); see `nearest_resident`."""
+    """Write the results for one pair, or for no pair (square -1); see `nearest_resident`."""
     if square < 0:
         said[SIGNED], said[LOWER] = np.inf, reach
         for at in range(NORMAL, COLUMNS):
@@ -44,15 +46,17 @@ def _say(square, pair, drop, radii, reach, scene, said):
 
 @nb.njit(nogil=True, cache=True)
 def nearest_resident(poses, avatar, radius, radius_units, reach_units, reach, scene, index, rows, said):
-    """`find_reach`, then `nearest_poses`, then the figures of the pair, for one pose.
+    """Answer `distance` for one pose: `find_reach`, `nearest_poses`, then the values of the pair.
 
-    poses: (1, 4, 4) float64, any.  radius: of the avatar's points [m].  radius_units: of the largest sphere of the
-    scan, reach_units: of the reach, exact units; reach: the same [m].
-    Writes rows (capacity,) int64, the voxels in reach, and said (COLUMNS,) float64: signed distance and what it is at
-    least [m], normal, witness of the avatar, of the cloud, world [m]; inf and NaN where no pair is within reach.
-    Returns (fault, pose, figure found) as `check_poses` does, how many rows, -1: not answered, for something has to be
-    loaded, the rows do not fit, or the search ended early (scene.stop, MOST_QUICK_VISITS); outside, node visits, point
-    tests.
+    poses: (1, 4, 4) float64, unchecked.  radius: of the avatar's points [m].  radius_units: radius
+    of the scan's largest sphere, exact units.  reach_units: the reach, exact units.  reach: the
+    same [m].
+    Writes rows (capacity,) int64, the voxels in reach, and said (COLUMNS,) float64: signed distance
+    and its lower bound [m], normal, witness of the avatar, witness of the cloud, world [m]; inf and
+    NaN where no pair is within reach.
+    Returns (fault, pose, value found), as `check_poses` does, then the number of rows, outside,
+    node visits, point tests. -1 rows: not answered, because a voxel has to be loaded, the rows do
+    not fit, or the search ended early (scene.stop, MOST_QUICK_VISITS).
     """
     outside = np.zeros(1, np.bool_)
     scales, units = np.empty(1), np.empty(1, np.int64)

@@ -1,7 +1,7 @@
-"""The normal at a scan point of a resident voxel: its neighbours gathered from the voxel's tree.
+"""Normal at a scan point of a resident voxel, from the neighbours in the voxel's tree.
 
-The definition is in schemas/kernels/normals.py. Spheres prune, in whole numbers that float64 holds exactly; points are
-decided by integers.
+schemas/kernels/normals.py has the definition. Spheres prune with integers that float64 holds
+exactly; integers decide each point.
 """
 
 import numpy as np
@@ -15,14 +15,14 @@ from .layout import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, normal_run
 from .rays import STACK
 from .reach import find_key
 
-# What no normal has as its code: both bytes of one are 1 at least.
+# A code that no normal has: both bytes of a normal's code are at least 1.
 UNASKED = np.uint16(1)
 SUMS = 10
 
 
 @nb.njit(nogil=True, cache=True)
 def find_voxel(keys, voxel_steps, x, y, z):
-    """The index row of the voxel that a lattice point is in, -1 where none holds points.
+    """Return the index row of the voxel that contains a lattice point; -1 where it holds no points.
 
     keys: (v,) uint64, sorted.
     """
@@ -34,9 +34,10 @@ def find_voxel(keys, voxel_steps, x, y, z):
 
 @borrowing
 def _find_point(scene, voxel, x, y, z, rows):
-    """The lane of a resident voxel, LANES a block, where a point (int64, from the voxel's low corner) is; -1: none.
+    """Return the lane of a point in a resident voxel, or -1, and the nodes visited.
 
-    rows: (STACK,) int64, scratch. Of points in one place any is named. Also returns the nodes visited.
+    Lanes are numbered LANES a block.  x, y, z: int64, relative to the voxel's low corner.  rows:
+    (STACK,) int64, scratch. Where points coincide, any of them is returned.
     """
     words, ints, halves = scene.words, scene.ints, scene.halves
     base, visits = scene.where[voxel, 0], 0
@@ -72,12 +73,13 @@ def _find_point(scene, voxel, x, y, z, rows):
 
 @borrowing
 def _add_near(scene, voxel, x, y, z, square, rows, sums):
-    """Add up, of a resident voxel's points within a square [steps] of a point, what `normal_code` is told.
+    """Accumulate the sums for `normal_code` over a resident voxel's points near a point.
 
-    Arguments as of `_find_point`; sums: (SUMS,) int64, zeros. Returns the nodes visited.
+    square: squared distance [steps^2] up to which points count.  Other arguments as for
+    `_find_point`.  sums: (SUMS,) int64, zeros. Returns the nodes visited.
     """
     words, ints, halves = scene.words, scene.ints, scene.halves
-    # Rounded up: 2^-50 is more than a root and a sum of whole numbers below 2^31 lose.
+    # Rounded up: 2^-50 exceeds what a root and a sum of integers below 2^31 lose.
     reach = np.sqrt(np.float64(square)) * (1.0 + 2.0**-50)
     base, visits = scene.where[voxel, 0], 0
     rows[0], depth = base, 1
@@ -121,12 +123,13 @@ def _add_near(scene, voxel, x, y, z, square, rows, sums):
 
 @nb.njit(nogil=True, cache=True)
 def code_at(scene, voxel, x, y, z, square, codes):
-    """The code of the normal at a lattice point, looked up in `codes`, else estimated and kept.
+    """Return the code of the normal at a lattice point, from `codes` or estimated.
 
-    scene: SceneArrays.  x, y, z: int64.  square: of the reach [steps^2], with `normals.normal_reach` found to fit.
-    codes: (blocks * LANES,) uint16, UNASKED where not estimated yet; written. Of length 0: nothing is kept.
-    Returns (code, nodes visited, whether it was estimated): NONE where no point of the voxel is there, or the voxel is
-    not resident.
+    scene: SceneArrays.  x, y, z: int64.  square: of the reach [steps^2], found to fit by
+    `normals.normal_reach`.  codes: (blocks * LANES,) uint16, UNASKED where not estimated yet; an
+    estimate is stored there. With length 0, nothing is stored.
+    Returns (code, nodes visited, whether it was estimated). The code is NONE where the voxel has no
+    point there, or is not resident.
     """
     if scene.where[voxel, 0] < 0:
         return NONE, 0, False
@@ -148,7 +151,10 @@ def code_at(scene, voxel, x, y, z, square, codes):
 
 @nb.njit(nogil=True, cache=True)
 def stored_code_at(scene, voxel, x, y, z, with_scan):
-    """`code_at` of an archive whose normals are in memory. with_scan: whether scan numbers are."""
+    """Return (code, nodes visited) of an archive whose normals are in memory; see `code_at`.
+
+    with_scan: whether scan numbers are in memory.
+    """
     if scene.where[voxel, 0] < 0:
         return NONE, 0
     rows = np.empty(STACK, np.int64)

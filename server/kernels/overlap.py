@@ -123,7 +123,7 @@ def nodes_meet(words, row, x, y, z, radius, room):
 
 @inlined
 def lanes_meet(words, row, lanes, block, off_x, off_y, off_z, room, keep):
-    """Mark in `keep` the points of an avatar's block that come within `room` of the bounds of a node.
+    """Mark in `keep` the points of an avatar's block that come within `room` of a node's bounds.
 
     lanes: relative to the frame.  room: reach plus error.  row: a scene node. Returns whether any
     point is marked.
@@ -178,7 +178,7 @@ def next_near(halves, lane_at, low_x, low_y, low_z, lanes, block, far, keep, kee
 
 @borrowing
 def leaves_touch(avatar, m, block, placed, scene, voxel, spot, row, by_class, work):
-    """Return whether a marked point of an avatar's block touches a point of scene leaf node `row`."""
+    """Return whether a marked point of an avatar's block touches a point of leaf node `row`."""
     halves, lanes, ints, mask = scene.halves, placed.lanes, scene.ints, by_class.mask
     number = ~np.int64(ints[U(row + FIRST)])
     block_at = spot.blocks + number * scene.block_words

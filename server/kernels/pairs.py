@@ -1,12 +1,15 @@
-"""Placed avatars against one another: which pairs could meet, and whether two of them touch.
+"""Contact between placed avatars: the pairs that could meet, and whether two of them touch.
 
-The definition is that of NUMERICS.md N5 for both: points a of A and b of B, each placed by its own pose and rounded
-once to exact units of 2^-26 m, are in contact when |a - b|^2 <= (r_a + r_b + margin)^2 in int64, each of the three
-rounded once. It says the same of (B, A) as of (A, B), so `touch_pairs` does too, though it descends in another order.
+The definition is that of NUMERICS.md N5 for both. Points a of A and b of B, each placed by its own
+pose and rounded once to exact units of 2^-26 m, are in contact when |a - b|^2 <= (r_a + r_b +
+margin)^2 in int64, each of the three rounded once. The definition is symmetric in A and B.
+`touch_pairs` therefore returns the same for (B, A) as for (A, B), although it descends in another
+order.
 
-[Fig12] moves A's spheres into B's frame by M_{B<-A}. Here both are placed from the dataset's origin, in float64: the
-definition rounds each placed point once, and a product of two poses would add a rounding that no bound needs. Points
-are compared in float32 from the centre of one of the two leaf nodes, with a certified band in which integers decide.
+[Fig12] transforms A's spheres into B's frame by M_{B<-A}. Here both are placed relative to the
+dataset's origin, in float64: the definition rounds each placed point once, and a product of two
+poses would add a rounding that no bound needs. Points are compared in float32 relative to the
+centre of one of the two leaf nodes, with a certified band in which integers decide.
 """
 
 import numpy as np
@@ -19,21 +22,23 @@ from .placing import MAX_REACH_UNITS, largest_term, place, to_units
 from .stopping import stopped
 
 CLEAR, CONTACT, UNKNOWN = 0, 1, 2  # schemas/answers.py Verdict
-# As in overlap.py: a pair of trees leaves at most 15 pairs a level behind.
+# As in overlap.py: a pair of trees leaves at most 15 pairs a level on the stack.
 STACK = 2 * 80 * 15 + 16
-# A similarity may shear by SIMILARITY_TOLERANCE, 1e-9, and so stretch a radius by as much.
+# A similarity may shear by SIMILARITY_TOLERANCE, 1e-9, and stretch a radius by as much.
 STRETCH = 1.0 + 1e-8
 
 
 @nb.njit(nogil=True, cache=True)
 def sweep_and_prune(order, low, high, groups, masks, stop, pairs):
-    """Pairs of objects whose boxes meet and whose groups and masks let them, by a sweep along the first axis.
+    """Find the pairs of objects whose boxes meet and whose groups and masks permit them.
 
-    order: (n,) int64, objects by ascending low[:, 0].  low, high: (n, 3) float64.  groups, masks: (n,) uint32: a pair
-    is let when each one's group has a bit of the other's mask.  pairs: (capacity, 2) int32, lesser object first.
-    Returns how many there are, and how many more were not let; those beyond the capacity are not written.
-    stop: (1,) int64, the request's stop flag; once it is set, what is returned is of no use.
-    After Cohen, Lin, Manocha and Ponamgi, I-COLLIDE (1995), one axis sorted anew a request.
+    Sweeps along the first axis, after Cohen, Lin, Manocha and Ponamgi, I-COLLIDE (1995), with one
+    axis sorted anew for each request.
+    order: (n,) int64, objects by ascending low[:, 0].  low, high: (n, 3) float64.  groups, masks:
+    (n,) uint32: a pair is permitted when the group of each has a bit of the other's mask.  stop:
+    (1,) int64, the request's stop flag; once it is set, the result is meaningless.
+    Writes pairs (capacity,) int32, two columns, lesser object first. Returns the number of pairs,
+    and the number of pairs that were not permitted; pairs beyond the capacity are not written.
     """
     found, filtered = 0, 0
     for at in range(order.shape[0]):
@@ -59,10 +64,11 @@ def sweep_and_prune(order, low, high, groups, masks, stop, pairs):
 
 @nb.njit(nogil=True, cache=True)
 def bound_objects(avatar, poses, which, scales, units, origin, margin_units, low, high):
-    """Boxes low, high (n, 3) float64, from the dataset's origin [m], of the objects `which` of one avatar, not empty.
+    """Write the boxes low, high (n, 3) float64 of the objects `which` of one avatar, not empty.
 
-    scales, units: (n,) of all objects, see `check_poses`. Half the margin is on either side. Rounded outward by much
-    more than the placing rounds.
+    The boxes are relative to the dataset's origin [m].  scales, units: (n,) of all objects, see
+    `check_poses`. Half the margin is added on either side. The boxes are rounded outward by much
+    more than the rounding of placing.
     """
     shift = np.empty(3)
     for at in range(which.shape[0]):
@@ -81,7 +87,7 @@ def bound_objects(avatar, poses, which, scales, units, origin, margin_units, low
 
 @nb.njit(nogil=True, cache=True)
 def _place_lanes(avatar, m, shift, block, center, lanes):
-    """The points of a leaf node, float32 from `center` (3,), into lanes (3, LANES)."""
+    """Write the points of a leaf node, float32, relative to `center` (3,), to lanes (3, LANES)."""
     points = avatar.points
     for r in range(3):
         for j in range(LANES):
@@ -91,7 +97,7 @@ def _place_lanes(avatar, m, shift, block, center, lanes):
 
 @nb.njit(nogil=True, cache=True)
 def _points_touch(a, ma, shift_a, block_a, lane_a, b, mb, shift_b, block_b, lane_b, units):
-    """The definition, for one pair of points."""
+    """Return whether one pair of points touches, by the definition."""
     square = np.int64(0)
     p, q = a.points, b.points
     for r in range(3):
@@ -108,11 +114,13 @@ def _points_touch(a, ma, shift_a, block_a, lane_a, b, mb, shift_b, block_b, lane
 def _leaves_touch(
     a, ma, shift_a, node_a, b, mb, shift_b, node_b, radius_b, center, units, error, lanes, counters
 ):
-    """Whether two leaf nodes hold a pair in contact.
+    """Return whether two leaf nodes hold a pair in contact.
 
-    center: (3,) where the node of b is.  radius_b: of it, as placed [m].  lanes: (2, 3, LANES), scratch.
-    Coordinates are from `center`; of points that are in contact, and of all of b's, they are at most radius_b + reach
-    large, and their rounding and that of their differences is below 4 U32 of it, that of the square's root below 16.
+    center: (3,), placed centre of the node of b.  radius_b: of that node, as placed [m].  lanes:
+    (2, 3, LANES), scratch.
+    Coordinates are relative to `center`. For points in contact, and for all of b's points, they are
+    at most radius_b + reach in size. Their rounding and that of their differences is below 4 U32 of
+    it; that of the square's root is below 16 U32.
     """
     block_a, block_b = ~a.first[node_a], ~b.first[node_b]
     one, other = lanes[0], lanes[1]
@@ -148,11 +156,12 @@ def _leaves_touch(
 
 @nb.njit(nogil=True, cache=True)
 def _touch(a, ma, scale_a, b, mb, scale_b, units, origin, visits, stop, nodes, at, lanes, counters):
-    """Return whether two avatars, neither empty, touch: CLEAR or CONTACT; UNKNOWN where the visits were spent or the
-    stop flag was set.
+    """Return CONTACT or CLEAR for two avatars, neither empty; UNKNOWN if the search ended early.
 
-    Descent after [Fig12] figures 5 and 6, corrected as in overlap.py: the larger inner node is opened, a leaf never.
-    nodes: (STACK, 2) int64, at: (STACK, 6) float64, scratch: pairs to be looked at, and where their centres are.
+    It ends early when the visits are spent or the stop flag is set. The descent follows [Fig12]
+    figures 5 and 6, corrected as in overlap.py: the larger inner node is opened, a leaf never is.
+    nodes: (STACK, 2) int64, at: (STACK, 6) float64, scratch: pairs still to examine, and their
+    placed centres.
     """
     shift_a, shift_b = np.empty(3), np.empty(3)
     for r in range(3):
@@ -161,7 +170,7 @@ def _touch(a, ma, scale_a, b, mb, scale_b, units, origin, visits, stop, nodes, a
     p, q = a.center, b.center
     largest = largest_term(ma, shift_a, p[0, 0], p[0, 1], p[0, 2]) + a.radius[0] * grow_a
     largest = max(largest, largest_term(mb, shift_b, q[0, 0], q[0, 1], q[0, 2]) + b.radius[0] * grow_b)
-    # Rounding of two points to units, and of all that is added up to place a point or a centre.
+    # Rounding of two points to units, and of all sums that place a point or a centre.
     error = 2.0 / UNITS_PER_METRE + largest * 2.0**-47
     reach = np.float64(units) / UNITS_PER_METRE + error
     for r in range(3):
@@ -210,11 +219,12 @@ def _touch(a, ma, scale_a, b, mb, scale_b, units, origin, visits, stop, nodes, a
 
 @nb.njit(nogil=True, cache=True)
 def touch_pairs(a, b, poses, scales, units, pairs, margin_units, origin, visits, stop, verdict, counters):
-    """Whether objects pairs[:, 0] of avatar a touch objects pairs[:, 1] of avatar b; neither avatar empty.
+    """Decide whether objects pairs[:, 0] of avatar a touch objects pairs[:, 1] of avatar b.
 
-    poses: (n, 4, 4), checked, of all objects; scales, units: (n,), see `check_poses`, units without the margin.
-    pairs: (p, 2) int64.  origin: (3,) of the dataset [m].  visits: node visits a pair.  stop: (1,) int64, the
-    request's stop flag; once it is set, pairs are UNKNOWN.
+    Neither avatar is empty.
+    poses: (n, 4, 4), checked, of all objects.  scales, units: (n,), see `check_poses`; units are
+    without the margin.  pairs: (p, 2) int64.  origin: (3,) of the dataset [m].  visits: node visits
+    a pair.  stop: (1,) int64, the request's stop flag; once it is set, pairs are UNKNOWN.
     Writes verdict (p,) uint8; adds to counters (2,) int64: node visits, pairs of points tested.
     """
     nodes, at = np.empty((STACK, 2), np.int64), np.empty((STACK, 6))

@@ -1,7 +1,8 @@
-"""One motion in one call, as server/sweep.py answers it, where all that is in its reach is resident.
+"""Sweep of one motion in one call, where all voxels in its reach are resident.
 
-What a motion costs is then its search: between Python and a kernel each array handed over takes a tenth of a
-microsecond, and each question about it another call.
+The result is that of server/sweep.py. The cost of a motion is then only its search: each array
+passed from Python to a kernel costs a tenth of a microsecond, and each inspection of its contents
+costs another call.
 """
 
 import numpy as np
@@ -17,21 +18,22 @@ from .stopping import MOST_QUICK_VISITS, stopped
 
 _CLEAR, _CONTACT, _UNKNOWN = int(Verdict.CLEAR), int(Verdict.CONTACT), int(Verdict.UNKNOWN)
 
-# What `sweep_resident` returns of a motion that it leaves to others.
+# Result of `sweep_resident` for a motion that it does not answer.
 _LEFT = (-1, _UNKNOWN, 0, 0, 0)
-# Columns of what is said of a motion: fractions, how far any point goes at most [m], the witness's centres, world [m].
+# Columns of the output: fractions, upper bound of the distance any point moves [m], the witness's
+# centres, world [m].
 LOWER, UPPER, SPEED, AVATAR, CLOUD, COLUMNS = 0, 1, 2, 3, 6, 9
 
 
 @nb.njit(nogil=True, cache=True)
 def box_of(avatar):
-    """`avatar_box` of an avatar, not empty."""
+    """Return `avatar_box` of an avatar, not empty."""
     return avatar_box(avatar)
 
 
 @nb.njit(nogil=True, cache=True)
 def _rigid(pose):
-    """Whether a pose is well within what server/sweep.py takes to be of scale 1."""
+    """Return whether a pose is well within what server/sweep.py accepts as scale 1."""
     square = 0.0
     for r in range(3):
         for c in range(3):
@@ -44,14 +46,16 @@ def sweep_resident(
     pose_from, pose_to, avatar, radius, other_units, box, scene, index, unknown, unknown_everywhere, tolerance, rows,
     said,
 ):  # fmt: skip
-    """Sweep one motion, where it is short, of scale 1, and all voxels in its reach are resident.
+    """Sweep one motion if it is short, of scale 1, and all voxels in its reach are resident.
 
-    pose_from, pose_to: (4, 4) world, as given.  avatar: not empty.  box: `box_of` it.  radius, other_units, tolerance:
-    as in kernels/advance.py.  scene: with the dataset's origin, which the motion is taken from as server/sweep.py does.
-    unknown: (u, 2, 3) int64 boxes [steps] of scans left out. Writes rows (capacity,) int64, the voxels in reach, and
-    said (COLUMNS,) float64; the witness is written where the verdict is CONTACT.
-    Returns (how many rows or -1: not answered, also for poses that are none, verdict, node visits, point tests,
-    advances).
+    pose_from, pose_to: (4, 4) world, unchecked.  avatar: not empty.  box: `box_of` it.  radius,
+    other_units, tolerance: as in kernels/advance.py.  scene: with the dataset's origin, which is
+    subtracted from the motion as in server/sweep.py.  unknown: (u, 2, 3) int64, boxes [steps] of
+    excluded scans.
+    Writes rows (capacity,) int64, the voxels in reach, and said (COLUMNS,) float64; the witness is
+    written where the verdict is CONTACT.
+    Returns (number of rows, verdict, node visits, point tests, advances). -1 rows: not answered;
+    this includes invalid poses.
     """
     origin, zero = scene.origin, np.zeros(3)
     first, last = np.empty((1, 4, 4)), np.empty((1, 4, 4))
@@ -113,10 +117,10 @@ def sweep_resident(
 
 @nb.njit(nogil=True, cache=True)
 def pose_between(pose_from, pose_to, fraction, box, origin, pose):
-    """Write the pose at a fraction of a motion, as `sweep_resident` takes it, into pose (4, 4), world.
+    """Write the pose at a fraction of a motion to pose (4, 4), world.
 
-    Returns whether it is that pose bit for bit, once the origin is taken off again: then what was proved of the motion
-    holds for it.
+    The motion is given as for `sweep_resident`. Returns whether it is that pose bit for bit once
+    the origin is subtracted again; what was proved of the motion then holds for it.
     """
     poses = np.empty((2, 4, 4))
     poses[0], poses[1] = pose_from, pose_to

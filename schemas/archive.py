@@ -1,7 +1,7 @@
-"""An archive opened for reading: a folder with `index.h5` and `shards/`, which index_file.py and shard.py write.
+"""Reader of archives: folders with `index.h5` and `shards/`. index_file.py and shard.py write them.
 
-FORMAT.md says the same in prose; change both together. Records are read by offsets, so that no HDF5 lock and no HDF5
-parser stands between a server and a record.
+FORMAT.md documents the same; change both together. Records are read by offsets, so that neither
+HDF5's lock nor its parser stands between a server and a record.
 """
 
 import contextlib
@@ -32,13 +32,17 @@ from .voxel_grid import voxel_coordinates
 
 
 class Archive:
-    """An archive opened for reading. Safe to use from several threads; a context manager.
+    """Archive opened for reading. Several threads may share it; it is a context manager.
 
-    header: see Header.  voxels: the index's rows, sorted by key.  coordinates: (v, 3) int64, voxel coordinates.
+    header: see Header.  voxels: the index's rows, sorted by key.
+    coordinates: (v, 3) int64, voxel coordinates.
     """
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
-        """Open the archive in `folder`. Raises FormatError or CorruptError naming the file and the fault."""
+        """Open the archive in `folder`.
+
+        Raises FormatError or CorruptError naming the file and the fault.
+        """
         self.folder = Path(folder)
         self._descriptors: list[int] = []
         while True:
@@ -47,19 +51,20 @@ class Archive:
                 self._open()
                 return
             except FormatError:
-                # Whoever adds scans replaces the index and then deletes the shards that it no longer names.
+                # `add` and `remove` replace the index and then delete the shards that it no longer
+                # names. If the index was replaced meanwhile, try again.
                 if self._index_file() == index:
                     raise
 
     def _index_file(self) -> tuple[int, int] | None:
-        """Which file the index is, and when it was written; None where there is none."""
+        """Return the identity and write time of the index file; None if there is none."""
         with contextlib.suppress(OSError):
             found = (self.folder / INDEX_NAME).stat()
             return found.st_ino, found.st_mtime_ns
         return None
 
     def _open(self) -> None:
-        """Read the index and open the shards it names."""
+        """Read the index and open the shards that it names."""
         path = self.folder / INDEX_NAME
         if not path.is_file():
             raise FormatError(
@@ -89,7 +94,8 @@ class Archive:
         self._classes = (
             sum(1 << c for c in np.flatnonzero(counts).tolist()) if self.header.radius_class else None
         )
-        # All of them now: an archive that is replaced while it is read stays the one that was opened.
+        # Open all shards now: if the archive is replaced later, this reader keeps the generation it
+        # opened.
         try:
             for number in range(len(self._shards)):
                 self._descriptors.append(os.open(self.shard_path(number), os.O_RDONLY | os.O_CLOEXEC))
@@ -98,7 +104,10 @@ class Archive:
             raise FormatError(f"{error.filename}: cannot be opened ({error.strerror}): check it") from error
 
     def _check_shards(self) -> None:
-        """Check that every shard is there, under its own name and as long as the index says. Raises FormatError."""
+        """Check that every shard exists under a valid name with the length that the index states.
+
+        Raises FormatError.
+        """
         if len({name for name, _ in self._shards}) < len(self._shards):
             raise FormatError(f"{self.folder}: the index names a shard twice: restore or rebuild it")
         for name, size in self._shards:
@@ -119,7 +128,7 @@ class Archive:
                 )
 
     def __enter__(self) -> "Archive":
-        """The archive itself."""
+        """Return the archive."""
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -127,31 +136,31 @@ class Archive:
         self.close()
 
     def close(self) -> None:
-        """Close the shards; nothing can be read afterwards."""
+        """Close the shards. Nothing can be read afterwards."""
         while self._descriptors:
             os.close(self._descriptors.pop())
 
     def shard_path(self, number: int) -> Path:
-        """The file of shard `number`."""
+        """Return the path of shard `number`."""
         return self.folder / SHARD_FOLDER / self._shards[number][0]
 
     def shards(self) -> list[tuple[str, int]]:
-        """The name and bytes of each shard file, in the order of their numbers."""
+        """Return the name and bytes of each shard file, in the order of their numbers."""
         return list(self._shards)
 
     def shard_count(self) -> int:
-        """The number of shard files."""
+        """Return the number of shard files."""
         return len(self._shards)
 
     def read_frames(self, row: int) -> tuple[bytes, bytes, bytes]:
-        """The three frames (cells, nodes, points) of the voxel in index row `row`.
+        """Read the three frames (cells, nodes, points) of the voxel in index row `row`.
 
-        Raises CorruptError, naming file, voxel and dataset, when a frame is not the one the index means.
+        Raises CorruptError, naming file, voxel and dataset, if a frame is not the one in the index.
         """
         return self._read_frame(row, 0), self._read_frame(row, 1), self._read_frame(row, 2)
 
     def _read_frame(self, row: int, i: int) -> bytes:
-        """The frame of dataset `i` of a voxel, as `read_frames` gives it."""
+        """Read the frame of dataset `i` of a voxel, as `read_frames` does."""
         if not self._descriptors:
             raise ValueError(f"{self.folder}: the archive is closed")
         check()
@@ -166,14 +175,14 @@ class Archive:
         return frame
 
     def where(self, row: int) -> str:
-        """Where the record of index row `row` lies, for messages."""
+        """Return the location of the record of index row `row`, for messages."""
         entry = self.voxels[row]
         x, y, z = self.coordinates[row]
         return f"{self.shard_path(int(entry['shard']))}: voxel ({x}, {y}, {z})"
 
     @contextlib.contextmanager
     def locating(self, row: int) -> Iterator[None]:
-        """Say of a CorruptError raised inside where the record of index row `row` lies, and what to do."""
+        """Add the location of row `row`'s record, and what to do, to a CorruptError raised inside."""
         try:
             yield
         except CorruptError as error:
@@ -188,10 +197,11 @@ class Archive:
         frames: tuple[bytes, bytes, bytes] | None = None,
         columns: Collection[str] = OPTIONAL_COLUMNS,
     ) -> OpenRecord:
-        """The voxel in index row `row`, decompressed, its points still unread; frames: where they are read already.
+        """Decompress the voxel in index row `row`; its points stay unread.
 
-        columns: of the optional columns those wanted; others are not held.
-        Raises CorruptError saying where.
+        frames: the voxel's frames if they have been read already.
+        columns: optional columns wanted; others are not held.
+        Raises CorruptError naming the location.
         """
         frames = frames or self.read_frames(row)
         with self.locating(row):
@@ -205,9 +215,9 @@ class Archive:
             )
 
     def open_tree(self, row: int) -> OpenTree:
-        """The hierarchy of the voxel in index row `row`; of its points nothing is read.
+        """Read the hierarchy of the voxel in index row `row`, without its points.
 
-        Raises CorruptError saying where.
+        Raises CorruptError naming the location.
         """
         cells, nodes = self._read_frame(row, 0), self._read_frame(row, 1)
         with self.locating(row):
@@ -221,7 +231,7 @@ class Archive:
             )
 
     def _shape(self, row: int) -> RecordShape:
-        """What the index says of the record of index row `row`."""
+        """Return the shape that the index states for the record of index row `row`."""
         entry = self.voxels[row]
         cells, nodes, points = entry["rows"].tolist()
         bounds = np.stack([entry["low"], entry["high"]])
@@ -230,7 +240,10 @@ class Archive:
         )
 
     def read_voxel(self, row: int) -> tuple[VoxelData, Links]:
-        """Read, decompress and check the voxel in index row `row`. Raises CorruptError saying where."""
+        """Read, decompress and check the voxel in index row `row`.
+
+        Raises CorruptError naming the location.
+        """
         record = self.open_voxel(row)
         with self.locating(row):
             return record.decode()

@@ -1,7 +1,7 @@
-"""VoxelData <-> the three compressed datasets of a record; pure, lossless.
+"""Encoding of a voxel to the three compressed datasets of a record, and decoding; pure, lossless.
 
-Each dataset is one frame (frames.py) over packed rows, whose types are here. FORMAT.md says the same in prose; change
-both together.
+Each dataset is one frame (frames.py) over packed rows, whose dtypes are defined here. FORMAT.md
+documents the same; change both together.
 """
 
 from collections.abc import Collection, Mapping
@@ -52,17 +52,18 @@ NODE_DTYPE = np.dtype(
     ]
 )
 
-# The most bytes that a frame of cells or nodes stands for. Points follow from the nodes: at most 32 a leaf node.
-# Scanners give many points in one place where nothing reflects. Their nodes are all alike: 16 MB are free.
+# Limits of the decompressed size of a frame of cells or nodes. The points need none: there are at
+# most 32 per leaf node. Scanners return many points in one place where nothing reflects, and their
+# nodes are all alike: the first 16 MB of nodes are therefore exempt from the ratio.
 CELL_EXPANSION = Expansion(1 << 20, 256)
 NODE_EXPANSION = Expansion(1 << 24, 256)
 
-# The optional columns of the points, in the order of their fields in a row.
+# Optional columns of the points, in the order of their fields in a row.
 OPTIONAL_COLUMNS = ("scan_index", "intensity", "radius_class", "normal")
 
 
 def point_dtype(*, scan_index: bool, intensity: bool, radius_class: bool, normal: bool = False) -> np.dtype:
-    """The row of the points dataset: x, y, z and the optional columns."""
+    """Return the row dtype of the points dataset: x, y, z and the optional columns."""
     fields: list[tuple] = [("xyz", "<u2", (3,))]
     if scan_index:
         fields.append(("scan_index", "<u2"))
@@ -76,12 +77,12 @@ def point_dtype(*, scan_index: bool, intensity: bool, radius_class: bool, normal
 
 
 def voxel_point_dtype(voxel: VoxelData) -> np.dtype:
-    """The row of the points dataset of this voxel."""
+    """Return the row dtype of the points dataset of this voxel."""
     return point_dtype(**{name: getattr(voxel, name) is not None for name in OPTIONAL_COLUMNS})
 
 
 class Record(NamedTuple):
-    """The compressed bytes of one voxel: one zstd frame a dataset, the rows each holds, and its leaf nodes."""
+    """Compressed bytes of one voxel: a zstd frame and a row count per dataset, and the leaf count."""
 
     cells: Frame
     nodes: Frame
@@ -93,11 +94,13 @@ class Record(NamedTuple):
 
 
 class RecordShape(NamedTuple):
-    """What the index says of a record.
+    """Shape of a record as the index states it.
 
-    cell_rows, node_rows, point_rows: rows of each dataset.  point_dtype: with the optional columns.  leaves: leaf
-    nodes.  bounds: (2, 3) int, least and greatest coordinates of the points [voxel steps].  classes: bit c is set where
-    points of the archive have radius class c. None: not known, and not compared with the record.
+    cell_rows, node_rows, point_rows: rows of each dataset.
+    point_dtype: with the optional columns.  leaves: number of leaf nodes.
+    bounds: (2, 3) int, least and greatest coordinates of the points [voxel steps].
+    classes: bit c is set if points of the archive have radius class c.
+    None: not known, and not compared with the record.
     """
 
     cell_rows: int
@@ -110,7 +113,10 @@ class RecordShape(NamedTuple):
 
 
 def encode_voxel(voxel: VoxelData, archive_id: bytes) -> Record:
-    """Compress a voxel. archive_id: 16 bytes, repeated in every record. `decode_voxel` gives it back bit for bit."""
+    """Compress a voxel. `decode_voxel` restores it bit for bit.
+
+    archive_id: 16 bytes, repeated in every record.
+    """
     leaf_runs = _leaf_runs(voxel, link_nodes(voxel))
     columns = {name: getattr(voxel, name) for name in OPTIONAL_COLUMNS}
     cells = cell_rows(voxel.key, archive_id, voxel.cells)
@@ -122,7 +128,7 @@ def encode_voxel(voxel: VoxelData, archive_id: bytes) -> Record:
 
 
 def cell_rows(key: int, archive_id: bytes, cells: Cells) -> NDArray:
-    """The rows (c,) of the cells dataset."""
+    """Return the rows (c,) of the cells dataset."""
     rows = np.zeros(len(cells.nodes), CELL_DTYPE)
     rows["archive"] = np.frombuffer(archive_id, "<u8")
     rows["voxel"] = key
@@ -132,7 +138,7 @@ def cell_rows(key: int, archive_id: bytes, cells: Cells) -> NDArray:
 
 
 def node_rows(nodes: Nodes) -> NDArray:
-    """The rows (n,) of the nodes dataset."""
+    """Return the rows (n,) of the nodes dataset."""
     rows = np.zeros(len(nodes.count), NODE_DTYPE)
     for name, column in zip(Nodes._fields, nodes, strict=True):
         rows[name] = column
@@ -144,10 +150,11 @@ def point_rows(
     leaf_runs: tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]],
     columns: Mapping[str, NDArray | None],
 ) -> NDArray:
-    """The rows (p,) of the points dataset, or of a part of it that is whole leaf nodes.
+    """Return the rows (p,) of the points dataset, or of a part of it made of whole leaf nodes.
 
-    points: (p, 3) as in VoxelData.  leaf_runs: first point, number of points and sort axis of every leaf node.
-    columns: by name, those of OPTIONAL_COLUMNS that there are.
+    points: (p, 3) as in VoxelData.
+    leaf_runs: first point, number of points and sort axis of every leaf node.
+    columns: the optional columns (OPTIONAL_COLUMNS) that exist, by name.
     """
     kept = {name: columns.get(name) for name in OPTIONAL_COLUMNS}
     rows = np.zeros(len(points), point_dtype(**{name: column is not None for name, column in kept.items()}))
@@ -159,7 +166,7 @@ def point_rows(
 
 
 class OpenTree(NamedTuple):
-    """What a record holds beside its points, decompressed and checked. Fields as of OpenRecord."""
+    """Content of a record besides its points, decompressed and checked. Fields as in OpenRecord."""
 
     cells: Cells
     nodes: Nodes
@@ -168,11 +175,13 @@ class OpenTree(NamedTuple):
 
 
 class OpenRecord(NamedTuple):
-    """A record decompressed, its tree checked; its points still as the frame has them, to be read once, in place.
+    """Decompressed record with a checked tree.
 
-    cells, nodes: columns of several components as (3, n), as the byte planes give them.  links: see there.
-    leaves: leaf nodes, b.  planes: (w, p) uint8, the byte planes of the points' rows, of dtype `dtype`.
-    shape: what the index says of the record.
+    Its points stay as byte planes, to be read once, in place.
+    cells, nodes: columns of several components as (3, n), as in the byte planes.
+    links: see Links.  leaves: number of leaf nodes, b.
+    planes: (w, p) uint8, the byte planes of the points' rows, of dtype `dtype`.
+    shape: the record's shape in the index.
     """
 
     key: int
@@ -187,14 +196,15 @@ class OpenRecord(NamedTuple):
 
     @property
     def tree(self) -> tuple[NDArray[np.int32], NDArray[np.bool_], NDArray[np.int32]]:
-        """The links as kernels take them."""
+        """Return the links as kernels take them."""
         return self.links.first, self.links.is_leaf, self.links.cell
 
     def read_points(self, lanes: NDArray[np.uint16]) -> None:
-        """Write the points into lanes (b, 3, MAX_LEAF), the last of a leaf node repeated to its end.
+        """Write the points into lanes (b, 3, MAX_LEAF).
 
-        Raises CorruptError when one lies outside its cell, MisleadingIndexError when the bounds of all are not those in
-        the index; what is in `lanes` then means nothing.
+        The last point of a leaf node is repeated up to the end of its lanes.
+        Raises CorruptError if a point lies outside its cell, MisleadingIndexError if the bounds of
+        all points differ from those in the index. The content of `lanes` is meaningless then.
         """
         name = f"voxel {self.key:#x}"
         self.check_bounds(
@@ -202,7 +212,10 @@ class OpenRecord(NamedTuple):
         )
 
     def check_bounds(self, found: NDArray[np.int64]) -> None:
-        """Compare the bounds (2, 3) of the points [voxel steps] with the index. Raises MisleadingIndexError."""
+        """Compare the bounds (2, 3) of the points [voxel steps] with the index.
+
+        Raises MisleadingIndexError.
+        """
         expected = self.shape.bounds
         if expected is not None and (found != expected).any():
             raise MisleadingIndexError(
@@ -211,24 +224,31 @@ class OpenRecord(NamedTuple):
             )
 
     def read_scans(self, lanes: NDArray[np.uint16]) -> None:
-        """Write scan_index, in a record that has it, into lanes (b, MAX_LEAF), as `read_points` does."""
+        """Write scan_index into lanes (b, MAX_LEAF), as `read_points` does.
+
+        The record must have the column.
+        """
         at = self.dtype.fields["scan_index"][1]  # type: ignore[index]  # its dtype has fields
         leaf_column(self.planes[at : at + 2], self.tree, self.nodes.count, lanes)
 
     def read_classes(self, lanes: NDArray[np.uint8]) -> None:
-        """Write radius_class, in a record that has it, into lanes (b, MAX_LEAF), as `read_points` does.
+        """Write radius_class into lanes (b, MAX_LEAF), as `read_points` does.
 
-        Raises CorruptError for a class that no table of radii has: a kernel would look it up beyond the table's end.
+        The record must have the column.
+        Raises CorruptError for a class beyond the table of radii: a kernel would index past its
+        end.
         """
         at = self.dtype.fields["radius_class"][1]  # type: ignore[index]  # its dtype has fields
         greatest, seen = leaf_bytes(self.planes[at], self.tree, self.nodes.count, lanes)
         self._check_classes(int(greatest), int(seen))
 
     def _check_classes(self, greatest: int, seen: int) -> None:
-        """Refuse a record whose greatest radius class is not below RADIUS_CLASSES, or that has one the index has not.
+        """Check that all radius classes are below RADIUS_CLASSES and are counted in the index.
 
-        seen: bit c is set where the record has class c. Questions reach no farther than the largest sphere of the
-        classes that the index counts.
+        seen: bit c is set if the record has class c.
+        The reach of a query is limited by the largest sphere among the classes that the index
+        counts.
+        Raises CorruptError, or MisleadingIndexError for a class that the index does not count.
         """
         if greatest >= RADIUS_CLASSES:
             raise CorruptError(
@@ -241,35 +261,42 @@ class OpenRecord(NamedTuple):
             )
 
     def read_normals(self, lanes: NDArray[np.uint16]) -> None:
-        """Write normal, in a record that has it, into lanes (b, MAX_LEAF), as `read_points` does.
+        """Write normal into lanes (b, MAX_LEAF), as `read_points` does.
 
-        Raises CorruptError for what is no code (kernels/normals.py).
+        The record must have the column.
+        Raises CorruptError for an invalid code (kernels/normals.py).
         """
         self.check_normals()
         at = self.dtype.fields["normal"][1]  # type: ignore[index]  # its dtype has fields
         leaf_column(self.planes[at : at + 2], self.tree, self.nodes.count, lanes)
 
     def check_normals(self) -> None:
-        """Refuse a record with what is no code of a normal: both bytes are 0, or neither is."""
+        """Check that both bytes of every normal's code are 0, or neither. Raises CorruptError."""
         at = self.dtype.fields["normal"][1]  # type: ignore[index]  # its dtype has fields
         low, high = self.planes[at : at + 2]
         if wrong := int(np.count_nonzero((low == 0) != (high == 0))):
             raise CorruptError(f"voxel {self.key:#x}: {wrong} normals that are no codes, expected none")
 
     def class_counts(self) -> NDArray[np.int64]:
-        """The points of each radius class, (RADIUS_CLASSES,); zeros in a record without. Raises as `read_classes`."""
+        """Return the number of points in each radius class, (RADIUS_CLASSES,).
+
+        All are zero in a record without classes. Raises as `read_classes` does.
+        """
         counts = np.zeros(256, np.int64)
         if "radius_class" in (self.dtype.names or ()):
             plane = self.planes[self.dtype.fields["radius_class"][1]]  # type: ignore[index]  # its dtype has fields
-            for begin in range(0, len(plane), 1 << 16):  # bincount makes int64 of what it is given
+            for begin in range(0, len(plane), 1 << 16):  # bincount converts its input to int64
                 counts += np.bincount(plane[begin : begin + (1 << 16)], minlength=256)
             found = np.flatnonzero(counts).tolist()
             self._check_classes(found[-1], sum(1 << c for c in found if c < RADIUS_CLASSES))
         return counts[:RADIUS_CLASSES]
 
     def decode(self) -> tuple[VoxelData, Links]:
-        """The whole voxel, its points in rows. Raises CorruptError when a point lies outside its cell, and for a
-        radius class or a normal that there is none of."""
+        """Return the whole voxel, with its points in rows, and its links.
+
+        Raises CorruptError if a point lies outside its cell, or for an invalid radius class or
+        normal.
+        """
         lanes = np.empty((self.leaves, 3, MAX_LEAF), np.uint16)
         self.read_points(lanes)
         points = np.empty((self.planes.shape[1], 3), np.uint16)
@@ -298,15 +325,16 @@ def open_record(
     voxel_steps: int,
     columns: Collection[str] = OPTIONAL_COLUMNS,
 ) -> OpenRecord:
-    """Decompress a record and check all of it but the points, which `OpenRecord.read_points` checks as it reads them.
+    """Decompress a record and check everything but the points.
 
-    columns: of the optional columns those wanted; the record is then one that has no others, and holds no others.
-    Raises CorruptError when a frame is damaged, of another size than `shape`, of another voxel or archive, or
-    holds what `check_voxel` refuses.
+    `OpenRecord.read_points` checks the points as it reads them.
+    columns: optional columns wanted; the result holds no others.
+    Raises CorruptError if a frame is damaged, has another size than `shape`, belongs to another
+    voxel or archive, or contains what `check_voxel` refuses.
     """
     names = [n for n in shape.point_dtype.names or () if n == "xyz" or n in columns]
     kept = np.dtype([(n, shape.point_dtype[n]) for n in names])
-    # In this order, so that each frame is decompressed only when those before it say how many rows it must have.
+    # In this order, so that no frame is decompressed before the earlier ones confirm its row count.
     tree = open_tree(cells, nodes, shape, key, archive_id, voxel_steps)
     planes = unpack(points, shape.point_dtype, shape.point_rows, f"voxel {key:#x}, points", kept)
     return OpenRecord(key, voxel_steps, *tree, planes, kept, shape)
@@ -315,11 +343,15 @@ def open_record(
 def open_tree(
     cells: bytes, nodes: bytes, shape: RecordShape, key: int, archive_id: bytes, voxel_steps: int
 ) -> OpenTree:
-    """`open_record` without the points: they need not have been read."""
+    """Decompress and check a record without its points, as `open_record` does.
+
+    The frame of the points need not have been read.
+    """
     name = f"voxel {key:#x}"
     cell_planes = unpack(cells, CELL_DTYPE, shape.cell_rows, f"{name}, cells")
     identity = np.frombuffer(archive_id + key.to_bytes(8, "little"), np.uint8)
-    if (cell_planes[: len(identity)] != identity[:, None]).any():  # archive and voxel come first in a row
+    # Archive and voxel are the first fields of a row.
+    if (cell_planes[: len(identity)] != identity[:, None]).any():
         raise MisleadingIndexError(f"{name}: the record found is another voxel's or another archive's")
     cell_columns = Cells(*(column_of(cell_planes, CELL_DTYPE, field) for field in Cells._fields))
     check_cell_nodes(name, cell_columns, shape.node_rows)
@@ -343,14 +375,17 @@ def decode_voxel(
     archive_id: bytes,
     voxel_steps: int,
 ) -> tuple[VoxelData, Links]:
-    """Decompress and check a record, points and all. Inverse of `encode_voxel`. Raises as `open_record` does."""
+    """Decompress and check a record, points included. Inverse of `encode_voxel`.
+
+    Raises as `open_record` does.
+    """
     return open_record(cells, nodes, points, shape, key, archive_id, voxel_steps).decode()
 
 
 def _leaf_runs(
     voxel: VoxelData, links: Links
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """First point, number of points and sort axis of every leaf node."""
+    """Return the first point, the number of points and the sort axis of every leaf node."""
     leaf = links.is_leaf
     return (
         links.first[leaf].astype(np.int64),

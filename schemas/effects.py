@@ -1,15 +1,16 @@
-"""The effects a scene may call for, and what each is told: types of the scene file. A tagged union, tag `effect`.
+"""Types of the effects in a scene file: a tagged union with the tag `effect`.
 
-What an effect does is said in server/effects/, one file each; what each default is for, in SCENE.md. Bounds catch what
-was meant in other units: a step of 200, a skin of 2.
+server/effects/ implements the effects, one file each; SCENE.md explains the defaults. Bounds catch
+values in other units: a step of 200, a skin of 2.
 """
 
 from typing import Annotated, ClassVar
 
 import msgspec
 
-# A pair reaches 16 m at most, radii and margin or reach together (WIRE.md): what is asked for leaves room for radii.
-# An integer: of two equal annotations Python makes one, and 10.0 or 10 would be in the JSON Schema by who comes first.
+# A pair reaches 16 m at most, radii and margin or reach together (WIRE.md); this leaves room for
+# radii. It is an integer because Python merges two equal annotations: with a float elsewhere, the
+# import order would decide if the JSON Schema contains 10.0 or 10.
 MOST_REACH = 10
 
 Length = Annotated[float, msgspec.Meta(ge=0, le=MOST_REACH)]
@@ -20,24 +21,28 @@ BoxName = Annotated[str, msgspec.Meta(min_length=1, max_length=64)]
 
 
 class Effect(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="effect"):
-    """One effect. needs: effects without which it means nothing."""
+    """Base class of effects.
+
+    needs: effects that this effect requires.
+    """
 
     needs: ClassVar[tuple[str, ...]] = ()
 
 
 class Stop(Effect, frozen=True, tag="stop"):
-    """What is touched blocks: the avatar stays at the last clear pose.
+    """Contact blocks: the avatar stays at the last clear pose.
 
-    skin: how far from what stopped it, along its way, it stays [m].
+    skin: distance that the avatar keeps, along its way, from the obstacle that stopped it [m].
     """
 
     skin: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.002
 
 
 class Sweep(Effect, frozen=True, tag="sweep"):
-    """Motion is continuous: nothing is passed through between two frames.
+    """Continuous motion: the avatar passes through nothing between two frames.
 
-    tolerance: how far any avatar point may go between the last clear moment known and the first touch [m].
+    tolerance: how far any avatar point may move between the last clear moment known and the first
+    contact [m].
     """
 
     needs: ClassVar[tuple[str, ...]] = ("stop",)
@@ -45,10 +50,11 @@ class Sweep(Effect, frozen=True, tag="sweep"):
 
 
 class Slide(Effect, frozen=True, tag="slide"):
-    """What is left of a stopped motion goes along the surface touched.
+    """Sliding: the rest of a stopped motion continues along the touched surface.
 
-    surfaces: at most so many are slid along in a frame.  normal_reach: a surface's normal is that of the scan points
-    so near the one touched [m].
+    surfaces: maximum number of surfaces per frame.
+    normal_reach: a surface's normal is estimated from the scan points this near the touched one
+    [m].
     """
 
     needs: ClassVar[tuple[str, ...]] = ("stop",)
@@ -57,7 +63,7 @@ class Slide(Effect, frozen=True, tag="slide"):
 
 
 class Step(Effect, frozen=True, tag="step"):
-    """What is no higher is climbed, and descended without a fall.
+    """Climbing: obstacles up to a height are climbed, and descended without a fall.
 
     height: of the highest step [m].
     """
@@ -67,10 +73,11 @@ class Step(Effect, frozen=True, tag="step"):
 
 
 class Ground(Effect, frozen=True, tag="ground"):
-    """Gravity: feet on the ground, or falling.
+    """Gravity: the avatar stands on the ground or falls.
 
-    slope: what is steeper is no ground [degrees].  clearance: feet are held so far above what they stand on, walking
-    within a fifth of it [m].  gravity: [m/s^2].  fall_speed: at most [m/s].
+    slope: steeper surfaces are not ground [degrees].
+    clearance: height of the feet above the ground, kept within a fifth of it while walking [m].
+    gravity: [m/s^2].  fall_speed: maximum [m/s].
     """
 
     needs: ClassVar[tuple[str, ...]] = ("stop",)
@@ -81,19 +88,21 @@ class Ground(Effect, frozen=True, tag="ground"):
 
 
 class Proximity(Effect, frozen=True, tag="proximity"):
-    """Each frame says how near the nearest point is, where, and the way out.
+    """Report, in each frame, of the nearest scan point: distance, place and contact normal.
 
-    reach: farthest worth saying [m].
+    reach: farthest distance worth reporting [m].
     """
 
     reach: Annotated[float, msgspec.Meta(gt=0, le=MOST_REACH)] = 0.5
 
 
 class Contacts(Effect, frozen=True, tag="contacts"):
-    """Each frame lists what is touched, or nearly, in clusters, deepest first.
+    """List, in each frame, of contacts and near contacts in clusters, deepest first.
 
-    margin: what is so near counts as touched [m].  limit: clusters listed, at most.  cluster_distance: scan points so
-    far apart at most are of one cluster [m]; left out: twice the reach of a contact.
+    margin: distance below which a pair counts as in contact [m].  limit: maximum number of
+    clusters.
+    cluster_distance: scan points at most this far apart belong to one cluster [m]; omitted: twice
+    the reach of a contact.
     """
 
     margin: Length = 0.01
@@ -102,13 +111,13 @@ class Contacts(Effect, frozen=True, tag="contacts"):
 
 
 class Objects(Effect, frozen=True, tag="objects"):
-    """The scene's dynamic objects block avatars; those that can be pushed give way as far as the scene lets them."""
+    """Dynamic objects of the scene block avatars; pushed ones give way as far as the scene allows."""
 
 
 class Crowd(Effect, frozen=True, tag="crowd"):
-    """Users do not walk through one another.
+    """Users do not walk through each other.
 
-    margin: they stay so far apart [m].
+    margin: distance that they keep [m].
     """
 
     needs: ClassVar[tuple[str, ...]] = ("stop",)
@@ -116,7 +125,10 @@ class Crowd(Effect, frozen=True, tag="crowd"):
 
 
 class ThroughBox(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A box where contact is ignored: scan points in it, borders included, are left out. low, high: world [m]."""
+    """Box in which contact is ignored: scan points in it, borders included, are left out.
+
+    low, high: world [m].
+    """
 
     name: BoxName
     low: Vector
@@ -124,7 +136,7 @@ class ThroughBox(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Through(Effect, frozen=True, tag="through"):
-    """Named boxes are passed: a door known to open, a portal.
+    """Passage through named boxes: a door known to open, a portal.
 
     boxes: scan points in them are left out.
     """
@@ -133,10 +145,11 @@ class Through(Effect, frozen=True, tag="through"):
 
 
 class Uncertainty(Effect, frozen=True, tag="uncertainty"):
-    """Each frame says how probable contact is, scans measuring ranges with some noise.
+    """Report, in each frame, of the probability of contact under range noise of the scans.
 
-    sigma: its standard deviation [m].  scans: that of some scans, by the file's name as `info` lists it.  An archive
-    that does not keep the scan of each point (`build --keep scan`) has one sigma.
+    sigma: standard deviation of the noise [m].
+    scans: that of individual scans, by the file's name as `info` lists it. An archive that does not
+    keep the scan of each point (`build --keep scan`) has one sigma.
     """
 
     sigma: Near = 0.005

@@ -1,7 +1,7 @@
-"""What an archive's index says: of the dataset as a whole, and of every voxel. Pure: no HDF5 in it.
+"""Content of an archive's index: the dataset as a whole, and every voxel. Pure: no HDF5 here.
 
-The one place where the index's datasets have names: `index_columns` makes them, `read_header` takes them apart,
-`index_digest` vouches for them. FORMAT.md, "The index", says the same in prose.
+Only this module names the index's datasets: `index_columns` makes them, `read_header` parses them,
+`index_digest` computes their checksum. FORMAT.md, "index.h5", documents the same.
 """
 
 import hashlib
@@ -16,15 +16,18 @@ from numpy.typing import NDArray
 from .radius_model import LOCAL_CLASSES, RADIUS_CLASSES, local_radii
 from .voxel_grid import Lattice
 
-# Points so near have a say in a point's normal, unless another reach is given [m]: some forty that a scanner sees of a
-# façade, on no more than a hand.
+# Default distance within which points contribute to a point's normal [m]: it covers some forty
+# points of a façade as a scanner sees it, on an area no larger than a hand.
 NORMAL_REACH = 0.08
-# Farther is no surface any more, and at steps of 0.1 mm sums fit 63 bits for any voxel (normals.py) [m].
+# Beyond this, points do not belong to one surface. At steps of 0.1 mm, sums fit 63 bits for any
+# voxel (normals.py) [m].
 MAX_NORMAL_REACH = 1.0
 
-# One row a voxel, sorted by key. frame_*: where the dataset's only chunk lies in its shard, in the order of
-# DATASETS; checksum: the last four bytes of the zstd frame, so that a wrong offset cannot deliver another's.
-# leaves: leaf nodes, so that a server knows a voxel's decoded bytes before it loads it.
+# One row per voxel, sorted by key.
+# frame_*: place of each dataset's only chunk in its shard, in the order of DATASETS.
+# frame_checksum: the last four bytes of the zstd frame, so that a wrong offset cannot deliver
+# another frame.
+# leaves: leaf nodes, so that a server knows a voxel's decoded size before it loads it.
 VOXEL_DTYPE = np.dtype(
     [
         ("key", "<u8"),
@@ -42,14 +45,17 @@ VOXEL_DTYPE = np.dtype(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Source:
-    """One scan that went in, or was left out.
+    """One scan that was built in, or was left out.
 
-    index: of the scan inside its file.  sha256: of the file.  pose: (4, 4) float64, scan to world.
-    count: points stored.  skipped: reason -> points left out.  fault: why the whole scan was left out, or "".
-    crs: the text of the coordinate reference system that the file names, or "".  units, up: what a length of the file
-    was taken for, and which of its axes for up; `pose` has both in it.  unknown: the row of the header's `unknown`
-    where a scan that was left out may have had points, -1 where that is not known; None: nothing was lost with it.
-    one_place: all its points, several, lay at one place.
+    index: index of the scan inside its file.  sha256: of the file.
+    pose: (4, 4) float64, scan to world.
+    count: points stored.  skipped: reason -> points left out.
+    fault: why the whole scan was left out, or "".
+    crs: text of the coordinate reference system that the file names, or "".
+    units, up: the unit of length and the up axis assumed for the file; `pose` includes both.
+    unknown: row of the header's `unknown` where a scan that was left out may have had points; -1 if
+    that is not known; None: nothing was lost with it.
+    one_place: all its points, two or more, lay at one place.
     """
 
     path: str
@@ -67,13 +73,18 @@ class Source:
     one_place: bool = False
 
 
-# Fields of a source that texts name only where they are not the default: without, an archive stays what it was.
+# Fields of a source that texts contain only if they differ from the default, so that archives
+# without them keep their bytes.
 _OPTIONAL = {"crs": "", "units": "m", "up": "z", "unknown": None, "one_place": False}
 
 
 @dataclass(frozen=True, slots=True)
 class RadiusNow:
-    """Half the mean closest-point distance of the points of this generation, its standard error [m], points asked."""
+    """Radius measured over the points of this generation.
+
+    radius: half the mean closest-point distance [m].  error: its standard error [m].
+    sample: number of points sampled.
+    """
 
     radius: float
     error: float
@@ -82,19 +93,26 @@ class RadiusNow:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Header:
-    """What the index says of the dataset as a whole.
+    """Index data of the dataset as a whole.
 
-    archive_id: 16 bytes, from the points and options alone.  low, high: (3,) int64, least and greatest lattice
-    coordinates of the points, inclusive.  radius: half the mean closest-point distance [m]; radius_error: its
-    standard error [m], 0 when all points were asked; radius_sample: points asked.  moved_max: farthest that
-    quantising moved a point along an axis [m].  lattice_source: "sources", "given" or "default".
-    models: the radius models stored, in the order of STORED_MODELS; radius_counts: (32,) int64, the points of each
-    radius class, zeros where none are stored; radius_capped: points that had too few neighbours for a local class,
-    and were given the largest.  options: the build's.  unknown: (u, 2, 3) int64, lattice boxes, inclusive, of scans
-    left out; unknown_everywhere: one was left out of which not even the bounds are known.
-    generation: how often scans were added or removed since the build.  radius_now: what `radius` would be if it were
-    measured now; None in generation 0, where it is, and where it was given.
-    normal_reach: what the points' normals were estimated with [m] (kernels/normals.py); 0: they have none.
+    archive_id: 16 bytes, determined by the points and options alone.
+    low, high: (3,) int64, least and greatest lattice coordinates of the points, inclusive.
+    radius: half the mean closest-point distance [m].
+    radius_error: its standard error [m], 0 if all points were sampled.
+    radius_sample: number of points sampled.
+    moved_max: farthest distance that quantising moved a point along an axis [m].
+    lattice_source: "sources", "given" or "default".
+    models: the radius models stored, in the order of STORED_MODELS.
+    radius_counts: (32,) int64, the points of each radius class, zeros if none are stored.
+    radius_capped: points that had too few neighbours for a local class and were given the largest.
+    options: the build's.
+    unknown: (u, 2, 3) int64, lattice boxes, inclusive, of scans left out.
+    unknown_everywhere: a scan was left out whose bounds are not known.
+    generation: how often scans were added or removed since the build.
+    radius_now: what `radius` would be if it were measured now; None in generation 0, where `radius`
+    is that value, and if the radius was given.
+    normal_reach: estimation distance of the points' normals [m] (kernels/normals.py); 0: no
+    normals.
     """
 
     archive_id: bytes
@@ -125,17 +143,17 @@ class Header:
 
     @property
     def radius_class(self) -> bool:
-        """Whether every point has a radius class."""
+        """Return True if the points have a radius class."""
         return self.models != ("mean",)
 
     @property
     def normals(self) -> bool:
-        """Whether every point has a normal, or the code that says it has none."""
+        """Return True if the points have a normal, or the code for "no normal"."""
         return self.normal_reach > 0
 
     @property
     def format_version(self) -> int:
-        """The version of the format that says all of this: the first where nothing newer is in it."""
+        """Return the lowest format version that can represent this header."""
         if self.normals:
             return 4
         if self.generation:
@@ -145,7 +163,7 @@ class Header:
 
 @dataclass(frozen=True, slots=True)
 class LocalRadius:
-    """The points that `local` gives one radius [m]."""
+    """Number of points that `local` gives a radius [m]."""
 
     radius: float
     points: int
@@ -153,10 +171,11 @@ class LocalRadius:
 
 @dataclass(frozen=True, slots=True)
 class RadiusDistribution:
-    """What the radius classes of an archive's points come to.
+    """Distribution of an archive's radius classes.
 
-    local: ascending, of those radii that some point has, empty where `local` is not stored.  capped: points that had
-    too few neighbours for a local class, and have the largest radius.  rim: points on the rim of a surface.
+    local: the radii that at least one point has, ascending; empty if `local` is not stored.
+    capped: points that had too few neighbours for a local class and have the largest radius.
+    rim: points on the rim of a surface.
     None: not stored.
     """
 
@@ -166,10 +185,10 @@ class RadiusDistribution:
 
 
 def radius_distribution(header: Header) -> RadiusDistribution | None:
-    """How the radius classes are distributed; None for an archive without."""
+    """Return the distribution of the radius classes; None for an archive without any."""
     if not header.radius_class:
         return None
-    by_class = header.radius_counts.reshape(2, LOCAL_CLASSES)  # on a rim: the second row
+    by_class = header.radius_counts.reshape(2, LOCAL_CLASSES)  # the second row: points on a rim
     local = zip(local_radii().tolist(), by_class.sum(axis=0).tolist(), strict=True)
     with_local = "local" in header.models
     return RadiusDistribution(
@@ -180,7 +199,10 @@ def radius_distribution(header: Header) -> RadiusDistribution | None:
 
 
 def _texts(header: Header) -> bytes:
-    """The parts of the header that are words and options, as canonical JSON. Floats that matter are not in it."""
+    """Encode the texts and options of the header as canonical JSON.
+
+    Floats whose bits matter are not part of it.
+    """
     sources = [
         {
             "path": s.path,
@@ -203,7 +225,7 @@ def _texts(header: Header) -> bytes:
 
 
 def index_columns(header: Header, voxels: NDArray, shards: list[tuple[str, int]]) -> dict[str, NDArray]:
-    """Every dataset of the index by name. One place for writer, reader and digest."""
+    """Return every dataset of the index by name, for writer, reader and digest alike."""
     lattice = header.lattice
     columns = [header.scan_index, header.intensity]
     classes = {}
@@ -248,7 +270,7 @@ def index_columns(header: Header, voxels: NDArray, shards: list[tuple[str, int]]
 
 
 def index_digest(archive_id: bytes, columns: dict[str, NDArray]) -> bytes:
-    """SHA-256 over the id and every dataset of the index, names and shapes included."""
+    """Return the SHA-256 over the id and every dataset of the index, names and shapes included."""
     digest = hashlib.sha256(archive_id)
     for name, column in sorted(columns.items()):
         digest.update(f"{name}:{column.dtype.str}:{column.shape}:".encode())
@@ -257,7 +279,10 @@ def index_digest(archive_id: bytes, columns: dict[str, NDArray]) -> bytes:
 
 
 def _check_counts(counts: NDArray, capped: int, points: int) -> None:
-    """ValueError unless every point has one radius class: radii and the reach of a question go by what is counted."""
+    """Raise ValueError unless every point has exactly one radius class.
+
+    Radii and the reach of a query depend on these counts.
+    """
     counted = counts.tolist()
     if counts.shape != (RADIUS_CLASSES,) or min(counted) < 0 or sum(counted) != points or capped > points:
         raise ValueError(
@@ -266,7 +291,10 @@ def _check_counts(counts: NDArray, capped: int, points: int) -> None:
 
 
 def _normal_reach(columns: dict[str, NDArray]) -> float:
-    """The reach of the normals, 0 where points have none. Raises ValueError for one that is none."""
+    """Return the estimation distance of the normals, 0 without normals.
+
+    Raises ValueError if it is invalid.
+    """
     if len(columns["columns"]) < 5:
         return 0.0
     reach = float(columns["normal_reach"][0])
@@ -279,7 +307,7 @@ _Count = Annotated[int, msgspec.Meta(ge=0)]
 
 
 class _SourceTexts(msgspec.Struct):
-    """What `texts` says of a source; see `Source`."""
+    """Texts of one source; see `Source`."""
 
     path: str
     index: _Count
@@ -295,7 +323,7 @@ class _SourceTexts(msgspec.Struct):
 
 
 class _Texts(msgspec.Struct):
-    """What `texts` says; see `_texts`."""
+    """Content of `texts`; see `_texts`."""
 
     lattice_source: Literal["sources", "given", "default"]
     radius_model: Literal["mean", "given"]
@@ -304,12 +332,12 @@ class _Texts(msgspec.Struct):
 
 
 def _no_number(name: str) -> NoReturn:
-    """Refuse NaN and infinity, which Python's JSON takes for numbers."""
+    """Refuse NaN and infinity, which Python's JSON parser accepts as numbers."""
     raise ValueError(f"texts with {name}: expected JSON")
 
 
 def _read_texts(columns: dict[str, NDArray]) -> _Texts:
-    """Parse `texts` and compare it with the datasets beside it. Raises ValueError."""
+    """Parse `texts` and compare it with the other datasets. Raises ValueError."""
     try:
         texts = msgspec.convert(
             json.loads(columns["texts"].tobytes(), parse_constant=_no_number), _Texts, strict=True
@@ -328,7 +356,10 @@ def _read_texts(columns: dict[str, NDArray]) -> _Texts:
 
 
 def read_header(archive_id: bytes, columns: dict[str, NDArray]) -> Header:
-    """Return the header of the index's datasets, which `check_columns` accepts (index_limits.py). Raises ValueError."""
+    """Return the header from the index's datasets, which `check_columns` has accepted.
+
+    Raises ValueError.
+    """
     texts = _read_texts(columns)
     counts = columns["source_count"]
     sources = tuple(

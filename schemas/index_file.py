@@ -1,6 +1,7 @@
-"""The file `index.h5`, writer and reader side by side: the columns of schemas/index.py as plain HDF5 datasets.
+"""Reader and writer of `index.h5`: the columns of schemas/index.py as plain HDF5 datasets.
 
-FORMAT.md says the same in prose; change both together. It is the last file of an archive to be written.
+FORMAT.md documents the same; change both together. The index is the last file of an archive to be
+written.
 """
 
 from pathlib import Path
@@ -14,17 +15,19 @@ from .index import Header, index_columns, index_digest
 from .index_limits import check_columns, check_layout
 from .new_file import new_file, publish
 
-# What this software reads, and writes: the first version that holds what is to be said (schemas/index.py Header).
+# Versions that this software reads. It writes the lowest version that can represent the header
+# (schemas/index.py).
 FORMAT_VERSIONS = (1, 2, 3, 4)
 INDEX_NAME = "index.h5"
-# Members of the root, and bytes of a text attribute: more than any version has.
+# Limits of the members of the root and of a text attribute's bytes: more than any version has.
 MOST_MEMBERS, MOST_NAME = 64, 64
 
 
 def write_index(folder: Path, header: Header, voxels: NDArray, shards: list[tuple[str, int]]) -> None:
-    """Write index.h5, the last file of an archive: with it the archive is whole.
+    """Write index.h5, the last file of an archive, which completes it.
 
-    voxels: VOXEL_DTYPE rows sorted by key.  shards: name and bytes of each, in the order of their numbers.
+    voxels: VOXEL_DTYPE rows sorted by key.
+    shards: name and bytes of each, in the order of their numbers.
     """
     path = folder / INDEX_NAME
     columns = index_columns(header, voxels, shards)
@@ -40,10 +43,10 @@ def write_index(folder: Path, header: Header, voxels: NDArray, shards: list[tupl
 
 
 def _text_attribute(file: h5py.File, name: str) -> str:
-    """A text attribute of fixed length, "" where there is none.
+    """Return a text attribute of fixed length, "" if there is none.
 
-    Text of variable length lies in HDF5's global heap, which has no checksum: with one byte flipped there, HDF5
-    2.0 never came back. So it is neither written nor read.
+    Text of variable length is stored in HDF5's global heap, which has no checksum: with one byte
+    flipped there, HDF5 2.0 hung. This software therefore neither writes nor reads it.
     """
     if name not in file.attrs:
         return ""
@@ -54,7 +57,7 @@ def _text_attribute(file: h5py.File, name: str) -> str:
 
 
 def _number_attribute(file: h5py.File, name: str, dtype: str, shape: tuple[int, ...]) -> NDArray:
-    """Return an attribute of numbers, whose type and shape are looked at before it is read. Raises ValueError."""
+    """Return a numeric attribute, after checking its type and shape. Raises ValueError."""
     if name not in file.attrs:
         raise ValueError(f"attribute {name} not found")
     attribute = file.attrs.get_id(name)
@@ -66,10 +69,11 @@ def _number_attribute(file: h5py.File, name: str, dtype: str, shape: tuple[int, 
 
 
 def read_columns(path: Path) -> tuple[bytes, dict[str, NDArray]]:
-    """Return the archive's id and every dataset of an index, each within what `check_columns` accepts.
+    """Return the archive's id and every dataset of an index, as `check_columns` accepts them.
 
-    No dataset leads elsewhere or claims more than the file holds. Raises FormatError or CorruptError naming the file,
-    ValueError for a number that no index has; of HDF5 what it raises for a file that is damaged.
+    No dataset links elsewhere or claims more bytes than the file holds. Raises FormatError or
+    CorruptError naming the file, ValueError for an invalid number, and whatever HDF5 raises for a
+    damaged file.
     """
     size = path.stat().st_size
     columns: dict[str, NDArray] = {}

@@ -1,9 +1,10 @@
-"""What the numbers of an index must be before anything uses them.
+"""Checks of the numbers in an index, made before anything uses them.
 
-A checksum says that an index is the one that was written, not that its writer was right: a forger computes another.
-`check_layout` looks at types and shapes before data is read, `check_columns` and `check_voxels` look at every number.
-FORMAT.md, "What a reader checks", lists the same; change both together. All raise ValueError naming the dataset, what
-was found and what was expected.
+A checksum proves that an index is the one that was written. It does not prove that its writer was
+correct: a forger computes a new checksum. `check_layout` checks types and shapes before data is
+read, `check_columns` and `check_voxels` check every number. FORMAT.md, "What a reader checks",
+lists the same; change both together. All functions raise ValueError naming the dataset, what was
+found and what was expected.
 """
 
 import math
@@ -20,7 +21,7 @@ from .voxel import MAX_DEGREE, MAX_LEAF, MAX_LEVELS, MIN_DEGREE
 from .voxel_grid import MAX_COORDINATE, MAX_VOXEL_STEPS, MIN_STEP, voxel_coordinates
 
 SHARD_DTYPE = np.dtype([("name", "S24"), ("bytes", "<u8")])
-# Every dataset that an index may have: its type and shape, -1 for any length.
+# Dtype and shape of every dataset that an index may have; -1 stands for any length.
 _LAYOUT: dict[str, tuple[np.dtype, tuple[int, ...]]] = {
     "origin": (np.dtype("<f8"), (3,)),
     "step": (np.dtype("<f8"), (1,)),
@@ -49,21 +50,21 @@ _CLASSES = ("radius_counts", "radius_capped")
 _LATER = ("generation", "radius_now")
 _OPTIONAL = (*_CLASSES, *_LATER, "normal_reach")
 
-# Texts of a dataset and of each source [bytes]: a path, a coordinate reference system and a few words. JSON takes some
-# 10 ms a megabyte.
+# Limits of the texts of a dataset and of each source [bytes]. A source's text is a path, a
+# coordinate reference system and a few words. JSON takes about 10 ms per megabyte.
 MOST_TEXT, MOST_TEXT_A_SOURCE = 1 << 20, 1 << 18
-# Corners of regions of scans that were left out lie anywhere; their differences fit int64.
+# Boxes of scans that were left out may lie anywhere; the differences of their corners fit int64.
 _MOST_LATTICE = 1 << 61
-# Beyond it float64 does not tell whole numbers apart.
+# Above this, float64 does not represent every integer.
 _MOST_SAMPLE = 1 << 53
 # Links are int32 (schemas/voxel.py).
 _MOST_ROWS = (1 << 31) - 1
-# zstd: magic number, header, one block and checksum.
+# The shortest zstd frame: magic number, header, one block and checksum.
 _LEAST_FRAME = 13
 
 
 def _refuse(what: str, found: Any, expected: str) -> None:
-    """Raise the ValueError of a fault."""
+    """Raise ValueError for an invalid value."""
     raise ValueError(f"{what} {found}: expected {expected}")
 
 
@@ -80,9 +81,9 @@ def check_layout(name: str, dtype: np.dtype, shape: tuple[int, ...]) -> None:
 
 
 def check_columns(version: int, columns: dict[str, NDArray]) -> None:
-    """Check every number of an index that is of the dataset as a whole.
+    """Check every number of an index that describes the dataset as a whole.
 
-    columns: datasets that `check_layout` accepts, and that the checksum vouches for.
+    columns: datasets that `check_layout` accepts and whose checksum is correct.
     """
     missing = [name for name in _LAYOUT if name not in columns and name not in _OPTIONAL]
     if missing:
@@ -94,7 +95,10 @@ def check_columns(version: int, columns: dict[str, NDArray]) -> None:
 
 
 def _numbers(columns: dict[str, NDArray], name: str, low: float, high: float) -> list[Any]:
-    """The values of a dataset, each of which must be from low to high; NaN is not."""
+    """Return the values of a dataset; raise ValueError unless all are from low to high.
+
+    NaN is refused.
+    """
     values = columns[name]
     if not ((values >= low) & (values <= high)).all():
         _refuse(name, values.tolist(), f"numbers from {low:g} to {high:g}")
@@ -103,14 +107,18 @@ def _numbers(columns: dict[str, NDArray], name: str, low: float, high: float) ->
 
 
 def _check_lattice(columns: dict[str, NDArray]) -> None:
-    """Origin, step, voxels and bounds: kernels turn them into int64 of 2^-26 m without looking."""
+    """Check origin, step, voxels and bounds.
+
+    Kernels convert them to int64 multiples of 2^-26 m without further checks.
+    """
     origin = np.array(_numbers(columns, "origin", -MAX_COORDINATE, MAX_COORDINATE))
     (step,) = _numbers(columns, "step", MIN_STEP, MAX_COORDINATE)
     (steps,) = _numbers(columns, "voxel_steps", 1, MAX_VOXEL_STEPS)
     if steps * step > 2 * MAX_COORDINATE:
         _refuse("step and voxel_steps", [step, steps], f"voxels of at most {2 * MAX_COORDINATE:g} m")
     bounds = columns["bounds"]
-    # Corners are compared in float64, as the product of int64 could overflow; a step is more than rounding.
+    # Corners are compared in float64, because the int64 product could overflow. The tolerance of
+    # one step is larger than the rounding error.
     world = bounds.astype(np.float64) * step + origin
     if (bounds[0] > bounds[1]).any() or not (np.abs(world) <= MAX_COORDINATE + step).all():
         _refuse("bounds", bounds.tolist(), f"low up to high, within {MAX_COORDINATE:g} m")
@@ -121,12 +129,12 @@ def _check_lattice(columns: dict[str, NDArray]) -> None:
         or (unknown < -_MOST_LATTICE).any()
         or (unknown > _MOST_LATTICE).any()
     ):
-        _refuse("unknown", "with a box that is none", "low up to high")
+        _refuse("unknown", "with an inverted or too distant box", "low up to high, within 2^61")
     _numbers(columns, "unknown_everywhere", 0, 1)
 
 
 def _check_kept(version: int, columns: dict[str, NDArray]) -> None:
-    """Which columns the points have, which datasets follow from it, and the version that says so."""
+    """Check the point columns, the datasets that they require, and the format version that follows."""
     kept = _numbers(columns, "columns", 0, 1)
     classes, normals, later = len(kept) > 2 and any(kept[2:4]), len(kept) == 5, "generation" in columns
     if len(kept) not in (2, 4, 5) or (len(kept) == 4 and not classes) or (normals and not kept[4]):
@@ -143,10 +151,14 @@ def _check_kept(version: int, columns: dict[str, NDArray]) -> None:
 
 
 def _check_radius(columns: dict[str, NDArray]) -> None:
-    """The figures that say how large spheres are. Radii too small would make contacts clear."""
+    """Check the numbers that determine the sizes of spheres.
+
+    Radii that are too small would turn contacts into clear.
+    """
     _numbers(columns, "radius", 0.0, MAX_COORDINATE)
     (points,) = _numbers(columns, "points", 1, 1 << 62)
-    # As it was built: of a later generation some of the points that were asked may be gone.
+    # `radius_sample` is as it was built: in a later generation, sampled points may have been
+    # removed.
     _numbers(columns, "radius_sample", 0, _MOST_SAMPLE if "generation" in columns else points)
     if "radius_now" in columns:
         _numbers(columns, "generation", 1, (1 << 32) - 1)
@@ -157,10 +169,10 @@ def _check_radius(columns: dict[str, NDArray]) -> None:
 
 
 def _check_sources(columns: dict[str, NDArray]) -> None:
-    """Poses and counts of the scans, and the length of their texts before JSON is parsed."""
+    """Check poses and counts of the scans, and the length of their texts before JSON is parsed."""
     pose, count = columns["source_pose"], columns["source_count"]
     if not np.isfinite(pose).all() or (len(pose) and (pose[:, 3] != (0.0, 0.0, 0.0, 1.0)).any()):
-        _refuse("source_pose", "with a matrix that is no pose", "finite numbers, last row 0 0 0 1")
+        _refuse("source_pose", "with a matrix that is not a pose", "finite numbers, last row 0 0 0 1")
     points = int(columns["points"][0])
     if len(count) != len(pose) or sum(count.tolist()) != points:
         _refuse(
@@ -176,9 +188,9 @@ def _check_sources(columns: dict[str, NDArray]) -> None:
 
 
 def check_voxels(columns: dict[str, NDArray], point_bytes: int) -> None:
-    """Check every number of an index that is of one voxel, and that all agree with those of the dataset.
+    """Check every number of an index that describes one voxel, also against those of the dataset.
 
-    columns: as `check_columns` accepts them.  point_bytes: a row of the points dataset.
+    columns: as `check_columns` accepts them.  point_bytes: size of a row of the points dataset.
     """
     voxels, sizes = columns["voxels"], columns["shards"]["bytes"]
     key = voxels["key"]
@@ -186,26 +198,32 @@ def check_voxels(columns: dict[str, NDArray], point_bytes: int) -> None:
         not len(voxels)
         or (voxels["shard"] >= len(sizes)).any()
         or (key[1:] <= key[:-1]).any()
-        # Three coordinates of 21 bits: with one bit more two keys would be one voxel.
+        # Three coordinates of 21 bits: with one more bit, two keys would denote one voxel.
         or key[-1] >= 1 << 63
     ):
-        _refuse("voxels", "does not add up", "keys of 63 bits that ascend, of shards that there are")
+        _refuse("voxels", "is inconsistent", "ascending keys of 63 bits, shards that exist")
     _check_frames(voxels, sizes[voxels["shard"]])
     _check_rows(columns, point_bytes)
     _check_bounds(columns)
 
 
 def _at(voxels: NDArray, wrong: NDArray[np.bool_]) -> str:
-    """The first of the voxels (v,) with something wrong (v,) or (v, k)."""
+    """Return the name of the first voxel with something wrong, for messages.
+
+    wrong: (v,) or (v, k), true where something is wrong.
+    """
     row = int(np.flatnonzero(wrong.reshape(len(voxels), -1).any(axis=1))[0])
     return f"voxel {voxels['key'][row]:#x}"
 
 
 def _check_frames(voxels: NDArray, sizes: NDArray[np.uint64]) -> None:
-    """Frames lie inside their shards (sizes: (v,) bytes), and no two of them share a byte."""
+    """Check that frames lie inside their shards, and that no two of them share a byte.
+
+    sizes: (v,), the length of each voxel's shard [bytes].
+    """
     offset, length = voxels["frame_offset"], voxels["frame_bytes"].astype(np.uint64)
     room = sizes[:, None]
-    beyond = (length > room) | (offset > room - np.minimum(length, room))  # a sum would wrap
+    beyond = (length > room) | (offset > room - np.minimum(length, room))  # a sum would overflow
     if beyond.any():
         _refuse(_at(voxels, beyond), "points beyond a shard's end", "frames inside their shards")
     if (short := length < _LEAST_FRAME).any():
@@ -217,11 +235,11 @@ def _check_frames(voxels: NDArray, sizes: NDArray[np.uint64]) -> None:
     shared = (shard[1:] == shard[:-1]) & (begin[1:] < end[:-1])
     if shared.any():
         row = int(order[np.flatnonzero(shared)[0]]) // 3
-        _refuse(f"voxel {voxels['key'][row]:#x}", "shares bytes with another frame", "frames of their own")
+        _refuse(f"voxel {voxels['key'][row]:#x}", "shares bytes with another frame", "disjoint frames")
 
 
 def _check_rows(columns: dict[str, NDArray], point_bytes: int) -> None:
-    """Rows add up to the dataset's points, to trees, and to what frames of their length can hold."""
+    """Check row counts against the dataset's points, the shape of trees, and the frames' sizes."""
     voxels = columns["voxels"]
     rows, leaves = voxels["rows"].astype(np.int64), voxels["leaves"].astype(np.int64)
     cells, nodes, points = rows.T
@@ -256,9 +274,10 @@ def _check_rows(columns: dict[str, NDArray], point_bytes: int) -> None:
 
 
 def _check_bounds(columns: dict[str, NDArray]) -> None:
-    """Bounds of voxels lie inside these, and together are the scene's.
+    """Check that the bounds of each voxel lie inside its cell, and that their union is the scene's.
 
-    The broad phase searches ascending keys and prunes by these bounds: it would call clear what they hide.
+    The broad phase searches ascending keys and prunes by these bounds. If they were too small, it
+    would report clear for points that they hide.
     """
     voxels, steps = columns["voxels"], int(columns["voxel_steps"][0])
     low, high = voxels["low"], voxels["high"]

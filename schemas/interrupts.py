@@ -1,10 +1,11 @@
-"""Interrupts: SIGINT (Ctrl-C) and SIGTERM are noted when they come, and raised where the work can stop.
+"""Interrupts: SIGINT (Ctrl-C) and SIGTERM set a flag; work raises Interrupted where it can stop.
 
-Python raises KeyboardInterrupt at any instruction. Inside a library's callback it comes out as that library's error
-(lazrs: 11 of 16 times), inside an error handler it hides the error, inside a `finally` it leaves something undone. In
-a block of `taken` a signal sets a flag instead. Long work calls `check` between blocks, voxels, files and units, and
-`check` raises Interrupted. Whatever else ends the block once the flag is set is an interrupt too, never a fault of a
-file.
+Python raises KeyboardInterrupt at any instruction. Inside a library's callback it comes out as that
+library's error (lazrs: 11 of 16 times), inside an error handler it hides the error, inside a
+`finally` it leaves cleanup incomplete. In a block of `taken` a signal sets a flag instead. Long
+work calls `check` between blocks, voxels, files and units, and `check` raises Interrupted. Once the
+flag is set, any other exception that ends the block counts as an interrupt too, never as a fault of
+a file.
 """
 
 import contextlib
@@ -14,22 +15,27 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 
-# Code that reaches no `check` for so long [s] is interrupted where it is: compilation, or a library that reads a whole
-# file in one call. Then it is tried again, in case a library swallowed the exception, and soon where Python did.
+# Code that calls no `check` for GRACE_SECONDS is interrupted at its current instruction:
+# compilation, or a library that reads a whole file in one call. The interrupt is repeated every
+# AGAIN_SECONDS, in case a library swallowed the exception, and after SOON_SECONDS if Python dropped
+# it.
 GRACE_SECONDS, AGAIN_SECONDS, SOON_SECONDS = 1.0, 5.0, 0.02
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class Interrupted(KeyboardInterrupt):
-    """The work was interrupted. The text says what is left of it, where that is known."""
+    """Interruption of the work by a signal.
+
+    The text says what is left of the work, where that is known.
+    """
 
 
 class _State:
-    """What this process knows of its interrupt.
+    """State of the interrupt in this process.
 
-    taken: in a block of `taken`.  held: blocks of `kept_back` in it.  since: when the first signal came
-    (time.monotonic); None before.
+    taken: in a block of `taken`.  held: number of active `kept_back` blocks in it.
+    since: time of the first signal (time.monotonic); None before.
     """
 
     taken = False
@@ -38,28 +44,33 @@ class _State:
 
 
 def came() -> bool:
-    """Return whether a signal has come in the block of `taken`."""
+    """Return True if a signal has arrived in the block of `taken`."""
     return _State.since is not None
 
 
 def check() -> None:
-    """Raise Interrupted once a signal has come; cheap, for any thread, and harmless outside `taken`."""
+    """Raise Interrupted once a signal has arrived.
+
+    The call is cheap, allowed in any thread, and harmless outside `taken`.
+    """
     if _State.since is not None:
         leave()
         raise Interrupted
 
 
 def leave() -> None:
-    """Stop the timer that insists: the stack is being left, and what tidies up is not to be interrupted."""
+    """Stop the timer of `_insist`, so that cleanup is not interrupted while the stack unwinds."""
     signal.setitimer(signal.ITIMER_REAL, 0)
 
 
 @contextlib.contextmanager
 def taken() -> Iterator[None]:
-    """Note SIGINT and SIGTERM in this block, for `check`; end it by Interrupted if one came, whatever else ends it.
+    """Note SIGINT and SIGTERM in this block, for `check`.
 
-    A signal that is ignored stays ignored, as under nohup. A further signal after GRACE_SECONDS raises at once. A block
-    within a block, and one outside the main thread, where Python runs no handlers, changes nothing.
+    If a signal arrived, the block ends with Interrupted, whatever else ends it. A signal that is
+    ignored stays ignored, as under nohup. A further signal after GRACE_SECONDS raises at once. A
+    nested block has no effect, and neither has a block outside the main thread, where Python runs
+    no handlers.
     """
     if _State.taken or threading.current_thread() is not threading.main_thread():
         yield
@@ -90,7 +101,7 @@ def taken() -> Iterator[None]:
 
 
 def _note(number: int, frame: object) -> None:
-    """Handle SIGINT and SIGTERM: set the flag; raise where it has been set for long."""
+    """Handle SIGINT and SIGTERM: set the flag; raise if it has been set for GRACE_SECONDS."""
     now = time.monotonic()
     if _State.since is None:
         _State.since = now
@@ -102,13 +113,16 @@ def _note(number: int, frame: object) -> None:
 
 
 def _insist(number: int, frame: object) -> None:
-    """Handle the timer that a signal starts: nobody has checked for long."""
+    """Handle the timer that a signal starts: raise, because nothing has called `check` for long."""
     if not _State.held:
         raise Interrupted
 
 
 def _swallowed(what: "sys.UnraisableHookArgs") -> None:
-    """Insist again soon where Python has to drop an exception, as in a callback of an import; tell of others."""
+    """Restart the timer if Python dropped an Interrupted, as in a callback of an import.
+
+    Report any other unraisable exception.
+    """
     if what.exc_type is Interrupted:
         signal.setitimer(signal.ITIMER_REAL, SOON_SECONDS, AGAIN_SECONDS)
     else:
@@ -117,12 +131,12 @@ def _swallowed(what: "sys.UnraisableHookArgs") -> None:
 
 @contextlib.contextmanager
 def kept_back() -> Iterator[Callable[[], None]]:
-    """Let SIGINT and SIGTERM raise when the block ends, or when what is yielded is called, and not between.
+    """Hold back SIGINT and SIGTERM until the block ends or the yielded function is called.
 
-    For calls of libraries that call Python back: raised in a callback of HDF5, a KeyboardInterrupt came out as a
-    SystemError, or not at all. In a block of `taken`, `check` raises here too, where Python code of ours calls it.
-    Outside `taken` the handlers run then, whatever they do. Outside the main thread, where Python runs no handlers,
-    nothing is done.
+    For calls of libraries that call Python back: raised in a callback of HDF5, a KeyboardInterrupt
+    came out as a SystemError, or not at all. In a block of `taken`, `check` still raises here where
+    our own Python code calls it. Outside `taken`, the original handlers run at that time. Outside
+    the main thread, where Python runs no handlers, this has no effect.
     """
     if threading.current_thread() is not threading.main_thread():
         yield lambda: None
@@ -142,7 +156,7 @@ def kept_back() -> Iterator[Callable[[], None]]:
             signal.signal(number, lambda number, _: waiting.append(number))
 
     def deliver() -> None:
-        """Run the handlers of what came."""
+        """Run the handlers of the signals that arrived."""
         while waiting:
             number = signal.Signals(waiting.pop(0))
             handler = before[number]
@@ -160,9 +174,10 @@ def kept_back() -> Iterator[Callable[[], None]]:
 
 @contextlib.contextmanager
 def children_ignore() -> Iterator[None]:
-    """Let processes started in this block begin with SIGINT blocked: Ctrl-C reaches a terminal's whole group.
+    """Start the processes of this block with SIGINT blocked.
 
-    A worker that is still loading Python would print a traceback. One that comes in the block waits for its end.
+    Ctrl-C reaches a terminal's whole process group, and a worker that is still loading Python would
+    print a traceback. A SIGINT that arrives in the block waits until its end.
     """
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:

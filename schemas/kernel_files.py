@@ -1,9 +1,9 @@
-"""The folder of compiled kernels: files of machine code, each checked before it is used.
+"""Folder of compiled kernels: files of machine code, each checked before it is used.
 
-A file holds a magic number, a SHA-256 over its own name and its payload, and the payload. The payload is unpickled
-and run, so a file is used only if its digest is right, and a folder only if nobody else may write it. A damaged file is
-removed, said once, and compiled again. Nothing here raises because of a file: a process that cannot use the folder
-compiles.
+A file contains a magic number, a SHA-256 over its own name and its payload, and the payload. The
+payload is unpickled and run, so a file is used only if its digest is right, and a folder only if
+nobody else can write to it. A damaged file is removed, reported once, and compiled again. No file
+makes this module raise: a process that cannot use the folder compiles.
 """
 
 import contextlib
@@ -27,13 +27,16 @@ _SUFFIX = ".kernel"
 _TEMPORARY = ".tmp"
 _STARTING = ".starting"
 _DAY = 86_400.0
-# What is kept: all kernels of one version of this package take 37 MB.
+# Limits of the folder. All kernels of one version of this package take 37 MB.
 MOST_BYTES = 1 << 29
 MOST_DAYS = 60.0
 
 
 def default_folder(cache: str) -> Path:
-    """Return where compiled kernels are kept. cache: what NUMBA_CACHE_DIR says, "" for nothing."""
+    """Return the folder of compiled kernels.
+
+    cache: value of NUMBA_CACHE_DIR, "" if it is not set.
+    """
     if cache:
         return Path(cache).absolute() / "solidcloud-kernels"
     home = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
@@ -41,9 +44,9 @@ def default_folder(cache: str) -> Path:
 
 
 class KernelFiles:
-    """One folder of compiled kernels. Threads may share it; processes may share the folder.
+    """Folder of compiled kernels. Threads may share an instance; processes may share the folder.
 
-    folder: where the files are; made when it is first used.
+    folder: where the files are; created on first use.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -58,7 +61,7 @@ class KernelFiles:
             os.close(descriptor)
 
     def read(self, name: str) -> bytes | None:
-        """Return the payload that was written under `name`; None where there is none, or none that may be used."""
+        """Return the payload that was written under `name`; None if there is none that may be used."""
         if self._descriptor is None:
             return None
         try:
@@ -75,7 +78,7 @@ class KernelFiles:
         return payload
 
     def write(self, name: str, payload: bytes) -> None:
-        """Keep a payload under `name`, whole or not at all."""
+        """Write a payload under `name`, atomically."""
         if self._descriptor is None:
             return
         if not self._pruned:
@@ -94,7 +97,7 @@ class KernelFiles:
             self._not_kept(error.strerror or str(error))
 
     def discard(self, name: str, fault: str) -> None:
-        """Remove a file that is not what was written, and say so the first time."""
+        """Remove a damaged file, and log that on the first occurrence."""
         removed = self._remove(name)
         outcome = "removed" if removed else "it cannot be removed: remove the folder"
         self._say(
@@ -109,7 +112,7 @@ class KernelFiles:
             self._remove(name)
 
     def prune(self, most_bytes: int = MOST_BYTES, most_days: float = MOST_DAYS) -> None:
-        """Remove what was not used for `most_days`, then the least recently used until `most_bytes` are left."""
+        """Remove files not used for `most_days`, then the least recently used beyond `most_bytes`."""
         now, kept = time.time(), 0
         for name, found in self._files(_TEMPORARY):
             if now - found.st_mtime > _DAY:
@@ -122,9 +125,10 @@ class KernelFiles:
 
     @contextlib.contextmanager
     def starting(self) -> Iterator[bool]:
-        """Mark the folder while inside; yield whether a process ended inside without leaving, as one that crashes does.
+        """Mark the folder during a block; yield True if an earlier process crashed in such a block.
 
-        A mark is a file that its process holds locked: the system unlocks it however the process ends.
+        A mark is a file that its process holds locked. The system unlocks it however the process
+        ends.
         """
         unfinished = any([self._left_behind(name) for name in self._names(_STARTING)])
         with contextlib.ExitStack() as stack:
@@ -138,7 +142,7 @@ class KernelFiles:
             yield unfinished
 
     def _left_behind(self, name: str) -> bool:
-        """Return whether nobody holds this mark, and remove it then."""
+        """Remove a mark that no process holds; return True if it was removed."""
         try:
             mark = os.open(name, os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC, dir_fd=self._descriptor)
         except OSError:
@@ -152,7 +156,7 @@ class KernelFiles:
             os.close(mark)
 
     def _open(self) -> int | None:
-        """Open the folder, made if need be; None, and said, where it cannot be used."""
+        """Open the folder, created if needed. If it cannot be used, log that and return None."""
         try:
             self.folder.parent.mkdir(parents=True, exist_ok=True)
             with contextlib.suppress(FileExistsError):
@@ -170,7 +174,10 @@ class KernelFiles:
         return None
 
     def _content(self, name: str) -> bytes:
-        """Read a file, and note that it is used. OSError: it cannot be read, or is no file."""
+        """Read a file and update its time of use.
+
+        Raises OSError if it cannot be read or is no regular file.
+        """
         flags = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
         descriptor = os.open(name, flags, dir_fd=self._descriptor)
         with open(descriptor, "rb", buffering=0, closefd=True) as file:
@@ -178,19 +185,18 @@ class KernelFiles:
             if not stat.S_ISREG(found.st_mode):
                 raise OSError(errno.EINVAL, "not a regular file")
             if time.time() - found.st_mtime > _DAY:
-                with contextlib.suppress(OSError):  # another owner's folder
+                with contextlib.suppress(OSError):  # fails in another owner's folder
                     os.utime(descriptor)
             return file.readall()
 
     def _create(self, name: str, *parts: bytes) -> None:
-        """Write a new file."""
         flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
         descriptor = os.open(name, flags, 0o600, dir_fd=self._descriptor)
         with open(descriptor, "wb") as file:
             file.writelines(parts)
 
     def _names(self, suffix: str) -> list[str]:
-        """List what the folder holds under names of one kind."""
+        """List the names in the folder with a suffix."""
         if self._descriptor is None:
             return []
         try:
@@ -199,7 +205,7 @@ class KernelFiles:
             return []
 
     def _files(self, suffix: str) -> Iterator[tuple[str, os.stat_result]]:
-        """Yield names of one kind and what the system says of them."""
+        """Yield the names with a suffix, and their file status."""
         for name in self._names(suffix):
             if (found := self._stat(name)) is not None:
                 yield name, found
@@ -211,7 +217,7 @@ class KernelFiles:
             return None
 
     def _remove(self, name: str) -> bool:
-        """Remove what is there under `name`; return whether nothing is any more."""
+        """Remove a file or folder; return True if nothing is left under its name."""
         try:
             os.unlink(name, dir_fd=self._descriptor)
         except FileNotFoundError:
@@ -230,14 +236,17 @@ class KernelFiles:
         )
 
     def _say(self, kind: str, message: str) -> None:
-        """Log a line, the first of its kind alone."""
+        """Log a message, but only the first of its kind."""
         if kind not in self._said:
             self._said.add(kind)
             log.warning(message)
 
 
 def _head(name: str, payload: bytes) -> bytes:
-    """Return what a file begins with: the digest covers its name too, so that no file stands in for another."""
+    """Return the header of a file.
+
+    The digest covers the name too, so that no file can stand in for another.
+    """
     digest = hashlib.sha256(f"{name}\0".encode())
     digest.update(payload)
     return _MAGIC + digest.digest()

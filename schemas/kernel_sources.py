@@ -1,8 +1,9 @@
-"""Digests of this package's sources, so that machine code is never used with a source that it was not made of.
+"""Digests of this package's sources.
 
-A kernel is compiled together with the functions and constants that its module imports. A digest covers a module and
-every module of the package that it imports, directly or through others. An edit invalidates what depends on it, and no
-more.
+Compiled code is used only with the source from which it was made.
+A kernel is compiled together with the functions and constants that its module imports. A digest
+therefore covers a module and every module of the package that it imports, directly or through
+others. An edit invalidates exactly the kernels that depend on it.
 """
 
 import functools
@@ -13,27 +14,32 @@ from typing import NamedTuple
 
 _ROOT = Path(__file__).resolve().parent.parent
 _PACKAGE = __name__.split(".")[0]
-# A relative import: its dots, its module, its names. Inside the package there are no others (tests/test_layers.py).
+# A relative import: its dots, its module, its names. The package has no other imports of itself
+# (tests/test_layers.py).
 _IMPORT = re.compile(rb"^[ \t]*from[ \t]+(\.+)([\w.]*)[ \t]+import[ \t]+(\([^)]*\)|[^\n#]*)", re.MULTILINE)
 _NAME = re.compile(rb"\w+")
 
 Parts = tuple[str, ...]
 
-# Modules that decide what is kept, and not what is compiled.
+# Modules that control what is cached, and do not affect compiled code.
 _APART = frozenset({("schemas", "kernel_files"), ("schemas", "kernel_sources")})
 
 
 class _Source(NamedTuple):
-    """One source file. digest: of its bytes.  imports: the modules of the package that it names."""
+    """One source file.
+
+    digest: of its bytes.  imports: the modules of the package that it names.
+    """
 
     digest: bytes
     imports: frozenset[Parts]
 
 
 def source_digest(module: str) -> bytes:
-    """Return the digest of a module of this package, `solidcloud.…`, and of all modules that it imports.
+    """Return the digest of a module of this package and of all modules that it imports.
 
-    OSError: a source cannot be read. ValueError: the module is not of this package.
+    module: its name, `solidcloud.…`.
+    Raises OSError if a source cannot be read, ValueError for a module of another package.
     """
     package, *parts = module.split(".")
     if package != _PACKAGE:
@@ -73,7 +79,10 @@ def _read(module: Parts) -> _Source:
 
 
 def _named(base: Parts, name: str, names: bytes) -> list[Parts]:
-    """Return the modules that `from BASE.NAME import NAMES` names; none where NAME is no module of the package."""
+    """Return the modules that `from BASE.NAME import NAMES` names.
+
+    The list is empty if NAME is not a module of the package.
+    """
     target = (*base, *filter(None, name.split(".")))
     if _file(target).is_file():
         return [target]
@@ -82,5 +91,5 @@ def _named(base: Parts, name: str, names: bytes) -> list[Parts]:
 
 
 def _file(module: Parts) -> Path:
-    """Return where the source of a module is, whether it exists or not."""
+    """Return the path of a module's source, whether it exists or not."""
     return _ROOT.joinpath(*module[:-1], f"{module[-1]}.py") if module else _ROOT / "__init__.py"

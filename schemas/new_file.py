@@ -1,7 +1,7 @@
-"""An HDF5 file written whole or not at all: under a temporary name, closed, synced, renamed, its folder synced.
+"""Atomic writing of HDF5 files: under a temporary name, closed, synced, renamed, the folder synced.
 
-The recipe survived kills at every system call. What a full disk, or an interrupt, would do to HDF5 is kept from it
-(`_Disk`, `kept_back`).
+The sequence survived kills at every system call. HDF5 is shielded from full disks (`_Disk`) and
+from interrupts (`kept_back`).
 """
 
 import contextlib
@@ -14,25 +14,32 @@ import h5py
 
 from .interrupts import kept_back
 
-# Of this process, or of the one it was forked from: process ids are given on many hosts.
+# Random id of this process, or of the one that it was forked from: several hosts use the same
+# process ids.
 _PROCESS = os.urandom(6).hex()
 
 
 def temporary_path(path: Path) -> Path:
-    """The name that `path` is written under: this thread's own, as a cluster may run one unit in two places at once."""
+    """Return the temporary name under which this thread writes `path`.
+
+    Names differ between threads and processes, because a cluster may run one unit in two places at
+    once.
+    """
     return path.with_name(f"{path.name}.{_PROCESS}-{os.getpid()}-{threading.get_ident()}.tmp")
 
 
-# No piece of HDF5's own structures is longer [bytes]; the longest is a group's list of its links.
+# No piece of HDF5's own structures is longer than this [bytes]; the longest is a group's list of
+# its links.
 _MOST_METADATA = 1 << 20
 
 
 class _Disk:
-    """A file that HDF5 writes, and whose errors it does not hear of: the first is kept in `error`.
+    """File object for HDF5 that hides write errors from it and keeps the first one in `error`.
 
-    With a full disk HDF5 2.0 crashed as it closed the file (SIGSEGV), or h5py printed what it ignored and went on. So
-    a write always succeeds; what comes after one that did not is kept in memory, for HDF5 to read back: its own
-    structures, and no record, which it does not read.
+    With a full disk HDF5 2.0 crashed when it closed the file (SIGSEGV), or h5py printed an ignored
+    exception and went on. A write here therefore always succeeds. After a failed write, data is
+    kept in memory so that HDF5 can read it back: its own structures, but not records, which it does
+    not read back.
     """
 
     def __init__(self, path: Path) -> None:
@@ -71,7 +78,7 @@ class _Disk:
         return len(data)
 
     def read(self, size: int = -1) -> bytes:
-        raise NotImplementedError  # h5py asks whether it is there, and uses `readinto`
+        raise NotImplementedError  # h5py requires the attribute, but calls `readinto`
 
     def readinto(self, buffer: memoryview) -> int:
         view = memoryview(buffer).cast("B")
@@ -97,16 +104,23 @@ class _Disk:
 
 
 class NewFile(h5py.File):  # type: ignore[misc]
-    """An HDF5 file being written."""
+    """HDF5 file that is being written."""
 
     def __init__(self, disk: _Disk, deliver: Callable[[], None]) -> None:
-        """Write to `disk`. deliver: hands on an interrupt that was kept back."""
+        """Open a file on `disk` for writing.
+
+        deliver: raises an interrupt that was held back.
+        """
         self._disk, self._deliver = disk, deliver
-        # Metadata of format 1.10 and later is checksummed; in older ones 5 of 1,600 flips were silently wrong.
+        # Metadata of format 1.10 and later has checksums; in older formats, 5 of 1,600 flipped
+        # bytes gave silently wrong results.
         super().__init__(disk, "w", libver=("v110", "v110"))
 
     def check(self) -> None:
-        """Raise the OSError of a write that failed, or an interrupt: to be asked now and then in long writing."""
+        """Raise the OSError of a failed write, or a pending interrupt.
+
+        Call it regularly in long writing.
+        """
         self._deliver()
         if self._disk.error is not None:
             raise self._disk.error
@@ -114,10 +128,10 @@ class NewFile(h5py.File):  # type: ignore[misc]
 
 @contextlib.contextmanager
 def new_file(path: Path) -> Iterator[NewFile]:
-    """An HDF5 file under a temporary name. Given its own only once it is closed and synced.
+    """Open an HDF5 file under a temporary name; `publish` gives it its own name.
 
-    A write that fails is an OSError that names the file; nothing is left then. Interrupts wait until the file is
-    closed, or for `check`.
+    A failed write raises an OSError that names the file, and no file is left. Interrupts wait until
+    the file is closed, or until `check`.
     """
     temporary = temporary_path(path)
     with kept_back() as deliver, contextlib.ExitStack() as stack:
@@ -137,7 +151,7 @@ def new_file(path: Path) -> Iterator[NewFile]:
 
 
 def publish(path: Path) -> None:
-    """Sync the temporary file of `path`, rename it, sync its folder."""
+    """Sync the temporary file of `path`, rename it, and sync its folder."""
     temporary = temporary_path(path)
     with open(temporary, "rb") as file:
         os.fsync(file.fileno())

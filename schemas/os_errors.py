@@ -1,6 +1,6 @@
-"""Errors of the operating system in words: where, what was found and what to do.
+"""Messages for errors of the operating system: where, what was found and what to do.
 
-Loads nothing that takes time: the command line reads this before it knows its verb.
+This module imports nothing slow: the command line loads it before it knows its subcommand.
 """
 
 import errno
@@ -35,14 +35,14 @@ _WORDS = {
 
 
 def os_error_words(error: OSError) -> str:
-    """Return what an error of the operating system found and what to do, without its path and its number."""
+    """Return the meaning of an operating system error and what to do, without path and number."""
     return _WORDS.get(error.errno or 0) or (
         f"{error.strerror}: check the path and the disk" if error.strerror else str(error)
     )
 
 
 def os_error_line(error: OSError) -> str:
-    """Return one sentence for an error of the operating system: its path if it has one, what was found, what to do."""
+    """Return one sentence for an error of the operating system: path if known, meaning, what to do."""
     where = error.filename if error.filename2 is None else error.filename2
     return (
         f"{os.fsdecode(where)}: {os_error_words(error)}"
@@ -53,10 +53,10 @@ def os_error_line(error: OSError) -> str:
 
 @contextmanager
 def writing(output: Path) -> Iterator[None]:
-    """Raise a SolidcloudError that names `output` where the operating system refuses to write it.
+    """Convert an OSError about writing `output` to a SolidcloudError that names it.
 
-    Errors about other files pass: only those about the output, the temporary files beside it and the folders above it
-    are taken, and a full disk.
+    Errors about other files pass unchanged. Errors count as about the output if they name the
+    output, the temporary files beside it or the folders above it, or if the disk is full.
     """
     try:
         yield
@@ -67,7 +67,10 @@ def writing(output: Path) -> Iterator[None]:
 
 
 def check_writable(folder: Path) -> None:
-    """Raise OSError where no file can be made in a folder, before hours go into what is written there at the end."""
+    """Raise OSError if no file can be created in a folder.
+
+    This is called before hours of work whose result is written there.
+    """
     probe = folder / f".{os.getpid()}.tmp"
     descriptor = os.open(probe, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o600)
     os.close(descriptor)
@@ -75,7 +78,7 @@ def check_writable(folder: Path) -> None:
 
 
 def _is_about(error: OSError, output: Path) -> bool:
-    """Return whether an error is about writing `output`."""
+    """Return True if an error is about writing `output`."""
     names = [os.fsdecode(n) for n in (error.filename, error.filename2) if isinstance(n, str | bytes)]
     if not names:
         return error.errno in (*_FULL, errno.EFBIG)
@@ -88,7 +91,7 @@ def _is_about(error: OSError, output: Path) -> bool:
 
 
 def write_error_words(error: OSError, output: Path) -> str:
-    """Return what stands in the way of writing `output`, and what to do."""
+    """Return what prevents writing `output`, and what to do."""
     if error.errno in (errno.ENOTDIR, errno.EEXIST, errno.ENOENT):
         for folder in output.parents:
             if folder.exists() and not folder.is_dir():

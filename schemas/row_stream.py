@@ -1,4 +1,4 @@
-"""A dataset of a record whose rows come in parts: for voxels that are not to be held."""
+"""Streaming writer of a record's dataset, for voxels that are too large to hold in memory."""
 
 import mmap
 import os
@@ -12,35 +12,40 @@ from numpy.typing import NDArray
 from .errors import BadRequestError, CorruptError
 from .frames import ANY_EXPANSION, Expansion, new_compressor, planes_of, sparse_frame
 
-# What is compressed at a time of a frame that is not held. The frame's bytes may depend on it.
+# Block size for compressing a frame that is not held in memory. The frame's bytes may depend on it.
 STREAM_BYTES = 1 << 20
-# The index says a frame's length in 32 bits (FORMAT.md).
+# The index stores a frame's length in 32 bits (FORMAT.md).
 MAX_FRAME_BYTES = (1 << 32) - 1
 
 
 class RowStream:
-    """A dataset of a record whose rows come in parts, in any order: their byte planes in a file, then one frame.
+    """Dataset of a record whose rows arrive in parts, in any order.
 
-    For voxels that are not to be held. The frame's bytes are a function of the rows, not of the parts; they are not
-    those that `encode_voxel` finds, which has all of them at once. Its files have no name and go with the process.
+    The byte planes are collected in a file and then compressed to one frame. The frame's bytes
+    depend on the rows, not on the parts. They differ from those of `encode_voxel`, which has all
+    rows at once. The temporary files have no name and disappear with the process.
     """
 
     def __init__(
         self, scratch: Path, dtype: np.dtype, rows: int, expansion: Expansion = ANY_EXPANSION
     ) -> None:
-        """Make room in the folder `scratch` for so many rows. expansion: limit that the frame keeps."""
+        """Create a file for `rows` rows in the folder `scratch`.
+
+        expansion: limit that the frame keeps.
+        """
         self._scratch, self._dtype, self._rows, self._expansion = scratch, dtype, rows, expansion
         self._planes = tempfile.TemporaryFile(dir=scratch, buffering=0)  # noqa: SIM115  `frame` closes it
 
     def put(self, first: int, rows: NDArray) -> None:
-        """Take the rows from row `first` on."""
+        """Store rows, beginning at row `first`."""
         for number, plane in enumerate(planes_of(rows.astype(self._dtype, copy=False))):
             pwrite_all(self._planes.fileno(), plane, number * self._rows + first)
 
     def frame(self) -> mmap.mmap:
-        """The frame, once all rows are there.
+        """Compress all rows to a frame.
 
-        Raises BadRequestError for one that the index could not name, CorruptError where rows are missing at the end.
+        Raises BadRequestError for a frame too long for the index, CorruptError if rows are missing
+        at the end.
         """
         with self._planes as planes, tempfile.TemporaryFile(dir=self._scratch, buffering=0) as file:
             size = self._rows * self._dtype.itemsize
@@ -57,7 +62,10 @@ class RowStream:
             return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
 
     def _parts(self, planes: int) -> Iterator[bytes]:
-        """Yield the planes from the file descriptor, some bytes at a time. CorruptError where they end early."""
+        """Yield the planes from the file, STREAM_BYTES at a time.
+
+        Raises CorruptError if they end early.
+        """
         size = self._rows * self._dtype.itemsize
         for at in range(0, size, STREAM_BYTES):
             wanted = min(STREAM_BYTES, size - at)
@@ -70,7 +78,7 @@ class RowStream:
 
 
 def _dense_frame(parts: Iterable[bytes], size: int) -> Iterator[bytes]:
-    """Yield the bytes of a zstd frame of parts, `size` bytes in all."""
+    """Yield the bytes of a zstd frame over parts, `size` bytes in all."""
     stream = new_compressor().compressobj(size=size)
     for part in parts:
         yield stream.compress(part)
@@ -78,7 +86,7 @@ def _dense_frame(parts: Iterable[bytes], size: int) -> Iterator[bytes]:
 
 
 def _write_pieces(descriptor: int, pieces: Iterable[bytes]) -> int:
-    """Write pieces one after the other from a file's beginning; return how many bytes they are."""
+    """Write pieces one after another from the beginning of a file; return the number of bytes."""
     written = 0
     for piece in pieces:
         written += pwrite_all(descriptor, piece, written)
@@ -86,7 +94,7 @@ def _write_pieces(descriptor: int, pieces: Iterable[bytes]) -> int:
 
 
 def pwrite_all(descriptor: int, data: bytes | NDArray, at: int) -> int:
-    """Write all of the data at an offset of a file; returns how many bytes."""
+    """Write all of the data at an offset of a file; return the number of bytes."""
     left = memoryview(data if isinstance(data, bytes) else data.data).cast("B")
     size = len(left)
     while left:

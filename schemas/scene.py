@@ -1,6 +1,7 @@
-"""The scene file, `scene.toml`: what a scene is made of, and which effects it calls for.
+"""Scene file `scene.toml`: archives, avatars, objects and limits of a scene, and its effects.
 
-Read by `solidcloud serve` and `solidcloud scene check`; SCENE.md says it in prose. Paths are relative to the file.
+`solidcloud serve` and `solidcloud scene check` read it; SCENE.md documents it. Paths are relative
+to the file.
 """
 
 import inspect
@@ -21,13 +22,14 @@ from .voxel_grid import MAX_COORDINATE
 
 SUFFIX = ".toml"
 FORMAT = 1
-# A pose may be written with seven digits: one that is so near to a rigid one is made rigid (NUMERICS.md case 4).
+# A pose may be written with seven digits: one that is rigid within this is made rigid (NUMERICS.md
+# case 4).
 _ALMOST_RIGID = 1e-6
-# A pose that is rigid to its last digits stays as it is; the server asks for 1e-9 (NUMERICS.md N6).
+# A pose that is rigid within this stays as it is; the server requires 1e-9 (NUMERICS.md N6).
 _RIGID = 1e-12
 
 Matrix = Annotated[list[Annotated[list[float], msgspec.Meta(min_length=4, max_length=4)]], msgspec.Meta(min_length=4, max_length=4)]  # fmt: skip  # noqa: E501
-# `$` of Python's is before a line end, too.
+# Python's `$` also matches before a final line end.
 SceneName = Annotated[
     str,
     msgspec.Meta(
@@ -39,24 +41,30 @@ ItemName = Annotated[str, msgspec.Meta(min_length=1, max_length=64)]
 
 
 def identity() -> list[list[float]]:
-    """The pose of what stays where it is."""
+    """Return the identity pose."""
     return [[float(row == column) for column in range(4)] for row in range(4)]
 
 
 class _Part(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A part of the file: what it does not know it refuses."""
+    """Base class of the file's tables. Unknown fields are refused."""
 
 
 class ArchiveItem(_Part, frozen=True):
-    """An archive. path: its folder.  pose: archive to world, rigid, row-major."""
+    """Archive of a scene.
+
+    path: its folder.  pose: archive to world, rigid, row-major.
+    """
 
     path: PathText
     pose: Matrix = msgspec.field(default_factory=identity)
 
 
 class AvatarItem(_Part, frozen=True):
-    """An avatar that every user finds there. file: a scan or mesh of it.  radius: of its points [m]; left out: half
-    the mean closest-point distance."""
+    """Avatar that every user may use.
+
+    file: a scan or mesh of it.
+    radius: of its points [m]; omitted: half the mean closest-point distance.
+    """
 
     name: SceneName
     file: PathText
@@ -64,8 +72,11 @@ class AvatarItem(_Part, frozen=True):
 
 
 class ObjectItem(_Part, frozen=True):
-    """A dynamic object. avatar: its shape, of `avatars`.  pose: where it begins.  kind: `kinematic`: where it is told
-    to be; `pushed`: users push it."""
+    """Dynamic object.
+
+    avatar: its shape, one of `avatars`.  pose: the initial pose.
+    kind: `kinematic`: a user sets its pose; `pushed`: users push it.
+    """
 
     name: ItemName
     avatar: ItemName
@@ -74,16 +85,25 @@ class ObjectItem(_Part, frozen=True):
 
 
 class Spawn(_Part, frozen=True):
-    """Where users begin: position of the avatar's origin, world [m]; heading: turned about up so far [degrees]."""
+    """Start of users.
+
+    position: of the avatar's origin, world [m].
+    heading: rotation about up [degrees].
+    """
 
     position: Vector
     heading: float = 0.0
 
 
 class Limits(_Part, frozen=True):
-    """What a scene may cost. users: at a time.  frame_ms: of one user's frame; effects it has no room for are skipped,
-    `stop`, `sweep`, `objects` and `crowd` never.  frame_visits: its twin that needs no clock, node visits.
-    longest_move: of a frame [m]."""
+    """Limits of a scene's cost.
+
+    users: at the same time.
+    frame_ms: time for one user's frame; effects beyond it are skipped, except `stop`, `sweep`,
+    `objects` and `crowd`.
+    frame_visits: the same limit in node visits, independent of a clock.
+    longest_move: farthest motion of a frame [m].
+    """
 
     users: Annotated[int, msgspec.Meta(ge=1, le=1024)] = 64
     frame_ms: Annotated[float, msgspec.Meta(gt=0, le=10_000)] | None = None
@@ -92,8 +112,13 @@ class Limits(_Part, frozen=True):
 
 
 class SceneFile(_Part, frozen=True):
-    """A scene. format: 1.  up: against gravity; any length but zero.  radius_model: of the scan's spheres, one the
-    archives hold; left out: each archive's one figure.  effects: in any order: they run in one of their own."""
+    """Scene.
+
+    format: 1.  up: against gravity; any length but zero.
+    radius_model: for the scan's spheres, one that the archives hold; omitted: each archive's one
+    radius.
+    effects: in any order; the server runs them in a fixed order.
+    """
 
     format: Literal[1]
     archives: Annotated[list[ArchiveItem], msgspec.Meta(min_length=1)]
@@ -108,24 +133,27 @@ class SceneFile(_Part, frozen=True):
 
 
 def scene_of(archive: str) -> SceneFile:
-    """The scene of an archive without a file: the archive and `stop`."""
+    """Return the scene of an archive without a file: the archive and `stop`."""
     return SceneFile(format=1, archives=[ArchiveItem(path=archive)])
 
 
 def effect_name(effect: AnyEffect) -> str:
-    """What an effect is called in the file and in answers."""
+    """Return the name of an effect in the file and in answers."""
     return str(type(effect).__struct_config__.tag)
 
 
 def up_of(scene: SceneFile) -> Vector:
-    """Unit vector against gravity."""
+    """Return the unit vector against gravity."""
     length = math.hypot(*scene.up)
     x, y, z = (value / length for value in scene.up)
     return x, y, z
 
 
 def scene_name(scene: SceneFile, path: Path) -> str:
-    """What clients call the scene of a file: its `name`, else the file's, without suffix. BadRequestError."""
+    """Return a scene's name for clients: its `name`, else the file's name without suffix.
+
+    Raises BadRequestError if the latter is not a valid name.
+    """
     if scene.name is not None:
         return scene.name
     try:
@@ -135,15 +163,17 @@ def scene_name(scene: SceneFile, path: Path) -> str:
 
 
 def read_scene(path: Path) -> SceneFile:
-    """The scene of a file, all that can be said without opening an archive checked. BadRequestError: what is wrong,
-    with file, place and what is allowed."""
+    """Read a scene file and check everything that needs no archive.
+
+    Raises BadRequestError with file, place, what was found and what is allowed.
+    """
     if path.suffix != SUFFIX:
         raise BadRequestError(
             f"{path}: expected a scene file, by a name that ends in {SUFFIX}: `serve` knows it by that"
         )
     try:
         with open(path, "rb") as file:
-            text = file.read(MOST_BYTES + 1)  # no more of a scan that was given by mistake
+            text = file.read(MOST_BYTES + 1)  # limits the read if a scan was given by mistake
     except OSError as error:
         raise BadRequestError(
             f"{path}: {error.strerror}: expected a scene file: make one with: solidcloud scene new"
@@ -152,7 +182,10 @@ def read_scene(path: Path) -> SceneFile:
 
 
 def parse_scene(text: bytes, where: str) -> SceneFile:
-    """The scene of a file's bytes, its poses made rigid to the last digits; where: its name, for errors."""
+    """Parse a scene file's bytes and orthonormalise its poses to the last digits.
+
+    where: the file's name, for errors.
+    """
     scene = decode(text, SceneFile, where)
     for place, said in _faults(scene):
         raise fault(where, place, said, text)
@@ -160,24 +193,30 @@ def parse_scene(text: bytes, where: str) -> SceneFile:
 
 
 def check_scene(scene: SceneFile, where: str) -> None:
-    """BadRequestError for what no type says: names that are there twice or not at all, effects that miss another, poses
-    that are not rigid."""
+    """Check what the types cannot express; raise BadRequestError.
+
+    Names must be unique and defined, required effects present, poses rigid.
+    """
     for place, said in _faults(scene):
         raise fault(where, place, said)
 
 
 def json_schema() -> str:
-    """The JSON Schema of a scene file: what `json/Scene.json` holds, for editors of TOML."""
+    """Return the JSON Schema of a scene file, for editors of TOML.
+
+    `json/Scene.json` holds the same text.
+    """
     schema = msgspec.json.schema(SceneFile)
     for definition in schema["$defs"].values():
-        # Python 3.13 strips a docstring's indentation, earlier ones do not: the same text from all.
+        # Python 3.13 strips a docstring's indentation, earlier versions do not; cleandoc gives the
+        # same text on all.
         definition["description"] = inspect.cleandoc(definition["description"])
     text = msgspec.json.format(msgspec.json.encode(schema, order="sorted"), indent=2)
     return text.decode() + "\n"
 
 
 def _faults(scene: SceneFile) -> Iterator[tuple[str, str]]:
-    """What is wrong: the place, and found and expected."""
+    """Yield the place and the explanation of each fault."""
     if scene.name is not None:
         try:
             check_name(scene.name, "name")
@@ -206,7 +245,7 @@ def _faults(scene: SceneFile) -> Iterator[tuple[str, str]]:
         yield from _path(avatar.file, f"$.avatars[{number}].file")
     for number, thing in enumerate(scene.objects):
         yield from _pose(thing.pose, f"$.objects[{number}].pose")
-    if not 1e-100 < math.hypot(*scene.up) < 1e100:  # whose squares are neither
+    if not 1e-100 < math.hypot(*scene.up) < 1e100:  # outside, squares overflow or underflow
         yield "$.up", f"found {list(scene.up)}: expected a direction, of any length but zero"
     if scene.spawn is not None:
         yield from _position(scene.spawn.position, "$.spawn.position")
@@ -218,7 +257,7 @@ def _faults(scene: SceneFile) -> Iterator[tuple[str, str]]:
 
 
 def _objects(scene: SceneFile, effects: list[str]) -> Iterator[tuple[str, str]]:
-    """Objects of no known shape, or without the effect."""
+    """Yield faults of objects with an unknown shape, or without the effect `objects`."""
     known = [item.name for item in scene.avatars]
     for number, item in enumerate(scene.objects):
         if item.avatar not in known:
@@ -236,7 +275,7 @@ def _objects(scene: SceneFile, effects: list[str]) -> Iterator[tuple[str, str]]:
 
 
 def _twice(names: list[str], what: str, field: str) -> Iterator[tuple[str, str]]:
-    """Names that are there before."""
+    """Yield faults of names that occur twice."""
     for number, name in enumerate(names):
         if name in names[:number]:
             first = f"$.{what}[{names.index(name)}]"
@@ -244,7 +283,7 @@ def _twice(names: list[str], what: str, field: str) -> Iterator[tuple[str, str]]
 
 
 def _boxes(effect: Through, place: str) -> Iterator[tuple[str, str]]:
-    """Boxes that hold nothing, or have the name of another."""
+    """Yield faults of boxes that are inverted, too far away, or named like another."""
     for number, box in enumerate(effect.boxes):
         yield from _position(box.low, f"{place}[{number}].low")
         yield from _position(box.high, f"{place}[{number}].high")
@@ -257,19 +296,19 @@ def _boxes(effect: Through, place: str) -> Iterator[tuple[str, str]]:
 
 
 def _path(path: str, place: str) -> Iterator[tuple[str, str]]:
-    """A path that no file has."""
+    """Yield the fault of a path that no file can have."""
     if "\0" in path:
         yield place, f"found {shown(path)}: expected a path, without the character NUL"
 
 
 def _position(position: Vector, place: str) -> Iterator[tuple[str, str]]:
-    """A position that no archive's lattice reaches."""
+    """Yield the fault of a position that no archive's lattice reaches."""
     if not all(abs(value) <= MAX_COORDINATE for value in position):
         yield place, f"found {list(position)}: expected coordinates within {MAX_COORDINATE:g} m"
 
 
 def _pose(pose: list[list[float]], place: str) -> Iterator[tuple[str, str]]:
-    """A pose that is not rigid, or shifts too far."""
+    """Yield the fault of a pose that is not rigid, or that shifts too far."""
     if pose[3] != [0.0, 0.0, 0.0, 1.0]:
         yield (
             f"{place}[3]",
@@ -278,7 +317,7 @@ def _pose(pose: list[list[float]], place: str) -> Iterator[tuple[str, str]]:
         return
     gram = _gram(pose)
     off = max(abs(gram[row][column] - (row == column)) for row in range(3) for column in range(3))
-    if not off <= _ALMOST_RIGID:  # not so for NaN either
+    if not off <= _ALMOST_RIGID:  # false for NaN, too
         yield (
             place,
             f"scales or shears, by {off:.2g}: expected a rotation and a shift, within {_ALMOST_RIGID:g}",
@@ -290,7 +329,7 @@ def _pose(pose: list[list[float]], place: str) -> Iterator[tuple[str, str]]:
 
 
 def _gram(pose: list[list[float]]) -> list[list[float]]:
-    """Dot products of the rows of a pose's rotation: those of unit vectors at right angles, were it exact."""
+    """Return the Gram matrix of the rows of a pose's rotation; the identity for an exact rotation."""
     return [
         [sum(a * b for a, b in zip(one[:3], other[:3], strict=True)) for other in pose[:3]]
         for one in pose[:3]
@@ -298,15 +337,16 @@ def _gram(pose: list[list[float]]) -> list[list[float]]:
 
 
 def _determinant(pose: list[list[float]]) -> float:
-    """Of a pose's rotation."""
+    """Return the determinant of a pose's rotation."""
     (a, b, c, _), (d, e, f, _), (g, h, i, _) = pose[:3]
     return a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
 
 
 def _rigid(items: list[Any]) -> list[Any]:
-    """Archives or objects with poses whose rotations are rotations to the last digits.
+    """Return archives or objects with their rotations orthonormalised to the last digits.
 
-    (3 R - R R' R) / 2 squares the distance of R from the nearest rotation: from 1e-6, twice is enough.
+    The iteration (3 R - R R' R) / 2 squares the distance of R from the nearest rotation: two steps
+    suffice from 1e-6.
     """
     made = []
     for item in items:

@@ -1,7 +1,8 @@
-"""A shard: an HDF5 file of the records of many voxels, verified by offsets before it is given its name.
+"""Writer of shards: HDF5 files with the records of many voxels.
 
-FORMAT.md says the same in prose; change both together. Shards are read by offsets (archive.py), so that no HDF5 lock
-and no HDF5 parser stands between a server and a record.
+A shard is verified by offsets before it is given its name. FORMAT.md documents the same; change
+both together. archive.py reads shards by offsets, so that neither HDF5's lock nor its parser stands
+between a server and a record.
 """
 
 import base64
@@ -27,12 +28,12 @@ from .voxel import VoxelData
 SHARD_FOLDER = "shards"
 ZSTD_FILTER = 32015  # registered with the HDF Group
 DATASETS = ("cells", "nodes", "points")
-# What is read back at a time of a shard just written.
+# Block size for reading back a shard that was just written [bytes].
 READ_BYTES = 1 << 20
 
-# An HDF5 file of 463 bytes with one dataset, x, of one int8 in one chunk; made with a filter class registered as
-# "zstd" through ctypes. h5py leaves no other way to name a filter, and one without a name is written with what its
-# plugin calls itself, or with none, as the process happens to have a plugin loaded: two builds would differ.
+# An HDF5 file of 463 bytes with one dataset, x, of one int8 in one chunk; made with a filter class
+# registered as "zstd" through ctypes. h5py has no other way to name a filter. Without a name, HDF5
+# writes the name that a loaded plugin gives itself, or none, so two builds would differ.
 _PROPERTIES = (
     rb"c-rgqaB<`1lHy|K;9!7(|4?wA5yCfsinmX3)${jo31U*1u$&<q8CNg~A!~#IE+z(`5o|mRK#H;AFwA@p2C4zY86rtwCjl*B6"
     rb"k%XsVgv%H9E@h>VPF*CfblsPSb?r$=H`}VU}RzfIgk-7!(Yn^W>poJq%bgp6v{9#umDvcnTQfP480743lx@TKLG&yO*Ul"
@@ -42,19 +43,22 @@ SHARD_NAME = re.compile(r"[0-9]{1,9}-[0-9]{1,9}\.h5")
 
 
 def shard_name(number: int, generation: int = 0) -> str:
-    """The file name of a shard inside SHARD_FOLDER."""
+    """Return the file name of a shard inside SHARD_FOLDER."""
     return f"{generation}-{number:06d}.h5"
 
 
 @functools.cache
 def _creation_properties() -> h5py.h5p.PropDCID:
-    """How a record's dataset is made: shuffle, then zstd named "zstd" and optional, no times kept. To be copied."""
+    """Return the creation properties of a record's dataset; callers must copy them.
+
+    They are: shuffle, then an optional filter zstd named "zstd", and no stored times.
+    """
     image = zlib.decompress(base64.b85decode(_PROPERTIES))
     return h5py.h5d.open(h5py.h5f.open_file_image(image), b"x").get_create_plist()
 
 
 def _write_frame(group: h5py.Group, name: str, frame: Frame, rows: int, dtype: np.dtype) -> tuple[int, int]:
-    """Write one dataset of one chunk from its frame; returns the chunk's offset and size in the file."""
+    """Write one dataset of one chunk from its frame; return the chunk's offset and size [bytes]."""
     properties = _creation_properties().copy()
     properties.set_chunk((rows,))
     space = h5py.h5s.create_simple((rows,))
@@ -73,10 +77,12 @@ def write_shard(
     *,
     version: int = 1,
 ) -> tuple[NDArray, int]:
-    """Write one shard; returns its rows of the index, VOXEL_DTYPE, and the `file_checksum` of the whole file.
+    """Write one shard; return its index rows (VOXEL_DTYPE) and its `file_checksum`.
 
-    voxels: per voxel its data, record, and the bounds low, high (3,) of its points [voxel steps, inclusive].
-    version: of the format, as the index will say it. The file is verified by offsets before it is given its name.
+    voxels: per voxel its data, its record, and the bounds low, high (3,) of its points [voxel
+    steps, inclusive].
+    version: of the format, as the index will state it.
+    The file is verified by offsets before it is given its name.
     """
     rows = []
     with new_file(path) as file:
@@ -116,7 +122,10 @@ def write_shard(
 
 
 def file_checksum(path: Path) -> int:
-    """The CRC-32 of a file's bytes, HDF5's structures among them, of which a record's checksum says nothing."""
+    """Return the CRC-32 of a file's bytes.
+
+    It covers HDF5's own structures, which the checksums of records do not.
+    """
     checksum, buffer = 0, memoryview(bytearray(READ_BYTES))
     with open(path, "rb", buffering=0) as file:
         while got := file.readinto(buffer):
@@ -126,7 +135,10 @@ def file_checksum(path: Path) -> int:
 
 
 def _verify_frames(path: Path, table: NDArray) -> int:
-    """Check the end of every frame of a shard by its offset, a full disk can lie until here; its `file_checksum`."""
+    """Check the end of every frame of a shard by its offset; return the shard's `file_checksum`.
+
+    A full disk may go unnoticed until here.
+    """
     with open(path, "rb") as file:
         for row in table:
             for i, name in enumerate(DATASETS):

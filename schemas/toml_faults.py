@@ -1,7 +1,7 @@
-"""What is wrong with a TOML file that is to be of some type, in one sentence: where, found, expected.
+"""Explanations of invalid TOML files, in one sentence: where, what was found, what was expected.
 
-msgspec says where (`$.effects[0].skin`) and of what type; here is added what was found there, all that is allowed, the
-nearest name to one that is none, and the line.
+msgspec reports the place (`$.effects[0].skin`) and the type. This module adds the value found
+there, everything that is allowed, the nearest valid name, and the line.
 """
 
 import bisect
@@ -20,16 +20,18 @@ from .errors import BadRequestError
 
 _T = TypeVar("_T")
 
-# A scene of a thousand objects with poses takes 300 KB.
+# Largest file [bytes]. A scene of a thousand objects with poses takes 300 KB.
 MOST_BYTES = 4 << 20
 
 _PLACE = re.compile(r" - at `(?:key in )?(\$[^`]*)`$")
 _TOKEN = re.compile(r"\.([^.\[]+)|\[(\d+|\.\.\.)\]")
 _FIELD = re.compile(r"^Object (contains unknown|missing required) field `([^`]*)`")
 _LONGEST_SHOWN = 60
-# TOML's integers are of 64 bits; Python's have as many as memory, and more than 4,300 digits it does not print.
+# TOML's integers have 64 bits. Python's are unlimited, and Python refuses to print more than 4,300
+# digits.
 _MOST_BITS = 63
-# What decides where a statement ends: brackets and line ends, but for those in strings and comments.
+# Tokens that decide where a statement ends: brackets and line ends. Strings and comments match
+# first, so that those inside them do not count.
 _MARKS = re.compile(
     r'"""(?:\\.|[^\\])*?"""(?:"{0,2})'
     r"|'''.*?'''(?:'{0,2})"
@@ -40,9 +42,9 @@ _MARKS = re.compile(
 
 
 def decode(text: bytes, kind: type[_T], where: str) -> _T:
-    """A TOML file's bytes as a type of msgspec's. where: its name.
+    """Convert a TOML file's bytes to a msgspec type.
 
-    BadRequestError: in one sentence, what is wrong with it.
+    where: the file's name. Raises BadRequestError with one sentence about the first fault.
     """
     data = load(text, where)
     try:
@@ -62,7 +64,7 @@ def decode(text: bytes, kind: type[_T], where: str) -> _T:
 
 
 def load(text: bytes, where: str) -> dict[str, Any]:
-    """The tables of a TOML file; BadRequestError says line and column."""
+    """Parse a TOML file. Raises BadRequestError with line and column."""
     if len(text) > MOST_BYTES:
         raise BadRequestError(f"{where}: more than {MOST_BYTES:,} bytes: expected a scene file")
     try:
@@ -79,35 +81,38 @@ def load(text: bytes, where: str) -> dict[str, Any]:
 
 
 def _decoded(text: bytes) -> str:
-    """A file's text, without the byte order mark that some editors put in front."""
+    """Decode a file's text without the byte order mark that some editors put in front."""
     return text.decode("utf-8-sig")
 
 
 def fault(where: str, place: str, said: str, text: bytes | None = None) -> BadRequestError:
-    """What is wrong at a place of a file; text: its bytes, for the line."""
+    """Return the error for a fault at a place of a file.
+
+    text: the file's bytes, to find the line; None: no line.
+    """
     line = None if text is None else line_of(_decoded(text), place)
     at = f"line {line}: " if line else ""
     return BadRequestError(f"{where}: {at}{place}: {said}")
 
 
 def shown(value: Any) -> str:
-    """A value as the file has it, shortened."""
+    """Format a value as in the file, shortened."""
     text = json.dumps(value, ensure_ascii=False, default=str)
     return text if len(text) <= _LONGEST_SHOWN else text[: _LONGEST_SHOWN - 1] + "…"
 
 
 def nearest(name: Any, names: list[str]) -> str:
-    """Which name was perhaps meant, to be put behind a sentence."""
+    """Return a hint with the most similar name, or ""."""
     close = difflib.get_close_matches(str(name), names, 1)
     return f": did you mean {shown(close[0])}?" if close else ""
 
 
 def line_of(text: str, place: str) -> int | None:
-    """The line, from 1, where the statement begins that makes a place of a TOML file; None for the whole of it, and
-    for what is not in it.
+    """Return the line, from 1, of the statement that defines a place in a TOML file.
 
-    Lines up to where a statement begins can be parsed. Once the place is there, it is there in every longer prefix:
-    that is bisected.
+    Returns None for the whole file, and for a place that it does not contain. The text up to the
+    beginning of any statement can be parsed. Once the place is defined, it is defined in every
+    longer prefix, so bisection finds the statement.
     """
     tokens = _tokens(place)
     if not tokens or not _has(tomllib.loads(text), tokens):
@@ -118,7 +123,7 @@ def line_of(text: str, place: str) -> int | None:
 
 
 def _statements(text: str) -> list[int]:
-    """Where the lines of a TOML file begin that do not go on with the line before."""
+    """Return the offsets of the lines of a TOML file that begin a statement."""
     begins, depth = [0], 0
     for mark in _MARKS.finditer(text):
         if mark[0] in "[{":
@@ -131,7 +136,10 @@ def _statements(text: str) -> list[int]:
 
 
 def _tokens(place: str) -> list[str | int]:
-    """The steps of a place; a table's values, of which msgspec does not say which, are none."""
+    """Return the steps of a place.
+
+    They end at a table's value, whose key msgspec does not report.
+    """
     steps: list[str | int] = []
     for name, number in _TOKEN.findall(place):
         if number == "...":
@@ -141,7 +149,7 @@ def _tokens(place: str) -> list[str | int]:
 
 
 def _has(data: Any, tokens: list[str | int]) -> bool:
-    """Whether there is such a place."""
+    """Return True if the data contains the place."""
     for token in tokens:
         try:
             data = data[token]
@@ -151,7 +159,7 @@ def _has(data: Any, tokens: list[str | int]) -> bool:
 
 
 def _numbers(value: Any, place: str) -> Iterator[tuple[str, int | float]]:
-    """All numbers, and where."""
+    """Yield all numbers with their places."""
     if isinstance(value, int | float):
         yield place, value
     elif isinstance(value, dict):
@@ -163,7 +171,7 @@ def _numbers(value: Any, place: str) -> Iterator[tuple[str, int | float]]:
 
 
 def _explained(message: str, data: Any, kind: Any) -> tuple[str, str]:
-    """The place that a message of msgspec's is about, and what is wrong there."""
+    """Return the place that a msgspec message is about, and an explanation of the fault."""
     found = _PLACE.search(message)
     place = found[1] if found else "$"
     root = inspect.type_info(kind)
@@ -181,13 +189,14 @@ def _explained(message: str, data: Any, kind: Any) -> tuple[str, str]:
     hint = nearest(field[2], names)
     of_file = [each.encode_name for each in root.fields] if isinstance(root, inspect.StructType) else []
     if not hint and place != "$" and field[2] in of_file:
-        # What stands behind the header of a table is a field of it; who wrote it meant one of the file.
+        # A line after a table's header belongs to that table; the author probably meant a field of
+        # the file.
         hint = f": `{field[2]}` of the file itself stands above its first [table]"
     return f"{place}.{field[2]}", f"{what} has no field `{field[2]}`: expected {', '.join(names)}{hint}"
 
 
 def _of_value(place: str, node: Any, value: Any) -> tuple[str, str]:
-    """What is wrong with a value."""
+    """Explain a fault of a value: return its place and the explanation."""
     if isinstance(node, inspect.UnionType):
         tags = {
             str(_struct(each).tag): each
@@ -201,7 +210,7 @@ def _of_value(place: str, node: Any, value: Any) -> tuple[str, str]:
 
 
 def _of_tag(place: str, field: str, tags: list[str], value: Any) -> tuple[str, str]:
-    """What is wrong with a table that may be of several kinds."""
+    """Explain a fault of a tagged table: return its place and the explanation."""
     listed = ", ".join(tags)
     if not isinstance(value, dict):
         hint = f": write [[{place.partition('[')[0][2:]}]] {field} = {shown(value)}" if value in tags else ""
@@ -214,8 +223,11 @@ def _of_tag(place: str, field: str, tags: list[str], value: Any) -> tuple[str, s
 
 
 def _resolve(node: Any, value: Any, tokens: list[str | int]) -> tuple[Any, Any]:
-    """The type and the value at a place: of a table that may be of several kinds, the kind its tag says; what is wrong
-    with the tag itself is wrong with the table."""
+    """Return the type and the value at a place.
+
+    For a tagged table, the type is the one that its tag selects. A fault of the tag itself is a
+    fault of the table.
+    """
     node = _narrowed(node, value)
     for token in tokens:
         node = _struct(node)
@@ -233,12 +245,12 @@ def _resolve(node: Any, value: Any, tokens: list[str | int]) -> tuple[Any, Any]:
 
 
 def _struct(node: Any) -> Any:
-    """A type without what is said of it."""
+    """Return a type without its metadata."""
     return _struct(node.type) if isinstance(node, inspect.Metadata) else node
 
 
 def _narrowed(node: Any, value: Any) -> Any:
-    """A union without null, which TOML does not have; of structs, that of the value's tag, if any's."""
+    """Remove null, which TOML lacks, from a union; select a tagged struct by the value's tag."""
     if not isinstance(node, inspect.UnionType):
         return node
     kinds = [each for each in node.types if not isinstance(each, inspect.NoneType)]
@@ -253,12 +265,12 @@ def _narrowed(node: Any, value: Any) -> Any:
 
 
 def _name(node: inspect.StructType) -> str:
-    """What a table of several kinds is called."""
+    """Return the name of a tagged table, for messages."""
     return f"{node.tag_field} {shown(node.tag)}"
 
 
 def _expected(node: Any) -> str:
-    """What a type allows, in words."""
+    """Describe what a type allows."""
     if isinstance(node, inspect.Metadata):
         said = (node.extra_json_schema or {}).get("description")
         return said or _expected(node.type)
@@ -287,7 +299,7 @@ def _expected(node: Any) -> str:
 
 
 def _bounds(node: inspect.FloatType | inspect.IntType) -> str:
-    """What a number is bounded by."""
+    """Describe the bounds of a number."""
     signs = {"gt": "above", "ge": "from", "lt": "below", "le": "up to"}
     said = [
         f"{word} {bound:,.10g}" for name, word in signs.items() if (bound := getattr(node, name)) is not None
@@ -296,7 +308,7 @@ def _bounds(node: inspect.FloatType | inspect.IntType) -> str:
 
 
 def _lengths(node: Any, what: str) -> str:
-    """What a length is bounded by."""
+    """Describe the bounds of a length."""
     low, high = node.min_length, node.max_length
     if low is None and high is None:
         return ""

@@ -1,13 +1,16 @@
-"""The data of one voxel as flat arrays, and the checks that every decoded voxel passes.
+"""Data of one voxel as flat arrays, and the checks that every decoded voxel passes.
 
-They are `link_tree`, `check_tree` and, as the points are read, `read_lanes` (codec.py); `check_voxel` runs all three.
+The checks are `link_tree`, `check_tree` and, as the points are read, `read_lanes` (codec.py);
+`check_voxel` runs all three.
 
-A voxel is an octree whose leaf cells each hold a bounding sphere hierarchy (BSH), with one more BSH over
-the cells ([Fig12] section 4 and figures 3, 4). Every BSH is an R-tree-like tree of degree m with all
-leaf nodes on one level. Only counts are stored: children are contiguous, so where they start follows.
+A voxel is an octree whose leaf cells each hold a bounding sphere hierarchy (BSH), with one more BSH
+over the cells ([Fig12] section 4 and figures 3, 4). Every BSH is an R-tree-like tree of degree m
+with all leaf nodes on one level. Only counts are stored: children are contiguous, so their start
+follows from the counts.
 
-Node order: the nodes of the top BSH, level by level from its root; then the root node of every cell, in
-cell order; then, cell by cell, the cell's other nodes, level by level. A voxel of one cell has no top BSH.
+Node order: the nodes of the top BSH, level by level from its root; then the root node of every
+cell, in cell order; then, cell by cell, the cell's other nodes, level by level. A voxel of one cell
+has no top BSH.
 """
 
 from typing import NamedTuple, TypeVar
@@ -19,23 +22,25 @@ from .errors import CorruptError
 from .kernels.links import link_rows
 from .kernels.rows import LANES, NO_AXIS, leaf_lanes
 
-# A leaf node's points fill at most this many lanes of the vector test (server/kernels/overlap.py); 32 is
-# what LLVM vectorises and 8 or 16 are not (see there).
+# A leaf node's points fill at most this many lanes of the vector test (server/kernels/overlap.py).
+# LLVM vectorises 32 lanes but not 8 or 16 (see there).
 MAX_LEAF = LANES
 MIN_DEGREE, MAX_DEGREE = 2, 16
-# Levels of nodes, root to leaf. Trees of degree 2 over 2^31 points have 32 levels a BSH, and a voxel has two BSHs one
-# upon the other. Kernels have stacks and lists for so many.
+# Limit of the levels of nodes from root to leaf. Trees of degree 2 over 2^31 points have 32 levels
+# per BSH, and a voxel has two BSHs on top of each other. Kernels have stacks and lists of this
+# size.
 MAX_LEVELS = 80
 
-# Coordinates inside a leaf cell are 16 bits an axis (NUMERICS.md N3).
+# Bits per axis of coordinates inside a leaf cell (NUMERICS.md N3).
 CELL_BITS = 16
 
 
 class Cells(NamedTuple):
-    """The leaf cells of a voxel's octree, c of them; cell `i` is `low[i] + [0, 2**log2_size[i])` an axis.
+    """Leaf cells of a voxel's octree, c of them.
 
-    low: (c, 3) int32 [voxel steps].  log2_size: (c,) uint8.  nodes: (c,) uint32, nodes of the cell's BSH.
-    points: (c,) uint32, points in the cell.
+    Cell `i` covers `low[i] + [0, 2**log2_size[i])` on each axis.
+    low: (c, 3) int32 [voxel steps].  log2_size: (c,) uint8.
+    nodes: (c,) uint32, nodes of the cell's BSH.  points: (c,) uint32, points in the cell.
     """
 
     low: NDArray[np.int32]
@@ -45,14 +50,18 @@ class Cells(NamedTuple):
 
 
 class Nodes(NamedTuple):
-    """Bounding spheres, each cut by a slab; n of them. Each encloses all *points* below it (centres only).
+    """Bounding spheres, each cut by a slab; n of them.
 
-    center: (n, 3) uint16 [steps from the cell's low corner; top BSH: 2**top_shift steps from the voxel's].
-    radius: (n,) uint16, the same unit.  normal: (n, 3) int8, the slab's direction, not of unit length;
-    zero: no slab.  slab: (n, 2) int32, least and greatest dot(normal, point - center) [steps].
+    Each sphere and slab encloses all *points* below its node (centres only, without their radii).
+    center: (n, 3) uint16 [steps from the cell's low corner; top BSH: 2**top_shift steps from the
+    voxel's].
+    radius: (n,) uint16, the same unit.
+    normal: (n, 3) int8, the slab's direction, not of unit length; zero: no slab.
+    slab: (n, 2) int32, least and greatest dot(normal, point - center) [steps].
     count: (n,) uint8, children, or points of a leaf node.
     axis: (n,) uint8, leaf nodes: the axis along which the points are sorted; else 0.
-    block_low: (n, 3) uint16, leaf nodes: low corner of the points' box [steps from the cell]; else 0.
+    block_low: (n, 3) uint16, leaf nodes: low corner of the points' box [steps from the cell]; else
+    0.
     """
 
     center: NDArray[np.uint16]
@@ -65,12 +74,13 @@ class Nodes(NamedTuple):
 
 
 class VoxelData(NamedTuple):
-    """All of one voxel.
+    """Complete data of one voxel.
 
-    key: voxel key.  top_shift: see Nodes.center.  cells, nodes: see there.
+    key: voxel key.  top_shift: see Nodes.center.  cells, nodes: see Cells and Nodes.
     points: (p, 3) uint16 x, y, z from their leaf node's block_low, in leaf-node order [steps].
-    scan_index: (p,) uint16 or None.  intensity: (p,) float32 or None.  radius_class: (p,) uint8 below
-    RADIUS_CLASSES, or None.  normal: (p,) uint16, codes of kernels/normals.py, or None.
+    scan_index: (p,) uint16 or None.  intensity: (p,) float32 or None.
+    radius_class: (p,) uint8 below RADIUS_CLASSES, or None.
+    normal: (p,) uint16, codes of kernels/normals.py, or None.
     """
 
     key: int
@@ -85,10 +95,11 @@ class VoxelData(NamedTuple):
 
 
 class Links(NamedTuple):
-    """Where children are; derived from the counts by `link_nodes`.
+    """Positions of the nodes' children, derived from the counts by `link_nodes`.
 
     first: (n,) int32, first child node; leaf nodes: first point.  is_leaf: (n,) bool.
-    cell: (n,) int32, the cell a node belongs to, -1 for the top BSH.  height: levels of nodes, root to leaf.
+    cell: (n,) int32, the cell of a node, -1 for the top BSH.
+    height: levels of nodes, root to leaf.
     """
 
     first: NDArray[np.int32]
@@ -98,17 +109,26 @@ class Links(NamedTuple):
 
 
 def top_shift(voxel_steps: int) -> int:
-    """The unit of the top BSH's centres, as a power of two: the least that fits a voxel into 16 bits."""
+    """Return the binary logarithm of the unit of the top BSH's centres.
+
+    The unit is the least power of two [steps] with which a voxel fits 16 bits.
+    """
     return max(0, int(voxel_steps - 1).bit_length() - CELL_BITS)
 
 
 def link_nodes(voxel: VoxelData) -> Links:
-    """Derive where every node's children are. Raises CorruptError when the counts do not add up."""
+    """Derive the positions of every node's children.
+
+    Raises CorruptError if the counts do not form trees.
+    """
     return link_tree(f"voxel {voxel.key:#x}", voxel.cells, voxel.nodes.count)
 
 
 def link_tree(name: str, cells: Cells, count: NDArray[np.uint8]) -> Links:
-    """`link_nodes` of cells and the counts (n,) of nodes. name: of the voxel, for messages."""
+    """Derive the links from cells and the nodes' counts (n,), as `link_nodes` does.
+
+    name: of the voxel, for messages.
+    """
     n = len(count)
     check_cell_nodes(name, cells, n)
     first, cell_of, is_leaf = np.empty(n, np.int32), np.empty(n, np.int32), np.zeros(n, bool)
@@ -121,7 +141,10 @@ def link_tree(name: str, cells: Cells, count: NDArray[np.uint8]) -> Links:
 
 
 def check_cell_nodes(name: str, cells: Cells, nodes: int) -> None:
-    """Check the cells' counts of nodes against the nodes of the voxel. Raises CorruptError."""
+    """Check the cells' node counts against the number of nodes in the voxel.
+
+    Raises CorruptError.
+    """
     c = len(cells.nodes)
     top = nodes - int(cells.nodes.sum(dtype=np.int64))
     if c == 0 or not cells.nodes.all() or not cells.points.all() or top < 0 or (top == 0) != (c == 1):
@@ -129,7 +152,10 @@ def check_cell_nodes(name: str, cells: Cells, nodes: int) -> None:
 
 
 def check_cell_points(name: str, cells: Cells, points: int) -> None:
-    """Check the cells' counts of points against the points of the voxel. Raises CorruptError."""
+    """Check the cells' point counts against the number of points in the voxel.
+
+    Raises CorruptError.
+    """
     claimed = int(cells.points.sum(dtype=np.int64))
     if claimed != points:
         raise CorruptError(f"{name}: cells claim {claimed} points, found {points}")
@@ -139,16 +165,16 @@ Columns = TypeVar("Columns", Cells, Nodes)
 
 
 def transposed(columns: Columns) -> Columns:
-    """The columns with those of several components as (3, n) instead of (n, 3), contiguous, or the other way round."""
+    """Transpose the columns of several components, (n, 3) to (3, n) or back, contiguous."""
     turned = (np.ascontiguousarray(column.T) for column in columns)
     return type(columns)(*turned)  # type: ignore[arg-type]  # each keeps its type
 
 
 def check_tree(name: str, cells: Cells, nodes: Nodes, links: Links, points: int, voxel_steps: int) -> None:
-    """Check what a kernel relies on in a voxel whose counts `link_nodes` has added up, but for the points.
+    """Check everything but the points that a kernel relies on, in a voxel whose counts form trees.
 
-    name: of the voxel, for messages.  cells, nodes: transposed.  points: how many there are. Raises CorruptError
-    naming the fault.
+    name: of the voxel, for messages.  cells, nodes: transposed.  points: number of points.
+    Raises CorruptError naming the fault.
     """
     check_cell_points(name, cells, points)
     if (cells.log2_size > CELL_BITS).any():
@@ -174,13 +200,14 @@ def read_lanes(
     *,
     deltas: bool = True,
 ) -> NDArray[np.int64]:
-    """Read the points of a checked tree from their byte planes (6, p) into lanes (leaf nodes, 3, MAX_LEAF).
+    """Read the points of a checked tree from their byte planes into lanes.
 
-    Return the bounds (2, 3) of the points, as `leaf_lanes` finds them.
-
-    cells, nodes: transposed.  deltas: whether the points are, see codec.py. They lie inside their cell, so their
-    sums with block_low stay inside 16 bits and kernels that add them cannot leave the certified range: CorruptError
-    where one does not.
+    planes: (6, p).  lanes: (leaf nodes, 3, MAX_LEAF), written.
+    cells, nodes: transposed.
+    deltas: True if points are stored as differences along the sort axis, see codec.py.
+    Returns the bounds (2, 3) of the points, as `leaf_lanes` computes them.
+    Raises CorruptError for a point outside its cell. Inside, sums with block_low fit 16 bits, so
+    kernels that add them stay in the range for which their error bounds are proved.
     """
     axis = nodes.axis if deltas else np.full(len(nodes.axis), NO_AXIS, np.uint8)
     tree = (links.first, links.is_leaf, links.cell)
@@ -192,11 +219,13 @@ def read_lanes(
 
 
 def check_voxel(voxel: VoxelData, voxel_steps: int) -> Links:
-    """Check everything a kernel relies on, and derive the links. Raises CorruptError naming the fault.
+    """Check everything a kernel relies on, and derive the links.
 
-    What is checked: shapes agree; counts add up to trees with all leaf nodes on one level; cells lie on
-    their own grid inside the voxel's cube; points lie inside their cell; the top unit is the one the voxel
-    size calls for. Not checked here: that bounds enclose (`solidcloud validate`).
+    Raises CorruptError naming the fault.
+    Checked: shapes agree; counts form trees with all leaf nodes on one level; cells lie on their
+    own grid inside the voxel's cube; points lie inside their cell; the unit of the top BSH is the
+    one that the voxel size requires. Not checked here: that bounds enclose their points
+    (`solidcloud validate`).
     """
     cells, nodes = voxel.cells, voxel.nodes
     name = f"voxel {voxel.key:#x}"
@@ -209,7 +238,7 @@ def check_voxel(voxel: VoxelData, voxel_steps: int) -> Links:
     cells, nodes = transposed(cells), transposed(nodes)
     check_tree(name, cells, nodes, links, p, voxel_steps)
     planes = np.ascontiguousarray(np.ascontiguousarray(voxel.points).view(np.uint8).T)
-    planes.flags.writeable = False  # as a record's are: one compiled form for both
+    planes.flags.writeable = False  # like a record's: the kernel is compiled once for both
     lanes = np.empty((int(np.count_nonzero(links.is_leaf)), 3, MAX_LEAF), np.uint16)
     read_lanes(name, planes, cells, nodes, links, voxel_steps, lanes, deltas=False)
     return links

@@ -1,6 +1,6 @@
-"""World position <-> lattice integer <-> voxel coordinate <-> voxel key.
+"""Conversion between world positions, lattice integers, voxel coordinates and voxel keys.
 
-The one place where world metres become integers (NUMERICS.md N1, N2). Three frames:
+Only this module converts world metres to integers (NUMERICS.md N1, N2). Three frames:
 
 - world: float64 metres, as the scans give them;
 - lattice: int64 steps from the dataset's origin; `Lattice.to_lattice`, `Lattice.to_world`;
@@ -17,27 +17,28 @@ from numpy.typing import ArrayLike, NDArray
 from .errors import BadRequestError
 from .kernels.morton import morton_decode, morton_encode
 
-# Exact contact is decided in this unit, 2^-26 m = 15 nm (NUMERICS.md N5). A power of two, so that
+# Unit in which exact contact is decided, 2^-26 m = 15 nm (NUMERICS.md N5). A power of two, so that
 # metres times UNITS_PER_METRE is exact in float64.
 UNITS_PER_METRE = 2.0**26
 
-# Voxel coordinates are biased by this and interleaved, 21 bits an axis, into a uint64 key.
+# Offset added to voxel coordinates before they are interleaved, 21 bits per axis, into a uint64
+# key.
 KEY_BIAS = 1 << 20
 
-# A step below 1 micrometre would leave under 67 exact units a step, and no scanner resolves it.
+# A step below 1 micrometre would span fewer than 67 exact units, and no scanner resolves it.
 MIN_STEP = 1e-6
 
-# Morton codes hold 21 bits an axis, so the octree of a larger voxel would fold points onto each other. Node
-# centres, in voxel steps, must also be exact in float32 for the fast pass of server/kernels/overlap.py:
-# a voxel and its neighbours within reach stay below 2^24 steps.
+# Morton codes hold 21 bits per axis, so the octree of a larger voxel would map distinct points to
+# the same code. Node centres, in voxel steps, must also be exact in float32 for the fast pass of
+# server/kernels/overlap.py: a voxel and its neighbours within reach stay below 2^24 steps.
 MAX_VOXEL_STEPS = 1 << 21
 
-# World coordinates beyond this are refused at the door (NUMERICS.md case 16).
+# Input with world coordinates beyond this is refused (NUMERICS.md case 16).
 MAX_COORDINATE = 1e9
 
 
 class Lattice(NamedTuple):
-    """The integer lattice of one dataset, cut into voxels.
+    """Integer lattice of one dataset, divided into voxels.
 
     origin: (3,) float64 world [m] of lattice point (0, 0, 0).  step: [m].
     voxel_steps: edge of a voxel [steps].
@@ -49,12 +50,12 @@ class Lattice(NamedTuple):
 
     @property
     def voxel_size(self) -> float:
-        """Edge of a voxel [m]."""
+        """Return the edge of a voxel [m]."""
         return self.voxel_steps * self.step
 
     @property
     def units_per_step(self) -> float:
-        """Exact units (2^-26 m) a lattice step; rounded once, here."""
+        """Return the exact units (2^-26 m) per lattice step; rounded once, here."""
         return self.step * UNITS_PER_METRE
 
     def to_lattice(self, xyz: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -62,18 +63,18 @@ class Lattice(NamedTuple):
         return np.rint((xyz - np.array(self.origin)) / self.step).astype(np.int64)
 
     def to_world(self, lattice: ArrayLike) -> NDArray[np.float64]:
-        """World position (n, 3) [m] of lattice integers (n, 3)."""
+        """Return the world positions (n, 3) [m] of lattice integers (n, 3)."""
         return np.asarray(lattice, np.int64) * self.step + np.array(self.origin)
 
     def voxel_of(self, lattice: ArrayLike) -> NDArray[np.int64]:
-        """Voxel coordinates (n, 3) of lattice integers (n, 3): floor division, negatives included."""
+        """Return the voxel coordinates (n, 3) of lattice integers (n, 3), by floor division."""
         return np.asarray(lattice, np.int64) // self.voxel_steps
 
 
 def make_lattice(origin: ArrayLike, step: float, voxel_size: float) -> Lattice:
-    """The lattice whose voxels are `voxel_size` [m] rounded to a whole number of steps.
+    """Make the lattice whose voxels are `voxel_size` [m], rounded to a whole number of steps.
 
-    Raises BadRequestError when step or voxel size are outside what the format can hold.
+    Raises BadRequestError if step or voxel size are outside what the format can hold.
     """
     if not (np.isfinite(step) and step >= MIN_STEP):
         raise BadRequestError(
@@ -94,7 +95,7 @@ def make_lattice(origin: ArrayLike, step: float, voxel_size: float) -> Lattice:
 
 
 def voxel_keys(voxels: NDArray[np.int64]) -> NDArray[np.uint64]:
-    """Morton keys (n,) of voxel coordinates (n, 3).
+    """Return the Morton keys (n,) of voxel coordinates (n, 3).
 
     Raises BadRequestError for a voxel farther than 2^20 voxels from the origin.
     """
@@ -108,5 +109,5 @@ def voxel_keys(voxels: NDArray[np.int64]) -> NDArray[np.uint64]:
 
 
 def voxel_coordinates(keys: NDArray[np.uint64]) -> NDArray[np.int64]:
-    """Voxel coordinates (n, 3) of Morton keys (n,)."""
+    """Return the voxel coordinates (n, 3) of Morton keys (n,)."""
     return morton_decode(np.asarray(keys, np.uint64)).astype(np.int64) - KEY_BIAS

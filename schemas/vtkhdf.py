@@ -1,8 +1,10 @@
-"""Points as VTKHDF PolyData, vertices only: what ParaView and VTK open as *.vtkhdf. Beside archives' a user of h5py.
+"""Files of points as VTKHDF PolyData (vertices only), which ParaView and VTK open as *.vtkhdf.
 
-After the VTKHDF file format, version 2.0 of it (docs.vtk.org, "VTKHDF format specification"): a group `VTKHDF` with the
-attributes Version and Type, `NumberOfPoints` and `Points`, four groups of cells of which only `Vertices` has any, and
-`PointData`. One partition. Numbers are written a block at a time, in bounded memory, and without clocks.
+Besides the archive modules, this is the only user of h5py. The layout follows the VTKHDF file
+format, version 2.0 (docs.vtk.org, "VTKHDF format specification"): a group `VTKHDF` with the
+attributes Version and Type, `NumberOfPoints` and `Points`, four groups of cells of which only
+`Vertices` is non-empty, and `PointData`. There is one partition. Data is written block by block, in
+bounded memory, and without timestamps.
 """
 
 from collections.abc import Iterator, Mapping
@@ -22,26 +24,30 @@ PREVIEW_NAME = "preview.vtkhdf"
 GROUP = "VTKHDF"
 _VERSION = (2, 0)
 _CELLS = ("Vertices", "Lines", "Polygons", "Strips")
-# Rows of a chunk: what is compressed and checked by itself.
+# Rows per chunk, the unit of compression and checksums.
 _CHUNK = 1 << 15
-# Numbers that count upwards, which shuffled compress to a hundredth.
+# For numbers that count upwards: shuffled, they compress to a hundredth.
 _SMALL: dict[str, Any] = {"shuffle": True, "compression": "gzip", "compression_opts": 1}
-# A chunk with a checksum, so that a flipped bit is found.
+# Compression with a checksum per chunk, so that a flipped bit is found.
 _CHECKED: dict[str, Any] = {"shuffle": True, "compression": "gzip", "compression_opts": 6, "fletcher32": True}
 
 
 class VtkPoints:
-    """Points on their way into a file. A context manager: whole when left without an error."""
+    """Writer of points to a file.
+
+    A context manager: the file is complete if it exits without an error.
+    """
 
     def __init__(self, file: h5py.File, columns: Mapping[str, np.dtype], *, compressed: bool) -> None:
-        """Begin `/VTKHDF`. columns: point data besides the coordinates, by name.
+        """Begin `/VTKHDF`.
 
-        compressed: and with a checksum; else as they are, which is six times as fast.
+        columns: dtypes of the point data besides the coordinates, by name.
+        compressed: compress and add checksums; without, writing is six times as fast.
         """
         self._file, self._options = file, _CHECKED if compressed else {}
         self._root = file.create_group(GROUP, track_times=False)
         self._root.attrs["Version"] = np.array(_VERSION, "<i8")
-        self._root.attrs["Type"] = np.bytes_("PolyData")  # of fixed length: VTK reads no other
+        self._root.attrs["Type"] = np.bytes_("PolyData")  # of fixed length: VTK requires that
         self._points = self._make("Points", np.dtype("<f8"), (3,))
         data = self._root.create_group("PointData", track_times=False)
         self._columns = {
@@ -50,31 +56,31 @@ class VtkPoints:
         }
 
     def __enter__(self) -> Self:
-        """Itself."""
+        """Return the writer."""
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        """Write what is known only now."""
+        """Write the data that depends on the number of points."""
         if kind is None:
             self._finish()
 
     def _make(self, name: str, kind: np.dtype, tail: tuple[int, ...]) -> h5py.Dataset:
-        """An empty dataset that can grow."""
+        """Create an empty dataset that can grow."""
         return self._root.create_dataset(
             name, (0, *tail), kind, maxshape=(None, *tail), chunks=(_CHUNK, *tail), **self._options
         )
 
     def append(self, points: NDArray[np.float64], columns: Mapping[str, NDArray]) -> None:
-        """Write so many more points (m, 3) [m], and the columns (m,) promised. OSError: of a write that failed."""
+        """Append points (m, 3) [m] and all columns (m,). Raises OSError if a write failed."""
         for dataset, rows in [(self._points, points), *((d, columns[n]) for n, d in self._columns.items())]:
             begin = len(dataset)
             dataset.resize(begin + len(rows), axis=0)
             dataset[begin:] = rows
         if isinstance(self._file, NewFile):
-            self._file.check()  # what HDF5 was not told of, it would go on writing behind
+            self._file.check()  # HDF5 does not see write errors and would continue
 
     def _finish(self) -> None:
-        """One vertex a point, and how many there are."""
+        """Write the cells, one vertex per point, and all counts."""
         count = len(self._points)
         self._count(self._root, "NumberOfPoints", count)
         for name in _CELLS:
@@ -91,20 +97,26 @@ class VtkPoints:
 
     @staticmethod
     def _count(group: h5py.Group, name: str, count: int) -> None:
-        """A number of the one partition there is."""
+        """Write a count of the only partition."""
         group.create_dataset(name, data=np.array([count], "<i8"))
 
 
 @contextmanager
 def vtk_file(path: Path, columns: Mapping[str, np.dtype]) -> Iterator[VtkPoints]:
-    """A new file of points, uncompressed; it has its name when it is whole. OSError: the disk is full, for one."""
+    """Create an uncompressed file of points, which gets its name when it is complete.
+
+    Raises OSError, for example if the disk is full.
+    """
     with new_file(path) as file, VtkPoints(file, columns, compressed=False) as points:
         yield points
     publish(path)
 
 
 class PointsRead(NamedTuple):
-    """What a file of points holds. points: (n, 3) [m].  columns: (n,) by name.  attributes: of the file's root."""
+    """Content of a file of points.
+
+    points: (n, 3) [m].  columns: (n,) by name.  attributes: of the file's root.
+    """
 
     points: NDArray[np.float64]
     columns: dict[str, NDArray]
@@ -112,9 +124,12 @@ class PointsRead(NamedTuple):
 
 
 def read_points(path: Path) -> PointsRead:
-    """What `VtkPoints` wrote, read whole. Raises CorruptError for anything else, OSError where no file is."""
+    """Read a file that `VtkPoints` wrote.
+
+    Raises CorruptError for anything else, OSError if the file cannot be opened.
+    """
     with open(path, "rb"):
-        pass  # an OSError of HDF5's says nothing of why
+        pass  # HDF5's OSError does not give the reason
     try:
         with h5py.File(path, "r") as file:
             return _read(file)
@@ -123,7 +138,7 @@ def read_points(path: Path) -> PointsRead:
 
 
 def _read(file: h5py.File) -> PointsRead:
-    """The same of an open file; ValueError and more for what is not what is written."""
+    """Read an open file; raise ValueError or another exception for content that is never written."""
     root = file[GROUP]
     if bytes(root.attrs["Type"]) != b"PolyData" or int(root.attrs["Version"][0]) != _VERSION[0]:
         raise ValueError("no PolyData of version 2")

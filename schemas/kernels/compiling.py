@@ -1,9 +1,10 @@
-"""How kernels are compiled, and how what was compiled is kept: the only module that imports numba.
+"""Compilation of kernels, and the cache of compiled code: the only module that imports numba.
 
-numba's own cache unpickles and runs whatever its files hold, does not notice an edit in another file, and numbers its
-data files so that two processes may take the same number for two signatures. Here a file's name is a digest of
-everything that decided the machine code: the sources, the signature, the processor, the versions and numba's settings.
-`schemas/kernel_files.py` checks its content.
+numba's own cache unpickles and runs whatever its files contain, does not notice an edit in another
+file, and numbers its data files so that two processes may take the same number for two signatures.
+Here a file's name is a digest of everything that determines the machine code: the sources, the
+signature, the processor, the versions and numba's settings. `schemas/kernel_files.py` checks its
+content.
 """
 
 import functools
@@ -28,19 +29,19 @@ from ..kernel_sources import source_digest
 
 __all__ = ["config", "intrinsic", "kernel_files", "njit", "types"]
 
-# Its attributes are made when it is imported, out of sight of type checkers.
+# numba creates its attributes on import, invisible to type checkers.
 config: Any = numba_config
 
-# Settings of numba that do not change machine code, and differ from process to process.
+# numba settings that do not affect machine code and differ between processes.
 _UNRELATED = frozenset({"CACHE_DIR", "COLOR_SCHEME", "NUMBA_DEFAULT_NUM_THREADS", "NUMBA_NUM_THREADS"})
-# A file name holds 255 bytes, the digest takes 64.
+# A file name holds 255 bytes; the digest takes 64.
 _MOST_LABEL = 150
 
 
 def njit(*, cache: bool = False, **options: Any) -> Callable[[Callable[..., Any]], Any]:
     """Return a decorator that compiles a function of a kernels module as numba's `njit` does.
 
-    cache: keep what is compiled in `kernel_files()`.  options: numba's.
+    cache: store compiled code in `kernel_files()`.  options: numba's.
     """
     compiled = numba.njit(**options)
 
@@ -55,12 +56,12 @@ def njit(*, cache: bool = False, **options: Any) -> Callable[[Callable[..., Any]
 
 @functools.cache
 def kernel_files() -> KernelFiles:
-    """Return the folder of compiled kernels of this process."""
+    """Return this process's folder of compiled kernels."""
     return KernelFiles(default_folder(config.CACHE_DIR))
 
 
 class _Kept(_Cache):  # type: ignore[misc]
-    """What numba asks for the machine code of one function."""
+    """Cache of one function's machine code, with numba's cache interface."""
 
     def __init__(self, function: Callable[..., Any]) -> None:
         if function.__closure__ is not None:
@@ -74,7 +75,7 @@ class _Kept(_Cache):  # type: ignore[misc]
         return str(kernel_files().folder)
 
     def load_overload(self, sig: Any, target_context: Any) -> CompileResult | None:
-        """Return what was compiled for a signature; None where nothing usable is kept."""
+        """Return the compiled code for a signature; None if nothing usable is stored."""
         if not self._enabled:
             return None
         target_context.refresh()
@@ -92,24 +93,24 @@ class _Kept(_Cache):  # type: ignore[misc]
             return None
 
     def save_overload(self, sig: Any, data: Any) -> None:
-        """Keep what was compiled for a signature."""
+        """Store the compiled code for a signature."""
         if not self._enabled or data.library.has_dynamic_globals or any(not x.can_cache for x in data.lifted):
             return
         kernel_files().write(self._name(sig, data.codegen), dumps((sig, data._reduce())))
 
     def enable(self) -> None:
-        """Use what is kept."""
+        """Enable the cache."""
         self._enabled = True
 
     def disable(self) -> None:
-        """Use nothing that is kept, and keep nothing."""
+        """Disable reading and writing of the cache."""
         self._enabled = False
 
     def flush(self) -> None:
-        """Forget nothing: a file that was right stays right."""
+        """Do nothing: a file with a valid name and digest stays valid."""
 
     def _name(self, sig: Any, codegen: Any) -> str:
-        """Return the name of the file for a signature and a processor."""
+        """Return the file name for a signature and a processor."""
         module, qualname = self._function.__module__, self._function.__qualname__
         decides = (
             _settings(),
@@ -126,7 +127,7 @@ class _Kept(_Cache):  # type: ignore[misc]
 
 @functools.cache
 def _settings() -> tuple[Any, ...]:
-    """Return versions and numba's settings: what decides the machine code beside sources, signature and processor."""
+    """Return versions and numba's settings that affect the machine code."""
     names = [name for name in dir(config) if name.isupper() and name not in _UNRELATED]
     versions = (sys.version, numba.__version__, llvmlite.__version__, np.__version__)
     return (*versions, *((name, repr(getattr(config, name))) for name in names))

@@ -1,4 +1,4 @@
-"""Where the children of a voxel's nodes are: derived from counts alone, and checked on the way."""
+"""Positions of the children of a voxel's nodes: derived from counts alone, and checked on the way."""
 
 from . import compiling as nb
 
@@ -7,9 +7,10 @@ from . import compiling as nb
 def _walk(count, total, root, rest, first, is_leaf, cell_of, cell, point, leaves_are_cells):
     """Walk one BSH level by level and fill in its rows.
 
-    Row k of the BSH is `root` for k = 0, else `rest + k - 1`. A level's children are the next level; the
-    last level's are points from `point` on, or, with leaves_are_cells, the rows right behind the BSH.
-    Returns (levels, items below the last level), or (-1, row) at a node that cannot be.
+    Row k of the BSH is `root` for k = 0, else `rest + k - 1`. A level's children are the next
+    level. The children of the last level are points from `point` on or, with leaves_are_cells, the
+    rows directly after the BSH.
+    Returns (levels, items below the last level), or (-1, row) at a node with an impossible count.
     """
     done, size, levels, child = 0, 1, 0, rest
     while True:
@@ -38,10 +39,13 @@ def _walk(count, total, root, rest, first, is_leaf, cell_of, cell, point, leaves
 
 @nb.njit(nogil=True, cache=True)
 def link_rows(count, cell_nodes, cell_points, first, is_leaf, cell_of):
-    """Fill first, is_leaf and cell_of (n,) of a voxel from its counts (schemas/voxel.py has the node order).
+    """Fill first, is_leaf and cell_of (n,) of a voxel from its counts.
 
-    count: (n,) uint8.  cell_nodes, cell_points: (c,) uint32, c >= 1, each >= 1, cell_nodes sum to at most n.
-    Returns the height in levels, root to leaf; or -1 - row for the first row where the counts do not add up.
+    schemas/voxel.py defines the node order.
+    count: (n,) uint8.
+    cell_nodes, cell_points: (c,) uint32, c >= 1, each >= 1; cell_nodes sum to at most n.
+    Returns the height in levels, root to leaf; or -1 - row for the first row whose counts do not
+    form a tree.
     """
     c = cell_nodes.shape[0]
     top = count.shape[0]

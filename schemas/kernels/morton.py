@@ -1,7 +1,7 @@
 """Morton codes: three integers of up to 21 bits interleaved into one uint64, x in the lowest bit.
 
-The bit-spreading constants are the usual ones for 21 bits an axis (Morton 1966; masks derived by halving
-the gap between groups at each line).
+The bit-spreading constants are the usual ones for 21 bits per axis (Morton 1966; masks derived by
+halving the gap between groups at each line).
 """
 
 import numpy as np
@@ -33,13 +33,13 @@ def _gather(code):
 
 @nb.njit(nogil=True, cache=True)
 def morton_code(x, y, z):
-    """Morton code, uint64, of three uint64 below 2^21."""
+    """Return the Morton code, uint64, of three uint64 below 2^21."""
     return _spread(x) | (_spread(y) << np.uint64(1)) | (_spread(z) << np.uint64(2))
 
 
 @nb.njit(nogil=True, cache=True)
 def morton_encode(coordinates):
-    """Morton codes (n,) uint64 of coordinates (n, 3) uint64, each below 2^21."""
+    """Return the Morton codes (n,) uint64 of coordinates (n, 3) uint64, each below 2^21."""
     n = coordinates.shape[0]
     codes = np.empty(n, np.uint64)
     for i in range(n):
@@ -49,7 +49,7 @@ def morton_encode(coordinates):
 
 @nb.njit(nogil=True, cache=True)
 def morton_decode(codes):
-    """Coordinates (n, 3) uint64 of Morton codes (n,) uint64."""
+    """Return the coordinates (n, 3) uint64 of Morton codes (n,) uint64."""
     n = codes.shape[0]
     coordinates = np.empty((n, 3), np.uint64)
     for i in range(n):

@@ -1,20 +1,22 @@
-"""The surface normal at a scan point, as a code of 16 bits: what builder and server compute alike.
+"""Surface normal at a scan point, as a 16-bit code; builder and server compute it identically.
 
-The definition, which no order, tree or machine can change. Of all points of the same voxel within reach of the point
-(itself and duplicates included), differences to it in whole steps; their number, sums and sums of products, exact
-int64. From these, in float64, each operation as it stands here and none but + - * / and square root, which IEEE 754
-rounds alike everywhere: the covariance, divided by its trace; SWEEPS cyclic sweeps of Jacobi rotations (Jacobi 1846;
-the stable form is Golub and Van Loan, Matrix Computations, section 8.5); the eigenvector of the least eigenvalue. There
-is no normal, code NONE,
+The definition does not depend on order, tree or machine. Take all points of the same voxel within
+reach of the point (itself and duplicates included). Sum their differences to the point, in whole
+steps: count, sums and sums of products, exact int64. From these compute in float64, with each
+operation exactly as it stands here and nothing but + - * / and square root, which IEEE 754 rounds
+identically everywhere: the covariance, divided by its trace; SWEEPS cyclic sweeps of Jacobi
+rotations (Jacobi 1846; the stable form is Golub and Van Loan, Matrix Computations, section 8.5);
+the eigenvector of the least eigenvalue. There is no normal, code NONE,
 
-- of fewer than LEAST_POINTS points, or where all are in one place;
-- of points along a line: the second eigenvalue is at most LINE times the greatest;
-- of points with no thin direction: the least eigenvalue is above THICK times the second.
+- for fewer than LEAST_POINTS points, or if all are in one place;
+- for points along a line: the second eigenvalue is at most LINE times the greatest;
+- for points without a thin direction: the least eigenvalue is above THICK times the second.
 
-The code is that of the unit normal or its opposite, whichever has z >= 0: octahedral, as Cigolle et al. 2014 (A Survey
-of Efficient Representations for Independent Unit Vectors) have it for hemispheres. With p = (x, y) / (|x| + |y| + |z|),
-u = p_x + p_y and v = p_x - p_y fill the square [-1, 1]; 127 u and 127 v are rounded half to even, 128 is added: u is
-the high byte, v the low one, so both are 1 to 255. The axes are exact, other directions off by 0.56 degrees at most.
+The code represents the unit normal or its opposite, whichever has z >= 0. It is the octahedral code
+for hemispheres of Cigolle et al. 2014 (A Survey of Efficient Representations for Independent Unit
+Vectors). With p = (x, y) / (|x| + |y| + |z|), u = p_x + p_y and v = p_x - p_y fill the square [-1,
+1]; 127 u and 127 v are rounded half to even, and 128 is added. u is the high byte, v the low one,
+so both are 1 to 255. The axes are exact; other directions are off by 0.56 degrees at most.
 """
 
 import math
@@ -25,23 +27,25 @@ from . import compiling as nb
 
 NONE = np.uint16(0)
 LEAST_POINTS = 3
-# Standard deviations of 1 : 32. A line of one scanner's row, noise and all, is below; what is left of a surface at its
-# edge, a strip a tenth as wide as it is long, above.
+# Ratio of variances; standard deviations of 1 : 32. The points of one scanner row, with noise, are
+# below it. A strip at the edge of a surface, a tenth as wide as it is long, is above it.
 LINE = 2.0**-10
-# Right-angled edges and corners are at 0.29, and have the direction between the faces; a ball is at 1.
+# Right-angled edges and corners are at 0.29, and get the direction between the faces; a ball is at
+# 1.
 THICK = 0.5
-# Off-diagonals shrink quadratically; four make them vanish in float64, from any start that was tried.
+# Off-diagonal elements shrink quadratically. Four sweeps make them vanish in float64, from every
+# start that was tried.
 SWEEPS = 6
 _SMALL = (
     2.0**-120
-)  # an off-diagonal of a matrix of trace 1 that is as good as zero; its square does not underflow
+)  # an off-diagonal element that counts as zero if the trace is 1; its square does not underflow
 _LEVELS = 127.0
 _MIDDLE = 128
 
 
 @nb.njit(nogil=True, cache=True)
 def _rotation(a_pp, a_qq, a_pq):
-    """(t, c, s) of the Jacobi rotation that makes a_pq vanish."""
+    """Return (t, c, s) of the Jacobi rotation that makes a_pq vanish."""
     if abs(a_pq) <= _SMALL:
         return 0.0, 1.0, 0.0
     theta = (a_qq - a_pp) / (2.0 * a_pq)
@@ -53,17 +57,18 @@ def _rotation(a_pp, a_qq, a_pq):
 
 @nb.njit(nogil=True, cache=True)
 def _turn(c, s, a, b):
-    """Two figures turned by a rotation."""
+    """Rotate the pair (a, b)."""
     return c * a - s * b, s * a + c * b
 
 
 @nb.njit(nogil=True, cache=True)
 def least_direction(xx, yy, zz, yz, zx, xy):
-    """Eigenvalues of a symmetric matrix, float64, of trace about 1: ascending, and the unit eigenvector of the least.
+    """Return the eigenvalues of a symmetric matrix, and the unit eigenvector of the least.
 
+    xx to xy: float64, elements of a matrix with trace about 1.
     Returns ((least, second, greatest), (x, y, z)). Equal eigenvalues: any of their eigenvectors.
     """
-    # The columns of the rotation so far: eigenvectors in the end.
+    # Columns of the accumulated rotation: the eigenvectors in the end.
     ax, ay, az, bx, by, bz, cx, cy, cz = 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0
     for _ in range(SWEEPS):
         t, c, s = _rotation(xx, yy, xy)
@@ -86,7 +91,7 @@ def least_direction(xx, yy, zz, yz, zx, xy):
         bz, cz = _turn(c, s, bz, cz)
     least, greatest = min(xx, yy, zz), max(xx, yy, zz)
     second = max(min(xx, yy), min(max(xx, yy), zz))
-    if least == zz:  # of equal ones z: what cannot be told apart lies flat
+    if least == zz:  # if equal, prefer z: ambiguous points count as horizontal
         ax, ay, az = cx, cy, cz
     elif least == yy:
         ax, ay, az = bx, by, bz
@@ -95,7 +100,7 @@ def least_direction(xx, yy, zz, yz, zx, xy):
 
 @nb.njit(nogil=True, cache=True)
 def encode_normal(x, y, z):
-    """The code, uint16, of a direction (x, y, z) of any length but 0."""
+    """Return the code, uint16, of a direction (x, y, z) of any length but 0."""
     if z < 0.0 or (z == 0.0 and (y < 0.0 or (y == 0.0 and x < 0.0))):
         x, y, z = -x, -y, -z
     size = abs(x) + abs(y) + z
@@ -107,7 +112,7 @@ def encode_normal(x, y, z):
 
 @nb.njit(nogil=True, cache=True)
 def decode_normal(code):
-    """The unit vector (x, y, z), z >= 0, of a code that is not NONE."""
+    """Return the unit vector (x, y, z), z >= 0, of a code that is not NONE."""
     u, v = np.float64(np.int64(code) // 256 - _MIDDLE), np.float64(np.int64(code) % 256 - _MIDDLE)
     x, y = (u + v) * 0.5, (u - v) * 0.5
     z = _LEVELS - abs(x) - abs(y)
@@ -117,9 +122,10 @@ def decode_normal(code):
 
 @nb.njit(nogil=True, cache=True)
 def normal_code(sums):
-    """The code, uint16, of the normal at a point.
+    """Return the code, uint16, of the normal at a point.
 
-    sums: (10,) int64, of the differences to it [steps]: how many, x, y, z, xx, yy, zz, yz, zx, xy.
+    sums: (10,) int64, over the differences to the point [steps]: count, x, y, z, xx, yy, zz, yz,
+    zx, xy.
     """
     if sums[0] < LEAST_POINTS:
         return NONE

@@ -1,25 +1,29 @@
-"""The rows of a record: their byte planes, and the points of leaf nodes as deltas along the axis they are sorted by.
+"""Rows of a record: byte planes, and the points of leaf nodes as deltas along their sort axis.
 
-Loops that should become vector code run to a length known only at run time: LLVM unrolls a loop of 32 constant trips
-over bytes and halfwords and then leaves it scalar (3 times as slow). And they index by uint64: numba gives signed
-indices a wrap-around check, and LLVM then loads element by element.
+Loops that should be vectorised run to a length known only at run time: LLVM unrolls a loop of 32
+constant iterations over bytes and halfwords and then leaves it scalar (3 times as slow). They also
+index by uint64: numba gives signed indices a wrap-around check, and LLVM then loads element by
+element.
 """
 
 import numpy as np
 
 from . import compiling as nb
 
-# Points of a leaf node side by side, all of a vector test; MAX_LEAF of schemas/voxel.py.
+# Lanes of a leaf node's points, all processed by one vector test; equals MAX_LEAF of
+# schemas/voxel.py.
 LANES = 32
-# Written instead of a leaf node's sort axis: its points are no deltas.
+# Replaces a leaf node's sort axis: its points are stored without deltas.
 NO_AXIS = 3
 
 
 @nb.njit(nogil=True, cache=True)
 def delta_along(points, first, count, axis):
-    """Points (p, 3) uint16 with the sort axis of each run replaced by steps from the point before it.
+    """Return points (p, 3) uint16 with the sort axis of each run replaced by differences.
 
-    first, count, axis: (r,) int64, the runs (leaf nodes); along `axis` a run ascends. Returns a new array.
+    Each difference is to the point before it in the run.
+    first, count, axis: (r,) int64, the runs (leaf nodes); along `axis` a run ascends. Returns a new
+    array.
     """
     deltas = points.copy()
     for run in range(first.shape[0]):
@@ -31,7 +35,10 @@ def delta_along(points, first, count, axis):
 
 @nb.njit(nogil=True, cache=True)
 def join_planes(planes, words):
-    """Join byte planes (k w, n) uint8, low bytes first, to words (k, n) of w bytes, unsigned: HDF5's shuffle undone."""
+    """Join byte planes (k w, n) uint8, low bytes first, to words (k, n) of w bytes, unsigned.
+
+    This undoes HDF5's shuffle.
+    """
     width = np.uint64(planes.shape[0] // words.shape[0])
     for k in range(np.uint64(words.shape[0])):
         out, first = words[k], planes[k * width]
@@ -45,7 +52,10 @@ def join_planes(planes, words):
 
 @nb.njit(nogil=True, inline="always")
 def _join(low, high, begin, count, out):
-    """out[j] = low[begin + j] + 256 high[begin + j] for j below count; the last one repeated to the end of out."""
+    """Write out[j] = low[begin + j] + 256 high[begin + j] for j < count.
+
+    The last value is repeated up to the end of out.
+    """
     for j in range(count):
         out[j] = np.uint16(low[begin + j]) | (np.uint16(high[begin + j]) << np.uint16(8))
     for j in range(count, np.uint64(out.shape[0])):
@@ -54,9 +64,10 @@ def _join(low, high, begin, count, out):
 
 @nb.njit(nogil=True, inline="always")
 def _undo_delta(count, out):
-    """Running sums of out[:count], the last one repeated to the end of out. Returns the last, which is the greatest.
+    """Replace out[:count] by its running sums, and repeat the last one up to the end of out.
 
-    Beyond 2^16 what is written wraps and what is returned does not.
+    Returns the last sum, which is the greatest. Beyond 2^16 the written values wrap and the
+    returned one does not.
     """
     total = np.uint32(0)
     for j in range(count):
@@ -69,7 +80,7 @@ def _undo_delta(count, out):
 
 @nb.njit(nogil=True, inline="always")
 def _greatest(values):
-    """The greatest of values (m,) uint16."""
+    """Return the greatest of values (m,) uint16."""
     most = np.uint16(0)
     for j in range(np.uint64(values.shape[0])):
         most = max(most, values[j])
@@ -78,15 +89,20 @@ def _greatest(values):
 
 @nb.njit(nogil=True, cache=True)
 def leaf_lanes(planes, links, nodes, cells, voxel_steps, lanes, bounds):
-    """Read the points of every leaf node, undo their deltas, and check that they lie in their cell and voxel.
+    """Read every leaf node's points, undo their deltas, and check that they lie in cell and voxel.
 
-    planes: (6 or more, p) uint8: low and high bytes of x, y, z.  links: (first, is_leaf, cell) of schemas/voxel.py.
-    nodes: (count, axis, block_low) (n,), (n,), (3, n); axis NO_AXIS: no deltas.  cells: (low (3, c), log2_size (c,)).
-    Writes lanes (b, 3, LANES) uint16: x[], y[], z[] of each leaf node's points from its block_low, in the order of
-    the rows, the last one repeated to the end. Returns whether all lie inside; stops at the first that does not.
-    Writes bounds (2, 3) int64: the least low corner of a leaf node's box and the greatest coordinate of a point
-    [voxel steps]. The low corner of a box is the least coordinate of its points in a record that follows FORMAT.md.
-    Assumes that the tree has been checked: runs inside the planes, at most LANES points, axis 0 to 3, b leaf nodes.
+    planes: (6 or more, p) uint8: low and high bytes of x, y, z.
+    links: (first, is_leaf, cell) of schemas/voxel.py.
+    nodes: (count, axis, block_low) (n,), (n,), (3, n); axis NO_AXIS: no deltas.
+    cells: (low (3, c), log2_size (c,)).
+    Writes lanes (b, 3, LANES) uint16: x[], y[], z[] of each leaf node's points from its block_low,
+    in the order of the rows, with the last one repeated to the end.
+    Returns True if all points lie inside; stops at the first that does not.
+    Writes bounds (2, 3) int64: the least low corner of a leaf node's box and the greatest
+    coordinate of a point [voxel steps]. In a record that follows FORMAT.md, the low corner of a box
+    is the least coordinate of its points.
+    Assumes that the tree has been checked: runs inside the planes, at most LANES points, axis 0 to
+    3, b leaf nodes.
     """
     first, is_leaf, cell_of = links
     count, axis, block_low = nodes
@@ -114,7 +130,10 @@ def leaf_lanes(planes, links, nodes, cells, voxel_steps, lanes, bounds):
 
 @nb.njit(nogil=True, cache=True)
 def leaf_column(planes, links, count, lanes):
-    """A column of two bytes a point as `leaf_lanes` lays it out: lanes (b, LANES) uint16 from planes (2, p) uint8."""
+    """Write a column of two bytes per point to lanes (b, LANES) uint16, laid out like `leaf_lanes`.
+
+    planes: (2, p) uint8.
+    """
     first, is_leaf, _ = links
     block = np.uint64(0)
     for i in range(np.uint64(first.shape[0])):
@@ -125,9 +144,10 @@ def leaf_column(planes, links, count, lanes):
 
 @nb.njit(nogil=True, cache=True)
 def leaf_bytes(plane, links, count, lanes):
-    """A column of one byte a point as `leaf_lanes` lays it out: lanes (b, LANES) uint8 from plane (p,) uint8.
+    """Write a column of one byte per point to lanes (b, LANES) uint8, laid out as in `leaf_lanes`.
 
-    Returns the greatest byte, and a uint32 with bit b set where a byte is b, modulo 32.
+    plane: (p,) uint8.
+    Returns the greatest byte, and a uint32 with bit b set if some byte equals b modulo 32.
     """
     first, is_leaf, _ = links
     block = np.uint64(0)
@@ -150,7 +170,7 @@ def leaf_bytes(plane, links, count, lanes):
 
 @nb.njit(nogil=True, cache=True)
 def lanes_to_points(lanes, links, count, points):
-    """Write the points (p, 3) uint16 of lanes (b, 3, LANES), each leaf node's where its run is."""
+    """Write the points (p, 3) uint16 from lanes (b, 3, LANES), each leaf node's at its run."""
     first, is_leaf, _ = links
     block = np.uint64(0)
     for i in range(np.uint64(first.shape[0])):

@@ -1,6 +1,8 @@
-"""A heap: more points of one lattice position than are held at once, one cell, whose points differ in columns alone.
+"""Construction of the cell of a heap: more points at one lattice position than fit in memory.
 
-Its columns are a multiset in canonical order: the runs, each in that order, merged a few rows of each at a time.
+The points of a heap form one cell and differ only in their columns. The columns are a multiset in
+canonical order. They are merged from the runs, each of which has that order, a few rows of each run
+at a time.
 """
 
 from collections.abc import Iterator, Sequence
@@ -15,19 +17,20 @@ from .config import BuildConfig
 from .kernels.pack import heap_counts, most_nodes
 from .partition import ranks
 
-# Behind all keys, which have 48 bits.
+# Greater than every key; keys have 48 bits.
 _END = np.uint64(0xFFFFFFFFFFFFFFFF)
 
 
 def heap_place(code: int) -> NDArray[np.int32]:
-    """Where all points of the Morton code `code` are, (1, 3) [voxel steps]."""
+    """Return the position (1, 3) of all points with the Morton code `code` [voxel steps]."""
     return morton_decode(np.array([code], np.uint64)).astype(np.int32)
 
 
 def heap_trees(code: int, points: int, config: BuildConfig) -> CellTrees:
-    """The cell as `build_trees` makes it of so many points of one Morton code, which need not be there for it.
+    """Make the cell that `build_trees` makes of `points` points with one Morton code.
 
-    Without `xyz` and `rank`. Held are its nodes.
+    The points themselves are not needed, and the result lacks `xyz` and `rank`. Memory holds only
+    the nodes.
     """
     one = build_trees(
         np.repeat(heap_place(code), 3, axis=0), np.zeros(1, np.int64), np.zeros(1, np.uint8), config
@@ -36,7 +39,7 @@ def heap_trees(code: int, points: int, config: BuildConfig) -> CellTrees:
     count, held = np.empty(most, np.uint8), np.empty(most, np.int64)
     total = heap_counts(points, config.leaf, config.degree, count, held)
     nodes = Nodes._make(np.repeat(column[:1], total, axis=0) for column in one.nodes)
-    nodes.normal[held[:total] < 3] = 0  # as `stored_direction` has it
+    nodes.normal[held[:total] < 3] = 0  # as in `stored_direction`
     spreads = one.spreads.copy()
     spreads[0, 0] = points
     return one._replace(
@@ -50,11 +53,13 @@ def heap_trees(code: int, points: int, config: BuildConfig) -> CellTrees:
 
 
 class _Run:
-    """A run on its way through the merge. rows: of it that are held, in order; none when it is at its end.
-    keys: (n,) uint64, see `_order_keys`."""
+    """Run during the merge.
+
+    rows: its rows in memory, in order; None at its end.  keys: (n,) uint64, see `_order_keys`.
+    """
 
     def __init__(self, windows: Iterator[NDArray]) -> None:
-        """Hold the first window."""
+        """Read the first window."""
         self._windows = windows
         self._read()
 
@@ -64,7 +69,10 @@ class _Run:
         self.keys = np.array([_END]) if rows is None else _order_keys(rows)
 
     def take(self, bound: np.uint64) -> tuple[NDArray, NDArray[np.uint64]]:
-        """The rows held whose key is at most `bound`, and their keys; then those behind them are held."""
+        """Return the rows in memory whose key is at most `bound`, and their keys.
+
+        Then advance past them.
+        """
         assert self.rows is not None
         cut = int(np.searchsorted(self.keys, bound, "right"))
         taken = self.rows[:cut], self.keys[:cut]
@@ -76,25 +84,29 @@ class _Run:
 
 
 def merge_runs(runs: Sequence[Iterator[NDArray]]) -> Iterator[NDArray]:
-    """Rows of the spool of one lattice position in canonical order, some at a time.
+    """Yield the spool rows of one lattice position in canonical order, some at a time.
 
-    runs: each the rows of one run in order, a window at a time. Held are two windows of each at most.
+    runs: the rows of each run in order, a window at a time. Memory holds at most two windows of
+    each.
     """
     held = [_Run(windows) for windows in runs]
     first, last = (np.array([run.keys[at] for run in held], np.uint64) for at in (0, -1))
-    # No row that is not held yet comes before the least of the last ones that are.
+    # No unread row precedes the least of the last rows in memory.
     while (bound := last.min()) != _END:
         parts = []
         for i in np.flatnonzero(first <= bound).tolist():
             parts.append(held[i].take(bound))
             first[i], last[i] = held[i].keys[0], held[i].keys[-1]
         keys = np.concatenate([keys for _, keys in parts])
-        # Rows of equal keys cannot be told apart.
+        # Rows with equal keys are identical.
         yield np.concatenate([rows for rows, _ in parts])[np.argsort(keys, kind="stable")]
 
 
 def _order_keys(rows: NDArray) -> NDArray[np.uint64]:
-    """Integers (n,) in the order that rows of one lattice position have (spool.py `canonical_columns`)."""
+    """Return integers (n,) that sort as the rows of one lattice position do.
+
+    The order is that of spool.py `canonical_columns`.
+    """
     keys = np.zeros(len(rows), np.uint64)
     if "scan_index" in (rows.dtype.names or ()):
         keys |= rows["scan_index"].astype(np.uint64) << np.uint64(32)

@@ -1,8 +1,11 @@
-"""The bounding sphere hierarchy (BSH) of one set of points, such as an avatar's; cells.py makes those of many cells.
+"""Bounding sphere hierarchy (BSH) of one set of points, such as an avatar's.
 
-[Fig12] section 5: an R-tree-like tree of spheres of degree m, all leaf nodes on one level, each point in
-one node. Two differences: nodes are packed from the top, not by insertion, and each sphere is cut by a
-slab, because scanned surfaces are flat and spheres are not (scripts/walkthrough compares both kinds of node).
+cells.py makes the hierarchies of many cells at once.
+
+[Fig12] section 5: an R-tree-like tree of spheres of degree m, with all leaf nodes on one level and
+each point in one node. There are two differences: nodes are packed from the top instead of
+inserted, and each sphere is cut by a slab, because scanned surfaces are flat and spheres are not
+(scripts/walkthrough compares both kinds of node).
 """
 
 from typing import NamedTuple
@@ -16,11 +19,12 @@ from .kernels.trees import build_tree, tree_rows, tree_space
 
 
 class Tree(NamedTuple):
-    """Which items stand below which node; nodes level by level from the root, t of them.
+    """Tree topology: which items are below which of t nodes, listed level by level from the root.
 
-    order: (n,) int64, items in leaf-node order.  begin, end: (t,) int64, a node's run in that order.
-    count: (t,) uint8, children, or items of a leaf node.  levels: (height + 1,) int64, first node of each
-    level, then t.
+    order: (n,) int64, items in leaf-node order.  begin, end: (t,) int64, range of each node in that
+    order.
+    count: (t,) uint8, number of children, or of items for a leaf node.
+    levels: (height + 1,) int64, first node of each level, then t.
     """
 
     order: NDArray[np.int64]
@@ -31,7 +35,7 @@ class Tree(NamedTuple):
 
 
 class Bounds(NamedTuple):
-    """The bounds of t nodes, as in schemas/voxel.py `Nodes`, int64: center, radius [units], normal, slab."""
+    """Bounds of t nodes, int64; columns as in schemas/voxel.py `Nodes`. radius: in units."""
 
     center: NDArray[np.int64]
     radius: NDArray[np.int64]
@@ -40,10 +44,11 @@ class Bounds(NamedTuple):
 
 
 class Hierarchy(NamedTuple):
-    """A tree over points and its bounds.
+    """Tree over points, with its bounds.
 
-    points: (n, 3) int32 in leaf-node order.  axis: (t,) uint8 and block_low: (t, 3) int64, leaf nodes: the
-    axis their points are sorted along, the low corner of their box; else 0.
+    points: (n, 3) int32 in leaf-node order.
+    axis: (t,) uint8, axis along which the points of a leaf node are sorted; 0 for inner nodes.
+    block_low: (t, 3) int64, low corner of the box of a leaf node; 0 for inner nodes.
     """
 
     tree: Tree
@@ -58,8 +63,9 @@ def build_hierarchy(
 ) -> Hierarchy:
     """Build the BSH of points (n, 3) int32, n >= 1, coordinates 0 to 2^23 [steps].
 
-    The result is a function of the points and their order alone; give them in a canonical order, and it
-    is a function of the set. leaf: 1 to 32 points, degree: 2 to 16 children.  highest: greatest stored coordinate of a
+    The result is a function of the points and their order alone. If the points are in a canonical
+    order, it is a function of their set.
+    leaf: 1 to 32 points.  degree: 2 to 16 children.  highest: greatest stored coordinate of a
     centre. Every bound encloses its points exactly.
     """
     n = len(points)

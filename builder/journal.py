@@ -1,8 +1,9 @@
-"""What a build has done so far, on disk: notes by which the same command goes on after a kill.
+"""Journal of a build on disk: entries that allow the same command to resume after a kill.
 
-A note is a small JSON file that is written once, when all that it speaks of is on disk for good, and vouches for it.
-What no note vouches for is deleted by the next build, never read. So a note is never wrong, whenever the power goes;
-work of which it was not yet written is done again.
+An entry is a small JSON file, also called a note. It is written once, when everything it refers to
+is durable on disk, and certifies these files. The next build deletes files that no entry certifies
+without reading them. An entry is therefore never wrong, at whatever moment the power fails. Work
+without an entry is repeated.
 """
 
 import json
@@ -29,9 +30,9 @@ _TEMPORARY = re.compile(r".+\.([0-9a-f]{32}|[0-9a-f]{12}-\d+-\d+|directory)\.tmp
 
 @contextmanager
 def new_file(path: Path) -> Iterator[BinaryIO]:
-    """A file to be written, that has its name only when it is whole and on disk for good.
+    """Open a file for writing that gets its name only when it is complete and durable on disk.
 
-    Its temporary name is nobody else's: a unit that a cluster has given up may still run somewhere.
+    Its temporary name is unique, because a unit that a cluster has given up may still be running.
     """
     temporary = path.with_name(f"{path.name}.{uuid.uuid4().hex}{TEMPORARY_SUFFIX}")
     try:
@@ -47,42 +48,48 @@ def new_file(path: Path) -> Iterator[BinaryIO]:
 
 
 def is_temporary(path: Path) -> bool:
-    """Whether a name is that of a file that has none yet, given here or by schemas/new_file.py."""
+    """Return whether a name is a temporary name, made here or by schemas/new_file.py."""
     return _TEMPORARY.fullmatch(path.name) is not None
 
 
 def remove_temporaries(folder: Path) -> None:
-    """Remove every file below a folder that has no name yet."""
+    """Remove every temporary file below a folder."""
     for path in folder.rglob(f"*{TEMPORARY_SUFFIX}"):
         path.unlink(missing_ok=True)
 
 
 @dataclass(frozen=True, slots=True)
 class Journal:
-    """The notes of one build. folder: the hidden one it is made in. Picklable: whoever does the work notes it."""
+    """Journal of one build. folder: hidden folder of the build.
+
+    Picklable: the process that does the work writes the entry.
+    """
 
     folder: Path
 
     def note(self, name: str, what: Any) -> None:
-        """Write the note `name`, such as "survey/000003": anything that JSON holds, infinities among it."""
+        """Write the entry `name`, such as "survey/000003".
+
+        what: any JSON value, including infinities.
+        """
         path = self.path(name)
         path.parent.mkdir(exist_ok=True)
         with new_file(path) as file:
             file.write(json.dumps(what, sort_keys=True).encode())
 
     def recall(self, name: str) -> Any:
-        """What was noted, or None."""
+        """Return the contents of an entry, or None if there is none."""
         try:
             return json.loads(self.path(name).read_bytes())
-        except (FileNotFoundError, ValueError):  # none, or cut short by a disk that lied
+        except (FileNotFoundError, ValueError):  # no entry, or one truncated by a disk that lost writes
             return None
 
     def forget(self, name: str) -> None:
-        """Remove a note: what it vouched for is not there."""
+        """Remove an entry whose files are missing or damaged."""
         self.path(name).unlink(missing_ok=True)
 
     def forget_file(self, path: Path) -> None:
-        """Remove every note that vouches for a file, by its name."""
+        """Remove every entry that certifies a file of this name."""
         for note in self.folder.rglob("*.json"):
             name = note.relative_to(self.folder).with_suffix("").as_posix()
             what = self.recall(name)
@@ -92,16 +99,17 @@ class Journal:
                 self.forget(name)
 
     def path(self, name: str) -> Path:
-        """The file of a note."""
+        """Return the file of an entry."""
         return self.folder / f"{name}.json"
 
 
 @dataclass(frozen=True, slots=True)
 class Work(Generic[Unit, Result]):
-    """Units of one kind, and how their results are noted. All functions are picklable.
+    """Units of one kind, and the form of their results in the journal. All functions are picklable.
 
-    run: does a unit; what it wrote is on disk for good when it returns.  dump, load: a result to what JSON holds, and
-    back.  holds: whether what a noted result speaks of is still there.
+    run: execute a unit; its output is durable on disk when it returns.
+    dump, load: convert a result to a JSON value, and back.
+    holds: return whether the files that a journalled result refers to still exist.
     """
 
     run: Callable[[Unit], Result]
@@ -112,7 +120,7 @@ class Work(Generic[Unit, Result]):
 
 @dataclass(frozen=True, slots=True)
 class _Noting(Generic[Unit, Result]):
-    """Does a unit in any process, and notes its result there."""
+    """Function that executes a unit in any process and journals its result there."""
 
     journal: Journal
     run: Callable[[Unit], Result]
@@ -121,7 +129,7 @@ class _Noting(Generic[Unit, Result]):
     def __call__(self, named: tuple[str, Unit]) -> Result:
         name, unit = named
         result = self.run(unit)
-        check()  # what was made while a signal came is not believed
+        check()  # results made while a signal arrived are not trusted
         self.journal.note(name, self.dump(result))
         return result
 
@@ -134,7 +142,7 @@ def resumed(
     progress: Progress,
     size: Callable[[Unit], int],
 ) -> list[Result]:
-    """The result of each unit (name of its note, unit), in order: as noted, or done now."""
+    """Return the result of each unit (entry name, unit), in order, journalled or computed now."""
     results: dict[str, Result] = {}
     for name, unit in units:
         noted = journal.recall(name)

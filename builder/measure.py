@@ -1,8 +1,8 @@
-"""How fast this machine builds, measured in seconds: rates for an estimate, by those that came with the package.
+"""Measurement of this machine's build rates, in seconds, relative to the packaged rates.
 
-A cloud of a room's surfaces is made, without casting rays, and built by one worker; how long each stage takes there,
-over what the rates say of it, is how much slower this machine is. Reading is measured for each format whose library is
-here.
+A synthetic cloud of a room's surfaces is generated, without ray casting, and built by one worker.
+The time of each stage divided by the time that the packaged rates predict is the slowdown of this
+machine. Reading is measured for each format whose library is installed.
 """
 
 import tempfile
@@ -25,7 +25,7 @@ READ_POINTS = 300_000
 
 
 def room(points: int, seed: int = 2012) -> NDArray[np.float64]:
-    """Points (n, 3) [m] on the floor, the ceiling and the walls of a hall of 30 x 20 x 8 m, with 2 mm of noise."""
+    """Generate points (n, 3) [m] on the surfaces of a hall of 30 x 20 x 8 m, with 2 mm of noise."""
     rng = np.random.default_rng(seed)
     size = np.array([30.0, 20.0, 8.0])
     at = rng.random((points, 3)) * size
@@ -33,12 +33,12 @@ def room(points: int, seed: int = 2012) -> NDArray[np.float64]:
     axis = rng.choice(3, points, p=walls / walls.sum())
     which = np.arange(points), axis
     at[which] = size[axis] * rng.integers(0, 2, points) + rng.normal(0, 0.002, points)
-    # In strips, as a scanner's columns come.
+    # Order the points in strips, as a scanner delivers columns.
     return at[np.argsort(np.floor(at[:, 0] * 20), kind="stable")]
 
 
 def _write_las(path: Path, xyz: NDArray[np.float64]) -> None:
-    """A LAS 1.2 file of points (n, 3), point format 0, 0.1 mm."""
+    """Write a LAS 1.2 file of points (n, 3), point format 0, scale 0.1 mm."""
     at = np.rint(xyz * 1e4).astype("<i4")
     bounds = np.stack([at.max(axis=0), at.min(axis=0)], axis=1).ravel() * 1e-4
     header = b"".join(
@@ -55,7 +55,7 @@ def _write_las(path: Path, xyz: NDArray[np.float64]) -> None:
 
 
 def _writers() -> dict[str, tuple[str, Callable[[Path, NDArray[np.float64]], None]]]:
-    """Format -> suffix, and what writes it."""
+    """Return the file suffix and the writer function of each format."""
 
     def made(path: Path, xyz: NDArray[np.float64]) -> None:
         from .made.scanner import Place, Scan
@@ -82,7 +82,7 @@ def _writers() -> dict[str, tuple[str, Callable[[Path, NDArray[np.float64]], Non
 
 
 def read_rates(folder: Path) -> dict[str, float]:
-    """Seconds a point that reading each format takes, of those whose library is installed."""
+    """Return the seconds per point of reading each format whose library is installed."""
     xyz = np.round(room(READ_POINTS), 4)
     found: dict[str, float] = {}
     for name, (suffix, write) in _writers().items():
@@ -98,7 +98,10 @@ def read_rates(folder: Path) -> dict[str, float]:
 
 
 def _read_seconds(path: Path) -> float:
-    """Processor time of reading a file that the system has in its cache: other work does not disturb it."""
+    """Return the processor time of reading a file in the page cache.
+
+    Other load does not affect it.
+    """
     begin = time.process_time()
     for scan in open_scans(path):
         for _ in scan.blocks():
@@ -107,7 +110,7 @@ def _read_seconds(path: Path) -> float:
 
 
 def measured(rates: Rates, progress: Progress | None = None) -> Rates:
-    """The rates of this machine: those given, each stage as much slower or faster as a small build here is."""
+    """Return the rates of this machine: those given, scaled by a small build, stage by stage."""
     progress = progress or Silent()
     config = BuildConfig(jobs=1)
     progress.start("measure", 3, "builds")
@@ -115,7 +118,7 @@ def measured(rates: Rates, progress: Progress | None = None) -> Rates:
         folder = Path(scratch)
         scan = folder / "room.las"
         _write_las(scan, room(20_000))
-        build_archive([scan], folder / "warm", config)  # the kernels are loaded, or compiled
+        build_archive([scan], folder / "warm", config)  # loads or compiles the kernels
         progress.advance(1)
         _write_las(scan, room(POINTS))
         summary = build_archive([scan], folder / "archive", config)
@@ -132,5 +135,5 @@ def measured(rates: Rates, progress: Progress | None = None) -> Rates:
     stages = {
         name: Stage(*(value * factors.get(name, whole) for value in stage)) for name, stage in known.items()
     }
-    said = f"a made cloud of {POINTS:,} points built here; what it does not tell as in: {rates.rests_on}"
+    said = f"a synthetic cloud of {POINTS:,} points built here; the rest as in: {rates.rests_on}"
     return replace(rates, stages=stages, read=read, rests_on=said)

@@ -1,4 +1,4 @@
-"""How `--memory` is shared: all processes of a build together, what they hold of the data and what they are made of."""
+"""Division of `--memory` among all processes of a build: their data and their baseline."""
 
 import math
 import os
@@ -11,53 +11,58 @@ from ..schemas.codec import point_dtype
 from ..schemas.errors import SolidcloudError
 from .config import BuildConfig
 
-# What a process takes before it holds a point, sum of PSS: Python, numpy, numba's compiled code, HDF5, a reader
-# (measured with two workers on LAS: the builder itself 75 MB, each worker 85 to 110).
+# Baseline of a process before it holds a point, as PSS: Python, numpy, numba's compiled code, HDF5
+# and a reader (measured with two workers on LAS: the builder itself 75 MB, each worker 85 to 110).
 BUILDER_BYTES = 90 << 20
 WORKER_BYTES = 110 << 20
-# A build of one job is one process.
+# Baseline of a build with one job, which is a single process.
 ALONE_BYTES = 150 << 20
-# What a worker cannot do without: a part of a dense voxel (dense.py) and what is around it.
+# Minimum that a worker needs: a part of a dense voxel (dense.py) and its surroundings.
 LEAST_SHARE = 96 << 20
-# What a build may take over `--memory` rather than be refused: 64 MB is less than Python with numba.
+# A build may exceed `--memory` by this much rather than be refused: 64 MB is less than Python with
+# numba.
 OVER_BYTES = 200 << 20
-# What radius, preview and verify hold of a record: its frame, at most as long as its rows, and the rows' planes; and of
-# each of its nodes, of which there are 1.2 to 1.4 times as many as leaf nodes would be if all were full.
+# Memory of radius, preview and verify for a record: its frame, at most as long as its rows, the
+# byte planes of the rows, and this much per node. There are 1.2 to 1.4 times as many nodes as leaf
+# nodes if all were full.
 RECORD_BYTES_A_NODE = 72
 NODES_A_FULL_LEAF = 1.5
-# Of all other things they hold.
+# Memory of everything else they hold.
 RECORD_BYTES = 16 << 20
 
-# Beside its share of --memory a worker of the local cluster has what Python, numba, HDF5, the readers and dask itself
-# take, and some air: dask kills what holds more than this part of both, it does not ask.
+# In addition to its share of --memory, a worker of the local cluster has memory for Python, numba,
+# HDF5, the readers and dask itself, and some slack: dask kills a worker that exceeds this fraction
+# of the sum without warning.
 CLUSTER_WORKER_AIR_BYTES = 384 << 20
 CLUSTER_WORKER_KILLED = 0.95
-# What such a worker is made of as dask counts it, shared libraries whole (measured: 205 MB when it has read records).
+# Baseline of such a worker as dask measures it, shared libraries included (measured: 205 MB after
+# reading records).
 CLUSTER_WORKER_BYTES = 240 << 20
 
-# How the advice for a voxel that is too large goes on where a build is refused: what it has done is kept.
+# End of the advice for a voxel that is too large when a build is refused: the finished work is
+# kept.
 OTHERWISE = " to go on from what is done, or a smaller --voxel and --fresh"
 
 
 def jobs_that_fit(jobs: int, config: BuildConfig) -> int:
-    """Processes that the memory bound allows, of so many that are wanted; at least one."""
+    """Return how many of the wanted processes the memory bound allows, at least one."""
     room = config.memory_bytes + OVER_BYTES - BUILDER_BYTES
     return max(1, min(jobs, room // (WORKER_BYTES + LEAST_SHARE)))
 
 
 def memory_share(jobs: int, config: BuildConfig) -> int:
-    """Bytes of data that each of `jobs` processes may hold."""
+    """Return the bytes of data that each of `jobs` processes may hold."""
     base = ALONE_BYTES if jobs == 1 else BUILDER_BYTES + jobs * WORKER_BYTES
     return max(LEAST_SHARE, (config.memory_bytes - base) // jobs)
 
 
 def cluster_worker_limit(jobs: int, memory_bytes: int) -> int:
-    """Bytes at which dask calls each of `jobs` workers that it started here full."""
+    """Return the dask memory limit [bytes] of each of `jobs` workers started here."""
     return memory_bytes // jobs + CLUSTER_WORKER_AIR_BYTES
 
 
 def record_bytes_a_point(config: BuildConfig) -> int:
-    """Bytes a point that is held of a record while it is read back."""
+    """Return the bytes per point that a record takes while it is read back."""
     row = point_dtype(
         scan_index="scan" in config.keep,
         intensity="intensity" in config.keep,
@@ -70,10 +75,11 @@ def record_bytes_a_point(config: BuildConfig) -> int:
 def readers_that_fit(
     counts: NDArray[np.int64], jobs: int, config: BuildConfig, otherwise: str = OTHERWISE
 ) -> int:
-    """How many of `jobs` processes may each hold the record of a voxel at a time, whichever of `counts` (v,) points.
+    """Return how many of `jobs` processes may each hold the record of any voxel at the same time.
 
-    `jobs` for workers of a scheduler that is elsewhere: their memory is not known here. Raises SolidcloudError where
-    not even one may hold the largest; otherwise: what its advice ends with, after the memory to be given.
+    counts: (v,) points of the voxels.  otherwise: end of the advice, after the memory to give. The
+    result is `jobs` for an external scheduler, because the memory of its workers is not known here.
+    Raise SolidcloudError if not even one process may hold the largest record.
     """
     if config.scheduler or not len(counts):
         return jobs
@@ -93,9 +99,10 @@ def readers_that_fit(
 
 
 def bytes_beside_records(counts: NDArray[np.int64], readers: int, jobs: int, config: BuildConfig) -> int:
-    """What each of `readers` processes, as `readers_that_fit` says, may hold beside the record of a voxel [bytes].
+    """Return the bytes that each of `readers` processes may hold beside the record of a voxel.
 
-    No more than its share of `--memory`, which alone is what workers elsewhere go by.
+    readers: result of `readers_that_fit`. The result is at most the process's share of `--memory`.
+    For external workers it is that share.
     """
     share = memory_share(jobs, config)
     if config.scheduler or not len(counts):
@@ -106,17 +113,20 @@ def bytes_beside_records(counts: NDArray[np.int64], readers: int, jobs: int, con
 
 
 def _base(jobs: int, config: BuildConfig) -> int:
-    """Bytes that `jobs` processes are made of."""
+    """Return the baseline memory [bytes] of `jobs` processes."""
     return ALONE_BYTES if jobs == 1 and not config.cluster else BUILDER_BYTES + jobs * WORKER_BYTES
 
 
 def _room(jobs: int, config: BuildConfig) -> int:
-    """Bytes that all of `jobs` processes may hold together of records that are read back."""
+    """Return the bytes that `jobs` processes together may hold of records being read back."""
     return max(config.memory_bytes + OVER_BYTES - _base(jobs, config), LEAST_SHARE)
 
 
 def _room_of_one(jobs: int, config: BuildConfig) -> int:
-    """Bytes that one of `jobs` processes may hold of them: all, but dask kills a worker for what it holds itself."""
+    """Return the bytes that one of `jobs` processes may hold of such records.
+
+    One process may hold all of them, but dask kills a worker for what it holds itself.
+    """
     if not config.cluster:
         return _room(jobs, config)
     limit = cluster_worker_limit(jobs, config.memory_bytes)
@@ -124,9 +134,10 @@ def _room_of_one(jobs: int, config: BuildConfig) -> int:
 
 
 def _memory_for(needed: int, jobs: int, config: BuildConfig) -> int:
-    """The `--memory` [bytes, whole MB] with which one of `jobs` processes may hold so many bytes, more than it may now.
+    """Return the `--memory` with which one of `jobs` processes may hold `needed` bytes.
 
-    With more memory there are more processes, up to those that are wanted, and each takes of it.
+    The result is in bytes, a whole number of MB. `needed` exceeds what a process may hold now. With
+    more memory there are more processes, up to the wanted number, and each takes some of it.
     """
     if config.cluster:
         limit = (needed + CLUSTER_WORKER_BYTES + 1) / CLUSTER_WORKER_KILLED
@@ -141,5 +152,5 @@ def _memory_for(needed: int, jobs: int, config: BuildConfig) -> int:
 
 
 def _whole_mb(size: int) -> int:
-    """So many bytes, rounded up to whole MB."""
+    """Round a number of bytes up to whole MB."""
     return -(-size >> 20) << 20

@@ -1,4 +1,4 @@
-"""Normals of all points of a voxel, as codes; the definition is in schemas/kernels/normals.py."""
+"""Codes of the normals of all points of a voxel; schemas/kernels/normals.py has the definition."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,9 +9,10 @@ from .kernels.octree import voxel_codes
 
 
 def voxel_normals(local: NDArray[np.int32], square: int) -> NDArray[np.uint16]:
-    """The codes (n,) of the normals at all points (n, 3) of a voxel [voxel steps], in any order, n >= 1.
+    """Return the codes (n,) of the normals at all points (n, 3) of a voxel [voxel steps], n >= 1.
 
-    square: of the reach [steps^2], which `normal_reach` found to fit. Points in one place count each.
+    The points may be in any order. square: squared radius of the neighbourhood [steps^2], as
+    `normal_reach` limits it. Points at the same position each count.
     """
     _, first, back, times = np.unique(
         voxel_codes(local), return_index=True, return_inverse=True, return_counts=True

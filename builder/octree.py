@@ -1,4 +1,4 @@
-"""One voxel's points -> its octree, a BSH in every leaf cell, a BSH over the cells: a `VoxelData`."""
+"""Octree of one voxel, with a BSH in every leaf cell and a BSH over the cells: a `VoxelData`."""
 
 from typing import NamedTuple
 
@@ -14,10 +14,12 @@ from .top import pack_top
 
 
 class VoxelPoints(NamedTuple):
-    """The points of one voxel, in any order.
+    """Points of one voxel, in any order.
 
-    local: (n, 3) int32 [voxel steps].  scan_index: (n,) uint16 or None.  intensity: (n,) float32 or None.
-    radius_class: (n,) uint8 or None, normal: (n,) uint16 or None: the same for equal points.
+    local: (n, 3) int32 [voxel steps].  scan_index: (n,) uint16 or None.  intensity: (n,) float32 or
+    None.
+    radius_class: (n,) uint8 or None.  normal: (n,) uint16 or None. These two are the same for equal
+    points.
     """
 
     local: NDArray[np.int32]
@@ -28,9 +30,10 @@ class VoxelPoints(NamedTuple):
 
 
 def canonical(points: VoxelPoints) -> tuple[VoxelPoints, NDArray[np.uint64]]:
-    """Sort into Morton order, duplicates by their columns, so that any input order gives the same bytes.
+    """Sort points into Morton order, duplicates by their columns, which makes the order unique.
 
-    Returns the points and their codes. What is in this order already stays where it is.
+    Every input order thus gives the same bytes. Return the points and their codes. Points already
+    in this order are not copied.
     """
     codes = voxel_codes(points.local)
     if is_ascending(codes):
@@ -41,7 +44,7 @@ def canonical(points: VoxelPoints) -> tuple[VoxelPoints, NDArray[np.uint64]]:
 
 
 def _with_ties_sorted(points: VoxelPoints, codes: NDArray[np.uint64]) -> VoxelPoints:
-    """Points in Morton order, those of equal codes sorted by their columns."""
+    """Sort points of equal codes by their columns. The points are in Morton order."""
     columns = [c for c in (points.intensity, points.scan_index) if c is not None]
     if not columns:
         return points
@@ -54,7 +57,7 @@ def _with_ties_sorted(points: VoxelPoints, codes: NDArray[np.uint64]) -> VoxelPo
 
 
 def gather_voxel(parts: list[NDArray]) -> VoxelPoints:
-    """The points of rows of the spool, several sorted arrays of them, in Morton order."""
+    """Merge several sorted arrays of spool rows into points in Morton order."""
     rows = np.concatenate(parts)
     names = rows.dtype.names or ()
     points = VoxelPoints(
@@ -69,15 +72,16 @@ def gather_voxel(parts: list[NDArray]) -> VoxelPoints:
 
 
 def _taken(points: VoxelPoints, order: NDArray[np.integer]) -> VoxelPoints:
-    """The points in another order."""
+    """Return the points in another order."""
     return VoxelPoints._make(None if column is None else column[order] for column in points)
 
 
 def build_voxel(key: int, points: VoxelPoints, voxel_steps: int, config: BuildConfig) -> VoxelData:
     """Build the octree and hierarchies of a voxel of n >= 1 points ([Fig12] sections 4 and 5).
 
-    The result depends on the set of points, `voxel_steps` and `config` alone. Hierarchies bound the points'
-    centres; radii are added when a question is asked, so that a scene may choose among radius models.
+    The result depends only on the set of points, `voxel_steps` and `config`. Hierarchies bound the
+    points' centres; the radii are added at query time, so that a scene may choose among radius
+    models.
     """
     points, codes = canonical(points)
     root_log2 = int(voxel_steps - 1).bit_length()

@@ -1,9 +1,10 @@
-"""Bytes a point of the archive that scans would make: some compact blocks of points, packed by the code that builds.
+"""Estimate of the archive's bytes per point.
 
-How well points compress depends on how close they are to each other, of all scans together. So the sample is not thin:
-whole cubes of the octree are taken, around points that are spread evenly over the scans, with all points in them.
-Scans are read whole where there is time for it, else in pieces around those points; what the pieces lack is made up
-for by how bytes a point fall when points are left out.
+The code that builds archives packs some compact blocks of points. How well points compress depends
+on how close they are to each other, across all scans. The sample is therefore not thinned: it
+consists of whole cubes of the octree around points spread evenly over the scans, with all points in
+them. Scans are read whole if there is time, otherwise in pieces around those points. The missing
+density of the pieces is extrapolated from how the bytes per point change when points are left out.
 """
 
 from collections.abc import Iterator, Sequence
@@ -23,28 +24,31 @@ from .partition import usable
 from .plan import Rates
 from .sources import Block, Scan
 
-# Blocks that are packed, and points of one: packing takes about 1 us a point.
+# Number of blocks to pack, and points per block: packing takes about 1 us per point.
 BLOCKS, BLOCK_POINTS = 48, 12_000
-# Scans of fewer points than this together are packed whole, a voxel at a time.
+# Scans with fewer points than this in total are packed whole, a voxel at a time.
 ALL_POINTS = 400_000
-# A cube is gathered with room for so many times the points, as scans are denser here and there.
+# A cube is gathered with room for this multiple of its points, because the density of scans varies.
 ROOM = 4
-# Reading may take so long [s], and so much a point where that is more; finding the cubes takes so much a point.
+# Time limit of reading [s], limit per point if that is more, and cost of finding the cubes per
+# point [s].
 READ_SECONDS, READ_SECONDS_A_POINT, FIND_SECONDS = 2.0, 2e-8, 1e-8
-# Points read to find one that a block is taken around; some may be no returns.
+# Points read to find the centre of a block; some of them may be invalid returns.
 PROBE_POINTS = 256
-# Scans are read whole where there is time for so much of them.
+# Scans are read whole if there is time for this share of them.
 MOST_SHARE = 0.8
-# Of a record; as hard to compress as any other.
+# Key and archive id of the sample's records; as hard to compress as any other.
 _KEY, _ID = 0x1B3A75C2D49E6F08, bytes.fromhex("8f1e6a03b7c95d2470eb42d81fa6395c")
-# Points that are held until cubes that hold too many are halved.
+# Most points held before cubes with too many points are halved.
 MOST_HELD = 6_000_000
 
 
 class Packed(NamedTuple):
-    """What packing a sample tells. bytes_a_point: of records, with the columns scan and intensity where they are kept.
+    """Result of packing a sample.
 
-    points: packed.  share: of all points that were read.  voxels: that hold points; None where not all were read.
+    bytes_a_point: bytes per point of the records, including the columns scan and intensity if they
+    are kept.  points: number packed.  share: fraction of all points that was read.
+    voxels: number that hold points; None if not all points were read.
     """
 
     bytes_a_point: float
@@ -54,16 +58,16 @@ class Packed(NamedTuple):
 
 
 class BrokenScanError(ScanError):
-    """A scan that cannot be read. scan: which."""
+    """Error for a scan that cannot be read. scan: that scan."""
 
     def __init__(self, scan: Scan, cause: ScanError) -> None:
-        """Say what the cause says."""
+        """Take over the message of the cause."""
         super().__init__(str(cause))
         self.scan = scan
 
 
 class _Gathered(NamedTuple):
-    """Points of the chosen cubes: slot (n,), local (n, 3) [steps], scan (n,) and intensity (n,) of each."""
+    """Points of the chosen cubes: slot (n,), local (n, 3) [steps], scan (n,) and intensity (n,)."""
 
     slot: NDArray[np.int64]
     local: NDArray[np.int32]
@@ -71,7 +75,7 @@ class _Gathered(NamedTuple):
     intensity: NDArray[np.float32]
 
     def rows(self, which: NDArray) -> "_Gathered":
-        """Return some of the points."""
+        """Return the selected points."""
         return _Gathered(*(column[which] for column in self))
 
 
@@ -83,12 +87,12 @@ _NOTHING = _Gathered(
 class _Cubes:
     """Cubes of the octree, each around a point.
 
-    around: (c, 3) int64, the point in its voxel [steps].  chosen: (c, 5), see `take_cubes`.  weight: (c,), how many of
-    the points that were drawn lie in it.
+    around: (c, 3) int64, the point in its voxel [steps].  chosen: (c, 5), see `take_cubes`.
+    weight: (c,), number of drawn points in the cube.
     """
 
     def __init__(self, drawn: NDArray[np.float64], lattice: Lattice, shift: int) -> None:
-        """Choose the cubes of 2^shift steps that points (n, 3) [m] lie in."""
+        """Choose the cubes of 2^shift steps that contain the points (n, 3) [m]."""
         steps = lattice.to_lattice(drawn)
         voxels = steps // lattice.voxel_steps
         at = steps - voxels * lattice.voxel_steps
@@ -99,14 +103,17 @@ class _Cubes:
         self.chosen, self.around = np.ascontiguousarray(found, np.int64), at[first]
 
     def shrink(self, slot: int, found: _Gathered, mine: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Halve a cube around its point; return which of its points, `mine` of those found, are still in it."""
+        """Halve a cube around its point.
+
+        Return a mask of the points `mine` that are still in it.
+        """
         shift = self.chosen[slot, 4] - 1
         cube = self.around[slot] >> shift
         self.chosen[slot, 1:4], self.chosen[slot, 4] = cube, shift
         return mine & (found.local >> shift == cube).all(axis=1)
 
     def cropped(self, found: _Gathered, most: int) -> _Gathered:
-        """Return the points found, with cubes halved until none holds more than so many."""
+        """Return the points found, with cubes halved until none holds more than `most`."""
         keep = np.ones(len(found.slot), bool)
         for slot in np.flatnonzero(np.bincount(found.slot, minlength=1) > most).tolist():
             mine = found.slot == slot
@@ -118,21 +125,24 @@ class _Cubes:
 
 
 class _Reader:
-    """Reads scans, counts voxels, and gathers the points of cubes."""
+    """Reader of scans that counts voxels and gathers the points of cubes."""
 
     def __init__(self, scans: Sequence[Scan], lattice: Lattice) -> None:
-        """Nothing read so far."""
+        """Start with empty counts."""
         self.scans, self.lattice = scans, lattice
         self.read = 0
         self.table, self._known = np.full(1 << 12, FREE), np.zeros(1, np.int64)
 
     @property
     def voxels(self) -> int:
-        """Return how many voxels hold points that were read."""
+        """Return the number of voxels that hold points that were read."""
         return int(self._known[0])
 
     def gather(self, pieces: Sequence[tuple[int, int, int | None]], cubes: _Cubes | None) -> _Gathered:
-        """Read pieces (scan, start, stop) and return the points in cubes; those that hold too many are halved."""
+        """Read pieces (scan, start, stop) and return the points in cubes.
+
+        Halve cubes with too many.
+        """
         parts, held = [_NOTHING], 0
         chosen = np.empty((0, 5), np.int64) if cubes is None else cubes.chosen
         for number, start, stop in pieces:
@@ -172,9 +182,9 @@ class _Reader:
 
 
 def _usable_blocks(scan: Scan, start: int, stop: int | None) -> Iterator[Block]:
-    """Yield the usable points of a piece of a scan; of one that cannot seek, from its beginning.
+    """Yield the usable points of a piece of a scan; if it cannot seek, from its beginning.
 
-    Raises BrokenScanError where the scan cannot be read.
+    Raise BrokenScanError if the scan cannot be read.
     """
     seen = 0
     try:
@@ -200,10 +210,12 @@ def packed_sample(
     config: BuildConfig,
     rates: Rates,
 ) -> Packed | None:
-    """Pack some blocks of scans. counts: points of each, about.  density: points a square metre, about.
+    """Pack some blocks of scans to measure their bytes per point.
 
-    some: (m, 3) [m], points from all over all scans; None where there are only those of their beginnings.
-    Returns None where no point was found. Raises BrokenScanError for a scan that cannot be read.
+    counts: approximate points of each scan.  density: approximate points per square metre.
+    some: (m, 3) [m], points from all parts of all scans; None if only points from their beginnings
+    are known. Return None if no point was found. Raise BrokenScanError for a scan that cannot be
+    read.
     """
     total = sum(counts)
     if total <= ALL_POINTS:
@@ -230,7 +242,7 @@ def packed_sample(
 
 
 def _share(scans: Sequence[Scan], counts: Sequence[int], rates: Rates) -> float:
-    """Return the share of all points that there is time to read; 1 where it is most."""
+    """Return the share of all points that there is time to read; 1 if that is most of them."""
     reading = sum(
         count * (rates.read.get(scan.format, rates.read["las"]) + FIND_SECONDS)
         for scan, count in zip(scans, counts, strict=True)
@@ -242,7 +254,7 @@ def _share(scans: Sequence[Scan], counts: Sequence[int], rates: Rates) -> float:
 def _bytes_a_point(
     found: _Gathered, weight: NDArray, lacking: float, lattice: Lattice, config: BuildConfig
 ) -> float:
-    """Return the mean of all blocks, for points so many times as dense as those found."""
+    """Return the mean over all blocks, for a density `lacking` times that of the points found."""
     each, less, weights = [], [], []
     rng = np.random.default_rng(0)
     for slot in np.unique(found.slot).tolist():
@@ -253,12 +265,12 @@ def _bytes_a_point(
             half = block.rows(rng.permutation(len(block.slot))[: -(-len(block.slot) // 2)])
             less.append(_packed_bytes(half, lattice, config) / len(half.slot) - each[-1])
     mean = float(np.average(each, weights=weights))
-    # Twice the points take so much less each, as half of them take more.
+    # Doubling the density saves as many bytes per point as halving it costs.
     return max(1.0, mean - float(np.average(less, weights=weights)) * np.log2(lacking)) if less else mean
 
 
 def _packed_bytes(block: _Gathered, lattice: Lattice, config: BuildConfig) -> int:
-    """Return the bytes of the record that points of one voxel make."""
+    """Return the bytes of the record of points of one voxel."""
     check()
     points = VoxelPoints(
         np.ascontiguousarray(block.local),
@@ -270,7 +282,7 @@ def _packed_bytes(block: _Gathered, lattice: Lattice, config: BuildConfig) -> in
 
 
 def _all_packed(scans: Sequence[Scan], lattice: Lattice, config: BuildConfig) -> Packed | None:
-    """Pack every voxel of scans that are few points."""
+    """Pack every voxel of scans with few points."""
     pieces = [(number, 0, None) for number in range(len(scans))]
     reader = _Reader(scans, lattice)
     reader.gather(pieces, None)
@@ -300,7 +312,10 @@ def _places(counts: Sequence[int]) -> list[tuple[int, int]]:
 
 
 def _drawn(scans: Sequence[Scan], places: Sequence[tuple[int, int]], share: float) -> NDArray[np.float64]:
-    """Return the points (n, 3) [m] at some places, or near them; of scans that cannot seek, in what will be read."""
+    """Return the points (n, 3) [m] at, or near, some places.
+
+    A scan that cannot seek is sampled in the part that will be read.
+    """
     found = [np.empty((0, 3))]
     for number, scan in enumerate(scans):
         wanted = [at for which, at in places if which == number]
@@ -323,7 +338,10 @@ def _drawn(scans: Sequence[Scan], places: Sequence[tuple[int, int]], share: floa
 def _pieces(
     scans: Sequence[Scan], counts: Sequence[int], places: Sequence[tuple[int, int]], share: float
 ) -> list[tuple[int, int, int | None]]:
-    """Return what to read (scan, start, stop): all of every scan, or pieces around places, of share of the points."""
+    """Return the pieces (scan, start, stop) to read: every scan whole, or pieces around places.
+
+    share: fraction of the points to read.
+    """
     pieces: list[tuple[int, int, int | None]] = []
     for number, (scan, count) in enumerate(zip(scans, counts, strict=True)):
         wanted = [at for which, at in places if which == number]

@@ -1,8 +1,8 @@
-"""The second pass over scans: points quantised, and spooled as runs sorted by voxel and Morton code, memory bounded.
+"""Second pass over scans: quantises the points and spools them as sorted runs in bounded memory.
 
-A worker holds a voxel number and a code a point; when its share of `memory_bytes` is full, or its range of a scan is
-at its end, it brings them into the order of their voxels, sorts each voxel's codes, which hold the coordinates, and
-writes them as one run (builder/spool.py).
+A worker holds a voxel number and a code per point. When its share of `memory_bytes` is full, or its
+range of a scan ends, it groups the points by voxel, sorts the codes of each voxel, which contain
+the coordinates, and writes them as one run (builder/spool.py).
 """
 
 from collections.abc import Iterator
@@ -22,24 +22,26 @@ from .kernels.spool import FREE, fill_local, order_ties, place_points, rehash, s
 from .sources import Block, Scan
 from .spool import RUN_SUFFIX, RunSums, new_run, run_sizes, write_directory
 
-# Bytes a point that a spooling worker holds: voxel number, code, and the code once more in order; with intensity its
-# bits, them once more, and, of a run in one voxel, order, sorted codes and ranks.
+# Bytes per point in a spooling worker: voxel number, code, and a copy of the code in sorted order.
+# With intensity also its bits, a copy of them, and, for a run in one voxel, order, sorted codes and
+# ranks.
 SPOOL_BYTES_A_POINT = 20
 SPOOL_BYTES_A_POINT_WITH_INTENSITY = 52
-# Beside that: a block as it is read, and one as it is written.
+# In addition: one block being read and one being written.
 SPOOL_BYTES = 48 << 20
-# A run is not smaller than this, whatever the memory: many small ones are slow to gather a voxel from.
+# Least points of a run, whatever the memory: gathering a voxel from many small runs is slow.
 LEAST_RUN_POINTS = 1 << 16
-# Rows made at a time when a run is written.
+# Rows generated at a time when a run is written.
 WRITTEN_ROWS = 1 << 18
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SpoolUnit:
-    """A range of a scan to be spooled, 0 to None of one that cannot seek.
+    """Range of a scan to spool; 0 to None for a scan that cannot seek.
 
-    number: of the scan.  count: points that the survey found usable.  dtype: of the rows; it may have a scan_index that
-    the archive does not keep, for the filters.  name: of the runs.  run_points: points a run.
+    number: of the scan.  count: usable points according to the survey.
+    dtype: of the rows; it may include a scan_index for the filters that the archive does not keep.
+    name: of the runs.  run_points: points per run.
     """
 
     scan: Scan
@@ -57,11 +59,12 @@ class SpoolUnit:
 
 @dataclass(frozen=True, slots=True)
 class Spooled:
-    """What the second pass made of a range. runs: name of each -> what was written of it.
+    """Result of the second pass for a range.
 
-    content: sums that identify the points, see `content_sum`.  places: the same of their lattice coordinates alone, see
-    `places_sum`.  moved_max: farthest along an axis that quantising
-    moved a point [m].
+    runs: name of each run -> sums of what was written.
+    content: sums that identify the points, see `content_sum`.
+    places: the same for their lattice coordinates alone, see `places_sum`.
+    moved_max: largest distance along an axis that quantising moved a point [m].
     """
 
     runs: dict[str, RunSums]
@@ -72,26 +75,29 @@ class Spooled:
 
 
 def dump_spooled(spooled: Spooled) -> dict[str, Any]:
-    """What was spooled, as its note says it."""
+    """Convert a result to its journal entry."""
     return asdict(spooled)
 
 
 def load_spooled(noted: dict[str, Any]) -> Spooled:
-    """What was spooled, from its note."""
+    """Convert a journal entry to a result."""
     return Spooled(**noted)
 
 
 class HasRuns(Protocol):
-    """What speaks of runs. runs: name of each -> what was written of it."""
+    """Object that names runs. runs: name of each run -> sums of what was written."""
 
     @property
     def runs(self) -> dict[str, RunSums]:
-        """The runs."""
+        """Return the runs."""
 
 
 @dataclass(frozen=True, slots=True)
 class RunsHold:
-    """Whether the runs that a note speaks of are in `folder`, as long as they were; their bytes: believed.py."""
+    """Check that the runs of a journal entry are in `folder` with the right sizes.
+
+    believed.py checks their bytes.
+    """
 
     folder: Path
 
@@ -100,24 +106,25 @@ class RunsHold:
 
 
 def run_points(memory_bytes: int, dtype: np.dtype) -> int:
-    """Points a run may hold where a worker may hold so many bytes."""
+    """Return the points that a run may have if a worker may hold `memory_bytes`."""
     with_intensity = "intensity" in (dtype.names or ())
     each = SPOOL_BYTES_A_POINT_WITH_INTENSITY if with_intensity else SPOOL_BYTES_A_POINT
     return max(LEAST_RUN_POINTS, (memory_bytes - SPOOL_BYTES) // each)
 
 
 def spool_range(unit: SpoolUnit) -> Spooled:
-    """Quantise a range of a scan and write it as runs. Raises ScanError when it changed since the survey.
+    """Quantise a range of a scan and write it as runs.
 
-    The runs are on disk for good when it returns. Pure and idempotent.
+    The runs are durable on disk when this returns. Pure and idempotent. Raise ScanError if the scan
+    changed since the survey.
     """
     held = _Held(unit, min(unit.count, unit.run_points))
     kept = 0
     runs: dict[str, RunSums] = {}
 
     def flush() -> None:
-        # Named by how the range is cut, too: a worker that was given up, of a session that cut it otherwise, may still
-        # write, and must not put its run in the place of one that is in use.
+        # The name includes how the range is cut: a worker given up by a session that cut it
+        # differently may still write, and must not replace a run that is in use.
         path = unit.folder / f"{unit.name}-{unit.run_points}-{len(runs):04d}{RUN_SUFFIX}"
         runs[path.name] = held.write(path)
 
@@ -133,7 +140,7 @@ def spool_range(unit: SpoolUnit) -> Spooled:
                 flush()
     if kept != unit.count:
         raise ScanError(
-            f"{unit.scan.path}: {kept} points, {unit.count} a moment ago: still being written? build again"
+            f"{unit.scan.path}: {kept} points, expected {unit.count} as surveyed: still being written? build again"
         )
     if held.size:
         flush()
@@ -142,7 +149,7 @@ def spool_range(unit: SpoolUnit) -> Spooled:
 
 
 def usable(block: Block) -> Block:
-    """The points of a block that are finite and within the coordinates admitted (NUMERICS.md N7, case 16)."""
+    """Return the points of a block that are finite and in range (NUMERICS.md N7, case 16)."""
     if usable_bounds(block.xyz, MAX_COORDINATE, np.empty(3), np.empty(3)) == len(block.xyz):
         return block
     good = (np.abs(block.xyz) <= MAX_COORDINATE).all(axis=1)  # false for NaN
@@ -150,7 +157,7 @@ def usable(block: Block) -> Block:
 
 
 class _Held:
-    """The points that wait to be written as a run: a voxel number and a code each, and the voxels' keys."""
+    """Points that wait to be written as a run: voxel numbers and codes, and the voxels' keys."""
 
     def __init__(self, unit: SpoolUnit, capacity: int) -> None:
         self.dtype = unit.dtype
@@ -159,7 +166,7 @@ class _Held:
         self.numbers, self.codes = np.empty(capacity, np.int32), np.empty(capacity, np.uint64)
         names = self.dtype.names or ()
         self.with_scan = "scan_index" in names
-        # A point is identified by what the archive keeps of it.
+        # The content sums identify a point by the columns that the archive keeps.
         self.scan_named = "scan" in unit.config.keep
         self.bits = np.empty(capacity, np.uint32) if "intensity" in names else None
         self.sums, self.moved_max = np.zeros(3, np.uint64), 0.0
@@ -167,23 +174,23 @@ class _Held:
 
     @property
     def full(self) -> bool:
-        """Whether a run is to be written before another point is taken."""
+        """Return whether a run must be written before another point is taken."""
         return self.size == self.capacity
 
     def _room(self, voxels: int) -> None:
-        """An empty table for up to so many voxels, a power of two."""
+        """Make an empty hash table for up to `voxels` voxels, a power of two."""
         self.table, self.number_of = np.full(2 * voxels, FREE), np.empty(2 * voxels, np.int32)
         self.keys, self.known = np.empty(voxels, np.uint64), np.zeros(1, np.int64)
 
     def _grow(self) -> None:
-        """Twice the room for voxels, with those there are in it."""
+        """Double the room for voxels and keep the existing ones."""
         keys, known = self.keys, self.known
         self._room(4 * len(keys))
         self.keys[: len(keys)], self.known = keys, known
         rehash(self.keys, int(known[0]), self.table, self.number_of)
 
     def take(self, block: Block, begin: int) -> int:
-        """Take points of a block from point `begin` on; returns how many."""
+        """Take points of a block from point `begin` on; return how many were taken."""
         end = min(len(block.xyz), begin + self.capacity - self.size)
         to = slice(self.size, self.size + end - begin)
         more = np.empty((self.scan_named + (self.bits is not None), end - begin), np.uint64)
@@ -206,7 +213,7 @@ class _Held:
             self.sums,
         )
         if lowest < -KEY_BIAS or highest >= KEY_BIAS:
-            voxel_keys(np.array([[lowest] * 3, [highest] * 3]))  # raises, and says it
+            voxel_keys(np.array([[lowest] * 3, [highest] * 3]))  # raises an error that explains the limit
         if not done:
             self._grow()
         self.size += done
@@ -214,7 +221,10 @@ class _Held:
         return done
 
     def write(self, path: Path) -> RunSums:
-        """Sort what is held and write it as the run `path`; then hold nothing. Returns what was written."""
+        """Sort the points, write them as the run `path` and forget them.
+
+        Return the sums of the run.
+        """
         size, voxels = self.size, int(self.known[0])
         numbers = self.numbers[:size]
         order = np.argsort(self.keys[:voxels])
@@ -241,7 +251,7 @@ class _Held:
         return [*file.sums, *directory]
 
     def _rows(self, codes: NDArray[np.uint64], bits: NDArray[np.uint32] | None) -> Iterator[NDArray]:
-        """The rows of sorted codes, WRITTEN_ROWS at a time, overwritten by the next."""
+        """Yield the rows of sorted codes, WRITTEN_ROWS at a time, each overwritten by the next."""
         rows = np.empty(min(len(codes), WRITTEN_ROWS), self.dtype)
         if self.with_scan:
             rows["scan_index"] = self.number
@@ -254,9 +264,10 @@ class _Held:
 
 
 def intensity_bits(block: Block, begin: int, end: int) -> NDArray[np.uint32]:
-    """The bits of the intensities of points [begin, end), 0 where the source has none.
+    """Return the bits of the intensities of points [begin, end), 0 if the source has none.
 
-    One pattern a value, or bytes would depend on the order of duplicates: no -0.0, one NaN.
+    Each value has one bit pattern (no -0.0, one NaN), or the bytes would depend on the order of
+    duplicates.
     """
     if block.intensity is None:
         return np.zeros(end - begin, np.uint32)
@@ -265,7 +276,10 @@ def intensity_bits(block: Block, begin: int, end: int) -> NDArray[np.uint32]:
 
 
 def sort_voxel(codes: NDArray[np.uint64], bits: NDArray[np.uint32] | None) -> None:
-    """Sort the codes (n,) of a voxel in place, and with them the bits of their intensities, which part equal ones."""
+    """Sort the codes (n,) of a voxel in place, and with them the bits of their intensities.
+
+    The intensities order equal codes.
+    """
     if bits is None:
         codes.sort()
         return
@@ -277,6 +291,9 @@ def sort_voxel(codes: NDArray[np.uint64], bits: NDArray[np.uint32] | None) -> No
 
 
 def ranks(bits: NDArray[np.uint32]) -> NDArray[np.uint32]:
-    """Integers in the order of the float32 values of these bits, a NaN last, as np.lexsort has them."""
+    """Return integers ordered like the float32 values of these bits.
+
+    NaN is last, as in np.lexsort.
+    """
     negative = (bits >> np.uint32(31)).astype(bool)
     return np.where(negative, ~bits, bits | np.uint32(1 << 31)).astype(np.uint32)

@@ -1,6 +1,6 @@
-"""The passes of a build that are noted: survey, spool, filters, shards. What a note vouches for is not done again.
+"""Journalled passes of a build: survey, spool, filters, shards. Certified work is not repeated.
 
-Each takes the place of the build, an executor and the options, and gives what the next ones need.
+Each pass takes the build folder, an executor and the options, and returns what the next one needs.
 """
 
 import base64
@@ -40,7 +40,7 @@ from .survey import (
 )
 from .workplace import Workplace
 
-# Bytes a point that building one voxel holds at its peak (measured with 10^7 points in one voxel: 128).
+# Bytes per point at the peak of building one voxel (measured with 10^7 points in one voxel: 128).
 VOXEL_BYTES_A_POINT = 160
 # The column of scan numbers is uint16 (schemas/FORMAT.md).
 MAX_SCANS = 1 << 16
@@ -54,8 +54,8 @@ def survey_scans(
     config: BuildConfig,
     stages: Stages,
 ) -> tuple[list[Survey], list[Survey]]:
-    """Read every scan once; returns the usable ones, in an order of their content, and the faulty ones."""
-    inputs = sorted(inputs, key=lambda item: str(item.path))  # the notes are named by this order
+    """Read every scan once; return the usable scans, ordered by content, and the faulty ones."""
+    inputs = sorted(inputs, key=lambda item: str(item.path))  # this order numbers the journal entries
     scans = [scan for item in inputs for scan in item.scans]
     files = [item.path for item in inputs if item.scans]
     units = [
@@ -82,29 +82,29 @@ def survey_scans(
 
 
 def _hash_or_survey(unit: Path | RangeUnit) -> Any:
-    """A unit of the survey: a file to be hashed, or a range to be read."""
+    """Run a unit of the survey: hash a file, or read a range."""
     return survey_range(unit) if isinstance(unit, RangeUnit) else hash_file(unit)
 
 
 def _dump_either(result: Any) -> Any:
-    """A result of the survey, as its note says it."""
+    """Convert a result of the survey to its journal entry."""
     return list(result) if isinstance(result, tuple) else dump_part(result)
 
 
 def _load_either(noted: Any) -> Any:
-    """A result of the survey from its note."""
+    """Convert a journal entry to a result of the survey."""
     return tuple(noted) if isinstance(noted, list) else load_part(noted)
 
 
 def _points_of(unit: Path | RangeUnit) -> int:
-    """Points that a unit of the survey reads."""
+    """Return the number of points that a unit of the survey reads."""
     return unit.points if isinstance(unit, RangeUnit) else 0
 
 
 def _check_surveys(
     good: list[Survey], faulty: list[Survey], inputs: Sequence[Input], config: BuildConfig
 ) -> None:
-    """Refuse scans that cannot be built as the options ask."""
+    """Refuse scans that cannot be built with these options."""
     if faulty and not config.skip_bad:
         more = "" if len(faulty) == 1 else "".join(f"\n  {s.fault}" for s in faulty[1:])
         raise ScanError(
@@ -126,7 +126,7 @@ def _check_surveys(
 
 
 def _content_order(survey: Survey) -> tuple[str, int, str]:
-    """Scans are numbered by their files' content, so that the order they are given in changes nothing."""
+    """Return the sort key of a scan. It depends on content, so the order of paths has no effect."""
     return survey.sha256, survey.scan.index if survey.scan else -1, str(survey.path)
 
 
@@ -139,7 +139,7 @@ def spool_scans(
     config: BuildConfig,
     stages: Stages,
 ) -> list[Spooled]:
-    """Second pass: quantised points, sorted into voxels, on disk."""
+    """Run the second pass: write quantised points to disk, sorted by voxel."""
     check_runs(place, stages)
     folder = place.folder / "spool"
     most = run_points(memory_share(executor.jobs, config), dtype)
@@ -167,29 +167,29 @@ def spool_scans(
     work = Work(spool_range, dump_spooled, load_spooled, RunsHold(folder))
     with stages.stage("spool", sum(s.count for s in surveys), "points"):
         spooled = resumed(place.journal, executor, work, units, stages.progress, lambda unit: unit.count)
-    # A range that had lost a run was spooled again, into fewer runs, perhaps, than it was in.
+    # A range that had lost a run was spooled again, possibly into fewer runs than before.
     _sweep_spool(folder, {name for found in spooled for name in found.runs})
     return spooled
 
 
 def _sweep_spool(folder: Path, vouched: set[str]) -> None:
-    """Delete the runs that no note vouches for: a spool is all runs in its folder."""
+    """Delete uncertified runs, because a spool consists of all runs in its folder."""
     stems = {Path(name).stem for name in vouched}
     for suffix in (RUN_SUFFIX, KEYS_SUFFIX):
         for path in folder.glob(f"*{suffix}"):
             if path.stem not in stems:
-                path.unlink(missing_ok=True)  # a worker that was given up may have had it removed itself
+                path.unlink(missing_ok=True)  # a worker that was given up may have removed it already
 
 
 def spool_rows(config: BuildConfig) -> np.dtype:
-    """A row of the spool: what the filters need besides what is kept, where there are any."""
+    """Return the dtype of a spool row, including the columns that only the filters need."""
     if not is_filtered(config):
         return spool_dtype(config)
     return filter_dtype(config)
 
 
 def check_filters(config: BuildConfig, lattice: Lattice) -> None:
-    """Raise BadRequestError for filters that cannot be done on this lattice."""
+    """Raise BadRequestError for filters that are impossible on this lattice."""
     if is_filtered(config):
         make_rules(config, lattice)
 
@@ -197,10 +197,13 @@ def check_filters(config: BuildConfig, lattice: Lattice) -> None:
 def filter_points(
     spool: Spool, place: Workplace, executor: Executor, config: BuildConfig, stages: Stages
 ) -> tuple[Spool, dict[str, dict[int, int]]]:
-    """The optional pass between: points are left out; also how many of each scan, by reason."""
+    """Run the optional filter pass.
+
+    Return the spool and the points left out of each scan, by reason.
+    """
     if not is_filtered(config):
         return spool, {}
-    from .filter import filtered_spool  # most builds have no use for its kernels, and do not load them
+    from .filter import filtered_spool  # most builds do not need its kernels, which this import loads
 
     total = filter_passes(config) * int(spool.counts.sum())
     with stages.stage("filter", total, "points"):
@@ -215,10 +218,10 @@ def build_shards(
     config: BuildConfig,
     stages: Stages,
 ) -> list[Shard]:
-    """Third pass: every voxel's octree and hierarchies, into shards; those with the most points first."""
+    """Run the third pass: build every voxel and write the shards. The largest are built first."""
     check_normals(spool.counts, config)
     folder = place.archive / SHARD_FOLDER
-    # Beside the voxel itself, or a part of it.
+    # Points of the surroundings that may be held beside the voxel itself, or a part of it.
     most_near = max(1 << 16, memory_share(executor.jobs, config) // (2 * VOXEL_BYTES_A_POINT))
     plans = plan_shards(spool.keys, spool.counts)
     units = [
@@ -240,7 +243,7 @@ def build_shards(
 
 
 def dump_shard(shard: Shard) -> dict[str, Any]:
-    """A shard as its note says it."""
+    """Convert a shard to its journal entry."""
     return {
         **shard._asdict(),
         "rows": base64.b85encode(shard.rows.tobytes()).decode(),
@@ -249,14 +252,17 @@ def dump_shard(shard: Shard) -> dict[str, Any]:
 
 
 def load_shard(noted: dict[str, Any]) -> Shard:
-    """A shard from its note."""
+    """Convert a journal entry to a shard."""
     rows = np.frombuffer(base64.b85decode(noted["rows"]), VOXEL_DTYPE)
     return Shard(**{**noted, "rows": rows, "radius_counts": np.array(noted["radius_counts"], np.int64)})
 
 
 @dataclass(frozen=True, slots=True)
 class ShardHolds:
-    """Whether the shard that a note speaks of is in `folder`, byte for byte: it is read once, as no pass will."""
+    """Check that the shard of a journal entry is in `folder`, byte for byte.
+
+    This reads the shard once; no pass does so otherwise.
+    """
 
     folder: Path
 

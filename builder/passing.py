@@ -1,4 +1,7 @@
-"""Errors of reading a scan that are none of the scan's: what is left out for one is left out for good."""
+"""Transient errors of reading a scan, which are no fault of the scan.
+
+A scan left out because of such an error would be left out of the archive for good.
+"""
 
 import errno
 from pathlib import Path
@@ -6,7 +9,7 @@ from pathlib import Path
 from ..schemas.errors import ScanError
 from ..schemas.interrupts import check
 
-# Errors of a disk, a network or a machine with too much to do.
+# Errors of a disk, a network or an overloaded machine.
 PASSING = frozenset(
     {errno.EIO, errno.EMFILE, errno.ENFILE, errno.ENODEV, errno.ENXIO, errno.ESTALE, errno.ETIMEDOUT,
      errno.ENOTCONN, errno.EHOSTDOWN, errno.EHOSTUNREACH, errno.EREMOTEIO}
@@ -14,9 +17,9 @@ PASSING = frozenset(
 
 
 def raise_passing(error: ScanError, path: Path) -> None:
-    """Raise where a file could not be read for a reason that is no fault of the scan: Interrupted, or the OSError.
+    """Raise Interrupted or the OSError if a file could not be read for a transient reason.
 
-    That there was no memory is told apart where it is found, in every pass (sources/scan.py `library_errors`).
+    Lack of memory is detected where it occurs, in every pass (sources/scan.py `library_errors`).
     """
     check()
     cause = error.__cause__

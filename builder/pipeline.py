@@ -1,7 +1,9 @@
-"""Scans -> archive: survey, spool, voxels, radius, verify, publish. builder/DESIGN.md says what each pass holds.
+"""Build of an archive from scans: survey, spool, voxels, radius, verify, publish.
 
-Everything is made in a hidden folder beside the target and renamed at the end: there is never half an archive under the
-name asked for. What is done stays there when a build is interrupted, and the same command goes on from it.
+builder/DESIGN.md lists what each pass holds. Everything is made in a hidden folder beside the
+target and renamed at the end; the target name therefore never refers to part of an archive.
+Finished work stays in the hidden folder when a build is interrupted, and the same command resumes
+from it.
 """
 
 import errno
@@ -56,25 +58,30 @@ from .workplace import (
     workplace,
 )
 
-# Bytes a point on disk at the end, at most (5 is the goal at 0.1 mm), to refuse a build that cannot finish.
+# Most bytes per point on disk at the end (the target is 5 at 0.1 mm). A build that cannot fit is
+# refused.
 ARCHIVE_BYTES_A_POINT = 6
-# Bytes a point that a dense voxel takes besides while it is built (dense.py); one a job is.
+# Additional bytes per point of a dense voxel while it is built (dense.py); each job builds at most
+# one.
 SCRATCH_BYTES_A_POINT = 21
-# A point of a file whose header says nothing of their number takes about so many bytes: text.
+# Approximate bytes per point of a file whose header does not declare their number: text.
 BYTES_A_POINT = 30
-# A record's points are numbered by int32 (schemas/voxel.py Links).
+# The points of a record are numbered by int32 (schemas/voxel.py Links).
 MOST_POINTS = (1 << 31) - 1
-# Points that quantising made one may be found out late, others are at once.
+# Points that become one by quantising are detected late, identical points at once.
 ONE_POINT = "a single distinct point has no closest point: give --radius"
 
 
 class BuildSummary(NamedTuple):
-    """What was built. bytes: of index and shards.  preview_bytes: of the file for ParaView, 0 where it is gone.
+    """Result of a build.
 
-    stages: seconds of each.  skipped: reason -> points left out.
-    lattice_step, moved_max, radius, radius_error: [m], see schemas/index.py Header.  faults: scans left out.
-    already: nothing was built, for the archive was there, of the same scans with the same options.
-    warnings: sentences about scans that are in and look wrong.
+    bytes: of index and shards.  preview_bytes: of the preview, 0 if it was deleted.
+    stages: seconds of each stage.  skipped: reason -> points left out.
+    lattice_step, moved_max, radius, radius_error: [m], see schemas/index.py Header.
+    faults: of the scans left out.
+    already: nothing was built, because the archive existed already, with the same scans and
+    options.
+    warnings: sentences about scans that are in the archive and look wrong.
     """
 
     archive: Path
@@ -99,14 +106,19 @@ class BuildSummary(NamedTuple):
 def build_archive(
     paths: Sequence[Path], target: Path, config: BuildConfig, progress: Progress | None = None
 ) -> BuildSummary:
-    """Build an archive in the folder `target` from scan files and folders of them; go on where such a build ended.
+    """Build an archive in the folder `target` from scan files and folders.
 
-    The archive's bytes depend on the points, their files' content, the paths as given (in the index alone) and the
-    options in `config.identity()`; not on the order of paths, the number of jobs, the memory bound, or how often the
-    build was interrupted. An archive that is there already, of the same scans and options, is left as it is.
-    Raises ScanError naming every scan that cannot be used (with `skip_bad` they are left out and their region is
-    unknown) and BadRequestError for impossible options, and leaves nothing behind where the survey of a build that
-    began here tells; SolidcloudError where the disk or a process failed. What is done is kept then.
+    Resume an interrupted build.
+
+    The archive's bytes depend on the points, the contents of the files, the paths as given (in the
+    index alone) and the options in `config.identity()`. They do not depend on the order of paths,
+    the number of jobs, the memory bound, or how often the build was interrupted. An existing
+    archive of the same scans and options is left as it is.
+
+    Raise ScanError naming every unusable scan (`skip_bad` leaves these out and marks their region
+    as unknown), and BadRequestError for impossible options. If the survey of a build that this call
+    began detects the error, nothing is left behind. Raise SolidcloudError if the disk or a process
+    fails. The finished work is then kept.
     """
     begin = time.perf_counter()
     target = Path(target)
@@ -138,7 +150,7 @@ def _build(
     config: BuildConfig,
     stages: Stages,
 ) -> tuple[Header, list[Shard]]:
-    """All passes: what is in `place.archive` when this returns is an archive, and verified."""
+    """Run all passes; `place.archive` then contains a verified archive."""
     about = sum(_about(item) for item in inputs)
     with make_executor(config, jobs_that_fit(worker_count(config.jobs, about), config)) as executor:
         place.staffed = True
@@ -182,7 +194,7 @@ def _build(
 
 
 def _check_request(surveys: Sequence[Survey], lattice: Lattice, config: BuildConfig) -> None:
-    """Refuse, while nothing is lost by it, what is known from the survey to be impossible."""
+    """Refuse a request that the survey shows to be impossible, before any work would be lost."""
     check_filters(config, lattice)
     low, high = np.min([s.low for s in surveys], axis=0), np.max([s.high for s in surveys], axis=0)
     if config.radius is None and (low == high).all():
@@ -194,7 +206,7 @@ def _check_request(surveys: Sequence[Survey], lattice: Lattice, config: BuildCon
 
 
 def _check_voxels(spool: Spool, config: BuildConfig) -> None:
-    """Refuse a voxel of more points than a record can hold, before hours go into it."""
+    """Refuse a voxel with more points than a record can hold, before it costs hours."""
     most = int(spool.counts.max())
     if most > MOST_POINTS:
         raise SolidcloudError(
@@ -206,11 +218,11 @@ def _check_voxels(spool: Spool, config: BuildConfig) -> None:
 def _check_unchanged(
     inputs: Sequence[Input], what: Mapping[str, Any], place: Workplace, config: BuildConfig
 ) -> None:
-    """Raise ScanError where a file is not as it was before it was read, and start over: what was read of it first,
-    its hash above all, need not go with what was read last.
+    """Raise ScanError and start over if a file changed since before it was read.
 
-    Asked as soon as all is read, and once more before an archive has its name: what is written through a memory map,
-    or on another host, may be seen late.
+    What was read of it first, above all its hash, may not match what was read last. This is checked
+    as soon as everything is read, and again before the archive gets its name: writes through a
+    memory map, or on another host, may become visible late.
     """
     if changed := changed_inputs(inputs, config, what):
         place.start_over()
@@ -220,9 +232,10 @@ def _check_unchanged(
 
 
 def _read_back(folder: Path, points: int, spool: Spool, executor: Executor, stages: Stages) -> None:
-    """Read what was written, for a preview and to the last record. Raises CorruptError where it is something else.
+    """Read back everything that was written, to make the preview and to verify every record.
 
-    The points of the records must be those of the scans: what is on disk may change while it is in use.
+    The points of the records must be those of the scans, because data on disk may change while in
+    use. Raise CorruptError if anything differs.
     """
     fault = ""
     paths: tuple[Path, ...] = ()
@@ -237,7 +250,7 @@ def _read_back(folder: Path, points: int, spool: Spool, executor: Executor, stag
         if report.faults:
             fault = report.faults[0]
             paths = (*map(Path, report.damaged), *((spool.folder,) if report.others else ()))
-    except FormatError as error:  # the index: what it is made of cannot be told, so all of it is made anew
+    except FormatError as error:  # a damaged index does not tell its cause: everything is rebuilt
         fault, paths = str(error), (*sorted((folder / SHARD_FOLDER).iterdir()), spool.folder)
     if fault:
         raise CorruptError(
@@ -248,12 +261,15 @@ def _read_back(folder: Path, points: int, spool: Spool, executor: Executor, stag
 
 
 def open_inputs(paths: Sequence[Path], config: BuildConfig) -> list[Input]:
-    """The files that the paths stand for, files, folders or a list of scans, opened: their headers are read."""
+    """Open the files that the paths stand for: files, folders or scan lists.
+
+    This reads their headers.
+    """
     return scans_of(paths, config.spacing)
 
 
 def _about(item: Input) -> int:
-    """About how many points a file holds."""
+    """Estimate the number of points in a file."""
     declared = [scan.declared_count for scan in item.scans]
     if None not in declared:
         return sum(count or 0 for count in declared)
@@ -261,7 +277,7 @@ def _about(item: Input) -> int:
 
 
 def _is_whole(target: Path, inputs: Sequence[Input], config: BuildConfig, stages: Stages) -> bool:
-    """Whether the archive is there already."""
+    """Return whether the archive is already complete."""
     if not target.is_dir():
         return False
     total = sum(item.path.stat().st_size for item in inputs if item.scans)
@@ -279,7 +295,7 @@ def _summary(
     *,
     already: bool = False,
 ) -> BuildSummary:
-    """What is said of an archive that is there."""
+    """Make the summary of a complete archive."""
     sizes = {f.relative_to(target).as_posix(): f.stat().st_size for f in target.rglob("*") if f.is_file()}
     return BuildSummary(
         archive=target,
@@ -304,33 +320,39 @@ def _summary(
 
 @contextmanager
 def _machine_errors(target: Path) -> Iterator[None]:
-    """Name the disk or the memory, and what to do, where it has failed; what is done stays in the hidden folder."""
+    """Turn a disk or memory failure into an error that says what to do.
+
+    The finished work stays in the hidden folder.
+    """
     folder = building_folder(target)
     try:
         yield
     except MemoryError as error:
         raise SolidcloudError(
-            f"{target}: out of memory ({error or 'no more is said'}): give fewer --jobs or a smaller --memory, or stop "
-            f"other programs, then give the same command again: it goes on from what is done, in {folder}"
+            f"{target}: out of memory ({error or 'no details'}): give fewer --jobs or a smaller --memory, or stop "
+            f"other programs, then give the same command again: it resumes from the finished work in {folder}"
         ) from error
     except OSError as error:
-        # HDF5 puts the number into its text alone.
+        # HDF5 puts the errno into its message only.
         full = error.errno in (errno.ENOSPC, errno.EDQUOT) or f"errno = {errno.ENOSPC}" in str(error)
         found = os_error_words(OSError(errno.ENOSPC, "") if full else error)
         where = f" ({error.filename})" if error.filename else ""
         raise SolidcloudError(
-            f"{target.parent}{where}: {found}, then give the same command again: it goes on from what is done, in "
+            f"{target.parent}{where}: {found}, then give the same command again: it resumes from the finished work in "
             f"{folder}"
         ) from error
 
 
 def _run_bytes_a_point(config: BuildConfig) -> int:
-    """Bytes a point of all runs together: the scans', and those of each pass of the filters, which may leave it in."""
+    """Return the bytes per point of all runs. Every filter pass is assumed to keep all points."""
     return filter_passes(config) * filter_dtype(config).itemsize + spool_dtype(config).itemsize
 
 
 def _check_space(disk: Path, folder: Path, needed: int) -> None:
-    """Refuse a build whose files cannot all be on the disk, with what is there of them in `folder`."""
+    """Refuse a build whose files do not fit on the disk.
+
+    Files already in `folder` count as room.
+    """
     there = sum(f.stat().st_size for f in folder.rglob("*") if f.is_file())
     free = shutil.disk_usage(disk).free
     if needed > free + there:
@@ -347,14 +369,14 @@ def _measure_radius(
     config: BuildConfig,
     stages: Stages,
 ) -> Header:
-    """Fourth pass: the mean closest-point distance over what is stored; then the final index is written."""
+    """Run the fourth pass: measure the mean closest-point distance, then write the final index."""
     rows = np.concatenate([s.rows for s in shards])
     names = [(s.name, s.size) for s in shards]
     if config.radius is not None:
         header = replace(header, radius=config.radius)
         write_index(folder, header, rows, names)
         return header
-    write_index(folder, header, rows, names)  # for the workers to read by; nobody else sees this folder
+    write_index(folder, header, rows, names)  # for the workers; nothing else reads this folder
     with stages.stage("radius", header.points, "points"):
         found = archive_mean(folder, RADIUS_SAMPLE, executor, stages.progress)
     if found.sample == 0:

@@ -1,4 +1,4 @@
-"""Cuts voxels into work units that keep all jobs busy to the end, and runs them."""
+"""Division of voxels into work units that keep all jobs busy to the end, and their execution."""
 
 from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
@@ -9,16 +9,17 @@ from numpy.typing import NDArray
 from .executor import Executor, Result, Unit
 from .progress import Progress
 
-# Units a job: the last ones to end are small beside all.
+# Units per job: the last units to finish are small compared with the whole.
 _UNITS_A_JOB = 8
-# Fewer points than this are no work: a unit opens the archive anew.
+# Least points of a unit: fewer are not worth opening the archive again.
 _LEAST_POINTS = 1 << 20
 
 
 def portions(points: NDArray[np.int64], jobs: int) -> list[range]:
-    """Cut rows of so many points each into runs of about as many points, those with the most first.
+    """Cut rows, of `points` points each, into ranges of similar numbers of points, largest first.
 
-    A run is longer than planned by one row at most. Which rows are in one depends on `jobs`: results must not.
+    A range exceeds the planned size by at most one row. Which rows are in which range depends on
+    `jobs`; results must not.
     """
     if not len(points):
         return []
@@ -31,7 +32,7 @@ def portions(points: NDArray[np.int64], jobs: int) -> list[range]:
 
 
 def jobs_of(executor: Executor | None) -> int:
-    """How many units run at a time."""
+    """Return the number of units that run at a time."""
     return executor.jobs if executor else 1
 
 
@@ -42,7 +43,7 @@ def run_units(
     progress: Progress,
     size: Callable[[Unit], int],
 ) -> Iterator[Result]:
-    """`Executor.map`; in this process where there is none."""
+    """Yield the results of `Executor.map`; without an executor run the units in this process."""
     if executor:
         yield from executor.map(function, units, progress, size)
         return

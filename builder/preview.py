@@ -1,4 +1,4 @@
-"""A few of an archive's points as a file that ParaView opens: `preview.vtkhdf` in the archive's folder."""
+"""Preview of an archive: a few of its points as `preview.vtkhdf`, a file that ParaView opens."""
 
 import math
 from pathlib import Path
@@ -19,17 +19,17 @@ from .portions import jobs_of, portions, run_units
 from .progress import Progress, Silent
 from .record_points import hash_limit, read_columns, record_columns, stored_columns, taken
 
-# Points of a preview, at most: what a viewer turns without waiting, in 1.2 MB.
+# Most points of a preview: a viewer rotates them smoothly, and they take 1.2 MB.
 MOST_POINTS = 200_000
-# And no more than this part of an archive's points, or a small archive would be the smaller part of its folder; but
-# up to so few points, all.
+# The preview has at most this fraction (1 / _PART) of an archive's points, or it would outweigh the
+# records of a small archive. Archives of up to _FEW points are previewed whole.
 _PART, _FEW = 8, 20_000
-# Coordinates are rounded to this [m]: they compress to 6 bytes a point, and as they are to 19.
+# Coordinates are rounded to this [m]: they then compress to 6 bytes a point instead of 19.
 _ROUNDED = 2.0**-13
 
 
 class _Unit(NamedTuple):
-    """Voxels to choose points of."""
+    """Voxels to select points from."""
 
     folder: Path
     rows: range
@@ -38,23 +38,25 @@ class _Unit(NamedTuple):
 
 
 class _Chosen(NamedTuple):
-    """Points chosen. lattice: (n, 3) int64.  columns: (n,) by name."""
+    """Selected points. lattice: (n, 3) int64.  columns: (n,) by name."""
 
     lattice: NDArray[np.int64]
     columns: dict[str, NDArray]
 
 
 def write_preview(folder: Path, executor: Executor | None = None, progress: Progress | None = None) -> int:
-    """Write the preview of the archive in `folder`: some of its distinct points, rounded to 2^-13 m.
+    """Write the preview of the archive in `folder`: distinct points, rounded to 2^-13 m.
 
-    Which ones is decided by a hash of their lattice coordinates, so that one archive has one preview to the byte. Says
-    whose it is: archive_id and generation. It is given its name when it is whole. Returns how many points. Progress
-    advances by the points of the archive. Raises CorruptError, OSError.
+    A hash of the lattice coordinates selects the points. An archive therefore has one preview, byte
+    for byte. The preview contains the archive_id and the generation. It gets its name when it is
+    complete. Return the number of points. Progress advances by the points of the archive. Raise
+    CorruptError, OSError.
     """
     with Archive(folder) as archive:
         header, points = archive.header, archive.voxels["rows"][:, 2].astype(np.int64)
     most = min(MOST_POINTS, max(_FEW, header.points // _PART))
-    # Five standard deviations fewer than may be, so that what is chosen by chance is hardly ever too much.
+    # Five standard deviations below the limit: the random number of selected points hardly ever
+    # exceeds it.
     share = 1.0 if header.points <= most else (most - 5 * math.sqrt(most)) / header.points
     units = [
         _Unit(folder, rows, share, int(points[rows.start : rows.stop].sum()))
@@ -63,7 +65,7 @@ def write_preview(folder: Path, executor: Executor | None = None, progress: Prog
     results = run_units(executor, _choose, units, progress or Silent(), lambda unit: unit.points)
     found = sorted(zip(units, results, strict=True), key=lambda pair: pair[0].rows.start)
     chosen = _trimmed(_joined([part for _, part in found]), most)
-    if not len(chosen.lattice):  # many points in few places, none of them chosen
+    if not len(chosen.lattice):  # many points at few positions, none of them selected
         chosen = _choose(_Unit(folder, range(1), 1.0, 1))
         chosen = _Chosen(chosen.lattice[:1], {name: column[:1] for name, column in chosen.columns.items()})
     path = folder / PREVIEW_NAME
@@ -78,7 +80,10 @@ def write_preview(folder: Path, executor: Executor | None = None, progress: Prog
 
 
 def preview_faults(folder: Path, header: Header) -> tuple[list[str], list[str]]:
-    """Faults of the preview in `folder`, and notes on it; none where there is no preview."""
+    """Return the faults of the preview in `folder`, and notes on it.
+
+    Both are empty without a preview.
+    """
     path = folder / PREVIEW_NAME
     if not path.exists():
         return [], []
@@ -89,7 +94,7 @@ def preview_faults(folder: Path, header: Header) -> tuple[list[str], list[str]]:
         check()
         return [str(error)], []
     except KeyError:
-        return [f"{path}: does not say whose preview it is: delete it"], []
+        return [f"{path}: does not name its archive and generation: delete it"], []
     if stamp != (header.archive_id, header.generation):
         return [], [f"{path}: of another archive or generation"]
     low, high = header.lattice.to_world(np.stack([header.low, header.high]))
@@ -100,7 +105,7 @@ def preview_faults(folder: Path, header: Header) -> tuple[list[str], list[str]]:
 
 
 def _choose(unit: _Unit) -> _Chosen:
-    """The points chosen in a run of voxels, of each place one; in any process."""
+    """Select points of a range of voxels, one per position; runs in any process."""
     parts = []
     with Archive(unit.folder) as archive:
         columns = stored_columns(archive.header)
@@ -112,19 +117,19 @@ def _choose(unit: _Unit) -> _Chosen:
                 xyz, rows = np.concatenate([t.xyz for t in some]), np.concatenate([t.rows for t in some])
                 first = first_of_each(xyz)
                 parts.append(_Chosen(xyz[first] + base[row], read_columns(record, columns, rows[first])))
-            del record  # before the next is read
+            del record  # free it before the next one is read
         nothing = {name: np.empty(0, kind) for name, kind in columns.items()}
     return _joined([_Chosen(np.empty((0, 3), np.int64), nothing), *parts])
 
 
 def _joined(parts: list[_Chosen]) -> _Chosen:
-    """One behind the other."""
+    """Concatenate selections."""
     columns = {name: np.concatenate([p.columns[name] for p in parts]) for name in parts[0].columns}
     return _Chosen(np.concatenate([p.lattice for p in parts]), columns)
 
 
 def _trimmed(chosen: _Chosen, most: int) -> _Chosen:
-    """No more than `most`: those with the least hashes."""
+    """Keep at most `most` points: those with the smallest hashes."""
     if len(chosen.lattice) <= most:
         return chosen
     kept = np.sort(np.argsort(point_hashes(chosen.lattice), kind="stable")[:most])

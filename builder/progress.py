@@ -1,32 +1,35 @@
-"""What long work says of itself, and a silent listener. How it looks on a terminal is the command line's."""
+"""Progress interface of long work, and a silent implementation. The command line draws it."""
 
 from typing import Protocol
 
 
 class Progress(Protocol):
-    """Told of stages one after another; `advance` adds up to the stage's total, or about."""
+    """Listener to the stages of long work.
+
+    The stages follow one another; the amounts of `advance` add up to about the total of the stage.
+    """
 
     def start(self, stage: str, total: int, unit: str) -> None:
-        """A stage begins; total in `unit`, such as "points"."""
+        """Begin a stage; total is in `unit`, such as "points"."""
         ...
 
     def advance(self, amount: int) -> None:
-        """So much more of the stage is done."""
+        """Report that `amount` more of the stage is done."""
         ...
 
     def finish(self) -> None:
-        """The stage is over."""
+        """End the stage."""
         ...
 
 
 class Silent:
-    """Says nothing."""
+    """Progress listener that ignores every report."""
 
     def start(self, stage: str, total: int, unit: str) -> None:
-        """Say nothing."""
+        """Ignore the beginning of a stage."""
 
     def advance(self, amount: int) -> None:
-        """Say nothing."""
+        """Ignore the amount."""
 
     def finish(self) -> None:
-        """Say nothing."""
+        """Ignore the end of a stage."""

@@ -1,7 +1,8 @@
-"""Radius models: how large a sphere a point stands for.
+"""Radius models: the radius of the sphere that represents a point.
 
-`mean` is the paper's ([Fig12] section 7): half the mean closest-point distance, one figure a dataset. It is
-taken over distinct points, across voxel borders; duplicates would make it zero (NUMERICS.md case 28).
+`mean` is the model of the paper ([Fig12] section 7): half the mean closest-point distance, one
+number per dataset. It is computed over distinct points, across voxel borders; duplicates would make
+it zero (NUMERICS.md case 28).
 """
 
 import math
@@ -15,20 +16,24 @@ from ..schemas.voxel import Links, VoxelData
 from .hierarchy import Hierarchy, build_hierarchy
 from .kernels.nearest import FAR, SearchTree, closest_other
 
-# Distances are added as integers of 2^-32 m: any order gives the same sum (NUMERICS.md N8), and 10^6 of
-# 2 km fit 63 bits.
+# Distances are added as integers of 2^-32 m: every order gives the same sum (NUMERICS.md N8), and
+# 10^6 distances of 2 km fit 63 bits.
 SUM_UNITS = 2.0**32
 
-# An avatar's own lattice is never finer than this: 1 micrometre.
+# The lattice of an avatar is never finer than this: 1 micrometre.
 FINEST_STEP = 2.0**-20
-# Most lattice steps an avatar extends, so that the bounds' arithmetic stays inside int64 and int32.
+# Most lattice steps that an avatar spans, which keeps the arithmetic of the bounds inside int64 and
+# int32.
 MOST_STEPS = 1 << 22
-# Distances summed at a time, between which other threads may take the interpreter.
+# Distances summed at a time; in between, other threads may take the interpreter lock.
 _PIECE = 4096
 
 
 class MeanDistance(NamedTuple):
-    """The mean closest-point distance [m], its standard error [m] (0 when all were asked), how many were asked."""
+    """Mean closest-point distance [m].
+
+    error: its standard error [m], 0 if all points were used.  sample: number of points used.
+    """
 
     mean: float
     error: float
@@ -36,7 +41,7 @@ class MeanDistance(NamedTuple):
 
 
 class LocalHierarchy(NamedTuple):
-    """A hierarchy of free points on a lattice of their own: world = low + steps * step (low (3,) [m])."""
+    """Hierarchy of free points on their own lattice: world = low + steps * step (low (3,) [m])."""
 
     hierarchy: Hierarchy
     low: NDArray[np.float64]
@@ -44,7 +49,7 @@ class LocalHierarchy(NamedTuple):
 
 
 def mean_of_squares(total: int, squares: int, sample: int, everything: bool) -> MeanDistance:
-    """The mean from integer sums: distances in SUM_UNITS, and their squares."""
+    """Return the mean from integer sums: distances in SUM_UNITS, and their squares."""
     if sample == 0:
         return MeanDistance(0.0, 0.0, 0)
     mean = total / sample
@@ -54,10 +59,11 @@ def mean_of_squares(total: int, squares: int, sample: int, everything: bool) -> 
 
 
 def build_local(points: NDArray[np.float64], *, leaf: int, degree: int) -> LocalHierarchy:
-    """The hierarchy of points (n, 3) [m], n >= 1, on a lattice of 2^-20 m, or of the power of two their
-    extent needs.
+    """Build the hierarchy of points (n, 3) [m], n >= 1, on their own lattice.
 
-    Points are rounded down to it, so each lies less than two steps (sqrt(3) of them) from its lattice point.
+    Its step is 2^-20 m, or the power of two that the extent of the points requires. Points are
+    rounded down to the lattice. Each therefore lies less than two steps (sqrt(3) of them) from its
+    lattice point.
     """
     low = points.min(axis=0)
     extent = float((points.max(axis=0) - low).max())
@@ -67,7 +73,10 @@ def build_local(points: NDArray[np.float64], *, leaf: int, degree: int) -> Local
 
 
 def mean_closest_distance(local: LocalHierarchy) -> float:
-    """The mean closest-point distance [m] over distinct points, on their lattice; 0 for fewer than two."""
+    """Return the mean closest-point distance [m] of distinct lattice points.
+
+    0 for fewer than two.
+    """
     tree = local.hierarchy.tree
     t = len(tree.begin)
     is_leaf = np.arange(t) >= tree.levels[-2]
@@ -87,7 +96,8 @@ def mean_closest_distance(local: LocalHierarchy) -> float:
     best = np.full(len(queries), FAR)
     closest_other(search, queries, best)
     distances = np.sqrt(best.astype(np.float64)) * local.step
-    # Piece by piece: math.fsum of the array would keep the interpreter for all of it, 50 ms for 10^6 points.
+    # Sum in pieces: math.fsum of the whole array would hold the interpreter lock for 50 ms with
+    # 10^6 points.
     pieces = (distances[i : i + _PIECE].tolist() for i in range(0, len(distances), _PIECE))
     return math.fsum(chain.from_iterable(pieces)) / len(queries)
 
@@ -95,7 +105,8 @@ def mean_closest_distance(local: LocalHierarchy) -> float:
 def _distinct(points: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the distinct rows of points (n, 3), n >= 1, in lexicographic order.
 
-    As `np.unique(points, axis=0)`, which sorts without letting go of the interpreter: 0.9 s for 10^6 points.
+    `np.unique(points, axis=0)` does the same, but holds the interpreter lock while sorting: 0.9 s
+    for 10^6 points.
     """
     ordered = points[np.lexsort(points.T[::-1])]
     first = np.ones(len(ordered), bool)
@@ -104,9 +115,10 @@ def _distinct(points: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def voxel_points(voxel: VoxelData, links: Links) -> NDArray[np.int64]:
-    """The points of a voxel (p, 3) int64 [voxel steps], in stored order."""
+    """Return the points of a voxel (p, 3) int64 [voxel steps], in stored order."""
     leaf = np.flatnonzero(links.is_leaf)
-    # By first point: a cell that is one leaf node stands among the roots, before the others' leaf nodes.
+    # Sort by first point: a cell that is a single leaf node stands among the roots, before the leaf
+    # nodes of other cells.
     leaf = leaf[np.argsort(links.first[leaf], kind="stable")]
     low = voxel.cells.low[links.cell[leaf]].astype(np.int64) + voxel.nodes.block_low[leaf]
     return np.repeat(low, voxel.nodes.count[leaf].astype(np.int64), axis=0) + voxel.points.astype(np.int64)

@@ -206,7 +206,7 @@ def test_the_places_of_what_is_spooled_are_summed_whatever_is_kept(
 @pytest.mark.parametrize("count", [299, 301])
 def test_a_scan_that_changes_between_the_passes_is_refused(count: int, tmp_path: Path) -> None:
     lattice = make_lattice((0, 0, 0), 0.001, 8.0)
-    with pytest.raises(ScanError, match=f"300 points, {count} a moment ago"):
+    with pytest.raises(ScanError, match=f"300 points, expected {count} as surveyed"):
         spooled(tmp_path / "s", Listed(make_scan("noise", 2, 300), 300), count, lattice, 100)
 
 

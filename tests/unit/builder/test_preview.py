@@ -114,7 +114,7 @@ def test_verify_reads_the_preview(built: Path) -> None:
     assert report.faults == () and report.notes == (f"{path}: of another archive or generation",)
     with h5py.File(path, "r+") as file:
         del file.attrs["archive_id"]
-    assert "whose preview" in verify_archive(built).faults[0]
+    assert "does not name its archive" in verify_archive(built).faults[0]
     path.write_bytes(whole)
     with h5py.File(path, "r+") as file:
         points = file["VTKHDF/Points"]

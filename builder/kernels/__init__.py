@@ -1,1 +1,1 @@
-"""Compiled functions of the builder."""
+"""Compiled kernels of the builder: numba functions over flat arrays."""

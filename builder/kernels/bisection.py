@@ -1,13 +1,14 @@
-"""Bisection of sorted values, inside kernels: np.searchsorted of a part, without a slice of it."""
+"""Bisection of a range of sorted values inside kernels: np.searchsorted without creating a slice."""
 
 from ...schemas.kernels import compiling as nb
 
 
 @nb.njit(nogil=True, cache=True)
 def first_at_least(values, lo, hi, value):
-    """First index in [lo, hi) of values (n,), sorted there, that is not below value; hi when there is none.
+    """Return the first index in [lo, hi) of values (n,) that is not below value; hi when there is none.
 
-    value: of the values' type, as an unsigned and a signed integer would be compared as float64.
+    values must be sorted in [lo, hi). value must have the type of values: numba compares an
+    unsigned with a signed integer as float64.
     """
     while lo < hi:
         mid = (lo + hi) // 2

@@ -1,11 +1,12 @@
 """Bounding spheres cut by a slab, exact over integers.
 
-The centre comes from Badoiu and Clarkson's iteration ("Smaller core-sets for balls", 2003): step toward
-the farthest point by 1 / (i + 1); it never fails on collinear, coplanar or cospherical points, as solvers
-for the minimal ball do (NUMERICS.md case 8). The slab's direction is the eigenvector of least variance.
-Both are only guesses of where a good bound lies, so float32 will do for the one, and sums over children for the other:
-the bound itself is measured afterwards from the *stored* integers, and rounded outward, so it encloses whatever the
-guess (NUMERICS.md N3).
+The centre comes from Badoiu and Clarkson's iteration ("Smaller core-sets for balls", 2003): step
+toward the farthest point by 1 / (i + 1). It never fails on collinear, coplanar or cospherical
+points, as solvers for the minimal ball do (NUMERICS.md case 8). The slab's direction is the
+eigenvector of least variance. Both are only estimates of a good bound. The centre can therefore be
+computed in float32, and the direction from sums over children. The bound itself is measured
+afterwards from the *stored* integers and rounded outward. It encloses the points whatever the
+estimate (NUMERICS.md N3).
 """
 
 import math
@@ -14,25 +15,27 @@ import numpy as np
 
 from ...schemas.kernels import compiling as nb
 
-# Ratio to the minimal ball: see tests/hard_cases/test_bounds.py, at most 1.25 on leaf blocks.
-# Large sets get fewer steps, because each step visits every point and an upper node is tested rarely.
+# Steps of the centre's iteration. Ratio of the radius to that of the minimal ball: see
+# tests/hard_cases/test_bounds.py, at most 1.25 on leaf blocks. Large sets get fewer steps, because
+# each step visits every point and queries test an upper node rarely.
 SMALL_SET = 256
 SMALL_STEPS = 32
 LARGE_STEPS = 8
-# Points whose distances are compared at once; their place among them fits the low bits of a distance.
+# Points whose distances are compared at once. The index of a point in its block fits into the low
+# bits of a distance.
 BLOCK = 256
 
-# The slab's direction is stored in three int8; finer directions gained nothing measurable.
+# The slab's direction is stored in three int8; a finer direction gave no measurable gain.
 NORMAL_LENGTH = 127.0
 
-# Numbers that say how points are spread: how many; their mean; the sums of products of what they are off it: xx, xy,
-# xz, yy, yz, zz.
+# Length of a spread, the statistics of a set of points: the number of points; their mean x, y, z;
+# the sums of products of deviations from the mean: xx, xy, xz, yy, yz, zz.
 SPREAD = 10
 
 
 @nb.njit(nogil=True, cache=True)
 def ceil_sqrt(value):
-    """The least integer whose square is at least value; value int64, 0 to 2^62."""
+    """Return the least integer whose square is at least value; value int64, 0 to 2^62."""
     root = np.int64(math.sqrt(float(value)))
     while root * root < value:
         root += 1
@@ -43,17 +46,23 @@ def ceil_sqrt(value):
 
 @nb.njit(nogil=True, cache=True)
 def bound_space(n):
-    """What `ball_center` works in, for up to n points: their coordinates (3, n) float32; distances, and their bits."""
+    """Allocate the work space of `ball_center` for up to n points.
+
+    Returns (coordinates (3, n) float32, distances (BLOCK,) float32, the same distances viewed as
+    int32).
+    """
     distances = np.empty(BLOCK, np.float32)
     return np.empty((3, n), np.float32), distances, distances.view(np.int32)
 
 
 @nb.njit(nogil=True, cache=True)
 def ball_center(space, lo, hi, steps, center):
-    """Move a guess of the centre (3,) float64 of the least ball around the points [lo, hi) of `space` by some steps.
+    """Improve an estimated centre (3,) float64 of the least ball around points of `space`.
 
-    The farthest is found among distances as their bits, which ascend as they do; a loop over floats that looks for the
-    greatest would stay scalar.
+    lo, hi: the range of points.
+    steps: number of iterations.
+    The farthest point is found among distances compared by their bits as integers, which order like
+    the floats. A loop that looks for the greatest float would stay scalar.
     """
     points, distances, bits = space
     place = np.int32(BLOCK - 1)
@@ -70,7 +79,7 @@ def ball_center(space, lo, hi, steps, center):
                 greatest = max(greatest, np.int32((bits[j] & ~place) | np.int32(j)))
             if np.int32(greatest & ~place) > best:
                 best, far = np.int32(greatest & ~place), begin + np.uint64(greatest & place)
-        # The box's centre is a good start already: the first steps of 1/2, 1/3 would only leave it.
+        # The box's centre is a good start: initial steps of 1/2 and 1/3 would only leave it.
         weight = 1.0 / (step + 4.0)
         for k in range(np.uint64(3)):
             center[k] += (float(points[k, far]) - center[k]) * weight
@@ -78,7 +87,10 @@ def ball_center(space, lo, hi, steps, center):
 
 @nb.njit(nogil=True, cache=True)
 def leaf_spread(own, lo, hi, spread):
-    """Write how the points [lo, hi) of a leaf node are spread: (SPREAD,) float64. Sums are exact until divided."""
+    """Write the spread (SPREAD,) float64 of the points [lo, hi) of a leaf node.
+
+    Sums are exact until they are divided.
+    """
     n = np.int64(hi - lo)
     x0, y0, z0 = own[0, lo], own[1, lo], own[2, lo]
     x = y = z = xx = xy = xz = yy = yz = zz = np.int64(0)
@@ -112,7 +124,7 @@ def leaf_spread(own, lo, hi, spread):
 
 @nb.njit(nogil=True, cache=True)
 def join_spread(spreads, first, count, spread):
-    """Write how all points of the rows first to first + count of spreads (n, SPREAD) are spread together: (SPREAD,)."""
+    """Write the joint spread (SPREAD,) of the rows first to first + count of spreads (n, SPREAD)."""
     n = 0.0
     x = y = z = 0.0
     for i in range(first, first + count):
@@ -139,10 +151,11 @@ def join_spread(spreads, first, count, spread):
 
 @nb.njit(nogil=True, cache=True)
 def _flat_direction(spread, direction):
-    """Write the direction (3,) of least variance where it is far from the others' and found at once; whether it is.
+    """Write the direction (3,) of least variance where it is distinct; return whether it is.
 
-    The least root of the characteristic polynomial by Newton from 0, which is never beyond it; then the direction is
-    across two rows of the matrix less that root. Only + - * / and sqrt: the same on any machine.
+    Newton's method from 0, which never passes it, finds the least root of the characteristic
+    polynomial. The direction is the cross product of two rows of the matrix minus that root. Only +
+    - * / and sqrt are used: the result is the same on any machine.
     """
     size = (spread[4] + spread[7] + spread[9]) / 3.0
     if not size > 0.0:
@@ -155,7 +168,7 @@ def _flat_direction(spread, direction):
     for _ in range(40):
         slope = second - root * (6.0 - 3.0 * root)
         value = third - root * (second - root * (3.0 - root))
-        if not slope > 1e-3:  # a double root, or nearly
+        if not slope > 1e-3:  # a double root, or nearly one
             return False
         step = value / slope
         root += step
@@ -179,7 +192,7 @@ def _flat_direction(spread, direction):
 
 @nb.njit(nogil=True, cache=True)
 def least_variance(spread, direction):
-    """Write the direction (3,) float64 of least variance of a spread (SPREAD,), of unit length."""
+    """Write the unit direction (3,) float64 of least variance of a spread (SPREAD,)."""
     if _flat_direction(spread, direction):
         return
     a, v = np.zeros((3, 3)), np.zeros((3, 3))
@@ -216,7 +229,10 @@ def least_variance(spread, direction):
 
 @nb.njit(nogil=True, cache=True)
 def farthest2(own, lo, hi, x, y, z):
-    """The greatest squared distance, int64, of the points [lo, hi) of own from (x, y, z); all within 2^30 of it."""
+    """Return the greatest squared distance, int64, of the points [lo, hi) of own from (x, y, z).
+
+    All points lie within 2^30 of (x, y, z).
+    """
     x, y, z = np.int32(x), np.int32(y), np.int32(z)
     farthest = np.int64(0)
     for i in range(lo, hi):
@@ -231,7 +247,10 @@ def farthest2(own, lo, hi, x, y, z):
 
 @nb.njit(nogil=True, cache=True)
 def extent_along(own, lo, hi, normal, x, y, z):
-    """The least and greatest dot(normal, point - (x, y, z)) of the points [lo, hi) of own; normal: (3,), int8."""
+    """Return the least and greatest dot(normal, point - (x, y, z)) of the points [lo, hi) of own.
+
+    normal: (3,) integers in the range of int8.
+    """
     x, y, z = np.int32(x), np.int32(y), np.int32(z)
     a, b, c = np.int64(np.int32(normal[0])), np.int64(np.int32(normal[1])), np.int64(np.int32(normal[2]))
     least, most = np.int64(1) << 62, -(np.int64(1) << 62)
@@ -248,7 +267,7 @@ def extent_along(own, lo, hi, normal, x, y, z):
 
 @nb.njit(nogil=True, cache=True)
 def box_center(own, lo, hi, center):
-    """Write the centre (3,) float64 of the box of the points [lo, hi) of own."""
+    """Write the centre (3,) float64 of the bounding box of the points [lo, hi) of own."""
     for k in range(np.uint64(3)):
         least, most = own[k, lo], own[k, lo]
         for i in range(lo, hi):
@@ -258,17 +277,22 @@ def box_center(own, lo, hi, center):
 
 @nb.njit(nogil=True, cache=True)
 def bound_run(own, space, lo, hi, highest, spread, with_slab, guess, center, normal, slab):
-    """Bound the points [lo, hi) of own (>= 3, n) int32, 0 to 2^23 [steps], lo < hi, by a sphere cut by a slab.
+    """Bound the points [lo, hi) of own by a sphere cut by a slab; return the radius, rounded up.
 
-    space: of `bound_space`, its coordinates written.  highest: greatest coordinate a stored centre may have, and the
-    greatest radius wanted.  spread: of these points.  with_slab: False leaves the normal zero.  guess: (3,) float64,
-    to work in. Writes integers: center (3,), normal (3,) of length about 127, slab (2,): least and greatest
-    dot(normal, point - center) [steps]. Returns the radius [steps], int64, rounded up.
+    own: (>= 3, n) int32, 0 to 2^23 [steps]; lo < hi.
+    space: of `bound_space`, with the coordinates of own written.
+    highest: greatest coordinate of a stored centre, and greatest radius.
+    spread: of these points.
+    with_slab: False leaves the normal zero.
+    guess: (3,) float64, work space.
+    Writes integers: center (3,), normal (3,) of length about 127, slab (2,): least and greatest
+    dot(normal, point - center) [steps]. Returns the radius [steps], int64.
     """
     steps = SMALL_STEPS if hi - lo <= np.uint64(SMALL_SET) else LARGE_STEPS
     radius = highest + 1
     while radius > highest:
-        # A ball around the box's centre, tried last, has at most half the diagonal: 0.87 of `highest`, and fits.
+        # If the first radius is too large, the second try takes the box's centre. Its radius is at
+        # most half the diagonal, 0.87 of `highest`, and fits.
         box_center(own, lo, hi, guess)
         ball_center(space, lo, hi, steps, guess)
         for k in range(np.uint64(3)):
@@ -285,7 +309,7 @@ def bound_run(own, space, lo, hi, highest, spread, with_slab, guess, center, nor
 
 @nb.njit(nogil=True, cache=True)
 def stored_direction(spread, with_slab, guess, normal):
-    """Write the slab's direction (3,) for points of a spread, of length about 127; zero for fewer than 3 points."""
+    """Write the slab's direction (3,) of length about 127 for a spread; zero for fewer than 3 points."""
     if not with_slab or spread[0] < 3.0:
         normal[0] = normal[1] = normal[2] = 0
         return

@@ -1,4 +1,4 @@
-"""Which boxes are near a point: a tree over boxes as they come, in the order of a space-filling curve at best."""
+"""Nearest boxes of a point: a tree over boxes in their given order, ideally a space-filling curve."""
 
 from typing import NamedTuple
 
@@ -8,16 +8,17 @@ from numpy.typing import NDArray
 from ...schemas.kernels import compiling as nb
 from .nearest import FAR
 
-# Boxes under one of the level above.
+# Boxes per box of the next level.
 DEGREE = 8
-# Differences from here on are FAR: their squares would not fit.
+# Differences from here on count as FAR: their squares would overflow.
 _MOST = 1 << 31
 
 
 class BoxTree(NamedTuple):
-    """Boxes, and boxes around DEGREE of those each, level by level up to one: low, high (t, 3) int64, inclusive.
+    """Boxes level by level, up to a single root; each encloses DEGREE boxes of the level below.
 
-    starts: (levels + 1,) int64, where each level begins; level 0 are the boxes themselves.
+    low, high: (t, 3) int64, inclusive corners.
+    starts: (levels + 1,) int64, where each level begins; level 0 holds the given boxes.
     """
 
     low: NDArray[np.int64]
@@ -26,7 +27,7 @@ class BoxTree(NamedTuple):
 
 
 def make_box_tree(low: NDArray[np.int64], high: NDArray[np.int64]) -> BoxTree:
-    """The tree over boxes low, high (v, 3), v >= 1."""
+    """Build the tree over boxes low, high (v, 3), v >= 1."""
     lows, highs = [low], [high]
     while len(lows[-1]) > 1:
         cuts = np.arange(0, len(lows[-1]), DEGREE)
@@ -38,13 +39,13 @@ def make_box_tree(low: NDArray[np.int64], high: NDArray[np.int64]) -> BoxTree:
 
 @nb.njit(nogil=True, inline="always")
 def _box_distance2(low, high, box, x, y, z):
-    """Squared distance of (x, y, z) from a box, FAR where it is that or more."""
+    """Return the squared distance of (x, y, z) from a box, at most FAR."""
     gx = max(low[box, 0] - x, x - high[box, 0], 0)
     gy = max(low[box, 1] - y, y - high[box, 1], 0)
     gz = max(low[box, 2] - z, z - high[box, 2], 0)
     if gx >= _MOST or gy >= _MOST or gz >= _MOST:
         return FAR
-    # In float64 first: three squares below 2^62 may be more than int64 holds.
+    # Compare in float64 first: three squares below 2^62 may sum to more than int64 holds.
     if np.float64(gx) * gx + np.float64(gy) * gy + np.float64(gz) * gz > 1.1 * FAR:
         return FAR
     return min(gx * gx + gy * gy + gz * gz, FAR)
@@ -52,12 +53,16 @@ def _box_distance2(low, high, box, x, y, z):
 
 @nb.njit(nogil=True, cache=True)
 def near_boxes(tree, queries, own, best, after, rows, distances):
-    """The nearest boxes of each query that are nearer than best, nearest first, of equal ones the first.
+    """Find the boxes nearer to each query than best, nearest first; on a tie the first box.
 
-    tree: BoxTree.  queries: (q, 3) int64.  own: (q,) int64, a box that is left out.  best: (q,) int64, squared
-    distances; where it is FAR, one box alone is found.  after: (q, 2) int64, squared distance and number of the last
-    box found before: only what comes behind it counts; -1, -1 for nothing before. Writes rows and distances (q, k)
-    int64, rows -1 behind the last, and into `after` the last found. Distances of FAR and more are none.
+    tree: BoxTree.
+    queries: (q, 3) int64.
+    own: (q,) int64, a box to exclude.
+    best: (q,) int64, squared distances; where it is FAR, only one box is found.
+    after: (q, 2) int64, squared distance and number of the last box of the previous call, to
+    continue after it; -1, -1 for the first call.
+    Writes rows and distances (q, k) int64, with rows -1 after the last, and writes the last box
+    found into `after`. Boxes at a distance of FAR or more are not found.
     """
     stack = np.empty((128, 2), np.int64)
     levels = tree.starts.shape[0] - 1

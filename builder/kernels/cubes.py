@@ -1,18 +1,18 @@
-"""Which points lie in some chosen cubes, and which voxels hold any: what a look at scans does with every point."""
+"""Points in chosen cubes, and the number of occupied voxels: one pass over points, for size estimates."""
 
 import numpy as np
 
 from ...schemas.kernels import compiling as nb
 
-# A free place of a table of voxels: no key is negative.
+# Free slot of a voxel table: no key is negative.
 FREE = np.int64(-1)
-# Voxels along an axis, either way; what lies farther is counted as at the edge.
+# Maximum voxel coordinate, either way; voxels beyond it are counted as if at the limit.
 _MOST = (1 << 20) - 1
 
 
 @nb.njit(nogil=True, cache=True)
 def _insert(key, table):
-    """Put a key into a table (2^b,) with places to spare; return 1 where it is new, else 0."""
+    """Insert a key into a table (2^b,) with free slots; return 1 where it is new, else 0."""
     mask = np.uint64(table.shape[0] - 1)
     place = ((np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(20)) & mask
     while table[place] != FREE:
@@ -25,7 +25,7 @@ def _insert(key, table):
 
 @nb.njit(nogil=True, cache=True)
 def insert_all(keys, table):
-    """Put keys (n,) into an empty table."""
+    """Insert keys (n,) into an empty table."""
     for i in range(keys.shape[0]):
         if keys[i] != FREE:
             _insert(keys[i], table)
@@ -33,12 +33,16 @@ def insert_all(keys, table):
 
 @nb.njit(nogil=True, cache=True)
 def take_cubes(xyz, origin, step, voxel_steps, chosen, table, known, picked, slots, local):
-    """Find the points of some cubes among points (n, 3) float64, finite; count the voxels that hold any of all.
+    """Find the points of chosen cubes among points (n, 3) float64, finite; count all occupied voxels.
 
-    chosen: (c, 5) int64, a voxel's key, the cube's coordinates in it, and s: it has 2^s steps along an axis.
-    table: (2^b,) int64 of voxel keys, `known` (1,) of them; filled to at most three quarters.  Writes picked, slots
-    (n,) and local (n, 3) int64: number, cube, and coordinates in the voxel [steps] of each point that is in one.
-    Returns (how many those are, points done): fewer are done where the table is full.
+    chosen: (c, 5) int64: a voxel's key, the cube's coordinates in it, and s; the cube has 2^s steps
+    along an axis.
+    table: (2^b,) int64 of voxel keys, filled to at most three quarters.
+    known: (1,) the number of keys in it.
+    Writes picked, slots (n,) and local (n, 3) int64: for each point in a cube its number, its cube,
+    and its coordinates in the voxel [steps].
+    Returns (number of points in cubes, points done). Fewer points than n are done where the table
+    is full.
     """
     count = 0
     last, any_chosen = FREE, False
@@ -50,7 +54,7 @@ def take_cubes(xyz, origin, step, voxel_steps, chosen, table, known, picked, slo
             steps = np.int64(np.rint((xyz[i, axis] - origin[axis]) / step))
             voxel = np.int64(np.floor(np.float64(steps) * inverse))
             left = steps - voxel * voxel_steps
-            # By multiplication it may be one off.
+            # The multiplication may be off by one.
             voxel += np.int64(left >= voxel_steps) - np.int64(left < 0)
             at[axis] = steps - voxel * voxel_steps
             clipped = min(max(int(voxel), -_MOST), _MOST)

@@ -1,4 +1,4 @@
-"""Does every bound of a record enclose the points below it? The check behind `solidcloud validate --deep`."""
+"""Check that every bound of a record encloses the points below it, for `solidcloud validate --deep`."""
 
 import numpy as np
 
@@ -9,10 +9,13 @@ from .records import U, link_parents, read_leaf
 
 @nb.njit(nogil=True, cache=True)
 def last_loose_node(leaves, spheres, normal, slab):
-    """The last node of a record whose sphere or slab does not enclose all points below it; -1 when all do.
+    """Return the last node of a record whose sphere or slab misses a point below it, or -1.
 
-    leaves, spheres: see records.py, nearest.py.  normal: (3, n) int8.  slab: (2, n) int32. Every point is held against
-    all nodes above it, in integers, while its leaf node is at hand.
+    leaves, spheres: see records.py, nearest.py.
+    normal: (3, n) int8.
+    slab: (2, n) int32.
+    Each leaf node is decoded once, and its points are checked in integers against all nodes above
+    it.
     """
     center, radius, unit = spheres
     parents = link_parents(leaves.first, leaves.count, leaves.is_leaf)
@@ -25,7 +28,7 @@ def last_loose_node(leaves, spheres, normal, slab):
         node = np.int64(i)
         while node >= 0:
             at, scale = U(node), np.int64(1)
-            # From the points' block to the node's centre.
+            # Offset from the node's centre to the points' block.
             x = np.int64(leaves.block_low[U(0), U(i)]) - np.int64(center[U(0), at])
             y = np.int64(leaves.block_low[U(1), U(i)]) - np.int64(center[U(1), at])
             z = np.int64(leaves.block_low[U(2), U(i)]) - np.int64(center[U(2), at])

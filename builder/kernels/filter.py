@@ -1,8 +1,9 @@
-"""Kernels of the filter stage: how many points, or points of how many scans, lie around each of many; a cell's best.
+"""Kernels of the filter stage: number of points or scans near each point, best point of a cell.
 
-All in integers. Positions are int32 lattice steps from a corner chosen so that none is negative, and points are sorted
-by the cell of a grid they are in, cells numbered as `cell_numbers` does. Cells are as long as the distance asked for,
-so that all that is near a point is in its own cell and the 26 around it: nine runs of three.
+All arithmetic is in integers. Positions are int32 lattice steps from a corner chosen to make all of
+them non-negative. Points are sorted by the grid cell they are in, with cells numbered by
+`cell_numbers`. The cell edge is the search distance: all points near a point are in its own cell
+and the 26 around it, nine runs of three cells.
 """
 
 import numpy as np
@@ -13,10 +14,11 @@ from .bisection import first_at_least
 
 @nb.njit(nogil=True, cache=True)
 def cell_numbers(positions, edge, across, deep):
-    """The cell (n,) uint64 of positions (n, 3) int32 >= 0 [steps]: edge: of a cell [steps].
+    """Return the cell (n,) uint64 of positions (n, 3) int32 >= 0 [steps].
 
-    across, deep: cells along y and z, two more than any position needs: cells are numbered from 1 on each axis, so that
-    every cell has one below it and one above.
+    edge: of a cell [steps].
+    across, deep: number of cells along y and z, two more than any position needs: cells are
+    numbered from 1 on each axis, and every cell has a neighbour below and above.
     """
     n = positions.shape[0]
     cells = np.empty(n, np.uint64)
@@ -30,15 +32,16 @@ def cell_numbers(positions, edge, across, deep):
 
 @nb.njit(nogil=True, cache=True)
 def _no_runs():
-    """Room for what `_runs_around` finds: of which cell, begins, ends. No cell has the number 0."""
+    """Allocate the result of `_runs_around`: cell, begins, ends. No cell has the number 0."""
     return np.zeros(1, np.uint64), np.empty(9, np.int64), np.empty(9, np.int64)
 
 
 @nb.njit(nogil=True, cache=True)
 def _runs_around(cells, cell, across, deep, runs):
-    """Where the cells around a cell lie in sorted `cells`: nine runs, the middle first. Writes runs (`_no_runs`).
+    """Write the cells around a cell, as nine runs in sorted `cells`, to runs; the central run first.
 
-    Nothing is looked for where they are those of this cell already: queries come cell by cell.
+    Does nothing where runs (`_no_runs`) already holds those of this cell: queries come cell by
+    cell.
     """
     known, begins, ends = runs
     if known[0] == cell:
@@ -51,7 +54,7 @@ def _runs_around(cells, cell, across, deep, runs):
             for dy in range(-1, 2):
                 middle = dx == 0 and dy == 0
                 if middle == (turn == 0):
-                    # dx and dy may be negative: sums modulo 2^64 are what they should be.
+                    # dx and dy may be negative: unsigned sums modulo 2^64 give the right result.
                     shift = np.uint64(np.int64(dx) * np.int64(across * deep) + np.int64(dy) * np.int64(deep))
                     at = cell + shift
                     begins[k] = first_at_least(cells, 0, n, at - np.uint64(1))
@@ -61,11 +64,14 @@ def _runs_around(cells, cell, across, deep, runs):
 
 @nb.njit(nogil=True, cache=True)
 def count_others(queries, query_cells, points, cells, across, deep, reach2, most, counts):
-    """Count the points within reach of each query, other than those where it is itself, up to `most`.
+    """Count up to `most` points within reach of each query, without points equal to the query.
 
-    queries: (q, 3) int32.  query_cells: (q,) uint64.  points: (n, 3) int32, distinct, in the order of their cells (n,)
-    uint64, ascending.  reach2: the square of the reach [steps^2], inclusive.  counts: (q,) int64, added to; where it is
-    `most` already, nothing is looked for.
+    queries: (q, 3) int32.
+    query_cells: (q,) uint64.
+    points: (n, 3) int32, distinct, in the order of their cells.
+    cells: (n,) uint64, ascending.
+    reach2: square of the reach [steps^2], inclusive.
+    counts: (q,) int64, increased; a query that has reached `most` is skipped.
     """
     runs = _no_runs()
     begins, ends = runs[1], runs[2]
@@ -90,7 +96,7 @@ def count_others(queries, query_cells, points, cells, across, deep, reach2, most
 
 @nb.njit(nogil=True, cache=True)
 def _has(row, count, value):
-    """Whether one of the first `count` entries of a row is value."""
+    """Return whether one of the first `count` entries of a row is value."""
     for k in range(count):  # noqa: SIM110  numba has no any() of a generator
         if row[k] == value:
             return True
@@ -99,13 +105,16 @@ def _has(row, count, value):
 
 @nb.njit(nogil=True, cache=True)
 def _group_in_reach(points, begin, end, low, high, x, y, z, reach2):
-    """Whether one of points[begin:end], whose box is low to high (3,), lies within reach of x, y, z."""
+    """Return whether one of points[begin:end] lies within reach of x, y, z.
+
+    low, high: (3,), the bounding box of these points.
+    """
     least, most = np.int64(0), np.int64(0)
     for axis in range(3):
         q = x if axis == 0 else (y if axis == 1 else z)
         below, above = np.int64(low[axis]) - q, q - np.int64(high[axis])
         out = max(below, above, np.int64(0))
-        far = max(-below, -above)  # to the box's far side; of a q outside it as well
+        far = max(-below, -above)  # to the box's far side, also for a q outside the box
         least += out * out
         most += far * far
     if least > reach2:
@@ -124,13 +133,20 @@ def other_scans(
     queries, query_cells, query_scans, points, groups, group_cells, group_scans, across, deep, reach2, found,
     counts,
 ):  # fmt: skip
-    """Find which other scans have a point within reach of each query, up to as many as `found` has room for.
+    """Find other scans with a point within reach of each query, up to the capacity of `found`.
 
-    queries: (q, 3) int32, query_cells: (q,) uint64, query_scans: (q,) int64.
-    points: (n, 3) int32 in the order of their groups: a group is the points of one scan in one cell. groups: (g + 1,)
-    int64, where each begins, the groups ordered by cell.  group_cells: (g,) uint64.  group_scans: (g,) int64.
-    reach2: inclusive [steps^2].  found: (q, most) int64, scans found so far, the first counts[i] of row i; both are
-    added to.
+    queries: (q, 3) int32.
+    query_cells: (q,) uint64.
+    query_scans: (q,) int64.
+    points: (n, 3) int32 in the order of their groups; a group is the points of one scan in one
+    cell.
+    groups: (g + 1,) int64, where each group begins, ordered by cell.
+    group_cells: (g,) uint64.
+    group_scans: (g,) int64.
+    reach2: inclusive [steps^2].
+    found: (q, most) int64, the scans found so far, the first counts[i] of row i.
+    counts: (q,) int64.
+    Adds to both found and counts.
     """
     most = found.shape[1]
     count = group_scans.shape[0]
@@ -160,10 +176,16 @@ def other_scans(
 
 @nb.njit(nogil=True, cache=True)
 def best_of_cells(order, cells, away, ranks, scans, intensities):
-    """The best point of each cell: (c,) int64 indices, cells ascending.
+    """Return the index of the best point of each cell: (c,) int64, cells ascending.
 
-    order: (n,) int64, n >= 1, sorts the points by cell.  cells: (n,) uint64.  The least away (n,) int64 is best, then
-    the least rank (n,) uint64, scan (n,) int64, intensity (n,) float32, NaN last; of equals the first in `order`.
+    order: (n,) int64, n >= 1, sorts the points by cell.
+    cells: (n,) uint64.
+    away: (n,) int64.
+    ranks: (n,) uint64.
+    scans: (n,) int64.
+    intensities: (n,) float32.
+    The least away is best, then the least rank, scan and intensity, NaN last; of equals the first
+    in `order`.
     """
     n = order.shape[0]
     best = np.empty(n, np.int64)

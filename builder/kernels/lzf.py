@@ -1,24 +1,25 @@
-"""Decoding of LZF, the compression of PCD files, a piece at a time: a loop in Python takes 1 us a byte."""
+"""Decoding of LZF, the compression of PCD files, piece by piece; a loop in Python takes 1 us a byte."""
 
 import numpy as np
 
 from ...schemas.kernels import compiling as nb
 
-# A reference copies at most this many bytes, from at most so far back [liblzf, lzf_d.c].
+# A reference copies at most this many bytes, from at most this far back [liblzf, lzf_d.c].
 LONGEST_COPY = 264
 FARTHEST_BACK = 1 << 13
-# Bytes that one step of the code takes at most: 32 literal bytes and their number.
+# Maximum bytes of one code: 32 literal bytes and their count.
 LONGEST_CODE = 33
 
 
 @nb.njit(cache=True, nogil=True)
 def decode(source, at, past, out, have, limit):
-    """Decode whole steps of LZF from source[at:past] into `out` behind its first `have` bytes; both (n,) uint8.
+    """Decode whole LZF codes from source[at:past] into `out` after its first `have` bytes.
 
-    Stops where fewer than LONGEST_CODE bytes are left of the source, unless `past` is its end (then where a step
-    does not fit), or at least `limit` bytes are there; `out` must have room for limit + LONGEST_COPY.
-    Returns (where it stands in the source, bytes in `out`, whether all was right): a reference to before the first
-    byte of `out` is not. Writes only to `out`.
+    source, out: (n,) uint8.
+    Stops at `past`, before a code that does not fit before `past`, and when `out` holds at least
+    `limit` bytes; `out` must have room for limit + LONGEST_COPY. Returns (position in the source,
+    bytes in `out`, valid). valid is False for a reference to before the first byte of `out`. Writes
+    only to `out`.
     """
     while at < past and have < limit:
         code = np.int64(source[at])
@@ -43,7 +44,7 @@ def decode(source, at, past, out, have, limit):
         begin = have - ((code & 31) << 8) - np.int64(source[at + taken - 1]) - 1
         if begin < 0:
             return at, have, False
-        for k in range(count):  # byte by byte: what is copied may be what was just written
+        for k in range(count):  # byte by byte: the ranges may overlap
             out[have + k] = out[begin + k]
         at += taken
         have += count

@@ -1,4 +1,4 @@
-"""Closest points by descent of a BSH, exact over integers."""
+"""Closest points by descent of a bounding sphere hierarchy, exact over integers."""
 
 from typing import NamedTuple
 
@@ -14,10 +14,14 @@ FAR = np.int64(1) << np.int64(62)
 
 
 class SearchTree(NamedTuple):
-    """A BSH with its points, all in one integer frame.
+    """A bounding sphere hierarchy with its points, all in one integer frame.
 
-    center: (n, 3) int64, radius: (n,) int64.  first: (n,) int32, first child, or first point of a leaf node.
-    count: (n,) uint8.  is_leaf: (n,) bool.  points: (p, 3) int64.
+    center: (n, 3) int64.
+    radius: (n,) int64.
+    first: (n,) int32, first child, or first point of a leaf node.
+    count: (n,) uint8.
+    is_leaf: (n,) bool.
+    points: (p, 3) int64.
     """
 
     center: NDArray[np.int64]
@@ -38,9 +42,11 @@ def _distance2(a, i, x, y, z):
 def closest_other(tree, queries, best):
     """Lower best (q,) int64 to the squared distance of the closest point *distinct* from each query.
 
-    queries: (q, 3) int64, in the tree's frame. best holds what is known before, FAR for nothing. A point equal
-    to its query is passed over, so duplicates are nobody's neighbour (NUMERICS.md case 28). A node is pruned
-    when center distance > radius + best distance, all rounded so that nothing closer is lost.
+    queries: (q, 3) int64, in the tree's frame.
+    best: the known upper bound on entry, FAR for none.
+    A point equal to its query is skipped: duplicates are not neighbours (NUMERICS.md case 28). A
+    node is pruned when center distance > radius + best distance, with all rounding in the direction
+    that loses no closer point.
     """
     stack = np.empty(1280, np.int64)  # 80 levels of at most 16 children
     for q in range(queries.shape[0]):
@@ -68,7 +74,7 @@ def closest_other(tree, queries, best):
                 d2 = _distance2(tree.center, child, x, y, z)
                 if d2 < closest_d2:
                     closest, closest_d2 = child, d2
-            # The closest child is looked at first: what it holds prunes most of the others.
+            # Visit the closest child first: its points prune most of the others.
             for child in range(first, first + count):
                 if child != closest:
                     stack[depth] = child
@@ -79,9 +85,11 @@ def closest_other(tree, queries, best):
 
 
 class Spheres(NamedTuple):
-    """The bounds of an opened record: center (3, n) uint16, radius (n,) uint16 (schemas/voxel.py Nodes).
+    """The bounds of an opened record (schemas/voxel.py Nodes).
 
-    unit: int64, how many voxel steps one is in the top hierarchy.
+    center: (3, n) uint16.
+    radius: (n,) uint16.
+    unit: int64, voxel steps per unit in the top hierarchy.
     """
 
     center: NDArray[np.uint16]
@@ -89,18 +97,21 @@ class Spheres(NamedTuple):
     unit: np.int64
 
 
-# Differences are clamped to this before they are squared, so that three squares stay inside int32: what is clamped is
-# farther than anything that is looked for there.
+# Differences are clamped to this before they are squared: three squares then fit into int32. A
+# clamped difference is larger than any distance that this path searches for.
 _CLAMP = 26754
-# A bound is lowered by this share, more than float64 can lose in it.
+# Factor that lowers a bound by more than its float64 rounding error.
 _SURE = 1 - 1e-14
 
 
 @nb.njit(nogil=True, inline="always")
 def _nearest_lane(lanes, held, x, y, z, found):
-    """The least squared distance of the points lanes (3, LANES) from (x, y, z), int64, other than 0; or `found`."""
+    """Return the least non-zero squared distance of points from (x, y, z), at most `found`; int64.
+
+    lanes: (3, LANES), the first `held` are points.
+    """
     if found <= _CLAMP * _CLAMP:
-        # int32 at every step, which numba would leave for int64: eight at a time.
+        # Cast to int32 at every step, because numba widens to int64: eight lanes per instruction.
         far = np.int32(_CLAMP)
         qx, qy, qz = np.int32(x), np.int32(y), np.int32(z)
         least = np.int32(0x7FFFFFFF)
@@ -121,7 +132,7 @@ def _nearest_lane(lanes, held, x, y, z, found):
 
 @nb.njit(nogil=True, inline="always")
 def _ask_leaf(leaves, node, queries, a, b, lanes, best):
-    """Lower best[a:b] by the points of a leaf node; returns the greatest of them."""
+    """Lower best[a:b] by the points of a leaf node; return the greatest of them."""
     held, cell, farthest = read_leaf(leaves, node, lanes), U(leaves.cell[node]), np.int64(0)
     x = np.int64(leaves.cell_low[U(0), cell]) + np.int64(leaves.block_low[U(0), node])
     y = np.int64(leaves.cell_low[U(1), cell]) + np.int64(leaves.block_low[U(1), node])
@@ -137,13 +148,16 @@ def _ask_leaf(leaves, node, queries, a, b, lanes, best):
 
 @nb.njit(nogil=True, cache=True)
 def closest_in_record(leaves, spheres, queries, groups, home, best):
-    """Lower best (q,) int64 to the squared distance of the closest point of a record *distinct* from each query.
+    """Lower best (q,) int64 to the squared distance of the closest *distinct* point of a record.
 
-    queries: (q, 3) int64 [voxel steps], at most 2^31 from any point; groups (g + 1,) int64: query groups[i] to
-    groups[i + 1] are asked together, and had better lie side by side; home (g,) int64: the leaf node a group stands in,
-    which is looked at first, or -1. best holds what is known before, FAR for nothing. What is at FAR or beyond is not
-    found. A point equal to its query is passed over, so duplicates are nobody's neighbour (NUMERICS.md case 28). A node
-    is pruned when it is surely farther from the box of the group than the worst of what its queries know.
+    queries: (q, 3) int64 [voxel steps], at most 2^31 from any point.
+    groups: (g + 1,) int64; queries groups[i] to groups[i + 1] are processed together and should lie
+    close to each other.
+    home: (g,) int64, the leaf node that contains a group, which is visited first, or -1.
+    best: the known upper bound on entry, FAR for none.
+    Points at FAR or beyond are not found. A point equal to its query is skipped: duplicates are not
+    neighbours (NUMERICS.md case 28). A node is pruned when it is certainly farther from the group's
+    box than the largest best of its queries.
     """
     center, radius, unit = spheres
     stack, bounds = np.empty(1280, np.int64), np.empty(1280, np.float64)  # 80 levels of at most 16 children
@@ -196,7 +210,7 @@ def closest_in_record(leaves, spheres, queries, groups, home, best):
                         nearest, least = depth, bound
                     stack[depth], bounds[depth] = child, bound
                     depth += 1
-            # The closest child is looked at first: what it holds prunes most of the others.
+            # Visit the closest child first: its points prune most of the others.
             if least < np.inf:
                 last = depth - 1
                 stack[nearest], stack[last] = stack[last], stack[nearest]

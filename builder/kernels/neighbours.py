@@ -1,8 +1,8 @@
-"""The closest points of each of many, among distinct points in Morton order; exact over integers.
+"""Closest points of each of many points, among distinct points in Morton order; exact over integers.
 
-The points stand in blocks of BLOCK, boxes of FAN blocks, boxes of FAN of those, and so on: no tree is stored, only the
-boxes. A point's closest are looked for in the blocks beside it first, which bounds what the boxes must still be
-opened for.
+The points form blocks of BLOCK, boxes of FAN blocks, boxes of FAN of those, and so on. Only the
+boxes are stored, no tree. The search visits the blocks beside a point first, which limits the boxes
+that it must open afterwards.
 """
 
 import numpy as np
@@ -11,13 +11,17 @@ from ...schemas.kernels import compiling as nb
 
 BLOCK = 16
 FAN = 8
-# Boxes that wait while one path to a block is followed: FAN - 1 a level and the block, 22 levels for 2^63 points.
+# Boxes on the stack while one path to a block is followed: FAN - 1 per level and the block, 22
+# levels for 2^63 points.
 STACK = 22 * FAN
 
 
 @nb.njit(nogil=True, cache=True)
 def box_starts(count):
-    """Where each level of boxes over `count` points begins, blocks first; then how many there are: (levels + 1,)."""
+    """Return where each level of boxes over `count` points begins, and the total: (levels + 1,).
+
+    The first level holds the blocks.
+    """
     starts = np.zeros(32, np.int64)
     boxes, levels = (count + BLOCK - 1) // BLOCK, 0
     while True:
@@ -30,7 +34,10 @@ def box_starts(count):
 
 @nb.njit(nogil=True, cache=True)
 def bound_boxes(points, starts):
-    """The boxes (b, 6) int32 of points (n, 3) int32, n >= 1: least coordinates, greatest ones; starts: `box_starts`."""
+    """Return the boxes (b, 6) int32 of points (n, 3) int32, n >= 1: least, then greatest coordinates.
+
+    starts: of `box_starts`.
+    """
     boxes = np.empty((starts[-1], 6), np.int32)
     for box in range(starts[1]):
         first = box * BLOCK
@@ -52,7 +59,7 @@ def bound_boxes(points, starts):
 
 @nb.njit(nogil=True, cache=True, inline="always")
 def _outside(boxes, box, x, y, z):
-    """The squared distance of a point from a box; 0 inside it."""
+    """Return the squared distance of a point from a box; 0 inside it."""
     dx = max(max(np.int64(boxes[box, 0]) - x, x - np.int64(boxes[box, 3])), np.int64(0))
     dy = max(max(np.int64(boxes[box, 1]) - y, y - np.int64(boxes[box, 4])), np.int64(0))
     dz = max(max(np.int64(boxes[box, 2]) - z, z - np.int64(boxes[box, 5])), np.int64(0))
@@ -61,9 +68,9 @@ def _outside(boxes, box, x, y, z):
 
 @nb.njit(nogil=True, cache=True)
 def _insert(closest, held, d2, dx, dy, dz):
-    """Put one more into closest[:held] (k, 4), sorted by (d2, dx, dy, dz), the last of a full list out.
+    """Insert an entry into closest[:held] (k, 4), sorted by (d2, dx, dy, dz).
 
-    Returns how many are held.
+    A full list drops its last entry. Returns the new number of entries.
     """
     k = closest.shape[0]
     at = min(held, k)
@@ -88,7 +95,7 @@ def _insert(closest, held, d2, dx, dy, dz):
 
 @nb.njit(nogil=True, cache=True)
 def _look_into(points, block, i, closest, held, limit2):
-    """Put the points of a block into the closest of point i. Returns how many are held."""
+    """Insert the points of a block into the closest of point i. Returns the new number of entries."""
     x, y, z = np.int64(points[i, 0]), np.int64(points[i, 1]), np.int64(points[i, 2])
     k = closest.shape[0]
     bound = closest[k - 1, 0] if held == k else limit2
@@ -104,12 +111,15 @@ def _look_into(points, block, i, closest, held, limit2):
 
 @nb.njit(nogil=True, cache=True)
 def closest_distinct(points, boxes, starts, i, limit2, closest, stack):
-    """Find the k closest of point i within a distance; returns how many there are, at most k.
+    """Find the k closest points of point i within a distance; return their number, at most k.
 
-    points: (n, 3) int32 [steps], distinct, in an order in which neighbours stand near each other.  boxes, starts: of
-    them.  limit2: the greatest squared distance that counts, int64.  Writes closest (k, 4) int64, its first rows:
-    squared distance and dx, dy, dz from the point, ascending in all four, so that of equally distant points those with
-    lesser coordinates are taken whatever the order. stack: (STACK, 2) int64, to work in.
+    points: (n, 3) int32 [steps], distinct, in an order that keeps neighbours close.
+    boxes, starts: of these points.
+    limit2: the greatest squared distance, inclusive, int64.
+    stack: (STACK, 2) int64, work space.
+    Writes the first rows of closest (k, 4) int64: squared distance and dx, dy, dz from the point,
+    sorted by all four. Of equally distant points those with lesser coordinates are therefore taken,
+    whatever the order of points.
     """
     x, y, z = np.int64(points[i, 0]), np.int64(points[i, 1]), np.int64(points[i, 2])
     k, own = closest.shape[0], i // BLOCK
@@ -141,7 +151,7 @@ def closest_distinct(points, boxes, starts, i, limit2, closest, stack):
                     nearest, least = depth, away
                 stack[depth, 0], stack[depth, 1] = level - 1, c
                 depth += 1
-        if depth - base > 1 and nearest != depth - 1:  # the closest is opened first: it bounds the others
+        if depth - base > 1 and nearest != depth - 1:  # open the closest first: it bounds the others
             swap = stack[nearest, 1]
             stack[nearest, 1] = stack[depth - 1, 1]
             stack[depth - 1, 1] = swap

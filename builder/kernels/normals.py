@@ -1,7 +1,8 @@
-"""Normals of all points of a voxel: neighbours from boxes over points in Morton order, wholly near ones by their sums.
+"""Normals of all points of a voxel; boxes wholly within reach contribute their precomputed sums.
 
-Boxes are those of neighbours.py. Sums of a box are taken from its least corner and moved to the point that asks; all is
-exact in int64: a box whose sums are used lies in the ball of the reach, so it is no longer than twice that, and
+The boxes are those of neighbours.py, over points in Morton order. Sums of a box are relative to its
+least corner and are translated to the query point. All arithmetic is exact in int64: a box whose
+sums are used lies in the ball of the reach, hence measures at most twice the reach, and
 `normal_reach` (schemas/normals.py) leaves room for it.
 """
 
@@ -11,12 +12,13 @@ from ...schemas.kernels import compiling as nb
 from ...schemas.kernels.normals import normal_code
 from .neighbours import BLOCK, FAN, STACK
 
+# Length of the sums: count; x, y, z; xx, yy, zz; yz, zx, xy.
 SUMS = 10
 
 
 @nb.njit(nogil=True, cache=True, inline="always")
 def _add_point(sums, times, x, y, z):
-    """Add a difference that is there so many times."""
+    """Add a difference with a multiplicity."""
     sums[0] += times
     sums[1] += times * x
     sums[2] += times * y
@@ -31,7 +33,7 @@ def _add_point(sums, times, x, y, z):
 
 @nb.njit(nogil=True, cache=True)
 def _add_moved(sums, other, x, y, z):
-    """Add the sums `other` (SUMS,), whose differences are from a place at (x, y, z) from where ours are from."""
+    """Add the sums `other` (SUMS,) relative to an origin at (x, y, z) from the origin of `sums`."""
     n, sx, sy, sz = other[0], other[1], other[2], other[3]
     sums[0] += n
     sums[1] += sx + n * x
@@ -47,7 +49,7 @@ def _add_moved(sums, other, x, y, z):
 
 @nb.njit(nogil=True, cache=True)
 def _diagonal(boxes, box):
-    """The square of a box's diagonal."""
+    """Return the square of a box's diagonal."""
     total = np.int64(0)
     for k in range(3):
         edge = np.int64(boxes[box, 3 + k]) - np.int64(boxes[box, k])
@@ -57,10 +59,13 @@ def _diagonal(boxes, box):
 
 @nb.njit(nogil=True, cache=True)
 def box_sums(points, times, boxes, starts, square):
-    """The sums (b, SUMS) int64 of the points of each box from its least corner; zeros where it fits into no reach.
+    """Return the sums (b, SUMS) int64 of the points of each box from its least corner.
 
-    points: (n, 3) int32, distinct.  times: (n,) int64, how many stand there.  boxes, starts: of them (neighbours.py).
+    points: (n, 3) int32, distinct.
+    times: (n,) int64, the multiplicity of each point.
+    boxes, starts: of these points (neighbours.py).
     square: of the reach.
+    The sums are zero for a box that fits into no ball of the reach.
     """
     sums = np.zeros((starts[-1], SUMS), np.int64)
     for box in range(starts[1]):
@@ -87,7 +92,10 @@ def box_sums(points, times, boxes, starts, square):
 
 @nb.njit(nogil=True, cache=True)
 def point_normals(points, times, boxes, starts, sums, square, codes):
-    """Write the codes (n,) uint16 of the normals at all points. Arguments as of `box_sums`; sums: what it gives."""
+    """Write the codes (n,) uint16 of the normals at all points.
+
+    sums: the result of `box_sums`. Other arguments as in `box_sums`.
+    """
     stack, total = np.empty((STACK, 2), np.int64), np.empty(SUMS, np.int64)
     for i in range(points.shape[0]):
         x, y, z = np.int64(points[i, 0]), np.int64(points[i, 1]), np.int64(points[i, 2])

@@ -1,4 +1,4 @@
-"""The octree of one voxel, split by occupancy, over points in Morton order."""
+"""The octree of one voxel, split by number of points, over points in Morton order."""
 
 import numpy as np
 
@@ -9,7 +9,7 @@ from .bisection import first_at_least
 
 @nb.njit(nogil=True, cache=True)
 def voxel_codes(points):
-    """Morton codes (n,) uint64 of points (n, 3) integers [voxel steps], each in [0, 2^21)."""
+    """Return the Morton codes (n,) uint64 of points (n, 3) integers [voxel steps], each in [0, 2^21)."""
     n = points.shape[0]
     codes = np.empty(n, np.uint64)
     for i in range(n):
@@ -19,13 +19,14 @@ def voxel_codes(points):
 
 @nb.njit(nogil=True, cache=True)
 def split_octree(codes, root_log2, largest_log2, capacity):
-    """Cut sorted points into the leaf cells of an octree ([Fig12] section 4), in Morton order.
+    """Split sorted points into the leaf cells of an octree ([Fig12] section 4), in Morton order.
 
-    codes: (n,) uint64 sorted, n >= 1, of points in [0, 2^root_log2).  largest_log2: cells above this size
-    are split whatever they hold.  capacity: cells above this many points are split, until a cell is one
-    lattice step: duplicates can fill that one over capacity (NUMERICS.md case 7, 12).
-    Returns (start (c,) int64, the first point of each cell; log2_size (c,) uint8). Depth first, so at most
-    7 siblings a level wait on the stack.
+    codes: (n,) uint64 sorted, n >= 1, of points in [0, 2^root_log2).
+    largest_log2: cells above this size are split whatever they hold.
+    capacity: cells with more points are split, down to one lattice step; duplicates can fill a cell
+    of one step over capacity (NUMERICS.md case 7, 12).
+    Returns (start (c,) int64, the first point of each cell; log2_size (c,) uint8). The split is
+    depth first: at most 7 siblings a level are on the stack.
     """
     n = codes.shape[0]
     starts = np.empty(n, np.int64)
@@ -44,7 +45,7 @@ def split_octree(codes, root_log2, largest_log2, capacity):
         shift = np.uint64(3 * (log2 - 1))
         base = (codes[lo] >> (shift + np.uint64(3))) << np.uint64(3)
         end = hi
-        for child in range(7, -1, -1):  # pushed last to first, so that they come out in Morton order
+        for child in range(7, -1, -1):  # pushed in reverse, popped in Morton order
             begin = first_at_least(codes, lo, end, (base | np.uint64(child)) << shift)
             if begin < end:
                 stack[depth, 0], stack[depth, 1], stack[depth, 2] = begin, end, log2 - 1
@@ -55,7 +56,7 @@ def split_octree(codes, root_log2, largest_log2, capacity):
 
 @nb.njit(nogil=True, cache=True)
 def is_ascending(codes):
-    """Whether codes (n,) uint64 ascend, equal ones admitted."""
+    """Return whether codes (n,) uint64 ascend; equal codes are allowed."""
     falls = np.uint64(0)
     for i in range(np.uint64(1), np.uint64(codes.shape[0])):
         falls += np.uint64(codes[i] < codes[i - np.uint64(1)])
@@ -64,10 +65,12 @@ def is_ascending(codes):
 
 @nb.njit(nogil=True, cache=True)
 def merge_order(codes, starts):
-    """The order (n,) int32 in which codes (n,) uint64, n < 2^31, ascend, as each run of them does already.
+    """Return the order (n,) int32 that sorts codes (n,) uint64, n < 2^31, made of ascending runs.
 
-    starts: (k + 1,) int64, k >= 1, first of each run, and n. Of equal codes those of earlier runs come first. Runs are
-    merged in pairs; which of two comes next is taken without a branch, which would be guessed wrong every other time.
+    starts: (k + 1,) int64, k >= 1, first index of each run, and n.
+    The sort is stable: of equal codes those of earlier runs come first. Runs are merged in pairs.
+    The choice between two runs is branch-free, because a branch would be mispredicted half the
+    time.
     """
     n, runs = codes.shape[0], starts.shape[0] - 1
     ends = starts.copy()

@@ -1,28 +1,31 @@
-"""Packing of points into an R-tree-like hierarchy: all leaf nodes on one level, nodes full where they can be.
+"""Packing of points into an R-tree-like hierarchy: leaf nodes on one level, nodes as full as possible.
 
-[Fig12] inserts into an R-tree; a tree known whole is better packed from the top (Lee and Lee, "OMT:
-Overlap minimizing top-down bulk loading", 2003): cut along the longest edge, at a multiple of the leaf
-size, until every part is one child.
+[Fig12] inserts into an R-tree. A tree whose points are all known is better packed from the top (Lee
+and Lee, "OMT: Overlap minimizing top-down bulk loading", 2003): split along the longest edge, at a
+multiple of the leaf size, until every part is one child.
 
-The points are moved while they are cut, so that every loop runs over neighbours in memory: `own` holds x, y, z and
-rank in rows, and what stands there at the end is the order of the leaf nodes. Loops index by uint64, see rows.py of
-schemas/kernels.
+The points are moved while they are split, and every loop runs over consecutive memory. `own` holds
+x, y, z and rank in rows; its final order is the order of the leaf nodes. Loop indices are uint64,
+see rows.py of schemas/kernels.
 """
 
 import numpy as np
 
 from ...schemas.kernels import compiling as nb
 
-# Most bins of the histogram that a median is looked for in.
+# Maximum bins of the histogram in which a median is located.
 BINS = 256
-# Rows of `own`: x, y, z [steps], and which point it was.
+# Rows of `own`: x, y, z [steps], and the original index of the point.
 ROWS = 4
 RANK = np.uint64(3)
 
 
 @nb.njit(nogil=True, cache=True)
 def longest_edge(own, lo, hi):
-    """The axis along which points [lo, hi) of own (4, n) extend farthest, the lower one on a tie; its least, extent."""
+    """Return the axis of greatest extent of points [lo, hi), its least coordinate and its extent.
+
+    own: (4, n). On a tie the lower axis is returned.
+    """
     axis, low, widest = np.uint64(0), np.int64(0), np.int64(-1)
     for k in range(np.uint64(3)):
         least, most = own[k, lo], own[k, lo]
@@ -35,7 +38,7 @@ def longest_edge(own, lo, hi):
 
 @nb.njit(nogil=True, cache=True)
 def _nth(keys, count, nth):
-    """The key that `nth` of keys[:count], all distinct, are less than; the keys are reordered.
+    """Return the key with `nth` smaller ones among keys[:count], all distinct; reorders the keys.
 
     Quickselect: numba's own `partition` takes 5 s to compile.
     """
@@ -64,9 +67,10 @@ def _nth(keys, count, nth):
 
 @nb.njit(nogil=True, cache=True)
 def _border(own, keys, bins, lo, hi, at, axis, low, extent):
-    """The key, coordinate << 32 | rank, that `at - lo` of the points [lo, hi) are less than, along an axis.
+    """Return the key, coordinate << 32 | rank, with `at - lo` smaller ones among the points [lo, hi).
 
-    The points are counted into bins along it; the key is looked for in the one bin that it must be in.
+    The points are counted into bins along the axis; the key is then selected in the one bin that
+    must contain it.
     """
     wanted = np.int64(at - lo)
     limit = min(np.int64(BINS), np.int64(hi - lo))
@@ -93,9 +97,9 @@ def _border(own, keys, bins, lo, hi, at, axis, low, extent):
 
 @nb.njit(nogil=True, cache=True)
 def _cut(own, spare, keys, bins, lo, hi, at):
-    """Move the points [lo, hi) so that the `at - lo` least along the longest edge stand first.
+    """Move the `at - lo` least of the points [lo, hi) along the longest edge to the front.
 
-    Ties go by rank, so the two sets are a function of the points and their ranks alone.
+    Ties are broken by rank: the two sets depend on the points and their ranks alone.
     """
     axis, low, extent = longest_edge(own, lo, hi)
     border = _border(own, keys, bins, lo, hi, at, axis, low, extent)
@@ -114,9 +118,10 @@ def _cut(own, spare, keys, bins, lo, hi, at):
 
 @nb.njit(nogil=True, cache=True)
 def _cut_into(own, spare, keys, bins, stack, lo, hi, leaf, parts, ends):
-    """Cut the points [lo, hi) into `parts` runs of as equal whole leaves as can be; writes their ends, in order.
+    """Split the points [lo, hi) into `parts` runs with numbers of whole leaves as equal as possible.
 
-    Halving: a stack of (lo, hi, parts), the left part on top, so ends come out in order.
+    Writes the runs' ends in order. The split halves recursively, with a stack of (lo, hi, parts)
+    and the left part on top.
     """
     stack[0, 0], stack[0, 1], stack[0, 2] = lo, hi, parts
     depth, found = 1, 0
@@ -138,16 +143,16 @@ def _cut_into(own, spare, keys, bins, stack, lo, hi, leaf, parts, ends):
 
 @nb.njit(nogil=True, cache=True)
 def most_nodes(n, leaf):
-    """At least as many nodes as a tree of n points in leaf nodes of `leaf` has.
+    """Return an upper bound on the nodes of a tree of n points in leaf nodes of `leaf`.
 
-    Degree 2 is the worst: a level for 2^l leaves has at most 2 leaves / 2^l + 1.
+    Degree 2 is the worst case: a level for 2^l leaves has at most 2 leaves / 2^l + 1 nodes.
     """
     return 4 * ((n + leaf - 1) // leaf) + 64
 
 
 @nb.njit(nogil=True, cache=True)
 def pack_space(n, degree):
-    """What `pack_points` works in, for up to n points: spare, keys, bins, stack, ends."""
+    """Allocate the work space of `pack_points` for up to n points: spare, keys, bins, stack, ends."""
     return (
         np.empty((ROWS, n), np.int32),
         np.empty(n + 1, np.int64),
@@ -159,16 +164,20 @@ def pack_space(n, degree):
 
 @nb.njit(nogil=True, cache=True)
 def pack_points(own, n, leaf, degree, space, begin, end, count, levels):
-    """Pack the first n points of own (4, >= n) int32, 1 <= n < 2^31: x, y, z of 0 to 2^23, distinct ranks.
+    """Pack the first n points of own into a tree; return h, the level of the leaf nodes.
 
-    leaf: most points a leaf node, degree: most children an inner node.  space: of `pack_space`.
-    Moves the points into leaf-node order; inside a leaf node they stand in none. Writes, nodes level by level from the
-    root, children in order: begin, end (>= t,) int64, each node's run; count (>= t,) uint8, children, or points of a
-    leaf node; levels (>= h + 2,) int64, first node of each level, and t. Returns h, the level of the leaf nodes.
+    own: (4, >= n) int32, 1 <= n < 2^31: x, y, z of 0 to 2^23, distinct ranks.
+    leaf: maximum points of a leaf node.
+    degree: maximum children of an inner node.
+    space: of `pack_space`.
+    Moves the points into leaf-node order; inside a leaf node the order is undefined. Writes the
+    nodes level by level from the root, children in order: begin, end (>= t,) int64, each node's
+    run; count (>= t,) uint8, children, or points of a leaf node; levels (>= h + 2,) int64, first
+    node of each level, and t.
     """
     spare, keys, bins, stack, ends = space
     leaves = (n + leaf - 1) // leaf
-    height, capacity = 0, np.int64(1)  # capacity: leaf nodes below one node of this level
+    height, capacity = 0, np.int64(1)  # capacity: maximum leaf nodes below one node of this level
     while capacity < leaves:
         capacity *= degree
         height += 1
@@ -196,10 +205,11 @@ def pack_points(own, n, leaf, degree, space, begin, end, count, levels):
 
 @nb.njit(nogil=True, cache=True)
 def heap_counts(n, leaf, degree, count, held):
-    """Write what `pack_points` writes in count (>= t,) for n points, wherever they are, and how many each node holds.
+    """Write the counts of `pack_points` for n points without the points; return t, the number of nodes.
 
-    The numbers are the same for all points, as cuts go by numbers alone: those of points of one place need no points.
-    Returns t; held: (>= t,) int64.
+    Splits depend on the number of points alone, and the counts are the same for any points.
+    Coincident points therefore need no packing. Writes count (>= t,) as `pack_points` does, and
+    held (>= t,) int64, the points of each node.
     """
     leaves = (n + leaf - 1) // leaf
     capacity = np.int64(1)
@@ -238,7 +248,10 @@ def heap_counts(n, leaf, degree, count, held):
 
 @nb.njit(nogil=True, cache=True)
 def sort_run(own, spare, lo, hi, axis):
-    """Sort the points [lo, hi) of own along an axis, ties by rank: each goes where as many stand as are before it."""
+    """Sort the points [lo, hi) of own along an axis, ties by rank.
+
+    Each point moves to the index given by the number of points before it.
+    """
     for j in range(lo, hi):
         coordinate, rank = own[axis, j], own[RANK, j]
         before = np.int32(0)
@@ -254,10 +267,10 @@ def sort_run(own, spare, lo, hi, axis):
 
 @nb.njit(nogil=True, cache=True)
 def pack_tree(points, leaf, degree):
-    """Pack points (n, 3) int32, 1 <= n < 2^31, coordinates 0 to 2^23, into a tree, as `pack_points` says.
+    """Pack points (n, 3) int32, 1 <= n < 2^31, coordinates 0 to 2^23, into a tree with `pack_points`.
 
-    Returns (order (n,) int64: the points in leaf-node order; begin, end (t,) int64; count (t,) uint8; levels (h + 2,)
-    int64).
+    Returns (order (n,) int64: the points in leaf-node order; begin, end (t,) int64; count (t,)
+    uint8; levels (h + 2,) int64).
     """
     n = points.shape[0]
     own = np.empty((ROWS, n), np.int32)

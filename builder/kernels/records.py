@@ -1,8 +1,9 @@
-"""The points of an opened record, leaf node by leaf node, straight from its byte planes: nothing is held beside them.
+"""Access to the points of an opened record, leaf node by leaf node, directly from its byte planes.
 
-A voxel may hold tens of millions of points: rows of int64 would take 24 bytes a point, the planes take 6. A leaf node's
-points are put together again whenever they are looked at, which takes 2 ns a point; indices are uint64 for the reasons
-in schemas/kernels/rows.py. What a record is to a kernel is a `Leaves`, or a tuple of the same.
+A voxel may hold tens of millions of points: rows of int64 would take 24 bytes a point, the planes
+take 6. The points of a leaf node are decoded on each access, which takes 2 ns a point. Indices are
+uint64 for the reasons in schemas/kernels/rows.py. Kernels take a record as a `Leaves`, or as a
+tuple of the same fields.
 """
 
 from typing import NamedTuple
@@ -20,8 +21,12 @@ U = np.uint64
 class Leaves(NamedTuple):
     """An opened record (schemas/codec.py OpenRecord) as kernels take it; its tree has been checked.
 
-    planes: (6 or more, p) uint8, low and high bytes of x, y, z.  first, is_leaf, cell: (n,), the links.  count, axis:
-    (n,) uint8.  block_low: (3, n) uint16.  cell_low: (3, c) int32.  log2_size: (c,) uint8.
+    planes: (6 or more, p) uint8, low and high bytes of x, y, z.
+    first, is_leaf, cell: (n,), the links.
+    count, axis: (n,) uint8.
+    block_low: (3, n) uint16.
+    cell_low: (3, c) int32.
+    log2_size: (c,) uint8.
     """
 
     planes: NDArray[np.uint8]
@@ -37,9 +42,10 @@ class Leaves(NamedTuple):
 
 @nb.njit(nogil=True, inline="always")
 def read_leaf(leaves, node, lanes):
-    """Write the points of a leaf node into lanes (3, LANES) int32 [steps from its block_low]; returns how many.
+    """Write the points of a leaf node into lanes (3, LANES) int32; return their number.
 
-    Deltas are undone: a sum beyond 2^16 stays what it is, and is found outside the cell.
+    Coordinates are steps from the node's block_low. Delta coding is undone. A sum beyond 2^16 is
+    kept as it is and later detected as outside the cell.
     """
     begin, held, along = U(leaves.first[node]), U(leaves.count[node]), U(leaves.axis[node])
     for k in range(U(3)):
@@ -56,7 +62,7 @@ def read_leaf(leaves, node, lanes):
 
 @nb.njit(nogil=True, cache=True)
 def link_parents(first, count, is_leaf):
-    """The node above each node, (n,) int32; -1 above the root."""
+    """Return the parent of each node, (n,) int32; -1 for the root."""
     parents = np.full(first.shape[0], -1, np.int32)
     for node in range(first.shape[0]):
         if not is_leaf[node]:
@@ -69,7 +75,8 @@ def link_parents(first, count, is_leaf):
 def measure_points(leaves, voxel_steps, low, high):
     """Find the least and greatest coordinates of all points, low and high (3,) int64 [voxel steps].
 
-    Returns whether every point lies inside its cell and the voxel; stops at the first leaf node where one does not.
+    Returns whether every point lies inside its cell and the voxel; stops at the first leaf node
+    where one does not.
     """
     lanes = np.empty((3, LANES), np.int32)
     low[:], high[:] = voxel_steps, -1
@@ -93,9 +100,10 @@ def measure_points(leaves, voxel_steps, low, high):
 
 @nb.njit(nogil=True, cache=True)
 def sum_places(leaves, base, seed):
-    """The `content_sum` (content.py) of seed uint64 over the lattice coordinates of all points: modulo 2^64.
+    """Return the `content_sum` (content.py) over the lattice coordinates of all points: modulo 2^64.
 
     base: (3,) int64, lattice coordinates of the voxel's corner.
+    seed: uint64.
     """
     lanes, hashed = np.empty((3, LANES), np.int32), np.empty(LANES, np.uint64)
     total = U(0)
@@ -116,13 +124,15 @@ def sum_places(leaves, base, seed):
 
 @nb.njit(nogil=True, cache=True)
 def take_points(leaves, start, base, low, high, limit, xyz, rows, nodes):
-    """Write out points of the leaf nodes from node `start` on, as many leaf nodes as have room.
+    """Write points of the leaf nodes from node `start` on, as many leaf nodes as have room.
 
-    base: (3,) int64, lattice coordinates of the voxel's corner.  low, high: (3,) int64, the box of lattice coordinates
-    wanted, inclusive.  limit: uint64, only points whose `point_hash` is below it, and of equal ones in a leaf node the
-    first alone; 0: all points. Writes xyz (m, 3) int32 [voxel steps], rows (m,) int64, which point of the record
-    it is, and nodes (m,) int32, its leaf node. m must be at least LANES. Returns the node to go on with, n when all are
-    done, and how many points were written.
+    base: (3,) int64, lattice coordinates of the voxel's corner.
+    low, high: (3,) int64, the wanted box of lattice coordinates, inclusive.
+    limit: uint64; only points whose `point_hash` is below it, and only the first of equal points in
+    a leaf node; 0: all points.
+    Writes xyz (m, 3) int32 [voxel steps], rows (m,) int64, the point's number in the record, and
+    nodes (m,) int32, its leaf node. m must be at least LANES. Returns (the node to continue with, n
+    when all are done; the number of points written).
     """
     lanes, hashes = np.empty((3, LANES), np.int32), np.zeros(LANES, np.uint64)
     done = 0
@@ -137,7 +147,7 @@ def take_points(leaves, start, base, low, high, limit, xyz, rows, nodes):
         y0 = np.int64(leaves.cell_low[U(1), cell]) + np.int64(leaves.block_low[U(1), node])
         z0 = np.int64(leaves.cell_low[U(2), cell]) + np.int64(leaves.block_low[U(2), node])
         if limit > U(0):
-            # In a loop of its own, without branches: half the time.
+            # A separate loop without branches takes half the time.
             for j in range(held):
                 x, y, z = (
                     base[0] + x0 + lanes[U(0), j],
@@ -162,7 +172,7 @@ def take_points(leaves, start, base, low, high, limit, xyz, rows, nodes):
 
 @nb.njit(nogil=True, inline="always")
 def _is_among(xyz, begin, end, x, y, z):
-    """Whether (x, y, z) is one of xyz[begin:end]."""
+    """Return whether (x, y, z) is one of xyz[begin:end]."""
     for i in range(begin, end):  # noqa: SIM110  numba has no any()
         if xyz[i, 0] == x and xyz[i, 1] == y and xyz[i, 2] == z:
             return True
@@ -171,7 +181,10 @@ def _is_among(xyz, begin, end, x, y, z):
 
 @nb.njit(nogil=True, cache=True)
 def point_hash(x, y, z):
-    """A number of 64 bits from lattice coordinates, int64: the finaliser of MurmurHash3 (Appleby) over all three."""
+    """Return a 64-bit hash of lattice coordinates, int64.
+
+    The hash applies the finaliser of MurmurHash3 (Appleby) over all three.
+    """
     h = U(0)
     for w in (x, y, z):
         h ^= U(w)
@@ -185,7 +198,7 @@ def point_hash(x, y, z):
 
 @nb.njit(nogil=True, cache=True)
 def point_hashes(lattice):
-    """The `point_hash` of each of lattice (n, 3) int64, (n,) uint64."""
+    """Return the `point_hash` of each of lattice (n, 3) int64, (n,) uint64."""
     hashes = np.empty(lattice.shape[0], np.uint64)
     for i in range(lattice.shape[0]):
         hashes[i] = point_hash(lattice[i, 0], lattice[i, 1], lattice[i, 2])
@@ -194,7 +207,10 @@ def point_hashes(lattice):
 
 @nb.njit(nogil=True, cache=True)
 def first_of_each(xyz):
-    """Whether each of xyz (n, 3) int32, coordinates in [0, 2^21), is the first of its place: (n,) bool."""
+    """Return which of xyz (n, 3) int32 is the first at its position: (n,) bool.
+
+    Coordinates are in [0, 2^21).
+    """
     n = xyz.shape[0]
     slots = 16
     while slots < 2 * n:

@@ -1,4 +1,4 @@
-"""Points of cells, (3, n), and the same with each cell's x, y and z side by side, so that one read gets a cell."""
+"""Reordering of a voxel's points (3, n): each cell's x, y and z become contiguous, one read gets a cell."""
 
 import numpy as np
 
@@ -7,7 +7,10 @@ from ...schemas.kernels import compiling as nb
 
 @nb.njit(nogil=True, cache=True)
 def by_cell(xyz, starts):
-    """Points (3, n) uint16 of the cells that begin at starts (c + 1,) as (3 n,): x[], y[], z[] of each cell."""
+    """Return points (3, n) uint16 in cell order as (3 n,): x[], y[], z[] of each cell.
+
+    starts: (c + 1,), where the cells begin.
+    """
     flat = np.empty(3 * xyz.shape[1], np.uint16)
     for cell in range(starts.shape[0] - 1):
         lo, held = np.uint64(starts[cell]), np.uint64(starts[cell + 1] - starts[cell])

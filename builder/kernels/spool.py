@@ -1,7 +1,7 @@
-"""World points -> voxel and Morton code, and back to rows: what survey and spool do with every point.
+"""Conversion of world points to voxel and Morton code and back, used by the survey and spool passes.
 
-Each step is a loop of its own over a few thousand points, which stay in the nearest caches between the steps: so the
-compiler makes vectors of every loop that has no branch in it.
+Each step is a separate loop over a few thousand points, which stay in the L1 and L2 caches between
+the steps. The compiler can then vectorise every loop without branches.
 """
 
 import numpy as np
@@ -10,15 +10,18 @@ from ...schemas.kernels import compiling as nb
 from ...schemas.kernels.morton import morton_code, morton_decode
 from .content import mix_column, mixed_sum
 
-# Points taken through all steps at a time.
+# Points per round of all steps.
 CHUNK = 4096
-# A free place of the voxel table: no Morton key has its highest bit set.
+# Free slot of the voxel table: no Morton key has its highest bit set.
 FREE = np.uint64(0xFFFFFFFFFFFFFFFF)
 
 
 @nb.njit(nogil=True, cache=True)
 def usable_bounds(xyz, farthest, low, high):
-    """Count the points of (n, 3) float64 that are finite, no coordinate beyond `farthest`; widen low, high (3,)."""
+    """Count the points of (n, 3) float64 that are finite and within `farthest` on every axis.
+
+    Widens low, high (3,) to these points.
+    """
     x0, y0, z0 = low[0], low[1], low[2]
     x1, y1, z1 = high[0], high[1], high[2]
     count = 0
@@ -35,9 +38,10 @@ def usable_bounds(xyz, farthest, low, high):
 
 @nb.njit(nogil=True, cache=True)
 def _to_lattice(xyz, axis, origin, step, steps):
-    """Quantise one axis of points (n, 3), half to even, into steps (n,) int64; returns the farthest it moved one [m].
+    """Quantise one axis of points (n, 3), half to even, into steps (n,) int64.
 
-    The operations of Lattice.to_lattice and to_world, one by one, so that the results are theirs to the bit.
+    The operations are those of Lattice.to_lattice and to_world, one by one: the results are
+    bit-identical. Returns the greatest quantisation error [m].
     """
     moved = 0.0
     for i in range(xyz.shape[0]):
@@ -50,11 +54,14 @@ def _to_lattice(xyz, axis, origin, step, steps):
 
 @nb.njit(nogil=True, cache=True)
 def _to_voxel(steps, voxel_steps, voxel, local):
-    """Floor division of lattice steps (n,) int64 below 2^52 in size: voxel (n,), and what is left, local (n,)."""
+    """Divide lattice steps (n,) int64 by voxel_steps, rounding down.
+
+    Writes voxel (n,), the quotients, and local (n,), the remainders. Steps are below 2^52 in size.
+    """
     inverse = 1.0 / voxel_steps
     for i in range(steps.shape[0]):
-        # By multiplication it may be one off, and then what is left is out of [0, voxel_steps): an integer division
-        # takes 20 times as long.
+        # The multiplication may be off by one; the remainder is then outside [0, voxel_steps). An
+        # integer division takes 20 times as long.
         quotient = np.int64(np.floor(np.float64(steps[i]) * inverse))
         left = steps[i] - quotient * voxel_steps
         correction = np.int64(left >= voxel_steps) - np.int64(left < 0)
@@ -64,14 +71,17 @@ def _to_voxel(steps, voxel_steps, voxel, local):
 
 @nb.njit(nogil=True, cache=True)
 def _to_codes(x, y, z, bias, codes):
-    """Morton codes (n,) of coordinates (n,) int64 an axis, plus bias."""
+    """Write the Morton codes (n,) of coordinates (n,) int64 per axis, plus bias."""
     for i in range(codes.shape[0]):
         codes[i] = morton_code(np.uint64(x[i] + bias), np.uint64(y[i] + bias), np.uint64(z[i] + bias))
 
 
 @nb.njit(nogil=True, cache=True)
 def _place_of(key, table):
-    """Where a key is in the table (2^b,), or would be: linear probing from a multiplicative hash."""
+    """Return the slot of a key in the table (2^b,), or a free slot for it.
+
+    Linear probing from a multiplicative hash.
+    """
     mask = np.uint64(table.shape[0] - 1)
     place = ((key * np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(20)) & mask
     while table[place] != key and table[place] != FREE:
@@ -81,10 +91,11 @@ def _place_of(key, table):
 
 @nb.njit(nogil=True, cache=True)
 def _number_voxels(keys, table, number_of, known, count, numbers):
-    """The number of each key (n,), numbers (n,) int32: voxels are numbered as they come. Returns how many there are.
+    """Write the number of each voxel key (n,) to numbers (n,) int32; return the number of voxels.
 
-    table (2^b,) uint64, number_of (2^b,) int32: hash table, with n places to spare.  known: (m,) uint64, the key of
-    each number, `count` of them so far.
+    Voxels are numbered in order of first occurrence.
+    table (2^b,) uint64, number_of (2^b,) int32: hash table, with n free slots.
+    known: (m,) uint64, the key of each number, `count` of them so far.
     """
     last, number = FREE, np.int32(0)
     for i in range(keys.shape[0]):
@@ -114,13 +125,17 @@ def rehash(known, count, table, number_of):
 def place_points(xyz, origin, step, voxel_steps, bias, more, seeds, voxels, numbers, codes, sums):
     """Quantise points and find their voxels, as many as the voxel table has room for.
 
-    xyz: (n, 3) float64 world [m], usable.  origin (3,) [m], step [m], voxel_steps [steps]: the lattice.
-    bias: KEY_BIAS.  more: (m, n) uint64, further columns that the points are identified by.  seeds: (2,) uint64.
-    voxels: (table, number_of, known, count), see `_number_voxels`; count (1,) int64 is kept up.
-    Writes numbers (n,) int32 of voxels and codes (n,) uint64 in them, adds to sums (3,) uint64: one a seed over all
-    columns, and one of the first seed over lattice coordinates alone.
-    Returns (points done, farthest that quantising moved one along an axis [m], lowest and highest voxel coordinate).
-    When the coordinates returned are out of [-bias, bias), what was written is of no use.
+    xyz: (n, 3) float64 world [m], finite and within range.
+    origin (3,) [m], step [m], voxel_steps [steps]: the lattice.
+    bias: KEY_BIAS.
+    more: (m, n) uint64, further columns that identify the points.
+    seeds: (2,) uint64.
+    voxels: (table, number_of, known, count), see `_number_voxels`; count (1,) int64 is updated.
+    Writes numbers (n,) int32 of voxels and codes (n,) uint64 in them. Adds to sums (3,) uint64: one
+    per seed over all columns, and one of the first seed over lattice coordinates alone.
+    Returns (points done, greatest quantisation error along an axis [m], lowest and highest voxel
+    coordinate). When the returned coordinates are outside [-bias, bias), the written data is
+    invalid.
     """
     table, number_of, known, count = voxels
     steps = np.empty((3 + more.shape[0], CHUNK), np.int64)
@@ -156,7 +171,7 @@ def place_points(xyz, origin, step, voxel_steps, bias, more, seeds, voxels, numb
 
 @nb.njit(nogil=True, cache=True)
 def scatter(numbers, values, place, out):
-    """Bring values (n,) into the order of their voxels: out[place[number]] for each, and place (v,) moves on."""
+    """Scatter values (n,) to out[place[number]], ordered by voxel; advances place (v,) per value."""
     for i in range(numbers.shape[0]):
         number = numbers[i]
         out[place[number]] = values[i]
@@ -165,9 +180,11 @@ def scatter(numbers, values, place, out):
 
 @nb.njit(nogil=True, cache=True)
 def order_ties(codes, order, ranks):
-    """Sort each stretch of equal codes (n,), ascending, by ranks: order (n,) int64 says whose code and rank it is.
+    """Sort each run of equal codes (n,), ascending, by ranks.
 
-    Insertion, for stretches are short; one of many, duplicates of one point, is done by a sort of its ranks.
+    order: (n,) int64, the point of each code; its rank is ranks[order]. Reordered.
+    Insertion sort, because runs are short; a long run, duplicates of one point, uses a library
+    sort.
     """
     n = codes.shape[0]
     begin = 0
@@ -191,7 +208,7 @@ def order_ties(codes, order, ranks):
 
 @nb.njit(nogil=True, cache=True)
 def fill_local(codes, local):
-    """Write the coordinates that Morton codes (n,) stand for into local (n, 3) int32."""
+    """Write the coordinates of Morton codes (n,) into local (n, 3) int32."""
     coordinates = morton_decode(codes)
     for i in range(codes.shape[0]):
         local[i, 0] = coordinates[i, 0]

@@ -1,8 +1,9 @@
-"""The hierarchy over a voxel's cells, bounded in a stream: first what cells are known by, then their points once.
+"""The hierarchy over a voxel's cells, bounded in a stream: from cell summaries, then the points once.
 
-Where a good centre lies is guessed from the extreme points of the cells below a node; the slab's direction comes from
-how the cells' points are spread. Neither needs a point again. Radius and slab do: every cell's points pass once, in any
-order, and a node's bounds grow to hold them. All of it is the same whether a voxel is held or read block by block.
+The extreme points of the cells below a node give an estimate of a good centre; the cells' spreads
+give the slab's direction. Neither needs the points again. Radius and slab do: every cell's points
+pass once, in any order, and a node's bounds grow to hold them. The result is the same whether a
+voxel is held in memory or read block by block.
 """
 
 import numpy as np
@@ -26,7 +27,10 @@ from .trees import DIRECTIONS, EXTREMES
 
 @nb.njit(nogil=True, cache=True)
 def _join_extremes(extremes, first, count, found):
-    """Write the extreme points (EXTREMES, 3) among the rows first to first + count of extremes (n, EXTREMES, 3)."""
+    """Write the extreme points (EXTREMES, 3) of the rows first to first + count of extremes.
+
+    extremes: (n, EXTREMES, 3).
+    """
     for d in range(EXTREMES // 2):
         least, most = np.int64(1) << 62, -(np.int64(1) << 62)
         for i in range(first, first + count):
@@ -45,17 +49,20 @@ def _join_extremes(extremes, first, count, found):
 
 @nb.njit(nogil=True, cache=True)
 def _stored_center(guess, unit, highest, center):
-    """Write the centre (3,) [units] nearest to a guess (3,) [steps]."""
+    """Write the stored centre (3,) [units] nearest to an estimate (3,) [steps]."""
     for k in range(3):
         center[k] = min(max(np.int64(np.rint(guess[k] / float(unit))), 0), highest)
 
 
 @nb.njit(nogil=True, cache=True)
 def _guess_center(extremes, first, count, own, space, unit, highest, center):
-    """Write a centre (3,) [units] for the points that the rows first to first + count of extremes stand for.
+    """Write an estimated centre (3,) [units] of the points that some rows of extremes represent.
 
-    own: (3, n) int32 [steps]: all the rows' points.  space: of `bound_space`, for as many. A ball around the box's
-    centre holds anything with a radius of at most 0.87 of `highest`: it is taken where the guess cannot promise to.
+    first, count: the rows of extremes.
+    own: (3, n) int32 [steps], filled with all the rows' points.
+    space: of `bound_space`, for as many points.
+    A ball around the box's centre holds any points with a radius of at most 0.87 of `highest`. It
+    replaces an estimate that cannot guarantee a radius of `highest`.
     """
     points = space[0]
     n = EXTREMES * count
@@ -85,12 +92,16 @@ def _guess_center(extremes, first, count, own, space, unit, highest, center):
 
 @nb.njit(nogil=True, cache=True)
 def guess_bounds(tree, spreads, extremes, unit, highest, with_slab, center, normal, reach2, slab):
-    """Choose the centres and directions of a tree over cells, and begin its radii and slabs with the extreme points.
+    """Choose centres and directions of a tree over cells; initialise its radii and slabs.
 
-    tree: (begin, count, levels) of `pack_tree` over c cells.  spreads (c, SPREAD), extremes (c, EXTREMES, 3) int32: of
-    the cells in the tree's order, see trees.py.  unit: of stored centres and radii [steps].  highest: greatest stored
-    coordinate. Writes int64, t rows: center (t, 3) [units], normal (t, 3), reach2 (t,) greatest squared
-    distance from the centre [steps], slab (t, 2): of these points, so all that `grow_bounds` adds only makes them grow.
+    tree: (begin, count, levels) of `pack_tree` over c cells.
+    spreads (c, SPREAD), extremes (c, EXTREMES, 3) int32: of the cells in the tree's order, see
+    trees.py.
+    unit: of stored centres and radii [steps].
+    highest: greatest stored coordinate.
+    Writes int64, t rows: center (t, 3) [units], normal (t, 3), reach2 (t,) greatest squared
+    distance from the centre [steps], slab (t, 2). reach2 and slab cover the extreme points only;
+    `grow_bounds` can only enlarge them.
     """
     begin, count, levels = tree
     t, leaves = begin.shape[0], levels[levels.shape[0] - 2]
@@ -121,12 +132,17 @@ def guess_bounds(tree, spreads, extremes, unit, highest, with_slab, center, norm
 
 @nb.njit(nogil=True, cache=True)
 def grow_bounds(xyz, starts, low, boxes, above, center, normal, unit, reach2, slab):
-    """Make the bounds of the nodes above some cells hold those cells' points.
+    """Enlarge the bounds of the nodes above some cells to hold those cells' points.
 
-    xyz: (3, n) uint16 from their cell's corner, cell by cell.  starts: (k + 1,) int64.  low: (k, 3) int64 corners.
-    boxes: (k, 2, 3) int64, least and greatest coordinates of the cells' points from the voxel's corner.  above: (h, k)
-    int64, the node of each level that holds the cell.  center, normal, unit: see `guess_bounds`. Raises reach2 and
-    widens slab where the points ask for it; a cell whose box lies within both is not looked into.
+    xyz: (3, n) uint16 from their cell's corner, cell by cell.
+    starts: (k + 1,) int64.
+    low: (k, 3) int64 corners.
+    boxes: (k, 2, 3) int64, least and greatest coordinates of the cells' points from the voxel's
+    corner.
+    above: (h, k) int64, the node of each level that holds the cell.
+    center, normal, unit: see `guess_bounds`.
+    Raises reach2 and widens slab where the points require it; the points of a cell whose box lies
+    within both are not read.
     """
     for cell in range(low.shape[0]):
         lo, hi = np.uint64(starts[cell]), np.uint64(starts[cell + 1])
@@ -153,10 +169,10 @@ def grow_bounds(xyz, starts, low, boxes, above, center, normal, unit, reach2, sl
 
 @nb.njit(nogil=True, cache=True)
 def leaf_rows(xyz, starts, leaf_starts, count, block_low, points):
-    """Write the points (n, 3) uint16 of some cells from the corners of their leaf nodes' boxes.
+    """Write the points (n, 3) uint16 of some cells relative to their leaf nodes' low corners.
 
-    xyz, starts: as `grow_bounds` takes them.  leaf_starts: (k,) int64, each cell's first leaf node among count (m,)
-    and block_low (m, 3).
+    xyz, starts: as in `grow_bounds`.
+    leaf_starts: (k,) int64, each cell's first leaf node in count (m,) and block_low (m, 3).
     """
     for cell in range(leaf_starts.shape[0]):
         at, node = np.uint64(starts[cell]), leaf_starts[cell]
@@ -173,7 +189,10 @@ def leaf_rows(xyz, starts, leaf_starts, count, block_low, points):
 
 @nb.njit(nogil=True, cache=True)
 def take_runs(values, starts, chosen, taken):
-    """Write the runs values[..., starts[i]:starts[i + 1]] of the chosen i behind each other: values, taken (w, n)."""
+    """Write the runs values[..., starts[i]:starts[i + 1]] of the chosen i, concatenated, into taken.
+
+    values, taken: (w, n).
+    """
     to = np.uint64(0)
     for run in chosen:
         lo, hi = np.uint64(starts[run]), np.uint64(starts[run + 1])

@@ -1,6 +1,7 @@
-"""The bounding sphere hierarchies of many sets of points in one call, those of a voxel's cells; or of an avatar's.
+"""Bounding sphere hierarchies of many sets of points in one call: a voxel's cells, or an avatar.
 
-Rows of `nodes`, a tuple of arrays as in schemas/voxel.py `Nodes`: center, radius, normal, slab, count, axis, block_low.
+Rows of `nodes`, a tuple of arrays as in schemas/voxel.py `Nodes`: center, radius, normal, slab,
+count, axis, block_low.
 """
 
 import numpy as np
@@ -9,7 +10,8 @@ from ...schemas.kernels import compiling as nb
 from .bounding_sphere import SPREAD, bound_run, bound_space, join_spread, leaf_spread
 from .pack import ROWS, longest_edge, most_nodes, pack_points, pack_space, sort_run
 
-# Directions whose two extreme points stand for a cell where the centre of a sphere around many cells is guessed.
+# The extreme points along these directions, two each, represent a cell in the estimate of the
+# centre of a sphere around many cells.
 DIRECTIONS = np.array(
     [[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1], [1, 1, -1], [1, -1, 1], [1, -1, -1]], np.int64
 )
@@ -18,7 +20,7 @@ EXTREMES = 14
 
 @nb.njit(nogil=True, cache=True)
 def tree_space(n, leaf, degree):
-    """What `build_tree` works in, for trees of up to n points."""
+    """Allocate the work space of `build_tree` for trees of up to n points."""
     most = most_nodes(n, leaf)
     runs = (np.empty(most, np.int64), np.empty(most, np.int64), np.empty(64, np.int64))
     return pack_space(n, degree), bound_space(n), runs, np.empty((most, SPREAD)), np.empty(3)
@@ -26,7 +28,7 @@ def tree_space(n, leaf, degree):
 
 @nb.njit(nogil=True, cache=True)
 def tree_rows(n, leaf):
-    """Rows of nodes, int64, of one tree of up to n points, as `build_tree` writes them."""
+    """Allocate the int64 node rows that `build_tree` writes for one tree of up to n points."""
     most = most_nodes(n, leaf)
     return (
         np.empty((most, 3), np.int64),
@@ -41,12 +43,15 @@ def tree_rows(n, leaf):
 
 @nb.njit(nogil=True, cache=True)
 def build_tree(own, n, leaf, degree, with_slab, highest, space, nodes, spread):
-    """Build the hierarchy of the first n points of own (4, >= n), see `pack_points`, and bound its nodes.
+    """Build the hierarchy of the first n points of own (4, >= n) and bound its nodes.
 
-    highest: see `bound_run`.  space: of `tree_space`, where its runs are left.  nodes: of `tree_rows`. Moves the points
-    into leaf-node order, those of a leaf node sorted along the longest edge of their box, ties by rank. Writes rows of
-    nodes, level by level from the root, and spread (SPREAD,) of all points. Returns how many rows, and the level of the
-    leaf nodes.
+    own, leaf, degree: see `pack_points`.
+    with_slab, highest: see `bound_run`.
+    space: of `tree_space`; its runs hold the result's runs afterwards.
+    nodes: of `tree_rows`.
+    Moves the points into leaf-node order; the points of a leaf node are sorted along the longest
+    edge of their box, ties by rank. Writes rows of nodes, level by level from the root, and spread
+    (SPREAD,) of all points. Returns (number of rows, level of the leaf nodes).
     """
     packing, bounding, runs, spreads, guess = space
     begin, end, levels = runs
@@ -98,7 +103,7 @@ def build_tree(own, n, leaf, degree, with_slab, highest, space, nodes, spread):
 
 @nb.njit(nogil=True, cache=True)
 def _store_rows(rows, total, nodes, at):
-    """Write the first rows of a tree into nodes from row `at` on, narrowed to the stored types."""
+    """Write the first `total` rows of a tree into nodes from row `at` on, narrowed to the stored types."""
     center, radius, normal, slab, count, axis, block_low = rows
     for i in range(total):
         for k in range(3):
@@ -112,7 +117,10 @@ def _store_rows(rows, total, nodes, at):
 
 @nb.njit(nogil=True, cache=True)
 def extreme_points(own, n, low, extremes):
-    """Write the extreme points (EXTREMES, 3) of the first n of own along DIRECTIONS, plus low (3,): least, greatest."""
+    """Write the extreme points (EXTREMES, 3) of the first n of own along DIRECTIONS, plus low (3,).
+
+    Each direction gives its least, then its greatest point.
+    """
     for d in range(EXTREMES // 2):
         a, b, c = DIRECTIONS[d, 0], DIRECTIONS[d, 1], DIRECTIONS[d, 2]
         least, most = np.int64(1) << 62, -(np.int64(1) << 62)
@@ -130,13 +138,16 @@ def extreme_points(own, n, low, extremes):
 def build_cells(
     points, starts, low, leaf, degree, with_slab, highest, nodes, held, xyz, rank, spreads, extremes
 ):
-    """Build the hierarchies of cells, one after the other.
+    """Build the hierarchies of cells, one after the other; return the number of rows.
 
-    points: (n, 3) int32 [voxel steps], cell by cell, in canonical order.  starts: (c + 1,) int64, first point of each
-    cell, and n.  low: (c, 3) int64, the cells' corners.  leaf, degree, with_slab, highest: see `build_tree`.
-    Writes rows of nodes, cell by cell, level by level; held (c,), how many of each cell; xyz (3, n) uint16, the points
-    in leaf-node order, from their cell's corner; rank (n,) int32, which of `points` each is; spreads (c, SPREAD) and
-    extremes (c, EXTREMES, 3) int32 of the cells' points, from the voxel's corner. Returns how many rows.
+    points: (n, 3) int32 [voxel steps], cell by cell, in canonical order.
+    starts: (c + 1,) int64, first point of each cell, and n.
+    low: (c, 3) int64, the cells' corners.
+    leaf, degree, with_slab, highest: see `build_tree`.
+    Writes rows of nodes, cell by cell, level by level; held (c,), the number of rows of each cell;
+    xyz (3, n) uint16, the points in leaf-node order, from their cell's corner; rank (n,) int32,
+    each point's index in `points`; spreads (c, SPREAD) and extremes (c, EXTREMES, 3) int32 of the
+    cells' points, from the voxel's corner.
     """
     largest = np.int64(0)
     for cell in range(low.shape[0]):

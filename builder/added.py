@@ -20,7 +20,7 @@ from .partition import SpoolUnit, run_points, spool_range
 from .passes import MAX_SCANS
 from .pipeline import ARCHIVE_BYTES_A_POINT
 from .scan_list import Input
-from .sources import Scan
+from .sources.scan import Scan
 from .spool import Spool
 from .survey import Survey, hash_file, joined, ranges, survey_range, unopened
 

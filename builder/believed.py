@@ -6,9 +6,9 @@ checksum. A flipped bit in a run would produce a valid archive of different poin
 
 from collections.abc import Mapping
 
-from .spool import RUN_FOLDERS, RunSums, is_other_run
+from .spool import RunSums, is_other_run
 from .stages import Stages
-from .workplace import Workplace
+from .workplace import RUN_FOLDERS, Workplace
 
 
 def check_runs(place: Workplace, stages: Stages) -> None:

@@ -25,9 +25,10 @@ from ..schemas.new_file import sync_folder
 from ..schemas.shard import SHARD_FOLDER
 from ..schemas.vtkhdf import PREVIEW_NAME
 from .config import BuildConfig
-from .executor import Executor, make_executor, worker_count
+from .executor import Executor, worker_count
 from .kernels.content import SEEDS
 from .kernels.records import sum_places
+from .make_executor import make_executor
 from .memory import bytes_beside_records, jobs_that_fit, memory_share, readers_that_fit
 from .preview import write_preview
 from .progress import Progress, Silent

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..schemas.errors import ScanError
 from ..schemas.index import Source
-from .sources import Scan
+from .sources.scan import Scan
 
 # A scan of so few points whose header declares no bounds is read to know whether they coincide: some milliseconds.
 MOST_READ = 1 << 16

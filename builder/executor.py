@@ -16,7 +16,6 @@ from typing import Any, Protocol, Self, TypeVar
 
 from ..schemas.errors import SolidcloudError
 from ..schemas.interrupts import check, children_ignore
-from .config import BuildConfig
 from .progress import Progress
 
 Unit = TypeVar("Unit")
@@ -125,20 +124,6 @@ def worker_count(jobs: int, points: int) -> int:
     if jobs:
         return jobs
     return min(os.cpu_count() or 1, max(1, points // POINTS_WORTH_A_PROCESS))
-
-
-def make_executor(config: BuildConfig, jobs: int) -> Executor:
-    """Make the executor: a cluster if the options name one, otherwise `jobs` processes.
-
-    One job runs in this process.
-    """
-    address = config.scheduler or config.cluster
-    if address is None:
-        return ProcessExecutor(jobs)
-    # This import loads dask, which nothing else needs.
-    from .cluster import ClusterExecutor
-
-    return ClusterExecutor(address, config.memory_bytes)
 
 
 def _begin_worker() -> None:

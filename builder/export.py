@@ -23,6 +23,7 @@ from ..schemas.index import Header
 from ..schemas.new_file import sync_folder
 from ..schemas.voxel_grid import MAX_COORDINATE, Lattice
 from ..schemas.vtkhdf import vtk_file
+from .export_contents import Contents
 from .progress import Progress, Silent
 from .record_points import Taken, read_columns, record_columns, stored_columns, taken
 
@@ -42,21 +43,6 @@ class Exported(NamedTuple):
     low: list[float] | None
     high: list[float] | None
     notes: tuple[str, ...]
-
-
-class Contents(NamedTuple):
-    """Properties of the points to write, known in advance.
-
-    low, high: (3,) int64 [lattice]; 0 without points.  columns: name -> type, of the stored
-    columns.
-    whole_intensity: every intensity is an integer that 16 bits hold.
-    """
-
-    points: int
-    low: NDArray[np.int64]
-    high: NDArray[np.int64]
-    columns: dict[str, np.dtype]
-    whole_intensity: bool
 
 
 class Writer(Protocol):

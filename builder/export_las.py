@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from ..schemas.errors import BadRequestError
 from ..schemas.index import Source
 from ..schemas.voxel_grid import Lattice
-from .export import Contents
+from .export_contents import Contents
 
 # Keywords that begin well-known text, in both of its versions [OGC 01-009, 18-010r7].
 _WKT = re.compile(

@@ -22,7 +22,6 @@ from .journal import Journal, Work, resumed
 from .partition import RunsHold
 from .progress import Progress
 from .spool import (
-    RUN_FOLDERS,
     RUN_SUFFIX,
     RunSums,
     Spool,
@@ -33,6 +32,7 @@ from .spool import (
     spool_dtype,
     write_directory,
 )
+from .workplace import RUN_FOLDERS
 
 # Points in a work unit.
 UNIT_POINTS = 1 << 21

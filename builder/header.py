@@ -15,7 +15,7 @@ from .coincident import coincide
 from .config import BuildConfig
 from .partition import Spooled
 from .shards import Shard
-from .sources import Scan
+from .sources.scan import Scan
 from .survey import Survey
 
 

@@ -18,7 +18,7 @@ from .config import BuildConfig
 from .pipeline import build_archive
 from .plan import Rates, Stage
 from .progress import Progress, Silent
-from .sources import open_scans
+from .sources.files import open_scans
 
 POINTS = 1_000_000
 READ_POINTS = 300_000

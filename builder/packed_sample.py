@@ -22,7 +22,7 @@ from .kernels.cubes import FREE, insert_all, take_cubes
 from .octree import VoxelPoints, build_voxel
 from .partition import usable
 from .plan import Rates
-from .sources import Block, Scan
+from .sources.scan import Block, Scan
 
 # Number of blocks to pack, and points per block: packing takes about 1 us per point.
 BLOCKS, BLOCK_POINTS = 48, 12_000

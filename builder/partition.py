@@ -19,7 +19,7 @@ from ..schemas.voxel_grid import KEY_BIAS, MAX_COORDINATE, Lattice, voxel_keys
 from .config import BuildConfig
 from .kernels.content import SEEDS
 from .kernels.spool import FREE, fill_local, order_ties, place_points, rehash, scatter, usable_bounds
-from .sources import Block, Scan
+from .sources.scan import Block, Scan
 from .spool import RUN_SUFFIX, RunSums, new_run, run_sizes, write_directory
 
 # Bytes per point in a spooling worker: voxel number, code, and a copy of the code in sorted order.

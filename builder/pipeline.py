@@ -30,9 +30,10 @@ from ..schemas.vtkhdf import PREVIEW_NAME
 from .coincident import coincident_sources, coincident_text
 from .config import RADIUS_SAMPLE, BuildConfig
 from .dense import DENSE_POINTS
-from .executor import Executor, make_executor, worker_count
+from .executor import Executor, worker_count
 from .filter_rules import filter_dtype, filter_passes
 from .header import archive_id, make_header
+from .make_executor import make_executor
 from .memory import jobs_that_fit, readers_that_fit
 from .passes import build_shards, check_filters, filter_points, spool_rows, spool_scans, survey_scans
 from .preview import write_preview

@@ -10,7 +10,7 @@ from ..schemas.index import Source
 from .config import BuildConfig
 from .scan_list import Input
 from .software import software
-from .sources import NOT_FINITE, Scan, sha256_of
+from .sources.scan import NOT_FINITE, Scan, sha256_of
 
 # Differences named in a message, at most.
 NAMED = 5

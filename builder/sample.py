@@ -19,7 +19,7 @@ from .config import DEFAULT_STEP, BuildConfig
 from .packed_sample import BrokenScanError, Packed, packed_sample
 from .plan import Plan, Rates, Scene, estimate, load_rates
 from .scan_list import Input, inputs
-from .sources import Scan
+from .sources.scan import Scan
 from .survey import shared_step
 
 # Surfaces are measured in cubes of the first of these edges [m] that is far more than the distance of points, so that

@@ -26,7 +26,9 @@ from ..schemas.new_file import sync_folder
 from .coincident import coincident_scan
 from .passing import raise_passing
 from .progress import Progress, Silent
-from .sources import METRES, TURNS, Scan, header_bounds, open_scans, placed, scan_files, sha256_of
+from .sources.files import header_bounds, open_scans, scan_files
+from .sources.placed import METRES, TURNS, placed
+from .sources.scan import Scan, sha256_of
 
 SUFFIX = ".toml"
 VERSION = 1

@@ -34,8 +34,6 @@ from .kernels.octree import voxel_codes
 
 RUN_SUFFIX = ".run"
 KEYS_SUFFIX = ".keys"
-# Folders of runs, each made of those before it.
-RUN_FOLDERS = ("spool", "filter-near", "filter-thin")
 # Of the file of all directories merged.
 MERGED_SUFFIX = f".directory{TEMPORARY_SUFFIX}"
 # Voxels of runs that are merged at a time. 1,400 runs of 1,500 voxels each took 200 MB in each process, all merged at

@@ -17,7 +17,7 @@ from ..schemas.voxel_grid import MAX_COORDINATE, MAX_VOXEL_STEPS, MIN_STEP, Latt
 from .config import DEFAULT_STEP, BuildConfig
 from .kernels.spool import usable_bounds
 from .passing import raise_passing
-from .sources import NOT_FINITE, Scan, sha256_of
+from .sources.scan import NOT_FINITE, Scan, sha256_of
 from .sources.scan import Lattice as SourceLattice
 
 # A header's bounds are believed when no point lies farther outside [m]: they are rounded, but not by more.

@@ -18,8 +18,9 @@ from ..schemas.vtkhdf import PREVIEW_NAME
 from .journal import TEMPORARY_SUFFIX, Journal, is_temporary, remove_temporaries
 from .lock import locked as locked
 from .resume import check_same
-from .spool import RUN_FOLDERS
 
+# Folders of runs, each made of those before it.
+RUN_FOLDERS = ("spool", "filter-near", "filter-thin")
 # The note of what is built, the first of all; and what in it names the folder that holds what is done.
 BEGUN, WORD = "build", "word"
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import BadRequestError
-from .voxel_grid import UNITS_PER_METRE
+from .units import UNITS_PER_METRE
 
 # Models that `solidcloud build --radius` can store.
 STORED_MODELS = ("mean", "local", "border")

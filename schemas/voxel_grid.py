@@ -16,10 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from .errors import BadRequestError
 from .kernels.morton import morton_decode, morton_encode
-
-# Unit in which exact contact is decided, 2^-26 m = 15 nm (NUMERICS.md N5). A power of two, so that
-# metres times UNITS_PER_METRE is exact in float64.
-UNITS_PER_METRE = 2.0**26
+from .units import UNITS_PER_METRE
 
 # Offset added to voxel coordinates before they are interleaved, 21 bits per axis, into a uint64
 # key.

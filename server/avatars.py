@@ -15,8 +15,7 @@ from ..schemas.seals import avatar_digest
 from ..schemas.stats import AvatarStats
 from .answering_avatars import note
 from .avatar import AvatarModel, make_avatar
-from .config import AvatarLimits
-from .served import EVERYBODY, THIS_PROCESS
+from .avatar_limits import EVERYBODY, THIS_PROCESS, AvatarLimits
 
 # What the arrays of an avatar take, at most [bytes]: 53.5 a point were measured, and one block for a few points.
 _BYTES_A_POINT, _LEAST_BYTES = 56, 1200

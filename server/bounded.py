@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..schemas.answers import CollideAnswers, Cost, DistanceAnswers, Verdict
-from ..schemas.voxel_grid import UNITS_PER_METRE
+from ..schemas.units import UNITS_PER_METRE
 from .avatar import AvatarModel
 from .effort import Effort
 from .kernels.closest import Nearest

@@ -57,7 +57,7 @@ from .endpoints import DEFAULT_ENDPOINT, check_endpoint, zenoh_words
 from .identity import OPEN_SECONDS, Identity
 from .questions import Questions
 from .replies import Anchor, Asked, OtherAvatarError
-from .transport import session_config
+from .zenoh_settings import session_config
 
 log = logging.getLogger(__name__)
 

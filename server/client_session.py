@@ -29,8 +29,8 @@ from ..schemas.messages import ErrorReply
 from ..schemas.moves import State, Wish
 from .endpoints import zenoh_words
 from .replies import Anchor, OtherAvatarError
-from .session_transport import FRAME_QOS
 from .state_query import StateQuery
+from .zenoh_settings import FRAME_QOS
 
 log = logging.getLogger(__name__)
 

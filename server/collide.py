@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..schemas.answers import CollideAnswers
-from ..schemas.voxel_grid import UNITS_PER_METRE
+from ..schemas.units import UNITS_PER_METRE
 from .avatar import AvatarModel
 from .bounded import collide_bounded
 from .coarse import settle

@@ -3,24 +3,11 @@
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 from ..schemas.errors import BadRequestError
 from ..schemas.messages import MAX_AVATAR_POINTS, MAX_POSES
+from .avatar_limits import AvatarLimits
 from .endpoints import DEFAULT_ENDPOINT, check_endpoint, is_loopback
-
-
-class AvatarLimits(NamedTuple):
-    """How much memory avatars may take; of all clients together, and of each one.
-
-    bytes: of their arrays.  avatars: their number.  clients: how many clients may have any.
-    """
-
-    bytes: int
-    bytes_by_client: int
-    avatars: int
-    avatars_by_client: int
-    clients: int
 
 
 @dataclass(frozen=True)

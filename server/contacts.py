@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..schemas.answers import ContactsAnswers, Verdict
 from ..schemas.errors import BadRequestError, TooLargeError
 from ..schemas.requests import MAX_CONTACTS
-from ..schemas.voxel_grid import UNITS_PER_METRE
+from ..schemas.units import UNITS_PER_METRE
 from .avatar import AvatarModel
 from .distance import signed_from_square
 from .effort import EXACT, Effort

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from msgspec import structs
 
+from ..schemas.effect_order import ORDER
 from ..schemas.index import Header
 from ..schemas.messages import (
     WIRE_VERSION,
@@ -85,8 +86,6 @@ def run_order(file: SceneFile) -> list[str]:
     declared = {effect_name(effect) for effect in file.effects}
     if len(declared) < 2:
         return list(declared)
-    from .effects import ORDER  # an archive without a file has one effect: nothing of them is imported for it
-
     return [name for name in ("through", *ORDER) if name in declared]
 
 

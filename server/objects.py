@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..schemas.answers import ObjectsAnswers
 from ..schemas.errors import BadRequestError, BadTransformError
-from ..schemas.voxel_grid import UNITS_PER_METRE
+from ..schemas.units import UNITS_PER_METRE
 from .avatar import AvatarModel
 from .collide import collide
 from .effort import EXACT, Effort

@@ -16,7 +16,8 @@ import numpy as np
 
 from ..schemas.answers import Part
 from ..schemas.errors import BadRequestError, CorruptError
-from ..schemas.voxel_grid import MAX_COORDINATE, UNITS_PER_METRE
+from ..schemas.units import UNITS_PER_METRE
+from ..schemas.voxel_grid import MAX_COORDINATE
 from .arena import ArenaBuffer
 from .avatar import AvatarModel, make_avatar
 from .coarse import Coarse, settle

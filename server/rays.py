@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..schemas.answers import RaycastAnswers
 from ..schemas.errors import BadRequestError
 from ..schemas.requests import make_vectors
-from ..schemas.voxel_grid import UNITS_PER_METRE
+from ..schemas.units import UNITS_PER_METRE
 from .effort import EXACT, Effort
 from .kernels.placing import MAX_REACH_UNITS
 from .kernels.rays import Nearest, Rays, follow_rays

@@ -10,7 +10,8 @@ from ..schemas.archive import Archive
 from ..schemas.errors import BadRequestError, BadTransformError, SolidcloudError, TooLargeError
 from ..schemas.radius_model import class_radii
 from ..schemas.requests import make_poses
-from ..schemas.voxel_grid import MAX_COORDINATE, UNITS_PER_METRE
+from ..schemas.units import UNITS_PER_METRE
+from ..schemas.voxel_grid import MAX_COORDINATE
 from .avatar import AvatarModel
 from .coarse import Coarse
 from .kernels import placing

@@ -14,7 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..schemas.errors import BadRequestError
 from ..schemas.requests import make_vectors
-from ..schemas.voxel_grid import MAX_COORDINATE, UNITS_PER_METRE
+from ..schemas.units import UNITS_PER_METRE
+from ..schemas.voxel_grid import MAX_COORDINATE
 from .effort import Effort
 from .kernels.rays import Nearest
 from .kernels.voxel_tree import Lists, VoxelTree, list_voxels

@@ -28,9 +28,9 @@ from ..schemas.messages import AvatarInfo, ReloadAnswer, SceneInfo, StatsAnswer
 from ..schemas.requests import make_objects, make_poses
 from ..schemas.scene import scene_of
 from .avatar import AvatarModel
+from .avatar_limits import AvatarLimits
 from .avatars import Avatars
 from .collide import collide
-from .config import AvatarLimits
 from .contacts import contacts
 from .describe import describe, describe_scene, make_stats
 from .distance import distance

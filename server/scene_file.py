@@ -19,7 +19,7 @@ from ..schemas.index import NORMAL_REACH
 from ..schemas.messages import AvatarInfo, SceneInfo
 from ..schemas.radius_model import class_radii
 from ..schemas.scene import SUFFIX, SceneFile, identity, read_scene, scene_name
-from ..schemas.voxel_grid import UNITS_PER_METRE
+from ..schemas.units import UNITS_PER_METRE
 from .arena import ArenaBuffer
 from .avatar import make_avatar
 from .describe import describe

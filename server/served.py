@@ -18,13 +18,8 @@ from ..schemas.errors import SolidcloudError
 from ..schemas.keys import User
 from ..schemas.messages import AvatarInfo, ReloadAnswer, SceneInfo, StatsAnswer
 from ..schemas.moves import Moved, State, Wish
-from .config import AvatarLimits
+from .avatar_limits import AvatarLimits
 from .stop import Stop
-
-# The client whose avatars every client may ask about; no key can name it.
-EVERYBODY = "*"
-# The client of avatars that were added in the process that serves, by no client.
-THIS_PROCESS = ""
 
 
 class Full(Enum):

@@ -27,13 +27,6 @@ _CHANNEL = 1024
 # Queries for states that may be open for each user that a scene has room for.
 _STREAMS_A_USER = 2
 
-# How wishes travel; states travel the same way (access.state_priority).
-FRAME_QOS: dict[str, Any] = {
-    "congestion_control": zenoh.CongestionControl.DROP,
-    "priority": zenoh.Priority.INTERACTIVE_HIGH,
-    "express": True,
-}
-
 
 class Sessions(Protocol):
     """What has the frames of a scene simulated."""

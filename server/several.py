@@ -33,8 +33,8 @@ from ..schemas.errors import BadRequestError, SolidcloudError
 from ..schemas.messages import AvatarInfo, ReloadAnswer, SceneInfo, StatsAnswer
 from ..schemas.requests import make_objects, make_poses, make_vectors
 from .avatar import AvatarModel
+from .avatar_limits import AvatarLimits
 from .collide import collide
-from .config import AvatarLimits
 from .contacts import contacts
 from .described import info_of_several, sources_asked, stats_of_several
 from .distance import distance

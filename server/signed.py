@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..schemas.answers import Verdict
-from ..schemas.voxel_grid import UNITS_PER_METRE
+from ..schemas.units import UNITS_PER_METRE
 from .kernels.closest import Nearest
 from .kernels.reach import Reach
 from .request import SceneData

@@ -12,8 +12,8 @@ import numpy as np
 
 from ..schemas.moves import FRAME_SECONDS, Moved
 from ..schemas.scene import SceneFile, scene_of
+from .avatar_limits import EVERYBODY
 from .posed import moved
-from .served import EVERYBODY
 from .simulation import Simulation, Stage
 from .stop import NEVER, Stop
 from .within import within

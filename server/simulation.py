@@ -33,7 +33,7 @@ from ..schemas.requests import make_poses
 from ..schemas.scene import SceneFile
 from .answering_avatars import noted
 from .avatar import AvatarModel
-from .config import AvatarLimits
+from .avatar_limits import AvatarLimits
 from .describe import describe_scene
 from .effects.frame import Body
 from .effort import EXACT, Effort

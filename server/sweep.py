@@ -8,7 +8,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..schemas.answers import SweepAnswers, Verdict
 from ..schemas.errors import BadRequestError, BadTransformError
-from ..schemas.voxel_grid import MAX_COORDINATE, UNITS_PER_METRE
+from ..schemas.units import UNITS_PER_METRE
+from ..schemas.voxel_grid import MAX_COORDINATE
 from .avatar import AvatarModel
 from .effort import EXACT, Effort
 from .kernels.advance import Progress, avatar_box, look_around, plan_segments, sweep_segments

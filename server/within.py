@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..schemas.answers import WithinAnswers
 from ..schemas.errors import BadRequestError
-from ..schemas.voxel_grid import UNITS_PER_METRE
+from ..schemas.units import UNITS_PER_METRE
 from .effort import EXACT, Effort
 from .kernels.placing import MAX_REACH_UNITS
 from .kernels.rays import Nearest

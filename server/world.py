@@ -6,7 +6,7 @@ there is one, at the identity, as nearly always, its questions are asked as they
 
 import threading
 from collections import OrderedDict
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import msgspec
 import numpy as np
@@ -15,9 +15,11 @@ from numpy.typing import NDArray
 from ..schemas.answers import ContactsAnswers, DistanceAnswers, Verdict, WithinAnswers
 from ..schemas.errors import CorruptError
 from ..schemas.index import MAX_NORMAL_REACH
+from ..schemas.messages import SceneInfo
 from ..schemas.scene import SceneFile
-from ..schemas.voxel_grid import UNITS_PER_METRE
+from ..schemas.units import UNITS_PER_METRE
 from .avatar import AvatarModel
+from .avatar_limits import EVERYBODY
 from .contacts import contacts
 from .effects.frame import Hit, Pose, Vec
 from .effort import EXACT, Effort
@@ -26,8 +28,6 @@ from .opened import Opened
 from .posed import inverse_of, moved, turned, under
 from .probe import Probe, Swept
 from .request import SceneData, with_stop
-from .scene import Scene
-from .served import EVERYBODY
 from .stop import NEVER, Stop
 from .vectors import lowest_of, unit
 from .within import within
@@ -41,10 +41,17 @@ _NOWHERE = np.zeros(3)
 SPARSE = 3.0
 
 
+class ArchiveScene(Protocol):
+    """A scene of one archive."""
+
+    def take(self) -> Opened: ...
+    def info(self) -> SceneInfo: ...
+
+
 class Placed(NamedTuple):
     """One archive of a scene. pose, inverse: (4, 4), archive to world and back; None at the identity."""
 
-    scene: Scene
+    scene: ArchiveScene
     pose: Pose | None = None
     inverse: Pose | None = None
 

@@ -20,6 +20,7 @@ DOORS = {
         "server/transport.py",
         "server/client.py",
         "server/session_transport.py",
+        "server/zenoh_settings.py",
         "server/state_streams.py",
         "server/state_query.py",
         "server/replies.py",

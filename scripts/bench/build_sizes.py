@@ -7,7 +7,7 @@ from pathlib import Path
 import laspy
 import numpy as np
 from numpy.typing import NDArray
-from solidcloud.builder.sources import open_scans, scan_files
+from solidcloud.builder.sources.files import open_scans, scan_files
 from solidcloud.schemas.archive import Archive
 
 # The real scans that are built, of the folder that SOLIDCLOUD_SCANS names.

@@ -18,7 +18,7 @@ from rogues.tools import widths, zeros
 from solidcloud.schemas import keys
 from solidcloud.schemas.messages import MSGPACK, AddAvatarRequest, CollideRequest, ContactsRequest, encode
 from solidcloud.schemas.requests import make_poses
-from solidcloud.server.transport import session_config
+from solidcloud.server.zenoh_settings import session_config
 
 from .ground import SCENE
 

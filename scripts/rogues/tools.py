@@ -28,7 +28,7 @@ from solidcloud.schemas.messages import AvatarInfo, CollideRequest, ErrorReply, 
 from solidcloud.schemas.moves import State, Wish
 from solidcloud.server.client import Client
 from solidcloud.server.client_session import ClientSession
-from solidcloud.server.transport import session_config
+from solidcloud.server.zenoh_settings import session_config
 
 MODES = ("client", "peer", "router")
 AVATAR = "al"

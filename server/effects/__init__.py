@@ -13,9 +13,3 @@ that a scene declares, in this order:
 
 `through` is none of a frame: it changes what the scene is, once, when it is opened.
 """
-
-ORDER = (
-    "objects", "crowd", "stop", "sweep", "slide", "step", "ground", "proximity", "contacts", "uncertainty",
-)  # fmt: skip
-# What safety asks for: never skipped, whatever a frame's budget.
-NEVER_SKIPPED = frozenset({"stop", "sweep", "objects", "crowd"})

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas.answers import Verdict
-from ...schemas.voxel_grid import UNITS_PER_METRE
+from ...schemas.units import UNITS_PER_METRE
 from ..avatar import AvatarModel, make_avatar
 from ..kernels.meeting import sweep_bodies
 from ..kernels.near_bodies import find_near

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ...schemas.errors import BadRequestError, BadTransformError
 from ...schemas.kernels.normals import NONE, decode_normal, normal_code
-from ...schemas.voxel_grid import UNITS_PER_METRE
+from ...schemas.units import UNITS_PER_METRE
 from ..avatar import AvatarModel
 from ..kernels.meeting_placed import make_scratch
 from ..kernels.near_bodies import bound_body

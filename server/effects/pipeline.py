@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from ...schemas.answers import Verdict
+from ...schemas.effect_order import NEVER_SKIPPED, ORDER
 from ...schemas.errors import BadRequestError
 from ...schemas.moves import FRAME_SECONDS, Moved, Touched
 from ...schemas.scene import SceneFile, effect_name
@@ -21,7 +22,6 @@ from ..effort import EXACT, Effort
 from ..stop import NEVER, StoppedError
 from ..vectors import size
 from ..world import World
-from . import NEVER_SKIPPED, ORDER
 from .frame import Body, Frame, Hit, Pose, Runner, Vec
 
 # What an effect usually takes follows what it took by this share.

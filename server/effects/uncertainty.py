@@ -14,7 +14,8 @@ from ...schemas.effects import Uncertainty
 from ...schemas.errors import BadRequestError
 from ...schemas.messages import SceneInfo, SourceInfo
 from ...schemas.moves import UncertaintyReport
-from ...schemas.voxel_grid import MAX_COORDINATE, UNITS_PER_METRE
+from ...schemas.units import UNITS_PER_METRE
+from ...schemas.voxel_grid import MAX_COORDINATE
 from ..avatar import make_avatar
 from ..by_scan import ANY_SCAN, gaps_by_scan
 from ..near import near

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from ...schemas.kernels import compiling as nb
 from ...schemas.kernels.morton import morton_code
-from ...schemas.voxel_grid import KEY_BIAS, UNITS_PER_METRE
+from ...schemas.units import UNITS_PER_METRE
+from ...schemas.voxel_grid import KEY_BIAS
 from .compiled import borrowing
 from .moments import INFINITE, scan_coordinate, touches_at
 from .motion import make_motion, pose_at

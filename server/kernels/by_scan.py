@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas.kernels import compiling as nb
-from ...schemas.voxel_grid import UNITS_PER_METRE
+from ...schemas.units import UNITS_PER_METRE
 from .closest import lower_bound, set_cut
 from .compiled import borrowing
 from .lanes import keep_near

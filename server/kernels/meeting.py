@@ -18,7 +18,7 @@ import math
 import numpy as np
 
 from ...schemas.kernels import compiling as nb
-from ...schemas.voxel_grid import UNITS_PER_METRE
+from ...schemas.units import UNITS_PER_METRE
 from .compiled import borrowing
 from .layout import LANES
 from .meeting_placed import (

@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from ...schemas.voxel_grid import UNITS_PER_METRE
+from ...schemas.units import UNITS_PER_METRE
 from .compiled import borrowing
 from .layout import LANES, point_class
 from .motion import pose_at

@@ -6,7 +6,7 @@ Their boxes are compared one by one: there are some hundred users.
 import numpy as np
 
 from ...schemas.kernels import compiling as nb
-from ...schemas.voxel_grid import UNITS_PER_METRE
+from ...schemas.units import UNITS_PER_METRE
 from .motion import make_motion
 
 

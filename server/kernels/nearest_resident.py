@@ -11,7 +11,7 @@ import math
 import numpy as np
 
 from ...schemas.kernels import compiling as nb
-from ...schemas.voxel_grid import UNITS_PER_METRE
+from ...schemas.units import UNITS_PER_METRE
 from .closest import Nearest
 from .compiled import borrowing
 from .nearest import nearest_poses

@@ -15,7 +15,7 @@ centre of one of the two leaf nodes, with a certified band in which integers dec
 import numpy as np
 
 from ...schemas.kernels import compiling as nb
-from ...schemas.voxel_grid import UNITS_PER_METRE
+from ...schemas.units import UNITS_PER_METRE
 from .layout import LANES
 from .placed import U32
 from .placing import MAX_REACH_UNITS, largest_term, place, to_units

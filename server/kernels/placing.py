@@ -11,7 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...schemas.voxel_grid import MAX_COORDINATE, UNITS_PER_METRE
+from ...schemas.units import UNITS_PER_METRE
+from ...schemas.voxel_grid import MAX_COORDINATE
 from .compiled import borrowing
 from .stopping import stopped
 

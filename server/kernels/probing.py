@@ -9,7 +9,7 @@ import numpy as np
 
 from ...schemas.answers import Verdict
 from ...schemas.kernels import compiling as nb
-from ...schemas.voxel_grid import UNITS_PER_METRE
+from ...schemas.units import UNITS_PER_METRE
 from .advance import Progress, avatar_box, look_around, plan_segments, sweep_segments
 from .layout import SceneArrays
 from .motion import make_motion, pose_at

@@ -10,7 +10,6 @@ import os
 import time
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any, NamedTuple
 
 from ...builder.config import BuildConfig
 from ...builder.progress import Progress
@@ -39,19 +38,12 @@ from .accuracy_engine import (
 )
 from .accuracy_felt import FACADES, FELT, measure_felt, measure_made
 from .accuracy_plan import Plan
+from .accuracy_report import Report
 from .accuracy_row import COLUMNS, SHOWN, Row, mark_front
 from .accuracy_sheet import count_sheet, measure_sheet
 from .spheres import load_pyplot
 
 TURNED = (VOLUME, PRIMITIVE)
-
-
-class Report(NamedTuple):
-    """What was measured. ground: in words.  facts: figures of the scene and the machine, for JSON and the page."""
-
-    ground: str
-    rows: list[Row]
-    facts: dict[str, Any]
 
 
 def run(

@@ -13,7 +13,7 @@ from ...builder.made.scenes import make_facade
 from ...builder.made.truth import SceneTruth, read_truth
 from ...builder.made.walk import walk_poses
 from ...builder.radius import voxel_points
-from ...builder.sources import open_scans
+from ...builder.sources.files import open_scans
 from ...schemas.answers import Verdict
 from ...schemas.archive import Archive
 from ...schemas.errors import BadDataError

@@ -6,14 +6,12 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from .accuracy_report import Report
 from .accuracy_row import PLAIN, Row, knobs
 from .accuracy_timing import NOISY
 from .accuracy_words import CHARTS, KNOBS, TERMS, findings
-
-if TYPE_CHECKING:
-    from .accuracy import Report
 
 STYLE = """
 body{font:16px/1.5 system-ui,sans-serif;color:#2f2a26;background:#fbfaf7;max-width:75rem}
@@ -36,7 +34,7 @@ HEADS = (
 )  # fmt: skip
 
 
-def write_page(report: "Report", charts: dict[str, Path], target: Path) -> None:
+def write_page(report: Report, charts: dict[str, Path], target: Path) -> None:
     """Write the page. charts: as `draw_charts` returns them."""
     facts = report.facts
     body = [

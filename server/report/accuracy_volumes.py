@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from ...builder.radius import voxel_points
 from ...schemas.archive import Archive
+from ...schemas.units import UNITS_PER_METRE
 from ...schemas.voxel import Links, VoxelData
-from ...schemas.voxel_grid import UNITS_PER_METRE
 from ..avatar import AvatarModel
 from ..kernels.layout import LANES
 from .kernels.descent import BOX, SLAB, SPHERE, SPHERE_AND_BOX, Body, Forest, box_nodes, descend, nearest

@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ...builder.sources import open_scans, placed, scan_files
+from ...builder.sources.files import open_scans, scan_files
+from ...builder.sources.placed import placed
 from ...schemas.errors import ScanError, TooLargeError
 from ...schemas.messages import MAX_AVATAR_POINTS
 

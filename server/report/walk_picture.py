@@ -1,7 +1,7 @@
 """A picture of a walk: where it went, what it touched, and how long each answer took."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -11,9 +11,7 @@ from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from ...schemas.answers import Verdict
-
-if TYPE_CHECKING:
-    from .walk import Frames, Walk
+from .walk_frames import Frames, Walk
 
 COLOURS = {Verdict.CLEAR: "#1f7a8c", Verdict.CONTACT: "#d62839", Verdict.UNKNOWN: "#e0a100"}
 PAPER, INK = "#fbfaf7", "#2f2a26"
@@ -27,7 +25,7 @@ PIXELS = 700
 PLAN_LOW, PLAN_HIGH = 0.15, 2.2
 
 
-def draw_walk(path: Path, walk: "Walk", frames: "Frames", avatar: NDArray[np.float64]) -> None:
+def draw_walk(path: Path, walk: Walk, frames: Frames, avatar: NDArray[np.float64]) -> None:
     """Draw a walk as a PNG: plan from above, elevation, and the times of every frame.
 
     avatar: (n, 3) [m], drawn where it stands in a few frames, the nearest with a contact where there is one.
@@ -51,7 +49,7 @@ def draw_walk(path: Path, walk: "Walk", frames: "Frames", avatar: NDArray[np.flo
     figure.savefig(path, dpi=100, pil_kwargs={"optimize": True})
 
 
-def _widths(walk: "Walk") -> list[float]:
+def _widths(walk: Walk) -> list[float]:
     """Widths of plan and elevation, so that both fill the same height."""
     x, y, z = _extent(walk.points).T
     ratios = [np.ptp(x) / np.ptp(y), np.ptp((x, y)[walk.elevation]) / np.ptp(z)]
@@ -76,7 +74,7 @@ def _stops(verdict: NDArray[np.uint8]) -> list[int]:
     return sorted(stops)
 
 
-def _draw_plan(axes: Any, walk: "Walk", frames: "Frames", stops: list[int]) -> None:
+def _draw_plan(axes: Any, walk: Walk, frames: Frames, stops: list[int]) -> None:
     """The scan from above, and the path coloured by verdict."""
     floor = np.median(walk.poses[:, 2, 3])
     heights = walk.points[:, 2] - floor
@@ -102,7 +100,7 @@ def _draw_plan(axes: Any, walk: "Walk", frames: "Frames", stops: list[int]) -> N
 
 
 def _draw_elevation(
-    axes: Any, walk: "Walk", frames: "Frames", avatar: NDArray[np.float64], stops: list[int]
+    axes: Any, walk: Walk, frames: Frames, avatar: NDArray[np.float64], stops: list[int]
 ) -> None:
     """The scan from the side, and the figure in some frames."""
     across = walk.elevation
@@ -160,7 +158,7 @@ def _draw_points(
     axes.set_facecolor(PAPER)
 
 
-def _draw_times(axes: Any, walk: "Walk", frames: "Frames") -> None:
+def _draw_times(axes: Any, walk: Walk, frames: Frames) -> None:
     """Engine time and round trip of every frame, contacts and loads marked."""
     for start, end in _runs(frames.verdict == Verdict.CONTACT):
         axes.axvspan(

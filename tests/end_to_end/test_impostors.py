@@ -21,7 +21,7 @@ from solidcloud.server.app import serving
 from solidcloud.server.client import Client, scenes_at
 from solidcloud.server.config import ServerConfig
 from solidcloud.server.key_files import find_key, key_paths
-from solidcloud.server.transport import session_config
+from solidcloud.server.zenoh_settings import session_config
 from walkers import pose_at
 
 POSES = heights([-1.0, -2.0])

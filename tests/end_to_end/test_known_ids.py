@@ -22,7 +22,7 @@ from solidcloud.server.app import serving
 from solidcloud.server.client import Client
 from solidcloud.server.config import ServerConfig
 from solidcloud.server.scene import Scene
-from solidcloud.server.transport import session_config
+from solidcloud.server.zenoh_settings import session_config
 from walkers import pose_at
 
 POSES = heights([-1.0, -0.5])

@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import build_archive
-from solidcloud.builder.sources import open_scans, scan_files
+from solidcloud.builder.sources.files import open_scans, scan_files
 from solidcloud.schemas.answers import Verdict
 from solidcloud.server.scene import Scene
 

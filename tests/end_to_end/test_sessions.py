@@ -23,7 +23,7 @@ from solidcloud.server import state_streams
 from solidcloud.server.app import serving
 from solidcloud.server.client import Client
 from solidcloud.server.config import ServerConfig
-from solidcloud.server.transport import session_config
+from solidcloud.server.zenoh_settings import session_config
 from walkers import REST, outcome, pose_at, walking
 
 

@@ -14,7 +14,8 @@ from solidcloud.server import lanes as lanes_module
 from solidcloud.server.app import Service, serving
 from solidcloud.server.client import Client
 from solidcloud.server.config import ServerConfig
-from solidcloud.server.transport import Transport, session_config
+from solidcloud.server.transport import Transport
+from solidcloud.server.zenoh_settings import session_config
 
 ASKED = 50
 _WORK = bytes(1 << 20)

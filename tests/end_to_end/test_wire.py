@@ -31,7 +31,7 @@ from solidcloud.server import questions as questions_module
 from solidcloud.server.app import serving
 from solidcloud.server.client import Client
 from solidcloud.server.config import ServerConfig
-from solidcloud.server.transport import session_config
+from solidcloud.server.zenoh_settings import session_config
 
 
 def test_client_answers_as_the_judge_does(client):

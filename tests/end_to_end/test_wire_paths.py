@@ -24,7 +24,7 @@ from solidcloud.server import lanes as lanes_module
 from solidcloud.server.app import serving
 from solidcloud.server.client import Client
 from solidcloud.server.config import ServerConfig
-from solidcloud.server.transport import session_config
+from solidcloud.server.zenoh_settings import session_config
 
 
 def test_a_path_comes_in_parts_and_in_order(client):

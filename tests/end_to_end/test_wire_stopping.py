@@ -17,7 +17,7 @@ from solidcloud.schemas.messages import (
 from solidcloud.server.app import serve, serving
 from solidcloud.server.client import Client
 from solidcloud.server.config import ServerConfig
-from solidcloud.server.transport import session_config
+from solidcloud.server.zenoh_settings import session_config
 
 
 def test_a_server_that_stops_finishes_the_paths_it_accepted(scene, endpoint):

@@ -18,11 +18,11 @@ import numpy as np
 import pytest
 import same_answers
 import scans
+from solidcloud.schemas.effect_order import ORDER
 from solidcloud.schemas.messages import MSGPACK, CollideRequest, encode
 from solidcloud.schemas.scene import SceneFile
 from solidcloud.server.app import Service
 from solidcloud.server.config import ServerConfig
-from solidcloud.server.effects import ORDER
 from solidcloud.server.scene import Scene
 from solidcloud.server.simulated import simulate
 

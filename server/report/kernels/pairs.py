@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....schemas.kernels import compiling as nb
-from ....schemas.voxel_grid import UNITS_PER_METRE
+from ....schemas.units import UNITS_PER_METRE
 from ...kernels.compiled import borrowing
 from ...kernels.layout import LANES
 from ...kernels.placing import lattice_to_units, place, to_units

@@ -20,7 +20,7 @@ from solidcloud.schemas.messages import (
     encode,
 )
 from solidcloud.server import path as path_module
-from solidcloud.server.transport import session_config
+from solidcloud.server.zenoh_settings import session_config
 
 
 @pytest.mark.parametrize(

@@ -37,7 +37,7 @@ from solidcloud.server import kernels
 from solidcloud.server import path as path_module
 from solidcloud.server.client import Client
 from solidcloud.server.scene import Scene
-from solidcloud.server.transport import session_config
+from solidcloud.server.zenoh_settings import session_config
 
 
 @pytest.mark.parametrize("question", QUESTIONS)

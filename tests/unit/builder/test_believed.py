@@ -12,8 +12,8 @@ import solidcloud.builder.pipeline as pipeline
 from resumed import build, content, done_folder, interrupted, two_scans
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.filter_rules import filter_dtype
-from solidcloud.builder.spool import KEYS_SUFFIX, RUN_FOLDERS, spool_dtype
-from solidcloud.builder.workplace import building_folder
+from solidcloud.builder.spool import KEYS_SUFFIX, spool_dtype
+from solidcloud.builder.workplace import RUN_FOLDERS, building_folder
 from solidcloud.schemas.errors import CorruptError
 
 COLUMNS: dict[str, Any] = {"keep": frozenset({"scan", "intensity"})}

@@ -7,7 +7,7 @@ import numpy as np
 import pye57
 import pytest
 from solidcloud.builder.coincident import coincident_scan
-from solidcloud.builder.sources import open_scans
+from solidcloud.builder.sources.files import open_scans
 from solidcloud.server.cli import run
 
 WARNING = "all 300 points of scan 0 lie at one place, expected a surface"

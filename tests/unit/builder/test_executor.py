@@ -13,7 +13,8 @@ from typing import Any
 import pytest
 import solidcloud.builder.executor as executor_module
 from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.executor import POINTS_WORTH_A_PROCESS, ProcessExecutor, make_executor, worker_count
+from solidcloud.builder.executor import POINTS_WORTH_A_PROCESS, ProcessExecutor, worker_count
+from solidcloud.builder.make_executor import make_executor
 from solidcloud.schemas.errors import SolidcloudError
 
 

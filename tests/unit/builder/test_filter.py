@@ -8,10 +8,10 @@ import pytest
 from solidcloud.builder import blocks
 from solidcloud.builder import filter as filters
 from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.executor import make_executor
 from solidcloud.builder.filter import filtered_spool
 from solidcloud.builder.filter_rules import MOVING, OUTLIER, THINNED, filter_dtype, filter_passes, is_filtered
 from solidcloud.builder.journal import Journal
+from solidcloud.builder.make_executor import make_executor
 from solidcloud.builder.progress import Silent
 from solidcloud.builder.spool import Spool, row_codes, spool_dtype, write_run
 from solidcloud.schemas.errors import BadRequestError

@@ -22,7 +22,7 @@ from solidcloud.builder.partition import (
     spool_range,
     usable,
 )
-from solidcloud.builder.sources import Block, Scan
+from solidcloud.builder.sources.scan import Block, Scan
 from solidcloud.builder.spool import Spool, places_sum, row_codes, spool_dtype, write_run
 from solidcloud.schemas.errors import BadRequestError, ScanError
 from solidcloud.schemas.voxel_grid import MAX_COORDINATE, Lattice, make_lattice, voxel_keys

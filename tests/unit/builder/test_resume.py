@@ -15,8 +15,7 @@ import solidcloud.builder.pipeline as pipeline
 from resumed import build, content, done_folder, interrupted, two_scans
 from scans import write_las
 from solidcloud.builder.scan_list import inputs
-from solidcloud.builder.sources import Scan
-from solidcloud.builder.sources.scan import library_errors
+from solidcloud.builder.sources.scan import Scan, library_errors
 from solidcloud.builder.workplace import building_folder
 from solidcloud.schemas.errors import BadRequestError, CorruptError, ScanError, SolidcloudError
 

@@ -13,8 +13,7 @@ import tomli_w
 from formats import glb_document, glb_vertices, ptx_scan, write_e57, write_glb
 from solidcloud.builder import scan_list
 from solidcloud.builder.scan_list import ScanEntry, inputs, inspect, read_scan_list, write_scan_list
-from solidcloud.builder.sources import sha256_of
-from solidcloud.builder.sources.scan import library_errors
+from solidcloud.builder.sources.scan import library_errors, sha256_of
 from solidcloud.schemas.archive import Archive
 from solidcloud.schemas.errors import BadRequestError, ScanError, SolidcloudError
 from solidcloud.server.cli import run

@@ -24,8 +24,8 @@ from formats import (
     write_pcd,
     write_pts,
 )
-from solidcloud.builder.sources import Scan, header_bounds, open_scans, scan_files, sha256_of
-from solidcloud.builder.sources.files import READERS
+from solidcloud.builder.sources.files import READERS, header_bounds, open_scans, scan_files
+from solidcloud.builder.sources.scan import Scan, sha256_of
 from solidcloud.schemas.errors import BadRequestError, ScanError
 
 COUNT = 1000  # no multiple of the small block, 7

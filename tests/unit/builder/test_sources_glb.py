@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from formats import glb_document, glb_vertices, write_glb
-from solidcloud.builder.sources import glb, open_scans
+from solidcloud.builder.sources import glb
+from solidcloud.builder.sources.files import open_scans
 from solidcloud.schemas.errors import ScanError
 
 SQUARE = np.array([[0.0, 0, 1], [2, 0, 1], [2, 2, 1], [0, 2, 1]])
@@ -70,7 +71,10 @@ LIES: dict[str, tuple[Callable[[dict], object], str]] = {
     "a view beyond": (lambda d: d["bufferViews"][0].update(byteLength=9999), "within the 76 bytes"),
     "a place beyond": (lambda d: d["accessors"][0].update(byteOffset=8), "from byte 8 of 64"),
     "a stride too short": (lambda d: d["bufferViews"][0].update(byteStride=8), "8 apart"),
-    "a negative count": (lambda d: d["accessors"][0].update(count=-1), "the number -1, expected a whole number"),
+    "a negative count": (
+        lambda d: d["accessors"][0].update(count=-1),
+        "the number -1, expected a whole number",
+    ),
     "vertices of 16 bits": (lambda d: d["accessors"][0].update(componentType=5122), "VEC3 of type 5122"),
     "no such accessor": (lambda d: d["accessors"].pop(), "number 1 of 1 accessors"),
     "no such mesh": (lambda d: d["nodes"][0].update(mesh=3), "number 3 of 1 meshes"),

@@ -7,7 +7,8 @@ import laspy
 import numpy as np
 import pytest
 from broken_scans import SEEDS
-from solidcloud.builder.sources import Lattice, header_bounds, open_scans
+from solidcloud.builder.sources.files import header_bounds, open_scans
+from solidcloud.builder.sources.scan import Lattice
 from solidcloud.schemas.errors import ScanError
 
 

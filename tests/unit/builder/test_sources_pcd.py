@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from formats import lzf, write_pcd
-from solidcloud.builder.sources import open_scans
+from solidcloud.builder.sources.files import open_scans
 from solidcloud.builder.sources.lzf import LzfStream
 from solidcloud.schemas.errors import ScanError
 

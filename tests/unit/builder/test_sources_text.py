@@ -10,7 +10,7 @@ import pytest
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import build_archive
 from solidcloud.builder.scan_list import inspect
-from solidcloud.builder.sources import open_scans
+from solidcloud.builder.sources.files import open_scans
 from solidcloud.builder.sources.rows import LONGEST_LINE, number_rows
 from solidcloud.schemas.errors import ScanError
 

@@ -8,8 +8,9 @@ import pytest
 import solidcloud.builder.survey as survey_module
 from scans import make_scan, write_las, write_xyz
 from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.sources import Block, Scan, open_scans
-from solidcloud.builder.sources import Lattice as SourceLattice
+from solidcloud.builder.sources.files import open_scans
+from solidcloud.builder.sources.scan import Block, Scan
+from solidcloud.builder.sources.scan import Lattice as SourceLattice
 from solidcloud.builder.survey import (
     Survey,
     choose_lattice,

@@ -15,7 +15,7 @@ from solidcloud.schemas.radius_model import (
     local_radii,
     parse_radius_model,
 )
-from solidcloud.schemas.voxel_grid import UNITS_PER_METRE
+from solidcloud.schemas.units import UNITS_PER_METRE
 
 pytestmark = pytest.mark.interpreted
 ALL = ("mean", "local", "border")

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from solidcloud.schemas.errors import BadRequestError
+from solidcloud.schemas.units import UNITS_PER_METRE
 from solidcloud.schemas.voxel_grid import (
     KEY_BIAS,
     MAX_VOXEL_STEPS,
-    UNITS_PER_METRE,
     Lattice,
     make_lattice,
     voxel_coordinates,

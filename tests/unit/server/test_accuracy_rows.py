@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 from solidcloud.builder.config import BuildConfig
 from solidcloud.server.report import accuracy_felt, accuracy_timing
-from solidcloud.server.report.accuracy import Report, write_rows
+from solidcloud.server.report.accuracy import write_rows
 from solidcloud.server.report.accuracy_engine import engine_settings, length_name, radius_settings
 from solidcloud.server.report.accuracy_felt import measure_felt, measure_made
 from solidcloud.server.report.accuracy_plan import BRIEF, FULL, Plan
+from solidcloud.server.report.accuracy_report import Report
 from solidcloud.server.report.accuracy_row import (
     BUDGET,
     COLUMNS,

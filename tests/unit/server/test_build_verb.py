@@ -85,7 +85,9 @@ def test_who_interrupts_is_told_how_to_go_on(
             raise SystemExit(run(build))
     assert stopped.value.code == 130
     said = capsys.readouterr().err
-    assert f"interrupted: completed work is kept in {tmp_path}/.hall.building: the same command resumes" in said
+    assert (
+        f"interrupted: completed work is kept in {tmp_path}/.hall.building: the same command resumes" in said
+    )
     assert said.count("interrupted") == 1
     assert signal.getsignal(signal.SIGTERM) == before
     assert run(build) == 0

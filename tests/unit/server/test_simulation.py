@@ -17,9 +17,10 @@ from solidcloud.schemas.errors import (
 from solidcloud.schemas.keys import User, public_id
 from solidcloud.schemas.moves import FRAME_SECONDS, Moved, State, Wish
 from solidcloud.schemas.scene import SceneFile, Spawn, scene_of
+from solidcloud.server.avatar_limits import EVERYBODY
 from solidcloud.server.client import Client
 from solidcloud.server.scene import Scene
-from solidcloud.server.served import EVERYBODY, SceneLike, Turn
+from solidcloud.server.served import SceneLike, Turn
 from solidcloud.server.simulation import SILENT_SECONDS, Simulation
 
 pytestmark = pytest.mark.interpreted

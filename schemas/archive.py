@@ -169,7 +169,7 @@ class Archive:
         frame = os.pread(self._descriptors[int(entry["shard"])], size, offset)
         if len(frame) != size or frame[-4:] != int(entry["frame_checksum"][i]).to_bytes(4, "little"):
             raise CorruptError(
-                f"{self.where(row)}, {DATASETS[i]}: {len(frame)} bytes that are not the record's, expected {size}",
+                f"{self.where(row)}, {DATASETS[i]}: {len(frame)} bytes that do not match the index, expected {size}",
                 (self.shard_path(int(entry["shard"])),),
             )
         return frame

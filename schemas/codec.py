@@ -257,7 +257,8 @@ class OpenRecord(NamedTuple):
         expected = self.shape.classes
         if expected is not None and (other := seen & ~expected):
             raise MisleadingIndexError(
-                f"voxel {self.key:#x}: points of radius class {other.bit_length() - 1}, the index counts none of it"
+                f"voxel {self.key:#x}: points of radius class {other.bit_length() - 1}, "
+                "the index counts no points of this class"
             )
 
     def read_normals(self, lanes: NDArray[np.uint16]) -> None:
@@ -275,7 +276,7 @@ class OpenRecord(NamedTuple):
         at = self.dtype.fields["normal"][1]  # type: ignore[index]  # its dtype has fields
         low, high = self.planes[at : at + 2]
         if wrong := int(np.count_nonzero((low == 0) != (high == 0))):
-            raise CorruptError(f"voxel {self.key:#x}: {wrong} normals that are no codes, expected none")
+            raise CorruptError(f"voxel {self.key:#x}: {wrong} invalid normal codes, expected none")
 
     def class_counts(self) -> NDArray[np.int64]:
         """Return the number of points in each radius class, (RADIUS_CLASSES,).
@@ -352,7 +353,7 @@ def open_tree(
     identity = np.frombuffer(archive_id + key.to_bytes(8, "little"), np.uint8)
     # Archive and voxel are the first fields of a row.
     if (cell_planes[: len(identity)] != identity[:, None]).any():
-        raise MisleadingIndexError(f"{name}: the record found is another voxel's or another archive's")
+        raise MisleadingIndexError(f"{name}: the record belongs to another voxel or archive")
     cell_columns = Cells(*(column_of(cell_planes, CELL_DTYPE, field) for field in Cells._fields))
     check_cell_nodes(name, cell_columns, shape.node_rows)
     check_cell_points(name, cell_columns, shape.point_rows)

@@ -152,7 +152,7 @@ def check_answers(answers: _A, k: int) -> _A:
             expected = 0
         if len(column) != expected:
             raise InternalError(
-                f"{kind.__name__}: {len(column)} values in {name!r}, expected {expected}, for {k} asked"
+                f"{kind.__name__}: {len(column)} values in {name!r}, expected {expected}, for {k} requested"
             )
         if name.endswith("verdict") and expected and max(column.tobytes()) > _LAST_VERDICT:
             raise InternalError(
@@ -161,7 +161,7 @@ def check_answers(answers: _A, k: int) -> _A:
         if contacts and name in _ROWS.values() and (column[0] != 0 or (np.diff(column) < 0).any()):
             raise InternalError(f"{kind.__name__}: {name!r} does not rise from 0")
     if pairs and not 0 <= int(answers.pairs.min()) <= int(answers.pairs.max()) < k:  # type: ignore[attr-defined]
-        raise InternalError(f"{kind.__name__}: pairs of objects that were not asked about, of {k}")
+        raise InternalError(f"{kind.__name__}: pairs with objects that were not requested, of {k}")
     return answers
 
 

@@ -78,7 +78,9 @@ def decode_answer(kind: type[_M], payload: bytes, encoding: str = MSGPACK) -> _M
     try:
         return _decoder(kind, encoding).decode(payload)  # type: ignore[arg-type, no-any-return]
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise InternalError(f"{kind.__name__}: {error}: client and server may be of other versions") from None
+        raise InternalError(
+            f"{kind.__name__}: {error}: client and server may have different versions"
+        ) from None
 
 
 def _of_null(name: str, tail: tuple[int, ...]) -> float:

@@ -137,7 +137,7 @@ def _unpack_fields(frame: bytes, dtype: np.dtype, count: int, kept: np.dtype) ->
             _fill(stream, part)
         at += width * wanted
     if stream.readinto(bytearray(1)):
-        raise zstandard.ZstdError("more than was declared")
+        raise zstandard.ZstdError("more content than declared")
     planes.flags.writeable = False
     return planes
 
@@ -154,7 +154,7 @@ def _fill(stream: zstandard.ZstdDecompressionReader, out: NDArray[np.uint8]) -> 
     while begin < len(out):
         read = stream.readinto(out[begin:].data)
         if not read:
-            raise zstandard.ZstdError("it ends early")
+            raise zstandard.ZstdError("content ends early")
         begin += read
 
 

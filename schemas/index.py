@@ -349,7 +349,7 @@ def _read_texts(columns: dict[str, NDArray]) -> _Texts:
         raise ValueError(f"texts of {sources} sources: expected {len(columns['source_pose'])}")
     rows = [s.unknown for s in texts.sources if s.unknown is not None and s.unknown != -1]
     if len(set(rows)) < len(rows) or not all(0 <= row < boxes for row in rows):
-        raise ValueError(f"sources with boxes {rows} of {boxes}: expected one of them each, or -1")
+        raise ValueError(f"sources with boxes {rows} of {boxes}: expected a different one each, or -1")
     if any(s.unknown == -1 for s in texts.sources) and not columns["unknown_everywhere"][0]:
         raise ValueError("unknown_everywhere 0: expected 1, as a source was left out that may be anywhere")
     return texts

@@ -103,7 +103,7 @@ def read_columns(path: Path) -> tuple[bytes, dict[str, NDArray]]:
                 or dataset.chunks
             ):
                 raise FormatError(
-                    f"{path}: {name} is no plain dataset: not written by solidcloud, do not use it"
+                    f"{path}: {name} is not a plain dataset: not written by solidcloud, do not use it"
                 )
             check_layout(name, dataset.dtype, dataset.shape)
             if dataset.size * dataset.dtype.itemsize > size:

@@ -144,7 +144,7 @@ def _check_kept(version: int, columns: dict[str, NDArray]) -> None:
         _refuse("datasets", [name for name in here if here[name]], f"those of columns {kept}")
     expected = 4 if normals else 3 if later else 2 if classes else 1
     if version != expected:
-        _refuse("format_version", version, f"{expected}, by the datasets")
+        _refuse("format_version", version, f"{expected}, from the datasets")
     degree, leaf = columns["tree"].tolist()
     if not (MIN_DEGREE <= degree <= MAX_DEGREE and 1 <= leaf <= MAX_LEAF):
         _refuse("tree", [degree, leaf], f"{MIN_DEGREE} to {MAX_DEGREE}, 1 to {MAX_LEAF}")
@@ -165,7 +165,7 @@ def _check_radius(columns: dict[str, NDArray]) -> None:
         radius, error, sample = columns["radius_now"].tolist()
         fits = 0 <= radius <= MAX_COORDINATE and 0 <= error <= MAX_COORDINATE
         if not (fits and 0 <= sample <= points and sample == math.floor(sample)):
-            _refuse("radius_now", [radius, error, sample], "a radius, its error, and points asked")
+            _refuse("radius_now", [radius, error, sample], "a radius, its error, and points sampled")
 
 
 def _check_sources(columns: dict[str, NDArray]) -> None:
@@ -181,7 +181,7 @@ def _check_sources(columns: dict[str, NDArray]) -> None:
             f"of {len(pose)}, {points}",
         )
     if columns["columns"][0] and len(count) > 1 << 16:
-        _refuse("source_count", f"of {len(count)} sources", "at most 65536, as points name theirs")
+        _refuse("source_count", f"of {len(count)} sources", "at most 65536, as scan_index has 16 bits")
     most = MOST_TEXT + MOST_TEXT_A_SOURCE * len(count)
     if len(columns["texts"]) > most:
         _refuse("texts", f"of {len(columns['texts'])} bytes", f"at most {most}")
@@ -256,7 +256,9 @@ def _check_rows(columns: dict[str, NDArray], point_bytes: int) -> None:
         row = int(np.flatnonzero(wrong)[0])
         found = f"{[*rows[row].tolist(), int(leaves[row])]}"
         _refuse(
-            f"{_at(voxels, wrong)} rows and leaves", found, "cells, nodes, points and leaf nodes of trees"
+            f"{_at(voxels, wrong)} rows and leaves",
+            found,
+            "counts of cells, nodes, points and leaf nodes that form trees",
         )
     widths = np.array([CELL_DTYPE.itemsize, NODE_DTYPE.itemsize, point_bytes])
     free, ratio = np.array([CELL_EXPANSION, NODE_EXPANSION, ANY_EXPANSION]).T

@@ -103,7 +103,7 @@ class KernelFiles:
         self._say(
             "damaged",
             f"compiled kernels in {self.folder}: {name} is damaged ({fault}): {outcome}; "
-            "whatever is damaged is compiled again",
+            "damaged kernels are compiled again",
         )
 
     def wipe(self) -> None:

@@ -66,7 +66,7 @@ class Wish(Request, frozen=True, kw_only=True):
     def __post_init__(self) -> None:
         Request.__post_init__(self)
         if len(self.pose) == (self.velocity is not None):
-            raise BadRequestError("a wish has pose or velocity: expected one of them")
+            raise BadRequestError("a wish with both or neither of pose and velocity: expected exactly one")
         if len(self.pose):
             check_one_pose("pose", self.pose)
         _check_finite("velocity", self.velocity or ())

@@ -23,6 +23,6 @@ def normal_reach(reach: float, step: float, points: int) -> int:
     if square * max(points, 1) >= 1 << 59:
         most = 0.995 * math.sqrt((1 << 59) / max(points, 1)) * step
         raise BadRequestError(
-            f"normal reach {reach!r} m: of {points} points in a voxel sums do not fit 63 bits: give {most:.3g} at most"
+            f"normal reach {reach!r} m: sums over {points} points in a voxel exceed 63 bits: give at most {most:.3g}"
         )
     return square

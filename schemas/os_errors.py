@@ -19,7 +19,7 @@ _WORDS = {
     errno.EROFS: "the file system is read-only: choose another path",
     errno.ENOENT: "no such file or folder: check the path",
     errno.ENOTDIR: "a part of the path is a file, expected a folder: check the path",
-    errno.EEXIST: "is there already: choose another path",
+    errno.EEXIST: "already exists: choose another path",
     errno.EISDIR: "is a folder, expected a file: choose another path",
     errno.ENOTEMPTY: "is a folder that is not empty: choose another path",
     errno.ENAMETOOLONG: "the name is too long: choose a shorter one",

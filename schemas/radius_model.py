@@ -40,7 +40,9 @@ BORDER_SHARE = 0.5
 # accept `0_8` for 8, spaces and `nan`.
 _NUMBER = re.compile(r"-?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 
-_EXPECTED = "expected mean, local, border or local+border, each with a factor where wanted (local:0.8), or fixed:METRES"
+_EXPECTED = (
+    "expected mean, local, border or local+border, each with an optional factor (local:0.8), or fixed:METRES"
+)
 
 
 class RadiusModel(NamedTuple):

@@ -270,7 +270,9 @@ def check_path_parameters(op: str, parameters: dict[str, Any]) -> None:
     taken = (*PATH_PARAMETERS[op], *Question.__struct_fields__)
     for name in parameters:
         if name not in taken:
-            raise BadRequestError(f"{name} is no parameter of {op} along a path: it takes {', '.join(taken)}")
+            raise BadRequestError(
+                f"{name} is not a parameter of {op} along a path: it takes {', '.join(taken)}"
+            )
     if op == "distance" and parameters.get("reach") is None:
         raise BadRequestError("distance along a path needs reach, the farthest distance worth reporting [m]")
 
@@ -329,7 +331,7 @@ def make_objects(objects: Sequence[Sequence[Any]]) -> tuple[list[ObjectItem], Po
     for number, entry in enumerate(objects):
         if not 2 <= len(entry) <= 4:
             raise BadRequestError(
-                f"object {number} of {len(entry)} values: expected name, pose and, where wanted, group and mask"
+                f"object {number} of {len(entry)} values: expected name, pose and optionally group and mask"
             )
         items.append(ObjectItem(entry[0], *(_as_bits(number, value) for value in entry[2:])))
     if not items:
@@ -340,7 +342,7 @@ def make_objects(objects: Sequence[Sequence[Any]]) -> tuple[list[ObjectItem], Po
 def _check_count(objects: Sequence[Any]) -> None:
     """Raise TooLargeError for more objects than one request may hold."""
     if len(objects) > MAX_OBJECTS:
-        raise TooLargeError(f"{len(objects)} objects: at most {MAX_OBJECTS}: ask in groups")
+        raise TooLargeError(f"{len(objects)} objects: at most {MAX_OBJECTS}: send several requests")
 
 
 def _as_bits(number: int, value: Any) -> int:

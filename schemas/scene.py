@@ -169,7 +169,7 @@ def read_scene(path: Path) -> SceneFile:
     """
     if path.suffix != SUFFIX:
         raise BadRequestError(
-            f"{path}: expected a scene file, by a name that ends in {SUFFIX}: `serve` knows it by that"
+            f"{path}: expected a scene file, with a name that ends in {SUFFIX}: `serve` recognises it by that"
         )
     try:
         with open(path, "rb") as file:
@@ -231,7 +231,7 @@ def _faults(scene: SceneFile) -> Iterator[tuple[str, str]]:
             less = " and ".join(f"`{needed}`" for needed in missing)
             yield (
                 f"$.effects[{number}]",
-                f"`{names[number]}` means nothing without {less}: add {add}, or leave it out",
+                f"`{names[number]}` requires {less}: add {add}, or leave it out",
             )
         if isinstance(effect, Through):
             yield from _boxes(effect, f"$.effects[{number}].boxes")
@@ -265,12 +265,13 @@ def _objects(scene: SceneFile, effects: list[str]) -> Iterator[tuple[str, str]]:
             close = nearest(item.avatar, known)
             yield (
                 f"$.objects[{number}].avatar",
-                f"{shown(item.avatar)} is no avatar of the scene: expected {listed}{close}",
+                f"{shown(item.avatar)} is not an avatar of the scene: expected {listed}{close}",
             )
     if scene.objects and "objects" not in effects:
         yield (
             "$.objects",
-            f'{len(scene.objects)} without the effect: add [[effects]] effect = "objects", or leave them out',
+            f"found {len(scene.objects)} without the effect `objects`: "
+            'add [[effects]] effect = "objects", or leave them out',
         )
 
 
@@ -279,7 +280,7 @@ def _twice(names: list[str], what: str, field: str) -> Iterator[tuple[str, str]]
     for number, name in enumerate(names):
         if name in names[:number]:
             first = f"$.{what}[{names.index(name)}]"
-            yield f"$.{what}[{number}].{field}", f"{shown(name)} again: expected once, as in {first}"
+            yield f"$.{what}[{number}].{field}", f"{shown(name)} is a duplicate: expected once, as in {first}"
 
 
 def _boxes(effect: Through, place: str) -> Iterator[tuple[str, str]]:

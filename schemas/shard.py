@@ -146,6 +146,6 @@ def _verify_frames(path: Path, table: NDArray) -> int:
                 checksum = os.pread(file.fileno(), 4, end - 4)
                 if checksum != int(row["frame_checksum"][i]).to_bytes(4, "little"):
                     raise CorruptError(
-                        f"{path}: voxel {int(row['key']):#x}, {name}: not what was written: disk full?"
+                        f"{path}: voxel {int(row['key']):#x}, {name}: differs from what was written: is the disk full?"
                     )
     return file_checksum(path)

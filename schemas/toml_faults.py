@@ -71,11 +71,11 @@ def load(text: bytes, where: str) -> dict[str, Any]:
         return tomllib.loads(_decoded(text))
     except UnicodeDecodeError as error:
         line = text.count(b"\n", 0, error.start) + 1
-        raise BadRequestError(f"{where}: line {line}: bytes that are no UTF-8: save it as UTF-8") from None
+        raise BadRequestError(f"{where}: line {line}: bytes that are not UTF-8: save it as UTF-8") from None
     except tomllib.TOMLDecodeError as error:
-        raise BadRequestError(f"{where}: no TOML: {error}") from None
+        raise BadRequestError(f"{where}: not valid TOML: {error}") from None
     except ValueError:
-        raise BadRequestError(f"{where}: a number of more digits than any has") from None
+        raise BadRequestError(f"{where}: a number with too many digits") from None
     except RecursionError:
         raise BadRequestError(f"{where}: nested too deeply") from None
 
@@ -219,7 +219,10 @@ def _of_tag(place: str, field: str, tags: list[str], value: Any) -> tuple[str, s
     if field not in value:
         return place, f"has no `{field}`: expected one of {listed}"
     tag = value[field]
-    return f"{place}.{field}", f"{shown(tag)} is no {field}: expected one of {listed}{nearest(tag, tags)}"
+    return (
+        f"{place}.{field}",
+        f"{shown(tag)} is not a known {field}: expected one of {listed}{nearest(tag, tags)}",
+    )
 
 
 def _resolve(node: Any, value: Any, tokens: list[str | int]) -> tuple[Any, Any]:

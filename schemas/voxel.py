@@ -134,7 +134,7 @@ def link_tree(name: str, cells: Cells, count: NDArray[np.uint8]) -> Links:
     first, cell_of, is_leaf = np.empty(n, np.int32), np.empty(n, np.int32), np.zeros(n, bool)
     height = link_rows(count, cells.nodes, cells.points, first, is_leaf, cell_of)
     if height < 0:
-        raise CorruptError(f"{name}: the counts of node {-1 - height} do not add up to a tree")
+        raise CorruptError(f"{name}: the counts of node {-1 - height} do not form a tree")
     if height > MAX_LEVELS:
         raise CorruptError(f"{name}: {height} levels of nodes, expected at most {MAX_LEVELS}")
     return Links(first, is_leaf, cell_of, height)
@@ -148,7 +148,7 @@ def check_cell_nodes(name: str, cells: Cells, nodes: int) -> None:
     c = len(cells.nodes)
     top = nodes - int(cells.nodes.sum(dtype=np.int64))
     if c == 0 or not cells.nodes.all() or not cells.points.all() or top < 0 or (top == 0) != (c == 1):
-        raise CorruptError(f"{name}: {nodes} nodes for {c} cells do not add up")
+        raise CorruptError(f"{name}: {nodes} nodes for {c} cells are inconsistent")
 
 
 def check_cell_points(name: str, cells: Cells, points: int) -> None:

@@ -134,14 +134,14 @@ def read_points(path: Path) -> PointsRead:
         with h5py.File(path, "r") as file:
             return _read(file)
     except (OSError, KeyError, ValueError, TypeError, AttributeError, RuntimeError) as error:
-        raise CorruptError(f"{path}: not a whole file of points ({error}): write it anew") from error
+        raise CorruptError(f"{path}: not a complete file of points ({error}): write it anew") from error
 
 
 def _read(file: h5py.File) -> PointsRead:
     """Read an open file; raise ValueError or another exception for content that is never written."""
     root = file[GROUP]
     if bytes(root.attrs["Type"]) != b"PolyData" or int(root.attrs["Version"][0]) != _VERSION[0]:
-        raise ValueError("no PolyData of version 2")
+        raise ValueError("not PolyData of version 2")
     count = int(root["NumberOfPoints"][0])
     points = root["Points"][()]
     columns = {name: column[()] for name, column in root["PointData"].items()}
@@ -153,7 +153,7 @@ def _read(file: h5py.File) -> PointsRead:
             or not np.array_equal(group["Connectivity"][()], np.arange(held))
             or not np.array_equal(group["Offsets"][()], np.arange(held + 1))
         ):
-            raise ValueError(f"{name} that are not one vertex a point")
+            raise ValueError(f"{name} are not one vertex per point")
     if points.shape != (count, 3) or points.dtype != "<f8" or any(len(c) != count for c in columns.values()):
         raise ValueError(f"{len(points)} points, expected {count}")
     return PointsRead(points, columns, dict(file.attrs))

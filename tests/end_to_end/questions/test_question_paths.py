@@ -96,9 +96,9 @@ def test_a_bad_pose_far_along_a_path_is_named_before_any_part(scene, client, mon
     "op, parameters, said",
     [
         ("raycast", {}, "expected one of collide, distance, contacts, sweep"),
-        ("collide", {"reach": 1.0}, "reach is no parameter of collide"),
+        ("collide", {"reach": 1.0}, "reach is not a parameter of collide"),
         ("distance", {}, "needs reach"),
-        ("distance", {"reach": 1.0, "limit": 3}, "limit is no parameter of distance"),
+        ("distance", {"reach": 1.0, "limit": 3}, "limit is not a parameter of distance"),
         ("sweep", {"margin": -1.0}, "margin"),
         ("collide", {"tolerance": np.inf}, "tolerance"),
         ("contacts", {"limit": -1}, "limit"),

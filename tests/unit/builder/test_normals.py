@@ -204,7 +204,7 @@ def test_a_normal_that_is_another_is_found(tmp_path: Path) -> None:
         patch.setattr(
             normals_module, "voxel_normals", lambda local, square: np.full(len(local), 0x80, np.uint16)
         )
-        with pytest.raises(CorruptError, match="normals that are no codes"):
+        with pytest.raises(CorruptError, match="invalid normal codes"):
             build(tmp_path, name="none")
     assert verify_archive(wrong).faults == ()
     faults = verify_archive(wrong, deep=True).faults

@@ -72,7 +72,7 @@ def test_another_voxels_or_archives_record_is_refused(
     other: dict[str, object], small: tuple[VoxelData, Record]
 ) -> None:
     voxel, record = small
-    with pytest.raises(CorruptError, match="another voxel's or another archive's"):
+    with pytest.raises(CorruptError, match="belongs to another voxel or archive"):
         decode(record, voxel, 1000, **other)
 
 

@@ -109,17 +109,17 @@ EDITS: dict[str, tuple[Callable[[h5py.File], None], str]] = {
     "checksum gone": (lambda f: f.attrs.__delitem__("sha256"), "not a readable archive index"),
     "external link": (
         replace_with("origin", lambda f, n: f.__setitem__(n, h5py.ExternalLink("other.h5", "/x"))),
-        "origin is no plain dataset",
+        "origin is not a plain dataset",
     ),
     "soft link": (replace_with("origin", lambda f, n: f.__setitem__(n, h5py.SoftLink("/step"))), "origin is no"),
-    "virtual dataset": (replace_with("origin", virtual), "origin is no plain dataset"),
+    "virtual dataset": (replace_with("origin", virtual), "origin is not a plain dataset"),
     "external storage": (
         replace_with(
             "origin", lambda f, n: f.create_dataset(n, (3,), "<f8", external=[("/etc/hostname", 0, 24)])
         ),
-        "origin is no plain dataset",
+        "origin is not a plain dataset",
     ),
-    "group": (replace_with("origin", lambda f, n: f.create_group(n)), "origin is no plain dataset"),
+    "group": (replace_with("origin", lambda f, n: f.create_group(n)), "origin is not a plain dataset"),
     "chunked": (
         replace_with("origin", lambda f, n: f.create_dataset(n, (1 << 30,), "<f8", chunks=(8,))), "origin is no",
     ),

@@ -170,7 +170,7 @@ def test_reach_counts_as_its_decimal_text_and_has_bounds() -> None:
     for reach in (0.0, -0.1, math.nan, math.inf, 1.01):
         with pytest.raises(BadRequestError, match="normal reach"):
             normal_reach(reach, 1e-4, 1)
-    with pytest.raises(BadRequestError, match="63 bits: give 0"):
+    with pytest.raises(BadRequestError, match="63 bits: give at most 0"):
         normal_reach(1.0, 1e-6, 1 << 23)
 
 

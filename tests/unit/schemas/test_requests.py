@@ -168,11 +168,11 @@ def test_too_many_objects_are_too_large():
 @pytest.mark.parametrize(
     "values, said",
     [
-        ({"op": "collide", "reach": 1.0}, "reach is no parameter of collide"),
-        ({"op": "sweep", "limit": 3}, "limit is no parameter of sweep"),
+        ({"op": "collide", "reach": 1.0}, "reach is not a parameter of collide"),
+        ({"op": "sweep", "limit": 3}, "limit is not a parameter of sweep"),
         ({"op": "distance"}, "needs reach"),
         ({"op": "distance", "reach": 1.0, "margin": 0.0}, "margin is no parameter"),
-        ({"op": "contacts", "reach": 1.0}, "reach is no parameter of contacts"),
+        ({"op": "contacts", "reach": 1.0}, "reach is not a parameter of contacts"),
     ],
 )
 def test_a_path_takes_what_its_question_takes(values, said):

@@ -75,9 +75,7 @@ def test_a_rigid_pose_stays_as_it_is_to_the_last_digit() -> None:
 
 def test_a_scene_that_was_made_is_checked_the_same() -> None:
     check_scene(SceneFile(format=1, archives=[ArchiveItem(path="hall")], effects=[Stop(), Sweep()]), "made")
-    with pytest.raises(
-        BadRequestError, match=r"^made: \$\.effects\[0\]: `sweep` means nothing without `stop`"
-    ):
+    with pytest.raises(BadRequestError, match=r"^made: \$\.effects\[0\]: `sweep` requires `stop`"):
         check_scene(SceneFile(format=1, archives=[ArchiveItem(path="hall")], effects=[Sweep()]), "made")
 
 

@@ -65,7 +65,7 @@ def test_a_whole_record_in_anothers_place_is_refused(copy: Path) -> None:
             rows[name][[0, 1]] = rows[name][[1, 0]]
 
     rewrite_index(copy, swap)
-    with Archive(copy) as archive, pytest.raises(CorruptError, match="another voxel's or another archive's"):
+    with Archive(copy) as archive, pytest.raises(CorruptError, match="belongs to another voxel or archive"):
         archive.read_voxel(0)
 
 
@@ -79,7 +79,7 @@ def test_another_archives_record_is_refused(copy: Path) -> None:
     table, checksum = write_shard(path, 0, bytes(16), records)
     assert checksum == file_checksum(path) == zlib.crc32(path.read_bytes())
     write_index(copy, header, table, [(path.name, path.stat().st_size)])
-    with Archive(copy) as archive, pytest.raises(CorruptError, match="another archive's"):
+    with Archive(copy) as archive, pytest.raises(CorruptError, match="another voxel or archive"):
         archive.read_voxel(0)
 
 
@@ -103,7 +103,7 @@ def test_a_shard_truncated_while_open_is_an_error(copy: Path) -> None:
         path = archive.shard_path(0)
         with open(path, "r+b") as file:
             file.truncate(1000)
-        with pytest.raises(CorruptError, match="bytes that are not the record's"):
+        with pytest.raises(CorruptError, match="bytes that do not match the index"):
             archive.read_voxel(len(archive.voxels) - 1)
 
 

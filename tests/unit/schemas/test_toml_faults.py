@@ -23,11 +23,11 @@ def refused(text: str) -> str:
     [
         (
             b"format = 1\n[[archives]\n",
-            "hall.toml: no TOML: Expected ']]' at the end of an array declaration (at l",
+            "hall.toml: not valid TOML: Expected ']]' at the end of an array declaration (at l",
         ),
         (b"format = 1\nname =\n", "(at line 2, column 7)"),
         (b"format = 1\nformat = 1\n", "Cannot overwrite a value (at line 2"),
-        (b"format = 1\n# \xff\n", "hall.toml: line 2: bytes that are no UTF-8: save it as UTF-8"),
+        (b"format = 1\n# \xff\n", "hall.toml: line 2: bytes that are not UTF-8: save it as UTF-8"),
         (b"a = " + b"[" * 100_000, "hall.toml: nested too deeply"),
         (b"#" * ((4 << 20) + 1), "hall.toml: more than 4,194,304 bytes: expected a scene file"),
     ],
@@ -112,7 +112,7 @@ def test_other_types_are_told_as_well(text: str, said: str) -> None:
     [
         (".".join(["a"] * 5000) + " = 1", "nested too deeply"),
         ("names." + ".".join(["a"] * 5000) + " = 1", "nested too deeply"),
-        ("inner = " + "9" * 5000, "a number of more digits than any has"),
+        ("inner = " + "9" * 5000, "a number with too many digits"),
         ("inner = 0x" + "F" * 5000, "line 1: $.inner: found an integer of 20,000 bits: expected at most 63"),
         ("\ufeffinner = 3", "line 1: $.inner: found 3: expected a table of size, flag"),
     ],

@@ -150,7 +150,7 @@ def test_what_is_not_one_vertex_a_point_is_refused(spoil: object, tmp_path: Path
     write(path, 10, compressed=False)
     with h5py.File(path, "r+") as file:
         spoil(file["VTKHDF"])  # type: ignore[operator]
-    with pytest.raises(CorruptError, match="not a whole file of points"):
+    with pytest.raises(CorruptError, match="not a complete file of points"):
         read_points(path)
 
 
@@ -158,7 +158,7 @@ def test_what_is_no_file_or_no_hdf5_is_refused(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError):
         read_points(tmp_path / "none")
     (tmp_path / "text").write_text("VTKHDF")
-    with pytest.raises(CorruptError, match="not a whole file of points"):
+    with pytest.raises(CorruptError, match="not a complete file of points"):
         read_points(tmp_path / "text")
 
 

@@ -102,7 +102,7 @@ def test_what_is_there_is_replaced_only_with_force(folder: Path, capsys: pytest.
             2,
             "--effects slid: expected some of stop, sweep, slide",
         ),
-        ("{archive} -o {folder}/new.toml --effects slide", 2, "`slide` means nothing without `stop`"),
+        ("{archive} -o {folder}/new.toml --effects slide", 2, "`slide` requires `stop`"),
         ("{archive} -o {folder}/new.toml --effects stop,stop", 0, ""),
         ("{archive} -o {folder}/new.txt", 2, "new.txt: expected a name that ends in .toml"),
         ("{archive} -o {folder}/no/new.toml", 1, "no/new.toml: cannot be written: there is no folder"),
@@ -195,8 +195,8 @@ def test_what_is_perhaps_not_meant_is_noted(
 @pytest.mark.parametrize(
     ("text", "code", "said"),
     [
-        ("format = 1\n[[archives]\n", 2, "hall.toml: no TOML: Expected ']]'"),
-        (TOP + '[[effects]]\neffect = "slid"\n', 2, '$.effects[0].effect: "slid" is no effect'),
+        ("format = 1\n[[archives]\n", 2, "hall.toml: not valid TOML: Expected ']]'"),
+        (TOP + '[[effects]]\neffect = "slid"\n', 2, '$.effects[0].effect: "slid" is not a known effect'),
         (TOP.replace("hall", "tower"), 3, "hall.toml: $.archives[0].path: {folder}/scans/tower: no archive here"),
         (TOP + '[[archives]]\npath = "visitor.xyz"\n', 3, "hall.toml: $.archives[1].path: {folder}/visitor.xyz"),
         (
@@ -238,11 +238,7 @@ def test_serve_refuses_a_scene_file_that_is_wrong(
 ) -> None:
     (folder / "hall.toml").write_text(TOP + '[[effects]]\neffect = "slide"\n')
     assert run(["serve", str(folder / name)]) == 2
-    said = (
-        "`slide` means nothing without `stop`"
-        if name == "hall.toml"
-        else "No such file or directory: expected a scene"
-    )
+    said = "`slide` requires `stop`" if name == "hall.toml" else "No such file or directory: expected a scene"
     assert f"{name}: " in (error := one_error(capsys)) and said in error
 
 
@@ -283,7 +279,7 @@ def test_what_serve_does_not_take_for_a_scene_file_check_refuses(
         path.write_text(TOP)
         assert not is_scene_file(path)
         assert run(["scene", "check", str(path)]) == 2
-        assert f"{name}: expected a scene file, by a name that ends in .toml" in one_error(capsys)
+        assert f"{name}: expected a scene file, with a name that ends in .toml" in one_error(capsys)
 
 
 def test_a_scan_given_as_a_scene_file_is_not_read_whole(

@@ -1,4 +1,4 @@
-"""Answers of all kinds as text, a line each, and as what --json prints."""
+"""Text lines and JSON values for the answers of all queries."""
 
 import math
 from collections.abc import Iterator
@@ -29,9 +29,9 @@ _WORDS = {SweepAnswers: "motions", RaycastAnswers: "rays", WithinAnswers: "point
 
 
 def answer_lines(labels: list[str], times: list[float], answers: Any) -> Iterator[str]:
-    """A line an answer, its label, verdict and figure; of `collide` one for each stretch of one verdict.
+    """Yield one line per answer: label, verdict and result. For `collide`, one line per run of equal verdicts.
 
-    labels: (k,), what each is the answer to.  times: (k,) [s], of `collide` only.
+    labels: (k,), what each answer is about.  times: (k,) [s], for `collide` only.
     """
     if isinstance(answers, CollideAnswers):
         yield from _stretches(times, answers)
@@ -46,12 +46,12 @@ def answer_lines(labels: list[str], times: list[float], answers: Any) -> Iterato
 
 
 def word_of(answers: Any) -> str:
-    """Return the plural of what each of the answers is about."""
+    """Return the plural noun for the items that the answers are about, such as "poses"."""
     return next((word for kind, word in _WORDS.items() if isinstance(answers, kind)), "poses")
 
 
 def summary_line(answers: Any, outside: NDArray[np.bool_] | None = None) -> str:
-    """How many there are of each verdict, how many lie outside the scan where some do, and the time they took."""
+    """Return the count of each verdict, the count outside the scan if any, and the engine time."""
     counts = ", ".join(f"{(answers.verdict == verdict).sum()} {verdict.name.lower()}" for verdict in Verdict)
     if outside is not None and outside.any():
         counts += f", {outside.sum()} outside the scan"
@@ -59,7 +59,11 @@ def summary_line(answers: Any, outside: NDArray[np.bool_] | None = None) -> str:
 
 
 def unknown_line(answers: Any, unanswered: int) -> str:
-    """Return how many answers are unknown for another reason than that nobody answered, and why; "" where none is."""
+    """Return a sentence with the number of answers that the server called unknown and the reason.
+
+    unanswered: the number of unknown answers that never arrived; they are not counted.
+    Returns "" if there are no others.
+    """
     count = int((answers.verdict == Verdict.UNKNOWN).sum()) - unanswered
     if count <= 0:
         return ""
@@ -76,7 +80,7 @@ def unknown_line(answers: Any, unanswered: int) -> str:
 
 
 def move_line(label: str, moved: Moved) -> str:
-    """What came of a frame: verdict, where it ended, what it lacks of the wish, what stopped it."""
+    """Format the result of a frame: verdict, final position, remaining motion, first obstacle, skipped effects."""
     line = f"{label}  {_NAMES[moved.verdict]:<8}at {_place(moved.pose[0, :3, 3])}"
     if moved.left:
         line += f", {moved.left:.4f} m left"
@@ -90,9 +94,9 @@ def move_line(label: str, moved: Moved) -> str:
 def answers_json(
     times: list[float], answers: Cost, outside: NDArray[np.bool_] | None = None
 ) -> dict[str, Any]:
-    """Answers as they are printed with --json; what is infinite or NaN is null. times: (k,) [s], or empty.
+    """Convert answers to the object that --json prints. Infinite and NaN values become null.
 
-    outside: (k,), which lie outside the scan; None where that is not known.
+    times: (k,) [s], or empty.  outside: (k,), mask of the items outside the scan; None if not known.
     """
     k = len(answers)  # type: ignore[arg-type]
     rows: list[dict[str, Any]] = [{"t": t} for t in times] or [{} for _ in range(k)]
@@ -117,7 +121,7 @@ def answers_json(
 
 
 def _stretches(times: list[float], answers: CollideAnswers) -> Iterator[str]:
-    """Each stretch of one verdict."""
+    """Yield one line per run of equal verdicts."""
     found = zip(times, answers.verdict.tolist(), strict=True)
     for verdict, group in groupby(found, key=lambda pair: pair[1]):
         stretch = [t for t, _ in group]
@@ -126,7 +130,7 @@ def _stretches(times: list[float], answers: CollideAnswers) -> Iterator[str]:
 
 
 def _figure(answers: Cost, i: int) -> str:
-    """What there is to say of one answer beside its verdict."""
+    """Format the result of one answer, without its verdict."""
     if isinstance(answers, DistanceAnswers):
         if not math.isfinite(answers.signed_distance[i]):
             return _beyond(answers, i)
@@ -155,17 +159,17 @@ def _figure(answers: Cost, i: int) -> str:
 
 
 def _beyond(answers: Any, i: int) -> str:
-    """What is said where nothing was found."""
+    """Format an answer whose query found nothing within its reach."""
     return f"nothing within {answers.lower[i]:.6f} m" if answers.lower[i] > 0 else ""
 
 
 def _place(point: Any) -> str:
-    """A point for a reader [m]."""
+    """Format a point [m]."""
     return " ".join(f"{value:.4f}" for value in point)
 
 
 def _of_pairs(answers: Cost, name: str) -> bool:
-    """Whether a column is not one of one element an answer, however long it is."""
+    """Return whether a column does not have one element per answer, even if its length equals theirs."""
     if isinstance(answers, ContactsAnswers):
         own = ("verdict", "exact", "pairs_found", "outside", "voxels_missing", "node_visits", "point_tests")
         return name not in own
@@ -173,7 +177,7 @@ def _of_pairs(answers: Cost, name: str) -> bool:
 
 
 def _rows(answers: ContactsAnswers, what: str, i: int) -> list[dict[str, Any]]:
-    """The contacts ("pair") or clusters ("cluster") of one pose."""
+    """Return the contacts ("pair") or clusters ("cluster") of one pose."""
     pairs = ("avatar_point", "cloud_point", "signed_distance", "avatar_index", "scan_index", "cluster")
     names = (
         {name: name for name in pairs}
@@ -190,12 +194,12 @@ def _rows(answers: ContactsAnswers, what: str, i: int) -> list[dict[str, Any]]:
 
 
 def _slice(starts: Any, i: int) -> slice:
-    """The rows of pose i."""
+    """Return the rows of pose i."""
     return slice(int(starts[i]), int(starts[i + 1]))
 
 
 def _plain(column: Any, *, vectors: bool) -> list[Any]:
-    """A column as JSON has it: what is not finite is None."""
+    """Convert a column to JSON values; elements that are not finite become None."""
     values: list[Any] = column.tolist()
     if column.dtype.kind != "f" or np.isfinite(column).all():
         return values

@@ -1,7 +1,7 @@
-"""What users asked and got: counts and times, a user and in all.
+"""Request statistics: counts and times, per user and in total.
 
-Every request passes here, so what is done for one is a few additions under a lock; percentiles are worked out when
-somebody wants to see them.
+Every request is counted here. Therefore counting is a few additions under a lock, and percentiles are
+computed only when statistics are read.
 """
 
 import threading
@@ -20,15 +20,15 @@ from ..schemas.answers import Cost, Verdict
 from ..schemas.keys import public_id
 from ..schemas.stats import TIME_BOUNDS, Times, UserStats
 
-# Users remembered, a client's avatar each: 2 kB apiece, and as many lines of an answer of `stats`.
+# Maximum number of users (pairs of client and avatar) kept: 2 kB each, and one row each in the answer of `stats`.
 MOST_USERS = 256
-# Buckets between two of TIME_BOUNDS, 2 or 2.5 times apart: each is a tenth wide.
+# Number of buckets between two of TIME_BOUNDS, which are a factor 2 or 2.5 apart: each bucket is 10 % wide.
 _STEPS = {2.0: 7, 2.5: 10}
 _UNKNOWN = int(Verdict.UNKNOWN)
 
 
 def _bounds() -> list[float]:
-    """Upper ends of a histogram's buckets [s]: TIME_BOUNDS, and others in between."""
+    """Return the upper bounds of a histogram's buckets [s]: TIME_BOUNDS and intermediate ones."""
     found = [TIME_BOUNDS[0]]
     for low, high in pairwise(TIME_BOUNDS):
         steps = _STEPS[round(high / low, 6)]
@@ -38,25 +38,26 @@ def _bounds() -> list[float]:
 
 
 BOUNDS = _bounds()
-# The place in BOUNDS of each of TIME_BOUNDS.
+# Index in BOUNDS of each of TIME_BOUNDS.
 _COARSE = [BOUNDS.index(bound) for bound in TIME_BOUNDS]
 
 
 class Histogram:
-    """Times [s] in buckets a tenth wide, from 1 µs to 100 s; what is shorter or longer is in the first or the last.
+    """Histogram of times [s] with buckets 10 % wide, from 1 µs to 100 s.
 
-    sum, max: of all [s].  Not thread-safe.
+    Shorter times are in the first bucket, longer ones in the last.
+    sum, max: of all times [s].  Not thread-safe.
     """
 
     __slots__ = ("_buckets", "max", "sum")
 
     def __init__(self) -> None:
-        """Empty."""
+        """Create an empty histogram."""
         self._buckets = [0] * (len(BOUNDS) + 1)
         self.sum = self.max = 0.0
 
     def add(self, seconds: float) -> None:
-        """One more."""
+        """Add one time."""
         self._buckets[bisect_left(BOUNDS, seconds)] += 1
         self.sum += seconds
         if seconds > self.max:
@@ -64,25 +65,26 @@ class Histogram:
 
     @property
     def count(self) -> int:
-        """How many there are."""
+        """Return the number of times."""
         return sum(self._buckets)
 
     def copy(self) -> "Histogram":
-        """The same, to be read while this one goes on."""
+        """Return a copy, to be read while this object continues to change."""
         other = Histogram()
         other._buckets, other.sum, other.max = self._buckets[:], self.sum, self.max
         return other
 
     def merge(self, other: "Histogram") -> None:
-        """All of another's more."""
+        """Add all times of another histogram."""
         self._buckets = list(map(add, self._buckets, other._buckets))
         self.sum += other.sum
         self.max = max(self.max, other.max)
 
     def percentiles(self, *shares: float) -> list[float]:
-        """For each share, rising from 0 to 1, what so many took no longer than [s]: up to a tenth more than is true.
+        """Return the percentile [s] of each share, in ascending order from 0 to 1.
 
-        0 where that is a microsecond or less, and where there are none.
+        A percentile is at most 10 % above the true one. It is 0 if it is at most a microsecond, and
+        if the histogram is empty.
         """
         found: list[float] = []
         count, passed, place = self.count, 0, -1
@@ -94,7 +96,7 @@ class Histogram:
         return found
 
     def times(self) -> Times:
-        """As `stats` says it."""
+        """Return the distribution as a message of `stats`."""
         p50, p90, p99 = self.percentiles(0.5, 0.9, 0.99)
         begins = [0, *(place + 1 for place in _COARSE)]
         buckets = np.add.reduceat(np.array(self._buckets, np.int64), begins).tolist()
@@ -102,7 +104,7 @@ class Histogram:
 
 
 def times_of(seconds: Iterable[float], of_all: Times) -> Times:
-    """Percentiles of the times of late [s], with the count, sum and buckets of all."""
+    """Return the percentiles of recent times [s], with the count, sum and buckets of all times."""
     ordered = sorted(seconds)
     if not ordered:
         return of_all
@@ -111,17 +113,20 @@ def times_of(seconds: Iterable[float], of_all: Times) -> Times:
 
 
 class Counts:
-    """What some requests asked and got; see `StatsAnswer`. stalls: what each waited for voxels [s]. Not thread-safe."""
+    """Counters of requests; see `StatsAnswer`. Not thread-safe.
+
+    stalls: time that each request waited for voxels [s].
+    """
 
     __slots__ = ("answers", "hits", "late", "misses", "requests", "stalls", "unknown", "waited")
 
     def __init__(self) -> None:
-        """None yet."""
+        """Start all counters at 0."""
         self.requests = self.answers = self.hits = self.misses = self.late = self.unknown = self.waited = 0
         self.stalls = Histogram()
 
     def add(self, cost: Cost, answers: int, unknown: int) -> None:
-        """One request more."""
+        """Count one request with this number of answers, some of them unknown."""
         self.requests += 1
         self.answers += answers
         self.hits += cost.hits
@@ -133,7 +138,7 @@ class Counts:
         self.stalls.add(cost.wait_seconds)
 
     def copy(self) -> Self:
-        """The same, to be read while this one goes on."""
+        """Return a copy, to be read while this object continues to change."""
         other = type(self)()
         for name in (name for kind in type(self).__mro__ for name in getattr(kind, "__slots__", ())):
             setattr(other, name, getattr(self, name))
@@ -141,7 +146,7 @@ class Counts:
         return other
 
     def merge(self, other: "Counts") -> None:
-        """All of another's requests more."""
+        """Add the counters of another object."""
         self.requests += other.requests
         self.answers += other.answers
         self.hits += other.hits
@@ -153,18 +158,18 @@ class Counts:
 
 
 class User(Counts):
-    """The same of one user. seen: when it was answered last, by the clock of its `Metrics` [s]."""
+    """Counters of one user. seen: time of its last answer, by the clock of its `Metrics` [s]."""
 
     __slots__ = ("seen",)
 
     def __init__(self) -> None:
-        """None yet."""
+        """Start all counters at 0."""
         super().__init__()
         self.seen = 0.0
 
 
 class Total(NamedTuple):
-    """What all requests came to. engine: their seconds in the engine; loads: those of the loads."""
+    """Totals of all requests. engine: time of each in the engine.  loads: time of each voxel load."""
 
     counts: Counts
     engine: Histogram
@@ -172,21 +177,22 @@ class Total(NamedTuple):
 
 
 class Metrics:
-    """The counts of one scene. Thread-safe.
+    """Counters of one scene. Thread-safe.
 
-    MOST_USERS users are remembered one by one; the longest silent is forgotten for a new one. In all they still count.
+    At most MOST_USERS users have counters of their own. A new user replaces the least recently active
+    one, whose counts remain in the total.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        """Nothing was asked yet. clock: seconds, from anywhere."""
+        """Start without any requests. clock: seconds since any epoch."""
         self._clock = clock
         self._lock = threading.Lock()
-        self._users: OrderedDict[tuple[str, str], User] = OrderedDict()  # the longest silent first
-        self._gone = Counts()  # of users that are not remembered
+        self._users: OrderedDict[tuple[str, str], User] = OrderedDict()  # least recently active first
+        self._gone = Counts()  # of users without counters of their own
         self._engine, self._loads = Histogram(), Histogram()
 
     def answered(self, client: str, avatar: str, answers: Cost) -> None:
-        """A request of a client about an avatar was answered; avatar "": about none, or several."""
+        """Count an answered request of a client about an avatar. avatar "": about none or several."""
         verdict: Any = getattr(answers, "verdict", None)
         count = unknown = 0
         if verdict is not None:
@@ -205,23 +211,24 @@ class Metrics:
             self._engine.add(answers.engine_seconds)
 
     def loaded(self, seconds: float) -> None:
-        """A voxel was loaded, which took so long."""
+        """Record the duration of a voxel load."""
         with self._lock:
             self._loads.add(seconds)
 
     def drop_client(self, client: str) -> None:
-        """A client is gone."""
+        """Remove the users of a client that is gone; their counts remain in the total."""
         with self._lock:
             for key in [key for key in self._users if key[0] == client]:
                 self._gone.merge(self._users.pop(key))
 
     def snapshot(self) -> tuple[Total, list[UserStats]]:
-        """What it came to in all, and for each user that is remembered, those heard of last first."""
+        """Return the total, and the statistics of each user with counters, most recently active first."""
         with self._lock:
             total = Total(self._gone.copy(), self._engine.copy(), self._loads.copy())
             known = list(reversed(self._users.items()))
         users = []
-        # One by one, for requests wait meanwhile. One that is forgotten now is counted all the same: it was not before.
+        # Copied one at a time, because requests wait for the lock. A user that is dropped meanwhile
+        # is still counted once: the copied total does not include it.
         for key, user in known:
             with self._lock:
                 users.append((key, user.copy()))
@@ -232,7 +239,7 @@ class Metrics:
 
 
 def _user_stats(key: tuple[str, str], silent: float, user: Counts) -> UserStats:
-    """What is said of one user."""
+    """Return the statistics of one user."""
     client, avatar = key
     p50, p99 = user.stalls.percentiles(0.5, 0.99)
     return UserStats(

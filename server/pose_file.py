@@ -1,6 +1,6 @@
-"""What the command asks about, in CSV files: poses t,x,y,z,qw,qx,qy,qz, a row a pose; rays; objects.
+"""CSV files of poses (t,x,y,z,qw,qx,qy,qz, one row per pose), rays and objects.
 
-Quaternions become matrices here only.
+This is the only module that converts between quaternions and matrices.
 """
 
 import csv
@@ -17,13 +17,13 @@ from ..schemas.errors import BadRequestError, ScanError
 COLUMNS = ("t", "x", "y", "z", "qw", "qx", "qy", "qz")
 RAY_COLUMNS = ("x", "y", "z", "dx", "dy", "dz")
 OBJECT_COLUMNS = ("avatar", "x", "y", "z", "qw", "qx", "qy", "qz", "group", "mask")
-# A quaternion farther than this from unit length is a mistake, not rounding (NUMERICS.md, case 4): |q| = 1.01
-# taken as it is would stretch space by 2 %.
+# A quaternion that deviates more than this from unit length is a mistake, not rounding (NUMERICS.md,
+# case 4): using |q| = 1.01 without normalising it would scale space by 2 %.
 UNIT_WITHIN = 1e-6
 
 
 class ObjectRow(NamedTuple):
-    """One object of an objects file. avatar: the file of its points.  pose: (4, 4)."""
+    """One object of an objects file. avatar: file of its points.  pose: (4, 4)."""
 
     avatar: Path
     pose: NDArray[np.float64]
@@ -32,10 +32,10 @@ class ObjectRow(NamedTuple):
 
 
 def read_poses(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Times (k,) [s] and poses (k, 4, 4), avatar to world [m], of a CSV file.
+    """Read times (k,) [s] and poses (k, 4, 4), avatar to world [m], from a CSV file.
 
-    Its first line names the columns, in any order. Quaternions within 1e-6 of unit length are normalised.
-    ScanError: the file cannot be read. BadRequestError: a line of it is wrong, and which.
+    The first line names the columns, in any order. Quaternions within 1e-6 of unit length are normalised.
+    Raises ScanError if the file cannot be read, BadRequestError naming the line if a line is invalid.
     """
     rows = [
         _unit_quaternion(where, _numbers(where, row), 4) for where, row in _read_rows(path, COLUMNS, "poses")
@@ -45,16 +45,21 @@ def read_poses(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 def read_rays(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Origins (k, 3) and directions (k, 3), world [m], of a CSV file x,y,z,dx,dy,dz; errors as `read_poses`."""
+    """Read origins (k, 3) and directions (k, 3), world frame [m], from a CSV file x,y,z,dx,dy,dz.
+
+    Raises the same errors as `read_poses`.
+    """
     rows = [_numbers(where, row) for where, row in _read_rows(path, RAY_COLUMNS, "rays")]
     table = np.array(rows, np.float64).reshape(-1, len(RAY_COLUMNS))
     return table[:, :3].copy(), table[:, 3:].copy()
 
 
 def read_objects(path: Path) -> list[ObjectRow]:
-    """The objects of a CSV file avatar,x,y,z,qw,qx,qy,qz,group,mask; errors as `read_poses`.
+    """Read the objects of a CSV file avatar,x,y,z,qw,qx,qy,qz,group,mask.
 
-    avatar: a file of points, from the folder of the CSV file.  group, mask: integers; 0x and 0b are understood.
+    avatar: a file of points, relative to the folder of the CSV file.
+    group, mask: integers; the prefixes 0x and 0b are allowed.
+    Raises the same errors as `read_poses`.
     """
     found = []
     for where, row in _read_rows(path, OBJECT_COLUMNS, "objects"):
@@ -69,7 +74,7 @@ def read_objects(path: Path) -> list[ObjectRow]:
 
 
 def _read_rows(path: Path, columns: tuple[str, ...], what: str) -> Iterator[tuple[str, list[str]]]:
-    """Where it stands, and the values in the order of `columns`, of each row of a CSV file."""
+    """Yield the location (file and line) and the values, in the order of `columns`, of each row of a CSV file."""
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             reader = csv.reader(file)
@@ -85,7 +90,7 @@ def _read_rows(path: Path, columns: tuple[str, ...], what: str) -> Iterator[tupl
                 where = f"{path}, line {reader.line_num}"
                 if len(row) != len(columns):
                     raise BadRequestError(
-                        f"{where}: {len(row)} values: expected {len(columns)}, one a column"
+                        f"{where}: {len(row)} values: expected {len(columns)}, one per column"
                     )
                 yield where, [row[column].strip() for column in order]
     except OSError as error:
@@ -95,7 +100,7 @@ def _read_rows(path: Path, columns: tuple[str, ...], what: str) -> Iterator[tupl
 
 
 def write_poses(path: Path, times: NDArray[np.float64], poses: NDArray[np.float64]) -> None:
-    """Write times (k,) [s] and rigid poses (k, 4, 4) as such a file; nothing half-written is left."""
+    """Write times (k,) [s] and rigid poses (k, 4, 4) as a pose file, completely or not at all."""
     rows = (
         (t, *pose[:3, 3].tolist(), *_quaternion(pose[:3, :3]))
         for t, pose in zip(times.tolist(), poses, strict=True)
@@ -113,7 +118,7 @@ def write_poses(path: Path, times: NDArray[np.float64], poses: NDArray[np.float6
 
 
 def _numbers(where: str, row: list[str]) -> list[float]:
-    """A row's numbers, finite."""
+    """Parse a row of finite numbers."""
     try:
         values = [float(value) for value in row]
     except ValueError as error:
@@ -124,7 +129,7 @@ def _numbers(where: str, row: list[str]) -> list[float]:
 
 
 def _unit_quaternion(where: str, values: list[float], first: int) -> list[float]:
-    """The same numbers with those from `first` on, a quaternion, checked and normalised."""
+    """Return the values with those from `first` on, a quaternion, checked and normalised."""
     length = math.hypot(*values[first:])
     if abs(length - 1) > UNIT_WITHIN:
         raise BadRequestError(
@@ -134,7 +139,7 @@ def _unit_quaternion(where: str, values: list[float], first: int) -> list[float]
 
 
 def _matrices(table: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rows of COLUMNS, quaternions of unit length, to poses (k, 4, 4)."""
+    """Convert rows of COLUMNS, with unit quaternions, to poses (k, 4, 4)."""
     w, x, y, z = table[:, 4:].T
     poses = np.zeros((len(table), 4, 4))
     poses[:, 0, 0], poses[:, 0, 1], poses[:, 0, 2] = (
@@ -158,9 +163,12 @@ def _matrices(table: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _quaternion(turn: NDArray[np.float64]) -> tuple[float, float, float, float]:
-    """The unit quaternion (w, x, y, z) of a rotation (3, 3), from its largest component for accuracy."""
+    """Return the unit quaternion (w, x, y, z) of a rotation (3, 3).
+
+    Divides by the largest component, for accuracy.
+    """
     m = turn.tolist()
-    # Four times the squares of w, x, y and z.
+    # 4 w², 4 x², 4 y², 4 z².
     squares = [
         1 + m[0][0] + m[1][1] + m[2][2],
         1 + m[0][0] - m[1][1] - m[2][2],
@@ -168,7 +176,7 @@ def _quaternion(turn: NDArray[np.float64]) -> tuple[float, float, float, float]:
         1 - m[0][0] - m[1][1] + m[2][2],
     ]
     k = max(range(4), key=squares.__getitem__)
-    # Products of that component, four times each, with the four.
+    # Four times the products of component k with each of w, x, y and z.
     products = [
         (squares[0], m[2][1] - m[1][2], m[0][2] - m[2][0], m[1][0] - m[0][1]),
         (m[2][1] - m[1][2], squares[1], m[1][0] + m[0][1], m[0][2] + m[2][0]),

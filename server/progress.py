@@ -1,4 +1,4 @@
-"""How long work looks while it goes on, on standard error: bars, plain lines, or JSON for programs."""
+"""Progress display of long work on standard error: bars, plain lines, or JSON for programs."""
 
 import json
 import sys
@@ -17,18 +17,19 @@ from rich.text import Text
 
 from ..schemas.interrupts import check
 
-# A rate is that of the last so many seconds: work comes in lumps of a second or two, and a disk's mood changes.
+# Rates average over this window: work completes in chunks of a second or two, and disk speed varies.
 RATE_SECONDS = 30.0
-# What is done so soon after a stage began was done before it began, by a build that was interrupted.
+# Work reported within this time of a stage's start was done earlier, by an interrupted build, and
+# does not count for the rate.
 HEAD_START_SECONDS = 0.05
-# Between two lines of one stage, where no terminal shows bars; JSON is for programs, which do not tire.
+# Interval between two lines of one stage without a terminal, as text for people and as JSON for programs.
 LINE_SECONDS, JSON_SECONDS = 10.0, 1.0
 
 
 class Pace:
-    """How far one stage of work is, how fast it goes and how long it has still to go.
+    """Progress, rate and remaining time of one stage of work.
 
-    done, total: in `unit`.  clock: seconds, from anywhere.
+    done, total: in `unit`.  clock: seconds since any epoch.
     """
 
     def __init__(self, stage: str, total: int, unit: str, clock: Callable[[], float]) -> None:
@@ -38,7 +39,7 @@ class Pace:
         self._samples = deque([(self._begin, 0)])
 
     def advance(self, amount: int) -> None:
-        """So much more is done."""
+        """Record that `amount` more is done."""
         now = self._clock()
         self.done += amount
         if now - self._begin < HEAD_START_SECONDS:
@@ -53,24 +54,27 @@ class Pace:
             self._samples.popleft()
 
     def end(self) -> None:
-        """All is done; a total that was an estimate becomes what was done."""
+        """Record that the stage is complete. An estimated total becomes the amount done."""
         self.total, self.ended = self.done, True
         self._samples = deque([(self._begin, self._before), (self._clock(), self.done)])
 
     @property
     def seconds(self) -> float:
-        """Since it began, until now or until it ended."""
+        """Return the duration of the stage until now, or until it ended."""
         return (self._samples[-1][0] if self.ended else self._clock()) - self._begin
 
     @property
     def rate(self) -> float | None:
-        """`unit` a second, of late; of all of it when it has ended. None while nothing is known."""
+        """Return the recent rate in `unit` per second, of the whole stage once it has ended.
+
+        None while unknown.
+        """
         (first, before), (last, done) = self._samples[0], self._samples[-1]
         return (done - before) / (last - first) if last > first and done > before else None
 
     @property
     def left(self) -> float | None:
-        """Seconds still to go; None while nothing is known."""
+        """Return the estimated remaining time [s]; None while unknown."""
         rate = self.rate
         if self.ended:
             return 0.0
@@ -80,12 +84,15 @@ class Pace:
 
 
 class Listener:
-    """What `builder.progress.Progress` asks for, and `builder.made`; a context manager. A subclass shows it."""
+    """Receiver of progress reports that displays nothing, base class of those that do; a context manager.
+
+    Implements the protocol `builder.progress.Progress` and the callback of `builder.made`.
+    """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
         self._pace: Pace | None = None
-        # The stage that something went wrong in: it is left as it stood.
+        # The stage in which an error occurred, with its progress at that time.
         self._broken: Pace | None = None
 
     def __enter__(self) -> Self:
@@ -97,20 +104,20 @@ class Listener:
         pass
 
     def start(self, stage: str, total: int, unit: str) -> None:
-        """Begin a stage. Raises Interrupted where a signal has come."""
+        """Begin a stage. Raises Interrupted if a signal has arrived."""
         check()
         self._pace = Pace(stage, total, unit, self._clock)
         self._began(self._pace)
 
     def advance(self, amount: int) -> None:
-        """Add to what is done of the stage. Raises Interrupted where a signal has come."""
+        """Add to the amount done of the stage. Raises Interrupted if a signal has arrived."""
         check()
         if self._pace is not None:
             self._pace.advance(amount)
             self._moved(self._pace)
 
     def finish(self) -> None:
-        """The stage is over; a total that was an estimate becomes what was done."""
+        """End the stage. An estimated total becomes the amount done."""
         if self._pace is None:
             return
         if sys.exception() is None:
@@ -121,7 +128,7 @@ class Listener:
         self._pace = None
 
     def made(self, done: int, total: int) -> None:
-        """What `builder.made` calls: points written so far, of all."""
+        """Report the points written so far and in total, as `builder.made` calls it."""
         if self._pace is None and done < total:
             self.start("scan", total, "points")
         if self._pace is not None:
@@ -130,20 +137,20 @@ class Listener:
                 self.finish()
 
     def _began(self, pace: Pace) -> None:
-        """A stage begins."""
+        """Display that a stage begins."""
 
     def _moved(self, pace: Pace) -> None:
-        """Some of it is done."""
+        """Display progress of the stage."""
 
     def _ended(self, pace: Pace) -> None:
-        """All of it is done."""
+        """Display that the stage is complete."""
 
 
 class Bars(Listener):
-    """A bar for each stage, on a terminal: how much is done, how fast, and how long it will take.
+    """Progress bars for a terminal: one per stage, with the amount done, the rate and the remaining time.
 
-    One line is drawn anew, four times a second: that of the stage at work. One that is over is printed above it, once,
-    and so is what others print meanwhile. Its columns have fixed places, 79 in all: what moves is the figures alone.
+    Only the line of the current stage is redrawn, four times a second. Completed stages and other
+    output are printed above it. The columns have fixed widths, 79 characters in all.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic, console: Console | None = None) -> None:
@@ -178,29 +185,29 @@ class Bars(Listener):
     def _ended(self, pace: Pace) -> None:
         if self._task is None:
             return
-        # A stage of nothing has a full bar too.
+        # A stage with a total of 0 also ends with a full bar.
         self._bars.update(self._task, completed=max(pace.done, 1), total=max(pace.done, 1))
         over = next(task for task in self._bars.tasks if task.id == self._task)
         self._bars.remove_task(self._task)
-        self._bars.refresh()  # what is printed next would else be followed by the line as it was drawn last
+        self._bars.refresh()  # otherwise the old line would be drawn again below the next output
         self._bars.console.print(self._bars.make_tasks_table([over]))
         self._task = None
 
 
 class _Cell(ProgressColumn):
-    """A text of fixed width about the pace of a task."""
+    """Column of fixed width with a text about the pace of a task."""
 
     def __init__(self, say: Callable[[Pace], str], width: int) -> None:
         super().__init__(Column(width=width, no_wrap=True, justify="left" if width == 8 else "right"))
         self._say = say
 
     def render(self, task: Task) -> Text:
-        """Called by rich some times a second, in a thread of its own."""
+        """Return the text. rich calls this several times a second, in its own thread."""
         return Text(self._say(task.fields["pace"]))
 
 
 class Lines(Listener):
-    """Plain lines, where no terminal is: one as a stage begins, one every 10 s, one as it ends."""
+    """Plain text lines, without a terminal: one at a stage's start, one every 10 s, one at its end."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic, stream: TextIO | None = None) -> None:
         super().__init__(clock)
@@ -234,11 +241,14 @@ class Lines(Listener):
 
 
 class JsonLines(Listener):
-    """One JSON object a line, for programs: as a stage begins, every second, as it ends, and when something fails.
+    """JSON lines for programs: one object at a stage's start, every second, at its end, and on failure.
 
-    time: ISO 8601, UTC.  event: "start", "progress", "end" or "failed".  stage: its name, null outside any.
-    done, total: so far and of all, in `unit`; total may be an estimate until the end.  rate: `unit` a second, of late,
-    at the end of all of it; eta: seconds to go; both null while unknown.  message: of what failed, there alone.
+    time: ISO 8601, UTC.  event: "start", "progress", "end" or "failed".
+    stage: its name; null outside any stage.
+    done, total: amount so far and in all, in `unit`; total may be an estimate until the end.
+    rate: recent `unit` per second, at the end that of the whole stage; null while unknown.
+    eta: estimated remaining time [s]; null while unknown.
+    message: error message; only in "failed".
     """
 
     def __init__(
@@ -285,7 +295,7 @@ class JsonLines(Listener):
 
 @contextmanager
 def progress_listener(log_json: bool = False) -> Iterator[Listener]:
-    """What listens to this command's work, on standard error: JSON if asked for, bars on a terminal, else lines."""
+    """Yield a progress display on standard error: JSON if `log_json`, bars on a terminal, else lines."""
     console = Console(stderr=True)
     listener: Listener
     if log_json:
@@ -299,7 +309,7 @@ def progress_listener(log_json: bool = False) -> Iterator[Listener]:
 
 
 def count_text(count: float) -> str:
-    """A count in at most seven characters: 99,999 as it is, then 100 k, 12.3 M, 4.56 G."""
+    """Format a count in at most seven characters: up to 99,999 in full, then 100 k, 12.3 M, 4.56 G."""
     if count < 99_999.5:
         return f"{count:,.0f}" if count >= 10 or count == int(count) else f"{count:.1f}"
     power = min(3, (len(str(round(count))) - 1) // 3)
@@ -311,7 +321,7 @@ def count_text(count: float) -> str:
 
 
 def clock_text(seconds: float) -> str:
-    """A time in seconds as on a clock: 0:07, 12:34, 1:02:03."""
+    """Format a duration as on a clock: 0:07, 12:34, 1:02:03."""
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"

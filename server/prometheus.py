@@ -1,6 +1,6 @@
-"""What `stats` says as Prometheus' text, over HTTP. The only user of prometheus_client.
+"""Prometheus metrics of `stats`, over HTTP. This is the only module that imports prometheus_client.
 
-Nothing is counted here: each scrape asks the scenes, so that what is read and what `stats` says is the same.
+It keeps no counters: each scrape calls `stats` of the scenes, and both report the same numbers.
 """
 
 import logging
@@ -23,57 +23,57 @@ except ModuleNotFoundError as missing:
 
 log = logging.getLogger(__name__)
 
-# With more users than this none is told apart: a series a client would be kept for ever by who scrapes, long after it
-# is gone.
+# With more users than this there are no metrics per user: the monitoring system would keep one series
+# per client forever, long after the client is gone.
 FEW_USERS = 10
 
-# Name, what it says, and the field of `StatsAnswer` that it is.
+# Name of each metric, its help text, and its field of `StatsAnswer`.
 _GAUGES = (
-    ("generation", "Generation of the archive that is served.", "generation"),
-    ("budget_bytes", "Bytes that decoded voxels may take.", "budget_bytes"),
-    ("resident_bytes", "Bytes that decoded voxels take.", "resident_bytes"),
-    ("coarse_bytes", "Bytes that coarse tops take.", "coarse_bytes"),
+    ("generation", "Generation of the served archive.", "generation"),
+    ("budget_bytes", "Memory budget of decoded voxels.", "budget_bytes"),
+    ("resident_bytes", "Memory used by decoded voxels.", "resident_bytes"),
+    ("coarse_bytes", "Memory used by coarse bounds.", "coarse_bytes"),
     ("voxels", "Voxels of the archive.", "voxels"),
-    ("resident_voxels", "Voxels decoded in memory, or being loaded.", "resident"),
-    ("kept_voxels", "Voxels that users stand in.", "kept"),
+    ("resident_voxels", "Voxels that are resident or being loaded.", "resident"),
+    ("kept_voxels", "Voxels that users are in.", "kept"),
 )
 _COUNTERS = (
-    ("voxel_hits", "Voxels asked for and there, or being loaded.", "hits"),
-    ("voxel_waits", "Voxels asked for and being loaded.", "waits"),
-    ("voxel_misses", "Voxels asked for and not there.", "misses"),
-    ("voxel_late", "Voxels not there in time.", "late"),
-    ("prefetched", "Voxels loaded before anybody asked.", "prefetched"),
-    ("prefetched_bytes", "Their bytes.", "prefetched_bytes"),
-    ("prefetched_used", "Voxels prefetched, and asked for since.", "used"),
-    ("prefetched_wasted", "Voxels prefetched, and gone without being asked for.", "wasted"),
-    ("prefetched_wasted_bytes", "Their bytes.", "wasted_bytes"),
-    ("evicted", "Voxels gone for others.", "evicted"),
-    ("evicted_too_soon", "Voxels gone for others, and asked for again shortly after.", "too_soon"),
-    ("moved_bytes", "Bytes of voxels moved to join free room.", "moved_bytes"),
-    ("failed_loads", "Loads that failed.", "failed"),
+    ("voxel_hits", "Voxels requested and resident, or being loaded.", "hits"),
+    ("voxel_waits", "Voxels requested while being loaded.", "waits"),
+    ("voxel_misses", "Voxels requested and not resident.", "misses"),
+    ("voxel_late", "Voxels requested and not resident in time.", "late"),
+    ("prefetched", "Voxel loads started before any request.", "prefetched"),
+    ("prefetched_bytes", "Bytes of prefetched voxels.", "prefetched_bytes"),
+    ("prefetched_used", "Prefetched voxels requested since.", "used"),
+    ("prefetched_wasted", "Wasted prefetches: loads that failed, or voxels evicted unused.", "wasted"),
+    ("prefetched_wasted_bytes", "Bytes of wasted prefetches.", "wasted_bytes"),
+    ("evicted", "Voxels evicted to make room for others.", "evicted"),
+    ("evicted_too_soon", "Evicted voxels that were requested again shortly after.", "too_soon"),
+    ("moved_bytes", "Bytes of voxels moved to join free memory.", "moved_bytes"),
+    ("failed_loads", "Voxel loads that failed.", "failed"),
     ("requests", "Requests answered.", "requests"),
     ("answers", "Poses, rays, points, motions and objects answered.", "answers"),
     ("unknown_answers", "Answers that were unknown.", "unknown"),
     ("waited_requests", "Requests that waited for voxels.", "waited"),
 )
 _HISTOGRAMS = (
-    ("load_seconds", "What loading a voxel took.", "load_seconds"),
-    ("stall_seconds", "What a request waited for voxels.", "stall_seconds"),
-    ("engine_seconds", "What a request took in the engine.", "engine_seconds"),
+    ("load_seconds", "Time to load a voxel.", "load_seconds"),
+    ("stall_seconds", "Time that a request waited for voxels.", "stall_seconds"),
+    ("engine_seconds", "Time of a request in the engine.", "engine_seconds"),
 )
 _OF_USERS = (
     ("user_requests", "Requests answered, of one user.", "requests"),
-    ("user_answers", "Poses, rays, points and motions answered, of one user.", "answers"),
+    ("user_answers", "Poses, rays, points, motions and objects answered, of one user.", "answers"),
     ("user_unknown_answers", "Answers that were unknown, of one user.", "unknown"),
-    ("user_voxel_hits", "Voxels asked for and there, by one user.", "hits"),
-    ("user_voxel_misses", "Voxels asked for and not there, by one user.", "misses"),
-    ("user_voxel_late", "Voxels not there in time, for one user.", "late"),
+    ("user_voxel_hits", "Voxels requested by one user and resident, or being loaded.", "hits"),
+    ("user_voxel_misses", "Voxels requested by one user and not resident.", "misses"),
+    ("user_voxel_late", "Voxels requested by one user and not resident in time.", "late"),
     ("user_waited_requests", "Requests that waited for voxels, of one user.", "waited"),
 )
 
 
 class StatsLike(Protocol):
-    """A scene that is asked."""
+    """A scene that reports statistics."""
 
     name: str
 
@@ -81,20 +81,20 @@ class StatsLike(Protocol):
 
 
 class StatsCollector(Collector):
-    """What a registry asks for the metrics of scenes."""
+    """Collector of the metrics of scenes, for a Prometheus registry."""
 
     def __init__(self, scenes: Sequence[StatsLike]) -> None:
-        """Of these scenes."""
+        """Collect the metrics of these scenes."""
         self._scenes = tuple(scenes)
 
     def collect(self) -> Iterator[Metric]:
-        """Every metric of every scene; a scene that cannot be asked has none this once."""
+        """Yield every metric of every scene. A scene whose `stats` fails is left out of this scrape."""
         found = []
         for scene in self._scenes:
             try:
                 found.append(scene.stats())
             except Exception:
-                log.exception("no metrics of scene %s", scene.name)
+                log.exception("cannot read the metrics of scene %s", scene.name)
         scenes = GaugeMetricFamily("solidcloud_scene_info", "1 for each scene.", labels=["scene", "policy"])
         for stats in found:
             scenes.add_metric([stats.scene, stats.policy], 1)
@@ -119,12 +119,12 @@ class StatsCollector(Collector):
 
 
 def _buckets(times: Times) -> list[tuple[str, float]]:
-    """Buckets as Prometheus wants them: upper end, and how many took no longer."""
+    """Return Prometheus buckets: upper bound and cumulative count."""
     return [("+Inf" if bound == math.inf else f"{bound:g}", count) for bound, count in times.at_most()]
 
 
 def _of_users(found: Sequence[StatsAnswer]) -> Iterator[Metric]:
-    """Counters a user, of scenes with few."""
+    """Yield the counters per user, for scenes with at most FEW_USERS."""
     users: list[tuple[str, UserStats]] = [
         (stats.scene, user) for stats in found if len(stats.users) <= FEW_USERS for user in stats.users
     ]
@@ -137,9 +137,10 @@ def _of_users(found: Sequence[StatsAnswer]) -> Iterator[Metric]:
 
 @contextmanager
 def metrics_served(scenes: Sequence[StatsLike], host: str, port: int) -> Iterator[str]:
-    """Serve the metrics of scenes, and of this process, over HTTP while inside; gives where.
+    """Serve the metrics of scenes and of this process over HTTP during the block; yield the URL.
 
-    host: the address to be reached at.  port: 0: any that is free. SolidcloudError: it cannot be listened on.
+    host: address to listen on.  port: 0: any free port.
+    Raises SolidcloudError if the port cannot be opened.
     """
     registry = CollectorRegistry(auto_describe=True)
     registry.register(StatsCollector(scenes))

@@ -1,4 +1,4 @@
-"""What `solidcloud query` asks: which options each question takes, and what they become."""
+"""Queries of `solidcloud query`: their options, the input files and the requests made from them."""
 
 from collections.abc import Callable, Iterator
 from itertools import pairwise
@@ -16,7 +16,7 @@ from ..schemas.requests import PATH_PARAMETERS, Question
 from .pose_file import read_objects, read_poses, read_rays
 from .scan_bounds import Bodies, Places, Points, Rays, box_of
 
-# What each question takes beside the scene and what all take; the first of these are needed.
+# Required and optional options of each query, besides the scene and the options common to all.
 _OPTIONS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "collide": (("avatar", "poses"), ("radius", "margin")),
     "distance": (("avatar", "poses", "reach"), ("radius",)),
@@ -36,7 +36,7 @@ ReadPoints = Callable[[Path], NDArray[np.float64]]
 
 
 class Asker(Protocol):
-    """What is asked: a `Client`, or a `Scene`; the questions without a line here too."""
+    """A `Client` or a `Scene`. Queries without a method here are called by name."""
 
     def add_avatar(self, *what: Any) -> Any: ...
     def sweep(self, *what: Any, **parameters: Any) -> Any: ...
@@ -46,9 +46,10 @@ class Asker(Protocol):
 
 
 class Asked(NamedTuple):
-    """Answers and what each is the answer to, as words; `times`, where it is a pose or motion, [s].
+    """Answers to a query or to a part of it.
 
-    places: where everything lies that the whole question asks about, of which this may be a part.
+    labels: description of the item of each answer.  times: of each item [s], if it is a pose or motion.
+    places: positions of all items of the whole query, even if these answers are a part of it.
     """
 
     labels: list[str]
@@ -58,9 +59,10 @@ class Asked(NamedTuple):
 
 
 class Query(NamedTuple):
-    """A question with its options as `check_query` leaves them: those that were given.
+    """A query and its checked options.
 
-    op: what of; along a path what of is `along`.
+    op: the query's name.  along: the query made along a path, if op is "path".
+    given: the options that were given.
     """
 
     op: str
@@ -69,7 +71,10 @@ class Query(NamedTuple):
 
 
 def check_query(op: str, options: dict[str, Any]) -> Query:
-    """A question of the options that are not None; BadRequestError says which does not fit, or is missing."""
+    """Return the query for the options that are not None.
+
+    Raises BadRequestError, which names an option that the query does not take or one that is missing.
+    """
     if op not in _OPTIONS:
         raise BadRequestError(f"--op {op}: expected one of {', '.join(_OPTIONS)}")
     needed, others = _OPTIONS[op]
@@ -80,12 +85,12 @@ def check_query(op: str, options: dict[str, Any]) -> Query:
             raise BadRequestError(f"--along {along}: expected one of {', '.join(PATH_PARAMETERS)}")
         needed, others = _OPTIONS[along][0], (*_OPTIONS[along][1], "along")
     asked = f"--op path --along {along}" if op == "path" else f"--op {op}"
-    # What a frame may cost is the scene's to say.
+    # The budget of a frame is set by the scene, not by the request.
     others = others if op == "move" else (*others, *_OF_ALL)
     takes = ", ".join(map(_option, (*needed, *others)))
     for name in given:
         if name not in (*needed, *others):
-            raise BadRequestError(f"{_option(name)} does not go with {asked}: it takes {takes}")
+            raise BadRequestError(f"{_option(name)} is not an option of {asked}: it takes {takes}")
     for name in needed:
         if name not in given:
             raise BadRequestError(f"{asked} needs {_option(name)}: it takes {takes}")
@@ -93,7 +98,10 @@ def check_query(op: str, options: dict[str, Any]) -> Query:
 
 
 def ask(scene: Asker, query: Query, read_points: ReadPoints) -> Iterator[Asked]:
-    """The answers, in one piece, of a path in parts. read_points: the points (n, 3) of a file [m]."""
+    """Make a query and yield its answers at once, or in parts for a path.
+
+    read_points: returns the points (n, 3) of a file [m].
+    """
     given = dict(query.given)
     parameters = {name: value for name, value in given.items() if name not in ("along", *_FILES)}
     if query.op == "objects":
@@ -123,9 +131,10 @@ def ask(scene: Asker, query: Query, read_points: ReadPoints) -> Iterator[Asked]:
 def ask_moves(
     scene: Asker, query: Query, read_points: ReadPoints
 ) -> tuple[Places, Iterator[tuple[str, Moved]]]:
-    """Where the avatar gets from each pose towards the next, and which it is as words; no frame remembers another.
+    """Simulate one frame from each pose towards the next; frames do not depend on one another.
 
-    A frame lasts from one pose's time to the next one's. Returns where the motions lie, and the frames.
+    A frame lasts from the time of one pose to that of the next. Returns the positions of the motions,
+    and an iterator over the frames: a label and the result of each.
     """
     times, poses = read_poses(query.given["poses"])
     places = _add_body(scene, query, read_points, poses, moving=True)
@@ -140,7 +149,7 @@ def ask_moves(
 
 
 def joined(found: list[Asked]) -> Asked:
-    """The parts of one question as one piece."""
+    """Join the parts of one query's answers."""
     labels = [label for part in found for label in part.labels]
     times = [time for part in found for time in part.times]
     return Asked(labels, times, join([part.answers for part in found]), found[0].places)
@@ -149,7 +158,7 @@ def joined(found: list[Asked]) -> Asked:
 def _add_body(
     scene: Asker, query: Query, read_points: ReadPoints, poses: NDArray[np.float64], *, moving: bool
 ) -> Bodies:
-    """Add the avatar of a question, and return where it is at each pose, or between each and the next."""
+    """Add the avatar of a query and return its positions at each pose, or between each pose and the next."""
     points = read_points(query.given["avatar"])
     radius = scene.add_avatar("avatar", points, query.given.get("radius")).radius
     reach = query.given.get("reach", query.given.get("margin", 0.0))
@@ -163,7 +172,7 @@ _FILES = ("avatar", "radius", "poses", "rays", "points", "objects")
 def _ask_objects(
     scene: Asker, path: Path, read_points: ReadPoints, parameters: dict[str, Any], radius: float | None
 ) -> Asked:
-    """The answers about the objects of a file."""
+    """Query the objects of a file."""
     rows = read_objects(path)
     names = {
         avatar: f"avatar-{number}" for number, avatar in enumerate(dict.fromkeys(row.avatar for row in rows))
@@ -184,12 +193,12 @@ def _ask_objects(
 
 
 def _labels(op: str, times: list[float]) -> tuple[list[str], list[float]]:
-    """What each answer is for, and the time it begins at [s]."""
+    """Return the label of each answer and the time at which its item begins [s]."""
     if op != "sweep":
         return [f"{time:10.3f} s" for time in times], times
     return [f"{begin:10.3f} .. {end:10.3f} s" for begin, end in pairwise(times)], times[:-1]
 
 
 def _option(name: str) -> str:
-    """A parameter as the option it is."""
+    """Return the command-line option for a parameter."""
     return "--" + name.replace("_", "-")

@@ -1,4 +1,4 @@
-"""What `solidcloud scene check` says of a scene file: what it names, found whole, which effects run in which order."""
+"""Checks and description of a scene file for `solidcloud scene check`: archives, avatars, order of effects."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -24,9 +24,10 @@ from .scene_file import (
 
 
 class Checked(NamedTuple):
-    """A scene file in which nothing is wrong. left_out: points that are passed through.
+    """A valid scene file.
 
-    notes: what is no fault, and perhaps not meant.
+    left_out: number of scan points removed by the effect `through`.
+    notes: sentences about settings that are valid but possibly unintended.
     """
 
     path: Path
@@ -39,7 +40,10 @@ class Checked(NamedTuple):
 
 
 def check_scene_file(path: Path, read_points: ReadPoints) -> Checked:
-    """Read a scene file and all that it names. Raises as `open_scene` does, but for budgets."""
+    """Read a scene file and everything it names.
+
+    Raises the same errors as `open_scene`, except those about budgets.
+    """
     file = read_scene(path)
     name = scene_name(file, path)
     archives = find_archives(file, path)
@@ -49,7 +53,7 @@ def check_scene_file(path: Path, read_points: ReadPoints) -> Checked:
 
 
 def scene_facts(checked: Checked) -> Iterator[tuple[str, str]]:
-    """Names and values for a table."""
+    """Yield names and values that describe a scene, for a table."""
     file = checked.file
     yield "scene", f"{checked.name}, {checked.path}"
     for item, found in zip(file.archives, checked.archives, strict=True):
@@ -61,7 +65,7 @@ def scene_facts(checked: Checked) -> Iterator[tuple[str, str]]:
             f"{found.folder}: {info.points:,} points in {info.voxels:,} voxels, radii {models}{posed}",
         )
     yield "up", _numbers(up_of(file))
-    yield "radius model", file.radius_model or "each archive's one figure"
+    yield "radius model", file.radius_model or "the radius stored in each archive"
     for avatar in checked.avatars:
         made = avatar.info
         yield f"avatar {made.name}", f"{avatar.file}: {made.points:,} points of {made.radius:.4g} m radius"
@@ -77,18 +81,21 @@ def scene_facts(checked: Checked) -> Iterator[tuple[str, str]]:
         effect = by_name[name]
         if isinstance(effect, Through):
             boxes = ", ".join(box.name for box in effect.boxes)
-            yield "once, at the start", f"through: {boxes}; {checked.left_out:,} points left out"
+            yield "at the start", f"through: {boxes}; {checked.left_out:,} points left out"
         else:
             options = _options(effect)
             yield f"effect {number - ('through' in steps)}", f"{name}{': ' if options else ''}{options}"
     if not steps:
-        yield "effects", "none: nothing stops anybody"
+        yield "effects", "none: nothing stops an avatar"
     for note in checked.notes:
         yield "note", note
 
 
 def scene_json(checked: Checked) -> dict[str, Any]:
-    """The same for a program; JSON's own types alone. scene: the file as read, with its defaults."""
+    """Return the description of a scene in JSON types.
+
+    Its field `scene` holds the file as read, with defaults filled in.
+    """
     return {
         "file": str(checked.path),
         "name": checked.name,
@@ -105,7 +112,7 @@ def scene_json(checked: Checked) -> dict[str, Any]:
 
 
 def _left_out(file: SceneFile, path: Path, archives: list[Found]) -> int:
-    """How many points are passed through."""
+    """Return the number of scan points that the effect `through` removes."""
     if not any(isinstance(effect, Through) for effect in file.effects):
         return 0
     left_out = 0
@@ -118,34 +125,37 @@ def _left_out(file: SceneFile, path: Path, archives: list[Found]) -> int:
 
 
 def _notes(file: SceneFile, archives: list[Found], left_out: int) -> Iterator[str]:
-    """What is no fault, and perhaps not meant."""
+    """Yield sentences about settings that are valid but possibly unintended."""
     for effect in file.effects:
         if isinstance(effect, Objects) and not file.objects:
-            yield "the effect `objects` without any in [[objects]]: it has nothing to do"
+            yield "the effect `objects` has nothing to do: there are no [[objects]]"
         if isinstance(effect, Through) and not left_out:
             yield "no scan point lies in a box of `through`: are the boxes in world coordinates, in metres?"
         if isinstance(effect, Uncertainty) and effect.scans:
             for found in archives:
                 if not found.keeps_scan:
-                    yield f"{found.folder} keeps no scan of its points (build --keep scan): one sigma holds for all"
+                    yield (
+                        f"{found.folder} does not store the scan of its points (build --keep scan): "
+                        "one sigma applies to all points"
+                    )
     names = {effect_name(effect) for effect in file.effects}
     if "stop" in names and "sweep" not in names:
-        yield "`stop` without `sweep`: what is thinner than a frame's motion may be passed through between two frames"
+        yield "`stop` without `sweep`: an avatar may pass through anything thinner than its motion in one frame"
     reach = normals_asked(file)
     for found in archives:
         if reach is not None and found.normal_reach != reach:
             yield (
-                f"{found.folder} keeps no normals within {reach:g} m (build --keep normal --normal-reach {reach:g}): "
-                "effects ask for them, and they are estimated when first needed"
+                f"{found.folder} stores no normals of reach {reach:g} m, which effects need (build --keep normal "
+                f"--normal-reach {reach:g}): they are estimated when first needed"
             )
     if file.spawn is not None:
         low, high = _bounds(file, archives)
         if not all(a <= x <= b for a, x, b in zip(low, file.spawn.position, high, strict=True)):
-            yield f"spawn lies outside what is scanned, {_numbers(low)} .. {_numbers(high)} m"
+            yield f"spawn lies outside the bounds of the archives, {_numbers(low)} .. {_numbers(high)} m"
 
 
 def _bounds(file: SceneFile, archives: list[Found]) -> tuple[list[float], list[float]]:
-    """A box around all archives, world [m]."""
+    """Return the low and high corner of a box around all archives, world frame [m]."""
     lows, highs = [], []
     for item, found in zip(file.archives, archives, strict=True):
         low, high = np.array(found.info.bounds)[:, None]
@@ -157,12 +167,12 @@ def _bounds(file: SceneFile, archives: list[Found]) -> tuple[list[float], list[f
 
 
 def _numbers(values: Any) -> str:
-    """Numbers for a reader."""
+    """Format numbers."""
     return " ".join(f"{value:.6g}" for value in values)
 
 
 def _options(part: Any) -> str:
-    """The fields of a part of the file that are set, as they are written there."""
+    """Format the fields of a part of the file that are set, as written in the file."""
     fields = msgspec.to_builtins(part)
     fields.pop("effect", None)
     return ", ".join(f"{name} {value}" for name, value in fields.items() if value not in (None, {}))

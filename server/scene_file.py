@@ -1,6 +1,6 @@
-"""What is served, opened: an archive, or what a scene file says. Every fault is told with the file and the place in it.
+"""Opening of an archive or of everything that a scene file names. Errors name the file and the place in it.
 
-What a scene does not call for is not imported: several archives, what points are left out of.
+Modules that a scene does not need are not imported: several archives, masked archives.
 """
 
 from collections.abc import Callable, Iterator
@@ -30,16 +30,19 @@ from .simulated import simulate
 from .simulation import Stage
 from .store import OpenStore, Store
 
-# Of avatars that meet one another [m]: two, and a margin, are within what a pair may reach (effects/bodies.py).
+# Maximum radius of avatars that may collide with one another [m]: two of them and a margin stay
+# within the reach of a pair (effects/bodies.py).
 MOST_BODY_RADIUS = MAX_REACH_UNITS / 4 / UNITS_PER_METRE
 
 ReadPoints = Callable[[Path], NDArray[np.float64]]
 
 
 class Found(NamedTuple):
-    """One archive of a scene. info: what it says of itself.  sizes: (v,) int64, bytes of each voxel once decoded.
+    """One archive of a scene.
 
-    keeps_scan: whether it knows the scan of each point.  normal_reach: of the normals it keeps [m]; 0: it keeps none.
+    info: its description.  sizes: (v,) int64, decoded size of each voxel [bytes].
+    keeps_scan: it stores the scan of each point.
+    normal_reach: of the normals it stores [m]; 0: it stores none.
     """
 
     folder: Path
@@ -50,7 +53,7 @@ class Found(NamedTuple):
 
 
 class FoundAvatar(NamedTuple):
-    """One avatar of a scene: the file's points (n, 3) [m], and what is made of them."""
+    """One avatar of a scene. points: (n, 3), of its file [m]."""
 
     file: Path
     points: NDArray[np.float64]
@@ -58,7 +61,7 @@ class FoundAvatar(NamedTuple):
 
 
 def is_scene_file(path: Path) -> bool:
-    """Whether a path is that of a scene file, there or not; else it is that of an archive, which is a folder."""
+    """Return whether a path, existing or not, is that of a scene file. Otherwise it is an archive's folder."""
     return path.suffix == SUFFIX and not path.is_dir()
 
 
@@ -71,11 +74,13 @@ def open_scene(
     budget_bytes: int = DEFAULT_BUDGET,
     policy: str = "lru",
 ) -> Iterator[SceneLike]:
-    """What is served of an archive's folder or a scene file; closed at the end.
+    """Open an archive or a scene file, and close it at the end of the block.
 
-    read_points: the points (n, 3) of a file [m].  name: what clients call it; None: as the file says, else the file's
-    or the folder's name.  budget_bytes: of decoded voxels, all archives together.  policy: see policies.py.
-    Raises BadRequestError for a file that is wrong, FormatError, CorruptError or ScanError for what it names.
+    read_points: returns the points (n, 3) of a file [m].
+    name: of the scene, for clients; None: the name in the scene file, else that of the file or folder.
+    budget_bytes: of decoded voxels, all archives together.  policy: eviction policy, see policies.py.
+    Raises BadRequestError for an invalid scene file, FormatError, CorruptError or ScanError for
+    invalid files that it names.
     """
     path = Path(path)
     if not is_scene_file(path):
@@ -95,9 +100,11 @@ def open_scene(
 
 
 def find_archives(file: SceneFile, path: Path) -> list[Found]:
-    """The archives that a scene file names, found whole by their indexes, and holding what the file asks of them.
+    """Return the archives that a scene file names, after checking their indexes.
 
-    path: the file's, for errors and for paths relative to it. Raises FormatError, CorruptError, BadRequestError.
+    Also checks that each archive stores what the scene file requires.
+    path: of the scene file, for errors and for relative paths.
+    Raises FormatError, CorruptError or BadRequestError.
     """
     found = []
     for number, item in enumerate(file.archives):
@@ -119,7 +126,7 @@ def find_archives(file: SceneFile, path: Path) -> list[Found]:
 
 
 def read_avatars(file: SceneFile, path: Path, read_points: ReadPoints) -> list[FoundAvatar]:
-    """The avatars that a scene file names. Raises what `read_points` does, and BadRequestError."""
+    """Return the avatars that a scene file names. Raises BadRequestError and the errors of `read_points`."""
     found = []
     meet = any(isinstance(effect, Objects | Crowd) for effect in file.effects)
     for number, item in enumerate(file.avatars):
@@ -130,8 +137,8 @@ def read_avatars(file: SceneFile, path: Path, read_points: ReadPoints) -> list[F
             model = make_avatar(points, item.radius)
             if meet and model.radius > MOST_BODY_RADIUS:
                 raise BadRequestError(
-                    f"avatar radius {model.radius:g} m: expected at most {MOST_BODY_RADIUS:g} m where `objects` or "
-                    "`crowd` let it meet others"
+                    f"avatar radius {model.radius:g} m: expected at most {MOST_BODY_RADIUS:g} m with the effect "
+                    "`objects` or `crowd`, under which avatars collide with others"
                 )
         info = AvatarInfo(item.name, len(points), model.radius, model.bounding_radius)
         found.append(FoundAvatar(avatar_file, points, info))
@@ -139,8 +146,10 @@ def read_avatars(file: SceneFile, path: Path, read_points: ReadPoints) -> list[F
 
 
 def store_opener(file: SceneFile, number: int) -> OpenStore:
-    """What opens the folder of archive `number`: with normals if effects ask for them, and without the points that are
-    passed through."""
+    """Return the function that opens the folder of archive `number`.
+
+    It loads normals if effects need them, and leaves out the points that the effect `through` removes.
+    """
     reach = normals_asked(file)
     for effect in file.effects:
         if isinstance(effect, Through):
@@ -151,7 +160,7 @@ def store_opener(file: SceneFile, number: int) -> OpenStore:
 
 
 def normals_asked(file: SceneFile) -> float | None:
-    """The reach of the normals that a scene's effects ask for [m]; None: they ask for none."""
+    """Return the reach of the normals that a scene's effects need [m]; None: they need none."""
     for effect in file.effects:
         if isinstance(effect, Slide):
             return effect.normal_reach
@@ -159,12 +168,14 @@ def normals_asked(file: SceneFile) -> float | None:
 
 
 def share_budget(budget_bytes: int, sizes: list[NDArray[np.int64]]) -> list[int]:
-    """What of a budget each archive gets: room for its largest voxel, the rest after what they take whole.
+    """Divide a cache budget among archives.
 
-    sizes: (v,) of each, bytes of its voxels. BadRequestError where the largest voxels alone take more.
+    Each archive gets the size of its largest voxel. The rest is divided in proportion to the total sizes.
+    sizes: for each archive (v,), the decoded size of each voxel [bytes].
+    Raises BadRequestError if the largest voxels together exceed the budget.
     """
     if len(sizes) == 1:
-        return [budget_bytes]  # `Residency` says what it misses
+        return [budget_bytes]  # `Residency` reports a budget that is too small
     least = [ArenaBuffer.rounded(int(each.max(initial=0))) for each in sizes]
     rest = budget_bytes - sum(least)
     if rest < 0:
@@ -185,7 +196,7 @@ def _open_archives(
     policy: str,
     stack: ExitStack,
 ) -> Stage:
-    """The archives as one scene; stack: closes them where that fails, else whoever has it does."""
+    """Open the archives as one scene. They are closed when `stack` is."""
     with at_place(path, "$.archives"):
         budgets = share_budget(budget_bytes, [each.sizes for each in found])
     scenes = []
@@ -210,8 +221,10 @@ def _open_archives(
 
 
 def _beside(path: Path, named: str) -> Path:
-    """A path that a scene file names. Links in it are followed whenever it is opened: a reload finds where they point
-    then."""
+    """Return a path that a scene file names, relative to its folder, without resolving the links in it.
+
+    Links are followed at each opening, and a reload finds their new targets.
+    """
     folder, there = path.parent.resolve(), Path(named)
     while there.parts[:1] == ("..",):
         folder, there = folder.parent, Path(*there.parts[1:])
@@ -219,7 +232,7 @@ def _beside(path: Path, named: str) -> Path:
 
 
 def _check_noise(file: SceneFile, path: Path, found: list[Found]) -> None:
-    """BadRequestError for the noise of a scan that is none."""
+    """Check the effect `uncertainty`. Raises BadRequestError if it gives noise for an unknown scan."""
     for number, effect in enumerate(file.effects):
         if isinstance(effect, Uncertainty):
             from .effects.uncertainty import check
@@ -231,7 +244,7 @@ def _check_noise(file: SceneFile, path: Path, found: list[Found]) -> None:
 
 @contextmanager
 def at_place(path: Path, place: str) -> Iterator[None]:
-    """Errors raised inside say the file and the place in front."""
+    """Prefix errors raised in this block with the scene file and the place in it."""
     try:
         yield
     except SolidcloudError as error:

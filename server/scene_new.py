@@ -1,4 +1,4 @@
-"""A new scene file, written where there is none, once all it names was found whole."""
+"""Creation of a scene file, after checking everything it names."""
 
 import os
 import re
@@ -17,7 +17,7 @@ from .describe import describe
 from .scene_text import Beginning, scene_text
 from .store import Store
 
-# What is in no name of an avatar (schemas/scene.py, SceneName), and how long one may be.
+# Characters that an avatar's name must not contain (schemas/scene.py, SceneName), and its maximum length.
 _NO_NAME = re.compile(r"[^A-Za-z0-9._-]+")
 _LONGEST_NAME = 64
 
@@ -31,14 +31,15 @@ def new_scene(
     name: str | None = None,
     force: bool = False,
 ) -> None:
-    """Write a scene file of archives, avatars by their files' names, and effects.
+    """Write a scene file with archives, avatars named after their files, and effects.
 
-    force: replace what is there. Raises BadRequestError for what such a file may not say, and where one is there;
-    FormatError or CorruptError for an archive that is none.
+    force: replace an existing file.
+    Raises BadRequestError for content that a scene file must not have and for an existing file,
+    FormatError or CorruptError for an invalid archive.
     """
     if out.suffix != SUFFIX:
         raise BadRequestError(
-            f"{out}: expected a name that ends in {SUFFIX}, by which `serve` knows a scene file"
+            f"{out}: expected a name that ends in {SUFFIX}, by which `serve` recognises a scene file"
         )
     if not archives:
         raise BadRequestError("no archive given: expected at least one")
@@ -59,17 +60,20 @@ def new_scene(
         bounds[:, 1].max(axis=0).tolist(),
     )
     text = scene_text(begin).encode()
-    scene_name(parse_scene(text, f"{out}, which is not written"), out)
+    scene_name(parse_scene(text, f"{out} (not written)"), out)
     try:
         _write(out, text, force)
     except FileExistsError:
-        raise BadRequestError(f"{out} is there: give another -o, or --force to replace it") from None
+        raise BadRequestError(f"{out} exists: give another -o, or --force to replace it") from None
     except OSError as error:
         raise SolidcloudError(f"{out}: cannot be written: {write_error_words(error, out)}") from None
 
 
 def _named(avatars: Sequence[Path]) -> dict[str, Path]:
-    """The files of avatars by what these are called: as the files, with - for what such a name may not hold."""
+    """Return the files of avatars by avatar name.
+
+    The name is that of the file, with - for characters that a name must not contain.
+    """
     found: dict[str, Path] = {}
     for file in avatars:
         if not file.is_file():
@@ -77,15 +81,18 @@ def _named(avatars: Sequence[Path]) -> dict[str, Path]:
         called = _NO_NAME.sub("-", file.stem)[:_LONGEST_NAME]
         if called in found:
             raise BadRequestError(
-                f"--avatar {file}: its avatar would be called {called}, as that of {found[called]}: expected names of "
-                "their own: give it under another"
+                f"--avatar {file}: its avatar would have the name {called}, as that of {found[called]}: expected "
+                "different names: rename one of the files"
             )
         found[called] = file
     return found
 
 
 def _write(out: Path, text: bytes, force: bool) -> None:
-    """Write the file whole or not at all. FileExistsError where one is there, unless it may be replaced."""
+    """Write the file completely or not at all.
+
+    Raises FileExistsError if the file exists and `force` is not set.
+    """
     written = out.with_name(f"{out.name}.{os.getpid()}.tmp") if force else out
     with open(written, "xb") as opened:
         try:
@@ -99,5 +106,5 @@ def _write(out: Path, text: bytes, force: bool) -> None:
 
 
 def _relative(path: Path, out: Path) -> str:
-    """A path as the file has it: relative to it."""
+    """Return a path relative to the folder of the scene file `out`."""
     return os.path.relpath(path.resolve(), out.parent.resolve())

@@ -1,6 +1,6 @@
-"""A scene file to begin with: the archives and avatars given, every other field commented out with its default.
+"""Text of a new scene file: the given archives and avatars, and every other field commented out with its default.
 
-Text is made of the types (schemas/scene.py, effects.py), so that no field is missing here.
+The text is generated from the types in schemas/scene.py and effects.py, so that no field is missing.
 """
 
 import inspect
@@ -21,9 +21,11 @@ _WIDTH = 100
 
 
 class Beginning(NamedTuple):
-    """What a new scene file says. archives, avatars: paths as it is to have them; avatars by name.
+    """Content of a new scene file.
 
-    effects: names.  models: of radius, that all archives hold.  low, high: of what is scanned, world [m].
+    archives: paths, relative to the file.  avatars: (name, path).
+    effects: names of the effects to enable.  models: radius models that all archives store.
+    low, high: bounds of the archives, world frame [m].
     """
 
     archives: Sequence[str]
@@ -36,14 +38,17 @@ class Beginning(NamedTuple):
 
 
 def scene_text(begin: Beginning) -> str:
-    """The text of a scene file. BadRequestError for a path that TOML cannot hold, or an effect that is none."""
+    """Return the text of a scene file.
+
+    Raises BadRequestError for a path that TOML cannot represent, or for an unknown effect.
+    """
     kinds = {str(kind.__struct_config__.tag): kind for kind in get_args(AnyEffect)}
     for name in begin.effects:
         if name not in kinds:
-            raise BadRequestError(f"--effects {name}: expected some of {', '.join(kinds)}")
+            raise BadRequestError(f"--effects {name}: expected one or more of {', '.join(kinds)}")
     lines = [*_head(begin), *_places(begin), *_limits()]
     lines += _comment(
-        "Effects: what is not here is not simulated. They run in an order of their own, see `solidcloud scene check`."
+        "Effects: only those declared here run. Their order is fixed, see `solidcloud scene check`."
     )
     for name, kind in kinds.items():
         lines += ["", *_effect(name, kind, begin, name in begin.effects)]
@@ -51,16 +56,16 @@ def scene_text(begin: Beginning) -> str:
 
 
 def toml_value(value: Any) -> str:
-    """A value as TOML: what msgspec makes of the types of a scene file, None apart.
+    """Format a value as TOML: any value that msgspec converts from the scene file's types, except None.
 
-    BadRequestError for text that is no Unicode, such as a file's name in other bytes.
+    Raises BadRequestError for text that is not Unicode, such as a file name in another encoding.
     """
     if isinstance(value, str):
         try:
             value.encode()
         except UnicodeEncodeError:
             raise BadRequestError(
-                f"{value!r}: a name that is no UTF-8, which a scene file cannot hold"
+                f"{value!r}: not valid UTF-8, expected a name that a scene file can hold: rename it"
             ) from None
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     if isinstance(value, bool | int):
@@ -74,46 +79,46 @@ def toml_value(value: Any) -> str:
 
 
 def _key(name: str) -> str:
-    """A key as TOML."""
+    """Format a key as TOML."""
     return name if _BARE_KEY.fullmatch(name) else toml_value(name)
 
 
 def _head(begin: Beginning) -> Iterator[str]:
-    """What is said once."""
-    yield "# A scene for `solidcloud serve`: archives, what moves in them, and which effects are simulated."
-    yield "# `solidcloud scene check` says whether all is well. Lengths are metres; paths are relative to this file;"
-    yield "# what is commented out without a space behind the # is a default, or an example."
+    """Yield the top-level fields."""
+    yield "# A scene for `solidcloud serve`: archives, avatars, dynamic objects, and simulated effects."
+    yield "# `solidcloud scene check` checks this file. Lengths are metres; paths are relative to this file;"
+    yield "# a line that begins with # and no space is a default or an example."
     yield ""
     yield f"format = {FORMAT}"
     yield ""
-    yield from _comment("What clients call the scene. Left out: this file's name without its suffix.")
+    yield from _comment("Name of the scene for clients. Default: this file's name without its suffix.")
     yield f"name = {toml_value(begin.name)}" if begin.name else '#name = "hall"'
     yield ""
-    yield from _comment("Against gravity; of any length.")
+    yield from _comment("Direction opposite to gravity; a vector of any length.")
     yield "#up = [0.0, 0.0, 1.0]"
     yield ""
     held = ", ".join(begin.models)
     yield from _comment(
-        f"How large a sphere a scan point stands for. The archives hold {held}; fixed:METRES always works. Left out: "
-        "each archive's one figure."
+        f"Radius of the sphere that represents a scan point. The archives store {held}; fixed:METRES always works. "
+        "Default: the radius stored in each archive."
     )
     yield f"#radius_model = {toml_value(begin.models[-1] if begin.models else 'mean')}"
     if not begin.effects:
         yield ""
-        yield from _comment("No effects: nothing stops anybody. Take this line out to declare some below.")
+        yield from _comment("No effects: nothing stops an avatar. Remove this line to declare effects below.")
         yield "effects = []"
 
 
 def _places(begin: Beginning) -> Iterator[str]:
-    """Archives, avatars, objects, where users begin."""
+    """Yield the archives, avatars, objects and the spawn."""
     pose = toml_value(identity())
     for path in begin.archives:
         yield from ("", "[[archives]]", f"path = {toml_value(path)}")
-        yield f"#pose = {pose}  # archive to world, rigid, row by row"
+        yield f"#pose = {pose}  # archive to world, rigid, rows of a 4 x 4 matrix"
     yield ""
     yield from _comment(
-        "Avatars that every user finds: points of a scan or mesh, in its own frame. radius: of each point's sphere; "
-        "left out: half the mean closest-point distance."
+        "Avatars that all users may use: points of a scan or mesh, in its own frame. radius: of each point's sphere; "
+        "default: half the mean closest-point distance."
     )
     for name, file in begin.avatars:
         yield from (
@@ -126,8 +131,8 @@ def _places(begin: Beginning) -> Iterator[str]:
     if not begin.avatars:
         yield from ("#[[avatars]]", '#name = "visitor"', '#file = "visitor.ply"', "#radius = 0.01", "")
     yield from _comment(
-        "Dynamic objects, in the shape of an avatar; they need the effect `objects`. kind: kinematic, where it is told "
-        "to be, or pushed, by users."
+        "Dynamic objects, in the shape of an avatar; they need the effect `objects`. kind: kinematic, at the pose that "
+        "is set for it, or pushed, moved by users who touch it."
     )
     shape = begin.avatars[0][0] if begin.avatars else "visitor"
     yield from (
@@ -139,7 +144,8 @@ def _places(begin: Beginning) -> Iterator[str]:
     )
     yield ""
     yield from _comment(
-        "Where users begin: the avatar's origin; turned about up, in degrees. Left out: where they say."
+        "Initial pose of users: position of the avatar's origin; heading about the up axis, in degrees. Default: the "
+        "pose that the user sends."
     )
     middle = [round((low + high) / 2, 3) for low, high in zip(begin.low[:2], begin.high[:2], strict=True)]
     yield from (
@@ -151,10 +157,10 @@ def _places(begin: Beginning) -> Iterator[str]:
 
 
 def _limits() -> Iterator[str]:
-    """What a scene may cost."""
+    """Yield the limits."""
     yield from _comment(
-        "users: at a time. frame_ms, frame_visits: of one user's frame, for effects that are no safety; left out: no "
-        "bound. longest_move: of a frame."
+        "users: maximum at a time. frame_ms, frame_visits: budget of one user's frame, for effects that are not "
+        "needed for safety; default: no limit. longest_move: maximum motion of a frame."
     )
     yield "#[limits]"
     for name, value in msgspec.to_builtins(Limits()).items():
@@ -163,7 +169,7 @@ def _limits() -> Iterator[str]:
 
 
 def _effect(name: str, kind: Any, begin: Beginning, declared: bool) -> Iterator[str]:
-    """One effect, commented out unless declared."""
+    """Yield one effect, commented out unless declared."""
     for paragraph in inspect.cleandoc(kind.__doc__).split("\n\n"):
         yield from _comment(" ".join(paragraph.split()))
     if kind.needs:
@@ -183,5 +189,5 @@ def _effect(name: str, kind: Any, begin: Beginning, declared: bool) -> Iterator[
 
 
 def _comment(text: str) -> list[str]:
-    """Lines of a comment."""
+    """Wrap a text into comment lines."""
     return textwrap.wrap(text, _WIDTH, initial_indent="# ", subsequent_indent="# ", break_on_hyphens=False)

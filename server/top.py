@@ -1,4 +1,4 @@
-"""What `solidcloud top` shows: tables of `stats`, with rates between two looks."""
+"""Tables of `solidcloud top`: the statistics of a server, with rates between two samples."""
 
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -13,13 +13,13 @@ from rich.text import Text
 from ..schemas.stats import StatsAnswer, UserStats
 from .console import bytes_text
 
-# Users shown, those heard of last.
+# Maximum number of users shown, the most recently active.
 MOST_ROWS = 16
 BAR = 30
-# How long Ctrl-C may take: a signal that the system hands to one of zenoh's threads does not wake the main one.
+# Maximum delay of Ctrl-C: a signal delivered to one of zenoh's threads does not wake the main thread.
 NAP_SECONDS = 0.2
 
-# What is counted, and the field of `StatsAnswer` it is.
+# Label of each counter, and its field of `StatsAnswer`.
 _COUNTS = (
     ("requests", "requests"),
     ("requests that waited", "waited"),
@@ -28,12 +28,12 @@ _COUNTS = (
     ("voxel hits", "hits"),
     ("hits that waited", "waits"),
     ("misses", "misses"),
-    ("late", "late"),
+    ("deadlines missed", "late"),
     ("prefetched", "prefetched"),
     ("prefetched, used", "used"),
     ("prefetched, wasted", "wasted"),
     ("evicted", "evicted"),
-    ("evicted too soon", "too_soon"),
+    ("evicted too early", "too_soon"),
     ("failed loads", "failed"),
 )
 _BYTES = (("prefetched", "prefetched_bytes"), ("wasted", "wasted_bytes"), ("moved", "moved_bytes"))
@@ -41,22 +41,22 @@ _TIMES = (("load", "load_seconds"), ("stall", "stall_seconds"), ("engine", "engi
 
 
 class Watched(Protocol):
-    """What is asked."""
+    """A client whose statistics are shown."""
 
     def stats(self) -> StatsAnswer: ...
 
 
 class Look(NamedTuple):
-    """What a scene said, and when [s]."""
+    """A sample of a scene's statistics. at: time of the sample [s]."""
 
     at: float
     stats: StatsAnswer
 
 
 def rate(before: Look | None, now: Look, field: str) -> float | None:
-    """How much a count of StatsAnswer rose a second between two looks; None where that is not known.
+    """Return the increase per second of a counter of StatsAnswer between two samples; None if not known.
 
-    As where it fell: another server answers, or another generation is served.
+    It is not known if the counter fell: another server answers, or another generation is served.
     """
     if before is None:
         return None
@@ -68,7 +68,7 @@ def _rise(more: int, seconds: float) -> float | None:
 
 
 def seconds_text(seconds: float) -> str:
-    """A time for a reader: 0.00123 -> "1.2 ms"."""
+    """Format a duration: 0.00123 -> "1.2 ms"."""
     for unit, name in ((1.0, "s"), (1e-3, "ms"), (1e-6, "µs")):
         if seconds >= unit:
             value = seconds / unit
@@ -77,17 +77,17 @@ def seconds_text(seconds: float) -> str:
 
 
 def rate_text(value: float | None) -> str:
-    """Counts a second for a reader."""
+    """Format a number per second."""
     return "" if value is None else f"{value:,.0f}" if value >= 10 else f"{value:.2g}"
 
 
 def plain(text: str) -> str:
-    """A name that somebody else chose, without what would move the cursor."""
+    """Replace unprintable characters in a name from a client, which could move the cursor."""
     return "".join(c if c.isprintable() else "?" for c in text)
 
 
 def scene_view(before: Look | None, now: Look) -> RenderableType:
-    """All tables of one scene. before: the last look, for rates."""
+    """Return all tables of one scene. before: the previous sample, for rates."""
     stats = now.stats
     generation = f", generation {stats.generation}" if stats.generation else ""
     facts = Text(f"{plain(stats.scene)}{generation}, policy {plain(stats.policy) or '?'}", style="bold")
@@ -98,7 +98,7 @@ def scene_view(before: Look | None, now: Look) -> RenderableType:
 
 
 def budget_line(stats: StatsAnswer) -> str:
-    """Bytes against the budget, with a bar."""
+    """Format the memory in use against the budget, with a bar."""
     used = stats.resident_bytes + stats.coarse_bytes
     share = used / stats.budget_bytes if stats.budget_bytes else 0.0
     full = min(BAR, round(BAR * share))
@@ -108,7 +108,7 @@ def budget_line(stats: StatsAnswer) -> str:
 
 
 def _table(first: str, *numbers: str) -> Table:
-    """An empty table: names to the left, numbers to the right."""
+    """Return an empty table: names to the left, numbers to the right."""
     table = Table(box=None, padding=(0, 1, 0, 0), pad_edge=False, header_style="dim")
     table.add_column(first, no_wrap=True)
     for name in numbers:
@@ -117,14 +117,14 @@ def _table(first: str, *numbers: str) -> Table:
 
 
 def _counts_table(before: Look | None, now: Look) -> Table:
-    table = _table("", "in all", "a second")
+    table = _table("", "total", "per second")
     for name, field in _COUNTS:
         table.add_row(name, f"{getattr(now.stats, field):,}", rate_text(rate(before, now, field)))
     return table
 
 
 def _bytes_table(before: Look | None, now: Look) -> Table:
-    table = _table("bytes", "in all", "a second")
+    table = _table("bytes", "total", "per second")
     for name, field in _BYTES:
         a_second = rate(before, now, field)
         table.add_row(
@@ -142,8 +142,8 @@ def _times_table(stats: StatsAnswer) -> Table:
 
 
 def _users_table(before: Look | None, now: Look) -> Table:
-    """The users heard of last, and how many more there are."""
-    table = _table("user", "asked", "/s", "misses", "late", "unknown", "waited", "p99", "max", "silent")
+    """Return a table of the most recently active users, with the number of the others."""
+    table = _table("user", "requests", "/s", "misses", "late", "unknown", "waited", "p99", "max", "silent")
     known = {} if before is None else {(user.client, user.avatar): user for user in before.stats.users}
     for user in now.stats.users[:MOST_ROWS]:
         last = known.get((user.client, user.avatar))
@@ -160,7 +160,7 @@ def _users_table(before: Look | None, now: Look) -> Table:
 
 
 def _user_row(user: UserStats, a_second: float | None) -> Iterable[RenderableType]:
-    """One user; a client by the beginning of its name, which is random."""
+    """Yield the cells of one user. A client is shown by the first characters of its random name."""
     yield Text(f"{plain(user.client[:6]) or '-'} {plain(user.avatar)[:10] or '-'}")
     yield f"{user.requests:,}"
     yield rate_text(a_second)
@@ -179,7 +179,10 @@ def watch(
     clock: Callable[[], float] = time.monotonic,
     sleep: Callable[[float], None] = time.sleep,
 ) -> None:
-    """Show what scenes say every `interval` [s] until interrupted; `once`: one time. Raises what asking raises."""
+    """Show the statistics of scenes every `interval` [s] until interrupted, or only once.
+
+    Raises the errors of `stats`.
+    """
     console = console or Console()
     before: list[Look | None] = [None] * len(scenes)
 
@@ -192,7 +195,7 @@ def watch(
     if once:
         console.print(look())
         return
-    # Without a terminal, what is live would come out once, at the end.
+    # Without a terminal, a live display would be printed only once, at the end.
     with Live(console=console, auto_refresh=False, vertical_overflow="crop") as live:
         while True:
             view = look()

@@ -119,7 +119,8 @@ def plan_facts(plan: "Plan") -> Iterator[tuple[str, str]]:
         "archive",
         f"{bytes_text(plan.archive_bytes)}, {plan.bytes_a_point:.2f} bytes per point at "
         f"{plan.lattice_step * 1e3:g} mm; {plan.shards:,} shards; "
-        f"from {bytes_text(plan.archive_bytes / plan.archive_within)} to {bytes_text(plan.archive_bytes * plan.archive_within)}",
+        f"from {bytes_text(plan.archive_bytes / plan.archive_within)} to "
+        f"{bytes_text(plan.archive_bytes * plan.archive_within)}",
     )
     yield (
         "voxels",

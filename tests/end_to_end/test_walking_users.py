@@ -304,7 +304,7 @@ def test_query_asks_for_moves(
         assert '"left": 0.3' in capsys.readouterr().out
         assert run([*ask, "--margin", "1"]) == 2
         assert (
-            "--margin does not go with --op move: it takes --avatar, --poses, --radius"
+            "--margin is not an option of --op move: it takes --avatar, --poses, --radius"
             in capsys.readouterr().err
         )
     assert run(ask) == 1

@@ -114,7 +114,7 @@ def test_a_scene_that_cannot_be_asked_does_not_hide_the_others(caplog: pytest.Lo
     found = read(CountedScene("hall", fault=RuntimeError("closed")), CountedScene("attic", hits=7))
     assert ("solidcloud_voxel_hits_total", {"scene": "attic"}, 7.0) in found
     assert not any(labels.get("scene") == "hall" for _, labels, _ in found)
-    assert "no metrics of scene hall" in caplog.text
+    assert "cannot read the metrics of scene hall" in caplog.text
 
 
 def test_every_scrape_asks_anew() -> None:

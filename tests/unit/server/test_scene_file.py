@@ -209,7 +209,7 @@ def test_what_is_passed_through_lies_in_the_world_for_each_archive(write: Write)
     checked = check_scene_file(file, read_points)
     assert checked.left_out == 25 + 9 and not [note for note in checked.notes if "spawn" in note]
     outside = check_scene_file(write(file.read_text().replace("5, 1.5]", "7, 1.5]")), read_points)
-    assert [note for note in outside.notes if "spawn lies outside what is scanned" in note]
+    assert [note for note in outside.notes if "spawn lies outside the bounds" in note]
 
 
 def test_a_cache_is_shared_by_what_archives_take() -> None:
@@ -264,7 +264,8 @@ def test_normals_are_loaded_where_effects_ask_for_them(
         ),
         (
             TOP + BALL.replace("0.05", "4.5") + STOP + '[[effects]]\neffect = "crowd"\n', BadRequestError,
-            "$.avatars[0]: avatar radius 4.5 m: expected at most 4 m where `objects` or `crowd` let it meet others",
+            "$.avatars[0]: avatar radius 4.5 m: expected at most 4 m with the effect `objects` or `crowd`, under which "
+            "avatars collide with others",
         ),
         (TOP + '[[archives]]\npath = "ball.xyz"\n', FormatError, "$.archives[1].path: {}/ball.xyz"),
     ],

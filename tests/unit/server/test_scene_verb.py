@@ -73,7 +73,7 @@ def test_a_new_scene_may_have_no_effects(folder: Path, capsys: pytest.CaptureFix
     assert new(folder, "--effects", "") == 0
     assert read_scene(folder / "hall.toml").effects == []
     assert run(["scene", "check", str(folder / "hall.toml")]) == 0
-    assert "none: nothing stops anybody" in capsys.readouterr().out
+    assert "none: nothing stops an avatar" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("avatar", [True, False])
@@ -88,7 +88,7 @@ def test_every_line_that_is_commented_out_may_be_put_in(folder: Path, avatar: bo
 def test_what_is_there_is_replaced_only_with_force(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (folder / "hall.toml").write_text("mine")
     assert new(folder) == 2
-    assert "hall.toml is there: give another -o, or --force" in one_error(capsys)
+    assert "hall.toml exists: give another -o, or --force" in one_error(capsys)
     assert (folder / "hall.toml").read_text() == "mine"
     assert new(folder, "--force") == 0
     assert read_scene(folder / "hall.toml").format == 1
@@ -100,7 +100,7 @@ def test_what_is_there_is_replaced_only_with_force(folder: Path, capsys: pytest.
         (
             "{archive} -o {folder}/new.toml --effects slid",
             2,
-            "--effects slid: expected some of stop, sweep, slide",
+            "--effects slid: expected one or more of stop, sweep, slide",
         ),
         ("{archive} -o {folder}/new.toml --effects slide", 2, "`slide` requires `stop`"),
         ("{archive} -o {folder}/new.toml --effects stop,stop", 0, ""),
@@ -112,9 +112,9 @@ def test_what_is_there_is_replaced_only_with_force(folder: Path, capsys: pytest.
         (
             "{archive} -o {folder}/new.toml --avatar {folder}/visitor.xyz --avatar {folder}/scans/visitor.obj",
             2,
-            "scans/visitor.obj: its avatar would be called visitor, as that of",
+            "scans/visitor.obj: its avatar would have the name visitor, as that of",
         ),
-        ("{archive} -o {folder}/new.toml --effects step", 2, "new.toml, which is not written: line"),
+        ("{archive} -o {folder}/new.toml --effects step", 2, "new.toml (not written): line"),
         ("-o {folder}/new.toml", 2, "Missing argument 'archives'"),
     ],
 )
@@ -146,7 +146,7 @@ def test_check_says_what_runs_in_which_order(folder: Path, capsys: pytest.Captur
     assert order == ["crowd", "stop", "sweep", "slide", "step", "ground", "proximity", "contacts"]
     assert re.search(r"^effect 1 +crowd: margin 0.0", said, re.M)
     assert "444 points in 5 voxels" in " ".join(said.split()) and "3 points of 0.1183 m radius" in said
-    assert len(re.findall("^note ", said, re.M)) == 1 and "keeps no normals within 0.08 m" in " ".join(
+    assert len(re.findall("^note ", said, re.M)) == 1 and "stores no normals of reach 0.08 m" in " ".join(
         said.split()
     )
 
@@ -175,9 +175,15 @@ def test_check_counts_what_is_passed_through(folder: Path, capsys: pytest.Captur
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        (TOP + STOP, "`stop` without `sweep`: what is thinner"),
-        (TOP + '[[effects]]\neffect = "objects"\n', "the effect `objects` without any in [[objects]]"),
-        (TOP + "[spawn]\nposition = [0, 0, 0]\n", "spawn lies outside what is scanned, 512345 5.61235e+06"),
+        (TOP + STOP, "`stop` without `sweep`: an avatar may pass through anything thinner"),
+        (
+            TOP + '[[effects]]\neffect = "objects"\n',
+            "the effect `objects` has nothing to do: there are no [[objects]]",
+        ),
+        (
+            TOP + "[spawn]\nposition = [0, 0, 0]\n",
+            "spawn lies outside the bounds of the archives, 512345 5.61235e+06",
+        ),
         (
             TOP
             + '[[effects]]\neffect = "through"\nboxes = [{name = "a", low = [0, 0, 0], high = [1, 1, 1]}]\n',

@@ -1,9 +1,10 @@
-"""How far an avatar is from the scene: asked once a frame for all effects that say something, and remembered.
+"""Separation of an avatar from the scene, queried once a frame for all reporting effects.
 
-What is known at one pose bounds the next: spheres that were a distance apart and went so far are at least the
-difference apart. Where that is beyond what an effect asks for, nothing is searched at all. What is remembered is true,
-and stays so whatever becomes of the frame that found it; no answer depends on it, only what it costs, and so, where a
-budget is too small for a search, whether it is known.
+The result is cached. A result at one pose bounds the next: spheres that were a distance apart and
+have moved are at least the difference apart. Where that exceeds the distance an effect needs, no
+search runs. A cached result is true, and stays true whatever becomes of the frame that found it. No
+answer depends on the cache, only the cost, and therefore, where a budget is too small for a search,
+whether the separation is known.
 """
 
 import math
@@ -15,21 +16,24 @@ from ..avatar import AvatarModel
 from .frame import Frame
 
 KEPT = "apart"
-# Where nothing was in reach so far, a search looks farther by so much, or twice as far where that is less [m]: what it
-# costs more it spares in the frames after, as many as the avatar needs for that way.
+# If nothing was in reach so far, a search extends farther by this distance, or to twice the reach
+# where that is less [m]. The extra cost saves searches in later frames, as many as the avatar needs
+# for that distance.
 AHEAD = 1.0
-# Distances are rounded, reaches to exact units of 15 nm: nearer than this, only the search itself can tell [m].
+# Distances are rounded, reaches to exact units of 15 nm: below this difference, only a search can
+# decide [m].
 ROUNDED = 1e-7
-# What placing a point may be off by, at 1e9 m from the origin, too [m].
+# Largest error of placing a point, at 1e9 m from the origin [m].
 PLACED = 1e-5
 
 Rows = list[list[float]]
 
 
 class Known(NamedTuple):
-    """What was found at one pose, exactly. rows: the pose.  looked: as far as this [m].  answers: of `distance`.
+    """Exact result at one pose.
 
-    generations: of the world's archives; of others it tells nothing.
+    generations: of the world's archives; the result does not apply to others.
+    rows: the pose.  looked: reach of the search [m].  answers: of `distance`.
     """
 
     world: Any
@@ -41,7 +45,10 @@ class Known(NamedTuple):
 
 
 def went(before: Rows, now: Rows, avatar: AvatarModel) -> float:
-    """How far any point of the avatar's spheres is from where it was, at most [m]. avatar: not empty."""
+    """Return an upper bound of the distance that any point of the avatar's spheres moved [m].
+
+    avatar: not empty.
+    """
     x, y, z = avatar.arrays.center[0].tolist()
     shift = turn = 0.0
     for (a, b, c, t), (d, e, f, u) in zip(before[:3], now[:3], strict=True):
@@ -52,9 +59,10 @@ def went(before: Rows, now: Rows, avatar: AvatarModel) -> float:
 
 
 def nearest(frame: Frame, reach: float) -> DistanceAnswers | None:
-    """What `distance` answers at the frame's pose, looking as far as reach or farther; None: surely nothing is within.
+    """Return the answer of `distance` at the frame's pose for `reach` or farther.
 
-    Where it is not exact, something in reach is missing, or the frame's budget is spent.
+    None: certainly nothing is within reach. An answer that is not exact means that a voxel in reach
+    is missing, or the frame's budget is spent.
     """
     body, world = frame.body, frame.world
     avatar, rows = body.avatar, frame.pose.tolist()
@@ -72,7 +80,7 @@ def nearest(frame: Frame, reach: float) -> DistanceAnswers | None:
                 return known.answers
         elif at_least - went(known.rows, rows, avatar) > reach + ROUNDED:
             return None
-        if at_least >= reach > ROUNDED:  # of no reach twice as far is no farther
+        if at_least >= reach > ROUNDED:  # with no reach, twice the reach is no farther
             looked = reach + min(reach, AHEAD)
             ahead = _ahead(frame, reach, looked)
             if ahead is not None:
@@ -87,22 +95,28 @@ def nearest(frame: Frame, reach: float) -> DistanceAnswers | None:
 
 
 def _ahead(frame: Frame, reach: float, looked: float) -> DistanceAnswers | None:
-    """The answer of a search as far as `looked`, where it tells what one as far as `reach` would; None: it does not."""
+    """Return the answer of a search up to `looked` if it also answers for `reach`, else None."""
     try:
         answers: DistanceAnswers = frame.world.distance(
             frame.body.avatar, frame.pose, looked, effort=frame.effort
         )
-    except SolidcloudError:  # too far to look; `reach` may not be
+    except SolidcloudError:  # too far to search; `reach` may not be
         return None
-    # What is missing beyond reach must not make the answer any less sure.
+    # A voxel that is missing beyond `reach` must not make the answer less certain.
     return answers if answers.exact[0] and abs(answers.lower[0] - reach) > ROUNDED else None
 
 
 def surely_farther(answers: DistanceAnswers | None, metres: float) -> bool:
-    """Whether the spheres are farther apart than this, by what `nearest` answers of it."""
+    """Return whether the spheres are certainly farther apart, by an answer of `nearest`.
+
+    metres: the distance.
+    """
     return answers is None or bool(answers.exact[0] and answers.signed_distance[0] > metres + ROUNDED)
 
 
 def farther(frame: Frame, metres: float) -> bool:
-    """Whether the avatar is surely farther from the scene than this: its spheres, from all spheres of the scan."""
+    """Return whether the avatar's spheres are certainly farther from all spheres of the scan.
+
+    metres: the distance.
+    """
     return surely_farther(nearest(frame, metres), metres)

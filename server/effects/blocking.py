@@ -1,11 +1,13 @@
-"""Blocking: what one mover meets of the bodies of a scene, as an `Obstacle` of one frame.
+"""Blocking: the bodies of a scene that obstruct one mover, as an `Obstacle` of one frame.
 
-First the bounds of all bodies against those of the motion, in one kernel call of some microseconds; mostly nobody is
-near. Then, exactly, those that are (kernels/meeting.py, kernels/pairs.py).
+First, one kernel call of some microseconds tests the bounds of all bodies against those of the
+motion; usually none is near. Then the near bodies are tested exactly (kernels/meeting.py,
+kernels/pairs.py).
 
-What is overlapped when the frame begins blocks only a translation that goes against `Bodies.way_out`: one along it,
-across it, up or down is let, and so is a turn. So bodies that came to be in one place, by where they began or by an
-object that was told to be there, get apart, and none is ever held.
+A body that the mover overlaps when the frame begins blocks only a translation against
+`Bodies.way_out`. A translation along it, across it, up or down is permitted, and so is a turn.
+Bodies that came to overlap, by their initial poses or because a motion command placed an object
+there, can therefore separate, and none is ever trapped.
 """
 
 from typing import NamedTuple
@@ -23,13 +25,16 @@ from ..vectors import dot, level, size, turned_by
 from .bodies import USER, Bodies, Shape
 from .frame import Body, Frame, Hit, Pose, Vec
 
-# Of a way that is across what is overlapped: rounding is not going deeper.
+# Tolerance for a translation across what is overlapped: rounding does not count as going deeper.
 _ACROSS = 1e-9
 
 
 class _First(NamedTuple):
-    """What ended a motion first. row: of the body.  witness: (2, 3) centres of the two spheres, world [m].  point: of
-    the body's model that touches."""
+    """First body that ends a motion.
+
+    row: of the body.  witness: (2, 3) centres of the two spheres, world [m].  point: of the body's
+    model that touches.
+    """
 
     row: int
     fraction: float
@@ -38,16 +43,19 @@ class _First(NamedTuple):
 
 
 class Blocking:
-    """The bodies of some kinds, for one mover and one frame."""
+    """Bodies of some kinds, as obstacles for one mover and one frame."""
 
     def __init__(
         self, name: str, bodies: Bodies, wanted: int, mover: str, model: AvatarModel, start: Pose,
         *, user: bool = True, margin_units: int = 0, skip: str = "", stop: Stop = NEVER,
     ) -> None:  # fmt: skip
-        """name: of the effect.  wanted: kinds, bits.  mover: its name; user: whether it is one, or an object.
+        """Prepare the obstacle.
 
-        start: where it is when the frame begins.  margin_units: apart, exact units.  skip: a user that does not block.
-        stop: of the frame; once it is set, what is said is of no use.
+        name: of the effect.  wanted: kinds, bits.  mover: its name.  user: whether the mover is a
+        user, or an object.
+        start: its pose when the frame begins.  margin_units: distance to keep, exact units.  skip:
+        a user that does not block.
+        stop: of the frame; once it is set, results are meaningless.
         """
         self.name = name
         self._bodies, self._wanted, self._margin_units = bodies, wanted, margin_units
@@ -58,25 +66,28 @@ class Blocking:
         self._hits: list[Hit] = []
 
     def sweep(self, avatar: AvatarModel, pose_from: Pose, pose_to: Pose, tolerance: float) -> Hit | None:
-        """What ends the motion first; see `Obstacle`. Of equal fractions the lowest row's."""
+        """Return what ends the motion first; see `Obstacle`. Ties go to the lowest row."""
         hit = self._sweep(avatar, pose_from, pose_to, tolerance)
         if hit is not None:
             self._hits.append(hit)
         return hit
 
     def touches(self, avatar: AvatarModel, pose: Pose) -> Hit | None:
-        """What is touched there, the lowest row; avatar and cloud of the hit are the two bodies' centres, level."""
+        """Return what is touched at a pose, the lowest row.
+
+        avatar and cloud of the hit are the two bodies' centres, level.
+        """
         hit = self._touches(avatar, pose)
         if hit is not None:
             self._hits.append(hit)
         return hit
 
     def is_own(self, hit: Hit) -> bool:
-        """Whether this said so."""
+        """Return whether this obstacle reported the hit."""
         return any(hit is own for own in self._hits)
 
     def _sweep(self, avatar: AvatarModel, pose_from: Pose, pose_to: Pose, tolerance: float) -> Hit | None:
-        """`sweep`."""
+        """Implement `sweep`."""
         bodies = self._bodies
         with bodies.lock:
             shape = bodies.shape_of(avatar)
@@ -92,7 +103,7 @@ class Blocking:
             return self._goes_deeper(shape, pose_from, pose_to)
 
     def _touches(self, avatar: AvatarModel, pose: Pose) -> Hit | None:
-        """`touches`."""
+        """Implement `touches`."""
         bodies = self._bodies
         with bodies.lock:
             shape = bodies.shape_of(avatar)
@@ -106,7 +117,10 @@ class Blocking:
             return self._goes_deeper(shape, self._start, pose)
 
     def overlaps(self, avatar: AvatarModel, pose: Pose) -> bool:
-        """Whether any body is touched there, whatever the margin; those touched when the frame began, too."""
+        """Return whether any body is touched at a pose, whatever the margin.
+
+        Bodies that were touched when the frame began count too.
+        """
         bodies = self._bodies
         with bodies.lock:
             shape = bodies.shape_of(avatar)
@@ -115,11 +129,11 @@ class Blocking:
             return bool(len(rows) and bodies.touching(shape, pose, rows, 0, self._stop).any())
 
     def give_way(self, frame: Frame, hit: Hit, to: Pose) -> bool:
-        """Nothing here does."""
+        """Return False: none of these bodies gives way."""
         return False
 
     def _in_reach(self, shape: Shape, first: Pose, last: Pose) -> NDArray[np.int64]:
-        """Rows that a motion, from the origin, could meet."""
+        """Return the rows that a motion, relative to the origin, could meet."""
         bodies = self._bodies
         rows = np.empty(len(bodies.names), np.int64)
         if not len(rows) or not len(shape.model.points):
@@ -130,7 +144,7 @@ class Blocking:
         return rows[:count]
 
     def _near(self, shape: Shape, first: Pose, last: Pose) -> NDArray[np.int64]:
-        """Rows that a motion, from the origin, could meet, but for those overlapped when the frame began."""
+        """Return the rows of `_in_reach`, except those overlapped when the frame began."""
         bodies = self._bodies
         if self._layout != bodies.layout:
             self._layout, self._overlapped = bodies.layout, {}
@@ -141,7 +155,7 @@ class Blocking:
         return found[~np.isin(found, left_out)] if len(found) and left_out else found
 
     def _from_origin(self, pose: Pose) -> Pose:
-        """A pose with its translation from the bodies' origin."""
+        """Return a pose with its translation relative to the bodies' origin."""
         there = np.array(pose, np.float64, order="C")
         there[:3, 3] -= self._bodies.origin
         return there
@@ -149,7 +163,7 @@ class Blocking:
     def _first(
         self, shape: Shape, ends: tuple[Pose, Pose], rows: NDArray[np.int64], tolerance: float
     ) -> "_First | None":
-        """What ends a motion first, of the bodies of these rows."""
+        """Return what ends a motion first among the bodies of these rows."""
         bodies, numbers = self._bodies, self._bodies.numbers[rows]
         best: _First | None = None
         until = np.inf
@@ -172,7 +186,7 @@ class Blocking:
         return best
 
     def _hit_of(self, first: "_First") -> Hit:
-        """What ended a motion; with the normal of its surface where it is an object."""
+        """Return the hit of the body that ended a motion, with its normal for an object."""
         bodies, row, (own, other) = self._bodies, first.row, first.witness
         normal = bodies.shapes[row].normal_at(first.point)
         if normal is not None:
@@ -181,7 +195,7 @@ class Blocking:
         return Hit(first.fraction, Verdict.CONTACT, own, other, bodies.names[row], normal=normal)
 
     def _is_overlapped(self, row: int) -> bool:
-        """Whether a body was touched where the mover was when the frame began."""
+        """Return whether the mover touched a body when the frame began."""
         found = self._overlapped.get(row)
         if found is None:
             bodies = self._bodies
@@ -191,7 +205,10 @@ class Blocking:
         return found
 
     def _goes_deeper(self, shape: Shape, pose_from: Pose, pose_to: Pose) -> Hit | None:
-        """What of that overlapped when the frame began the translation of a motion goes against the way out of."""
+        """Return a hit of a body, overlapped at the start, that a motion goes deeper into.
+
+        A motion does so if its translation is directed against the body's `_out`. None: no body.
+        """
         way = pose_to[:3, 3] - pose_from[:3, 3]
         for row in sorted(row for row, overlapped in self._overlapped.items() if overlapped):
             out = self._out(row)
@@ -201,20 +218,24 @@ class Blocking:
         return None
 
     def _out(self, row: int) -> Vec:
-        """The way out of what the mover overlapped when the frame began."""
+        """Return the direction out of a body that the mover overlapped when the frame began."""
         bodies = self._bodies
         center = bodies.shape_of(self._model).center(self._start)
         return bodies.way_out(row, self._mover if self._user else "", center)
 
     def _hit_at(self, shape: Shape, pose: Pose, row: int) -> Hit:
-        """A body touched at a pose: nothing is known of when, so that its middle says where, from the frame's start."""
+        """Return the hit of a body touched at a pose.
+
+        The time of contact is unknown; the body's centre therefore gives the position, as seen from
+        the frame's start.
+        """
         bodies, center = self._bodies, shape.center(pose)
         out = shape.center(self._start) - bodies.shapes[row].center(bodies.poses[row])
         return Hit(0.0, Verdict.CONTACT, center, center - level(out, bodies.up), bodies.names[row])
 
 
 def warm() -> None:
-    """Have the kernels compiled, before anybody waits for them."""
+    """Compile the kernels before the first request needs them."""
     model = make_avatar([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]], 0.05)
     bodies = Bodies(np.zeros(3), np.array([0.0, 0.0, 1.0]))
     poses = [np.eye(4), np.eye(4)]

@@ -1,7 +1,8 @@
-"""Bodies: all that moves in one scene, users and objects, and where they are now. One of a simulation.
+"""Bodies: everything that moves in one scene, users and objects, with their current poses.
 
-A simulation keeps it up to date as it would a dict of its users (`bodies[user] = body` after each frame, `pop`), and
-tells it where wishes put objects (`tell`). Effects ask it through `Blocking` (blocking.py).
+Each simulation has one. It updates the bodies like a dict of its users (`bodies[user] = body` after
+each frame, `pop`), and passes on the poses at which motion commands place objects (`tell`). Effects
+query it through `Blocking` (blocking.py).
 """
 
 import threading
@@ -26,16 +27,18 @@ from ..vectors import level, turned_back, turned_by
 from .frame import Body, Pose, Vec
 
 USER, TOLD, PUSHED = 1, 2, 4  # kinds, one bit each
-# Points so near one another make a body's surface [m], as `slide` and `ground` have it of scans.
+# Points this near to one another form a body's surface [m], as `slide` and `ground` define it for
+# scans.
 _SURFACE = 0.08
-# Shapes kept of avatars that are of no body, before they are forgotten.
+# Number of cached shapes of avatars that belong to no body, beyond which they are dropped.
 _MOST_LOOSE = 64
 
 
 class Shape(NamedTuple):
-    """An avatar's model with what a broad phase asks. box: (2, 3) of its points [m], zeros where it has none.
+    """Avatar's model with the data of the broad phase.
 
-    units: its radius, exact units.  number: of it among its `Bodies`.  normals: those asked for, by point.
+    box: (2, 3) of its points [m], zeros where it has none.  units: its radius, exact units.
+    number: of it among its `Bodies`.  normals: those computed so far, by point.
     """
 
     model: AvatarModel
@@ -45,14 +48,15 @@ class Shape(NamedTuple):
     normals: dict[int, Vec | None]
 
     def center(self, pose: Pose) -> Vec:
-        """The middle of its box, placed."""
+        """Return the placed centre of its box."""
         placed: Vec = turned_by(pose, 0.5 * (self.box[0] + self.box[1])) + pose[:3, 3]
         return placed
 
     def normal_at(self, point: int) -> Vec | None:
-        """The unit normal of its surface at a point, avatar frame, or its opposite; None: there is none.
+        """Return the unit normal of its surface at a point, or its opposite; None if none.
 
-        As that of a scan's (schemas/kernels/normals.py), its lattice being exact units.
+        The normal is in the avatar frame. It is computed as for a scan
+        (schemas/kernels/normals.py), with exact units as the lattice.
         """
         if point not in self.normals:
             points = self.model.points
@@ -68,16 +72,21 @@ class Shape(NamedTuple):
 
 
 class Bodies:
-    """Bodies by row: users in the order they came, after the objects that were there first.
+    """Bodies by row: the initial objects, then users in order of arrival.
 
-    origin: (3,) from which bodies are placed, as the scene is [m].  up: (3,) unit.  lock: held while asked or changed:
-    a move of which nothing is remembered may be asked beside a frame.  Rows: names; kinds (n,) uint8; poses (n, 4, 4),
-    world; bounds (n, 2, 3), from the origin, radius included; shapes; numbers (n,) of shapes; changed: when last moved.
-    clock: counts moves.  layout: counts bodies that came and went, after which rows are others.
+    origin: (3,), the scene's origin, relative to which bodies are placed [m].  up: (3,) unit.
+    lock: held during queries and changes, because a move that keeps no state may run at the same
+    time as a frame.
+    Rows: names; kinds (n,) uint8; poses (n, 4, 4), world; bounds (n, 2, 3), relative to the origin,
+    radius included; shapes; numbers (n,) of shapes; changed: the clock at the last move.
+    clock: counts moves.  layout: counts arrivals and departures of bodies, after which rows change.
     """
 
     def __init__(self, origin: Vec, up: Vec, begin: "Callable[[Bodies], None] | None" = None) -> None:
-        """begin: adds what is there first, when somebody first asks: avatars come after effects."""
+        """Create an empty set of bodies.
+
+        begin: adds the initial objects on first use, because avatars are loaded after effects.
+        """
         self._begin = begin
         self.origin, self.up = np.array(origin, np.float64), np.array(up, np.float64)
         self.lock = threading.RLock()
@@ -94,13 +103,13 @@ class Bodies:
         self._users: dict[Hashable, Body] = {}
         self._known: dict[int, Shape] = {}
         self._numbered = 0
-        # Of user and object, see `_remember_way`.
+        # By user and object, see `_remember_way`.
         self._came_from: dict[tuple[str, str], Vec] = {}
 
     # --- shapes -------------------------------------------------------------------------------------------
 
     def shape_of(self, model: AvatarModel) -> Shape:
-        """The shape of a model, kept."""
+        """Return the cached shape of a model."""
         shape = self._known.get(id(model.points))
         if shape is not None and shape.model.arrays is model.arrays and shape.model.radius == model.radius:
             return shape
@@ -111,7 +120,7 @@ class Bodies:
             box = np.array([model.points.min(axis=0), model.points.max(axis=0)])
         units = to_units(model.radius, "radius")
         if units > MAX_REACH_UNITS // 4:
-            raise BadRequestError(f"avatar radius {model.radius:g} m: expected at most 4 m where bodies meet")
+            raise BadRequestError(f"avatar radius {model.radius:g} m: expected at most 4 m with crowd or objects")
         nodes = max(len(model.arrays.radius), self.scratch.moving.shape[1])
         blocks = max(len(model.arrays.points), len(self.scratch.lanes))
         if nodes > self.scratch.moving.shape[1] or blocks > len(self.scratch.lanes):
@@ -125,7 +134,10 @@ class Bodies:
     # --- who is there -------------------------------------------------------------------------------------
 
     def begin(self) -> None:
-        """What is there first is there. Raises what makes it none, each time: nobody walks through what is missing."""
+        """Add the initial objects, once. Raise the error of an invalid object on each call.
+
+        Without its objects, a scene would let users walk through them.
+        """
         with self.lock:
             begin, self._begin = self._begin, None
             if begin is None:
@@ -139,7 +151,7 @@ class Bodies:
                 raise
 
     def __setitem__(self, user: Hashable, body: Body) -> None:
-        """A user is there, where its body is now."""
+        """Add a user, or update its body's pose."""
         with self.lock:
             self.begin()
             self._users[user] = body
@@ -153,7 +165,7 @@ class Bodies:
             self._put(row, body.pose)
 
     def pop(self, user: Hashable, default: Body | None = None) -> Body | None:
-        """A user is gone."""
+        """Remove a user and return its body."""
         with self.lock:
             body = self._users.pop(user, default)
             if body is not None and (True, body.name) in self._rows:
@@ -161,20 +173,23 @@ class Bodies:
             return body
 
     def remembers(self, body: Body) -> bool:
-        """Whether this is a body of a user that is there, and not one of which nothing is remembered."""
+        """Return whether this is the body of a present user.
+
+        A move that keeps no state has another one.
+        """
         return any(body is known for known in self._users.values())
 
     def add_object(self, name: str, model: AvatarModel, pose: Pose, *, pushed: bool) -> None:
-        """An object, where it begins. BadTransformError for a pose that is not rigid."""
+        """Add an object at its initial pose; BadTransformError unless the pose is rigid."""
         with self.lock:
             self._add(name, PUSHED if pushed else TOLD, model, _checked(name, pose))
 
     def row_of(self, name: str, *, user: bool) -> int:
-        """The row of a user or an object; -1: there is none."""
+        """Return the row of a user or an object, or -1."""
         return self._rows.get((user, name), -1)
 
     def _add(self, name: str, kind: int, model: AvatarModel, pose: Pose) -> None:
-        """A row more."""
+        """Append a row."""
         row = len(self.names)
         shape = self.shape_of(model)
         self.names.append(name)
@@ -189,7 +204,7 @@ class Bodies:
         self._put(row, pose, begun=True)
 
     def _remove(self, row: int) -> None:
-        """A row less: later ones move up."""
+        """Remove a row; later rows move up."""
         name = self.names[row]
         for rows in (self.names, self.shapes, self.changed):
             del rows[row]  # type: ignore[attr-defined]
@@ -207,7 +222,7 @@ class Bodies:
             return self.layout, self.poses.copy()
 
     def put_back(self, standing: tuple[int, NDArray[np.float64]]) -> None:
-        """Have all bodies where they stood, if they are the same ones."""
+        """Restore the poses that `standing` returned, if the bodies are still the same."""
         layout, poses = standing
         with self.lock:
             if layout == self.layout:
@@ -215,12 +230,12 @@ class Bodies:
                     self._put(row, poses[row])
 
     def put(self, row: int, pose: Pose) -> None:
-        """A body is somewhere else now."""
+        """Set the pose of a body."""
         with self.lock:
             self._put(row, pose)
 
     def _put(self, row: int, pose: Pose, begun: bool = False) -> None:
-        """`put`; begun: it is there at all."""
+        """Implement `put`. begun: the body is new."""
         if not begun and (self.poses[row] == pose).all():
             return
         self.poses[row] = pose
@@ -234,10 +249,13 @@ class Bodies:
             self.changed[row] = self.clock
 
     def tell(self, poses: Mapping[str, Sequence[Sequence[float]]], stop: Stop = NEVER) -> Callable[[], None]:
-        """Objects are where a wish puts them, whatever is there: a user that is, starts its next frame in contact.
+        """Place objects where a motion command puts them, even into users.
 
-        poses: (4, 4) row-major by name. All are checked before any is put: BadRequestError, BadTransformError.
-        Returns what puts them back, for a wish that is refused, or stopped, after all.
+        A user that is touched then starts its next frame in contact.
+        poses: (4, 4) row-major by name. All are checked before any is set: BadRequestError,
+        BadTransformError.
+        Returns a function that restores the poses, for a motion command that is refused or stopped
+        later.
         """
         with self.lock:
             self.begin()
@@ -256,18 +274,21 @@ class Bodies:
         return put_back
 
     def _told(self, name: str) -> int:
-        """The row of an object that wishes may move; BadRequestError for others."""
+        """Return the row of an object that motion commands may place, else BadRequestError."""
         row = self.row_of(name, user=False)
         if row < 0 or self.kinds[row] != TOLD:
             told = [each for each, kind in zip(self.names, self.kinds, strict=True) if kind == TOLD]
-            found = "is none of this scene" if row < 0 else "is pushed, and not told where to be"
+            found = "is not in this scene" if row < 0 else "is pushed by users and cannot be placed"
             raise BadRequestError(
                 f"object {name!r} {found}: expected one of {', '.join(told) or 'none: no object is kinematic'}"
             )
         return row
 
     def _remember_way(self, thing: int, before: Pose, stop: Stop) -> None:
-        """Where from, in its own frame, an object that was told to move has come into users; `way_out` asks."""
+        """Store the direction from which a placed object has moved into users.
+
+        The direction is in the object's frame; `way_out` uses it.
+        """
         bounds, now = self.bounds, self.poses[thing]
         apart = (bounds[:, 0] > bounds[thing, 1]) | (bounds[:, 1] < bounds[thing, 0])
         near = np.flatnonzero((self.kinds == USER) & ~apart.any(axis=1))
@@ -281,10 +302,11 @@ class Bodies:
             self._came_from[self.names[row], self.names[thing]] = own[0] - own[1]
 
     def way_out(self, row: int, user: str, center: Vec) -> Vec:
-        """Level, which way a mover whose centre is there gets free of what it overlaps; zeros: any way.
+        """Return the level direction in which a mover gets free of a body it overlaps; zeros: any.
 
-        Away from the other's centre; of an object that was moved into a user, the way the object came: not through it.
-        user: the mover's name, "" where it is none.
+        The direction is away from the body's centre. For an object that was moved into a user, it
+        is the direction the object came from, which does not lead through it.
+        center: of the mover.  user: the mover's name, "" for an object.
         """
         came_from = self._came_from.get((user, self.names[row])) if self.kinds[row] != USER else None
         pose = self.poses[row]
@@ -294,8 +316,10 @@ class Bodies:
     def touching(
         self, shape: Shape, pose: Pose, rows: NDArray[np.int64], margin_units: int, stop: Stop = NEVER
     ) -> NDArray[np.bool_]:
-        """Whether an avatar at a pose touches the bodies of each of rows (m,), by the definition; of no use once the
-        stop is set."""
+        """Return whether an avatar at a pose touches the bodies of each of rows (m,).
+
+        The definition decides. The result is meaningless once `stop` is set.
+        """
         found = np.zeros(len(rows), bool)
         if not len(shape.model.points):
             return found
@@ -319,13 +343,16 @@ class Bodies:
 
 
 def _checked(name: str, pose: Sequence[Sequence[float]] | Pose) -> Pose:
-    """The pose (4, 4) of an object; BadRequestError, BadTransformError unless it is rigid."""
+    """Return the pose (4, 4) of an object; raise an error unless it is rigid.
+
+    Raises BadRequestError or BadTransformError.
+    """
     array = np.array(pose, np.float64)
     if array.shape != (4, 4):
         raise BadRequestError(f"object {name!r}: pose of shape {array.shape}: expected 4 rows of 4 numbers")
     array = kernel_poses(array[None])[0]
     if not np.isfinite(array).all() or np.abs(array[:3, 3]).max() > 1e9:
-        raise BadRequestError(f"object {name!r}: expected finite numbers, and a place within 1e9 m")
+        raise BadRequestError(f"object {name!r}: expected finite numbers, and a position within 1e9 m")
     off = float(np.abs(array[:3, :3] @ array[:3, :3].T - np.eye(3)).max())
     if array[3].tolist() != [0, 0, 0, 1] or off > SIMILARITY_TOLERANCE or np.linalg.det(array[:3, :3]) < 0:
         raise BadTransformError(

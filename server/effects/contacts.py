@@ -1,6 +1,6 @@
-"""`contacts`: what the avatar touches, or nearly, each frame: in clusters, the deepest first.
+"""Effect `contacts`: report what the avatar touches, or nearly touches, in clusters, deepest first.
 
-Of the scene as scanned; users and dynamic objects are not in it.
+It reports each frame, on the scene as scanned; users and dynamic objects are not included.
 """
 
 from collections.abc import Iterator
@@ -14,27 +14,30 @@ from .frame import Frame
 
 
 def make(effect: Contacts, world: Any) -> "ContactsRunner":
-    """The effect of a scene."""
+    """Create the effect of a scene."""
     return ContactsRunner(effect)
 
 
 class ContactsRunner:
-    """Reports the clusters of `contacts` at the frame's pose; its pairs are counted, not listed."""
+    """Effect that reports the clusters of `contacts` at the frame's pose.
+
+    Its pairs are counted, not listed.
+    """
 
     name = "contacts"
 
     def __init__(self, effect: Contacts) -> None:
-        """effect: as declared."""
+        """Create the effect as declared."""
         self._effect = effect
 
     def run(self, frame: Frame) -> None:
-        """Look, and report."""
+        """Search, and write the report."""
         frame.reports[self.name] = self._report(frame)
 
     def _report(self, frame: Frame) -> ContactsReport:
-        """What is to be said. Where not all in reach could be looked at, what was found, and `unknown`."""
+        """Return the report; after an incomplete search, what was found, with `unknown`."""
         effect = self._effect
-        # Nothing is in contact in most frames; to know that takes a fifth of what it takes to gather nothing.
+        # Most frames have no contact; finding that out costs a fifth of gathering nothing.
         if farther(frame, effect.margin):
             return ContactsReport()
         of_archives = frame.world.contacts(
@@ -48,7 +51,7 @@ class ContactsRunner:
 
 
 def _clusters(answers: ContactsAnswers) -> Iterator[ContactCluster]:
-    """Those of one archive, deepest first."""
+    """Yield the clusters of one archive, deepest first."""
     columns = (
         answers.cluster_count, answers.cluster_deepest, answers.cluster_avatar, answers.cluster_cloud
     )  # fmt: skip

@@ -1,8 +1,9 @@
-"""`crowd`: users do not walk through one another.
+"""Effect `crowd`: users do not walk through one another.
 
-The others stand where they are now: those whose turn came before in this frame have moved already, in the order that
-the simulation has, which its log keeps. Who is met blocks, and does not move. Users that overlap, as those who began in
-one place, are let apart and not deeper (blocking.py).
+The other users stand where they are now. Those whose turn came earlier in this frame have already
+moved, in the order of the simulation, which its log records. A user that is met blocks, and does
+not move. Users that overlap, for example because they began in one place, may separate but not move
+deeper (blocking.py).
 """
 
 from typing import Any
@@ -15,12 +16,12 @@ from .blocking import Blocking, warm
 from .bodies import USER, Bodies
 from .frame import Frame, Hit, Pose
 
-# Users farther apart than this do not meet [m].
+# Largest permitted margin [m].
 _MOST_MARGIN = 8.0
 
 
 def make(effect: Crowd, world: Any) -> "CrowdRunner":
-    """The effect of a scene."""
+    """Create the effect of a scene."""
     if effect.margin > _MOST_MARGIN:
         raise BadRequestError(f"margin {effect.margin:g} m of crowd: expected at most {_MOST_MARGIN:g} m")
     warm()
@@ -30,26 +31,29 @@ def make(effect: Crowd, world: Any) -> "CrowdRunner":
 
 
 class CrowdRunner:
-    """Puts the other users in a frame's way. bodies: the simulation keeps them up to date, and may put others there."""
+    """Effect that adds the other users to the obstacles of a frame.
+
+    bodies: the simulation updates them, and may replace them by those of another effect.
+    """
 
     name = "crowd"
 
     def __init__(self, bodies: Bodies, margin_units: int) -> None:
-        """margin_units: users stay so far apart, exact units."""
+        """Create the effect. margin_units: distance between users, exact units."""
         self.bodies, self._margin_units = bodies, margin_units
 
     def run(self, frame: Frame) -> None:
-        """Add the others to what blocks; the report counts those that do."""
+        """Add the other users to the obstacles; the report counts those that block."""
         self.bodies.begin()
         frame.reports[self.name] = CrowdReport()
         frame.obstacles.append(Others(self.name, self.bodies, frame, self._margin_units))
 
 
 class Others(Blocking):
-    """The other users; counts those that ended a motion."""
+    """Obstacle of the other users; counts those that ended a motion."""
 
     def __init__(self, name: str, bodies: Bodies, frame: Frame, margin_units: int) -> None:
-        """frame: whose way they are in."""
+        """Create the obstacle for a frame's mover."""
         body, stop = frame.body, frame.effort.stop
         super().__init__(
             name, bodies, USER, body.name, body.avatar, body.pose, margin_units=margin_units, stop=stop
@@ -57,7 +61,7 @@ class Others(Blocking):
         self._met: set[str] = set()
 
     def give_way(self, frame: Frame, hit: Hit, to: Pose) -> bool:
-        """They stand."""
+        """Count the user that was met; return False, as users do not give way."""
         if self.is_own(hit):
             self._met.add(hit.what)
             frame.reports[self.name] = CrowdReport(len(self._met))

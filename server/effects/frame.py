@@ -1,4 +1,4 @@
-"""One frame of one user on its way through the effects: what was wished, and what came of it so far."""
+"""One frame of one user on its way through the effects: motion command and results so far."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -17,11 +17,13 @@ Pose = NDArray[np.float64]  # (4, 4) float64, avatar to world, rigid
 
 
 class Hit(NamedTuple):
-    """What ended a motion. fraction: of the motion, gone.  verdict: CONTACT or UNKNOWN.
+    """End of a motion.
 
-    avatar, cloud: (3,) centres of the two spheres that touch, world [m]; None where UNKNOWN.  what: "" the scene, else
-    the object or user.  archive: which of the scene's archives; -1: none of them.  normal: (3,) unit, of the surface
-    touched, towards the avatar; None where nobody estimated it.
+    fraction: of the motion, completed.  verdict: CONTACT or UNKNOWN.
+    avatar, cloud: (3,) centres of the two spheres that touch, world [m]; None where UNKNOWN.  what:
+    "" for the scene, else the object or user.  archive: index among the scene's archives; -1: none
+    of them.  normal: (3,) unit, of the surface touched, towards the avatar; None where it was not
+    estimated.
     """
 
     fraction: float
@@ -34,35 +36,46 @@ class Hit(NamedTuple):
 
 
 class Obstacle(Protocol):
-    """What moves and blocks: the other users, the dynamic objects. See bodies.py.
+    """Bodies that move and block: the other users, the dynamic objects. See bodies.py.
 
-    One obstacle may stand for many bodies: `Hit.what` names the one. What was touched when the frame began blocks only
-    what goes deeper into it, so that an avatar gets free: then neither question says that it is touched.
+    One obstacle may represent many bodies: `Hit.what` names the one. A body that was touched when
+    the frame began blocks only motions that go deeper into it, so that an avatar can get free. For
+    other motions, neither `sweep` nor `touches` reports it.
     """
 
     name: str
 
     def sweep(self, avatar: AvatarModel, pose_from: Pose, pose_to: Pose, tolerance: float) -> Hit | None:
-        """What ends the motion against it; None: nothing does. Nothing is touched before the hit's fraction."""
+        """Return what ends the motion against it, or None.
+
+        Nothing is touched before the hit's fraction.
+        """
 
     def touches(self, avatar: AvatarModel, pose: Pose) -> Hit | None:
-        """Whether it is touched by an avatar there."""
+        """Return what an avatar at a pose touches of it, or None."""
 
     def overlaps(self, avatar: AvatarModel, pose: Pose) -> bool:
-        """Whether an avatar there touches it, whatever was touched when the frame began."""
+        """Return whether an avatar at a pose touches it.
+
+        Bodies that were touched when the frame began count too.
+        """
 
     def give_way(self, frame: "Frame", hit: Hit, to: Pose) -> bool:
-        """Asked of what ended a motion, the avatar at frame.pose and on its way to `to`: it may be pushed on, and then
-        says that it was and that the way is worth going on."""
+        """Move the body that ended a motion, if possible; return whether to try the motion again.
+
+        Called for each hit. The avatar is at frame.pose and on its way to `to`.
+        """
 
 
 @dataclass(slots=True)
 class Body:
-    """What is remembered of a user between frames. name: as others are told.  avatar: its model.  pose: where it is.
+    """State of a user between frames.
 
-    fall_speed: [m/s], 0 on the ground.  on_ground: whether the last frame left it standing.  clear: whether `pose` was
-    found clear, of the archives `generations` (World.generations).  kept: what an effect keeps for itself, by its name.
-    user: client and avatar.
+    name: as other users see it.  avatar: its model.  pose: its current pose.
+    fall_speed: [m/s], 0 on the ground.  on_ground: whether the avatar stood at the end of the last
+    frame.  clear: whether `pose` was found clear, for the archives `generations`
+    (World.generations).  kept: what effects store for themselves, by effect name.  user: client and
+    avatar.
     """
 
     name: str
@@ -78,15 +91,18 @@ class Body:
 
 @dataclass(slots=True)
 class Frame:
-    """One user's one frame. body: as the frame before left it; written once, when the frame is done (pipeline.py).
+    """One frame of one user.
 
-    wish: where to.  seconds: since the frame before.  world: what is asked (world.py).  pose, verdict: so far.
-    generations: of the archives asked.  clear: whether nothing is touched at `pose`, which is asked once: `go` keeps
-    it so.
-    left: (3,) of the translation wished, not gone yet [m].  hits: what ended motions, in order.  blocked: what ended
-    the wish first, and met: where; None: nothing did.  obstacles: what else blocks.  go: as far as nothing is touched;
-    `stop` or `sweep` puts it there.  reports: fields of `Moved`.
-    kept: what goes into `Body.kept`.
+    body: as the previous frame left it; written once, when the frame is finished (pipeline.py).
+    wish: the commanded pose.  seconds: since the previous frame.  world: answers the queries
+    (world.py).  pose, verdict: so far.
+    generations: of the archives in use.  clear: whether nothing is touched at `pose`; queried once,
+    then maintained by `go`.
+    left: (3,), the part of the commanded translation not completed yet [m].  hits: what ended
+    motions, in order.  blocked, met: what ended the commanded motion first, and the pose there;
+    None: nothing did.  obstacles: what else blocks.
+    go: moves as far as nothing is touched; set by `stop` or `sweep`.  reports: fields of `Moved`.
+    kept: entries for `Body.kept`.
     """
 
     body: Body
@@ -112,30 +128,34 @@ class Frame:
     kept: dict[str, Any] = field(default_factory=dict)
 
 
-# Go towards a pose from `frame.pose`, as far as nothing is touched; sets frame.pose, returns what ended it.
+# Move towards a pose from `frame.pose`, as far as nothing is touched; set frame.pose and return
+# what ended it.
 Go = Callable[[Frame, Pose], Hit | None]
 
 
 class Runner(Protocol):
-    """One effect of one scene. It keeps nothing of a user but in `Body`.
+    """One effect of one scene. It stores the state of a user only in `Body`.
 
-    A module of effects makes one: `make(effect, world)`. One with a method `begin(frame)`, too, is called before any
-    effect runs: it may change the wish.
+    Each effect's module creates one: `make(effect, world)`. If a runner also has a method
+    `begin(frame)`, it is called before any effect runs and may change the motion command.
     """
 
     name: str
 
     def run(self, frame: Frame) -> None:
-        """Its part of one frame."""
+        """Run this effect for one frame."""
 
 
 def moved_by(pose: Pose, way: Vec) -> Pose:
-    """A pose carried along."""
+    """Return a pose translated by a vector."""
     there = pose.copy()
     there[:3, 3] += way
     return there
 
 
 def lowest(avatar: AvatarModel, pose: Pose, up: Vec) -> float:
-    """How far up the lowest of an avatar's spheres, not none, begins under a pose [m]."""
+    """Return the lowest height of an avatar's spheres under a pose, along `up` [m].
+
+    The avatar has at least one sphere.
+    """
     return dot(pose[:3, 3], up) + lowest_of(avatar.points, turned_back(pose, up)) - avatar.radius

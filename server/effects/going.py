@@ -1,24 +1,27 @@
-"""How an avatar goes: what it would meet first, how far from that it stays, and that it is clear where it ends.
+"""Motion of an avatar: what it meets first, the distance it keeps, and a clear final pose.
 
-`stop` and `sweep` put `frame.go` together of this.
+`stop` and `sweep` build `frame.go` from these functions.
 """
 
 from ...schemas.answers import Verdict
 from ..vectors import dot, size, spread, turned_back, turned_by
 from .frame import Frame, Hit, Pose
 
-# A motion that is stopped sooner is not begun [m]: else an avatar that pushes would tremble by what `lower` is off.
+# A motion that would be shorter is not begun [m]: otherwise a pushing avatar would tremble by the
+# error of `lower`.
 LEAST_WAY = 2e-5
-# Along a wall that is grazed, the way back that leaves `skin` is long: at most so many times `skin`.
+# Along a wall that is grazed, the way back that keeps `skin` is long: at most this many times
+# `skin`.
 MOST_BACK = 4.0
-# A doubt so far before a contact is what ended the motion, not the contact [m].
+# If a motion is undecided for more than this distance before its contact, the undecided part ends
+# it [m].
 DOUBT = 1e-4
-# First way back from a pose that proves not to be clear [m], and by how much it grows.
+# First way back from a pose that proves not to be clear [m], and its growth factor.
 _BACK, _GROWS = 1e-7, 4.0
 
 
 def first_hit(frame: Frame, to: Pose, tolerance: float) -> Hit | None:
-    """What would end the motion from frame.pose to a pose first, of the scene and of what else blocks."""
+    """Return what would first end the motion from frame.pose to a pose, scene or obstacle."""
     avatar, found = frame.body.avatar, None
     swept = frame.world.sweep(avatar, frame.pose, to, tolerance, frame.effort)
     if swept.verdict != Verdict.CLEAR:
@@ -36,7 +39,7 @@ def first_hit(frame: Frame, to: Pose, tolerance: float) -> Hit | None:
 
 
 def touched_at(frame: Frame, pose: Pose) -> Hit | None:
-    """What is touched at a pose, with fraction 0, or is not known not to be."""
+    """Return what is touched at a pose, with fraction 0, or a hit with UNKNOWN, or None."""
     avatar = frame.body.avatar
     verdict = frame.world.collide(avatar, pose, frame.effort)
     if verdict == Verdict.CONTACT:
@@ -47,9 +50,9 @@ def touched_at(frame: Frame, pose: Pose) -> Hit | None:
 
 
 def is_clear(frame: Frame, pose: Pose, *, proved: bool = False) -> bool:
-    """Whether nothing is touched at a pose, and that is known.
+    """Return whether it is known that nothing is touched at a pose.
 
-    proved: of the scene; then only what else blocks is asked.
+    proved: known for the scene; only the other obstacles are then tested.
     """
     avatar = frame.body.avatar
     if not proved and frame.world.collide(avatar, pose, frame.effort) != Verdict.CLEAR:
@@ -58,7 +61,7 @@ def is_clear(frame: Frame, pose: Pose, *, proved: bool = False) -> bool:
 
 
 def farthest(frame: Frame, to: Pose) -> float:
-    """How far any avatar point goes from frame.pose to a pose, at most, or hardly more [m]."""
+    """Return how far any avatar point moves from frame.pose to a pose, at most or nearly so [m]."""
     avatar, begin = frame.body.avatar, frame.pose
     if not len(avatar.points):
         return 0.0
@@ -71,7 +74,10 @@ def farthest(frame: Frame, to: Pose) -> float:
 
 
 def way_back(frame: Frame, to: Pose, hit: Hit, skin: float) -> float:
-    """Of the motion, the share to stay before `hit`: so that the tangent plane of the two spheres is `skin` away."""
+    """Return the share of the motion by which to stop before `hit`.
+
+    The tangent plane of the two spheres is then `skin` away.
+    """
     way = farthest(frame, to)
     if way <= 0.0 or skin <= 0.0:
         return 0.0
@@ -79,7 +85,7 @@ def way_back(frame: Frame, to: Pose, hit: Hit, skin: float) -> float:
         return skin / way
     out = hit.avatar - hit.cloud
     there, _ = frame.world.between(frame.body.avatar, frame.pose, to, min(hit.fraction, 1.0))
-    # The point that touches, in the avatar's frame, and how it moves.
+    # The point that touches, in the avatar's frame, and its displacement.
     point = turned_back(there, hit.avatar - there[:3, 3])
     goes = (to[:3, 3] - frame.pose[:3, 3]) + turned_by(to[:3, :3] - frame.pose[:3, :3], point)
     length, speed = size(out), size(goes)
@@ -90,9 +96,10 @@ def way_back(frame: Frame, to: Pose, hit: Hit, skin: float) -> float:
 
 
 def settle(frame: Frame, to: Pose, fraction: float, proved: float) -> None:
-    """Set frame.pose to that at `fraction` of the way to a pose, or so far before it that it is clear.
+    """Set frame.pose to that at `fraction` of the way to a pose, or before it where that is clear.
 
-    proved: nothing touches before. Stays where it is, where that is no way worth the name.
+    proved: nothing touches before this fraction. The pose stays unchanged if the way is shorter
+    than LEAST_WAY.
     """
     begin, way = frame.pose, farthest(frame, to)
     back = 0.0
@@ -105,19 +112,19 @@ def settle(frame: Frame, to: Pose, fraction: float, proved: float) -> None:
 
 
 def gives_way(frame: Frame, hit: Hit, to: Pose) -> bool:
-    """Whether what was met on the way to a pose is pushed on, so that the way is worth trying again."""
+    """Return whether what was met was pushed on, which makes the motion worth trying again."""
     return bool(hit.what) and any(obstacle.give_way(frame, hit, to) for obstacle in frame.obstacles)
 
 
 def note(frame: Frame, hit: Hit) -> None:
-    """Write down what ended a motion."""
+    """Record what ended a motion."""
     frame.hits.append(hit)
     if hit.verdict == Verdict.UNKNOWN and frame.verdict == Verdict.CLEAR:
         frame.verdict = Verdict.UNKNOWN
 
 
 def set_out(frame: Frame) -> None:
-    """Go for the wish."""
+    """Move towards the commanded pose."""
     assert frame.go is not None
     frame.blocked = frame.go(frame, frame.wish)
     frame.met = None if frame.blocked is None else frame.pose

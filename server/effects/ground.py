@@ -1,15 +1,18 @@
-"""`ground`: gravity, with feet held a little above what they stand on, or falling.
+"""Effect `ground`: gravity, with feet held slightly above the ground, or falling.
 
-Each frame, where the avatar got to, it is swept straight down. What is met within reach and is no steeper than `slope`
-is stood on: the avatar is held `clearance` above it, so that a floor's bumps stop nobody, and low sills are walked
-over. What is steeper is no ground: gravity goes on along it. Without anything there it falls: v t + g t^2 / 2 in a
-frame of t, at most `fall_speed`, swept like any motion, so that it lands in the frame that reaches the ground.
+Each frame, the avatar is swept straight down from where it arrived. It stands on what it meets
+within reach, if that is no steeper than `slope`. It is held `clearance` above the ground, so that a
+floor's bumps do not stop it, and low sills are walked over. Anything steeper is not ground: gravity
+continues along it. With nothing below, the avatar falls: v t + g t^2 / 2 in a frame of t, at most
+at `fall_speed`, swept like any motion, so that it lands in the frame that reaches the ground.
 
-Scans have holes, floors behind columns and under furniture above all. Who stood and has nothing to stand on falls only
-if feet would land: where nothing at all was scanned below, or the rest of the body would be caught by a hole's rim or
-the ledge just left, the avatar walks on at its height, until there is ground again or it is clear of the ledge.
+Scans have holes, above all in floors behind columns and under furniture. An avatar that stood and
+has nothing to stand on falls only if its feet would land. Where nothing at all was scanned below,
+or where the rest of the body would be caught by a hole's rim or the ledge just left, the avatar
+walks on at its height, until there is ground again or it is clear of the ledge.
 
-What a wish says of up and down is ignored, standing and falling: who has weight does not choose its height.
+The vertical part of a motion command is ignored, standing and falling: a body with weight does not
+choose its height.
 """
 
 import math
@@ -26,41 +29,47 @@ from ..world import World
 from .frame import Frame, Hit, Vec, lowest, moved_by
 from .going import first_hit, note, settle
 
-# Feet this near to their height are left there [m]: at rest nothing moves.
+# Feet this near to their target height stay there [m]: at rest nothing moves.
 DEAD_BAND = 1e-4
-# Who stands and goes on is left at its height within so large a share of `clearance`: a floor's bumps would move it up
-# and down in every frame, each time by a motion that is swept. Of the 1,200 frames of
-# the façade's walk 1,017 take two questions, without it 558.
+# A standing avatar that moves keeps its height within this share of `clearance`. A floor's bumps
+# would otherwise move it up and down in every frame, each time by a swept motion. Of the 1,200
+# frames of the façade's walk, 1,017 take two queries with this band, 558 without it.
 BAND = 0.2
-# And beside a wall, by whose bumps the way up and down leads.
+# The same beside a wall, whose bumps are in the way up and down [m].
 ASIDE_BAND = 5e-3
-# A frame of gravity lasts no longer [s].
+# A frame of gravity lasts no longer than this [s].
 LONGEST_FRAME = 0.1
-# The points that make the normal of what is stood on are so near the one that is touched [m]; with `slide`, as it says,
-# for normals that an archive keeps are of one reach.
+# Radius around the touched point of the points that form the ground's normal [m]. With `slide`, its
+# radius is used instead, because an archive keeps normals for one radius.
 NORMAL_REACH = 0.08
-# An edge is looked at so far into what it is the edge of, for points as near to there [m].
+# Distance past an edge at which the surface behind it is tested, and the radius of that test [m].
 EDGE, EDGE_REACH = 0.08, 0.04
-# What is steeper is no edge, but the side of something: points of both sides of an edge make some 45 degrees.
+# Anything steeper is not an edge but the side of an object: points of both sides of an edge give
+# some 45 degrees.
 _EDGE_RISES = 0.15
-# Clearances in which ground is looked for first.
+# Ground is searched for within this many clearances first.
 _NEAR = 2.0
-# So far away from a wall the ground is looked for [m], and for so many walls.
+# Distance from a wall at which ground is searched for [m], and the number of walls tried.
 _ASIDE, _ASIDES = 0.01, 3
-# Points so near the plane of what was stood on last, and so near where, are of it [m].
+# A point within these distances of the plane, and of the place, of the last ground belongs to it
+# [m].
 _SAME_FLOOR, _FLOOR = 5e-3, 0.3
-# Normals are kept to a third of a degree: of a cosine so much.
+# Normals are stored to a third of a degree: the corresponding error of a cosine.
 _ROUNDING = 0.005
-# The body is swept so far beneath a scene's lowest sphere, its own height apart [m]; how exactly that is asked.
+# The body is swept down to this distance below the scene's lowest sphere [m]; the tolerance of that
+# sweep [m].
 _BELOW, _ROUGH = 0.1, 1e-2
-# Without `sweep` [m].
+# Tolerance without `sweep` [m].
 _TOLERANCE = 1e-5
 
 
 class Below(NamedTuple):
-    """What is straight down. hit: None: nothing.  reach: looked so far [m].  free: nothing is met before [m].
+    """Result of a search straight down.
 
-    normal: (3,) of ground; None: none, or it is too steep.  aside: found a little aside, where nothing steep is met.
+    hit: None: nothing.  reach: distance searched [m].  free: nothing is met before this distance
+    [m].
+    normal: (3,) of the ground; None: no ground, or too steep.  aside: found slightly aside, where
+    nothing steep is met.
     """
 
     hit: Hit | None
@@ -71,12 +80,16 @@ class Below(NamedTuple):
 
 
 class Grounded:
-    """The effect of one scene. clearance: as `Ground` has it."""
+    """Effect `ground` of one scene. clearance: of `Ground`."""
 
     name = "ground"
 
     def __init__(self, effect: Ground, up: Vec, step: float, tolerance: float, sliding: Any) -> None:
-        """up: unit.  step: how far below the next step may be [m].  sliding: `slide`, where the scene calls for it."""
+        """Create the effect.
+
+        up: unit.  step: how far below the next step may be [m].  sliding: effect `slide`, where the
+        scene declares it.
+        """
         along = np.flatnonzero(up)
         self._axis = int(along[0]) if len(along) == 1 else None
         self.clearance, self._gravity, self._most = effect.clearance, effect.gravity, effect.fall_speed
@@ -86,7 +99,7 @@ class Grounded:
         self._walkable = math.cos(math.radians(effect.slope)) - _ROUNDING
 
     def begin(self, frame: Frame) -> None:
-        """Take up and down out of the wish."""
+        """Remove the vertical part of the motion command."""
         up, begin = frame.world.up, frame.body.pose[:3, 3]
         if self._axis is not None:
             if frame.wish[self._axis, 3] != begin[self._axis]:
@@ -117,7 +130,7 @@ class Grounded:
         elif hit is None:
             self.lower(frame, below, fall)
         elif hit.verdict == Verdict.UNKNOWN:
-            # Whether there is ground is not known: nothing falls into the unknown.
+            # It is not known whether there is ground: nothing falls into the unknown.
             note(frame, hit)
             self.lower(frame, below, min(fall, below.free - self.clearance))
             frame.on_ground, frame.fall_speed = stood, 0.0
@@ -138,15 +151,16 @@ class Grounded:
         frame.reports["ground"] = GroundReport(frame.on_ground, frame.fall_speed, normal)
 
     def _remember(self, frame: Frame, hit: Hit, normal: Vec) -> None:
-        """Note what is stood on, where it is not the plane noted already."""
+        """Store what the avatar stands on, unless that plane is stored already."""
         stood = frame.body.kept.get(self.name)
         if hit.archive >= 0 and hit.cloud is not None and (stood is None or normal is not stood[1]):
             frame.kept[self.name] = hit.cloud, normal
 
     def below(self, frame: Frame, reach: float) -> Below:
-        """What is met first straight down from frame.pose within a reach [m].
+        """Find what is met first straight down from frame.pose within a reach [m].
 
-        Beside a wall the way down leads by its bumps: what is too steep is looked past, a little away from it.
+        Beside a wall, its bumps are in the way down: the search is repeated slightly away from
+        anything too steep.
         """
         first: Below | None = None
         aside = np.zeros(3)
@@ -158,7 +172,7 @@ class Grounded:
             begin = frame.pose
             if beside or first is not None:
                 frame.pose = moved_by(begin, aside)
-            # Nearly always ground is near, and a short way takes half the time.
+            # Ground is nearly always near, and a short sweep takes half the time.
             far = min(reach, _NEAR * self.clearance)
             hit = self._first_below(frame, far)
             if hit is None and far < reach:
@@ -186,7 +200,7 @@ class Grounded:
         return first_hit(frame, moved_by(frame.pose, -reach * frame.world.up), self._tolerance)
 
     def _away(self, frame: Frame, hit: Hit) -> Vec | None:
-        """The level direction away from something steep."""
+        """Return the level direction away from something steep."""
         if hit.avatar is None or hit.cloud is None:
             return None
         out = frame.world.normal(hit, self._normal_reach)
@@ -197,7 +211,7 @@ class Grounded:
         return None if length == 0.0 else level / length
 
     def lower(self, frame: Frame, below: Below, way: float) -> None:
-        """Go straight down by a way [m] within what was found free."""
+        """Move straight down by a way [m] within what was found free."""
         assert frame.go is not None
         if way <= 0.0:
             return
@@ -208,7 +222,7 @@ class Grounded:
         self.slide(frame, -way * frame.world.up)
 
     def slide(self, frame: Frame, way: Vec) -> None:
-        """Go by a way (3,) [m], along what is met."""
+        """Move by a way (3,) [m], sliding along what is met."""
         assert frame.go is not None
         begin, hits = frame.pose[:3, 3], len(frame.hits)
         hit = frame.go(frame, moved_by(frame.pose, way))
@@ -217,7 +231,7 @@ class Grounded:
         del frame.hits[hits:]
 
     def _falls(self, frame: Frame, reach: float, *, stood: bool) -> bool:
-        """Whether an avatar under whose feet nothing is within reach would land on something, or that is not known."""
+        """Return whether an avatar with nothing within reach below its feet would or may land."""
         world, avatar, up = frame.world, frame.body.avatar, frame.world.up
         if not len(avatar.points):
             return False
@@ -228,14 +242,14 @@ class Grounded:
         swept = world.sweep(avatar, frame.pose, moved_by(frame.pose, -deep * up), _ROUGH, frame.effort)
         if swept.verdict != Verdict.CONTACT:
             return bool(swept.verdict == Verdict.UNKNOWN)
-        # A hole's rim, or the ledge behind it, is met by what is higher and wider than the feet.
+        # A hole's rim, or the ledge behind it, is met by the parts above the feet, which are wider.
         return not stood or dot(swept.cloud, up) < feet - reach
 
     def standing(self, frame: Frame, hit: Hit) -> Vec | None:
-        """The normal of what was met, if it can be stood on; None: it is too steep.
+        """Return the normal of what was met, if it can be stood on; None: it is too steep.
 
-        The points around an edge, of a stair say, have a slanting normal. It is stood upon where what lies farther in,
-        at its height, is ground.
+        The points around an edge, for example of a stair, have a slanting normal. An avatar can
+        stand on an edge if the surface farther in, at its height, is ground.
         """
         if hit.avatar is None or hit.cloud is None:
             return None
@@ -243,7 +257,7 @@ class Grounded:
         if stood is not None and hit.archive >= 0:
             way = hit.cloud - stood[0]
             if abs(dot(way, stood[1])) <= _SAME_FLOOR and size(way) <= _FLOOR:
-                return stood[1]  # what was stood on last: a normal takes as long as half a sweep
+                return stood[1]  # the last ground: a normal takes as long as half a sweep
         up, out = frame.world.up, hit.avatar - hit.cloud
         length = size(out)
         normal: Vec | None = frame.world.normal(hit, self._normal_reach)
@@ -266,7 +280,7 @@ class Grounded:
         return top if top is not None and dot(top, up) >= self._walkable else None
 
     def _fall_along(self, frame: Frame, fall: float, seconds: float) -> None:
-        """Fall onto something steep, and along it; what is not fallen takes its speed away."""
+        """Fall onto something steep, and along it; distance not fallen reduces the speed."""
         begin = frame.pose[:3, 3]
         self.slide(frame, -fall * frame.world.up)
         fell = -dot(frame.pose[:3, 3] - begin, frame.world.up)
@@ -275,14 +289,14 @@ class Grounded:
 
 
 def make(effect: Ground, world: World) -> Grounded:
-    """The effect of a scene."""
+    """Create the effect of a scene."""
     declared = {type(each): each for each in world.file.effects}
     with world as seen:
         warm(seen[0].data)
     step, sweep, slide = declared.get(Step), declared.get(Sweep), declared.get(Slide)
     sliding = None
     if isinstance(slide, Slide):
-        # Here: what no effect asks for is not imported.
+        # Imported here: what no effect needs is not imported.
         from .slide import make as make_sliding
 
         sliding = make_sliding(slide, world)

@@ -1,11 +1,12 @@
-"""`objects`: dynamic objects block users; those that can be pushed give way as far as the scene lets them.
+"""Effect `objects`: dynamic objects block users; pushable ones give way where there is space.
 
-A kinematic object is where wishes put it (`Bodies.tell`), whatever is there. A pushed one is moved by the user whose
-motion it ended: by what is left of the translation, level, as far as nothing is touched by it on its way; then the
-user follows. It has no momentum: it never goes farther than its user wished to, and stands when nobody pushes. An
-object that touches the scene where it stands, such as the floor, is not moved: place it clear of it.
+Motion commands place a kinematic object (`Bodies.tell`), whatever is at that pose. A pushed object
+is moved by the user whose motion it ended: by the remaining translation, level, as far as the
+object touches nothing on its way. Then the user follows. The object has no momentum: it never moves
+farther than its user's motion command, and stands when nobody pushes. An object that touches the
+scene where it stands, such as the floor, does not move: place it clear of the scene.
 
-What objects touch is found anew only of those that have moved (contact as server/objects.py has it).
+Contacts of objects are recomputed only for those that have moved (contact as in server/objects.py).
 """
 
 from collections.abc import Sequence
@@ -23,48 +24,57 @@ from .blocking import Blocking, warm
 from .bodies import PUSHED, TOLD, USER, Bodies
 from .frame import Frame, Hit, Pose, Vec, moved_by
 
-# A pushed object keeps so far from what stops it, along its way [m], as `stop` has it of users.
+# A pushed object keeps this distance from what stops it, along its way [m], as `stop` does for
+# users.
 _SKIN = 0.002
-# How far any point may go between the last clear moment known and a touch [m].
+# Largest distance any point may move between the last moment known to be clear and a touch [m].
 _TOLERANCE = 1e-5
-# What would move an object less than this does not [m].
+# A push that would move an object by less than this does not move it [m].
 _LEAST = 1e-4
-# Cosine: an object goes where it is pushed within 60 degrees of head on; users slide along it otherwise.
+# Cosine: an object moves where it is pushed within 60 degrees of head on; otherwise users slide
+# along it.
 _HEAD_ON = 0.5
 
 
 def make(effect: Objects, world: Any) -> "ObjectsRunner":
-    """The effect of a scene. BadRequestError for objects that are none."""
+    """Create the effect of a scene.
+
+    Raises BadRequestError for invalid objects.
+    """
     warm()
     return ObjectsRunner(world, world.file.objects)
 
 
 class ObjectsRunner:
-    """Puts the scene's objects in a frame's way. bodies: the simulation keeps its users in them up to date.
+    """Effect that adds the scene's objects to the obstacles of a frame.
 
-    world: of the scene.  Not thread-safe but for what `Bodies` is asked.
+    bodies: the simulation updates its users in them.  world: of the scene.  Not thread-safe, except
+    for queries of `Bodies`.
     """
 
     name = "objects"
 
     def __init__(self, world: Any, items: Sequence[ObjectItem]) -> None:
-        """items: the objects, as they begin."""
+        """Create the effect. items: the objects at their initial poses."""
         self._world = world
         with world as seen:
             self.bodies = Bodies(seen[0].data.arrays.origin, world.up, self._begin)
         self._items = list(items)
-        # Row: when it had moved last, and the archives asked, as it was asked what it touches.
+        # By row: the clock of its last move, and the archives, when its contacts were computed.
         self._asked: dict[int, tuple[int, tuple[int, ...]]] = {}
         self._touching: set[tuple[int, int]] = set()  # rows, the lesser first; -1: the scene
 
     def _begin(self, bodies: Bodies) -> None:
-        """The objects where they begin."""
+        """Add the objects at their initial poses."""
         for item in self._items:
             model = self._world.avatar(item.avatar)
             bodies.add_object(item.name, model, np.array(item.pose), pushed=item.kind == "pushed")
 
     def run(self, frame: Frame) -> None:
-        """Add the objects to what blocks, and say which moved since the user's frame before, and what they touch."""
+        """Add the objects to the obstacles, and report their moves and contacts.
+
+        The report covers the moves since the user's previous frame.
+        """
         bodies = self.bodies
         with bodies.lock:
             bodies.begin()
@@ -73,7 +83,7 @@ class ObjectsRunner:
             frame.reports[self.name] = self.report(since, frame.effort)
 
     def report(self, since: int, effort: Effort) -> ObjectsReport:
-        """What moved since a count of moves, and what touches."""
+        """Return the objects that moved since a count of moves, and the contacts."""
         bodies = self.bodies
         poses = {
             bodies.names[row]: bodies.poses[row].tolist()
@@ -86,11 +96,11 @@ class ObjectsRunner:
         )
 
     def _objects(self) -> list[int]:
-        """The objects' rows: they came first."""
+        """Return the objects' rows, which precede those of users."""
         return np.flatnonzero(self.bodies.kinds != USER).tolist()
 
     def _find_touching(self, effort: Effort) -> list[tuple[int, int]]:
-        """What touches, by rows; asked of what has moved since it was asked last."""
+        """Return the contacts, by rows; recompute those of objects that have moved."""
         bodies, rows, archives = self.bodies, self._objects(), self._world.generations()
         for row in rows:
             now = bodies.changed[row], archives
@@ -108,14 +118,14 @@ class ObjectsRunner:
             for other in near[bodies.touching(shape, pose, near, 0, effort.stop)].tolist():
                 self._touching.add((min(row, other), max(row, other)))
             if verdict == Verdict.UNKNOWN or effort.stop:
-                continue  # it is asked again, once what is missing may be there
+                continue  # query again, once missing voxels may be there
             self._asked[row] = now
         return sorted(self._touching)
 
     def push(self, name: str, way: Vec, user: str, effort: Effort) -> bool:
-        """Move an object along a level way, as far as nothing is touched; whether it moved.
+        """Move an object along a level way, as far as nothing is touched; return whether it moved.
 
-        user: who pushes, and follows: it does not stand in the way.
+        user: the one who pushes, and follows; it is no obstacle.
         """
         bodies = self.bodies
         row, length = bodies.row_of(name, user=False), size(way)
@@ -137,16 +147,16 @@ class ObjectsRunner:
                 return False
             to = moved_by(pose, way * clear)
         if effort.stop:
-            return False  # what was found may be too little
+            return False  # the result may be incomplete
         bodies.put(row, to)
         return True
 
 
 class Things(Blocking):
-    """The objects, for one user's frame. Those that are pushed give way."""
+    """Obstacle of the objects, for one user's frame. Pushable objects give way."""
 
     def __init__(self, runner: ObjectsRunner, frame: Frame, since: int) -> None:
-        """frame: whose it is.  since: the moves it was told of."""
+        """Create the obstacle for a frame. since: the count of moves its user knows of."""
         body, stop = frame.body, frame.effort.stop
         super().__init__(
             runner.name, runner.bodies, TOLD | PUSHED, body.name, body.avatar, body.pose, stop=stop
@@ -154,7 +164,10 @@ class Things(Blocking):
         self._runner, self._since = runner, since
 
     def give_way(self, frame: Frame, hit: Hit, to: Pose) -> bool:
-        """One that can be pushed is moved by what is left of the way; of a move nothing is remembered of, none is."""
+        """Push the object that was met by the rest of the way; return whether it moved.
+
+        Only pushable objects move, and a move that keeps no state pushes nothing.
+        """
         bodies = self._runner.bodies
         if not self.is_own(hit):
             return False

@@ -1,8 +1,10 @@
-"""The effects that a scene declares, composed: nothing else is imported, called or answered (NUMERICS.md case 31).
+"""Pipeline of the effects that a scene declares.
 
-A frame's budget is of `limits` in the scene file. Before each effect that may be skipped, what was spent of the frame
-and what the effect usually takes are added up; where that is too much the effect is skipped, and the answer says so.
-Those that come later in ORDER, and take less, may still find room. Effects that keep from contact are never skipped.
+No other effect is imported, called or reported (NUMERICS.md case 31). The scene file's `limits` set
+a frame's budget. Before each effect that may be skipped, the time spent in the frame and the
+effect's usual time are added. If the sum exceeds the budget, the effect is skipped, and the answer
+says so. Later effects in ORDER that take less may still fit. Effects that prevent contact are never
+skipped.
 """
 
 import importlib
@@ -24,54 +26,57 @@ from ..vectors import size
 from ..world import World
 from .frame import Body, Frame, Hit, Pose, Runner, Vec
 
-# What an effect usually takes follows what it took by this share.
+# The usual time of an effect follows its last time by this share.
 _FOLLOWS = 0.1
-# What a skipped effect is taken to need fades by this share a frame, so that it is tried again. What once took long, a
-# compiler's time or a disk's in it, would else be skipped for ever; what always does gets one frame in some dozens.
+# The estimate for a skipped effect decays by this share a frame, so that the effect is tried again.
+# Otherwise one slow run, for example because of a compiler or a disk, would make it skipped for
+# ever. An effect that is always slow gets one frame in some dozens.
 _FADES = 0.02
-# Things touched that an answer names at most.
+# Largest number of touched things that an answer names.
 _MOST_TOUCHED = 16
 
 
 class Usual:
-    """What an effect usually takes: seconds and node visits. The first frame says nothing: it compiles."""
+    """Usual cost of an effect: seconds and node visits. The first frame is ignored: it compiles."""
 
     __slots__ = ("frames", "seconds", "tried", "visits")
 
     def __init__(self) -> None:
         self.frames, self.seconds, self.visits = 0, 0.0, 0.0
-        self.tried = False  # whether the next time it runs is the first after it was skipped
+        self.tried = False  # whether its next run is the first after it was skipped
 
     def took(self, seconds: float, visits: int) -> None:
-        """It took so much now."""
+        """Record the cost of a run."""
         self.frames += 1
         if self.frames == 1:
             return
-        # What faded says nothing any more: a trial counts whole, or the next would follow at once.
+        # A decayed estimate is no longer valid: a trial counts whole; otherwise the next would
+        # follow at once.
         share = 1.0 if self.tried else max(_FOLLOWS, 1.0 / (self.frames - 1))
         self.tried = False
         self.seconds += share * (seconds - self.seconds)
         self.visits += share * (visits - self.visits)
 
     def skipped(self) -> None:
-        """There was no room for it."""
+        """Record that the budget had no room for the effect."""
         self.tried = True
         self.seconds *= 1.0 - _FADES
         self.visits *= 1.0 - _FADES
 
 
 class Pipeline:
-    """The effects of one scene in their order. Thread-safe, but for one body at a time.
+    """Effects of one scene in their order. Thread-safe, except for two frames of one body.
 
-    runners: the effects.  usual: what each takes, by name, where there is a budget.  bodies: see bodies.py; None
-    where no effect asks for it.
+    runners: the effects.  usual: cost of each, by name, where there is a budget.  bodies: see
+    bodies.py; None where no effect uses it.
     """
 
     def __init__(self, file: SceneFile, world: World, runners: list[Runner]) -> None:
-        """Use `make_pipeline`."""
+        """Create a pipeline; call `make_pipeline` instead."""
         self.file, self.world, self.runners = file, world, runners
         self.usual = {runner.name: Usual() for runner in runners}
-        # Where users and objects are: one for all effects that ask, kept up to date by the simulation. None: none asks.
+        # Users and objects: shared by all effects that use them, updated by the simulation. None:
+        # no effect does.
         self.bodies: Any = None
         for runner in runners:
             if hasattr(runner, "bodies"):
@@ -82,7 +87,7 @@ class Pipeline:
         limits = file.limits
         self._seconds = None if limits.frame_ms is None else limits.frame_ms / 1e3
         self._visits = limits.frame_visits
-        self._free = self._seconds is None and self._visits is None  # nothing to be measured for
+        self._free = self._seconds is None and self._visits is None  # no budget, no measurement
 
     def run(
         self,
@@ -93,11 +98,12 @@ class Pipeline:
         *,
         skip: Collection[str] | None = None,
     ) -> Moved:
-        """One frame of a body: where it gets to that wishes to be at a pose (4, 4), rigid.
+        """Run one frame of a body: move it towards a commanded pose (4, 4), rigid.
 
-        seconds: that the frame lasts.  skip: the effects to leave out, as a frame before had to; None: those that the
-        frame's budget has no room for. The body is as it was where this raises: BadRequestError for a wish that is
-        farther than limits.longest_move, what questions about its poses raise, and StoppedError.
+        seconds: duration of the frame.  skip: the effects to omit, as an earlier frame had to;
+        None: those that do not fit the frame's budget. The body is unchanged if this raises:
+        BadRequestError for a pose farther than limits.longest_move, the errors of queries about its
+        poses, and StoppedError.
         """
         begin = time.perf_counter()
         body.pose = np.ascontiguousarray(body.pose, np.float64)
@@ -105,8 +111,8 @@ class Pipeline:
         far = size(wish[:3, 3] - body.pose[:3, 3])
         if not far <= self.file.limits.longest_move:
             raise BadRequestError(
-                f"the wish is {far:g} m away: expected within {self.file.limits.longest_move:g} m, the scene's longest "
-                "move: wish for something nearer, or begin there"
+                f"the commanded pose is {far:g} m away: expected within {self.file.limits.longest_move:g} m, the "
+                "scene's longest_move: send a nearer pose, or begin there"
             )
         frame = Frame(body, wish, seconds, self.world, effort, body.pose)
         frame.fall_speed, frame.on_ground = body.fall_speed, body.on_ground
@@ -128,10 +134,11 @@ class Pipeline:
                     self._run_one(runner, frame, begin, since, skip)
             if not self._stops:
                 frame.verdict = self.world.collide(body.avatar, frame.pose, effort)
-            # What came into it, an object say, blocks nobody: then the verdict alone says so.
+            # A body that came into the avatar, for example an object, blocks nothing: only the
+            # verdict reports it.
             if any(each.overlaps(body.avatar, frame.pose) for each in frame.obstacles):
                 frame.verdict = Verdict.CONTACT
-            if effort.stop:  # what the effects made of unfinished answers counts for nothing
+            if effort.stop:  # results of effects from incomplete answers are discarded
                 raise StoppedError
             self.world.saw(body.user, body.avatar, frame.pose)
         body.pose, body.clear, body.generations = frame.pose, frame.clear, frame.generations
@@ -141,8 +148,10 @@ class Pipeline:
 
     @contextmanager
     def _undone_if_stopped(self, body: Body, effort: Effort) -> Iterator[None]:
-        """Have objects that a frame pushed stand where they stood before, where it is stopped: a clock decides when it
-        is, and no pose is to depend on one."""
+        """Restore the poses of pushed objects if the frame is stopped.
+
+        A clock decides when a frame is stopped, and no pose may depend on a clock.
+        """
         if effort.stop is NEVER or self.bodies is None or not self.bodies.remembers(body):
             yield
             return
@@ -156,7 +165,7 @@ class Pipeline:
     def _run_one(
         self, runner: Runner, frame: Frame, begin: float, since: int, skip: Collection[str] | None
     ) -> None:
-        """One effect of a frame, or none of it."""
+        """Run or skip one effect of a frame."""
         name, usual = runner.name, self.usual[runner.name]
         visits, now = self.world.visits, time.perf_counter()
         if name not in NEVER_SKIPPED:
@@ -170,7 +179,7 @@ class Pipeline:
         usual.took(time.perf_counter() - now, self.world.visits - visits)
 
     def _no_room(self, usual: Usual, seconds: float, visits: int) -> bool:
-        """Whether a frame that has spent so much has no room for what usually takes so much more."""
+        """Return whether an effect's usual cost exceeds the rest of the frame's budget."""
         if self._seconds is not None and seconds + usual.seconds > self._seconds:
             return True
         return self._visits is not None and visits + usual.visits > self._visits
@@ -182,7 +191,10 @@ def _vector(place: Vec) -> tuple[float, float, float]:
 
 
 def _touched(hits: list[Hit], there: Vec) -> list[Touched]:
-    """What stopped a frame's motions, each place once. there: for what has no place of its own."""
+    """Return what stopped a frame's motions, each position once.
+
+    there: for a hit without a position.
+    """
     found: dict[Any, Touched] = {}
     for hit in hits:
         place = _vector(there if hit.cloud is None else hit.cloud)
@@ -192,7 +204,7 @@ def _touched(hits: list[Hit], there: Vec) -> list[Touched]:
 
 
 def _moved(frame: Frame, unknown: bool) -> Moved:
-    """Return what came of a frame. unknown: as `Moved` has it."""
+    """Return the answer for a frame. unknown: as in `Moved`."""
     x, y, z = frame.left.tolist()
     return Moved(
         pose=frame.pose[None].copy(),
@@ -207,7 +219,7 @@ def _moved(frame: Frame, unknown: bool) -> Moved:
 
 
 def make_pipeline(file: SceneFile, world: World) -> Pipeline:
-    """The pipeline of a scene: each effect it declares is imported, and made of what the file says of it."""
+    """Create the pipeline of a scene: import each declared effect and create its runner."""
     declared = {effect_name(effect): effect for effect in file.effects}
     runners: list[Runner] = [
         importlib.import_module(f".{name}", __package__).make(declared[name], world)

@@ -1,6 +1,7 @@
-"""`proximity`: how near the nearest scan point is, where, and the way out, each frame: for haptics and warnings.
+"""Effect `proximity`: report the nearest scan point and the contact normal.
 
-Of the scene as scanned; users and dynamic objects are not in it.
+It reports each frame, for haptics and warnings, on the scene as scanned; users and dynamic objects
+are not included.
 """
 
 from typing import Any
@@ -12,25 +13,28 @@ from .frame import Frame
 
 
 def make(effect: Proximity, world: Any) -> "ProximityRunner":
-    """The effect of a scene."""
+    """Create the effect of a scene."""
     return ProximityRunner(effect.reach)
 
 
 class ProximityRunner:
-    """Reports what `distance` answers at the frame's pose, with witnesses where something is within reach."""
+    """Effect that reports the answer of `distance` at the frame's pose.
+
+    The report has witnesses where something is within reach.
+    """
 
     name = "proximity"
 
     def __init__(self, reach: float) -> None:
-        """reach: farthest worth saying [m]."""
+        """Create the effect. reach: largest distance to report [m]."""
         self._reach = reach
 
     def run(self, frame: Frame) -> None:
-        """Look, and report."""
+        """Search, and write the report."""
         frame.reports[self.name] = self._report(frame)
 
     def _report(self, frame: Frame) -> ProximityReport:
-        """What is to be said. Where not all in reach could be looked at, of the nearest pair known, and `unknown`."""
+        """Return the report; after an incomplete search, the nearest pair known, with `unknown`."""
         answers = nearest(frame, self._reach)
         if answers is None:
             return ProximityReport()

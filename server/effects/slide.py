@@ -1,17 +1,20 @@
-"""`slide`: what is left of a stopped motion goes along the surface touched, several of them, creases and corners.
+"""Effect `slide`: continue a stopped motion along the surfaces touched, their creases and corners.
 
-Collide and slide with the planes of a frame: what is left of the translation is clipped against every surface met in
-it, so that the way goes into none of them; along the crease of two, and nowhere between three. It never goes against
-the wish, and never farther than what was left: no energy appears.
+This is collide and slide with the planes of a frame. The remaining translation is clipped against
+every surface met in it, so that the way goes into none of them: along the crease of two, and
+nowhere between three. It never goes against the motion command, and never farther than the
+remainder: no energy appears.
 
-A surface is a plane by the smoothed normal of the scan points around the one that was touched. The scan's spheres make
-a flat wall bumpy, by up to their radius: where the plane is one that the frame has met already, a bump is in the way.
-The avatar goes off the surface by a few millimetres, and on; that counts where it led farther along the wish. So each
-frame of one wish gains on the one before or changes nothing, and nobody who pushes on trembles for ever. Nearly head
-on, what is left along a surface is mostly what the normal is off: who pushes so stays, as by friction (STICK).
+A surface is a plane with the smoothed normal of the scan points around the one that was touched.
+The scan's spheres make a flat wall bumpy, by up to their radius. If the frame has already met the
+same plane, a bump is in the way. The avatar then moves off the surface by a few millimetres, and
+on; the result is kept if it led farther along the motion command. Each frame of one motion command
+therefore improves on the previous one or changes nothing, and an avatar that keeps pushing does not
+tremble for ever. For a nearly head-on push, the remainder along a surface is mostly the error of
+the normal: the avatar then stays, as by friction (STICK).
 
-Turning: the wish's screw motion is tried first; what is left of its translation slides at the orientation reached, and
-then what is left of the turn is tried on the spot.
+For turns, the screw motion of the motion command is tried first. The rest of its translation slides
+at the orientation reached. Then the rest of the turn is tried on the spot.
 """
 
 import math
@@ -26,39 +29,46 @@ from ..vectors import dot, size
 from ..world import World
 from .frame import Frame, Hit, Vec, moved_by
 
-# Of what is left, a smaller share along the surfaces is not gone: 6 degrees off head on, or less. Smoothed normals are
-# off by a few: at 0.02 an avatar pushed straight at a flat wall crept along it.
+# A smaller share of the remainder along the surfaces is not followed: 6 degrees off head on, or
+# less. Smoothed normals are off by a few degrees: at 0.02, an avatar pushed straight at a flat wall
+# crept along it.
 STICK = 0.1
-# Nor is a shorter way [m]: an avatar in a corner would tremble.
+# A shorter way is not followed either [m]: an avatar in a corner would tremble.
 LEAST_SLIDE = 5e-5
-# Normals so close are of one plane: 8 degrees.
+# Normals this close belong to one plane: 8 degrees.
 SAME_PLANE = 0.99
-# Off a surface with a bump, as multiples of `skin`, one after the other, and at least so far [m].
+# Distances to move off a surface with a bump, as multiples of `skin`, tried in turn, and the least
+# distance [m].
 LIFTS, LEAST_LIFT = (1.0, 3.0), 5e-4
-# Over it counts what leads so much farther along the wish, as a share of the way.
+# Moving over a bump counts if it leads this much farther along the motion command, as a share of
+# the way.
 GAIN = 1e-3
-# Motions of a frame for each surface: bumps take some, too.
+# Motions of a frame for each surface: bumps take some of them.
 _MOTIONS = 2
-# A way that goes into a surface by no more than rounding, as a share of it, does not.
+# A way that goes into a surface by no more than this share of itself, its rounding, does not go
+# into it.
 _ROUNDING = 1e-9
 
 
 class Sliding:
-    """The effect of one scene. surfaces, normal_reach: as `Slide` has them."""
+    """Effect `slide` of one scene. surfaces, normal_reach: of `Slide`."""
 
     name = "slide"
 
     def __init__(
         self, surfaces: int, normal_reach: float, skin: float, slope: float | None, world: World
     ) -> None:
-        """skin: of `stop` [m].  slope: what is steeper is a wall [degrees]; None: there is no ground."""
+        """Create the effect.
+
+        skin: of `stop` [m].  slope: anything steeper is a wall [degrees]; None: there is no ground.
+        """
         self._lift = max(skin, LEAST_LIFT)
         self.surfaces, self.normal_reach = surfaces, normal_reach
         self._up = world.up
         self._walkable = None if slope is None else math.cos(math.radians(slope))
 
     def run(self, frame: Frame) -> None:
-        """Slide, and turn on the spot."""
+        """Slide, then turn on the spot."""
         hit = frame.blocked
         if hit is None or frame.go is None:
             return
@@ -66,7 +76,8 @@ class Sliding:
         wish, left = frame.wish[:3, 3] - begin, frame.wish[:3, 3] - frame.pose[:3, 3]
         far = size(left)
         if far > 0.0:
-            # Who turns goes by an arc: with all that is left it could get farther than it wished.
+            # A turning avatar moves along an arc: with the whole remainder it could get farther
+            # than commanded.
             left = left * min(1.0, max(0.0, size(wish) - size(frame.pose[:3, 3] - begin)) / far)
             self.along(frame, hit, left, wish, upright=True)
         if frame.pose[:3, :3].tobytes() != frame.wish[:3, :3].tobytes():
@@ -76,10 +87,11 @@ class Sliding:
         frame.left = frame.wish[:3, 3] - frame.pose[:3, 3]
 
     def along(self, frame: Frame, hit: Hit, left: Vec, wish: Vec, *, upright: bool) -> Hit | None:
-        """Go on along what ended a motion. left: of its translation, wish: all of it (3,) [m].
+        """Continue along what ended a motion.
 
-        upright: what is too steep to be walked is a wall, where there is ground. Returns what ended it in the end;
-        None: nothing did.
+        left: (3,), the rest of its translation.  wish: (3,), the whole translation [m].  upright:
+        treat what is too steep to walk on as a wall, where there is ground. Returns what ended the
+        motion finally, or None.
         """
         assert frame.go is not None
         start, most = frame.pose[:3, 3] - (wish - left), size(wish)
@@ -118,10 +130,10 @@ class Sliding:
         return ended
 
     def _over(self, frame: Frame, out: Vec, way: Vec, wish: Vec, start: Vec) -> tuple[bool, Hit | None]:
-        """Go on along a surface that was met, over a bump of it: off it a little, then on.
+        """Move over a bump of a surface that was met: off it a little, then on.
 
-        out: (3,) its normal.  start: (3,) where the wish began. Whether that led farther along the wish, and what
-        ended it; else all is as it was.
+        out: (3,), its normal.  start: (3,), where the motion command began. Returns whether that
+        led farther along the motion command, and what ended it; otherwise everything is as before.
         """
         assert frame.go is not None
         before, hits, ended = frame.pose, len(frame.hits), None
@@ -139,7 +151,7 @@ class Sliding:
         return False, ended
 
     def _surface(self, frame: Frame, hit: Hit, *, upright: bool) -> Vec | None:
-        """The plane that was met, by its unit normal, noted; None: none that is known."""
+        """Return the unit normal of the plane that was met, stored in the hit; None if unknown."""
         if hit.verdict == Verdict.UNKNOWN or hit.avatar is None or hit.cloud is None:
             return None
         normal: Vec | None = frame.world.normal(hit, self.normal_reach)
@@ -154,7 +166,7 @@ class Sliding:
         return self._wall(normal) if upright else normal
 
     def _wall(self, normal: Vec) -> Vec:
-        """A plane as it is to who has weight: what is too steep to be walked is upright."""
+        """Return a plane as a walking avatar meets it: vertical if too steep to walk on."""
         rises = dot(normal, self._up)
         if self._walkable is None or rises >= self._walkable:
             return normal
@@ -164,7 +176,7 @@ class Sliding:
 
 
 def within(gone: Vec, way: Vec, most: float) -> Vec:
-    """A way (3,), shortened so that it ends within `most` of where what is `gone` (3,) began [m]."""
+    """Shorten a way (3,) so that it ends within `most` of the beginning of `gone` (3,) [m]."""
     a, b, c = dot(way, way), dot(gone, way), dot(gone, gone) - most * most * (1.0 - 1e-12)
     if a + 2.0 * b + c <= 0.0:
         return way
@@ -175,9 +187,10 @@ def within(gone: Vec, way: Vec, most: float) -> Vec:
 
 
 def clip(left: Vec, planes: list[Vec]) -> Vec | None:
-    """The part of a way (3,) that goes into none of the planes (unit normals, on the free side), as long as may be.
+    """Return the longest part of a way (3,) that goes into none of the planes.
 
-    All of it; else along one plane; else along the crease of two; None: there is none.
+    planes: unit normals, on the free side. The part is the whole way, else along one plane, else
+    along the crease of two; None if there is none.
     """
     least = -_ROUNDING * size(left)
 
@@ -200,7 +213,7 @@ def clip(left: Vec, planes: list[Vec]) -> Vec | None:
 
 
 def make(effect: Slide, world: World) -> Sliding:
-    """The effect of a scene."""
+    """Create the effect of a scene."""
     slope = next((each.slope for each in world.file.effects if isinstance(each, Ground)), None)
     with world as seen:
         warm(seen[0].data)

@@ -1,8 +1,9 @@
-"""`step`: what is no higher than `height` is climbed, and descended without a fall.
+"""Effect `step`: climb what is no higher than `height`, and descend without a fall.
 
-Who stands and was stopped goes up by `height`, as far as nothing is touched, forward by what was left of the wish, and
-down. That is kept where it led farther along the wish than sliding did, ends on ground, and rose by no more than
-`height`; else all is as it was. Descending is `ground`'s: it looks so far down for what to stand on.
+An avatar that stands and was stopped moves up by `height`, as far as nothing is touched, forward by
+the rest of the motion command, and down. The result is kept if it led farther along the motion
+command than sliding did, ends on ground, and rose by no more than `height`; otherwise everything is
+as before. `ground` does the descending: it searches that far down for ground.
 """
 
 from ...schemas.effects import Ground, Step
@@ -13,12 +14,12 @@ from .going import LEAST_WAY
 from .ground import DEAD_BAND, Grounded
 from .ground import make as make_ground
 
-# It must lead so much farther than sliding [m], and so large a share of what was left.
+# The climb must lead this much farther than sliding [m], and by this share of the remainder.
 _FARTHER, _SHARE = 2e-4, 0.02
 
 
 class Stepping:
-    """The effect of one scene."""
+    """Effect `step` of one scene."""
 
     name = "step"
 
@@ -26,7 +27,7 @@ class Stepping:
         self._height, self._ground = height, ground
 
     def run(self, frame: Frame) -> None:
-        """Climb what stopped the wish, if it can be climbed."""
+        """Climb what stopped the motion command, if possible."""
         hit, met = frame.blocked, frame.met
         if hit is None or met is None or not frame.body.on_ground or hit.cloud is None:
             return
@@ -54,10 +55,13 @@ class Stepping:
         del frame.hits[hits:]
 
     def _climb(self, frame: Frame, along: Vec, length: float, least: float) -> float | None:
-        """Up, forward and down from frame.pose. Returns how far it rose [m], None: not onto ground, or too far."""
+        """Move up, forward and down from frame.pose.
+
+        Returns how far it rose [m], None: not onto ground, or too far.
+        """
         assert frame.go is not None
         up, begin, start = frame.world.up, frame.body.pose[:3, 3], frame.pose
-        self._ground.slide(frame, self._height * up)  # beside a riser the way up leads by its bumps
+        self._ground.slide(frame, self._height * up)  # beside a riser, its bumps are in the way up
         rose = self._rise(start, frame.pose, up)
         if rose < LEAST_WAY:
             return None
@@ -71,7 +75,7 @@ class Stepping:
         if rose - lower > self._height + DEAD_BAND:
             return None
         self._ground.lower(frame, below, lower)
-        # Down beside something it may have been led back.
+        # On the way down beside something, the avatar may have been led back.
         if dot(frame.pose[:3, 3] - begin, along) < least:
             return None
         return self._rise(start, frame.pose, up)
@@ -82,6 +86,6 @@ class Stepping:
 
 
 def make(effect: Step, world: World) -> Stepping:
-    """The effect of a scene."""
+    """Create the effect of a scene."""
     ground = next(each for each in world.file.effects if isinstance(each, Ground))
     return Stepping(effect.height, make_ground(ground, world))

@@ -1,12 +1,13 @@
-"""`stop`: what is touched blocks; the avatar stays at the last clear pose.
+"""Effect `stop`: touched things block; the avatar stays at the last clear pose.
 
-Alone it is discrete: the wish is taken where nothing is touched there, and else the avatar stays where it is. With
-`sweep` it goes as far as it can.
+Alone it is discrete: the commanded pose is taken if nothing is touched there, and otherwise the
+avatar stays where it is. With `sweep`, it moves as far as it can.
 
-An avatar that touches something before it goes (it was put there, or what it stands in is served anew) gets free first:
-by its wish, where that does not go deeper into the deepest contact, or by the shortest of a few ways, out of that and
-up, of at most MOST_FREE, whose end is clear. What lies between is not asked: an avatar in a wall has no clear side to
-keep to. Where none is clear it stays, and the verdict says so.
+An avatar that touches something before it moves (because it was placed there, or the archive was
+hot-reloaded) gets free first. It moves by the motion command, if that does not go deeper into the
+deepest contact, or by the shortest of a few ways, along the contact normal and up, of at most
+MOST_FREE, whose end is clear. What lies between is not tested: an avatar in a wall has no clear
+side to stay on. If no end is clear, it stays, and the verdict says so.
 """
 
 from ...schemas.answers import Verdict
@@ -16,22 +17,22 @@ from ..world import World
 from .frame import Frame, Hit, Pose, Vec, moved_by
 from .going import gives_way, is_clear, note, set_out, touched_at
 
-# How far an avatar gets free by itself [m], and the ways it tries.
+# How far an avatar gets free by itself [m], and the distances it tries.
 MOST_FREE = 0.5
 _WAYS = (0.005, 0.01, 0.02, 0.04, 0.08, 0.16, 0.32, MOST_FREE)
 
 
 class Stopping:
-    """The effect of one scene."""
+    """Effect `stop` of one scene."""
 
     name = "stop"
 
     def __init__(self, continuous: bool) -> None:
-        """continuous: `sweep` goes for the wish."""
+        """Create the effect. continuous: `sweep` follows the motion command."""
         self._continuous = continuous
 
     def run(self, frame: Frame) -> None:
-        """Begin clear; without `sweep`, go for the wish."""
+        """Begin clear; without `sweep`, move to the commanded pose."""
         frame.go = go
         frame.clear = frame.body.clear and frame.body.generations == frame.generations
         if not frame.clear:
@@ -41,7 +42,7 @@ class Stopping:
 
 
 def go(frame: Frame, to: Pose) -> Hit | None:
-    """Be at a pose, where nothing is touched there."""
+    """Move to a pose if nothing is touched there; return what is touched."""
     if frame.pose.tobytes() == to.tobytes():
         return None
     hit = touched_at(frame, to)
@@ -57,7 +58,7 @@ def go(frame: Frame, to: Pose) -> Hit | None:
 
 
 def get_free(frame: Frame) -> None:
-    """Leave what is touched at frame.pose, if anything is, and a clear pose is near."""
+    """Leave what is touched at frame.pose, if anything is, for a near clear pose."""
     hit = touched_at(frame, frame.pose)
     frame.clear = hit is None
     if hit is None:
@@ -71,7 +72,7 @@ def get_free(frame: Frame) -> None:
 
 
 def _ways(frame: Frame, hit: Hit) -> list[Vec]:
-    """The ways to get free, shortest first."""
+    """Return the ways to get free, shortest first."""
     directions: list[Vec] = [frame.world.up]
     wished = frame.wish[:3, 3] - frame.pose[:3, 3]
     deeper = False
@@ -88,5 +89,5 @@ def _ways(frame: Frame, hit: Hit) -> list[Vec]:
 
 
 def make(effect: Stop, world: World) -> Stopping:
-    """The effect of a scene."""
+    """Create the effect of a scene."""
     return Stopping(any(isinstance(each, Sweep) for each in world.file.effects))

@@ -1,7 +1,8 @@
-"""`sweep`: motion is continuous; nothing is passed through between two frames, however fast.
+"""Effect `sweep`: continuous motion; nothing is passed through between two frames at any speed.
 
-The way from one pose to the next is the screw motion of server/sweep.py. What it meets ends it `skin` before (`stop`),
-at a pose that is clear by `collide`: proved by the sweep where the pose is the sweep's bit for bit, else asked.
+The way from one pose to the next is the screw motion of server/sweep.py. What it meets ends it
+`skin` before (`stop`), at a pose that is clear by `collide`. The sweep proves that where the pose
+is the sweep's bit for bit; otherwise it is queried.
 """
 
 from ...schemas.effects import Stop, Sweep
@@ -9,12 +10,12 @@ from ..world import World
 from .frame import Frame, Hit, Pose
 from .going import first_hit, gives_way, note, set_out, settle, way_back
 
-# What gives way is pushed on so often at most in one motion.
+# Largest number of pushes of what gives way, in one motion.
 _PUSHES = 4
 
 
 class Sweeping:
-    """The effect of one scene. skin, tolerance: as `Stop` and `Sweep` have them."""
+    """Effect `sweep` of one scene. skin, tolerance: of `Stop` and `Sweep`."""
 
     name = "sweep"
 
@@ -22,12 +23,12 @@ class Sweeping:
         self.skin, self.tolerance = skin, tolerance
 
     def run(self, frame: Frame) -> None:
-        """Go for the wish."""
+        """Follow the motion command."""
         frame.go = self.go
         set_out(frame)
 
     def go(self, frame: Frame, to: Pose) -> Hit | None:
-        """Go towards a pose as far as nothing is touched."""
+        """Move towards a pose as far as nothing is touched; return what ended the motion."""
         hit: Hit | None = None
         for _ in range(_PUSHES):
             if frame.pose.tobytes() == to.tobytes():
@@ -45,6 +46,6 @@ class Sweeping:
 
 
 def make(effect: Sweep, world: World) -> Sweeping:
-    """The effect of a scene."""
+    """Create the effect of a scene."""
     skin = next(each.skin for each in world.file.effects if isinstance(each, Stop))
     return Sweeping(skin, effect.tolerance)

@@ -1,7 +1,8 @@
-"""`through`: named boxes where contact is ignored, such as a door known to open, or a portal.
+"""Effect `through`: named boxes where contact is ignored, such as a door or a portal.
 
-The scan points in them, borders included, are left out of what is served (server/left_out.py): every question answers
-as of a scan that never had them. No frame is asked anything, so this effect has no runner.
+A door is one that is known to open. The scan points in the boxes, borders included, are masked in
+what is served (server/left_out.py): every query answers as for a scan that never had them. This
+effect has no part in a frame and therefore no runner.
 """
 
 from functools import partial
@@ -14,10 +15,11 @@ from ..store import OpenStore, Store
 
 
 def store_without(effect: Through, pose: ArrayLike | None = None, normals: float | None = None) -> OpenStore:
-    """What opens an archive's folder without the points in the boxes, for `Scene.open(..., open_store=...)`.
+    """Return a function that opens an archive's folder without the points in the boxes.
 
-    pose: (4, 4) where the archive lies in the world, as boxes are world boxes; None: at the identity.  normals: as
-    `Store` takes it.
+    It is for `Scene.open(..., open_store=...)`.
+    pose: (4, 4), the archive's pose in the world, because boxes are in world coordinates; None: the
+    identity.  normals: as for `Store`.
     """
     boxes = [(box.low, box.high) for box in effect.boxes]
     return partial(Store, open_archive=partial(LeftOut, boxes=boxes, pose=pose), normals=normals)

@@ -1,6 +1,7 @@
-"""`uncertainty`: how probable contact is, each frame, where scans measure ranges with some noise.
+"""Effect `uncertainty`: report the probability of contact, for scans with range noise.
 
-server/uncertainty.py says what is assumed. Of the scene as scanned; users and dynamic objects are not in it.
+server/uncertainty.py states the assumptions. It reports each frame, on the scene as scanned; users
+and dynamic objects are not included.
 """
 
 from collections import Counter
@@ -25,12 +26,12 @@ from ..uncertainty import FARTHEST, each_alone, together
 from .apart import nearest, surely_farther
 from .frame import Frame
 
-# Names told in an error.
+# Number of names listed in an error message.
 TOLD = 8
-# A margin is rounded to exact units: one more, so that nothing within four sigma is left out.
+# A margin is rounded to exact units: one unit more, so that nothing within four sigma is omitted.
 UNIT = 1.0 / UNITS_PER_METRE
 
-# What a source may be called, shortest first: a later one tells apart what an earlier one does not.
+# Names of a source, shortest first: a later one distinguishes sources that an earlier one does not.
 _NAMES: tuple[Callable[[SourceInfo], str], ...] = (
     lambda source: PurePath(source.path).name,
     lambda source: source.path,
@@ -39,8 +40,11 @@ _NAMES: tuple[Callable[[SourceInfo], str], ...] = (
 
 
 def scan_names(sources: Sequence[SourceInfo]) -> list[str]:
-    """What each source is called in reports: its file's name; where others have it too, its path; where it is one scan
-    of several in a file, with its place in it."""
+    """Return the name of each source in reports.
+
+    It is the file's name; where others share it, the path; for one scan of several in a file, the
+    path with its index.
+    """
     counts = [Counter(name(source) for source in sources) for name in _NAMES]
     return [
         next(
@@ -52,13 +56,19 @@ def scan_names(sources: Sequence[SourceInfo]) -> list[str]:
 
 
 def _called(effect: Uncertainty, source: SourceInfo) -> float | None:
-    """The standard deviation [m] that `scans` gives a source, by the longest of its names; None: none."""
+    """Return the standard deviation [m] that `scans` gives a source, or None.
+
+    The longest of its names decides.
+    """
     own = [effect.scans[name(source)] for name in reversed(_NAMES) if name(source) in effect.scans]
     return own[0] if own else None
 
 
 def check(effect: Uncertainty, *infos: SceneInfo) -> None:
-    """BadRequestError where a name in `scans` is that of no scan. infos: of the scene's archives."""
+    """Raise BadRequestError if a name in `scans` belongs to no scan.
+
+    infos: of the scene's archives.
+    """
     sources = [source for info in infos for source in info.sources if not source.fault]
     names = {name(source) for source in sources for name in _NAMES}
     for name in effect.scans:
@@ -72,10 +82,11 @@ def check(effect: Uncertainty, *infos: SceneInfo) -> None:
 
 
 class Scans(NamedTuple):
-    """The scans of one archive. sigmas: [m], by their rows in `SceneInfo.sources`.  names: of each row, in reports.
+    """Scans of one archive.
 
-    one: the only one there is, or ANY_SCAN, where the archive does not say which scan a point is of, and one sigma
-    holds for all; None: it does.
+    sigmas: [m], by their rows in `SceneInfo.sources`.  names: of each row, in reports.
+    one: the only scan, or ANY_SCAN where the archive does not store the scan of a point, and one
+    sigma holds for all; None: it stores it.
     """
 
     sigmas: dict[int, float]
@@ -84,14 +95,14 @@ class Scans(NamedTuple):
 
 
 class Known(NamedTuple):
-    """The scans of each archive of a world, of these generations."""
+    """Scans of each archive of a world, of these generations."""
 
     generations: tuple[int, ...]
     scans: list[Scans]
 
 
 def scans_of(effect: Uncertainty, info: SceneInfo, keeps_scan: bool) -> Scans:
-    """The scans of an archive. keeps_scan: whether it says which scan each point is of."""
+    """Return the scans of an archive. keeps_scan: whether it stores the scan of each point."""
     sigmas, live = {ANY_SCAN: effect.sigma}, []
     for number, source in enumerate(info.sources):
         if not source.fault:
@@ -103,7 +114,7 @@ def scans_of(effect: Uncertainty, info: SceneInfo, keeps_scan: bool) -> Scans:
 
 
 def make(effect: Uncertainty, world: Any) -> "UncertaintyRunner":
-    """The effect of a scene. BadRequestError as `check`."""
+    """Create the effect of a scene. Raises BadRequestError as `check` does."""
     with world as seen:
         check(effect, *(each.placed.scene.info() for each in seen))
         for each in seen:
@@ -113,25 +124,28 @@ def make(effect: Uncertainty, world: Any) -> "UncertaintyRunner":
 
 
 def _warm(data: SceneData) -> None:
-    """Have the kernel compiled, before anybody waits for it: a frame gets to it only where something is near."""
+    """Compile the kernel before the first request needs it.
+
+    Without this, it would be compiled in the first frame in which something is near.
+    """
     nowhere = np.eye(4)
     nowhere[:3, 3] = MAX_COORDINATE / 2
     gaps_by_scan(data, make_avatar([[0.0, 0.0, 0.0]], 0.1), nowhere, 0.0, 1)
 
 
 class UncertaintyRunner:
-    """Reports the probability of contact at the frame's pose."""
+    """Effect that reports the probability of contact at the frame's pose."""
 
     name = "uncertainty"
 
     def __init__(self, effect: Uncertainty, world: Any) -> None:
-        """world: whose scans there are; after a reload, others."""
+        """Create the effect. world: provides the scans, which change with a hot reload."""
         self._effect = effect
         self._margin = FARTHEST * max(effect.sigma, *effect.scans.values(), 0.0)
         self._known = self._scans_of(world)
 
     def _scans_of(self, world: Any) -> Known:
-        """The scans of each archive, as they are now."""
+        """Return the current scans of each archive."""
         with world as seen:
             return Known(
                 world.generations(),
@@ -139,11 +153,11 @@ class UncertaintyRunner:
             )
 
     def run(self, frame: Frame) -> None:
-        """Look, and report."""
+        """Search, and write the report."""
         frame.reports[self.name] = self._report(frame)
 
     def _report(self, frame: Frame) -> UncertaintyReport:
-        """What is to be said: at least so probable, where not all in reach could be looked at."""
+        """Return the report; after an incomplete search, its probability is a lower bound."""
         answers = nearest(frame, self._margin)
         if surely_farther(answers, self._margin):
             return UncertaintyReport(0.0)
@@ -156,7 +170,7 @@ class UncertaintyRunner:
                 known = self._known = self._scans_of(frame.world)
             for archive, (each, scans) in enumerate(zip(seen, known.scans, strict=True)):
                 if scans.one is not None and len(known.scans) == 1 and answers is not None:
-                    # The nearest pair of all is that of the only scan.
+                    # The nearest pair of all belongs to the only scan.
                     gaps, all_seen = {scans.one: float(answers.signed_distance[0])}, bool(answers.exact[0])
                 else:
                     gaps, all_seen = self._gaps(frame, each, scans)
@@ -170,7 +184,10 @@ class UncertaintyRunner:
         return UncertaintyReport(together(alone), named, not exact)
 
     def _gaps(self, frame: Frame, each: Any, scans: Scans) -> tuple[dict[int, float], bool]:
-        """The least signed gap [m] of each scan of an archive that is within the margin, and whether all was seen."""
+        """Return the least signed separation [m] of each scan of an archive within the margin.
+
+        Also returns whether the search was complete.
+        """
         inverse, avatar, margin = each.placed.inverse, frame.body.avatar, self._margin + UNIT
         pose = frame.pose if inverse is None else under(inverse, frame.pose[None])[0]
         if scans.one is None:

@@ -1,21 +1,24 @@
-"""Where a ray meets the first sphere of the scan. What decides is a formula of the ray and one point alone.
+"""First sphere of the scan that a ray meets, decided by a formula of the ray and one point alone.
 
-The definition, which no tree, order, voxel size or thread can change. All lengths are exact units of 2^-26 m, from
-the dataset's origin O. The ray starts at o = rint((origin - O) 2^26), int64, half to even; its direction u is the one
-given, divided by its largest component and then by the root of (x x + y y) + z z, float64. A scan point b is as in
-NUMERICS.md N5, r the radius of its own sphere, and d = b - o in int64, exact in float64 within any reach allowed. Then
+Definition. No tree, order, voxel size or thread can change it. All lengths are exact units of
+2^-26 m, from the dataset's origin O. The ray starts at o = rint((origin - O) 2^26), int64, half to
+even. Its direction u is the given one, divided by its largest component and then by the root of (x
+x + y y) + z z, float64. A scan point b is as in NUMERICS.md N5, r is the radius of its own sphere,
+and d = b - o in int64, which is exact in float64 within any permitted reach. Then
 
 - |d|^2 <= r^2 in int64: the ray starts inside, t = 0;
-- else, in float64 in the order written: s = (dx ux + dy uy) + dz uz; the sphere lies behind unless s > 0;
-  m = |d x u| = the root of (cx cx + cy cy) + cz cz, cx = dy uz - dz uy, cy = dz ux - dx uz, cz = dx uy - dy ux;
-  m > r: missed; else t = max(s - the root of ((r - m) (r + m)), 0).
+- else, in float64 in the order written: s = (dx ux + dy uy) + dz uz; the sphere lies behind unless
+  s > 0; m = |d x u| = the root of (cx cx + cy cy) + cz cz, cx = dy uz - dz uy, cy = dz ux - dx uz,
+  cz = dx uy - dy ux; m > r: missed; else t = max(s - the root of ((r - m) (r + m)), 0).
 
-It is a hit when t <= reach; the first is that of least t, of equal ones that of the least point (x, y, z). The cross
-product does not cancel as the textbook's b^2 - 4ac does. Against the ideal (exact o, b, r and the direction as given) m
-and s are off by less than 2^-49 |d|, so no sphere is judged wrongly unless the ray passes its surface within that,
-0.01 units at 100 km; and t is off by less than 2^-48 |d| + sqrt(2^-47 r |d|), the second where the ray grazes.
+It is a hit when t <= reach. The first hit is that of least t; among equal ones, that of the least
+point (x, y, z). The cross product does not cancel as the textbook's b^2 - 4ac does. Compared with
+the ideal (exact o, b, r and the direction as given), m and s are off by less than 2^-49 |d|. No
+sphere is therefore judged wrongly unless the ray passes its surface within that, 0.01 units at 100
+km. t is off by less than 2^-48 |d| + sqrt(2^-47 r |d|), the second term where the ray grazes.
 
-Everything else here prunes and never decides: node bounds in float64, 32 points at a time in float32, both inflated.
+Everything else here prunes and never decides: node bounds in float64, 32 points at a time in
+float32, both inflated.
 """
 
 import math
@@ -32,13 +35,16 @@ from .placed import U32
 from .placing import lattice_to_units
 from .stopping import stopped
 
-# Siblings left behind by a descent of one tree.
+# Siblings that a descent of one tree leaves on the stack.
 STACK = MAX_LEVELS * 15 + 16
 
 
 class Rays(NamedTuple):
-    """k rays. origin: (k, 3) int64, direction: (k, 3) float64 unit vectors.  reach, radius: int64, radius of the
-    scan's largest sphere; exact units."""
+    """Rays, k of them.
+
+    origin: (k, 3) int64.  direction: (k, 3) float64 unit vectors.  reach, radius: int64, radius of
+    the scan's largest sphere; exact units.
+    """
 
     origin: NDArray[np.int64]
     direction: NDArray[np.float64]
@@ -47,11 +53,13 @@ class Rays(NamedTuple):
 
 
 class Nearest(NamedTuple):
-    """The best found so far of k rays or points, and what it took.
+    """Best results so far of k rays or points, and their cost.
 
-    value: (k,) float64, t of a ray, exact units, inf: none; for points unused.  square: (k,) int64, of points, -1:
-    none; for rays unused.  lattice: (k, 3) int64 [steps].  unseen: (k,) float64, exact units: nothing nearer than
-    this was passed over.  counts: (3, k) uint32, voxels missing, node visits, point tests.
+    value: (k,) float64, t of a ray, exact units, inf: none; unused for points.
+    square: (k,) int64, of points, -1: none; unused for rays.
+    lattice: (k, 3) int64 [steps].
+    unseen: (k,) float64, exact units: nothing nearer than this was skipped.
+    counts: (3, k) uint32, voxels missing, node visits, point tests.
     """
 
     value: NDArray[np.float64]
@@ -63,10 +71,13 @@ class Nearest(NamedTuple):
 
 @borrowing
 def first_meeting(dx, dy, dz, ux, uy, uz, radius):
-    """t of one ray and one sphere by the definition above, inf when missed. dx, dy, dz, radius: int64 units."""
+    """Return t of one ray and one sphere by the definition above, inf when missed.
+
+    dx, dy, dz, radius: int64 units.
+    """
     inside = (
         abs(dx) <= radius and abs(dy) <= radius and abs(dz) <= radius
-    )  # else squares might not fit 63 bits
+    )  # otherwise squares might not fit 63 bits
     if inside and dx * dx + dy * dy + dz * dz <= radius * radius:
         return 0.0
     x, y, z, r = np.float64(dx), np.float64(dy), np.float64(dz), np.float64(radius)
@@ -82,11 +93,12 @@ def first_meeting(dx, dy, dz, ux, uy, uz, radius):
 
 @borrowing
 def _meet_node(words, row, ray, radius, limit):
-    """Lower bound of t [steps] for the spheres of a node's points, inf when none is met before `limit`.
+    """Return a lower bound of t [steps] for the spheres of a node's points, inf if none is met.
 
-    ray: (12,) float64: origin from the voxel's low corner, direction, and two more axes of its frame.  radius: of the
-    largest sphere below, inflated by what this function rounds. The ray is clipped by the node's sphere, then by its
-    slab.
+    limit: spheres beyond it count as not met.
+    ray: (12,) float64: origin relative to the voxel's low corner, direction, and two more axes of
+    its frame.  radius: of the largest sphere below, inflated by the rounding of this function. The
+    ray is clipped by the node's sphere, then by its slab.
     """
     dx, dy, dz = words[row] - ray[0], words[row + 1] - ray[1], words[row + 2] - ray[2]
     a = dx * ray[6] + dy * ray[7] + dz * ray[8]
@@ -118,10 +130,11 @@ def _meet_node(words, row, ray, radius, limit):
 
 @borrowing
 def _test_block(scene, voxel, row, ray, radius, rays, i, best):
-    """All points of a leaf node against ray i: 32 in float32, those within the band by the definition.
+    """Test all points of a leaf node against ray i: 32 in float32, those within the band exactly.
 
-    radius: as in `_meet_node`. Distances across the ray are of coordinates from the point of the ray nearest to the
-    node's centre, at most 3 (R + radius) large: their float32 rounding is below 64 U32 of R + radius + 1.
+    The definition decides within the band.  radius: as in `_meet_node`. Distances across the ray
+    are of coordinates relative to the point of the ray nearest to the node's centre, at most 3 (R +
+    radius) large. Their float32 rounding is below 64 U32 of R + radius + 1.
     """
     words, ints, halves = scene.words, scene.ints, scene.halves
     block = ~ints[row + FIRST]
@@ -177,7 +190,7 @@ def _test_block(scene, voxel, row, ray, radius, rays, i, best):
 
 @borrowing
 def is_less(x, y, z, other):
-    """Whether a lattice point comes before another (3,), by x, then y, then z."""
+    """Return whether a lattice point precedes another (3,), by x, then y, then z."""
     if x != other[0]:
         return x < other[0]
     if y != other[1]:
@@ -187,9 +200,13 @@ def is_less(x, y, z, other):
 
 @borrowing
 def _set_frame(ray, direction):
-    """Fill ray[3:12]: the direction and two unit vectors across it, off by a few roundings of float64."""
+    """Fill ray[3:12] with the direction and two perpendicular unit vectors.
+
+    They are off by a few roundings of float64.
+    """
     ux, uy, uz = direction[0], direction[1], direction[2]
-    # Across the axis the direction leans on least, so that the cross product is far from zero.
+    # Perpendicular to the axis the direction is least aligned with: the cross product is then far
+    # from zero.
     if abs(ux) <= abs(uy) and abs(ux) <= abs(uz):
         ax, ay, az = 0.0, uz, -uy
     elif abs(uy) <= abs(uz):
@@ -204,7 +221,7 @@ def _set_frame(ray, direction):
 
 @borrowing
 def push_sorted(rows, bounds, begin, depth, row, bound):
-    """Push a node onto a stack so that of entries [begin, depth] the least bound comes off first."""
+    """Push a node onto a stack whose entries [begin, depth] are popped by ascending bound."""
     at = depth
     while at > begin and bounds[at - 1] < bound:
         rows[at], bounds[at] = rows[at - 1], bounds[at - 1]
@@ -214,10 +231,10 @@ def push_sorted(rows, bounds, begin, depth, row, bound):
 
 @borrowing
 def _follow(scene, voxel, rays, i, ray, near, tolerance, visits, best, rows, bounds, drops):
-    """Follow ray i through the tree of one resident voxel, front to back; `best`, its counts included, is updated.
+    """Follow ray i through the tree of one resident voxel, front to back; update `best`.
 
-    drops: as `scene.drop`, float64 [steps].
-    near: exact units, as in Lists. What holds of a node holds of its children, so no bound gets worse with more visits.
+    drops: `scene.drop` in float64 [steps].  near: exact units, as in Lists. A bound of a node holds
+    for its children; no bound therefore gets worse with more visits.
     """
     words, ints = scene.words, scene.ints
     per_unit = 1.0 / scene.units_per_step
@@ -227,7 +244,8 @@ def _follow(scene, voxel, rays, i, ray, near, tolerance, visits, best, rows, bou
         from_corner = rays.origin[i, r] - lattice_to_units(corner, scene.units_per_step)
         ray[r] = np.float64(from_corner) * per_unit
         farthest = max(farthest, abs(ray[r]), abs(np.float64(corner)))
-    # Rounding to units, the voxel's corner and the point; float64 of all coordinates in here, with much to spare.
+    # Rounding to units, the voxel's corner and the point; float64 of all coordinates here, with a
+    # wide margin.
     error = 2.0 * per_unit + (farthest + scene.voxel_steps) * 2.0**-45
     largest = np.float64(rays.radius) * per_unit + error
     base, mask = scene.where[voxel, 0], np.uint64(drops.shape[0] - 1)
@@ -267,12 +285,13 @@ def _follow(scene, voxel, rays, i, ray, near, tolerance, visits, best, rows, bou
 
 @nb.njit(nogil=True, cache=True)
 def follow_rays(rays, lists, cursor, held, scene, tolerance, visits, best):
-    """Follow each ray along its list, from its cursor up to the first voxel that is not held: one call a round.
+    """Follow each ray along its list, from its cursor up to the first voxel that is not held.
 
-    lists: Lists of these rays.  cursor: (k,) int64, entries done; one at the end of its list is done altogether.
-    held: (v,) bool, voxels that stay as they are during this call; of these one not resident is counted as missing.
-    tolerance: exact units.  visits: node visits a ray. Updates cursor and best. Once the scene's stop flag is set, no
-    more visits are spent.
+    One call serves one round. Once the scene's stop flag is set, no more visits are spent.
+    lists: Lists of these rays.  cursor: (k,) int64, entries processed; a ray whose cursor is at the
+    end of its list is finished.  held: (v,) bool, voxels that do not change during this call; a
+    held voxel that is not resident is counted as missing.  tolerance: exact units.  visits: node
+    visits a ray. Updates cursor and best.
     """
     ray = np.empty(12)
     rows, bounds = np.empty(STACK, np.int64), np.empty(STACK)

@@ -1,27 +1,33 @@
-"""When does a moving avatar first touch a scene? Two hierarchies, one of them on its way ([Fig12] section 6, in time).
+"""First contact of a moving avatar with a scene: two hierarchies, one of them moving.
 
-Conservative advancement (Mirtich 1996; Zhang, Redon, Lee, Kim 2007; Tang, Kim, Manocha 2009, C2A), with what bounds
-an advance taken from the directions of the motion, not from a greatest speed: over an interval [t0, t1] every avatar
-point x is taken to go straight from a0 = M(t0) x to a1 = M(t1) x, in proportion to time, and one descent finds the
-first moment at which any straight-moving sphere could touch, and the first at which one must. Each pair has its own
-reach: where scan points have radius classes, spheres of several sizes are met by one descent, a subtree pruned by the
-largest sphere in it.
+This extends [Fig12] section 6 to time by conservative advancement (Mirtich 1996; Zhang, Redon, Lee,
+Kim 2007; Tang, Kim, Manocha 2009, C2A). The bound of an advance comes from the directions of the
+motion, not from a maximum speed. Over an interval [t0, t1], every avatar point x moves straight
+from a0 = M(t0) x to a1 = M(t1) x, in proportion to time. One descent finds the first moment at
+which any straight-moving sphere could touch, and the first at which one must. Each pair has its own
+reach: where scan points have radius classes, one descent handles spheres of several sizes, and a
+subtree is pruned by its largest sphere.
 
-Proof. Let a*(t) be the ideal motion of x, b a scan point, U the reach of these two, all in exact units.
- 1. |a*(t) - chord of a*| <= B (t1 - t0)^2 / 8, B the greatest |a*''| of any point (motion.py, `bend`).
+Proof. Let a*(t) be the ideal motion of x, b a scan point, U the reach of these two, all in exact
+units.
+ 1. |a*(t) - chord of a*| <= B (t1 - t0)^2 / 8, B the greatest |a*''| of any point (motion.py,
+    `bend`).
  2. A computed coordinate vector, at t, t0 and t1, lies within `slip` of a*.
- 3. Rounding to whole units moves a by at most sqrt(3) / 2, and b is a whole number.
-So |a - b|, as NUMERICS.md N5 has it under M(t), lies within `band` = sqrt(3) / 2 + B (t1 - t0)^2 / 8 + 2 slip of the
-distance D(t) from b to the chord. While D > U + band nothing touches; once D <= U - band the pair does. D is of a
-point on a line from a fixed one: both moments are roots of a quadratic, here taken from the point of closest approach,
-whose rounding is relative to the lengths and not to their squares. A node's sphere moves straight with its centre:
-|lerp(x) - lerp(c)| is convex in t, so never above the radius. Node pairs are pruned by the least distance of the
-centre's chord, up to the earliest certain contact found so far, in float32 with the error bound of placed.py enlarged
-by 32 half units in the last place of the chord.
+ 3. Rounding to whole units moves a by at most sqrt(3) / 2, and b is an integer.
+Therefore |a - b|, as NUMERICS.md N5 defines it under M(t), lies within `band` = sqrt(3) / 2 + B (t1
+- t0)^2 / 8 + 2 slip of the distance D(t) from b to the chord. While D > U + band nothing touches;
+once D <= U - band the pair touches. D is the distance of a point on a line from a fixed point: both
+moments are roots of a quadratic. They are computed from the point of closest approach, whose
+rounding is relative to the lengths and not to their squares. A node's sphere moves straight with
+its centre: |lerp(x) - lerp(c)| is convex in t and therefore never exceeds the radius. Node pairs
+are pruned by the least distance of the centre's chord, up to the earliest certain contact found so
+far, in float32 with the error bound of placed.py enlarged by 32 half units in the last place of the
+chord.
 
-The interval found is halved and quartered until its ends are within the tolerance, or until B (t1 - t0)^2 / 8 no
-longer counts beside rounding: what is undecided then is a graze. Which pairs are looked at in float64 may differ
-from tree to tree; what they give does not, and the least of it is taken: so no tree, voxel or order changes an answer.
+The resulting interval is halved and quartered until its ends are within the tolerance, or until B
+(t1 - t0)^2 / 8 is negligible beside rounding; what is undecided then is a graze. The pairs that are
+examined in float64 may differ from tree to tree. Their results do not, and the least result is
+taken: no tree, voxel or order therefore changes an answer.
 """
 
 import math
@@ -37,15 +43,18 @@ from .moving import ZERO, Chord, place_block, place_nodes
 from .placed import ONE_SLACK, SLACK, make_limits
 from .stopping import stopped
 
-# An interval whose sagitta is below this many units is not worth halving: rounding alone makes up 0.87 of the band.
+# Halving an interval whose sagitta is below this many units is useless: rounding alone contributes
+# 0.87 to the band.
 LEAST_SAGITTA = 0.25
 
 
 @borrowing
 def _nodes_meet(words, row, x, y, z, dx, dy, dz, inverse, radius, latest, room):
-    """Whether a sphere that goes from (x, y, z) by (dx, dy, dz) comes within `room`, reach and error together, of a
-    node's points before the fraction `latest` of that way, as far as its bound can tell: the sphere, then the slab.
-    All float32."""
+    """Return whether a moving sphere comes within `room` of a node's points, by the node's bounds.
+
+    The sphere moves from (x, y, z) by (dx, dy, dz); its way up to the fraction `latest` counts.
+    room: reach plus error. Tests the sphere, then the slab. All float32.
+    """
     wx, wy, wz = x - words[row], y - words[row + 1], z - words[row + 2]
     span = radius + room
     both = words[row + 3] + span
@@ -62,21 +71,22 @@ def _nodes_meet(words, row, x, y, z, dx, dy, dz, inverse, radius, latest, room):
 
 @borrowing
 def _latest(moving):
-    """The fraction of the chord that still matters, float32, rounded up."""
+    """Return the fraction of the chord that still matters, float32, rounded up."""
     return np.float32(min(moving.first[2] * (1.0 + 1e-6) + 1e-30, 1.0))
 
 
 @borrowing
 def _leaves(job, chord, voxel, block, row):
-    """Take all pairs of a leaf node of the avatar and one of the scene into account.
+    """Update moving.first with all pairs of a leaf node of the avatar and one of the scene.
 
-    As in overlap.py: avatar points against the node's bound, then against its points, each in one vector loop.
+    As in overlap.py: avatar points are tested against the node's bound, then against its points,
+    each in one vector loop.
     """
     scene, moving = job.scene, job.moving
     words, ints, halves = scene.words, scene.ints, scene.halves
     lanes, ways, keep, off = moving.lanes, moving.ways, moving.keep, moving.off
     limits, mask = moving.limits, np.uint64(scene.drop.shape[0] - 1)
-    largest = node_class(ints, row, mask)  # of the spheres in the scene's block
+    largest = node_class(ints, row, mask)  # class of the spheres in the scene's block
     room, far = limits[0, largest], limits[1, largest]
     latest = _latest(moving)
     cx, cy, cz = words[row] + off[0], words[row + 1] + off[1], words[row + 2] + off[2]
@@ -136,10 +146,10 @@ def _leaves(job, chord, voxel, block, row):
 
 @borrowing
 def _sweep_voxel(job, chord, voxel):
-    """Take one resident voxel into account: the two trees descended together, depth first.
+    """Update moving.first with one resident voxel by a joint descent, depth first.
 
-    Returns whether to go on: not when nothing can be earlier, when the visits are spent, or when the scene's stop flag
-    is set.
+    Returns whether to continue: not when nothing can be earlier, when the visits are spent, or when
+    the scene's stop flag is set.
     """
     avatar, scene, moving = job.avatar, job.scene, job.moving
     words, ints = scene.words, scene.ints
@@ -199,9 +209,10 @@ def _sweep_voxel(job, chord, voxel):
 
 @borrowing
 def search(job, t0, t1, rows):
-    """One descent over the interval [t0, t1], through the voxels `rows`; those not resident are passed by.
+    """Descend once over the interval [t0, t1], through those voxels of `rows` that are resident.
 
-    Fills moving.first and moving.pair. Returns (whether all was looked at, whether halving is of no use).
+    Fills moving.first and moving.pair. Returns (whether the search was complete, whether halving
+    the interval is useless).
     """
     motion, scene, moving = job.motion, job.scene, job.moving
     pose_at(motion, t0, moving.ends[0])

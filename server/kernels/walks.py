@@ -1,8 +1,8 @@
-"""The walks of all users in one array, and what they need of a scene, found in one call for all of them.
+"""Tracks of all users in one array, and the voxels they need, found in one call for all of them.
 
-walks: (u, WALK) float64, a user a row: COUNT of poses remembered, NEWEST of them, SINCE when it came or last teleported
-[s], REACH of the last pose [m], LAST its time [s]; from POSES on a ring of MOST_POSES poses, POSE words each: time [s]
-and place [m].
+walks: (u, WALK) float64, one user a row: COUNT of poses stored, NEWEST of them, SINCE, the time of
+the first pose or the last teleport [s], REACH of the last pose [m], LAST, its time [s]; from POSES
+on a ring buffer of MOST_POSES poses, POSE words each: time [s] and position [m].
 """
 
 import math
@@ -15,31 +15,38 @@ from ...schemas.kernels import compiling as nb
 from .ahead import Motion, predict_way, rows_ahead, rows_in_reach
 from .compiled import borrowing
 
-# Farther than this since the last pose is no motion but a teleport: a speed nobody walks, runs or is driven at indoors
-# [m/s], over the time passed but no longer than a second, and some slack for poses that come late and all at once [m].
+# A displacement since the last pose beyond this limit is a teleport, not a motion: a speed at which
+# nobody walks, runs or drives indoors [m/s], over the time passed but at most one second, plus some
+# slack for poses that arrive late and all at once [m].
 MOST_SPEED, MOST_PAUSE, SLACK = 15.0, 1.0, 1.0
-# Without a pose for this long a user is taken to stand where the last one was [s].
+# Without a pose for this long, a user is assumed to stand at the last one [s].
 STALE = 0.5
-# The least time between two poses that are remembered [s], and how many are: at 90 poses a second, more than half a
-# second. Of poses asked as fast as they are answered, most are passed over.
+# The least time between two stored poses [s], and the number of stored poses: at 90 poses a second,
+# more than half a second. If a client sends poses as fast as they are answered, most are dropped.
 LEAST_GAP, MOST_POSES = 0.005, 64
-# A reach is widened by this share of itself, and a step: by more than the rounding of what is done with it.
+# A reach is widened by this share of itself, and by one step: by more than the rounding of the
+# computations with it.
 WIDER = 1e-6
 # Straight pieces of a predicted way.
 PIECES = 16
-# Rows found before the soonest are taken, as a multiple of those: a piece's rows are found in an order of place.
+# Rows to find before the soonest are selected, as a multiple of those: the rows of a piece are
+# found in spatial order.
 SPARE = 4
 
 COUNT, NEWEST, SINCE, REACH, LAST, POSES, POSE = 0, 1, 2, 3, 4, 5, 4
 WALK = POSES + POSE * MOST_POSES
-# Of a hash table's places at most one in so many is taken; rows are spread over it by 2^32 over the golden ratio.
+# At most one in SPARSE places of a hash table is taken; rows are spread over it by 2^32 over the
+# golden ratio.
 SPARSE, SPREAD = 4, 2654435769
 
 
 class Look(NamedTuple):
-    """How to look ahead. horizon: [s].  ring: [m], for who came so long ago: settled [s].  most_wanted: rows a user.
+    """Parameters of the prediction.
 
-    origin: (3,), step: of the lattice [m].  voxel_steps: edge of a voxel.  motion: what bounds predictions.
+    horizon: [s].  ring: [m], for users who have been present for at least `settled` [s].
+    most_wanted: rows a user.
+    origin: (3,), step: of the lattice [m].  voxel_steps: edge of a voxel.  motion: limits of
+    predictions.
     """
 
     horizon: float
@@ -52,13 +59,14 @@ class Look(NamedTuple):
     motion: Motion
 
 
-# With the interpreter held: to give it up for a microsecond is to wait for whoever takes it.
+# This holds the interpreter lock: releasing it for a microsecond means waiting for the thread that
+# takes it.
 @nb.njit(cache=True)
 def note_pose(walks, user, now, x, y, z, reach):
-    """Remember a pose [s, m] of row `user`; whether it is a teleport, after which what was before says nothing.
+    """Store a pose [s, m] of row `user`; return whether it is a teleport.
 
-    A pose older than the last is passed over, unless it is so old that the clock must be another one: then it starts
-    afresh.
+    A teleport discards earlier poses. A pose older than the last is ignored, unless it is so old
+    that it must come from another clock; the track then starts afresh.
     """
     walk = walks[user]
     count, newest = int(walk[COUNT]), int(walk[NEWEST])
@@ -89,9 +97,9 @@ def note_pose(walks, user, now, x, y, z, reach):
 
 @nb.njit(cache=True)
 def note_poses(walks, users, times, centers, reaches, teleports):
-    """`note_pose` of n poses, one after another: users (n,) int64, times (n,), centers (n, 3), reaches (n,).
+    """Call `note_pose` for n poses, one after another.
 
-    Fills teleports (n,) bool.
+    users: (n,) int64.  times: (n,).  centers: (n, 3).  reaches: (n,). Fills teleports (n,) bool.
     """
     for i in range(users.shape[0]):
         teleports[i] = note_pose(
@@ -101,7 +109,7 @@ def note_poses(walks, users, times, centers, reaches, teleports):
 
 @borrowing
 def _poses_of(walk, poses):
-    """Fill the first of poses (MOST_POSES, 4) with those of a walk, in order of time; returns how many."""
+    """Copy the poses of a track to the first of poses (MOST_POSES, 4), by time; return how many."""
     count, newest = int(walk[COUNT]), int(walk[NEWEST])
     for i in range(count):
         at = POSES + POSE * ((newest - count + 1 + i) % MOST_POSES)
@@ -112,13 +120,16 @@ def _poses_of(walk, poses):
 
 @borrowing
 def _span(reach, step):
-    """A reach [m] in steps, widened by more than the rounding of what is done with it."""
+    """Convert a reach [m] to steps, widened by more than the rounding of its uses."""
     return reach / step * (1.0 + WIDER) + 1.0
 
 
 @borrowing
 def _place_of(row, table, mask):
-    """Where a row is in a hash table of rows, -1 where there is none, or would be."""
+    """Return the place of a row in a hash table of rows, or the free place where it belongs.
+
+    A free place holds -1.
+    """
     at = (row * SPREAD >> 16) & mask
     while table[at] >= 0 and table[at] != row:
         at = (at + 1) & mask
@@ -127,7 +138,7 @@ def _place_of(row, table, mask):
 
 @nb.njit(nogil=True, cache=True)
 def plan_walks(walks, now, look, index):
-    """What all users need of a scene: each row once, soonest first, equals in the order of users.
+    """Plan the rows that all users need: each row once, soonest first, ties in the order of users.
 
     Returns rows (n,) int64, need (n,) float64 [s from now], see `Wanted`; and the predicted ways
     (u, PIECES + 1, 3) [steps].
@@ -151,7 +162,8 @@ def plan_walks(walks, now, look, index):
         reach = _span(walk[REACH], step)
         found = rows_ahead(way, reach, ring / step, index, look.voxel_steps, own_rows, own_need)
         for i in range(min(found, look.most_wanted)):
-            # Around: beyond the horizon, by as much again for what is as far as the ring goes.
+            # For voxels around the start: beyond the horizon, up to twice the horizon at the outer
+            # edge of the ring.
             pieces = own_need[i]
             around = pieces > PIECES
             rows[wanted] = own_rows[i]
@@ -165,7 +177,10 @@ def plan_walks(walks, now, look, index):
 
 @nb.njit(nogil=True, cache=True)
 def merge_wanted(rows, need):
-    """Of rows (n,), need (n,), each row once and when it is needed first, soonest first; equals as they came."""
+    """Merge rows (n,), need (n,): each row once with its earliest need, soonest first.
+
+    Ties keep their order.
+    """
     size = 1
     while size < SPARSE * rows.shape[0]:
         size *= 2
@@ -189,7 +204,10 @@ def merge_wanted(rows, need):
 
 @nb.njit(nogil=True, cache=True)
 def rows_kept(walks, now, after, look, index):
-    """The rows (n,) int64, each once, ascending, that users touch whose last pose is at most `after` old [s]."""
+    """Return the rows that users touch whose last pose is at most `after` old [s].
+
+    (n,) int64, each once, ascending.
+    """
     users, step = 0, look.step
     centers, reaches = np.empty((walks.shape[0], 3)), np.empty(walks.shape[0])
     for user in range(walks.shape[0]):

@@ -1,11 +1,13 @@
-"""The scan point nearest to a loose point, as a k-d tree would find it.
+"""Scan point nearest to a single point, as a k-d tree would find it.
 
-The definition, which no tree, order, voxel size or thread can change: q = rint((point - O) 2^26) in int64, half to
-even, O the dataset's origin; b a scan point as in NUMERICS.md N5; the least integer |q - b|^2 is within reach when it
-is at most the square of the reach in units of 2^-26 m; of several points at that distance the least (x, y, z) is
-named. The distance is the float64 root of that square, divided by 2^26.
+Definition. No tree, order, voxel size or thread can change it. q = rint((point - O) 2^26) in int64,
+half to even, O the dataset's origin; b is a scan point as in NUMERICS.md N5. The least integer |q -
+b|^2 is within reach when it is at most the square of the reach in units of 2^-26 m. Of several
+points at that distance, the least (x, y, z) is returned. The distance is the float64 root of that
+square, divided by 2^26.
 
-Everything else here prunes and never decides: node bounds in float64, 32 points at a time in float32, both inflated.
+Everything else here prunes and never decides: node bounds in float64, 32 points at a time in
+float32, both inflated.
 """
 
 import math
@@ -23,11 +25,13 @@ from .stopping import stopped
 
 @borrowing
 def _below_node(words, row, x, y, z, limit):
-    """Lower bound of the distance [steps] from a point (float64, from the voxel's low corner) to a node's points, and
-    the distance to its centre. Beyond `limit` the bound may be as low as the sphere alone makes it.
+    """Return a lower bound of the distance [steps] from a point to a node's points.
 
-    They lie in the node's sphere and in its slab, and so in the round disc that holds both. Rounding: under 2^-24 of
-    the distance to the centre, where the root of a small difference magnifies it.
+    x, y, z: float64, relative to the voxel's low corner. Also returns the distance to the node's
+    centre. Beyond `limit`, the bound may be as low as that of the sphere alone.
+    The node's points lie in its sphere and in its slab, and therefore in the round disc that
+    contains both. Rounding: less than 2^-24 of the distance to the centre, where the root of a
+    small difference magnifies it.
     """
     dx, dy, dz = x - words[row], y - words[row + 1], z - words[row + 2]
     nx, ny, nz = np.float64(words[row + 4]), np.float64(words[row + 5]), np.float64(words[row + 6])
@@ -40,7 +44,8 @@ def _below_node(words, row, x, y, z, limit):
     if length > 0.0 and below <= limit:
         inverse = 1.0 / length
         along = (nx * dx + ny * dy + nz * dz) * inverse
-        # The length is rounded up, so offsets divided by it come out shorter by 2^-23 at most, undone by the slack.
+        # The length is rounded up; offsets divided by it are too short by at most 2^-23, which the
+        # slack covers.
         gap: float = max(along - words[row + 9] * inverse, words[row + 8] * inverse - along, 0.0)
         gap = gap - (abs(along) + radius) * 2.0**-21
         if gap > 0.0:
@@ -52,11 +57,12 @@ def _below_node(words, row, x, y, z, limit):
 
 @borrowing
 def _test_block(scene, voxel, row, x, y, z, error, at_units, i, best, limit):
-    """All points of a leaf node against point i: 32 in float32, those within the band in integers.
+    """Test all points of a leaf node against point i: 32 in float32, those in the band in integers.
 
     limit: the best square so far, or that of the reach [units^2]. Returns it, lowered.
-    Rounding in float32: where a scan point is within the limit, coordinates from the block's corner are at most its
-    root and four radii large, and differences below that: under 16 U32 of it.
+    Rounding in float32: where a scan point is within the limit, coordinates relative to the block's
+    corner are at most its root plus four radii, and the rounding of differences is below 16 U32 of
+    that.
     """
     words, ints, halves = scene.words, scene.ints, scene.halves
     block = ~ints[row + FIRST]
@@ -82,7 +88,7 @@ def _test_block(scene, voxel, row, x, y, z, error, at_units, i, best, limit):
         dy = np.float32(halves[lane_at + LANES + j]) - qy
         dz = np.float32(halves[lane_at + 2 * LANES + j]) - qz
         least = min(least, dx * dx + dy * dy + dz * dz)
-    # None beyond the least by more than twice the rounding can be nearest.
+    # No point beyond the least by more than twice the rounding can be nearest.
     nearest = math.sqrt(np.float64(least)) * (1.0 + 8.0 * U32)
     nearest += 2.0 * error + 32.0 * U32 * (nearest + 4.0 * words[row + 3] + 1.0)
     far = min(far, np.float32(nearest * nearest * (1.0 + 64.0 * U32)))
@@ -116,9 +122,10 @@ def _test_block(scene, voxel, row, x, y, z, error, at_units, i, best, limit):
 
 @borrowing
 def _search(scene, voxel, at_units, i, near, tolerance, visits, best, limit, rows, bounds, keys):
-    """Search one resident voxel, nearest nodes first. Returns the limit, lowered; updates `best`.
+    """Search one resident voxel, nearest nodes first; update `best` and return the lowered limit.
 
-    near: exact units, as in Lists. What holds of a node holds of its children, so no bound gets worse with more visits.
+    near: exact units, as in Lists. A bound of a node holds for its children; no bound therefore
+    gets worse with more visits.
     """
     words, ints = scene.words, scene.ints
     per_unit = 1.0 / scene.units_per_step
@@ -160,11 +167,12 @@ def _search(scene, voxel, at_units, i, near, tolerance, visits, best, limit, row
         for child in range(first, first + (ints[row + COUNT] & COUNTED)):
             child_row = base + child * ROW_WORDS
             bound, middle = _below_node(words, child_row, x, y, z, steps)
-            # Its farthest point is no farther than that: no sibling beyond holds the nearest.
+            # The farthest point of this node is no farther than that: a sibling beyond it cannot
+            # hold the nearest point.
             steps = min(steps, (middle + words[child_row + 3]) * (1.0 + 2.0**-24) + 2.0 * error)
             bound = max(bound, above)
             if bound <= steps:
-                # Many bounds are 0: of these the one with the nearest centre first.
+                # Many bounds are 0: among these, the one with the nearest centre comes first.
                 key = bound + middle / 16.0
                 place = depth
                 while place > begin and keys[place - 1] < key:
@@ -182,9 +190,11 @@ def _search(scene, voxel, at_units, i, near, tolerance, visits, best, limit, row
 
 @nb.njit(nogil=True, cache=True)
 def search_points(at_units, reach, lists, cursor, held, scene, tolerance, visits, best):
-    """Search for the points nearest to k loose points, each along its list up to the first voxel that is not held.
+    """Search for the scan points nearest to k single points, along their lists.
 
-    at_units: (k, 3) int64.  reach: exact units, at most MAX_REACH_UNITS. The rest as in `rays.follow_rays`.
+    Each search runs up to the first voxel that is not held.
+    at_units: (k, 3) int64.  reach: exact units, at most MAX_REACH_UNITS. Other arguments as in
+    `rays.follow_rays`.
     """
     rows, bounds, keys = np.empty(STACK, np.int64), np.empty(STACK), np.empty(STACK)
     for i in range(cursor.shape[0]):

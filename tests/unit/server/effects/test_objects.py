@@ -259,8 +259,8 @@ def test_wishes_for_objects_that_cannot_be_granted_are_refused_and_nothing_moves
         skewed, mirrored = at(0), at(0)
         skewed[0, 1], mirrored[0, 0] = 1e-3, -1.0
         refused: list[tuple[str, Any, type[Exception], str]] = [
-            ("gate", at(0).tolist(), BadRequestError, "'gate' is none of this scene: expected one of door"),
-            ("crate", at(0).tolist(), BadRequestError, "is pushed, and not told"),
+            ("gate", at(0).tolist(), BadRequestError, "'gate' is not in this scene: expected one of door"),
+            ("crate", at(0).tolist(), BadRequestError, "is pushed by users and cannot be placed"),
             ("door", skewed.tolist(), BadTransformError, "not rigid"),
             ("door", mirrored.tolist(), BadTransformError, "not rigid"),
             ("door", (at(0) * 2).tolist(), BadTransformError, "not rigid"),
@@ -426,6 +426,6 @@ def test_objects_that_cannot_begin_are_refused_each_time_and_not_once() -> None:
 
     bodies = Bodies(np.zeros(3), np.array([0.0, 0, 1]), begin)
     for _ in range(2):
-        with pytest.raises(BadRequestError, match="at most 4 m where bodies meet"):
+        with pytest.raises(BadRequestError, match="at most 4 m with crowd or objects"):
             bodies.begin()
         assert not bodies.names and not len(bodies.poses)

@@ -120,7 +120,9 @@ class Bodies:
             box = np.array([model.points.min(axis=0), model.points.max(axis=0)])
         units = to_units(model.radius, "radius")
         if units > MAX_REACH_UNITS // 4:
-            raise BadRequestError(f"avatar radius {model.radius:g} m: expected at most 4 m with crowd or objects")
+            raise BadRequestError(
+                f"avatar radius {model.radius:g} m: expected at most 4 m with crowd or objects"
+            )
         nodes = max(len(model.arrays.radius), self.scratch.moving.shape[1])
         blocks = max(len(model.arrays.points), len(self.scratch.lanes))
         if nodes > self.scratch.moving.shape[1] or blocks > len(self.scratch.lanes):
@@ -280,7 +282,7 @@ class Bodies:
             told = [each for each, kind in zip(self.names, self.kinds, strict=True) if kind == TOLD]
             found = "is not in this scene" if row < 0 else "is pushed by users and cannot be placed"
             raise BadRequestError(
-                f"object {name!r} {found}: expected one of {', '.join(told) or 'none: no object is kinematic'}"
+                f"object {name!r} {found}: expected a kinematic object: {', '.join(told) or 'there is none'}"
             )
         return row
 

@@ -259,7 +259,12 @@ def test_wishes_for_objects_that_cannot_be_granted_are_refused_and_nothing_moves
         skewed, mirrored = at(0), at(0)
         skewed[0, 1], mirrored[0, 0] = 1e-3, -1.0
         refused: list[tuple[str, Any, type[Exception], str]] = [
-            ("gate", at(0).tolist(), BadRequestError, "'gate' is not in this scene: expected one of door"),
+            (
+                "gate",
+                at(0).tolist(),
+                BadRequestError,
+                "'gate' is not in this scene: expected a kinematic object: door",
+            ),
             ("crate", at(0).tolist(), BadRequestError, "is pushed by users and cannot be placed"),
             ("door", skewed.tolist(), BadTransformError, "not rigid"),
             ("door", mirrored.tolist(), BadTransformError, "not rigid"),

@@ -1,6 +1,7 @@
-"""Scans whose points all lie at one place: no surface, and hardly what was scanned.
+"""Detection of scans whose points all lie at one position, which are most likely export errors.
 
-Some exporters store a range of 0, at the scanner, for a direction without a return and do not mark it as invalid.
+Some exporters store a range of 0, at the scanner, for a direction without a return and do not mark
+it as invalid.
 """
 
 from collections.abc import Iterable
@@ -13,7 +14,8 @@ from ..schemas.errors import ScanError
 from ..schemas.index import Source
 from .sources.scan import Scan
 
-# A scan of so few points whose header declares no bounds is read to know whether they coincide: some milliseconds.
+# A scan with at most this many points whose header declares no bounds is read to check it: some
+# milliseconds.
 MOST_READ = 1 << 16
 
 
@@ -26,7 +28,10 @@ def coincident_text(path: Path | str, index: int, count: int) -> str:
 
 
 def coincide(low: NDArray[np.float64], high: NDArray[np.float64], count: int | None) -> bool:
-    """Return whether several points with the bounds low, high (3,) lie at one place. A single point is no fault."""
+    """Return whether several points with the bounds low, high (3,) are at one position.
+
+    A single point is no fault.
+    """
     return count is not None and count > 1 and bool((low == high).all())
 
 
@@ -36,7 +41,10 @@ def coincident_sources(sources: Iterable[Source]) -> tuple[str, ...]:
 
 
 def coincident_scan(scan: Scan) -> str:
-    """Return the warning about a scan by its header's bounds, or "". A small one that declares none is read."""
+    """Return the warning about a scan by its header's bounds, or "".
+
+    A small scan without declared bounds is read.
+    """
     count = scan.declared_count
     if scan.fault or count is None:
         return ""
@@ -48,7 +56,10 @@ def coincident_scan(scan: Scan) -> str:
 
 
 def _read_bounds(scan: Scan) -> NDArray[np.float64] | None:
-    """Return the bounds (2, 3) of a scan's points; None where it cannot be read, which a build tells."""
+    """Return the bounds (2, 3) of a scan's points, or None if it cannot be read.
+
+    A build reports that.
+    """
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     try:
         for block in scan.blocks():

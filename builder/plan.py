@@ -1,11 +1,14 @@
-"""What a build will take: bytes, memory, time by stage, voxels, and the limits that would stop it; before it is begun.
+"""Estimate of a build before it begins: bytes, memory, time by stage, voxels, and limits.
 
-Everything follows from a few figures of the scene (`Scene`: of scans that are there, found by `sample.py`, or of a
-number of points that are thought of) and from measured rates (`Rates`: rates.json, which `scripts/bench_build
---write-rates` writes, or measured here). A stage takes a start, and so much a point; what of that is shared among
-workers was found by measuring with one and with two. Bytes a point are those of a sample that is packed
-(`packed_sample.py`), and hold within 15 %; without one they follow the density of points on surfaces, a guess. Times
-hold within a factor of 1.5 where the scene is like a scanned building. An estimate says what it assumed.
+The estimate follows from a few properties of the scene (`Scene`: of existing scans, found by
+`sample.py`, or of a hypothetical number of points) and from measured rates (`Rates`: rates.json,
+which `scripts/bench_build --write-rates` writes, or measured here). A stage takes a constant time
+plus a time per point. The part shared among workers was determined by measuring with one worker and
+with two.
+
+Bytes per point are those of a packed sample (`packed_sample.py`) and hold within 15 %. Without a
+sample they are guessed from the density of points on surfaces. Times hold within a factor of 1.5 if
+the scene resembles a scanned building. An estimate lists its assumptions.
 """
 
 import json
@@ -30,36 +33,42 @@ from .spool import spool_dtype
 RATES_NAME = "rates.json"
 VERSION = 1
 
-# Bytes of the index beside its voxels, and a voxel (schemas/FORMAT.md); of a shard's file beside the records, HDF5's
-# own, a voxel (measured: 1,020 to 1,050); and of a voxel in a run's directory, read by every process.
+# Bytes of the index apart from its voxels, and per voxel (schemas/FORMAT.md); of a shard's file
+# apart from the records, for HDF5 itself, per voxel (measured: 1,020 to 1,050); and per voxel in a
+# run's directory, which every process reads.
 HEADER_BYTES = 7500
 INDEX_BYTES = 100
 GROUP_BYTES = 1030
 DIRECTORY_BYTES = 40
-# Runs that a voxel is spread over, about: scans that overlap, and ranges of a scan that meet.
+# Approximate number of runs over which a voxel is spread: overlapping scans, and adjacent ranges of
+# a scan.
 RUNS_A_VOXEL = 8
-# A scan is spooled in ranges: about so many of a file, each of so many points (survey.py).
+# A scan is spooled in ranges: approximate number per file, and least and most points of each
+# (survey.py).
 RANGES, RANGE_POINTS = 32, (1 << 20, 1 << 24)
-# The preview beside the shards: 6 bytes a point of at least, at most, and one in so many (preview.py).
+# Preview beside the shards: least points, most points, one point in this many, and bytes per point
+# (preview.py).
 PREVIEW, PREVIEW_BYTES = (20_000, 200_000, 8), 6
-# A frame's length is uint32 in the index; the column of scans is uint16 (schemas/FORMAT.md).
+# The length of a frame is uint32 in the index; the column of scans is uint16 (schemas/FORMAT.md).
 MAX_FRAME = 1 << 32
 MAX_SCANS = 1 << 16
-# A voxel of more points is built in parts, and has no normals (dense.py).
+# A voxel with more points is built in parts, and has no normals (dense.py).
 DENSE_POINTS = 1 << 20
-# A folder of more files than this is slow to list on most file systems.
+# A folder with more files than this is slow to list on most file systems.
 MANY_FILES = 1_000_000
-# The densest voxel holds about so many times the mean (measured: 7 on a made façade in voxels of 8 m, 3 of 2 m).
+# The densest voxel holds about this multiple of the mean (measured: 7 on a generated façade in
+# voxels of 8 m, 3 of 2 m).
 DENSEST = 8
-# Bytes of the archive are within this factor of an estimate, of scans whose points were packed, and of others.
+# The archive's bytes are within this factor of an estimate, with a packed sample and without.
 MEASURED_WITHIN, GUESSED_WITHIN = 1.15, 2.5
 
 
 class Stage(NamedTuple):
-    """What a stage takes. start: whatever it holds [s].  serial: a point [s].  parallel: a point, of one core [s].
+    """Cost of a stage.
 
-    first: each of the first RADIUS_SAMPLE points besides, of one core [s]: no more than those have their closest
-    points looked for, and a part of other stages is like that.
+    start: constant [s].  serial: per point, not shared [s].  parallel: per point, of one core [s].
+    first: additional cost of each of the first RADIUS_SAMPLE points, of one core [s]. At most that
+    many points have their closest points searched, and part of other stages behaves the same way.
     """
 
     start: float
@@ -68,21 +77,27 @@ class Stage(NamedTuple):
     parallel: float
 
     def seconds(self, points: float, jobs: int) -> float:
-        """For so many points with so many workers."""
+        """Return the time [s] for `points` points with `jobs` workers."""
         first = min(points, RADIUS_SAMPLE) * self.first
         return self.start + points * self.serial + (first + points * self.parallel) / jobs
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Rates:
-    """What builds were measured to take.
+    """Measured rates of builds.
 
-    machine: its class.  cores: of it.  rests_on: what was measured.  stages: name -> Stage, a build's in their order.
-    workers: starting the processes of more than one job [s].  read: format -> seconds a point, reading alone, on one
-    core.  passes: how often a build reads its scans.  archive: (pitch, bytes a point), ascending: pitch is the square
-    root of the surface a point has, over the lattice step.  process, worker, point: memory [bytes] of the first
-    process, of each other, and of each point until --memory is reached.  disk: bytes/s that the disk writes.
-    density: points/m^2 of the made façade of 587,923 points.  crossed: voxels over area / voxel^2.
+    machine: its class.  cores: their number.  rests_on: what was measured.
+    stages: name -> Stage, in the order of a build.  workers: starting the processes of more than
+    one job [s].
+    read: format -> seconds per point, reading alone, on one core.  passes: number of times a build
+    reads its scans.
+    archive: (pitch, bytes per point), ascending. The pitch is the square root of the surface area
+    per point, divided by the lattice step.
+    process, worker, point: memory [bytes] of the first process, of each other process, and of each
+    point until --memory is reached.
+    disk: write rate of the disk [bytes/s].  density: points/m^2 of the generated façade of 587,923
+    points.
+    crossed: number of voxels divided by area / voxel^2.
     """
 
     machine: str
@@ -101,23 +116,26 @@ class Rates:
     crossed: float
 
     def bytes_a_point(self, ratio: float) -> float:
-        """Of the archive, for a pitch of so many lattice steps: linear in its logarithm, as bits are."""
+        """Return the archive's bytes per point for a pitch of `ratio` lattice steps.
+
+        They are linear in the logarithm of the pitch, as the number of bits is.
+        """
         known = [(math.log2(at), size) for at, size in self.archive]
         at = math.log2(max(ratio, 1e-3))
         pairs = list(pairwise(known))
         (x0, y0), (x1, y1) = next((p for p in pairs if at <= p[1][0]), pairs[-1])
-        # Never below one byte: nodes and cells alone take that.
+        # At least one byte: nodes and cells alone take that.
         return max(1.0, y0 + (y1 - y0) * (at - x0) / (x1 - x0))
 
 
 def load_rates(text: str | None = None) -> Rates:
-    """The rates that came with the package, or those of a text. Raises CorruptError for one that cannot be read."""
+    """Return the packaged rates, or those of a text. Raise CorruptError if they cannot be read."""
     if text is None:
         text = (resources.files(__package__) / RATES_NAME).read_text(encoding="utf-8")
     try:
         found = json.loads(text)
         if found.pop("version") != VERSION:
-            raise ValueError("another version")
+            raise ValueError("unsupported version")
         found["stages"] = {name: Stage(**stage) for name, stage in found["stages"].items()}
         found["archive"] = [(float(at), float(size)) for at, size in found["archive"]]
         rates = Rates(**found)
@@ -131,20 +149,24 @@ def load_rates(text: str | None = None) -> Rates:
 
 
 def dump_rates(rates: Rates) -> str:
-    """Rates as the text of rates.json."""
+    """Return rates as the text of rates.json."""
     stages = {name: stage._asdict() for name, stage in rates.stages.items()}
     return json.dumps({"version": VERSION, **asdict(rates), "stages": stages}, indent=1) + "\n"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scene:
-    """What is known of the points to be built.
+    """Known properties of the points to build.
 
-    points, scans: how many.  largest: points of the largest scan.  input_bytes: of files; None: not known.
-    formats: format -> points.  step: lattice step that all scans share [m], or None.  area: of the surfaces [m^2].
-    voxels: how many hold points, by a voxel's edge [m], found by a look; else they follow from the area.
-    extent: greatest length along an axis [m], or None.  assumed: sentences.  packed: bytes a point of records of a
-    sample, with scan and intensity where they are kept; None: not measured.
+    points, scans: their numbers.  largest: points of the largest scan.  input_bytes: of the files;
+    None: not known.
+    formats: format -> points.  step: lattice step that all scans share [m], or None.  area: of the
+    surfaces [m^2].
+    voxels: (edge [m], number of voxels with points) if sampled; otherwise the number follows from
+    the area.
+    extent: greatest length along an axis [m], or None.  assumed: sentences.
+    packed: bytes per point of the records of a sample, with scan and intensity if they are kept;
+    None: not measured.
     """
 
     points: int
@@ -161,9 +183,10 @@ class Scene:
 
 
 def imagined(points: int, rates: Rates, density: float | None = None, scans: int | None = None) -> Scene:
-    """A scene of so many points that nobody has seen. density: points/m^2 of surface; None: as the façade's.
+    """Return a hypothetical scene. density: points/m^2 of surface; None: that of the façade.
 
-    scans: None: of 1.4 million points each, as [Fig12] section 3: 700 scans, 10^9 points.
+    scans: their number; None: scans of 1.4 million points each, as in [Fig12] section 3: 700 scans,
+    10^9 points.
     """
     dense = density or rates.density
     number = scans or max(1, round(points / 1.4e6))
@@ -184,7 +207,10 @@ def imagined(points: int, rates: Rates, density: float | None = None, scans: int
 
 
 class Limit(NamedTuple):
-    """Something that ends. found: what the build needs of it.  most: what there is.  advice: where it binds."""
+    """Limit of a build. found: need of the build.  most: what is available.
+
+    advice: what to do if the limit binds.
+    """
 
     what: str
     found: float
@@ -194,15 +220,16 @@ class Limit(NamedTuple):
 
     @property
     def binds(self) -> bool:
-        """Whether the build needs more than there is."""
+        """Return whether the build needs more than is available."""
         return self.found > self.most
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Plan:
-    """What a build will take: bytes, seconds; see `estimate`. disk_bytes: at most at one time, beside the scans.
+    """Estimate of a build; see `estimate`. disk_bytes: most at one time, apart from the scans.
 
-    archive_within: the archive has archive_bytes divided by this at least, and times this at most.
+    archive_within: factor; the archive takes at least archive_bytes divided by it and at most
+    archive_bytes times it.
     """
 
     points: int
@@ -229,13 +256,16 @@ class Plan:
     limits: tuple[Limit, ...] = field(default=())
 
     def as_json(self) -> dict[str, Any]:
-        """For JSON: each limit says whether it binds."""
+        """Return a JSON value; each limit says whether it binds."""
         limits = [{**limit._asdict(), "binds": limit.binds} for limit in self.limits]
         return {**asdict(self), "limits": limits}
 
 
 def estimate(scene: Scene, config: BuildConfig, rates: Rates, target: Path | None = None) -> Plan:
-    """What building a scene will take. target: where the archive goes, for the room on its disk; None: not asked."""
+    """Estimate the build of a scene. target: location of the archive, to check free space.
+
+    None: no check.
+    """
     step = config.resolution or scene.step or DEFAULT_STEP
     pitch = math.sqrt(scene.area / scene.points)
     voxels = _voxels(scene, config.voxel, rates)
@@ -278,14 +308,17 @@ def estimate(scene: Scene, config: BuildConfig, rates: Rates, target: Path | Non
 
 
 def _voxels(scene: Scene, edge: float, rates: Rates) -> int:
-    """Voxels that hold points: counted in a sample for this edge, or by the area of the surfaces they are cut from."""
+    """Return the number of voxels with points, from a sample of this edge or from the area."""
     if scene.voxels is not None and scene.voxels[0] == edge:
         return max(1, round(scene.voxels[1]))
     return max(1, min(scene.points, round(rates.crossed * scene.area / edge**2)))
 
 
 def _runs(scene: Scene, config: BuildConfig, jobs: int) -> int:
-    """Runs of the spool, as survey.py cuts scans into ranges and partition.py ranges into runs."""
+    """Return the number of runs.
+
+    survey.py cuts scans into ranges, partition.py ranges into runs.
+    """
     mean = scene.points / scene.scans
     a_range = min(max(mean / RANGES, RANGE_POINTS[0]), RANGE_POINTS[1], mean)
     a_run = min(a_range, run_points(memory_share(jobs, config), spool_dtype(config)))
@@ -293,13 +326,16 @@ def _runs(scene: Scene, config: BuildConfig, jobs: int) -> int:
 
 
 def _seconds(scene: Scene, config: BuildConfig, rates: Rates, jobs: int, written: int) -> dict[str, float]:
-    """Seconds of each stage; reading other formats than LAS is added to the passes that read."""
+    """Return the seconds of each stage.
+
+    The passes that read are slower for formats other than LAS.
+    """
     working = min(jobs, os.cpu_count() or 1)
     reading = sum(
         points * max(0.0, rates.read.get(name, rates.read["las"]) - rates.read["las"])
         for name, points in scene.formats.items()
     )
-    # One scan that cannot seek is read by one worker.
+    # A single scan that cannot seek is read by one worker.
     reading /= min(working, scene.scans) if scene.scans > 1 or set(scene.formats) <= {"las", "laz"} else 1
     found = {name: stage.seconds(scene.points, working) for name, stage in rates.stages.items()}
     if jobs > 1:
@@ -310,19 +346,19 @@ def _seconds(scene: Scene, config: BuildConfig, rates: Rates, jobs: int, written
         found[name] = found.get(name, 0.0) + reading
     least = written / rates.disk
     total = sum(found.values())
-    if least > total:  # the disk is what is slow
+    if least > total:  # the disk is the bottleneck
         found["waiting for the disk"] = least - total
     return found
 
 
 def _memory(scene: Scene, config: BuildConfig, rates: Rates, jobs: int, tables: float) -> int:
-    """Of all processes together: what --memory bounds, and beside it what grows with voxels and not with points."""
+    """Return the memory of all processes. Tables that grow with voxels are added to --memory."""
     base = rates.process + (jobs * rates.worker if jobs > 1 else 0)
     return round(min(base + rates.point * scene.points, max(base, config.memory_bytes)) + tables)
 
 
 def _assumed(config: BuildConfig, rates: Rates, jobs: int) -> tuple[str, ...]:
-    """What an estimate takes for granted."""
+    """Return the assumptions of an estimate."""
     said = [
         f"{jobs} jobs on {os.cpu_count()} cores, each as fast as those measured, and nothing else running"
     ]
@@ -330,9 +366,11 @@ def _assumed(config: BuildConfig, rates: Rates, jobs: int) -> tuple[str, ...]:
         "scans come off the disk as fast as they are read: a slow disk or network adds to survey and spool"
     )
     if config.models != {"mean"}:
-        said.append("radius classes: their bytes are counted, their time (2.5 µs a point of one core) is not")
+        said.append(
+            "radius classes: their bytes are included, their time (2.5 µs a point of one core) is not"
+        )
     if "normal" in config.keep:
-        said.append("normals: their bytes are counted, their time (1.6 µs a point of one core) is not")
+        said.append("normals: their bytes are included, their time (1.6 µs a point of one core) is not")
     if config.thin is not None or config.outliers is not None or config.moving is not None:
         said.append(
             "no point is left out by filters, and their time (0.3 to 3 µs a point of one core) is not counted"
@@ -345,7 +383,7 @@ def _assumed(config: BuildConfig, rates: Rates, jobs: int) -> tuple[str, ...]:
 def _limits(
     plan: Plan, scene: Scene, config: BuildConfig, directories: float, target: Path | None
 ) -> tuple[Limit, ...]:
-    """What could stop the build, and what grows with it though --memory does not bound it."""
+    """Return what could stop the build. Some limits grow with it although --memory is kept."""
     dense = plan.points_a_voxel * DENSEST * plan.bytes_a_point
     found = [
         Limit("voxels along an axis", (scene.extent or math.sqrt(scene.area)) / config.voxel, KEY_BIAS, "voxels",

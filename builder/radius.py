@@ -75,7 +75,7 @@ def build_local(points: NDArray[np.float64], *, leaf: int, degree: int) -> Local
 def mean_closest_distance(local: LocalHierarchy) -> float:
     """Return the mean closest-point distance [m] of distinct lattice points.
 
-    0 for fewer than two.
+    Return 0 for fewer than two points.
     """
     tree = local.hierarchy.tree
     t = len(tree.begin)

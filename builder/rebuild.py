@@ -1,4 +1,4 @@
-"""What a change touches built anew, beside what stays: the new records, the new index, and both published."""
+"""Rebuilding of the voxels that a change affects: new records, new index, and their publication."""
 
 import time
 from collections import Counter
@@ -37,13 +37,16 @@ from .touched import touched
 
 
 class ChangeSummary(NamedTuple):
-    """What a change did. generation: of the archive now.  points_before, points: in it.  voxels: in it; built: of them,
-    anew; gone: that hold nothing any more.
+    """Result of a change.
 
-    bytes: of the new shards.  dead_bytes: of records that were replaced, but stay on disk in shards that are in use.
-    radius: the stored figure; radius_now: what it would be now, None where it was given [m].
-    scans: those added or removed, as the index names them.  skipped: reason -> points of those added left out.
-    warnings: sentences about those added.
+    generation: of the archive now.  points_before, points: in the archive.
+    voxels: number in the archive.  built: number rebuilt.  gone: number that became empty.
+    bytes: of the new shards.  dead_bytes: of replaced records that stay on disk in shards still in
+    use.
+    radius: the stored radius.  radius_now: what it would be now; None if it was given [m].
+    scans: scans added or removed, as the index names them.
+    skipped: reason -> points of the added scans that were left out.
+    warnings: sentences about the added scans.
     """
 
     archive: Path
@@ -65,10 +68,12 @@ class ChangeSummary(NamedTuple):
 
 
 class Difference(NamedTuple):
-    """What is to be different. header: with its sources as they are to be.  scans: those added or removed, by name.
+    """Intended change. header: with the new sources.  scans: names of the scans added or removed.
 
-    boxes: key -> box (2, 3) of the points that change, lattice.  dropped: scans whose points go.  places: `places_sum`
-    of the points that are spooled already (spool.py).  added: key -> how many those are.
+    boxes: key -> box (2, 3) of the points that change, lattice.  dropped: scans whose points are
+    removed.
+    places: `places_sum` of the points already spooled (spool.py).  added: key -> number of these
+    points.
     """
 
     header: Header
@@ -82,10 +87,11 @@ class Difference(NamedTuple):
 def rebuild(
     change: Change, difference: Difference, check: Callable[[], None] = lambda: None
 ) -> ChangeSummary:
-    """Build what a difference touches, and publish it. check: called before it is published.
+    """Rebuild what a difference affects, and publish it. check: called before publication.
 
-    Raises CorruptError where what was written is not what is read back, and SolidcloudError where there is no room on
-    the disk, or for a voxel in memory; the archive is then what it was.
+    Raise CorruptError if the data read back differ from the data written, and SolidcloudError if
+    there is not enough disk space, or not enough memory for a voxel. After an error the archive is
+    unchanged.
     """
     before = change.archive.header
     header = replace(difference.header, generation=before.generation + 1, radius_now=None)
@@ -136,14 +142,14 @@ def rebuild(
 
 
 def _left_out(sources: Sequence[Source]) -> dict[str, int]:
-    """Reason -> points of some scans left out."""
+    """Return the points left out of some scans, by reason."""
     return dict(sum((Counter(source.skipped) for source in sources), Counter[str]()))
 
 
 def _points_after(
     change: Change, rebuilt: NDArray[np.int64], added: Mapping[int, int]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """The points, at most, of each voxel to be built anew, and of each that there is then."""
+    """Return upper bounds on the points of each voxel to build, and of each final voxel."""
     keys, points = change.archive.voxels["key"], change.points
     new, counts = np.array(list(added), np.uint64), np.array(list(added.values()), np.int64)
     at = np.minimum(np.searchsorted(keys, new), len(keys) - 1)
@@ -160,10 +166,14 @@ def _room(
     read: NDArray[np.int64],
     built: NDArray[np.int64],
 ) -> int:
-    """Bytes, about, that are yet to be written: runs of what is read, the records of what is built, of so many points
-    a voxel at most (b,), and what dense ones take meanwhile, one a job."""
+    """Estimate the bytes still to be written.
+
+    These are the runs of the voxels read, the records of the voxels built, and the scratch files of
+    dense voxels, one per job. built: (b,) upper bounds on the points of the voxels built.
+    """
     archive, before = change.archive, change.archive.header
-    # With radius classes what is read is spooled once more, as it was before.
+    # With radius classes, the points read are spooled a second time, in their state before the
+    # change.
     a_point = change.dtype.itemsize * (2 if change.with_classes else 1)
     runs = int(archive.voxels["rows"][read, 2].sum(dtype=np.int64)) * a_point
     added = sum(source.count for source in header.sources[len(before.sources) :])
@@ -173,7 +183,7 @@ def _room(
 
 
 def _dead_bytes(archive: Archive, rebuilt: NDArray[np.int64], files: list[tuple[str, int]]) -> int:
-    """Bytes of the records that were replaced, but stand in shards that stay."""
+    """Return the bytes of replaced records in shards that stay."""
     named = {name for name, _ in files}
     stays = np.array([name in named for name, _ in archive.shards()], bool)
     rows = archive.voxels[rebuilt]
@@ -181,8 +191,11 @@ def _dead_bytes(archive: Archive, rebuilt: NDArray[np.int64], files: list[tuple[
 
 
 class _Before(NamedTuple):
-    """What the voxels to be rebuilt had, as they are stored. radius_counts, few: of `radius_counts` and of
-    `radius_capped`.  places: `places_sum` of their points that stay (spool.py)."""
+    """Stored state of the voxels to rebuild.
+
+    radius_counts: of each class.  few: their part of `radius_capped`.  places: `places_sum` of
+    their points that stay (spool.py).
+    """
 
     radius_counts: NDArray[np.int64]
     few: int
@@ -199,7 +212,7 @@ def _gather(
         (rows, group) for rows in (rebuilt, np.setdiff1d(read, rebuilt)) for group in change.units_of(rows)
     ]
     with change.reading(change.points[read]) as beside:
-        # With radius classes two runs are filled at a time.
+        # With radius classes, two runs are filled at the same time.
         most = max(LEAST_RUN_POINTS, beside // (RUN_BYTES_A_POINT * (2 if before else 1)))
         units = [
             GatherUnit(
@@ -233,7 +246,7 @@ def _gather(
 
 
 def _most_near(change: Change) -> int:
-    """Points around a voxel that a job may hold beside it."""
+    """Return the number of points around a voxel that a job may hold beside it."""
     return max(1 << 16, change.share // (2 * VOXEL_BYTES_A_POINT))
 
 
@@ -255,7 +268,10 @@ def _build(change: Change, header: Header, spool: Spool, wanted: set[int]) -> li
 def _new_index(
     change: Change, header: Header, rebuilt: NDArray[np.int64], shards: list[Shard]
 ) -> tuple[Header, NDArray, list[tuple[str, int]]]:
-    """The rows of the new index, ascending, the shards it names, and the header with counts and bounds of both."""
+    """Return the new header, the rows of the new index, ascending, and the shards it names.
+
+    The header has the counts and bounds of both kept and new voxels.
+    """
     kept = np.delete(change.archive.voxels, rebuilt)
     used, where = np.unique(kept["shard"], return_inverse=True)
     kept["shard"] = where
@@ -279,7 +295,7 @@ def _new_index(
 
 
 def _check_counts(change: Change, header: Header) -> None:
-    """What is built must be what the scans had."""
+    """Raise CorruptError unless the number of points equals that of the scans."""
     expected = sum(s.count for s in header.sources)
     if header.points != expected:
         raise CorruptError(
@@ -288,7 +304,7 @@ def _check_counts(change: Change, header: Header) -> None:
 
 
 def _measure(change: Change, header: Header) -> Header:
-    """Measure the mean closest-point distance of what there is now; not where the radius was given."""
+    """Measure the mean closest-point distance after the change, unless the radius was given."""
     if header.radius_model != "mean":
         return header
     with change.stage("radius", header.points, "points"):

@@ -1,4 +1,4 @@
-"""The points of an opened record a block at a time: all, those in a box, or a sample."""
+"""Access to the points of an opened record, block by block: all, those in a box, or a sample."""
 
 from collections.abc import Iterable, Iterator
 from typing import NamedTuple
@@ -13,18 +13,21 @@ from .kernels.nearest import Spheres
 from .kernels.records import Leaves, take_points
 
 BLOCK_POINTS = 1 << 16
-# By the name that `--keep` calls them: the field of a record, and its type.
+# Name in `--keep` -> field of a record, and its type.
 _COLUMNS: dict[str, tuple[str, np.dtype]] = {
     "scan": ("scan_index", np.dtype("<u2")),
     "intensity": ("intensity", np.dtype("<f4")),
 }
-# No coordinate of a lattice is beyond.
+# Larger than every lattice coordinate.
 _EVERYWHERE = np.array([[-(1 << 62)] * 3, [1 << 62] * 3], np.int64)
 
 
 class Taken(NamedTuple):
-    """Points of a record. xyz: (m, 3) int32 [voxel steps].  rows: (m,) int64, which point of the record each is.
-    nodes: (m,) int32, its leaf node."""
+    """Points of a record.
+
+    xyz: (m, 3) int32 [voxel steps].  rows: (m,) int64, index of each point in the record.  nodes:
+    (m,) int32, its leaf node.
+    """
 
     xyz: NDArray[np.int32]
     rows: NDArray[np.int64]
@@ -32,7 +35,7 @@ class Taken(NamedTuple):
 
 
 def leaves_of(record: OpenRecord) -> Leaves:
-    """A record as kernels take it."""
+    """Return a record in the form that kernels take."""
     first, is_leaf, cell = record.tree
     nodes, cells = record.nodes, record.cells
     return Leaves(
@@ -49,23 +52,26 @@ def leaves_of(record: OpenRecord) -> Leaves:
 
 
 def spheres_of(record: OpenRecord) -> Spheres:
-    """A record's bounds as kernels take them."""
+    """Return the bounds of a record in the form that kernels take."""
     return Spheres(record.nodes.center, record.nodes.radius, np.int64(1 << top_shift(record.voxel_steps)))
 
 
 def stored_columns(header: Header) -> dict[str, np.dtype]:
-    """The columns of points that go out of an archive, by the name that `--keep` calls them: those it stores."""
+    """Return the stored columns of an archive that can be exported, by their name in `--keep`."""
     kept = {"scan": header.scan_index, "intensity": header.intensity}
     return {name: kind for name, (_, kind) in _COLUMNS.items() if kept[name]}
 
 
 def record_columns(columns: Iterable[str]) -> list[str]:
-    """What a record calls these columns (schemas/codec.py OPTIONAL_COLUMNS)."""
+    """Return the names of these columns in a record (schemas/codec.py OPTIONAL_COLUMNS)."""
     return [_COLUMNS[name][0] for name in columns]
 
 
 def read_columns(record: OpenRecord, columns: Iterable[str], rows: NDArray[np.int64]) -> dict[str, NDArray]:
-    """Columns of some points of a record, which has them, by name; rows: (m,), see Taken."""
+    """Return columns of some points of a record, by name. rows: (m,), see `Taken`.
+
+    The record must have these columns.
+    """
     found = {}
     for name in columns:
         field, kind = _COLUMNS[name]
@@ -76,10 +82,11 @@ def read_columns(record: OpenRecord, columns: Iterable[str], rows: NDArray[np.in
 
 
 def hash_limit(share: float) -> np.uint64:
-    """What a point's hash must be below to be one of about `share` of all points; 0, which takes all, from 1 on.
+    """Return the limit below which a point's hash must lie to select about `share` of all points.
 
-    A point is taken or not by its lattice coordinates alone, whatever the order of scans, the voxel size or the number
-    of jobs.
+    The result for a share of 1 or more is 0, which selects all. The lattice coordinates alone
+    decide whether a point is selected, whatever the order of scans, the voxel size or the number of
+    jobs.
     """
     return np.uint64(0 if share >= 1.0 else max(1, int(share * 2.0**64)))
 
@@ -92,10 +99,11 @@ def taken(
     limit: np.uint64 = np.uint64(0),  # noqa: B008  a number
     block: int = BLOCK_POINTS,
 ) -> Iterator[Taken]:
-    """Blocks of at most `block` points of a record, in the order of their leaf nodes' rows. None is empty.
+    """Yield blocks of at most `block` points of a record, in the order of the leaf nodes' rows.
 
-    base: (3,) lattice coordinates of the voxel's corner.  box: (2, 3) lattice coordinates, both corners inclusive.
-    limit: see `hash_limit`; then of equal points in one leaf node the first alone.
+    No block is empty. base: (3,) lattice coordinates of the voxel's corner.
+    box: (2, 3) lattice coordinates, both corners inclusive.
+    limit: see `hash_limit`; if set, only the first of equal points in one leaf node is yielded.
     """
     leaves = leaves_of(record)
     low, high = _EVERYWHERE if box is None else box

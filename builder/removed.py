@@ -1,4 +1,4 @@
-"""What is taken out of an archive: the scans that are meant, and where their points are."""
+"""Selection of the scans to remove from an archive, and search for the voxels with their points."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,7 +12,10 @@ from .stored_points import FindUnit, Found, find_scans
 
 
 def rows_of(sources: Sequence[Source], scans: Sequence[str], target: Path) -> frozenset[int]:
-    """The rows of the sources that are meant. BadRequestError names what is not in, and refuses to remove all."""
+    """Return the rows of the sources that `scans` names.
+
+    Raise BadRequestError for a scan that is not in the archive, and for removing all scans.
+    """
     held = {row: s for row, s in enumerate(sources) if not s.fault}
     rows: set[int] = set()
     for text in scans:
@@ -32,7 +35,10 @@ def rows_of(sources: Sequence[Source], scans: Sequence[str], target: Path) -> fr
 
 
 def find_removed(change: Change, scans: frozenset[int]) -> list[Found]:
-    """The voxels that hold points of these scans, all of which must be found."""
+    """Find the voxels that hold points of these scans.
+
+    Raise CorruptError unless all of their points are found.
+    """
     archive = change.archive
     rows = np.arange(len(archive.voxels))
     units = [FindUnit(change.target, held, points, scans) for held, points in change.units_of(rows)]

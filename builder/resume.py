@@ -1,4 +1,7 @@
-"""What is being built, as a note says it: so that a build goes on only where it is the same, and says what is not."""
+"""Description of a build in its journal.
+
+A build resumes only if the description is the same. Otherwise an error names the differences.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -12,18 +15,21 @@ from .scan_list import Input
 from .software import software
 from .sources.scan import NOT_FINITE, Scan, sha256_of
 
-# Differences named in a message, at most.
+# Most differences that a message names.
 NAMED = 5
 
-# What says where a scan stands: field of its note -> for a reader.
+# Fields of a scan's entry that define its placement -> name in messages.
 _PLACED = {"pose": "pose", "crs": "coordinate system", "units": "unit", "up": "direction up"}
 
-# Options that are not named as they are stored, or that the command line does not have.
+# Options whose stored name differs from the command line, or that the command line lacks.
 _OPTION_NAMES = {"models": "--radius", "cell_points": "cell_points", "with_slab": "with_slab"}
 
 
 def described(inputs: Sequence[Input], config: BuildConfig) -> dict[str, Any]:
-    """What is to be built: software, options and inputs, as JSON holds them. Memory and jobs are no part of it."""
+    """Return the software, options and inputs of a build, as a JSON value.
+
+    Memory and jobs are not included.
+    """
     return {
         "software": software(),
         "options": {**config.identity(), "strict": config.strict, "skip_bad": config.skip_bad},
@@ -34,7 +40,7 @@ def described(inputs: Sequence[Input], config: BuildConfig) -> dict[str, Any]:
 
 
 def _entries(item: Input) -> list[dict[str, Any]]:
-    """What is noted of a file: its size and time, and of each scan in it its place in the world."""
+    """Return the entries of a file: its size and time, and for each of its scans the placement."""
     try:
         status = item.path.stat()
         file = {"path": str(item.path), "bytes": status.st_size, "changed_ns": status.st_mtime_ns}
@@ -46,19 +52,22 @@ def _entries(item: Input) -> list[dict[str, Any]]:
 
 
 def _placed(scan: Scan | Source) -> dict[str, Any]:
-    """Where a scan, or a source of an archive, stands in the world."""
+    """Return the placement of a scan, or of a source of an archive, in the world."""
     return {"pose": scan.pose.tolist(), "crs": scan.crs, "units": scan.units, "up": scan.up}
 
 
 def check_same(folder: Path, was: Mapping[str, Any], now: Mapping[str, Any]) -> None:
-    """Raise BadRequestError unless a build begun in `folder` is the one asked for, naming what differs."""
+    """Raise BadRequestError unless the build begun in `folder` is the requested one.
+
+    Name differences.
+    """
     if was.get("software") != now["software"]:
         found, here = was.get("software", {}), now["software"]
         names = sorted(name for name in {*found, *here} if found.get(name) != here.get(name))
         differ = [f"{name} {found.get(name, 'none')}, now {here.get(name, 'none')}" for name in names]
         raise BadRequestError(
-            f"{folder}: a build was begun by other software: {_listed(differ)}: use what it was, or give --fresh to "
-            "start over"
+            f"{folder}: this build was begun with other software: {_listed(differ)}: use that software, or "
+            "give --fresh to start over"
         )
     options, remedies = _option_differences(was["options"], now["options"])
     inputs = _input_differences(was["inputs"], now["inputs"])
@@ -66,18 +75,18 @@ def check_same(folder: Path, was: Mapping[str, Any], now: Mapping[str, Any]) -> 
         return
     remedies += ["the same scans as they were"] if inputs else []
     raise BadRequestError(
-        f"{folder}: a build that was begun is another: {_listed(options + inputs)}: give {_listed(remedies)} to go on, "
+        f"{folder}: another build was begun here: {_listed(options + inputs)}: give {_listed(remedies)} to resume it, "
         "or --fresh to start over"
     )
 
 
 def changed_inputs(inputs: Sequence[Input], config: BuildConfig, what: Mapping[str, Any]) -> str:
-    """Which of the inputs are not as `what` described them before they were read, for a reader; "" where all are."""
+    """Return a text listing the inputs that changed since `what` was described, or ""."""
     return _listed(_input_differences(what["inputs"], described(inputs, config)["inputs"]))
 
 
 def _option_differences(was: Mapping[str, Any], now: Mapping[str, Any]) -> tuple[list[str], list[str]]:
-    """What differs, and what to give to go on."""
+    """Return the differences, and the options that would resume the build."""
     differ, give = [], []
     for name in sorted({*was, *now}):
         before, after = was.get(name), now.get(name)
@@ -91,14 +100,14 @@ def _option_differences(was: Mapping[str, Any], now: Mapping[str, Any]) -> tuple
 
 
 def _value(value: Any) -> str:
-    """The value of an option for a reader."""
+    """Return the value of an option for a message."""
     if value is True:
         return "given"
     return "not given" if value in (None, False, "") else str(value)
 
 
 def _input_differences(was: list[dict[str, Any]], now: list[dict[str, Any]]) -> list[str]:
-    """Which scans came, went or changed."""
+    """Return which scans were added, are missing, or changed."""
     before, after = ({(e["path"], e["scan"]): e for e in entries} for entries in (was, now))
     differ = []
     for key in sorted({*before, *after}):
@@ -117,7 +126,7 @@ def _input_differences(was: list[dict[str, Any]], now: list[dict[str, Any]]) -> 
 
 
 def _listed(items: list[str]) -> str:
-    """Some items for a reader."""
+    """Join some items for a message."""
     more = len(items) - NAMED
     return "; ".join(items[:NAMED]) + (f"; and {more} more" if more > 0 else "")
 
@@ -125,9 +134,10 @@ def _listed(items: list[str]) -> str:
 def is_whole(
     target: Path, inputs: Sequence[Input], config: BuildConfig, tick: Callable[[int], None] = lambda _: None
 ) -> bool:
-    """Whether `target` is already the archive of these scans with these options, by the scans' SHA-256.
+    """Return whether `target` already is the archive of these scans, by their SHA-256, and options.
 
-    tick: told the bytes of each file as it is hashed; none is where anything cheaper tells that it is another.
+    tick: receives the bytes of each file that is hashed. No file is hashed if a cheaper check finds
+    a difference.
     """
     try:
         with Archive(target) as archive:

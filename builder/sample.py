@@ -1,7 +1,8 @@
-"""A quick look at scans, for an estimate: how many points, over how much surface, in how many voxels.
+"""Quick sampling of scans for an estimate: number of points, surface area, number of voxels.
 
-Headers say how many points there are, and where. Over how much surface they lie no header says: some points of each
-scan are looked at, a few seconds' worth. Scans that can seek are looked at in many places, others at their beginning.
+Headers tell the number of points and where they are. No header tells the surface area. Some points
+of each scan are therefore read, which takes a few seconds. Scans that can seek are sampled in many
+places, others at their beginning.
 """
 
 import time
@@ -22,25 +23,31 @@ from .scan_list import Input, inputs
 from .sources.scan import Scan
 from .survey import shared_step
 
-# Surfaces are measured in cubes of the first of these edges [m] that is far more than the distance of points, so that
-# a cube has at least so many: far less than a room.
+# Edges [m] of the cubes that measure surface area. The first edge is used that is far more than the
+# distance between points, which gives a cube at least POINTS_A_CUBE points; it should be far less
+# than a room.
 CUBES = (0.25, 0.5, 1.0, 2.0)
 POINTS_A_CUBE = 8
-# Looks at all scans together, and points at a time; a chunk of LAZ, 50,000 points, is decoded for each.
+# Total number of samples (looks) over all scans, and points of each; each decodes a chunk of LAZ,
+# 50,000 points.
 LOOKS, LOOK_POINTS = 512, 2048
-# Of the points looked at one in so many is kept.
+# One in this many sampled points is kept.
 SOME = 8
-# Points looked at of a scan that cannot seek, and the time after which no more scans are looked at [s].
+# Points sampled from a scan that cannot seek, and the time limit [s] after which no further scan is
+# sampled.
 FIRST_POINTS = 1 << 17
 SECONDS = 10.0
-# A file whose header says nothing of its points, text mostly, has one in so many bytes, or as its beginning shows.
+# A file whose header does not declare its points, mostly text, has one point per this many bytes,
+# or more if its beginning has.
 TEXT_BYTES = 30
-# Scans left out that are named.
+# Most scans left out that are named.
 MOST_NAMED = 5
 
 
 class _Look(NamedTuple):
-    """What was seen at one place. points: looked at.  held: edge [m] -> (k,) int64 keys of cubes that hold some.
+    """Sample at one place. points: their number.
+
+    held: edge [m] -> (k,) int64 keys of non-empty cubes.
 
     some: (m, 3) [m], one point in SOME.
     """
@@ -51,7 +58,10 @@ class _Look(NamedTuple):
 
 
 def _keys(xyz: NDArray[np.float64], edge: float) -> NDArray[np.int64]:
-    """Which cubes of an edge hold points (n, 3): a number each; a few that share one do not matter."""
+    """Return hash keys of the cubes of an edge that hold points (n, 3).
+
+    Rare collisions are harmless.
+    """
     at = np.floor(xyz / edge).astype(np.int64)
     return np.unique(
         at[:, 0] * 73_856_093 ^ at[:, 1] * 19_349_663 * 4_093 ^ at[:, 2] * 83_492_791 * 8_388_593
@@ -59,22 +69,22 @@ def _keys(xyz: NDArray[np.float64], edge: float) -> NDArray[np.int64]:
 
 
 class _Grid(NamedTuple):
-    """What is counted. edge: of voxels [m].  origin: (3,) [m] of cubes and voxels."""
+    """Grids to count in. edge: of voxels [m].  origin: (3,) [m] of cubes and voxels."""
 
     edge: float
     origin: NDArray[np.float64]
 
     def look(self, xyz: NDArray[np.float64]) -> _Look:
-        """What points (n, 3) [m] are in."""
+        """Sample points (n, 3) [m]: find the cubes that hold them."""
         xyz = xyz[(np.abs(xyz) <= MAX_COORDINATE).all(axis=1)] - self.origin
         held = {edge: _keys(xyz, edge) for edge in {*CUBES, self.edge}}
         return _Look(len(xyz), held, xyz[::SOME] + self.origin)
 
 
 def unseen(looks: Sequence[NDArray[np.int64]]) -> float:
-    """How many different keys there are, of those seen in some looks (Chao 1987, incidence): at least, about.
+    """Estimate a lower bound on the number of distinct keys from samples (Chao 1987, incidence).
 
-    Keys seen in one look alone, and in two, tell how many were seen in none.
+    The numbers of keys seen in one sample only, and in two, indicate how many were seen in none.
     """
     seen = Counter(key for look in looks for key in look.tolist())
     once = sum(count == 1 for count in seen.values())
@@ -84,19 +94,22 @@ def unseen(looks: Sequence[NDArray[np.int64]]) -> float:
 
 
 class _Seen(NamedTuple):
-    """What was seen of one scan. points: that it has.  all_over: looks fell everywhere, not on its beginning alone."""
+    """Samples of one scan. points: number in the scan.
+
+    all_over: samples lie everywhere in the scan.
+    """
 
     points: int
     looks: list[_Look]
     all_over: bool
 
 
-# A scan that cannot be read is left out.
+# Represents a scan that cannot be read and is left out.
 _LOST = _Seen(0, [], True)
 
 
 def _see(scan: Scan, looks: int, grid: _Grid) -> _Seen:
-    """Look at a scan: its header's number of points, and some of them."""
+    """Sample a scan: read some of its points, and their number from its header."""
     count = scan.declared_count
     if scan.seekable and count:
         if count <= looks * LOOK_POINTS:
@@ -117,7 +130,7 @@ def _see(scan: Scan, looks: int, grid: _Grid) -> _Seen:
             whole = False
             break
     if count is None:
-        # Its file's length is all there is to go by.
+        # Only the length of the file is known.
         count = read if whole else max(read, scan.path.stat().st_size // TEXT_BYTES)
     return _Seen(count, found, whole)
 
@@ -125,17 +138,18 @@ def _see(scan: Scan, looks: int, grid: _Grid) -> _Seen:
 def seen_scene(
     inputs: Sequence[Input], config: BuildConfig, rates: Rates | None = None, *, quick: bool = False
 ) -> Scene:
-    """Return what a look at opened scans tells of a build of them; some blocks of points are packed.
+    """Sample opened scans to describe a build of them; pack some blocks of points.
 
-    quick: look at a few points alone, and pack none.  rates: None: those of the package.
-    Raises ScanError where no scan has a point, and for a broken one unless `skip_bad`.
+    quick: read only a few points, and pack none.  rates: None: the packaged rates.
+    Raise ScanError if no scan has a point, and for a broken scan unless `skip_bad` is set.
     """
     lost = [each.fault for each in inputs if each.fault]
     scans = [scan for each in inputs for scan in each.scans]
     if lost and not config.skip_bad:
         raise ScanError(f"{lost[0]} (--skip-bad leaves such scans out)")
     bounds = _bounds(scans)
-    # Where headers say nothing the lattice's origin is not known, and voxels are cut elsewhere than they will be.
+    # Without bounds in the headers, the origin of the lattice is not known, and the voxel borders
+    # differ from those of the build.
     grid = _Grid(config.voxel, np.zeros(3) if bounds is None else bounds[0])
     begin, blind = time.perf_counter(), 0
     seen: list[_Seen] = []
@@ -201,7 +215,10 @@ def seen_scene(
 
 
 def _points_and_area(seen: Sequence[_Seen]) -> tuple[int, float]:
-    """Return how many points scans have, and over how much surface [m^2]. Raises ScanError where there are none."""
+    """Return the number of points and their surface area [m^2].
+
+    Raise ScanError if there are none.
+    """
     points = sum(each.points for each in seen)
     if not points:
         raise ScanError("no scan holds a point, expected some: check the files")
@@ -220,7 +237,7 @@ def _packed(
     config: BuildConfig,
     rates: Rates,
 ) -> Packed | None:
-    """Return what a sample of the scans tells; None where nothing can be packed as they are asked to be built."""
+    """Pack a sample of the scans; return None if they cannot be built with these options."""
     some = [look.some for each in seen for look in each.looks]
     if not any(map(len, some)):
         return None
@@ -228,7 +245,7 @@ def _packed(
     if not (step >= MIN_STEP and 1 <= round(config.voxel / step) <= MAX_VOXEL_STEPS):
         return None
     low = np.min(np.concatenate(some), axis=0) if bounds is None else bounds[0]
-    # Of a scan that was not looked at, or is broken, nothing is read.
+    # A scan that was not sampled, or is broken, is not read.
     used = [(scan, each.points) for scan, each in zip(scans, seen, strict=True) if each.points and each.looks]
     all_over = all(each.all_over for each in seen)
     return packed_sample(
@@ -243,7 +260,7 @@ def _packed(
 
 
 def _total(seen: Sequence[_Seen], edge: float) -> float:
-    """Cubes of an edge that all scans together have points in, those that no look fell on included."""
+    """Estimate the number of cubes of an edge that hold points, including unsampled cubes."""
     through = [look for each in seen if each.all_over for look in each.looks]
     if through and sum(look.points for look in through) >= sum(each.points for each in seen if each.all_over):
         found = float(len(np.unique(np.concatenate([look.held[edge] for look in through]))))
@@ -251,7 +268,7 @@ def _total(seen: Sequence[_Seen], edge: float) -> float:
         found = unseen([look.held[edge] for look in through])
     for each in seen:
         if each.looks and not each.all_over:
-            # Only its beginning was seen, the rest is taken to be as wide.
+            # Only its beginning was sampled; the rest is assumed to extend as far in proportion.
             own = len(np.unique(np.concatenate([look.held[edge] for look in each.looks])))
             found += own * each.points / max(1, sum(look.points for look in each.looks))
     looked = sum(each.points for each in seen if each.looks)
@@ -259,13 +276,16 @@ def _total(seen: Sequence[_Seen], edge: float) -> float:
 
 
 def _shared_step(scans: Sequence[Scan], voxel: float) -> float | None:
-    """Return the step of the lattice that all scans have, by their headers, as survey.py chooses it; or None."""
+    """Return the lattice step that all scans share by their headers, or None.
+
+    As survey.py chooses it.
+    """
     step = shared_step([scan.lattice for scan in scans])
     return step if step and max(MIN_STEP, voxel / MAX_VOXEL_STEPS) <= step <= voxel else None
 
 
 def _bounds(scans: Sequence[Scan]) -> NDArray[np.float64] | None:
-    """Low and high corner (2, 3) [m] of all scans by their headers; None where one says nothing."""
+    """Return the bounds (2, 3) [m] of all scans by their headers; None if one declares none."""
     bounds = [scan.bounds for scan in scans if scan.bounds is not None]
     if not bounds or len(bounds) < len(scans):
         return None
@@ -280,9 +300,9 @@ def planned(
     *,
     quick: bool = False,
 ) -> Plan:
-    """Return what building scans, folders of them or a list will take. quick: as of `seen_scene`.
+    """Return the estimate of building scans, folders of them or a list. quick: see `seen_scene`.
 
-    Raises ScanError and BadRequestError as a build would, as far as a look can tell.
+    Raise ScanError and BadRequestError as a build would, as far as a sample can detect the error.
     """
     rates = rates or load_rates()
     scene = seen_scene(inputs(paths, config.spacing), config, rates, quick=quick)

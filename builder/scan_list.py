@@ -1,9 +1,9 @@
-"""The list of scans that a build reads: found by their headers, written as TOML for hands to edit, read back.
+"""List of the scans that a build reads: made from headers, written as TOML, and read back.
 
-`inspect` makes entries of files and folders, `write_scan_list` and `read_scan_list` a file of them, `inputs` what a
-build opens: files and folders as they are, or a list with what was changed in it. Points are read only of the text of
-PTX and PTS files, in which the second scan can only be found by reading past the first, and of small scans without
-declared bounds (coincident.py).
+`inspect` makes entries of files and folders. `write_scan_list` and `read_scan_list` write and read
+a file of them. `inputs` opens what a build reads: files and folders as they are, or a list with its
+edits. Points are read only from the text of PTX and PTS files, where the second scan can be found
+only by reading past the first, and from small scans without declared bounds (coincident.py).
 """
 
 import math
@@ -33,31 +33,34 @@ from .sources.scan import Scan, sha256_of
 SUFFIX = ".toml"
 VERSION = 1
 
-# What stands for the bytes of a file's name that are no UTF-8.
+# Code points that represent bytes of a file name that is not UTF-8.
 _BROKEN_NAME = re.compile("[\ud800-\udfff]")
 
 HEAD = """\
 # Scans for `solidcloud build`, as their headers describe them. Edit by hand:
-#   use    false leaves a scan out: the archive says nothing of where it was.
-#   units  what a length in the file is: {units}.
-#   scale  multiplies coordinates besides.
-#   up     which axis of the file is up: z, y or x. Scans are turned so that it is z.
-#   pose   four rows of four: where the scan is, in metres with z up, after units, scale and up. Written here
-#          is what the file itself says, in its own units; left as it is, or left out, that is applied first.
-# The rest is for the record: count, low and high (bounds in the file's units, as declared), crs, sha256, fault.
+#   use    false leaves a scan out: the archive has no information about its region. units  unit of
+# length in the file: {units}.
+#   scale  additional factor of the coordinates.
+#   up     axis of the file that points up: z, y or x. Scans are turned to make it z. pose   four
+# rows of four: where the scan is, in metres with z up, after units, scale and up. The value written
+# here is the file's own pose, in its own units; unchanged or removed, it is applied first. The
+# other fields are for information: count, low and high (declared bounds in the file's units), crs,
+# sha256, fault.
 """
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScanEntry:
-    """One scan of a list.
+    """Entry of a scan list.
 
-    path, index: its file, and which of the scans in it, from 0.  format: as `Scan` says, "" where not known.
-    count: points that its header declares; None: not said.  bounds: (2, 3) as declared, in the file's units and frame
-    or where its pose puts it; None: not said.  pose: (4, 4), None where there is none.  units, up: keys of METRES and
-    TURNS.  scale: besides.  crs: text of the coordinate reference system, or "".  sha256: of the file, "" where not
-    asked.  use: whether a build takes it.  fault: why it cannot be read, or "".  warning: what looks wrong, or ""; not
-    written to a list.
+    path, index: file, and number of the scan in it, from 0.  format: as in `Scan`, "" if not known.
+    count: points that the header declares; None: not declared.
+    bounds: (2, 3) as declared, in the file's units, in its frame or where its pose puts it; None:
+    not declared.
+    pose: (4, 4), or None.  units, up: keys of METRES and TURNS.  scale: additional factor.
+    crs: text of the coordinate reference system, or "".  sha256: of the file, "" if not requested.
+    use: whether a build reads the scan.  fault: why it cannot be read, or "".
+    warning: what looks wrong, or ""; not written to a list.
     """
 
     path: Path
@@ -77,9 +80,10 @@ class ScanEntry:
 
 
 class Input(NamedTuple):
-    """One file of a build: its scans, opened and placed, or why there are none.
+    """File of a build: its scans, opened and placed, or the fault that prevents it.
 
-    region: (2, 3) world [m], where the points of a file that cannot be opened may have been; None: not known.
+    region: (2, 3) world [m], where the points of a file that cannot be opened may have been; None:
+    not known.
     """
 
     path: Path
@@ -91,10 +95,11 @@ class Input(NamedTuple):
 def inspect(
     paths: Iterable[Path], *, with_sha256: bool = False, progress: Progress | None = None
 ) -> list[ScanEntry]:
-    """The scans of files and folders by their headers, in the order of `scan_files`.
+    """List the scans of files and folders by their headers, in the order of `scan_files`.
 
-    A file that cannot be read is an entry with a fault, a file that holds no scan (E57 may) one too. Raises ScanError
-    for a path that does not exist and a folder without scans, BadRequestError for a file that is named twice.
+    A file that cannot be read, or that holds no scan (possible in E57), becomes an entry with a
+    fault. Raise ScanError for a path that does not exist and a folder without scans,
+    BadRequestError for a file that is named twice.
     """
     files = scan_files(paths)
     _check_once((path, 0) for path in files)
@@ -109,7 +114,7 @@ def inspect(
 
 
 def _inspect_file(path: Path, with_sha256: bool) -> list[ScanEntry]:
-    """The scans of one file."""
+    """List the scans of one file."""
     digest = ""
     try:
         digest = sha256_of(path) if with_sha256 else ""
@@ -139,9 +144,11 @@ def _inspect_file(path: Path, with_sha256: bool) -> list[ScanEntry]:
 
 
 def write_scan_list(path: Path, entries: Sequence[ScanEntry]) -> None:
-    """Write a list of scans as TOML, their paths relative to it. Replaces a file of that name, once all is written.
+    """Write a list of scans as TOML, with paths relative to it.
 
-    Raises BadRequestError for a name that is no UTF-8, which TOML cannot hold.
+    Replaces an existing file atomically.
+
+    Raise BadRequestError for a file name that is not UTF-8, which TOML cannot hold.
     """
     folder = Path(path).parent
     tables = [_table(entry, folder) for entry in entries]
@@ -150,10 +157,10 @@ def write_scan_list(path: Path, entries: Sequence[ScanEntry]) -> None:
     for entry in entries:
         if _BROKEN_NAME.search(str(entry.path)):
             raise BadRequestError(
-                f"{str(entry.path)!r}: a name that is no UTF-8, which a list cannot hold: give it another, or build "
+                f"{str(entry.path)!r}: the file name is not UTF-8, which a list cannot hold: rename the file, or build "
                 "without a list"
             )
-    # What else a header says is for the record.
+    # Other broken text is informational only: replace what is not UTF-8.
     data = _BROKEN_NAME.sub("\ufffd", text).encode()
     temporary = Path(path).with_name(f".{Path(path).name}.{os.getpid()}.tmp")
     try:
@@ -168,7 +175,7 @@ def write_scan_list(path: Path, entries: Sequence[ScanEntry]) -> None:
 
 
 def _table(entry: ScanEntry, folder: Path) -> dict[str, Any]:
-    """One scan as a table, without what is not known."""
+    """Make the table of one scan, without unknown values."""
     low, high = ([], []) if entry.bounds is None else entry.bounds.tolist()
     table = {
         "path": _relative(entry.path, folder),
@@ -190,18 +197,19 @@ def _table(entry: ScanEntry, folder: Path) -> dict[str, Any]:
 
 
 def _relative(path: Path, folder: Path) -> str:
-    """A path as seen from a folder, with slashes."""
+    """Return a path relative to a folder, with slashes."""
     seen = os.path.relpath(os.path.abspath(path), os.path.abspath(folder))
     if seen.startswith(".."):
-        # Up from a folder that is reached by a link leads elsewhere.
+        # If the folder is reached by a link, ".." leads elsewhere.
         seen = os.path.relpath(path.resolve(), folder.resolve())
     return Path(seen).as_posix()
 
 
 def read_scan_list(path: Path) -> list[ScanEntry]:
-    """The scans of a list that was written here, and edited perhaps. Reads no scan.
+    """Read a list of scans, possibly edited by hand. Opens no scan.
 
-    Raises BadRequestError that names the file, the scan and the field, what was found and what was expected.
+    Raise BadRequestError that names the file, the scan and the field, what was found and what was
+    expected.
     """
     path = Path(path)
     text = ""
@@ -230,7 +238,10 @@ def read_scan_list(path: Path) -> list[ScanEntry]:
 
 
 def _long_number(text: str) -> str:
-    """Where a number has more digits than Python reads, of which its own error does not say the line; or ""."""
+    """Return the position of a number with more digits than Python reads, or "".
+
+    Python's own error does not tell the line.
+    """
     most = sys.get_int_max_str_digits()
     found = re.search(rf"[0-9_]{{{most + 1},}}", text) if most else None
     if found is None:
@@ -240,22 +251,22 @@ def _long_number(text: str) -> str:
 
 
 def _shown(value: Any) -> str:
-    """A value for a reader, its beginning."""
+    """Return the beginning of a value as text for a message."""
     try:
         return str(value)[:80]
-    except ValueError:  # a hexadecimal number may have any length; as a decimal one it may not
+    except ValueError:  # a hexadecimal number may be too long to be converted to decimal
         return "a number of very many digits"
 
 
 class _Field(NamedTuple):
-    """What a field of a table may be. good: says whether a value is."""
+    """Constraint on a field of a table. good: predicate of valid values."""
 
     expected: str
     good: Any
 
 
 def _is_number(value: Any) -> bool:
-    if isinstance(value, int):  # of any length, in TOML
+    if isinstance(value, int):  # TOML integers have any length
         return not isinstance(value, bool) and abs(value) <= sys.float_info.max
     return isinstance(value, float) and math.isfinite(value)
 
@@ -295,7 +306,7 @@ _FIELDS = {
 
 
 def _entry(path: Path, number: int, table: Any) -> ScanEntry:
-    """One scan out of its table, every field checked."""
+    """Make an entry from a table; check every field."""
     name = table.get("path", "without path") if isinstance(table, dict) else "no table"
     where = f"{path}: scan {number} ({name})"
     if not isinstance(table, dict) or "path" not in table:
@@ -329,11 +340,12 @@ def _entry(path: Path, number: int, table: Any) -> ScanEntry:
 
 
 def inputs(paths: Sequence[Path], spacing: float | None = None) -> list[Input]:
-    """What a build reads: files and folders, and lists of scans (.toml), opened and placed in metres with z up.
+    """Open what a build reads: files, folders and lists of scans (.toml).
 
-    spacing: of sampled meshes [m].  A file that cannot be opened is kept with its fault, for all of them to be named.
-    Raises ScanError for a path that does not exist and a folder without scans, BadRequestError for a broken list and
-    for a scan that is named twice, OSError where a file cannot be opened now (passing.py).
+    Scans are placed in metres with z up. spacing: of sampled meshes [m].  A file that cannot be
+    opened is kept with its fault, so that all faults are named together. Raise ScanError for a path
+    that does not exist and a folder without scans, BadRequestError for a broken list and for a scan
+    that is named twice, OSError if a file cannot be opened for a transient reason (passing.py).
     """
     found: list[Input] = []
     for path in map(Path, paths):
@@ -352,7 +364,7 @@ def inputs(paths: Sequence[Path], spacing: float | None = None) -> list[Input]:
 
 
 def _check_once(scans: Iterable[tuple[Path, int]]) -> None:
-    """Raise BadRequestError for a scan, a file and which of its scans, that is there twice, by one path or another."""
+    """Raise BadRequestError for a scan (file, index) that occurs twice, even by different paths."""
     seen: dict[tuple[str, int], Path] = {}
     for path, index in scans:
         key = os.path.realpath(path), index
@@ -364,7 +376,7 @@ def _check_once(scans: Iterable[tuple[Path, int]]) -> None:
 
 
 def _opened(path: Path, entries: list[ScanEntry] | None, spacing: float | None) -> Input:
-    """One file with the scans that are listed of it; None: all, as they are."""
+    """Open one file with its listed scans; None: all of them, unchanged."""
 
     @cache
     def scans_spaced(factor: float) -> list[Scan]:
@@ -394,5 +406,5 @@ def _opened(path: Path, entries: list[ScanEntry] | None, spacing: float | None) 
             (entry.units, entry.up, entry.scale) != ("m", "z", 1.0) or entry.pose is not None
             for entry in entries
         )
-        # A header's bounds say nothing of where a list has put the scan.
+        # The header's bounds do not apply after a list has moved the scan.
         return Input(path, [], str(error), None if moved else region)

@@ -1,4 +1,7 @@
-"""The builder's work units: a run of voxels -> one shard file. Pure and idempotent; run in any process."""
+"""Build units: a run of consecutive voxels -> one shard file. Pure and idempotent.
+
+Run in any process.
+"""
 
 from collections.abc import Iterator
 from functools import partial
@@ -22,10 +25,11 @@ from .spool import Spool
 
 
 class ShardUnit(NamedTuple):
-    """One shard to be written. number, generation: its name's.  keys: its voxels, ascending.  points: in all of them.
+    """Shard to write. number, generation: of its name.  keys: of its voxels, ascending.
 
-    spool: where the points lie.  most_near: points around a voxel that may be held beside it, see classes.py.
-    folder: where the shard goes.
+    points: total number in its voxels.  spool: source of the points.
+    most_near: points around a voxel that may be held beside it, see classes.py.  folder:
+    destination of the shard.
     """
 
     number: int
@@ -41,9 +45,11 @@ class ShardUnit(NamedTuple):
 
 
 class Shard(NamedTuple):
-    """A shard written. rows: of the index.  size: of the file [bytes].  checksum: of all its bytes, `file_checksum`.
+    """Shard as written. rows: of the index.  size: of the file [bytes].
 
-    radius_counts: (32,) int64, points of each radius class; radius_capped: see schemas/index.py Header.
+    checksum: `file_checksum` of all its bytes.  radius_counts: (32,) int64, points of each radius
+    class.
+    radius_capped: see schemas/index.py Header.
     """
 
     name: str
@@ -55,9 +61,10 @@ class Shard(NamedTuple):
 
 
 def plan_shards(keys: NDArray[np.uint64], counts: NDArray[np.int64]) -> list[tuple[tuple[int, ...], int]]:
-    """Cut voxels (ascending keys, points of each) into runs of about `shard_points`: (keys, points) each.
+    """Cut voxels into runs of about `shard_points` points; return (keys, points) of each.
 
-    A function of the points alone, so that the archive does not depend on the number of jobs.
+    keys: ascending.  counts: points of each voxel. The result is a function of the points alone,
+    which makes the archive independent of the number of jobs.
     """
     most = shard_points(int(counts.sum()))
     plans: list[tuple[tuple[int, ...], int]] = []
@@ -75,17 +82,23 @@ def plan_shards(keys: NDArray[np.uint64], counts: NDArray[np.int64]) -> list[tup
 
 
 class _ClassCounts:
-    """Finds the radius classes of a unit's voxels and counts them. of: (32,) int64.  capped: too few neighbours."""
+    """Finder and counter of the radius classes of a unit's voxels.
+
+    of: (32,) int64, points of each class.  capped: points with too few neighbours.
+    """
 
     def __init__(self, unit: ShardUnit) -> None:
-        """Nothing counted yet."""
+        """Start with zero counts."""
         self.unit = unit
         self.of, self.capped = np.zeros(RADIUS_CLASSES, np.int64), 0
 
     def find(
         self, key: int, local: NDArray[np.int32], codes: range = ALL_CODES, times: int = 1
     ) -> NDArray[np.uint8]:
-        """The classes (n,) of points (n, 3) of a voxel, see `voxel_classes`. times: each is there, and so counted."""
+        """Return the classes (n,) of points (n, 3) of a voxel, see `voxel_classes`.
+
+        times: number of times that each point occurs and is counted.
+        """
         unit = self.unit
         found = voxel_classes(key, local, unit.config.models, unit.spool, unit.most_near, codes)
         self.of += times * np.bincount(found.of_point, minlength=RADIUS_CLASSES)
@@ -106,7 +119,7 @@ def build_shard(unit: ShardUnit) -> Shard:
 
 
 def _voxels(unit: ShardUnit, classes: _ClassCounts | None) -> Iterator[BuiltVoxel]:
-    """Each voxel of a unit built, its record, and the bounds of its points."""
+    """Yield each voxel of a unit, built, with its record and the bounds of its points."""
     for key in unit.keys:
         check()
         if is_dense(unit.spool.count(key), unit.config):

@@ -1,4 +1,4 @@
-"""What the bytes of an archive may depend on beside scans and options: versions, and our own sources."""
+"""Software that the bytes of an archive may depend on: library versions, hash of our sources."""
 
 import functools
 import hashlib
@@ -11,7 +11,10 @@ LIBRARIES = ("numpy", "numba", "llvmlite", "h5py", "zstandard")
 
 @functools.cache
 def software() -> dict[str, str]:
-    """What a unit's bytes may depend on, name -> version; solidcloud's own with a hash of its sources."""
+    """Return the software that a unit's bytes may depend on, name -> version.
+
+    The version of solidcloud includes a hash of its sources.
+    """
     root = Path(__file__).resolve().parent.parent
     sources = hashlib.sha256()
     for package in ("schemas", "builder"):

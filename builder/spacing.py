@@ -1,8 +1,10 @@
-"""The mean closest-point distance of an archive: over a sample of its distinct points, across voxel borders.
+"""Mean closest-point distance of an archive, over a sample of its distinct points.
 
-A voxel is opened once for its own points. What may have something closer in another voxel is asked there in rounds,
-all that concerns one voxel together: so each is opened twice in all, and one at a time, whatever they hold: 12 bytes a
-point of it, 16 where there are intensities, for its frame, its bytes and its nodes.
+Closest points are found across voxel borders. A voxel is opened once for its own points. Points
+that may have a closer point in another voxel are queried there in rounds, with all queries to one
+voxel together. Each voxel is therefore opened twice in total, and one voxel at a time is in memory,
+however many points they have: 12 bytes per point, 16 with intensities, for its frame, its bytes and
+its nodes.
 """
 
 from collections.abc import Callable, Iterator
@@ -22,31 +24,33 @@ from .progress import Progress, Silent
 from .radius import SUM_UNITS, MeanDistance, mean_of_squares
 from .record_points import hash_limit, leaves_of, spheres_of, taken
 
-# Voxels that a point is asked in at a time. A corner has 7 around it.
+# Voxels in which a point is queried at a time. A corner has 7 other voxels around it.
 _NEAR_VOXELS = 8
-# Points asked together that may have something closer in other voxels: what bounds the lists of those.
+# Number of points queried together that may have a closer point in other voxels; it bounds the
+# lists of voxels.
 _BATCH = 1 << 17
-# Below this a square of a distance in SUM_UNITS can be summed in three parts of 64 bits: 2 km.
+# Squares of distances below this [SUM_UNITS] can be summed in three parts of 64 bits: 2 km.
 _SHORT = 1 << 43
 
 
 class Sums(NamedTuple):
-    """Sums over points: distances in SUM_UNITS, their squares, how many. No order changes them."""
+    """Sums over points, in any order: distances in SUM_UNITS, their squares, and the count."""
 
     total: int = 0
     squares: int = 0
     sample: int = 0
 
     def plus(self, other: "Sums") -> "Sums":
-        """Both."""
+        """Return the sum of both."""
         return Sums(*(a + b for a, b in zip(self, other, strict=True)))
 
 
 class Open(NamedTuple):
-    """Points that may have something closer in another voxel.
+    """Points that may have a closer point in another voxel.
 
-    lattice: (q, 3) int64.  own: (q,) int64, the row of their voxel.  best: (q,) int64, squared distance of the closest
-    other point known [steps], FAR for none.
+    lattice: (q, 3) int64.  own: (q,) int64, row of their voxel.
+    best: (q,) int64, squared distance to the closest other point known [steps^2]; FAR if none is
+    known.
     """
 
     lattice: NDArray[np.int64]
@@ -55,7 +59,7 @@ class Open(NamedTuple):
 
 
 class _OwnUnit(NamedTuple):
-    """Voxels whose sampled points are to be asked among themselves."""
+    """Voxels whose sampled points are queried in their own voxel."""
 
     folder: Path
     rows: range
@@ -64,7 +68,7 @@ class _OwnUnit(NamedTuple):
 
 
 class _OtherUnit(NamedTuple):
-    """Points to be asked in voxels that they are not of: starts[i] to starts[i + 1] in rows[i].
+    """Queries of points in voxels other than their own: starts[i] to starts[i + 1] in rows[i].
 
     lattice: (m, 3) int64; best: (m,) int64.
     """
@@ -79,10 +83,11 @@ class _OtherUnit(NamedTuple):
 def archive_mean(
     folder: Path, sample: int, executor: Executor | None = None, progress: Progress | None = None
 ) -> MeanDistance:
-    """The mean closest-point distance [m] of the archive in `folder`, over about `sample` distinct points, or all.
+    """Measure the mean closest-point distance [m] of the archive in `folder`.
 
-    Points are chosen by their lattice coordinates alone; a point alone in the dataset has no closest other and is left
-    out, as is one 2^31 steps from any. Progress advances by the archive's points. Raises CorruptError, FormatError.
+    It uses about `sample` distinct points, or all, selected by their lattice coordinates alone. A
+    point that is alone in the dataset, or 2^31 steps from every other, is left out. Progress
+    advances by the archive's points. Raise CorruptError, FormatError.
     """
     progress = progress or Silent()
     with Archive(folder) as archive:
@@ -119,7 +124,7 @@ def archive_mean(
 
 
 def sums_of(best: NDArray[np.int64], step: float) -> Sums:
-    """The sums of squared distances (q,) [steps], FAR left out."""
+    """Return the sums for squared distances (q,) [steps^2], without those that are FAR."""
     distances = np.rint(np.sqrt(best[best < FAR].astype(np.float64)) * (step * SUM_UNITS)).astype(np.int64)
     total = squares = 0
     for begin in range(0, len(distances), 1 << 18):
@@ -140,10 +145,10 @@ def settle(
         [NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]], NDArray[np.int64]
     ],
 ) -> None:
-    """Lower left.best by the points of other voxels, nearest boxes first, until none can hold anything closer.
+    """Lower left.best by the points of other voxels, nearest boxes first, until none can be closer.
 
-    ask(rows, starts, lattice, best): what best (m,) becomes for points (m, 3) asked in voxels: starts[i] to
-    starts[i + 1] in rows[i]; rows ascend.
+    ask(rows, starts, lattice, best): returns the new best (m,) of points (m, 3) queried in voxels:
+    starts[i] to starts[i + 1] in rows[i]; rows ascend.
     """
     pending = np.arange(len(left.best))
     after = np.full((len(pending), 2), -1, np.int64)
@@ -160,15 +165,19 @@ def settle(
         query, target = pending[query[order]], target[order]
         begins = np.flatnonzero(np.diff(target, prepend=-1))
         found = ask(target[begins], np.append(begins, len(target)), left.lattice[query], left.best[query])
-        # Where nothing was known one voxel alone was asked; where all that can be nearer were, the point is done.
+        # A point without a known distance queried one voxel only. A point whose candidates are
+        # exhausted is done.
         again = (rows[:, -1] >= 0) | ((left.best[pending] >= FAR) & (rows[:, 0] >= 0))
         np.minimum.at(left.best, query, found)
         pending = pending[again]
 
 
 def own_best(archive: Archive, row: int, share: float) -> tuple[Open, NDArray[np.int64]]:
-    """What the sampled distinct points of one voxel know of their closest other, from that voxel: those that may have
-    something closer elsewhere, and the squared distances [steps] of the others."""
+    """Find the closest other point, within one voxel, of its sampled distinct points.
+
+    Return the points that may have a closer point elsewhere, and the squared distances [steps^2] of
+    the others.
+    """
     base, steps = _corners(archive)[row], archive.header.lattice.voxel_steps
     record = archive.open_voxel(row, columns=())
     parts = list(taken(record, base, limit=hash_limit(share)))
@@ -191,7 +200,7 @@ def own_best(archive: Archive, row: int, share: float) -> tuple[Open, NDArray[np
 def other_best(
     archive: Archive, row: int, lattice: NDArray[np.int64], best: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """What best (q,) [steps, squared] becomes when points (q, 3) are asked in another voxel."""
+    """Return the new best (q,) [steps^2] of points (q, 3) queried in another voxel."""
     record, best = archive.open_voxel(row, columns=()), best.copy()
     each = np.arange(len(best) + 1)
     home = np.full(len(best), -1, np.int32)
@@ -202,17 +211,20 @@ def other_best(
 
 
 def _corners(archive: Archive) -> NDArray[np.int64]:
-    """Lattice coordinates of the corner of every voxel, (v, 3)."""
+    """Return the lattice coordinates of the corner of every voxel, (v, 3)."""
     return archive.coordinates * archive.header.lattice.voxel_steps
 
 
 def _points(archive: Archive) -> NDArray[np.int64]:
-    """Points of every voxel, (v,)."""
+    """Return the number of points of every voxel, (v,)."""
     return archive.voxels["rows"][:, 2].astype(np.int64)
 
 
 def _own_sums(unit: _OwnUnit) -> tuple[Sums, Open]:
-    """The sums of the points that are done, and what is left, of a run of voxels; in any process."""
+    """Return the sums of the points settled in a range of voxels, and the others.
+
+    Runs in any process.
+    """
     with Archive(unit.folder) as archive:
         sums, left = Sums(), []
         for row in unit.rows:
@@ -230,14 +242,14 @@ def _other_unit(
     best: NDArray[np.int64],
     run: range,
 ) -> _OtherUnit:
-    """The part of what is to be asked that concerns rows[run]."""
+    """Return the part of the queries that concerns rows[run]."""
     cuts = starts[run.start : run.stop + 1]
     a, b = int(cuts[0]), int(cuts[-1])
     return _OtherUnit(folder, rows[run.start : run.stop], cuts - a, lattice[a:b], best[a:b])
 
 
 def _other_best(unit: _OtherUnit) -> NDArray[np.int64]:
-    """`other_best` of each voxel of a unit, one behind the other; in any process."""
+    """Return `other_best` of each voxel of a unit, concatenated; runs in any process."""
     with Archive(unit.folder) as archive:
         return np.concatenate(
             [
@@ -248,5 +260,5 @@ def _other_best(unit: _OtherUnit) -> NDArray[np.int64]:
 
 
 def _runs(rows: NDArray[np.int64], starts: NDArray[np.int64]) -> Iterator[tuple[int, int, int]]:
-    """Each row with where what concerns it begins and ends."""
+    """Return each row with the begin and end of its queries."""
     return zip(rows.tolist(), starts[:-1].tolist(), starts[1:].tolist(), strict=True)

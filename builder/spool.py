@@ -1,13 +1,15 @@
-"""The spool: all points of a build, quantised, in sorted runs on disk, from which any voxel is read in order.
+"""Spool: all points of a build, quantised, in sorted runs on disk.
 
-A run is two files that say nothing of each other but their name:
+Voxels are read from the runs in order. A run consists of two files that share only their name:
 
-- `NAME.run`: packed rows, see `spool_dtype`, sorted by (voxel key, Morton code in the voxel, scan_index, intensity);
-- `NAME.keys`: its directory, uint64 words: the keys of its voxels ascending, then the row each begins at, then how many
-  rows there are. `s` voxels are `2 s + 1` words.
+- `NAME.run`: packed rows, see `spool_dtype`, sorted by (voxel key, Morton code in the voxel,
+  scan_index, intensity);
+- `NAME.keys`: its directory, uint64 words: the keys of its voxels, ascending, then the first row of
+  each voxel, then the total number of rows. `s` voxels take `2 s + 1` words.
 
-Nothing in them says whether they are what was written: notes do, by sizes and checksums (`RunSums`). A `Spool` is a
-folder of runs. It holds no rows: a voxel's are read from the few runs that have some of it, each time.
+The files contain no checksums; journal entries record their sizes and checksums (`RunSums`). A
+`Spool` is a folder of runs. It holds no rows: each access reads the rows of a voxel from the few
+runs that have some.
 """
 
 import json
@@ -34,24 +36,24 @@ from .kernels.octree import voxel_codes
 
 RUN_SUFFIX = ".run"
 KEYS_SUFFIX = ".keys"
-# Of the file of all directories merged.
+# Suffix of the file of all merged directories.
 MERGED_SUFFIX = f".directory{TEMPORARY_SUFFIX}"
-# Voxels of runs that are merged at a time. 1,400 runs of 1,500 voxels each took 200 MB in each process, all merged at
-# once in its memory; 5,000 scans would have taken two gigabytes.
+# Voxels of runs that are merged at a time. Merging all of 1,400 runs of 1,500 voxels each at once
+# took 200 MB in each process; 5,000 scans would have taken two gigabytes.
 MERGED_ENTRIES = 1 << 18
 
-# Every so many rows of a voxel in a run, one Morton code is read to find a block: then a block's end is found with
-# one more read of so many rows, 48 kB, and 10^8 rows are known by 24,000 codes.
+# Distance in rows between the Morton codes that are read to find a block of a voxel in a run. One
+# more read of this many rows, 48 kB, then finds the end of a block. 10^8 rows need 24,000 codes.
 CODE_STRIDE = 4096
 # A voxel key has three coordinates of 21 bits.
 KEY_BITS = 63
 
-# What was written of a run, as JSON holds it: bytes and `file_checksum` of NAME.run, then those of NAME.keys.
+# Sums of a run as a JSON value: size and `file_checksum` of NAME.run, then those of NAME.keys.
 RunSums = list[int]
 
 
 def spool_dtype(config: BuildConfig) -> np.dtype:
-    """A row of the spool."""
+    """Return the dtype of a row of the spool."""
     fields: list[tuple[Any, ...]] = [("local", "<i4", (3,))]
     if "scan" in config.keep:
         fields.append(("scan_index", "<u2"))
@@ -61,23 +63,29 @@ def spool_dtype(config: BuildConfig) -> np.dtype:
 
 
 def canonical_columns(rows: NDArray) -> tuple[NDArray, ...]:
-    """The columns of rows, least significant first, that the order within a Morton code goes by, for np.lexsort."""
+    """Return the sort keys of rows within a Morton code, least significant first (np.lexsort)."""
     return tuple(rows[name] for name in ("intensity", "scan_index") if name in (rows.dtype.names or ()))
 
 
 def row_codes(rows: NDArray) -> NDArray[np.uint64]:
-    """The Morton codes (n,) of rows in their voxel."""
+    """Return the Morton codes (n,) of rows in their voxel."""
     return np.asarray(voxel_codes(np.ascontiguousarray(rows["local"])), np.uint64)
 
 
 def places_sum(key: int, local: NDArray[np.int32], lattice: Lattice) -> int:
-    """Sum modulo 2^64 of a hash of the lattice coordinates of each point, local (n, 3), of a voxel."""
+    """Return the sum modulo 2^64 of a hash of the lattice coordinates of each point of a voxel.
+
+    local: (n, 3) coordinates in the voxel.
+    """
     corner = voxel_coordinates(np.array([key], np.uint64))[0] * lattice.voxel_steps
     return int(content_sum(np.ascontiguousarray((local + corner).T).view(np.uint64), SEEDS[0]))
 
 
 def write_run(path: Path, keys: NDArray[np.uint64], rows: NDArray) -> None:
-    """Sort rows (n,), in any order, of the voxels `keys` (n,), and write them as the run `path` (NAME.run), n >= 1."""
+    """Sort rows (n,) and write them as the run `path` (NAME.run). n >= 1.
+
+    keys: (n,) voxel of each row.
+    """
     order = np.lexsort((*canonical_columns(rows), row_codes(rows), keys))
     rows, keys = rows[order], keys[order]
     found, starts = np.unique(keys, return_index=True)
@@ -87,44 +95,53 @@ def write_run(path: Path, keys: NDArray[np.uint64], rows: NDArray) -> None:
 
 
 class SummedFile:
-    """A file that is being written, and the sums of what was. sums: bytes, and their `file_checksum`."""
+    """File being written, with the sums of its contents. sums: size, and `file_checksum`."""
 
     def __init__(self, file: BinaryIO) -> None:
-        """Nothing written yet."""
+        """Start with empty sums."""
         self._file, self.sums = file, [0, 0]
 
     def write(self, data: bytes | memoryview) -> None:
-        """Write more, in bytes."""
+        """Append bytes."""
         self._file.write(data)
-        # Summed here and not from the disk: what a disk reads back is what is in question.
+        # The checksum is of the data in memory, because it has to detect a disk that reads back
+        # other data.
         self.sums = [self.sums[0] + len(data), zlib.crc32(data, self.sums[1])]
 
 
 @contextmanager
 def new_run(path: Path) -> Iterator[SummedFile]:
-    """The file of a run, to be written in order; it has its name when it is whole and on disk for good."""
+    """Open the file of a run, to be written in order.
+
+    It gets its name when complete and durable.
+    """
     with new_file(path) as file:
         yield SummedFile(file)
 
 
 def write_directory(path: Path, keys: NDArray[np.uint64], starts: NDArray[np.int64]) -> list[int]:
-    """Write the directory of the run `path`: keys (s,) ascending, starts (s + 1,) ascending; returns its sums."""
+    """Write the directory of the run `path`; return its sums.
+
+    keys: (s,) ascending.  starts: (s + 1,) ascending.
+    """
     with new_run(path.with_suffix(KEYS_SUFFIX)) as file:
         file.write(np.concatenate([keys.astype("<u8"), starts.astype("<u8")]).tobytes())
     return file.sums
 
 
 def run_sizes(path: Path) -> tuple[int | None, int | None]:
-    """The bytes of a run's two files; None for one that is missing."""
+    """Return the sizes of a run's two files; None for a missing file."""
     files = (path, path.with_suffix(KEYS_SUFFIX))
     first, second = (file.stat().st_size if file.is_file() else None for file in files)
     return first, second
 
 
 def is_other_run(path: Path, sums: RunSums) -> bool:
-    """Whether what there is of a run is not what was written, of which nothing can be made; both files are read.
+    """Return whether a run differs from what was written and is therefore unusable.
 
-    A file that is missing is no other: what was made of the run while it was there is as it should be.
+    Reads both files.
+
+    A missing file is no difference: what was made from the run while it existed is correct.
     """
     written = zip((path, path.with_suffix(KEYS_SUFFIX)), sums[::2], sums[1::2], strict=True)
     return any(
@@ -134,10 +151,10 @@ def is_other_run(path: Path, sums: RunSums) -> bool:
 
 
 def read_directory(path: Path, row_bytes: int) -> tuple[NDArray[np.uint64], NDArray[np.int64]]:
-    """keys (s,) and starts (s + 1,) of the run `path`, of rows of so many bytes.
+    """Read keys (s,) and starts (s + 1,) of the run `path`.
 
-    Raises CorruptError for words that can be no directory of this run. One that can be, and is not what was written,
-    is told by its checksum alone.
+    row_bytes: size of its rows. Raise CorruptError for words that cannot be a directory of this
+    run. Only the checksum detects a directory that is possible but differs from what was written.
     """
     words = np.fromfile(path.with_suffix(KEYS_SUFFIX), "<u8")
     voxels = len(words) // 2
@@ -159,7 +176,7 @@ def read_directory(path: Path, row_bytes: int) -> tuple[NDArray[np.uint64], NDAr
 
 
 class _Part(NamedTuple):
-    """Some rows of one voxel in one run: from row `start`, `size` of them."""
+    """Consecutive rows of one voxel in one run: `size` rows from row `start` on."""
 
     run: int
     start: int
@@ -167,9 +184,10 @@ class _Part(NamedTuple):
 
 
 class _Directory(NamedTuple):
-    """All runs' directories, merged: voxel i has the rows first[i] to first[i + 1] of entries: run, start, size.
+    """Merged directories of all runs. Rows first[i] to first[i + 1] of `entries` belong to voxel i.
 
-    keys, counts: (v,), see Spool.  first: (v + 1,).  entries: (e, 3).  All are mapped from a file.
+    keys, counts: (v,), see Spool.  first: (v + 1,).  entries: (e, 3): run, start, size. All arrays
+    are mapped from a file.
     """
 
     paths: list[Path]
@@ -180,10 +198,12 @@ class _Directory(NamedTuple):
 
 
 def _merge_directories(paths: Sequence[Path], row_bytes: int, path: Path) -> None:
-    """Write the directories of runs, of rows of so many bytes, merged, as the file `path`.
+    """Merge the directories of runs and write them as the file `path`.
 
-    uint64 words: how many voxels, entries, and bytes of names there are; keys, first, entries and counts as in
-    `_Directory`; then the runs' names as JSON. Memory: 24 bytes a voxel, and 100 an entry of MERGED_ENTRIES.
+    row_bytes: size of the rows of the runs.
+    The file holds uint64 words: the numbers of voxels, of entries, and of bytes of names; keys,
+    first, entries and counts as in `_Directory`; then the runs' names as JSON. This takes 24 bytes
+    of memory per voxel, and 100 per entry of MERGED_ENTRIES.
     """
     keys = _all_keys(paths, row_bytes)
     pairs = np.zeros(len(keys) + 1, np.int64)
@@ -207,7 +227,7 @@ def _merge_directories(paths: Sequence[Path], row_bytes: int, path: Path) -> Non
 
 
 def _all_keys(paths: Sequence[Path], row_bytes: int) -> NDArray[np.uint64]:
-    """The keys of all voxels in some runs, ascending."""
+    """Return the keys of all voxels in some runs, ascending."""
     keys, waiting, held = np.empty(0, np.uint64), [np.empty(0, np.uint64)], 0
     for run in paths:
         waiting.append(read_directory(run, row_bytes)[0])
@@ -218,7 +238,7 @@ def _all_keys(paths: Sequence[Path], row_bytes: int) -> NDArray[np.uint64]:
 
 
 def _entries_of(paths: Sequence[Path], row_bytes: int, low: np.uint64, high: np.uint64) -> NDArray[np.int64]:
-    """Run, start and size (e, 3) of the voxels from key `low` to `high`, by key, then by run."""
+    """Return run, start and size (e, 3) of the voxels `low` to `high`, sorted by key, then run."""
     keys, tables = [], []
     for number, run in enumerate(paths):
         found, starts = read_directory(run, row_bytes)
@@ -230,7 +250,7 @@ def _entries_of(paths: Sequence[Path], row_bytes: int, low: np.uint64, high: np.
 
 
 def _open_directories(path: Path) -> _Directory:
-    """Map what `_merge_directories` wrote: a process that asks for a few voxels holds those alone."""
+    """Map the file of `_merge_directories`: a process that needs a few voxels loads only these."""
     words = np.asarray(np.memmap(path, "<i8", "r", shape=(path.stat().st_size // 8,)))
     voxels, entries, length = (int(n) for n in words[:3])
     ends = np.cumsum([3, voxels, voxels + 1, 3 * entries, voxels])
@@ -243,10 +263,11 @@ def _open_directories(path: Path) -> _Directory:
 
 
 class Spool:
-    """A folder of sorted runs. Picklable, and cheap to send: what it knows of the runs is read on first use.
+    """Folder of sorted runs. Picklable and small; its directories are read on first use.
 
-    Safe in any process, and from one thread at a time. Opened when all runs are written: later ones are not seen.
-    places: what `places_sum` of all its rows must be; None: not known.
+    Safe in any process, and from one thread at a time. Open it after all runs are written: it does
+    not see later ones.
+    places: the `places_sum` that all its rows must have; None: not known.
     """
 
     def __init__(
@@ -257,9 +278,11 @@ class Spool:
         runs: Collection[str] | None = None,
         places: int | None = None,
     ) -> None:
-        """Take the runs in `folder`, rows of `dtype`, voxels of `lattice`; nothing is read yet.
+        """Use the runs in `folder`, with rows of `dtype` and voxels of `lattice`.
 
-        runs: names of those that count; None: all that are there.
+        Reads nothing yet.
+
+        runs: names of the runs to use; None: all in the folder.
         """
         self.folder, self.dtype, self.lattice = Path(folder), np.dtype(dtype), lattice
         self.runs, self.places = None if runs is None else tuple(sorted(runs)), places
@@ -268,55 +291,68 @@ class Spool:
         self._sampled: tuple[int, list[NDArray[np.uint64]]] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
-        """What says where it is: a file that each process maps, of directories that are merged before any is sent."""
+        """Return the state to pickle.
+
+        The directories are merged first, into a file that each process maps.
+        """
         self._merged()
         return {**self.__dict__, "runs": (), "_directory": None, "_sampled": None}
 
     @property
     def keys(self) -> NDArray[np.uint64]:
-        """(v,) the voxels that hold points, ascending."""
+        """Return the keys (v,) of the voxels that hold points, ascending."""
         return self._merged().keys
 
     @property
     def counts(self) -> NDArray[np.int64]:
-        """(v,) points of each voxel of `keys`."""
+        """Return the number of points (v,) of each voxel of `keys`."""
         return self._merged().counts
 
     def count(self, key: int) -> int:
-        """How many points a voxel holds; 0 for one that is not there."""
+        """Return the number of points of a voxel; 0 if the voxel has none."""
         return sum(part.size for part in self._parts(key))
 
     def rows(self, key: int) -> list[NDArray]:
-        """A voxel's rows, one array a run that holds some, each in canonical order."""
+        """Return the rows of a voxel, one array per run that has some, each in canonical order."""
         return [self._read(part) for part in self._parts(key)]
 
     def block_count(self, key: int, code_lo: int, code_hi: int) -> int:
-        """How many of a voxel's points have a Morton code in [code_lo, code_hi)."""
+        """Return how many points of a voxel have a Morton code in [code_lo, code_hi)."""
         return sum(part.size for part in self._block(key, code_lo, code_hi))
 
     def block_rows(self, key: int, code_lo: int, code_hi: int) -> list[NDArray]:
-        """The rows of a voxel whose Morton code is in [code_lo, code_hi), one array a run that holds some."""
+        """Return the rows of a voxel in a Morton code range, one array per run that has some.
+
+        The range is [code_lo, code_hi).
+        """
         return [self._read(part) for part in self._block(key, code_lo, code_hi)]
 
     def block_windows(self, key: int, code_lo: int, code_hi: int, points: int) -> list[Iterator[NDArray]]:
-        """The same a few rows at a time: an iterator a run, such that a window of each is about `points` together."""
+        """Iterate over the same rows window by window, with one iterator per run.
+
+        One window of each iterator together have about `points` points.
+        """
         parts = self._block(key, code_lo, code_hi)
         most = max(1, points // max(1, len(parts)))
         return [self._windows(part, most) for part in parts]
 
     def _windows(self, part: _Part, most: int) -> Iterator[NDArray]:
-        """The rows of a part, at most so many at a time."""
+        """Yield the rows of a part, at most `most` at a time."""
         for at in range(0, part.size, most):
             yield self._read(_Part(part.run, part.start + at, min(most, part.size - at)))
 
     def _merged(self) -> _Directory:
-        """All directories, sorted by key, then by the name of the run: merged once, by whom it is asked first."""
+        """Return the merged directories, sorted by key, then by run name.
+
+        Merge them on first use.
+        """
         if self._directory is None:
             if self._file is None:
                 names = self.runs
                 if names is None:
                     names = tuple(sorted(path.name for path in self.folder.glob(f"*{RUN_SUFFIX}")))
-                # Of use to this session alone, and so removed with what is temporary by the next.
+                # The file serves this session only. The next build removes it with the other
+                # temporary files.
                 path = self.folder / f"{uuid.uuid4().hex}{MERGED_SUFFIX}"
                 _merge_directories([self.folder / name for name in names], self.dtype.itemsize, path)
                 self._file = path
@@ -324,7 +360,7 @@ class Spool:
         return self._directory
 
     def _parts(self, key: int) -> list[_Part]:
-        """Where a voxel's rows lie."""
+        """Return where a voxel's rows are."""
         merged = self._merged()
         at = int(np.searchsorted(merged.keys, np.uint64(key)))
         if at == len(merged.keys) or int(merged.keys[at]) != key:
@@ -333,7 +369,10 @@ class Spool:
         return [_Part(*part) for part in merged.entries[which].tolist()]
 
     def _read(self, part: _Part) -> NDArray:
-        """The rows of a part. Raises CorruptError for a run that is shorter than its directory says."""
+        """Read the rows of a part.
+
+        Raise CorruptError if the run is shorter than its directory says.
+        """
         check()
         path = self._merged().paths[part.run]
         rows = np.fromfile(path, self.dtype, part.size, offset=part.start * self.dtype.itemsize)
@@ -345,7 +384,7 @@ class Spool:
         return rows
 
     def _block(self, key: int, code_lo: int, code_hi: int) -> list[_Part]:
-        """Where the rows of a block lie; runs that hold none of it are left out."""
+        """Return where the rows of a block are; runs without any are left out."""
         found = []
         for part, samples in zip(self._parts(key), self._samples(key), strict=True):
             begin = self._first_at_least(part, samples, code_lo)
@@ -355,13 +394,16 @@ class Spool:
         return found
 
     def _samples(self, key: int) -> list[NDArray[np.uint64]]:
-        """The code of every CODE_STRIDE'th row of each part of a voxel; of the last voxel asked they are kept."""
+        """Return the code of every CODE_STRIDE'th row of each part of a voxel.
+
+        Those of the last voxel are cached.
+        """
         if self._sampled is None or self._sampled[0] != key:
             self._sampled = (key, [self._sample(part) for part in self._parts(key)])
         return self._sampled[1]
 
     def _sample(self, part: _Part) -> NDArray[np.uint64]:
-        """The code of every CODE_STRIDE'th row of a part, by one small read each."""
+        """Read the code of every CODE_STRIDE'th row of a part, with one small read each."""
         size = self.dtype.itemsize
         with open(self._merged().paths[part.run], "rb", buffering=0) as file:
             rows = b"".join(
@@ -371,7 +413,10 @@ class Spool:
         return row_codes(np.frombuffer(rows, self.dtype))
 
     def _first_at_least(self, part: _Part, samples: NDArray[np.uint64], code: int) -> int:
-        """The first row of a part whose code is not below `code`; its size where there is none."""
+        """Return the first row of a part whose code is at least `code`.
+
+        The part's size if there is none.
+        """
         stride = int(
             np.searchsorted(samples, np.uint64(code))
         )  # samples[stride - 1] < code <= samples[stride]

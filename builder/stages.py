@@ -1,4 +1,4 @@
-"""The stages of long work: each is timed, and told to a listener."""
+"""Timing of the stages of long work, and their report to a progress listener."""
 
 import time
 from collections.abc import Iterator
@@ -8,16 +8,16 @@ from .progress import Progress
 
 
 class Stages:
-    """Times the stages and passes them on to the listener."""
+    """Timer of stages that passes them on to a progress listener."""
 
     def __init__(self, progress: Progress) -> None:
-        """Tell `progress`. seconds: of each stage so far."""
+        """Report to `progress`. seconds: of each stage so far."""
         self.progress = progress
         self.seconds: dict[str, float] = {}
 
     @contextmanager
     def timed(self, name: str) -> Iterator[None]:
-        """A stage that says itself what it does."""
+        """Time a stage that reports its own progress."""
         begin = time.perf_counter()
         try:
             yield
@@ -26,7 +26,7 @@ class Stages:
 
     @contextmanager
     def stage(self, name: str, total: int, unit: str) -> Iterator[None]:
-        """A stage of so much work."""
+        """Time a stage and report it, with its total amount of work."""
         with self.timed(name):
             self.progress.start(name, total, unit)
             try:

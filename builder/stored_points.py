@@ -1,7 +1,8 @@
-"""Points of an archive's voxels back into sorted runs, and which voxels hold points of a scan: work units.
+"""Work units that turn stored voxels back into sorted runs, and that find the voxels of a scan.
 
-What an added scan does not touch stays as it is on disk; of what it touches the stored points are spooled again, beside
-the new ones, so that a voxel is built of both as if all had come together.
+Voxels that an added scan does not affect stay as they are on disk. The stored points of the
+affected voxels are spooled again, beside the new ones. A voxel is then built from both as if all
+had been added together.
 """
 
 from collections.abc import Iterator
@@ -28,20 +29,20 @@ from .octree import gather_voxel
 from .record_points import leaves_of, taken
 from .spool import RUN_SUFFIX, Spool, canonical_columns, places_sum, spool_dtype, write_directory
 
-# Bytes a point that is held while a run is written: code and columns, and of a voxel order, sorted copies and rows.
-# Beside the record that they are read of (memory.py).
+# Bytes per point held while a run is written: code and columns, and for one voxel order, sorted
+# copies and rows. This is in addition to the record that they are read from (memory.py).
 RUN_BYTES_A_POINT = 60
-# Points of which scan a record's are that are looked at together.
+# Points of a record whose scan numbers are examined together.
 LOOKED_AT = 1 << 16
 
 _FROM_CORNER = np.zeros(3, np.int64)
 
 
 class GatherUnit(NamedTuple):
-    """Voxels of an archive to be spooled. rows: of its index.  points: in them.
+    """Voxels of an archive to spool. rows: of its index.  points: their total number.
 
-    spool: folder of the runs.  name: of them.  dropped: scans whose points are left out.  before: folder for runs with
-    those too, or None.  run_points: points a run.
+    spool: folder of the runs.  name: of the runs.  dropped: scans whose points are left out.
+    before: folder for runs that include these points, or None.  run_points: points per run.
     """
 
     archive: Path
@@ -56,8 +57,12 @@ class GatherUnit(NamedTuple):
 
 
 class Gathered(NamedTuple):
-    """radius_counts: (32,) int64, points of each radius class as stored.  perhaps_few: keys of the voxels that may have
-    points with too few neighbours for a class.  places: `places_sum` of the points that are not left out (spool.py)."""
+    """Result of spooling stored voxels.
+
+    radius_counts: (32,) int64, points of each radius class as stored.
+    perhaps_few: keys of the voxels that may have points with too few neighbours for a class.
+    places: `places_sum` of the points that are not left out (spool.py).
+    """
 
     radius_counts: NDArray[np.int64]
     perhaps_few: tuple[int, ...]
@@ -65,7 +70,7 @@ class Gathered(NamedTuple):
 
 
 class FindUnit(NamedTuple):
-    """Voxels of an archive in which points of some scans are looked for. points: in them."""
+    """Voxels of an archive to search for points of some scans. points: their total number."""
 
     archive: Path
     rows: tuple[int, ...]
@@ -74,7 +79,9 @@ class FindUnit(NamedTuple):
 
 
 class Found(NamedTuple):
-    """A voxel that holds points of those scans. row: of the index.  box: (2, 3) lattice, of those points.
+    """Voxel that holds points of these scans. row: of the index.
+
+    box: (2, 3) lattice, of those points.
 
     counts: points of each scan.
     """
@@ -85,7 +92,7 @@ class Found(NamedTuple):
 
 
 class FewUnit(NamedTuple):
-    """Voxels of which the points with too few neighbours are to be counted."""
+    """Voxels whose points with too few neighbours are to be counted."""
 
     keys: tuple[int, ...]
     points: int
@@ -95,21 +102,24 @@ class FewUnit(NamedTuple):
 
 
 def stored_column(record: OpenRecord, name: str, rows: NDArray[np.int64]) -> NDArray:
-    """A column (m,) of some points of a record, whose dtype has it."""
+    """Return a column (m,) of some points of a record, whose dtype must have it."""
     kind, at = record.dtype.fields[name][:2]  # type: ignore[index]  # its dtype has fields
     planes = record.planes[at : at + kind.itemsize]
     return np.ascontiguousarray(planes[:, rows].T).view(kind).reshape(-1)
 
 
 class _Points(NamedTuple):
-    """Points of one voxel. codes: (n,) uint64, Morton codes, which hold the coordinates.  columns: (n,) by name."""
+    """Points of one voxel.
+
+    codes: (n,) uint64, Morton codes, which contain the coordinates.  columns: (n,) by name.
+    """
 
     codes: NDArray[np.uint64]
     columns: dict[str, NDArray]
 
 
 def record_points(record: OpenRecord, dtype: np.dtype) -> Iterator[_Points]:
-    """The points of a record with the columns of a row of the spool, a block at a time."""
+    """Yield the points of a record, with the columns of a spool row, a block at a time."""
     columns = [name for name in dtype.names or () if name != "local"]
     for block in taken(record, _FROM_CORNER):
         yield _Points(
@@ -118,7 +128,10 @@ def record_points(record: OpenRecord, dtype: np.dtype) -> Iterator[_Points]:
 
 
 class _Runs:
-    """Points that wait to be written as runs NAME-0000, NAME-0001, ... of a folder; voxel by voxel, by rising keys."""
+    """Points waiting to be written as runs NAME-0000, NAME-0001, ...
+
+    of a folder, in order of voxel keys.
+    """
 
     def __init__(self, folder: Path, name: str, dtype: np.dtype, run_points: int) -> None:
         self._folder, self._name, self._dtype, self._run_points = folder, name, dtype, run_points
@@ -126,7 +139,7 @@ class _Runs:
         self._waiting = self._written = 0
 
     def take(self, key: int, points: _Points) -> None:
-        """Points of one voxel."""
+        """Add points of one voxel."""
         if len(points.codes):
             self._held.setdefault(key, []).append(points)
             self._waiting += len(points.codes)
@@ -134,7 +147,7 @@ class _Runs:
             self.write()
 
     def write(self) -> None:
-        """Write what waits."""
+        """Write the waiting points as a run."""
         if not self._held:
             return
         path = self._folder / f"{self._name}-{self._written:04d}{RUN_SUFFIX}"
@@ -151,10 +164,10 @@ class _Runs:
 
 
 def sorted_rows(parts: list[_Points], dtype: np.dtype) -> NDArray:
-    """Points of one voxel as rows of the spool, in the order of a run.
+    """Return the points of one voxel as spool rows, in the order of a run.
 
-    Codes are sorted alone, and by the columns where they are equal; coordinates are made of them again. To sort rows by
-    all columns takes five times as long.
+    Codes are sorted alone, and by the columns where they are equal; then coordinates are made from
+    the codes. Sorting rows by all columns takes five times as long.
     """
     codes = np.concatenate([part.codes for part in parts])
     names = [name for name in dtype.names or () if name != "local"]
@@ -177,7 +190,7 @@ def sorted_rows(parts: list[_Points], dtype: np.dtype) -> NDArray:
 
 
 def gather(unit: GatherUnit) -> Gathered:
-    """Write the stored points of voxels as runs. Raises CorruptError."""
+    """Write the stored points of voxels as runs. Raise CorruptError if a record cannot be read."""
     dtype = spool_dtype(unit.config)
     runs = _Runs(unit.spool, unit.name, dtype, unit.run_points)
     before = _Runs(unit.before, unit.name, dtype, unit.run_points) if unit.before else None
@@ -205,7 +218,7 @@ def gather(unit: GatherUnit) -> Gathered:
                 counts += each
                 if few_are_possible(each, archive.header.models):
                     perhaps_few.append(key)
-            del record  # before the next is read
+            del record  # free it before the next one is read
     for written in (runs, before):
         if written:
             written.write()
@@ -213,16 +226,16 @@ def gather(unit: GatherUnit) -> Gathered:
 
 
 def _without(points: _Points, scans: NDArray[np.int64]) -> tuple[_Points, NDArray[np.uint64]]:
-    """Points but those of some scans, and the codes of those."""
+    """Return the points that are not of the given scans, and the codes of those that are."""
     kept = ~np.isin(points.columns["scan_index"], scans)
     columns = {name: column[kept] for name, column in points.columns.items()}
     return _Points(points.codes[kept], columns), points.codes[~kept]
 
 
 def few_are_possible(counts: NDArray[np.int64], models: tuple[str, ...]) -> bool:
-    """Whether a voxel with so many points of each class may hold some with too few neighbours.
+    """Return whether a voxel may hold points with too few neighbours.
 
-    Those have the last local class, and no rim.
+    counts: points of each class. Such points have the last local class, and no rim.
     """
     last = LOCAL_CLASSES - 1 if "local" in models else 0
     assert last < RIM_BIT
@@ -230,14 +243,17 @@ def few_are_possible(counts: NDArray[np.int64], models: tuple[str, ...]) -> bool
 
 
 def find_scans(unit: FindUnit) -> list[Found]:
-    """The voxels that hold points of some scans. Raises CorruptError."""
+    """Find the voxels that hold points of some scans.
+
+    Raise CorruptError if a record cannot be read.
+    """
     scans = np.array(sorted(unit.scans), np.int64)
     found = []
     with Archive(unit.archive) as archive:
         for row in unit.rows:
             record = archive.open_voxel(row, columns={"scan_index"})
             if not _holds_scans(record, scans):
-                del record  # before the next is read
+                del record  # free it before the next one is read
                 continue
             low, high = np.full(3, 1 << 31, np.int64), np.full(3, -1, np.int64)
             counts = np.zeros(len(scans), np.int64)
@@ -255,7 +271,7 @@ def find_scans(unit: FindUnit) -> list[Found]:
 
 
 def _holds_scans(record: OpenRecord, scans: NDArray[np.int64]) -> bool:
-    """Whether a record has points of some scans, by the column alone."""
+    """Return whether a record has points of some scans; reads only the column of scan numbers."""
     kind, at = record.dtype.fields["scan_index"][:2]  # type: ignore[index]  # its dtype has fields
     planes = record.planes[at : at + kind.itemsize]
     for begin in range(0, planes.shape[1], LOOKED_AT):
@@ -266,12 +282,15 @@ def _holds_scans(record: OpenRecord, scans: NDArray[np.int64]) -> bool:
 
 
 def count_few(unit: FewUnit) -> int:
-    """The points of some voxels that have too few neighbours for a class, as `radius_capped` counts them."""
+    """Count the points of voxels with too few neighbours for a class, as in `radius_capped`."""
     return sum(_few_of(key, unit) for key in unit.keys)
 
 
 def _few_of(key: int, unit: FewUnit) -> int:
-    """The same of one voxel, one of many points in the parts that it is built in."""
+    """Count such points of one voxel.
+
+    A dense voxel is processed in the parts that it is built in.
+    """
     spool, models = unit.spool, unit.config.models
     if not is_dense(spool.count(key), unit.config):
         local = gather_voxel(spool.rows(key)).local
@@ -279,7 +298,7 @@ def _few_of(key: int, unit: FewUnit) -> int:
     few = 0
     for part in plan_parts(spool, key, unit.config):
         codes, times = range(part[0].code, part[-1].past), 1
-        if is_heap(part):  # all have the class of one
+        if is_heap(part):  # all points have the same class
             local, times = heap_place(codes.start), part[0].points
         else:
             local = gather_voxel(spool.block_rows(key, codes.start, codes.stop)).local

@@ -1,6 +1,7 @@
-"""The first pass over scans: bounds, counts, hashes and faults of each; then the lattice that all are quantised to.
+"""First pass over scans: finds bounds, counts, hashes and faults, then chooses the common lattice.
 
-A scan that can seek is surveyed in ranges of its points, in any process, and its file's SHA-256 in another.
+A scan that can seek is surveyed in ranges of its points, in any process, and its file's SHA-256 in
+another.
 """
 
 from collections import Counter
@@ -20,23 +21,26 @@ from .passing import raise_passing
 from .sources.scan import NOT_FINITE, Scan, sha256_of
 from .sources.scan import Lattice as SourceLattice
 
-# A header's bounds are believed when no point lies farther outside [m]: they are rounded, but not by more.
+# A header's bounds are trusted if no point lies farther outside than this [m]: they are rounded,
+# but not by more.
 BOUNDS_WITHIN = 0.01
 
-# Points of a range, at least and at most. A worker is done with 2^24 in 2 s; a small scan is cut as well, so that two
-# workers have something to do. A file is cut into about RANGES, whatever the machine.
+# Least and most points of a range. A worker takes 2 s for 2^24 points. A small scan is also cut,
+# which gives two workers something to do. A file is cut into about RANGES ranges, on every machine.
 RANGE_POINTS = (1 << 20, 1 << 24)
 RANGES = 32
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Survey:
-    """What the first pass found of one scan.
+    """Result of the first pass for one scan.
 
-    scan: the reader.  sha256: of its file.  count: points that can be kept.
-    low, high: (3,) float64 world [m] of those; infinite when there are none.  not_finite: points left out.
-    fault: why the scan cannot be used, or "".  region: (2, 3) world [m] that a faulty scan may have covered; None:
-    not known.  empty: nothing was lost with it.  parts: of each of its ranges.
+    scan: its reader.  sha256: of its file.  count: usable points.
+    low, high: (3,) float64 world [m] of these; infinite if there are none.  not_finite: points left
+    out.
+    fault: why the scan cannot be used, or "".
+    region: (2, 3) world [m] that a faulty scan may have covered; None: not known.
+    empty: leaving the scan out loses no points.  parts: results of its ranges.
     """
 
     scan: Scan | None
@@ -53,20 +57,20 @@ class Survey:
 
     @property
     def dropped(self) -> dict[str, int]:
-        """Reason -> points left out: by the reader, and for being not finite or too far away."""
+        """Return the points left out, by reason. These include non-finite and too distant ones."""
         found = sum((Counter(part.dropped) for part in self.parts), Counter[str]())
         found[NOT_FINITE] += self.not_finite
         return {reason: count for reason, count in found.items() if count}
 
     @property
     def unclean(self) -> int:
-        """Points, or triangles of a sampled mesh, that were left out because they are not finite."""
+        """Return how many points, or triangles of a sampled mesh, were left out as not finite."""
         return self.dropped.get(NOT_FINITE, 0)
 
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """What was found in a range of a scan. dropped: reason -> points the reader left out.
+    """Result for a range of a scan. dropped: reason -> points that the reader left out.
 
     fault: why it could not be read to its end, or "".
     """
@@ -82,7 +86,10 @@ class Part:
 
 
 class RangeUnit(NamedTuple):
-    """A range of a scan to be surveyed; 0 to None of one that cannot seek. points: about."""
+    """Range of a scan to survey; 0 to None for a scan that cannot seek.
+
+    points: approximate number.
+    """
 
     scan: Scan
     start: int
@@ -91,7 +98,7 @@ class RangeUnit(NamedTuple):
 
 
 def ranges(scan: Scan, points: int) -> list[RangeUnit]:
-    """The ranges a scan is read in: a function of it and of the points of all scans together (about)."""
+    """Cut a scan into ranges. points: approximate total of all scans; it sets their size."""
     count = scan.declared_count
     if not scan.seekable or not count:
         return [RangeUnit(scan, 0, None, count or 0)]
@@ -104,7 +111,7 @@ def ranges(scan: Scan, points: int) -> list[RangeUnit]:
 
 
 def survey_range(unit: RangeUnit) -> Part:
-    """Read a range of a scan once. A scan at fault is a result; nothing is raised but by the disk."""
+    """Read a range of a scan once. A faulty scan is a result; only transient errors are raised."""
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     count = seen = 0
     fault = ""
@@ -128,17 +135,17 @@ def survey_range(unit: RangeUnit) -> Part:
 
 
 def dump_part(part: Part) -> dict[str, Any]:
-    """A part as its note says it."""
+    """Convert a part to its journal entry."""
     return asdict(part)
 
 
 def load_part(noted: dict[str, Any]) -> Part:
-    """A part from its note."""
+    """Convert a journal entry to a part."""
     return Part(**{**noted, "low": tuple(noted["low"]), "high": tuple(noted["high"])})
 
 
 def hash_file(path: Path) -> tuple[str, str]:
-    """The SHA-256 of a file, and "", or "" and why it cannot be read."""
+    """Return (SHA-256 of a file, ""), or ("", why it cannot be read)."""
     try:
         return sha256_of(path), ""
     except ScanError as error:
@@ -147,7 +154,7 @@ def hash_file(path: Path) -> tuple[str, str]:
 
 
 def joined(scan: Scan, parts: Sequence[Part], sha256: tuple[str, str]) -> Survey:
-    """The survey of a scan from those of its ranges and `hash_file`."""
+    """Combine the results of a scan's ranges and of `hash_file` to its survey."""
     low = np.min([part.low for part in parts], axis=0)
     high = np.max([part.high for part in parts], axis=0)
     count, not_finite = sum(part.count for part in parts), sum(part.not_finite for part in parts)
@@ -180,13 +187,13 @@ def joined(scan: Scan, parts: Sequence[Part], sha256: tuple[str, str]) -> Survey
 
 
 def survey_scan(scan: Scan) -> Survey:
-    """Survey one scan here and now: bounds, counts, and whether it can be read to its end."""
+    """Survey one scan in this process: bounds, counts, and whether it can be read to its end."""
     parts = [survey_range(unit) for unit in ranges(scan, scan.declared_count or 0)]
     return joined(scan, parts, hash_file(scan.path))
 
 
 def unopened(path: Path, fault: str, region: NDArray[np.float64] | None = None) -> Survey:
-    """The survey of a file that cannot be opened, or, with no fault, that holds no scan at all.
+    """Return the survey of a file that cannot be opened, or that holds no scan if `fault` is empty.
 
     region: (2, 3) world [m], where its points may have been; None: not known.
     """
@@ -198,9 +205,10 @@ def unopened(path: Path, fault: str, region: NDArray[np.float64] | None = None) 
 
 
 def _region(scan: Scan, low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    """Where a scan that broke off may have had points: its header's bounds and what was read of it.
+    """Return where a truncated scan may have had points: its header's bounds and the points read.
 
-    None, not known: without such bounds, or when a point read lies outside them, for then they are wrong.
+    The result is None, not known, if there are no such bounds, or if a point read lies outside
+    them, which shows that they are wrong.
     """
     if scan.bounds is None:
         return None
@@ -210,10 +218,13 @@ def _region(scan: Scan, low: NDArray[np.float64], high: NDArray[np.float64]) -> 
 
 
 def choose_lattice(surveys: list[Survey], config: BuildConfig) -> tuple[Lattice, str]:
-    """The dataset's lattice, and where its step is from: "given", "sources" or "default".
+    """Choose the lattice of a dataset.
 
-    The origin is the least coordinate on each axis, exactly: so a scene moved by a shift that float64 holds exactly
-    is quantised to the same integers (NUMERICS.md case 1). Raises BadRequestError for impossible sizes.
+    Return it and the source of its step: "given", "sources" or "default".
+
+    The origin is exactly the least coordinate on each axis. A scene moved by a shift that float64
+    holds exactly is therefore quantised to the same integers (NUMERICS.md case 1). Raise
+    BadRequestError for impossible sizes.
     """
     origin = np.min([s.low for s in surveys], axis=0)
     step, source = config.resolution, "given"
@@ -228,12 +239,15 @@ def choose_lattice(surveys: list[Survey], config: BuildConfig) -> tuple[Lattice,
 
 
 def _shared_step(surveys: list[Survey]) -> float | None:
-    """Return the step of `shared_step` for what was surveyed."""
+    """Return the `shared_step` of the surveyed scans."""
     return shared_step([s.scan.lattice for s in surveys if s.scan is not None])
 
 
 def shared_step(lattices: Sequence[SourceLattice | None]) -> float | None:
-    """Return the step of the lattice on which all sources lie: same scale, offsets apart by whole steps; or None."""
+    """Return the step of the lattice that contains all sources, or None.
+
+    The sources need the same scale, and offsets that differ by whole steps.
+    """
     if not lattices or any(lattice is None for lattice in lattices):
         return None
     first = lattices[0]
@@ -244,7 +258,8 @@ def shared_step(lattices: Sequence[SourceLattice | None]) -> float | None:
         if any(scale != step for scale in lattice.scale):
             return None
         apart = (np.array(lattice.offset) - np.array(first.offset)) / step
-        # Offsets are decimal text rounded to float64: a millionth of a step is theirs, more is another lattice.
+        # Offsets are decimal text rounded to float64. This explains a millionth of a step; more is
+        # another lattice.
         if (
             not np.isfinite(apart).all()
             or (np.abs(apart - np.rint(apart)) > 1e-6 * np.maximum(1, np.abs(apart) * 1e-9)).any()

@@ -1,4 +1,4 @@
-"""The top hierarchy of a voxel: packed over its cells, bounded around their points as these pass by."""
+"""Top hierarchy of a voxel: packed over its cells, and bounded around points as they are added."""
 
 from itertools import pairwise
 from typing import NamedTuple
@@ -15,11 +15,15 @@ from .kernels.top import grow_bounds, guess_bounds
 
 
 class Top(NamedTuple):
-    """The top hierarchy over c cells, t nodes; its bounds still grow, see kernels/top.py.
+    """Top hierarchy over c cells, with t nodes.
 
-    order: (c,) int64, cells as they stand below its leaf nodes.  count: (t,) uint8.  above: (h, c) int64, the node of
-    each level above each cell in that order.  boxes: (c, 2, 3) int64, of the cells' points in that order.
-    center: (t, 3), normal: (t, 3), reach2: (t,), slab: (t, 2): int64.  unit: of stored lengths [steps].
+    Its bounds grow as points are added, see kernels/top.py.
+
+    order: (c,) int64, cells in the order of its leaf nodes.  count: (t,) uint8.
+    above: (h, c) int64, the node of each level above each cell in that order.
+    boxes: (c, 2, 3) int64, of the cells' points in that order.
+    center: (t, 3), normal: (t, 3), reach2: (t,), slab: (t, 2): int64.  unit: of stored lengths
+    [steps].
     """
 
     order: NDArray[np.int64]
@@ -35,9 +39,10 @@ class Top(NamedTuple):
     def grow(
         self, xyz: NDArray[np.uint16], starts: NDArray[np.int64], low: NDArray[np.int64], first: int
     ) -> None:
-        """Make the bounds hold the points of some cells of the order, from cell `first` on.
+        """Enlarge the bounds to enclose the points of consecutive cells, from `first` of the order.
 
-        xyz: (3, n) from their cell's corner; starts: (k + 1,), first point of each cell; low: (k, 3) int64 corners.
+        xyz: (3, n) from their cell's corner; starts: (k + 1,), first point of each cell; low: (k,
+        3) int64 corners.
         """
         of = slice(first, first + len(low))
         above, boxes = np.ascontiguousarray(self.above[:, of]), self.boxes[of]
@@ -46,7 +51,7 @@ class Top(NamedTuple):
         )
 
     def rows(self) -> Nodes:
-        """The nodes as stored, once all points have passed."""
+        """Return the nodes in their stored form; call it after all points are added."""
         t = len(self.count)
         radius = [-(-int(ceil_sqrt(reach2)) // self.unit) for reach2 in self.reach2]
         return Nodes(
@@ -68,7 +73,10 @@ def pack_top(
     voxel_steps: int,
     config: BuildConfig,
 ) -> Top:
-    """Pack the top hierarchy over the cells of a voxel, c > 1, in the octree's order; columns as in `CellTrees`."""
+    """Pack the top hierarchy over the cells of a voxel, c > 1, in octree order.
+
+    Columns as in `CellTrees`.
+    """
     middle = (low + (np.int64(1) << log2_size.astype(np.int64))[:, None] // 2).astype(np.int32)
     order, begin, end, count, levels = pack_tree(middle, config.degree, config.degree)
     t, unit = len(begin), 1 << top_shift(voxel_steps)
@@ -79,7 +87,8 @@ def pack_top(
     guess_bounds(
         tree, spreads[order], extremes, unit, HIGHEST, config.with_slab, center, normal, reach2, slab
     )
-    # The least points along x, y and z come 1st, 3rd and 5th, the greatest behind them (kernels/trees.py DIRECTIONS).
+    # The points least along x, y and z are 1st, 3rd and 5th, each followed by the greatest
+    # (kernels/trees.py DIRECTIONS).
     sides = [[extremes[:, 2 * k + side, k] for k in range(3)] for side in range(2)]
     boxes = np.ascontiguousarray(np.moveaxis(np.array(sides, np.int64), 2, 0))
     held = end - begin

@@ -1,4 +1,4 @@
-"""Which voxels a change of an archive touches: those whose points change, and those whose radius classes may."""
+"""Voxels that a change of an archive affects: their points change, or their radius classes may."""
 
 from collections.abc import Mapping
 
@@ -8,16 +8,17 @@ from numpy.typing import NDArray
 from ..schemas.archive import Archive
 from .classes import class_limits
 
-# A block of a grid and those around it.
+# Offsets of a grid block and of its neighbours.
 AROUND = np.stack(np.meshgrid(*[np.arange(-1, 2)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
 def touched(
     archive: Archive, boxes: Mapping[int, NDArray[np.int64]]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Rows of the index to be built anew where points in `boxes` change, and those whose points are needed for it.
+    """Return the index rows of voxels to rebuild, and of voxels whose points are needed for that.
 
-    Where points have radius classes, those as far off as a neighbour counts have a say in each other.
+    boxes: key -> box of the points that change. With radius classes, points within neighbour
+    distance of each other affect each other's class.
     """
     lattice, keys = archive.header.lattice, archive.voxels["key"]
     changes = np.isin(keys, np.array(list(boxes), np.uint64))
@@ -34,15 +35,16 @@ def touched(
 
 
 def within_reach(held: NDArray[np.int64], boxes: NDArray[np.int64], reach2: int) -> NDArray[np.bool_]:
-    """Which boxes (v, 2, 3) lie within a squared distance of some of the others (b, 2, 3), corners inclusive.
+    """Return a mask of the boxes within a squared distance of any of the others.
 
-    Both are put into blocks of a grid, and only boxes of neighbouring blocks held against each other: a block is as
-    long as the longest of them and the reach, so that no other is near.
+    held: (v, 2, 3).  boxes: the others, (b, 2, 3). Corners are inclusive. Both sets are sorted into
+    the blocks of a grid, and only boxes of neighbouring blocks are compared. A block is as long as
+    the longest box plus the reach; boxes in other blocks are therefore too far away.
     """
     found = np.zeros(len(held), bool)
     if not len(held) or not len(boxes):
         return found
-    farther = int(reach2**0.5) + 1  # no gap counts for more, so that squares stay small
+    farther = int(reach2**0.5) + 1  # larger gaps are clamped, which keeps squares small
     block = farther + 1 + max(int((each[:, 1] - each[:, 0]).max()) + 1 for each in (held, boxes))
     corners = np.concatenate([held[:, 0], boxes[:, 0]])
     block = max(

@@ -1,4 +1,4 @@
-"""Reading an archive to its end, which `add`, `remove` or a build may meanwhile put another in the place of."""
+"""Detection of an archive that `add`, `remove` or a build replaces while it is being read."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -11,10 +11,10 @@ from ..schemas.index import Header
 
 @contextmanager
 def unchanged(folder: Path, header: Header) -> Iterator[None]:
-    """Raise SolidcloudError where the archive in `folder` is not that of `header` any more when all is read.
+    """Raise SolidcloudError if the archive in `folder` no longer is that of `header` after reading.
 
-    What was read then is of two archives, and any error met on the way comes of that. Otherwise errors are what they
-    were.
+    What was read is then a mix of two archives, and any error on the way is a consequence.
+    Otherwise errors pass unchanged.
     """
     try:
         yield
@@ -29,7 +29,7 @@ def _check(folder: Path, header: Header) -> None:
         with Archive(folder) as archive:
             now = archive.header
     except (FormatError, OSError):
-        return  # whoever reads has told of it, or will
+        return  # the reader has reported it, or will
     if (now.archive_id, now.generation) != (header.archive_id, header.generation):
         raise SolidcloudError(
             f"{folder}: changed while it was read, generation {header.generation} and then {now.generation}"

@@ -1,4 +1,4 @@
-"""Reopens an archive and checks every invariant that FORMAT.md states."""
+"""Verification of an archive: reopens it and checks every invariant that FORMAT.md states."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -27,11 +27,12 @@ from .unchanged import unchanged
 
 
 class VerifyReport(NamedTuple):
-    """What was checked, and every fault found, one sentence each; none: all is well.
+    """Result of a verification: what was checked, and every fault, one sentence each.
 
-    exact_nodes: bounds proved in Python's integers, of `nodes` there are.  notes: what is no fault, but had better be
-    known: files that mean nothing, shards that no voxel is in any more.  damaged: the shards with faults.  others:
-    whether each record is sound, but the points are not those expected.
+    exact_nodes: bounds verified in Python integers, out of `nodes`.
+    notes: facts that are not faults: unknown files, shards that no voxel uses any more.
+    damaged: shards with faults.  others: the records are valid, but hold other points than
+    expected.
     """
 
     voxels: int
@@ -44,13 +45,16 @@ class VerifyReport(NamedTuple):
     others: bool = False
 
 
-# What a point takes beside building it, which worker_count knows of: measured, 10, 60 and 6,000 ns of 600.
+# Cost per point relative to building it, which worker_count assumes: measured, 10, 60 and 6,000 ns
+# of 600.
 _WORK, _DEEP_WORK, _EXACT_WORK = 1 / 60, 1 / 10, 10
 
 
 class _Unit(NamedTuple):
-    """Voxels to be checked. asked: of each, the nodes to be proved; None: none of any.  summed: whether their points'
-    places are."""
+    """Voxels to check. asked: nodes of each voxel to verify exactly; None: none.
+
+    summed: compute the sum of their points' positions.
+    """
 
     folder: Path
     rows: range
@@ -61,9 +65,12 @@ class _Unit(NamedTuple):
 
 
 class _Found(NamedTuple):
-    """What a unit came to. points: in voxels that could be read.  classes: (RADIUS_CLASSES,), of those points.
+    """Result of a unit. points: in voxels that could be read.
 
-    places: sum of where they are, see `places_sum`; 0 where it is not asked for.  damaged: shards with faults.
+    classes: (RADIUS_CLASSES,), of those points.
+
+    places: sum of their positions, see `places_sum`; 0 if not requested.  damaged: shards with
+    faults.
     """
 
     faults: list[str]
@@ -84,15 +91,19 @@ def verify_archive(
     executor: Executor | None = None,
     places: int | None = None,
 ) -> VerifyReport:
-    """Read every record and check it; with `deep`, also that every bound encloses all points below it, exactly, and
-    that normals are those of the points.
+    """Read every record and check it.
 
-    exact: prove the bounds once more in Python's integers, without compiled code.  sample: only so many of them,
-    spread over the archive; None: all.  executor: what runs the work; None: this process.  places: what
-    the `places_sum` of all points must be (spool.py); None: not known. A job holds one voxel, 12
-    bytes a point of it, 16 with intensities, and 40 where bounds are proved. Raises FormatError or CorruptError only
-    when the index itself cannot be used, BadRequestError for a sample that is none, SolidcloudError where the archive
-    is changed meanwhile; a broken record is a fault.
+    deep: also check that every bound encloses all points below it, exactly, and that normals are
+    those of the points.
+    exact: verify the bounds once more in Python integers, without compiled code.
+    sample: verify only this many of them, spread over the archive; None: all.
+    executor: runs the work; None: this process.
+    places: the `places_sum` that all points must have (spool.py); None: not known.
+
+    A job holds one voxel: 12 bytes per point of it, 16 with intensities, and 40 if bounds are
+    verified. Raise FormatError or CorruptError only if the index itself cannot be used,
+    BadRequestError for an invalid sample, SolidcloudError if the archive changes meanwhile; a
+    broken record is a fault.
     """
     if sample is not None and (not exact or sample < 1):
         raise BadRequestError(f"--sample {sample}: expected 1 or more, and --exact with it")
@@ -115,7 +126,7 @@ def verify_archive(
         for rows in portions(counts[:, 2], jobs_of(executor))
     ]
     progress.start("verify", header.points, "points")
-    with unchanged(folder, header):  # each unit opens it anew
+    with unchanged(folder, header):  # because each unit opens the archive again
         results = list(run_units(executor, _verify_rows, units, progress, lambda unit: unit.points))
     progress.finish()
     found = [
@@ -148,14 +159,17 @@ def verify_archive(
 
 
 def verify_jobs(folder: Path, jobs: int, *, deep: bool, exact: bool) -> int:
-    """Processes for `verify_archive`: as asked, or, for 0, one a core where the archive is worth it."""
+    """Return the number of processes for `verify_archive`.
+
+    It is `jobs`, or for 0 one per core if the archive is large enough.
+    """
     with Archive(folder) as archive:
         points = archive.header.points
     return worker_count(jobs, int(points * (_EXACT_WORK if exact else _DEEP_WORK if deep else _WORK)))
 
 
 def _verify_rows(unit: _Unit) -> _Found:
-    """Check a run of voxels; in any process."""
+    """Check a range of voxels; runs in any process."""
     faults: list[str] = []
     points = proved = places = 0
     damaged: set[Path] = set()
@@ -193,19 +207,23 @@ def _verify_rows(unit: _Unit) -> _Found:
 
 
 def _loose(archive: Archive, row: int, node: int) -> str:
-    """The fault of a bound that does not enclose."""
+    """Return the fault of a bound that does not enclose its points."""
     return f"{archive.where(row)}: node {node} does not enclose its points: rebuild the archive"
 
 
 def voxel_faults(archive: Archive, row: int, record: OpenRecord, deep: bool) -> list[str]:
-    """Faults of one voxel that opening it does not look for. CorruptError: a point outside its cell."""
+    """Return the faults of one voxel that opening it does not detect.
+
+    Raise CorruptError for a point outside its cell.
+    """
     faults = []
     low, high = np.empty(3, np.int64), np.empty(3, np.int64)
     leaves = leaves_of(record)
     if not measure_points(leaves, np.int64(record.voxel_steps), low, high):
         raise CorruptError(f"voxel {record.key:#x}: a point outside its cell")
     record.check_bounds(np.stack([low, high]))
-    # An archive may have no slabs at all; a reader takes a node without a normal for one.
+    # An archive may have no slabs at all: readers treat a node without a normal as a node without a
+    # slab.
     nodes = record.nodes
     stray = np.flatnonzero(nodes.slab.any(axis=0) & ~nodes.normal.any(axis=0))
     if len(stray):
@@ -218,8 +236,11 @@ def voxel_faults(archive: Archive, row: int, record: OpenRecord, deep: bool) -> 
 
 
 def normal_faults(archive: Archive, row: int) -> list[str]:
-    """The fault of a voxel whose normals are not those of its points, which are held, all columns and all."""
-    from .normals import voxel_normals  # most archives have none
+    """Return the fault of a voxel whose normals are not those of its points.
+
+    All points with all their columns are held in memory.
+    """
+    from .normals import voxel_normals  # most archives have no normals
 
     header = archive.header
     voxel, links = archive.read_voxel(row)
@@ -232,11 +253,11 @@ def normal_faults(archive: Archive, row: int) -> list[str]:
 
 
 def _strangers(archive: Archive) -> list[str]:
-    """Notes on shards that no voxel is in, and on files that the index does not name."""
+    """Return notes on unused shards and on files that the index does not name."""
     shards = archive.folder / SHARD_FOLDER
     used = set(np.unique(archive.voxels["shard"]).tolist())
     named = [archive.shard_path(number) for number in range(archive.shard_count())]
     dead = [path for number, path in enumerate(named) if number not in used]
-    notes = [f"{path}: a shard that no voxel is in any more" for path in dead]
+    notes = [f"{path}: no voxel uses this shard any more" for path in dead]
     strangers = sorted(set(shards.iterdir()) - set(named))
-    return notes + [f"{path}: not of this archive as it is: left by a build or by hand" for path in strangers]
+    return notes + [f"{path}: not part of this archive: left by a build or by hand" for path in strangers]

@@ -1,8 +1,9 @@
-"""A voxel of an archive without some of its points: what a build of the points that are left would have stored.
+"""Voxels of an archive without some of their points, equal to what a build of the rest would store.
 
-A server asks for it where a scene says that contact is ignored (server/left_out.py). Columns of the points that are
-left stay what they are stored as: a radius class is that of the whole scan, or what is left would grow. But normals are
-those of what is left, as they are where a server estimates them.
+A server requests them if a scene ignores contacts (server/left_out.py). The remaining points keep
+their columns as stored: a radius class remains that of the whole scan, or the surface of the rest
+would grow. Normals, however, are computed from the remaining points, as they are when a server
+estimates them.
 """
 
 import numpy as np
@@ -21,20 +22,24 @@ __all__ = ["BuiltVoxel", "build_rest", "read_points"]
 
 
 def read_points(archive: Archive, row: int) -> VoxelPoints:
-    """All points of the voxel of index row `row`, with all columns stored. Raises CorruptError, OSError."""
+    """Return all points of a voxel with all stored columns. row: of the index.
+
+    Raise CorruptError, OSError.
+    """
     voxel, links = archive.read_voxel(row)
     local = voxel_points(voxel, links).astype(np.int32)
     return VoxelPoints(local, **{name: getattr(voxel, name) for name in OPTIONAL_COLUMNS})
 
 
 def build_rest(header: Header, key: int, points: VoxelPoints, stays: NDArray[np.bool_]) -> BuiltVoxel:
-    """The voxel of those points, at least one, that stay (n,), built with the options of the archive's build.
+    """Build the voxel of the points that stay, with the options of the archive's build.
 
-    It is built whole: of a voxel that a build would take part by part (dense.py), row for row the same.
+    stays: (n,) mask, at least one set. The voxel is built as a whole. If a build would make it part
+    by part (dense.py), the result is the same, row for row.
     """
     left = VoxelPoints._make(None if column is None else column[stays] for column in points)
     if header.normals:
-        from .normals import voxel_normals  # most archives have none
+        from .normals import voxel_normals  # most archives have no normals
 
         square = normal_reach(header.normal_reach, header.lattice.step, len(left.local))
         left = left._replace(normal=voxel_normals(left.local, square))
@@ -44,7 +49,7 @@ def build_rest(header: Header, key: int, points: VoxelPoints, stays: NDArray[np.
 
 
 def _config(header: Header) -> BuildConfig:
-    """The options that what a voxel is built of its points depends on."""
+    """Return the build options that affect how a voxel is built from its points."""
     names = ("cell_points", "cells", "with_slab")
     stored = {name: header.options[name] for name in names if name in header.options}
     return BuildConfig(degree=header.degree, leaf=header.leaf, **stored)

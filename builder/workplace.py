@@ -1,4 +1,4 @@
-"""The folder that an archive is made in, and how it gets the name asked for: locked, hidden, renamed when whole."""
+"""Build directory: hidden folder in which an archive is made; it is renamed when complete."""
 
 import json
 import os
@@ -19,14 +19,15 @@ from .journal import TEMPORARY_SUFFIX, Journal, is_temporary, remove_temporaries
 from .lock import locked as locked
 from .resume import check_same
 
-# Folders of runs, each made of those before it.
+# Folders of runs; each is made from the one before it.
 RUN_FOLDERS = ("spool", "filter-near", "filter-thin")
-# The note of what is built, the first of all; and what in it names the folder that holds what is done.
+# Name of the first journal entry, which describes the build, and of its field that names the work
+# folder.
 BEGUN, WORD = "build", "word"
 
 
 def check_target(target: Path, overwrite: bool) -> None:
-    """Refuse to write where something else is."""
+    """Refuse to write to a target that holds anything else."""
     if not target.exists() or (target.is_dir() and not any(target.iterdir())):
         return
     if not (target / INDEX_NAME).is_file():
@@ -35,7 +36,8 @@ def check_target(target: Path, overwrite: bool) -> None:
         raise BadRequestError(f"{target}: an archive is here already: give another -o, or --overwrite")
     shards = list((target / SHARD_FOLDER).iterdir()) if (target / SHARD_FOLDER).is_dir() else []
     strangers = [p for p in target.iterdir() if p.name not in (INDEX_NAME, SHARD_FOLDER, PREVIEW_NAME)]
-    # A unit that was given up may have left a file without a name, of a build killed before it could remove it.
+    # A unit that was given up may have left a temporary file of a build that was killed before it
+    # could remove it.
     strangers += [p for p in shards if not p.is_file() or (p.suffix != ".h5" and not is_temporary(p))]
     if strangers:
         raise BadRequestError(
@@ -45,31 +47,33 @@ def check_target(target: Path, overwrite: bool) -> None:
 
 @contextmanager
 def made_parents(target: Path) -> Iterator[None]:
-    """Make the folders above the target; after a failure, remove those that were made here."""
+    """Create the folders above the target; after a failure, remove those created here."""
     made = [folder for folder in target.parents if not folder.exists()]
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         yield
     except BaseException:
         for folder in made:
-            with suppress(OSError):  # somebody else uses it by now
+            with suppress(OSError):  # another process uses it by now
                 folder.rmdir()
         raise
 
 
 def building_folder(target: Path) -> Path:
-    """The hidden folder that the archive `target` is made in."""
+    """Return the hidden folder in which the archive `target` is made."""
     return target.parent / f".{target.name}.building"
 
 
 @dataclass
 class Workplace:
-    """The hidden folder of a build, and the folder in it that holds what is done.
+    """Hidden folder of a build, and the folder in it that holds the finished work.
 
-    That one has a name that is nobody else's, which the note in the hidden folder tells: a unit of an earlier build
-    that a worker of a cluster still runs finds no folder to write to. hidden: the hidden folder.  begun: its note.
-    surveyed: all scans were read to their end once and can be built as asked: what is found later removes nothing.
-    staffed: there is somebody to do the work: what is refused from then on is what was asked for.
+    The name of the work folder is unique; an entry in the hidden folder records it. A unit of an
+    earlier build that a cluster worker is still running therefore finds no folder to write to.
+    hidden: the hidden folder.  begun: the entry.
+    surveyed: all scans were read to their end once and can be built as requested; later errors
+    remove nothing.
+    staffed: workers are available; from now on, a refusal concerns the request itself.
     """
 
     hidden: Path
@@ -78,13 +82,15 @@ class Workplace:
     staffed: bool = False
 
     def start_over(self) -> None:
-        """Forget all that is done: the files it was read from are not what they were."""
+        """Discard all finished work, because the files it was read from have changed."""
         remove_building(self.hidden)
 
     def distrust(self, path: Path) -> None:
-        """Forget what was found not to be what was written: a run or a shard, or, by their folder, all points.
+        """Discard a run or a shard that differs from what was written.
 
-        What was made of a run is forgotten with it.
+        A folder stands for all its points.
+
+        What was made from a run is discarded with it.
         """
         if path.is_dir():
             self._keep(("survey",))
@@ -94,12 +100,13 @@ class Workplace:
         self.journal.forget_file(path)
 
     def distrust_made_of(self, folder: str) -> None:
-        """Forget what was made of the runs in a folder of RUN_FOLDERS: what filters left of them, and shards."""
+        """Discard the filtered runs and shards made from a folder of RUN_FOLDERS."""
         self._keep(("survey", *RUN_FOLDERS[: RUN_FOLDERS.index(folder) + 1]))
 
     def _keep(self, names: Sequence[str]) -> None:
-        """Keep these folders of what is done, under another name: who still works on the rest of it, and of what is not
-        believed, has nowhere to write what comes of it.
+        """Keep these folders of finished work, and rename the work folder.
+
+        Units that still work on the rest, or on untrusted data, then have no folder to write to.
         """
         old = self.folder
         begun = {**self.begun, WORD: uuid.uuid4().hex}
@@ -114,41 +121,43 @@ class Workplace:
         self.make_folders()
 
     def make_folders(self) -> None:
-        """Make the folders that passes write to."""
+        """Create the folders that passes write to."""
         for folder in (self.folder, self.folder / "spool", self.archive, self.archive / SHARD_FOLDER):
             folder.mkdir(exist_ok=True)
 
     @property
     def folder(self) -> Path:
-        """Where all is that is done."""
+        """Return the work folder."""
         return self.hidden / str(self.begun[WORD])
 
     @property
     def journal(self) -> Journal:
-        """What is done."""
+        """Return the journal of the finished work."""
         return Journal(self.folder)
 
     @property
     def archive(self) -> Path:
-        """What will be renamed to the target."""
+        """Return the folder that will be renamed to the target."""
         return self.folder / "archive"
 
 
 @contextmanager
 def workplace(target: Path, what: dict[str, Any], *, fresh: bool) -> Iterator[Workplace]:
-    """Go on with a build of `what` that was interrupted, or begin one; see resume.py `described`.
+    """Resume an interrupted build of `what`, or begin one; see resume.py `described`.
 
-    What is done stays, whatever happens: hours of work are worth more than a clean disk. Only a request that cannot be
-    done, and a scan at fault, found in the survey of a build that began here, leave nothing; of what is found not to be
-    what was written, that is forgotten and no more. Raises BadRequestError for
-    a build that was begun of something else, which it leaves as it is.
+    Finished work is kept whatever happens: hours of work are worth more than a clean disk. There
+    are two exceptions. An impossible request or a faulty scan, detected in the survey of a build
+    that began here, leaves nothing behind. Data that differ from what was written are discarded,
+    and nothing else is. Raise BadRequestError for a folder that holds a different build, and leave
+    it as it is.
     """
     hidden = building_folder(target)
     if fresh:
         remove_building(hidden)
         if (note := Journal(hidden).path(BEGUN)).exists():
             raise SolidcloudError(
-                f"{note}: cannot be removed, as --fresh asks, and the build would go on from it: remove {hidden} by "
+                f"{note}: cannot be removed, as --fresh requires, and the build would resume from it: remove "
+                f"{hidden} by "
                 "hand, then give the same command again"
             )
     begun = Journal(hidden).recall(BEGUN)
@@ -156,7 +165,7 @@ def workplace(target: Path, what: dict[str, Any], *, fresh: bool) -> Iterator[Wo
         check_same(hidden, begun, json.loads(json.dumps(what)))
     place = Workplace(hidden, begun or {**what, WORD: uuid.uuid4().hex})
     try:
-        if begun is None:  # nothing, or killed before it could say what it was
+        if begun is None:  # a new build, or one killed before it wrote its first entry
             remove_building(hidden)
             hidden.mkdir(exist_ok=True)
             Journal(hidden).note(BEGUN, place.begun)
@@ -179,7 +188,7 @@ def workplace(target: Path, what: dict[str, Any], *, fresh: bool) -> Iterator[Wo
 
 
 def _prepare(place: Workplace) -> None:
-    """Make the folders of a build, and remove what is not of it."""
+    """Create the folders of a build, and remove everything else."""
     for path in place.hidden.iterdir():
         if path.is_dir() and path != place.folder:
             _remove(path)
@@ -188,11 +197,11 @@ def _prepare(place: Workplace) -> None:
 
 
 def forget_finished(target: Path, what: dict[str, Any]) -> None:
-    """Remove what a build left that was killed just after it had published `what`."""
+    """Remove what remains of a build of `what` that was killed just after publishing."""
     folder = building_folder(target)
     begun = Journal(folder).recall(BEGUN)
     if begun is None or {**begun, WORD: ""} == {**json.loads(json.dumps(what)), WORD: ""}:
-        # What units that were given up left in it after its rename; anything else there is somebody's own.
+        # Units that were given up may have written here after the rename; other files are not ours.
         left = (target / SHARD_FOLDER).glob(f"*{TEMPORARY_SUFFIX}") if folder.is_dir() else ()
         for path in filter(is_temporary, left):
             path.unlink(missing_ok=True)
@@ -200,7 +209,10 @@ def forget_finished(target: Path, what: dict[str, Any]) -> None:
 
 
 def remove_building(folder: Path) -> None:
-    """Remove the hidden folder of a build, the note of what it is last: killed here, it can still be told."""
+    """Remove the hidden folder of a build.
+
+    Its first entry is removed last, so that a build killed here can still be identified.
+    """
     if folder.is_dir():
         for path in folder.iterdir():
             if path.is_dir():
@@ -209,7 +221,10 @@ def remove_building(folder: Path) -> None:
 
 
 def _remove(folder: Path) -> None:
-    """Remove a folder, first of all from where a unit that still runs would write into it while it is emptied."""
+    """Remove a folder.
+
+    It is renamed first, so that a unit that is still running cannot write into it meanwhile.
+    """
     with suppress(OSError):
         os.rename(folder, gone := folder.with_name(uuid.uuid4().hex))
         folder = gone
@@ -217,7 +232,7 @@ def _remove(folder: Path) -> None:
 
 
 def recover(target: Path) -> None:
-    """Finish what an earlier build with `overwrite` left when it was killed between its two renames."""
+    """Finish an earlier build with `overwrite` that was killed between its two renames."""
     old = target.parent / f".{target.name}.old"
     if old.exists() and not target.exists():
         os.rename(old, target)
@@ -225,7 +240,7 @@ def recover(target: Path) -> None:
 
 
 def publish_folder(folder: Path, target: Path, overwrite: bool) -> None:
-    """Give the finished folder its name."""
+    """Rename the finished folder to its target."""
     sync_folder(folder)
     if target.exists() and overwrite and (target / INDEX_NAME).is_file():
         old = target.parent / f".{target.name}.old"
@@ -238,6 +253,7 @@ def publish_folder(folder: Path, target: Path, overwrite: bool) -> None:
         shutil.rmtree(old)
     else:
         os.rename(folder, target)  # replaces an empty folder
-    # Of a unit that was given up and still runs: from now on it can name no other.
+    # Remove files of a unit that was given up and is still running: from now on it cannot create
+    # others.
     remove_temporaries(target)
     sync_folder(target.parent)

@@ -29,9 +29,9 @@ def scans(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Path]:
 
 
 OTHER = {
-    "voxel": (4.0, "--voxel was 0.9, is 4.0: give --voxel 0.9 to go on, or --fresh to start over"),
-    "resolution": (0.01, "--resolution was not given, is 0.01: give no --resolution to go on"),
-    "strict": (True, "--strict was not given, is given: give no --strict to go on"),
+    "voxel": (4.0, "--voxel was 0.9, is 4.0: give --voxel 0.9 to resume it, or --fresh to start over"),
+    "resolution": (0.01, "--resolution was not given, is 0.01: give no --resolution to resume it"),
+    "strict": (True, "--strict was not given, is given: give no --strict to resume it"),
     "thin": (0.05, "--thin was not given, is 0.05"),
     "models": (frozenset({"mean", "local"}), "--radius was not given, is mean,local"),
 }
@@ -59,7 +59,7 @@ def test_an_option_that_was_given_is_asked_for_again(
     with pytest.raises(BadRequestError) as caught:
         build(tmp_path / "hall", scans)
     assert "--keep was scan, is not given; --strict was given, is not given" in str(caught.value)
-    assert "give --keep scan; --strict to go on" in str(caught.value)
+    assert "give --keep scan; --strict to resume it" in str(caught.value)
 
 
 def test_other_scans_are_refused_by_name(
@@ -89,7 +89,7 @@ def test_other_software_is_refused(
     interrupted(tmp_path / "hall", scans, monkeypatch)
     other = {**software(), "h5py": "0.1"}
     monkeypatch.setattr("solidcloud.builder.resume.software", lambda: other)
-    expected = rf"begun by other software: h5py {software()['h5py']}, now 0\.1: use .*--fresh to start over"
+    expected = rf"begun with other software: h5py {software()['h5py']}, now 0\.1: use .*--fresh to start over"
     with pytest.raises(BadRequestError, match=expected):
         build(tmp_path / "hall", scans)
 

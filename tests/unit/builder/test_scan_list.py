@@ -175,7 +175,7 @@ def test_a_list_that_cannot_be_written_leaves_the_one_there_was(
     before = path.read_bytes()
     odd = folder / os.fsdecode(b"odd\xff.xyz")
     odd.write_text("1 2 3\n")
-    with pytest.raises(BadRequestError, match=r"odd\\udcff\.xyz'.* no UTF-8"):
+    with pytest.raises(BadRequestError, match=r"odd\\udcff\.xyz'.* not UTF-8"):
         write_scan_list(path, inspect([folder]))
     assert [p.read_bytes() for p in path.parent.iterdir()] == [before]
 

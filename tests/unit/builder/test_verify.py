@@ -316,7 +316,7 @@ def test_a_shard_that_no_voxel_is_in_is_a_note(copy: Path) -> None:
     shards = [(p.name, p.stat().st_size) for p in (copy / "shards" / shard_name(0), dead)]
     write_index(copy, header, rows, shards)
     report = verify_archive(copy)
-    assert report.faults == () and report.notes == (f"{dead}: a shard that no voxel is in any more",)
+    assert report.faults == () and report.notes == (f"{dead}: no voxel uses this shard any more",)
 
 
 def test_other_leaf_nodes_than_the_index_says_are_a_fault(copy: Path) -> None:

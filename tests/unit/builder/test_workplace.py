@@ -104,7 +104,7 @@ def test_a_build_that_cannot_be_forgotten_is_not_gone_on_with(
         patch.setattr("solidcloud.builder.workplace.shutil.rmtree", lambda *_, **__: None)
         with (
             pytest.raises(
-                SolidcloudError, match=r"build\.json: cannot be removed, as --fresh asks.* by hand"
+                SolidcloudError, match=r"build\.json: cannot be removed, as --fresh requires.* by hand"
             ),
             workplace(tmp_path / "hall", WHAT, fresh=True),
         ):

@@ -1,4 +1,4 @@
-"""The contents of a file to be exported, known before it is written."""
+"""Properties of the points in an exported file, known before it is written."""
 
 from typing import NamedTuple
 

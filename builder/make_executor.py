@@ -1,4 +1,4 @@
-"""Choose what runs the work units of a build."""
+"""Selection of the executor that runs the work units of a build."""
 
 from .config import BuildConfig
 from .executor import Executor, ProcessExecutor

@@ -27,7 +27,7 @@ class SearchTree(NamedTuple):
     center: NDArray[np.int64]
     radius: NDArray[np.int64]
     first: NDArray[np.int32]
-    count: NDArray[np.uint8]  # type: ignore[assignment]  # hides tuple.count, which nobody calls
+    count: NDArray[np.uint8]  # type: ignore[assignment]  # hides tuple.count, which is never called
     is_leaf: NDArray[np.bool_]
     points: NDArray[np.int64]
 

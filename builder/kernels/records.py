@@ -33,7 +33,7 @@ class Leaves(NamedTuple):
     first: NDArray[np.int32]
     is_leaf: NDArray[np.bool_]
     cell: NDArray[np.int32]
-    count: NDArray[np.uint8]  # type: ignore[assignment]  # hides tuple.count, which nobody calls
+    count: NDArray[np.uint8]  # type: ignore[assignment]  # hides tuple.count, which is never called
     axis: NDArray[np.uint8]
     block_low: NDArray[np.uint16]
     cell_low: NDArray[np.int32]

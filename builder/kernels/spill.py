@@ -1,4 +1,4 @@
-"""Reordering of a voxel's points (3, n): each cell's x, y and z become contiguous, one read gets a cell."""
+"""Reordering of a voxel's points (3, n): a cell's x, y and z become contiguous, one read gets a cell."""
 
 import numpy as np
 

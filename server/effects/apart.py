@@ -107,16 +107,13 @@ def _ahead(frame: Frame, reach: float, looked: float) -> DistanceAnswers | None:
 
 
 def surely_farther(answers: DistanceAnswers | None, metres: float) -> bool:
-    """Return whether the spheres are certainly farther apart, by an answer of `nearest`.
-
-    metres: the distance.
-    """
+    """Return whether the spheres are surely more than `metres` apart, by an answer of `nearest`."""
     return answers is None or bool(answers.exact[0] and answers.signed_distance[0] > metres + ROUNDED)
 
 
 def farther(frame: Frame, metres: float) -> bool:
-    """Return whether the avatar's spheres are certainly farther from all spheres of the scan.
+    """Return whether the avatar is surely more than `metres` from the scene.
 
-    metres: the distance.
+    The distance is that of its spheres from all spheres of the scan.
     """
     return surely_farther(nearest(frame, metres), metres)

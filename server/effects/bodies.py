@@ -106,7 +106,7 @@ class Bodies:
         # By user and object, see `_remember_way`.
         self._came_from: dict[tuple[str, str], Vec] = {}
 
-    # --- shapes -------------------------------------------------------------------------------------------
+    # --- shapes --------------------------------------------------------------------------------
 
     def shape_of(self, model: AvatarModel) -> Shape:
         """Return the cached shape of a model."""
@@ -133,7 +133,7 @@ class Bodies:
         self._numbered += 1
         return shape
 
-    # --- who is there -------------------------------------------------------------------------------------
+    # --- arrivals and departures ---------------------------------------------------------------
 
     def begin(self) -> None:
         """Add the initial objects, once. Raise the error of an invalid object on each call.
@@ -177,7 +177,7 @@ class Bodies:
     def remembers(self, body: Body) -> bool:
         """Return whether this is the body of a present user.
 
-        A move that keeps no state has another one.
+        The body of a move that keeps no state is a different one.
         """
         return any(body is known for known in self._users.values())
 
@@ -206,7 +206,7 @@ class Bodies:
         self._put(row, pose, begun=True)
 
     def _remove(self, row: int) -> None:
-        """Remove a row; later rows move up."""
+        """Remove a row; the numbers of later rows decrease by one."""
         name = self.names[row]
         for rows in (self.names, self.shapes, self.changed):
             del rows[row]  # type: ignore[attr-defined]
@@ -216,7 +216,7 @@ class Bodies:
         self._came_from = {key: way for key, way in self._came_from.items() if key[0] != name}
         self.layout += 1
 
-    # --- where they are -----------------------------------------------------------------------------------
+    # --- poses ---------------------------------------------------------------------------------
 
     def standing(self) -> tuple[int, NDArray[np.float64]]:
         """Return the layout and the poses (n, 4, 4) of all bodies now, for `put_back`."""

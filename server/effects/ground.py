@@ -211,7 +211,7 @@ class Grounded:
         return None if length == 0.0 else level / length
 
     def lower(self, frame: Frame, below: Below, way: float) -> None:
-        """Move straight down by a way [m] within what was found free."""
+        """Move straight down by a distance `way` [m], within what was found free."""
         assert frame.go is not None
         if way <= 0.0:
             return
@@ -222,7 +222,7 @@ class Grounded:
         self.slide(frame, -way * frame.world.up)
 
     def slide(self, frame: Frame, way: Vec) -> None:
-        """Move by a way (3,) [m], sliding along what is met."""
+        """Move by a displacement `way` (3,) [m], sliding along what is met."""
         assert frame.go is not None
         begin, hits = frame.pose[:3, 3], len(frame.hits)
         hit = frame.go(frame, moved_by(frame.pose, way))

@@ -123,8 +123,9 @@ class ObjectsRunner:
         return sorted(self._touching)
 
     def push(self, name: str, way: Vec, user: str, effort: Effort) -> bool:
-        """Move an object along a level way, as far as nothing is touched; return whether it moved.
+        """Move an object by a level displacement; return whether it moved.
 
+        It moves as far as nothing is touched.
         user: the one who pushes, and follows; it is no obstacle.
         """
         bodies = self.bodies

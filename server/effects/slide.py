@@ -1,7 +1,7 @@
 """Effect `slide`: continue a stopped motion along the surfaces touched, their creases and corners.
 
 This is collide and slide with the planes of a frame. The remaining translation is clipped against
-every surface met in it, so that the way goes into none of them: along the crease of two, and
+every surface met in the frame, so that it goes into none of them: along the crease of two, and
 nowhere between three. It never goes against the motion command, and never farther than the
 remainder: no energy appears.
 
@@ -176,7 +176,10 @@ class Sliding:
 
 
 def within(gone: Vec, way: Vec, most: float) -> Vec:
-    """Shorten a way (3,) so that it ends within `most` of the beginning of `gone` (3,) [m]."""
+    """Shorten a displacement so that the total of it and `gone` is at most `most` long [m].
+
+    gone, way: (3,). The direction of `way` is kept.
+    """
     a, b, c = dot(way, way), dot(gone, way), dot(gone, gone) - most * most * (1.0 - 1e-12)
     if a + 2.0 * b + c <= 0.0:
         return way
@@ -187,10 +190,10 @@ def within(gone: Vec, way: Vec, most: float) -> Vec:
 
 
 def clip(left: Vec, planes: list[Vec]) -> Vec | None:
-    """Return the longest part of a way (3,) that goes into none of the planes.
+    """Return the longest part of a displacement (3,) that goes into none of the planes.
 
-    planes: unit normals, on the free side. The part is the whole way, else along one plane, else
-    along the crease of two; None if there is none.
+    planes: unit normals, on the free side. The part is the whole displacement, else along one
+    plane, else along the crease of two; None if there is none.
     """
     least = -_ROUNDING * size(left)
 

@@ -85,8 +85,8 @@ class Scans(NamedTuple):
     """Scans of one archive.
 
     sigmas: [m], by their rows in `SceneInfo.sources`.  names: of each row, in reports.
-    one: the only scan, or ANY_SCAN where the archive does not store the scan of a point, and one
-    sigma holds for all; None: it stores it.
+    one: the number of the only scan; ANY_SCAN where the archive has several and does not store the
+    scan of a point, and one sigma holds for all; None where it stores the scan.
     """
 
     sigmas: dict[int, float]

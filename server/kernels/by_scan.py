@@ -1,8 +1,8 @@
 """Nearest pair of each scan: a joint descent, bounded by the nearest pair of each scan so far.
 
 The descent is that of contacts.py. What counts as nearer, and what a pair rules out, follows
-closest.py, for every scan with points here. An inner node does not hold the scans of its points; it
-is therefore searched up to the margin. A leaf node does, and is skipped where it is farther than
+closest.py, for every scan with points here. An inner node does not record the scans of its points;
+it is therefore searched up to the margin. A leaf node does, and is skipped where it is farther than
 the nearest pair of each scan it has points of. A wall that one scan saw therefore costs only its
 nodes and the scan numbers of its points.
 """

@@ -268,8 +268,8 @@ def _list_by_class(c, block, block_at, lane_at, off, best, ints, halves, lanes):
 def take_candidates(least, c, block, block_at, lane_at, off, best, points, m, shift, ints, halves, lanes):
     """Add the points that `least_squares` found to the candidates, and shrink the cut.
 
-    This uses no integers; `settle` does the integer work at the end: while the cut shrinks, ten or
-    twenty points are the nearest for a while.
+    This uses no integers. As points arrive and the cut shrinks, ten or twenty of them are the
+    nearest in turn; `settle` does the integer work once, at the end.
     least: the least square, within the cut.  c: class of the scene's leaf node.
     """
     far, units, counters, nearly = best.far, best.units, best.counters, best.nearly

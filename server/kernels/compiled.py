@@ -5,8 +5,8 @@ counter for each array that is taken out of a tuple or passed on, inside the ker
 although the caller holds the arrays for the whole call. In the descents this took between a fifth
 and a half of the time (scripts/bench_engine: collide 5.0 us a pose with counting, 4.1 without).
 
-`borrowing` disables the counting. It is for functions that create no array. Slices are as cheap as
-elements there, but the compiler refuses np.empty and similar calls, and assignments of whole
+`borrowing` disables the counting. It is for functions that create no array. Such a function may use
+elements and slices; the compiler refuses np.empty and similar calls, and assignments of whole
 arrays.
 """
 

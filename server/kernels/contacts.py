@@ -357,8 +357,8 @@ def gather_contacts(poses, avatar, scene, reach, which, asked, closes, pause, me
     poses; they are then listed.
     pause: node visits after which the call returns with the work unfinished, 1 or more. The work is
     finished when memory.cursor[0] == len(which). Until then, call again with the returned memory,
-    unless the memory has no space for LANES more of `asked.cells`. A pose that has cost
-    `asked.visits` with work left is cut. Adds to `tally`.
+    unless its table of cells has reached `asked.cells` and has no space for LANES more. A pose that
+    has cost `asked.visits` with work left is cut. Adds to `tally`.
     """
     placed = make_placed(avatar)
     work = Work(

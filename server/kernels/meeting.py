@@ -3,10 +3,13 @@
 The motion is that of kernels/motion.py, the contact that of kernels/pairs.py: both bodies are
 placed relative to the dataset's origin, in float64, and each centre is rounded once to exact units.
 The proof is that of kernels/sweep.py, with a rounded point of the standing avatar in place of the
-scan point. Over [t0, t1], every moving point is taken along its chord, within `band` = sqrt(3) / 2
-+ B (t1 - t0)^2 / 8 + 2 slip of its true position. An interval that may contain an early contact is
-halved and quartered until its sagitta is negligible beside rounding. A translation has no sagitta
-and takes one descent.
+scan point. Over [t0, t1], every moving point is taken along its chord, at most `band` from its true
+position:
+
+    band = sqrt(3) / 2 + B (t1 - t0)^2 / 8 + 2 slip
+
+An interval that may contain an early contact is halved and quartered until its sagitta is
+negligible beside rounding. A translation has no sagitta and takes one descent.
 
 The answer is only how far nothing touches. Beyond that lies a contact, or a graze within 1.2 units,
 18 nm, of one. All arithmetic is float64: avatars have some thousand points, few of which are near

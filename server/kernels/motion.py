@@ -2,16 +2,17 @@
 
 Definition: R0, R1 are the upper left 3x3 of the two poses (both contain the scale), p0, p1 their
 translations, and E(a) is the rotation by `a` about the axis u of the shorter rotation that takes R0
-to R1, by the angle A:
+to R1, by the angle A. The translation p1 - p0 = along + across, with `along` parallel to u. Then
 
-    R(t) = E(t A) (R0 + t F)          F = E(-A) R1 - R0, the rounding difference of the two poses
-    p(t) = p0 + t along + sin(t A/2) / sin(A/2) E(-(1 - t) A/2) across       p1 - p0 = along +
-    across, along u
+    R(t) = E(t A) (R0 + t F)
+    p(t) = p0 + t along + sin(t A/2) / sin(A/2) E(-(1 - t) A/2) across
+
+where F = E(-A) R1 - R0 is the difference that rounding leaves between the two poses.
 
 This is M(t) = exp(t log(M1 M0^-1)) M0 for exact poses, written so that nothing cancels as A
-approaches 0 (then the ratio is t) or pi. M(0) and M(1) are the given bits. A rotation by pi is
-about the axis whose first non-zero component is positive; within rounding of pi, the sign of the
-quaternion computed here decides.
+approaches 0 (then the ratio of the sines is t) or pi. M(0) and M(1) are the given bits. A rotation
+by pi is about the axis whose first non-zero component is positive; within rounding of pi, the sign
+of the quaternion computed here decides.
 
 All arithmetic is float64 in one fixed order, with +, -, *, / and square roots only; sine and cosine
 are computed by their series. The bits are therefore the same on every machine, compiled and
@@ -136,8 +137,8 @@ def make_motion(first, last, box, origin):
     dataset, world [m].
 
     Speed and bend are convex functions of the point's position; their maximum over the box is
-    therefore at a corner. The motion rotates velocity and acceleration with it; their value at t =
-    0, apart from F, therefore holds for the whole way.
+    therefore at a corner. The motion rotates velocity and acceleration with it; their values at its
+    beginning, apart from F, therefore hold for all of it.
     slip: entries of E(t A) and p(t) - p0 are off by some 30 half units in the last place of s and
     |p1 - p0|; placing and shifting add 4 of the largest term (measured by
     tests/unit/server/test_motion.py). The stated bound is twice that.

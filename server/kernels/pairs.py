@@ -37,8 +37,8 @@ def sweep_and_prune(order, low, high, groups, masks, stop, pairs):
     order: (n,) int64, objects by ascending low[:, 0].  low, high: (n, 3) float64.  groups, masks:
     (n,) uint32: a pair is permitted when the group of each has a bit of the other's mask.  stop:
     (1,) int64, the request's stop flag; once it is set, the result is meaningless.
-    Writes pairs (capacity,) int32, two columns, lesser object first. Returns the number of pairs,
-    and the number of pairs that were not permitted; pairs beyond the capacity are not written.
+    Writes pairs (capacity, 2) int32, lesser object first; pairs beyond the capacity are not
+    written. Returns the number of pairs, and the number of pairs that were not permitted.
     """
     found, filtered = 0, 0
     for at in range(order.shape[0]):

@@ -40,7 +40,7 @@ STACK = MAX_LEVELS * 15 + 16
 
 
 class Rays(NamedTuple):
-    """Rays, k of them.
+    """Batch of k rays.
 
     origin: (k, 3) int64.  direction: (k, 3) float64 unit vectors.  reach, radius: int64, radius of
     the scan's largest sphere; exact units.

@@ -2,27 +2,29 @@
 
 This extends [Fig12] section 6 to time by conservative advancement (Mirtich 1996; Zhang, Redon, Lee,
 Kim 2007; Tang, Kim, Manocha 2009, C2A). The bound of an advance comes from the directions of the
-motion, not from a maximum speed. Over an interval [t0, t1], every avatar point x moves straight
-from a0 = M(t0) x to a1 = M(t1) x, in proportion to time. One descent finds the first moment at
-which any straight-moving sphere could touch, and the first at which one must. Each pair has its own
-reach: where scan points have radius classes, one descent handles spheres of several sizes, and a
-subtree is pruned by its largest sphere.
+motion, not from a maximum speed. Over an interval [t0, t1], every avatar point x is taken to move
+straight from a0 = M(t0) x to a1 = M(t1) x, in proportion to time. One descent finds the first
+moment at which any straight-moving sphere could touch, and the first at which one must. Each pair
+has its own reach: where scan points have radius classes, one descent handles spheres of several
+sizes, and a subtree is pruned by its largest sphere.
 
 Proof. Let a*(t) be the ideal motion of x, b a scan point, U the reach of these two, all in exact
 units.
- 1. |a*(t) - chord of a*| <= B (t1 - t0)^2 / 8, B the greatest |a*''| of any point (motion.py,
-    `bend`).
- 2. A computed coordinate vector, at t, t0 and t1, lies within `slip` of a*.
+ 1. |a*(t) - chord of a*| <= B (t1 - t0)^2 / 8, B the greatest |a*''| of any point (`bend`).
+ 2. A computed coordinate vector, at t, t0 and t1, lies within `slip` of a* (motion.py).
  3. Rounding to whole units moves a by at most sqrt(3) / 2, and b is an integer.
-Therefore |a - b|, as NUMERICS.md N5 defines it under M(t), lies within `band` = sqrt(3) / 2 + B (t1
-- t0)^2 / 8 + 2 slip of the distance D(t) from b to the chord. While D > U + band nothing touches;
-once D <= U - band the pair touches. D is the distance of a point on a line from a fixed point: both
-moments are roots of a quadratic. They are computed from the point of closest approach, whose
-rounding is relative to the lengths and not to their squares. A node's sphere moves straight with
-its centre: |lerp(x) - lerp(c)| is convex in t and therefore never exceeds the radius. Node pairs
-are pruned by the least distance of the centre's chord, up to the earliest certain contact found so
-far, in float32 with the error bound of placed.py enlarged by 32 half units in the last place of the
-chord.
+Therefore |a - b|, as NUMERICS.md N5 defines it under M(t), differs from the distance D(t) of b from
+the chord by at most
+
+    band = sqrt(3) / 2 + B (t1 - t0)^2 / 8 + 2 slip.
+
+While D > U + band nothing touches; once D <= U - band the pair touches. D is the distance of a
+point on a line from a fixed point: both moments are roots of a quadratic. They are computed from
+the point of closest approach, whose rounding is relative to the lengths and not to their squares. A
+node's sphere moves straight with its centre: |lerp(x) - lerp(c)| is convex in t and therefore never
+exceeds the radius. Node pairs are pruned by the least distance of the centre's chord, up to the
+earliest certain contact found so far, in float32 with the error bound of placed.py enlarged by 32
+half units in the last place of the chord.
 
 The resulting interval is halved and quartered until its ends are within the tolerance, or until B
 (t1 - t0)^2 / 8 is negligible beside rounding; what is undecided then is a graze. The pairs that are

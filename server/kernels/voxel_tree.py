@@ -1,4 +1,4 @@
-"""Lists of the voxels that rays and single points reach, nearest first, from the index alone.
+"""Lists of the voxels that rays and query points reach, nearest first, from the index alone.
 
 No voxel is read. The rows of the index are in Morton order; a tree of boxes over them therefore
 groups FAN consecutive rows at a time. An entry of a list carries `near`, a lower bound of the

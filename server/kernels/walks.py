@@ -59,8 +59,8 @@ class Look(NamedTuple):
     motion: Motion
 
 
-# This holds the interpreter lock: releasing it for a microsecond means waiting for the thread that
-# takes it.
+# This holds the interpreter lock: after releasing it for a microsecond, the thread would wait for
+# whichever thread takes it.
 @nb.njit(cache=True)
 def note_pose(walks, user, now, x, y, z, reach):
     """Store a pose [s, m] of row `user`; return whether it is a teleport.

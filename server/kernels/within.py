@@ -1,4 +1,4 @@
-"""Scan point nearest to a single point, as a k-d tree would find it.
+"""Scan point nearest to a query point, as a k-d tree would find it.
 
 Definition. No tree, order, voxel size or thread can change it. q = rint((point - O) 2^26) in int64,
 half to even, O the dataset's origin; b is a scan point as in NUMERICS.md N5. The least integer |q -
@@ -190,7 +190,7 @@ def _search(scene, voxel, at_units, i, near, tolerance, visits, best, limit, row
 
 @nb.njit(nogil=True, cache=True)
 def search_points(at_units, reach, lists, cursor, held, scene, tolerance, visits, best):
-    """Search for the scan points nearest to k single points, along their lists.
+    """Search for the scan points nearest to k query points, along their lists.
 
     Each search runs up to the first voxel that is not held.
     at_units: (k, 3) int64.  reach: exact units, at most MAX_REACH_UNITS. Other arguments as in

@@ -1,1 +1,1 @@
-"""What the walkthrough and the accuracy report write."""
+"""Reports: the measured walkthrough and the accuracy report of `solidcloud accuracy`."""

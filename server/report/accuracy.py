@@ -1,7 +1,8 @@
-"""The price of accuracy: one knob at a time, what each setting costs and what it gets wrong.
+"""Accuracy report: query time and errors of each setting, varying one parameter ("knob") at a time.
 
-`solidcloud accuracy` calls `run`: accuracy.csv, accuracy.json, accuracy.html and the charts come out. All happens in
-this process: archives are built from one scan, opened, asked and closed.
+`solidcloud accuracy` calls `run`, which writes accuracy.csv, accuracy.json, accuracy.html and the
+charts. Everything runs in this process: it builds archives from one scan, opens, queries and closes
+them.
 """
 
 import csv
@@ -56,15 +57,17 @@ def run(
 ) -> Report:
     """Measure everything and write it into the folder `out`.
 
-    scratch: a folder for scans and archives, the caller's to remove.  archive: of a user; None: the façade is made.
-    avatar: a file of points; None: the made figure. Raises SolidcloudError where matplotlib is missing.
+    scratch: a folder for scans and archives, which the caller removes.
+    archive: folder of an archive to measure; None: one built from a generated façade.
+    avatar: a file of points; None: the generated figure.
+    Raises SolidcloudError if matplotlib is missing.
     """
     from .accuracy_page import write_page
     from .accuracy_picture import draw_charts
 
-    load_pyplot()  # missing: better said now than after minutes
+    load_pyplot()  # fails now if matplotlib is missing, not after minutes of measuring
     if archive is not None:
-        Archive(archive).close()  # what cannot be opened leaves no empty folder
+        Archive(archive).close()  # fails before the output folder is created
     out.mkdir(parents=True, exist_ok=True)
     check_writable(out)
     report = measure(scratch, plan, progress, archive, avatar)
@@ -80,7 +83,7 @@ def run(
 def measure(
     scratch: Path, plan: Plan, progress: Progress, archive: Path | None = None, avatar: Path | None = None
 ) -> Report:
-    """`run` without its files."""
+    """Measure everything and return the report without writing it."""
     begin = time.perf_counter()
     progress.start("make", 1, "scene")
     ground = given_ground(archive, plan, avatar, scratch) if archive else made_ground(plan, avatar, scratch)
@@ -127,12 +130,12 @@ def measure(
 
 
 def with_slabs(ground: Ground) -> BuildConfig:
-    """The ground's build, with slabs where it has none: the plain descent compares bounds with and without."""
+    """Return the ground's build configuration with slabs: the plain descent compares bounds with and without them."""
     return replace(ground.config, with_slab=True)
 
 
 def judge(ground: Ground, config: BuildConfig, archives: Archives, plan: Plan) -> Exact:
-    """The exact verdicts and distances, by the server's exact answers on the archive of `config`."""
+    """Return the reference: the server's exact verdicts and distances on the archive of `config`."""
     scene = archives.scene(config)
     tangent = tangent_poses(scene, ground.judged, plan.near_tangent)
     distance = scene.distance(AVATAR, ground.judged, REACH).signed_distance
@@ -140,19 +143,17 @@ def judge(ground: Ground, config: BuildConfig, archives: Archives, plan: Plan) -
 
 
 def warnings_of(ground: Ground, exact: Exact) -> list[str]:
-    """What the figures cannot show, in sentences."""
+    """Return sentences about effects that this measurement cannot show."""
     said = list(ground.warnings)
     if not exact.contact.any():
         said.append(
-            f"None of the {len(exact.contact):,} judged poses touches: clear where it should be contact cannot show."
+            f"None of the {len(exact.contact):,} judged poses touches: wrong clear verdicts cannot appear."
         )
     if exact.contact.all():
-        said.append(
-            f"All {len(exact.contact):,} judged poses touch: contact where it should be clear cannot show."
-        )
+        said.append(f"All {len(exact.contact):,} judged poses touch: wrong contact verdicts cannot appear.")
     if not len(exact.tangent):
         said.append(
-            "No pose was found within a micrometre of touching: where rounding shows first is not measured."
+            "No pose was found within a micrometre of touching: the effect of rounding is not measured."
         )
     return said
 
@@ -160,7 +161,7 @@ def warnings_of(ground: Ground, exact: Exact) -> list[str]:
 def measure_engine(
     settings: list[Setting], archives: Archives, ground: Ground, exact: Exact, plan: Plan, progress: Progress
 ) -> None:
-    """Everything of the server's engine, stage by stage."""
+    """Measure the settings of the server's engine: verdicts, doorways and leaks, times."""
 
     def tick() -> None:
         progress.advance(1)
@@ -178,7 +179,10 @@ def measure_engine(
 
 
 def measure_made_scenes(settings: list[Setting], scratch: Path, plan: Plan, progress: Progress) -> list[Row]:
-    """What needs other scenes than the façade as it is: the sheet with a door, its rows; and doors made narrower."""
+    """Measure on other generated scenes: a sheet with a door, and façades with narrower doors.
+
+    Returns the rows of the sheet. The doorways are entered into the rows of `settings`.
+    """
 
     def tick() -> None:
         progress.advance(1)
@@ -194,7 +198,10 @@ def measure_made_scenes(settings: list[Setting], scratch: Path, plan: Plan, prog
 
 
 def measure_turned(ground: Ground, scratch: Path, plan: Plan, progress: Progress) -> list[Row]:
-    """Volumes and primitives once more where no wall stands along an axis: boxes like axes, spheres do not care."""
+    """Measure bounding volumes and primitives on the rotated scene, whose walls are not parallel to the axes.
+
+    Axis-aligned walls favour boxes; the orientation does not matter to spheres.
+    """
     folder = scratch / "turned"
     folder.mkdir(exist_ok=True)
     turned = turned_ground(ground, folder)
@@ -211,7 +218,7 @@ def measure_turned(ground: Ground, scratch: Path, plan: Plan, progress: Progress
 
 
 def write_rows(report: Report, out: Path) -> None:
-    """accuracy.json: facts and rows; accuracy.csv: the rows."""
+    """Write accuracy.json, with facts and rows, and accuracy.csv, with the rows."""
     rows = [row.as_dict() for row in report.rows]
     (out / "accuracy.json").write_text(
         json.dumps({"facts": report.facts, "rows": rows}, indent=1, allow_nan=False) + "\n"

@@ -1,4 +1,4 @@
-"""Settings of the plain descent: arithmetic, bounding volumes, points as spheres or cubes."""
+"""Measurement of the plain descent: arithmetic, bounding volumes, points as spheres or cubes."""
 
 from collections.abc import Callable
 from functools import partial
@@ -34,7 +34,7 @@ ARITHMETICS = (
     Kind("float32 certified, integers decide", SLAB, CERTIFIED),
     Kind("integers", SLAB, INTEGERS),
 )
-# What each knob's times are compared with.
+# Setting of each knob with which the times of the others are compared.
 DEFAULTS = {
     ARITHMETIC: "float32 certified, integers decide",
     VOLUME: "sphere with slab",
@@ -44,7 +44,7 @@ DEFAULTS = {
 
 
 def plain_settings() -> list[tuple[str, Kind]]:
-    """Knob and kind of each setting."""
+    """Return the knob and the kind of each setting."""
     return [
         *((ARITHMETIC, kind) for kind in ARITHMETICS),
         *((VOLUME, kind) for kind in VOLUMES),
@@ -56,9 +56,10 @@ def plain_settings() -> list[tuple[str, Kind]]:
 def measure_plain(
     archive: Archive, ground: Ground, exact: Exact, plan: Plan, tick: Tick, *, only: tuple[str, ...] = ()
 ) -> list[Row]:
-    """One row a setting of the plain descent, judged and timed on `ground`. only: the knobs wanted; none: all.
+    """Measure errors and times of each setting of the plain descent on `ground`; return one row each.
 
-    Raises InternalError where an exact kind, or a bounding volume, changes an answer.
+    only: the knobs to measure; empty: all.
+    Raises InternalError if an exact kind, or a bounding volume, changes an answer.
     """
     plain = make_plain(archive, make_avatar(ground.avatar))
     chosen = [(knob, kind) for knob, kind in plain_settings() if not only or knob in only]
@@ -77,7 +78,7 @@ def measure_plain(
 
 
 def _judge(plain: Plain, knob: str, kind: Kind, ground: Ground, exact: Exact) -> Row:
-    """What one kind gets wrong, and what it tests."""
+    """Return a row with the errors of one kind and its numbers of node and pair tests."""
     row = Row(knob, kind.name, default=kind.name == DEFAULTS[knob], by=PLAIN, scene=ground.name)
     found = ask(plain, kind, ground.judged)
     judge_verdicts(row, found.contact, np.zeros(len(found.contact), bool), exact.contact)
@@ -89,15 +90,18 @@ def _judge(plain: Plain, knob: str, kind: Kind, ground: Ground, exact: Exact) ->
     wrong = row.early + row.late + row.tangent_early + row.tangent_late
     if kind.leaf in (CERTIFIED, INTEGERS) and wrong:
         raise InternalError(
-            f"{knob} {kind.name}: {wrong} verdicts differ from the server's, expected none: an error of this software, "
-            "report it"
+            f"{knob} {kind.name}: {wrong} verdicts differ from the server's, expected none: this is a bug of this "
+            "software, report it"
         )
     return row
 
 
 def check_judge(archive: Archive, ground: Ground, exact: Exact, poses: int) -> int:
-    """Judge the judge: every pair of points, in integers, at `poses` poses, half of them near-tangent where there are
-    so many. Returns how many were compared; raises InternalError where one differs."""
+    """Check the reference verdicts against brute force: every pair of points, in integers, at `poses` poses.
+
+    Half of the poses are near-tangent, if there are enough. Returns the number of poses compared.
+    Raises InternalError if a verdict differs.
+    """
     scene = _scene_units(archive)
     origin = np.array(archive.header.lattice.origin)
     avatar = make_avatar(ground.avatar)
@@ -113,14 +117,14 @@ def check_judge(archive: Archive, ground: Ground, exact: Exact, poses: int) -> i
         close = scene[(np.abs(scene - middle) <= reach).all(axis=1)]
         if brute_touch(pose, ground.avatar, close, units, origin) != contact:
             raise InternalError(
-                f"pose {number} of those judged: the server says {'contact' if contact else 'clear'}, every pair of "
-                "points says otherwise: an error of this software, report it"
+                f"pose {number} of those judged: the server answers {'contact' if contact else 'clear'}, a test of "
+                "every pair of points finds the opposite: this is a bug of this software, report it"
             )
     return len(asked)
 
 
 def _scene_units(archive: Archive) -> NDArray[np.int64]:
-    """All scan points (n, 3) in exact units from the origin (NUMERICS.md N5)."""
+    """Return all scan points (n, 3) in exact units from the origin (NUMERICS.md N5)."""
     from ...builder.radius import voxel_points
 
     lattice = archive.header.lattice

@@ -1,4 +1,4 @@
-"""Bars and bands of the accuracy report: bounding volumes, each knob by itself, and the sheet with a door."""
+"""Bar charts of the accuracy report: bounding volumes, each knob by itself, and the sheet with a door."""
 
 import io
 from collections.abc import Sequence
@@ -11,7 +11,7 @@ from .accuracy_arithmetic import PRIMITIVE, VOLUME
 from .accuracy_row import RADIUS, Row
 from .spheres import load_pyplot
 
-# Half of the bytes, and no colour is lost.
+# Colours of the pictures' palette: halves the file size without losing a colour.
 PALETTE = 256
 MODEL_COLOURS = {
     "mean": "#2f2a26", "local": "#1f7a8c", "border": "#c8553d", "local+border": "#7a5195", "fixed": "#b8860b",
@@ -19,7 +19,7 @@ MODEL_COLOURS = {
 
 
 def draw_volumes(rows: Sequence[Row], target: Path) -> Path:
-    """Bars: time of each bounding volume and of each point primitive, walls along the axes and turned."""
+    """Draw the times of the bounding volumes and point primitives, with axis-aligned and rotated walls."""
     pyplot = load_pyplot()
     groups = [knob for knob in (VOLUME, PRIMITIVE) if any(row.knob == knob for row in rows)]
     figure, panels = pyplot.subplots(
@@ -34,11 +34,11 @@ def draw_volumes(rows: Sequence[Row], target: Path) -> Path:
 
 
 def draw_bars(panel: Any, rows: Sequence[Row], knob: str) -> None:
-    """The times of a knob of the plain descent, walls along the axes and turned."""
+    """Draw the times of a knob of the plain descent, with axis-aligned and rotated walls."""
     names = list(dict.fromkeys(row.setting for row in rows if row.knob == knob))
     most = 0.0
     for shift, (suffix, colour, said) in enumerate(
-        (("", "#1f7a8c", "walls along the axes"), (", turned", "#e0a100", "the same scene, turned"))
+        (("", "#1f7a8c", "axis-aligned walls"), (", turned", "#e0a100", "the same scene, rotated"))
     ):
         own = {row.setting: row for row in rows if row.knob == knob + suffix}
         for i, name in enumerate(names):
@@ -51,21 +51,21 @@ def draw_bars(panel: Any, rows: Sequence[Row], knob: str) -> None:
     panel.set_yticks(range(len(names)), [name.replace(", ", ",\n") for name in names])
     panel.invert_yaxis()
     panel.set_xlim(0, 1.45 * most)
-    panel.set_xlabel("time of a pose, one plain scalar descent [µs]   ← faster")
-    title = "What bounds a node: no answer changes" if knob == VOLUME else "What stands for a point"
+    panel.set_xlabel("time per pose, plain scalar descent [µs]   ← faster")
+    title = "Bounding volume of a node: no answer changes" if knob == VOLUME else "Primitive of a point"
     panel.set_title(title, fontsize=10.5, loc="left")
     for side in ("top", "right"):
         panel.spines[side].set_visible(False)
 
 
 def _bar_text(row: Row) -> str:
-    """What stands at a bar's end."""
+    """Format the text at a bar's end."""
     wrong = row.early + row.late
     return f"{row.mean_us or 0.0:.1f}" + (f", {wrong} of {row.poses:,} wrong" if wrong else "")
 
 
 def draw_knob(knob: str, rows: Sequence[Row], target: Path) -> Path:
-    """One knob: each setting's time, from the middle pose to one in a hundred, and beside it what it gets wrong."""
+    """Draw the times (p50 to p99) and the errors of each setting of one knob, side by side."""
     pyplot = load_pyplot()
     figure, (times, wrong) = pyplot.subplots(
         1, 2, figsize=(9.0, 1.3 + 0.34 * len(rows)), sharey=True, layout="constrained", width_ratios=[1.3, 1]
@@ -91,16 +91,16 @@ def draw_knob(knob: str, rows: Sequence[Row], target: Path) -> Path:
     times.invert_yaxis()
     most = max((row.p99_us or 0.0) for row in rows)
     times.set_xlim(0, most * 1.08)
-    times.set_xlabel("time of a pose [µs]: p50 to p99 of dozens, mean as a point")
+    times.set_xlabel("time per pose [µs]: p50 to p99 of groups of poses, mean as a point")
     left = np.zeros(len(rows))
     for name, colour in (("early", "#d62839"), ("late", "#5b1a8b"), ("unknown", "#b9b2a8")):
         share = np.array([getattr(row, name) / max(row.poses, 1) * 100 for row in rows])
         wrong.barh(range(len(rows)), share, left=left, color=colour, height=0.6, label=name)
         left += share
     wrong.set_xlim(0, max(1.0, float(left.max()) * 1.15))
-    than = "mean's" if knob == RADIUS else "the judge's"
-    wrong.set_xlabel(f"verdicts that are not {than} [% of poses]")
-    # Above, where no bar is.
+    than = "mean's" if knob == RADIUS else "the exact ones"
+    wrong.set_xlabel(f"verdicts that differ from {than} [% of poses]")
+    # Above the panel, clear of the bars.
     wrong.legend(frameon=False, fontsize=8, loc="lower right", bbox_to_anchor=(1.0, 0.99), ncols=3)
     for panel in (times, wrong):
         panel.grid(alpha=0.25, axis="x")
@@ -110,7 +110,7 @@ def draw_knob(knob: str, rows: Sequence[Row], target: Path) -> Path:
 
 
 def save_picture(figure: Any, target: Path) -> None:
-    """As a PNG of few colours."""
+    """Save a figure as a PNG with PALETTE colours."""
     from PIL import Image
 
     drawn = io.BytesIO()
@@ -122,12 +122,12 @@ def save_picture(figure: Any, target: Path) -> None:
 
 
 def draw_sheet(rows: Sequence[Row], target: Path) -> Path:
-    """A sheet with a door: its doorway and its leak under each model, by the factor on the mean radius."""
+    """Draw the doorway error and the leak of the sheet with a door, by radius model and factor."""
     pyplot = load_pyplot()
     figure, panels = pyplot.subplots(1, 2, figsize=(9.0, 3.4), layout="constrained")
     titles = {
-        "doorway_mm": "A door: how much wider it must be [mm]",
-        "leak_p99_mm": "The sheet: leak, 99th percentile [mm]",
+        "doorway_mm": "Door: extra width that the figure needs [mm]",
+        "leak_p99_mm": "Sheet: leak, 99th percentile [mm]",
     }
     models = list(dict.fromkeys(row.setting.split(":")[0] for row in rows))
     factors = sorted({row.value or 0.0 for row in rows})
@@ -143,7 +143,7 @@ def draw_sheet(rows: Sequence[Row], target: Path) -> Path:
         panel.axhline(0.0, color="#8a8178", lw=0.8)
         panel.margins(y=0.15)
         panel.set_xticks(range(len(factors)), [f"{factor:g}" for factor in factors])
-        panel.set_xlabel("times the mean radius")
+        panel.set_xlabel("factor on the mean radius")
         panel.set_title(title, fontsize=10.5, loc="left")
         for side in ("top", "right"):
             panel.spines[side].set_visible(False)

@@ -1,4 +1,4 @@
-"""What the accuracy report is measured on: a scene, an avatar, and the poses that settings are judged at."""
+"""Test data of the accuracy report: a scene, an avatar, and the poses at which settings are compared."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -28,25 +28,28 @@ Floats = NDArray[np.float64]
 
 AVATAR = "avatar"
 SEED = 2012
-# Distances are asked up to here [m].
+# Reach of the distance queries [m].
 REACH = 0.5
-# How far poses are moved off the walk, to both sides and upwards [m]: about one in nine of them touches.
+# Maximum offset of poses from the walk, to both sides and upwards [m]: about one in nine touches.
 SIDEWAYS, UPWARDS = 0.2, 0.2
-# Near-tangent poses have their nearest pair off by this much, from an exact unit to a micrometre [m].
+# Absolute signed distance of near-tangent poses, from one exact unit to a micrometre [m].
 LEAST_OFF, MOST_OFF = 1.5e-8, 1e-6
-# Moving along the nearest pair's normal lands on another pair at times: then again, so often at most.
+# Maximum number of moves along the nearest pair's normal: after a move another pair may be the nearest.
 TANGENT_STEPS = 12
-# The turn that takes the façade's walls off the axes: about z, then about x [rad].
+# Rotation that makes the façade's walls oblique to the axes: about z, then about x [rad].
 TURN, TILT = np.deg2rad(33.0), np.deg2rad(21.0)
 
 
 class Ground(NamedTuple):
-    """What is measured on.
+    """Test data of a measurement.
 
-    name: for titles.  scan: the file to build.  config: how, where nothing else is said; its lattice step is given.
-    warnings: what of it is not measured, in sentences.  truth: of the made façade, else None.
-    own: whether the avatar is the made figure, of which alone the doorway's error is known.
-    avatar: (n, 3) [m].  walk: (k, 4, 4), on which times are measured.  around: (k, 4, 4), the walk's poses moved.
+    name: for titles.  scan: file to build.
+    config: default configuration of its build, with a lattice step.
+    warnings: sentences about what cannot be measured.
+    truth: ground truth of the generated façade; None for other scans.
+    own: the avatar is the generated figure; the doorway error is defined only for it.
+    avatar: (n, 3) [m].  walk: (k, 4, 4), poses on which times are measured.
+    around: (k, 4, 4), the walk's poses with random offsets.
     """
 
     name: str
@@ -61,31 +64,31 @@ class Ground(NamedTuple):
 
     @property
     def step(self) -> float:
-        """The lattice step [m]."""
+        """Return the lattice step [m]."""
         return self.config.resolution or DEFAULT_STEP
 
     @property
     def judged(self) -> Floats:
-        """The poses (2 k, 4, 4) whose verdicts and distances are compared with the judge's."""
+        """Return the poses (2 k, 4, 4) at which verdicts and distances are compared with the reference."""
         return np.concatenate([self.walk, self.around])
 
 
 def made_ground(plan: Plan, avatar: Path | None, folder: Path) -> Ground:
-    """The made façade, scanned into `folder`, and the walk through it."""
+    """Generate the façade's scan in `folder`, and return it with the walk through it."""
     scan = folder / "facade.laz"
     made = make_facade(scan, points=plan.points)
     body = figure_points() if avatar is None else read_avatar(avatar)
     _, walk = walk_poses(build_facade().truth, plan.frames)
-    name, truth = f"made façade of {made.points:,} points", read_truth(made.truth)
+    name, truth = f"generated façade of {made.points:,} points", read_truth(made.truth)
     config = BuildConfig(resolution=DEFAULT_STEP, overwrite=True)
     return Ground(name, scan, config, (), truth, avatar is None, body, walk, _moved(walk))
 
 
 def given_ground(archive: Path, plan: Plan, avatar: Path | None, folder: Path) -> Ground:
-    """The points of an archive, those nearest to its middle voxel, written to `folder`; a straight walk over them.
+    """Write the points nearest to an archive's middle voxel to `folder`, and plan a straight walk over them.
 
-    They are built again as the archive was, with its radius: fewer points would have another mean.
-    BadDataError: nothing to stand on.
+    They are built with the archive's options and its radius: fewer points would have another mean.
+    Raises BadDataError if there is no floor to stand on.
     """
     with Archive(archive) as opened:
         points, total = _middle_points(opened, plan.most_points), opened.header.points
@@ -95,14 +98,15 @@ def given_ground(archive: Path, plan: Plan, avatar: Path | None, folder: Path) -
     body = figure_points() if avatar is None else read_avatar(avatar)
     walk = floor_walk(points)[1]
     walk = walk[np.linspace(0, len(walk) - 1, min(plan.frames, len(walk))).astype(int)]
-    # The walk's height is that of points over points; a thin avatar's large spheres would all stand in the floor.
+    # The walk places avatar points on scan points. Raise it by both radii: the spheres would else
+    # intersect the floor at every pose.
     walk[:, 2, 3] += (config.radius or 0.0) + make_avatar(body).radius
     name = f"{archive.resolve().name}, {len(points):,} of {total:,} points"
     return Ground(name, scan, config, warnings, None, avatar is None, body, walk, _moved(walk))
 
 
 def config_of(header: Header) -> BuildConfig:
-    """The options that build an archive again from its points, into another of the same radius, lattice and nodes."""
+    """Return the options that build an archive's points again with the same radius, lattice and nodes."""
     options = header.options
     return BuildConfig(
         voxel=header.lattice.voxel_size, resolution=header.lattice.step, radius=header.radius, degree=header.degree,
@@ -112,21 +116,21 @@ def config_of(header: Header) -> BuildConfig:
 
 
 def unknown_regions(header: Header) -> tuple[str, ...]:
-    """What is said of regions whose scans were left out: they are not built again."""
+    """Return a warning about regions whose scans were left out of the archive, if there are any."""
     if header.unknown_everywhere:
-        where = "everywhere, for of a scan left out not even the bounds are known"
+        where = "everywhere, because the bounds of a scan that was left out are not known"
     elif len(header.unknown):
         where = f"in {len(header.unknown)} region{'s' * (len(header.unknown) > 1)}"
     else:
         return ()
     return (
-        f"Scans were left out of this archive: it answers unknown {where}. That is not measured here: the points it "
-        "has are built again without.",
+        f"Scans were left out of this archive: it answers unknown {where}. That is not measured here: its points are "
+        "built again without those regions.",
     )
 
 
 def turned_ground(ground: Ground, folder: Path) -> Ground:
-    """The same scene, avatar and poses, turned together so that no wall stands along an axis; it has no truth."""
+    """Return the scene and poses rotated together so that no wall is parallel to an axis, without ground truth."""
     c, s, c2, s2 = np.cos(TURN), np.sin(TURN), np.cos(TILT), np.sin(TILT)
     turn = np.array([[1, 0, 0], [0, c2, -s2], [0, s2, c2]]) @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
     middle = ground.walk[:, :3, 3].mean(axis=0)
@@ -146,10 +150,11 @@ def turned_ground(ground: Ground, folder: Path) -> Ground:
 
 
 def tangent_poses(scene: Scene, poses: Floats, count: int) -> Floats:
-    """Poses (<= count, 4, 4) whose signed distance is within MOST_OFF of 0, on either side, by the engine's `distance`.
+    """Return poses (<= count, 4, 4) whose signed distance is within MOST_OFF of 0, on either side.
 
-    scene: with the avatar added. Each pose is moved along the normal of its nearest pair until that pair is as far off
-    as was drawn; a pose where it does not settle is left out.
+    Each pose is moved along the contact normal of its nearest pair, as `distance` returns it, until its
+    signed distance is as small as drawn at random. Poses that do not converge are left out.
+    scene: with the avatar added.
     """
     rng = np.random.default_rng([SEED, 0x7A])
     moved = poses[rng.choice(len(poses), min(len(poses), 2 * count), replace=False)].copy()
@@ -168,7 +173,7 @@ def tangent_poses(scene: Scene, poses: Floats, count: int) -> Floats:
 
 
 def judged_contact(scene: Scene, poses: Floats) -> NDArray[np.bool_]:
-    """The exact verdicts (k,) of poses; BadDataError where one is unknown."""
+    """Return the exact verdicts (k,) of poses: contact or not. Raises BadDataError if one is unknown."""
     verdict = scene.collide(AVATAR, poses).verdict
     if (verdict == Verdict.UNKNOWN).any():
         raise BadDataError(
@@ -185,12 +190,15 @@ def write_ply(target: Path, points: Floats) -> None:
 
 
 def _scan_points(scan: Path) -> Floats:
-    """All points (n, 3) of a scan file [m]."""
+    """Return all points (n, 3) of a scan file [m]."""
     return np.concatenate([block.xyz for each in open_scans(scan) for block in each.blocks()])
 
 
 def _middle_points(archive: Archive, most: int) -> Floats:
-    """The points (n, 3) world [m] of the voxels nearest to the scene's middle, so many at most (but one voxel)."""
+    """Return the points (n, 3), world frame [m], of the voxels nearest to the scene's middle.
+
+    At most `most` points, but at least one voxel.
+    """
     middle = np.median(archive.coordinates, axis=0)
     held: list[Floats] = []
     count = 0
@@ -205,7 +213,7 @@ def _middle_points(archive: Archive, most: int) -> Floats:
 
 
 def _moved(walk: Floats) -> Floats:
-    """The walk's poses, each moved at random."""
+    """Return the walk's poses with random offsets."""
     rng = np.random.default_rng([SEED, 0xA0])
     moved = walk.copy()
     moved[:, :2, 3] += rng.uniform(-SIDEWAYS, SIDEWAYS, (len(walk), 2))

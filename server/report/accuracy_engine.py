@@ -1,4 +1,4 @@
-"""The knobs of the server's own engine: tolerance, budget, radius model, lattice step, degree, leaf size, slabs."""
+"""Measurement of the server's engine: tolerance, budget, radius model, lattice step, degree, leaf size, slabs."""
 
 import contextlib
 import math
@@ -41,13 +41,17 @@ Bools = NDArray[np.bool_]
 Tick = Callable[[], None]
 
 DECODE_LOOPS = 3
-# Never spent: a tolerance alone is answered exactly, a budget asks for the search that may stop within it.
+# A budget of node visits that is never spent. A tolerance without a budget is answered exactly; with
+# a budget, the engine uses the search that may stop within the tolerance.
 UNSPENT = 1 << 40
 
 
 class Exact(NamedTuple):
-    """What the judge says. contact: (k,) and distance: (k,) [m] of the judged poses; tangent: (t,) contact of the
-    near-tangent ones, poses (t, 4, 4)."""
+    """Reference answers.
+
+    contact, distance: (k,), verdict and signed distance [m] of the judged poses.
+    tangent: (t,), verdict of the near-tangent poses.  tangent_poses: (t, 4, 4).
+    """
 
     contact: Bools
     distance: Floats
@@ -56,7 +60,10 @@ class Exact(NamedTuple):
 
 
 class Setting(NamedTuple):
-    """One setting of the engine. row: to be filled.  config: how its archive is built.  options: of each question."""
+    """One setting of the engine.
+
+    row: receives the results.  config: of its archive's build.  options: of each query.
+    """
 
     row: Row
     config: BuildConfig
@@ -64,17 +71,17 @@ class Setting(NamedTuple):
 
 
 def engine_settings(plan: Plan, plain: BuildConfig, radius: float) -> list[Setting]:
-    """One setting a value of a knob, everything else as by default; each knob's default value is among them.
+    """Return one setting per value of each knob, including its default; everything else is the default.
 
-    plain: the ground's own build, whose values are the defaults; its lattice step is given.
-    radius: what `mean` gives there [m], held fixed where an archive is built anew: what a coarser lattice changes is
-    then the lattice alone, and not the mean distance of the points that are left.
+    plain: the ground's configuration, with a lattice step; its values are the defaults.
+    radius: result of the model `mean` for `plain` [m]. Other builds use it as a fixed radius. A coarser
+    lattice then changes only the lattice, not the mean distance of the points that are left.
     """
     found: list[Setting] = []
     step = plain.resolution or DEFAULT_STEP
 
     def held(default: bool, **changes: Any) -> BuildConfig:
-        """A build with the default's radius; the default itself has it anyway, and is not built twice."""
+        """Return a build with the radius of the default; the default itself is returned unchanged."""
         return plain if default else replace(plain, radius=radius, **changes)
 
     def add(
@@ -106,7 +113,7 @@ def engine_settings(plan: Plan, plain: BuildConfig, radius: float) -> list[Setti
 
 
 def radius_settings(plan: Plan, plain: BuildConfig, radius: float) -> list[Setting]:
-    """The radius models, each with the plan's factors; `fixed` with radii rounded to what a user would type."""
+    """Return the settings of the radius models, each with the plan's factors; `fixed` with rounded radii."""
     config = replace(plain, models=frozenset({"mean", "local", "border"}))
     found = []
     for model in ("mean", "local", "border", "local+border"):
@@ -122,17 +129,17 @@ def radius_settings(plan: Plan, plain: BuildConfig, radius: float) -> list[Setti
 
 
 def length_name(metres: float) -> str:
-    """A length as a label: 0, 2 mm, 5 cm."""
+    """Format a length as a label: 0, 2 mm, 5 cm."""
     if not metres:
         return "0"
     return f"{metres * 100:g} cm" if metres >= 0.01 else f"{metres * 1e3:g} mm"
 
 
 class Archives:
-    """The archives that settings need, each built once and open until the end; a context manager."""
+    """Archives of the settings, each built once and kept open; a context manager."""
 
     def __init__(self, ground: Ground, folder: Path) -> None:
-        """Archives of the ground's scan, in `folder`."""
+        """Build archives of the ground's scan in `folder` when they are first needed."""
         self._ground, self._folder = ground, folder
         self._scenes: dict[tuple[Any, ...], Scene] = {}
         self._figures: dict[tuple[Any, ...], tuple[int, float]] = {}
@@ -140,20 +147,23 @@ class Archives:
         self._open = contextlib.ExitStack()
 
     def __enter__(self) -> "Archives":
-        """The archives."""
+        """Return the archives."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Close them."""
+        """Close all archives."""
         self._open.close()
 
     def scene(self, config: BuildConfig) -> Scene:
-        """The scene built as `config` says, with the avatar; all of it fits in memory: answers are timed, not loads."""
+        """Return the scene built with `config`, with the avatar added.
+
+        Its cache holds the whole archive: answers are timed, not loads.
+        """
         key = _key(config)
         if key not in self._scenes:
             target = self._folder / f"archive-{len(self._scenes)}"
             self._folders[key] = target
-            # Of one shard as a rule: more processes would each load numba first, for nothing.
+            # The archive usually has one shard: more processes would only load numba several times.
             summary = build_archive([self._ground.scan], target, replace(config, jobs=1))
             self._figures[key] = (summary.bytes, decode_seconds(target))
             store = Store(target)
@@ -165,23 +175,23 @@ class Archives:
         return self._scenes[key]
 
     def figures(self, config: BuildConfig) -> tuple[int, float]:
-        """Bytes of the archive's files, and seconds to read and decode all of its voxels."""
+        """Return the size of the archive's files [bytes] and the time to read and decode all its voxels [s]."""
         self.scene(config)
         return self._figures[_key(config)]
 
     def folder(self, config: BuildConfig) -> Path:
-        """Where the archive built as `config` says is."""
+        """Return the folder of the archive built with `config`."""
         self.scene(config)
         return self._folders[_key(config)]
 
 
 def _key(config: BuildConfig) -> tuple[Any, ...]:
-    """What tells archives apart."""
+    """Return a key that identifies the archive of a configuration."""
     return tuple(sorted(config.identity().items()))
 
 
 def decode_seconds(folder: Path) -> float:
-    """The time to read, check and lay out all voxels of an archive, the best of DECODE_LOOPS [s]."""
+    """Return the time to read, check and lay out all voxels of an archive, the best of DECODE_LOOPS [s]."""
     store = Store(folder)
     try:
         best = math.inf
@@ -201,7 +211,7 @@ def decode_seconds(folder: Path) -> float:
 def judge_engine(
     settings: list[Setting], archives: Archives, ground: Ground, exact: Exact, tick: Tick
 ) -> None:
-    """Fill in what each setting gets wrong, what it visits, and what its archive takes."""
+    """Fill in the errors, node and pair tests, and archive size of each setting."""
     for setting in settings:
         row, scene = setting.row, archives.scene(setting.config)
         answers = scene.collide(AVATAR, ground.judged, **setting.options)
@@ -222,26 +232,26 @@ def judge_engine(
 
 
 def _must_be_right(setting: Setting) -> None:
-    """Raise InternalError where a knob changed an answer that it must not change."""
+    """Raise InternalError if a setting changed an answer that it must not change."""
     row = setting.row
     wrong = row.early + row.late + row.unknown + row.tangent_early + row.tangent_late + row.tangent_unknown
     exact = row.knob == TOLERANCE and "budget_visits" not in setting.options
     if (exact or row.knob in (DEGREE, LEAF, NODES)) and wrong:
         raise InternalError(
-            f"{row.knob} {row.setting}: {wrong} verdicts differ from the default's, expected none: an error of this "
-            "software, report it"
+            f"{row.knob} {row.setting}: {wrong} verdicts differ from the default's, expected none: this is a bug of "
+            "this software, report it"
         )
     if row.knob in (TOLERANCE, BUDGET) and row.late + row.tangent_late:
         raise InternalError(
-            f"{row.knob} {row.setting}: {row.late + row.tangent_late} poses are called clear that touch, expected "
-            "none: an error of this software, report it"
+            f"{row.knob} {row.setting}: {row.late + row.tangent_late} touching poses are called clear, expected "
+            "none: this is a bug of this software, report it"
         )
 
 
 def time_engine(settings: list[Setting], archives: Archives, ground: Ground, plan: Plan, tick: Tick) -> None:
-    """Fill in the time of each setting; `times` is over the default's, which is timed in turn with all others.
+    """Fill in the time of each setting, and its ratio to the time of the default.
 
-    Settings that ask the same of the same archive are one, and timed once.
+    All settings are timed in turn. Settings with the same archive and options are timed once.
     """
     timed: dict[tuple[Any, ...], Timed] = {}
     of: list[Timed] = []
@@ -261,11 +271,11 @@ def time_engine(settings: list[Setting], archives: Archives, ground: Ground, pla
 
 
 def count_timed(settings: list[Setting]) -> int:
-    """How many settings `time_engine` times."""
+    """Return the number of settings that `time_engine` times."""
     return len({(_key(s.config), *sorted(s.options.items())) for s in settings})
 
 
 def fill_times(row: Row, subject: Timed) -> None:
-    """The times of a subject into its row."""
+    """Fill in the times of a subject."""
     row.mean_us, row.noise = subject.mean * 1e6, subject.noise
     row.p50_us, row.p99_us = subject.percentile(50) * 1e6, subject.percentile(99) * 1e6

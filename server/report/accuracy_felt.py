@@ -1,4 +1,4 @@
-"""The two errors a user feels, of every setting that can change them: too narrow a doorway, and walls that leak."""
+"""Measurement of the two errors that a user notices: doorways that are too narrow, and walls that leak."""
 
 import math
 from collections.abc import Callable
@@ -12,20 +12,22 @@ from .doorway import doorway_error
 from .leak import leak, leak_places
 from .made_doorway import made_doorways
 
-# Knobs that change no answer: what is felt is what is felt by default.
+# Knobs that change no answer: their settings have the errors of the default.
 ALIKE = (DEGREE, LEAF, NODES)
 FELT = (TOLERANCE, BUDGET, STEP, RADIUS)
 DOOR = "main"
-# How many façades `measure_made` makes, about: twelve for the first model, and a few for each of three others.
+# Approximate number of façades that `measure_made` generates: twelve for the first model, and a few
+# for each of three others.
 FACADES = 20
 
 
 def measure_felt(
     settings: list[Setting], archives: Archives, ground: Ground, plan: Plan, tick: Callable[[], None]
 ) -> None:
-    """Fill in the doorway and the leak of each setting; nothing where the ground's truth is not known.
+    """Fill in the doorway error and the leak of each setting; nothing if there is no ground truth.
 
-    The doorway is that of the made figure: with another avatar the leak alone is measured, whose ball is its own.
+    The doorway error is defined for the generated figure. With another avatar only the leak is
+    measured, which uses a ball instead of the avatar.
     """
     if ground.truth is None:
         return
@@ -54,9 +56,10 @@ def measure_felt(
 
 
 def measure_made(settings: list[Setting], folder: Path, plan: Plan, tick: Callable[[], None]) -> None:
-    """Fill in the doorway found by making doors, of the plan's models; doorway.py infers it from one wide door.
+    """Fill in the doorway error of the plan's models, measured on generated doors of decreasing width.
 
-    folder: an empty one, for the façades.  tick: called after each façade.
+    The other doorway error, of doorway.py, is inferred from one wide door.
+    folder: an empty folder for the façades.  tick: called after each façade.
     """
     own = {s.row.setting: s for s in settings if s.row.knob == RADIUS and s.row.setting in plan.made_models}
     if not own:

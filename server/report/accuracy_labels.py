@@ -1,4 +1,4 @@
-"""Labels beside points of a chart, placed so that none covers another or a point."""
+"""Placement of labels beside the points of a chart, without overlaps."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -6,19 +6,19 @@ from typing import Any
 import numpy as np
 
 FONT = 9.0
-# Where a label may stand, in points from its anchor: beside it first, then farther off with a line to it.
+# Distances of a label from its anchor, in points: beside it first, then farther away with a line to it.
 NEAR, FAR, FARTHER = 11.0, 27.0, 45.0
 TURNS = 16
-# How far a star or a ring reaches from its middle, in points.
+# Half the size of a star or a ring, in points.
 MARK = 8.0
 
 
 def place_labels(
     panel: Any, anchors: Sequence[tuple[float, float]], labels: Sequence[str], colours: Sequence[str]
 ) -> None:
-    """Write each label near its anchor, in the order given: the first has the choice of all places.
+    """Place each label near its anchor, in the given order: the first may choose among all places.
 
-    The figure must have been drawn: a layout may move its panels.
+    The figure must have been drawn before, because its layout may move the panels.
     """
     from matplotlib.patheffects import withStroke
 
@@ -34,7 +34,9 @@ def place_labels(
             label, anchor, xytext=(0, 0), textcoords="offset points", fontsize=FONT, color=colour, ha="center",
             va="center", zorder=6, arrowprops={"arrowstyle": "-", "lw": 0.5, "color": colour, "shrinkA": 0},
         )  # fmt: skip
-        text.set_path_effects([withStroke(linewidth=4.0, foreground="white")])  # lines run behind
+        text.set_path_effects(
+            [withStroke(linewidth=4.0, foreground="white")]
+        )  # keeps the label legible over lines
         box = text.get_window_extent(renderer)
         half_width, half_height = box.width / 2, box.height / 2
         best, least = (0.0, 0.0), np.inf
@@ -56,14 +58,14 @@ def place_labels(
 
 
 def _shared(one: tuple[float, ...], other: tuple[float, ...]) -> float:
-    """The area two rectangles (left, low, right, high) share, in pixels."""
+    """Return the area of the intersection of two rectangles (left, low, right, high), in pixels."""
     width = min(one[2], other[2]) - max(one[0], other[0])
     height = min(one[3], other[3]) - max(one[1], other[1])
     return max(width, 0.0) * max(height, 0.0)
 
 
 def _outside(one: tuple[float, ...], frame: Any) -> float:
-    """How far a rectangle leaves the frame, in pixels."""
+    """Return how far a rectangle extends beyond the frame, summed over its sides, in pixels."""
     return float(
         max(frame.x0 - one[0], 0.0)
         + max(frame.y0 - one[1], 0.0)

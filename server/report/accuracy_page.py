@@ -1,4 +1,4 @@
-"""The accuracy report as one HTML page: pictures inside, no network, words for who did not write it."""
+"""HTML page of the accuracy report: self-contained, with embedded pictures and explanations of its terms."""
 
 import base64
 import math
@@ -24,10 +24,10 @@ th{text-align:right;vertical-align:bottom;white-space:normal}th:first-child,td:f
 tr.default{background:#efe9dc;font-weight:600}.noisy{color:#a05a00}dt{font-weight:600}dd{margin:0 0 .5rem 1rem}
 """
 
-# Column heads of a table, and what a row shows under each; a column that is empty for all rows is left out.
+# Column headings of a table, in the order of `_cells`. Columns that are empty in all rows are left out.
 HEADS = (
-    "setting", "time of a pose [µs]", "p50 of dozens", "p99 of dozens", "times default", "early", "late", "unknown",
-    "near-tangent: early", "late", "unknown", "distance off, most [mm]", "mean [mm]", "no pair found",
+    "setting", "time per pose [µs]", "p50 of groups", "p99 of groups", "ratio to default", "early", "late", "unknown",
+    "near-tangent: early", "late", "unknown", "distance error, max [mm]", "mean [mm]", "no pair found",
     "doorway [mm]", "made doorway [mm]", "leak p50 [mm]", "p99 [mm]", "worst [mm]", "passed [%]",
     "archive [bytes]", "decode [ms]",
     "node tests", "pair tests", "Pareto front", "note",
@@ -38,14 +38,15 @@ def write_page(report: Report, charts: dict[str, Path], target: Path) -> None:
     """Write the page. charts: as `draw_charts` returns them."""
     facts = report.facts
     body = [
-        f"<h1>The price of accuracy</h1><p>{escape(report.ground)}; an avatar of {facts['avatar_points']:,} points; "
-        f"times on a walk of {facts['walk_poses']:,} poses, verdicts on {facts['judged_poses']:,} poses, "
+        f"<h1>Accuracy and query time</h1><p>{escape(report.ground)}; an avatar of {facts['avatar_points']:,} points. "
+        f"Times are measured on a walk of {facts['walk_poses']:,} poses, verdicts on {facts['judged_poses']:,} poses, "
         f"{facts['judged_contacts']:,} of them in contact, and on {facts['near_tangent_poses']:,} within a micrometre "
-        f"of touching. The judge is the server's exact answer; at {facts['poses_judged_by_every_pair']:,} poses every "
-        "pair of points was compared in integers as well, and agreed."
+        "of touching. The reference is the server's exact answer. At "
+        f"{facts['poses_judged_by_every_pair']:,} poses it was compared with a test of every pair of points in "
+        "integers, and agreed."
         f"{''.join(f' <strong>{escape(said)}</strong>' for said in facts['warnings'])}</p>",
         _noise(report.rows),
-        "<h2>At a glance</h2>",
+        "<h2>Summary</h2>",
         _picture(charts["main"], CHARTS["main"]),
         "<ul>"
         + "".join(
@@ -57,10 +58,11 @@ def write_page(report: Report, charts: dict[str, Path], target: Path) -> None:
         body.append(_picture(charts["verdicts"], CHARTS["verdicts"]))
     body.append(_picture(charts["volumes"], CHARTS["volumes"]))
     body.append(
-        "<h2>The Pareto set</h2><p>Settings of the server that nothing beats, for at least one error.</p>"
+        "<h2>Pareto front</h2><p>Settings of the server that no other setting beats in time and in at least one "
+        "error.</p>"
     )
     body.append(table(front_rows(report.rows)))
-    body.append("<h2>The words</h2><dl>")
+    body.append("<h2>Terms</h2><dl>")
     body += [f"<dt>{escape(term)}</dt><dd>{escape(said)}</dd>" for term, said in TERMS.items()]
     body.append("</dl>")
     for knob in knobs(report.rows):
@@ -68,25 +70,25 @@ def write_page(report: Report, charts: dict[str, Path], target: Path) -> None:
         body.append(f"<h2>{escape(knob.capitalize())}</h2>")
         body.append(f"<p>{escape(KNOBS[knob])}</p>{_picture(charts[knob], '')}{table(own)}")
     page = (
-        '<!doctype html><html lang="en"><head><meta charset="utf-8"><title>The price of accuracy</title>'
+        '<!doctype html><html lang="en"><head><meta charset="utf-8"><title>Accuracy and query time</title>'
         f"<style>{STYLE}</style></head><body>{''.join(body)}</body></html>\n"
     )
     target.write_text(page, encoding="utf-8")
 
 
 def front_rows(rows: Sequence[Row]) -> list[Row]:
-    """The rows on a front, named by their knob; what everybody gets by default once."""
+    """Return the rows on a Pareto front, with the knob in their names; the default settings appear once."""
     chosen = [row for row in rows if row.front]
     first = next((row for row in chosen if row.default), None)
     return [
-        replace(row, setting="everything" if row is first else f"{row.knob} {row.setting}")
+        replace(row, setting="all settings" if row is first else f"{row.knob} {row.setting}")
         for row in chosen
         if row is first or not row.default
     ]
 
 
 def table(rows: Sequence[Row]) -> str:
-    """The rows of one knob as an HTML table."""
+    """Format the rows of one knob as an HTML table."""
     cells = [_cells(row) for row in rows]
     shown = [k for k in range(len(HEADS)) if any(line[k] for line in cells)]
     head = "".join(f"<th>{escape(HEADS[k])}</th>" for k in shown)
@@ -98,7 +100,7 @@ def table(rows: Sequence[Row]) -> str:
 
 
 def _cells(row: Row) -> list[str]:
-    """What a row shows, under HEADS."""
+    """Return the cells of a row, in the order of HEADS."""
     noisy = " (noisy)" if row.noise is not None and row.noise > NOISY else ""
     return [
         row.setting + (" (default)" if row.default and row.by != PLAIN else ""),
@@ -131,14 +133,14 @@ def _figure(value: float | None, digits: int) -> str:
 
 
 def _small(value: float | None) -> str:
-    """A length [mm] that may be 0, a rounding, or centimetres."""
+    """Format a length [mm] that may be 0, a rounding error, or centimetres."""
     if value is None:
         return ""
     return "0" if value < 1e-9 else f"{value:.3g}"
 
 
 def _picture(file: Path, said: str) -> str:
-    """A PNG inside the page, with a sentence below it."""
+    """Return a PNG as embedded HTML, with a caption."""
     data = base64.b64encode(file.read_bytes()).decode("ascii")
     below = f"<figcaption>{escape(said)}</figcaption>" if said else ""
     return (
@@ -147,12 +149,12 @@ def _picture(file: Path, said: str) -> str:
 
 
 def _noise(rows: Sequence[Row]) -> str:
-    """A warning where other work disturbed the times."""
+    """Return a warning if other work on the machine disturbed the times."""
     noisy: list[Any] = [row for row in rows if row.noise is not None and row.noise > NOISY]
     if not noisy:
         return ""
     return (
-        f'<p class="noisy">The machine was busy: at {len(noisy)} of {len(rows)} settings the middle repetition took '
-        f"over {NOISY:g} times as long as the best. Times are the best of several repetitions taken in turn; read "
-        "them as ratios within this page.</p>"
+        f'<p class="noisy">The machine was busy: at {len(noisy)} of {len(rows)} settings the median repetition took '
+        f"over {NOISY:g} times as long as the best. Times are the best of several repetitions taken in turn; compare "
+        "them only with one another.</p>"
     )

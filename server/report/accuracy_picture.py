@@ -1,4 +1,4 @@
-"""Charts of the accuracy report: time against error, every setting a labelled point, the Pareto front marked."""
+"""Charts of the accuracy report: time against error, one labelled point per setting, with the Pareto front."""
 
 import math
 from collections.abc import Sequence
@@ -30,35 +30,35 @@ INK, FRONT = "#2f2a26", "#1b7f3b"
 COLOURS = {
     TOLERANCE: "#c8553d", BUDGET: "#7a5195", RADIUS: "#1f7a8c", STEP: "#b8860b", NODES: "#444444",
 }  # fmt: skip
-# Of knobs, where a legend says more than their headings.
+# Legend texts of knobs, where the knob's name is not clear enough.
 NAMES = {
     TOLERANCE: "search that may stop within a tolerance",
     BUDGET: "search with a budget",
-    NODES: "bound of a node",
+    NODES: "bounding volume of a node",
 }
-# Behind words that lines may run under.
+# Background of texts that lines may cross.
 PAPER = {"facecolor": "white", "edgecolor": "none", "alpha": 0.85, "pad": 1.5}
 MARKERS = {TOLERANCE: "o", BUDGET: "s", RADIUS: "D", STEP: "^", NODES: "P"}
-# Points of the radius models nearer than this in both errors share a label [mm].
+# Points of the radius models closer than this in both errors share a label [mm].
 SAME = 0.8
-# How far below zero the leak is drawn, over how far above: what stops the ball early is drawn at the edge.
+# Extent of the leak axis below zero, relative to that above. Points below it are drawn at its end.
 BELOW = 0.4
-# Errors that may be exactly 0, and below what they are drawn as next to none.
+# Errors that may be exactly 0, and the value below which their axis is linear.
 LEAST = {"wrong": 1e-3, "distance": 1e-2}
 
 
 TITLES = {
-    "doorway": "A door: how much wider than the figure it must be",
-    "leak": "A wall: how far a ball of 5 cm gets into it",
-    "wrong": "Verdicts that are not the exact ones",
-    "distance": "Distances that are not the exact ones",
+    "doorway": "Door: extra width that the figure needs",
+    "leak": "Wall: depth that a ball of 5 cm radius gets into it",
+    "wrong": "Verdicts that differ from the exact ones",
+    "distance": "Distances that differ from the exact ones",
 }
-# Labels of a panel: where their points are, what they say, their colours.
+# Labels of a panel: positions of their points, texts, colours.
 Wanted = tuple[list[tuple[float, float]], list[str], list[str]]
 
 
 class Point(NamedTuple):
-    """A row in a chart: time [us], error, what stands beside it."""
+    """A row in a chart. time: [us].  label: text beside the point."""
 
     row: Row
     time: float
@@ -67,7 +67,10 @@ class Point(NamedTuple):
 
 
 def draw_charts(rows: Sequence[Row], ground: str, out: Path) -> dict[str, Path]:
-    """Write all charts into `out`; returns name -> file: "main", "verdicts", "volumes", and one a knob."""
+    """Write all charts into `out`.
+
+    Returns name -> file: "main", "verdicts" (with ground truth only), "volumes", and one per knob.
+    """
     pyplot = load_pyplot()
     pyplot.rcParams.update(
         {"font.size": 10, "text.color": INK, "axes.edgecolor": "#8a8178", "axes.labelcolor": INK}
@@ -88,9 +91,10 @@ def draw_charts(rows: Sequence[Row], ground: str, out: Path) -> dict[str, Path]:
 
 
 def points_of(rows: Sequence[Row], error: str) -> list[Point]:
-    """What a chart of time against an error shows: the engine's settings, the default once and first.
+    """Return the points of a chart of time against an error: the engine's settings, the default first and once.
 
-    Of radius models those without a factor: a factor trades one felt error for the other, which is a panel of its own.
+    Radius models are included without factors: a factor trades one felt error for the other, which
+    another panel shows.
     """
     found: list[Point] = []
     for row in sorted(rows, key=lambda r: not r.default):
@@ -101,7 +105,7 @@ def points_of(rows: Sequence[Row], error: str) -> list[Point]:
             continue
         if row.knob == RADIUS and not row.default and is_scaled(row):
             continue
-        if row.setting.endswith(ALONE):  # the default once more
+        if row.setting.endswith(ALONE):  # the same as the default
             continue
         shown = float(getattr(row, ERRORS[error][1])) if error == "leak" else size
         found.append(Point(row, row.mean_us, shown, "default" if row.default else label_of(row)))
@@ -109,19 +113,19 @@ def points_of(rows: Sequence[Row], error: str) -> list[Point]:
 
 
 def is_scaled(row: Row) -> bool:
-    """Whether a radius model is another one's with a factor, or a figure that is not about the mean."""
+    """Return whether a radius model has a factor, or is a fixed radius that is not close to the mean."""
     return row.factor not in (None, 1.0)
 
 
 def label_of(row: Row) -> str:
-    """A setting's name beside its point."""
+    """Return the label of a setting."""
     if row.knob == NODES:
         return "spheres with slab" if row.value else "spheres without slab"
     return f"lattice {row.setting}" if row.knob == STEP else row.setting
 
 
 def draw_scatter(rows: Sequence[Row], errors: tuple[str, ...], ground: str, target: Path) -> Path:
-    """Time against two errors; of the felt ones, below, one against the other, and what bounds a node."""
+    """Draw time against two errors. For the felt errors, also draw one against the other, and bounding volumes."""
     pyplot = load_pyplot()
     felt = "leak" in errors
     figure, panels = pyplot.subplots(
@@ -144,12 +148,12 @@ def draw_scatter(rows: Sequence[Row], errors: tuple[str, ...], ground: str, targ
         ),
         pyplot.Line2D(
             [], [], color=FRONT, lw=2.5, alpha=0.6, marker="o", markersize=11, markerfacecolor="none",
-            label="Pareto front: nothing is both faster and better",
+            label="Pareto front: no setting is both faster and better",
         ),
     ]  # fmt: skip
     figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False)
-    figure.suptitle(f"What a collision test costs, and what it gets wrong: {ground}", fontsize=13)
-    # Labels last: what was laid out before moves the panels.
+    figure.suptitle(f"Cost and errors of a collision test: {ground}", fontsize=13)
+    # Labels last: the layout moves the panels.
     figure.canvas.draw()
     for panel, labels in wanted:
         place_labels(panel, *labels)
@@ -159,7 +163,7 @@ def draw_scatter(rows: Sequence[Row], errors: tuple[str, ...], ground: str, targ
 
 
 def _scatter(panel: Any, points: list[Point], error: str) -> Wanted:
-    """One panel: points and front; returns the labels it wants."""
+    """Draw the points and the Pareto front of one panel; return its labels."""
     stuck = [p.label for p in points if not math.isfinite(p.error)]
     points = [p for p in points if math.isfinite(p.error)]
     sizes = [p.error for p in points]
@@ -189,7 +193,7 @@ def _scatter(panel: Any, points: list[Point], error: str) -> Wanted:
             fontsize=8.5,
         )
     _plain_ticks(panel)
-    panel.set_xlabel("time of a pose [µs]   ← faster")
+    panel.set_xlabel("time per pose [µs]   ← faster")
     panel.set_ylabel(f"{ERRORS[error][0]}   ← better", labelpad=2)
     panel.grid(alpha=0.25)
     for point in points:
@@ -198,21 +202,21 @@ def _scatter(panel: Any, points: list[Point], error: str) -> Wanted:
     _front(panel, [(p.time, p.error) for p, free in zip(points, best, strict=True) if free])
     panel.set_title(TITLES[error], fontsize=10.5, loc="left")
     if stuck:
-        said = f"not drawn, the figure cannot pass at all: {', '.join(stuck)}"
+        said = f"not drawn, the figure cannot pass: {', '.join(stuck)}"
         panel.text(0.015, 0.975, said, transform=panel.transAxes, va="top", fontsize=8.5, bbox=PAPER)
     return _merged([(p.time, p.error) for p in points], [p.label for p in points], [p.row for p in points])
 
 
 def _raised(point: Point, floor: float) -> Point:
-    """A point that lies below `floor` on it, its error in its label [mm]."""
+    """Return the point, moved up to `floor` if it lies below, with its error [mm] in the label."""
     if point.error >= floor:
         return point
     return point._replace(error=floor, label=f"{point.label}: {point.error:.0f} mm")
 
 
 def _mark(panel: Any, x: float, y: float, row: Row) -> None:
-    """One point."""
-    star = row.default  # above all others, ring and all, with a white edge: it is what most people look for
+    """Draw one point."""
+    star = row.default  # the default is drawn above all others, with a white edge
     panel.plot(
         x, y, marker="*" if star else MARKERS[row.knob], color="black" if star else COLOURS[row.knob],
         markersize=20 if star else 7, markeredgecolor="white", markeredgewidth=1.2 if star else 0.5,
@@ -221,7 +225,7 @@ def _mark(panel: Any, x: float, y: float, row: Row) -> None:
 
 
 def _plain_ticks(panel: Any) -> None:
-    """To be read in microseconds and millimetres, not in powers: 1, 2, 5, 10 on a logarithmic axis."""
+    """Label logarithmic axes with plain numbers (1, 2, 5, 10) instead of powers of ten."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     for axis, scale in ((panel.xaxis, panel.get_xscale()), (panel.yaxis, panel.get_yscale())):
@@ -232,7 +236,7 @@ def _plain_ticks(panel: Any) -> None:
 
 
 def _front(panel: Any, points: list[tuple[float, float]]) -> None:
-    """The front as a staircase: what lies above and to the right of it is beaten."""
+    """Draw the Pareto front as a staircase: every point above and to the right of it is beaten."""
     if not points:
         return
     chosen = sorted(points)
@@ -246,14 +250,14 @@ def _front(panel: Any, points: list[tuple[float, float]]) -> None:
 
 
 def _trade(panel: Any, rows: Sequence[Row]) -> Wanted:
-    """Radius models: the doorway against the leak, each model a line over its factors; returns the labels it wants."""
+    """Draw the doorway error against the leak, one line per radius model over its factors; return the labels."""
     anchors: list[tuple[float, float]] = []
     labels, colours = [], []
     for name, colour in MODEL_COLOURS.items():
         own = [r for r in rows if r.setting.split(":")[0] == name and r.leak_p99_mm is not None]
         own = [r for r in own if math.isfinite(r.doorway_mm or 0.0)]
         places = [(abs(r.doorway_mm or 0.0), r.leak_p99_mm or 0.0) for r in own]
-        rim = "border" in name  # hollow: its points lie nearly on those without
+        rim = "border" in name  # hollow: its points almost coincide with those of the model without border
         panel.plot(
             *zip(*places, strict=True), color=colour, lw=1.2, ls="--" if rim else "-", marker="o" if rim else "D",
             markersize=8 if rim else 5, markerfacecolor="none" if rim else colour, zorder=4 if rim else 3,
@@ -264,7 +268,7 @@ def _trade(panel: Any, rows: Sequence[Row]) -> Wanted:
             anchors.append(place)
             labels.append(f"{row.setting}, default" if row.default else row.setting)
             colours.append(colour)
-    best = unbeaten([(1.0, x, max(y, 0.0)) for x, y in anchors])  # their times are in the panels above
+    best = unbeaten([(1.0, x, max(y, 0.0)) for x, y in anchors])  # times are ignored: other panels show them
     low, high = min(y for _, y in anchors), max(y for _, y in anchors)
     room = 0.12 * (high - low) + 1.0
     panel.set_ylim(low - room, high + room)
@@ -273,13 +277,13 @@ def _trade(panel: Any, rows: Sequence[Row]) -> Wanted:
     panel.axhspan(panel.get_ylim()[0], 0.0, color=FRONT, alpha=0.06, lw=0)
     panel.set_xlabel("doorway error [mm]   ← better")
     panel.set_ylabel("leak, 99th percentile [mm]   ← better", labelpad=2)
-    panel.set_title("Radius models: a larger sphere shuts the wall, and the door", fontsize=10.5, loc="left")
+    panel.set_title("Radius models: larger spheres close the wall, and the door", fontsize=10.5, loc="left")
     panel.grid(alpha=0.25)
     return _beside(anchors, labels, colours)
 
 
 def _beside(places: list[tuple[float, float]], labels: list[str], colours: list[str]) -> Wanted:
-    """Labels of points that nearly coincide, one above the other in the first one's colour."""
+    """Stack the labels of points that almost coincide, in the colour of the first."""
     found: list[tuple[tuple[float, float], list[str], str]] = []
     for place, label, colour in zip(places, labels, colours, strict=True):
         near = (f for f in found if max(abs(f[0][0] - place[0]), abs(f[0][1] - place[1])) < SAME)
@@ -295,11 +299,11 @@ def _beside(places: list[tuple[float, float]], labels: list[str], colours: list[
 
 
 def _merged(places: list[tuple[float, float]], labels: list[str], rows: list[Row]) -> Wanted:
-    """Places, labels and colours, those that nearly coincide under one label."""
+    """Return places, labels and colours, with one label for points that almost coincide."""
     found: list[tuple[tuple[float, float], list[str], Row]] = []
     for place, label, row in zip(places, labels, rows, strict=True):
         for other, names, first in found:
-            # Of the same error and nearly the same time, or of nearly both.
+            # The same error and almost the same time, or almost the same error and time.
             apart = abs(math.log(place[0] / other[0]))
             off = abs(place[1] - other[1]) / (abs(other[1]) + 1e-3)
             alike = row.knob == first.knob or first.default
@@ -313,7 +317,7 @@ def _merged(places: list[tuple[float, float]], labels: list[str], rows: list[Row
 
 
 def _short(names: list[str]) -> list[str]:
-    """Labels that share one place, those of one knob on one line: "search within 1 mm, 2 mm", "lattice 1 cm"."""
+    """Combine labels at one place, one line per knob: "search within 1 mm, 2 mm", "lattice 1 cm"."""
     lines: dict[str, list[str]] = {}
     for name in names:
         knob = next((knob for knob in ("search within", "lattice") if name.startswith(f"{knob} ")), name)

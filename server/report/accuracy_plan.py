@@ -1,4 +1,4 @@
-"""What the accuracy report sweeps, and how long it may take; frozen."""
+"""Parameters of the accuracy report: the values of each knob and the number of measurements."""
 
 from dataclasses import dataclass
 
@@ -7,18 +7,22 @@ from .case import PAPER_POINTS
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Plan:
-    """The settings that are swept, one knob at a time, and how often each is measured.
+    """Settings to measure, one knob at a time, and the number of measurements of each.
 
-    points: of the made façade; of an archive that is given at most `most_points` are taken.
-    frames: poses of the walk, on which times are measured; as many more, moved off it at random, join them where
-    verdicts and distances are judged.  near_tangent: poses within a micrometre of touching.
-    brute: poses at which the judge itself is judged, by every pair of points.
-    plain_frames: of the walk, those that the plain descent is timed on.
-    loops: timed repetitions of each setting, all settings in turn.  chunk: neighbouring poses timed as one, for the
-    percentiles: a call of one pose would measure the call.
-    tolerances [m]; budgets [node visits]; steps: of the lattice [m]; factors: on the radii of each radius model.
-    places: where the leak is probed.  alone: a tolerance without a budget, answered exactly [m].
-    made_models: radius models whose narrowest door is found by making doors, 12 to 20 façades; none: not at all.
+    points: of the generated façade.  most_points: maximum number taken from a given archive.
+    frames: poses of the walk, on which times are measured. Verdicts and distances are compared at these
+    and at as many poses with random offsets from the walk.
+    near_tangent: poses within a micrometre of touching.
+    brute: poses at which the reference itself is checked, by a test of every pair of points.
+    plain_frames: poses of the walk on which the plain descent is timed.
+    loops: timed repetitions of each setting, all settings in turn.
+    chunk: consecutive poses timed as one call, for the percentiles: the time of a call with one pose
+    would be mostly overhead.
+    tolerances [m].  budgets [node visits].  steps: of the lattice [m].
+    factors: on the radii of each radius model.  places: number of places where the leak is measured.
+    alone: a tolerance without a budget, which is answered exactly [m].
+    made_models: radius models whose doorway error is measured on generated doors, which takes 12 to 20
+    façades; empty: none.
     """
 
     points: int = PAPER_POINTS

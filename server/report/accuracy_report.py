@@ -1,4 +1,4 @@
-"""The measured rows of an accuracy report."""
+"""Results of an accuracy report."""
 
 from typing import Any, NamedTuple
 
@@ -6,7 +6,11 @@ from .accuracy_row import Row
 
 
 class Report(NamedTuple):
-    """What was measured. ground: in words.  facts: figures of the scene and the machine, for JSON and the page."""
+    """Results of all measurements.
+
+    ground: description of the test data.
+    facts: numbers about the scene and the machine, for JSON and the page.
+    """
 
     ground: str
     rows: list[Row]

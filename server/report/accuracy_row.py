@@ -1,4 +1,4 @@
-"""A row of the accuracy report: one setting of one knob, what it costs and what it gets wrong."""
+"""Row of the accuracy report: one setting of one knob, with its cost and its errors."""
 
 import math
 from collections.abc import Iterable, Sequence
@@ -11,37 +11,41 @@ from numpy.typing import NDArray
 Bools = NDArray[np.bool_]
 Floats = NDArray[np.float64]
 
-# What is measured with the server's own engine, and what with the plain descent of kernels/descent.py: times of the
-# two do not compare.
+# Measured with the server's engine, or with the plain descent of kernels/descent.py. The times of the
+# two are not comparable.
 ENGINE, PLAIN = "engine", "plain descent"
 
-# The knobs of the server's own engine.
+# Knobs of the server's engine.
 TOLERANCE, BUDGET, RADIUS = "tolerance", "budget", "radius model"
 SHEET = "radius model, a thin sheet with a door"
 STEP, DEGREE, LEAF, NODES = "lattice step", "degree", "leaf size", "bounding volume"
-# Behind a tolerance that comes without a budget: answered exactly.
+# Suffix of a tolerance without a budget, which is answered exactly.
 ALONE = ", alone"
-# What the charts of time against error show: degree and leaf size change no answer, and hardly any time.
+# Knobs in the charts of time against error. Degree and leaf size change no answer and hardly any time.
 SHOWN = (TOLERANCE, BUDGET, RADIUS, STEP, NODES)
 
 
 @dataclass
 class Row:
-    """One setting. Figures that were not measured are None.
+    """One setting and its results. Results that were not measured are None.
 
-    knob, setting: what is turned, and to what.  value: the setting as a number, where it is one.  default: whether it
-    is what a user gets who says nothing.  by: ENGINE or PLAIN.  scene: where it was measured.
-    factor: of a radius model, on its radii; of a fixed figure, about what it is over the mean.
-    mean_us, p50_us, p99_us: time of a pose [us], see accuracy_timing.py.  times: mean_us over that of the default
-    setting beside which it was timed.  noise: see Timed.
-    poses, early, late, unknown: of the judged poses, how many, and called contact where the judge says clear, the
-    reverse, not answered.  tangent, tangent_early, tangent_late, tangent_unknown: the same of near-tangent poses.
-    distance_max_mm, distance_mean_mm: |distance - exact distance| [mm].  distance_missing: poses where no pair was
-    found though one is in reach.
-    doorway_mm (inf: the figure cannot even stand in the door); leak_p50_mm, leak_p99_mm, leak_worst_mm, leak_share:
-    what a user feels, see doorway.py and leak.py.  made_doorway_mm: the doorway by doors made, see made_doorway.py.
+    knob, setting: the parameter that is varied, and its value.
+    value: the setting as a number, if it is one.  default: it is the server's default.
+    by: ENGINE or PLAIN.  scene: where it was measured.
+    factor: of a radius model, on its radii; of a fixed radius, its approximate ratio to the mean radius.
+    mean_us, p50_us, p99_us: time per pose [us], see accuracy_timing.py.
+    times: ratio of mean_us to that of the default setting timed with it.  noise: see Timed.
+    poses: number of judged poses.  early: of these, contact where the exact answer is clear.
+    late: clear where the exact answer is contact.  unknown: not answered.
+    tangent, tangent_early, tangent_late, tangent_unknown: the same for near-tangent poses.
+    distance_max_mm, distance_mean_mm: |distance - exact distance| [mm].
+    distance_missing: poses where no pair was found although one is in reach.
+    doorway_mm: see doorway.py; inf: the figure cannot even stand in the door.
+    made_doorway_mm: doorway error measured on generated doors, see made_doorway.py.
+    leak_p50_mm, leak_p99_mm, leak_worst_mm, leak_share: see leak.py.
     archive_bytes, decode_ms: of a build.  node_tests, pair_tests: means over poses.
-    front: against which errors no setting is both faster and better; of those that the charts show.  note: in words.
+    front: the errors for which this row is on the Pareto front of the settings in the charts.
+    note: remark in words.
     """
 
     knob: str
@@ -82,11 +86,14 @@ class Row:
 
     @property
     def wrong_share(self) -> float:
-        """Judged poses whose verdict is not the judge's, unknown ones among them; of one."""
+        """Return the share (0 to 1) of judged poses whose verdict is wrong or unknown."""
         return (self.early + self.late + self.unknown) / self.poses if self.poses else 0.0
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON and CSV: the fields, and the share that is wrong; None for what is infinite, named in the note."""
+        """Return the fields and `wrong_share`, for JSON and CSV.
+
+        Infinite values become None and are named in the note.
+        """
         found = {**asdict(self), "front": list(self.front), "wrong_share": self.wrong_share}
         endless = [
             f"{name} is infinite"
@@ -102,7 +109,7 @@ class Row:
 
 COLUMNS = (*(field.name for field in fields(Row)), "wrong_share")
 
-# Name of an error -> what it is on an axis, and the attribute of a row.
+# Name of an error -> axis label, and attribute of a row.
 ERRORS = {
     "doorway": ("doorway error [mm]", "doorway_mm"),
     "leak": ("leak, 99th percentile [mm]", "leak_p99_mm"),
@@ -113,13 +120,13 @@ ERRORS = {
 
 FELT_ERRORS = ("doorway", "leak")
 
-# Times that differ by less than this factor count as equal: of one archive built twice they did by 6 %, on a busy
-# machine.
+# Times that differ by less than this factor count as equal: times of one archive built twice differed
+# by 6 % on a busy machine.
 ALIKE = 1.1
 
 
 def judge_verdicts(row: Row, contact: Bools, unknown: Bools, exact: Bools, *, tangent: bool = False) -> None:
-    """Count into the row where verdicts (k,) differ from the exact ones."""
+    """Enter into the row how many verdicts (k,) differ from the exact ones."""
     early = int((contact & ~exact & ~unknown).sum())
     late = int((~contact & exact & ~unknown).sum())
     if tangent:
@@ -130,7 +137,7 @@ def judge_verdicts(row: Row, contact: Bools, unknown: Bools, exact: Bools, *, ta
 
 
 def judge_distances(row: Row, found: Floats, exact: Floats) -> None:
-    """Measure into the row how far distances (k,) [m] are off; inf: no pair was found, and is left out."""
+    """Enter into the row the errors of distances (k,) [m]; inf: no pair was found, which is left out."""
     both = np.isfinite(found) & np.isfinite(exact)
     row.distance_missing = int((~np.isfinite(found) & np.isfinite(exact)).sum())
     if both.any():
@@ -139,11 +146,12 @@ def judge_distances(row: Row, found: Floats, exact: Floats) -> None:
 
 
 def error_of(row: Row, error: str) -> float | None:
-    """An error of ERRORS, by its size, inf where nothing passes; None where it was not measured.
+    """Return the size of an error of ERRORS; inf if nothing passes, None if it was not measured.
 
-    A door too wide is as wrong as one too narrow; a ball stopped before the wall does not leak. Another radius model is
-    another definition of the scene: that its verdicts and distances differ from the mean's is no error. What stops a
-    ball where a budget leaves answers unknown is the budget: that is no wall that holds.
+    A door that is too wide is as wrong as one that is too narrow. A ball stopped before the wall does not
+    leak. Another radius model defines another scene, and its verdicts and distances are not wrong where
+    they differ from those of `mean`. If a budget leaves answers unknown, the leak is None: an unknown
+    answer stops the ball, not the wall.
     """
     if error == "leak" and row.unknown:
         return None
@@ -156,9 +164,10 @@ def error_of(row: Row, error: str) -> float | None:
 
 
 def unbeaten(places: Sequence[tuple[float, ...]]) -> list[bool]:
-    """Which of some (time, error, ...) no other beats: as fast and as good in every error, and better in one of all.
+    """Return which (time, error, ...) are on the Pareto front.
 
-    Times within ALIKE of each other are the same: less than that is noise on any machine.
+    One tuple beats another if it is as fast, as good in every error, and better in at least one of all.
+    Times within the factor ALIKE of each other count as equal: such differences are noise.
     """
 
     def beats(other: tuple[float, ...], one: tuple[float, ...]) -> bool:
@@ -170,7 +179,7 @@ def unbeaten(places: Sequence[tuple[float, ...]]) -> list[bool]:
 
 
 def mark_front(rows: Sequence[Row], knobs: Sequence[str]) -> None:
-    """Mark, for each error, and for both of FELT_ERRORS at once, those rows of `knobs` that no other beats."""
+    """Mark the rows of `knobs` on the Pareto front of each error, and of both FELT_ERRORS together."""
     for name, errors in (*((error, (error,)) for error in ERRORS), ("doorway and leak", FELT_ERRORS)):
         known = []
         for row in rows:
@@ -183,5 +192,5 @@ def mark_front(rows: Sequence[Row], knobs: Sequence[str]) -> None:
 
 
 def knobs(rows: Iterable[Row]) -> list[str]:
-    """The knobs, in the order of the rows."""
+    """Return the knobs, in the order of the rows."""
     return list(dict.fromkeys(row.knob for row in rows))

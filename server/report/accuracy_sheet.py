@@ -1,4 +1,7 @@
-"""What `border` is for: a sheet without thickness with a door in it, whose rim is all that a figure can meet."""
+"""Measurement of the radius model `border` on a sheet without thickness with a door.
+
+The figure can only touch the rim of this sheet.
+"""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -14,14 +17,15 @@ from .leak import leak
 
 MODELS = ("mean", "border")
 FACTORS = (1.0, 2.0, 3.0)
-# Between points [m]: what a laser scanner a few metres away leaves of a partition or a shop window's frame.
+# Spacing of the points [m]: that of a partition or a shop window's frame in a laser scan from a few metres.
 SPACING = 0.03
 
 
 def measure_sheet(folder: Path, tick: Callable[[], None]) -> list[Row]:
-    """Doorway and leak of each of MODELS with each of FACTORS, on the sheet of builder/made/sheet.py.
+    """Measure the doorway error and the leak of MODELS with FACTORS, on the sheet of builder/made/sheet.py.
 
-    folder: the sheet and its archive are put there.  tick: called after each row. No times: the façade has them.
+    Times are not measured here, but on the façade.
+    folder: receives the sheet and its archive.  tick: called after each row.
     """
     made = make_sheet(folder / "sheet.ply", spacing=SPACING)
     build_archive(
@@ -44,5 +48,5 @@ def measure_sheet(folder: Path, tick: Callable[[], None]) -> list[Row]:
 
 
 def count_sheet() -> int:
-    """How many rows `measure_sheet` makes."""
+    """Return the number of rows of `measure_sheet`."""
     return len(MODELS) * len(FACTORS)

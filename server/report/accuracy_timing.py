@@ -1,4 +1,4 @@
-"""Times of many settings, taken in turn, so that a busy moment of the machine meets all of them alike."""
+"""Timing of many settings in turn, which spreads disturbances by other work over all of them."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Ask = Callable[[Floats], Any]
 
-# A setting whose middle repetition took so much longer than its best is marked: something else ran meanwhile.
+# A setting is marked as noisy if its median repetition took this much longer than its best: other work
+# ran on the machine.
 NOISY = 1.3
 
 
@@ -19,8 +20,8 @@ NOISY = 1.3
 class Timed:
     """One setting and its times.
 
-    ask: answers poses (k, 4, 4).  chunk: poses of each run of neighbours that is timed as one.
-    loops: (runs,) [s] of each repetition.
+    ask: queries poses (k, 4, 4).  chunk: number of consecutive poses in a run, which is timed as one call.
+    loops: for each repetition (runs,), the time of each run [s].
     """
 
     ask: Ask
@@ -29,31 +30,32 @@ class Timed:
 
     @property
     def best(self) -> Floats:
-        """Of each run, its best repetition (runs,) [s]: a busy moment of the machine rarely meets a run twice."""
+        """Return the shortest time of each run (runs,) [s]: a disturbance rarely hits a run in every repetition."""
         return np.min(self.loops, axis=0)
 
     @property
     def mean(self) -> float:
-        """Of a pose, over all runs [s]."""
+        """Return the mean time per pose over all runs [s]."""
         return float(self.best.mean()) / self.chunk
 
     @property
     def noise(self) -> float:
-        """How much longer the middle repetition took than the best of each run: 1 on a quiet machine."""
+        """Return the ratio of the median repetition to the sum of the best runs: 1 on a quiet machine."""
         return float(np.median([loop.sum() for loop in self.loops]) / self.best.sum())
 
     def percentile(self, share: float) -> float:
-        """Of a pose, over runs [s]."""
+        """Return a percentile, over runs, of the time per pose [s]. share: in percent."""
         return float(np.percentile(self.best, share)) / self.chunk
 
 
 def take_times(
     subjects: Sequence[Timed], poses: Floats, loops: int, chunk: int, tick: Callable[[], None]
 ) -> None:
-    """Time all subjects on the same poses, `loops` times in turn; tick() after each.
+    """Time all subjects on the same poses, `loops` times in turn.
 
-    Before each measurement all poses are asked untimed: the subject before has left the processor's caches in no fair
-    state, and the first call of all may compile.
+    Before each measurement all poses are queried untimed: the previous subject has changed the contents
+    of the processor's caches, and the very first call may compile.
+    tick: called after each measurement.
     """
     chunk = min(chunk, len(poses))
     parts = [np.ascontiguousarray(poses[i : i + chunk]) for i in range(0, len(poses) - chunk + 1, chunk)]

@@ -1,8 +1,9 @@
-"""Bounding volumes compared: sphere, sphere with slab, box, and points as cubes, by one plain descent.
+"""Comparison of bounding volumes (sphere, sphere with slab, box) and of points as cubes, by one plain descent.
 
-[Fig12] recalls that its authors first had a cube for each point, as wide as the mean closest-point distance, and leaves
-open whether groups of spheres bound tighter than groups of cubes. Both are asked here the same way: the same trees, the
-same order of descent, boxes measured from the points; only the test of two nodes, or of two points, differs.
+[Fig12] reports that its authors first used a cube for each point, as wide as the mean closest-point
+distance, and leaves open whether groups of spheres bound tighter than groups of cubes. Both are
+measured here in the same way: with the same trees, the same order of descent, and boxes measured from
+the points. Only the test of two nodes, or of two points, differs.
 """
 
 from typing import NamedTuple
@@ -23,7 +24,7 @@ Floats = NDArray[np.float64]
 
 
 class Kind(NamedTuple):
-    """One way to test nodes and points. name: for tables.  node, leaf, sift: see kernels/descent.py."""
+    """A way to test nodes and points. name: for tables.  node, leaf, sift: see kernels/descent.py."""
 
     name: str
     node: int
@@ -37,7 +38,7 @@ VOLUMES = (
     Kind("box", BOX, CERTIFIED),
     Kind("box, avatar spheres", SPHERE_AND_BOX, CERTIFIED),
 )
-# Points as spheres or as cubes, each with the bound that is natural to it, in integers.
+# Points as spheres or as cubes, each with its natural bounding volumes, in integers.
 PRIMITIVES = (
     Kind("points spheres, nodes spheres with slabs", SLAB, INTEGERS),
     Kind("points spheres, nodes boxes", BOX, INTEGERS),
@@ -46,7 +47,7 @@ PRIMITIVES = (
 
 
 class Plain(NamedTuple):
-    """What the plain descent reads. units, reach: r_a + r_b in exact units, and in metres."""
+    """Input of the plain descent. units, reach: r_a + r_b in exact units, and in metres."""
 
     body: Body
     forest: Forest
@@ -56,7 +57,7 @@ class Plain(NamedTuple):
 
 
 class Found(NamedTuple):
-    """The answers of one kind. contact: (k,) bool.  node_tests, pair_tests: (k,) int64."""
+    """Answers of one kind. contact: (k,) bool.  node_tests, pair_tests: (k,) int64."""
 
     contact: NDArray[np.bool_]
     node_tests: NDArray[np.int64]
@@ -64,7 +65,10 @@ class Found(NamedTuple):
 
 
 def make_plain(archive: Archive, avatar: AvatarModel) -> Plain:
-    """All voxels of an archive, and an avatar, as the plain descent reads them; the archive's radius, no margin."""
+    """Convert all voxels of an archive, and an avatar, to the input of the plain descent.
+
+    The scan's points have the archive's radius, and there is no margin.
+    """
     header = archive.header
     lattice = Lattice(np.array(header.lattice.origin), header.lattice.step, header.lattice.units_per_step)
     units = round(header.radius * UNITS_PER_METRE) + round(avatar.radius * UNITS_PER_METRE)
@@ -72,7 +76,7 @@ def make_plain(archive: Archive, avatar: AvatarModel) -> Plain:
 
 
 def ask(plain: Plain, kind: Kind, poses: Floats) -> Found:
-    """Which poses (k, 4, 4), rigid, touch, as `kind` has it, and what it took."""
+    """Test rigid poses (k, 4, 4) for contact in the way of `kind`."""
     contact, counts = np.zeros(len(poses), bool), np.zeros((2, len(poses)), np.int64)
     descend(
         poses, plain.body, plain.forest, plain.lattice, plain.units, plain.reach, kind.node, kind.leaf,
@@ -82,7 +86,7 @@ def ask(plain: Plain, kind: Kind, poses: Floats) -> Found:
 
 
 def distances(plain: Plain, kind: Kind, poses: Floats, farthest: float) -> Floats:
-    """Signed distances (k,) [m] as the leaf test of `kind` has them, `farthest` where nothing is nearer."""
+    """Return signed distances (k,) [m] by the leaf test of `kind`; `farthest` if nothing is nearer."""
     found = np.empty(len(poses))
     nearest(
         poses, plain.body, plain.forest, plain.lattice, plain.units, plain.reach, farthest, kind.leaf, found
@@ -91,7 +95,7 @@ def distances(plain: Plain, kind: Kind, poses: Floats, farthest: float) -> Float
 
 
 def _make_body(avatar: AvatarModel) -> Body:
-    """The avatar's tree with boxes of its points as given."""
+    """Return the avatar's tree with boxes of its points."""
     a = avatar.arrays
     middle, half = _boxes(a.first, a.count, a.points.min(axis=2), a.points.max(axis=2))
     return Body(a.center, a.radius, middle, half, a.first, a.count, a.points)
@@ -100,14 +104,14 @@ def _make_body(avatar: AvatarModel) -> Body:
 def _boxes(
     first: NDArray[np.int32], count: NDArray[np.int32], leaf_low: Floats, leaf_high: Floats
 ) -> tuple[Floats, Floats]:
-    """Middles and half sides (n, 3) of the nodes' boxes; exact but for the last bit, which SLACK covers."""
+    """Return centres and half sides (n, 3) of the nodes' boxes, exact except the last bit, which SLACK covers."""
     low, high = np.empty((len(first), 3)), np.empty((len(first), 3))
     box_nodes(first, count, leaf_low, leaf_high, low, high)
     return (low + high) / 2, (high - low) / 2
 
 
 def make_forest(archive: Archive) -> Forest:
-    """The hierarchies of all voxels of an archive, one after another."""
+    """Return the hierarchies of all voxels of an archive, concatenated."""
     lattice = archive.header.lattice
     parts: list[Forest] = []
     nodes = blocks = 0
@@ -122,13 +126,13 @@ def make_forest(archive: Archive) -> Forest:
 
 
 def _make_tree(voxel: VoxelData, links: Links, corner: NDArray[np.int64], step: float) -> Forest:
-    """One voxel's hierarchy; corner: (3,) lattice."""
+    """Return one voxel's hierarchy. corner: (3,), of the voxel, lattice steps."""
     stored = voxel.nodes
     in_cell = links.cell >= 0
     low = np.where(in_cell[:, None], voxel.cells.low[links.cell], 0).astype(np.int64) + corner
     unit = np.where(in_cell, 1, 1 << voxel.top_shift).astype(np.int64)
     center = np.asarray((low + stored.center.astype(np.int64) * unit[:, None]) * step, np.float64)
-    # Blocks are numbered in the order of their nodes, as the arena has them.
+    # Blocks are numbered in the order of their nodes, as in the arena.
     leaf = np.flatnonzero(links.is_leaf)
     first = links.first.astype(np.int32).copy()
     first[leaf] = ~np.arange(len(leaf), dtype=np.int32)

@@ -1,4 +1,4 @@
-"""What the accuracy report says in words: terms, a paragraph a knob, and what the figures come to."""
+"""Texts of the accuracy report: terms, one paragraph per knob, and sentences that summarise the results."""
 
 import math
 from collections.abc import Sequence
@@ -8,91 +8,92 @@ from .accuracy_arithmetic import ALL_PAIRS, ARITHMETIC, PRIMITIVE, VOLUME
 from .accuracy_row import ALONE, BUDGET, DEGREE, LEAF, NODES, RADIUS, SHEET, STEP, TOLERANCE, Row
 from .accuracy_timing import NOISY
 
-# Times that differ by less than this factor are called the same: of one archive built twice they did by 6 %.
+# Times that differ by less than this factor are called the same: times of one archive built twice
+# differed by 6 %.
 SAME_TIME = 1.15
 
 TERMS = {
-    "pose": "where the avatar stands and how it is turned; each is one question: does it touch the scan there?",
-    "time of a pose": "a dozen neighbouring poses are timed as one call and divided; the best of several repetitions. "
-    "p50 is the middle one of these dozens, p99 the one that only one dozen in a hundred is slower than: a single pose "
-    "may take longer.",
-    "early, late": "early: called contact though the exact answer is clear, so one is stopped before touching. Late: "
-    "called clear though the exact answer is contact, so one may pass through.",
-    "unknown": "neither: the work allowed was spent before an answer was certain.",
-    "near-tangent": "poses moved until the nearest spheres are within a micrometre of just touching, on either side: "
-    "where rounding shows first.",
-    "distance off": "how far the distance that is reported lies from the exact one.",
-    "doorway": "how much wider than the figure a door must be made before the figure passes it upright along the "
-    "middle. 0 would be perfect; the spheres that stand for the door's points make it narrower than it is.",
-    "made doorway": "the same found the long way: façades are made with narrower and narrower doors, each is scanned "
-    "and walked through. A narrow door's jambs are seen at a smaller angle, so more sparsely; and rays that graze "
-    "both jambs leave points that hang in between, which stop the figure whatever their radius.",
-    "leak": "how far a ball of 5 cm radius is past a wall's true surface when it is stopped: where points stand "
-    "thinly, it slips in between. Negative: stopped before the surface. A ball that goes through counts 100 mm.",
-    "passed": "the share of places where that ball goes right through the wall.",
-    "Pareto front": "settings that no other beats: nothing is both faster and at least as good, nor better and as "
+    "pose": "position and orientation of the avatar. Each pose is one query: does the avatar touch the scan there?",
+    "time per pose": "a group of consecutive poses, a dozen by default, is timed as one call, and the time is divided "
+    "by their number; the best of several repetitions counts. p50 is the median of these groups, and one group in a "
+    "hundred is slower than p99. A single pose may take longer.",
+    "early, late": "early: contact is reported although the exact answer is clear; the avatar is stopped before it "
+    "touches. Late: clear is reported although the exact answer is contact; the avatar may pass through.",
+    "unknown": "neither contact nor clear: the budget was spent before the answer was certain.",
+    "near-tangent": "poses at which the nearest spheres are within a micrometre of touching, on either side. Rounding "
+    "errors appear first at these poses.",
+    "distance error": "difference between the reported distance and the exact one.",
+    "doorway": "extra width that a door needs before the figure passes upright along its middle. 0 would be perfect; "
+    "the spheres that represent the door's points make it narrower than it is.",
+    "made doorway": "the same error, measured directly: façades are generated with doors of decreasing width, each is "
+    "scanned and walked through. The jambs of a narrow door are seen at a smaller angle and therefore have fewer "
+    "points. Rays that graze both jambs also leave points in the opening, which stop the figure whatever their radius.",
+    "leak": "distance between a wall's true surface and a ball of 5 cm radius that has passed it and is then stopped: "
+    "where points are sparse, the ball slips between them. Negative: stopped before the surface. A ball that passes "
+    "through counts as 100 mm.",
+    "passed": "share of places where that ball passes through the wall.",
+    "Pareto front": "settings that no other setting beats: none is both faster and at least as good, or better and as "
     "fast.",
 }
 
 CHARTS = {
-    "main": "Each point is a setting, the star is what you get without saying anything. Left is faster, low is "
-    "better; points ringed in green are on the Pareto front.",
-    "verdicts": "The same settings against how often the verdict is not the exact one, and how far off a distance "
-    "can be.",
-    "volumes": "The same hierarchy, descended by the same plain program, with its nodes bounded by spheres, by "
-    "spheres cut by a slab, and by boxes along the axes; and with a cube in place of each point's sphere.",
+    "main": "Each point is a setting; the star is the default. Left is faster, low is better; points with a green ring "
+    "are on the Pareto front.",
+    "verdicts": "The same settings against the share of verdicts that differ from the exact ones, and against the "
+    "largest distance error.",
+    "volumes": "The same hierarchy, traversed by the same plain program, with nodes bounded by spheres, by spheres cut "
+    "by a slab, and by axis-aligned boxes; and with a cube in place of each point's sphere.",
 }
 
-# Why `local` leaks less than `mean` at the same doorway, and not less than half: of the made façade.
+# Why `local` leaks less than `mean` at the same doorway error, but not less than half; on the generated façade.
 LEFT = (
-    "What density causes is gone: the median no longer grows with the spacing of points. What is left is chance gaps "
-    "between points, and one jamb of the door that is scanned as thinly as the thinnest wall."
+    "The effect of density is gone: the median leak no longer grows with the spacing of points. The rest is due to "
+    "random gaps between points, and to one jamb of the door that is scanned as sparsely as the sparsest wall."
 )
 
 _PLAIN = (
-    "Measured with a plain scalar descent, so that nothing but the test differs: its times compare with one another "
-    "and not with the server's. "
+    "Measured with a plain scalar descent in which only the test differs. Its times are comparable with one another, "
+    "but not with the server's. "
 )
 
 KNOBS = {
-    TOLERANCE: "How early contact may be called [m]. A tolerance alone is answered exactly, for that is the fastest: "
-    "see the row `alone`. What the other rows show is the search that a budget asks for: it keeps bounds, may stop as "
-    "soon as they are within the tolerance, and says how far it got if the budget is spent. Here the budget is never "
-    "spent, so that the tolerance alone makes the difference.",
-    BUDGET: "How many nodes may be looked at for one pose. When they are spent the answer is unknown: never a wrong "
-    "clear.",
-    STEP: "How fine the lattice is on which points are stored. The radius is held at the default's, so only the "
-    "moving of points shows. A coarser lattice makes a smaller archive, and moves each point by up to half a step an "
-    "axis.",
-    DEGREE: "How many children a node of the hierarchy has. No answer changes.",
-    LEAF: "How many points a leaf of the hierarchy holds at most. No answer changes.",
-    NODES: "What bounds the points below a node, in the server itself: a sphere, as in the paper, or a sphere cut by "
-    "the slab that holds its points. No answer changes.",
-    RADIUS: "How large a sphere stands for each point: one mean for all (the paper's), one after the spacing around "
-    "each point (local), smaller ones on the rims of surfaces (border), or a fixed figure; a number behind a colon is "
-    "a factor. Early and late are counted against `mean`: here they say what differs, not what is wrong. At the same "
-    "doorway error local leaks less than mean, for its median does not grow with the spacing of points; what is left "
-    "is chance gaps, and a jamb of the door that is scanned as thinly as the thinnest wall.",
-    SHEET: "What smaller spheres on rims are for. A sheet without thickness with a door of 1 m in it: all that the "
-    "figure can meet is the rim. The façade's jambs are planes 1.2 m deep, with hardly a point on a rim: `border` "
-    "changes next to nothing there. The ball is pushed at the sheet away from its rims.",
+    TOLERANCE: "Distance by which contact may be reported early [m]. A tolerance without a budget is answered exactly, "
+    "because that is the fastest: see the row `alone`. The other rows show the search that is used with a budget: it "
+    "maintains bounds, may stop as soon as they are within the tolerance, and reports the bounds if the budget is "
+    "spent. Here the budget is never spent: only the tolerance makes the difference.",
+    BUDGET: "Maximum number of node visits per pose. When it is spent, the answer is unknown, never a wrong clear.",
+    STEP: "Step of the lattice on which points are stored. The radius is that of the default, and only the "
+    "displacement of points has an effect. A coarser lattice makes a smaller archive, and moves each point by up to "
+    "half a step per axis.",
+    DEGREE: "Maximum number of children of a node of the hierarchy. No answer changes.",
+    LEAF: "Maximum number of points of a leaf of the hierarchy. No answer changes.",
+    NODES: "Bounding volume of a node in the server: a sphere, as in the paper, or a sphere cut by the slab that "
+    "contains its points. No answer changes.",
+    RADIUS: "Radius of the sphere that represents each point: one mean for all (as in the paper), one that follows the "
+    "spacing around each point (local), smaller ones on the rims of surfaces (border), or a fixed radius. A number "
+    "after a colon is a factor. Early and late are counted against `mean`: here they are differences, not errors. At "
+    "the same doorway error local leaks less than mean, because its median leak does not grow with the spacing of "
+    "points. The rest is due to random gaps, and to a jamb of the door that is scanned as sparsely as the sparsest "
+    "wall.",
+    SHEET: "The purpose of smaller spheres on rims. The scene is a sheet without thickness with a door of 1 m: the "
+    "figure can only touch the rim. The façade's jambs are planes 1.2 m deep with hardly a point on a rim, where "
+    "`border` changes almost nothing. The ball is pushed at the sheet away from its rims.",
     ARITHMETIC: _PLAIN + "The test of two points in five kinds of arithmetic. Map coordinates are those of a scene at "
-    "500 km east and 5,600 km north; the other kinds count from a place near the avatar or from the scan's origin.",
-    VOLUME: _PLAIN + "Two leaves are compared as the server does it: the avatar's points are first held against the "
-    "bound of the scene's leaf. The façade's walls stand along the axes, which favours boxes.",
-    VOLUME + ", turned": _PLAIN + "The same scene and poses, turned so that no wall stands along an axis.",
-    ALL_PAIRS: _PLAIN + "Two leaves are compared as the paper does it: every point of one with every point of the "
-    "other.",
-    PRIMITIVE: _PLAIN + "A cube as wide as the sphere in place of each sphere: simpler to test, and a corner reaches "
-    "1.7 times as far as a side. Cubes stay along the world's axes however the avatar turns.",
-    PRIMITIVE + ", turned": _PLAIN + "The same scene and poses, turned so that no wall stands along an axis.",
+    "500 km east and 5,600 km north; the other kinds use a place near the avatar or the scan's origin as origin.",
+    VOLUME: _PLAIN + "Two leaves are compared as in the server: the avatar's points are first tested against the "
+    "bounding volume of the scene's leaf. The façade's walls are parallel to the axes, which favours boxes.",
+    VOLUME + ", turned": _PLAIN + "The same scene and poses, rotated so that no wall is parallel to an axis.",
+    ALL_PAIRS: _PLAIN + "Two leaves are compared as in the paper: every point of one with every point of the other.",
+    PRIMITIVE: _PLAIN + "A cube as wide as the sphere in place of each sphere: simpler to test, but a corner reaches "
+    "1.7 times as far as a side. Cubes stay parallel to the world's axes when the avatar rotates.",
+    PRIMITIVE + ", turned": _PLAIN + "The same scene and poses, rotated so that no wall is parallel to an axis.",
 }  # fmt: skip
 
 
 def findings(rows: Sequence[Row], brute: int = 0) -> list[str]:
-    """What the figures come to, in sentences; each is left out where its settings were not measured.
+    """Summarise the results in sentences. A sentence is left out if its settings were not measured.
 
-    brute: at how many poses every pair of points was compared.
+    brute: number of poses at which every pair of points was compared.
     """
     said = [
         _exact(rows, brute),
@@ -109,7 +110,7 @@ def findings(rows: Sequence[Row], brute: int = 0) -> list[str]:
 
 
 def _find(rows: Sequence[Row], knob: str, setting: str | None = None) -> Row | None:
-    """A setting of a knob; None: its default."""
+    """Return the row of a setting of a knob, or of its default if `setting` is None."""
     return next(
         (r for r in rows if r.knob == knob and (r.setting == setting if setting else r.default)),
         None,
@@ -120,16 +121,17 @@ def _exact(rows: Sequence[Row], brute: int) -> str:
     row = _find(rows, TOLERANCE)
     if row is None or row.mean_us is None:
         return ""
-    said = f"The exact answer takes {row.mean_us:.1f} µs a pose, p99 of dozens {row.p99_us:.1f} µs."
+    said = f"The exact answer takes {row.mean_us:.1f} µs per pose, p99 of groups {row.p99_us:.1f} µs."
     plain = _find(rows, ARITHMETIC, "integers")
     if plain is None or not brute:
         return said
-    # Its verdicts are those that the others are compared with: that none is wrong says nothing. What else agrees does.
+    # The exact answer is the reference, and its own count of wrong verdicts means nothing. The agreement
+    # of other methods does.
     wrong = plain.early + plain.late + plain.tangent_early + plain.tangent_late
     agree = "agree" if not wrong else f"disagree {wrong} times"
     return (
-        f"{said} The judge: every pair of points in integers at {brute:,} poses, and the plain integer descent at "
-        f"{plain.poses + plain.tangent:,} poses, {plain.tangent:,} of them near-tangent, {agree} with it."
+        f"{said} Check: a test of every pair of points in integers at {brute:,} poses, and the plain integer descent "
+        f"at {plain.poses + plain.tangent:,} poses, {plain.tangent:,} of them near-tangent, {agree} with it."
     )
 
 
@@ -141,29 +143,29 @@ def _tolerance(rows: Sequence[Row]) -> str:
         return ""
     best = min(searches, key=lambda r: r.times or 0.0)
     said = (
-        f"A tolerance alone is answered exactly: {alone.early + alone.late} of {alone.poses:,} verdicts are wrong with "
-        f"{alone.setting.removesuffix(ALONE)}, in {_ratio(alone, 'the exact answer')}. "
-        f"A budget asks for a search that may stop within the tolerance: at best, {best.setting}, it takes "
+        f"A tolerance without a budget is answered exactly: {alone.early + alone.late} of {alone.poses:,} verdicts are "
+        f"wrong with {alone.setting.removesuffix(ALONE)}, in {_ratio(alone, 'the exact answer')}. "
+        f"With a budget, the search may stop within the tolerance: at best, {best.setting}, it takes "
         f"{_ratio(best, 'the exact answer')}, and calls {best.early:,} of {best.poses:,} poses early"
     )
     faster = not _noisy(best) and (best.times or 0.0) * SAME_TIME < 1.0
-    return f"{said}." if faster else f"{said}: no time is seen to be won, but the work is bounded."
+    return f"{said}." if faster else f"{said}: it is not measurably faster, but its work is bounded."
 
 
 def _noisy(row: Row) -> bool:
-    """Whether other work disturbed a row's times."""
+    """Return whether other work on the machine disturbed a row's times."""
     return row.noise is not None and row.noise > NOISY
 
 
 def _alike(one: float, other: float) -> bool:
-    """Whether two times differ by no more than noise."""
+    """Return whether two times differ only by noise."""
     return max(one, other) <= SAME_TIME * min(one, other)
 
 
 def _ratio(row: Row, of: str = "", base: Row | None = None) -> str:
-    """A row's time over that of its knob's default, or of `base`, in words that claim no more than was seen.
+    """Describe the ratio of a row's time to that of its knob's default, or of `base`, considering noise.
 
-    of: what it is compared with, in words; empty where that is said before.
+    of: name of what it is compared with; empty if the sentence already contains it.
     """
     times = (row.times if base is None else (row.mean_us or 0.0) / (base.mean_us or math.inf)) or 0.0
     if _alike(times, 1.0):
@@ -179,9 +181,9 @@ def _budget(rows: Sequence[Row]) -> str:
     if not spent:
         return ""
     least = min(spent, key=lambda r: r.value or 0.0)
-    tail = f" {enough[0].setting} are enough for every pose here." if enough else ""
+    tail = f" {enough[0].setting} suffice for every pose here." if enough else ""
     return (
-        f"A budget bounds the work and never calls clear what touches: of {least.setting} it leaves "
+        f"A budget bounds the work and never causes a wrong clear: with {least.setting} it leaves "
         f"{least.unknown / max(least.poses, 1):.0%} of poses unknown.{tail}"
     )
 
@@ -192,12 +194,12 @@ def _lattice(rows: Sequence[Row]) -> str:
     if default is None or len(steps) < 2:
         return ""
     parts = [
-        f"{r.setting}: {r.archive_bytes / (default.archive_bytes or 1):.2f} times the bytes, distances off by up to "
+        f"{r.setting}: {r.archive_bytes / (default.archive_bytes or 1):.2f} times the bytes, distance errors up to "
         f"{r.distance_max_mm or 0.0:.2g} mm"
         for r in steps
         if not r.default and r.archive_bytes
     ]
-    return f"Lattice step, against {default.setting}: " + "; ".join(parts) + "."
+    return f"Lattice step, compared with {default.setting}: " + "; ".join(parts) + "."
 
 
 def _radius(rows: Sequence[Row]) -> str:
@@ -205,7 +207,7 @@ def _radius(rows: Sequence[Row]) -> str:
     others = [r for r in rows if r.knob == RADIUS and not r.default and ":" not in r.setting]
     if mean is None or mean.leak_p99_mm is None or not others:
         return ""
-    if mean.doorway_mm is None:  # another avatar than the made figure
+    if mean.doorway_mm is None:  # the avatar is not the generated figure
         leaks = [f"{r.setting} {r.leak_p99_mm:.0f} mm" for r in (mean, *others) if r.leak_p99_mm is not None]
         return "Radius models, 99th percentile of the leak: " + "; ".join(leaks) + "."
     parts = [
@@ -213,13 +215,13 @@ def _radius(rows: Sequence[Row]) -> str:
         for r in (mean, *others)
         if r.doorway_mm is not None and r.leak_p99_mm is not None
     ]
-    return "Radius models, doorway and 99th percentile of the leak: " + "; ".join(parts) + "."
+    return "Radius models, doorway error and 99th percentile of the leak: " + "; ".join(parts) + "."
 
 
 def _equal_door(rows: Sequence[Row]) -> str:
-    """The leak of `mean` and of `local` at one doorway error, that of `mean`: a fair comparison of two models.
+    """Compare the leaks of `mean` and `local` at the same doorway error, that of `mean`.
 
-    A factor alone trades one error for the other, so that models with different doorways do not compare.
+    A factor trades one error for the other: models with different doorway errors are not comparable.
     """
     mean = _find(rows, RADIUS)
     if mean is None or mean.doorway_mm is None or mean.leak_p99_mm is None:
@@ -235,13 +237,14 @@ def _equal_door(rows: Sequence[Row]) -> str:
         return f"{said}: half or less."
     if leak >= mean.leak_p99_mm:
         return f"{said}: no gain."
-    return f"{said}: half is not reached. {LEFT}"
+    return f"{said}: more than half. {LEFT}"
 
 
 def leak_at(rows: Sequence[Row], model: str, doorway: float) -> float | None:
-    """The 99th percentile of the leak [mm] of a radius model at a doorway error [mm], linear between its factors.
+    """Interpolate the 99th percentile of the leak [mm] of a radius model at a doorway error [mm].
 
-    None where the factors measured do not reach there from both sides.
+    The interpolation is linear between the model's factors. Returns None if the measured doorway errors
+    do not enclose the given one.
     """
     known = sorted(
         (r.doorway_mm, r.leak_p99_mm)
@@ -260,11 +263,11 @@ def _made(rows: Sequence[Row]) -> str:
     if not known:
         return ""
     parts = [f"{r.setting} {_door(r.made_doorway_mm)} (inferred: {_door(r.doorway_mm)})" for r in known]
-    return "Doorway by doors that were made narrower and narrower: " + "; ".join(parts) + "."
+    return "Doorway error measured on generated doors of decreasing width: " + "; ".join(parts) + "."
 
 
 def _door(error: float | None) -> str:
-    """A doorway's error in words."""
+    """Format a doorway error."""
     return f"{error:.0f} mm" if error is not None and math.isfinite(error) else "none passes"
 
 
@@ -279,10 +282,10 @@ def _sheet(rows: Sequence[Row]) -> str:
     ]
     if not parts:
         return ""
-    said = "Doorway of a thin sheet, where a surface ends: " + "; ".join(parts) + "."
+    said = "Doorway error of a thin sheet, at the rim of a surface: " + "; ".join(parts) + "."
     wider = own.get("border")
     if wider is not None and (wider.doorway_mm or 0.0) < 0.0:
-        said += f" At the mean radius border makes this door wider than it is, by {-(wider.doorway_mm or 0.0):.0f} mm."
+        said += f" At the mean radius, border makes this door {-(wider.doorway_mm or 0.0):.0f} mm wider than it is."
     return said
 
 
@@ -297,7 +300,7 @@ def _arithmetic(rows: Sequence[Row]) -> str:
         if not r.default
     ]
     return (
-        "Arithmetic, against float32 with a certified bound and integers where it does not decide: "
+        "Arithmetic, compared with float32 with a certified bound and integers where it does not decide: "
         + "; ".join(parts)
         + "."
     )
@@ -308,7 +311,7 @@ def _volumes(rows: Sequence[Row], suffix: str) -> str:
     if not {"sphere", "sphere with slab", "box"} <= own.keys():
         return ""
     sphere, slab, box = (own[name].mean_us or 0.0 for name in ("sphere", "sphere with slab", "box"))
-    where = "walls turned off the axes" if suffix else "walls along the axes"
+    where = "with rotated walls" if suffix else "with axis-aligned walls"
     if _alike(box, sphere):
         order = "Groups of boxes and groups of spheres take the same time, within noise,"
     elif box < sphere:
@@ -321,14 +324,14 @@ def _volumes(rows: Sequence[Row], suffix: str) -> str:
         else f"{'more' if box < slab else 'less'} than boxes"
     )
     return (
-        f"{order} as bounds, {where}: {box:.1f} against {sphere:.1f} µs a pose in a plain descent. A sphere cut by a "
+        f"{order} as bounds, {where}: {box:.1f} against {sphere:.1f} µs per pose in a plain descent. A sphere cut by a "
         f"slab takes {slab:.1f} µs: {third}."
     )
 
 
 def _cubes(rows: Sequence[Row]) -> str:
     lines = []
-    for suffix, where in (("", "walls along the axes"), (", turned", "turned")):
+    for suffix, where in (("", "axis-aligned walls"), (", turned", "rotated walls")):
         own = [r for r in rows if r.knob == PRIMITIVE + suffix]
         cubes = next((r for r in own if r.setting.startswith("points cubes")), None)
         boxes = next((r for r in own if r.setting == "points spheres, nodes boxes"), None)
@@ -336,7 +339,7 @@ def _cubes(rows: Sequence[Row]) -> str:
             continue
         lines.append(
             f"{where}: {_ratio(cubes, 'spheres under the same boxes', boxes)}, "
-            f"{cubes.early} of {cubes.poses:,} poses early, distances off by up to "
+            f"{cubes.early} of {cubes.poses:,} poses early, distance errors up to "
             f"{cubes.distance_max_mm or 0.0:.0f} mm"
         )
-    return "Cubes in place of spheres for points, " + "; ".join(lines) + "." if lines else ""
+    return "Cubes instead of spheres for points, " + "; ".join(lines) + "." if lines else ""

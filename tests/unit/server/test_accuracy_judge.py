@@ -117,7 +117,7 @@ def test_every_pair_of_points_agrees_with_the_judge_and_would_say_if_not(judged:
     exact = judged.exact
     assert check_judge(judged.archive, judged.ground, exact, 20) == 20
     for wrong in (exact._replace(contact=~exact.contact), exact._replace(tangent=~exact.tangent)):
-        with pytest.raises(InternalError, match="every pair of points says otherwise"):
+        with pytest.raises(InternalError, match="every pair of points finds the opposite"):
             check_judge(judged.archive, judged.ground, wrong, 20)
 
 

@@ -199,7 +199,7 @@ def config_of(header: Header, target: Path, jobs: int, memory_bytes: int) -> Bui
     known = set(BuildConfig().identity()) | {"cells", "models", "normal_reach"}
     if others := sorted(set(stored) - known):
         raise BadRequestError(
-            f"{target}: built with {', '.join(others)}, which look at all scans at once: build again"
+            f"{target}: built with {', '.join(others)}, which depend on all scans together: build again"
         )
     for name in ("keep", "models"):
         if name in stored:

@@ -180,14 +180,14 @@ class BuildConfig:
             (
                 {"mean"} <= self.models <= set(STORED_MODELS),
                 f"--radius {','.join(sorted(self.models))}",
-                "mean, and local or border where wanted",
+                "mean, optionally with local and border",
             ),
             (self.jobs >= 0, f"--jobs {self.jobs}", "0 (all cores) or more"),
             (self.memory_bytes >= 64 << 20, f"--memory {self.memory_bytes} bytes", "at least 64MB"),
             (
                 self.keep <= {"scan", "intensity", "normal"},
                 f"--keep {','.join(sorted(self.keep))}",
-                "scan, intensity, normal, by comma",
+                "scan, intensity, normal, separated by commas",
             ),
             (
                 0 < self.normal_reach <= MAX_NORMAL_REACH,

@@ -296,7 +296,7 @@ class _Spill:
         for start, count in zip((starts * size).tolist(), (counts * size).tolist(), strict=True):
             got = os.preadv(descriptor, [view[at : at + count]], start)
             if got != count:
-                raise CorruptError(f"a spill file ends {count - got} bytes too soon: check the disk")
+                raise CorruptError(f"a spill file is {count - got} bytes too short: check the disk")
             at += count
         return taken
 

@@ -125,7 +125,7 @@ def _first_steps(lattice: Lattice, contents: Contents) -> NDArray[np.int64]:
     world = (ends - first) * lattice.step + lattice.to_world(first[None])[0]
     if not np.array_equal(lattice.to_lattice(world), ends):
         raise BadRequestError(
-            f"coordinates of {np.abs(world).max():g} m do not come back from LAS in steps of {lattice.step:g} m: "
+            f"coordinates of {np.abs(world).max():g} m are not reproduced by LAS in steps of {lattice.step:g} m: "
             "export --format ply"
         )
     return first

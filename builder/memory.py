@@ -41,7 +41,7 @@ CLUSTER_WORKER_BYTES = 240 << 20
 
 # End of the advice for a voxel that is too large when a build is refused: the finished work is
 # kept.
-OTHERWISE = " to go on from what is done, or a smaller --voxel and --fresh"
+OTHERWISE = " to resume, or a smaller --voxel and --fresh"
 
 
 def jobs_that_fit(jobs: int, config: BuildConfig) -> int:

@@ -359,11 +359,9 @@ def _memory(scene: Scene, config: BuildConfig, rates: Rates, jobs: int, tables: 
 
 def _assumed(config: BuildConfig, rates: Rates, jobs: int) -> tuple[str, ...]:
     """Return the assumptions of an estimate."""
-    said = [
-        f"{jobs} jobs on {os.cpu_count()} cores, each as fast as those measured, and nothing else running"
-    ]
+    said = [f"{jobs} jobs on {os.cpu_count()} cores, each as fast as the measured ones, and no other load"]
     said.append(
-        "scans come off the disk as fast as they are read: a slow disk or network adds to survey and spool"
+        "the disk delivers scans as fast as they are decoded: a slow disk or network adds to survey and spool"
     )
     if config.models != {"mean"}:
         said.append(
@@ -373,10 +371,10 @@ def _assumed(config: BuildConfig, rates: Rates, jobs: int) -> tuple[str, ...]:
         said.append("normals: their bytes are included, their time (1.6 µs a point of one core) is not")
     if config.thin is not None or config.outliers is not None or config.moving is not None:
         said.append(
-            "no point is left out by filters, and their time (0.3 to 3 µs a point of one core) is not counted"
+            "filters leave out no point; their time (0.3 to 3 µs a point of one core) is not included"
         )
     if config.cells != "octree":
-        said.append("cells as octree: balanced ones take longer")
+        said.append("time of octree cells: balanced ones take longer")
     return tuple(said)
 
 

@@ -25,7 +25,7 @@ def rows_of(sources: Sequence[Source], scans: Sequence[str], target: Path) -> fr
         if not wanted:
             there = ", ".join(f"{row}: {scan_name(s)}" for row, s in list(held.items())[:10])
             more = f" and {len(held) - 10} more (solidcloud info)" if len(held) > 10 else ""
-            raise BadRequestError(f"{target}: {text} is no scan of this archive; there are {there}{more}")
+            raise BadRequestError(f"{target}: {text} is not a scan of this archive, which has {there}{more}")
         rows |= wanted
     if not rows:
         raise BadRequestError(f"{target}: no scan is named: name at least one")

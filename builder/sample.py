@@ -183,19 +183,17 @@ def seen_scene(
     formats: Counter[str] = Counter()
     for scan, each in zip(scans, seen, strict=True):
         formats[scan.format] += each.points
-    assumed = [f"surface and voxels as in {looked:,} points looked at of {points:,}"]
+    assumed = [f"surface and voxels as in a sample of {looked:,} of {points:,} points"]
     if blind:
-        assumed.append(f"{blind:,} scans not looked at are like the others")
+        assumed.append(f"{blind:,} scans not sampled are like the others")
     if unsaid := sum(scan.declared_count is None for scan in scans):
-        assumed.append(
-            f"{unsaid:,} files do not say how many points they hold: a point in {TEXT_BYTES} bytes"
-        )
+        assumed.append(f"{unsaid:,} files do not declare their number of points: one per {TEXT_BYTES} bytes")
     assumed += [f"without a scan that cannot be read: {fault}" for fault in lost[:MOST_NAMED]]
     if len(lost) > MOST_NAMED:
         assumed.append(f"without {len(lost) - MOST_NAMED:,} more scans that cannot be read")
     if packed is not None:
         assumed.append(
-            f"bytes as {packed.points:,} points take, packed as a build packs them; {packed.share:.0%} of all were read"
+            f"bytes per point as in {packed.points:,} points packed as in a build; {packed.share:.0%} of all were read"
         )
         if packed.voxels is not None:
             voxels = float(packed.voxels)

@@ -227,7 +227,7 @@ def voxel_faults(archive: Archive, row: int, record: OpenRecord, deep: bool) -> 
     nodes = record.nodes
     stray = np.flatnonzero(nodes.slab.any(axis=0) & ~nodes.normal.any(axis=0))
     if len(stray):
-        faults.append(f"{archive.where(row)}: node {stray[0]} has a slab and no normal: rebuild the archive")
+        faults.append(f"{archive.where(row)}: node {stray[0]} has a slab but no normal: rebuild the archive")
     if deep:
         node = last_loose_node(leaves, spheres_of(record), nodes.normal, nodes.slab)
         if node >= 0:

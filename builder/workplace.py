@@ -157,8 +157,7 @@ def workplace(target: Path, what: dict[str, Any], *, fresh: bool) -> Iterator[Wo
         if (note := Journal(hidden).path(BEGUN)).exists():
             raise SolidcloudError(
                 f"{note}: cannot be removed, as --fresh requires, and the build would resume from it: remove "
-                f"{hidden} by "
-                "hand, then give the same command again"
+                f"{hidden} by hand, then give the same command again"
             )
     begun = Journal(hidden).recall(BEGUN)
     if begun is not None:

@@ -306,7 +306,9 @@ def test_other_radius_texts_are_refused(text: str) -> None:
 
 
 def test_a_config_always_holds_the_mean() -> None:
-    with pytest.raises(BadRequestError, match="--radius local: expected mean, and local or border"):
+    with pytest.raises(
+        BadRequestError, match="--radius local: expected mean, optionally with local and border"
+    ):
         BuildConfig(models=frozenset({"local"}))
     with pytest.raises(BadRequestError, match="--radius colour,mean"):
         BuildConfig(models=frozenset({"mean", "colour"}))

@@ -190,7 +190,7 @@ def test_removing_needs_scans_and_leaves_one(built: Build, files: Files, tmp_pat
         refused(
             target,
             BadRequestError,
-            "is no scan of this archive; there are 0: ",
+            "is not a scan of this archive, which has 0: ",
             lambda n=named: remove_scans(target, [n], jobs=1),
         )
     refused(

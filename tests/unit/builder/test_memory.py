@@ -92,7 +92,7 @@ def test_the_memory_and_the_jobs_named_for_a_large_voxel_are_enough(
         except SolidcloudError as error:
             said = str(error)
         refused += 1
-        named = re.search(r"give (?:--(?:jobs |cluster local:)(\d+) or )?--memory (\d+)MB to go on", said)
+        named = re.search(r"give (?:--(?:jobs |cluster local:)(\d+) or )?--memory (\d+)MB to resume", said)
         assert named, said
         read(points, int(named[2]), wanted)
         with pytest.raises(SolidcloudError):  # and no more than that

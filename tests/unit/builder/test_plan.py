@@ -199,7 +199,7 @@ def test_a_look_at_a_part_tells_of_the_whole(tmp_path: Path, monkeypatch: pytest
     monkeypatch.setattr(sample, "LOOKS", 64)
     monkeypatch.setattr(sample, "LOOK_POINTS", 512)
     part = looked(tmp_path / "a.las")
-    assert part.points == whole.points and "32,768 points looked at" in part.assumed[0]
+    assert part.points == whole.points and "a sample of 32,768 of" in part.assumed[0]
     assert part.area == pytest.approx(whole.area, rel=0.3)
     assert part.voxels is not None and whole.voxels is not None
     assert part.voxels[1] == pytest.approx(whole.voxels[1], rel=0.3)
@@ -212,7 +212,7 @@ def test_text_whose_number_of_points_nobody_says_is_guessed_by_its_length(
     monkeypatch.setattr(sample, "FIRST_POINTS", 10_000)
     scene = looked(tmp_path / "a.xyz")
     assert 25_000 < scene.points < 60_000
-    assert any("do not say how many" in line for line in scene.assumed)
+    assert any("do not declare their number" in line for line in scene.assumed)
 
 
 def test_scans_there_is_no_time_for_are_like_the_others(
@@ -224,7 +224,7 @@ def test_scans_there_is_no_time_for_are_like_the_others(
     whole = looked(tmp_path)
     monkeypatch.setattr(sample, "SECONDS", -1.0)
     scene = looked(tmp_path)
-    assert scene.points == whole.points and any("3 scans not looked at" in line for line in scene.assumed)
+    assert scene.points == whole.points and any("3 scans not sampled" in line for line in scene.assumed)
     assert whole.area < scene.area < 4.5 * whole.area
 
 

@@ -145,7 +145,7 @@ def test_a_slab_without_a_normal_is_found(copy: Path) -> None:
 
     rewrite(copy, without_normal)
     (fault,) = verify_archive(copy).faults
-    assert "node 3 has a slab and no normal" in fault
+    assert "node 3 has a slab but no normal" in fault
 
 
 def test_a_bound_one_step_too_small_is_found_by_the_exact_check(copy: Path) -> None:

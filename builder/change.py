@@ -46,9 +46,9 @@ _OURS = re.compile(r"[0-9]{1,9}-[0-9]{1,9}\.h5(\..*\.?tmp|\.tmp)?")
 
 
 class Change:
-    """Change in progress. archive: its old state.  target: its folder.
+    """Change in progress.
 
-    folder: the hidden folder.
+    archive: its old state.  target: its folder.  folder: the hidden folder.
     """
 
     def __init__(
@@ -276,10 +276,10 @@ def _read_back(unit: _ReadUnit) -> int:
 
 
 def verify_new(change: Change, new: set[str], places: int) -> None:
-    """Read back every voxel that was built; unaffected voxels have not moved.
+    """Read back every voxel that was built. The files of all other voxels are unchanged.
 
-    places: the `places_sum` that their points must have (spool.py). The sum detects what damaged
-    runs cause, since runs have no checksums. Raise CorruptError if a record is broken, or if the
+    places: the `places_sum` that their points must have (spool.py). The sum detects damage to
+    runs, which have no checksums. Raise CorruptError if a record is broken, or if the
     records are valid but hold other points.
     """
     with Archive(change.folder) as archive:

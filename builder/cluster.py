@@ -1,6 +1,6 @@
 """Execution of pure work units on a dask cluster, existing or started here.
 
-The only user of distributed.
+This module is the only user of distributed.
 
 dask decides which worker runs a unit, what happens when a worker dies, and how often a unit is
 retried. A unit is pure and writes under its own temporary name. A unit that is killed half-way or
@@ -109,7 +109,7 @@ def _run_unit(work: bytes, expected: dict[str, str], folder: str) -> Any:
 def _look(dask_worker: Worker) -> tuple[dict[str, str], int]:
     """Return the software and the number of threads of a worker.
 
-    Called before work is handed out.
+    The builder calls this before it hands out work.
     """
     return software(), dask_worker.state.nthreads
 
@@ -131,7 +131,7 @@ def _check_worker(address: str, found: dict[str, str], expected: dict[str, str],
 class ClusterExecutor:
     """Map a picklable function over work units on dask workers.
 
-    A context manager, like `executor.Executor`.
+    It is a context manager, like `executor.Executor`.
 
     jobs: number of workers at construction; workers may come and go later.  at_once: see
     `Executor`.
@@ -242,7 +242,7 @@ class ClusterExecutor:
     def hand_out(self, function: Callable[[Unit], Result], unit: Unit) -> Future:
         """Submit a unit, as `Hands` describes.
 
-        Not `pure` in dask's sense: an equal unit must run again.
+        The unit is not `pure` in dask's sense: an equal unit must run again.
         """
         # dask would search an unpickled unit for tasks, through all its keys.
         work = pickle.dumps((function, unit))

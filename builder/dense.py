@@ -397,7 +397,7 @@ class _Layout:
     def _heap(self, cell: int) -> Iterator[NDArray]:
         """Yield the point rows of a cell whose points are all at one position.
 
-        They hold columns only.
+        The rows contain columns only.
         """
         if self.top is not None:
             low = self.cells.low[cell : cell + 1].astype(np.int64)

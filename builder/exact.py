@@ -50,7 +50,7 @@ def loose_nodes(voxel: VoxelData, links: Links, nodes: Iterable[int]) -> list[in
 def _encloses(voxel: VoxelData, links: Links, node: int, leaves: NDArray[np.int64]) -> bool:
     """Return whether the bounds of one node hold.
 
-    Leaves: the leaf nodes in the order of their points.
+    leaves: the leaf nodes in the order of their points.
     """
     cell = int(links.cell[node])
     low = [0, 0, 0] if cell < 0 else voxel.cells.low[cell].tolist()

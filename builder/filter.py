@@ -137,9 +137,9 @@ def _add(total: Counts, more: Counts) -> None:
 
 
 def filter_voxels(unit: FilterUnit) -> Filtered:
-    """Write the remaining points of the unit's voxels as one run. Pure and idempotent.
+    """Write the remaining points of the unit's voxels as one run.
 
-    Runs in any process.
+    This is pure and idempotent, and runs in any process.
     """
     left_out: Counts = {}
     reader = BlockReader(unit.spool)

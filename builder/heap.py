@@ -53,7 +53,7 @@ def heap_trees(code: int, points: int, config: BuildConfig) -> CellTrees:
 
 
 class _Run:
-    """Run during the merge.
+    """State of a run during the merge.
 
     rows: its rows in memory, in order; None at its end.  keys: (n,) uint64, see `_order_keys`.
     """

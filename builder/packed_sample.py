@@ -141,7 +141,7 @@ class _Reader:
     def gather(self, pieces: Sequence[tuple[int, int, int | None]], cubes: _Cubes | None) -> _Gathered:
         """Read pieces (scan, start, stop) and return the points in cubes.
 
-        Halve cubes with too many.
+        Halve cubes with too many points.
         """
         parts, held = [_NOTHING], 0
         chosen = np.empty((0, 5), np.int64) if cubes is None else cubes.chosen

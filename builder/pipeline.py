@@ -109,7 +109,7 @@ def build_archive(
 ) -> BuildSummary:
     """Build an archive in the folder `target` from scan files and folders.
 
-    Resume an interrupted build.
+    If an earlier build of the target was interrupted, resume it.
 
     The archive's bytes depend on the points, the contents of the files, the paths as given (in the
     index alone) and the options in `config.identity()`. They do not depend on the order of paths,

@@ -262,9 +262,9 @@ class Plan:
 
 
 def estimate(scene: Scene, config: BuildConfig, rates: Rates, target: Path | None = None) -> Plan:
-    """Estimate the build of a scene. target: location of the archive, to check free space.
+    """Estimate the build of a scene.
 
-    None: no check.
+    target: location of the archive, to check free space; None: no check.
     """
     step = config.resolution or scene.step or DEFAULT_STEP
     pitch = math.sqrt(scene.area / scene.points)

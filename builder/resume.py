@@ -59,7 +59,7 @@ def _placed(scan: Scan | Source) -> dict[str, Any]:
 def check_same(folder: Path, was: Mapping[str, Any], now: Mapping[str, Any]) -> None:
     """Raise BadRequestError unless the build begun in `folder` is the requested one.
 
-    Name differences.
+    The error names the differences.
     """
     if was.get("software") != now["software"]:
         found, here = was.get("software", {}), now["software"]

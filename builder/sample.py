@@ -45,10 +45,9 @@ MOST_NAMED = 5
 
 
 class _Look(NamedTuple):
-    """Sample at one place. points: their number.
+    """Sample at one place.
 
-    held: edge [m] -> (k,) int64 keys of non-empty cubes.
-
+    points: their number.  held: edge [m] -> (k,) int64 keys of non-empty cubes.
     some: (m, 3) [m], one point in SOME.
     """
 
@@ -276,7 +275,7 @@ def _total(seen: Sequence[_Seen], edge: float) -> float:
 def _shared_step(scans: Sequence[Scan], voxel: float) -> float | None:
     """Return the lattice step that all scans share by their headers, or None.
 
-    As survey.py chooses it.
+    survey.py makes the same choice.
     """
     step = shared_step([scan.lattice for scan in scans])
     return step if step and max(MIN_STEP, voxel / MAX_VOXEL_STEPS) <= step <= voxel else None

@@ -1,6 +1,6 @@
-"""Build units: a run of consecutive voxels -> one shard file. Pure and idempotent.
+"""Work units of the build pass: consecutive voxels -> one shard file.
 
-Run in any process.
+They are pure and idempotent, and run in any process.
 """
 
 from collections.abc import Iterator

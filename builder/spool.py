@@ -415,7 +415,7 @@ class Spool:
     def _first_at_least(self, part: _Part, samples: NDArray[np.uint64], code: int) -> int:
         """Return the first row of a part whose code is at least `code`.
 
-        The part's size if there is none.
+        Return the part's size if there is no such row.
         """
         stride = int(
             np.searchsorted(samples, np.uint64(code))

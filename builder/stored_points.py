@@ -79,11 +79,9 @@ class FindUnit(NamedTuple):
 
 
 class Found(NamedTuple):
-    """Voxel that holds points of these scans. row: of the index.
+    """Voxel that holds points of these scans.
 
-    box: (2, 3) lattice, of those points.
-
-    counts: points of each scan.
+    row: of the index.  box: (2, 3) lattice, of those points.  counts: points of each scan.
     """
 
     row: int
@@ -128,9 +126,9 @@ def record_points(record: OpenRecord, dtype: np.dtype) -> Iterator[_Points]:
 
 
 class _Runs:
-    """Points waiting to be written as runs NAME-0000, NAME-0001, ...
+    """Points that wait to be written as runs NAME-0000, NAME-0001 and so on of a folder.
 
-    of a folder, in order of voxel keys.
+    They are written in order of voxel keys.
     """
 
     def __init__(self, folder: Path, name: str, dtype: np.dtype, run_points: int) -> None:

@@ -75,7 +75,7 @@ def pack_top(
 ) -> Top:
     """Pack the top hierarchy over the cells of a voxel, c > 1, in octree order.
 
-    Columns as in `CellTrees`.
+    The columns are as in `CellTrees`.
     """
     middle = (low + (np.int64(1) << log2_size.astype(np.int64))[:, None] // 2).astype(np.int32)
     order, begin, end, count, levels = pack_tree(middle, config.degree, config.degree)

@@ -65,10 +65,9 @@ class _Unit(NamedTuple):
 
 
 class _Found(NamedTuple):
-    """Result of a unit. points: in voxels that could be read.
+    """Result of a unit.
 
-    classes: (RADIUS_CLASSES,), of those points.
-
+    points: in voxels that could be read.  classes: (RADIUS_CLASSES,), of those points.
     places: sum of their positions, see `places_sum`; 0 if not requested.  damaged: shards with
     faults.
     """

@@ -88,8 +88,7 @@ class Workplace:
     def distrust(self, path: Path) -> None:
         """Discard a run or a shard that differs from what was written.
 
-        A folder stands for all its points.
-
+        path: the file; or the folder of a spool, to discard everything except the survey.
         What was made from a run is discarded with it.
         """
         if path.is_dir():

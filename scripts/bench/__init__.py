@@ -1,1 +1,1 @@
-"""What scripts/bench_walk, scripts/bench_engine and scripts/check_exact share; a section of bench_engine a file."""
+"""Shared code of the benchmark scripts and check_exact; each section of bench_engine is one file."""

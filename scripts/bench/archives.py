@@ -1,4 +1,4 @@
-"""The archives that are measured: built with the command line as a user does, opened with room for all voxels."""
+"""Archives for measurement: built with the command line as a user does, opened fully resident."""
 
 import subprocess
 import sys
@@ -12,23 +12,23 @@ from solidcloud.server.scene import Scene
 
 from .machine import say
 
-PAPER_VOXEL, DEFAULT_VOXEL = 32, 8  # [m]; 32 holds the whole façade, as the paper's one voxel does
-STEP = 1e-4  # the lattice step the goals speak of [m]
+PAPER_VOXEL, DEFAULT_VOXEL = 32, 8  # [m]; 32 holds the whole façade, like the paper's single voxel
+STEP = 1e-4  # lattice step of the targets [m]
 
 
 def build(scan: Path, target: Path, *, voxel: int | None = None, step: float | None = STEP) -> Path:
-    """Build an archive of `scan` with the command line, as a user does; None: the command's defaults."""
+    """Build an archive of `scan` with the command line; None: the command's defaults."""
     say(f"building {target.name}" + (f" with --voxel {voxel}" if voxel else ""))
     options = ["--voxel", str(voxel)] if voxel else []
     options += ["--resolution", str(step)] if step else []
     command = [str(Path(sys.executable).with_name("solidcloud")), "build", str(scan), "-o", str(target)]
-    # Not on the standard output: that is for the figures.
+    # Standard output is reserved for the figures.
     subprocess.run([*command, *options], check=True, stdout=sys.stderr)
     return target
 
 
 def facade_archives(folder: Path) -> dict[int, Path]:
-    """Make the façade and build it twice: voxel [m] -> archive."""
+    """Generate the façade and build it twice; return voxel [m] -> archive."""
     say("making the façade")
     scan = folder / "facade.laz"
     make_facade(scan)
@@ -37,7 +37,7 @@ def facade_archives(folder: Path) -> dict[int, Path]:
 
 
 def stored_points(path: Path) -> NDArray[np.float64]:
-    """All points of an archive (n, 3), from its origin [m]: what is stored, not what was scanned."""
+    """Return all points (n, 3) that an archive stores, from its origin [m]."""
     blocks = []
     with Archive(path) as archive:
         lattice = archive.header.lattice
@@ -52,7 +52,7 @@ def stored_points(path: Path) -> NDArray[np.float64]:
 
 
 def contact_distance(scenes: list[Scene], avatar: NDArray[np.float64]) -> float:
-    """Give every scene the avatar; both radii together, which must be the same in all [m]."""
+    """Add the avatar to every scene; return the sum of both radii [m], which must be equal in all."""
     infos = [scene.add_avatar("avatar", avatar) for scene in scenes]
     found = {float(scene.info().radius + info.radius) for scene, info in zip(scenes, infos, strict=True)}
     if len(found) != 1:
@@ -61,5 +61,5 @@ def contact_distance(scenes: list[Scene], avatar: NDArray[np.float64]) -> float:
 
 
 def archive_bytes(path: Path) -> int:
-    """Bytes of an archive's files."""
+    """Return the total size of an archive's files [bytes]."""
     return sum(file.stat().st_size for file in path.rglob("*") if file.is_file())

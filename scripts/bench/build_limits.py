@@ -1,4 +1,4 @@
-"""What the machine and the formats allow, measured beside the builds: reading, writing, hashing and decoding alone."""
+"""Limits of machine and formats, measured beside the builds: reading, writing, hashing, decoding alone."""
 
 import hashlib
 import os
@@ -8,22 +8,22 @@ from pathlib import Path
 import laspy
 
 BLOCK = 8 << 20
-# Points decoded at a time: small enough for any cache to hold what a decoder hands on.
+# Points decoded at a time: few enough for a decoder's output to stay in any cache.
 CHUNK = 1 << 18
 
 
 def forget(path: Path) -> bool:
-    """Ask the system to drop a file from its cache, so that it is read from the disk; whether it could be asked."""
+    """Drop a file from the page cache to force reading from disk; return whether this is possible."""
     if not hasattr(os, "posix_fadvise"):
         return False
     with open(path, "rb") as file:
-        os.fsync(file.fileno())  # only clean pages can go
+        os.fsync(file.fileno())  # only clean pages can be dropped
         os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
     return True
 
 
 def read_seconds(path: Path) -> float:
-    """Read a file from its begin to its end, and do nothing with it."""
+    """Time reading a file from start to end."""
     buffer = bytearray(BLOCK)
     begin = time.perf_counter()
     with open(path, "rb", buffering=0) as file:
@@ -33,9 +33,9 @@ def read_seconds(path: Path) -> float:
 
 
 def write_seconds(folder: Path, size: int) -> float:
-    """Write so many bytes to a new file and have the disk confirm them; the file is removed again."""
+    """Time writing this many bytes to a new file with the disk confirming them; removes the file."""
     path = folder / "written.tmp"
-    block = os.urandom(BLOCK)  # nothing that a file system could make smaller
+    block = os.urandom(BLOCK)  # incompressible for any file system
     begin = time.perf_counter()
     try:
         with open(path, "wb", buffering=0) as file:
@@ -48,7 +48,7 @@ def write_seconds(folder: Path, size: int) -> float:
 
 
 def sha256_seconds(path: Path) -> float:
-    """The SHA-256 of a file that is in the system's cache."""
+    """Time the SHA-256 of a file in the page cache."""
     begin = time.perf_counter()
     with open(path, "rb") as file:
         hashlib.file_digest(file, "sha256")
@@ -56,7 +56,7 @@ def sha256_seconds(path: Path) -> float:
 
 
 def laz_of(las: Path, laz: Path, points: int) -> Path:
-    """The first `points` points of a LAS file as LAZ, all their fields; made once."""
+    """Return the first `points` points of a LAS file as LAZ with all fields; created once."""
     if not laz.exists():
         temporary = laz.with_suffix(".tmp")
         with laspy.open(las) as source, open(temporary, "wb") as file:
@@ -73,7 +73,7 @@ def laz_of(las: Path, laz: Path, points: int) -> Path:
 
 
 def decode_seconds(path: Path, parallel: bool) -> tuple[float, int]:
-    """Decode a LAS or LAZ file, chunk by chunk, on one core or on all; seconds and points."""
+    """Decode a LAS or LAZ file chunk by chunk, on one core or on all; return seconds and points."""
     backend = laspy.LazBackend.LazrsParallel if parallel else laspy.LazBackend.Lazrs
     begin, points = time.perf_counter(), 0
     with laspy.open(path, laz_backend=backend) as file:

@@ -1,4 +1,4 @@
-"""How the goals of scripts/bench_build are to be read: shown beside them, by the goal's key."""
+"""Notes on the targets of scripts/bench_build, shown beside them, by the target's key."""
 
 NOTES: dict[str, str] = {
     "throughput": "from the command's start to its end: interpreter, both passes over the LAS file, SHA-256, verifying",

@@ -1,4 +1,4 @@
-"""scripts/bench_build as one picture: stages and limits, memory over time, bytes a point, and the goals."""
+"""Picture of scripts/bench_build: stages and limits, memory over time, bytes per point, and targets."""
 
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,12 @@ def draw(
     machine: str,
     target: Path,
 ) -> None:
-    """Write the picture as PNG. builds: one a size.  limits: points -> what -> seconds.  bound: --memory [bytes]."""
+    """Write the picture as PNG.
+
+    builds: one per size.
+    limits: points -> name -> seconds.
+    bound: --memory [bytes].
+    """
     pyplot = load_pyplot()
     rows = goal_rows(parts, notes)
     sizes = [
@@ -38,7 +43,7 @@ def draw(
     axes = left.subplots(2, 1, height_ratios=heights[0])
     _stages(axes[0], builds, limits)
     _memory(axes[1], builds, bound)
-    # Each in a figure of its own: beside the long names of the lower the upper would be squeezed.
+    # Two separate figures: in a shared one, the long labels of the lower would squeeze the upper.
     parts_right = right.subfigures(2, 1, height_ratios=heights[1]) if cases else [right]
     goals_table(parts_right[0].subplots(), rows, heights[1][0] if cases else height)
     if cases:
@@ -48,7 +53,7 @@ def draw(
 
 
 def _stages(axes: Any, builds: list[Built], limits: dict[int, dict[str, float]]) -> None:
-    """Nanoseconds a point of each stage, one bar a size; below it what the machine could do at best."""
+    """Draw nanoseconds per point of each stage, one bar per size, and the machine's limits below."""
     names = [*dict.fromkeys(name for built in builds for name in built.stages if name != REST), REST]
     colours = {name: STAGES[k % len(STAGES)] for k, name in enumerate(names)} | {REST: REST_COLOUR}
     longest = max(built.seconds / built.points for built in builds) * 1e9
@@ -82,7 +87,7 @@ def _stages(axes: Any, builds: list[Built], limits: dict[int, dict[str, float]])
 
 
 def _memory(axes: Any, builds: list[Built], bound: int) -> None:
-    """Memory over the build, each build's length being one."""
+    """Draw memory over the build, with each build's duration scaled to one."""
     for k, built in enumerate(builds):
         samples = built.watched.samples
         axes.plot(
@@ -99,7 +104,7 @@ def _memory(axes: Any, builds: list[Built], bound: int) -> None:
 
 
 def _sizes(axes: Any, sizes: list[Any], cases: list[str]) -> None:
-    """Bytes a point: archive, and LAZ of the same xyz where there is one."""
+    """Draw bytes per point: the archive, and LAZ of the same xyz where it exists."""
     for shift, what, colour in ((-0.2, "archive", STAGES[0]), (0.2, "LAZ", "#8a8a8a")):
         own = [f for f in sizes if f.what == what]
         places = [cases.index(f.case) + shift for f in own]

@@ -1,4 +1,4 @@
-"""Rates that `solidcloud plan` goes by, from builds of two sizes by one worker and by two."""
+"""Rates that `solidcloud plan` uses, fitted to builds of several sizes by one worker and by two."""
 
 import os
 import platform
@@ -18,19 +18,23 @@ from .machine import cpu_name, say
 from .results import BUSY
 
 Builds = Mapping[tuple[int, int], Sequence[Built]]
-# Starting two processes, seconds, where it cannot be measured because the machine is busy.
+# Time to start two processes [s], for a machine too busy to measure it.
 USUAL_WORKERS = 1.2
 
-# A build of TINY is its start and hardly more; up to SMALL all points have their closest looked for (RADIUS_SAMPLE).
+# A build of TINY takes little more than its start. Up to SMALL the closest neighbours of all points
+# are searched (RADIUS_SAMPLE).
 TINY, SMALL, LARGE = 20_000, 1_000_000, 10_000_000
 SIZES = ((TINY, 1), (SMALL, 1), (LARGE, 1), (SMALL, 2), (LARGE, 2))
 WRITTEN = 256 << 20
-# Reading the scans twice, survey and spool, is how a build is made.
+# A build reads the scans twice: survey and spool.
 PASSES = 2
 
 
 def fit_stage(times: Mapping[tuple[int, int], float]) -> Stage:
-    """A stage from its seconds at SIZES, (points, jobs). Nothing is below 0, and two jobs are at most twice as fast."""
+    """Fit a stage to its seconds at SIZES, (points, jobs).
+
+    No parameter is below 0, and two jobs are at most twice as fast as one.
+    """
     one, two = (max(0.0, times[LARGE, jobs] - times[SMALL, jobs]) / (LARGE - SMALL) for jobs in (1, 2))
     parallel = min(max(0.0, 2 * (one - two)), one)
     start = max(0.0, times[TINY, 1] - TINY * one)
@@ -39,10 +43,10 @@ def fit_stage(times: Mapping[tuple[int, int], float]) -> Stage:
 
 
 def calm_times(name: str, builds: Builds) -> dict[tuple[int, int], float]:
-    """Seconds of a stage at each of SIZES, the best, for what slows it is not the builder.
+    """Return the least seconds of a stage at each of SIZES; what slows it down is not the builder.
 
-    Where others wanted cores a build by one job is taken to last as long as its processor time, and two jobs to halve
-    that, which they do within a tenth for all but the start and the end on a machine that is left alone.
+    On a busy machine a build by one job is assumed to take its processor time, and two jobs half of
+    that. On an idle machine this holds within a tenth, except for the start and the end.
     """
     if not is_busy(builds):
         return {at: min(run.stages.get(name, 0.0) for run in runs) for at, runs in builds.items()}
@@ -56,12 +60,12 @@ def calm_times(name: str, builds: Builds) -> dict[tuple[int, int], float]:
 
 
 def is_busy(builds: Builds) -> bool:
-    """Whether other work took more of the machine than leaves times as they are."""
+    """Return whether other work used more of the machine than leaves the times unaffected."""
     return max(run.watched.others or 0.0 for runs in builds.values() for run in runs) > BUSY
 
 
 def fit_stages(builds: Builds) -> dict[str, Stage]:
-    """All stages of builds at SIZES."""
+    """Fit all stages to builds at SIZES."""
     names = list(dict.fromkeys(name for runs in builds.values() for run in runs for name in run.stages))
     found = {name: fit_stage(calm_times(name, builds)) for name in names}
     found["start, end"] = found.pop(REST)
@@ -69,7 +73,10 @@ def fit_stages(builds: Builds) -> dict[str, Stage]:
 
 
 def fit_workers(builds: Builds, stages: Mapping[str, Stage]) -> float:
-    """Seconds that starting processes takes: what builds by two jobs take beyond what the stages say."""
+    """Return the seconds of starting processes.
+
+    This is the time of builds by two jobs beyond that of the stages.
+    """
     if is_busy(builds):
         return USUAL_WORKERS
     beyond = [
@@ -81,7 +88,7 @@ def fit_workers(builds: Builds, stages: Mapping[str, Stage]) -> float:
 
 
 def fit_memory(builds: Builds) -> tuple[float, float, float]:
-    """Memory of the first process, of each other, and of a point [bytes]."""
+    """Return the memory of the first process, of each further process, and of a point [bytes]."""
     peak = {at: statistics.median(run.watched.peak or 0 for run in runs) for at, runs in builds.items()}
     point = max(0.0, max(peak[LARGE, jobs] - peak[SMALL, jobs] for jobs in (1, 2)) / (LARGE - SMALL))
     process = max(0.0, peak[SMALL, 1] - point * SMALL)
@@ -90,7 +97,7 @@ def fit_memory(builds: Builds) -> tuple[float, float, float]:
 
 
 def surface(las: Path) -> float:
-    """The surface of a scan [m^2], as builder/sample.py counts it, from all points."""
+    """Return the surface of a scan [m^2] as builder/sample.py counts it, from all points."""
     found: set[tuple[int, int, int]] = set()
     with laspy.open(las) as file:
         for chunk in file.chunk_iterator(1 << 20):
@@ -106,7 +113,11 @@ def measure_rates(
     paper_points: int,
     repeat: int,
 ) -> Rates:
-    """Build and read what rates need. scan_of: points -> a façade.  build: points, jobs, step -> a build of it."""
+    """Run the builds and reads that the rates need, and fit the rates.
+
+    scan_of: points -> a façade.
+    build: points, jobs, step -> a build of it.
+    """
     builds = {(points, jobs): [build(points, jobs, None) for _ in range(repeat)] for points, jobs in SIZES}
     paper = scan_of(paper_points)
     area = surface(paper)

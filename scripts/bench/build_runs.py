@@ -1,4 +1,4 @@
-"""Builds of made façades with the real command, watched: times, memory, bytes a point."""
+"""Observed builds of generated façades with the real command: times, memory, bytes per point."""
 
 import itertools
 import shutil
@@ -12,15 +12,19 @@ from .build_watch import Sample, Watched, last_json, watch
 from .machine import say
 
 COMMAND = [sys.executable, "-m", "solidcloud.server.cli"]
-# What a build does outside its stages: the interpreter, kernels from numba's cache, processes, renaming.
+# Time of a build outside its stages: the interpreter, kernels from numba's cache, processes,
+# renaming.
 REST = "start, rest"
 
 
 @dataclass(frozen=True)
 class Built:
-    """One build. summary: what the command said of it.  watched: what it took, seen from outside.
+    """One build.
 
-    step: of its lattice [m].  stored, preview: bytes of index and shards, and of what is beside them.
+    summary: the command's own report.
+    watched: its resources, observed from outside.
+    step: of its lattice [m].
+    stored, preview: bytes of index and shards, and of the files beside them.
     """
 
     points: int
@@ -32,17 +36,17 @@ class Built:
 
     @property
     def seconds(self) -> float:
-        """On the clock, from the command's start to its end."""
+        """Return the wall time from the command's start to its end."""
         return self.watched.seconds
 
     @property
     def bytes_a_point(self) -> float:
-        """Of the archive: index and shards."""
+        """Return bytes per point of the archive: index and shards."""
         return self.stored / self.points
 
     @property
     def stages(self) -> dict[str, float]:
-        """Seconds of each stage, and of what is in none."""
+        """Return the seconds of each stage, and of the time outside all stages."""
         named = {name: float(seconds) for name, seconds in self.summary["stages"].items()}
         return {**named, REST: max(0.0, self.seconds - sum(named.values()))}
 
@@ -52,12 +56,12 @@ class BuildError(RuntimeError):
 
 
 def scan_path(work: Path, points: int) -> Path:
-    """Where the façade of so many points is kept."""
+    """Return the path of the façade of this many points."""
     return work / f"facade-{points}.las"
 
 
 def made_scan(work: Path, points: int) -> Path:
-    """The made façade of so many points as LAS; made where the folder has none."""
+    """Return the generated façade of this many points as LAS; generate it where it is missing."""
     path = scan_path(work, points)
     if not path.exists():
         say(f"making a façade of {points:,} points, once")
@@ -76,12 +80,9 @@ def build(
     step: float | None = None,
     extra: Iterable[str] = (),
 ) -> Built:
-    """Build an archive, watched, then validate it, which is not counted: the build verifies what it wrote itself.
-
-    Raises BuildError with what the command said.
-    """
+    """Build an archive under observation. Raises BuildError with the command's output."""
     shutil.rmtree(target, ignore_errors=True)
-    # A benchmark that was stopped may have left a build half done: going on with it would take less time.
+    # An interrupted benchmark may have left a partial build: resuming it would take less time.
     options = ["--memory", memory, "--jobs", str(jobs), "--json", "--fresh", *extra]
     options += ["--voxel", f"{voxel:g}"] if voxel else []
     options += ["--resolution", f"{step:g}"] if step else []
@@ -100,7 +101,7 @@ def build(
 
 
 def validate(target: Path) -> int:
-    """The faults that `validate` finds in an archive."""
+    """Return the number of faults that `validate` finds in an archive."""
     return len(last_json(_must([*COMMAND, "validate", str(target), "--json"], (0, 3)).out)["faults"])
 
 
@@ -112,9 +113,10 @@ def _must(command: list[str], codes: tuple[int, ...] = (0,)) -> Watched:
 
 
 def stage_peaks(stages: dict[str, float], samples: list[Sample], seconds: float) -> dict[str, int]:
-    """Most memory during each stage [bytes], sum of PSS.
+    """Return the maximum memory during each stage [bytes], sum of PSS.
 
-    Stages follow one another and end with the command, about: what was in none is taken to come before them.
+    Stages are assumed to be consecutive and to end with the command; time outside all stages comes
+    before them.
     """
     named = {name: spent for name, spent in stages.items() if name != REST}
     ends = list(itertools.accumulate(named.values()))
@@ -130,15 +132,19 @@ def stage_peaks(stages: dict[str, float], samples: list[Sample], seconds: float)
 
 
 def linearity(built: dict[int, list[Built]]) -> dict[tuple[int, int], float]:
-    """Seconds a point of each size over those of the size before it, medians: (smaller, larger) -> ratio."""
+    """Return ratios of seconds per point between consecutive sizes.
+
+    (smaller, larger) -> ratio of the medians.
+    """
     spent = {points: _median_seconds(runs) / points for points, runs in sorted(built.items())}
     return {(small, large): spent[large] / spent[small] for small, large in itertools.pairwise(spent)}
 
 
 def marginal(built: dict[int, list[Built]]) -> dict[tuple[int, int], float]:
-    """Seconds that each further point takes from one size to the next, medians: (smaller, larger) -> seconds.
+    """Return the seconds per additional point between consecutive sizes.
 
-    What does not grow with the scan, the command's start above all, is in none of them.
+    (smaller, larger) -> seconds, from medians. Constant costs, above all the command's start, are
+    excluded.
     """
     spent = {points: _median_seconds(runs) for points, runs in sorted(built.items())}
     return {
@@ -153,12 +159,12 @@ def _median_seconds(runs: list[Built]) -> float:
 
 
 def median_run(runs: list[Built]) -> Built:
-    """The run whose time is the median, the slower of two."""
+    """Return the run with the median time, the slower of two."""
     return sorted(runs, key=lambda run: run.seconds)[len(runs) // 2]
 
 
 def report(built: Built) -> dict[str, Any]:
-    """A build for the JSON, its memory over time included."""
+    """Return a build for the JSON, its memory over time included."""
     return {
         "points": built.points,
         "step": built.step,

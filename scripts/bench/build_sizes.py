@@ -1,4 +1,4 @@
-"""Bytes a point of archives, beside LAZ of the same xyz on the same lattice."""
+"""Bytes per point of archives, and of LAZ of the same xyz on the same lattice."""
 
 import os
 import shutil
@@ -10,27 +10,27 @@ from numpy.typing import NDArray
 from solidcloud.builder.sources.files import open_scans, scan_files
 from solidcloud.schemas.archive import Archive
 
-# The real scans that are built, of the folder that SOLIDCLOUD_SCANS names.
+# Real scans to build, in the folder that SOLIDCLOUD_SCANS names.
 REAL_SCANS = (
     "indoor_atrium.laz", "pumpA.e57", "cupola_las", "octomap_hall.xyz", "campus_scan_a.ply", "lone_star.copc.laz",
 )  # fmt: skip
 
 
 def real_scans() -> list[Path]:
-    """Those of REAL_SCANS that are here."""
+    """Return those of REAL_SCANS that exist here."""
     folder = os.environ.get("SOLIDCLOUD_SCANS")
     return [path for name in REAL_SCANS if folder and (path := Path(folder) / name).exists()]
 
 
 def archive_bytes(folder: Path) -> int:
-    """Of an archive's index and shards."""
+    """Return the size of an archive's index and shards [bytes]."""
     return sum(path.stat().st_size for path in folder.rglob("*.h5"))
 
 
 def quantised(scans: Path, archive: Path) -> NDArray[np.int64]:
-    """The points of a file or folder (n, 3) on an archive's lattice, in the order they were scanned.
+    """Return the points of a file or folder (n, 3) on an archive's lattice, in scan order.
 
-    Raises ValueError when they are not as many as the archive holds.
+    Raises ValueError when their number differs from the archive's.
     """
     with Archive(archive) as opened:
         lattice, expected = opened.header.lattice, opened.header.points
@@ -47,9 +47,10 @@ def quantised(scans: Path, archive: Path) -> NDArray[np.int64]:
 
 
 def laz_bytes(points: NDArray[np.int64], folder: Path) -> int:
-    """Size of a LAZ file of these lattice integers (n, 3) and nothing else, header included.
+    """Return the size of a LAZ file of only these lattice integers (n, 3), header included.
 
-    Point format 0 cannot leave out intensity, returns, class and source; being all zero they take about nothing.
+    Point format 0 cannot omit intensity, returns, class and source; being all zero they compress to
+    almost nothing.
     """
     low = points.min(axis=0)
     if int((points - low).max()) >= 1 << 31:
@@ -68,7 +69,7 @@ def laz_bytes(points: NDArray[np.int64], folder: Path) -> int:
 
 
 def beside_laz(scans: Path, archive: Path, folder: Path) -> tuple[int, int]:
-    """Bytes of an archive, and of LAZ of the same xyz in the order of the scan."""
+    """Return the bytes of an archive, and of LAZ of the same xyz in scan order."""
     folder.mkdir(parents=True, exist_ok=True)
     try:
         return archive_bytes(archive), laz_bytes(quantised(scans, archive), folder)

@@ -1,7 +1,8 @@
-"""A command, watched from outside: memory of all its processes together, processor time, and who else had a core.
+"""Observation of a command from outside: memory and processor time of all its processes, other load.
 
-Memory is PSS, of which a page that k processes share counts 1/k in each: summed over a tree of processes it is what
-they take together. Anonymous memory alone leaves out what is mapped from files, which the system can take back.
+Memory is PSS, in which a page shared by k processes counts 1/k in each; the sum over a process tree
+is its total memory. Anonymous memory alone excludes pages mapped from files, which the system can
+reclaim.
 """
 
 import json
@@ -14,16 +15,22 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 PROC = Path("/proc")
-# Between two looks [s]: an array that lives shorter is missed, and the kernel frees none of ours in less.
+# Sampling period [s]: a shorter-lived array is missed; the builder frees no array that fast.
 PERIOD = 0.05
-# The mappings, and who belongs to the tree (5 ms for all processes of a machine), are looked up this often [s]; the
-# mappings (2 to 5 ms a process) also whenever the peak has risen by a hundredth, as the cheap count of pages says.
+# Period of reading the mappings and the process tree [s]; finding the tree takes 5 ms for all
+# processes of a machine. The mappings (2 to 5 ms per process) are also read whenever the
+# inexpensive resident page count indicates a peak higher by a hundredth.
 FULL_PERIOD = 0.5
 PEAK_STEP = 1.01
 
 
 class Sample(NamedTuple):
-    """One look. at: since the start [s].  pss, anonymous: of the tree [bytes].  processes: in it."""
+    """One sample.
+
+    at: since the start [s].
+    pss, anonymous: of the process tree [bytes].
+    processes: number of processes in the tree.
+    """
 
     at: float
     pss: int
@@ -33,10 +40,15 @@ class Sample(NamedTuple):
 
 @dataclass
 class Watched:
-    """What a command took. seconds: on the clock.  cpu: of all its processes [s].
+    """Resources of a command.
 
-    others: cores that other work had meanwhile, on average; None where the system does not say.
-    samples: looks, in order.  looking: share of a core that looking took.  out, err, code: of the command.
+    seconds: wall time.
+    cpu: of all its processes [s].
+    others: mean number of cores that other work used meanwhile; None where the system does not
+    report it.
+    samples: in order.
+    looking: share of a core that the sampling took.
+    out, err, code: of the command.
     """
 
     seconds: float
@@ -50,17 +62,17 @@ class Watched:
 
     @property
     def peak(self) -> int | None:
-        """Most memory at one moment, sum of PSS [bytes]; None where it could not be seen."""
+        """Return the maximum memory at one moment, sum of PSS [bytes]; None where it is unknown."""
         return max((s.pss for s in self.samples), default=None)
 
     @property
     def peak_anonymous(self) -> int | None:
-        """Most anonymous memory at one moment [bytes]."""
+        """Return the maximum anonymous memory at one moment [bytes]."""
         return max((s.anonymous for s in self.samples), default=None)
 
 
 def parse_rollup(text: str) -> tuple[int, int]:
-    """PSS and anonymous memory [bytes] of a process's smaps_rollup."""
+    """Return PSS and anonymous memory [bytes] from a process's smaps_rollup."""
     found = {"Pss": 0, "Anonymous": 0}
     for line in text.splitlines():
         name, _, rest = line.partition(":")
@@ -70,12 +82,12 @@ def parse_rollup(text: str) -> tuple[int, int]:
 
 
 def parse_parent(text: str) -> int:
-    """The parent named in a process's stat; its own name, in brackets, may hold anything."""
+    """Return the parent process from a process's stat; the name in brackets there may hold anything."""
     return int(text[text.rindex(")") + 1 :].split()[1])
 
 
 def family(root: int, parents: dict[int, int]) -> list[int]:
-    """`root` and all that descend from it, of process -> parent."""
+    """Return `root` and all its descendants, from process -> parent."""
     children: dict[int, list[int]] = {}
     for child, parent in parents.items():
         children.setdefault(parent, []).append(child)
@@ -92,12 +104,12 @@ def _parents() -> dict[int, int]:
             try:
                 found[int(entry)] = parse_parent((PROC / entry / "stat").read_text())
             except (OSError, ValueError, IndexError):
-                continue  # it ended while we looked
+                continue  # the process has ended meanwhile
     return found
 
 
 def _resident(process: int) -> int:
-    """Resident memory [bytes], shared pages in full: never less than PSS, and cheap."""
+    """Return resident memory [bytes] with shared pages in full: at least PSS, and inexpensive."""
     try:
         return int((PROC / str(process) / "statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
     except (OSError, IndexError):
@@ -112,7 +124,7 @@ def _proportional(process: int) -> tuple[int, int]:
 
 
 def _machine_busy() -> float | None:
-    """Processor time that anyone had since the machine started [s]."""
+    """Return the total processor time used since the machine started [s]."""
     try:
         fields = (PROC / "stat").read_text().split("\n", 1)[0].split()[1:]
     except OSError:
@@ -122,7 +134,7 @@ def _machine_busy() -> float | None:
 
 
 class _Looker(threading.Thread):
-    """Looks at a tree of processes until told to stop."""
+    """Thread that samples a process tree until it is stopped."""
 
     def __init__(self, root: int, begin: float) -> None:
         super().__init__(daemon=True)
@@ -132,7 +144,8 @@ class _Looker(threading.Thread):
         self.done = threading.Event()
 
     def run(self) -> None:
-        # shared: by how much resident memory, in which shared pages count in full, was above PSS at the last full look.
+        # shared: difference of resident memory, in which shared pages count in full, and PSS at the
+        # last full sample.
         peak, last, tree, shared = 0, -FULL_PERIOD, [self.root], 0
         while not self.done.is_set():
             begin, cost = time.perf_counter(), time.thread_time()
@@ -152,7 +165,7 @@ class _Looker(threading.Thread):
 
 
 def watch(command: list[str], cwd: Path | None = None) -> Watched:
-    """Run a command to its end and say what it took; it is for the caller to look at the exit code."""
+    """Run a command to its end and return its resources; the caller checks the exit code."""
     busy, own = _machine_busy(), sum(os.times()[:2])
     begin = time.perf_counter()
     with subprocess.Popen(
@@ -177,6 +190,6 @@ def watch(command: list[str], cwd: Path | None = None) -> Watched:
 
 
 def last_json(text: str) -> dict[str, Any]:
-    """The JSON object that a command printed, whatever lines stand before it."""
+    """Return the JSON object that a command printed after any other lines."""
     at = 0 if text.startswith("{") else text.index("\n{") + 1
     return json.loads(text[at:])

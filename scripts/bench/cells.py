@@ -1,7 +1,8 @@
-"""Section `cells`: the plain octree at several sizes of cell, and cells merged too until all trees have one height.
+"""Section `cells`: the plain octree with several cell sizes, and cells merged to equal tree heights.
 
-The future work of [Fig12] section 8, and the reason for the default of `BuildConfig.cell_points`; only when asked for
-(--only cells). Its poses are the same in every repetition: nothing is kept between calls.
+This is the future work of [Fig12] section 8, and the reason for the default of
+`BuildConfig.cell_points`. It runs only on request (--only cells). Its poses are the same in every
+repetition: nothing is kept between calls.
 """
 
 from solidcloud.server.report.case import PAPER_VOXEL, STEP, made_case
@@ -21,7 +22,7 @@ def run(bench: Bench, clock: Clock) -> Part:
         scratch.mkdir()
         case = made_case(scratch, voxel)
         group = f"voxel {voxel:g} m"
-        # Raises when two plans answer differently.
+        # Raises when two plans give different answers.
         for plan in compare_cells(case, scratch, max(1, bench.loops), say):
             heights = ", ".join(f"{cells} of height {levels}" for levels, cells in plan.heights.items())
             part.add(group, plan.name, COLLIDE, plan.loops / len(case.poses) * 1e6, "µs", len(case.poses))

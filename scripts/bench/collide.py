@@ -1,4 +1,4 @@
-"""Section `collide`: stateless, one core, the walk and its classes of poses, beside every peer."""
+"""Section `collide`: stateless, one core, the walk and its classes of poses, against every peer."""
 
 import time
 
@@ -17,7 +17,7 @@ TABLE_PART, CAPT_PART, FAR_MOST, CONTACT_MOST = 0.25, 0.15, 2.0, 10.0
 
 
 def pose_sets(bench: Bench) -> list[PoseSet]:
-    """The walk, its classes, and far poses where the walk holds none."""
+    """Return the walk, its classes, and far poses where the walk has none."""
     place = bench.facade
     walk = bench.walk
     contact = place.contact(walk)
@@ -41,14 +41,15 @@ def pose_sets(bench: Bench) -> list[PoseSet]:
 
 
 def run(bench: Bench, clock: Clock) -> Part:
-    """Time them all."""
+    """Time all sets."""
     part = Part("collide")
     place = bench.facade
     sets = pose_sets(bench)
     part.remarks += place.settings()
     clock.restart()
     for k, poses in enumerate(sets):
-        # The walk first, for as many repetitions as asked; the rest share what time is left.
+        # The walk comes first, with the requested number of repetitions; the rest share the
+        # remaining time.
         compare_set(part, CASE, place, poses, bench.loops, clock, bench.rng, 0.6 if k == 0 else 0.5)
     walk = f"{CASE}, {WALK}"
     contact = place.contact(bench.walk)

@@ -1,4 +1,4 @@
-"""What the sections share, made once when first asked for: the façade, its archives, and every side opened on it."""
+"""State that the sections share, created on first use: the façade, its archives, the opened sides."""
 
 import argparse
 from collections.abc import Callable
@@ -18,14 +18,17 @@ from .results import Part
 from .sides import OURS, Place
 
 T = TypeVar("T")
-RATE = 30.0  # frames a second of the walk: 1,200 poses
+RATE = 30.0  # frames per second of the walk: 1,200 poses
 
 
 class Bench:
     """One run of the benchmark.
 
-    options: the command line.  folder: scratch.  program: of the peers, or why there is none.  stack: closes what is
-    opened.  rng: of every jitter.
+    options: the command line.
+    folder: scratch.
+    program: of the peers, or the reason for its absence.
+    stack: closes everything opened.
+    rng: of every jitter.
     """
 
     def __init__(
@@ -37,22 +40,22 @@ class Bench:
 
     @cached_property
     def truth(self) -> FacadeTruth:
-        """Of the façade; its own frame is the world."""
+        """Return the truth of the façade; its own frame is the world."""
         return build_facade().truth
 
     @cached_property
     def avatar(self) -> Floats:
-        """The figure of 3,617 points."""
+        """Return the figure of 3,617 points."""
         return figure_points()
 
     @cached_property
     def walk(self) -> Floats:
-        """The walk of 1,200 poses."""
+        """Return the walk of 1,200 poses."""
         return walk_at(self.truth, RATE)
 
     @cached_property
     def archives(self) -> dict[int, Path]:
-        """Voxel [m] -> archive of the façade; those given, or made."""
+        """Return voxel [m] -> archive of the façade, from the command line or generated."""
         given: list[Path] = self.options.facade
         if given:
             return dict(zip((32, 8), given, strict=True))
@@ -60,18 +63,18 @@ class Bench:
 
     @cached_property
     def facade(self) -> Place:
-        """The façade with every side ready."""
+        """Return the façade with every side ready."""
         archives = {our_name(voxel): path for voxel, path in self.archives.items()}
         return Place(archives, self.avatar, self.walk, self.program, self.folder / "peers", self.stack)
 
 
 def our_name(voxel: int) -> str:
-    """What our side is called with voxels of this size [m]."""
+    """Return the name of our side with voxels of this size [m]."""
     return f"{OURS}, voxel {voxel} m"
 
 
 def attempt(part: Part, what: str, call: Callable[[], T]) -> T | None:
-    """What `call` gives; None where this engine does not answer that question yet, which is then said."""
+    """Return the result of `call`; None, with a note in `part`, where this engine lacks the query."""
     try:
         return call()
     except NotImplementedError as error:

@@ -1,4 +1,7 @@
-"""The definition of contact, every pair of points in integers (NUMERICS.md N5): it knows no voxel, tree or float32."""
+"""The definition of contact over every pair of points in integers (NUMERICS.md N5).
+
+It uses no voxel, no tree and no float32.
+"""
 
 from collections.abc import Sequence
 
@@ -6,16 +9,20 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-UNITS = 2.0**26  # exact units a metre
+UNITS = 2.0**26  # exact units per metre
 
 
 @nb.njit
 def pairs_touch(a: NDArray[np.int64], b: NDArray[np.int64], reach: int) -> bool:
-    """Whether any of a (m, 3) and any of b (n, 3) are within reach, all in exact units, tangency included."""
+    """Return whether any of a (m, 3) and any of b (n, 3) are within reach.
+
+    All values are in exact units; tangency counts.
+    """
     for i in range(a.shape[0]):
         for j in range(b.shape[0]):
             x, y, z = a[i, 0] - b[j, 0], a[i, 1] - b[j, 1], a[i, 2] - b[j, 2]
-            # Farther along one axis is farther; the squares of the others fit 63 bits.
+            # A pair farther apart along one axis is farther apart; the squares of the other pairs
+            # fit into 63 bits.
             if (
                 abs(x) <= reach
                 and abs(y) <= reach
@@ -28,7 +35,7 @@ def pairs_touch(a: NDArray[np.int64], b: NDArray[np.int64], reach: int) -> bool:
 
 @nb.njit
 def least_distance(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
-    """Least distance of any of a (m, 3) and any of b (n, 3) by all pairs, float64."""
+    """Return the least distance of any of a (m, 3) and any of b (n, 3) over all pairs, float64."""
     least = np.inf
     for i in range(a.shape[0]):
         for j in range(b.shape[0]):
@@ -38,10 +45,12 @@ def least_distance(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
 
 
 class Judge:
-    """The definition, over the points of a scan.
+    """The definition of contact, over the points of a scan.
 
-    points: (n, 3) float64 world [m].  origin, step, scan_radius: as the archive declares them [m].
-    pairs: pairs of points near enough, by the box around the avatar, to be tried until one touches.
+    points: (n, 3) float64 world [m].
+    origin, step, scan_radius: as the archive declares them [m].
+    pairs: number of pairs that the box around the avatar does not rule out; they are tested until
+    one touches.
     """
 
     def __init__(self, points: NDArray[np.float64], origin: Sequence[float], step: float, scan_radius: float):
@@ -60,9 +69,10 @@ class Judge:
         *,
         all_pairs: bool = False,
     ) -> bool:
-        """Whether the avatar (m, 3) [m], with spheres of this radius, touches under a rigid pose (4, 4).
+        """Return whether the avatar (m, 3) [m] touches under a rigid pose (4, 4).
 
-        all_pairs: also those that the box around the avatar rules out; the same answer.
+        radius: of the avatar's spheres [m].
+        all_pairs: also test pairs that the box around the avatar rules out; the answer is the same.
         """
         reach = int(np.rint(radius * UNITS)) + self._scan_radius
         placed = np.empty((len(avatar), 3), np.int64)

@@ -1,4 +1,4 @@
-"""What effects cost: the 40-second walk, a frame at a time in this process, under every set of effects."""
+"""Cost of effects: the 40-second walk, frame by frame in this process, under every set of effects."""
 
 import time
 from collections.abc import Sequence
@@ -35,7 +35,7 @@ Floats = NDArray[np.float64]
 STOP, SWEEP, SLIDE, STEP, GROUND = Stop(), Sweep(), Slide(), Step(), Ground()
 WALKING: tuple[AnyEffect, ...] = (STOP, SWEEP, SLIDE, STEP, GROUND)
 EVERYTHING: tuple[AnyEffect, ...] = (*WALKING, Crowd(), Proximity(), Contacts(), Uncertainty())
-# The least scene in which each effect means something.
+# The smallest scene in which each effect is active.
 ALONE: dict[str, tuple[AnyEffect, ...]] = {
     "stop": (STOP,),
     "sweep": (STOP, SWEEP),
@@ -48,21 +48,22 @@ ALONE: dict[str, tuple[AnyEffect, ...]] = {
     "contacts": (Contacts(),),
     "uncertainty": (Uncertainty(),),
 }
-# For `through`, which costs when a scene is opened: a box in the main door's arch that holds some points.
+# For `through`, whose cost arises when a scene is opened: a box in the main door's arch that holds
+# some points.
 ARCH = Through(boxes=[ThroughBox(name="arch", low=(-1.0, -0.2, 3.0), high=(1.0, 1.4, 4.5))])
 FRAME = 1 / 30
-# A viewer does not wish farther ahead of its body than this [m]: one that waits before a stair without `step` would
-# else have ever longer ways swept.
+# Maximum distance of a motion command's target from the body [m]. Without it, a viewer that waits
+# before a stair without `step` would have ever longer motions swept.
 AHEAD = 0.25
 
 
 def file_of(effects: Sequence[AnyEffect]) -> SceneFile:
-    """A scene that calls for these."""
+    """Return a scene file that declares these effects."""
     return SceneFile(format=1, archives=[ArchiveItem(path=".")], effects=list(effects))
 
 
 def towards(pose: Floats, wish: Floats) -> Floats:
-    """The wish (4, 4), no farther than AHEAD from a pose (4, 4)."""
+    """Return the target pose (4, 4) of a motion command, no farther than AHEAD from a pose (4, 4)."""
     way = wish[:3, 3] - pose[:3, 3]
     far = float(np.linalg.norm(way))
     if far <= AHEAD:
@@ -73,14 +74,14 @@ def towards(pose: Floats, wish: Floats) -> Floats:
 
 
 class Timed:
-    """An effect, and what each of its frames took [s]."""
+    """An effect, and the duration of each of its frames [s]."""
 
     def __init__(self, runner: Runner) -> None:
         self.runner, self.name = runner, runner.name
         self.seconds: list[float] = []
 
     def run(self, frame: Frame) -> None:
-        """Its part of one frame."""
+        """Run and time its part of one frame."""
         begin = time.perf_counter()
         self.runner.run(frame)
         self.seconds.append(time.perf_counter() - begin)
@@ -88,8 +89,13 @@ class Timed:
 
 @dataclass
 class Walk:
-    """What came of one walk. frames: (k,) of each frame [s].  effects: name -> (k,) of each in it [s]; of walks that
-    time them.  places: (k, 3) where the body was.  visits: node visits of all frames."""
+    """Results of one walk.
+
+    frames: (k,) duration of each frame [s].
+    effects: name -> (k,) duration of each frame in the effect [s], for timed walks.
+    places: (k, 3) positions of the body.
+    visits: node visits of all frames.
+    """
 
     frames: Floats
     effects: dict[str, Floats] = field(default_factory=dict)
@@ -98,18 +104,18 @@ class Walk:
 
 
 class Stage:
-    """One archive, resident, and pipelines of effects over it, each made once. A context manager."""
+    """One resident archive, and pipelines of effects over it, each created once. A context manager."""
 
     def __init__(self, archive: Path, avatar: AvatarModel, poses: Floats) -> None:
-        """poses: (k, 4, 4) the wishes, a frame each."""
+        """Open the archive. poses: (k, 4, 4), the target of each frame's motion command."""
         self.scene = Scene.open(archive, budget_bytes=1 << 30)
         self.avatar, self.poses = avatar, poses
         self._made: dict[str, tuple[World, Pipeline]] = {}
         self.scene.add_avatar("all", avatar.points, avatar.radius)
-        self.scene.collide("all", poses)  # everything is resident
+        self.scene.collide("all", poses)  # makes everything resident
 
     def __enter__(self) -> "Stage":
-        """The stage itself."""
+        """Return the stage."""
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -117,7 +123,7 @@ class Stage:
         self.scene.close()
 
     def pipeline(self, effects: Sequence[AnyEffect]) -> tuple[World, Pipeline]:
-        """The effects' pipeline over the archive."""
+        """Return the effects' pipeline over the archive."""
         key = " ".join(effect_name(effect) for effect in effects)
         if key not in self._made:
             file = file_of(effects)
@@ -126,7 +132,10 @@ class Stage:
         return self._made[key]
 
     def walk(self, effects: Sequence[AnyEffect], *, timed: bool = False) -> Walk:
-        """The whole walk of one user. timed: each effect, too, which adds a tenth of a microsecond to each."""
+        """Run the whole walk of one user.
+
+        timed: time each effect, which adds a tenth of a microsecond to each.
+        """
         world, pipeline = self.pipeline(effects)
         plain = pipeline.runners
         if timed:
@@ -148,9 +157,10 @@ class Stage:
         return found
 
     def crowd(self, effects: Sequence[AnyEffect], users: int) -> Floats:
-        """The walk of so many users, each some way behind the one before: what each frame of all took (k,) [s].
+        """Run the walk of several users, each some way behind the previous one.
 
-        Each begins at the next pose that is clear: the walk brushes walls on purpose.
+        Each begins at the next clear pose: the walk touches walls on purpose. Returns the duration
+        of each frame of all users (k,) [s].
         """
         pipeline = self.pipeline(effects)[1]
         apart = len(self.poses) // users

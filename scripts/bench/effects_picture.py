@@ -1,4 +1,4 @@
-"""What effects cost as one picture: the time of every frame of the walk, stacked by effect, and each effect's mean."""
+"""Picture of the cost of effects: every frame of the walk, stacked by effect, and each effect's mean."""
 
 from pathlib import Path
 
@@ -24,7 +24,11 @@ def draw(
     machine: str,
     target: Path,
 ) -> None:
-    """Write it as PNG. company: effect -> (k,) seconds of each frame.  limit: of walking [us]."""
+    """Write the picture as PNG.
+
+    company: effect -> (k,) seconds of each frame.
+    limit: of walking [us].
+    """
     pyplot = load_pyplot()
     rows = goal_rows(parts, notes)
     figure = pyplot.figure(figsize=(15, 9 if rows else 7), dpi=110, layout="constrained")
@@ -37,7 +41,7 @@ def draw(
 
 
 def _stack(axes, company: dict[str, np.ndarray], limit: float) -> None:  # type: ignore[no-untyped-def]
-    """Time of each frame, stacked in the order in which effects run."""
+    """Draw the time of each frame, stacked in the order in which effects run."""
     names = [name for name, values in company.items() if values.max() > 0]
     kernel = np.ones(SMOOTH) / SMOOTH
     values = [1e6 * np.convolve(company[name], kernel, mode="same") for name in names]
@@ -52,7 +56,7 @@ def _stack(axes, company: dict[str, np.ndarray], limit: float) -> None:  # type:
 
 
 def _means(axes, parts: list[Part]) -> None:  # type: ignore[no-untyped-def]
-    """What each effect adds alone, and takes in company."""
+    """Draw the added time of each effect alone, and its own time with all others."""
     figures = [f for part in parts for f in part.figures if f.case == "an effect"]
     names = list(dict.fromkeys(f.side for f in figures))
     alone = {f.side: f.value for f in figures if "alone" in f.what}

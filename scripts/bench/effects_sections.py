@@ -1,4 +1,4 @@
-"""The sections of bench_effects: effects alone and in company, many users, and what is not declared."""
+"""Sections of bench_effects: effects alone and combined, many users, and undeclared effects."""
 
 import statistics
 import subprocess
@@ -32,7 +32,7 @@ def _name(effects: tuple) -> str:
 
 
 def walk(stage: Stage, clock: Clock, loops: int) -> tuple[Part, dict[str, np.ndarray]]:
-    """Each set of effects in turn; and, of all together, what each effect took of each frame."""
+    """Time each set of effects in turn; for all together, also each effect in each frame."""
     part = Part("walk")
     sets = {_name(e): e for e in ((), *ALONE.values(), EVERYTHING)}
     means: dict[str, list[float]] = {name: [] for name in sets}
@@ -72,7 +72,7 @@ def walk(stage: Stage, clock: Clock, loops: int) -> tuple[Part, dict[str, np.nda
 
 
 def _counts(stage: Stage) -> str:
-    """How much was looked at, a frame."""
+    """Return the work counts of a frame."""
     found = stage.walk(WALKING)
     far = np.linalg.norm(found.places[:, :2] - stage.poses[:, :2, 3], axis=1)
     return (
@@ -82,7 +82,7 @@ def _counts(stage: Stage) -> str:
 
 
 def users(stage: Stage, clock: Clock, loops: int) -> Part:
-    """Many users in one frame; with `crowd` they jam at the door, through which the walk goes both ways."""
+    """Time many users in one frame; with `crowd` they jam at the door, which the walk passes both ways."""
     part = Part("users")
     for effects in (WALKING, (*WALKING, Crowd())):
         stage.crowd(effects, USERS)
@@ -101,7 +101,7 @@ def users(stage: Stage, clock: Clock, loops: int) -> Part:
 
 
 def through(archive: Path, loops: int) -> Part:
-    """Opening a scene with a box and without; then nothing differs but the points that are there."""
+    """Time opening a scene with a box and without; afterwards the scenes differ only in their points."""
     part = Part("through")
     took: dict[str, list[float]] = {"without": [], "with a box": []}
     for _ in range(loops):
@@ -115,7 +115,7 @@ def through(archive: Path, loops: int) -> Part:
 
 
 class Child:
-    """A process that walks when it is told to, and says how long a frame took on average [us]."""
+    """A process that walks on command and reports the mean duration of a frame [us]."""
 
     def __init__(self, script: Path, archive: Path, everything: bool) -> None:
         options = ["--child", str(archive), "everything" if everything else "alone"]
@@ -124,18 +124,18 @@ class Child:
         )
 
     def turn(self) -> float:
-        """One walk."""
+        """Run one walk; return its mean frame [us]."""
         assert self._process.stdin is not None and self._process.stdout is not None
         print("walk", file=self._process.stdin, flush=True)
         return float(self._process.stdout.readline())
 
     def close(self) -> None:
-        """End it."""
+        """End the process."""
         self._process.communicate()
 
 
 def undeclared(script: Path, archive: Path, clock: Clock) -> Part:
-    """The same scene beside all that it does not declare, and without; in turn, first the one, then the other."""
+    """Time the same scene with all undeclared effects loaded, and without; alternating."""
     part = Part("undeclared")
     children = [Child(script, archive, everything) for everything in (False, True)]
     try:
@@ -164,7 +164,7 @@ def undeclared(script: Path, archive: Path, clock: Clock) -> Part:
 
 
 def child(archive: Path, everything: bool, stage: Stage) -> None:
-    """A child's work: a walk for each line it reads."""
+    """Run the child process: one walk for each line it reads."""
     other = Stage(archive, stage.avatar, stage.poses) if everything else None
     if other is not None:
         other.walk(EVERYTHING)

@@ -1,8 +1,9 @@
-"""Section `growth`: the same walk in the first façade of ever larger towns, as dense as one another, all resident.
+"""Section `growth`: the same walk in the first façade of growing towns of equal density, all resident.
 
-Towns are of whole façades of the paper's 587,923 points: 2, 17 and 170 of them hold 1.2, 10 and 100 million points.
-A town that is made stays in the folder of --growth, as `town-N` beside `town-N.truth.json`; the 100 million points
-take long to make, so they are only asked for with --growth.
+Towns consist of whole façades of the paper's 587,923 points: 2, 17 and 170 of them hold 1.2, 10 and
+100 million points. A generated town stays in the folder of --growth, as `town-N` beside
+`town-N.truth.json`. The 100 million points take long to generate and are only measured with
+--growth.
 """
 
 import shutil
@@ -32,7 +33,7 @@ CASE = "growth"
 
 
 def town(folder: Path, facades: int) -> tuple[Path, Path]:
-    """The archive of a town of so many façades and its truth; made where the folder has none."""
+    """Return the archive of a town of this many façades and its truth; generate it where it is missing."""
     points = facades * POINTS_PER_FACADE
     archive, truth = folder / f"town-{points}", folder / f"town-{points}.truth.json"
     if not (archive / "index.h5").exists() or not truth.exists():
@@ -48,7 +49,7 @@ def town(folder: Path, facades: int) -> tuple[Path, Path]:
 
 
 def _tenths() -> Callable[[int, int], None]:
-    """Progress that says something every tenth of the way."""
+    """Return a progress callback that reports every tenth."""
     said = 0
 
     def progress(done: int, of: int) -> None:
@@ -97,7 +98,7 @@ def run(bench: Bench, clock: Clock) -> Part:
 
 
 def _describe(part: Part, scene: Scene, name: str, walk: np.ndarray) -> None:
-    """What the walk meets in this town, so that equal density can be seen."""
+    """Add the work of the walk in this town, which shows that the density is equal."""
     info = scene.info()
     answers = scene.collide("avatar", walk)
     part.add(name, OURS, "voxels, all resident", float(info.voxels), "")

@@ -1,4 +1,4 @@
-"""Section `hard`: the façade again, with poses that are hard for a hierarchy; every side beside ours."""
+"""Section `hard`: the façade with poses that are hard for a hierarchy; every side beside ours."""
 
 import numpy as np
 
@@ -13,7 +13,7 @@ COUNT = 300
 
 
 def pose_sets(bench: Bench) -> list[PoseSet]:
-    """The hard poses; the façade's own frame is the world."""
+    """Return the hard poses; the façade's own frame is the world."""
     place, avatar, rng = bench.facade, bench.avatar, bench.rng
     say("making the hard poses")
     points = place.case.points + place.case.origin

@@ -1,4 +1,4 @@
-"""The machine that is measured: one core or all, what else runs on it, and how long a section may take."""
+"""The machine under measurement: one core or all, other load, and the time limits of sections."""
 
 import os
 import platform
@@ -8,19 +8,20 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-# Above this load other work disturbs the figures.
+# Load average above which other work disturbs the figures.
 BUSY = 0.5
-# Until a process that has answered waits for its next question, and the threads of a library stop spinning [s].
+# Time for a process that has answered to become idle, and for a library's threads to stop spinning
+# [s].
 SETTLE = 0.005
 
 
 def say(message: str) -> None:
-    """Progress, on standard error."""
+    """Print progress on standard error."""
     print(message, file=sys.stderr, flush=True)
 
 
 def load_average() -> float:
-    """What else runs here, as the system counts it; says so where it disturbs."""
+    """Return the system's load average; print a warning where it disturbs the figures."""
     load = os.getloadavg()[0]
     if load > BUSY:
         say(f"load average {load:.1f}: other work runs here, so figures scatter; the best less")
@@ -28,7 +29,7 @@ def load_average() -> float:
 
 
 def pin() -> int | None:
-    """Keep this process, and those it starts, on one core. None where the system cannot."""
+    """Pin this process and its children to one core; return the core, None where the system cannot."""
     if not hasattr(os, "sched_setaffinity"):
         say("this system cannot keep a process on one core: figures will scatter more")
         return None
@@ -39,12 +40,12 @@ def pin() -> int | None:
 
 @contextmanager
 def cores(wanted: int | None) -> Iterator[int]:
-    """Inside, this process and those it starts then may use so many cores, None: all there are. Gives how many."""
+    """Allow this process and its children this many cores, None: all; yield the number."""
     if not hasattr(os, "sched_setaffinity"):
         yield os.cpu_count() or 1
         return
     before = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, range(os.cpu_count() or 1))  # the system leaves out those that are not ours
+    os.sched_setaffinity(0, range(os.cpu_count() or 1))  # the system ignores cores that are not available
     try:
         allowed = sorted(os.sched_getaffinity(0))
         os.sched_setaffinity(0, set(allowed[-wanted:] if wanted else allowed))
@@ -54,7 +55,7 @@ def cores(wanted: int | None) -> Iterator[int]:
 
 
 def cpu_name() -> str:
-    """What the processor calls itself."""
+    """Return the processor's name."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:
@@ -65,7 +66,7 @@ def cpu_name() -> str:
 
 
 def others_running() -> int | None:
-    """How many processes or threads but this one want a core at this moment; None where the system does not say."""
+    """Return how many other processes or threads want a core now; None where this is unknown."""
     try:
         running = Path("/proc/loadavg").read_text().split()[3]
     except OSError:
@@ -74,9 +75,10 @@ def others_running() -> int | None:
 
 
 class Clock:
-    """How long a section may take [s]: it repeats while there is time, and once in any case.
+    """Time limit of a section [s]: repeats while there is time, but at least once.
 
-    others: how many others wanted a core, each time it was looked at; what we started waits at these moments.
+    others: number of other processes that wanted a core, at each check; our own processes are idle
+    at these moments.
     """
 
     def __init__(self, seconds: float, others: list[int] | None = None) -> None:
@@ -85,11 +87,11 @@ class Clock:
         self._start = time.perf_counter()
 
     def restart(self) -> None:
-        """Begin now: what came before was preparing."""
+        """Restart the clock after preparation."""
         self._start = time.perf_counter()
 
     def look_around(self) -> None:
-        """Count who else wants a core, once the side that had its turn has gone to sleep."""
+        """Count the other processes that want a core, once the last side has become idle."""
         time.sleep(SETTLE)
         found = others_running()
         if found is not None:
@@ -97,21 +99,24 @@ class Clock:
 
     @property
     def busy(self) -> float:
-        """How many others wanted a core, on average; 0 where it is not known."""
+        """Return the mean number of others that wanted a core; 0 where it is unknown."""
         return sum(self.others) / len(self.others) if self.others else 0.0
 
     @property
     def spent(self) -> float:
-        """Since the section began [s]."""
+        """Return the time since the section began [s]."""
         return time.perf_counter() - self._start
 
     @property
     def left(self) -> float:
-        """Until the section should end [s]; negative when it is late."""
+        """Return the time until the section should end [s]; negative when it is over."""
         return self.seconds - self.spent
 
     def loops(self, most: int, share: float = 1.0) -> Iterator[int]:
-        """0, 1, ... below `most`, ending early when another one would not fit into this share of what is left now."""
+        """Yield 0, 1, ... below `most`; end early when another loop would exceed the time.
+
+        share: of the time left now.
+        """
         begin, limit = time.perf_counter(), self.left * share
         for k in range(most):
             passed = time.perf_counter() - begin

@@ -1,4 +1,4 @@
-"""Section `memory`: bytes a point that is resident, and how soon a voxel's record is."""
+"""Section `memory`: resident bytes per point, and the time to load a voxel's record."""
 
 import time
 
@@ -35,7 +35,7 @@ def run(bench: Bench, clock: Clock) -> Part:
 
 
 def _loads(bench: Bench, clock: Clock, part: Part, store: Store, name: str) -> float:
-    """From the bytes of a record to a resident voxel [ms], of the largest voxel; the file is in the system's cache."""
+    """Time loading the largest voxel [ms], from its record's bytes, with the file in the page cache."""
     row = int(np.argmax(store.sizes))
     arena = ArenaBuffer(ArenaBuffer.rounded(int(store.sizes[row]))).arena
     read, decoded, whole = [], [], []

@@ -1,4 +1,4 @@
-"""What was tried where a goal is not reached, or how its figure is to be read: shown beside it, by the goal's key."""
+"""Notes on missed targets and on the reading of figures, shown beside them, by the target's key."""
 
 NOTES: dict[str, str] = {
     "distance collide": (

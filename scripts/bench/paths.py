@@ -16,7 +16,7 @@ from .poses import Floats, jittered, walk_at
 from .results import Part
 
 THREADS = 2
-RATE = 600.0  # frames a second of the walk: 24,000 poses, so that neither end of a request counts
+RATE = 600.0  # frames per second of the walk: 24,000 poses make start and end of a request negligible
 IN_PROCESS, OVER_ZENOH = 100_000.0, 50_000.0
 CASE = "walk at 600 frames/s"
 
@@ -47,7 +47,7 @@ def _time(
     walk: Walk,
     expected: np.ndarray,
 ) -> float:
-    """Poses a second, all answers taken."""
+    """Measure poses per second, with all answers received."""
     verdicts = np.concatenate([answers.verdict for answers in walk(poses)])
     if not np.array_equal(verdicts, expected):
         part.wrong.append(f"{name}, {what}: verdicts are not those of collide")
@@ -62,7 +62,7 @@ def _time(
 
 
 def _in_process(bench: Bench, clock: Clock, part: Part, name: str, archive: Path, poses: Floats) -> None:
-    with Scene.open(archive) as scene:  # a scene of its own, so that its threads may use all cores
+    with Scene.open(archive) as scene:  # a separate scene, whose threads may use all cores
         scene.add_avatar("avatar", bench.avatar)
         expected = scene.collide("avatar", poses).verdict
         for threads in (1, THREADS):

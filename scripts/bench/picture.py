@@ -1,4 +1,4 @@
-"""The benchmark as one picture: sides on the walk, every set of poses, growth, and the goals as a table."""
+"""Picture of the benchmark: sides on the walk, every set of poses, growth, and the targets as a table."""
 
 import textwrap
 from pathlib import Path
@@ -26,7 +26,7 @@ INK, FAINT = "#222222", "#777777"
 
 
 def draw(parts: list[Part], notes: dict[str, str], machine: str, target: Path) -> None:
-    """Write the picture as PNG; panels whose section did not run stay away."""
+    """Write the picture as PNG, without the panels of sections that did not run."""
     pyplot = load_pyplot()
     figures = [f for part in parts for f in part.figures if f.what == COLLIDE]
     walk = [f for f in figures if f.section == "collide" and f.case.endswith(", walk")]
@@ -53,7 +53,7 @@ def draw(parts: list[Part], notes: dict[str, str], machine: str, target: Path) -
 
 
 def write_picture(figure: Any, title: str, parts: list[Part], target: Path) -> None:
-    """Write the figure as PNG, and let it go. Its title says so where the machine was busy in one of the parts."""
+    """Write the figure as PNG and close it; the title says where the machine was busy in a part."""
     warning = busy(parts)
     if warning:
         title += f"\n{warning}: not figures to quote"
@@ -73,7 +73,7 @@ def _ours(figures: list[Figure]) -> list[str]:
 
 
 def _plain(axes: Any, axis: str = "x") -> None:
-    """A log axis with plain numbers, and no frame."""
+    """Format a log axis with plain numbers and no frame."""
     chosen = getattr(axes, f"{axis}axis")
     chosen.set_major_formatter(FuncFormatter(lambda v, _: f"{v:,.0f}" if v >= 1 else f"{v:g}"))
     chosen.set_minor_formatter(NullFormatter())
@@ -83,7 +83,7 @@ def _plain(axes: Any, axis: str = "x") -> None:
 
 
 def _bars(axes: Any, walk: list[Figure]) -> None:
-    """Microseconds a pose of each side, and where the goals lie."""
+    """Draw microseconds per pose of each side, and the targets."""
     ours = _ours(walk)
     order = sorted(walk, key=lambda f: f.value)
     values = [f.value for f in order]
@@ -112,7 +112,7 @@ def _bars(axes: Any, walk: list[Figure]) -> None:
 
 
 def _sets(axes: Any, sets: list[Figure], cases: list[str]) -> None:
-    """Every set of poses: a dot a side."""
+    """Draw every set of poses: one dot per side."""
     ours = _ours([f for f in sets if f.section != "scans"])
     for side in dict.fromkeys(f.side for f in sets):
         own = [f for f in sets if f.side == side]
@@ -141,7 +141,7 @@ def _sets(axes: Any, sets: list[Figure], cases: list[str]) -> None:
 
 
 def _growth(axes: Any, growth: list[Figure]) -> None:
-    """Mean over the size of the scene, beside 1.3 times the first."""
+    """Draw the mean over the size of the scene, and 1.3 times the first."""
     sizes = [float(f.case.split()[0].replace(",", "")) for f in growth]
     values = [f.value for f in growth]
     axes.plot(sizes, values, "o-", color=COLOURS[OURS], lw=1.8)
@@ -172,7 +172,7 @@ def _growth(axes: Any, growth: list[Figure]) -> None:
 
 
 def goals_table(axes: Any, rows: list[dict[str, Any]], height: float) -> None:
-    """The goals: what was asked for, what was measured, met or missed."""
+    """Draw the targets: target, measurement, met or missed."""
     axes.set_axis_off()
     axes.set(xlim=(0, 1), ylim=(0, 1))
     line = min(0.3 / height, 0.94 / (len(rows) + 2))

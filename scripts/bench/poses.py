@@ -1,4 +1,4 @@
-"""The poses that are asked about: jittered, sorted into classes, and sets made to be hard."""
+"""Query poses: jittered, sorted into classes, and sets designed to be hard."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -11,20 +11,21 @@ from solidcloud.builder.made.walk import floor_height, walk_poses
 
 Floats = NDArray[np.float64]
 
-JITTER = 1e-6  # [m], each repetition: no pose comes twice, none moves visibly
-FAR = 0.5  # a far pose is farther than this from anything [m]
+JITTER = 1e-6  # [m] per repetition: no pose occurs twice, none moves visibly
+FAR = 0.5  # a far pose is farther than this from all points [m]
 SOLE = 0.03  # feet above the floor, as on the walk [m]
-SLIDING = 0.01  # between the nearest spheres of a wall and of an avatar that slides along it [m]
-# About the height at which the feet touch the floor exactly [m]; 15 nm is the exact unit.
+SLIDING = 0.01  # gap between the nearest spheres of a wall and an avatar that slides along it [m]
+# Offsets from the height at which the feet touch the floor exactly [m]; 15 nm is the exact unit.
 FOOT_STEPS = (-1e-3, -1e-4, -1e-5, -1e-6, -3e-8, 0.0, 3e-8, 1e-6, 1e-5, 1e-4, 1e-3)
 WALK_SECONDS = 40.0
-# Of `near_surfaces`: how far around a figure it is moved out of, and what gap is left [m].
+# Parameters of `near_surfaces`: the surroundings out of which a figure is moved, and the gap left
+# [m].
 AROUND, LEFT = 0.3, (-0.005, 0.05)
-PILOT = 200  # poses asked to find the distance at which half of them touch
+PILOT = 200  # poses tried to find the distance at which half of them touch
 
 
 class PoseSet(NamedTuple):
-    """Poses (k, 4, 4), avatar to world, under a name; said: one sentence of what they are."""
+    """Named poses (k, 4, 4), avatar to world; said: a one-sentence description."""
 
     name: str
     poses: Floats
@@ -32,19 +33,19 @@ class PoseSet(NamedTuple):
 
 
 def jittered(poses: Floats, rng: np.random.Generator, size: float = JITTER) -> Floats:
-    """The poses, each moved along each axis by at most `size` [m], at random; a new array."""
+    """Return a copy of the poses, each moved at random along each axis by at most `size` [m]."""
     moved = poses.copy()
     moved[:, :3, 3] += rng.uniform(-size, size, (len(poses), 3))
     return moved
 
 
 def walk_at(truth: FacadeTruth, rate: float) -> Floats:
-    """The walk of WALK_SECONDS at so many frames a second (k, 4, 4): the same path, sampled anew."""
+    """Return the walk of WALK_SECONDS at this frame rate (k, 4, 4): the same path, resampled."""
     return walk_poses(truth, round(WALK_SECONDS * rate), rate)[1]
 
 
 def classes(contact: NDArray[np.bool_], gaps: Floats, far: float = FAR) -> dict[str, NDArray[np.bool_]]:
-    """Which poses (k,) are far, near but clear, and in contact; every pose is in one class.
+    """Classify poses (k,) as far, near but clear, and in contact; every pose is in one class.
 
     gaps: (k,) least distance of spheres [m], or any number above `far` beyond it.
     """
@@ -53,14 +54,16 @@ def classes(contact: NDArray[np.bool_], gaps: Floats, far: float = FAR) -> dict[
 
 
 def gaps(tree: cKDTree, avatar: Floats, local_poses: Floats, distance: float, most: float = FAR) -> Floats:
-    """Least distance (k,) of the spheres of tree and avatar [m], inf beyond `most`.
+    """Return the least distance (k,) of the spheres of tree and avatar [m], inf beyond `most`.
 
-    local_poses: avatar to the tree's frame.  distance: both radii together [m].
+    local_poses: avatar to the tree's frame.
+    distance: sum of both radii [m].
     """
     found = np.full(len(local_poses), np.inf)
     some = avatar[:: max(1, len(avatar) // 64)]
     for i, pose in enumerate(local_poses):
-        # A search bounded by what a few points found is many times as fast as one bounded by `most`.
+        # A search bounded by the result of a few points is many times as fast as one bounded by
+        # `most`.
         bound = most + distance
         for points in (some, avatar):
             placed = points @ pose[:3, :3].T + pose[:3, 3]
@@ -72,7 +75,7 @@ def gaps(tree: cKDTree, avatar: Floats, local_poses: Floats, distance: float, mo
 
 
 def upright(places: Floats, yaw: Floats) -> Floats:
-    """Poses (k, 4, 4) of an avatar that stands at places (k, 3), turned about z by yaw (k,) [rad]."""
+    """Return poses (k, 4, 4) of an avatar upright at places (k, 3), turned about z by yaw (k,) [rad]."""
     poses = np.zeros((len(places), 4, 4))
     poses[:, 0, 0] = poses[:, 1, 1] = np.cos(yaw)
     poses[:, 1, 0] = np.sin(yaw)
@@ -85,7 +88,10 @@ def upright(places: Floats, yaw: Floats) -> Floats:
 def random_poses(
     rng: np.random.Generator, points: Floats, avatar: Floats, count: int, farthest: float
 ) -> Floats:
-    """Poses (count, 4, 4), rigid: a random avatar point within `farthest` [m] of a random scan point."""
+    """Return rigid poses (count, 4, 4) with random avatar points near random scan points.
+
+    farthest: maximum distance of the two points [m].
+    """
     q = rng.normal(size=(count, 4))
     w, x, y, z = (q / np.linalg.norm(q, axis=1)[:, None]).T
     poses = np.zeros((count, 4, 4))
@@ -108,7 +114,10 @@ def random_poses(
 def half_touching(
     rng: np.random.Generator, points: Floats, avatar: Floats, touching: Callable[[Floats], NDArray[np.bool_]]
 ) -> float:
-    """A distance [m] at which about half of `random_poses` touch; only a choice of poses, so the engine may tell."""
+    """Return a distance [m] at which about half of `random_poses` touch.
+
+    This only selects poses, and the engine may therefore decide it.
+    """
     distance = float(np.ptp(avatar, axis=0).max()) / 32
     for _ in range(12):
         if touching(random_poses(rng, points, avatar, PILOT, distance)).mean() <= 0.5:
@@ -118,12 +127,14 @@ def half_touching(
 
 
 def touching_shift(points: Floats, placed: Floats, axis: ArrayLike, distance: float) -> float:
-    """How far along a unit axis to move centres placed (m, 3) so that the nearest pair is `distance` apart [m].
+    """Return the shift along a unit axis that brings the nearest pair to `distance` [m].
 
-    Moved farther, no pair is as near as that. -inf where no pair can be, for all lie beside one another.
+    placed: (m, 3) centres to move.
+    A larger shift brings no pair that near. -inf where no pair can be, because all points lie to
+    the side.
     """
     u = np.asarray(axis, np.float64)
-    across = np.linalg.svd(u[None])[2][1:]  # two directions square to the axis
+    across = np.linalg.svd(u[None])[2][1:]  # two directions perpendicular to the axis
     at = placed @ across.T
     low, high = at.min(axis=0) - distance, at.max(axis=0) + distance
     flat = points @ across.T
@@ -145,10 +156,11 @@ def _placed(avatar: Floats, pose: Floats) -> Floats:
 def feet_on_floor(
     points: Floats, avatar: Floats, walk: Floats, distance: float, count: int, feet: float = 0.25
 ) -> PoseSet:
-    """Poses of the walk lowered to where the feet just touch what is below them, and a little above and below it.
+    """Return poses of the walk lowered to the exact contact of the feet, and to slight offsets from it.
 
-    points, walk: one frame.  walk: poses in contact with nothing.  feet: how far above the soles a point of the
-    scan may lie to count as below [m].
+    points, walk: in one frame.
+    walk: poses without contact.
+    feet: maximum height above the soles of a scan point that counts as below the feet [m].
     """
     found = []
     for k, i in enumerate(np.linspace(0, len(walk) - 1, min(count, len(walk))).astype(int)):
@@ -169,7 +181,10 @@ def feet_on_floor(
 def along_walls(
     points: Floats, avatar: Floats, truth: FacadeTruth, distance: float, rng: np.random.Generator, count: int
 ) -> PoseSet:
-    """Poses 1 cm from each wall of the façade, all along it, turned at random; points in the truth's own frame."""
+    """Return poses 1 cm from each wall of the façade, distributed along it, with random rotations.
+
+    points: in the truth's own frame.
+    """
     found = []
     for wall in truth.walls:
         axis = 0 if wall.axis == "x" else 1
@@ -191,7 +206,7 @@ def along_walls(
 
 
 def inside_columns(truth: FacadeTruth, rng: np.random.Generator, count: int) -> PoseSet:
-    """Poses in the axis of a column, turned at random, somewhere in its height; in the truth's own frame."""
+    """Return poses on the axis of a column, with random rotation and height; in the truth's own frame."""
     chosen = [truth.columns[i] for i in rng.integers(len(truth.columns), size=count)]
     places = np.array([(c.x, c.y, rng.uniform(c.z_low, c.z_high)) for c in chosen])
     return PoseSet("inside columns", upright(places, rng.uniform(-np.pi, np.pi, count)), "in a column's axis")
@@ -200,9 +215,11 @@ def inside_columns(truth: FacadeTruth, rng: np.random.Generator, count: int) -> 
 def near_surfaces(
     tree: cKDTree, points: Floats, avatar: Floats, distance: float, rng: np.random.Generator, count: int
 ) -> PoseSet:
-    """Poses turned at random, moved along a random direction out of what is around them until a small gap is left.
+    """Return randomly rotated poses, moved out of their surroundings until a small gap is left.
 
-    tree: over points (n, 3), the frame of the poses. What was not around may be touched: some are in contact.
+    tree: over points (n, 3), in the frame of the poses.
+    The direction of motion is random. A pose may touch points outside its initial surroundings:
+    some are in contact.
     """
     centre = avatar.mean(axis=0)
     around = float(np.linalg.norm(avatar - centre, axis=1).max()) + AROUND
@@ -214,7 +231,7 @@ def near_surfaces(
     for i, (pose, axis, gap) in enumerate(zip(poses, axes, left, strict=True)):
         near = tree.query_ball_point(pose[:3, :3] @ centre + pose[:3, 3], around)
         shift = touching_shift(points[near], _placed(avatar, pose), axis, distance + gap)
-        moved[i] = np.isfinite(shift)  # not where all that is around lies beside it
+        moved[i] = np.isfinite(shift)  # not where all surrounding points lie to the side
         if moved[i]:
             pose[:3, 3] += shift * axis
     low, high = (f"{edge * 1e3:g}" for edge in LEFT)
@@ -231,7 +248,10 @@ def free_space(
     count: int,
     far: float,
 ) -> PoseSet:
-    """Upright poses at random within bounds (2, 3), that have nothing within `far` [m]; 0: that touch nothing."""
+    """Return random upright poses within bounds (2, 3) that have nothing within `far` [m].
+
+    far: 0 for poses that touch nothing.
+    """
     found = np.empty((0, 4, 4))
     for _ in range(20):
         poses = upright(rng.uniform(bounds[0], bounds[1], (count, 3)), rng.uniform(-np.pi, np.pi, count))

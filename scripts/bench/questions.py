@@ -1,4 +1,4 @@
-"""Section `questions`: distance with witness beside collide, and every other question; scipy where it has a like."""
+"""Section `questions`: distance with witness against collide, all other queries; scipy where possible."""
 
 import time
 from collections.abc import Callable
@@ -14,18 +14,18 @@ from .poses import Floats, jittered
 from .results import Part, ratio
 from .sides import BRUTE, COLLIDE, SCIPY, Contender, evenly, time_in_turn, timer
 
-REACH = 0.5  # of distance [m]
+REACH = 0.5  # reach of distance [m]
 AT_MOST, AT_LEAST = 2.0, 10_000.0
 DISTANCE = "distance, witness, 0.5 m"
-NEARLY = 1e-6  # scipy's distances are float64 from other sums than ours [m]
+NEARLY = 1e-6  # tolerance: scipy sums distances in float64 in another order [m]
 SCIPY_POSES = 60
 RAYS, RAY_REACH = 2000, 30.0
 LOOSE, LOOSE_REACH = 20_000, 0.5
-TOGETHER = 12  # objects of one request
+TOGETHER = 12  # objects per request
 
 
 def run(bench: Bench, clock: Clock) -> Part:
-    """Time each question."""
+    """Time each query."""
     part = Part("questions")
     _compile(bench)
     clock.restart()
@@ -42,7 +42,7 @@ def run(bench: Bench, clock: Clock) -> Part:
 
 
 def _compile(bench: Bench) -> None:
-    """Ask each question once, so that none is compiled on the clock; one that is not answered yet says so later."""
+    """Run each query once to compile it before timing; a missing query is reported later."""
     scene, pose = bench.facade.scene, bench.walk[:1]
     eye = pose[:, :3, 3] + [0.0, 0.0, 1.6]
     first: list[Callable[[], object]] = [
@@ -88,7 +88,7 @@ def _distance(bench: Bench, clock: Clock, part: Part, name: str, scene: Scene) -
 
 
 def _judge_distance(bench: Bench, part: Part, name: str, scene: Scene, case: str) -> None:
-    """scipy on a sample of clear poses, for its time and as a judge; brute force on one of them."""
+    """Compare with scipy on a sample of clear poses, and with brute force on one of them; time scipy."""
     place = bench.facade
     poses = evenly(bench.walk[~place.contact(bench.walk)], SCIPY_POSES)
     bound = np.nextafter(REACH + place.case.distance, np.inf)
@@ -104,9 +104,9 @@ def _judge_distance(bench: Bench, part: Part, name: str, scene: Scene, case: str
         worst = int(np.argmax(apart))
         part.wrong.append(f"distance, {name}: {found[worst]} m where scipy finds {nearest[worst]} m")
     if name != next(iter(place.scenes)):
-        return  # brute force looks at the same points, whatever the voxel
+        return  # brute force tests the same points for any voxel size
     pose = local[:1]
-    least_distance(place.case.points[:1], bench.avatar)  # compiled
+    least_distance(place.case.points[:1], bench.avatar)  # compiles
     begin = time.perf_counter()
     brute = least_distance(place.case.points, bench.avatar @ pose[0, :3, :3].T + pose[0, :3, 3])
     part.add(
@@ -129,7 +129,7 @@ def _timed(
     count: int,
     ask: Callable[[], object],
 ) -> None:
-    """Microseconds each of `count` things that `ask` asks about."""
+    """Time `ask`, in microseconds per each of the `count` items it queries."""
     ask()
     spent = []
     for _ in clock.loops(bench.loops, 0.15):
@@ -199,7 +199,7 @@ def _within(bench: Bench, clock: Clock, part: Part, name: str, scene: Scene) -> 
     )  # fmt: skip
     found = scene.within(world, LOOSE_REACH).distance
     nearest = place.tree.query(local, distance_upper_bound=bound)[0]
-    # scipy's points are moved by up to 15 nm less than ours, which are rounded to exact units.
+    # scipy's points are up to 15 nm off ours, which are rounded to exact units.
     with np.errstate(invalid="ignore"):
         differs = (np.abs(found - nearest) > NEARLY) & ~(np.isinf(found) & np.isinf(nearest))
     if differs.any():

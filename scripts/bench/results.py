@@ -1,4 +1,4 @@
-"""What the benchmark found: figures, goals and notes, as a table, JSON and CSV."""
+"""Results of the benchmark: figures, targets and notes, as a table, JSON and CSV."""
 
 import csv
 import dataclasses
@@ -13,16 +13,22 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-# Others that wanted a core, on average; with more, long turns suffer more than short ones and ratios mean little.
+# Mean number of other processes that wanted a core. Above it, long turns suffer more than short
+# ones, and ratios mean little.
 BUSY = 0.3
 MET, MISSED, NOT_MEASURED = "met", "missed", "not measured"
 
 
 @dataclass(frozen=True)
 class Figure:
-    """One figure. case: what was asked about.  side: who answered.  what: what was measured.
+    """One figure.
 
-    value: the median of the repetitions.  best: the best of them.  count: poses, rays, points behind it.
+    case: the measured case.
+    side: the contender.
+    what: the measured quantity.
+    value: the median of the repetitions.
+    best: the best of them.
+    count: number of poses, rays or points behind it.
     """
 
     section: str
@@ -38,9 +44,11 @@ class Figure:
 
 @dataclass(frozen=True)
 class Goal:
-    """A goal beside its figure. measured, limit: None where not measured.  at_least: else the figure is at most it.
+    """A target and its figure.
 
     key: of its note in notes.py.
+    measured, limit: None where not measured.
+    at_least: True for a lower limit, else the limit is an upper one.
     """
 
     key: str
@@ -53,23 +61,26 @@ class Goal:
 
     @property
     def met(self) -> bool | None:
-        """Whether it is reached; None: not measured. A figure that is no number reaches nothing."""
+        """Return whether it is met; None: not measured. A NaN meets nothing."""
         if self.measured is None or self.limit is None:
             return None
         return self.measured >= self.limit if self.at_least else self.measured <= self.limit
 
     @property
     def word(self) -> str:
-        """`met`, `missed` or `not measured`."""
+        """Return `met`, `missed` or `not measured`."""
         return {True: MET, False: MISSED, None: NOT_MEASURED}[self.met]
 
 
 @dataclass
 class Part:
-    """What one section found. remarks: sentences.  wrong: verdicts that are not as the judge says, a sentence each.
+    """Results of one section.
 
-    missing: what could not be measured, and why.  error: why the section ended early, or None.
-    others: how many others wanted a core while it was timed, on average.
+    remarks: sentences.
+    wrong: verdicts that differ from the reference, one sentence each.
+    missing: what could not be measured, and why.
+    error: reason for an early end of the section, or None.
+    others: mean number of others that wanted a core while it was timed.
     """
 
     section: str
@@ -91,7 +102,7 @@ class Part:
         unit: str,
         count: int | None = None,
     ) -> float:
-        """Add a figure of one or more repetitions; returns its value, their median."""
+        """Add a figure of one or more repetitions; return its value, their median."""
         times = np.atleast_1d(np.asarray(values, np.float64))
         best = float(times.max() if unit.endswith("/s") else times.min())
         value = float(np.median(times))
@@ -108,11 +119,11 @@ class Part:
         *,
         at_least: bool = False,
     ) -> None:
-        """Add a goal."""
+        """Add a target."""
         self.goals.append(Goal(key, self.section, text, measured, limit, unit, at_least))
 
     def value(self, case: str, side: str, what: str) -> float | None:
-        """A figure that was added; None: it was not."""
+        """Return the value of an added figure; None where it was not added."""
         for figure in self.figures:
             if (figure.case, figure.side, figure.what) == (case, side, what):
                 return figure.value
@@ -120,12 +131,12 @@ class Part:
 
 
 def ratio(above: float | None, below: float | None) -> float | None:
-    """above / below; None where either is missing, or below is zero."""
+    """Return above / below; None where either is missing, or below is zero."""
     return None if above is None or not below else above / below
 
 
 def number(value: float | None) -> str:
-    """A figure for people: three digits that count, thousands apart."""
+    """Format a figure for people: three significant digits, thousands separated."""
     if value is None:
         return "-"
     if not math.isfinite(value) or value == 0:
@@ -135,19 +146,19 @@ def number(value: float | None) -> str:
 
 
 def limit_text(row: dict[str, Any]) -> str:
-    """The goal of a row for people: its sense, limit and unit."""
+    """Format the target of a row for people: its sense, limit and unit."""
     limit = "-" if row["limit"] is None else f"{row['limit']:,g}"
     return f"{'≥' if row['sense'] == '>=' else '≤'} {limit} {row['unit']}"
 
 
 def busy(parts: Iterable[Part]) -> str:
-    """What to say of other work on the machine; empty where there was none to speak of."""
+    """Return a remark about other work on the machine; empty where it was negligible."""
     worst = max((part.others for part in parts), default=0.0)
     return f"the machine was busy: {worst:.1f} others wanted a core" if worst > BUSY else ""
 
 
 def goal_rows(parts: Iterable[Part], notes: dict[str, str]) -> list[dict[str, Any]]:
-    """One row a goal, for the table, the JSON and the picture."""
+    """Return one row per target, for the table, the JSON and the picture."""
     return [
         {
             "key": goal.key,
@@ -166,7 +177,10 @@ def goal_rows(parts: Iterable[Part], notes: dict[str, str]) -> list[dict[str, An
 
 
 def show(parts: list[Part], notes: dict[str, str], section: str = "Speed") -> None:
-    """Print figures, then goals, of `section` of the README, with what was tried, then what is wrong or missing."""
+    """Print figures, targets with their notes, wrong verdicts and missing measurements.
+
+    section: of the README.
+    """
     console = Console(width=150)
     for part in parts:
         if part.figures:

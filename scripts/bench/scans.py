@@ -1,4 +1,4 @@
-"""Section `scans`: real scans, each with a walk over its floor and with poses near its surfaces; every side."""
+"""Section `scans`: real scans, each with a walk over its floor and poses near its surfaces; every side."""
 
 import os
 from contextlib import ExitStack
@@ -22,7 +22,7 @@ LONELY = 0.3  # [m]
 
 
 def scan_files() -> list[Path]:
-    """The scans that are here: those of REAL_SCANS in the folder that SOLIDCLOUD_SCANS names."""
+    """Return the scans of REAL_SCANS that exist in the folder that SOLIDCLOUD_SCANS names."""
     folder = os.environ.get("SOLIDCLOUD_SCANS")
     return [path for name in REAL_SCANS if folder and (path := Path(folder) / name).exists()]
 
@@ -59,7 +59,7 @@ def _one(bench: Bench, clock: Clock, part: Part, file: Path) -> None:
 
 
 def walk_set(bench: Bench, archive: Path) -> PoseSet:
-    """A walk where the scan has a floor to walk on; else, poses near its surfaces."""
+    """Return a walk where the scan has a floor, else poses near its surfaces."""
     with Archive(archive) as opened:
         origin = np.array(opened.header.lattice.origin)
     points = stored_points(archive) + origin
@@ -76,7 +76,7 @@ def walk_set(bench: Bench, archive: Path) -> PoseSet:
 
 
 def near_set(bench: Bench, place: Place) -> PoseSet:
-    """Poses near surfaces, world."""
+    """Return poses near surfaces, world frame."""
     poses = near_surfaces(
         place.tree, place.case.points, bench.avatar, place.case.distance, bench.rng, NEAR_POSES
     )

@@ -1,6 +1,7 @@
-"""One place with every side ready to be asked, and the sides timed in turn: ours, the crates, scipy, brute force.
+"""One place with every side ready, and the timing of the sides in turn.
 
-The crates warm up on the very poses they are then timed on, ours on others: where that tells, it is to their good.
+The sides are ours, the crates, scipy and brute force. The crates warm up on the same poses that
+they are timed on, ours on others: any effect of this favours the crates.
 """
 
 import time
@@ -28,19 +29,21 @@ TABLE = "multilevel voxel table"
 CAPT, CAPT16 = "CAPT SIMD, best lanes", "CAPT SIMD, 16 lanes"
 SCIPY, BRUTE = "scipy cKDTree", "brute force, integers"
 OURS = "ours"
-# What scripts/peers calls them. The scalar ones, never faster, are in bench_walk.
+# Names in scripts/peers. The scalar variants, never faster, are in bench_walk.
 PEERS = {"mvtable_simd": TABLE, "capt_simd": CAPT, "capt_simd16": CAPT16}
-# A second or two of scipy is enough to see how far it is behind.
+# A second or two of scipy is enough to rank it.
 SCIPY_POSES, SCIPY_LOOPS = 300, 2
-JUDGED = 12  # poses of a set that the judge is asked about, and as many of those where the sides differ
+JUDGED = 12  # sampled poses of a set that the judge decides, and maximum of those where the sides differ
 COLLIDE = "collide"
 
 
 class Contender(NamedTuple):
-    """One side. time: (poses to warm up with, poses (k, 4, 4) world) -> microseconds a pose, answers included.
+    """One side.
 
-    touching: poses -> (k,) bool, or None where nobody needs to know.  most: poses it is asked about, evenly spread.
-    loops: how often at most.
+    time: (poses to warm up with, poses (k, 4, 4) world) -> microseconds per pose, answers included.
+    touching: poses -> (k,) bool, or None where it is not compared.
+    most: maximum poses it is timed on, evenly spread.
+    loops: maximum repetitions.
     """
 
     name: str
@@ -51,10 +54,14 @@ class Contender(NamedTuple):
 
 
 class Place:
-    """A scanned place: scenes, the peers' program, scipy's tree and the judge, all of the same stored points.
+    """A scanned place: scenes, the peers' program, scipy's tree and the judge over the same points.
 
-    archives: name of a side -> archive.  avatar: (m, 3) [m].  walk: poses (k, 4, 4) world, on which the peers choose
-    their settings.  program: of the peers, or why there is none.  folder: for what the program is given.
+    The points are those that the archives store.
+    archives: name of a side -> archive.
+    avatar: (m, 3) [m].
+    walk: poses (k, 4, 4) world, on which the peers choose their settings.
+    program: of the peers, or the reason for its absence.
+    folder: for the program's input.
     """
 
     def __init__(
@@ -71,7 +78,7 @@ class Place:
         distance = contact_distance(list(self.scenes.values()), avatar)
         points = stored_points(next(iter(archives.values())))
         info = self.scene.info()
-        self.radius = distance - info.radius  # of the avatar
+        self.radius = distance - info.radius  # radius of the avatar
         self.case = Case(points, np.array(info.origin), avatar, walk, distance)
         self.tree = cKDTree(points)
         self.judge = Judge(points + self.case.origin, info.origin, info.lattice_step, info.radius)
@@ -85,21 +92,21 @@ class Place:
 
     @property
     def scene(self) -> Scene:
-        """The first of our scenes."""
+        """Return the first of our scenes."""
         return next(iter(self.scenes.values()))
 
     def local(self, poses: Floats) -> Floats:
-        """World poses (k, 4, 4) to the frame of the points."""
+        """Transform world poses (k, 4, 4) to the frame of the points."""
         moved = poses.copy()
         moved[:, :3, 3] -= self.case.origin
         return moved
 
     def contact(self, poses: Floats) -> NDArray[np.bool_]:
-        """Which poses (k,) touch, says our first scene."""
+        """Return which poses (k,) touch, according to our first scene."""
         return _touching(self.scene, poses)
 
     def settings(self) -> list[str]:
-        """What each peer was found fastest with."""
+        """Return the fastest settings found for each peer."""
         if self.peers is None:
             return [f"CAPT and the voxel table were not measured: {self.peers_missing}"]
         found = [
@@ -117,7 +124,7 @@ class Place:
         return found
 
     def contenders(self, *, scipy: bool = True) -> list[Contender]:
-        """Every side of `collide`."""
+        """Return every side of `collide`."""
         found = [
             Contender(name, _timed(scene), lambda poses, scene=scene: _touching(scene, poses))
             for name, scene in self.scenes.items()
@@ -152,8 +159,8 @@ class Place:
         return (time.perf_counter() - begin) / len(poses) * 1e6
 
     def brute(self, poses: Floats) -> float:
-        """The definition on every pair of points, first contact ends the search [us a pose]."""
-        self.judge.touches(self.avatar, self.radius, poses[0])  # compiled
+        """Time the definition on every pair of points [us per pose]; the first contact ends the search."""
+        self.judge.touches(self.avatar, self.radius, poses[0])  # compiles
         begin = time.perf_counter()
         for pose in poses:
             self.judge.touches(self.avatar, self.radius, pose, all_pairs=True)
@@ -168,12 +175,12 @@ def _touching(scene: Scene, poses: Floats) -> NDArray[np.bool_]:
 
 
 def _timed(scene: Scene) -> Callable[[Floats, Floats], float]:
-    """`Scene.collide` on all poses in one call, after one that warms."""
+    """Return the timer of `Scene.collide` on all poses in one call, after a warm-up call."""
     return timer(lambda poses: scene.collide("avatar", poses))
 
 
 def timer(ask: Callable[[Floats], Any]) -> Callable[[Floats, Floats], float]:
-    """Of a question about poses, asked once to warm up and once on the clock: microseconds a pose."""
+    """Return a function that times a query about poses after a warm-up: microseconds per pose."""
 
     def turn(warm: Floats, poses: Floats) -> float:
         ask(warm)
@@ -185,7 +192,7 @@ def timer(ask: Callable[[Floats], Any]) -> Callable[[Floats, Floats], float]:
 
 
 def evenly(poses: NDArray[Any], most: int | None) -> NDArray[Any]:
-    """At most so many of the poses (k, ...), evenly spread."""
+    """Return at most `most` of the poses (k, ...), evenly spread."""
     if most is None or len(poses) <= most:
         return poses
     return poses[np.linspace(0, len(poses) - 1, most).astype(int)]
@@ -199,7 +206,10 @@ def time_in_turn(
     rng: np.random.Generator,
     share: float = 0.5,
 ) -> dict[str, list[float]]:
-    """Microseconds a pose of each repetition, the sides in turn; each repetition jitters all poses anew."""
+    """Time the sides in turn; return the microseconds per pose of each repetition.
+
+    Each repetition jitters all poses anew.
+    """
     times: dict[str, list[float]] = {c.name: [] for c in contenders}
     for loop in clock.loops(loops, share):
         warm, asked = jittered(poses, rng), jittered(poses, rng)
@@ -220,7 +230,7 @@ def compare_set(
     rng: np.random.Generator,
     share: float,
 ) -> None:
-    """Time every side on one set of poses and hold their verdicts against the judge; adds to `part`."""
+    """Time every side on one set of poses and compare their verdicts with the judge; adds to `part`."""
     label = f"{case}, {poses.name}"
     if not len(poses.poses):
         part.missing.append(f"{label}: no such poses here")
@@ -243,7 +253,7 @@ def hold(
     ours: NDArray[np.bool_],
     found: dict[str, NDArray[np.bool_]],
 ) -> None:
-    """Ask the judge about a sample of poses, and about those where sides differ."""
+    """Compare a sample of poses, and those where sides differ, with the judge."""
     differing = np.flatnonzero(np.any([verdicts != ours for verdicts in found.values()], axis=0))
     kinds = [np.flatnonzero(ours), np.flatnonzero(~ours), differing]
     asked = np.unique(np.concatenate([evenly(kind, JUDGED) for kind in kinds]))

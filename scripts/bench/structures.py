@@ -1,7 +1,8 @@
-"""Section `structures`: the paper's structure beside ours, degrees 4 to 16; only when asked for (--only structures).
+"""Section `structures`: the paper's structure against ours, degrees 4 to 16.
 
-`scripts/walkthrough` says more of each, frame by frame, with the paper's own table; it times these here too. Its poses
-are the same in every repetition: nothing is kept between calls.
+It runs only on request (--only structures). `scripts/walkthrough` reports more on each, frame by
+frame, with the paper's own table; this section times them too. Its poses are the same in every
+repetition: nothing is kept between calls.
 """
 
 from solidcloud.server.report.case import PAPER_VOXEL, STEP, Case, made_case
@@ -20,7 +21,8 @@ def run(bench: Bench, clock: Clock) -> Part:
     scratch.mkdir()
     case: Case = made_case(scratch, PAPER_VOXEL)
     structures = build_structures(case, DEGREES, scratch, say)
-    # `measure` raises when two structures answer differently. It also walks frame by frame: minutes a loop.
+    # `measure` raises when two structures give different answers. It also walks frame by frame,
+    # which takes minutes per loop.
     clock.look_around()
     measure(case, structures, max(1, min(bench.loops, 3)), say)
     clock.look_around()

@@ -1,1 +1,1 @@
-"""Cases that scripts/compare times in two versions; they use the public interface of either."""
+"""Cases that scripts/compare times in two versions, using the public interface of both."""

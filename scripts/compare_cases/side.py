@@ -1,8 +1,8 @@
-"""One version's process for scripts/compare: runs a case when its name comes, and prints how long it took.
+"""Process of one version for scripts/compare: runs the cases it is told to and prints their durations.
 
     python -P side.py ARCHIVE CASE,CASE,...
 
-The interpreter decides which version is timed. Only names that both versions have are used.
+The interpreter determines the version. Only names that both versions have are used.
 """
 
 import sys
@@ -15,7 +15,7 @@ DEFAULT_CASES = (
     "collide", "single", "distance", "contacts", "sweep", "raycast", "within", "frame", "round_trip", "session",
 )  # fmt: skip
 CASES = (*DEFAULT_CASES, "build")
-# Repetitions in one turn, so that a turn takes some 0.1 to 0.3 s.
+# Repetitions in one turn, which then takes about 0.1 to 0.3 s.
 PASSES, SINGLES, MOTIONS, FRAMES, TRIPS, WISHES = 20, 4000, 1200, 600, 300, 150
 BUILD_POINTS = 10_000_000
 EFFECTS = ("stop", "sweep", "slide", "step", "ground")
@@ -104,7 +104,7 @@ def open_walk(archive: Path, stack: ExitStack):  # type: ignore[no-untyped-def]
 
 
 def wire_cases(archive: Path, stack: ExitStack) -> dict[str, Case]:
-    """Return the cases of a client of a server of its own."""
+    """Return the cases of a client with a separate server."""
     import numpy as np
     from solidcloud.builder.made.figure import figure_points
 
@@ -158,7 +158,7 @@ def build_case(archive: Path, stack: ExitStack) -> dict[str, Case]:
 
 
 def main() -> None:
-    """Prepare the cases, run each once, then run those whose names come on standard input."""
+    """Prepare the cases, run each once, then run those named on standard input."""
     archive, wanted = Path(sys.argv[1]), sys.argv[2].split(",")
     with ExitStack() as stack:
         cases: dict[str, Case] = {}

@@ -1,4 +1,7 @@
-"""Builds killed at random moments, some several times in a row, then finished: the archive is the undisturbed one."""
+"""Builds killed at random moments, some several times in a row, then finished and compared.
+
+The finished archive must be that of an undisturbed build.
+"""
 
 import os
 import random
@@ -15,16 +18,19 @@ from solidcloud.server.cli import run
 from .case import Case, Change, Tally, arguments, content, make_small, write_scans
 from .child import Child, CountCalls, KillAt, build
 
-# Kills of one build before it is left to finish: one, and now and then more.
+# Kills of one build before it is left to finish: usually one, sometimes more.
 ROW = (1, 1, 2, 4)
 SCRIPTS = Path(__file__).resolve().parent.parent
 
 
 class Ground:
-    """The scans, the archive that an undisturbed build makes of them, and how long that takes."""
+    """The scans, the archive that an undisturbed build makes of them, and the duration of that build."""
 
     def __init__(self, folder: Path) -> None:
-        """Build it, once here to load the kernels, once to see what it takes. Raises RuntimeError where that fails."""
+        """Build the archive, first here to load the kernels, then to measure it.
+
+        Raises RuntimeError where a build fails.
+        """
         make_small()
         self.folder, self.scans = folder, folder / "scans"
         write_scans(self.scans)
@@ -37,7 +43,7 @@ class Ground:
         self.seconds = time.perf_counter() - begin
         log = self._built("counted", CountCalls())
         self.calls = int(log.rpartition("calls ")[2])
-        # What --overwrite replaces: of the same scans with other options.
+        # The archive that --overwrite replaces: the same scans with other options.
         self.old = self._undisturbed("old", ".", "--voxel", "1.5")
         self._cases = 0
         self._changed: dict[str, str] = {}
@@ -56,7 +62,7 @@ class Ground:
         return child.said()
 
     def change(self) -> Change:
-        """An archive of the first scan, to which the second is to be added."""
+        """Return an archive of the first scan, to which the second is to be added."""
         if not self._changed:
             self._first = self._undisturbed("first", "a.las")
             undisturbed = Change(self.folder / "changed", self.scans / "b.xyz", self._first, {})
@@ -68,7 +74,7 @@ class Ground:
         return Change(self.folder / f"case-{self._cases}", self.scans / "b.xyz", self._first, self._changed)
 
     def case(self, jobs: int = 1, overwrite: bool = False) -> Case:
-        """A new target."""
+        """Return a new target."""
         self._cases += 1
         case = Case(self.folder / f"case-{self._cases}", self.scans, self.reference, jobs)
         if overwrite:
@@ -77,17 +83,20 @@ class Ground:
 
 
 def check_finish(case: Case, tally: Tally, what: str, **how: object) -> None:
-    """Run the same command to its end; the archive must be the undisturbed one, byte for byte."""
+    """Run the same command to its end and check that the archive is the undisturbed one, byte for byte."""
     done = case.whole()
     child = build(case.arguments(), case.folder.with_suffix(".log"))
     faults = case.finished()
-    if child.status != 0 and not (done and isinstance(case, Change)):  # a scan is not added twice
+    if child.status != 0 and not (done and isinstance(case, Change)):  # a second addition is refused
         faults.append(f"the same command again exited with {child.status}: {child.said()[-2000:]}")
     tally.add(what, faults, **how)
 
 
 def forked_kills(ground: Ground, kills: int, seed: int, tally: Tally) -> None:
-    """Kill builds of one process in forks, half of them at a random moment, half at a random call of CALLS."""
+    """Kill builds of one process in forks.
+
+    Half of them are killed at a random moment, half at a random call of CALLS.
+    """
     rng = random.Random(seed)
     done = 0
     while done < kills:
@@ -95,7 +104,7 @@ def forked_kills(ground: Ground, kills: int, seed: int, tally: Tally) -> None:
         hows: list[str] = []
         how = {"seed": seed, "kills": hows, "overwrite": bool(case.old)}
         for turn in range(min(rng.choice(ROW), kills - done)):
-            # What was done is not done again: the later, the shorter.
+            # Finished work is not repeated: each repetition is shorter.
             by_call, span = rng.random() < 0.5, 1 / (turn + 1)
             if by_call:
                 trap = KillAt(rng.randint(1, round(ground.calls * span)), rng.random() < 0.5)
@@ -117,7 +126,7 @@ def forked_kills(ground: Ground, kills: int, seed: int, tally: Tally) -> None:
 
 
 def _after_kill(case: Case, status: int | None, said: str, tally: Tally, **how: object) -> None:
-    """What must hold when a build was just killed, or ended before it could be."""
+    """Check the state after a build was killed, or ended before the kill."""
     faults = case.visible()
     if status == 0:
         if not case.whole():
@@ -131,7 +140,7 @@ def _after_kill(case: Case, status: int | None, said: str, tally: Tally, **how: 
 
 
 def real_kills(ground: Ground, kills: int, seed: int, tally: Tally) -> None:
-    """Kill real commands, each a process group of its own, with one job and with two."""
+    """Kill real commands, each in a separate process group, with one job and with two."""
     rng = random.Random(seed)
     spans = {jobs: _span(ground, jobs) for jobs in (1, 2)}
     tally.counts["milliseconds of an undisturbed command, one job"] = round(spans[1] * 1e3)
@@ -148,7 +157,8 @@ def real_kills(ground: Ground, kills: int, seed: int, tally: Tally) -> None:
             with tempfile.TemporaryFile() as log:
                 process = _start(case, log)
                 time.sleep(delay)
-                # All of it at once, workers too; of one that has ended by itself, nothing.
+                # Kill the whole group at once, workers included; no-op for a command that has ended
+                # by itself.
                 os.killpg(process.pid, signal.SIGKILL)
                 status = process.wait()
                 _wait_for_group(process.pid)
@@ -158,12 +168,12 @@ def real_kills(ground: Ground, kills: int, seed: int, tally: Tally) -> None:
             if status == 0:
                 break
             done += 1
-        case.jobs = rng.choice((1, 2))  # who finishes may have another number of jobs
+        case.jobs = rng.choice((1, 2))  # the finishing command may use another number of jobs
         check_finish(case, tally, "finished after kills", **how)
 
 
 def _start(case: Case, log: object) -> "subprocess.Popen[bytes]":
-    """The command, in a process group of its own; returns when it is about to begin."""
+    """Start the command in a new process group; return when it is about to begin."""
     ready, told = os.pipe()
     code = f"import os; from kills.at_random import command; command({told}, {case.arguments()!r})"
     process = subprocess.Popen(
@@ -185,7 +195,7 @@ def _start(case: Case, log: object) -> "subprocess.Popen[bytes]":
 
 
 def command(told: int, words: list[str]) -> None:
-    """What a real command does: load everything, say so, run."""
+    """Act as a real command: load everything, report it, run."""
     make_small()
     os.write(told, b"!")
     os.close(told)
@@ -193,7 +203,7 @@ def command(told: int, words: list[str]) -> None:
 
 
 def _span(ground: Ground, jobs: int) -> float:
-    """How long a command takes undisturbed, from where it begins [s]."""
+    """Return the duration of an undisturbed command from its beginning [s]."""
     case = ground.case(jobs)
     with tempfile.TemporaryFile() as log:
         process = _start(case, log)
@@ -207,7 +217,7 @@ def _span(ground: Ground, jobs: int) -> float:
 
 
 def _wait_for_group(group: int) -> None:
-    """Until no process of the group is left: a worker dies a moment after its builder."""
+    """Wait until the group has no process left: a worker dies shortly after its builder."""
     deadline = time.monotonic() + 10
     while time.monotonic() < deadline:
         try:

@@ -1,4 +1,7 @@
-"""Every system call by which a build writes, stopped in turn by strace: killed, interrupted, no space, I/O error."""
+"""Every system call by which a build writes, stopped in turn by strace.
+
+The faults are: killed, interrupted, no space, I/O error.
+"""
 
 import os
 import re
@@ -15,12 +18,13 @@ from .at_random import Ground, check_finish
 from .case import Case, Tally
 from .child import Child
 
-# By what a build makes, fills, syncs, names and removes files.
+# System calls by which a build makes, fills, syncs, names and removes files.
 CALLS = (
     "write", "pwrite64", "fsync", "fdatasync", "ftruncate", "openat", "rename", "renameat", "renameat2", "mkdir",
     "mkdirat", "unlink", "unlinkat", "rmdir",
 )  # fmt: skip
-# Only these fail for want of space; and only what is written, synced and named is told to fail by the disk.
+# Only these calls can fail for lack of space; an I/O error is injected into writing, syncing and
+# naming only.
 FULL = ("write", "pwrite64", "fsync", "fdatasync", "ftruncate", "openat", "rename", "mkdir")
 FAULTS = {"KILL": "signal=KILL", "INT": "signal=INT", "ENOSPC": "error=ENOSPC", "EIO": "error=EIO"}
 SAID = {"INT": "interrupted", "ENOSPC": "no space left", "EIO": "input/output error"}
@@ -28,7 +32,11 @@ EXITS = {"INT": 130, "ENOSPC": 1, "EIO": 1}
 
 
 class Call(NamedTuple):
-    """One system call of a build. number: among all of its name, from 1.  text: as strace shows it."""
+    """One system call of a build.
+
+    number: among all calls of its name, from 1.
+    text: as strace shows it.
+    """
 
     name: str
     number: int
@@ -36,7 +44,7 @@ class Call(NamedTuple):
 
 
 def has_strace() -> bool:
-    """Whether strace is here and may trace: containers forbid it unless asked not to."""
+    """Return whether strace is installed and permitted; containers forbid it by default."""
     program = shutil.which("strace")
     return program is not None and subprocess.run(
         [program, "-o", os.devnull, "true"], stderr=subprocess.DEVNULL, check=False
@@ -44,7 +52,7 @@ def has_strace() -> bool:
 
 
 def calls_of(case: Case) -> list[Call]:
-    """The calls of an undisturbed command that write to its own files or name them."""
+    """Return the calls of an undisturbed command that write or name its own files."""
     trace = case.folder.with_suffix(".trace")
     child = _traced(case, trace, ["-y"])
     if child.end() != 0 or case.finished():
@@ -65,10 +73,10 @@ def calls_of(case: Case) -> list[Call]:
 
 
 def inject(case: Case, call: Call, fault: str, tally: Tally, **how: object) -> None:
-    """Stop a command at one call, check what is there, and let the same command finish it.
+    """Stop a command at one call, check the files, and let the same command finish.
 
-    A disk that is full stays full until the build has ended, but for `write`, by which the error is said too; an
-    input/output error happens once.
+    A full disk stays full until the build has ended, except for `write`, which also writes the
+    error message; an I/O error occurs once.
     """
     when = f"{call.number}+" if fault == "ENOSPC" and call.name != "write" else str(call.number)
     trace = case.folder.with_suffix(".trace")
@@ -78,7 +86,7 @@ def inject(case: Case, call: Call, fault: str, tally: Tally, **how: object) -> N
     faults = case.visible()
     said = child.said()
     if status == 0:
-        # Only tidying up may fail without the build failing.
+        # Only the cleanup may fail without the build failing.
         tally.counts[f"{fault}: done all the same"] += 1
         faults += [] if fault == "KILL" else case.finished()[:1] if not case.whole() else []
         if fault == "KILL":
@@ -105,7 +113,7 @@ def inject(case: Case, call: Call, fault: str, tally: Tally, **how: object) -> N
 
 
 def one_of_each(calls: list[Call]) -> list[Call]:
-    """The middle one of each name."""
+    """Return the middle call of each name."""
     names = dict.fromkeys(call.name for call in calls)
     alike = [[call for call in calls if call.name == name] for name in names]
     return [found[len(found) // 2] for found in alike]
@@ -114,9 +122,10 @@ def one_of_each(calls: list[Call]) -> list[Call]:
 def all_calls(
     ground: Ground, tally: Tally, every: int | None = 1, say: Callable[[str], None] | None = None
 ) -> int:
-    """Each fault at each call of a build, of one that overwrites and of `add`; returns how many that were.
+    """Inject each fault at each call of a build, of one that overwrites, and of `add`.
 
-    every: at each so-many-th call alone; None: at one of each name of `build` and `add`.
+    every: only each K-th call; None: only one call of each name of `build` and `add`.
+    Returns the number of calls.
     """
     points = 0
     commands: dict[str, Callable[[], Case]] = {
@@ -129,7 +138,8 @@ def all_calls(
     for name, make in commands.items():
         calls = calls_of(make())
         if name == "build --overwrite":
-            # As the first build until the names are changed; only what follows is new.
+            # The calls equal those of the first build until names are changed; only the later ones
+            # are new.
             calls = calls[-12:]
         calls = calls[::every] if every else one_of_each(calls)
         for index, call in enumerate(calls):
@@ -144,7 +154,7 @@ def all_calls(
 
 
 def _traced(case: Case, trace: Path, options: list[str]) -> Child:
-    """A build under strace, going."""
+    """Start a build under strace."""
     child = Child(case.arguments(), case.folder.with_suffix(".log"))
     command = [
         "strace",

@@ -1,4 +1,4 @@
-"""A build that is small and writes many files, its undisturbed archive, and what must hold after it was stopped."""
+"""A small build that writes many files, its undisturbed archive, and the checks after it was stopped."""
 
 import hashlib
 import importlib
@@ -17,7 +17,8 @@ from solidcloud.schemas.errors import SolidcloudError
 from solidcloud.schemas.index_file import INDEX_NAME
 from solidcloud.schemas.vtkhdf import PREVIEW_NAME
 
-# What cuts a build into units, made small: some 10 units of a few hundred points, a shard a quarter of SHARD_POINTS.
+# Limits that divide a build into units, reduced: about 10 units of a few hundred points, a shard of
+# a quarter of SHARD_POINTS.
 SMALL: dict[str, Any] = {"SHARD_POINTS": 3200, "RANGE_POINTS": (1500, 1500), "LEAST_RUN_POINTS": 700}
 POINTS = 4000
 VOXEL = 1.0
@@ -25,7 +26,10 @@ NAME = "hall"
 
 
 def make_small() -> list[str]:
-    """Set the constants of SMALL wherever the builder's modules hold them; returns where. Once in each process."""
+    """Set the constants of SMALL wherever the builder's modules hold them; return where.
+
+    Call it once in each process.
+    """
     for module in pkgutil.iter_modules(solidcloud.builder.__path__):
         if module.name != "cluster":  # loads dask
             importlib.import_module(f"solidcloud.builder.{module.name}")
@@ -42,7 +46,7 @@ def make_small() -> list[str]:
 
 
 def write_scans(folder: Path) -> None:
-    """Two scans of a room of 4 m, the one LAS, the other text, some of their points the same."""
+    """Write two scans of a room of 4 m, one LAS, one text, with some points in common."""
     rng = np.random.default_rng(5)
     floor = np.column_stack([rng.uniform(0, 4, (POINTS // 2, 2)), rng.normal(0, 0.002, POINTS // 2)])
     wall = np.column_stack(
@@ -61,7 +65,7 @@ def write_scans(folder: Path) -> None:
 
 
 def content(folder: Path) -> dict[str, str]:
-    """What a folder holds: path below it -> SHA-256."""
+    """Return the content of a folder: path below it -> SHA-256."""
     return {
         path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
         for path in sorted(folder.rglob("*"))
@@ -72,8 +76,9 @@ def content(folder: Path) -> dict[str, str]:
 class Case:
     """One target to build, and the archive it must become.
 
-    folder: empty but for what a build leaves.  target: in it.  old: content of an archive that stood there before, {}
-    for none.
+    folder: empty except for what a build leaves.
+    target: in the folder.
+    old: content of a previous archive there, {} for none.
     """
 
     def __init__(self, folder: Path, scans: Path, reference: dict[str, str], jobs: int = 1) -> None:
@@ -83,17 +88,17 @@ class Case:
         folder.mkdir(parents=True)
 
     def put_old(self, archive: Path) -> None:
-        """Let another archive stand there, to be replaced."""
+        """Copy another archive to the target, to be replaced."""
         shutil.copytree(archive, self.target)
         self.old = content(archive)
 
     def arguments(self) -> list[str]:
-        """Of the command."""
+        """Return the command's arguments."""
         more = ["--overwrite"] if self.old else []
         return arguments(self.scans, self.target, self.jobs) + more
 
     def visible(self) -> list[str]:
-        """What is wrong with what stands under the name asked for; the build may be anywhere."""
+        """Return the faults of whatever the requested name shows; the build may be at any stage."""
         aside = self.folder / f".{NAME}.old"
         if self.target.exists():
             found = content(self.target)
@@ -106,11 +111,11 @@ class Case:
         return []
 
     def whole(self) -> bool:
-        """Whether the archive is there, every byte of it."""
+        """Return whether the archive is complete, every byte of it."""
         return self.target.exists() and content(self.target) == self.reference
 
     def finished(self) -> list[str]:
-        """What is wrong after a build that said it was done."""
+        """Return the faults after a build that reported success."""
         faults = []
         if not self.whole():
             found = content(self.target) if self.target.exists() else {}
@@ -123,14 +128,14 @@ class Case:
         return faults
 
     def _valid(self) -> list[str]:
-        """What `validate` says of the archive."""
+        """Return the faults that `validate` finds in the archive."""
         try:
             return [f"{self.target}: {fault}" for fault in verify_archive(self.target).faults]
         except SolidcloudError as error:
             return [str(error)]
 
     def stage(self) -> str:
-        """How far a build came that was stopped, by the files it left."""
+        """Return how far a stopped build came, judged by the files it left."""
         work = self.folder / f".{NAME}.building"
         if (self.folder / f".{NAME}.old").exists():
             return "between two renames"
@@ -148,8 +153,9 @@ class Case:
 
 
 class Change(Case):
-    """One archive that a scan is added to: it is the old one or the new, with or without files that it does not name.
+    """One archive that a scan is added to.
 
+    It is the old archive or the new one, with or without files that it does not name.
     scans: the one that is added.
     """
 
@@ -158,29 +164,29 @@ class Change(Case):
         self.put_old(before)
 
     def arguments(self) -> list[str]:
-        """Of the command."""
+        """Return the command's arguments."""
         return ["add", str(self.target), str(self.scans), "--jobs", "1"]
 
     def visible(self) -> list[str]:
-        """What is wrong with the archive, whenever it is looked at."""
+        """Return the faults of the archive, at any moment."""
         found = content(self.target)
         for whole in (self.old, self.reference):
-            # The preview follows, and says of which archive it is.
+            # The preview is replaced later; it states the archive it belongs to.
             if {name: whole[name] for name in whole if name != PREVIEW_NAME}.items() <= found.items():
                 return self._valid()
         return [f"{self.target}: neither the new archive nor the old: {difference(found, self.reference)}"]
 
     def whole(self) -> bool:
-        """Whether it is the new archive."""
+        """Return whether it is the new archive."""
         return content(self.target).get(INDEX_NAME) == self.reference[INDEX_NAME]
 
     def finished(self) -> list[str]:
-        """What is wrong after the scan was added, be it by a command that was stopped while it tidied up."""
+        """Return the faults after the scan was added, even by a command stopped during its cleanup."""
         return self.visible() if self.whole() else [f"{self.target}: the scan is not in it"]
 
 
 def arguments(scans: Path, target: Path, jobs: int) -> list[str]:
-    """Of the command that builds the scans."""
+    """Return the arguments of the command that builds the scans."""
     return [
         "build",
         str(scans),
@@ -196,7 +202,7 @@ def arguments(scans: Path, target: Path, jobs: int) -> list[str]:
 
 
 def difference(found: dict[str, str], expected: dict[str, str]) -> str:
-    """Which files differ, in a few words."""
+    """Describe briefly which files differ."""
     missing = sorted(expected.keys() - found.keys())
     extra = sorted(found.keys() - expected.keys())
     other = sorted(name for name in found.keys() & expected.keys() if found[name] != expected[name])
@@ -209,7 +215,7 @@ def difference(found: dict[str, str], expected: dict[str, str]) -> str:
 
 
 class Tally:
-    """Counts what was done to builds and what was found; `bad` holds each fault with how to do it again."""
+    """Counts of the disturbed builds and their faults; `bad` holds each fault with how to reproduce it."""
 
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter()
@@ -217,11 +223,11 @@ class Tally:
         self.bad: list[dict[str, Any]] = []
 
     def add(self, what: str, faults: list[str], **how: Any) -> None:
-        """One more of `what`; its faults, if any."""
+        """Count one more of `what`, with its faults."""
         self.counts[what] += 1
         if faults:
             self.bad.append({"what": what, **how, "faults": faults})
 
     def summary(self) -> dict[str, Any]:
-        """All of it, for JSON."""
+        """Return all counts, for JSON."""
         return {"counts": dict(self.counts), "stages": dict(self.stages), "bad": self.bad}

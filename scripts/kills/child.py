@@ -1,6 +1,6 @@
-"""The command `solidcloud` in a forked process: all is loaded already, so a build takes a fraction of a second.
+"""The command `solidcloud` in a forked process with everything loaded: a build takes a fraction of a second.
 
-The process that forks must have no other threads: no bars, no cluster.
+The forking process must have no other threads: no progress bars, no cluster.
 """
 
 import os
@@ -13,12 +13,12 @@ from pathlib import Path
 
 from solidcloud.server.cli import run
 
-# Far above what a small build takes, even while it is traced; then it hangs.
+# Far above the duration of a small build, even under strace; a longer run counts as hanging.
 PATIENCE = 60.0
 
 
 class Child:
-    """A build that waits for `go`. A process group of its own; what it prints goes to the file `log`."""
+    """A build that waits for `go`, in a separate process group; its output goes to the file `log`."""
 
     def __init__(self, arguments: list[str], log: Path, before: Callable[[], None] | None = None) -> None:
         """Fork. before: called in the child as it begins."""
@@ -27,22 +27,22 @@ class Child:
         self.pid = os.fork()
         if self.pid == 0:
             _build(arguments, log, gate, before)
-        os.setpgid(self.pid, self.pid)  # here as well as there: whoever comes first
+        os.setpgid(self.pid, self.pid)  # in parent and child, whichever is first
         os.close(gate)
 
     status: int | None
 
     def go(self) -> None:
-        """Let it begin."""
+        """Let the build begin."""
         os.write(self._gate, b"!")
         os.close(self._gate)
 
     def signal(self, number: int) -> None:
-        """Send a signal to all of its processes."""
+        """Send a signal to all processes of the group."""
         os.killpg(self.pid, number)
 
     def wait(self, seconds: float = PATIENCE) -> int | None:
-        """Its exit code, or minus the signal that ended it; None where it still runs after so long."""
+        """Return the exit code, or minus the signal that ended it; None at the time limit."""
         deadline = time.monotonic() + seconds
         while self.status is None:
             done, status = os.waitpid(self.pid, os.WNOHANG)
@@ -55,7 +55,7 @@ class Child:
         return self.status
 
     def end(self) -> int:
-        """Wait for its end; one that hangs is killed, and counts as -99."""
+        """Wait for the end; a hanging process is killed and counts as -99."""
         if self.wait() is None:
             self.signal(signal.SIGKILL)
             self.wait()
@@ -64,12 +64,12 @@ class Child:
         return self.status
 
     def said(self) -> str:
-        """All that it printed."""
+        """Return all output."""
         return self.log.read_text(errors="replace") if self.log.exists() else ""
 
 
 def build(arguments: list[str], log: Path, before: Callable[[], None] | None = None) -> Child:
-    """Run a build to its end, undisturbed but by what `before` does."""
+    """Run a build to its end, disturbed only by `before`."""
     child = Child(arguments, log, before)
     child.go()
     child.end()
@@ -77,7 +77,7 @@ def build(arguments: list[str], log: Path, before: Callable[[], None] | None = N
 
 
 def _build(arguments: list[str], log: Path, gate: int, before: Callable[[], None] | None) -> None:
-    """In the child: run the command, exit as it says. Never returns."""
+    """Run the command in the child and exit with its code. Never returns."""
     code = 1
     try:
         os.setpgid(0, 0)
@@ -90,13 +90,14 @@ def _build(arguments: list[str], log: Path, gate: int, before: Callable[[], None
         if before is not None:
             before()
         code = run(arguments)
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # as the command does
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # as the command itself does
     except SystemExit as error:
         code = error.code if isinstance(error.code, int) else 1
     except BaseException:
         traceback.print_exc()
     finally:
-        # Whatever happens: above this are the callers of the process that forked, and their folders to be tidied.
+        # Never return: the callers above belong to the forking process and would clean up its
+        # folders.
         try:
             sys.stdout.flush()
             sys.stderr.flush()
@@ -105,9 +106,9 @@ def _build(arguments: list[str], log: Path, gate: int, before: Callable[[], None
 
 
 class KillAt:
-    """Kills the process at its n-th call of what makes files durable and visible, before it or right after it.
+    """Kills the process at its n-th call that makes files durable and visible, before it or after it.
 
-    What is counted: os.fsync, os.replace, os.rename, os.unlink, os.rmdir and os.mkdir.
+    Counted calls: os.fsync, os.replace, os.rename, os.unlink, os.rmdir and os.mkdir.
     """
 
     CALLS = ("fsync", "replace", "rename", "unlink", "rmdir", "mkdir")
@@ -116,7 +117,7 @@ class KillAt:
         self.number, self.after, self.count = number, after, 0
 
     def __call__(self) -> None:
-        """Set the traps; in the child."""
+        """Install the hooks, in the child."""
         for name in self.CALLS:
             setattr(os, name, self._trapped(getattr(os, name)))
 
@@ -134,13 +135,13 @@ class KillAt:
 
 
 class CountCalls(KillAt):
-    """Counts the calls and kills nobody: the count is printed when the process ends."""
+    """Counts the calls without killing: the count is printed when the process ends."""
 
     def __init__(self) -> None:
         super().__init__(0, False)
 
     def __call__(self) -> None:
-        """Set the traps, and one for the end."""
+        """Install the hooks, and one for the end."""
         leave = os._exit
         super().__call__()
 

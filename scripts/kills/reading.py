@@ -1,6 +1,7 @@
 """Builds interrupted (SIGINT) at random moments while they read scans of one format, then finished.
 
-A build has two scans: one of the format, and a small one of text, so that one lost by --skip-bad would be missed.
+A build has two scans, one of the format and a small text scan: the loss of one by --skip-bad would
+be noticed.
 """
 
 import os
@@ -25,7 +26,8 @@ from solidcloud.server.cli import run
 from .case import NAME, Case, Tally, content
 from .child import PATIENCE, Child, build
 
-# Format -> the seed that writes it, its points for one of --points (text takes longer to read), options of the build.
+# Format -> seed file, points per point of --points (text takes longer to read), options of the
+# build.
 FORMATS: dict[str, tuple[Any, ...]] = {
     "las": ("new.las", 8),
     "laz": ("old.laz", 8),
@@ -50,13 +52,14 @@ FORMATS: dict[str, tuple[Any, ...]] = {
     "ply sampled": ("little.ply", 4, "--spacing", "0.5"),
     "glb sampled": ("mesh.glb", 4, "--spacing", "0.5"),
 }
-# An interrupt must end a build of any size within this many seconds, on a machine with nothing else to do.
+# Maximum time from an interrupt to the end of a build of any size, on an otherwise idle machine
+# [s].
 PROMPT = 1.0
 FORBIDDEN = ("Traceback", "check the file", "error:", "left out", "Exception ignored")
 
 
 class Interrupts(Tally):
-    """Counts of builds that were interrupted. waits: from the signal to the end of each [s]."""
+    """Counts of interrupted builds. waits: from the signal to the end of each [s]."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -64,7 +67,7 @@ class Interrupts(Tally):
 
 
 class ReadingCase(Case):
-    """One build of a scan of some format. options: more words of the command."""
+    """One build of a scan of some format. options: additional arguments of the command."""
 
     def __init__(
         self, folder: Path, scans: Path, reference: dict[str, str], options: tuple[str, ...]
@@ -73,16 +76,16 @@ class ReadingCase(Case):
         self.options = options
 
     def _valid(self) -> list[str]:
-        """Say nothing: it is the undisturbed archive, byte for byte."""
+        """Return no faults: the archive equals the undisturbed one, byte for byte."""
         return []
 
     def arguments(self) -> list[str]:
-        """Of the command."""
+        """Return the command's arguments."""
         return words(self.scans, self.target, self.options)
 
 
 def words(scans: Path, target: Path, options: tuple[str, ...]) -> list[str]:
-    """Of the command that builds all scans of a folder."""
+    """Return the arguments of the command that builds all scans of a folder."""
     files = sorted(str(path) for path in scans.iterdir())
     return [
         "build",
@@ -94,11 +97,11 @@ def words(scans: Path, target: Path, options: tuple[str, ...]) -> list[str]:
         "--voxel",
         "4",
         *options,
-    ]  # the last --jobs counts
+    ]  # the last --jobs takes effect
 
 
 def _usual_interrupt() -> None:
-    """Let SIGINT interrupt, in the child, also where its parent ignores it (nohup)."""
+    """Let SIGINT interrupt the child even where its parent ignores the signal (nohup)."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
@@ -106,7 +109,7 @@ class Command(Child):
     """The command as a user starts it: a process that loads all it needs. See `Child`."""
 
     def __init__(self, arguments: list[str], log: Path) -> None:
-        """Start it, in a session of its own."""
+        """Start the command in a new session."""
         self.log, self.status = log, None
         with open(log, "w") as output:
             self._process = subprocess.Popen(
@@ -121,10 +124,10 @@ class Command(Child):
         self.pid = self._process.pid
 
     def go(self) -> None:
-        """Do nothing: it has begun."""
+        """Do nothing: the command has begun."""
 
     def wait(self, seconds: float = PATIENCE) -> int | None:
-        """Return its exit code, or None where it still runs after so long."""
+        """Return the exit code, or None where it still runs after the limit."""
         try:
             self.status = self._process.wait(seconds)
         except subprocess.TimeoutExpired:
@@ -132,7 +135,7 @@ class Command(Child):
         return self.status
 
     def end(self) -> int:
-        """Wait for its end, and for that of all processes that it started."""
+        """Wait for the end of the command and of all processes that it started."""
         code = super().end()
         deadline = time.monotonic() + PATIENCE
         while time.monotonic() < deadline:
@@ -145,7 +148,7 @@ class Command(Child):
 
 
 def wait_for_handlers(child: Child) -> None:
-    """Wait until a command handles signals: Python is loaded, and it begins with its work, or has ended."""
+    """Wait until a command handles signals or has ended: Python is loaded, and its work begins."""
     deadline = time.monotonic() + PATIENCE
     while child.wait(0) is None and not _handles(child.pid, signal.SIGTERM):
         if time.monotonic() > deadline:
@@ -154,14 +157,14 @@ def wait_for_handlers(child: Child) -> None:
 
 
 def _handles(pid: int, number: int) -> bool:
-    """Return whether a process has a handler of its own for a signal."""
+    """Return whether a process has a custom handler for a signal."""
     lines = Path(f"/proc/{pid}/status").read_text().splitlines()
     caught = next((line.split()[1] for line in lines if line.startswith("SigCgt")), "0")
     return bool(int(caught, 16) >> (number - 1) & 1)
 
 
 class Format:
-    """The scans of one format, the archive that an undisturbed build makes of them, and how long that takes."""
+    """The scans of one format, the archive of an undisturbed build, and the duration of that build."""
 
     def __init__(self, folder: Path, name: str, points: int) -> None:
         """Write the scans and build them once. Raises RuntimeError where that fails."""
@@ -177,7 +180,7 @@ class Format:
         target.parent.mkdir()
         self.seconds = 0.0
         with open(folder / "warm.log", "w") as log, redirect_stdout(log), redirect_stderr(log):
-            run(words(self.scans, folder / "warm", self.options))  # load here what builds in forks need
+            run(words(self.scans, folder / "warm", self.options))  # load everything that builds in forks need
         begin = time.perf_counter()
         child = build(words(self.scans, target, self.options), folder / "reference.log")
         self.seconds = time.perf_counter() - begin
@@ -187,9 +190,9 @@ class Format:
         self.cases = 0
 
     def interrupted(self, moment: float, skip_bad: bool, tally: Interrupts, *more: str) -> None:
-        """Interrupt one build after `moment` [s] and finish it; what is wrong goes to the tally.
+        """Interrupt one build after `moment` [s] and finish it; adds faults to the tally.
 
-        more: options; with any, the command is started as a process of its own, and may start others.
+        more: options; with any, the command is started as a separate process and may start others.
         """
         self.cases += 1
         options = (*self.options, *(("--skip-bad",) if skip_bad else ()), *more)
@@ -223,7 +226,7 @@ class Format:
 
 
 def judged(status: int, said: str) -> list[str]:
-    """What is wrong with the end of a command that was interrupted."""
+    """Return the faults of the end of an interrupted command."""
     faults = [] if status == 130 else [f"exit code {status}, expected 130: {said[-500:]}"]
     faults += [f"it said {word!r}: {said[-1500:]}" for word in FORBIDDEN if word in said]
     if said.count("interrupted") != 1:
@@ -232,14 +235,17 @@ def judged(status: int, said: str) -> list[str]:
 
 
 def moments(seconds: float, count: int, rng: random.Random) -> list[float]:
-    """Random moments of a build, half of them in its first half, where scans are read."""
+    """Return random moments of a build, half of them in its first half, where scans are read."""
     return [rng.uniform(0, seconds * (0.5 if k % 2 else 1.0)) for k in range(count)]
 
 
 def interrupt_reading(
     folder: Path, name: str, points: int, count: int, seed: int, say: Callable[[str], None], *more: str
 ) -> Interrupts:
-    """Interrupt `count` builds of scans of one format, every second with --skip-bad. more: see `Format.interrupted`."""
+    """Interrupt `count` builds of scans of one format, every second with --skip-bad.
+
+    more: see `Format.interrupted`.
+    """
     tally = Interrupts()
     begin = time.perf_counter()
     plain = Format(folder / name.replace(" ", "-"), name, points)

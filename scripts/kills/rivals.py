@@ -1,4 +1,4 @@
-"""Two builders of one target: the second is refused at once, and the first goes on as if nobody had been there."""
+"""Two builders of one target: the second is refused at once, and the first continues undisturbed."""
 
 import signal
 import time
@@ -7,12 +7,12 @@ from .at_random import Ground, check_finish
 from .case import Tally
 from .child import Child
 
-# A builder that comes second is told so within this [s].
+# Maximum time until the second builder is refused [s].
 AT_ONCE = 1.0
 
 
 def rival(ground: Ground, tally: Tally) -> float:
-    """Stop a builder half-way, let another try, let the first go on; returns what the second took [s]."""
+    """Stop a builder halfway, let another try, resume the first; return the duration of the second [s]."""
     case = ground.case()
     work = case.folder / ".hall.building"
     first = Child(case.arguments(), case.folder.with_suffix(".first.log"))
@@ -36,7 +36,7 @@ def rival(ground: Ground, tally: Tally) -> float:
         faults.append(f"the first builder exited with {first.status}: {first.said()[-1000:]}")
     tally.add("two builders", faults + case.finished())
 
-    # A lock dies with its holder: who comes after a kill is not refused.
+    # A lock ends with its holder: a builder that starts after a kill is not refused.
     case = ground.case()
     first = Child(case.arguments(), case.folder.with_suffix(".first.log"))
     first.go()

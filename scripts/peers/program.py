@@ -1,4 +1,4 @@
-"""The peers program from Python: built where a nightly Rust is found, fed with arrays, asked loop by loop."""
+"""Python interface of the peers program: builds it with a nightly Rust, sends arrays, runs loops."""
 
 import json
 import os
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 
 def build_peers(cache: Path) -> Path | str:
-    """The program, built into the folder `cache`; or, as text, why there is none."""
+    """Build the program into the folder `cache` and return it; or return the reason why there is none."""
     command = _nightly()
     if command is None:
         return "no nightly cargo found: `rustup toolchain install nightly`, then run this again"
@@ -26,7 +26,7 @@ def build_peers(cache: Path) -> Path | str:
 
 
 def _nightly() -> list[str] | None:
-    """The command of a nightly cargo: by rustup's switch, or because the only one is."""
+    """Return the command of a nightly cargo: by rustup's switch, or the only one installed."""
     cargo = shutil.which("cargo")
     for command in ([cargo, "+nightly"], [cargo]) if cargo else ():
         version = subprocess.run([*command, "--version"], capture_output=True, text=True)
@@ -36,14 +36,15 @@ def _nightly() -> list[str] | None:
 
 
 def _flat(poses: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Poses (k, 4, 4) as README.md describes them, (k, 12)."""
+    """Return poses (k, 4, 4) as README.md describes them, (k, 12)."""
     return np.concatenate([poses[:, :3, :3].reshape(-1, 9), poses[:, :3, 3]], axis=1).astype("<f4")
 
 
 class Peers:
-    """The program kept running on one case, so that its loops can alternate with another side's.
+    """The program kept running on one case, which lets its loops alternate with another side's.
 
-    sides: name -> what README.md says of a side. A context manager: the program ends with it.
+    sides: name -> the description of a side as in README.md.
+    A context manager: the program ends with it.
     """
 
     def __init__(
@@ -58,8 +59,10 @@ class Peers:
     ) -> None:
         """Write the case into `folder`, start the program and wait until it has tried every setting.
 
-        scene: (n, 3) and avatar: (m, 3) [m]; poses: (k, 4, 4), avatar to the scene's frame, whose origin must
-        be near, for all becomes float32.  distance: both radii together [m].
+        scene: (n, 3) and avatar: (m, 3) [m].
+        poses: (k, 4, 4), avatar to the scene's frame, whose origin must be near, because everything
+        becomes float32.
+        distance: sum of both radii [m].
         """
         self.folder = folder
         for name, rows in (("scene", scene), ("avatar", avatar), ("poses", _flat(poses))):
@@ -71,7 +74,7 @@ class Peers:
         self.sides: dict[str, dict] = json.loads(self._line())["sides"]
 
     def __enter__(self) -> "Peers":
-        """The program itself."""
+        """Return the program."""
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -86,26 +89,26 @@ class Peers:
         return line
 
     def turn(self, name: str, file: Path | None = None) -> float:
-        """One loop of a side over all poses, or those of a file, after one that warms it [us a pose]."""
+        """Run one loop of a side over all poses or a file's, after a warm-up loop; return [us per pose]."""
         assert self.process.stdin is not None
         self.process.stdin.write(f"{name} {file}\n" if file else f"{name}\n")
         self.process.stdin.flush()
         return float(self._line())
 
     def give(self, label: str, poses: NDArray[np.float64]) -> Path:
-        """Write other poses (k, 4, 4), avatar to the scene's frame, as a file for `turn`."""
+        """Write other poses (k, 4, 4), avatar to the scene's frame, to a file for `turn`."""
         file = self.folder / f"{label}.f32"
         _flat(poses).tofile(file)
         return file
 
     def touching_of(self, name: str, file: Path) -> NDArray[np.bool_]:
-        """Which poses (k,) of a file touch, says this side, once it had a turn with it."""
+        """Return which poses (k,) of a file touch, according to a side that has run a turn with it."""
         return np.fromfile(f"{file}.{name}.u8", np.uint8) == 1
 
     def touching(self, name: str) -> NDArray[np.bool_]:
-        """Which poses (k,) touch, says this side."""
+        """Return which poses (k,) touch, according to this side."""
         return np.fromfile(self.folder / f"{name}.verdicts.u8", np.uint8) == 1
 
     def each(self, name: str) -> NDArray[np.float32]:
-        """Least time of each pose (k,) [us]."""
+        """Return the least time of each pose (k,) [us]."""
         return np.fromfile(self.folder / f"{name}.us.f32", "<f4")

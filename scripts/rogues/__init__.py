@@ -1,1 +1,1 @@
-"""Rogue clients: whoever reaches a server's port and lies, listens or takes another's place."""
+"""Rogue clients: sessions that reach a server's port and forge, eavesdrop or impersonate."""

@@ -1,7 +1,8 @@
-"""What a rogue tries against one victim: each tool under each width of key expression, and what came of it.
+"""Attacks of a rogue on one victim: each tool under each width of key expression, and the outcome.
 
-The victim is a `Client` of the made floor of the tests, with a session. A rogue is a plain zenoh session at the
-same server. An attempt succeeds if the victim hears a lie or loses something, or if the rogue hears of the victim.
+The victim is a `Client` of the tests' generated floor, with a session. A rogue is a plain zenoh
+session at the same server. An attempt succeeds if the victim receives forged data or loses
+something, or if the rogue receives the victim's data.
 """
 
 import json
@@ -34,12 +35,12 @@ MODES = ("client", "peer", "router")
 AVATAR = "al"
 POINTS = np.array([[0.0, 0.0, 0.5], [0.25, 0.0, 1.0], [0.0, 0.25, 1.5]])
 MSGPACK = "application/msgpack"
-# A state waited for on a busy machine [s], a query that nobody lets through [s].
+# Time limits [s]: for a state on a busy machine, and for a query that nothing lets through.
 DEADLINE, NO_REPLY = 20.0, 0.02
 
 
 def widths(scene: str, client: str) -> list[str]:
-    """Key expressions that match the victim's keys, from the widest to its own, and some that are its neighbours."""
+    """Return key expressions that match the victim's keys, from wide to exact, and some neighbours."""
     return [
         "**",
         "solidcloud/**",
@@ -57,7 +58,7 @@ def widths(scene: str, client: str) -> list[str]:
 
 
 class Victim(NamedTuple):
-    """A client of the floor that walks it, and its id."""
+    """A client of the floor with a session on it, and its id."""
 
     client: Client
     session: ClientSession
@@ -79,7 +80,10 @@ class Rogue:
         self.session.close()  # type: ignore[no-untyped-call]
 
     def settle(self) -> None:
-        """Wait until the server has seen what was declared and sent: it answers what comes behind it on this link."""
+        """Wait until the server has processed everything declared and sent.
+
+        It then answers a later query on this link.
+        """
         assert list(self.session.get("solidcloud/1/scenes", timeout=DEADLINE)), "the server is there"
 
 
@@ -87,7 +91,7 @@ Tool = Callable[[Rogue, str, Victim], list[str]]
 
 
 def attempt(tool: str, rogue: Rogue, width: str, victim: Victim) -> list[str]:
-    """Try a tool under one width; what it achieved, in words."""
+    """Try a tool under one width; return its achievements in words."""
     try:
         return TOOLS[tool](rogue, width, victim)
     except zenoh.ZError:
@@ -95,7 +99,7 @@ def attempt(tool: str, rogue: Rogue, width: str, victim: Victim) -> list[str]:
 
 
 def pose_at(x: float, z: float) -> Any:
-    """A pose (4, 4), not turned."""
+    """Return a pose (4, 4) without rotation."""
     pose = np.eye(4)
     pose[0, 3], pose[2, 3] = x, z
     return pose
@@ -118,7 +122,7 @@ def _queryable(rogue: Rogue, width: str, victim: Victim) -> list[str]:
 
 
 def zeros(query: zenoh.Query) -> bytes:
-    """Return an answer to a question that says `clear` of everything; to what is no question a state far away."""
+    """Return a forged answer: `clear` for everything to a request, a far state to anything else."""
     operation = str(query.key_expr).rpartition("/")[2]
     try:
         asked = msgspec.msgpack.decode(query.payload.to_bytes())
@@ -142,7 +146,7 @@ _ANSWERS: dict[str, Any] = {
 
 
 def _asked(victim: Victim) -> list[str]:
-    """What is wrong with what the victim is told about poses in the floor."""
+    """Return the faults in the victim's answers about poses in the floor."""
     poses = np.tile(pose_at(0.0, -1.0), (3, 1, 1))
     verdicts = [victim.client.collide(AVATAR, poses).verdict]
     verdicts += [part.verdict for part in victim.client.path(AVATAR, poses)]
@@ -152,7 +156,7 @@ def _asked(victim: Victim) -> list[str]:
 
 
 def _walked(victim: Victim, z: float) -> list[str]:
-    """What is wrong with where the victim gets to."""
+    """Return the faults in the victim's position after a motion."""
     try:
         for _ in range(3):
             state = victim.session.wait(victim.session.wish(pose_at(0.0, z)), DEADLINE)
@@ -180,12 +184,12 @@ def _put(rogue: Rogue, width: str, victim: Victim) -> list[str]:
 def _token(rogue: Rogue, width: str, victim: Victim) -> list[str]:
     rogue.session.liveliness().declare_token(width).undeclare()
     rogue.settle()
-    time.sleep(0.005)  # the server hears of tokens on a channel of its own
+    time.sleep(0.005)  # the server receives tokens on a separate channel
     request = encode(CollideRequest(AVATAR, pose_at(0.0, -1.0)[None]))
     try:
         victim.client._ask("collide", request, [AVATAR])
     except SolidcloudError as error:
-        _asked(victim)  # the avatar is added again
+        _asked(victim)  # adds the avatar again
         return [f"{type(error).__name__}: {error}"]
     return []
 
@@ -227,9 +231,10 @@ TOOLS: dict[str, Tool] = {
 
 
 class Impostor:
-    """A program that listens where a server was and says `clear` under the right keys; a context manager.
+    """A program that listens at a server's address and answers `clear` under the right keys.
 
-    seal: makes the attachment of a reply, from the query and the payload; by default there is none.
+    A context manager.
+    seal: makes the attachment of a reply from the query and the payload; by default there is none.
     """
 
     def __init__(

@@ -1,9 +1,9 @@
 """Journal of a build on disk: entries that allow the same command to resume after a kill.
 
 An entry is a small JSON file, also called a note. It is written once, when everything it refers to
-is durable on disk, and certifies these files. The next build
-deletes, unread, the files that no entry certifies. An entry is therefore never wrong, at whatever moment the power fails. Work
-without an entry is repeated.
+is durable on disk, and certifies these files. The next build deletes, unread, the files that no
+entry certifies. An entry is therefore never wrong, at whatever moment the power fails. Work without
+an entry is repeated.
 """
 
 import json

@@ -29,7 +29,7 @@ def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.case(
     25,
-    "10,000 mixed requests on 1, 2 and 4 threads, loads and evictions between: the same reply bytes, costs aside",
+    "10,000 mixed requests on 1, 2 and 4 threads, with loads and evictions: the same reply bytes, except for costs",
 )
 @pytest.mark.interpreted
 @pytest.mark.timeout(900)  # it may be the first to compile everything

@@ -39,7 +39,7 @@ def elsewhere(code: str, *arguments: str, **environment: str) -> str:
 
 @pytest.mark.case(
     21,
-    "nothing there is clear; outside is clear and says so; a corrupt record and a scan left out are unknown",
+    "an empty region is clear; outside is clear and flagged; a corrupt record and a scan left out are unknown",
 )
 @pytest.mark.interpreted
 def test_case_21_empty_outside_not_loaded_skipped(tmp_path: Path) -> None:
@@ -78,7 +78,7 @@ def test_case_22_an_avatar_over_the_cap_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.case(
     23,
-    "512 voxels in reach with room for 1, 7 and 200: the answers of the whole, none missing, each read once a pose",
+    "512 voxels in reach with room for 1, 7 and 200: same answers, none missing, each read once per pose",
 )
 @pytest.mark.interpreted
 def test_case_23_a_pose_that_reaches_hundreds_of_voxels(tmp_path: Path) -> None:
@@ -103,7 +103,7 @@ def test_case_23_a_pose_that_reaches_hundreds_of_voxels(tmp_path: Path) -> None:
 
 @pytest.mark.case(
     24,
-    "placed integers, verdicts and counters of 60 poses are the interpreter's",
+    "placed integers, verdicts and counters of 60 poses equal the interpreter's",
     compiled_only="it runs both itself",
 )
 @pytest.mark.skipif(INTERPRETED, reason="the other side of this comparison is the interpreted one")

@@ -119,7 +119,7 @@ print(json.dumps(found))
 
 @pytest.mark.case(
     31,
-    "each effect alone: of all effects, and of what only some have a use for, what it needs is imported and said",
+    "each effect alone: only this effect and its requirements are imported, and only they report",
 )
 @pytest.mark.interpreted
 def test_case_31_of_all_effects_only_those_declared_are_imported_and_say_something(tmp_path: Path) -> None:
@@ -156,7 +156,7 @@ def test_case_31_of_all_effects_only_those_declared_are_imported_and_say_somethi
 
 @pytest.mark.case(
     31,
-    "a scene opened and asked imports no effect, report, maker, reader, transport, zenoh or plotting",
+    "a scene that is opened and queried imports no effect, report, generator, reader, transport, zenoh or plotting",
 )
 @pytest.mark.interpreted
 def test_case_31_what_is_not_declared_is_not_imported(tmp_path: Path) -> None:
@@ -194,7 +194,7 @@ def test_case_31_what_is_not_declared_is_not_imported(tmp_path: Path) -> None:
 
 @pytest.mark.case(
     31,
-    "beside other avatars and questions, and every effect, collide replies the same bytes at the same cost",
+    "beside other avatars, queries and all effects, collide replies the same bytes at the same cost",
 )
 @pytest.mark.interpreted
 def test_case_31_what_else_a_scene_holds_costs_a_question_nothing(

@@ -15,7 +15,8 @@ CLEAR, CONTACT, UNKNOWN = Verdict
 
 
 @pytest.mark.case(
-    30, "what a budget of visits decides, every larger one decides alike; no verdict contradicts the judge's"
+    30,
+    "a verdict decided under a budget of visits stays under every larger one; none contradicts the judge's",
 )
 @pytest.mark.interpreted
 def test_case_30_a_budget_takes_nothing_back(tmp_path: Path, rng: np.random.Generator) -> None:
@@ -37,7 +38,7 @@ def test_case_30_a_budget_takes_nothing_back(tmp_path: Path, rng: np.random.Gene
     assert told[0] < told[-1] == len(poses) and told == sorted(told) and truth.any() and not truth.all()
 
 
-@pytest.mark.case(30, "contact is called early by no more than the tolerance, and said not to be exact")
+@pytest.mark.case(30, "contact is reported early by no more than the tolerance, and flagged as not exact")
 @pytest.mark.interpreted
 def test_case_30_early_by_at_most_the_tolerance(tmp_path: Path) -> None:
     # One point, one ball of 0.25 m: contact begins at a distance of exactly 0.25 m, and early at 0.25 m + 1/8 m.
@@ -59,7 +60,7 @@ def test_case_30_early_by_at_most_the_tolerance(tmp_path: Path) -> None:
     assert (near.upper - near.lower <= 0.125 + 1e-7).all()
 
 
-@pytest.mark.case(30, "what is not loaded when the time is up is unknown, never clear")
+@pytest.mark.case(30, "what is not loaded when the time is over is unknown, never clear")
 @pytest.mark.interpreted
 def test_case_30_what_is_not_resident_by_the_deadline_is_unknown(tmp_path: Path) -> None:
     case = cases.build(tmp_path, np.array([[0.0, 0, 0], [2.0, 0, 0]]), voxel=1.0, resolution=1e-3)

@@ -65,7 +65,7 @@ def questions(scene: Scene, shift: NDArray[np.float64], seed: int) -> dict[str, 
 
 @pytest.mark.case(
     1,
-    "every question at UTM and ECEF coordinates: the reply of the scene at the origin, bit for bit, costs too",
+    "every query at UTM and ECEF coordinates: the reply of the scene at the origin, bit for bit, costs included",
 )
 @pytest.mark.interpreted
 @pytest.mark.parametrize("shift", SHIFTS)

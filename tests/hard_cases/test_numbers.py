@@ -23,7 +23,7 @@ POINT = np.zeros((1, 3))
 
 
 @pytest.mark.case(
-    1, "moved by 5.6e6, 6.4e6 and 1e8 m, index and verdicts are those at the origin, and the judge's"
+    1, "moved by 5.6e6, 6.4e6 and 1e8 m: index and verdicts equal those at the origin, and the judge's"
 )
 @pytest.mark.interpreted
 @pytest.mark.parametrize(
@@ -125,7 +125,7 @@ def test_case_14_what_is_not_finite_reaches_no_kernel(tmp_path: Path, bad: float
 
 
 @pytest.mark.case(
-    15, "radii of 0 and denormal ones touch where the integers coincide; negative ones are refused"
+    15, "radii of 0 and denormal radii give contact where the integers coincide; negative ones are refused"
 )
 @pytest.mark.interpreted
 def test_case_15_radii_of_zero_and_less(tmp_path: Path) -> None:
@@ -163,7 +163,7 @@ def test_case_16_coordinates_up_to_their_bound_overflow_nothing(tmp_path: Path) 
 
 @pytest.mark.case(
     17,
-    "a² - 2ab + b² in float64 at UTM: over a tenth negative, over a tenth of verdicts wrong; ours none",
+    "a² - 2ab + b² in float64 at UTM: over a tenth negative, over a tenth of verdicts wrong; of ours none",
 )
 @pytest.mark.interpreted
 def test_case_17_the_expanded_square_is_not_what_decides(tmp_path: Path, rng: np.random.Generator) -> None:
@@ -223,7 +223,7 @@ def test_case_19_the_lattice_moves_contact_by_its_declared_band(
     assert 20 < plain.sum() < 130
 
 
-@pytest.mark.case(16, "a reach of 2^30 units is answered, more is refused")
+@pytest.mark.case(16, "a reach of 2^30 units is accepted, more is refused")
 @pytest.mark.interpreted
 def test_case_16_reach_is_bounded_so_that_squares_fit(tmp_path: Path) -> None:
     case = cases.build(tmp_path, POINT, radius=8.0, resolution=1e-2, voxel=8.0)

@@ -73,7 +73,8 @@ def test_case_09_one_point_an_empty_voxel_an_empty_avatar_an_empty_scene(tmp_pat
 
 
 @pytest.mark.case(
-    10, "points on cell and voxel borders, -0.0 among them, are stored once each and touched where they are"
+    10,
+    "points on cell and voxel borders, including -0.0, are stored once each and give contact where they are",
 )
 @pytest.mark.interpreted
 def test_case_10_points_on_borders_are_each_in_one_cell(tmp_path: Path) -> None:
@@ -157,7 +158,7 @@ def test_case_12_the_deepest_level_is_one_lattice_step(tmp_path: Path) -> None:
 
 @pytest.mark.case(
     13,
-    "10^6 points in 5 cm beside 100 over 8 m (10^4 interpreted): work grows by levels, in the build and in questions",
+    "10^6 points in 5 cm beside 100 over 8 m (10^4 interpreted): work grows with the levels, in build and queries",
 )
 @pytest.mark.interpreted
 def test_case_13_a_million_to_one_in_one_voxel(tmp_path: Path, rng: np.random.Generator) -> None:

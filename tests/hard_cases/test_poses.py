@@ -50,7 +50,7 @@ def test_case_02_an_origin_comes_back_to_the_bit(tmp_path: Path, place: tuple[fl
 
 @pytest.mark.case(
     4,
-    "a quaternion off by 1e-6 is normalised to rounding; 1 % off, zero or not finite it is refused by its line",
+    "a quaternion off by 1e-6 is normalised to rounding; 1 % off, zero or not finite, it is refused with its line",
 )
 @pytest.mark.interpreted
 def test_case_04_quaternions_are_normalised_or_refused(tmp_path: Path, rng: np.random.Generator) -> None:
@@ -86,7 +86,7 @@ def test_case_04_quaternions_are_normalised_or_refused(tmp_path: Path, rng: np.r
 
 @pytest.mark.case(
     5,
-    "a pose turned 10^6 times (10^4 interpreted) and asked each time: closes within 1 µm at 10 m, same verdict",
+    "a pose rotated 10^6 times (10^4 interpreted), queried each time: closes within 1 µm at 10 m, same verdict",
 )
 @pytest.mark.interpreted
 def test_case_05_a_pose_updated_a_million_times_closes(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
 
 @pytest.mark.case(
     28,
-    "half the mean closest-point distance, twins and voxel borders everywhere: that of brute force to 2^-33 m",
+    "half the mean closest-point distance, with duplicates and voxel borders everywhere: brute force to 2^-33 m",
 )
 @pytest.mark.interpreted
 @pytest.mark.parametrize("kind", ["plane", "noise", "duplicates"])

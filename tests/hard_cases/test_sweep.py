@@ -25,7 +25,7 @@ UNIT = 2.0**-26
 
 @pytest.mark.case(
     26,
-    "ways of 1 cm, 1 m, 100 m and 10 km: first contact within 1 µm of the truth; clear where the way ends 0.1 mm short",
+    "motions of 1 cm, 1 m, 100 m and 10 km: first contact within 1 µm of the truth; clear if it ends 0.1 mm short",
 )
 @pytest.mark.interpreted
 @pytest.mark.parametrize("length", [0.01, 1.0, 100.0, 10_000.0])
@@ -46,7 +46,7 @@ def test_case_26_ways_from_a_centimetre_to_ten_kilometres(tmp_path: Path, length
             assert back.verdict[0] == Verdict.CLEAR and back.lower[0] == 1 and back.upper[0] == np.inf
 
 
-@pytest.mark.case(26, "no motion: the verdict of collide, to the unit")
+@pytest.mark.case(26, "a motion of length zero: the verdict of collide, exact to the unit")
 @pytest.mark.interpreted
 def test_case_26_zero_motion_is_the_static_answer(tmp_path: Path, rng: np.random.Generator) -> None:
     case = cases.build(tmp_path, scans.make_scan("plane", 1, 60), radius=0.0)
@@ -69,7 +69,7 @@ def test_case_26_zero_motion_is_the_static_answer(tmp_path: Path, rng: np.random
                 )
 
 
-@pytest.mark.case(26, "tangent, to the unit, at one end alone: found")
+@pytest.mark.case(26, "tangency, exact to the unit, at one end only: found")
 @pytest.mark.interpreted
 def test_case_26_contact_at_the_very_end_and_at_the_very_beginning(tmp_path: Path) -> None:
     # Tangent, to the unit, at one end of the way and nowhere else.
@@ -85,7 +85,7 @@ def test_case_26_contact_at_the_very_end_and_at_the_very_beginning(tmp_path: Pat
     assert away.verdict[0] == Verdict.CONTACT and away.lower[0] == away.upper[0] == 0 and away.exact[0]
 
 
-@pytest.mark.case(26, "a graze within rounding is unknown or found, never clear")
+@pytest.mark.case(26, "a grazing contact within rounding is unknown or found, never clear")
 @pytest.mark.interpreted
 def test_case_26_a_graze_is_unknown_or_found_never_clear(tmp_path: Path) -> None:
     """Past a sphere by so many units: well apart is clear, well inside exact, between them nothing is claimed."""
@@ -107,7 +107,7 @@ def test_case_26_a_graze_is_unknown_or_found_never_clear(tmp_path: Path) -> None
             assert answers.steps[0] < 100
 
 
-@pytest.mark.case(26, "contact beyond a graze that could not be decided is found")
+@pytest.mark.case(26, "contact beyond an undecided grazing contact is found")
 @pytest.mark.interpreted
 def test_case_26_contact_beyond_a_graze_is_found(tmp_path: Path) -> None:
     points = np.array([[0.0, 0, 0], [2.0, 0.5, 0]])
@@ -122,7 +122,7 @@ def test_case_26_contact_beyond_a_graze_is_found(tmp_path: Path) -> None:
 
 @pytest.mark.case(
     26,
-    "turns in place up to half a turn: the judge's answers, none unknown",
+    "rotations in place up to half a turn: the judge's answers, none unknown",
 )
 @pytest.mark.interpreted
 def test_case_26_turns_alone(tmp_path: Path, rng: np.random.Generator) -> None:
@@ -143,7 +143,7 @@ def test_case_26_turns_alone(tmp_path: Path, rng: np.random.Generator) -> None:
 
 @pytest.mark.case(
     23,
-    "a way through 8 caches of voxels: the bounds of the whole; what lies beyond the contact is not loaded",
+    "a motion through over 8 times the cache: the bounds of a large cache; voxels beyond contact are not loaded",
 )
 @pytest.mark.interpreted
 def test_case_23_a_way_through_more_than_the_cache_holds(tmp_path: Path, rng: np.random.Generator) -> None:
@@ -172,7 +172,7 @@ def test_case_23_a_way_through_more_than_the_cache_holds(tmp_path: Path, rng: np
         assert data.residency.misses < 0.6 * loaded
 
 
-@pytest.mark.case(21, "voxels that cannot be read: unknown from there on, exact before")
+@pytest.mark.case(21, "voxels that cannot be read: unknown from there on along the motion, exact before")
 @pytest.mark.interpreted
 def test_case_21_what_is_missing_is_unknown_from_there_on(tmp_path: Path, rng: np.random.Generator) -> None:
     points = np.concatenate(
@@ -213,7 +213,7 @@ def test_case_21_what_is_missing_is_unknown_from_there_on(tmp_path: Path, rng: n
     assert apart.verdict[0] == Verdict.CLEAR and apart.voxels_missing[0] == 0
 
 
-@pytest.mark.case(21, "regions of scans left out: unknown from there on")
+@pytest.mark.case(21, "regions of scans left out: unknown from there on along the motion")
 @pytest.mark.interpreted
 def test_case_21_regions_of_scans_left_out(tmp_path: Path) -> None:
     case = cases.build(tmp_path, POINT, radius=0.25, resolution=cases.BINARY_STEP)
@@ -240,7 +240,7 @@ def test_case_21_regions_of_scans_left_out(tmp_path: Path) -> None:
     assert found.verdict[0] == Verdict.CONTACT and found.lower[0] == 0 and not found.exact[0]
 
 
-@pytest.mark.case(3, "motions that change size, shear, or are no motions are refused")
+@pytest.mark.case(3, "motions that change size or shear, and unequal numbers of ends, are refused")
 @pytest.mark.interpreted
 def test_case_03_motions_that_change_size_are_refused(tmp_path: Path) -> None:
     case = cases.build(tmp_path, POINT, radius=0.25)
@@ -299,7 +299,7 @@ print([column.tobytes().hex() for column in (found.verdict, found.lower, found.u
 
 
 @pytest.mark.case(
-    24, "bounds and witnesses of sweeps are the interpreter's", compiled_only="it runs both itself"
+    24, "bounds and witnesses of sweeps equal the interpreter's", compiled_only="it runs both itself"
 )
 def test_case_24_compiled_and_interpreted_agree_bit_for_bit(tmp_path: Path) -> None:
     case = cases.build(tmp_path, scans.make_scan("corner", 2, 60), radius=0.01)

@@ -19,7 +19,7 @@ POINT = np.zeros((1, 3))
 
 @pytest.mark.case(
     26,
-    "500 motions of 20 to 200 m through a wall of one layer, half turning: none missed; poses 1 m apart miss most",
+    "500 motions of 20 to 200 m through a wall of one layer, half rotating: none missed; poses 1 m apart miss most",
 )
 @pytest.mark.interpreted
 def test_case_26_no_thin_wall_is_missed(tmp_path: Path, rng: np.random.Generator) -> None:
@@ -60,7 +60,7 @@ def test_case_26_no_thin_wall_is_missed(tmp_path: Path, rng: np.random.Generator
 
 
 @pytest.mark.case(
-    26, "400 motions of 1 cm to 10 km through a wall 1 mm thick, straight and turning: none missed"
+    26, "400 motions of 1 cm to 10 km through a wall 1 mm thick, straight and rotating: none missed"
 )
 @pytest.mark.interpreted
 @pytest.mark.parametrize("length", [0.01, 1.0, 100.0, 10_000.0])
@@ -93,7 +93,7 @@ def test_case_26_a_wall_of_a_millimetre_is_met_on_any_way(
 
 @pytest.mark.case(
     26,
-    "along a wall at 1 cm to 1 µm, turning and rolling: the judge's answers in a bounded number of steps",
+    "motion along a wall at 1 cm to 1 µm, rotating and rolling: the judge's answers in a bounded number of steps",
 )
 @pytest.mark.interpreted
 def test_case_26_along_a_wall_and_round_in_place(tmp_path: Path, rng: np.random.Generator) -> None:

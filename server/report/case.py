@@ -1,4 +1,4 @@
-"""What the walkthrough is measured on: the made façade of the paper's size, or a user's own scene."""
+"""Test data of the walkthrough: the generated façade of the paper's size, or a user's own scene."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,12 +17,12 @@ from ..pose_file import read_poses
 from .points import read_avatar
 
 PAPER_POINTS = 587_923
-PAPER_VOXEL = 32.0  # [m]; holds the whole made façade, as the paper's one voxel does
-STEP = 1e-4  # lattice step of the builds, unless an archive brings its own [m]
+PAPER_VOXEL = 32.0  # [m]; contains the whole generated façade, like the paper's one voxel
+STEP = 1e-4  # lattice step of the builds [m], unless an archive with its own step is given
 
 
 class Case(NamedTuple):
-    """What is walked through by whom.
+    """A scene, an avatar and a walk.
 
     name: for titles.  scans: the files to build.  voxel, step: of the builds [m].
     avatar: (n, 3) float64 [m].  times: (k,) [s].  poses: (k, 4, 4) float64, avatar to world.
@@ -38,11 +38,11 @@ class Case(NamedTuple):
 
 
 def made_case(folder: Path, voxel: float = PAPER_VOXEL) -> Case:
-    """The made façade of the paper's size, its scan in `folder`; the figure of 3,617 points, the 40 seconds' walk."""
+    """Generate the façade of the paper's size in `folder`; with the figure of 3,617 points and the walk of 40 s."""
     scan = folder / "facade.laz"
     make_facade(scan, points=PAPER_POINTS)
     times, poses = walk_poses(build_facade().truth)
-    return Case("made façade", [scan], voxel, STEP, figure_points(), times, poses)
+    return Case("generated façade", [scan], voxel, STEP, figure_points(), times, poses)
 
 
 def given_case(
@@ -53,7 +53,7 @@ def given_case(
     folder: Path,
     voxel: float = PAPER_VOXEL,
 ) -> Case:
-    """A user's scans, or the points of an archive, written to `folder` and built anew for each degree."""
+    """Return the case of a user's scans, or of an archive, whose points are written to `folder`."""
     step = STEP
     name = ", ".join(path.name for path in scans)
     if archive is not None:
@@ -62,12 +62,12 @@ def given_case(
     body = figure_points() if avatar is None else read_avatar(avatar)
     times, walk = read_poses(poses)
     if not len(walk):
-        raise BadRequestError(f"{poses}: no poses, expected at least one: give a path to walk")
+        raise BadRequestError(f"{poses}: no poses, expected at least one: give a file with poses")
     return Case(name, scans, voxel, step, body, times, walk)
 
 
 def archive_points(archive: Archive) -> Iterator[NDArray[np.float64]]:
-    """The points (n, 3) world [m] of an archive, voxel by voxel."""
+    """Yield the points (n, 3), world frame [m], of an archive, voxel by voxel."""
     lattice = archive.header.lattice
     for row, coordinate in enumerate(archive.coordinates):
         voxel, links = archive.read_voxel(row)
@@ -79,9 +79,9 @@ def archive_points(archive: Archive) -> Iterator[NDArray[np.float64]]:
 
 
 def write_points(folder: Path, target: Path) -> float:
-    """Write the points of the archive in `folder` as a binary PLY; returns its lattice step [m].
+    """Write the points of the archive in `folder` as a binary PLY; return its lattice step [m].
 
-    An archive holds one hierarchy; for another degree its points are built anew, and a build takes scans.
+    An archive holds one hierarchy. Another degree requires a new build, which reads scans.
     """
     with Archive(folder) as archive, open(target, "wb") as file:
         header = ["ply", "format binary_little_endian 1.0", f"element vertex {archive.header.points}"]

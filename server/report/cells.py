@@ -1,6 +1,6 @@
-"""What cells of one height are worth: [Fig12] section 8, beside the plain octree of section 4 (builder/balance.py).
+"""Comparison of cells of one height ([Fig12] section 8) with the plain octree of section 4 (builder/balance.py).
 
-The walk is timed in each, in turn; the verdicts must be the same.
+The walk is timed with each kind of cells in turn. The verdicts must be equal.
 """
 
 import contextlib
@@ -22,7 +22,8 @@ from ...schemas.voxel import Links, VoxelData
 from .case import Case
 from .walkthrough import AVATAR, Say, open_whole
 
-# Kind of cells and most points of one: the default, the split alone that makes most trees one height, and both.
+# Kind of cells and maximum number of points of a cell: octrees with several limits (some of which make
+# most trees one height by splitting alone), and balanced cells.
 PLANS = (
     ("octree", 4096),
     ("octree", 2048),
@@ -35,10 +36,11 @@ PLANS = (
 
 @dataclass
 class CellPlan:
-    """One way to cut cells, built and timed.
+    """One way to divide voxels into cells, with its measurements.
 
-    kind, cell_points: of BuildConfig.  heights: levels of a cell's tree -> cells, in all voxels.
-    seconds: of the build, least.  loops: (loops,) [s], all poses in one call.  Visits and tests: mean a pose.
+    kind, cell_points: of BuildConfig.  heights: number of levels of a cell's tree -> number of cells.
+    build_seconds: the least of the builds.  loops: (loops,) [s], all poses in one call.
+    node_visits, point_tests: mean per pose.
     """
 
     kind: str
@@ -55,14 +57,15 @@ class CellPlan:
 
     @property
     def name(self) -> str:
-        """For tables."""
+        """Return the name for tables."""
         return f"{self.kind}, {self.cell_points} points"
 
 
 def compare_cells(case: Case, folder: Path, loops: int, say: Say) -> list[CellPlan]:
-    """Build `case` with each plan, in `folder`, and time its walk: this thread's time, warm, loop by loop in turn.
+    """Build `case` with each plan, in `folder`, and time its walk.
 
-    Raises InternalError when two answer differently, SolidcloudError when a pose is unknown.
+    Measures the CPU time of this thread with warm caches, all plans in turn in each loop.
+    Raises InternalError if two plans answer differently, SolidcloudError if a pose is unknown.
     """
     plans = [CellPlan(kind, most, folder / f"{kind}-{most}") for kind, most in PLANS]
     for plan in plans:
@@ -89,7 +92,7 @@ def compare_cells(case: Case, folder: Path, loops: int, say: Say) -> list[CellPl
             for i, scene in enumerate(scenes):
                 scene.collide(
                     AVATAR, case.poses
-                )  # untimed: the side before has left the caches in no fair state
+                )  # untimed: the previous plan has changed the contents of the caches
                 begin = time.thread_time()
                 scene.collide(AVATAR, case.poses)
                 spent[i, loop] = time.thread_time() - begin
@@ -99,7 +102,7 @@ def compare_cells(case: Case, folder: Path, loops: int, say: Say) -> list[CellPl
 
 
 def _build(case: Case, plan: CellPlan) -> None:
-    """Build one archive, twice, as the first time compiles, and say what it holds."""
+    """Build one archive twice, because the first build compiles, and fill in its properties."""
     config = BuildConfig(
         voxel=case.voxel,
         resolution=case.step,
@@ -119,7 +122,7 @@ def _build(case: Case, plan: CellPlan) -> None:
 
 
 def tree_heights(voxel: VoxelData, links: Links) -> list[int]:
-    """The levels of every cell's tree, in the order of the cells."""
+    """Return the number of levels of every cell's tree, in the order of the cells."""
     root = len(voxel.nodes.count) - int(voxel.cells.nodes.sum(dtype=np.int64))
     heights = []
     for node in range(root, root + len(voxel.cells.nodes)):

@@ -1,8 +1,9 @@
-"""The doorway's error: how much wider than the figure a door of the made façade must be for it to pass.
+"""Doorway error: extra width that a door of the generated façade needs before the figure passes.
 
-The figure is solid as its spheres are, so they count as its own width; what is left is made by the scan and by the
-spheres of its points. The door of the façade is wider than the narrowest one that lets the figure pass, by the play
-that is left to either side; the jambs are independent of one another, so the play is found for each alone.
+The width of the figure includes its own spheres. The error is due to the scan and to the spheres of the
+scan's points. It is inferred from one wide door: the narrowest door that lets the figure pass is
+narrower than this door by the free play on both sides. The jambs are independent of one another, and
+the play is measured for each separately.
 """
 
 import math
@@ -18,26 +19,30 @@ from ...builder.made.truth import DoorTruth, FacadeTruth
 from ...schemas.answers import Verdict
 from ..scene import Scene
 
-# Each side's play is found to a quarter of a millimetre, the door's width to half of one [m].
+# Resolution of the play on each side [m]; the width of the door has an uncertainty of twice that, half a
+# millimetre.
 FINEST = 0.00025
-# Poses this far apart along the passage [m]: between two of them a sphere's side is missed by ALONG² / 8 over the sum
-# of two radii, 0.15 mm with those of figure and façade.
+# Distance of poses along the passage [m]. Between two poses, the contact of two spheres is missed by up to
+# ALONG² / 8 divided by the sum of their radii: 0.15 mm with those of figure and façade.
 ALONG = 0.005
-# The soles above the sill [m]. High, for what stops the figure is to be a jamb: spheres thicken the floor as well, and
-# under a tolerance of 10 cm the figure would stand in it. Several, and the mean of their doors: which points of the
-# jambs its widest parts meet is chance, worth 5 mm from one height to the next.
+# Heights of the soles above the sill [m]. They are large because a jamb, not the floor, must stop the
+# figure: spheres thicken the floor as well, and under a tolerance of 10 cm the figure would be in contact
+# with it. The result is the mean over several heights: the widest parts of the figure meet random points
+# of the jambs, which makes a difference of 5 mm from one height to the next.
 LIFTS = (0.24, 0.28, 0.32, 0.36)
-# How far before the true jamb a side is looked for first [m].
+# The search on each side begins this far before the true jamb [m].
 OUTSIDE = 0.05
-# How far past the true jamb a side is looked for [m]: where spheres are so small that the figure slips between them,
-# its error on this side is this far below zero. Farther, the inside of a wall is empty of points.
+# The search ends this far past the true jamb [m]. It is the limit of a negative error on one side, where
+# spheres are so small that the figure slips between them. Farther inside, a wall contains no points.
 INSIDE = 0.10
 
 
 class Doorway(NamedTuple):
-    """The narrowest door that lets the figure pass [m], the figure's own width [m], the former minus the latter [mm].
+    """Result of a doorway measurement.
 
-    Door and error are infinite where the figure cannot even stand in the middle of the door.
+    narrowest: width of the narrowest door that lets the figure pass [m].
+    width: of the figure [m].  error: narrowest - width [mm].
+    narrowest and error are infinite if the figure cannot even stand in the middle of the door.
     """
 
     narrowest: float
@@ -47,7 +52,7 @@ class Doorway(NamedTuple):
 
 @lru_cache(1)
 def made_figure() -> NDArray[np.float64]:
-    """The made figure (n, 3) [m]; it takes half a second to make."""
+    """Return the points (n, 3) of the generated figure [m]; cached, because it takes half a second."""
     figure = figure_points()
     figure.setflags(write=False)
     return figure
@@ -63,12 +68,14 @@ def doorway_error(
     tolerance: float = 0.0,
     budget_visits: int | None = None,
 ) -> Doorway:
-    """The narrowest door the made figure passes, upright and along the middle, minus its width across.
+    """Measure the doorway error of a door for the generated figure, upright and along the middle.
 
-    scene: of a scan of the façade.  avatar_name: of the made figure in it; added where it is not there yet, otherwise a
-    BadRequestError if another figure has the name.  door: which one.  The others as in `Scene.collide`.
-    The figure goes straight through, shifted to a side; a pose that is not clear stops it. The shift that just lets it
-    pass is its play on this side, found by bisection.
+    The figure moves straight through the door, shifted to a side. A pose that is not clear stops it. The
+    largest shift with which it passes is the play on this side, found by bisection.
+    scene: of a scan of the façade.
+    avatar_name: of the figure in the scene. It is added if missing; BadRequestError if the name belongs
+    to another avatar.
+    door: name of the door.  The other parameters are those of `Scene.collide`.
     """
     figure = made_figure()
     radius = scene.add_avatar(avatar_name, figure).radius or 0.0
@@ -82,7 +89,7 @@ def doorway_error(
     )
 
     def stops(poses: NDArray[np.float64], x: float) -> NDArray[np.bool_]:
-        """Which of the poses are not clear once moved aside by x [m]."""
+        """Return which of the poses are not clear after a shift by x [m]."""
         moved = poses.copy()
         moved[:, 0, 3] += x
         return np.asarray(ask(moved).verdict != Verdict.CLEAR)
@@ -106,16 +113,16 @@ def _play(
     side: int,
     true_play: float,
 ) -> float:
-    """How far to a side poses that are clear in the middle can all be moved and stay clear [m], by bisection.
+    """Return the largest shift to one side [m] at which all poses stay clear, by bisection.
 
-    true_play: what the door's true width leaves.
+    The poses are clear in the middle.  true_play: the play by the door's true width [m].
     """
     free, stopped = 0.0, true_play + INSIDE
     guess = max(true_play - OUTSIDE, 0.0)
     while stopped - free > FINEST:
         stopping = stops(poses, side * guess)
         if stopping.any():
-            # A pose that is clear here is clear farther from this jamb too: it need not be asked again.
+            # A pose that is clear here is also clear farther from this jamb, and is not tested again.
             stopped, poses = guess, poses[stopping]
         else:
             free = guess
@@ -126,9 +133,9 @@ def _play(
 def passage(
     door: DoorTruth, lift: float, origin: tuple[float, float, float], figure: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Poses (k, 4, 4) along the door's middle, ALONG apart, from before the jambs' fronts to behind their backs.
+    """Return poses (k, 4, 4) along the door's middle, ALONG apart, from in front of the jambs to behind them.
 
-    lift: of the soles above the sill [m].  origin: of the façade.
+    lift: height of the soles above the sill [m].  origin: of the façade.
     """
     y = np.arange(door.y_front - figure[:, 1].max(), door.y_back - figure[:, 1].min() + ALONG, ALONG)
     poses = np.tile(np.eye(4), (len(y), 1, 1))

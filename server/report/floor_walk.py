@@ -1,4 +1,4 @@
-"""A walk through a scan of which nothing is known: straight, through its middle, over its floor. z is up."""
+"""Straight walk through the middle of an unknown scan, over its floor; z is up."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -6,21 +6,23 @@ from numpy.typing import NDArray
 from ...schemas.errors import BadDataError
 
 FRAMES, RATE = 1200, 30.0
-# Feet above what is taken for the floor [m], as on the façade's walk.
+# Height of the feet above the detected floor [m], as on the façade's walk.
 SOLE = 0.03
-# The floor is looked for in squares of this half width [m] around places this far apart along the path.
+# Half width of the squares in which the floor is detected, and their spacing along the path [m].
 HALF, SPACING = 0.75, 0.25
-# Height of a layer [m], and the share of the fullest layer's points that makes another one dense.
+# Height of a layer [m], and the minimum number of points of a dense layer, as a share of the fullest layer's.
 LAYER, DENSE = 0.05, 0.2
-# Points this rare at either end [share] are taken for outliers, not for where the scan ends.
+# Share of points at either end of an axis that is ignored as outliers.
 OUTLIERS = 0.02
 
 
 def floor_walk(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Times (1200,) [s] and poses (1200, 4, 4), avatar to world, through points (n, 3) [m], 30 a second.
+    """Return times (1200,) [s] and poses (1200, 4, 4), avatar to world, of a walk through points (n, 3) [m].
 
-    Along the longer horizontal axis, through the median of the other; the avatar faces the way it goes, its
-    feet SOLE above the lowest dense layer of points around it. BadDataError: too few points to tell a floor.
+    The walk has 30 poses per second. It follows the longer horizontal axis, at the median of the other.
+    The avatar faces its direction of motion, with its feet SOLE above the lowest dense layer of points
+    around it.
+    Raises BadDataError if there are too few points to detect a floor.
     """
     low, high = (
         np.quantile(points[:, :2], [OUTLIERS, 1 - OUTLIERS], axis=0) if len(points) else np.zeros((2, 2))
@@ -34,13 +36,13 @@ def floor_walk(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArra
     known = np.isfinite(floors)
     if not known.any():
         raise BadDataError(
-            f"{len(points)} points, none dense enough around the middle to stand on: expected a floor: "
+            f"{len(points)} points, too few around the middle to detect a floor: expected a floor: "
             "give scans of a place to walk in"
         )
     floors = _smooth(np.interp(places, places[known], floors[known]))
     at = np.linspace(places[0], places[-1], FRAMES)
     poses = np.zeros((FRAMES, 4, 4))
-    # The avatar faces +y; along x it is turned right by a quarter.
+    # The avatar faces +y; for a walk along x it is turned right by 90 degrees.
     poses[:, :3, :3] = np.eye(3) if along == 1 else np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])
     poses[:, along, 3], poses[:, across, 3] = at, middle
     poses[:, 2, 3] = np.interp(at, places, floors) + SOLE
@@ -49,7 +51,7 @@ def floor_walk(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArra
 
 
 def _floor(heights: NDArray[np.float64]) -> float:
-    """The top of the lowest dense layer among heights (n,) [m]; NaN where there are too few."""
+    """Return the top of the lowest dense layer of heights (n,) [m]; NaN if there are too few."""
     if len(heights) < 5:
         return np.nan
     start = heights.min()
@@ -60,7 +62,7 @@ def _floor(heights: NDArray[np.float64]) -> float:
 
 
 def _smooth(floors: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Medians over five places, which drop single holes and boxes, then means over five, which make ramps."""
+    """Smooth floors by medians of five, which remove single holes and boxes, then means of five, which make ramps."""
     padded = np.pad(floors, 2, mode="edge")
     medians = np.median(np.lib.stride_tricks.sliding_window_view(padded, 5), axis=1)
     padded = np.pad(medians, 2, mode="edge")

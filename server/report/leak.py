@@ -1,8 +1,8 @@
-"""How far a wall of scanned points leaks: how deep a round probe gets into it before it is stopped.
+"""Leak of a wall of scanned points: the depth that a spherical probe reaches before it is stopped.
 
-The probe is pushed along the normal into places of the made façade's walls, whose true surface is known. With a hole of
-radius g between points of radius r, a probe of radius R is first touched where its foremost point is R - sqrt((R +
-r)² - g²) past the surface; where g is larger than R + r, it goes through.
+The probe is pushed along the normal into places of the generated façade's walls, whose true surface is
+known. At a hole of radius g between points of radius r, a probe of radius R touches first when its
+foremost point is R - sqrt((R + r)² - g²) past the surface. If g is larger than R + r, it passes through.
 """
 
 from typing import NamedTuple
@@ -17,20 +17,21 @@ from ..scene import Scene
 
 PROBE = "leak probe"
 RADIUS = 0.05
-# The probe's centre starts this far before the wall [m]: so that it is stopped in time by spheres of 25 cm and by
-# tolerances of 10 cm with usual spheres. The places are free of all else for 15 cm to the sides.
+# Distance of the probe's centre from the wall at the start [m]: large enough for point radii of 25 cm, and
+# for tolerances of 10 cm with usual radii. The places are free of other surfaces for 15 cm to the sides.
 START = 0.30
-# How exactly the first contact is found [m], where no larger tolerance is asked for.
+# Resolution of the first contact [m], unless a larger tolerance is given.
 FINEST = 1e-6
 
 __all__ = ["Leak", "WallPlaces", "leak", "leak_places"]
 
 
 class Leak(NamedTuple):
-    """How far the probe's foremost point is past the true surface when it is stopped, over all places.
+    """Distribution, over all places, of the depth of the probe's foremost point past the true surface.
 
-    p50, p99, worst: [mm], negative before the surface; a probe that goes through counts its diameter, at which all of
-    it is past the surface.  passed: the share of places where it goes through.
+    p50, p99, worst: [mm], negative before the surface. A probe that passes through counts as its diameter,
+    the depth at which all of it is past the surface.
+    passed: share of places where it passes through.
     """
 
     p50: float
@@ -40,7 +41,7 @@ class Leak(NamedTuple):
 
 
 def leak_places(truth: SceneTruth, places: int = 2000, seed: int = 2012) -> WallPlaces:
-    """Where to push: places of the façade's walls, from dense to four times as sparse; see builder/made/places.py."""
+    """Return places on the façade's walls, from dense to four times as sparse; see builder/made/places.py."""
     return wall_places(truth, places, seed)
 
 
@@ -52,7 +53,10 @@ def leak(
     tolerance: float = 0.0,
     budget_visits: int | None = None,
 ) -> Leak:
-    """Push a probe of 5 cm radius at every place; the others as in `Scene.sweep`. Adds an avatar, "leak probe"."""
+    """Measure the leak with a probe of 5 cm radius at every place.
+
+    Adds the avatar "leak probe" to the scene. The other parameters are those of `Scene.sweep`.
+    """
     depth = leak_depths(
         scene, walls, radius_model=radius_model, tolerance=tolerance, budget_visits=budget_visits
     )
@@ -69,9 +73,9 @@ def leak_depths(
     tolerance: float = 0.0,
     budget_visits: int | None = None,
 ) -> NDArray[np.float64]:
-    """How far past the true surface the foremost point of the probe is when it is stopped (k,) [m].
+    """Return the depths (k,) of the probe's foremost point past the true surface when it is stopped [m].
 
-    It is stopped where its way is no longer proved clear. 2 RADIUS where nothing stops it.
+    The probe is stopped where its motion is no longer proved clear. 2 RADIUS if nothing stops it.
     """
     scene.add_avatar(PROBE, [[0.0, 0.0, 0.0]], RADIUS)
     first, last = np.tile(np.eye(4), (2, len(walls.points), 1, 1))

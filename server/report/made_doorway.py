@@ -1,10 +1,11 @@
-"""The narrowest door made: façades are made with narrower and narrower doors, scanned, built, and walked through.
+"""Doorway error measured directly: façades with doors of decreasing width are generated, scanned and walked through.
 
-The long way to what doorway.py infers from one wide door. The two differ where a narrow door is scanned otherwise than
-a wide one. The stations stand where they stand, and see its jambs at a smaller angle, so more sparsely. And where a
-ray grazes the near edge of one jamb and goes on to the other, the mixed return hangs in the middle of the passage: in
-doors of 0.59 to 0.61 m, scanned with two seeds, none to five points did. Such a point stops the figure whatever its
-radius: with the made façade's usual seed all radius models say 87 mm, and two of three scans agreeing 86 mm.
+doorway.py infers the same error from one wide door. The two differ where a narrow door is scanned
+differently. The scanner stations do not move, and see the jambs of a narrow door at a smaller angle and
+therefore with fewer points. A ray that grazes the near edge of one jamb and continues to the other gives a
+mixed return in the middle of the passage: zero to five such points were found in doors of 0.59 to 0.61 m
+scanned with two seeds. Such a point stops the figure whatever its radius: with the generated façade's usual
+seed all radius models give 87 mm, and requiring two of three scans to agree gives 86 mm.
 """
 
 import math
@@ -25,15 +26,15 @@ from ...schemas.answers import Verdict
 from ..scene import Scene
 from .doorway import LIFTS, Doorway, made_figure, passage
 
-# The widest door tried [m], twice the figure: one that does not pass there needs an infinite one.
+# Widest door tried [m], twice the figure. If the figure does not pass it, the error is infinite.
 WIDEST = 1.06
-# Doors are told apart by half a millimetre [m].
+# Resolution of the door's width, half a millimetre [m].
 FINEST = 0.0005
 AVATAR = "figure"
 
 
 class MadeDoor(NamedTuple):
-    """A façade made with a door of some width: its scene, with the figure, and its truth."""
+    """A generated façade with a door of some width: its scene, with the figure added, and its ground truth."""
 
     scene: Scene
     truth: FacadeTruth
@@ -48,18 +49,19 @@ def made_doorways(
     seed: int = 2012,
     tick: Callable[[], None] = lambda: None,
 ) -> dict[str, Doorway]:
-    """The narrowest made main door that the figure passes along the middle, under each of the radius models.
+    """Return, for each radius model, the narrowest generated main door that the figure passes along the middle.
 
-    folder: an empty one, for scans and archives.  config: of the builds; stores what `models` need.  points, seed: of
-    the façades.  tick: called after each façade. A door is found by bisection between 0.5 m and WIDEST, about 12
-    façades for the first model; what was made for one serves all.
+    The width is found by bisection between 0.5 m and WIDEST, which takes about 12 façades for the first
+    model. Façades are reused for the other models.
+    folder: an empty folder for scans and archives.  config: of the builds; must store the radius models.
+    points, seed: of the façades.  tick: called after each façade.
     """
     made: dict[float, MadeDoor] = {}
     figure = made_figure()
     with ExitStack() as scenes:
 
         def at(width: float) -> MadeDoor:
-            """The façade with a door of this width, made when first asked for."""
+            """Return the façade with a door of this width, generated at the first call."""
             if width not in made:
                 made[width] = _make(folder / f"door{len(made)}", config, width, points, seed)
                 scenes.callback(made[width].scene.close)
@@ -67,7 +69,7 @@ def made_doorways(
             return made[width]
 
         def passing(model: str, width: float) -> bool:
-            """Whether the figure passes a door of this width under this model."""
+            """Return whether the figure passes a door of this width under this model."""
             return passes(at(width), model)
 
         own = float(np.ptp(figure[:, 0])) + 2 * (at(WIDEST).scene.add_avatar(AVATAR, figure).radius or 0.0)
@@ -79,7 +81,7 @@ def made_doorways(
 
 
 def passes(door: MadeDoor, model: str) -> bool:
-    """Whether the figure goes clear through the middle of the main door, at half of the heights LIFTS or more."""
+    """Return whether the figure passes the middle of the main door at half of the heights LIFTS or more."""
     figure = made_figure()
     clear = 0
     for lift in LIFTS:
@@ -90,7 +92,7 @@ def passes(door: MadeDoor, model: str) -> bool:
 
 
 def _narrowest(passing: Callable[[float], bool]) -> float:
-    """The least width [m] found passing, within FINEST of one that does not; infinite if WIDEST does not."""
+    """Return the least passing width found [m], within FINEST of one that fails; infinite if WIDEST fails."""
     if not passing(WIDEST):
         return math.inf
     blocked, passed = NARROWEST_DOOR, WIDEST
@@ -104,7 +106,7 @@ def _narrowest(passing: Callable[[float], bool]) -> float:
 
 
 def _make(folder: Path, config: BuildConfig, width: float, points: int, seed: int) -> MadeDoor:
-    """Make, build and open a façade; everything is put into `folder`."""
+    """Generate, build and open a façade in `folder`."""
     folder.mkdir(parents=True)
     made = make_facade(folder / "facade.laz", points=points, seed=seed, door=width)
     build_archive(list(made.paths), folder / "archive", config)

@@ -1,4 +1,4 @@
-"""Figure 7 of [Fig12]: the frame rate along the path, for each degree, with a collision test and without."""
+"""Figure 7 of [Fig12]: frame rate along the path for each degree, with and without a collision test."""
 
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,21 +13,24 @@ SMOOTH_SECONDS = 0.5
 
 
 class Curve(NamedTuple):
-    """One degree: the time of each frame's collision test (k,) [s]."""
+    """Times of one degree. seconds: (k,), of each frame's collision test [s]."""
 
     degree: int
     seconds: NDArray[np.float64]
 
 
 def rolling_median(values: NDArray[np.float64], width: int) -> NDArray[np.float64]:
-    """The median (k,) over an odd width of neighbours, ends held: single frames hide what degrees differ by."""
+    """Return the medians (k,) over an odd number of neighbours, with the end values repeated.
+
+    Unsmoothed frames would hide the differences between degrees.
+    """
     padded = np.pad(values, width // 2, mode="edge")
     median: NDArray[np.float64] = np.median(np.lib.stride_tricks.sliding_window_view(padded, width), axis=1)
     return median
 
 
 def contact_spans(times: NDArray[np.float64], contact: NDArray[np.bool_]) -> list[tuple[float, float]]:
-    """The stretches of time [s] in which every frame is a contact."""
+    """Return the time intervals [s] in which every frame is in contact."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], contact, [False]]).astype(np.int8)))
     return [(float(times[a]), float(times[b - 1])) for a, b in zip(edges[::2], edges[1::2], strict=True)]
 
@@ -40,10 +43,10 @@ def draw_path(
     paper_fps: dict[int, float],
     target: Path,
 ) -> None:
-    """Write the picture as PNG: the loop of 30 frames a second, then a panel of test times for each kind of node.
+    """Write the figure as PNG: the loop of 30 frames per second, then one panel of test times per kind of node.
 
-    times: (k,) [s].  curves: kind -> one curve a degree.  without: (k,) [s], no collision test.
-    contact: (k,) bool.  paper_fps: degree -> average frames a second in the paper's table 1.
+    times: (k,) [s].  curves: kind -> one curve per degree.  without: (k,) [s], without a collision test.
+    contact: (k,) bool.  paper_fps: degree -> mean frames per second in the paper's table 1.
     """
     pyplot = load_pyplot()
     figure, axes = pyplot.subplots(
@@ -68,17 +71,15 @@ def draw_path(
         panel.plot(times, rolling_median(without, width) * 1e3, "k--", lw=1.2, label="no test")
         for i, (a, b) in enumerate(contact_spans(times, contact)):
             panel.axvspan(a, b + step, color="tab:red", alpha=0.12, lw=0, label=None if i else "contact")
-        panel.set(
-            yscale="log", ylim=(low * 1e3 / 1.3, high * 1e3 * 1.3), ylabel="time of a frame's test [ms]"
-        )
+        panel.set(yscale="log", ylim=(low * 1e3 / 1.3, high * 1e3 * 1.3), ylabel="test time per frame [ms]")
         panel.set_title(
-            f"{kind}: one call a frame, rolling median over {SMOOTH_SECONDS:g} s", fontsize=11, loc="left"
+            f"{kind}: one call per frame, rolling median over {SMOOTH_SECONDS:g} s", fontsize=11, loc="left"
         )
         panel.yaxis.set_major_formatter("{x:g}")
         panel.grid(alpha=0.25, which="both")
         right = panel.secondary_yaxis("right", functions=(_inverse, _inverse))
         right.yaxis.set_major_formatter("{x:,.0f}")
-        right.set_ylabel("frames a second it would allow")
+        right.set_ylabel("possible frames per second")
     figure.legend(*axes[1].get_legend_handles_labels(), title="degree", fontsize=9, loc="outside right upper")
     axes[-1].set(xlabel="time along the path [s]", xlim=(times[0], times[-1]))
     figure.savefig(target)
@@ -86,24 +87,24 @@ def draw_path(
 
 
 def _inverse(milliseconds: Any) -> Any:
-    """Frames a second from milliseconds a frame, and the other way round."""
+    """Convert milliseconds per frame to frames per second, or back."""
     return 1e3 / np.maximum(milliseconds, 1e-12)
 
 
 def _draw_loop(
     panel: Any, times: NDArray[np.float64], group: list[Curve], paper_fps: dict[int, float]
 ) -> None:
-    """The paper's synchronised loop: a frame takes 1/30 s, or its test where that is longer."""
+    """Draw the paper's synchronised loop: a frame takes 1/30 s, or its test if that is longer."""
     for curve in group:
         panel.plot(times, 1 / np.maximum(curve.seconds, 1 / FRAME_RATE), color="tab:green", lw=1.5)
-    panel.plot([], [], color="tab:green", label="here, every degree (nothing rendered)")
+    panel.plot([], [], color="tab:green", label="solidcloud, every degree (without rendering)")
     panel.plot(times[[0, -1]], [FRAME_RATE] * 2, "k--", lw=1.2, label="no test")
     paper = [paper_fps[c.degree] for c in group if c.degree in paper_fps]
     if paper:
         panel.axhspan(
-            min(paper), max(paper), color="tab:orange", alpha=0.3, lw=0, label="averages of [Fig12], table 1"
+            min(paper), max(paper), color="tab:orange", alpha=0.3, lw=0, label="means of [Fig12], table 1"
         )
-    panel.set(ylim=(0, 1.15 * FRAME_RATE), ylabel="frames a second")
-    panel.set_title("in a loop of 30 frames a second", fontsize=11, loc="left")
+    panel.set(ylim=(0, 1.15 * FRAME_RATE), ylabel="frames per second")
+    panel.set_title("in a loop of 30 frames per second", fontsize=11, loc="left")
     panel.grid(alpha=0.25)
     panel.legend(fontsize=9, loc="lower right", ncols=3)

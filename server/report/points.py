@@ -1,4 +1,4 @@
-"""Points of a scan file, all of them for an avatar or evenly thinned for a picture."""
+"""Reading of points from scan files: all points for an avatar, or thinned ones for a picture."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,9 +13,10 @@ from ...schemas.messages import MAX_AVATAR_POINTS
 
 
 def read_avatar(path: Path) -> NDArray[np.float64]:
-    """All points (n, 3) of a file [m], as an avatar; meshes give their vertices.
+    """Read all points (n, 3) of a file [m] as an avatar; of a mesh, its vertices.
 
-    ScanError: it cannot be read, or holds a point that is not finite. TooLargeError: over a million points.
+    Raises ScanError if the file cannot be read or contains a point that is not finite, TooLargeError if
+    it has more than a million points.
     """
     blocks = []
     count = 0
@@ -33,7 +34,10 @@ def read_avatar(path: Path) -> NDArray[np.float64]:
 
 
 def read_thinned(paths: Sequence[Path], points: int, at_most: int) -> NDArray[np.float64]:
-    """About `at_most` of the `points` points of scans, taken at even steps, (n, 3) [m]; ScanError as open_scans."""
+    """Read every n-th of the `points` points of scans, about `at_most` in all, (n, 3) [m].
+
+    Raises the errors of open_scans.
+    """
     step = max(1, -(-points // at_most))
     blocks = [
         block.xyz[::step]

@@ -1,4 +1,4 @@
-"""A server in a process of its own, for as long as a report asks it: `solidcloud serve` on a free port."""
+"""Context manager that runs `solidcloud serve` in a child process, on a free port."""
 
 import socket
 import subprocess
@@ -10,19 +10,20 @@ from pathlib import Path
 
 from ...schemas.errors import SolidcloudError
 
-# To load the libraries and compile every kernel on two slow cores; a server that takes longer hangs.
+# Enough to load the libraries and compile every kernel on two slow cores. A server that takes longer is
+# considered hung.
 READY_SECONDS = 300.0
 STOP_SECONDS = 15.0
 
 
 @contextmanager
 def served(what: Path, name: str | None, *options: str) -> Iterator[str]:
-    """Serve an archive or a scene file while inside; gives the endpoint.
+    """Serve an archive or a scene file during the block; yield the endpoint.
 
-    name: what clients call it; None: as the file or folder has it.  options: more, as the command takes them.
-
-    SolidcloudError: the server did not start; its own error stands on standard error. On the way out, whatever
-    the reason, it is asked to stop, and killed if it does not.
+    At the end of the block the server is terminated, and killed if it does not stop.
+    name: of the scene, for clients; None: that of the file or folder.
+    options: further options of the command.
+    Raises SolidcloudError if the server does not start; its own error is on standard error.
     """
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     command = [sys.executable, "-P", "-m", "solidcloud.server.cli", "serve", str(what)]
@@ -46,15 +47,16 @@ def served(what: Path, name: str | None, *options: str) -> Iterator[str]:
 
 
 def free_port() -> int:
-    """A TCP port of the loopback interface that nobody listens on at this moment."""
+    """Return a TCP port of the loopback interface that is free at this moment."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
 
 
 def _wait_ready(process: "subprocess.Popen[str]", archive: Path) -> None:
-    """Return when the server says that it serves."""
-    # Killed, it closes its output: no other way to wait for a line with a deadline on every system.
+    """Wait until the server reports that it serves."""
+    # The timer kills the server, which closes its output and ends readline(): the only way to wait for a
+    # line with a deadline on every system.
     timer = threading.Timer(READY_SECONDS, process.kill)
     timer.start()
     try:

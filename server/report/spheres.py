@@ -1,4 +1,4 @@
-"""Figure 8 of [Fig12]: the bounding spheres of one level of the hierarchy, of every partition, drawn."""
+"""Figure 8 of [Fig12]: rendering of the bounding spheres of one level of every partition's hierarchy."""
 
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -9,18 +9,18 @@ from numpy.typing import NDArray
 from ...schemas.archive import Archive
 from ...schemas.errors import BadRequestError, SolidcloudError
 
-# Seen from before and above, a little from the left: a façade's front, and what stands before it.
+# Direction of view: from the front and above, slightly from the left, towards a façade's front.
 AZIMUTH, ELEVATION = np.deg2rad(-17.0), np.deg2rad(17.0)
 LIGHT = np.array([-0.45, 0.55, 0.70])
 WIDTH = 1800
 
 
 class Spheres(NamedTuple):
-    """The spheres of one level, s of them.
+    """The s spheres of one level.
 
-    center: (s, 3) float64 world [m].  radius: (s,) float64 [m], the radius of the points included.
-    partition: (s,) int64, the leaf cell, numbered over all voxels.  ended: (s,) bool, a leaf node of a
-    partition whose tree ends above the level asked for, drawn in its place.
+    center: (s, 3) float64, world frame [m].  radius: (s,) float64 [m], including the radius of the points.
+    partition: (s,) int64, the leaf cell, numbered over all voxels.
+    ended: (s,) bool, the sphere is a leaf node of a tree that ends above the level, and is drawn instead.
     """
 
     center: NDArray[np.float64]
@@ -30,9 +30,10 @@ class Spheres(NamedTuple):
 
 
 def level_spheres(folder: Path, level: int) -> Spheres:
-    """The spheres of level `level`, 1 the root, of the BSH of every leaf cell (the paper's partition) of an archive.
+    """Return the spheres of a level of the BSH of every leaf cell (the paper's partition) of an archive.
 
-    A tree that ends earlier gives its leaf nodes. The top BSH, over the cells, is not in it.
+    A tree that ends earlier contributes its leaf nodes. The top BSH, over the cells, is not included.
+    level: 1 is the root.
     """
     if level < 1:
         raise BadRequestError(f"level {level}: expected 1 (the root of every partition) or more")
@@ -41,7 +42,7 @@ def level_spheres(folder: Path, level: int) -> Spheres:
         lattice, radius = archive.header.lattice, archive.header.radius
         for row, coordinate in enumerate(archive.coordinates):
             voxel, links = archive.read_voxel(row)
-            # The roots of the cells' trees stand in cell order behind the top BSH (schemas/voxel.py).
+            # The roots of the cells' trees follow the top BSH, in cell order (schemas/voxel.py).
             count = voxel.nodes.count.astype(np.int64)
             top = len(count) - int(voxel.cells.nodes.sum(dtype=np.int64))
             chosen, at = np.arange(top, top + len(voxel.cells.nodes)), 1
@@ -69,7 +70,7 @@ def level_spheres(folder: Path, level: int) -> Spheres:
 
 
 def _view() -> NDArray[np.float64]:
-    """Rows right, up and towards the eye (3, 3), unit vectors in the world; z is up."""
+    """Return the rows right, up and towards the eye (3, 3), unit vectors in the world frame; z is up."""
     toward = np.array(
         [np.sin(AZIMUTH) * np.cos(ELEVATION), -np.cos(AZIMUTH) * np.cos(ELEVATION), np.sin(ELEVATION)]
     )
@@ -79,7 +80,7 @@ def _view() -> NDArray[np.float64]:
 
 
 def _colours(partition: NDArray[np.int64]) -> NDArray[np.float64]:
-    """A colour (s, 3) for each partition: stone, varied so that neighbours can be told apart."""
+    """Return colours (s, 3) by partition: shades of stone that distinguish neighbours."""
     turn = np.arange(partition.max() + 1) * 0.6180339887498949 % 1.0
     shade = np.arange(partition.max() + 1) * 0.7548776662466927 % 1.0
     warm = np.array([0.97, 0.78, 0.50]) * (1 - turn[:, None]) + np.array([0.50, 0.72, 0.93]) * turn[:, None]
@@ -88,7 +89,10 @@ def _colours(partition: NDArray[np.int64]) -> NDArray[np.float64]:
 
 
 def render_spheres(spheres: Spheres, width: int = WIDTH) -> NDArray[np.float64]:
-    """An image (h, width, 3) of the spheres as lit balls in parallel projection, the nearest one at each pixel."""
+    """Render the spheres as lit balls in parallel projection to an image (h, width, 3).
+
+    Each pixel shows the nearest sphere.
+    """
     seen = spheres.center @ _view().T
     low = (seen - spheres.radius[:, None]).min(axis=0)[:2]
     high = (seen + spheres.radius[:, None]).max(axis=0)[:2]
@@ -113,14 +117,14 @@ def render_spheres(spheres: Spheres, width: int = WIDTH) -> NDArray[np.float64]:
         wins = (square <= 1) & (depth[i] + radius[i] * nz > window)
         window[wins] = (depth[i] + radius[i] * nz)[wins]
         lit = 0.45 + 0.70 * np.maximum(nx * light[0] + ny * light[1] + nz * light[2], 0)
-        # The rim is darkened, so that balls of one partition part from each other.
+        # The rim is darkened to separate balls of one partition.
         lit *= np.where(square > 0.82, 0.55, 1.0)
         image[above:below, left:right][wins] = np.clip(lit[wins][:, None] * colours[i], 0, 1)
     return image
 
 
 def draw_spheres(spheres: Spheres, title: str, target: Path) -> None:
-    """Write the picture of the spheres as PNG. Raises SolidcloudError when matplotlib is missing."""
+    """Write the picture of the spheres as PNG. Raises SolidcloudError if matplotlib is missing."""
     pyplot = load_pyplot()
     image = render_spheres(spheres)
     size = (12.0, 12.0 * image.shape[0] / image.shape[1] + 0.6)
@@ -134,7 +138,7 @@ def draw_spheres(spheres: Spheres, title: str, target: Path) -> None:
 
 
 def load_pyplot() -> Any:
-    """matplotlib's pyplot, drawing to files. Raises SolidcloudError when it is not installed."""
+    """Return matplotlib's pyplot, set to draw to files. Raises SolidcloudError if it is not installed."""
     try:
         import matplotlib
 
@@ -142,6 +146,6 @@ def load_pyplot() -> Any:
         import matplotlib.pyplot
     except ImportError as error:
         raise SolidcloudError(
-            "matplotlib is not installed, and the pictures need it: pip install 'solidcloud[report]'"
+            "matplotlib is not installed, expected it for the pictures: pip install 'solidcloud[report]'"
         ) from error
     return matplotlib.pyplot

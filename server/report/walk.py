@@ -1,9 +1,9 @@
-"""The demonstration: a scan is built, served and walked through over zenoh; what came of it, as walk.json.
+"""Demonstration: build a scan, serve it, walk through it over zenoh; results in walk.json and walk.png.
 
     python -m solidcloud.server.report.walk OUT [SCAN...] [--realtime]
 
-Without scans the façade is made, and the walk is that of [Fig12] section 3: 40 s, 1,200 poses of a figure of
-3,617 points. `scripts/demo` calls this.
+Without scans a façade is generated, and the walk is that of [Fig12] section 3: 40 s, 1,200 poses of a
+figure of 3,617 points. `scripts/demo` runs this module.
 """
 
 import argparse
@@ -32,20 +32,24 @@ from .points import read_thinned
 from .serving import served
 from .walk_frames import Frames, Walk
 
-# Points read again from the scans: for the picture, and to find a floor in scans without known truth.
+# Number of points read again from the scans, for the picture and to detect a floor in scans without ground truth.
 PICTURE_POINTS = 600_000
 
 
 def main() -> None:
-    """Run the demonstration and exit: 0 well, else as `solidcloud` does."""
+    """Run the demonstration and exit with the exit codes of `solidcloud`."""
     parser = argparse.ArgumentParser(
         prog="scripts/demo", description="Build a scan, serve it, walk through it."
     )
     parser.add_argument("out", type=Path, help=argparse.SUPPRESS)
-    parser.add_argument("scans", nargs="*", type=Path, metavar="SCAN", help="scans; none: a façade is made")
-    parser.add_argument("--realtime", action="store_true", help="30 frames a second, not as fast as it goes")
+    parser.add_argument(
+        "scans", nargs="*", type=Path, metavar="SCAN", help="scans; default: a generated façade"
+    )
+    parser.add_argument(
+        "--realtime", action="store_true", help="30 frames per second instead of as fast as possible"
+    )
     chosen = parser.parse_args()
-    # As Ctrl-C does: leave by way of every `with`, so that no server is left behind.
+    # Like Ctrl-C: leave every `with` block, which stops the server.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         demonstrate(chosen.out, chosen.scans, realtime=chosen.realtime)
@@ -58,9 +62,9 @@ def main() -> None:
 
 
 def demonstrate(out: Path, scans: Sequence[Path] = (), *, realtime: bool = False) -> dict[str, Any]:
-    """Build, serve, walk; write walk.json and walk.png into the folder `out`; returns what walk.json holds.
+    """Build, serve and walk; write walk.json and walk.png into the folder `out`; return the content of walk.json.
 
-    scans: of a place with z up [m]; none: a façade is made. realtime: a frame every 1/30 s.
+    scans: of a place with z up [m]; empty: a façade is generated.  realtime: one frame every 1/30 s.
     """
     out.mkdir(parents=True, exist_ok=True)
     facade = None if scans else make_scan(out)
@@ -78,16 +82,16 @@ def demonstrate(out: Path, scans: Sequence[Path] = (), *, realtime: bool = False
     report = make_report(walk, frames, info, len(avatar))
     _print_summary(report["summary"])
     (out / "walk.json").write_text(json.dumps(report, indent=1) + "\n")
-    # Late, and here only: matplotlib takes a second to load.
+    # Imported here because matplotlib takes a second to load.
     from .walk_picture import draw_walk
 
     draw_walk(out / "walk.png", walk, frames, avatar)
-    print(f"written: {out / 'walk.json'}, {out / 'walk.png'}; the archive is {summary.archive}")
+    print(f"wrote {out / 'walk.json'} and {out / 'walk.png'}; the archive is {summary.archive}")
     return report
 
 
 def make_scan(out: Path) -> Path:
-    """Make the façade's scan in the folder `out`; returns the path of its truth."""
+    """Generate the façade's scan in the folder `out`; return the path of its ground truth."""
     from ...builder.made.scenes import make_facade
 
     with progress_listener() as bars:
@@ -95,9 +99,10 @@ def make_scan(out: Path) -> Path:
 
 
 def take_walk(client: Client, walk: Walk, *, realtime: bool) -> Frames:
-    """Ask for one pose after another, as a viewer does for each of its frames.
+    """Query one pose after another, as a viewer does for each of its frames.
 
-    Without a bar: its thread would hold the interpreter for milliseconds, and be timed as round trips.
+    There is no progress bar: its thread would hold the interpreter for milliseconds, which would count as
+    round-trip time.
     """
     answers: list[CollideAnswers] = []
     round_trip = np.empty(len(walk.poses))
@@ -120,7 +125,7 @@ def take_walk(client: Client, walk: Walk, *, realtime: bool) -> Frames:
 
 
 def make_report(walk: Walk, frames: Frames, info: SceneInfo, avatar_points: int) -> dict[str, Any]:
-    """What walk.json holds: a summary, and the frames one by one. Times end in their unit."""
+    """Return the content of walk.json: a summary and each frame. Names of times end in their unit."""
     names = [verdict.name.lower() for verdict in Verdict]
     summary = {
         "path": walk.path,
@@ -155,7 +160,7 @@ def make_report(walk: Walk, frames: Frames, info: SceneInfo, avatar_points: int)
 
 
 def _facade_walk(scans: Sequence[Path], truth: Path, points: int) -> Walk:
-    """The walk of the made façade."""
+    """Return the walk through the generated façade."""
     from ...builder.made.truth import read_truth
     from ...builder.made.walk import walk_poses
 
@@ -165,7 +170,7 @@ def _facade_walk(scans: Sequence[Path], truth: Path, points: int) -> Walk:
 
 
 def _scan_walk(scans: Sequence[Path], points: int) -> Walk:
-    """A walk made for scans that are given."""
+    """Return a straight walk through the given scans."""
     thinned = read_thinned(scans, points, PICTURE_POINTS)
     times, poses = floor_walk(thinned)
     along = int(np.argmax(np.ptp(poses[:, :2, 3], axis=0)))
@@ -174,14 +179,14 @@ def _scan_walk(scans: Sequence[Path], points: int) -> Walk:
 
 
 def _spread(values: NDArray[np.float64]) -> dict[str, float]:
-    """Mean, median, 99th percentile and maximum."""
+    """Return mean, median, 99th percentile and maximum."""
     p50, p99 = np.percentile(values, [50, 99])
     found = {"mean": values.mean(), "p50": p50, "p99": p99, "max": values.max()}
     return {name: round(float(value), 3) for name, value in found.items()}
 
 
 def _print_summary(summary: dict[str, Any]) -> None:
-    """The summary as a table."""
+    """Print the summary as a table."""
 
     def times(of: dict[str, float]) -> str:
         return ", ".join(f"{name} {value:,.0f}" for name, value in of.items()) + " µs"

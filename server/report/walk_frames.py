@@ -1,4 +1,4 @@
-"""A walk through a scan, and the answers of its frames."""
+"""Types of a walk through a scan and of the answers of its frames."""
 
 from typing import NamedTuple
 
@@ -7,9 +7,11 @@ from numpy.typing import NDArray
 
 
 class Walk(NamedTuple):
-    """A walk to be walked. times: (k,) [s].  poses: (k, 4, 4).  path: where it comes from, in words.
+    """A walk through scans.
 
-    points: (n, 3) of the scans, thinned [m].  elevation: the horizontal axis that an elevation shows, 0 or 1.
+    times: (k,) [s].  poses: (k, 4, 4).  path: description in words.
+    points: (n, 3) of the scans, thinned [m].
+    elevation: the horizontal axis, 0 or 1, of the elevation view.
     """
 
     times: NDArray[np.float64]
@@ -20,9 +22,11 @@ class Walk(NamedTuple):
 
 
 class Frames(NamedTuple):
-    """What was answered, one element a pose: seconds in the engine, seconds from question to answer, the rest.
+    """Answers of a walk, one element per pose.
 
-    verdict: (k,) uint8.  engine, round_trip: (k,) float64 [s].  resident, hits, misses: (k,) int64.
+    verdict: (k,) uint8.  engine: (k,) float64, time in the engine [s].
+    round_trip: (k,) float64, time from request to answer [s].
+    resident, resident_bytes, hits, misses: (k,) int64.
     """
 
     verdict: NDArray[np.uint8]

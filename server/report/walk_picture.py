@@ -1,4 +1,4 @@
-"""A picture of a walk: where it went, what it touched, and how long each answer took."""
+"""Picture of a walk: its path, its contacts, and the time of each answer."""
 
 from pathlib import Path
 from typing import Any
@@ -16,19 +16,19 @@ from .walk_frames import Frames, Walk
 COLOURS = {Verdict.CLEAR: "#1f7a8c", Verdict.CONTACT: "#d62839", Verdict.UNKNOWN: "#e0a100"}
 PAPER, INK = "#fbfaf7", "#2f2a26"
 STONE = LinearSegmentedColormap.from_list("stone", [PAPER, "#d9cfc1", "#a08e78", "#5b4d40"])
-# The figure is drawn in the middle of the longest contacts and in even steps between, MOST of them in all, each
-# at least APART of the walk from the next.
+# The figure is drawn at most MOST times: in the middle of the CONTACTS longest contacts, and at regular
+# intervals, at least the share APART of the walk from one another.
 MOST, CONTACTS, APART = 8, 4, 0.07
-# Pixels along the longest extent; the plan, where walls are lines, is drawn with half as many.
+# Pixels along the longest extent; the plan, where walls are lines, has half as many.
 PIXELS = 700
-# What the plan shows: from a step above the floor to over the head [m].
+# Range of heights above the floor that the plan shows [m]: from shin to above the head.
 PLAN_LOW, PLAN_HIGH = 0.15, 2.2
 
 
 def draw_walk(path: Path, walk: Walk, frames: Frames, avatar: NDArray[np.float64]) -> None:
     """Draw a walk as a PNG: plan from above, elevation, and the times of every frame.
 
-    avatar: (n, 3) [m], drawn where it stands in a few frames, the nearest with a contact where there is one.
+    avatar: (n, 3) [m], drawn at its pose in a few frames, in the longest contacts if there are any.
     """
     matplotlib.rcParams.update({"font.size": 10, "axes.edgecolor": "#8a8178", "text.color": INK})
     figure = Figure(figsize=(12, 8.2), facecolor=PAPER, layout="constrained")
@@ -50,19 +50,19 @@ def draw_walk(path: Path, walk: Walk, frames: Frames, avatar: NDArray[np.float64
 
 
 def _widths(walk: Walk) -> list[float]:
-    """Widths of plan and elevation, so that both fill the same height."""
+    """Return the widths of plan and elevation at which both have the same height."""
     x, y, z = _extent(walk.points).T
     ratios = [np.ptp(x) / np.ptp(y), np.ptp((x, y)[walk.elevation]) / np.ptp(z)]
     return [min(max(float(ratio), 0.5), 2.0) for ratio in ratios]
 
 
 def _extent(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Low and high corner (2, 3) [m], the farthest outliers left out."""
+    """Return the low and high corner (2, 3) of points [m], without the farthest outliers."""
     return np.quantile(points, [0.0005, 0.9995], axis=0) + np.array([[-0.3], [0.3]])
 
 
 def _stops(verdict: NDArray[np.uint8]) -> list[int]:
-    """The frames that the figure is drawn in."""
+    """Return the frames in which the figure is drawn."""
     count = len(verdict)
     longest = sorted(_runs(verdict == Verdict.CONTACT), key=lambda run: run[0] - run[1])[:CONTACTS]
     wanted = [(first + last) // 2 for first, last in longest]
@@ -75,7 +75,7 @@ def _stops(verdict: NDArray[np.uint8]) -> list[int]:
 
 
 def _draw_plan(axes: Any, walk: Walk, frames: Frames, stops: list[int]) -> None:
-    """The scan from above, and the path coloured by verdict."""
+    """Draw the scan from above, and the path coloured by verdict."""
     floor = np.median(walk.poses[:, 2, 3])
     heights = walk.points[:, 2] - floor
     walls = walk.points[(heights > PLAN_LOW) & (heights < PLAN_HIGH)]
@@ -88,7 +88,7 @@ def _draw_plan(axes: Any, walk: Walk, frames: Frames, stops: list[int]) -> None:
         axes.scatter(*at[chosen].T, s=size, color=COLOURS[verdict], linewidths=0, zorder=3 + int(verdict))
     for number, k in enumerate(stops, 1):
         _badge(axes, number, at[k], (9, 9), frames.verdict[k])
-    axes.set_title("From above, shin to head")
+    axes.set_title("Plan, from shin to head")
     axes.set_xlabel("x [m]")
     axes.set_ylabel("y [m]")
     handles = [
@@ -102,7 +102,7 @@ def _draw_plan(axes: Any, walk: Walk, frames: Frames, stops: list[int]) -> None:
 def _draw_elevation(
     axes: Any, walk: Walk, frames: Frames, avatar: NDArray[np.float64], stops: list[int]
 ) -> None:
-    """The scan from the side, and the figure in some frames."""
+    """Draw the scan from the side, and the figure in some frames."""
     across = walk.elevation
     low, high = _extent(walk.points)
     _draw_points(axes, walk.points, (across, 2), (low, high), PIXELS)
@@ -112,13 +112,13 @@ def _draw_elevation(
         axes.scatter(placed[:, across], placed[:, 2], s=0.8, color=colour, linewidths=0, zorder=4)
         head = (walk.poses[k, across, 3], placed[:, 2].max())
         _badge(axes, number, head, (0, 11), frames.verdict[k])
-    axes.set_title("From the side: the figure where the numbers are")
+    axes.set_title("Elevation, with the figure at the numbered places")
     axes.set_xlabel(f"{'xy'[across]} [m]")
     axes.set_ylabel("z [m]")
 
 
 def _badge(axes: Any, number: int, at: Any, shift: tuple[int, int], verdict: int) -> None:
-    """The number of a place, in the colour of its verdict, some points beside it."""
+    """Draw the number of a place beside it, in the colour of its verdict."""
     axes.annotate(
         str(number),
         at,
@@ -141,7 +141,7 @@ def _draw_points(
     extent: tuple[NDArray[np.float64], NDArray[np.float64]],
     pixels: int,
 ) -> None:
-    """Points as an image of their density, on a logarithmic scale. shown: the axes to the right and upwards."""
+    """Draw points as an image of their density on a logarithmic scale. shown: horizontal and vertical axis."""
     low, high = extent
     pixel = float((high - low).max()) / pixels
     edges = [np.arange(low[axis], high[axis] + pixel, pixel) for axis in shown]
@@ -159,7 +159,7 @@ def _draw_points(
 
 
 def _draw_times(axes: Any, walk: Walk, frames: Frames) -> None:
-    """Engine time and round trip of every frame, contacts and loads marked."""
+    """Draw the engine and round-trip times of every frame, with contacts and loads marked."""
     for start, end in _runs(frames.verdict == Verdict.CONTACT):
         axes.axvspan(
             walk.times[start], walk.times[end], color=COLOURS[Verdict.CONTACT], alpha=0.13, linewidth=0
@@ -184,14 +184,14 @@ def _draw_times(axes: Any, walk: Walk, frames: Frames) -> None:
     axes.set_xlim(walk.times[0], walk.times[-1])
     axes.set_xlabel("time along the walk [s]; shaded: contact")
     axes.set_ylabel("[ms]")
-    axes.set_title("What each frame cost, one question a frame over zenoh")
+    axes.set_title("Time of each frame, one request per frame over zenoh")
     axes.set_facecolor(PAPER)
     axes.grid(axis="y", color="#e4ded4", linewidth=0.6)
     axes.legend(loc="upper right", ncols=3, framealpha=0.9)
 
 
 def _runs(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """First and last index of each stretch of True."""
+    """Return the first and last index of each run of True."""
     steps = np.diff(np.concatenate([[0], flags.astype(np.int8), [0]]))
     ends = np.flatnonzero(steps == -1) - 1
     return list(zip(np.flatnonzero(steps == 1).tolist(), ends.tolist(), strict=True))

@@ -1,7 +1,7 @@
-"""The experiment of [Fig12] section 7, repeated: what a collision test of the walk costs, for each degree.
+"""Repetition of the experiment of [Fig12] section 7: time of a collision test along the walk, for each degree.
 
-Table 1, figure 7 and figure 8 of the paper, on a scene that is made instead of the Batalha scan. CAVEATS lists
-what else differs.
+Produces table 1, figure 7 and figure 8 of the paper on a generated scene instead of the Batalha scan.
+CAVEATS lists the other differences.
 """
 
 import contextlib
@@ -33,20 +33,20 @@ from .spheres import draw_spheres, level_spheres, load_pyplot
 
 DEGREES = (4, 6, 8, 10, 12, 14, 16)
 FRAME_RATE = 30.0
-# Untimed calls before the timed ones: the first few after other work took several times as long as the rest.
+# Untimed calls before the timed ones: the first few calls after other work took several times as long.
 WARM_FRAMES = 30
-# Degrees this close are called as good as the best: of three runs, figures differed by up to 4 %.
+# Degrees within this factor of the best count as equal: times of three runs differed by up to 4 %.
 NEAR = 1.05
 
 SLAB, PLAIN = "ours", "plain spheres"
 AVATAR, NOBODY = "avatar", "nobody"
 
-# What our figures are not, said wherever they are shown.
+# Limits of the comparison with the paper, printed with every report.
 CAVEATS = (
-    "Here nothing is rendered: a frame of the 30 fps loop takes 1/30 s, or its test where that is longer.",
-    "The degree is that of the scene's trees; the avatar's has degree 8 throughout.",
-    "Plain spheres have the paper's bounds in our trees: packed from the top instead of by insertion, up to 32 points "
-    "a leaf node, and resident in the same layout, which keeps the place of a slab.",
+    "Nothing is rendered here: a frame of the 30 fps loop takes 1/30 s, or its test if that is longer.",
+    "The degree is that of the scene's trees; the avatar's tree always has degree 8.",
+    "Plain spheres are the paper's bounds in our trees: packed top-down instead of by insertion, with up to 32 points "
+    "per leaf node, and in the same memory layout, which reserves the space of a slab.",
 )
 
 Say = Callable[[str], None]
@@ -54,11 +54,12 @@ Say = Callable[[str], None]
 
 @dataclass
 class Structure:
-    """One hierarchy, built and timed.
+    """One hierarchy with its measurements.
 
-    kind: SLAB, nodes are spheres cut by slabs, or PLAIN, the paper's spheres.  folder: its archive.
-    frames: (loops, k) [s], one call a frame.  loops: (loops,) [s], all frames in one call.
-    verdict: (k,) uint8.  Bytes: decoded and resident; of the archive's files.
+    kind: SLAB, nodes are spheres cut by slabs, or PLAIN, the paper's spheres.  folder: of its archive.
+    frames: (loops, k) [s], one call per frame.  loops: (loops,) [s], all frames in one call.
+    verdict: (k,) uint8.  node_visits, point_tests: mean per pose.
+    resident_bytes: of all decoded voxels.  archive_bytes: of the archive's files.
     """
 
     kind: str
@@ -76,12 +77,12 @@ class Structure:
 
     @property
     def frame_median(self) -> NDArray[np.float64]:
-        """Time of each frame (k,) [s], median of the loops: a frame is slow because of what it meets, not by chance."""
+        """Return the time of each frame (k,) [s]: the median of the loops, which removes random disturbances."""
         return np.median(self.frames, axis=0)
 
 
 def build_structures(case: Case, degrees: tuple[int, ...], folder: Path, say: Say) -> list[Structure]:
-    """Build one archive a degree and kind of node, in `folder`."""
+    """Build one archive per degree and kind of node, in `folder`."""
     found = []
     k = len(case.poses)
     for degree in degrees:
@@ -102,7 +103,7 @@ def build_structures(case: Case, degrees: tuple[int, ...], folder: Path, say: Sa
 
 
 def time_frames(scene: Scene, avatar: str, poses: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Time of each frame (k,) [s], one call a frame."""
+    """Return the time of each frame (k,) [s], with one call per frame."""
     spent = np.empty(len(poses))
     singles = [np.ascontiguousarray(pose[None]) for pose in poses]
     for pose in singles[:WARM_FRAMES]:
@@ -115,7 +116,7 @@ def time_frames(scene: Scene, avatar: str, poses: NDArray[np.float64]) -> NDArra
 
 
 def open_whole(folder: Path) -> Scene:
-    """The scene of an archive, with room for all of its voxels: the walk is timed, not the loading."""
+    """Open an archive with a cache for all its voxels: the walk is timed, not the loading."""
     store = Store(folder)
     try:
         budget = sum(ArenaBuffer.rounded(int(size)) for size in store.sizes)
@@ -125,10 +126,12 @@ def open_whole(folder: Path) -> Scene:
 
 
 def measure(case: Case, structures: list[Structure], loops: int, say: Say) -> NDArray[np.float64]:
-    """Time every structure, warm, loop by loop in turn, so that a busy moment of the machine hits all of them.
+    """Time every structure with warm caches, all structures in turn in each loop.
 
-    Returns the time of each frame without a collision test (k,) [s]: the same call, an avatar without points.
-    Raises InternalError when two structures answer differently, SolidcloudError when there is nothing to time.
+    The order spreads disturbances by other work over all structures.
+    Returns the time of each frame without a collision test (k,) [s]: the same call, with an avatar without
+    points.
+    Raises InternalError if two structures answer differently, SolidcloudError if poses are unknown.
     """
     with contextlib.ExitStack() as stack:
         scenes = [stack.enter_context(open_whole(s.folder)) for s in structures]
@@ -144,7 +147,7 @@ def measure(case: Case, structures: list[Structure], loops: int, say: Say) -> ND
             say(f"walking, loop {loop + 1} of {loops}")
             without.append(time_frames(scenes[0], NOBODY, case.poses))
             for i, scene in enumerate(scenes):
-                # The structure of the turn before has left the processor's caches in no fair state: one loop untimed.
+                # The previous structure has changed the contents of the processor's caches: one untimed call.
                 scene.collide(AVATAR, case.poses)
                 begin = time.perf_counter()
                 scene.collide(AVATAR, case.poses)
@@ -156,7 +159,7 @@ def measure(case: Case, structures: list[Structure], loops: int, say: Say) -> ND
 
 
 def _first_answers(case: Case, structure: Structure, scene: Scene) -> None:
-    """The answers of one structure and what it takes; every voxel of the walk is resident afterwards."""
+    """Fill in the answers and sizes of one structure; every voxel of the walk is resident afterwards."""
     scene.add_avatar(AVATAR, case.avatar)
     answers = scene.collide(AVATAR, case.poses)
     if (answers.verdict == Verdict.UNKNOWN).any() or answers.faults:
@@ -174,14 +177,15 @@ def _first_answers(case: Case, structure: Structure, scene: Scene) -> None:
 
 
 def check_verdicts(structures: list[Structure]) -> None:
-    """The answer is the points' alone: no degree and no kind of node may change it. Raises InternalError."""
+    """Raise InternalError if verdicts differ: no degree and no kind of node may change an answer."""
     first = structures[0]
     for other in structures[1:]:
         differing = np.flatnonzero(first.verdict != other.verdict)
         if len(differing):
             raise InternalError(
                 f"degree {other.degree}, {other.kind}: {len(differing)} verdicts differ from degree {first.degree}, "
-                f"{first.kind}, the first at pose {differing[0]}; expected none: an error of this software, report it"
+                f"{first.kind}, the first at pose {differing[0]}; expected none: this is a bug of this software, "
+                "report it"
             )
 
 
@@ -189,12 +193,19 @@ def check_verdicts(structures: list[Structure]) -> None:
 
 
 def loop_fps(seconds: NDArray[np.float64], rate: float = FRAME_RATE) -> float:
-    """Average frames a second of a loop synchronised to `rate`, as the paper's: a frame takes 1/rate or its test."""
+    """Return the mean frames per second of a loop synchronised to `rate`, as in the paper.
+
+    A frame takes 1/rate, or its test if that is longer.
+    """
     return len(seconds) / float(np.maximum(seconds, 1 / rate).sum())
 
 
 def table_row(structure: Structure) -> dict[str, Any]:
-    """Table 1, one row. Per frame: one call a frame, mean over frames; the loops' median, and the least of each."""
+    """Return one row of table 1.
+
+    frame_ms: one call per frame; mean over frames of the loops' median, in frame_ms_best of their minimum.
+    batch_ms: all frames in one call, per frame; median of the loops, in batch_ms_best their minimum.
+    """
     s, k = structure, structure.frames.shape[1]
     frame = s.frame_median
     return {
@@ -218,19 +229,19 @@ def table_row(structure: Structure) -> dict[str, Any]:
 
 
 def compare(rows: list[dict[str, Any]], structures: list[Structure]) -> list[str]:
-    """What was measured beside what the paper says of it, in sentences."""
+    """Compare the measurements with the paper, in sentences."""
     said = [
         f"All {len(structures)} structures give the same {len(structures[0].verdict)} verdicts, "
         f"{int((structures[0].verdict == Verdict.CONTACT).sum())} of them contact.",
-        "The paper: best at degree 10, 21.25 fps; worst at degree 12, 15.40 fps: a factor of 1.38, up and down "
-        "over degrees 4 to 16. Its frames are rendered as well; ours are not.",
+        "The paper: best at degree 10, 21.25 fps; worst at degree 12, 15.40 fps: a factor of 1.38, without a trend "
+        "over degrees 4 to 16. Its frames include rendering; ours do not.",
     ]
     for kind in (SLAB, PLAIN):
         own = [row for row in rows if row["structure"] == kind]
         best, worst = (pick(own, key=lambda row: row["batch_ms_best"]) for pick in (min, max))
         near = [str(r["degree"]) for r in own if r["batch_ms_best"] <= NEAR * best["batch_ms_best"]]
         said.append(
-            f"{kind.capitalize()}: best at degree {best['degree']}, {best['batch_ms_best'] * 1e3:.1f} us a test, "
+            f"{kind.capitalize()}: best at degree {best['degree']}, {best['batch_ms_best'] * 1e3:.1f} us per test, "
             f"worst at degree {worst['degree']}, {worst['batch_ms_best'] * 1e3:.1f} us (all frames in one call, best "
             f"loop): a factor of {worst['batch_ms_best'] / best['batch_ms_best']:.2f}. Within {NEAR - 1:.0%} of the "
             f"best: degree {', '.join(near)}."
@@ -238,17 +249,13 @@ def compare(rows: list[dict[str, Any]], structures: list[Structure]) -> list[str
     frame = max(row["slowest_frame_ms"] for row in rows)
     said.append(
         f"The slowest frame of all takes {frame:.3f} ms: "
-        + (
-            "no test is seen in the 30 fps loop."
-            if frame < 1e3 / FRAME_RATE
-            else "it is seen in the 30 fps loop."
-        )
+        + ("no test slows the 30 fps loop." if frame < 1e3 / FRAME_RATE else "it slows the 30 fps loop.")
     )
     return said
 
 
 def make_report(case: Case, structures: list[Structure], without: NDArray[np.float64]) -> dict[str, Any]:
-    """All figures: table 1, figure 7 along the path, the sentences."""
+    """Return the content of walkthrough.json: the case, table 1 and the sentences."""
     rows = [table_row(s) for s in structures]
     first = structures[0]
     return {
@@ -265,7 +272,7 @@ def make_report(case: Case, structures: list[Structure], without: NDArray[np.flo
         },
         "paper_machine": PAPER_MACHINE,
         "caveats": list(CAVEATS),
-        "verdicts_equal": True,  # measure() has raised otherwise
+        "verdicts_equal": True,  # otherwise measure() raises
         "table1": rows,
         "table1_paper": paper_rows(tuple(dict.fromkeys(s.degree for s in structures))),
         "comparison": compare(rows, structures),
@@ -276,7 +283,7 @@ def make_report(case: Case, structures: list[Structure], without: NDArray[np.flo
 def write_report(
     report: dict[str, Any], case: Case, structures: list[Structure], without: NDArray[np.float64], out: Path
 ) -> None:
-    """walkthrough.json; table1.csv, the paper's rows at its end; figure7.csv, the median time of each frame."""
+    """Write walkthrough.json, table1.csv (the paper's rows last) and figure7.csv (median time of each frame)."""
     (out / "walkthrough.json").write_text(json.dumps(report, indent=1) + "\n")
     with open(out / "table1.csv", "w", newline="") as file:
         writer = csv.DictWriter(file, list(report["table1"][0]))
@@ -295,20 +302,20 @@ def write_report(
 def draw_report(
     case: Case, structures: list[Structure], without: NDArray[np.float64], level: int, out: Path
 ) -> dict[str, Any]:
-    """figure7.png and figure8.png; returns what figure 8 shows, in numbers."""
+    """Draw figure7.png and figure8.png; return the numbers that figure 8 shows."""
     curves = {
         kind: [Curve(s.degree, s.frame_median) for s in structures if s.kind == kind]
         for kind in (SLAB, PLAIN)
     }
     contact = structures[0].verdict == Verdict.CONTACT
     draw_path(case.times, curves, without, contact, PAPER_FPS, out / "figure7.png")
-    # The lowest degree has the deepest trees: the most of its partitions reach the level.
+    # The lowest degree has the deepest trees: most of its partitions reach the level.
     chosen = min((s for s in structures if s.kind == PLAIN), key=lambda s: s.degree)
     spheres = level_spheres(chosen.folder, level)
     partitions, ended = int(spheres.partition.max()) + 1, int(spheres.ended.sum())
     title = (
         f"Bounding spheres of level {level} in each of the {partitions} partitions, degree {chosen.degree}: "
-        f"{len(spheres.radius)} spheres\n(one colour a partition; {ended} are leaf nodes of trees that end earlier)"
+        f"{len(spheres.radius)} spheres\n(one colour per partition; {ended} are leaf nodes of trees that end earlier)"
     )
     draw_spheres(spheres, title, out / "figure8.png")
     return {
@@ -329,11 +336,11 @@ def show(report: dict[str, Any], console: Console) -> None:
         f"{case['avatar_points']} points, {case['poses']} poses"
     )
     heads = {
-        "degree": "degree", "structure": "structure", "fps_30_loop": "fps, 30 fps loop", "frame_ms": "ms a frame",
+        "degree": "degree", "structure": "structure", "fps_30_loop": "fps, 30 fps loop", "frame_ms": "ms per frame",
         "frame_ms_best": "best", "slowest_frame_ms": "slowest", "tests_per_second": "tests/s",
         "batch_ms": "ms, one call for all", "batch_ms_best": "best", "tests_per_second_batch": "tests/s",
-        "resident_mb": "MB", "resident_bytes_per_point": "bytes a point", "archive_bytes": "archive bytes",
-        "archive_bytes_per_point": "bytes a point",
+        "resident_mb": "MB", "resident_bytes_per_point": "bytes per point", "archive_bytes": "archive bytes",
+        "archive_bytes_per_point": "bytes per point",
     }  # fmt: skip
     table = Table(title=title)
     for head in heads.values():
@@ -344,8 +351,8 @@ def show(report: dict[str, Any], console: Console) -> None:
     console.print(table)
     console.print(f"The paper's rows: {report['paper_machine']}.")
     console.print(
-        "Columns 'ms a frame' and 'slowest': one call a frame, median of the loops. Without a "
-        f"collision test (an avatar of no points) a frame's call takes {report['without_collision_ms']:.4f} ms. "
+        "Columns 'ms per frame' and 'slowest': one call per frame, median of the loops. Without a "
+        f"collision test (an avatar without points) a call takes {report['without_collision_ms']:.4f} ms. "
         "Columns 'ms, one call for all': all frames in one call, per frame."
     )
     for sentence in report["caveats"] + report["comparison"]:
@@ -353,7 +360,7 @@ def show(report: dict[str, Any], console: Console) -> None:
 
 
 def _cell(name: str, value: Any) -> str:
-    """A figure as the table shows it."""
+    """Format a value of the table."""
     if value is None or isinstance(value, str):
         return value or "-"
     if name.startswith("tests") or isinstance(value, int):
@@ -371,11 +378,12 @@ def run(
     level: int,
     say: Say,
 ) -> dict[str, Any]:
-    """The whole experiment: make(scratch) the case, build, walk, write everything into `out`; returns the report.
+    """Run the whole experiment: make(scratch) the case, build, walk, write everything into `out`.
 
-    scratch: a folder for scans and archives, the caller's to remove.
+    Returns the report.
+    scratch: a folder for scans and archives, which the caller removes.
     """
-    load_pyplot()  # missing: better said now than after minutes
+    load_pyplot()  # fails now if matplotlib is missing, not after minutes of measuring
     out.mkdir(parents=True, exist_ok=True)
     say("making the case")
     case = make(scratch)

@@ -37,8 +37,8 @@ _ROWS = {
     **dict.fromkeys(PAIR_COLUMNS, "pair_starts"),
     **dict.fromkeys(CLUSTER_COLUMNS, "cluster_starts"),
 }
-# Values that mean "nothing is known". `lower` is treated apart: in some answers it is a fraction or
-# a length along a ray, where that value is 0.
+# Values that mean "nothing is known" for columns in which 0 does not. `unknown` itself sets
+# `lower`: to 0 where it is a fraction or a length along a ray, else to -inf.
 _UNKNOWN = {"verdict": float(Verdict.UNKNOWN), "upper": np.inf, "distance": np.inf, "signed_distance": np.inf}
 
 

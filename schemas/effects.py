@@ -41,8 +41,8 @@ class Stop(Effect, frozen=True, tag="stop"):
 class Sweep(Effect, frozen=True, tag="sweep"):
     """Continuous motion: the avatar passes through nothing between two frames.
 
-    tolerance: how far any avatar point may move between the last clear moment known and the first
-    contact [m].
+    tolerance: how far any avatar point may move between the last pose known to be clear and the
+    first contact [m].
     """
 
     needs: ClassVar[tuple[str, ...]] = ("stop",)
@@ -88,7 +88,7 @@ class Ground(Effect, frozen=True, tag="ground"):
 
 
 class Proximity(Effect, frozen=True, tag="proximity"):
-    """Report, in each frame, of the nearest scan point: distance, place and contact normal.
+    """Report on the nearest scan point in each frame: distance, place and contact normal.
 
     reach: farthest distance worth reporting [m].
     """
@@ -97,7 +97,7 @@ class Proximity(Effect, frozen=True, tag="proximity"):
 
 
 class Contacts(Effect, frozen=True, tag="contacts"):
-    """List, in each frame, of contacts and near contacts in clusters, deepest first.
+    """List of contacts and near contacts in each frame, in clusters, deepest first.
 
     margin: distance below which a pair counts as in contact [m].  limit: maximum number of
     clusters.
@@ -111,11 +111,11 @@ class Contacts(Effect, frozen=True, tag="contacts"):
 
 
 class Objects(Effect, frozen=True, tag="objects"):
-    """Dynamic objects of the scene block avatars; pushed ones give way as far as the scene allows."""
+    """Collision with dynamic objects; pushed ones give way as far as the scene allows."""
 
 
 class Crowd(Effect, frozen=True, tag="crowd"):
-    """Users do not walk through each other.
+    """Collision between users: they do not walk through each other.
 
     margin: distance that they keep [m].
     """
@@ -145,7 +145,7 @@ class Through(Effect, frozen=True, tag="through"):
 
 
 class Uncertainty(Effect, frozen=True, tag="uncertainty"):
-    """Report, in each frame, of the probability of contact under range noise of the scans.
+    """Report on the probability of contact in each frame, under range noise of the scans.
 
     sigma: standard deviation of the noise [m].
     scans: that of individual scans, by the file's name as `info` lists it. An archive that does not

@@ -106,7 +106,8 @@ def unpack(
         declared = zstandard.get_frame_parameters(frame)
         if declared.content_size != expected:
             raise CorruptError(f"{what}: frame of {declared.content_size} bytes, expected {expected}")
-        # One flipped bit turns the checksum off: the frame would be read unchecked, its checksum as extra bytes.
+        # One flipped bit disables the checksum: the frame would be decoded unchecked, with its
+        # checksum as extra bytes.
         if not declared.has_checksum:
             raise CorruptError(f"{what}: frame without checksum, expected one")
         if kept is not None and kept != dtype:

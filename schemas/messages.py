@@ -144,7 +144,7 @@ class SourceInfo(msgspec.Struct, frozen=True):
 
 
 class SpawnInfo(msgspec.Struct, frozen=True):
-    """Start of a scene's users.
+    """Initial pose of a scene's users.
 
     position: of the avatar's origin, world [m].  heading: about `up` [degrees].
     """

@@ -188,7 +188,8 @@ class Moved(msgspec.Struct, frozen=True, eq=False, kw_only=True, omit_defaults=T
     left: part of the commanded motion not carried out [m].  touched: obstacles that stopped it.
     simulated: effects, in the order in which they ran.
     skipped: effects for which the frame's budget was too small.
-    stepped to crowd: report of each effect.
+    stepped: height climbed by `step` [m].
+    ground, proximity, contacts, uncertainty, objects, crowd: the report of each effect.
     unknown: the frame needed data that could not be examined; with it, any of these fields might
     differ.
     """

@@ -85,7 +85,7 @@ class ObjectItem(_Part, frozen=True):
 
 
 class Spawn(_Part, frozen=True):
-    """Start of users.
+    """Initial pose of users.
 
     position: of the avatar's origin, world [m].
     heading: rotation about up [degrees].
@@ -112,7 +112,7 @@ class Limits(_Part, frozen=True):
 
 
 class SceneFile(_Part, frozen=True):
-    """Scene.
+    """Content of a scene file.
 
     format: 1.  up: against gravity; any length but zero.
     radius_model: for the scan's spheres, one that the archives hold; omitted: each archive's one

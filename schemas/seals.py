@@ -31,7 +31,7 @@ _HEX_KEY = re.compile(rf"[0-9a-fA-F]{{{2 * KEY_BYTES}}}")
 
 
 class Sealer:
-    """Computes and checks the seals of the replies to one query."""
+    """Seals of the replies to one query: a server makes them, a client checks them."""
 
     __slots__ = ("_begun", "_key", "_name")
 
@@ -82,7 +82,10 @@ class Sealer:
 
 
 def is_about(seal: bytes, about: bytes) -> bool:
-    """Return whether a seal of the right length names these avatars. about: as in `Sealer.seal`."""
+    """Return True if a seal of the right length names these avatars.
+
+    about: as in `Sealer.seal`.
+    """
     return seal[_ABOUT] == hash_of(about)
 
 

@@ -13,7 +13,7 @@ TIME_BOUNDS = (*(float(f"{m}e{e}") for e in range(-6, 2) for m in (1, 2, 5)), 10
 
 
 class StatsRequest(Request, frozen=True):
-    """Ask for cache and user statistics. An omitted payload means the defaults.
+    """Request for cache and user statistics. An omitted payload means the defaults.
 
     keys: also list the resident voxels.
     """

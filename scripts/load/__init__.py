@@ -1,1 +1,1 @@
-"""What scripts/loadtest and its kin share: traces of users in a made town, and what is done with them."""
+"""Shared code of loadtest and simulate_cache: traces of users in a generated town, and their use."""

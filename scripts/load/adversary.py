@@ -1,7 +1,8 @@
-"""A user who always asks for what was evicted: most recently, or longest ago. It keeps an LRU of its own to know.
+"""A user who always requests what was evicted: either most recently or longest ago.
 
-The cache it works against may evict otherwise; then what it asks for is still what least recent use would have let go.
-Its poses stand in the middle of a voxel's points and not on a floor. What was asked is recorded as a trace.
+The user predicts evictions with a local LRU model. The cache under test may evict differently; the
+requests are then still what an LRU cache would have evicted. The poses stand in the middle of a
+voxel's points and not on a floor. The requests are recorded as a trace.
 """
 
 from collections import OrderedDict
@@ -18,17 +19,17 @@ Floats = NDArray[np.float64]
 
 
 class LruModel:
-    """Least recently used rows go first, never more than `budget` bytes; and which were evicted, in what order."""
+    """Least-recently-used cache of at most `budget` bytes, with the order of evictions."""
 
     def __init__(self, sizes: NDArray[np.int64], budget: int) -> None:
-        """sizes: (v,) bytes of each row."""
+        """Create an empty model. sizes: (v,) bytes of each row."""
         self._sizes, self._budget = sizes.tolist(), budget
-        self.resident: OrderedDict[int, None] = OrderedDict()  # used last at the end
-        self.evicted: OrderedDict[int, None] = OrderedDict()  # evicted last at the end
+        self.resident: OrderedDict[int, None] = OrderedDict()  # most recently used at the end
+        self.evicted: OrderedDict[int, None] = OrderedDict()  # most recently evicted at the end
         self.bytes = 0
 
     def use(self, rows: Iterable[int]) -> None:
-        """Demand rows together: those that are not resident are loaded, and the oldest others make room."""
+        """Request rows together: load absent rows, and evict the least recently used others."""
         wanted = list(rows)
         for row in wanted:
             if row not in self.resident:
@@ -44,20 +45,25 @@ class LruModel:
 
 
 class Adversary:
-    """Where to stand next, so that what was evicted is needed. All users of a process share one."""
+    """Chooses the next position such that an evicted row is needed. All users of a process share one."""
 
     def __init__(self, boxes: Floats, model: LruModel, center: Floats, reach: float) -> None:
-        """boxes: (v, 2, 3) of each voxel's points, world [m].  center, reach: of the avatar's root sphere [m]."""
+        """Create an adversary.
+
+        boxes: (v, 2, 3) of each voxel's points, world [m].
+        center, reach: of the avatar's root sphere [m].
+        """
         self._boxes, self._model = boxes, model
         self._center, self._reach = center, reach
-        self._fresh = 0  # rows below were asked for once
+        self._fresh = 0  # rows below have been requested once
         self._needed: dict[int, list[int]] = {}
 
     def pose(self, recent: bool) -> Floats:
-        """The next pose (4, 4). recent: at what was evicted last, else at what was evicted first.
+        """Return the next pose (4, 4).
 
-        Before, one voxel after the other, until as many were evicted as there are in the cache: evicted first and
-        evicted last are not the same then.
+        recent: at the row evicted most recently, else at the row evicted first.
+        Initially it visits one voxel after the other, until as many are evicted as the cache holds:
+        the first and the last evicted rows then differ.
         """
         model = self._model
         if self._fresh < len(self._boxes) and len(model.evicted) < max(1, len(model.resident)):
@@ -77,7 +83,7 @@ class Adversary:
         return self._boxes[row].mean(axis=0)
 
     def needed(self, row: int) -> list[int]:
-        """The rows that standing in the middle of this one needs, itself among them."""
+        """Return the rows that a position in the middle of this row needs, the row itself included."""
         if row not in self._needed:
             middle = self._middle(row)
             gap = np.maximum(0.0, np.maximum(self._boxes[:, 0] - middle, middle - self._boxes[:, 1]))
@@ -86,7 +92,7 @@ class Adversary:
 
 
 def make_adversary(archive: Path, budget: int, avatar: AvatarModel) -> Adversary:
-    """One for the voxels of an archive, against a cache of `budget` bytes."""
+    """Create an adversary for the voxels of an archive, against a cache of `budget` bytes."""
     voxels = read_voxels(archive)
     reach = float(avatar.arrays.radius[0]) + avatar.radius + voxels.radius
     return Adversary(voxels.boxes, LruModel(voxels.sizes, budget), avatar.arrays.center[0], reach)

@@ -1,7 +1,8 @@
-"""Belady's optimum: the fewest loads any order of eviction can do with, for who knows the future.
+"""Belady's optimum: the least number of loads of any eviction order, with knowledge of the future.
 
-L. A. Belady, "A study of replacement algorithms for a virtual-storage computer", IBM Systems Journal 5 (1966): what is
-used again last goes first. That is the optimum where all voxels are one size, so it is counted in voxels.
+L. A. Belady, "A study of replacement algorithms for a virtual-storage computer", IBM Systems
+Journal 5 (1966): evict what is used again last. This is optimal where all voxels have one size; the
+optimum is therefore counted in voxels.
 """
 
 import heapq
@@ -11,7 +12,10 @@ from numpy.typing import NDArray
 
 
 def next_uses(rows: NDArray[np.int64]) -> NDArray[np.int64]:
-    """For each of n references the number of the next one of the same row; n and more, all different, where none is."""
+    """Return for each of n references the number of the next one of the same row.
+
+    A reference without a next one gets a distinct number of at least n.
+    """
     n = len(rows)
     order = np.argsort(rows, kind="stable")
     following = n + np.arange(n)
@@ -21,14 +25,16 @@ def next_uses(rows: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def optimum(rows: NDArray[np.int64], capacity: int) -> NDArray[np.bool_]:
-    """Which of the references (n,) are misses when `capacity` voxels may be resident, as few as possible in all.
+    """Return which references (n,) are misses, as few as possible in total.
 
-    References are taken one after another, also those of one request, and each row is loaded when it is missed. To a
-    cache that must hold all rows of a request at once this is a bound from below. capacity: at least 1.
+    capacity: number of voxels that may be resident, at least 1.
+    References are processed one after another, also those of one request, and each row is loaded
+    when it is missed. For a cache that must hold all rows of a request at once this is a lower
+    bound.
     """
     missed = np.zeros(len(rows), bool)
     resident: dict[int, int] = {}  # row -> its next use
-    latest: list[tuple[int, int]] = []  # (-next use, row); out of date where `resident` says otherwise
+    latest: list[tuple[int, int]] = []  # (-next use, row); outdated where `resident` differs
     for number, (row, following) in enumerate(zip(rows.tolist(), next_uses(rows).tolist(), strict=True)):
         if row not in resident:
             missed[number] = True

@@ -1,4 +1,4 @@
-"""What a load test runs: each case a kind of user at a budget under a policy; and its figures and goals."""
+"""Cases of a load test, each a kind of user at a budget under a policy; their figures and targets."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -19,22 +19,25 @@ Floats = NDArray[np.float64]
 AS_SERVED = "as served"  # where the server takes no --policy
 ECHO = "echo"
 DEFAULT = "lru+prefetch"
-# The goals. Users of the first three: 8; of the last: 64.
+# The targets. Users of the first three: 8; of the last: 64.
 STEADY = ("stroll", "run")
 STALLED, WAIT_MS, WITHOUT_MISS = 0.0, 2.0, 0.999
-IN_VAIN = 0.3  # of the bytes prefetched
+IN_VAIN = 0.3  # share of the prefetched bytes
 HARD = (ADVERSARY, "teleport")
-MEMORY_BEYOND = 150 << 20  # above the budget and what the warm process had [bytes]
-ROUND_TRIP = 1.5  # of the echo's, medians
+MEMORY_BEYOND = 150 << 20  # above the budget and the memory of the warm process [bytes]
+ROUND_TRIP = 1.5  # ratio to the echo's, medians
 CROWD = 64
 START_COLD, START_WARM = 3.0, 1.5  # [s]
 
 
 @dataclass(frozen=True)
 class Case:
-    """One run. section: kinds, budgets, speeds or users.  share: the budget, of all decoded bytes.
+    """One run.
 
-    policy: None: the server's own.  speed: at most [m/s], None: the kind's own.
+    section: kinds, budgets, speeds or users.
+    share: the budget, as a share of all decoded bytes.
+    policy: None: the server's default.
+    speed: maximum [m/s], None: the kind's default.
     """
 
     section: str
@@ -46,21 +49,25 @@ class Case:
 
     @property
     def side(self) -> str:
-        """Who answered, for tables."""
+        """Return the contender's name, for tables."""
         return self.policy or AS_SERVED
 
     @property
     def name(self) -> str:
-        """What was asked, for tables."""
+        """Return the name of the measured case, for tables."""
         speed = "" if self.speed is None else f" at {self.speed:g} m/s"
         return f"{self.kind}{speed}, {self.users} users, budget {self.share:.3g}"
 
 
 @dataclass
 class Ran:
-    """A case that was run. budget: bytes.  wrong: frames whose verdict is not true.  speed: what users did [m/s].
+    """A finished case.
 
-    resident, rss: over time: seconds since the first frame, bytes.  strip, stats: as in `Outcome`.
+    budget: bytes.
+    wrong: number of frames with a wrong verdict.
+    speed: actual speed of the users [m/s].
+    resident, rss: over time: seconds since the first frame, bytes.
+    strip, stats: as in `Outcome`.
     """
 
     case: Case
@@ -79,7 +86,7 @@ class Ran:
 
 
 def make_ran(case: Case, budget: int, outcome: Outcome, wrong: int) -> Ran:
-    """The figures of a run, without its frames."""
+    """Return the figures of a run, without its frames."""
     at, rss = outcome.memory.samples()
     return Ran(
         case, budget, results.figures(outcome.frames), wrong, mean_speed(outcome.trace), outcome.empty,
@@ -89,7 +96,7 @@ def make_ran(case: Case, budget: int, outcome: Outcome, wrong: int) -> Ran:
 
 
 def mean_speed(trace: Trace) -> float:
-    """Of all users together over the floor, jitter left out [m/s]; NaN of those who jump."""
+    """Return the mean speed of all users over the floor without jitter [m/s]; NaN for users who jump."""
     moved, spent = 0.0, 0.0
     for user in np.unique(trace.user):
         own = of_users(trace, [int(user)])
@@ -102,7 +109,7 @@ def mean_speed(trace: Trace) -> float:
 
 
 def add_figures(part: Part, ran: Ran) -> None:
-    """The figures of one run."""
+    """Add the figures of one run."""
     case, side, f = ran.case.name, ran.case.side, ran.figures
 
     def add(what: str, value: float, unit: str) -> None:
@@ -142,7 +149,7 @@ def add_figures(part: Part, ran: Ran) -> None:
 
 
 def _add_stats(part: Part, ran: Ran) -> None:
-    """What the server itself counted, from its start on."""
+    """Add the server's own counts, from its start on."""
     case, side, stats = ran.case.name, ran.case.side, ran.stats
     part.add(case, side, "the server's stalls, p99", 1e3 * stats.stall_seconds.p99, "ms", stats.requests)
     part.add(case, side, "a voxel's load, p99", 1e3 * stats.load_seconds.p99, "ms", stats.load_seconds.count)
@@ -154,7 +161,10 @@ def _add_stats(part: Part, ran: Ran) -> None:
 
 
 def add_goals(part: Part, runs: list[Ran]) -> None:
-    """The goals of a section's runs: those of steady users for the default policy alone, where it was run by name."""
+    """Add the targets of a section's runs.
+
+    Those of steady users apply to the default policy only, where it was run by name.
+    """
     sides = {ran.case.side for ran in runs}
     held = {DEFAULT} if DEFAULT in sides else sides
     for ran in runs:
@@ -191,7 +201,7 @@ def add_goals(part: Part, runs: list[Ran]) -> None:
 
 
 def add_start(part: Part, cold: list[float], warm: list[float]) -> None:
-    """How long from the command until a client had its first right answer."""
+    """Add the time from the command to a client's first right answer."""
     for name, seconds, limit in (("cold", cold, START_COLD), ("warm", warm, START_WARM)):
         value = None
         if seconds:
@@ -200,7 +210,10 @@ def add_start(part: Part, cold: list[float], warm: list[float]) -> None:
 
 
 def knee(runs: list[Ran]) -> dict[str, int | None]:
-    """By side, the fewest users for whom a hundredth of the frames stalls or is not answered; None: for none."""
+    """Return by side the least number of users at which a hundredth of the frames stalls.
+
+    Unanswered frames count as stalled. None where no number of users reaches this.
+    """
     found: dict[str, int | None] = {}
     for ran in sorted(runs, key=lambda r: r.case.users):
         f = ran.figures
@@ -210,7 +223,7 @@ def knee(runs: list[Ran]) -> dict[str, int | None]:
 
 
 def _number(value: float) -> float | None:
-    """A figure, None where there is none."""
+    """Return a figure, or None for NaN."""
     return float(value) if np.isfinite(value) else None
 
 
@@ -227,7 +240,7 @@ NOTES: dict[str, str] = {
 
 
 def summary(ran: Ran) -> dict[str, object]:
-    """A run for JSON: the case, its figures, memory and bytes over time."""
+    """Return a run for JSON: the case, its figures, memory and bytes over time."""
     f = ran.figures._asdict()
     plain = {name: [_number(v) for v in np.atleast_1d(value)] for name, value in f.items()}
     plain = {name: values[0] if np.ndim(f[name]) == 0 else values for name, values in plain.items()}

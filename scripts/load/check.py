@@ -1,4 +1,4 @@
-"""Whether what the server said under load is right: held against a scene in this process with everything resident."""
+"""Check of a server's verdicts under load against a scene in this process with everything resident."""
 
 from pathlib import Path
 
@@ -14,15 +14,15 @@ from .users import AVATAR
 
 
 class Judge:
-    """The undisturbed scene. Opened with the first question, closed by `close`."""
+    """The undisturbed scene, opened at the first query, closed by `close`."""
 
     def __init__(self, archive: Path, points: int) -> None:
-        """points: of the avatar."""
+        """Create the judge. points: of the avatar."""
         self._archive, self._points = archive, points
         self._scene: Scene | None = None
 
     def verdicts(self, trace: Trace) -> np.ndarray:
-        """What is true of each pose (n,), asked in one call for each user."""
+        """Return the true verdict of each pose (n,), in one call per user."""
         if self._scene is None:
             self._scene = open_whole(self._archive)
             self._scene.add_avatar(AVATAR, figure_points(self._points))
@@ -33,13 +33,16 @@ class Judge:
         return found
 
     def close(self) -> None:
-        """Close the scene, if it was opened."""
+        """Close the scene, if it is open."""
         scene, self._scene = self._scene, None
         if scene is not None:
             scene.close()
 
 
 def wrong(frames: Frames, truth: np.ndarray) -> np.ndarray:
-    """Frames whose verdict is neither `UNKNOWN` nor the true one: their numbers. What was not answered says nothing."""
+    """Return the numbers of frames whose verdict is neither `UNKNOWN` nor the true one.
+
+    Unanswered frames are ignored.
+    """
     said = (frames.status == ANSWERED) & (frames.verdict != Verdict.UNKNOWN)
     return np.flatnonzero(said & (frames.verdict != truth))

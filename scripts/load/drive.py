@@ -1,4 +1,4 @@
-"""One run: a real server, N users in processes of their own, and what became of every frame; beside it a bare echo."""
+"""One run: a real server or a bare echo, N users in separate processes, and the outcome of every frame."""
 
 import os
 import subprocess
@@ -23,15 +23,18 @@ from .server import Memory
 from .traces import Trace
 from .users import AVATAR, LAST_ANSWERS, Job
 
-LEAD = 0.5  # from the time users are told to start until the first frame is due [s]
-STRIP = 12  # pictures of what is resident, evenly over a run
+LEAD = 0.5  # from the start command to the users until the first frame is due [s]
+STRIP = 12  # snapshots of the resident voxels, evenly over a run
 
 
 @dataclass(frozen=True)
 class Setup:
-    """What all runs have in common. work: a folder for logs and what processes exchange.  points: of the avatar.
+    """Settings common to all runs.
 
-    processes: of users, at most.  budget_ms: of each question; None: an answer waits for its voxels.
+    work: a folder for logs and the files that processes exchange.
+    points: of the avatar.
+    processes: maximum processes of users.
+    budget_ms: time budget of each request; None: an answer waits for its voxels.
     """
 
     archive: Path
@@ -43,11 +46,15 @@ class Setup:
 
 @dataclass
 class Outcome:
-    """One run. trace: what was asked in the end.  start: when the first frame could be due, time.monotonic() [s].
+    """Result of one run.
 
-    empty: RSS of the server when it was warm and its cache empty [bytes].  memory: of the server from then on.
-    strip: pictures of what was resident: seconds since the start, keys.  stats: what the server said of its cache in
-    the end (`StatsAnswer`); None: nothing.  faults: what went wrong in its words, some of them.
+    trace: the poses actually requested.
+    start: when the first frame could be due, time.monotonic() [s].
+    empty: RSS of the server when it was warm and its cache empty [bytes].
+    memory: of the server from then on.
+    strip: snapshots of the resident voxels: seconds since the start, keys.
+    stats: the server's cache statistics at the end (`StatsAnswer`), or None.
+    faults: some of the error messages.
     """
 
     trace: Trace
@@ -64,7 +71,8 @@ class Outcome:
 def run(setup: Setup, trace: Trace, budget: int, policy: str | None, adversary: bool = False) -> Outcome:
     """Serve the archive with a cache of `budget` bytes and drive the users of a trace.
 
-    adversary: the trace says who asks when; what, the adversaries do. ServerError: something did not start.
+    adversary: the trace determines users and times; the adversaries choose the poses.
+    Raises ServerError where something did not start.
     """
     log = setup.work / "server.log"
     with server.serving(setup.archive, budget, policy, log) as served, ExitStack() as stack:
@@ -75,7 +83,8 @@ def run(setup: Setup, trace: Trace, budget: int, policy: str | None, adversary: 
         job = Job(served.endpoint, "", "", server.SCENE, setup.points, setup.budget_ms)
         if adversary:
             job = msgspec.structs.replace(job, archive=str(setup.archive), budget=budget)
-        # Adversaries of one process share what they know: in several none would know what is evicted.
+        # Adversaries share their knowledge within one process: in several processes none would know
+        # what is evicted.
         users = Users(stack, setup, trace, job, 1 if adversary else setup.processes)
         strip = stack.enter_context(Strip(served.endpoint, float(trace.time[-1])))
         start = users.go()
@@ -93,7 +102,7 @@ def run(setup: Setup, trace: Trace, budget: int, policy: str | None, adversary: 
 
 
 def run_echo(setup: Setup, trace: Trace, request_bytes: int, reply_bytes: int) -> Outcome:
-    """The same load on a bare echo: as many sessions, as many questions at the same times, as many bytes."""
+    """Run the same load on a bare echo: as many sessions, as many requests at the same times and sizes."""
     with server.echoing(reply_bytes, setup.work / "echo.log") as endpoint, ExitStack() as stack:
         job = Job(endpoint, "", "", request_bytes=request_bytes)
         users = Users(stack, setup, trace, job, setup.processes)
@@ -104,7 +113,7 @@ def run_echo(setup: Setup, trace: Trace, request_bytes: int, reply_bytes: int) -
 
 
 def message_sizes(setup: Setup, trace: Trace, budget: int) -> tuple[int, int]:
-    """Bytes of a question and of its answer, as they are sent."""
+    """Return the bytes of a request and of its answer as they are sent."""
     pose = trace.pose[:1]
     request = CollideRequest(AVATAR, pose, 0.0, budget_ms=setup.budget_ms)
     with (
@@ -116,10 +125,10 @@ def message_sizes(setup: Setup, trace: Trace, budget: int) -> tuple[int, int]:
 
 
 class Users:
-    """The processes of users, whose sessions are open once this is made."""
+    """The processes of users; their sessions are open once this object exists."""
 
     def __init__(self, stack: ExitStack, setup: Setup, trace: Trace, job: Job, processes: int) -> None:
-        """stack: ends the processes."""
+        """Start the processes. stack: ends the processes."""
         names = np.unique(trace.user)
         count = max(1, min(processes, len(names)))
         self._length, self._processes, self._outs = float(trace.time[-1]), [], []
@@ -136,7 +145,7 @@ class Users:
             self._processes.append(stack.enter_context(server.running(command, log, "ready")))
 
     def go(self) -> float:
-        """Tell all when to start; returns it."""
+        """Send the start time to all; return it."""
         start = time.monotonic() + LEAD
         for process in self._processes:
             process.stdin.write(f"{start!r}\n")
@@ -144,7 +153,7 @@ class Users:
         return start
 
     def results(self) -> list[tuple[Frames, dict[str, NDArray]]]:
-        """Wait until all are done. ServerError: one of them failed."""
+        """Wait until all are done. Raises ServerError where one of them failed."""
         deadline = time.monotonic() + LEAD + self._length + 2 * LAST_ANSWERS + 30.0
         for process, out in zip(self._processes, self._outs, strict=True):
             try:
@@ -158,10 +167,10 @@ class Users:
 
 
 class Strip:
-    """Pictures of what is resident, taken from a server that says so; none of another."""
+    """Snapshots of the resident voxels, from a server that reports them; none from any other."""
 
     def __init__(self, endpoint: str, length: float) -> None:
-        """length: of the run [s]."""
+        """Prepare the snapshots. length: of the run [s]."""
         self.pictures: list[tuple[float, NDArray[np.uint64]]] = []
         self._length = length
         self._done = threading.Event()
@@ -179,7 +188,7 @@ class Strip:
         self._client.close()
 
     def begin(self, start: float) -> None:
-        """Take them from `start` on, in a thread."""
+        """Take snapshots from `start` on, in a thread."""
         self._thread = threading.Thread(target=self._take, args=(start,), daemon=True)
         self._thread.start()
 
@@ -194,11 +203,11 @@ class Strip:
             self.pictures.append((at, np.array(stats.keys, np.uint64)))
 
     def end(self) -> Any:
-        """Take no more; what the server says in the end, None: nothing."""
+        """Stop taking snapshots; return the server's final statistics, or None."""
         self._done.set()
         return server.ask_stats(self._client)
 
 
 def cores() -> int:
-    """How many this process may use."""
+    """Return the number of cores available to this process."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -1,6 +1,7 @@
-"""A process with nothing but zenoh, that answers whatever is asked below `echo/` with as many bytes as it was told.
+"""A bare zenoh process that answers any query below `echo/` with a fixed number of bytes.
 
-Arguments: the endpoint to listen on, and the bytes of a reply. It prints `ready`, and ends when its input does.
+Arguments: the endpoint to listen on, and the bytes of a reply. It prints `ready`, and ends at the
+end of its input.
 """
 
 import json
@@ -10,7 +11,7 @@ import zenoh
 
 
 def main() -> None:
-    """Answer until the standard input ends."""
+    """Answer until standard input ends."""
     config = zenoh.Config()
     config.insert_json5("listen/endpoints", json.dumps([sys.argv[1]]))
     config.insert_json5("scouting/multicast/enabled", "false")

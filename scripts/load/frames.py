@@ -1,4 +1,4 @@
-"""What became of every frame of a run, and the figures made of it."""
+"""Outcome of every frame of a run, and the figures derived from it."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -12,17 +12,21 @@ from .pace import after_first, stalled
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-# A frame is answered, or refused with an error, or nothing came.
+# A frame is answered, refused with an error, or unanswered.
 NOTHING, ANSWERED, REFUSED = 0, 1, 2
 PERCENTILES = (50.0, 99.0, 99.9, 100.0)
 
 
 class Frames(NamedTuple):
-    """n frames in order of when they were due; times are seconds on one clock.
+    """n frames in order of their due times; times are seconds on one clock.
 
-    user: (n,) int64.  due, sent, done: when it should be asked, was asked, and its answer was decoded; NaN: never.
-    status: (n,) of the three above.  verdict: (n,) int64, -1 without an answer.  hits, misses: of the answer, voxels.
-    engine, wait: time in the server's engine, and what of it was waiting for voxels, whoever had them loaded [s].
+    user: (n,) int64.
+    due, sent, done: when the request was due and sent, and its answer decoded; NaN: never.
+    status: (n,) of the three above.
+    verdict: (n,) int64, -1 without an answer.
+    hits, misses: of the answer, voxels.
+    engine, wait: time in the server's engine, and the part of it spent waiting for voxels,
+    whichever request loaded them [s].
     resident_bytes: in the server, after the request.
     """
 
@@ -40,11 +44,15 @@ class Frames(NamedTuple):
 
 
 class Figures(NamedTuple):
-    """A run in figures; times [s], of frames after the first second of each user, all but the counts of faults.
+    """Figures of a run; times in [s].
 
-    without_miss, waited: shares of the answered frames.  hit_rate: of voxels.
-    delays, waits: percentiles (PERCENTILES) of due to done, and of the wait for voxels.  round_trips: of sent to done.
-    late: 99th percentile of due to sent: what the users themselves were behind.  rate: answers a second.
+    They cover frames after the first second of each user, except the fault counts.
+    without_miss, waited: shares of the answered frames.
+    hit_rate: of voxels.
+    delays, waits: percentiles (PERCENTILES) of due to done, and of the wait for voxels.
+    round_trips: of sent to done.
+    late: 99th percentile of due to sent: the delay of the users themselves.
+    rate: answers per second.
     """
 
     frames: int
@@ -64,7 +72,7 @@ class Figures(NamedTuple):
 
 
 def empty(user: Ints, due: Floats) -> Frames:
-    """Frames (n,) of which nothing came yet."""
+    """Return frames (n,) without any outcome yet."""
     n = len(user)
     return Frames(
         user, due, np.full(n, np.nan), np.full(n, np.nan), np.full(n, NOTHING), np.full(n, -1),
@@ -73,26 +81,29 @@ def empty(user: Ints, due: Floats) -> Frames:
 
 
 def merged(parts: list[Frames]) -> Frames:
-    """Frames of several processes as those of one, in order of when they were due; at equal times of users."""
+    """Merge the frames of several processes in order of due time; at equal times in order of users."""
     columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
     order = np.lexsort((columns[0], columns[1]))
     return Frames(*(column[order] for column in columns))
 
 
 def save(path: Path, frames: Frames, **more: NDArray) -> None:
-    """Write frames, and whatever else, as .npz."""
+    """Write frames and further arrays as .npz."""
     np.savez(path, **frames._asdict(), **more)
 
 
 def load(path: Path) -> tuple[Frames, dict[str, NDArray]]:
-    """Read what `save` wrote: the frames, and what else there is."""
+    """Read a file of `save`: the frames, and the further arrays."""
     with np.load(path, allow_pickle=False) as file:
         columns = {name: file[name] for name in file.files}
     return Frames(*(columns.pop(name) for name in Frames._fields)), columns
 
 
 def percentiles(values: Floats, shares: tuple[float, ...] = PERCENTILES) -> Floats:
-    """Percentiles of what is a number; NaN of nothing. No value between two that were measured is made up."""
+    """Return percentiles of the numbers among the values; NaN where there are none.
+
+    No value is interpolated between two measurements.
+    """
     known = values[np.isfinite(values)]
     if not len(known):
         return np.full(len(shares), np.nan)
@@ -100,7 +111,11 @@ def percentiles(values: Floats, shares: tuple[float, ...] = PERCENTILES) -> Floa
 
 
 def figures(frames: Frames, warm_up: float = 1.0) -> Figures:
-    """The figures of a run. warm_up: seconds of each user that count only for refused, unanswered and unknown."""
+    """Return the figures of a run.
+
+    warm_up: initial seconds of each user that count only for refused, unanswered and unknown
+    frames.
+    """
     kept = after_first(frames.user, frames.due, warm_up)
     answered = kept & (frames.status == ANSWERED)
     hits, misses = int(frames.hits[answered].sum()), int(frames.misses[answered].sum())
@@ -125,7 +140,10 @@ def figures(frames: Frames, warm_up: float = 1.0) -> Figures:
 
 
 def bytes_over_time(frames: Frames, pieces: int = 200) -> tuple[Floats, Floats]:
-    """Most resident bytes that any answer told of, in so many pieces of the run: times from its start [s], bytes."""
+    """Return the most resident bytes that answers report in each of `pieces` parts of the run.
+
+    Returns (times from its start [s], bytes).
+    """
     answered = frames.status == ANSWERED
     if not answered.any():
         return np.empty(0), np.empty(0)

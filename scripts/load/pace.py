@@ -1,4 +1,4 @@
-"""The clock of simulated users: an open loop. Each frame has its time, and none waits for the answer to another."""
+"""Clock of simulated users, an open loop: each frame has its due time and waits for no other answer."""
 
 import time
 from collections.abc import Callable, Iterable
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 
-FRAME = 1.0 / 30.0  # an answer that comes later than this after its frame was due stalls the viewer [s]
+FRAME = 1.0 / 30.0  # an answer later than this after its frame was due stalls the viewer [s]
 
 
 def pace(
@@ -17,10 +17,10 @@ def pace(
     clock: Callable[[], float] = time.monotonic,
     sleep: Callable[[float], None] = time.sleep,
 ) -> None:
-    """Call act(0), act(1), ... each as soon as its time has come, never before; due ascends.
+    """Call act(0), act(1), ... each as soon as it is due, never before; due ascends.
 
-    What came late, because `act` took long or the machine was busy, is made up for at once: later times stay as they
-    are, so that a slow system is asked as often as a fast one.
+    A delay, because `act` took long or the machine was busy, is caught up at once: later times stay
+    unchanged. A slow system thus gets as many requests as a fast one.
     """
     for number, at in enumerate(due):
         while (left := at - clock()) > 0:
@@ -29,12 +29,12 @@ def pace(
 
 
 def stalled(due: Floats, done: Floats, limit: float = FRAME) -> NDArray[np.bool_]:
-    """Which frames (k,) had no answer `limit` seconds after they were due; NaN in `done`: never answered."""
+    """Return which frames (k,) had no answer `limit` seconds after they were due; NaN in `done`: never."""
     return ~(done - due <= limit)
 
 
 def after_first(user: NDArray[np.int64], due: Floats, seconds: float = 1.0) -> NDArray[np.bool_]:
-    """Which frames (k,) are due at least so long after their user's first one."""
+    """Return which frames (k,) are due at least `seconds` after their user's first one."""
     first = np.full(int(user.max(initial=-1)) + 1, np.inf)
     np.minimum.at(first, user, due)
     return due >= first[user] + seconds

@@ -1,4 +1,4 @@
-"""The page of a load test: goals, pictures and figures in one HTML file that needs no other."""
+"""Page of a load test: targets, pictures and figures in one self-contained HTML file."""
 
 import base64
 import html
@@ -21,7 +21,11 @@ p.note { color: #777; font-size: 13px; } p.warn { color: #c0392b; }
 def write_page(
     parts: list[Part], notes: dict[str, str], pictures: list[tuple[str, bytes]], about: str, target: Path
 ) -> None:
-    """Write the page. pictures: what each is called, PNG.  about: machine and archive, in a sentence."""
+    """Write the page.
+
+    pictures: title and PNG of each.
+    about: machine and archive, in a sentence.
+    """
     body = [f"<h1>solidcloud under load</h1><p>{html.escape(about)}</p>"]
     if warning := busy(parts):
         body.append(f'<p class="warn">{html.escape(warning)}: not figures to quote</p>')
@@ -57,7 +61,7 @@ def _goals(rows: list[dict[str, Any]]) -> str:
 
 
 def _figures(part: Part) -> str:
-    """A section's figures: a line a case and side, a column a figure."""
+    """Return a section's figures: one row per case and side, one column per figure."""
     columns = list(dict.fromkeys((f.what, f.unit) for f in part.figures))
     lines: dict[tuple[str, str], dict[tuple[str, str], float]] = {}
     for f in part.figures:

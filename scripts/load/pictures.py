@@ -1,4 +1,4 @@
-"""The pictures of a load test, each as PNG bytes: hit rate, stalls, bytes, round trips, and what is resident where."""
+"""Pictures of a load test as PNG bytes: hit rate, stalls, bytes, round trips, resident voxels."""
 
 import io
 from typing import Any
@@ -22,7 +22,7 @@ MARKS = "osD^vP*X"
 
 
 def png(figure: Any) -> bytes:
-    """A figure as PNG; it is closed."""
+    """Return a figure as PNG and close it."""
     out = io.BytesIO()
     figure.savefig(out, format="png")
     load_pyplot().close(figure)
@@ -38,14 +38,14 @@ def _axes(title: str, width: float = 9.0, height: float = 4.6) -> tuple[Any, Any
 
 
 def _frame(axes: Any) -> None:
-    """The line above which a frame stalls."""
+    """Draw the line above which a frame stalls."""
     axes.axhline(1e3 * FRAME, color=LIMIT, lw=1.1, ls="--")
     across = axes.get_yaxis_transform()
     axes.text(0.01, 1e3 * FRAME, "a frame: 33 ms", color=LIMIT, fontsize=8, va="bottom", transform=across)
 
 
 def _plain_ticks(axis: Any) -> None:
-    """Numbers as people write them on a logarithmic axis, at 1, 2 and 5."""
+    """Format a logarithmic axis with plain numbers, at 1, 2 and 5."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
@@ -54,7 +54,7 @@ def _plain_ticks(axis: Any) -> None:
 
 
 def _ticks_at(axes: Any, values: list[float]) -> None:
-    """Ticks of a logarithmic x axis where something was measured, and nowhere else."""
+    """Place ticks of a logarithmic x axis at the measured values only."""
     from matplotlib.ticker import NullLocator
 
     axes.xaxis.set_minor_locator(NullLocator())
@@ -62,7 +62,7 @@ def _ticks_at(axes: Any, values: list[float]) -> None:
 
 
 def _sides(runs: list[Ran]) -> dict[str, list[Ran]]:
-    """Runs by kind and policy, in order of their first."""
+    """Return runs by kind and policy, in order of their first."""
     found: dict[str, list[Ran]] = {}
     for ran in runs:
         found.setdefault(f"{ran.case.kind}, {ran.case.side}", []).append(ran)
@@ -70,7 +70,7 @@ def _sides(runs: list[Ran]) -> dict[str, list[Ran]]:
 
 
 def hit_rate(runs: list[Ran]) -> bytes:
-    """Voxels in reach that were resident, over the budget as a share of all decoded bytes."""
+    """Draw the share of resident voxels in reach over the budget, as a share of all decoded bytes."""
     figure, axes = _axes("hit rate of voxels over the budget, %")
     for k, (name, own) in enumerate(_sides(runs).items()):
         own = sorted(own, key=lambda r: r.case.share)
@@ -83,7 +83,7 @@ def hit_rate(runs: list[Ran]) -> bytes:
 
 
 def stalls(runs: list[Ran]) -> bytes:
-    """Percentiles of the time from due to answer, over the speed of users."""
+    """Draw percentiles of the time from due to answer over the users' speed."""
     figure, axes = _axes("from when a frame is due to its answer, over the users' speed, ms")
     for k, (side, own) in enumerate(_by(runs, lambda r: r.case.side).items()):
         own = sorted((r for r in own if np.isfinite(r.speed)), key=lambda r: r.speed)
@@ -101,7 +101,7 @@ def stalls(runs: list[Ran]) -> bytes:
 
 
 def round_trips(runs: list[Ran]) -> bytes:
-    """p50 and p99 over the number of users, beside a bare echo's."""
+    """Draw p50 and p99 over the number of users, beside a bare echo's."""
     figure, axes = _axes("from when a frame is due to its answer, over the number of users, ms")
     for k, (side, own) in enumerate(_by(runs, lambda r: r.case.side).items()):
         own = sorted(own, key=lambda r: r.case.users)
@@ -121,7 +121,10 @@ def round_trips(runs: list[Ran]) -> bytes:
 
 
 def bytes_over_time(runs: list[Ran]) -> bytes:
-    """Resident bytes as answers tell them, and the process's memory, with the budget line; a panel a run."""
+    """Draw the resident bytes that answers report, the process's memory and the budget.
+
+    There is one panel per run.
+    """
     columns = min(3, max(1, len(runs)))
     rows = -(-len(runs) // columns)
     size = (5.2 * columns, 2.9 * rows)
@@ -143,7 +146,7 @@ def bytes_over_time(runs: list[Ran]) -> bytes:
 
 
 def film_strip(ran: Ran, voxels: Voxels) -> bytes:
-    """Which voxels are resident where, from above, over time."""
+    """Draw the positions of the resident voxels over time, from above."""
     boxes = voxels.boxes
     low, high = boxes[:, 0, :2].min(axis=0), boxes[:, 1, :2].max(axis=0)
     columns = min(6, len(ran.strip))
@@ -167,7 +170,7 @@ def film_strip(ran: Ran, voxels: Voxels) -> bytes:
 
 
 def _plan(axes: Any, boxes: Floats, colour: str, alpha: float) -> None:
-    """Boxes (k, 2, 3) from above."""
+    """Draw boxes (k, 2, 3) from above."""
     from matplotlib.collections import PolyCollection
 
     (x0, y0), (x1, y1) = boxes[:, 0, :2].T, boxes[:, 1, :2].T

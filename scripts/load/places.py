@@ -1,8 +1,8 @@
-"""Where people walk in a made town: forecourts, doors, naves, streets and lanes, read from its truth.
+"""Paths of people in a generated town, from its truth: forecourts, doors, naves, streets and lanes.
 
-Frame: the world's, metres, z up. A visit of a façade and the ways between visits are corners of a path, with no turn
-much above a right angle, so that rounding them leaves no cusp (motion.py). The way through the main door is straight
-from before the portal until behind the wall.
+Frame: the world's, metres, z up. A visit of a façade and the connections between visits are corners
+of a path, without turns much above a right angle: rounding them leaves no cusp (motion.py). The
+path through the main door is straight from before the portal until behind the wall.
 """
 
 from typing import NamedTuple
@@ -17,25 +17,26 @@ from solidcloud.builder.made.walk import floor_height
 Floats = NDArray[np.float64]
 Cell = tuple[int, int]  # column, row of a façade in the town
 
-# In a façade's own frame: the middle of the street before its forecourt, and where a visit leaves it and comes back.
+# In a façade's own frame: the middle of the street before its forecourt, and where a visit leaves
+# and rejoins it.
 STREET_Y = FORECOURT_Y - 2.0
 SIDE_X = 6.5
-# How far the corners of a path are from where they stand here, at most [m].
+# Maximum random offset of a path's corners [m].
 LOOSE = 0.5
 
 
 class Town(NamedTuple):
-    """The façades of a made scene by column and row; one façade alone is a town too."""
+    """The façades of a generated scene by column and row; a single façade is a town too."""
 
     facades: dict[Cell, FacadeTruth]
 
     @property
     def cells(self) -> list[Cell]:
-        """All of them, row by row."""
+        """Return all cells, row by row."""
         return sorted(self.facades, key=lambda cell: (cell[1], cell[0]))
 
     def bounds(self) -> Floats:
-        """(2, 2): least and greatest x and y that any way here reaches, lanes and streets included."""
+        """Return (2, 2): least and greatest x and y of all paths, lanes and streets included."""
         cells = np.array(self.cells, np.float64)
         low, high = cells.min(axis=0), cells.max(axis=0)
         return np.array(
@@ -46,13 +47,17 @@ class Town(NamedTuple):
         )
 
     def only(self, cell: Cell) -> "Town":
-        """The town of one of its façades alone."""
+        """Return the town of only one of its façades."""
         return Town({cell: self.facades[cell]})
 
     def floor(self, xy: Floats) -> Floats:
-        """Height of the floor [m] (k,) below positions (k, 2): forecourt, steps and nave; 0 in streets and lanes."""
+        """Return the height of the floor [m] (k,) below positions (k, 2).
+
+        The floor is the forecourt, the steps or the nave; 0 in streets and lanes.
+        """
         column = np.rint(xy[:, 0] / PITCH_X).astype(np.int64)
-        # From the middle of the street before a façade to the middle of the one behind it.
+        # The range from the middle of the street before a façade to the middle of the street behind
+        # it.
         row = np.floor((xy[:, 1] - STREET_Y) / PITCH_Y).astype(np.int64)
         height = np.zeros(len(xy))
         for cell in {(int(c), int(r)) for c, r in zip(column, row, strict=True)} & self.facades.keys():
@@ -65,12 +70,12 @@ class Town(NamedTuple):
 
 
 def make_town_of(truth: SceneTruth) -> Town:
-    """The town whose truth this is."""
+    """Return the town of this truth."""
     return Town({(round(f.origin[0] / PITCH_X), round(f.origin[1] / PITCH_Y)): f for f in truth.facades})
 
 
 def spots(town: Town, count: int, rng: np.random.Generator) -> Floats:
-    """Places to stand (count, 2), drawn evenly over façades, forecourt and nave alike."""
+    """Return places to stand (count, 2), drawn evenly over façades, forecourts and naves."""
     cells = town.cells
     origins = np.array([town.facades[cell].origin[:2] for cell in cells])[
         rng.integers(len(cells), size=count)
@@ -84,10 +89,11 @@ def spots(town: Town, count: int, rng: np.random.Generator) -> Floats:
 def visit(
     truth: FacadeTruth, side: int, inside: bool, rng: np.random.Generator, hurried: bool = False
 ) -> Floats:
-    """Corners (k, 2) from the street over the forecourt to the portal and back to the street.
+    """Return corners (k, 2) from the street over the forecourt to the portal and back to the street.
 
-    side: +1: comes at the left and goes at the right, -1: the other way round.  inside: through the main door, around
-    the nave and out again.  hurried: else only across the forecourt, in one wide turn.
+    side: +1: arrives at the left and leaves at the right, -1: the reverse.
+    inside: through the main door, around the nave and out again.
+    hurried: else only across the forecourt, in one wide turn.
     """
     if hurried and not inside:
         across = np.array(
@@ -112,7 +118,7 @@ def visit(
     corners = np.array([*way, *middle, *back])
     loose = rng.uniform(-LOOSE, LOOSE, corners.shape)
     if inside:
-        # Straight through the door, both ways, each a little off its middle.
+        # Straight through the door both ways, each with a small offset from its centre.
         free = max(0.0, truth.door("main").width / 2 - 0.4)
         at = len(way)
         for first, second in ((at, at + 1), (at + 6, at + 7)):
@@ -131,14 +137,15 @@ def next_visit(
     rng: np.random.Generator,
     hurried: bool = False,
 ) -> tuple[Floats, int]:
-    """Corners (k, 2) from the end of a way, on the street of `cell`, to the end of a visit of `to`; and its side.
+    """Return corners (k, 2) from the end of a path to the end of a visit of `to`, and its side.
 
-    way: (n, 2), so far.  side: of the visit it ends with.
+    way: (n, 2), the path so far; it ends on the street of `cell`.
+    side: of the visit that ends it.
     """
     start, between = way[-1], np.empty((0, 2))
     street = to[1] * PITCH_Y + STREET_Y
     if cell[1] != to[1]:
-        # Over the lane beside the façade, on the side where the way left it.
+        # Over the lane beside the façade, on the side where the path left it.
         lane = (cell[0] + (0.5 if start[0] > cell[0] * PITCH_X else -0.5)) * PITCH_X + rng.uniform(-0.3, 0.3)
         between = np.array([(lane, start[1]), (lane, street + rng.uniform(-LOOSE, LOOSE))])
         start = between[-1]
@@ -150,9 +157,10 @@ def next_visit(
 def wander(
     town: Town, length: float, inside: float, rng: np.random.Generator, hurried: bool = False
 ) -> Floats:
-    """Corners (k, 2) of a way from façade to neighbouring façade, of at least so many metres.
+    """Return corners (k, 2) of a path from façade to neighbouring façade, of at least `length` metres.
 
-    inside: share of the visits that go through the door.  hurried: the others cross the forecourt in one wide turn.
+    inside: share of the visits that pass the door.
+    hurried: the others cross the forecourt in one wide turn.
     """
     cells = town.cells
     cell = cells[int(rng.integers(len(cells)))]
@@ -171,7 +179,7 @@ def wander(
 
 
 def tour(town: Town, rng: np.random.Generator) -> Floats:
-    """Corners (k, 2) of one long way through every façade, row by row and back to where it began: a closed loop."""
+    """Return corners (k, 2) of a closed loop through every façade, row by row."""
     rows = sorted({row for _, row in town.cells})
     order = [
         cell
@@ -186,7 +194,7 @@ def tour(town: Town, rng: np.random.Generator) -> Floats:
         cell = to
     last, first = parts[-1][-1], parts[0][0]
     if cell[1] != order[0][1]:
-        # Back over the lane on the left of all, on which no façade stands.
+        # Back over the leftmost lane, beside which no façade stands.
         lane = (min(column for column, _ in order) - 0.5) * PITCH_X
         parts.append(np.array([(lane, last[1]), (lane, first[1])]))
     parts.append(first[None])
@@ -194,5 +202,5 @@ def tour(town: Town, rng: np.random.Generator) -> Floats:
 
 
 def path_length(corners: Floats) -> float:
-    """Length of the way through corners (k, 2) [m]."""
+    """Return the length of the path through corners (k, 2) [m]."""
     return float(np.linalg.norm(np.diff(corners, axis=0), axis=1).sum())

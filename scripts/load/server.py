@@ -1,4 +1,4 @@
-"""The server under load: a process of its own on loopback, with what it can be told, and its memory over time."""
+"""The server under load: a separate process on loopback, its options, and its memory over time."""
 
 import functools
 import os
@@ -24,19 +24,22 @@ SCENE = "load"
 SCRIPTS = Path(__file__).resolve().parents[1]
 START_SECONDS = 900.0  # the first start on a machine compiles
 STOP_SECONDS = 20.0
-# RSS is cheap to look at. PSS goes over all mappings, some ms in which the process may map nothing.
+# RSS is inexpensive to read. PSS visits all mappings and blocks the process's mmap for some ms.
 RSS_PERIOD, PSS_PERIOD = 0.05, 1.0
 
 
 class ServerError(RuntimeError):
-    """The server did not start, or ended early; says what it said."""
+    """The server did not start, or ended early; the message holds its output."""
 
 
 @dataclass
 class Memory:
-    """A process's memory. at: when looked, time.monotonic() [s].  rss: then [bytes].  pss_at, pss: less often.
+    """Memory of a process over time.
 
-    high: the most RSS ever, as the kernel counts it [bytes]; 0 where it does not say.
+    at: sample times, time.monotonic() [s].
+    rss: at these times [bytes].
+    pss_at, pss: the same for PSS, less often.
+    high: the maximum RSS according to the kernel [bytes]; 0 where unknown.
     """
 
     at: list[float] = field(default_factory=list)
@@ -46,22 +49,22 @@ class Memory:
     high: int = 0
 
     def peak(self) -> int:
-        """Most RSS [bytes]; of the looks where the kernel does not say."""
+        """Return the maximum RSS [bytes], from the samples where the kernel does not report it."""
         return max(self.high, *self.rss, 0)
 
     def samples(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Times and RSS."""
+        """Return times and RSS."""
         return np.array(self.at), np.array(self.rss, np.float64)
 
 
 def parse_high(text: str) -> int:
-    """Most RSS [bytes] that a process's status tells of; 0: it does not."""
+    """Return the maximum RSS [bytes] in a process's status; 0 where it is missing."""
     found = re.search(r"^VmHWM:\s+(\d+) kB", text, re.MULTILINE)
     return int(found[1]) * 1024 if found else 0
 
 
 class Watcher(threading.Thread):
-    """Looks at one process's memory until it ends, or is told to stop."""
+    """Samples one process's memory until it ends, or until stopped."""
 
     def __init__(self, process: int) -> None:
         super().__init__(daemon=True)
@@ -70,7 +73,7 @@ class Watcher(threading.Thread):
         self._done = threading.Event()
 
     def look(self, whole: bool) -> None:
-        """One look; whole: at PSS too. OSError: the process is gone."""
+        """Take one sample; whole: PSS too. Raises OSError where the process has ended."""
         pages = int((self._folder / "statm").read_text().split()[1])
         memory, now = self.memory, time.monotonic()
         memory.at.append(now)
@@ -92,7 +95,7 @@ class Watcher(threading.Thread):
             self._done.wait(RSS_PERIOD)
 
     def stop(self) -> Memory:
-        """What was seen, the last look included."""
+        """Return all samples, the last one included."""
         self._done.set()
         if self.ident is not None:
             self.join()
@@ -103,7 +106,12 @@ class Watcher(threading.Thread):
 
 @dataclass
 class Served:
-    """A server that answers. endpoint: where.  process: its id.  seconds: from its start until it said so."""
+    """A server that answers.
+
+    endpoint: its address.
+    process: its id.
+    seconds: from its start until it reported readiness.
+    """
 
     endpoint: str
     process: int
@@ -111,7 +119,7 @@ class Served:
 
 
 def free_endpoint() -> str:
-    """An endpoint on loopback that nobody listens on yet."""
+    """Return a free endpoint on loopback."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         return f"tcp/127.0.0.1:{free.getsockname()[1]}"
@@ -119,7 +127,7 @@ def free_endpoint() -> str:
 
 @functools.cache
 def serve_help() -> str:
-    """What `solidcloud serve --help` says."""
+    """Return the output of `solidcloud serve --help`."""
     shown = subprocess.run(
         [*COMMAND, "serve", "--help"], capture_output=True, text=True, check=True,
         env={**os.environ, "COLUMNS": "250", "TERM": "dumb"},
@@ -128,25 +136,25 @@ def serve_help() -> str:
 
 
 def takes(option: str) -> bool:
-    """Whether `solidcloud serve` takes this option."""
+    """Return whether `solidcloud serve` accepts this option."""
     return re.search(rf"(?<![\w-]){re.escape(option)}(?![\w-])", serve_help()) is not None
 
 
 def serve_command(archive: Path, endpoint: str, budget: int, policy: str | None) -> list[str]:
-    """The command that serves an archive. policy: None: none is named."""
+    """Return the command that serves an archive. policy: None: the server's default."""
     command = [*COMMAND, "serve", str(archive), "--name", SCENE, "--listen", endpoint, "--cache", str(budget)]
     return command + (["--policy", policy] if policy else [])
 
 
 def script(module: str, *arguments: str) -> list[str]:
-    """The command that runs `main` of a module of this folder. Nothing of scripts/ hides a library's module."""
+    """Return the command that runs `main` of a module of this folder, without hiding library modules."""
     code = f"import sys; sys.path.append({str(SCRIPTS)!r}); from load.{module} import main; main()"
     return [sys.executable, "-c", code, *arguments]
 
 
 @contextmanager
 def started(command: list[str], log: Path) -> Iterator[subprocess.Popen]:
-    """A process, ended afterwards, by SIGTERM first. log: gets its standard error."""
+    """Start a process and end it afterwards, by SIGTERM first. log: receives its standard error."""
     with (
         open(log, "w") as errors,
         subprocess.Popen(
@@ -161,7 +169,10 @@ def started(command: list[str], log: Path) -> Iterator[subprocess.Popen]:
 
 @contextmanager
 def running(command: list[str], log: Path, ready: str) -> Iterator[subprocess.Popen]:
-    """A process that has printed a line that begins with `ready`. ServerError: it ended before, or was too slow."""
+    """Start a process and wait for a line that begins with `ready`.
+
+    Raises ServerError where it ended before, or was too slow.
+    """
     with started(command, log) as process:
         first = _first_line(process)
         if not first.startswith(ready):
@@ -171,7 +182,7 @@ def running(command: list[str], log: Path, ready: str) -> Iterator[subprocess.Po
 
 
 def _first_line(process: subprocess.Popen) -> str:
-    """Its first line on standard output, or what came of it until START_SECONDS."""
+    """Return its first line on standard output, or its failure within START_SECONDS."""
     found: list[str] = []
     assert process.stdout is not None
     reader = threading.Thread(
@@ -183,7 +194,7 @@ def _first_line(process: subprocess.Popen) -> str:
 
 
 def end(process: subprocess.Popen) -> None:
-    """End a process: asked first, killed when it does not listen."""
+    """End a process: SIGTERM first, then kill."""
     process.terminate()
     if process.stdin is not None:
         process.stdin.close()
@@ -196,7 +207,7 @@ def end(process: subprocess.Popen) -> None:
 
 @contextmanager
 def serving(archive: Path, budget: int, policy: str | None, log: Path) -> Iterator[Served]:
-    """`solidcloud serve` of an archive, warm and reachable, with an empty cache of `budget` bytes."""
+    """Run `solidcloud serve` on an archive, warm and reachable, with an empty cache of `budget` bytes."""
     endpoint, begin = free_endpoint(), time.monotonic()
     with running(serve_command(archive, endpoint, budget, policy), log, "serving") as process:
         yield Served(endpoint, process.pid, time.monotonic() - begin)
@@ -204,17 +215,17 @@ def serving(archive: Path, budget: int, policy: str | None, log: Path) -> Iterat
 
 @contextmanager
 def echoing(reply_bytes: int, log: Path) -> Iterator[str]:
-    """A bare echo, reachable at the endpoint that is given."""
+    """Run a bare echo, reachable at the yielded endpoint."""
     endpoint = free_endpoint()
     with running(script("echo", endpoint, str(reply_bytes)), log, "ready"):
         yield endpoint
 
 
 def ask_stats(client: Any) -> Any:
-    """What a server says of its cache (`StatsAnswer`), its resident voxels named; None: it has no such question."""
+    """Return a server's cache statistics (`StatsAnswer`), resident voxels included; None if unsupported."""
     if not hasattr(client, "stats"):
         return None
     try:
         return client.stats(keys=True)
-    except SolidcloudError:  # a server older than its clients
+    except SolidcloudError:  # an older server
         return None

@@ -1,8 +1,9 @@
-"""Replays traces against the policies and the prediction that serve, offline: no clock, no threads, no bytes read.
+"""Offline replay of traces against the server's policies and prediction.
 
-What is modelled is loading: one loader, so many seconds a load and a byte, demands first and in their order; a load
-that has begun is finished. A demand whose voxel is absent, or not there yet, is a miss, and waits until it is there.
-The trace goes on meanwhile, as the users of an open loop do. Fragments of the arena are not modelled.
+It uses no clock and no threads, and reads no data. Loading is modelled: one loader, with a time per
+load and per byte, demands first and in their order; a load that has begun is finished. A demand
+whose voxel is absent or still loading is a miss, and waits for it. The trace continues meanwhile,
+as the users of an open loop do. Fragmentation of the arena is not modelled.
 """
 
 import math
@@ -21,17 +22,21 @@ from solidcloud.server.policies import Policy, make_policy
 
 from .traces import Centers
 
-# Of the times that loads take, the share that is shorter than what predictions reckon with.
+# Quantile of the load times that predictions assume.
 USUAL = 0.9
-# Who sweeps: no user, so that it is nowhere; and how long one sweep through all voxels takes [s].
+# User id of sweeps, which belong to no user and have no position; duration of one sweep through all
+# voxels [s].
 NOBODY, SWEEP_SECONDS = -1, 10.0
 
 
 class Town(NamedTuple):
-    """What a simulation reads of an archive.
+    """Data of an archive that a simulation needs.
 
-    index: its voxels, in lattice steps.  voxel_steps: edge of a voxel.  origin (3,), step: of the lattice [m].
-    sizes: (v,) int64, bytes of each voxel once decoded.  radius: of its largest sphere [m].
+    index: its voxels, in lattice steps.
+    voxel_steps: edge of a voxel.
+    origin (3,), step: of the lattice [m].
+    sizes: (v,) int64, bytes of each decoded voxel.
+    radius: of its largest sphere [m].
     """
 
     index: SceneIndex
@@ -42,12 +47,12 @@ class Town(NamedTuple):
     radius: float
 
     def neighbourhood(self, ahead: Ahead = AHEAD) -> Neighbourhood:
-        """The prediction of users here, nobody seen yet."""
+        """Return a new motion prediction, without any user."""
         return Neighbourhood(self.index, self.voxel_steps, self.origin, self.step, ahead)
 
 
 def town_of(archive: Archive, sizes: NDArray[np.int64]) -> Town:
-    """What a simulation reads of an archive whose voxels take `sizes` (v,) bytes."""
+    """Return the data of an archive whose decoded voxels take `sizes` (v,) bytes."""
     lattice, voxels = archive.header.lattice, archive.voxels
     base = archive.coordinates * lattice.voxel_steps
     index = SceneIndex(
@@ -59,9 +64,13 @@ def town_of(archive: Archive, sizes: NDArray[np.int64]) -> Town:
 
 
 class Requests(NamedTuple):
-    """n requests and the voxels each needs. asked: who, when, where.  rows: (n,) lists.  flat: all of them, in order.
+    """n requests and the voxels each needs.
 
-    request: the number of the request each of `flat` belongs to.  first: (n,) bool, in the user's first second.
+    asked: user, time and position of each.
+    rows: (n,) lists.
+    flat: all of them, in order.
+    request: the number of the request of each of `flat`.
+    first: (n,) bool, in the user's first second.
     """
 
     asked: Centers
@@ -72,7 +81,7 @@ class Requests(NamedTuple):
 
 
 def requests_of(town: Town, asked: Centers) -> Requests:
-    """What each request of a trace needs: one kernel call for all of them."""
+    """Return the voxels that each request of a trace needs, by one kernel call."""
     starts, flat = town.neighbourhood().rows_in_reach(asked.center, asked.reach)
     every, bounds = flat.tolist(), starts.tolist()
     rows = [every[a:b] for a, b in pairwise(bounds)]
@@ -85,7 +94,10 @@ def requests_of(town: Town, asked: Centers) -> Requests:
 
 
 def with_sweeps(town: Town, asked: Centers, sweeps: int) -> Centers:
-    """A trace and, evenly over its time, sweeps through all voxels in the order of their rows: scans, by NOBODY."""
+    """Add sweeps through all voxels to a trace, evenly over its time.
+
+    Sweeps are scans in row order, by the user NOBODY.
+    """
     voxels, seconds = len(town.sizes), float(asked.time[-1] - asked.time[0])
     middle = (town.index.low + town.index.high) / 2 * town.step + town.origin
     begin = asked.time[0] + seconds * (np.arange(sweeps) + 1) / (sweeps + 1)
@@ -100,7 +112,10 @@ def with_sweeps(town: Town, asked: Centers, sweeps: int) -> Centers:
 
 
 class Loading(NamedTuple):
-    """How long one load takes: per_load + per_byte * bytes [s]. plan_seconds: how often what is wanted is found out."""
+    """Model of load times: per_load + per_byte * bytes [s].
+
+    plan_seconds: interval of plans.
+    """
 
     per_load: float = 1e-3
     per_byte: float = 5e-9
@@ -112,13 +127,18 @@ LOADING = Loading()
 
 @dataclass
 class Outcome:
-    """What became of a trace.
+    """Result of a replay.
 
-    misses: references to voxels not resident, each load counted once; `misses_later` those after the users' first
-    second.  late: of misses, those whose load had begun ahead of time.  frames_missed, frames_missed_later: requests
-    that waited.  waits: of each request [s].  prefetched, vain: loads ahead of time, and of those the ones evicted or
-    left at the end without a demand; the same in bytes.  evictions: all.  misses_swept: of sweeps, in `misses` too;
-    their waits and frames are nobody's, and what was loaded ahead was not for them.
+    misses: references to absent voxels, each load counted once; `misses_later` after the users'
+    first second.
+    late: misses whose load was already running as a prefetch.
+    frames_missed, frames_missed_later: requests that waited.
+    waits: of each request [s].
+    prefetched, vain: prefetches, and wasted ones, which were evicted or left at the end without a
+    demand; the same in bytes.
+    evictions: all.
+    misses_swept: of sweeps, also included in `misses`. Sweeps count neither waits nor frames, and
+    do not use prefetches.
     """
 
     requests: int = 0
@@ -137,7 +157,10 @@ class Outcome:
     waits: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
 
     def row(self) -> dict[str, float]:
-        """The figures, for tables: waits as percentiles [ms], over the frames that waited and over all."""
+        """Return the figures for tables.
+
+        Waits are percentiles [ms], over the frames that waited and over all.
+        """
         figures = {name: value for name, value in vars(self).items() if name != "waits"}
         missed = self.waits[self.waits > 0] * 1e3
         figures["wait_p50_ms"] = float(np.percentile(missed, 50)) if len(missed) else 0.0
@@ -147,12 +170,13 @@ class Outcome:
         return figures
 
 
-# One request: its number, the rows it needs, whose it is, when [s], and whether in the user's first second.
+# One request: its number, its rows, its user, its time [s], and whether it is in the user's first
+# second.
 Each = tuple[int, list[int], int, float, bool]
 
 
 def plan_turns(times: list[float], seconds: float) -> list[int]:
-    """At which requests what is wanted is found out: at the first, then whenever so long has passed."""
+    """Return the requests at which a plan is made: the first, then one after each interval."""
     turns: list[int] = []
     due = -math.inf
     for number, time in enumerate(times):
@@ -163,7 +187,10 @@ def plan_turns(times: list[float], seconds: float) -> list[int]:
 
 
 class Replay:
-    """One run of one policy. Demands hold what they need; users' places are kept where there is prefetching."""
+    """One replay with one policy.
+
+    Demands pin what they need; with prefetching, users' positions are pinned.
+    """
 
     def __init__(
         self,
@@ -175,7 +202,7 @@ class Replay:
         loading: Loading = LOADING,
         ahead: Ahead = AHEAD,
     ) -> None:
-        """name: of the policy."""
+        """Prepare an empty cache. name: of the policy."""
         self.budget_bytes, self.prefetch, self.loading = budget_bytes, prefetch, loading
         self.neighbourhood = town.neighbourhood(ahead)
         self.policy: Policy = make_policy(name, budget_bytes, self.neighbourhood.nearness)
@@ -183,10 +210,10 @@ class Replay:
         self.costs = (loading.per_load + town.sizes * loading.per_byte).tolist()
         self.usual = float(np.quantile(self.costs, USUAL)) if self.costs else 0.0
         self.sees = prefetch or name == "distance"
-        self.resident: set[int] = set()  # loaded, or being loaded: what has room
+        self.resident: set[int] = set()  # loaded or being loaded: rows with allocated room
         self.bytes = 0
-        self.ready: dict[int, float] = {}  # of what is being loaded: when it is there
-        self.unused: set[int] = set()  # loaded ahead, and not demanded yet
+        self.ready: dict[int, float] = {}  # completion time of rows being loaded
+        self.unused: set[int] = set()  # prefetched and not demanded yet
         self.kept: frozenset[int] = frozenset()
         self.need: dict[int, float] = {}
         self.queue: deque[tuple[int, float]] = deque()
@@ -194,7 +221,10 @@ class Replay:
         self.found = Outcome()
 
     def run(self, requests: Requests) -> Outcome:
-        """Replay all of it, from an empty cache. ValueError: one request alone does not fit the budget."""
+        """Replay all requests from an empty cache.
+
+        Raises ValueError where a single request exceeds the budget.
+        """
         found, asked = self.found, requests.asked
         most = max((sum(self.sizes[row] for row in rows) for rows in requests.rows), default=0)
         if most > self.budget_bytes:
@@ -216,10 +246,10 @@ class Replay:
         return found
 
     def run_planned(self, requests: Requests, each: Iterator[Each], waits: NDArray[np.float64]) -> None:
-        """The same where users are seen: from one plan to the next.
+        """Replay with users' positions known, from one plan to the next.
 
-        What is wanted is found out at a request, when its pose is known. All poses until the next time are seen at
-        once: nobody looks at them before.
+        A plan is made at a request, when its pose is known. All poses until the next plan are
+        registered at once, because nothing reads them before.
         """
         asked = requests.asked
         somebody = np.flatnonzero(asked.user != NOBODY)
@@ -245,9 +275,9 @@ class Replay:
     def run_some(
         self, each: Iterator[Each], scans: list[bool], waits: NDArray[np.float64], planned: int
     ) -> None:
-        """Answer requests, one after another, and load meanwhile what is wanted; fills their waits.
+        """Answer requests in turn, prefetch meanwhile, and fill in their waits.
 
-        planned: the request at which a plan was made: what is wanted since is loaded from the next on.
+        planned: the request at which a plan was made; its prefetches begin with the next request.
         """
         resident, ready, unused, queue = self.resident, self.ready, self.unused, self.queue
         used = self.policy.used
@@ -280,7 +310,7 @@ class Replay:
             found.frames_missed_later += wait > 0
 
     def demand(self, rows: list[int], now: float, scan: bool) -> float:
-        """Make rows resident; returns how long their request waits [s]."""
+        """Make rows resident; return the wait of their request [s]."""
         self.settle(now)
         until = now
         absent = []
@@ -300,12 +330,12 @@ class Replay:
         return until - now
 
     def settle(self, now: float) -> None:
-        """Forget about loads that have ended."""
+        """Forget loads that have ended."""
         for row in [row for row, there in self.ready.items() if there <= now]:
             del self.ready[row]
 
     def load(self, row: int, now: float, scan: bool) -> float:
-        """Begin a load that has room, when the loader is free; returns when it ends."""
+        """Begin a load that has room, when the loader is free; return when it ends."""
         self.free = self.ready[row] = max(self.free, now) + self.costs[row]
         self.resident.add(row)
         self.bytes += self.sizes[row]
@@ -313,7 +343,7 @@ class Replay:
         return self.free
 
     def make_room(self, row: int, own: list[int]) -> None:
-        """Room for a demand: of what nobody stands in, else of anything but the request's own."""
+        """Make room for a demand: evict rows where no user stands, else any but the request's own."""
         while self.bytes + self.sizes[row] > self.budget_bytes:
             spare = None
             for victim in self.policy.victims():
@@ -327,7 +357,7 @@ class Replay:
             self.evict(spare)
 
     def evict(self, row: int) -> None:
-        """Give the room of a row back."""
+        """Evict a row."""
         self.policy.removed(row, evicted=True)
         self.resident.remove(row)
         self.ready.pop(row, None)
@@ -339,16 +369,16 @@ class Replay:
             self.found.vain_bytes += self.sizes[row]
 
     def run_until(self, now: float) -> None:
-        """Let the loader do what is wanted until now."""
+        """Let the loader prefetch until now."""
         if self.ready:
             self.settle(now)
         while self.queue and self.free <= now:
             row, at = self.queue.popleft()
             if row not in self.resident and not self.load_ahead(row, at):
-                self.queue.clear()  # what is wanted later would have no room either
+                self.queue.clear()  # later entries would have no room either
 
     def plan(self, now: float) -> None:
-        """Find out anew what is wanted, and who stands where."""
+        """Update the prefetch queue and the users' positions."""
         self.planned = now
         self.neighbourhood.expire(now)
         wanted = self.neighbourhood.plan(now, self.usual)
@@ -360,7 +390,10 @@ class Replay:
             self.queue.extend(each for each in self.need.items() if each[0] not in resident)
 
     def load_ahead(self, row: int, at: float) -> bool:
-        """Begin a load ahead of time; False: no room, but for what is stood in, or wanted as soon."""
+        """Begin a prefetch; return False where there is no room.
+
+        It evicts no row at a user's position, and none wanted as soon.
+        """
         short = self.bytes + self.sizes[row] - self.budget_bytes
         if short > 0:
             given: list[int] = []

@@ -1,4 +1,4 @@
-"""How long a server takes from its command to its first right answer, its archive's files cached or not."""
+"""Time from a server's command to its first right answer, with the archive's files cached or not."""
 
 import time
 from contextlib import ExitStack
@@ -19,10 +19,12 @@ MOST_SECONDS = 900.0
 def first_answer(
     setup: Setup, budget: int, pose: NDArray[np.float64], verdict: int, cold: bool
 ) -> float | None:
-    """Seconds from the command until a client that was there before it has the right answer about `pose` (4, 4).
+    """Return the seconds from the command until a waiting client has the right answer.
 
-    verdict: the right one, CLEAR or CONTACT.  cold: the archive's files are dropped from the system's cache before;
-    None: the system cannot. ServerError: no right answer came.
+    pose: (4, 4).
+    verdict: the right one, CLEAR or CONTACT.
+    cold: drop the archive's files from the page cache first; returns None where the system cannot.
+    Raises ServerError where no right answer came.
     """
     if cold and not all([forget(path) for path in setup.archive.rglob("*") if path.is_file()]):
         return None

@@ -1,4 +1,4 @@
-"""The archive a load test serves: one that is given, or a made town that stays in a folder once it was built."""
+"""Archive that a load test serves: a given one, or a generated town that is kept in a folder."""
 
 import shutil
 import subprocess
@@ -12,9 +12,9 @@ from bench.machine import say
 def find(
     archive: Path | None, truth: Path | None, points: int, voxel: float, work: Path
 ) -> tuple[Path, Path]:
-    """The archive and its truth: as given, else of a made town of so many points, made where `work` has none.
+    """Return the archive and its truth, given or of a generated town of this many points.
 
-    SystemExit: a truth that is not there.
+    The town is generated where `work` has none. Raises SystemExit for a missing truth.
     """
     if archive is None:
         archive, beside = made_town(work, points, voxel)
@@ -29,7 +29,10 @@ def find(
 
 
 def made_town(work: Path, points: int, voxel: float) -> tuple[Path, Path]:
-    """The archive of a town of so many points and its truth; made where the folder has none. The scan is not kept."""
+    """Return the archive of a town of this many points and its truth; generate it where it is missing.
+
+    The scan is not kept.
+    """
     name = f"town-{points}-{voxel:g}"
     archive, truth = work / name, work / f"{name}.truth.json"
     if (archive / "index.h5").exists() and truth.exists():
@@ -42,7 +45,7 @@ def made_town(work: Path, points: int, voxel: float) -> tuple[Path, Path]:
             ["make", "town", "-o", str(scan), "--points", str(points)],
             ["build", str(scan), "-o", str(archive), "--voxel", f"{voxel:g}", "--overwrite"],
         ):
-            # Not on the standard output: that is for the figures.
+            # Standard output is reserved for the figures.
             subprocess.run([*COMMAND, *step], check=True, stdout=sys.stderr)
     finally:
         scan.unlink(missing_ok=True)

@@ -1,8 +1,9 @@
-"""Traces: where each of several users is, 30 times a second, in a made town. The same arguments give the same bits.
+"""Traces: positions of several users, 30 times a second, in a generated town.
 
-Kinds: stroll and run from façade to façade, some through the door; turn on the spot; tour, one long way through every
-façade, on which users are spread; crowd, all through one door; teleport, another place every second. What an adversary
-asks depends on what was evicted: it is no trace until it was played (adversary.py), and then is recorded like all.
+The same arguments give the same bits. Kinds: stroll and run from façade to façade, some through the
+door; turn on the spot; tour, one long path through every façade, along which users are spread;
+crowd, all through one door; teleport, another place every second. An adversary's requests depend on
+evictions: its trace exists only after a run, which records it (adversary.py).
 """
 
 from collections.abc import Callable
@@ -20,18 +21,23 @@ from .places import Town
 
 Floats = NDArray[np.float64]
 
-SPEEDS = {"stroll": 1.5, "run": 5.0, "tour": 5.0, "crowd": 1.2}  # at most [m/s]
+SPEEDS = {"stroll": 1.5, "run": 5.0, "tour": 5.0, "crowd": 1.2}  # maximum [m/s]
 SLOWEST_TOUR = 1.5
-INSIDE = {"stroll": 0.5, "run": 0.1}  # share of the visits that go through the door
+INSIDE = {"stroll": 0.5, "run": 0.1}  # share of the visits that pass the door
 KINDS = ("stroll", "run", "turn", "tour", "crowd", "teleport")
 ADVERSARY = "adversary"
 TELEPORT_SECONDS = 1.0
-# From one pose to the next nobody goes faster [m/s], nor so far by jitter alone [m]: what does is a teleport.
+# Maximum speed between poses [m/s], and maximum jitter [m]; anything beyond both is a teleport.
 FASTEST, FARTHEST_JITTER = 30.0, 0.05
 
 
 class Trace(NamedTuple):
-    """n poses of all users. user: (n,) int64 from 0.  time: (n,) float64 [s], ascending.  pose: (n, 4, 4) float64."""
+    """n poses of all users.
+
+    user: (n,) int64 from 0.
+    time: (n,) float64 [s], ascending.
+    pose: (n, 4, 4) float64.
+    """
 
     user: NDArray[np.int64]
     time: Floats
@@ -39,9 +45,10 @@ class Trace(NamedTuple):
 
 
 class Centers(NamedTuple):
-    """What a trace asks for, for the broad phase alone; rows are those of the trace.
+    """The part of a trace that the broad phase needs; rows are those of the trace.
 
-    center: (n, 3), of the avatar's root sphere, world [m].  reach: (n,), its radius with spheres and margin [m].
+    center: (n, 3), of the avatar's root sphere, world [m].
+    reach: (n,), its radius with spheres and margin [m].
     scan: (n,) bool, right after a teleport.
     """
 
@@ -55,10 +62,12 @@ class Centers(NamedTuple):
 def traces(
     kind: str, truth: SceneTruth, users: int, seconds: float, seed: int, speed: float | None = None
 ) -> Trace:
-    """The trace of users who do all the same kind of thing, each at places and in turns of its own.
+    """Return the trace of users of one kind, each with its own places and turns.
 
-    seconds: of each user, RATE poses a second, the users' frames spread over the time of one.  speed: at most [m/s],
-    None: the kind's own.  ValueError: no such kind, or nothing to trace.
+    seconds: duration of each user's trace, RATE poses a second, with the users' frames spread over
+    the period of one.
+    speed: maximum [m/s], None: the kind's own.
+    Raises ValueError for an unknown kind, or an empty trace.
     """
     if kind not in _MAKERS:
         raise ValueError(f"kind {kind!r}: expected one of {', '.join(KINDS)}")
@@ -78,14 +87,14 @@ def traces(
 
 
 def merged(parts: list[Trace]) -> Trace:
-    """Traces of different users as one, in order of time; at equal times in order of users."""
+    """Merge traces of different users in order of time; at equal times in order of users."""
     user, time, pose = (np.concatenate(column) for column in zip(*parts, strict=True))
     order = np.lexsort((user, time))
     return Trace(user[order], time[order], pose[order])
 
 
 def of_users(trace: Trace, users: NDArray[np.int64] | list[int]) -> Trace:
-    """The part of a trace that is of these users."""
+    """Return the part of a trace that belongs to these users."""
     own = np.isin(trace.user, users)
     return Trace(trace.user[own], trace.time[own], trace.pose[own])
 
@@ -94,7 +103,7 @@ _Make = Callable[[int, np.random.Generator], Floats]
 
 
 def _wander(town: Town, inside: float, time: Floats, speed: float, hurried: bool = False) -> _Make:
-    """Users who go from façade to façade; each is somewhere on the first stretch of its way when the trace begins."""
+    """Return users who go from façade to façade; each starts somewhere on its first stretch."""
 
     def make(user: int, rng: np.random.Generator) -> Floats:
         ahead = float(rng.uniform(0.0, 60.0))
@@ -120,10 +129,10 @@ def _crowd(town: Town, users: int, time: Floats, speed: float, rng: np.random.Ge
 
 
 def _tour(town: Town, users: int, time: Floats, speed: float, rng: np.random.Generator) -> _Make:
-    """Users spread evenly on one loop, as fast as it takes for them to see all of it together, if they may."""
+    """Return users spread evenly on one loop, fast enough to see all of it together, within the limit."""
     corners = places.tour(town, rng)
     way, together = motion.make_way(corners, speed, closed=True), users * float(time[-1])
-    for _ in range(2):  # the slower, the less turns slow one down further
+    for _ in range(2):  # at a lower speed, turns slow a user down less
         slower = float(np.clip(speed * way.time[-1] / together, min(SLOWEST_TOUR, speed), speed))
         way, speed = motion.make_way(corners, slower, closed=True), slower
 
@@ -145,7 +154,7 @@ def _turn(town: Town, users: int, time: Floats, speed: float, rng: np.random.Gen
 
 def _teleport(town: Town, users: int, time: Floats, speed: float, rng: np.random.Generator) -> _Make:
     def make(user: int, rng: np.random.Generator) -> Floats:
-        # Counted in frames: a second is RATE of them, whatever rounding makes of their times.
+        # Count frames, not times, because of rounding: a second is RATE frames.
         stay = (np.arange(len(time)) // round(TELEPORT_SECONDS * RATE)).astype(np.int64)
         spots = places.spots(town, int(stay[-1]) + 1, rng)
         heading = rng.uniform(-np.pi, np.pi, len(spots))
@@ -166,7 +175,7 @@ def save(path: Path, trace: Trace) -> None:
 
 
 def load(path: Path) -> Trace:
-    """Read a trace. ValueError: it is none."""
+    """Read a trace. Raises ValueError where the file holds none."""
     try:
         with np.load(path, allow_pickle=False) as file:
             trace = Trace(file["user"], file["time"], file["pose"])
@@ -179,9 +188,9 @@ def load(path: Path) -> Trace:
 
 
 def centers(trace: Trace, avatar: AvatarModel, margin: float = 0.0) -> Centers:
-    """Where the avatar's root sphere is in each pose, and how far it reaches.
+    """Return the position and the reach of the avatar's root sphere in each pose.
 
-    margin: whatever else is added to its reach: the radius of the scan's points, and a question's own margin [m].
+    margin: added to its reach: the radius of the scan's points, and a query's own margin [m].
     """
     local = np.append(avatar.arrays.center[0], 1.0)
     scale = np.linalg.norm(trace.pose[:, :3, 0], axis=1)
@@ -191,7 +200,10 @@ def centers(trace: Trace, avatar: AvatarModel, margin: float = 0.0) -> Centers:
 
 
 def jumps(user: NDArray[np.int64], time: Floats, place: Floats) -> NDArray[np.bool_]:
-    """Which rows (n,) are so far from the same user's last place (n, 3) that nobody goes there; first ones are not."""
+    """Return which rows (n,) are too far from the same user's last place (n, 3) to be walked.
+
+    First rows are no jumps.
+    """
     order = np.lexsort((time, user))
     far = np.linalg.norm(np.diff(place[order], axis=0), axis=1)
     most = FASTEST * np.diff(time[order]) + FARTHEST_JITTER

@@ -1,7 +1,8 @@
-"""One process of simulated users, each with a zenoh session of its own; started by drive.py.
+"""Process of simulated users, each with its own zenoh session; started by drive.py.
 
-It reads a job, opens the sessions, prints `ready`, waits for the time to start on its standard input, asks every frame
-when it is due, and writes what became of them. An answer is timed once it is decoded, in the thread that received it.
+It reads a job, opens the sessions, prints `ready`, reads the start time from standard input, sends
+every frame when it is due, and writes the outcomes. An answer is timed once it is decoded, in the
+thread that received it.
 """
 
 import gc
@@ -30,14 +31,17 @@ from .frames import ANSWERED, REFUSED, Frames
 from .pace import pace
 
 AVATAR = "avatar"
-LAST_ANSWERS = 6.0  # how long the last answers are waited for [s], a second more than a query lives
-FAULTS = 5  # of so many refusals what was said is kept
+LAST_ANSWERS = 6.0  # time limit of the last answers [s], a second above the lifetime of a query
+FAULTS = 5  # maximum refusals whose message is kept
 
 
 class Job(msgspec.Struct, frozen=True):
-    """What a process is to do. trace, out: paths.  scene: "": a bare echo is asked, whose request has request_bytes.
+    """Task of a process.
 
-    archive, budget: of the server, for adversaries; "": the poses are the trace's.  points: of the avatar.
+    trace, out: paths.
+    scene: "" to query a bare echo with request_bytes.
+    archive, budget: of the server, for adversaries; "": the poses are the trace's.
+    points: of the avatar.
     """
 
     endpoint: str
@@ -55,24 +59,24 @@ Came = Callable[[Any], None]
 
 
 class Asker(Protocol):
-    """One user's session."""
+    """Interface of one user's session."""
 
     def send(self, payload: bytes, came: Came) -> None:
-        """Ask; `came` is called with zenoh's reply, in another thread."""
+        """Send a request; `came` is called with zenoh's reply, in another thread."""
 
 
 class SceneUser(Client):
     """A client that does not wait for its answers."""
 
     def send(self, payload: bytes, came: Came) -> None:
-        """Ask `collide`; see `Asker`."""
-        # Called in the thread that receives: the default starts a thread for each question.
+        """Send a `collide` request; see `Asker`."""
+        # Called in the receiving thread: the default starts a thread for each request.
         handler = zenoh.handlers.Callback(came, indirect=False)
         self._querier("collide").get(handler, payload=payload, encoding=zenoh.Encoding(MSGPACK))
 
 
 class EchoUser:
-    """Asks a bare echo (echo.py), as zenoh's examples do."""
+    """A user of a bare echo (echo.py), as in zenoh's examples."""
 
     def __init__(self, endpoint: str, user: int) -> None:
         config = zenoh.Config()
@@ -91,12 +95,12 @@ class EchoUser:
         self._stack.close()
 
     def send(self, payload: bytes, came: Came) -> None:
-        """Ask the echo; see `Asker`."""
+        """Query the echo; see `Asker`."""
         self._querier.get(zenoh.handlers.Callback(came, indirect=False), payload=payload)
 
 
 class Run:
-    """Frames on their way: what is sent, and what came."""
+    """The frames in flight: what is sent, and what came back."""
 
     def __init__(self, job: Job, trace: traces.Trace, start: float) -> None:
         self.job, self.trace = job, trace
@@ -123,7 +127,7 @@ class Run:
         askers[user].send(payload, lambda reply: self._came(number, reply))
 
     def _came(self, number: int, reply: Any) -> None:
-        """Note one reply; a thread of zenoh's."""
+        """Record one reply; called in a zenoh thread."""
         frames = self.frames
         try:
             if reply.ok is None:
@@ -154,12 +158,12 @@ class Run:
             self.faults.append(text)
 
     def wait(self) -> None:
-        """Until all is answered, or no longer will be."""
+        """Wait until all frames are answered, or the time limit."""
         self._all.wait(LAST_ANSWERS)
 
 
 def main() -> None:
-    """The process; the job's path is its one argument."""
+    """Run the process; the job's path is its one argument."""
     job = msgspec.json.decode(Path(sys.argv[1]).read_bytes(), type=Job)
     trace = traces.load(Path(job.trace))
     sys.setswitchinterval(0.0005)
@@ -173,7 +177,7 @@ def main() -> None:
             else:
                 askers[user] = stack.enter_context(EchoUser(job.endpoint, user))
         run = Run(job, trace, 0.0)
-        gc.freeze()  # no collection of what is here already while frames are paced
+        gc.freeze()  # no garbage collection of existing objects while frames are paced
         print("ready", flush=True)
         start = float(sys.stdin.readline())
         run.frames.due[:] += start

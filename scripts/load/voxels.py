@@ -1,4 +1,4 @@
-"""The voxels of an archive as a load test needs them: their keys, where their points are, their bytes decoded."""
+"""Voxels of an archive as a load test needs them: keys, positions of the points, decoded sizes."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -10,9 +10,12 @@ from solidcloud.server.store import Store
 
 
 class Voxels(NamedTuple):
-    """By index row. keys: (v,) uint64, ascending.  boxes: (v, 2, 3) of each one's points, world [m].
+    """Voxels by index row.
 
-    sizes: (v,) int64, bytes each takes in a cache.  radius: of the scan's points [m].
+    keys: (v,) uint64, ascending.
+    boxes: (v, 2, 3) of each one's points, world [m].
+    sizes: (v,) int64, bytes each takes in a cache.
+    radius: of the scan's points [m].
     """
 
     keys: NDArray[np.uint64]
@@ -22,11 +25,11 @@ class Voxels(NamedTuple):
 
     @property
     def decoded(self) -> int:
-        """Bytes of all of them."""
+        """Return the total decoded bytes."""
         return int(self.sizes.sum())
 
     def rows(self, keys: NDArray[np.uint64]) -> NDArray[np.int64]:
-        """Rows of the voxels of these keys; a key that is none of them is left out."""
+        """Return the rows of the voxels of these keys; unknown keys are omitted."""
         at = np.searchsorted(self.keys, keys)
         known = at < len(self.keys)
         known[known] = self.keys[at[known]] == keys[known]
@@ -34,7 +37,7 @@ class Voxels(NamedTuple):
 
 
 def read_voxels(archive: Path) -> Voxels:
-    """The voxels of the archive in this folder."""
+    """Read the voxels of the archive in this folder."""
     store = Store(archive)
     try:
         found, header = store.archive, store.archive.header

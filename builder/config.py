@@ -4,10 +4,10 @@ import math
 import re
 from dataclasses import dataclass, field
 
+from ..schemas.archive.index import MAX_NORMAL_REACH, NORMAL_REACH
+from ..schemas.archive.radius_model import MAX_RADIUS, STORED_MODELS
+from ..schemas.archive.voxel import MAX_DEGREE, MAX_LEAF, MIN_DEGREE
 from ..schemas.errors import BadRequestError
-from ..schemas.index import MAX_NORMAL_REACH, NORMAL_REACH
-from ..schemas.radius_model import MAX_RADIUS, STORED_MODELS
-from ..schemas.voxel import MAX_DEGREE, MAX_LEAF, MIN_DEGREE
 
 # Closest-point distances are measured at about this many points; at all points if there are fewer.
 RADIUS_SAMPLE = 1_000_000
@@ -98,7 +98,7 @@ class BuildConfig:
     m and 16 % less with voxels of 8 m, for 4 % more memory and 1 % more archive. 256 gains little
     more, for 16 % more memory (scripts/bench_engine --only cells).
     cells: "octree", or "balanced", which also merges cells until all trees have the same height
-    (balance.py).
+    (balance_cells.py).
     models: stored radius models: always "mean", optionally "local" and "border", which need one
     byte per point. Default "mean" alone: `local` leaks 14 mm where "mean" leaks 16, takes a seventh
     more time, and narrows narrow doors, whose jambs are scanned thinly. `border` pays off only on
@@ -111,7 +111,7 @@ class BuildConfig:
     passes.
     keep: extra columns, among "scan", "intensity" and "normal".
     normal_reach: radius of the neighbourhood from which a normal is estimated [m]
-    (schemas/kernels/normals.py), if normals are kept.
+    (schemas/kernels/normal_codes.py), if normals are kept.
     strict: a non-finite point fails the build.
     skip_bad: leave out scans that cannot be read and mark their region as unknown.
     overwrite: replace an archive of the same name, once the new one is complete.
@@ -120,7 +120,7 @@ class BuildConfig:
     outliers: (distance [m], count): leave out points with fewer than `count` other points within
     the distance; None: keep all.
     moving: (distance [m], scans): leave out points that other scans saw through
-    (builder/filter_rules.py); None: keep all.
+    (builder/passes/filter_rules.py); None: keep all.
     scheduler: address of a dask scheduler whose workers do the work.
     cluster: "local:N", a cluster of N workers that is started for the build. If both are None,
     processes on this machine do the work.

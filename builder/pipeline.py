@@ -18,36 +18,32 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..schemas.archive import Archive
+from ..schemas.archive.archive import Archive
+from ..schemas.archive.index import Header
+from ..schemas.archive.index_file import write_index
+from ..schemas.archive.shard import SHARD_FOLDER
+from ..schemas.archive.voxel_grid import Lattice
+from ..schemas.archive.vtkhdf import PREVIEW_NAME
 from ..schemas.errors import BadRequestError, CorruptError, FormatError, ScanError, SolidcloudError
-from ..schemas.index import Header
-from ..schemas.index_file import write_index
-from ..schemas.interrupts import check
-from ..schemas.os_errors import os_error_words
-from ..schemas.shard import SHARD_FOLDER
-from ..schemas.voxel_grid import Lattice
-from ..schemas.vtkhdf import PREVIEW_NAME
-from .coincident import coincident_sources, coincident_text
+from ..schemas.process.interrupts import check
+from ..schemas.process.os_errors import os_error_words
 from .config import RADIUS_SAMPLE, BuildConfig
-from .dense import DENSE_POINTS
-from .executor import Executor, worker_count
-from .filter_rules import filter_dtype, filter_passes
-from .header import archive_id, make_header
-from .make_executor import make_executor
-from .memory import jobs_that_fit, readers_that_fit
-from .passes import build_shards, check_filters, filter_points, spool_rows, spool_scans, survey_scans
-from .preview import write_preview
-from .progress import Progress, Silent
-from .resume import changed_inputs, described, is_whole
-from .scan_list import Input
-from .scan_list import inputs as scans_of
-from .shards import Shard
-from .spacing import archive_mean
-from .spool import Spool, spool_dtype
-from .stages import Stages
-from .survey import Survey, choose_lattice
-from .verify import verify_archive
-from .workplace import (
+from .passes.build_shards import Shard
+from .passes.dataset_header import archive_id, make_header
+from .passes.filter_rules import filter_dtype, filter_passes
+from .passes.point_spacing import archive_mean
+from .passes.preview import write_preview
+from .passes.resumable_passes import (
+    build_shards,
+    check_filters,
+    filter_points,
+    spool_rows,
+    spool_scans,
+    survey_scans,
+)
+from .passes.survey import Survey, choose_lattice
+from .passes.verify import verify_archive
+from .resume.build_directory import (
     Workplace,
     building_folder,
     check_target,
@@ -58,16 +54,27 @@ from .workplace import (
     recover,
     workplace,
 )
+from .resume.build_identity import changed_inputs, described, is_whole
+from .run.executor import Executor, worker_count
+from .run.make_executor import make_executor
+from .run.memory_shares import jobs_that_fit, readers_that_fit
+from .run.progress import Progress, Silent
+from .run.stages import Stages
+from .sources.coincident_scans import coincident_sources, coincident_text
+from .sources.scan_list import Input
+from .sources.scan_list import inputs as scans_of
+from .spool.spool import Spool, spool_dtype
+from .voxel.dense_voxel import DENSE_POINTS
 
 # Most bytes per point on disk at the end (the target is 5 at 0.1 mm). A build that cannot fit is
 # refused.
 ARCHIVE_BYTES_A_POINT = 6
-# Additional bytes per point of a dense voxel while it is built (dense.py); each job builds at most
+# Additional bytes per point of a dense voxel while it is built (dense_voxel.py); each job builds at most
 # one.
 SCRATCH_BYTES_A_POINT = 21
 # Approximate bytes per point of a file whose header does not declare their number: text.
 BYTES_A_POINT = 30
-# The points of a record are numbered by int32 (schemas/voxel.py Links).
+# The points of a record are numbered by int32 (schemas/archive/voxel.py Links).
 MOST_POINTS = (1 << 31) - 1
 # Points that become one by quantising are detected late, identical points at once.
 ONE_POINT = "a single distinct point has no closest point: give --radius"
@@ -78,7 +85,7 @@ class BuildSummary(NamedTuple):
 
     bytes: of index and shards.  preview_bytes: of the preview, 0 if it was deleted.
     stages: seconds of each stage.  skipped: reason -> points left out.
-    lattice_step, moved_max, radius, radius_error: [m], see schemas/index.py Header.
+    lattice_step, moved_max, radius, radius_error: [m], see schemas/archive/index.py Header.
     faults: of the scans left out.
     already: nothing was built, because the archive existed already, with the same scans and
     options.

@@ -17,9 +17,6 @@ from typing import Any, Self
 
 import zenoh
 
-from ..schemas import keys
-from ..schemas.answers import PARTS, PATH_ANSWERS, Cost, Part
-from ..schemas.columns import as_part, check_answers, unknown
 from ..schemas.errors import (
     BadRequestError,
     BusyError,
@@ -30,7 +27,10 @@ from ..schemas.errors import (
     UnknownSceneError,
     error_from_code,
 )
-from ..schemas.messages import (
+from ..schemas.wire import keys
+from ..schemas.wire.answers import PARTS, PATH_ANSWERS, Cost, Part
+from ..schemas.wire.columns import as_part, check_answers, unknown
+from ..schemas.wire.messages import (
     MAX_POSES,
     MSGPACK,
     WIRE_VERSION,
@@ -45,19 +45,19 @@ from ..schemas.messages import (
     decode_answer,
     encode,
 )
-from ..schemas.requests import (
+from ..schemas.wire.requests import (
     check_path_parameters,
     is_bounded,
     make_poses,
     make_positions,
 )
-from .added_avatars import Added, AddedAvatars
-from .client_session import ClientSession, WishNumbers
-from .endpoints import DEFAULT_ENDPOINT, check_endpoint, zenoh_words
-from .identity import OPEN_SECONDS, Identity
-from .questions import Questions
-from .replies import Anchor, Asked, OtherAvatarError
-from .zenoh_settings import session_config
+from .network.endpoints import DEFAULT_ENDPOINT, check_endpoint, zenoh_words
+from .network.replies import Anchor, Asked, OtherAvatarError
+from .network.zenoh_settings import session_config
+from .remote.added_avatars import Added, AddedAvatars
+from .remote.client_identity import OPEN_SECONDS, Identity
+from .remote.client_session import ClientSession, WishNumbers
+from .remote.request_batches import Questions
 
 log = logging.getLogger(__name__)
 

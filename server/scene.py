@@ -12,7 +12,9 @@ from typing import Any, TypeVar, Unpack
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..schemas.answers import (
+from ..schemas.errors import BadRequestError, BusyError
+from ..schemas.scene.scene_file import scene_of
+from ..schemas.wire.answers import (
     CollideAnswers,
     ContactsAnswers,
     Cost,
@@ -23,33 +25,31 @@ from ..schemas.answers import (
     SweepAnswers,
     WithinAnswers,
 )
-from ..schemas.errors import BadRequestError, BusyError
-from ..schemas.messages import AvatarInfo, ReloadAnswer, SceneInfo, StatsAnswer
-from ..schemas.requests import make_objects, make_poses
-from ..schemas.scene import scene_of
-from .avatar import AvatarModel
-from .avatar_limits import AvatarLimits
-from .avatars import Avatars
-from .collide import collide
-from .contacts import contacts
-from .describe import describe, describe_scene, make_stats
-from .distance import distance
-from .effort import Effort, EngineOptions, make_effort
-from .heap import give_back_freed_memory
-from .metrics import Metrics
-from .objects import objects as ask_objects
-from .opened import HeldParts, Opened
-from .path import PATH_THREADS, largest_part, path_parts, path_question
-from .path_threads import PathThreads
-from .rays import raycast
-from .request import SceneData, with_stop
-from .residency import Residency
-from .simulated import Simulated
-from .stop import NEVER, Stop
-from .stopped_answers import ask_until_stopped
-from .store import OpenStore, Store
-from .sweep import sweep
-from .within import within
+from ..schemas.wire.messages import AvatarInfo, ReloadAnswer, SceneInfo, StatsAnswer
+from ..schemas.wire.requests import make_objects, make_poses
+from .archives.archive_generation import HeldParts, Opened
+from .archives.archive_info import describe, describe_scene, make_stats
+from .avatars.avatar_model import AvatarModel
+from .avatars.client_avatars import Avatars
+from .observability.metrics import Metrics
+from .queries.collide import collide
+from .queries.contacts import contacts
+from .queries.context.query_budget import Effort, EngineOptions, make_effort
+from .queries.context.query_context import SceneData, with_stop
+from .queries.distance import distance
+from .queries.objects import objects as ask_objects
+from .queries.path import PATH_THREADS, largest_part, path_parts, path_question
+from .queries.raycast import raycast
+from .queries.stopped_answers import ask_until_stopped
+from .queries.sweep import sweep
+from .queries.within import within
+from .residency.voxel_cache import Residency
+from .residency.voxel_store import OpenStore, Store
+from .runtime.path_threads import PathThreads
+from .runtime.process_heap import give_back_freed_memory
+from .runtime.stop_flag import NEVER, Stop
+from .served.avatar_limits import AvatarLimits
+from .simulation.assembly import Simulated
 
 _A = TypeVar("_A", bound=Cost)
 
@@ -101,9 +101,9 @@ class Scene(Simulated):
     ) -> "Scene":
         """Open the archive in `folder`, keeping at most budget_bytes of decoded voxels in memory.
 
-        policy: which of them go first, and whether others are loaded before they are asked for, see policies.py.
-        open_store: opens the folder, now and at each reload (effects/through.py).
-        radius_model: of questions that name none, see schemas/radius_model.py; None: the archive's one figure.
+        policy: which of them go first, and whether others are loaded before they are asked for, see eviction.py.
+        open_store: opens the folder, now and at each reload (simulation/effects/through_effect.py).
+        radius_model: of questions that name none, see schemas/archive/radius_model.py; None: the archive's one figure.
         Raises FormatError or CorruptError when it is no whole archive, BadRequestError for too small a budget.
         """
         store = open_store(folder)
@@ -295,11 +295,11 @@ class Scene(Simulated):
         client: str = "",
         **options: Unpack[EngineOptions],
     ) -> CollideAnswers:
-        """Whether avatar `name` touches the scene under each of the poses (k, 4, 4); see server/collide.py.
+        """Whether avatar `name` touches the scene under each of the poses (k, 4, 4); see server/queries/collide.py.
 
         options, here and below: tolerance [m], budget_ms, budget_visits: what the answer may cost, see
-        server/effort.py; radius_model: how large the scan's spheres are, see schemas/radius_model.py, None: as the
-        scene was opened.
+        server/queries/context/query_budget.py; radius_model: how large the scan's spheres are, see
+        schemas/archive/radius_model.py, None: as the scene was opened.
         """
         return self._ask(collide, name, client, poses, (poses, margin), margin, options)
 
@@ -312,7 +312,10 @@ class Scene(Simulated):
         client: str = "",
         **options: Unpack[EngineOptions],
     ) -> DistanceAnswers:
-        """How far avatar `name` is from the scene under each pose, up to `reach` [m]; see server/distance.py."""
+        """How far avatar `name` is from the scene under each pose, up to `reach` [m].
+
+        See server/queries/distance.py.
+        """
         return self._ask(distance, name, client, poses, (poses, reach), reach, options)
 
     def contacts(
@@ -326,7 +329,10 @@ class Scene(Simulated):
         client: str = "",
         **options: Unpack[EngineOptions],
     ) -> ContactsAnswers:
-        """Which pairs of points are in contact under each of the poses, deepest first; see server/contacts.py."""
+        """Which pairs of points are in contact under each of the poses, deepest first.
+
+        See server/queries/contacts.py.
+        """
         what = (poses, limit, margin, cluster_distance)
         return self._ask(contacts, name, client, poses, what, margin, options)
 
@@ -340,7 +346,7 @@ class Scene(Simulated):
         client: str = "",
         **options: Unpack[EngineOptions],
     ) -> SweepAnswers:
-        """When avatar `name` first touches the scene on its way between poses; see server/sweep.py."""
+        """When avatar `name` first touches the scene on its way between poses; see server/queries/sweep.py."""
         options.setdefault("tolerance", 1e-6)
         what = (pose_from, pose_to, margin, options["tolerance"])
         return self._ask(sweep, name, client, pose_to, what, margin, options)
@@ -352,7 +358,7 @@ class Scene(Simulated):
         reach: float,
         **options: Unpack[EngineOptions],
     ) -> RaycastAnswers:
-        """Which scan point's sphere rays (k, 3), (k, 3) hit first, up to `reach` [m]; see server/rays.py."""
+        """Which scan point's sphere rays (k, 3), (k, 3) hit first, up to `reach` [m]; see server/queries/raycast.py."""
         with self.take() as opened:
             data, effort = self._terms(opened, **options)
             answers = ask_until_stopped(
@@ -367,7 +373,7 @@ class Scene(Simulated):
         reach: float,
         **options: Unpack[EngineOptions],
     ) -> WithinAnswers:
-        """Which scan point is nearest to each loose point (k, 3), up to `reach` [m]; see server/within.py."""
+        """Which scan point is nearest to each loose point (k, 3), up to `reach` [m]; see server/queries/within.py."""
         with self.take() as opened:
             data, effort = self._terms(opened, **options)
             answers = ask_until_stopped(
@@ -386,7 +392,7 @@ class Scene(Simulated):
     ) -> ObjectsAnswers:
         """Which of several avatars (name, pose, group = 1, mask = all) touch the scene and one another.
 
-        See server/objects.py.
+        See server/queries/objects.py.
         """
         with self.take() as opened:
             data, effort = self._terms(opened, **options)

@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from archive_mutations import AVATAR, AVATAR_RADIUS, Outcome, Template
 from numpy.typing import NDArray
-from solidcloud.schemas.answers import DistanceAnswers, Verdict
 from solidcloud.schemas.errors import FormatError
+from solidcloud.schemas.wire.answers import DistanceAnswers, Verdict
 from solidcloud.server.scene import Scene
 
 REACH = 0.1

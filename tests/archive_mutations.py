@@ -16,13 +16,13 @@ from naive import placed_units, reach_units, scan_units, touches
 from numpy.typing import NDArray
 from scans import WITH_POINTS, make_scan, write_xyz
 from small_builds import build
-from solidcloud.builder.radius import voxel_points
-from solidcloud.builder.verify import verify_archive
-from solidcloud.schemas.answers import Verdict
-from solidcloud.schemas.archive import Archive
-from solidcloud.schemas.codec import decode_voxel
+from solidcloud.builder.passes.verify import verify_archive
+from solidcloud.builder.voxel.point_radius import voxel_points
+from solidcloud.schemas.archive.archive import Archive
+from solidcloud.schemas.archive.codec import decode_voxel
+from solidcloud.schemas.archive.voxel_grid import voxel_coordinates
 from solidcloud.schemas.errors import BadRequestError, CorruptError, FormatError
-from solidcloud.schemas.voxel_grid import voxel_coordinates
+from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.scene import Scene
 from zstandard import ZstdError
 

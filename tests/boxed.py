@@ -11,9 +11,9 @@ import scans
 from numpy.typing import NDArray
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import build_archive
-from solidcloud.schemas.effects import Through, ThroughBox
-from solidcloud.server.effects.through import store_without
+from solidcloud.schemas.scene.effect_options import Through, ThroughBox
 from solidcloud.server.scene import Scene
+from solidcloud.server.simulation.effects.through_effect import store_without
 
 STEP = cases.BINARY_STEP
 

@@ -11,14 +11,14 @@ import scans
 from numpy.typing import NDArray
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import build_archive
-from solidcloud.schemas.answers import ContactsAnswers, Verdict
-from solidcloud.server.avatar import AvatarModel, make_avatar
-from solidcloud.server.contacts import contacts
-from solidcloud.server.describe import describe
-from solidcloud.server.effort import EXACT, Effort
-from solidcloud.server.request import SceneData, make_scene_data, with_radius_model
-from solidcloud.server.residency import Residency
-from solidcloud.server.store import Store
+from solidcloud.schemas.wire.answers import ContactsAnswers, Verdict
+from solidcloud.server.archives.archive_info import describe
+from solidcloud.server.avatars.avatar_model import AvatarModel, make_avatar
+from solidcloud.server.queries.contacts import contacts
+from solidcloud.server.queries.context.query_budget import EXACT, Effort
+from solidcloud.server.queries.context.query_context import SceneData, make_scene_data, with_radius_model
+from solidcloud.server.residency.voxel_cache import Residency
+from solidcloud.server.residency.voxel_store import Store
 
 
 class ScanCase(NamedTuple):

@@ -8,10 +8,10 @@ import cases
 import naive_rays
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from solidcloud.schemas.answers import RaycastAnswers, WithinAnswers
-from solidcloud.server.request import SceneData, make_scene_data, with_radius_model
-from solidcloud.server.residency import Residency
-from solidcloud.server.store import Store
+from solidcloud.schemas.wire.answers import RaycastAnswers, WithinAnswers
+from solidcloud.server.queries.context.query_context import SceneData, make_scene_data, with_radius_model
+from solidcloud.server.residency.voxel_cache import Residency
+from solidcloud.server.residency.voxel_store import Store
 
 KINDS = ("cluster", "plane", "line", "grid", "duplicates", "noise", "one point")
 

@@ -10,11 +10,11 @@ import pytest
 import scans
 from numpy.typing import NDArray
 from solidcloud.builder.config import BuildConfig
+from solidcloud.builder.edit.rebuild_voxels import ChangeSummary
+from solidcloud.builder.passes.verify import verify_archive
 from solidcloud.builder.pipeline import build_archive
-from solidcloud.builder.radius import voxel_points
-from solidcloud.builder.rebuild import ChangeSummary
-from solidcloud.builder.verify import verify_archive
-from solidcloud.schemas.archive import Archive
+from solidcloud.builder.voxel.point_radius import voxel_points
+from solidcloud.schemas.archive.archive import Archive
 
 OPTIONS: dict[str, Any] = {"voxel": 0.5, "resolution": 1e-3, "jobs": 1}
 EVERYTHING = frozenset({"scan", "intensity"})

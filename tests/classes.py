@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from solidcloud.builder import shards
-from solidcloud.builder.radius import voxel_points
-from solidcloud.schemas.archive import Archive
-from solidcloud.schemas.radius_model import RADIUS_CLASSES, class_radii
+from solidcloud.builder.passes import build_shards as shards
+from solidcloud.builder.voxel.point_radius import voxel_points
+from solidcloud.schemas.archive.archive import Archive
+from solidcloud.schemas.archive.radius_model import RADIUS_CLASSES, class_radii
 
 STORED = frozenset({"mean", "local", "border"})
 # Of archives of a few metres and some hundred points, so that some poses touch and some do not.

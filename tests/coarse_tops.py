@@ -9,15 +9,15 @@ import naive
 import numpy as np
 import scans
 from numpy.typing import NDArray
-from solidcloud.schemas.radius_model import class_radii
-from solidcloud.server.arena import ArenaBuffer
-from solidcloud.server.avatar import AvatarModel
-from solidcloud.server.coarse import Coarse, settle
-from solidcloud.server.kernels.coarse import MOST_NODES
-from solidcloud.server.kernels.layout import ROW_WORDS, Arena, SceneArrays, block_words
-from solidcloud.server.kernels.placing import GOOD
-from solidcloud.server.kernels.reach import Reach, SceneIndex, find_reach
-from solidcloud.server.store import Store
+from solidcloud.schemas.archive.radius_model import class_radii
+from solidcloud.server.avatars.avatar_model import AvatarModel
+from solidcloud.server.kernels.core.pose_transform import GOOD
+from solidcloud.server.kernels.core.voxel_layout import ROW_WORDS, Arena, SceneArrays, block_words
+from solidcloud.server.kernels.core.voxels_in_reach import Reach, SceneIndex, find_reach
+from solidcloud.server.kernels.overlap.coarse_overlap import MOST_NODES
+from solidcloud.server.residency.arena import ArenaBuffer
+from solidcloud.server.residency.coarse_bounds import Coarse, settle
+from solidcloud.server.residency.voxel_store import Store
 
 # For the tops of all voxels of any scene here.
 ROOM = 1 << 25

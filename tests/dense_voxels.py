@@ -4,11 +4,11 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from solidcloud.builder.dense import BuiltVoxel
-from solidcloud.builder.spool import Spool, write_run
-from solidcloud.schemas.codec import RecordShape, decode_voxel, voxel_point_dtype
-from solidcloud.schemas.voxel import VoxelData
-from solidcloud.schemas.voxel_grid import Lattice
+from solidcloud.builder.spool.spool import Spool, write_run
+from solidcloud.builder.voxel.dense_voxel import BuiltVoxel
+from solidcloud.schemas.archive.codec import RecordShape, decode_voxel, voxel_point_dtype
+from solidcloud.schemas.archive.voxel import VoxelData
+from solidcloud.schemas.archive.voxel_grid import Lattice
 
 KEY = 0x1C0000000000000  # voxel (0, 0, 0)
 COLUMNS = {"scan_index": "<u2", "intensity": "<f4"}

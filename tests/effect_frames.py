@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from solidcloud.schemas.archive import Archive
-from solidcloud.schemas.scene import ArchiveItem, SceneFile
-from solidcloud.server.avatar import AvatarModel
-from solidcloud.server.effects.frame import Body, Frame
-from solidcloud.server.effort import EXACT, Effort
+from solidcloud.schemas.archive.archive import Archive
+from solidcloud.schemas.scene.scene_file import ArchiveItem, SceneFile
+from solidcloud.server.avatars.avatar_model import AvatarModel
+from solidcloud.server.queries.context.query_budget import EXACT, Effort
 from solidcloud.server.scene import Scene
-from solidcloud.server.world import World
+from solidcloud.server.simulation.world.collision_world import World
+from solidcloud.server.simulation.world.frame import Body, Frame
 
 
 class Counting:

@@ -12,12 +12,12 @@ from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.made.scenes import make_facade
 from solidcloud.builder.made.truth import FacadeTruth, read_truth
 from solidcloud.builder.pipeline import build_archive
-from solidcloud.schemas.answers import Verdict
-from solidcloud.schemas.moves import Moved
-from solidcloud.server.app import serving
+from solidcloud.schemas.wire.answers import Verdict
+from solidcloud.schemas.wire.moves import Moved
 from solidcloud.server.client import Client
-from solidcloud.server.config import ServerConfig
-from solidcloud.server.scene_file import open_scene
+from solidcloud.server.scenes.open_scene import open_scene
+from solidcloud.server.service.server_config import ServerConfig
+from solidcloud.server.service.service import serving
 
 WALKING = ("stop", "sweep", "slide", "step", "ground")
 FRAME = 1 / 30

@@ -7,8 +7,8 @@ from collections import Counter
 import numpy as np
 from numpy.typing import NDArray
 from solidcloud.schemas.errors import CorruptError
-from solidcloud.server.arena import ALIGNMENT as BLOCK
-from solidcloud.server.kernels.layout import Arena
+from solidcloud.server.kernels.core.voxel_layout import Arena
+from solidcloud.server.residency.arena import ALIGNMENT as BLOCK
 
 
 class FakeStore:

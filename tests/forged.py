@@ -8,9 +8,9 @@ import h5py
 import numpy as np
 import zstandard
 from numpy.typing import NDArray
-from solidcloud.schemas.codec import CELL_DTYPE, NODE_DTYPE, point_dtype
-from solidcloud.schemas.frames import pack
-from solidcloud.schemas.index import index_digest
+from solidcloud.schemas.archive.codec import CELL_DTYPE, NODE_DTYPE, point_dtype
+from solidcloud.schemas.archive.index import index_digest
+from solidcloud.schemas.archive.zstd_frame import pack
 
 Columns = dict[str, NDArray]
 

@@ -10,7 +10,7 @@ import scans
 from clouds import signed_permutations
 from numpy.typing import NDArray
 from solidcloud.server.scene import Scene
-from solidcloud.server.several import SeveralScenes
+from solidcloud.server.scenes.placed_archives import SeveralScenes
 
 STEP = cases.BINARY_STEP
 

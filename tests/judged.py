@@ -3,7 +3,7 @@
 import naive_distance
 import numpy as np
 from numpy.typing import NDArray
-from solidcloud.schemas.answers import CollideAnswers, DistanceAnswers, Verdict
+from solidcloud.schemas.wire.answers import CollideAnswers, DistanceAnswers, Verdict
 
 # Bounds are rounded outward, by some exact units of 2^-26 m.
 ROUNDED = 2e-7

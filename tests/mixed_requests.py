@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 import scans
 from numpy.typing import NDArray
-from solidcloud.schemas.answers import (
+from solidcloud.schemas.wire.answers import (
     CollideAnswers,
     ContactsAnswers,
     DistanceAnswers,
@@ -25,7 +25,7 @@ from solidcloud.schemas.answers import (
     SweepAnswers,
     WithinAnswers,
 )
-from solidcloud.schemas.messages import (
+from solidcloud.schemas.wire.messages import (
     MSGPACK,
     AddAvatarRequest,
     CollideRequest,
@@ -38,10 +38,10 @@ from solidcloud.schemas.messages import (
     decode_answer,
     encode,
 )
-from solidcloud.schemas.requests import ObjectItem, Question
-from solidcloud.server.app import Service
-from solidcloud.server.config import ServerConfig
+from solidcloud.schemas.wire.requests import ObjectItem, Question
 from solidcloud.server.scene import Scene
+from solidcloud.server.service.server_config import ServerConfig
+from solidcloud.server.service.service import Service
 
 SCAN = ("corner", 21, 500)
 MODELS = ("mean:1.5", "local", "border", "local+border:0.8", "fixed:0.004")

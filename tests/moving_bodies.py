@@ -10,15 +10,15 @@ import cases
 import naive
 import numpy as np
 from numpy.typing import NDArray
-from solidcloud.schemas.effects import AnyEffect
-from solidcloud.schemas.moves import Moved
-from solidcloud.schemas.scene import ArchiveItem, AvatarItem, ObjectItem, SceneFile
-from solidcloud.server.avatar import AvatarModel, make_avatar
-from solidcloud.server.effects.bodies import Bodies
-from solidcloud.server.effects.frame import Body
-from solidcloud.server.effects.pipeline import Pipeline, make_pipeline
+from solidcloud.schemas.scene.effect_options import AnyEffect
+from solidcloud.schemas.scene.scene_file import ArchiveItem, AvatarItem, ObjectItem, SceneFile
+from solidcloud.schemas.wire.moves import Moved
+from solidcloud.server.avatars.avatar_model import AvatarModel, make_avatar
 from solidcloud.server.scene import Scene
-from solidcloud.server.world import World
+from solidcloud.server.simulation.effects.bodies import Bodies
+from solidcloud.server.simulation.effects.pipeline import Pipeline, make_pipeline
+from solidcloud.server.simulation.world.collision_world import World
+from solidcloud.server.simulation.world.frame import Body
 
 INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
 FLAT, HIGH = (0.1, 0.1) if not INTERPRETED else (0.2, 0.2)  # spacing of floor and walls [m]

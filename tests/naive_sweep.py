@@ -1,7 +1,8 @@
 """The judge of motions: the pose at a fraction of the way by its formula, and what it should be by its meaning.
 
 Plain Python and numpy, nothing of the project's own but the judge of poses. `pose_at` is the documented float64 formula
-(server/kernels/motion.py), operation by operation; `ideal_pose` is exp(t log(M1 M0^-1)) M0 in 60 decimal digits.
+(server/kernels/motion/screw_motion.py), operation by operation; `ideal_pose` is exp(t log(M1
+M0^-1)) M0 in 60 decimal digits.
 """
 
 import math

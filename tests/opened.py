@@ -4,8 +4,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scans import make_steps
 from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.octree import VoxelPoints, build_voxel
-from solidcloud.schemas.codec import (
+from solidcloud.builder.voxel.voxel_octree import VoxelPoints, build_voxel
+from solidcloud.schemas.archive.codec import (
     OPTIONAL_COLUMNS,
     OpenRecord,
     Record,
@@ -15,8 +15,8 @@ from solidcloud.schemas.codec import (
     open_record,
     voxel_point_dtype,
 )
-from solidcloud.schemas.radius_model import RADIUS_CLASSES
-from solidcloud.schemas.voxel import Links, VoxelData
+from solidcloud.schemas.archive.radius_model import RADIUS_CLASSES
+from solidcloud.schemas.archive.voxel import Links, VoxelData
 
 ARCHIVE_ID = bytes(range(16))
 KEY = 0x1234567

@@ -9,14 +9,14 @@ from typing import Any, NamedTuple
 import cases
 import numpy as np
 from numpy.typing import NDArray
-from solidcloud.schemas.effects import AnyEffect
-from solidcloud.schemas.moves import Moved
-from solidcloud.schemas.scene import ArchiveItem, Limits, SceneFile
-from solidcloud.server.avatar import AvatarModel, make_avatar
-from solidcloud.server.effects.frame import Body
-from solidcloud.server.effects.pipeline import Pipeline, make_pipeline
+from solidcloud.schemas.scene.effect_options import AnyEffect
+from solidcloud.schemas.scene.scene_file import ArchiveItem, Limits, SceneFile
+from solidcloud.schemas.wire.moves import Moved
+from solidcloud.server.avatars.avatar_model import AvatarModel, make_avatar
 from solidcloud.server.scene import Scene
-from solidcloud.server.world import World
+from solidcloud.server.simulation.effects.pipeline import Pipeline, make_pipeline
+from solidcloud.server.simulation.world.collision_world import World
+from solidcloud.server.simulation.world.frame import Body
 
 INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
 # Spheres of the scan [m] and their spacing: closer than their size, so that walls have no holes; fewer interpreted.

@@ -6,12 +6,12 @@ from typing import Any
 import numpy as np
 import pytest
 import solidcloud.builder.config as config
+import solidcloud.builder.passes.survey as survey
 import solidcloud.builder.pipeline as pipeline
-import solidcloud.builder.survey as survey
 from scans import make_scan, write_las, write_xyz
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import BuildSummary, build_archive
-from solidcloud.builder.workplace import building_folder
+from solidcloud.builder.resume.build_directory import building_folder
 
 
 def build(target: Path, scans: list[Path], **options: Any) -> BuildSummary:

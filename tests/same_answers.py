@@ -10,7 +10,7 @@ from pathlib import Path
 import cases
 import numpy as np
 import scans
-from solidcloud.server.kernels.placing import place, to_units
+from solidcloud.server.kernels.core.pose_transform import place, to_units
 from solidcloud.server.scene import Scene
 
 SCAN = ("corner", 21, 150)

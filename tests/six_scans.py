@@ -7,8 +7,8 @@ import numpy as np
 from scans import WITH_POINTS, make_scan, write_xyz
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import build_archive
-from solidcloud.schemas.archive import Archive
-from solidcloud.schemas.index_file import write_index
+from solidcloud.schemas.archive.archive import Archive
+from solidcloud.schemas.archive.index_file import write_index
 
 # Of version 3, with dead voxels in its shards.
 LATER = Path(__file__).resolve().parent / "golden" / "archive-3"

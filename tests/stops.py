@@ -5,20 +5,20 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from solidcloud.schemas.answers import ContactsAnswers, ObjectsAnswers, SweepAnswers, Verdict
-from solidcloud.server.avatar import AvatarModel
-from solidcloud.server.by_scan import gaps_by_scan
-from solidcloud.server.collide import collide
-from solidcloud.server.contacts import contacts
-from solidcloud.server.distance import distance
-from solidcloud.server.effort import Effort
-from solidcloud.server.near import near
-from solidcloud.server.objects import objects
-from solidcloud.server.rays import raycast
-from solidcloud.server.request import SceneData, with_stop
-from solidcloud.server.stopped_answers import ask_until_stopped
-from solidcloud.server.sweep import sweep
-from solidcloud.server.within import within
+from solidcloud.schemas.wire.answers import ContactsAnswers, ObjectsAnswers, SweepAnswers, Verdict
+from solidcloud.server.avatars.avatar_model import AvatarModel
+from solidcloud.server.queries.collide import collide
+from solidcloud.server.queries.contacts import contacts
+from solidcloud.server.queries.context.query_budget import Effort
+from solidcloud.server.queries.context.query_context import SceneData, with_stop
+from solidcloud.server.queries.distance import distance
+from solidcloud.server.queries.distance_by_scan import gaps_by_scan
+from solidcloud.server.queries.objects import objects
+from solidcloud.server.queries.raycast import raycast
+from solidcloud.server.queries.resident_distance import near
+from solidcloud.server.queries.stopped_answers import ask_until_stopped
+from solidcloud.server.queries.sweep import sweep
+from solidcloud.server.queries.within import within
 
 CLEAR, CONTACT, UNKNOWN = Verdict
 # A budget of visits that is not spent: what is bounded has kernels of its own.

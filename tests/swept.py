@@ -10,12 +10,12 @@ import naive
 import naive_sweep
 import numpy as np
 from numpy.typing import NDArray
-from solidcloud.schemas.answers import SweepAnswers, Verdict
-from solidcloud.server.avatar import make_avatar
-from solidcloud.server.request import SceneData, make_scene_data, with_radius_model
-from solidcloud.server.residency import Residency
-from solidcloud.server.store import Store
-from solidcloud.server.sweep import sweep
+from solidcloud.schemas.wire.answers import SweepAnswers, Verdict
+from solidcloud.server.avatars.avatar_model import make_avatar
+from solidcloud.server.queries.context.query_context import SceneData, make_scene_data, with_radius_model
+from solidcloud.server.queries.sweep import sweep
+from solidcloud.server.residency.voxel_cache import Residency
+from solidcloud.server.residency.voxel_store import Store
 
 CLOUDS = ("plane", "corner", "pillar", "noise", "duplicates", "one point")
 

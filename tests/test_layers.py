@@ -1,8 +1,12 @@
-"""Who may import whom, read from the sources: imports point down, and each library has one door."""
+"""Check the structure of the product by its sources: rooms, cycles, doors of libraries, names and sizes of files.
+
+A room is a folder of schemas/, builder/ or server/; a module at the top of one of these is a room of its own.
+"""
 
 import ast
 import sys
-from collections.abc import Iterator
+from collections import defaultdict
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,51 +15,138 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ("schemas", "builder", "server")
 
+# Rooms of the same package that each room may import, lower rooms first; every entry is in use. "kernels" stands for
+# all its sub-rooms, except between these. Every room may import schemas.
+ALLOWED = {
+    "schemas/process": "errors.py",
+    "schemas/archive": "errors.py kernels process",
+    "schemas/wire": "archive errors.py",
+    "schemas/scene": "archive errors.py wire",
+    "builder/kernels/neighbours": "kernels/points kernels/trees",
+    "builder/run": "config.py",
+    "builder/sources/formats": "kernels sources/common",
+    "builder/sources": "sources/common run sources/formats",
+    "builder/resume": "config.py sources/common run sources",
+    "builder/spool": "config.py kernels sources/common resume",
+    "builder/voxel": "config.py kernels spool",
+    "builder/export": "run voxel",
+    "builder/passes": "config.py kernels sources/common run sources resume spool voxel",
+    "builder/pipeline.py": "config.py run sources resume spool voxel passes",
+    "builder/edit": "config.py kernels sources/common run sources resume spool voxel passes pipeline.py",
+    "builder/plan": "config.py kernels made sources/common run sources spool voxel passes pipeline.py",
+    "server/kernels/overlap": "kernels/core",
+    "server/kernels/prediction": "kernels/core",
+    "server/kernels/rays": "kernels/core",
+    "server/served": "runtime",
+    "server/kernels/contacts": "kernels/core kernels/overlap",
+    "server/kernels/motion": "kernels/core kernels/overlap",
+    "server/kernels/nearest": "kernels/core kernels/overlap",
+    "server/network": "served",
+    "server/kernels/bodies": "kernels/core kernels/motion",
+    "server/remote": "network",
+    "server/service": "observability runtime served network",
+    "server/avatars": "kernels served",
+    "server/client.py": "network remote",
+    "server/report/kernels": "kernels",
+    "server/residency": "kernels runtime",
+    "server/cli/output": "residency",
+    "server/queries/context": "kernels runtime avatars residency",
+    "server/queries": "kernels runtime avatars residency queries/context",
+    "server/archives": "observability runtime avatars residency queries/context queries",
+    "server/simulation/world": "kernels runtime served avatars queries/context queries archives",
+    "server/simulation/effects": (
+        "kernels runtime avatars residency queries/context queries archives simulation/world"
+    ),
+    "server/simulation": (
+        "runtime served avatars queries/context queries archives simulation/world simulation/effects"
+    ),
+    "server/scene.py": "observability runtime served avatars residency queries/context queries archives simulation",
+    "server/report/common": "cli/input scene.py",
+    "server/scenes": (
+        "kernels observability runtime served avatars residency queries/context queries archives "
+        "simulation/effects simulation scene.py"
+    ),
+    "server/cli/scene_files": "residency archives scenes",
+    "server/report/accuracy": "cli/input kernels avatars report/kernels residency scene.py report/common",
+    "server/report/walk": "cli/input client.py residency cli/output scene.py report/common",
+    "server/cli/commands": (
+        "cli/input served network service client.py residency cli/output archives simulation scenes "
+        "cli/scene_files report/accuracy"
+    ),
+    "server/cli": "cli/commands",
+}
+
+# From server to builder: an avatar's tree and an archive without some of its points are built by the builder's code.
+CROSSING = {
+    "server/archives": ("builder/voxel/masked_voxel",),
+    "server/avatars": ("builder/voxel/point_radius",),
+}
+# The command line and the reports run builds too.
+COMMANDS = ("server/cli", "server/report")
+
 # Library: the files, or the folders with a slash behind, that may import it.
 DOORS = {
-    "h5py": ("schemas/new_file.py", "schemas/shard.py", "schemas/index_file.py", "schemas/vtkhdf.py"),
-    "zstandard": ("schemas/frames.py",),
-    # Questions and sessions, of either side.
+    "h5py": (
+        "schemas/process/new_file.py",
+        "schemas/archive/shard.py",
+        "schemas/archive/index_file.py",
+        "schemas/archive/vtkhdf.py",
+    ),
+    "zstandard": ("schemas/archive/zstd_frame.py",),
     "zenoh": (
-        "server/transport.py",
         "server/client.py",
-        "server/session_transport.py",
-        "server/zenoh_settings.py",
-        "server/state_streams.py",
-        "server/state_query.py",
-        "server/replies.py",
-        "server/client_session.py",
-        "server/identity.py",
+        "server/network/",
+        "server/remote/",
+        "server/service/session_transport.py",
+        "server/service/state_streams.py",
+        "server/service/transport.py",
     ),
     "numba": ("schemas/kernels/compiling.py",),
     "llvmlite": ("schemas/kernels/compiling.py",),
-    "laspy": ("builder/made/write.py", "builder/export_las.py"),
-    "lazrs": ("builder/sources/las.py",),
-    "pye57": ("builder/sources/e57.py", "builder/made/write.py"),
-    "plyfile": ("builder/sources/ply.py",),
-    "tomli_w": ("builder/scan_list.py",),
-    "trimesh": ("builder/sources/surface.py", "builder/made/"),
+    "laspy": ("builder/made/write.py", "builder/export/las_export.py"),
+    "lazrs": ("builder/sources/formats/las.py",),
+    "pye57": ("builder/sources/formats/e57.py", "builder/made/write.py"),
+    "plyfile": ("builder/sources/formats/ply.py",),
+    "tomli_w": ("builder/sources/scan_list.py",),
+    "trimesh": ("builder/sources/formats/surface.py", "builder/made/"),
     "embreex": ("builder/made/scanner.py",),
-    "prometheus_client": ("server/prometheus.py",),
-    "distributed": ("builder/cluster.py",),
-    "dask": ("builder/cluster.py",),
+    "prometheus_client": ("server/observability/prometheus.py",),
+    "distributed": ("builder/run/dask_cluster.py",),
+    "dask": ("builder/run/dask_cluster.py",),
     "matplotlib": ("server/report/",),
     "PIL": ("server/report/",),
-    "typer": ("server/cli.py", "server/verbs/"),
-    "rich": ("server/console.py", "server/progress.py", "server/top.py", "server/report/"),
+    "typer": ("server/cli/main.py", "server/cli/commands/"),
+    "rich": ("server/cli/output/", "server/report/"),
 }
 # Needed everywhere; numpy and msgspec are the language that arrays and messages are written in.
 FREE = frozenset({"numpy", "msgspec"}) | sys.stdlib_module_names
 
-# An avatar's tree is built by the code that builds a voxel's, and so is a voxel that a scene leaves points of out of;
-# nothing else crosses from builder to server.
-CROSSING = ("builder/hierarchy", "builder/radius", "builder/without")
-# Above both sides: the command line, and the reports.
-ABOVE = ("server/cli.py", "server/console.py", "server/report/", "server/verbs/")
+MOST_LINES = 400
+# Longer files, with their lines: a file here may only become shorter, and none may be added.
+LONG = {
+    "builder/plan/build_plan.py": 417,
+    "builder/sources/scan_list.py": 409,
+    "builder/spool/spool.py": 427,
+    "builder/voxel/dense_voxel.py": 438,
+    "schemas/archive/index.py": 410,
+    "schemas/wire/requests.py": 434,
+    "server/client.py": 517,
+    "server/kernels/contacts/contact_pairs.py": 418,
+    "server/kernels/motion/sweep_advance.py": 436,
+    "server/kernels/nearest/best_first_search.py": 414,
+    "server/kernels/overlap/overlap.py": 475,
+    "server/residency/voxel_cache.py": 535,
+    "server/scene.py": 458,
+    "server/scenes/placed_archives.py": 413,
+    "server/service/request_lanes.py": 401,
+    "server/service/service.py": 412,
+    "server/simulation/simulation.py": 410,
+    "server/simulation/world/collision_world.py": 411,
+}
 
 
 class Import(NamedTuple):
-    """One import: the file it stands in, what it names as a path below the root or a library, its line."""
+    """One import: its file, what it names as a path below the root or a library, its line."""
 
     file: str
     target: str
@@ -64,7 +155,7 @@ class Import(NamedTuple):
 
 
 def imports_of(file: str, source: str) -> Iterator[Import]:
-    """The imports of one file. Relative ones become paths such as "schemas/errors"."""
+    """Yield the imports of one file. Relative ones become paths such as "schemas/errors"."""
     tree = ast.parse(source)
     for_types = {
         id(inner)
@@ -82,15 +173,12 @@ def imports_of(file: str, source: str) -> Iterator[Import]:
             yield Import(file, (node.module or "").split(".")[0], node.lineno, typing_only)
         elif isinstance(node, ast.ImportFrom):
             base = (*folder[: len(folder) - node.level + 1], *filter(None, (node.module or "").split(".")))
-            if node.module is None or (ROOT.joinpath(*base)).is_dir():
-                for alias in node.names:
-                    module = (*base, alias.name)
-                    found = module if is_module(module) else base
-                    yield Import(file, "/".join(found), node.lineno, typing_only)
-            else:
-                yield Import(file, "/".join(base), node.lineno, typing_only)
+            for alias in node.names:
+                module = (*base, alias.name)
+                found = module if is_module(module) else base
+                yield Import(file, "/".join(found), node.lineno, typing_only)
         elif isinstance(node, ast.Call) and is_late_import(node):
-            # builder/sources imports a library by name, on first use.
+            # builder/sources/formats imports a library by name, on first use.
             argument = node.args[0]
             if isinstance(argument, ast.Constant):
                 yield Import(file, str(argument.value).split(".")[0], node.lineno, False)
@@ -106,24 +194,44 @@ def is_late_import(call: ast.Call) -> bool:
     return bool(call.args) and name in ("reader_library", "import_module", "__import__")
 
 
+def sources() -> list[Path]:
+    return [path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))]
+
+
 def all_imports() -> list[Import]:
     return [
         found
-        for package in PACKAGES
-        for path in sorted((ROOT / package).rglob("*.py"))
+        for path in sources()
         for found in imports_of(path.relative_to(ROOT).as_posix(), path.read_text(encoding="utf-8"))
     ]
 
 
+def room_of(module: str) -> str:
+    """Return the room of a module, given as a path without suffix: its folder, or itself at the top of a package."""
+    folder, _, name = module.rpartition("/")
+    return f"{folder}/{name}.py" if folder in PACKAGES else folder
+
+
+def allowed_from(room: str) -> set[str]:
+    """Return the rooms of its package that a room may import, as ALLOWED names them."""
+    package = room.split("/")[0]
+    return {f"{package}/{name}" for name in ALLOWED.get(room, "").split()}
+
+
+def entry_for(room: str, aim: str) -> str:
+    """Return how ALLOWED names the imported room `aim` in the row of `room`."""
+    kernels = f"{aim.split('/')[0]}/kernels"
+    return kernels if aim.startswith(kernels) and not room.startswith(kernels) else aim
+
+
 def stray(found: Import) -> str | None:
-    """What is wrong with one import, if anything."""
+    """Return what is wrong with one import, if anything."""
     file, target, line, typing_only = found
     where = f"{file}:{line}"
-    top = file.split("/")[0]
-    aim = target.split("/")[0]
+    top, aim = file.split("/")[0], target.split("/")[0]
     if target == "solidcloud":
         return f"{where}: imports solidcloud by name; inside the package imports are relative"
-    if aim in PACKAGES and "/" not in target:
+    if aim in PACKAGES and (ROOT / target).is_dir():
         return f"{where}: imports {target} as a whole or bare; name a module of it, relatively"
     if aim in PACKAGES:
         return stray_inside(where, file, top, target)
@@ -138,37 +246,120 @@ def stray(found: Import) -> str | None:
 
 
 def stray_inside(where: str, file: str, top: str, target: str) -> str | None:
-    """What is wrong with an import of another module of the package, if anything."""
+    """Return what is wrong with an import of another module of the package, if anything."""
     aim = target.split("/")[0]
+    room, aimed = room_of(file.removesuffix(".py")), room_of(target)
     if PACKAGES.index(aim) > PACKAGES.index(top):
         return f"{where}: {top} imports {target}; imports point down, server to builder to schemas"
-    above = file.startswith(ABOVE)
-    if top == "server" and aim == "builder" and not above and not target.startswith(CROSSING):
-        return f"{where}: imports {target}; the server uses {', '.join(CROSSING)} alone"
-    if target.startswith(ABOVE[2:]) and not above:
-        return f"{where}: imports {target}; only the command line and the reports stand that high"
+    if aim == "builder" and top == "server":
+        if room.startswith(COMMANDS) or target in CROSSING.get(room, ()):
+            return None
+        return f"{where}: imports {target}; of the builder {room} may import {CROSSING.get(room, 'nothing')}"
+    if aim == top and room != aimed and entry_for(room, aimed) not in allowed_from(room):
+        return f"{where}: {room} imports {aimed}; it may import {ALLOWED.get(room, 'no other room')}"
     return None
 
 
-def test_imports_point_down_and_each_library_has_one_door() -> None:
+def cycles(graph: Mapping[str, set[str]]) -> list[list[str]]:
+    """Return a cycle for each edge that closes one, found depth first."""
+    found: list[list[str]] = []
+    done: set[str] = set()
+
+    def visit(node: str, path: list[str]) -> None:
+        if node in path:
+            found.append([*path[path.index(node) :], node])
+        elif node not in done:
+            for after in sorted(graph.get(node, ())):
+                visit(after, [*path, node])
+            done.add(node)
+
+    for node in sorted(graph):
+        visit(node, [])
+    return found
+
+
+def test_imports_follow_the_table_and_each_library_has_one_door() -> None:
     found = all_imports()
     assert len(found) > 100, "the sources were not read"
     assert [fault for each in found if (fault := stray(each))] == []
 
 
+def test_no_module_and_no_room_is_in_a_cycle() -> None:
+    modules, rooms = defaultdict(set), defaultdict(set)
+    for found in all_imports():
+        module, target = found.file.removesuffix(".py"), found.target
+        if target.split("/")[0] in PACKAGES and "/" in target:
+            modules[module].add(target)
+            if room_of(module) != room_of(target):
+                rooms[room_of(module)].add(room_of(target))
+    assert cycles(modules) == []
+    assert cycles(rooms) == []
+
+
+def test_every_allowed_import_is_used() -> None:
+    used = defaultdict(set)
+    for found in all_imports():
+        room, aim = room_of(found.file.removesuffix(".py")), room_of(found.target)
+        if room != aim and room.split("/")[0] == aim.split("/")[0]:
+            used[room].add(entry_for(room, aim))
+    assert {
+        room: allowed_from(room) - used[room] for room in ALLOWED if allowed_from(room) - used[room]
+    } == {}
+
+
+def test_no_two_files_of_a_package_have_one_name() -> None:
+    places = defaultdict(list)
+    for path in sources():
+        if path.name != "__init__.py":
+            file = path.relative_to(ROOT)
+            places[file.parts[0], file.name].append(file.as_posix())
+    assert [same for same in places.values() if len(same) > 1] == []
+
+
+def test_no_file_is_long() -> None:
+    lines = {
+        path.relative_to(ROOT).as_posix(): len(path.read_text(encoding="utf-8").splitlines())
+        for path in sources()
+    }
+    too_long = {file: count for file, count in lines.items() if count > LONG.get(file, MOST_LINES)}
+    assert too_long == {}, "split it by subject"
+    assert [file for file in LONG if lines.get(file, 0) <= MOST_LINES] == [], (
+        "no longer long: take it off LONG"
+    )
+
+
+def test_every_room_says_what_it_is_for_and_imports_nothing() -> None:
+    for folder in {path.parent for path in sources()}:
+        tree = ast.parse((folder / "__init__.py").read_text(encoding="utf-8"))
+        assert ast.get_docstring(tree), folder
+        lazy = folder == ROOT / "server" / "api"
+        assert lazy or len(tree.body) == 1, f"{folder}/__init__.py holds more than a docstring"
+
+
 @pytest.mark.parametrize(
     ("file", "source", "said"),
     [
-        ("builder/octree.py", "from ..server.scene import Scene", "imports point down"),
-        ("schemas/codec.py", "from ..builder.octree import x", "imports point down"),
-        ("server/scene.py", "from ..builder.pipeline import build_archive", "alone"),
-        ("server/scene.py", "from .report.walk import main", "stand that high"),
-        ("server/scene.py", "import h5py", "its door is schemas/new_file.py, schemas/shard.py"),
-        ("builder/sources/ply.py", "laspy = reader_library('laspy', path)", "its door is"),
+        ("builder/voxel/voxel_octree.py", "from ...server.scene import Scene", "imports point down"),
+        ("schemas/archive/codec.py", "from ...builder.voxel.voxel_octree import x", "imports point down"),
+        ("server/scene.py", "from ..builder.pipeline import build_archive", "may import nothing"),
+        ("server/scene.py", "from .report.walk.demo_walk import main", "it may import observability"),
+        ("server/queries/collide.py", "from ..service.jobs import Job", "it may import kernels"),
+        ("server/kernels/core/voxel_layout.py", "from ..rays.rays import STACK", "no other room"),
+        ("server/scene.py", "from . import queries", "as a whole"),
+        ("server/scene.py", "import h5py", "its door is schemas/process/new_file.py"),
+        ("builder/sources/formats/ply.py", "laspy = reader_library('laspy', path)", "its door is"),
         ("server/scene.py", "import requests", "has no door"),
-        ("server/scene.py", "from solidcloud.schemas.voxel import check_voxel", "imports are relative"),
+        (
+            "server/scene.py",
+            "from solidcloud.schemas.archive.voxel import check_voxel",
+            "imports are relative",
+        ),
         ("server/scene.py", "def f():\n    import zenoh", "its door is"),
-        ("server/kernels/overlap.py", "import numba as nb", "its door is schemas/kernels/compiling.py"),
+        (
+            "server/kernels/overlap/overlap.py",
+            "import numba as nb",
+            "its door is schemas/kernels/compiling.py",
+        ),
     ],
 )
 def test_a_stray_import_is_named(file: str, source: str, said: str) -> None:
@@ -180,12 +371,18 @@ def test_a_stray_import_is_named(file: str, source: str, said: str) -> None:
 @pytest.mark.parametrize(
     ("file", "source"),
     [
-        ("server/avatar.py", "from ..builder.hierarchy import build"),
-        ("server/report/walk.py", "from ...builder.pipeline import build_archive"),
-        ("server/cli.py", "from ..builder.verify import verify_archive"),
-        ("server/kernels/overlap.py", "from ...schemas.kernels import compiling as nb"),
-        ("builder/pipeline.py", "from ..schemas import keys"),
+        ("server/avatars/avatar_model.py", "from ...builder.voxel.point_radius import voxel_points"),
+        ("server/report/walk/demo_walk.py", "from ....builder.pipeline import build_archive"),
+        ("server/cli/main.py", "from ...builder.passes.verify import verify_archive"),
+        ("server/kernels/overlap/overlap.py", "from ....schemas.kernels import compiling as nb"),
+        ("server/kernels/overlap/overlap.py", "from ..core.voxel_layout import LANES"),
+        ("builder/pipeline.py", "from ..schemas.wire import keys"),
     ],
 )
 def test_an_allowed_import_is_not(file: str, source: str) -> None:
     assert [stray(found) for found in imports_of(file, source)] == [None]
+
+
+def test_a_cycle_is_found() -> None:
+    assert cycles({"a": {"b"}, "b": {"c"}, "c": {"a"}}) == [["a", "b", "c", "a"]]
+    assert cycles({"a": {"b", "c"}, "b": {"c"}}) == []

@@ -12,6 +12,7 @@ import sys
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -19,9 +20,10 @@ from unittest import mock
 import cases
 import numpy as np
 from numpy.typing import NDArray
-from solidcloud.schemas.archive import Archive
-from solidcloud.schemas.arrays import array_fields
-from solidcloud.server import avatar, effort
+from solidcloud.schemas.archive.archive import Archive
+from solidcloud.schemas.wire.arrays import array_fields
+from solidcloud.server.avatars import avatar_model as avatar
+from solidcloud.server.queries.context import query_budget as effort
 from solidcloud.server.scene import Scene
 
 GOLDEN = Path(__file__).with_name("golden") / "work.json"
@@ -248,7 +250,7 @@ def counted_calls() -> Iterator[Counter[str]]:
             code = frame.f_code
             if code not in names:
                 path = Path(code.co_filename)
-                own = path.parts[-3:-1] == ("server", "kernels") and path.stem != "stopping"
+                own = ("server", "kernels") in pairwise(path.parts) and path.stem != "stop_flag_checks"
                 names[code] = f"{path.stem}.{code.co_name}" if own else ""
             calls[names[code]] += 1
 

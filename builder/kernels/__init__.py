@@ -1,1 +1,5 @@
-"""Compiled kernels of the builder: numba functions over flat arrays."""
+"""Numba kernels of the builder, a folder a subject: points, trees, neighbours.
+
+May import schemas.
+Begin with the folder of the subject.
+"""

@@ -1,1 +1,5 @@
-"""Generated test scenes with known ground truth: meshes, simulated scans, and reference figures."""
+"""Generated scenes, scans and avatars with known ground truth, for tests, reports and the demo.
+
+May import schemas.
+Begin with scenes.py.
+"""

@@ -1,4 +1,5 @@
-"""Readers of scan formats, one file per format, all behind open_scans().
+"""Scan inputs: the files of a folder or a scan list, opened as scans with a placement.
 
-Each reader returns Scan objects; a Scan yields its points in blocks.
+May import builder.run, builder.sources.common, builder.sources.formats, schemas.
+Begin with scan_files.py, which opens a file of any format.
 """

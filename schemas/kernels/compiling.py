@@ -3,7 +3,7 @@
 numba's own cache unpickles and runs whatever its files contain, does not notice an edit in another
 file, and numbers its data files so that two processes may take the same number for two signatures.
 Here a file's name is a digest of everything that determines the machine code: the sources, the
-signature, the processor, the versions and numba's settings. `schemas/kernel_files.py` checks its
+signature, the processor, the versions and numba's settings. `schemas/kernels/kernel_files.py` checks its
 content.
 """
 
@@ -24,8 +24,8 @@ from numba.core.compiler import CompileResult
 from numba.core.serialize import dumps
 from numba.extending import intrinsic
 
-from ..kernel_files import KernelFiles, default_folder
-from ..kernel_sources import source_digest
+from .kernel_files import KernelFiles, default_folder
+from .kernel_sources import source_digest
 
 __all__ = ["config", "intrinsic", "kernel_files", "njit", "types"]
 

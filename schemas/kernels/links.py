@@ -41,7 +41,7 @@ def _walk(count, total, root, rest, first, is_leaf, cell_of, cell, point, leaves
 def link_rows(count, cell_nodes, cell_points, first, is_leaf, cell_of):
     """Fill first, is_leaf and cell_of (n,) of a voxel from its counts.
 
-    schemas/voxel.py defines the node order.
+    schemas/archive/voxel.py defines the node order.
     count: (n,) uint8.
     cell_nodes, cell_points: (c,) uint32, c >= 1, each >= 1; cell_nodes sum to at most n.
     Returns the height in levels, root to leaf; or -1 - row for the first row whose counts do not

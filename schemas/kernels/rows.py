@@ -11,7 +11,7 @@ import numpy as np
 from . import compiling as nb
 
 # Lanes of a leaf node's points, all processed by one vector test; equals MAX_LEAF of
-# schemas/voxel.py.
+# schemas/archive/voxel.py.
 LANES = 32
 # Replaces a leaf node's sort axis: its points are stored without deltas.
 NO_AXIS = 3
@@ -92,7 +92,7 @@ def leaf_lanes(planes, links, nodes, cells, voxel_steps, lanes, bounds):
     """Read every leaf node's points, undo their deltas, and check that they lie in cell and voxel.
 
     planes: (6 or more, p) uint8: low and high bytes of x, y, z.
-    links: (first, is_leaf, cell) of schemas/voxel.py.
+    links: (first, is_leaf, cell) of schemas/archive/voxel.py.
     nodes: (count, axis, block_low) (n,), (n,), (3, n); axis NO_AXIS: no deltas.
     cells: (low (3, c), log2_size (c,)).
     Writes lanes (b, 3, LANES) uint16: x[], y[], z[] of each leaf node's points from its block_low,

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from solidcloud.server.report.spheres import load_pyplot
+from solidcloud.server.report.common.sphere_pictures import load_pyplot
 
 from .build_runs import REST, Built
 from .picture import FAINT, INK, goals_table, write_picture

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import laspy
 import numpy as np
-from solidcloud.builder.measure import read_rates
-from solidcloud.builder.plan import Rates, Stage
-from solidcloud.builder.sample import CUBES
+from solidcloud.builder.plan.build_plan import Rates, Stage
+from solidcloud.builder.plan.build_rates import read_rates
+from solidcloud.builder.plan.scan_sample import CUBES
 
 from .build_limits import write_seconds
 from .build_runs import REST, Built
@@ -97,7 +97,7 @@ def fit_memory(builds: Builds) -> tuple[float, float, float]:
 
 
 def surface(las: Path) -> float:
-    """Return the surface of a scan [m^2] as builder/sample.py counts it, from all points."""
+    """Return the surface of a scan [m^2] as builder/plan/scan_sample.py counts it, from all points."""
     found: set[tuple[int, int, int]] = set()
     with laspy.open(las) as file:
         for chunk in file.chunk_iterator(1 << 20):

@@ -11,7 +11,7 @@ from typing import Any
 from .build_watch import Sample, Watched, last_json, watch
 from .machine import say
 
-COMMAND = [sys.executable, "-m", "solidcloud.server.cli"]
+COMMAND = [sys.executable, "-m", "solidcloud.server.cli.main"]
 # Time of a build outside its stages: the interpreter, kernels from numba's cache, processes,
 # renaming.
 REST = "start, rest"

@@ -7,8 +7,8 @@ from pathlib import Path
 import laspy
 import numpy as np
 from numpy.typing import NDArray
-from solidcloud.builder.sources.files import open_scans, scan_files
-from solidcloud.schemas.archive import Archive
+from solidcloud.builder.sources.scan_files import open_scans, scan_files
+from solidcloud.schemas.archive.archive import Archive
 
 # Real scans to build, in the folder that SOLIDCLOUD_SCANS names.
 REAL_SCANS = (

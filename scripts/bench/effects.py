@@ -7,8 +7,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from solidcloud.schemas.answers import Verdict
-from solidcloud.schemas.effects import (
+from solidcloud.schemas.scene.effect_options import (
     AnyEffect,
     Contacts,
     Crowd,
@@ -23,12 +22,13 @@ from solidcloud.schemas.effects import (
     ThroughBox,
     Uncertainty,
 )
-from solidcloud.schemas.scene import ArchiveItem, SceneFile, effect_name
-from solidcloud.server.avatar import AvatarModel
-from solidcloud.server.effects.frame import Body, Frame, Runner
-from solidcloud.server.effects.pipeline import Pipeline, make_pipeline
+from solidcloud.schemas.scene.scene_file import ArchiveItem, SceneFile, effect_name
+from solidcloud.schemas.wire.answers import Verdict
+from solidcloud.server.avatars.avatar_model import AvatarModel
 from solidcloud.server.scene import Scene
-from solidcloud.server.world import World
+from solidcloud.server.simulation.effects.pipeline import Pipeline, make_pipeline
+from solidcloud.server.simulation.world.collision_world import World
+from solidcloud.server.simulation.world.frame import Body, Frame, Runner
 
 Floats = NDArray[np.float64]
 

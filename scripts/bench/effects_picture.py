@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import numpy as np
-from solidcloud.server.report.spheres import load_pyplot
+from solidcloud.server.report.common.sphere_pictures import load_pyplot
 
 from .picture import FAINT, INK, VERDICTS, goals_table, write_picture
 from .results import MISSED, Part, goal_rows

@@ -7,11 +7,11 @@ import time
 from pathlib import Path
 
 import numpy as np
-from solidcloud.schemas.effects import Crowd
-from solidcloud.schemas.scene import effect_name
-from solidcloud.server.effects.through import store_without
+from solidcloud.schemas.scene.effect_options import Crowd
+from solidcloud.schemas.scene.scene_file import effect_name
+from solidcloud.server.residency.voxel_store import Store
 from solidcloud.server.scene import Scene
-from solidcloud.server.store import Store
+from solidcloud.server.simulation.effects.through_effect import store_without
 
 from .effects import ALONE, ARCH, EVERYTHING, WALKING, Stage
 from .machine import Clock

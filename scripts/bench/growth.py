@@ -16,7 +16,7 @@ import numpy as np
 from solidcloud.builder.made.scenes import make_town
 from solidcloud.builder.made.town import POINTS_PER_FACADE
 from solidcloud.builder.made.truth import read_truth
-from solidcloud.server.report.walkthrough import open_whole
+from solidcloud.server.report.walk.walkthrough import open_whole
 from solidcloud.server.scene import Scene
 
 from .archives import build

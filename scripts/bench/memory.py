@@ -3,8 +3,8 @@
 import time
 
 import numpy as np
-from solidcloud.server.arena import ArenaBuffer
-from solidcloud.server.store import Store
+from solidcloud.server.residency.arena import ArenaBuffer
+from solidcloud.server.residency.voxel_store import Store
 
 from .archives import PAPER_VOXEL, archive_bytes
 from .context import Bench, our_name

@@ -5,9 +5,9 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import numpy as np
-from solidcloud.schemas.answers import Part as Answers
+from solidcloud.schemas.wire.answers import Part as Answers
 from solidcloud.server.client import Client
-from solidcloud.server.report.serving import served
+from solidcloud.server.report.walk.server_process import served
 from solidcloud.server.scene import Scene
 
 from .context import Bench, our_name

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from matplotlib.ticker import FuncFormatter, NullFormatter
-from solidcloud.server.report.spheres import load_pyplot
+from solidcloud.server.report.common.sphere_pictures import load_pyplot
 
 from .collide import CAPT_PART, TABLE_PART
 from .growth import FACADES

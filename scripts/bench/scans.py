@@ -5,9 +5,9 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
-from solidcloud.schemas.archive import Archive
+from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.errors import BadDataError
-from solidcloud.server.report.floor_walk import floor_walk
+from solidcloud.server.report.common.floor_walk import floor_walk
 
 from .archives import build, stored_points
 from .context import Bench

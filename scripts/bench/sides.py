@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from peers.judge import Case
 from peers.program import Peers
 from scipy.spatial import cKDTree
-from solidcloud.schemas.answers import Verdict
-from solidcloud.server.report.walkthrough import open_whole
+from solidcloud.schemas.wire.answers import Verdict
+from solidcloud.server.report.walk.walkthrough import open_whole
 from solidcloud.server.scene import Scene
 
 from .archives import contact_distance, stored_points

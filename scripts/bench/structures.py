@@ -5,8 +5,8 @@ frame, with the paper's own table; this section times them too. Its poses are th
 repetition: nothing is kept between calls.
 """
 
-from solidcloud.server.report.case import PAPER_VOXEL, STEP, Case, made_case
-from solidcloud.server.report.walkthrough import DEGREES, build_structures, measure
+from solidcloud.server.report.common.paper_case import PAPER_VOXEL, STEP, Case, made_case
+from solidcloud.server.report.walk.walkthrough import DEGREES, build_structures, measure
 
 from .context import Bench
 from .machine import Clock, say

@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from solidcloud.schemas.answers import Verdict
 from solidcloud.schemas.errors import BusyError
-from solidcloud.schemas.moves import Moved
+from solidcloud.schemas.wire.answers import Verdict
+from solidcloud.schemas.wire.moves import Moved
 from solidcloud.server.client import Client
 
 from . import board as b

@@ -15,13 +15,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.generation import add_scans
+from solidcloud.builder.edit.edit_archive import add_scans
 from solidcloud.builder.made.figure import figure_points
 from solidcloud.builder.made.scenes import make_facade
 from solidcloud.builder.pipeline import build_archive
-from solidcloud.schemas.answers import Verdict
-from solidcloud.schemas.index_file import INDEX_NAME
-from solidcloud.server.report.points import read_thinned
+from solidcloud.schemas.archive.index_file import INDEX_NAME
+from solidcloud.schemas.wire.answers import Verdict
+from solidcloud.server.cli.input.point_file import read_thinned
 from solidcloud.server.scene import Scene
 
 SCENE = "chaos"
@@ -165,8 +165,8 @@ def ask(scene: Any, op: str, arguments: tuple[Any, ...], parameters: dict[str, A
     """Ask a scene or a client one question; a path is answered by its parts, joined."""
     if op != "path":
         return getattr(scene, op)(*arguments, **parameters)
-    from solidcloud.schemas.answers import PATH_ANSWERS
-    from solidcloud.schemas.columns import join, without_part
+    from solidcloud.schemas.wire.answers import PATH_ANSWERS
+    from solidcloud.schemas.wire.columns import join, without_part
 
     kind = PATH_ANSWERS[arguments[2]]
     return join([without_part(kind, part) for part in scene.path(*arguments, **parameters)])

@@ -8,10 +8,10 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from solidcloud.schemas.answers import ContactsAnswers, Cost, ObjectsAnswers, SweepAnswers, Verdict
-from solidcloud.schemas.arrays import array_fields
-from solidcloud.schemas.columns import CLUSTER_COLUMNS, PAIR_COLUMNS
-from solidcloud.schemas.moves import Moved
+from solidcloud.schemas.wire.answers import ContactsAnswers, Cost, ObjectsAnswers, SweepAnswers, Verdict
+from solidcloud.schemas.wire.arrays import array_fields
+from solidcloud.schemas.wire.columns import CLUSTER_COLUMNS, PAIR_COLUMNS
+from solidcloud.schemas.wire.moves import Moved
 
 # What is judged by itself, what depends on what was in memory, and what says how sure the rest is.
 _NOT_COMPARED = {

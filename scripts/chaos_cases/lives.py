@@ -70,7 +70,7 @@ class Lives:
         """Start a server, and return when it says that it serves."""
         self._tell(up=True)
         self.number += 1
-        command = [sys.executable, "-P", "-m", "solidcloud.server.cli", "serve", str(self.ground.live)]
+        command = [sys.executable, "-P", "-m", "solidcloud.server.cli.main", "serve", str(self.ground.live)]
         command += ["--name", SCENE, "--listen", self.endpoint, "--cache", str(self.ground.cache)]
         process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=self.log, text=True)
         timer = threading.Timer(START_SECONDS, process.kill)

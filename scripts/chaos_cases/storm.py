@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Any
 
 from kills.calls import has_strace
+from solidcloud.schemas.archive.index_file import INDEX_NAME
 from solidcloud.schemas.errors import SolidcloudError
-from solidcloud.schemas.index_file import INDEX_NAME
 from solidcloud.server.client import Client
 
 from . import board as b

@@ -15,10 +15,16 @@ from typing import Any
 import numpy as np
 import zenoh
 from rogues.tools import widths, zeros
-from solidcloud.schemas import keys
-from solidcloud.schemas.messages import MSGPACK, AddAvatarRequest, CollideRequest, ContactsRequest, encode
-from solidcloud.schemas.requests import make_poses
-from solidcloud.server.zenoh_settings import session_config
+from solidcloud.schemas.wire import keys
+from solidcloud.schemas.wire.messages import (
+    MSGPACK,
+    AddAvatarRequest,
+    CollideRequest,
+    ContactsRequest,
+    encode,
+)
+from solidcloud.schemas.wire.requests import make_poses
+from solidcloud.server.network.zenoh_settings import session_config
 
 from .ground import SCENE
 

@@ -93,12 +93,12 @@ def open_walk(archive: Path, stack: ExitStack):  # type: ignore[no-untyped-def]
     """Open a scene with the effects of a walk."""
     path = scene_file(archive)
     try:
-        from solidcloud.server.scene_file import open_scene
+        from solidcloud.server.scenes.open_scene import open_scene
     except ImportError:
         from solidcloud import Scene  # a later version opens scene files by itself
 
         return stack.enter_context(Scene.open(path, budget_bytes=1 << 30))
-    from solidcloud.server.report.points import read_avatar
+    from solidcloud.server.cli.input.point_file import read_avatar
 
     return stack.enter_context(open_scene(path, read_points=read_avatar, budget_bytes=1 << 30))
 
@@ -110,10 +110,10 @@ def wire_cases(archive: Path, stack: ExitStack) -> dict[str, Case]:
 
     try:
         from solidcloud import Client
-        from solidcloud.server.report.serving import served
+        from solidcloud.server.report.walk.server_process import served
     except ImportError:
         from solidcloud.server.client import Client
-        from solidcloud.server.report.serving import served
+        from solidcloud.server.report.walk.server_process import served
 
     endpoint = stack.enter_context(served(scene_file(archive), "walk"))
     client = stack.enter_context(Client(endpoint, scene="walk"))
@@ -140,7 +140,7 @@ def build_case(archive: Path, stack: ExitStack) -> dict[str, Case]:
     import subprocess
 
     scan = archive.parent / "town.laz"
-    run = [sys.executable, "-P", "-c", "from solidcloud.server.cli import main; main()"]
+    run = [sys.executable, "-P", "-c", "from solidcloud.server.cli.main import main; main()"]
     if not scan.exists():
         make = [*run, "make", "town", "--points", str(BUILD_POINTS), "-o", str(scan)]
         subprocess.run(make, check=True, stdout=sys.stderr)

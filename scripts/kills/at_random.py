@@ -13,7 +13,7 @@ import time
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 
-from solidcloud.server.cli import run
+from solidcloud.server.cli.main import run
 
 from .case import Case, Change, Tally, arguments, content, make_small, write_scans
 from .child import Child, CountCalls, KillAt, build

@@ -12,10 +12,10 @@ from typing import Any
 import laspy
 import numpy as np
 import solidcloud.builder
-from solidcloud.builder.verify import verify_archive
+from solidcloud.builder.passes.verify import verify_archive
+from solidcloud.schemas.archive.index_file import INDEX_NAME
+from solidcloud.schemas.archive.vtkhdf import PREVIEW_NAME
 from solidcloud.schemas.errors import SolidcloudError
-from solidcloud.schemas.index_file import INDEX_NAME
-from solidcloud.schemas.vtkhdf import PREVIEW_NAME
 
 # Limits that divide a build into units, reduced: about 10 units of a few hundred points, a shard of
 # a quarter of SHARD_POINTS.
@@ -30,9 +30,11 @@ def make_small() -> list[str]:
 
     Call it once in each process.
     """
-    for module in pkgutil.iter_modules(solidcloud.builder.__path__):
-        if module.name != "cluster":  # loads dask
-            importlib.import_module(f"solidcloud.builder.{module.name}")
+    for module in pkgutil.walk_packages(solidcloud.builder.__path__, "solidcloud.builder."):
+        if (
+            not module.name.endswith((".dask_cluster", ".las_export")) and ".made" not in module.name
+        ):  # loads dask
+            importlib.import_module(module.name)
     found = []
     for name, module in sorted(sys.modules.items()):
         if name.startswith("solidcloud.builder."):

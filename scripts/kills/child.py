@@ -11,7 +11,7 @@ import traceback
 from collections.abc import Callable
 from pathlib import Path
 
-from solidcloud.server.cli import run
+from solidcloud.server.cli.main import run
 
 # Far above the duration of a small build, even under strace; a longer run counts as hanging.
 PATIENCE = 60.0

@@ -21,7 +21,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests"))
 
 from broken_scans import SEEDS
-from solidcloud.server.cli import run
+from solidcloud.server.cli.main import run
 
 from .case import NAME, Case, Tally, content
 from .child import PATIENCE, Child, build
@@ -113,7 +113,7 @@ class Command(Child):
         self.log, self.status = log, None
         with open(log, "w") as output:
             self._process = subprocess.Popen(
-                [sys.executable, "-P", "-m", "solidcloud.server.cli", *arguments],
+                [sys.executable, "-P", "-m", "solidcloud.server.cli.main", *arguments],
                 stdin=subprocess.DEVNULL,
                 stdout=output,
                 stderr=output,

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from solidcloud.server.avatar import AvatarModel
+from solidcloud.server.avatars.avatar_model import AvatarModel
 
 from .voxels import read_voxels
 

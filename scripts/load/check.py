@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 from solidcloud.builder.made.figure import figure_points
-from solidcloud.schemas.answers import Verdict
-from solidcloud.server.report.walkthrough import open_whole
+from solidcloud.schemas.wire.answers import Verdict
+from solidcloud.server.report.walk.walkthrough import open_whole
 from solidcloud.server.scene import Scene
 
 from .frames import ANSWERED, Frames

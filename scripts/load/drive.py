@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 from solidcloud.builder.made.figure import figure_points
-from solidcloud.schemas.messages import CollideRequest, encode
+from solidcloud.schemas.wire.messages import CollideRequest, encode
 from solidcloud.server.client import Client
 
 from . import frames as results

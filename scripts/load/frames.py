@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from solidcloud.schemas.answers import Verdict
+from solidcloud.schemas.wire.answers import Verdict
 
 from .pace import after_first, stalled
 

@@ -7,7 +7,7 @@ import numpy as np
 from bench.picture import FAINT, INK, VERDICTS
 from bench.results import MISSED
 from numpy.typing import NDArray
-from solidcloud.server.report.spheres import load_pyplot
+from solidcloud.server.report.common.sphere_pictures import load_pyplot
 
 from .cases import ECHO, Ran
 from .frames import PERCENTILES

@@ -15,10 +15,10 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from solidcloud.schemas.archive import Archive
-from solidcloud.server.kernels.reach import SceneIndex
-from solidcloud.server.neighbourhood import AHEAD, Ahead, Neighbourhood
-from solidcloud.server.policies import Policy, make_policy
+from solidcloud.schemas.archive.archive import Archive
+from solidcloud.server.kernels.core.voxels_in_reach import SceneIndex
+from solidcloud.server.residency.eviction import Policy, make_policy
+from solidcloud.server.residency.motion_prediction import AHEAD, Ahead, Neighbourhood
 
 from .traces import Centers
 

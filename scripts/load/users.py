@@ -19,9 +19,9 @@ import msgspec
 import numpy as np
 import zenoh
 from solidcloud.builder.made.figure import figure_points
-from solidcloud.schemas.answers import CollideAnswers
-from solidcloud.schemas.messages import MSGPACK, CollideRequest, decode_answer, encode
-from solidcloud.server.avatar import make_avatar
+from solidcloud.schemas.wire.answers import CollideAnswers
+from solidcloud.schemas.wire.messages import MSGPACK, CollideRequest, decode_answer, encode
+from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.client import Client
 
 from . import frames as results

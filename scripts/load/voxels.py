@@ -5,8 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from solidcloud.server.arena import ArenaBuffer
-from solidcloud.server.store import Store
+from solidcloud.server.residency.arena import ArenaBuffer
+from solidcloud.server.residency.voxel_store import Store
 
 
 class Voxels(NamedTuple):

@@ -39,10 +39,11 @@ of every function of `server/kernels`, for fixed questions about small scenes.
 "killed" is by an assertion, "error" by any other exception, "time" by running {patience} times as long as unchanged
 (a loop without end, mostly). The goal is {goal:.0%} of each file.
 Samples are small: of 25 mutants a share of 85 % is known to some 7 points either way, of 60 to some 5; a file near the
-goal may lie on the other side of it. `builder/kernels/neighbours.py`, `server/kernels/nearest.py` and `within.py`
-were below the goal at 25 or 30, and drawn larger. `server/kernels/nearest_resident.py`, `probing.py` and `by_scan.py`
-are below it: the first two make arrays of one element for others, and nearly all that survives there, one element
-more, or the last for the first, is the same; the third's survivors are bounds, or the same.
+goal may lie on the other side of it. In `builder/kernels/neighbours`, `nearest_neighbours.py`, and in `server/kernels`,
+`nearest_search.py` and `nearest_point.py` were below the goal at 25 or 30, and drawn larger. `nearest_resident.py`,
+`sweep_resident.py` and `nearest_by_scan.py` are below it: the first two make arrays of one element for others, and
+nearly all that survives there, one element more, or the last for the first, is the same; the third's survivors are
+bounds, or the same.
 `server/report/kernels` compare, and are not tried.
 """
 

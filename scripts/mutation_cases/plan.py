@@ -76,10 +76,10 @@ NORMALS = tuple(
 TESTS: dict[str, tuple[str, ...]] = {
     "schemas/kernels/links.py": (SCHEMAS + "test_links.py",),
     "schemas/kernels/morton.py": (SCHEMAS + "test_morton.py",),
-    "schemas/kernels/normals.py": (SCHEMAS + "test_normals.py",),
+    "schemas/kernels/normal_codes.py": (SCHEMAS + "test_normals.py",),
     "schemas/kernels/rows.py": (SCHEMAS + "test_rows.py",),
-    "builder/kernels/bisection.py": (BUILDER + "test_bisection.py",),
-    "builder/kernels/bounding_sphere.py": (
+    "builder/kernels/points/bisection.py": (BUILDER + "test_bisection.py",),
+    "builder/kernels/trees/bounding_sphere.py": (
         BUILDER + "test_bounding_sphere.py::test_a_bound_is_as_tight_as_its_guess",
         BUILDER + "test_bounding_sphere.py::test_a_guess_whose_radius_does_not_fit_is_given_up_for_the_box",
         BUILDER + "test_bounding_sphere.py::test_what_stood_in_the_arrays_before_is_not_read",
@@ -92,14 +92,14 @@ TESTS: dict[str, tuple[str, ...]] = {
         BUILDER
         + "test_bounding_sphere.py::test_a_direction_is_found_at_once_where_one_variance_is_the_least",
     ),
-    "builder/kernels/filter.py": (BUILDER + "test_filter_kernels.py",),
-    "builder/kernels/classes.py": (
+    "builder/kernels/neighbours/filter_counts.py": (BUILDER + "test_filter_kernels.py",),
+    "builder/kernels/neighbours/point_classes.py": (
         BUILDER + "test_classes_kernels.py",
         BUILDER + "test_classes.py::test_the_kernel_and_the_judge_agree_at_the_edge_of_each_rule",
         BUILDER + "test_classes.py::test_the_twelfth_neighbour_decides_and_at_the_limit_is_within",
         BUILDER + "test_classes.py::test_a_mean_at_the_limit_is_no_rim",
     ),
-    "builder/kernels/neighbours.py": (
+    "builder/kernels/neighbours/nearest_neighbours.py": (
         BUILDER + "test_neighbours.py::test_what_is_inserted_is_among_the_first_in_order",
         BUILDER + "test_neighbours.py::test_the_distance_of_a_box_is_that_of_its_nearest_place",
         BUILDER + "test_neighbours.py::test_the_closest_equal_brute_force",
@@ -108,82 +108,92 @@ TESTS: dict[str, tuple[str, ...]] = {
         BUILDER + "test_neighbours.py::test_boxes_hold_their_points",
         BUILDER + "test_neighbours.py::test_the_order_of_points_changes_nothing",
     ),
-    "builder/kernels/content.py": (BUILDER + "test_content.py",),
-    "builder/kernels/enclosure.py": (BUILDER + "test_enclosure.py",),
-    "builder/kernels/nearest.py": (BUILDER + "test_nearest.py",),
-    "builder/kernels/records.py": (BUILDER + "test_records.py",),
-    "builder/kernels/boxes.py": (BUILDER + "test_boxes.py",),
-    "builder/kernels/cubes.py": (BUILDER + "test_cubes.py",),
-    "builder/kernels/lzf.py": (BUILDER + "test_lzf.py",),
-    "builder/kernels/normals.py": (
+    "builder/kernels/points/content_hash.py": (BUILDER + "test_content.py",),
+    "builder/kernels/neighbours/enclosure.py": (BUILDER + "test_enclosure.py",),
+    "builder/kernels/neighbours/nearest_points.py": (BUILDER + "test_nearest.py",),
+    "builder/kernels/points/voxel_records.py": (BUILDER + "test_records.py",),
+    "builder/kernels/neighbours/box_tree.py": (BUILDER + "test_boxes.py",),
+    "builder/kernels/points/occupied_cubes.py": (BUILDER + "test_cubes.py",),
+    "builder/kernels/points/lzf_decoder.py": (BUILDER + "test_lzf.py",),
+    "builder/kernels/neighbours/estimate_normals.py": (
         BUILDER + "test_normals.py::test_codes_are_those_of_the_definition",
         BUILDER + "test_normals.py::test_sums_at_the_bound_are_exact",
         BUILDER
         + "test_normals.py::test_sums_of_boxes_are_those_of_their_points_and_of_those_that_fit_no_reach_zeros",
         BUILDER + "test_normals.py::test_order_changes_nothing_and_a_heap_costs_what_a_point_does",
     ),
-    "builder/kernels/octree.py": (
+    "builder/kernels/points/octree_cells.py": (
         BUILDER + "test_octree.py::test_cells_are_runs_of_the_sorted_codes",
         BUILDER + "test_octree.py::test_a_cell_is_split_only_when_it_must_be",
         BUILDER + "test_octree.py::test_a_cell_may_be_full",
         BUILDER + "test_octree.py::test_points_on_cell_borders_are_in_one_cell",
         BUILDER + "test_octree.py::test_sorted_runs_are_merged_stably",
     ),
-    "builder/kernels/pack.py": (BUILDER + "test_pack.py",),
-    "builder/kernels/spill.py": (BUILDER + "test_spill.py",),
-    "builder/kernels/spool.py": (BUILDER + "test_spool_kernels.py",),
-    "builder/kernels/top.py": (BUILDER + "test_top_kernels.py", BUILDER + "test_top.py"),
-    "builder/kernels/trees.py": (BUILDER + "test_trees.py",),
-    "server/kernels/placing.py": (SERVER + "test_pose_checks.py", SERVER + "test_placing.py"),
-    "server/kernels/reach.py": (
+    "builder/kernels/trees/pack_tree.py": (BUILDER + "test_pack.py",),
+    "builder/kernels/points/cell_spill.py": (BUILDER + "test_spill.py",),
+    "builder/kernels/points/spool_rows.py": (BUILDER + "test_spool_kernels.py",),
+    "builder/kernels/trees/top_bounds.py": (BUILDER + "test_top_kernels.py", BUILDER + "test_top.py"),
+    "builder/kernels/trees/build_tree.py": (BUILDER + "test_trees.py",),
+    "server/kernels/core/pose_transform.py": (SERVER + "test_pose_checks.py", SERVER + "test_placing.py"),
+    "server/kernels/core/voxels_in_reach.py": (
         SERVER + "test_reach_rows.py",
         SERVER + "test_reach.py::test_find_key_finds_what_is_there_and_nothing_else",
     ),
-    "server/kernels/pairs.py": (SERVER + "test_pairs.py",),
-    "server/kernels/motion.py": (SERVER + "test_motion.py", *work("sweep")),
-    "server/kernels/ahead.py": AHEAD,
-    "server/kernels/advance.py": (*work("sweep", "sweep bounded"), *SWEEPS),
-    "server/kernels/closer.py": (SERVER + "test_closer.py", *work("distance")),
-    "server/kernels/closest.py": work("distance", "distance deep", "distance bounded"),
-    "server/kernels/coarse.py": (
+    "server/kernels/bodies/body_pairs.py": (SERVER + "test_pairs.py",),
+    "server/kernels/motion/screw_motion.py": (SERVER + "test_motion.py", *work("sweep")),
+    "server/kernels/prediction/track_prediction.py": AHEAD,
+    "server/kernels/motion/sweep_advance.py": (*work("sweep", "sweep bounded"), *SWEEPS),
+    "server/kernels/core/gap_order.py": (SERVER + "test_closer.py", *work("distance")),
+    "server/kernels/nearest/nearest_pair.py": work("distance", "distance deep", "distance bounded"),
+    "server/kernels/overlap/coarse_overlap.py": (
         SERVER + "test_coarse.py::test_the_nodes_of_a_top_enclose_all_points",
         SERVER + "test_coarse.py::test_filled_and_remembered_are_the_same_rows",
         SERVER + "test_coarse.py::test_no_point_has_a_larger_sphere_than_its_node_says",
         SERVER + "test_settle.py",
     ),
-    "server/kernels/contacts.py": (*work("contacts", "contacts deep"), *tangent("contacts")),
-    "server/kernels/front.py": work("collide", "distance"),
-    "server/kernels/lanes.py": work("distance", "distance deep", "bounded deep"),
-    "server/kernels/layout.py": (
+    "server/kernels/contacts/contact_pairs.py": (*work("contacts", "contacts deep"), *tangent("contacts")),
+    "server/kernels/core/avatar_front.py": work("collide", "distance"),
+    "server/kernels/core/vector_lanes.py": work("distance", "distance deep", "bounded deep"),
+    "server/kernels/core/voxel_layout.py": (
         SERVER + "test_outward.py",
         SERVER + "test_layout.py",
         *work("collide", "contacts"),
     ),
-    "server/kernels/moments.py": (*work("sweep", "sweep bounded"), *SWEEPS),
-    "server/kernels/moving.py": (SERVER + "test_moving.py", *work("sweep", "sweep bounded")),
-    "server/kernels/by_scan.py": (SERVER + "test_by_scan.py",),
-    "server/kernels/nearest.py": work("distance", "distance deep"),
-    "server/kernels/nearest_resident.py": (
+    "server/kernels/motion/contact_times.py": (*work("sweep", "sweep bounded"), *SWEEPS),
+    "server/kernels/motion/moving_avatar.py": (SERVER + "test_moving.py", *work("sweep", "sweep bounded")),
+    "server/kernels/nearest/nearest_by_scan.py": (SERVER + "test_by_scan.py",),
+    "server/kernels/nearest/nearest_search.py": work("distance", "distance deep"),
+    "server/kernels/nearest/nearest_resident.py": (
         SERVER + "test_near.py",
         "tests/property/test_near.py::test_one_pose_has_the_bits_of_distance",
     ),
-    "server/kernels/meeting.py": (SERVER + "test_meeting.py",),
-    "server/kernels/meeting_placed.py": (SERVER + "test_meeting.py",),
-    "server/kernels/near_bodies.py": (SERVER + "test_meeting.py",),
-    "server/kernels/normals.py": NORMALS,
-    "server/kernels/overlap.py": (*work("collide", "collide deep", "collide one"), *tangent("collide")),
-    "server/kernels/placed.py": (SERVER + "test_placed.py", *tangent("collide"), *work("collide")),
-    "server/kernels/priority.py": (
+    "server/kernels/bodies/body_sweep.py": (SERVER + "test_meeting.py",),
+    "server/kernels/bodies/moving_bodies.py": (SERVER + "test_meeting.py",),
+    "server/kernels/bodies/near_bodies.py": (SERVER + "test_meeting.py",),
+    "server/kernels/rays/stored_normals.py": NORMALS,
+    "server/kernels/overlap/overlap.py": (
+        *work("collide", "collide deep", "collide one"),
+        *tangent("collide"),
+    ),
+    "server/kernels/core/placed_avatar.py": (
+        SERVER + "test_placed.py",
+        *tangent("collide"),
+        *work("collide"),
+    ),
+    "server/kernels/nearest/best_first_search.py": (
         *work("bounded deep", "collide bounded", "distance bounded"),
         *tangent("bounded"),
     ),
-    "server/kernels/probing.py": (SERVER + "test_probe.py",),
-    "server/kernels/rays.py": work("raycast", "raycast bounded"),
-    "server/kernels/sweep.py": work("sweep", "sweep bounded"),
-    "server/kernels/voxel_tree.py": (SERVER + "test_voxel_tree.py",),
-    "server/kernels/walks.py": (SERVER + "test_neighbourhood.py",),
-    "server/kernels/within.py": (*work("within", "within bounded"), SERVER + "test_within_exact.py"),
-    "server/kernels/clusters.py": (
+    "server/kernels/motion/sweep_resident.py": (SERVER + "test_probe.py",),
+    "server/kernels/rays/rays.py": work("raycast", "raycast bounded"),
+    "server/kernels/motion/sweep_interval.py": work("sweep", "sweep bounded"),
+    "server/kernels/core/voxel_tree.py": (SERVER + "test_voxel_tree.py",),
+    "server/kernels/prediction/user_tracks.py": (SERVER + "test_neighbourhood.py",),
+    "server/kernels/rays/nearest_point.py": (
+        *work("within", "within bounded"),
+        SERVER + "test_within_exact.py",
+    ),
+    "server/kernels/contacts/contact_clusters.py": (
         SERVER + "test_clusters.py",
         SERVER + "test_cell_hash.py",
         *work("contacts"),
@@ -191,5 +201,9 @@ TESTS: dict[str, tuple[str, ...]] = {
 }
 # Files without a mutant, with the reason.
 NONE = {
-    "server/kernels/compiled.py": "options of the compiler only, which an interpreted kernel does not see",
+    "schemas/kernels/kernel_files.py": "no kernel: how compiled kernels are kept",
+    "schemas/kernels/kernel_sources.py": "no kernel: what compiled kernels depend on",
+    "server/kernels/core/borrowing_kernels.py": (
+        "options of the compiler only, which an interpreted kernel does not see"
+    ),
 }

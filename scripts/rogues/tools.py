@@ -13,7 +13,8 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 import zenoh
-from solidcloud.schemas.answers import (
+from solidcloud.schemas.errors import SolidcloudError
+from solidcloud.schemas.wire.answers import (
     CollideAnswers,
     CollidePart,
     DistanceAnswers,
@@ -22,14 +23,13 @@ from solidcloud.schemas.answers import (
     Verdict,
     WithinAnswers,
 )
-from solidcloud.schemas.columns import unknown
-from solidcloud.schemas.encoding import decode_request, encode
-from solidcloud.schemas.errors import SolidcloudError
-from solidcloud.schemas.messages import AvatarInfo, CollideRequest, ErrorReply, ScenesAnswer
-from solidcloud.schemas.moves import State, Wish
+from solidcloud.schemas.wire.columns import unknown
+from solidcloud.schemas.wire.encoding import decode_request, encode
+from solidcloud.schemas.wire.messages import AvatarInfo, CollideRequest, ErrorReply, ScenesAnswer
+from solidcloud.schemas.wire.moves import State, Wish
 from solidcloud.server.client import Client
-from solidcloud.server.client_session import ClientSession
-from solidcloud.server.zenoh_settings import session_config
+from solidcloud.server.network.zenoh_settings import session_config
+from solidcloud.server.remote.client_session import ClientSession
 
 MODES = ("client", "peer", "router")
 AVATAR = "al"

@@ -1,1 +1,5 @@
-"""Compiled functions of the server."""
+"""Numba kernels of the server, a folder a subject.
+
+May import schemas.
+Begin with core/voxel_layout.py, then overlap/overlap.py.
+"""

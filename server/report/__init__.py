@@ -1,1 +1,5 @@
-"""Reports: the measured walkthrough and the accuracy report of `solidcloud accuracy`."""
+"""Reports: `solidcloud accuracy` and the demo.
+
+May import builder, schemas.
+Begin with accuracy/accuracy.py or walk/demo_walk.py.
+"""

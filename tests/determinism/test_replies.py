@@ -12,7 +12,7 @@ import mixed_requests
 import numpy as np
 import pytest
 import scans
-from solidcloud.schemas.archive import Archive
+from solidcloud.schemas.archive.archive import Archive
 from solidcloud.server.scene import Scene
 
 INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"

@@ -4,9 +4,9 @@ import socket
 
 import pytest
 from fake_server import FloorScene
-from solidcloud.server.app import serving
 from solidcloud.server.client import Client
-from solidcloud.server.config import ServerConfig
+from solidcloud.server.service.server_config import ServerConfig
+from solidcloud.server.service.service import serving
 
 
 def _free_endpoint():

@@ -8,7 +8,7 @@ import classes
 import numpy as np
 import scans
 from msgspec import structs
-from solidcloud.schemas.answers import (
+from solidcloud.schemas.wire.answers import (
     CollideAnswers,
     ContactsAnswers,
     DistanceAnswers,
@@ -17,8 +17,8 @@ from solidcloud.schemas.answers import (
     SweepAnswers,
     WithinAnswers,
 )
-from solidcloud.schemas.arrays import array_fields
-from solidcloud.schemas.messages import (
+from solidcloud.schemas.wire.arrays import array_fields
+from solidcloud.schemas.wire.messages import (
     CollideRequest,
     ContactsRequest,
     DistanceRequest,
@@ -27,12 +27,12 @@ from solidcloud.schemas.messages import (
     SweepRequest,
     WithinRequest,
 )
-from solidcloud.schemas.requests import make_objects
-from solidcloud.server.app import serving
+from solidcloud.schemas.wire.requests import make_objects
 from solidcloud.server.client import Client
-from solidcloud.server.config import ServerConfig
-from solidcloud.server.report.serving import free_port
+from solidcloud.server.report.walk.server_process import free_port
 from solidcloud.server.scene import Scene
+from solidcloud.server.service.server_config import ServerConfig
+from solidcloud.server.service.service import serving
 
 BODY = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.0, 0.2, 0], [0.05, 0.05, 0.3]])
 POINTS = scans.make_scan("corner", 4, 300)

@@ -8,7 +8,9 @@ import threading
 import time
 
 import numpy as np
-from solidcloud.schemas.answers import (
+from solidcloud.schemas.errors import BadRequestError, BadTransformError, UnknownAvatarError
+from solidcloud.schemas.scene.scene_file import Limits, SceneFile, scene_of
+from solidcloud.schemas.wire.answers import (
     CollideAnswers,
     ContactsAnswers,
     DistanceAnswers,
@@ -18,9 +20,8 @@ from solidcloud.schemas.answers import (
     Verdict,
     WithinAnswers,
 )
-from solidcloud.schemas.columns import as_part, unknown
-from solidcloud.schemas.errors import BadRequestError, BadTransformError, UnknownAvatarError
-from solidcloud.schemas.messages import (
+from solidcloud.schemas.wire.columns import as_part, unknown
+from solidcloud.schemas.wire.messages import (
     WIRE_VERSION,
     AvatarInfo,
     ReloadAnswer,
@@ -28,15 +29,14 @@ from solidcloud.schemas.messages import (
     SourceInfo,
     StatsAnswer,
 )
-from solidcloud.schemas.moves import Moved, Touched
-from solidcloud.schemas.scene import Limits, SceneFile, scene_of
-from solidcloud.schemas.seals import avatar_digest
-from solidcloud.server.answering_avatars import note
-from solidcloud.server.app import serve
-from solidcloud.server.avatar import make_avatar
-from solidcloud.server.config import ServerConfig
-from solidcloud.server.frame_log import Begin, FrameLog
-from solidcloud.server.simulation import Simulation
+from solidcloud.schemas.wire.moves import Moved, Touched
+from solidcloud.schemas.wire.seals import avatar_digest
+from solidcloud.server.avatars.avatar_model import make_avatar
+from solidcloud.server.served.answering_avatars import note
+from solidcloud.server.service.server_config import ServerConfig
+from solidcloud.server.service.service import serve
+from solidcloud.server.simulation.replay_log import Begin, FrameLog
+from solidcloud.server.simulation.simulation import Simulation
 
 PART = 10  # poses in a part of a path
 

@@ -10,9 +10,9 @@ import pytest
 import scans
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import build_archive
-from solidcloud.server import cli
-from solidcloud.server.report import accuracy_plan
-from solidcloud.server.report.accuracy_plan import Plan
+from solidcloud.server.cli import main as cli
+from solidcloud.server.report.accuracy import accuracy_plan
+from solidcloud.server.report.accuracy.accuracy_plan import Plan
 
 SMALL = Plan(
     points=20_000, frames=48, plain_frames=24, near_tangent=12, brute=12, loops=1, tolerances=(0.0, 0.05),

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from solidcloud.server.cli import run
-from solidcloud.server.report.serving import free_port, served
-from solidcloud.server.verbs.options import parse_bytes
+from solidcloud.server.cli.commands.command_options import parse_bytes
+from solidcloud.server.cli.main import run
+from solidcloud.server.report.walk.server_process import free_port, served
 
 VERBS = [
     "build",
@@ -62,7 +62,9 @@ def errors(capsys: pytest.CaptureFixture[str]) -> list[str]:
 
 @pytest.mark.parametrize("verb", ["", *VERBS, *NESTED])
 def test_help_loads_no_numpy(verb: str) -> None:
-    code = f"import sys; from solidcloud.server.cli import run; code = run({[*verb.split(), '--help']!r})"
+    code = (
+        f"import sys; from solidcloud.server.cli.main import run; code = run({[*verb.split(), '--help']!r})"
+    )
     heavy = ["pydantic", "numpy", "numba", "h5py", "zenoh", "rich"]
     check = f"sys.exit(code or ','.join(name for name in {heavy!r} if name in sys.modules) or 0)"
     done = subprocess.run(
@@ -464,7 +466,7 @@ def test_serve_stops_when_told_to(archive: Path) -> None:
         sys.executable,
         "-P",
         "-m",
-        "solidcloud.server.cli",
+        "solidcloud.server.cli.main",
         "serve",
         str(archive),
         "--listen",

@@ -14,15 +14,15 @@ import pytest
 
 pytest.importorskip("distributed")
 
-import solidcloud.builder.cluster as cluster_module
 import solidcloud.builder.config as config_module
+import solidcloud.builder.passes.build_shards as shards_module
 import solidcloud.builder.pipeline as pipeline_module
-import solidcloud.builder.portions as portions_module
-import solidcloud.builder.shards as shards_module
+import solidcloud.builder.run.dask_cluster as cluster_module
+import solidcloud.builder.run.work_units as portions_module
 from solidcloud.builder.config import BuildConfig
+from solidcloud.builder.passes.verify import verify_archive
 from solidcloud.builder.pipeline import build_archive
-from solidcloud.builder.verify import verify_archive
-from solidcloud.server.cli import run
+from solidcloud.server.cli.main import run
 
 VOXEL = 0.5
 
@@ -194,7 +194,7 @@ def test_what_is_wrong_on_the_cluster_is_said_as_here(
 def test_without_dask_it_is_said_what_to_install(tmp_path: Path) -> None:
     np.savetxt(tmp_path / "good.xyz", np.eye(3))
     words = ["build", str(tmp_path / "good.xyz"), "-o", str(tmp_path / "hall"), "--cluster", "local:2"]
-    hidden = "import sys; sys.modules['distributed'] = None; from solidcloud.server.cli import run"
+    hidden = "import sys; sys.modules['distributed'] = None; from solidcloud.server.cli.main import run"
     code = f"{hidden}; sys.exit(run({words!r}))"
     done = subprocess.run([sys.executable, "-P", "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 1

@@ -12,13 +12,13 @@ import naive
 import numpy as np
 import pytest
 import scans
-from solidcloud.builder.generation import add_scans, remove_scans
-from solidcloud.schemas.answers import Verdict
-from solidcloud.server.app import serving
-from solidcloud.server.cli import run
+from solidcloud.builder.edit.edit_archive import add_scans, remove_scans
+from solidcloud.schemas.wire.answers import Verdict
+from solidcloud.server.cli.main import run
 from solidcloud.server.client import Client
-from solidcloud.server.config import ServerConfig
 from solidcloud.server.scene import Scene
+from solidcloud.server.service.server_config import ServerConfig
+from solidcloud.server.service.service import serving
 from test_reload import endpoint as endpoint  # the fixture
 
 BODY = np.array([[0.0, 0, 0], [0.1, 0, 0.1]])
@@ -84,7 +84,7 @@ def start_adding(hall: Path) -> subprocess.Popen[str]:
     """`solidcloud add` with workers, in a process of its own that has begun."""
     command = ["add", str(hall), str(hall.parent / "chair.ply"), "--jobs", "2"]
     process = subprocess.Popen(
-        [sys.executable, "-m", "solidcloud.server.cli", *command], stderr=subprocess.PIPE, text=True
+        [sys.executable, "-m", "solidcloud.server.cli.main", *command], stderr=subprocess.PIPE, text=True
     )
     deadline = time.monotonic() + 120
     while not (hall.parent / ".hall.changing" / "spool").exists():

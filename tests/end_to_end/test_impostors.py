@@ -10,18 +10,18 @@ import pytest
 import zenoh
 from floor import DEADLINE, PATH, POINTS, TRUTH, eventually, heights, joined, server_process
 from rogues.tools import Impostor
-from solidcloud.schemas import keys
-from solidcloud.schemas.answers import Verdict
-from solidcloud.schemas.encoding import MSGPACK, encode
 from solidcloud.schemas.errors import BadRequestError, BusyError
-from solidcloud.schemas.messages import AvatarInfo, ErrorReply
-from solidcloud.schemas.moves import State
-from solidcloud.schemas.seals import Sealer, hash_of
-from solidcloud.server.app import serving
+from solidcloud.schemas.wire import keys
+from solidcloud.schemas.wire.answers import Verdict
+from solidcloud.schemas.wire.encoding import MSGPACK, encode
+from solidcloud.schemas.wire.messages import AvatarInfo, ErrorReply
+from solidcloud.schemas.wire.moves import State
+from solidcloud.schemas.wire.seals import Sealer, hash_of
 from solidcloud.server.client import Client, scenes_at
-from solidcloud.server.config import ServerConfig
-from solidcloud.server.key_files import find_key, key_paths
-from solidcloud.server.zenoh_settings import session_config
+from solidcloud.server.network.key_files import find_key, key_paths
+from solidcloud.server.network.zenoh_settings import session_config
+from solidcloud.server.service.server_config import ServerConfig
+from solidcloud.server.service.service import serving
 from walkers import pose_at
 
 POSES = heights([-1.0, -2.0])

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 import scans
 from kills.reading import FORMATS
-from solidcloud.schemas.archive import Archive
-from solidcloud.server.cli import run
+from solidcloud.schemas.archive.archive import Archive
+from solidcloud.server.cli.main import run
 
 SCRIPTS = Path(__file__).parents[2] / "scripts"
 

@@ -12,17 +12,17 @@ from floor import DEADLINE, POINTS, eventually, heights
 from rogues.tools import Impostor
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import build_archive
-from solidcloud.schemas import keys
-from solidcloud.schemas.answers import Verdict
-from solidcloud.schemas.encoding import MSGPACK, encode
 from solidcloud.schemas.errors import SolidcloudError
-from solidcloud.schemas.messages import AddAvatarRequest
-from solidcloud.schemas.moves import Wish
-from solidcloud.server.app import serving
+from solidcloud.schemas.wire import keys
+from solidcloud.schemas.wire.answers import Verdict
+from solidcloud.schemas.wire.encoding import MSGPACK, encode
+from solidcloud.schemas.wire.messages import AddAvatarRequest
+from solidcloud.schemas.wire.moves import Wish
 from solidcloud.server.client import Client
-from solidcloud.server.config import ServerConfig
+from solidcloud.server.network.zenoh_settings import session_config
 from solidcloud.server.scene import Scene
-from solidcloud.server.zenoh_settings import session_config
+from solidcloud.server.service.server_config import ServerConfig
+from solidcloud.server.service.service import serving
 from walkers import pose_at
 
 POSES = heights([-1.0, -0.5])

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from solidcloud.server.cli import run
+from solidcloud.server.cli.main import run
 
 NOBODY = 65534
 DEADLINE = 300.0
@@ -131,7 +131,7 @@ def test_a_name_that_is_too_long_is_said(place: Path, capsys: pytest.CaptureFixt
 def test_accuracy_leaves_nothing_when_it_is_terminated(place: Path, tmp_path: Path) -> None:
     scratch, report = tmp_path / "scratch", tmp_path / "report"
     scratch.mkdir()
-    command = [sys.executable, "-P", "-m", "solidcloud.server.cli", "accuracy", str(place / "hall")]
+    command = [sys.executable, "-P", "-m", "solidcloud.server.cli.main", "accuracy", str(place / "hall")]
     with subprocess.Popen(
         [*command, "-o", str(report)], env={**os.environ, "TMPDIR": str(scratch)}, stderr=subprocess.PIPE
     ) as process:

@@ -12,8 +12,8 @@ import pytest
 from numpy.typing import NDArray
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import build_archive
-from solidcloud.builder.sources.files import open_scans, scan_files
-from solidcloud.schemas.answers import Verdict
+from solidcloud.builder.sources.scan_files import open_scans, scan_files
+from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.scene import Scene
 
 

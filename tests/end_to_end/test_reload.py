@@ -17,15 +17,15 @@ import numpy as np
 import pytest
 import scans
 from numpy.typing import NDArray
-from solidcloud.schemas.answers import Verdict
 from solidcloud.schemas.errors import BusyError, FormatError, UnknownSceneError
-from solidcloud.schemas.messages import ReloadAnswer
-from solidcloud.server.app import serving
-from solidcloud.server.cli import run
+from solidcloud.schemas.wire.answers import Verdict
+from solidcloud.schemas.wire.messages import ReloadAnswer
+from solidcloud.server.cli.main import run
 from solidcloud.server.client import Client
-from solidcloud.server.config import ServerConfig
-from solidcloud.server.identity import OPEN_SECONDS
+from solidcloud.server.remote.client_identity import OPEN_SECONDS
 from solidcloud.server.scene import Scene
+from solidcloud.server.service.server_config import ServerConfig
+from solidcloud.server.service.service import serving
 
 sys.path.insert(0, str(Path(__file__).parent))
 from fake_server import FloorScene
@@ -209,7 +209,7 @@ def server(generations: Generations, endpoint: str, tmp_path: Path) -> Iterator[
     command = [
         sys.executable,
         "-m",
-        "solidcloud.server.cli",
+        "solidcloud.server.cli.main",
         "serve",
         str(tmp_path / "hall"),
         "--listen",
@@ -270,7 +270,7 @@ def test_the_command_and_the_signal_reload(
         assert now() == {0}
         command = ["reload", "--scene", "hall", "--connect", endpoint]
         ran = subprocess.run(
-            [sys.executable, "-m", "solidcloud.server.cli", *command],
+            [sys.executable, "-m", "solidcloud.server.cli.main", *command],
             capture_output=True,
             text=True,
             check=True,

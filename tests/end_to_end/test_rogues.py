@@ -9,10 +9,10 @@ import pytest
 from fake_server import floor_simulation
 from floor import eventually
 from rogues.tools import AVATAR, DEADLINE, MODES, POINTS, TOOLS, Rogue, Victim, attempt, widths
-from solidcloud.server.app import serving
-from solidcloud.server.avatar_limits import EVERYBODY
 from solidcloud.server.client import Client
-from solidcloud.server.config import ServerConfig
+from solidcloud.server.served.avatar_limits import EVERYBODY
+from solidcloud.server.service.server_config import ServerConfig
+from solidcloud.server.service.service import serving
 from walkers import pose_at
 
 SCRIPTS = Path(__file__).parents[2] / "scripts"

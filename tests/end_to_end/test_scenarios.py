@@ -15,10 +15,10 @@ from solidcloud.builder.made.figure import figure_points
 from solidcloud.builder.made.sheet import make_sheet
 from solidcloud.builder.made.truth import FacadeTruth
 from solidcloud.builder.pipeline import build_archive
-from solidcloud.schemas.answers import Verdict
+from solidcloud.schemas.wire.answers import Verdict
 
 POINTS = 300_000
-# Feet are held so far above the ground (schemas/effects.py, `Ground.clearance`).
+# Feet are held so far above the ground (schemas/scene/effect_options.py, `Ground.clearance`).
 FEET = 0.03
 # The scan's noise and half its spacing, with the spheres of both sides: how far from a true surface a body may stop.
 NEAR = 0.08

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from solidcloud.schemas.answers import Verdict
 from solidcloud.schemas.errors import UnknownAvatarError
-from solidcloud.server.cli import run
+from solidcloud.schemas.wire.answers import Verdict
+from solidcloud.server.cli.main import run
 from solidcloud.server.client import Client
-from solidcloud.server.report.serving import served
+from solidcloud.server.report.walk.server_process import served
 
 BALL, SCAN = 0.05, 0.03
 HOLE = np.array([[-0.45, -0.45, -1.0], [0.45, 0.45, 1.0]])
@@ -153,7 +153,7 @@ def test_a_new_scene_file_is_checked_served_and_asked(
 
 def test_a_server_of_a_scene_file_that_is_wrong_ends_with_one_line(folder: Path) -> None:
     (folder / "wrong.toml").write_text(SCENE.replace('path = "upper"', 'path = "attic"'))
-    command = [sys.executable, "-P", "-m", "solidcloud.server.cli", "serve", str(folder / "wrong.toml")]
+    command = [sys.executable, "-P", "-m", "solidcloud.server.cli.main", "serve", str(folder / "wrong.toml")]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 3
     (line,) = [line for line in done.stderr.splitlines() if line.startswith("error: ")]

@@ -8,8 +8,6 @@ import pytest
 import zenoh
 from fake_server import floor_simulation
 from floor import DEADLINE, POINTS, eventually
-from solidcloud.schemas import keys
-from solidcloud.schemas.encoding import JSON, MSGPACK, decode_answer, encode
 from solidcloud.schemas.errors import (
     BadRequestError,
     BadTransformError,
@@ -17,13 +15,15 @@ from solidcloud.schemas.errors import (
     InternalError,
     UnknownAvatarError,
 )
-from solidcloud.schemas.messages import ErrorReply
-from solidcloud.schemas.moves import State, Wish
-from solidcloud.server import state_streams
-from solidcloud.server.app import serving
+from solidcloud.schemas.wire import keys
+from solidcloud.schemas.wire.encoding import JSON, MSGPACK, decode_answer, encode
+from solidcloud.schemas.wire.messages import ErrorReply
+from solidcloud.schemas.wire.moves import State, Wish
 from solidcloud.server.client import Client
-from solidcloud.server.config import ServerConfig
-from solidcloud.server.zenoh_settings import session_config
+from solidcloud.server.network.zenoh_settings import session_config
+from solidcloud.server.service import state_streams
+from solidcloud.server.service.server_config import ServerConfig
+from solidcloud.server.service.service import serving
 from walkers import REST, outcome, pose_at, walking
 
 

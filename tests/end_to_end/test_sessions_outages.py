@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 from fake_server import floor_simulation
 from floor import DEADLINE, POINTS, eventually, server_process
-from solidcloud.schemas import keys
-from solidcloud.schemas.encoding import encode
-from solidcloud.schemas.moves import Wish
-from solidcloud.server.app import serving
+from solidcloud.schemas.wire import keys
+from solidcloud.schemas.wire.encoding import encode
+from solidcloud.schemas.wire.moves import Wish
 from solidcloud.server.client import Client
-from solidcloud.server.config import ServerConfig
-from solidcloud.server.frame_log import Frame, read_log
-from solidcloud.server.replay import replay
+from solidcloud.server.service.server_config import ServerConfig
+from solidcloud.server.service.service import serving
+from solidcloud.server.simulation.replay import replay
+from solidcloud.server.simulation.replay_log import Frame, read_log
 from walkers import pose_at, walking
 
 

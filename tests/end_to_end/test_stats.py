@@ -19,10 +19,10 @@ import msgspec
 import numpy as np
 import pytest
 import scans
-from solidcloud.schemas.answers import Verdict
 from solidcloud.schemas.errors import BadRequestError, BusyError
-from solidcloud.schemas.keys import public_id, question_key
-from solidcloud.schemas.messages import (
+from solidcloud.schemas.wire.answers import Verdict
+from solidcloud.schemas.wire.keys import public_id, question_key
+from solidcloud.schemas.wire.messages import (
     JSON,
     MSGPACK,
     ErrorReply,
@@ -31,12 +31,12 @@ from solidcloud.schemas.messages import (
     decode_answer,
     encode,
 )
-from solidcloud.server.app import Service, serving
-from solidcloud.server.cli import run
+from solidcloud.server.cli.main import run
 from solidcloud.server.client import Client, scenes_at
-from solidcloud.server.config import ServerConfig
-from solidcloud.server.report.serving import free_port
+from solidcloud.server.report.walk.server_process import free_port
 from solidcloud.server.scene import Scene
+from solidcloud.server.service.server_config import ServerConfig
+from solidcloud.server.service.service import Service, serving
 
 sys.path.insert(0, str(Path(__file__).parent))
 from fake_server import FloorScene
@@ -153,7 +153,7 @@ def test_users_go_with_their_client_and_still_count_in_all(archive: Path, endpoi
 @contextmanager
 def server(archive: Path, endpoint: str, *options: str) -> Iterator[subprocess.Popen[str]]:
     """`solidcloud serve` in a process of its own, ready; killed if it still runs."""
-    command = [sys.executable, "-P", "-m", "solidcloud.server.cli", "serve", str(archive)]
+    command = [sys.executable, "-P", "-m", "solidcloud.server.cli.main", "serve", str(archive)]
     options = ("--name", "hall", "--listen", endpoint, *options)
     with subprocess.Popen(
         [*command, *options], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
@@ -219,7 +219,7 @@ def test_the_command_serves_metrics_and_top_shows_them(
 
 def top(endpoint: str) -> "subprocess.Popen[str]":
     """`solidcloud top` in a process of its own, its first table printed."""
-    command = [sys.executable, "-P", "-m", "solidcloud.server.cli", "top", "--connect", endpoint]
+    command = [sys.executable, "-P", "-m", "solidcloud.server.cli.main", "top", "--connect", endpoint]
     process = subprocess.Popen(
         [*command, "--interval", "0.2"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )

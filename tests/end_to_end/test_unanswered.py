@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 from fake_server import FloorScene, floor_simulation
-from solidcloud.schemas.answers import CollideAnswers, Verdict
-from solidcloud.schemas.moves import Moved
-from solidcloud.server import questions as questions_module
-from solidcloud.server.app import serving
-from solidcloud.server.cli import run
-from solidcloud.server.config import ServerConfig
+from solidcloud.schemas.wire.answers import CollideAnswers, Verdict
+from solidcloud.schemas.wire.moves import Moved
+from solidcloud.server.cli.main import run
+from solidcloud.server.remote import request_batches as questions_module
+from solidcloud.server.service.server_config import ServerConfig
+from solidcloud.server.service.service import serving
 
 OPS = [
     "collide",
@@ -104,7 +104,7 @@ def test_the_command_itself_exits_with_1(endpoint: str, files: dict[str, Any], v
     arguments = (
         query(endpoint, "collide", files["collide"]) if verb == "query" else [verb, "--scene", "floor"]
     )
-    command = [sys.executable, "-P", "-m", "solidcloud.server.cli", *arguments]
+    command = [sys.executable, "-P", "-m", "solidcloud.server.cli.main", *arguments]
     command += [] if verb == "query" else ["--connect", endpoint]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120)
     assert (done.returncode, done.stdout.strip(), len(done.stderr.splitlines())) == (1, "", 1)

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from solidcloud.schemas.errors import ScanError, SolidcloudError
-from solidcloud.server.report.serving import served
-from solidcloud.server.report.walk import demonstrate
+from solidcloud.server.report.walk.demo_walk import demonstrate
+from solidcloud.server.report.walk.server_process import served
 
 
 @pytest.fixture

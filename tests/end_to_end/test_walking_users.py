@@ -11,22 +11,31 @@ import cases
 import numpy as np
 import pytest
 from floor import DEADLINE, eventually
-from solidcloud.schemas.answers import Verdict
-from solidcloud.schemas.effects import Contacts, Crowd, Ground, Proximity, Slide, Step, Stop, Sweep
-from solidcloud.schemas.keys import User
-from solidcloud.schemas.moves import Wish
-from solidcloud.schemas.scene import SceneFile, scene_of
-from solidcloud.server.app import serving
-from solidcloud.server.cli import run
+from solidcloud.schemas.scene.effect_options import (
+    Contacts,
+    Crowd,
+    Ground,
+    Proximity,
+    Slide,
+    Step,
+    Stop,
+    Sweep,
+)
+from solidcloud.schemas.scene.scene_file import SceneFile, scene_of
+from solidcloud.schemas.wire.answers import Verdict
+from solidcloud.schemas.wire.keys import User
+from solidcloud.schemas.wire.moves import Wish
+from solidcloud.server.cli.main import run
 from solidcloud.server.client import Client
-from solidcloud.server.config import ServerConfig
-from solidcloud.server.frame_log import MAGIC, Frame, read_log
-from solidcloud.server.replay import recorded, replay
-from solidcloud.server.report.serving import served
+from solidcloud.server.report.walk.server_process import served
 from solidcloud.server.scene import Scene
-from solidcloud.server.scene_file import open_scene
-from solidcloud.server.served import Turn
-from solidcloud.server.simulated import simulate
+from solidcloud.server.scenes.open_scene import open_scene
+from solidcloud.server.served.served_scene import Turn
+from solidcloud.server.service.server_config import ServerConfig
+from solidcloud.server.service.service import serving
+from solidcloud.server.simulation.assembly import simulate
+from solidcloud.server.simulation.replay import recorded, replay
+from solidcloud.server.simulation.replay_log import MAGIC, Frame, read_log
 
 # A body of a metre and a half, of three spheres.
 BODY = np.array([[0.0, 0.0, 0.3], [0.0, 0.0, 0.8], [0.0, 0.0, 1.3]])

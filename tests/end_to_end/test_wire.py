@@ -7,7 +7,6 @@ import pytest
 import zenoh
 from fake_server import FloorScene, floor_verdicts
 from floor import DEADLINE, POINTS, eventually, heights
-from solidcloud.schemas.answers import Verdict
 from solidcloud.schemas.errors import (
     BadRequestError,
     BadTransformError,
@@ -17,7 +16,8 @@ from solidcloud.schemas.errors import (
     UnknownAvatarError,
     UnknownSceneError,
 )
-from solidcloud.schemas.messages import (
+from solidcloud.schemas.wire.answers import Verdict
+from solidcloud.schemas.wire.messages import (
     JSON,
     MSGPACK,
     AvatarInfo,
@@ -27,11 +27,11 @@ from solidcloud.schemas.messages import (
     decode_answer,
     encode,
 )
-from solidcloud.server import questions as questions_module
-from solidcloud.server.app import serving
 from solidcloud.server.client import Client
-from solidcloud.server.config import ServerConfig
-from solidcloud.server.zenoh_settings import session_config
+from solidcloud.server.network.zenoh_settings import session_config
+from solidcloud.server.remote import request_batches as questions_module
+from solidcloud.server.service.server_config import ServerConfig
+from solidcloud.server.service.service import serving
 
 
 def test_client_answers_as_the_judge_does(client):

@@ -6,18 +6,18 @@ import time
 import numpy as np
 import pytest
 from floor import DEADLINE, PATH, POINTS, eventually, heights, server_process
-from solidcloud.schemas.answers import Verdict
 from solidcloud.schemas.errors import (
     BusyError,
     UnknownSceneError,
 )
-from solidcloud.schemas.messages import (
+from solidcloud.schemas.wire.answers import Verdict
+from solidcloud.schemas.wire.messages import (
     AvatarInfo,
 )
-from solidcloud.server import questions as questions_module
-from solidcloud.server.app import serving
 from solidcloud.server.client import Client
-from solidcloud.server.config import ServerConfig
+from solidcloud.server.remote import request_batches as questions_module
+from solidcloud.server.service.server_config import ServerConfig
+from solidcloud.server.service.service import serving
 
 
 def test_nobody_there_is_unknown_until_a_server_comes(scene, endpoint):

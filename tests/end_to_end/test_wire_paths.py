@@ -9,22 +9,22 @@ import pytest
 import zenoh
 from fake_server import FloorScene
 from floor import DEADLINE, PATH, POINTS, TRUTH, eventually, heights, joined, sending, server_process
-from solidcloud.schemas.answers import Verdict
 from solidcloud.schemas.errors import (
     BadTransformError,
     BusyError,
     InternalError,
     UnknownAvatarError,
 )
-from solidcloud.schemas.messages import (
+from solidcloud.schemas.wire.answers import Verdict
+from solidcloud.schemas.wire.messages import (
     PathRequest,
     encode,
 )
-from solidcloud.server import lanes as lanes_module
-from solidcloud.server.app import serving
 from solidcloud.server.client import Client
-from solidcloud.server.config import ServerConfig
-from solidcloud.server.zenoh_settings import session_config
+from solidcloud.server.network.zenoh_settings import session_config
+from solidcloud.server.service import request_lanes as lanes_module
+from solidcloud.server.service.server_config import ServerConfig
+from solidcloud.server.service.service import serving
 
 
 def test_a_path_comes_in_parts_and_in_order(client):

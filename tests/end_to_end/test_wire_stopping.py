@@ -9,15 +9,15 @@ import pytest
 import zenoh
 from fake_server import FloorScene
 from floor import DEADLINE, PATH, POINTS, TRUTH, eventually, heights, joined, server_process
-from solidcloud.schemas.answers import Verdict
-from solidcloud.schemas.messages import (
+from solidcloud.schemas.wire.answers import Verdict
+from solidcloud.schemas.wire.messages import (
     CollideRequest,
     encode,
 )
-from solidcloud.server.app import serve, serving
 from solidcloud.server.client import Client
-from solidcloud.server.config import ServerConfig
-from solidcloud.server.zenoh_settings import session_config
+from solidcloud.server.network.zenoh_settings import session_config
+from solidcloud.server.service.server_config import ServerConfig
+from solidcloud.server.service.service import serve, serving
 
 
 def test_a_server_that_stops_finishes_the_paths_it_accepted(scene, endpoint):

@@ -14,9 +14,9 @@ import same_answers
 import scans
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import build_archive
-from solidcloud.schemas.archive import Archive
+from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.errors import TooLargeError
-from solidcloud.schemas.messages import MAX_AVATAR_POINTS
+from solidcloud.schemas.wire.messages import MAX_AVATAR_POINTS
 from solidcloud.server.scene import Scene
 
 INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"

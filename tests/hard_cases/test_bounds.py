@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 import scans
 from numpy.typing import NDArray
-from solidcloud.builder.radius import voxel_points
-from solidcloud.builder.verify import verify_archive
-from solidcloud.schemas.archive import Archive
-from solidcloud.schemas.voxel import Links, VoxelData
-from solidcloud.server.avatar import make_avatar
-from solidcloud.server.kernels.layout import ROW_WORDS
+from solidcloud.builder.passes.verify import verify_archive
+from solidcloud.builder.voxel.point_radius import voxel_points
+from solidcloud.schemas.archive.archive import Archive
+from solidcloud.schemas.archive.voxel import Links, VoxelData
+from solidcloud.server.avatars.avatar_model import make_avatar
+from solidcloud.server.kernels.core.voxel_layout import ROW_WORDS
 from solidcloud.server.scene import Scene
 
 INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"

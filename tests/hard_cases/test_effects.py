@@ -18,13 +18,13 @@ import numpy as np
 import pytest
 import same_answers
 import scans
-from solidcloud.schemas.effect_order import ORDER
-from solidcloud.schemas.messages import MSGPACK, CollideRequest, encode
-from solidcloud.schemas.scene import SceneFile
-from solidcloud.server.app import Service
-from solidcloud.server.config import ServerConfig
+from solidcloud.schemas.scene.effect_order import ORDER
+from solidcloud.schemas.scene.scene_file import SceneFile
+from solidcloud.schemas.wire.messages import MSGPACK, CollideRequest, encode
 from solidcloud.server.scene import Scene
-from solidcloud.server.simulated import simulate
+from solidcloud.server.service.server_config import ServerConfig
+from solidcloud.server.service.service import Service
+from solidcloud.server.simulation.assembly import simulate
 
 INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
 
@@ -55,16 +55,16 @@ ALONE: dict[str, list[str]] = {
 }
 # What only some effects have a use for, and which; every effect has itself.
 HELPERS = {
-    "server.effects.apart": {"proximity", "contacts", "uncertainty"},
-    "server.uncertainty": {"uncertainty"},
-    "server.by_scan": {"uncertainty"},
-    "server.kernels.by_scan": {"uncertainty"},
-    "server.left_out": {"through"},
-    "server.effects.bodies": {"objects", "crowd"},
-    "server.effects.blocking": {"objects", "crowd"},
-    "server.kernels.meeting": {"objects", "crowd"},
-    "server.normals": {"slide", "ground", "step"},
-    "server.kernels.normals": {"slide", "ground", "step"},
+    "server.simulation.effects.separation_cache": {"proximity", "contacts", "uncertainty"},
+    "server.simulation.world.contact_probability": {"uncertainty"},
+    "server.queries.distance_by_scan": {"uncertainty"},
+    "server.kernels.nearest.nearest_by_scan": {"uncertainty"},
+    "server.archives.masked_archive": {"through"},
+    "server.simulation.effects.bodies": {"objects", "crowd"},
+    "server.simulation.effects.blocking": {"objects", "crowd"},
+    "server.kernels.bodies.body_sweep": {"objects", "crowd"},
+    "server.queries.surface_normals": {"slide", "ground", "step"},
+    "server.kernels.rays.stored_normals": {"slide", "ground", "step"},
 }
 # All that needs no objects of its own.
 EVERY_EFFECT = msgspec.convert(
@@ -79,12 +79,12 @@ FRAMES = """
 import json, os, pathlib, sys
 import msgspec
 import numpy as np
-from solidcloud.schemas.messages import encode, JSON
-from solidcloud.schemas.scene import ArchiveItem, SceneFile
-from solidcloud.server import world
-from solidcloud.server.effects import pipeline
+from solidcloud.schemas.wire.messages import encode, JSON
+from solidcloud.schemas.scene.scene_file import ArchiveItem, SceneFile
+from solidcloud.server.simulation.world import collision_world as world
+from solidcloud.server.simulation.effects import pipeline
 from solidcloud.server.scene import Scene
-from solidcloud.server.simulated import simulate
+from solidcloud.server.simulation.assembly import simulate
 def child(names):
     effects = [{"effect": name} for name in names]
     file = msgspec.convert({"format": 1, "archives": [{"path": "a"}], "effects": effects}, SceneFile)
@@ -133,7 +133,7 @@ def test_case_31_of_all_effects_only_those_declared_are_imported_and_say_somethi
     every = {"through", *ORDER}
     for key, names in ALONE.items():
         modules, declared = set(found[key]["modules"]), set(names)
-        loaded = {name for name in every if f"server.effects.{name}" in modules}
+        loaded = {name for name in every if f"server.simulation.effects.{name}_effect" in modules}
         # `step` goes on as `ground` does, and `sweep` is how `stop` goes on.
         assert loaded == declared, (key, loaded)
         for module, users in HELPERS.items():
@@ -168,14 +168,11 @@ def test_case_31_what_is_not_declared_is_not_imported(tmp_path: Path) -> None:
     verdict, effects, modules = json.loads(done.stdout)
     assert verdict == [1] and effects == ["stop"], "that of a scene without a file, for who moves in it"
     ours = {name.removeprefix("solidcloud.") for name in modules if name.startswith("solidcloud.")}
-    assert {"server.scene", "server.collide"} <= ours
+    assert {"server.scene", "server.queries.collide"} <= ours
     # What a frame is made of, and their order, are types; nothing that would simulate one.
-    assert {name for name in ours if name.startswith("server.effects")} <= {
-        "server.effects",
-        "server.effects.frame",
-    }
-    assert not {"server.world", "server.probe", *HELPERS} & ours
-    for part in ("server.report", "server.app", "server.transport", "server.client", "server.cli",
+    assert not {name for name in ours if name.startswith("server.simulation.effects")}
+    assert not {"server.simulation.world.collision_world", "server.queries.resident_motion", *HELPERS} & ours
+    for part in ("server.report", "server.service", "server.network", "server.remote", "server.client", "server.cli",
                  "builder.made", "builder.sources", "builder.pipeline"):  # fmt: skip
         assert not [name for name in ours if name == part or name.startswith(part + ".")], part
     for library in (

@@ -6,9 +6,9 @@ import cases
 import numpy as np
 import pytest
 import scans
-from solidcloud.schemas.answers import Verdict
-from solidcloud.server.bounded import collide_bounded, distance_bounded
-from solidcloud.server.effort import NO_LIMIT, Effort
+from solidcloud.schemas.wire.answers import Verdict
+from solidcloud.server.queries.context.anytime_search import collide_bounded, distance_bounded
+from solidcloud.server.queries.context.query_budget import NO_LIMIT, Effort
 from solidcloud.server.scene import Scene
 
 CLEAR, CONTACT, UNKNOWN = Verdict

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import scans
 from numpy.typing import NDArray
-from solidcloud.schemas.answers import Cost, Verdict
-from solidcloud.schemas.arrays import array_fields
+from solidcloud.schemas.wire.answers import Cost, Verdict
+from solidcloud.schemas.wire.arrays import array_fields
 from solidcloud.server.scene import Scene
 
 INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"

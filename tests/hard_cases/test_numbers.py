@@ -14,7 +14,7 @@ import pytest
 import scans
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import build_archive
-from solidcloud.schemas.archive import Archive
+from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.errors import BadRequestError, BadTransformError, ScanError
 from solidcloud.server.scene import Scene
 

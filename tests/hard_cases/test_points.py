@@ -9,8 +9,8 @@ import pytest
 import scans
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import build_archive
-from solidcloud.builder.radius import voxel_points
-from solidcloud.schemas.archive import Archive
+from solidcloud.builder.voxel.point_radius import voxel_points
+from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.errors import BadRequestError, ScanError
 from solidcloud.server.scene import Scene
 

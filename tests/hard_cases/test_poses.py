@@ -8,11 +8,11 @@ import h5py
 import numpy as np
 import pytest
 import scans
-from solidcloud.schemas.archive import Archive
+from solidcloud.schemas.archive.archive import Archive
+from solidcloud.schemas.archive.index_file import INDEX_NAME
 from solidcloud.schemas.errors import BadRequestError, BadTransformError
-from solidcloud.schemas.index_file import INDEX_NAME
-from solidcloud.schemas.messages import JSON, MSGPACK, SceneInfo, decode_answer, encode
-from solidcloud.server.pose_file import read_poses
+from solidcloud.schemas.wire.messages import JSON, MSGPACK, SceneInfo, decode_answer, encode
+from solidcloud.server.cli.input.pose_file import read_poses
 from solidcloud.server.scene import Scene
 
 INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"

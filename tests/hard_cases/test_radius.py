@@ -8,7 +8,7 @@ import cases
 import numpy as np
 import pytest
 import scans
-from solidcloud.schemas.archive import Archive
+from solidcloud.schemas.archive.archive import Archive
 
 INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
 

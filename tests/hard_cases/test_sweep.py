@@ -11,12 +11,12 @@ import pytest
 import scans
 import swept
 from motions import at, turn_z
-from solidcloud.schemas.answers import Verdict
-from solidcloud.schemas.archive import Archive
+from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.errors import BadRequestError, BadTransformError
-from solidcloud.server.avatar import make_avatar
-from solidcloud.server.collide import collide
-from solidcloud.server.effort import Effort
+from solidcloud.schemas.wire.answers import Verdict
+from solidcloud.server.avatars.avatar_model import make_avatar
+from solidcloud.server.queries.collide import collide
+from solidcloud.server.queries.context.query_budget import Effort
 
 INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
 POINT = np.zeros((1, 3))

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import swept
 from motions import at, turn_z, wall
-from solidcloud.schemas.answers import Verdict
-from solidcloud.server.avatar import make_avatar
-from solidcloud.server.collide import collide
+from solidcloud.schemas.wire.answers import Verdict
+from solidcloud.server.avatars.avatar_model import make_avatar
+from solidcloud.server.queries.collide import collide
 
 INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
 POINT = np.zeros((1, 3))

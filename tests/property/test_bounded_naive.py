@@ -14,10 +14,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from judged import judge_collide, judge_distance
 from numpy.typing import NDArray
-from solidcloud.schemas.answers import CollideAnswers, DistanceAnswers, Verdict
-from solidcloud.server import bounded
-from solidcloud.server.bounded import collide_bounded, distance_bounded
-from solidcloud.server.effort import NO_LIMIT, Effort
+from solidcloud.schemas.wire.answers import CollideAnswers, DistanceAnswers, Verdict
+from solidcloud.server.queries.context import anytime_search as bounded
+from solidcloud.server.queries.context.anytime_search import collide_bounded, distance_bounded
+from solidcloud.server.queries.context.query_budget import NO_LIMIT, Effort
 from solidcloud.server.scene import Scene
 
 BUDGETS = (0, 1, 5, 30, 200, 2000, NO_LIMIT - 1)

@@ -16,10 +16,10 @@ from clouds import KINDS, TREES, cloud
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from solidcloud.server.avatar import AvatarModel, make_avatar
-from solidcloud.server.by_scan import gaps_by_scan
-from solidcloud.server.contacts import contacts
-from solidcloud.server.effort import Effort
+from solidcloud.server.avatars.avatar_model import AvatarModel, make_avatar
+from solidcloud.server.queries.contacts import contacts
+from solidcloud.server.queries.context.query_budget import Effort
+from solidcloud.server.queries.distance_by_scan import gaps_by_scan
 
 SCANS = 4
 

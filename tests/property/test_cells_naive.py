@@ -6,7 +6,7 @@ import cases
 import numpy as np
 import pytest
 import scans
-from solidcloud.builder.verify import verify_archive
+from solidcloud.builder.passes.verify import verify_archive
 
 
 @pytest.mark.interpreted

@@ -14,9 +14,9 @@ from coarse_tops import Made, least_margin, open_made
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from solidcloud.builder.radius import voxel_points
-from solidcloud.schemas.radius_model import class_radii
-from solidcloud.server.avatar import AvatarModel, make_avatar
+from solidcloud.builder.voxel.point_radius import voxel_points
+from solidcloud.schemas.archive.radius_model import class_radii
+from solidcloud.server.avatars.avatar_model import AvatarModel, make_avatar
 
 MOST_UNITS = 1 << 30  # of a pair's reach
 

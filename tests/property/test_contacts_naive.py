@@ -11,11 +11,11 @@ from cases_contacts import ScanCase, compare, open_case, tight
 from clouds import COUNTS, FAR, KINDS, SCALES, STEPS, TREES, VOXEL_STEPS, cloud, signed_permutations
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from solidcloud.schemas.answers import ContactsAnswers
-from solidcloud.server import contacts as contacts_module
-from solidcloud.server.avatar import make_avatar
-from solidcloud.server.contacts import contacts
-from solidcloud.server.effort import Effort, make_effort
+from solidcloud.schemas.wire.answers import ContactsAnswers
+from solidcloud.server.avatars.avatar_model import make_avatar
+from solidcloud.server.queries import contacts as contacts_module
+from solidcloud.server.queries.contacts import contacts
+from solidcloud.server.queries.context.query_budget import Effort, make_effort
 
 
 @settings(max_examples=60, deadline=None, derandomize=True)

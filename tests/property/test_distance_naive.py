@@ -14,7 +14,7 @@ from clouds import COUNTS, FAR, KINDS, OFF, SCALES, STEPS, TREES, VOXEL_STEPS, c
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from judged import compare
-from solidcloud.schemas.answers import Verdict
+from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.scene import Scene
 
 

@@ -8,8 +8,8 @@ import naive_distance
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from solidcloud.schemas.answers import Verdict
-from solidcloud.server.kernels.placed import U32
+from solidcloud.schemas.wire.answers import Verdict
+from solidcloud.server.kernels.core.placed_avatar import U32
 from solidcloud.server.scene import Scene
 
 
@@ -64,7 +64,7 @@ def test_ten_million_pairs_none_wrong(tmp_path: Path, rng: np.random.Generator) 
         scan = naive.scan_units(naive.lattice_of(shell, origin, step), step)
         found = [squares(naive.placed_units(np.zeros((1, 3)), pose, origin), scan) for pose in poses]
         judge(scene, poses, [int(each.min()) for each in found], naive.reach_units(poses[0], 0.1, 0.1, 0.0))
-    # Within what float32 may lose of the nearest pair (placed.py): nothing but the integers tells these apart.
+    # Within what float32 may lose of the nearest pair (placed_avatar.py): nothing but the integers tells these apart.
     band = 2 * np.sqrt(3.0) * U32 * (2 * steps) * step * naive.UNITS
     near = sum(int((np.sqrt(each.astype(float)) <= each.min() ** 0.5 + band).sum()) for each in found)
     assert pairs + 500 * len(shell) >= 10**7 and near >= 10**5, near

@@ -11,15 +11,15 @@ import cases
 import numpy as np
 import pytest
 from clouds import KINDS, cloud
-from solidcloud.schemas.answers import Verdict
-from solidcloud.server.avatar import make_avatar
-from solidcloud.server.bounded import collide_bounded, distance_bounded
-from solidcloud.server.effort import Effort
-from solidcloud.server.rays import raycast
-from solidcloud.server.request import make_scene_data
-from solidcloud.server.residency import Residency
-from solidcloud.server.store import Store
-from solidcloud.server.within import within
+from solidcloud.schemas.wire.answers import Verdict
+from solidcloud.server.avatars.avatar_model import make_avatar
+from solidcloud.server.queries.context.anytime_search import collide_bounded, distance_bounded
+from solidcloud.server.queries.context.query_budget import Effort
+from solidcloud.server.queries.context.query_context import make_scene_data
+from solidcloud.server.queries.raycast import raycast
+from solidcloud.server.queries.within import within
+from solidcloud.server.residency.voxel_cache import Residency
+from solidcloud.server.residency.voxel_store import Store
 
 BUDGETS = (*range(0, 150, 7), 200, 300, 500, 1000, 5000)
 

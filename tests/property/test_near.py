@@ -15,12 +15,12 @@ from clouds import KINDS, TREES, cloud
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from solidcloud.schemas.answers import DistanceAnswers
 from solidcloud.schemas.errors import SolidcloudError
-from solidcloud.server.avatar import AvatarModel, make_avatar
-from solidcloud.server.distance import distance
-from solidcloud.server.near import QUICK_REACH, near
-from solidcloud.server.request import SceneData
+from solidcloud.schemas.wire.answers import DistanceAnswers
+from solidcloud.server.avatars.avatar_model import AvatarModel, make_avatar
+from solidcloud.server.queries.context.query_context import SceneData
+from solidcloud.server.queries.distance import distance
+from solidcloud.server.queries.resident_distance import QUICK_REACH, near
 from solidcloud.server.scene import Scene
 
 INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"

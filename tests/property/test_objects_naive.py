@@ -14,11 +14,11 @@ from clouds import signed_permutations
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from solidcloud.server.avatar import AvatarModel, make_avatar
-from solidcloud.server.objects import SCENE_GROUP, objects
-from solidcloud.server.request import SceneData, make_scene_data
-from solidcloud.server.residency import Residency
-from solidcloud.server.store import Store
+from solidcloud.server.avatars.avatar_model import AvatarModel, make_avatar
+from solidcloud.server.queries.context.query_context import SceneData, make_scene_data
+from solidcloud.server.queries.objects import SCENE_GROUP, objects
+from solidcloud.server.residency.voxel_cache import Residency
+from solidcloud.server.residency.voxel_store import Store
 
 ALL = 0xFFFF_FFFF
 ORIGIN_SHIFT = 3.0
@@ -213,7 +213,7 @@ def test_tangent_objects_touch_and_one_unit_apart_do_not(data: SceneData) -> Non
 
 
 def test_against_the_scene_as_each_alone(data: SceneData, rng: np.random.Generator) -> None:
-    from solidcloud.server.collide import collide
+    from solidcloud.server.queries.collide import collide
 
     bodies = [body(rng, kind) for kind in ("few", "shell", "empty")]
     models: list[AvatarModel] = [make_avatar(points, 0.02) for points in bodies]

@@ -11,9 +11,9 @@ import pushed
 import pytest
 from numpy.typing import NDArray
 from pushed import INTERPRETED, Play, play
-from solidcloud.schemas.answers import Verdict
-from solidcloud.schemas.effects import AnyEffect, Ground, Slide, Step, Stop, Sweep
-from solidcloud.server.effects.frame import Body
+from solidcloud.schemas.scene.effect_options import AnyEffect, Ground, Slide, Step, Stop, Sweep
+from solidcloud.schemas.wire.answers import Verdict
+from solidcloud.server.simulation.world.frame import Body
 
 # Pushes of a test, and of the one that is asked for with -m slow.
 PUSHES, MANY = (800, 100_000) if not INTERPRETED else (6, 6)

@@ -13,12 +13,12 @@ from clouds import KINDS, TREES, cloud, signed_permutations
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from solidcloud.schemas.answers import ContactsAnswers
-from solidcloud.schemas.radius_model import RIM_BIT, local_radii
-from solidcloud.server import contacts as contacts_module
-from solidcloud.server.avatar import make_avatar
-from solidcloud.server.contacts import contacts
-from solidcloud.server.effort import Effort, make_effort
+from solidcloud.schemas.archive.radius_model import RIM_BIT, local_radii
+from solidcloud.schemas.wire.answers import ContactsAnswers
+from solidcloud.server.avatars.avatar_model import make_avatar
+from solidcloud.server.queries import contacts as contacts_module
+from solidcloud.server.queries.contacts import contacts
+from solidcloud.server.queries.context.query_budget import Effort, make_effort
 
 
 @settings(max_examples=30, deadline=None, derandomize=True)

@@ -16,10 +16,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from judged import compare, judge_collide, judge_distance
 from numpy.typing import NDArray
-from solidcloud.schemas.answers import CollideAnswers, DistanceAnswers, Verdict
-from solidcloud.schemas.radius_model import RIM_BIT
-from solidcloud.server import bounded
-from solidcloud.server.effort import NO_LIMIT
+from solidcloud.schemas.archive.radius_model import RIM_BIT
+from solidcloud.schemas.wire.answers import CollideAnswers, DistanceAnswers, Verdict
+from solidcloud.server.queries.context import anytime_search as bounded
+from solidcloud.server.queries.context.query_budget import NO_LIMIT
 from solidcloud.server.scene import Scene
 
 # `local` and `border` as they are: spheres as large as the cloud, so that avatars are inside most of them.

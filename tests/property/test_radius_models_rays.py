@@ -16,12 +16,12 @@ from clouds import TREES, cloud
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from solidcloud.schemas.radius_model import RIM_BIT
-from solidcloud.server.avatar import make_avatar
-from solidcloud.server.effort import Effort
-from solidcloud.server.objects import SCENE_GROUP, objects
-from solidcloud.server.rays import raycast
-from solidcloud.server.within import within
+from solidcloud.schemas.archive.radius_model import RIM_BIT
+from solidcloud.server.avatars.avatar_model import make_avatar
+from solidcloud.server.queries.context.query_budget import Effort
+from solidcloud.server.queries.objects import SCENE_GROUP, objects
+from solidcloud.server.queries.raycast import raycast
+from solidcloud.server.queries.within import within
 
 MODELS = (*classes.MODELS, "local", "local+border", "border:0")
 

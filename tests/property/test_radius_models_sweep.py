@@ -16,11 +16,11 @@ from clouds import TREES
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from solidcloud.schemas.answers import SweepAnswers, Verdict
-from solidcloud.schemas.radius_model import LOCAL_CLASSES, RADIUS_CLASSES
-from solidcloud.server.avatar import make_avatar
-from solidcloud.server.collide import collide
-from solidcloud.server.effort import Effort
+from solidcloud.schemas.archive.radius_model import LOCAL_CLASSES, RADIUS_CLASSES
+from solidcloud.schemas.wire.answers import SweepAnswers, Verdict
+from solidcloud.server.avatars.avatar_model import make_avatar
+from solidcloud.server.queries.collide import collide
+from solidcloud.server.queries.context.query_budget import Effort
 from solidcloud.server.scene import Scene
 
 FOUND = ("verdict", "lower", "upper", "exact", "outside", "witness_avatar", "witness_cloud")

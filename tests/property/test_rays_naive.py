@@ -16,10 +16,10 @@ from clouds import FAR, STEPS, TREES, VOXEL_STEPS, cloud
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from solidcloud.server.kernels.rays import first_meeting
-from solidcloud.server.rays import raycast
-from solidcloud.server.request import SceneData
-from solidcloud.server.within import within
+from solidcloud.server.kernels.rays.rays import first_meeting
+from solidcloud.server.queries.context.query_context import SceneData
+from solidcloud.server.queries.raycast import raycast
+from solidcloud.server.queries.within import within
 
 
 def stored(case: cases.Case, data: SceneData) -> NDArray[np.float64]:
@@ -129,7 +129,7 @@ def test_far_from_the_origin_is_as_at_the_origin(seed: int, shift: tuple[int, in
 def test_the_formula_is_as_near_the_ideal_as_it_says(
     seed: int, size: float, radius: int, grazing: bool
 ) -> None:
-    """In fractions, for the direction given: which spheres are hit, and where. The bounds of kernels/rays.py."""
+    """In fractions, for the direction given: which spheres are hit, and where. The bounds of kernels/rays/rays.py."""
     rng = np.random.default_rng(seed)
     d = np.rint(rng.normal(size=3) * size).astype(np.int64)
     direction = rng.normal(size=3)

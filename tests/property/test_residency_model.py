@@ -10,8 +10,8 @@ from fake_store import BLOCK, FakeStore
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
-from solidcloud.server.policies import POLICIES, make_policy
-from solidcloud.server.residency import Ahead, Held, Residency
+from solidcloud.server.residency.eviction import POLICIES, make_policy
+from solidcloud.server.residency.voxel_cache import Ahead, Held, Residency
 
 SIZES = [1, 1, 2, 3, 1, 4, 2, 1, 5, 2]  # cache lines
 BUDGET = 9

@@ -7,11 +7,11 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from msgspec import inspect
-from solidcloud.schemas.effects import Ground, Objects, Slide, Stop
 from solidcloud.schemas.errors import BadRequestError
-from solidcloud.schemas.scene import SceneFile, check_scene, parse_scene
-from solidcloud.schemas.toml_faults import decode
-from solidcloud.server.scene_text import toml_value
+from solidcloud.schemas.scene.effect_options import Ground, Objects, Slide, Stop
+from solidcloud.schemas.scene.scene_file import SceneFile, check_scene, parse_scene
+from solidcloud.schemas.scene.toml_faults import decode
+from solidcloud.server.cli.scene_files.scene_text import toml_value
 
 TURNS = ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.6, 0.8), (0.6, -0.8))
 

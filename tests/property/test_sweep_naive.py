@@ -11,10 +11,10 @@ import scans
 import swept
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from solidcloud.schemas.answers import Verdict
-from solidcloud.server.avatar import make_avatar
-from solidcloud.server.collide import collide
-from solidcloud.server.effort import Effort
+from solidcloud.schemas.wire.answers import Verdict
+from solidcloud.server.avatars.avatar_model import make_avatar
+from solidcloud.server.queries.collide import collide
+from solidcloud.server.queries.context.query_budget import Effort
 
 
 @settings(max_examples=60, deadline=None, derandomize=True)

@@ -1,1 +1,5 @@
-"""Compiled functions of the accuracy report: plain descents that what the server does is compared with."""
+"""Plain descents that the accuracy report compares with.
+
+May import server.kernels, builder, schemas.
+Begin with plain_descent.py.
+"""

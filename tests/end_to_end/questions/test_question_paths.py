@@ -4,23 +4,23 @@ import numpy as np
 import pytest
 import zenoh
 from corner import POSES, same
-from solidcloud.schemas import keys
-from solidcloud.schemas.answers import (
+from solidcloud.schemas.errors import BadRequestError, BadTransformError
+from solidcloud.schemas.wire import keys
+from solidcloud.schemas.wire.answers import (
     PARTS,
     PATH_ANSWERS,
     Verdict,
 )
-from solidcloud.schemas.columns import join, without_part
-from solidcloud.schemas.errors import BadRequestError, BadTransformError
-from solidcloud.schemas.messages import (
+from solidcloud.schemas.wire.columns import join, without_part
+from solidcloud.schemas.wire.messages import (
     JSON,
     MSGPACK,
     PathRequest,
     decode_answer,
     encode,
 )
-from solidcloud.server import path as path_module
-from solidcloud.server.zenoh_settings import session_config
+from solidcloud.server.network.zenoh_settings import session_config
+from solidcloud.server.queries import path as path_module
 
 
 @pytest.mark.parametrize(

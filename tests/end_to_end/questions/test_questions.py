@@ -1,9 +1,9 @@
 """Every question over zenoh: what comes back is what the scene in this process says, bit for bit."""
 
 import importlib
+import pkgutil
 import threading
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
 import cases
 import numpy as np
@@ -20,13 +20,13 @@ from corner import (
     add_avatars,
     same,
 )
-from solidcloud.schemas import keys
-from solidcloud.schemas.answers import (
+from solidcloud.schemas.errors import TooLargeError
+from solidcloud.schemas.wire import keys
+from solidcloud.schemas.wire.answers import (
     ContactsAnswers,
 )
-from solidcloud.schemas.columns import join, without_part
-from solidcloud.schemas.errors import TooLargeError
-from solidcloud.schemas.messages import (
+from solidcloud.schemas.wire.columns import join, without_part
+from solidcloud.schemas.wire.messages import (
     JSON,
     MSGPACK,
     check_answers,
@@ -34,10 +34,10 @@ from solidcloud.schemas.messages import (
     encode,
 )
 from solidcloud.server import kernels
-from solidcloud.server import path as path_module
 from solidcloud.server.client import Client
+from solidcloud.server.network.zenoh_settings import session_config
+from solidcloud.server.queries import path as path_module
 from solidcloud.server.scene import Scene
-from solidcloud.server.zenoh_settings import session_config
 
 
 @pytest.mark.parametrize("question", QUESTIONS)
@@ -63,7 +63,7 @@ def test_plain_zenoh_is_answered_as_the_scene_does(scene, endpoint, question, en
 
 @pytest.mark.parametrize("question", QUESTIONS)
 def test_what_is_split_is_what_was_asked_at_once(scene, client, question, monkeypatch):
-    from solidcloud.server import questions as questions_module
+    from solidcloud.server.remote import request_batches as questions_module
 
     monkeypatch.setattr(questions_module, "BATCH_POSES", 7)
     monkeypatch.setattr(questions_module, "SLOW_BATCH", 7)
@@ -73,7 +73,7 @@ def test_what_is_split_is_what_was_asked_at_once(scene, client, question, monkey
 
 def test_contacts_that_no_message_holds_come_in_smaller_ones(scene, client, monkeypatch):
     """Clusters are not bounded by `limit`: here there are many of them, and messages are small."""
-    from solidcloud.server import app as app_module
+    from solidcloud.server.service import service as app_module
 
     parameters = {"limit": 0, "margin": 0.5, "cluster_distance": 0.0}
     expected = scene.contacts("al", POSES, **parameters)
@@ -94,11 +94,11 @@ def test_contacts_that_no_message_holds_come_in_smaller_ones(scene, client, monk
 def compiled():
     """How many versions of each kernel there are; none where nothing is compiled."""
     found = {}
-    for path in Path(kernels.__file__).parent.glob("*.py"):
-        module = importlib.import_module(f"{kernels.__name__}.{path.stem}")
+    for found_module in pkgutil.walk_packages(kernels.__path__, f"{kernels.__name__}."):
+        module = importlib.import_module(found_module.name)
         for name, kernel in vars(module).items():
             if hasattr(kernel, "signatures"):
-                found[path.stem, name] = len(kernel.signatures)
+                found[found_module.name, name] = len(kernel.signatures)
     return found
 
 

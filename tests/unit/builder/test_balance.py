@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 from scans import WITH_POINTS, make_steps
-from solidcloud.builder.balance import balance_cells, tree_limits
 from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.kernels.octree import voxel_codes
-from solidcloud.builder.octree import VoxelPoints, build_voxel
-from solidcloud.schemas.codec import encode_voxel
-from solidcloud.schemas.voxel import check_voxel
-from solidcloud.server.report.cells import tree_heights
+from solidcloud.builder.kernels.points.octree_cells import voxel_codes
+from solidcloud.builder.voxel.balance_cells import balance_cells, tree_limits
+from solidcloud.builder.voxel.voxel_octree import VoxelPoints, build_voxel
+from solidcloud.schemas.archive.codec import encode_voxel
+from solidcloud.schemas.archive.voxel import check_voxel
+from solidcloud.server.report.walk.cell_comparison import tree_heights
 
 pytestmark = pytest.mark.interpreted
 

@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import solidcloud.builder.passes as passes
+import solidcloud.builder.passes.resumable_passes as passes
 import solidcloud.builder.pipeline as pipeline
 from resumed import build, content, done_folder, interrupted, two_scans
 from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.filter_rules import filter_dtype
-from solidcloud.builder.spool import KEYS_SUFFIX, spool_dtype
-from solidcloud.builder.workplace import RUN_FOLDERS, building_folder
+from solidcloud.builder.passes.filter_rules import filter_dtype
+from solidcloud.builder.resume.build_directory import RUN_FOLDERS, building_folder
+from solidcloud.builder.spool.spool import KEYS_SUFFIX, spool_dtype
 from solidcloud.schemas.errors import CorruptError
 
 COLUMNS: dict[str, Any] = {"keep": frozenset({"scan", "intensity"})}

@@ -6,8 +6,7 @@ import minimal_ball
 import numpy as np
 import pytest
 from scans import WITH_POINTS, make_steps
-from solidcloud.builder.hierarchy import Bounds, build_hierarchy
-from solidcloud.builder.kernels.bounding_sphere import (
+from solidcloud.builder.kernels.trees.bounding_sphere import (
     SPREAD,
     _flat_direction,
     ceil_sqrt,
@@ -15,7 +14,8 @@ from solidcloud.builder.kernels.bounding_sphere import (
     leaf_spread,
     least_variance,
 )
-from solidcloud.builder.kernels.trees import build_tree, tree_rows, tree_space
+from solidcloud.builder.kernels.trees.build_tree import build_tree, tree_rows, tree_space
+from solidcloud.builder.voxel.hierarchy import Bounds, build_hierarchy
 
 
 def assert_encloses(bounds: Bounds, i: int, points: np.ndarray) -> None:

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from solidcloud.builder.kernels.boxes import make_box_tree, near_boxes
-from solidcloud.builder.kernels.nearest import FAR
+from solidcloud.builder.kernels.neighbours.box_tree import make_box_tree, near_boxes
+from solidcloud.builder.kernels.neighbours.nearest_points import FAR
 
 pytestmark = pytest.mark.interpreted
 

@@ -10,20 +10,22 @@ import pytest
 from dense_voxels import KEY, rows_of, spooled
 from numpy.typing import NDArray
 from scans import make_scan, write_xyz
-from solidcloud.builder import classes, dense, shards
-from solidcloud.builder.classes import class_limits, voxel_classes
 from solidcloud.builder.config import BuildConfig, parse_radius
-from solidcloud.builder.kernels.classes import FEW, point_classes
-from solidcloud.builder.kernels.neighbours import bound_boxes, box_starts
-from solidcloud.builder.kernels.octree import voxel_codes
+from solidcloud.builder.kernels.neighbours.nearest_neighbours import bound_boxes, box_starts
+from solidcloud.builder.kernels.neighbours.point_classes import FEW, point_classes
+from solidcloud.builder.kernels.points.octree_cells import voxel_codes
+from solidcloud.builder.passes import build_shards as shards
+from solidcloud.builder.passes import radius_classes as classes
+from solidcloud.builder.passes.radius_classes import class_limits, voxel_classes
+from solidcloud.builder.passes.verify import verify_archive
 from solidcloud.builder.pipeline import build_archive
-from solidcloud.builder.radius import voxel_points
-from solidcloud.builder.spool import Spool, write_run
-from solidcloud.builder.verify import verify_archive
-from solidcloud.schemas.archive import Archive
+from solidcloud.builder.spool.spool import Spool, write_run
+from solidcloud.builder.voxel import dense_voxel as dense
+from solidcloud.builder.voxel.point_radius import voxel_points
+from solidcloud.schemas.archive.archive import Archive
+from solidcloud.schemas.archive.index import Header, radius_distribution
+from solidcloud.schemas.archive.radius_model import LOCAL_CLASSES, RIM_BIT, local_radii
 from solidcloud.schemas.errors import BadRequestError
-from solidcloud.schemas.index import Header, radius_distribution
-from solidcloud.schemas.radius_model import LOCAL_CLASSES, RIM_BIT, local_radii
 
 STEP = 0.001
 ALL = frozenset({"mean", "local", "border"})

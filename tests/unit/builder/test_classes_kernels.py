@@ -4,9 +4,14 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from solidcloud.builder.kernels.classes import RIM_SHARE, _is_rim, _local_class, point_classes
-from solidcloud.builder.kernels.neighbours import bound_boxes, box_starts
-from solidcloud.builder.kernels.octree import voxel_codes
+from solidcloud.builder.kernels.neighbours.nearest_neighbours import bound_boxes, box_starts
+from solidcloud.builder.kernels.neighbours.point_classes import (
+    RIM_SHARE,
+    _is_rim,
+    _local_class,
+    point_classes,
+)
+from solidcloud.builder.kernels.points.octree_cells import voxel_codes
 
 pytestmark = pytest.mark.interpreted
 

@@ -12,12 +12,12 @@ import pytest
 pytest.importorskip("distributed")
 
 import dask
-import solidcloud.builder.cluster as cluster_module
+import solidcloud.builder.run.dask_cluster as cluster_module
 from distributed import LocalCluster
-from solidcloud.builder.cluster import ClusterExecutor, local_workers
-from solidcloud.builder.executor import WAITING
-from solidcloud.builder.progress import Silent
-from solidcloud.builder.software import software
+from solidcloud.builder.run.dask_cluster import ClusterExecutor, local_workers
+from solidcloud.builder.run.executor import WAITING
+from solidcloud.builder.run.progress import Silent
+from solidcloud.builder.run.software import software
 from solidcloud.schemas.errors import BadRequestError, ScanError, SolidcloudError
 
 # Units are text for `eval`, because workers cannot import a test module by its name.

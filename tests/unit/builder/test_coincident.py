@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pye57
 import pytest
-from solidcloud.builder.coincident import coincident_scan
-from solidcloud.builder.sources.files import open_scans
-from solidcloud.server.cli import run
+from solidcloud.builder.sources.coincident_scans import coincident_scan
+from solidcloud.builder.sources.scan_files import open_scans
+from solidcloud.server.cli.main import run
 
 WARNING = "all 300 points of scan 0 lie at one place, expected a surface"
 LINE = "".join(f"{i * 0.1:.1f} 0 0\n" for i in range(40))

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from solidcloud.builder.config import MOST_SHARDS, SHARD_POINTS, BuildConfig, parse_rule, shard_points
-from solidcloud.builder.shards import plan_shards
+from solidcloud.builder.passes.build_shards import plan_shards
 from solidcloud.schemas.errors import BadRequestError
 
 WRONG = {

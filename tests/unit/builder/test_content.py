@@ -4,7 +4,7 @@ from decimal import Decimal, localcontext
 
 import numpy as np
 import pytest
-from solidcloud.builder.kernels.content import CHUNK, SEEDS, content_sum
+from solidcloud.builder.kernels.points.content_hash import CHUNK, SEEDS, content_sum
 
 pytestmark = pytest.mark.interpreted
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from solidcloud.builder.kernels.cubes import FREE, insert_all, take_cubes
+from solidcloud.builder.kernels.points.occupied_cubes import FREE, insert_all, take_cubes
 
 MOST = (1 << 20) - 1
 

@@ -9,11 +9,11 @@ import pytest
 from dense_voxels import COLUMNS, KEY, assert_same, decoded, hashed, rows_of, spooled
 from numpy.typing import NDArray
 from scans import make_steps
-from solidcloud.builder import dense
 from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.dense import build_dense, is_dense, plan_parts
-from solidcloud.builder.kernels.octree import voxel_codes
-from solidcloud.builder.octree import VoxelPoints, build_voxel
+from solidcloud.builder.kernels.points.octree_cells import voxel_codes
+from solidcloud.builder.voxel import dense_voxel as dense
+from solidcloud.builder.voxel.dense_voxel import build_dense, is_dense, plan_parts
+from solidcloud.builder.voxel.voxel_octree import VoxelPoints, build_voxel
 from solidcloud.schemas.errors import BadRequestError, CorruptError
 
 PART = 200
@@ -126,7 +126,7 @@ def test_which_voxels_are_dense() -> None:
 
 def test_a_frame_too_long_for_the_index_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     spool = spooled(tmp_path / "spool", rows_of(make_steps("noise", 3, 600, 1000)), 1000, [])
-    monkeypatch.setattr("solidcloud.schemas.row_stream.MAX_FRAME_BYTES", 500)
+    monkeypatch.setattr("solidcloud.schemas.archive.row_stream.MAX_FRAME_BYTES", 500)
     with pytest.raises(BadRequestError, match=r"a voxel of [0-9]+ rows takes .* smaller --voxel"):
         build_dense(KEY, spool, BuildConfig(cell_points=40), bytes(16), tmp_path)
 
@@ -142,10 +142,10 @@ MEMORY = """
 import sys
 from pathlib import Path
 import numpy as np
-from solidcloud.builder import dense
+from solidcloud.builder.voxel import dense_voxel as dense
 from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.spool import Spool
-from solidcloud.schemas.voxel_grid import Lattice
+from solidcloud.builder.spool.spool import Spool
+from solidcloud.schemas.archive.voxel_grid import Lattice
 
 def peak():
     return int(next(l for l in open("/proc/self/status") if l.startswith("VmHWM")).split()[1]) << 10

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 from opened import open_scan
-from solidcloud.builder.exact import loose_nodes
-from solidcloud.builder.kernels.enclosure import last_loose_node
-from solidcloud.builder.record_points import leaves_of, spheres_of
-from solidcloud.schemas.codec import OpenRecord
+from solidcloud.builder.kernels.neighbours.enclosure import last_loose_node
+from solidcloud.builder.voxel.exact_enclosure import loose_nodes
+from solidcloud.builder.voxel.record_points import leaves_of, spheres_of
+from solidcloud.schemas.archive.codec import OpenRecord
 
 pytestmark = pytest.mark.interpreted
 

@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import solidcloud.builder.executor as executor_module
+import solidcloud.builder.run.executor as executor_module
 from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.executor import POINTS_WORTH_A_PROCESS, ProcessExecutor, worker_count
-from solidcloud.builder.make_executor import make_executor
+from solidcloud.builder.run.executor import POINTS_WORTH_A_PROCESS, ProcessExecutor, worker_count
+from solidcloud.builder.run.make_executor import make_executor
 from solidcloud.schemas.errors import SolidcloudError
 
 
@@ -125,7 +125,7 @@ def test_a_worker_that_died_while_it_had_nothing_to_do_is_said(tmp_path: Path) -
 
 BUILDER = """
 import os, sys, time
-from solidcloud.builder.executor import ProcessExecutor
+from solidcloud.builder.run.executor import ProcessExecutor
 if __name__ == "__main__":
     with ProcessExecutor(2) as executor:
         code = "import os, time; open(%r + '/' + str(os.getpid()), 'w').close(); time.sleep(600)" % sys.argv[1]

@@ -10,18 +10,18 @@ import laspy
 import numpy as np
 import plyfile
 import pytest
-import solidcloud.builder.export as export
+import solidcloud.builder.export.export_archive as export
 from scans import make_scan, write_las, write_ply
 from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.export import export_archive, lattice_box
+from solidcloud.builder.export.export_archive import export_archive, lattice_box
 from solidcloud.builder.pipeline import build_archive
-from solidcloud.schemas.archive import Archive
+from solidcloud.schemas.archive.archive import Archive
+from solidcloud.schemas.archive.index import Header
+from solidcloud.schemas.archive.index_file import write_index
+from solidcloud.schemas.archive.voxel_grid import Lattice
+from solidcloud.schemas.archive.vtkhdf import read_points
 from solidcloud.schemas.errors import BadRequestError
-from solidcloud.schemas.index import Header
-from solidcloud.schemas.index_file import write_index
-from solidcloud.schemas.voxel_grid import Lattice
-from solidcloud.schemas.vtkhdf import read_points
-from solidcloud.server.cli import run
+from solidcloud.server.cli.main import run
 
 UTM = np.array([512_345.25, 5_612_000.5, 87.125])
 WKT = 'PROJCS["ETRS89 / UTM zone 32N",GEOGCS["ETRS89"],UNIT["metre",1]]'

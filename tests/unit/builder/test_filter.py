@@ -5,17 +5,24 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from solidcloud.builder import blocks
-from solidcloud.builder import filter as filters
 from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.filter import filtered_spool
-from solidcloud.builder.filter_rules import MOVING, OUTLIER, THINNED, filter_dtype, filter_passes, is_filtered
-from solidcloud.builder.journal import Journal
-from solidcloud.builder.make_executor import make_executor
-from solidcloud.builder.progress import Silent
-from solidcloud.builder.spool import Spool, row_codes, spool_dtype, write_run
+from solidcloud.builder.passes import filter as filters
+from solidcloud.builder.passes.filter import filtered_spool
+from solidcloud.builder.passes.filter_rules import (
+    MOVING,
+    OUTLIER,
+    THINNED,
+    filter_dtype,
+    filter_passes,
+    is_filtered,
+)
+from solidcloud.builder.resume.journal import Journal
+from solidcloud.builder.run.make_executor import make_executor
+from solidcloud.builder.run.progress import Silent
+from solidcloud.builder.spool import spool_blocks as blocks
+from solidcloud.builder.spool.spool import Spool, row_codes, spool_dtype, write_run
+from solidcloud.schemas.archive.voxel_grid import Lattice, voxel_coordinates, voxel_keys
 from solidcloud.schemas.errors import BadRequestError
-from solidcloud.schemas.voxel_grid import Lattice, voxel_coordinates, voxel_keys
 
 STEP = 0.001
 ALL = frozenset({"scan", "intensity"})

@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 import pytest
-from solidcloud.builder.kernels.filter import (
+from solidcloud.builder.kernels.neighbours.filter_counts import (
     _group_in_reach,
     _no_runs,
     _runs_around,

@@ -22,11 +22,11 @@ from changes import (
 )
 from changes import built as built  # the fixtures
 from changes import files as files
-from solidcloud.builder import change as change_module
-from solidcloud.builder import rebuild as rebuild_module
-from solidcloud.builder.generation import add_scans, remove_scans
-from solidcloud.builder.verify import verify_archive
-from solidcloud.schemas.archive import Archive
+from solidcloud.builder.edit import rebuild_voxels as rebuild_module
+from solidcloud.builder.edit import transaction as change_module
+from solidcloud.builder.edit.edit_archive import add_scans, remove_scans
+from solidcloud.builder.passes.verify import verify_archive
+from solidcloud.schemas.archive.archive import Archive
 from solidcloud.server.scene import Scene
 
 

@@ -18,17 +18,17 @@ from changes import (
 )
 from changes import built as built  # the fixtures
 from changes import files as files
-from solidcloud.builder import rebuild as rebuild_module
-from solidcloud.builder.change import delete_orphans
-from solidcloud.builder.generation import add_scans, remove_scans
-from solidcloud.builder.preview import write_preview
-from solidcloud.builder.rebuild import ChangeSummary
-from solidcloud.builder.verify import verify_archive
-from solidcloud.schemas.archive import Archive
+from solidcloud.builder.edit import rebuild_voxels as rebuild_module
+from solidcloud.builder.edit.edit_archive import add_scans, remove_scans
+from solidcloud.builder.edit.rebuild_voxels import ChangeSummary
+from solidcloud.builder.edit.transaction import delete_orphans
+from solidcloud.builder.passes.preview import write_preview
+from solidcloud.builder.passes.verify import verify_archive
+from solidcloud.schemas.archive.archive import Archive
+from solidcloud.schemas.archive.index_file import INDEX_NAME
+from solidcloud.schemas.archive.shard import SHARD_FOLDER
+from solidcloud.schemas.archive.vtkhdf import PREVIEW_NAME
 from solidcloud.schemas.errors import SolidcloudError
-from solidcloud.schemas.index_file import INDEX_NAME
-from solidcloud.schemas.shard import SHARD_FOLDER
-from solidcloud.schemas.vtkhdf import PREVIEW_NAME
 
 # What changes files, all of which a change goes through by name.
 STEPS = ("replace", "rename", "unlink", "fsync", "link", "symlink", "mkdir", "rmdir")

@@ -10,18 +10,18 @@ import scans
 from changes import EVERYTHING, OPTIONS, A, B, Build, Files, all_points, refused, same_scene, sort_points
 from changes import built as built  # the fixtures
 from changes import files as files
-from solidcloud.builder import added as added_module
-from solidcloud.builder import generation as generation_module
-from solidcloud.builder import rebuild as rebuild_module
-from solidcloud.builder.change import config_of
 from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.generation import add_scans, remove_scans
+from solidcloud.builder.edit import added_scans as added_module
+from solidcloud.builder.edit import edit_archive as generation_module
+from solidcloud.builder.edit import rebuild_voxels as rebuild_module
+from solidcloud.builder.edit.edit_archive import add_scans, remove_scans
+from solidcloud.builder.edit.transaction import config_of
+from solidcloud.builder.passes.verify import verify_archive
 from solidcloud.builder.pipeline import build_archive
-from solidcloud.builder.verify import verify_archive
-from solidcloud.builder.workplace import locked
-from solidcloud.schemas.archive import Archive
+from solidcloud.builder.resume.build_directory import locked
+from solidcloud.schemas.archive.archive import Archive
+from solidcloud.schemas.archive.shard import SHARD_FOLDER
 from solidcloud.schemas.errors import BadRequestError, CorruptError, FormatError, ScanError
-from solidcloud.schemas.shard import SHARD_FOLDER
 
 
 def test_a_scan_that_is_in_is_refused_unless_again(built: Build, files: Files, tmp_path: Path) -> None:

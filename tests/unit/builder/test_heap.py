@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from dense_voxels import KEY, assert_same, decoded, hashed, spooled
 from numpy.typing import NDArray
-from solidcloud.builder import dense
-from solidcloud.builder.cells import build_trees
 from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.dense import build_dense
-from solidcloud.builder.heap import heap_place, heap_trees, merge_runs
-from solidcloud.builder.octree import VoxelPoints, build_voxel
-from solidcloud.builder.spool import Spool, canonical_columns
+from solidcloud.builder.spool.spool import Spool, canonical_columns
+from solidcloud.builder.voxel import dense_voxel as dense
+from solidcloud.builder.voxel.cell_trees import build_trees
+from solidcloud.builder.voxel.coincident_points import heap_place, heap_trees, merge_runs
+from solidcloud.builder.voxel.dense_voxel import build_dense
+from solidcloud.builder.voxel.voxel_octree import VoxelPoints, build_voxel
 from solidcloud.schemas.kernels.morton import morton_code
 
 PLACE = (77, 5, 901)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from scans import WITH_POINTS, make_steps
-from solidcloud.builder.hierarchy import Hierarchy, build_hierarchy
+from solidcloud.builder.voxel.hierarchy import Hierarchy, build_hierarchy
 
 pytestmark = pytest.mark.interpreted
 

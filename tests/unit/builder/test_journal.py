@@ -4,10 +4,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import solidcloud.builder.journal as journal_module
-from solidcloud.builder.executor import ProcessExecutor
-from solidcloud.builder.journal import Journal, Work, new_file, remove_temporaries, resumed
-from solidcloud.builder.progress import Silent
+import solidcloud.builder.resume.journal as journal_module
+from solidcloud.builder.resume.journal import Journal, Work, new_file, remove_temporaries, resumed
+from solidcloud.builder.run.executor import ProcessExecutor
+from solidcloud.builder.run.progress import Silent
 
 
 def test_a_file_is_forgotten_by_its_name(tmp_path: Path) -> None:

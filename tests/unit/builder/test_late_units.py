@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import solidcloud.builder.passes as passes
+import solidcloud.builder.passes.resumable_passes as passes
 import solidcloud.builder.pipeline as pipeline
 from resumed import build, content, two_scans
-from solidcloud.builder.executor import ProcessExecutor
-from solidcloud.builder.journal import _Noting
-from solidcloud.builder.partition import SpoolUnit
-from solidcloud.builder.workplace import building_folder
+from solidcloud.builder.resume.build_directory import building_folder
+from solidcloud.builder.resume.journal import _Noting
+from solidcloud.builder.run.executor import ProcessExecutor
+from solidcloud.builder.spool.spool_pass import SpoolUnit
 
 
 @pytest.fixture

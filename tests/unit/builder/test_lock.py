@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from solidcloud.builder.lock import check_free, lock_path, locked
+from solidcloud.builder.resume.lock import check_free, lock_path, locked
 from solidcloud.schemas.errors import BadRequestError
 
 
@@ -36,7 +36,7 @@ def test_asking_whether_it_is_free_keeps_nobody_off(tmp_path: Path) -> None:
 
 def test_a_second_builder_loads_no_numpy(tmp_path: Path) -> None:
     code = (
-        "import sys; from solidcloud.server.cli import run; code = run(sys.argv[1:]); "
+        "import sys; from solidcloud.server.cli.main import run; code = run(sys.argv[1:]); "
         "sys.exit(code + 100 * ('numpy' in sys.modules))"
     )
     with open(lock_path(tmp_path / "hall"), "w") as lock:

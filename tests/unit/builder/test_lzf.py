@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from solidcloud.builder.kernels.lzf import FARTHEST_BACK, LONGEST_CODE, LONGEST_COPY, decode
+from solidcloud.builder.kernels.points.lzf_decoder import FARTHEST_BACK, LONGEST_CODE, LONGEST_COPY, decode
 
 pytestmark = pytest.mark.interpreted
 

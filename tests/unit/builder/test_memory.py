@@ -5,7 +5,7 @@ import re
 import numpy as np
 import pytest
 from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.memory import (
+from solidcloud.builder.run.memory_shares import (
     ALONE_BYTES,
     BUILDER_BYTES,
     CLUSTER_WORKER_BYTES,

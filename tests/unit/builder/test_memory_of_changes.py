@@ -13,20 +13,20 @@ from changes import EVERYTHING, OPTIONS, A, Build, Files, refused
 from changes import built as built  # the fixtures
 from changes import files as files
 from dense_voxels import KEY, rows_of, spooled
-from solidcloud.builder import added as added_module
-from solidcloud.builder import change as change_module
-from solidcloud.builder import memory
-from solidcloud.builder import rebuild as rebuild_module
-from solidcloud.builder import removed as removed_module
-from solidcloud.builder.change import Change
 from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.executor import ProcessExecutor
-from solidcloud.builder.generation import add_scans, remove_scans
+from solidcloud.builder.edit import added_scans as added_module
+from solidcloud.builder.edit import rebuild_voxels as rebuild_module
+from solidcloud.builder.edit import removed_scans as removed_module
+from solidcloud.builder.edit import transaction as change_module
+from solidcloud.builder.edit.edit_archive import add_scans, remove_scans
+from solidcloud.builder.edit.transaction import Change
 from solidcloud.builder.pipeline import SCRATCH_BYTES_A_POINT, build_archive
-from solidcloud.schemas.archive import Archive
+from solidcloud.builder.run import memory_shares as memory
+from solidcloud.builder.run.executor import ProcessExecutor
+from solidcloud.schemas.archive.archive import Archive
+from solidcloud.schemas.archive.voxel_grid import voxel_coordinates
+from solidcloud.schemas.archive.vtkhdf import PREVIEW_NAME
 from solidcloud.schemas.errors import SolidcloudError
-from solidcloud.schemas.voxel_grid import voxel_coordinates
-from solidcloud.schemas.vtkhdf import PREVIEW_NAME
 
 ADVICE = r"give --memory \d+MB, or build again with a smaller --voxel; the archive is what it was$"
 LEAST = 64 << 20

@@ -8,17 +8,17 @@ from typing import Any
 import numpy as np
 import pytest
 from scans import write_ply
-from solidcloud.builder.change import _read_back, _ReadUnit
 from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.memory import RECORD_BYTES, record_bytes_a_point
+from solidcloud.builder.edit.stored_points import FindUnit, GatherUnit, find_scans, gather
+from solidcloud.builder.edit.transaction import _read_back, _ReadUnit
+from solidcloud.builder.passes.point_spacing import _own_sums, _OwnUnit
+from solidcloud.builder.passes.preview import _choose
+from solidcloud.builder.passes.preview import _Unit as PreviewUnit
+from solidcloud.builder.passes.verify import _Unit as VerifyUnit
+from solidcloud.builder.passes.verify import _verify_rows
 from solidcloud.builder.pipeline import build_archive
-from solidcloud.builder.preview import _choose
-from solidcloud.builder.preview import _Unit as PreviewUnit
-from solidcloud.builder.spacing import _own_sums, _OwnUnit
-from solidcloud.builder.stored_points import FindUnit, GatherUnit, find_scans, gather
-from solidcloud.builder.verify import _Unit as VerifyUnit
-from solidcloud.builder.verify import _verify_rows
-from solidcloud.schemas.archive import Archive
+from solidcloud.builder.run.memory_shares import RECORD_BYTES, record_bytes_a_point
+from solidcloud.schemas.archive.archive import Archive
 
 FEW, MANY = 100_000, 250_000
 # Of all points so many are asked for the radius, or chosen for the preview, that they count as nothing.

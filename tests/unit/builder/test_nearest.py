@@ -5,15 +5,15 @@ import os
 import numpy as np
 import pytest
 from opened import open_points, open_scan, points_of
-from solidcloud.builder.kernels.nearest import (
+from solidcloud.builder.kernels.neighbours.nearest_points import (
     FAR,
     SearchTree,
     closest_in_record,
     closest_other,
 )
-from solidcloud.builder.octree import VoxelPoints
-from solidcloud.builder.record_points import leaves_of, spheres_of
-from solidcloud.schemas.codec import OpenRecord
+from solidcloud.builder.voxel.record_points import leaves_of, spheres_of
+from solidcloud.builder.voxel.voxel_octree import VoxelPoints
+from solidcloud.schemas.archive.codec import OpenRecord
 
 pytestmark = pytest.mark.interpreted
 interpreted_only = pytest.mark.skipif(

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scans import make_steps
-from solidcloud.builder.kernels.neighbours import (
+from solidcloud.builder.kernels.neighbours.nearest_neighbours import (
     BLOCK,
     FAN,
     STACK,
@@ -14,7 +14,7 @@ from solidcloud.builder.kernels.neighbours import (
     box_starts,
     closest_distinct,
 )
-from solidcloud.builder.kernels.octree import voxel_codes
+from solidcloud.builder.kernels.points.octree_cells import voxel_codes
 
 
 def in_morton_order(points: NDArray[np.int32]) -> NDArray[np.int32]:

@@ -8,20 +8,20 @@ import pytest
 import scans
 import small_builds
 from numpy.typing import NDArray
-from solidcloud.builder import dense
-from solidcloud.builder import normals as normals_module
 from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.generation import add_scans, remove_scans
-from solidcloud.builder.kernels.neighbours import BLOCK, FAN, bound_boxes, box_starts
-from solidcloud.builder.kernels.normals import box_sums
-from solidcloud.builder.kernels.octree import voxel_codes
-from solidcloud.builder.normals import voxel_normals
-from solidcloud.builder.radius import voxel_points
-from solidcloud.builder.verify import verify_archive
-from solidcloud.schemas.archive import Archive
+from solidcloud.builder.edit.edit_archive import add_scans, remove_scans
+from solidcloud.builder.kernels.neighbours.estimate_normals import box_sums
+from solidcloud.builder.kernels.neighbours.nearest_neighbours import BLOCK, FAN, bound_boxes, box_starts
+from solidcloud.builder.kernels.points.octree_cells import voxel_codes
+from solidcloud.builder.passes.verify import verify_archive
+from solidcloud.builder.voxel import dense_voxel as dense
+from solidcloud.builder.voxel import point_normals as normals_module
+from solidcloud.builder.voxel.point_normals import voxel_normals
+from solidcloud.builder.voxel.point_radius import voxel_points
+from solidcloud.schemas.archive.archive import Archive
+from solidcloud.schemas.archive.normal_reach import normal_reach
 from solidcloud.schemas.errors import BadRequestError, CorruptError
-from solidcloud.schemas.kernels.normals import NONE, normal_code
-from solidcloud.schemas.normals import normal_reach
+from solidcloud.schemas.kernels.normal_codes import NONE, normal_code
 
 pytestmark = pytest.mark.interpreted
 

@@ -4,11 +4,16 @@ import numpy as np
 import pytest
 from scans import WITH_POINTS, make_steps
 from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.kernels.octree import is_ascending, merge_order, split_octree, voxel_codes
-from solidcloud.builder.octree import VoxelPoints, build_voxel, gather_voxel
-from solidcloud.builder.spool import canonical_columns, row_codes
-from solidcloud.schemas.codec import encode_voxel
-from solidcloud.schemas.voxel import CELL_BITS, VoxelData, check_voxel
+from solidcloud.builder.kernels.points.octree_cells import (
+    is_ascending,
+    merge_order,
+    split_octree,
+    voxel_codes,
+)
+from solidcloud.builder.spool.spool import canonical_columns, row_codes
+from solidcloud.builder.voxel.voxel_octree import VoxelPoints, build_voxel, gather_voxel
+from solidcloud.schemas.archive.codec import encode_voxel
+from solidcloud.schemas.archive.voxel import CELL_BITS, VoxelData, check_voxel
 
 SIZES = [1000, 65536, 200_000, 1 << 21]
 

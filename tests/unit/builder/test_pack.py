@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 from scans import WITH_POINTS, make_steps
-from solidcloud.builder.hierarchy import Tree, build_hierarchy
-from solidcloud.builder.kernels.pack import heap_counts, most_nodes, pack_tree, sort_run
+from solidcloud.builder.kernels.trees.pack_tree import heap_counts, most_nodes, pack_tree, sort_run
+from solidcloud.builder.voxel.hierarchy import Tree, build_hierarchy
 
 pytestmark = pytest.mark.interpreted
 

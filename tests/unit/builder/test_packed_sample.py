@@ -6,11 +6,12 @@ import numpy as np
 import plan_kinds
 import pytest
 import scans
-from solidcloud.builder import packed_sample, sample
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import build_archive
-from solidcloud.builder.plan import GUESSED_WITHIN, MEASURED_WITHIN
-from solidcloud.builder.sample import planned
+from solidcloud.builder.plan import packed_sample
+from solidcloud.builder.plan import scan_sample as sample
+from solidcloud.builder.plan.build_plan import GUESSED_WITHIN, MEASURED_WITHIN
+from solidcloud.builder.plan.scan_sample import planned
 
 POINTS = 60_000
 ONE = BuildConfig(jobs=1)

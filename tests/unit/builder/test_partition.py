@@ -6,11 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import solidcloud.builder.partition as partition
+import solidcloud.builder.spool.spool_pass as partition
 from scans import make_scan
 from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.kernels.content import SEEDS, content_sum
-from solidcloud.builder.partition import (
+from solidcloud.builder.kernels.points.content_hash import SEEDS, content_sum
+from solidcloud.builder.sources.common.scan import Block, Scan
+from solidcloud.builder.spool.spool import Spool, places_sum, row_codes, spool_dtype, write_run
+from solidcloud.builder.spool.spool_pass import (
     RunsHold,
     Spooled,
     SpoolUnit,
@@ -22,10 +24,8 @@ from solidcloud.builder.partition import (
     spool_range,
     usable,
 )
-from solidcloud.builder.sources.scan import Block, Scan
-from solidcloud.builder.spool import Spool, places_sum, row_codes, spool_dtype, write_run
+from solidcloud.schemas.archive.voxel_grid import MAX_COORDINATE, Lattice, make_lattice, voxel_keys
 from solidcloud.schemas.errors import BadRequestError, ScanError
-from solidcloud.schemas.voxel_grid import MAX_COORDINATE, Lattice, make_lattice, voxel_keys
 
 
 class Listed(Scan):

@@ -8,15 +8,15 @@ import hdf5plugin  # noqa: F401  see test_two_jobs_write_the_bytes_of_one
 import numpy as np
 import pytest
 import solidcloud.builder.config as config
-import solidcloud.builder.partition as partition
+import solidcloud.builder.passes.survey as survey
 import solidcloud.builder.pipeline as pipeline
-import solidcloud.builder.survey as survey
+import solidcloud.builder.spool.spool_pass as partition
 from scans import make_scan, write_las, write_ply, write_xyz
 from small_builds import build, content, six_files
-from solidcloud.builder.verify import verify_archive
-from solidcloud.schemas.archive import Archive
+from solidcloud.builder.passes.verify import verify_archive
+from solidcloud.schemas.archive.archive import Archive
+from solidcloud.schemas.archive.shard import ZSTD_FILTER
 from solidcloud.schemas.errors import BadRequestError, ScanError
-from solidcloud.schemas.shard import ZSTD_FILTER
 
 
 def records(archive: Path) -> list[tuple[int, bytes, bytes]]:

@@ -11,13 +11,13 @@ import laspy
 import numpy as np
 import pytest
 import solidcloud.builder.config as config
-import solidcloud.builder.passes as passes
+import solidcloud.builder.passes.resumable_passes as passes
 import solidcloud.builder.pipeline as pipeline
 from scans import make_scan, write_las, write_ply, write_xyz
 from small_builds import build, content, six_files
 from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.verify import verify_archive
-from solidcloud.schemas.archive import Archive
+from solidcloud.builder.passes.verify import verify_archive
+from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.errors import BadRequestError, CorruptError, ScanError, SolidcloudError
 from solidcloud.server.scene import Scene
 

@@ -10,14 +10,15 @@ import numpy as np
 import pytest
 import scans
 from scans import write_xyz
-from solidcloud.builder import dense, sample
-from solidcloud.builder import plan as plans
 from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.measure import POINTS, measured, room
 from solidcloud.builder.pipeline import build_archive
-from solidcloud.builder.plan import Rates, Stage, dump_rates, estimate, imagined, load_rates
-from solidcloud.builder.sample import planned, seen_scene, unseen
-from solidcloud.builder.scan_list import Input, inputs
+from solidcloud.builder.plan import build_plan as plans
+from solidcloud.builder.plan import scan_sample as sample
+from solidcloud.builder.plan.build_plan import Rates, Stage, dump_rates, estimate, imagined, load_rates
+from solidcloud.builder.plan.build_rates import POINTS, measured, room
+from solidcloud.builder.plan.scan_sample import planned, seen_scene, unseen
+from solidcloud.builder.sources.scan_list import Input, inputs
+from solidcloud.builder.voxel import dense_voxel as dense
 from solidcloud.schemas.errors import BadRequestError, CorruptError, ScanError
 
 RATES = Rates(
@@ -274,8 +275,8 @@ def test_bytes_and_voxels_are_those_of_a_build_within_a_half(tmp_path: Path, vox
 
 
 def test_measuring_here_changes_times_and_nothing_else(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("solidcloud.builder.measure.POINTS", 20_000)
-    monkeypatch.setattr("solidcloud.builder.measure.READ_POINTS", 2_000)
+    monkeypatch.setattr("solidcloud.builder.plan.build_rates.POINTS", 20_000)
+    monkeypatch.setattr("solidcloud.builder.plan.build_rates.READ_POINTS", 2_000)
     rates = load_rates()
     found = measured(rates)
     assert POINTS == 1_000_000

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from solidcloud.builder.portions import jobs_of, portions, run_units
-from solidcloud.builder.progress import Silent
+from solidcloud.builder.run.progress import Silent
+from solidcloud.builder.run.work_units import jobs_of, portions, run_units
 
 M = 1 << 20
 

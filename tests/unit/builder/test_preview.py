@@ -5,16 +5,16 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-import solidcloud.builder.portions as portions
-import solidcloud.builder.preview as preview
+import solidcloud.builder.passes.preview as preview
+import solidcloud.builder.run.work_units as portions
 from scans import make_scan, write_ply
 from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.kernels.records import point_hashes
+from solidcloud.builder.kernels.points.voxel_records import point_hashes
+from solidcloud.builder.passes.preview import write_preview
+from solidcloud.builder.passes.verify import verify_archive
 from solidcloud.builder.pipeline import build_archive
-from solidcloud.builder.preview import write_preview
-from solidcloud.builder.verify import verify_archive
-from solidcloud.schemas.archive import Archive
-from solidcloud.schemas.vtkhdf import PREVIEW_NAME, read_points
+from solidcloud.schemas.archive.archive import Archive
+from solidcloud.schemas.archive.vtkhdf import PREVIEW_NAME, read_points
 
 
 @pytest.fixture(scope="module")

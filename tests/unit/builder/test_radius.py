@@ -5,17 +5,17 @@ import math
 import numpy as np
 import pytest
 from scans import make_scan, make_steps
-from solidcloud.builder import radius
 from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.octree import VoxelPoints, build_voxel
-from solidcloud.builder.radius import (
+from solidcloud.builder.voxel import point_radius as radius
+from solidcloud.builder.voxel.point_radius import (
     SUM_UNITS,
     build_local,
     mean_closest_distance,
     mean_of_squares,
     voxel_points,
 )
-from solidcloud.schemas.voxel import check_voxel
+from solidcloud.builder.voxel.voxel_octree import VoxelPoints, build_voxel
+from solidcloud.schemas.archive.voxel import check_voxel
 
 
 def test_sums_give_mean_and_standard_error() -> None:

@@ -26,7 +26,7 @@ from formats import (
 from scans import write_las
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import build_archive
-from solidcloud.schemas.archive import Archive
+from solidcloud.schemas.archive.archive import Archive
 
 STEP = 2.0**-10
 # Where the index speaks of scans; all else of it must be the same.

@@ -9,12 +9,12 @@ import scans
 from changes import EVERYTHING, A, B, Build, Files, refused
 from changes import built as built  # the fixtures
 from changes import files as files
-from solidcloud.builder import rebuild as rebuild_module
-from solidcloud.builder.change import Change
-from solidcloud.builder.generation import add_scans, remove_scans
-from solidcloud.schemas.archive import Archive
+from solidcloud.builder.edit import rebuild_voxels as rebuild_module
+from solidcloud.builder.edit.edit_archive import add_scans, remove_scans
+from solidcloud.builder.edit.transaction import Change
+from solidcloud.schemas.archive.archive import Archive
+from solidcloud.schemas.archive.shard import SHARD_FOLDER
 from solidcloud.schemas.errors import CorruptError
-from solidcloud.schemas.shard import SHARD_FOLDER
 
 ADVICE = "the data read back differ from the data written: check disk and memory.*the archive is what it was"
 OTHERS = f"the points built anew are not those that were stored and read: {ADVICE}"

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 from opened import open_points, open_scan, points_of
-from solidcloud.builder.kernels.content import SEEDS, content_sum
-from solidcloud.builder.kernels.records import (
+from solidcloud.builder.kernels.points.content_hash import SEEDS, content_sum
+from solidcloud.builder.kernels.points.voxel_records import (
     first_of_each,
     link_parents,
     measure_points,
@@ -12,9 +12,9 @@ from solidcloud.builder.kernels.records import (
     point_hashes,
     sum_places,
 )
-from solidcloud.builder.octree import VoxelPoints
-from solidcloud.builder.record_points import Taken, hash_limit, leaves_of, taken
-from solidcloud.schemas.codec import OpenRecord
+from solidcloud.builder.voxel.record_points import Taken, hash_limit, leaves_of, taken
+from solidcloud.builder.voxel.voxel_octree import VoxelPoints
+from solidcloud.schemas.archive.codec import OpenRecord
 
 pytestmark = pytest.mark.interpreted
 

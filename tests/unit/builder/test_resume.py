@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-import solidcloud.builder.passes as passes
+import solidcloud.builder.passes.resumable_passes as passes
 import solidcloud.builder.pipeline as pipeline
 from resumed import build, content, done_folder, interrupted, two_scans
 from scans import write_las
-from solidcloud.builder.scan_list import inputs
-from solidcloud.builder.sources.scan import Scan, library_errors
-from solidcloud.builder.workplace import building_folder
+from solidcloud.builder.resume.build_directory import building_folder
+from solidcloud.builder.sources.common.scan import Scan, library_errors
+from solidcloud.builder.sources.scan_list import inputs
 from solidcloud.schemas.errors import BadRequestError, CorruptError, ScanError, SolidcloudError
 
 

@@ -8,18 +8,18 @@ from typing import Any
 
 import numpy as np
 import pytest
-import solidcloud.builder.memory as memory
-import solidcloud.builder.passes as passes
+import solidcloud.builder.passes.resumable_passes as passes
 import solidcloud.builder.pipeline as pipeline
+import solidcloud.builder.run.memory_shares as memory
 from resumed import build, content, done_folder, interrupted, two_scans
 from scans import make_scan, write_las, write_xyz
 from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.resume import check_same, described
-from solidcloud.builder.scan_list import Input, inputs, inspect, write_scan_list
-from solidcloud.builder.software import software
-from solidcloud.builder.workplace import building_folder
+from solidcloud.builder.resume.build_directory import building_folder
+from solidcloud.builder.resume.build_identity import check_same, described
+from solidcloud.builder.run.software import software
+from solidcloud.builder.sources.scan_list import Input, inputs, inspect, write_scan_list
 from solidcloud.schemas.errors import BadRequestError, ScanError
-from solidcloud.server.cli import run
+from solidcloud.server.cli.main import run
 
 
 @pytest.fixture
@@ -88,7 +88,7 @@ def test_other_software_is_refused(
 ) -> None:
     interrupted(tmp_path / "hall", scans, monkeypatch)
     other = {**software(), "h5py": "0.1"}
-    monkeypatch.setattr("solidcloud.builder.resume.software", lambda: other)
+    monkeypatch.setattr("solidcloud.builder.resume.build_identity.software", lambda: other)
     expected = rf"begun with other software: h5py {software()['h5py']}, now 0\.1: use .*--fresh to start over"
     with pytest.raises(BadRequestError, match=expected):
         build(tmp_path / "hall", scans)

@@ -11,12 +11,12 @@ import pytest
 import scans
 import tomli_w
 from formats import glb_document, glb_vertices, ptx_scan, write_e57, write_glb
-from solidcloud.builder import scan_list
-from solidcloud.builder.scan_list import ScanEntry, inputs, inspect, read_scan_list, write_scan_list
-from solidcloud.builder.sources.scan import library_errors, sha256_of
-from solidcloud.schemas.archive import Archive
+from solidcloud.builder.sources import scan_list
+from solidcloud.builder.sources.common.scan import library_errors, sha256_of
+from solidcloud.builder.sources.scan_list import ScanEntry, inputs, inspect, read_scan_list, write_scan_list
+from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.errors import BadRequestError, ScanError, SolidcloudError
-from solidcloud.server.cli import run
+from solidcloud.server.cli.main import run
 
 POSE = np.array([[0.0, -1, 0, 10], [1, 0, 0, 20], [0, 0, 1, 30], [0, 0, 0, 1]])
 

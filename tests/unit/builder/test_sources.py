@@ -24,8 +24,8 @@ from formats import (
     write_pcd,
     write_pts,
 )
-from solidcloud.builder.sources.files import READERS, header_bounds, open_scans, scan_files
-from solidcloud.builder.sources.scan import Scan, sha256_of
+from solidcloud.builder.sources.common.scan import Scan, sha256_of
+from solidcloud.builder.sources.scan_files import READERS, header_bounds, open_scans, scan_files
 from solidcloud.schemas.errors import BadRequestError, ScanError
 
 COUNT = 1000  # no multiple of the small block, 7
@@ -262,7 +262,7 @@ def test_memory_is_that_of_a_block_and_not_of_the_file(
     """Of 30,000 points, 0.7 MB as float64, in blocks of 500; text in pieces of 16 kB."""
     for module in ("rows", "counted"):
         monkeypatch.setattr(f"solidcloud.builder.sources.{module}.CHUNK_BYTES", 1 << 14)
-    monkeypatch.setattr("solidcloud.builder.sources.lzf.PIECE_BYTES", 1 << 12)
+    monkeypatch.setattr("solidcloud.builder.sources.formats.lzf.PIECE_BYTES", 1 << 12)
     rng = np.random.default_rng(3)
     count = 30_016  # three points a triangle and one; whole columns of 8
     many = Truth(rng.uniform(-50, 50, (count, 3)), rng.integers(0, 99, count).astype(np.float32))

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from broken_scans import with_checksums
 from formats import cartesian, write_e57
-from solidcloud.builder.scan_list import inspect
-from solidcloud.builder.sources.files import header_bounds, open_scans
+from solidcloud.builder.sources.scan_files import header_bounds, open_scans
+from solidcloud.builder.sources.scan_list import inspect
 from solidcloud.schemas.errors import ScanError
 
 

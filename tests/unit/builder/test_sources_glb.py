@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from formats import glb_document, glb_vertices, write_glb
-from solidcloud.builder.sources import glb
-from solidcloud.builder.sources.files import open_scans
+from solidcloud.builder.sources.formats import glb
+from solidcloud.builder.sources.scan_files import open_scans
 from solidcloud.schemas.errors import ScanError
 
 SQUARE = np.array([[0.0, 0, 1], [2, 0, 1], [2, 2, 1], [0, 2, 1]])

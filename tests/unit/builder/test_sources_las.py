@@ -7,8 +7,8 @@ import laspy
 import numpy as np
 import pytest
 from broken_scans import SEEDS
-from solidcloud.builder.sources.files import header_bounds, open_scans
-from solidcloud.builder.sources.scan import Lattice
+from solidcloud.builder.sources.common.scan import Lattice
+from solidcloud.builder.sources.scan_files import header_bounds, open_scans
 from solidcloud.schemas.errors import ScanError
 
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from solidcloud.builder.sources.files import open_scans
+from solidcloud.builder.sources.scan_files import open_scans
 from solidcloud.schemas.errors import ScanError
 
 

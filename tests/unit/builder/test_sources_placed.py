@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import scans
 from formats import ptx_scan, write_e57
-from solidcloud.builder.sources.files import open_scans
-from solidcloud.builder.sources.placed import METRES, TURNS, placed
-from solidcloud.builder.sources.scan import Scan
+from solidcloud.builder.sources.common.scan import Scan
+from solidcloud.builder.sources.placed_scan import METRES, TURNS, placed
+from solidcloud.builder.sources.scan_files import open_scans
 
 TURN = np.array([[0.0, -1, 0, 10], [1, 0, 0, 20], [0, 0, 1, 30], [0, 0, 0, 1]])
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import plyfile
 import pytest
-from solidcloud.builder.sources.files import open_scans
+from solidcloud.builder.sources.scan_files import open_scans
 from solidcloud.schemas.errors import ScanError
 
 

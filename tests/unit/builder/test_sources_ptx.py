@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from formats import ptx_scan, text_rows, write_pts
-from solidcloud.builder.sources.files import open_scans
+from solidcloud.builder.sources.scan_files import open_scans
 from solidcloud.schemas.errors import ScanError
 
 POSE = np.array([[0.0, -1.0, 0.0, 10.0], [1.0, 0.0, 0.0, 20.0], [0.0, 0.0, 1.0, 30.0], [0, 0, 0, 1]])
-CHUNK = "solidcloud.builder.sources.counted.CHUNK_BYTES"
+CHUNK = "solidcloud.builder.sources.common.counted_rows.CHUNK_BYTES"
 
 
 def points(seed: int, count: int = 60) -> tuple[np.ndarray, np.ndarray]:

@@ -9,7 +9,7 @@ import numpy as np
 import plyfile
 import pye57
 import pytest
-from solidcloud.builder.sources.files import open_scans, scan_files
+from solidcloud.builder.sources.scan_files import open_scans, scan_files
 from solidcloud.schemas.errors import ScanError
 
 FOLDER = os.environ.get("SOLIDCLOUD_SCANS")

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import build_archive
-from solidcloud.builder.scan_list import inspect
-from solidcloud.builder.sources.files import open_scans
-from solidcloud.builder.sources.rows import LONGEST_LINE, number_rows
+from solidcloud.builder.sources.common.text_rows import LONGEST_LINE, number_rows
+from solidcloud.builder.sources.scan_files import open_scans
+from solidcloud.builder.sources.scan_list import inspect
 from solidcloud.schemas.errors import ScanError
 
 
@@ -96,7 +96,7 @@ def test_text_is_read_right_across_chunks(tmp_path: Path, monkeypatch: pytest.Mo
     xyz = np.random.default_rng(5).normal(size=(300, 3)).round(6)
     lines = [f"{x} {y} {z}" for x, y, z in xyz.tolist()]
     path.write_text("\n".join(lines))
-    monkeypatch.setattr("solidcloud.builder.sources.rows.CHUNK_BYTES", 100)
+    monkeypatch.setattr("solidcloud.builder.sources.common.text_rows.CHUNK_BYTES", 100)
     assert np.array_equal(read_all(path), xyz)
     lines[222] = "1 2"
     path.write_text("\n".join(lines))

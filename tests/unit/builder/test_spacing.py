@@ -7,20 +7,20 @@ from typing import Any
 
 import numpy as np
 import pytest
+import solidcloud.builder.passes.point_spacing as spacing
 import solidcloud.builder.pipeline as pipeline
-import solidcloud.builder.portions as portions
-import solidcloud.builder.spacing as spacing
+import solidcloud.builder.run.work_units as portions
 from scans import make_steps, write_xyz
 from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.kernels.boxes import make_box_tree
-from solidcloud.builder.kernels.nearest import FAR
-from solidcloud.builder.kernels.records import point_hash
+from solidcloud.builder.kernels.neighbours.box_tree import make_box_tree
+from solidcloud.builder.kernels.neighbours.nearest_points import FAR
+from solidcloud.builder.kernels.points.voxel_records import point_hash
+from solidcloud.builder.passes.point_spacing import Open, Sums, archive_mean, settle, sums_of
 from solidcloud.builder.pipeline import build_archive
-from solidcloud.builder.progress import Progress, Silent
-from solidcloud.builder.radius import SUM_UNITS
-from solidcloud.builder.spacing import Open, Sums, archive_mean, settle, sums_of
-from solidcloud.schemas.archive import Archive
-from solidcloud.schemas.index import Header
+from solidcloud.builder.run.progress import Progress, Silent
+from solidcloud.builder.voxel.point_radius import SUM_UNITS
+from solidcloud.schemas.archive.archive import Archive
+from solidcloud.schemas.archive.index import Header
 
 STEP = 0.001
 

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import solidcloud.builder.spool as spool_module
+import solidcloud.builder.spool.spool as spool_module
 from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.spool import (
+from solidcloud.builder.spool.spool import (
     KEYS_SUFFIX,
     Spool,
     is_other_run,
@@ -20,9 +20,9 @@ from solidcloud.builder.spool import (
     write_directory,
     write_run,
 )
+from solidcloud.schemas.archive.shard import file_checksum
+from solidcloud.schemas.archive.voxel_grid import make_lattice
 from solidcloud.schemas.errors import CorruptError
-from solidcloud.schemas.shard import file_checksum
-from solidcloud.schemas.voxel_grid import make_lattice
 
 LATTICE = make_lattice((0, 0, 0), 0.001, 0.1)
 KEYS = np.array([3, 7, 1 << 61], np.uint64)

@@ -4,8 +4,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from solidcloud.builder.kernels.content import content_sum
-from solidcloud.builder.kernels.spool import (
+from solidcloud.builder.kernels.points.content_hash import content_sum
+from solidcloud.builder.kernels.points.spool_rows import (
     CHUNK,
     FREE,
     fill_local,
@@ -15,7 +15,7 @@ from solidcloud.builder.kernels.spool import (
     scatter,
     usable_bounds,
 )
-from solidcloud.schemas.voxel_grid import KEY_BIAS, Lattice, make_lattice, voxel_keys
+from solidcloud.schemas.archive.voxel_grid import KEY_BIAS, Lattice, make_lattice, voxel_keys
 
 pytestmark = pytest.mark.interpreted
 

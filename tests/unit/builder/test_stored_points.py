@@ -6,10 +6,11 @@ from typing import Any
 import numpy as np
 import pytest
 from dense_voxels import KEY, rows_of, spooled
-from solidcloud.builder import dense, stored_points
-from solidcloud.builder.classes import voxel_classes
 from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.stored_points import FewUnit, count_few
+from solidcloud.builder.edit import stored_points
+from solidcloud.builder.edit.stored_points import FewUnit, count_few
+from solidcloud.builder.passes.radius_classes import voxel_classes
+from solidcloud.builder.voxel import dense_voxel as dense
 
 
 def test_points_with_too_few_neighbours_are_counted_a_part_at_a_time(

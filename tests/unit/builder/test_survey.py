@@ -5,13 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import solidcloud.builder.survey as survey_module
+import solidcloud.builder.passes.survey as survey_module
 from scans import make_scan, write_las, write_xyz
 from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.sources.files import open_scans
-from solidcloud.builder.sources.scan import Block, Scan
-from solidcloud.builder.sources.scan import Lattice as SourceLattice
-from solidcloud.builder.survey import (
+from solidcloud.builder.passes.survey import (
     Survey,
     choose_lattice,
     dump_part,
@@ -22,8 +19,11 @@ from solidcloud.builder.survey import (
     survey_range,
     survey_scan,
 )
+from solidcloud.builder.sources.common.scan import Block, Scan
+from solidcloud.builder.sources.common.scan import Lattice as SourceLattice
+from solidcloud.builder.sources.scan_files import open_scans
+from solidcloud.schemas.archive.voxel_grid import MAX_COORDINATE
 from solidcloud.schemas.errors import BadRequestError, ScanError, SolidcloudError
-from solidcloud.schemas.voxel_grid import MAX_COORDINATE
 
 
 class Listed(Scan):

@@ -6,12 +6,12 @@ import math
 import numpy as np
 import pytest
 from scans import make_steps
-from solidcloud.builder.cells import CellTrees, build_trees, take_cells
 from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.kernels.octree import split_octree
-from solidcloud.builder.kernels.top import guess_bounds
-from solidcloud.builder.octree import VoxelPoints, canonical
-from solidcloud.builder.top import Top, pack_top
+from solidcloud.builder.kernels.points.octree_cells import split_octree
+from solidcloud.builder.kernels.trees.top_bounds import guess_bounds
+from solidcloud.builder.voxel.cell_trees import CellTrees, build_trees, take_cells
+from solidcloud.builder.voxel.top_hierarchy import Top, pack_top
+from solidcloud.builder.voxel.voxel_octree import VoxelPoints, canonical
 
 pytestmark = pytest.mark.interpreted
 

@@ -4,8 +4,14 @@ import itertools
 
 import numpy as np
 import pytest
-from solidcloud.builder.kernels.top import _join_extremes, _stored_center, grow_bounds, leaf_rows, take_runs
-from solidcloud.builder.kernels.trees import DIRECTIONS, EXTREMES
+from solidcloud.builder.kernels.trees.build_tree import DIRECTIONS, EXTREMES
+from solidcloud.builder.kernels.trees.top_bounds import (
+    _join_extremes,
+    _stored_center,
+    grow_bounds,
+    leaf_rows,
+    take_runs,
+)
 
 pytestmark = pytest.mark.interpreted
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from changes import built as built  # the fixtures
 from changes import files as files
-from solidcloud.builder.touched import within_reach
+from solidcloud.builder.edit.affected_voxels import within_reach
 
 
 def test_within_reach_holds_boxes_against_those_around_them(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,10 +5,10 @@ import itertools
 import numpy as np
 import pytest
 from scans import make_steps
-from solidcloud.builder.cells import CellTrees, block_points, build_trees, leaf_runs, take_cells
 from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.hierarchy import build_hierarchy
-from solidcloud.builder.kernels.trees import DIRECTIONS, EXTREMES
+from solidcloud.builder.kernels.trees.build_tree import DIRECTIONS, EXTREMES
+from solidcloud.builder.voxel.cell_trees import CellTrees, block_points, build_trees, leaf_runs, take_cells
+from solidcloud.builder.voxel.hierarchy import build_hierarchy
 
 pytestmark = pytest.mark.interpreted
 

@@ -8,15 +8,15 @@ from typing import Any
 import numpy as np
 import pytest
 import scans
-from solidcloud.builder import export as export_module
-from solidcloud.builder import verify as verify_module
 from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.export import export_archive
-from solidcloud.builder.generation import add_scans
+from solidcloud.builder.edit.edit_archive import add_scans
+from solidcloud.builder.export import export_archive as export_module
+from solidcloud.builder.export.export_archive import export_archive
+from solidcloud.builder.passes import verify as verify_module
+from solidcloud.builder.passes.unchanged_archive import unchanged
+from solidcloud.builder.passes.verify import verify_archive
 from solidcloud.builder.pipeline import build_archive
-from solidcloud.builder.unchanged import unchanged
-from solidcloud.builder.verify import verify_archive
-from solidcloud.schemas.archive import Archive
+from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.errors import BadRequestError, CorruptError, SolidcloudError
 
 

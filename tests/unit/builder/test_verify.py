@@ -9,24 +9,24 @@ from typing import Any
 
 import numpy as np
 import pytest
-import solidcloud.builder.portions as portions
+import solidcloud.builder.run.work_units as portions
 from opened import points_of
 from scans import WITH_POINTS, make_scan, write_ply, write_xyz
 from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.exact import loose_nodes, sample_nodes
+from solidcloud.builder.passes.point_spacing import archive_mean
+from solidcloud.builder.passes.verify import verify_archive
 from solidcloud.builder.pipeline import build_archive
-from solidcloud.builder.spacing import archive_mean
-from solidcloud.builder.spool import places_sum
-from solidcloud.builder.verify import verify_archive
-from solidcloud.schemas.archive import Archive
-from solidcloud.schemas.codec import encode_voxel
+from solidcloud.builder.spool.spool import places_sum
+from solidcloud.builder.voxel.exact_enclosure import loose_nodes, sample_nodes
+from solidcloud.schemas.archive.archive import Archive
+from solidcloud.schemas.archive.codec import encode_voxel
+from solidcloud.schemas.archive.index import Header
+from solidcloud.schemas.archive.index_file import write_index
+from solidcloud.schemas.archive.radius_model import RADIUS_CLASSES
+from solidcloud.schemas.archive.shard import shard_name, write_shard
+from solidcloud.schemas.archive.voxel import VoxelData
 from solidcloud.schemas.errors import BadRequestError, FormatError
-from solidcloud.schemas.index import Header
-from solidcloud.schemas.index_file import write_index
-from solidcloud.schemas.radius_model import RADIUS_CLASSES
-from solidcloud.schemas.shard import shard_name, write_shard
-from solidcloud.schemas.voxel import VoxelData
-from solidcloud.server.cli import run
+from solidcloud.server.cli.main import run
 
 
 @pytest.fixture(scope="module")

@@ -5,8 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from solidcloud.builder.journal import Journal, new_file
-from solidcloud.builder.workplace import (
+from solidcloud.builder.resume.build_directory import (
     Workplace,
     building_folder,
     check_target,
@@ -15,6 +14,7 @@ from solidcloud.builder.workplace import (
     remove_building,
     workplace,
 )
+from solidcloud.builder.resume.journal import Journal, new_file
 from solidcloud.schemas.errors import BadRequestError, CorruptError, ScanError, SolidcloudError
 
 WHAT: dict[str, Any] = {"software": {"resume": 1}, "options": {"voxel": 8.0}, "inputs": []}
@@ -101,7 +101,7 @@ def test_a_build_that_cannot_be_forgotten_is_not_gone_on_with(
 ) -> None:
     failed(tmp_path / "hall", KeyboardInterrupt(), surveyed=True)
     with monkeypatch.context() as patch:
-        patch.setattr("solidcloud.builder.workplace.shutil.rmtree", lambda *_, **__: None)
+        patch.setattr("solidcloud.builder.resume.build_directory.shutil.rmtree", lambda *_, **__: None)
         with (
             pytest.raises(
                 SolidcloudError, match=r"build\.json: cannot be removed, as --fresh requires.* by hand"
@@ -167,7 +167,7 @@ def test_the_note_of_what_it_is_is_removed_last(tmp_path: Path, monkeypatch: pyt
             late.note("survey/2", {})
         seen.append((folder / "build.json").exists() and path != folder)
 
-    monkeypatch.setattr("solidcloud.builder.workplace.shutil.rmtree", watched)
+    monkeypatch.setattr("solidcloud.builder.resume.build_directory.shutil.rmtree", watched)
     remove_building(folder)
     assert seen == [True, False]
 

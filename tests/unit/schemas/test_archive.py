@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from six_scans import LATER, dataset, rewrite_index, rows_of
 from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.radius import voxel_points
-from solidcloud.schemas.archive import Archive
+from solidcloud.builder.voxel.point_radius import voxel_points
+from solidcloud.schemas.archive.archive import Archive
+from solidcloud.schemas.archive.index import RadiusNow
+from solidcloud.schemas.archive.index_file import write_index
 from solidcloud.schemas.errors import FormatError
-from solidcloud.schemas.index import RadiusNow
-from solidcloud.schemas.index_file import write_index
 
 
 def test_the_index_tells_what_went_in(built: Path) -> None:

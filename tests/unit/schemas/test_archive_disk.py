@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from solidcloud.schemas.new_file import new_file, publish
+from solidcloud.schemas.process.new_file import new_file, publish
 
 
 def write(path: Path, datasets: int = 40) -> None:

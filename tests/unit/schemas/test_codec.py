@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from opened import ARCHIVE_ID, KEY, assert_same_bits, decode, kept, shape_of
 from scans import WITH_POINTS, make_steps
 from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.octree import VoxelPoints, build_voxel
-from solidcloud.schemas.codec import OPTIONAL_COLUMNS, encode_voxel
-from solidcloud.schemas.voxel import VoxelData
+from solidcloud.builder.voxel.voxel_octree import VoxelPoints, build_voxel
+from solidcloud.schemas.archive.codec import OPTIONAL_COLUMNS, encode_voxel
+from solidcloud.schemas.archive.voxel import VoxelData
 
 INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
 

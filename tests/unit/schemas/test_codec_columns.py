@@ -5,11 +5,11 @@ import pytest
 from opened import ARCHIVE_ID, KEY, assert_same_bits, decode, kept, shape_of
 from scans import make_steps
 from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.octree import VoxelPoints, build_voxel
-from solidcloud.schemas.codec import OPTIONAL_COLUMNS, encode_voxel, open_record
+from solidcloud.builder.voxel.voxel_octree import VoxelPoints, build_voxel
+from solidcloud.schemas.archive.codec import OPTIONAL_COLUMNS, encode_voxel, open_record
+from solidcloud.schemas.archive.radius_model import RADIUS_CLASSES
+from solidcloud.schemas.archive.voxel import MAX_LEAF, VoxelData, link_nodes
 from solidcloud.schemas.errors import CorruptError
-from solidcloud.schemas.radius_model import RADIUS_CLASSES
-from solidcloud.schemas.voxel import MAX_LEAF, VoxelData, link_nodes
 
 
 @pytest.mark.interpreted

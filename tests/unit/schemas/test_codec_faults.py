@@ -8,10 +8,10 @@ import zstandard
 from opened import ARCHIVE_ID, KEY, assert_same_bits, decode, shape_of
 from scans import make_steps
 from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.octree import VoxelPoints, build_voxel
-from solidcloud.schemas.codec import Record, encode_voxel
+from solidcloud.builder.voxel.voxel_octree import VoxelPoints, build_voxel
+from solidcloud.schemas.archive.codec import Record, encode_voxel
+from solidcloud.schemas.archive.voxel import VoxelData, link_nodes
 from solidcloud.schemas.errors import CorruptError
-from solidcloud.schemas.voxel import VoxelData, link_nodes
 
 
 @pytest.fixture(scope="module")

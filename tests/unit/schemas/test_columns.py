@@ -5,7 +5,8 @@ from itertools import pairwise
 import msgspec
 import numpy as np
 import pytest
-from solidcloud.schemas.answers import (
+from solidcloud.schemas.errors import InternalError
+from solidcloud.schemas.wire.answers import (
     PARTS,
     CollideAnswers,
     ContactsAnswers,
@@ -16,10 +17,9 @@ from solidcloud.schemas.answers import (
     Verdict,
     WithinAnswers,
 )
-from solidcloud.schemas.arrays import array_fields
-from solidcloud.schemas.columns import as_part, check_answers, in_pieces, join, unknown, without_part
-from solidcloud.schemas.errors import InternalError
-from solidcloud.schemas.messages import JSON, MSGPACK, decode_answer, encode
+from solidcloud.schemas.wire.arrays import array_fields
+from solidcloud.schemas.wire.columns import as_part, check_answers, in_pieces, join, unknown, without_part
+from solidcloud.schemas.wire.messages import JSON, MSGPACK, decode_answer, encode
 
 KINDS = [
     CollideAnswers,

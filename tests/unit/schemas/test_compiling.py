@@ -11,8 +11,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from solidcloud.schemas.kernel_files import KernelFiles
 from solidcloud.schemas.kernels.compiling import njit
+from solidcloud.schemas.kernels.kernel_files import KernelFiles
 
 pytestmark = pytest.mark.skipif(
     os.environ.get("NUMBA_DISABLE_JIT") == "1", reason="interpreted kernels are not kept"

@@ -11,14 +11,14 @@ from scans import make_scan, write_xyz
 from six_scans import LATER, dataset, rows_of
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import build_archive
-from solidcloud.builder.radius import voxel_points
-from solidcloud.schemas import index as index_module
-from solidcloud.schemas.archive import Archive
-from solidcloud.schemas.index import VOXEL_DTYPE
-from solidcloud.schemas.radius_model import LOCAL_RADII
-from solidcloud.schemas.shard import shard_name
+from solidcloud.builder.voxel.point_radius import voxel_points
+from solidcloud.schemas.archive import index as index_module
+from solidcloud.schemas.archive.archive import Archive
+from solidcloud.schemas.archive.index import VOXEL_DTYPE
+from solidcloud.schemas.archive.radius_model import LOCAL_RADII
+from solidcloud.schemas.archive.shard import shard_name
 
-FORMAT = Path(index_module.__file__).with_name("FORMAT.md")
+FORMAT = Path(index_module.__file__).parents[1] / "FORMAT.md"
 
 
 def worked_example() -> str:

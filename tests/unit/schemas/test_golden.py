@@ -10,13 +10,13 @@ import naive_normals
 import numpy as np
 import pytest
 from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.generation import add_scans, remove_scans
+from solidcloud.builder.edit.edit_archive import add_scans, remove_scans
+from solidcloud.builder.passes.verify import verify_archive
 from solidcloud.builder.pipeline import build_archive
-from solidcloud.builder.radius import voxel_points
-from solidcloud.builder.verify import verify_archive
-from solidcloud.schemas.archive import Archive
-from solidcloud.schemas.kernels.normals import LINE, THICK, decode_normal
-from solidcloud.schemas.radius_model import RADIUS_CLASSES, RIM_BIT
+from solidcloud.builder.voxel.point_radius import voxel_points
+from solidcloud.schemas.archive.archive import Archive
+from solidcloud.schemas.archive.radius_model import RADIUS_CLASSES, RIM_BIT
+from solidcloud.schemas.kernels.normal_codes import LINE, THICK, decode_normal
 
 GOLDEN = Path(__file__).resolve().parents[2] / "golden"
 

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from solidcloud.schemas.archive import Archive
-from solidcloud.schemas.index import Header, Source, index_columns, read_header
+from solidcloud.schemas.archive.archive import Archive
+from solidcloud.schemas.archive.index import Header, Source, index_columns, read_header
 
 GOLDEN = Path(__file__).resolve().parents[2] / "golden"
 

@@ -11,8 +11,8 @@ import pytest
 from forged import Columns, bomb, forge, put_frame, read_index, write_index
 from scans import make_scan, write_xyz
 from small_builds import build
-from solidcloud.builder.verify import verify_archive
-from solidcloud.schemas.archive import Archive
+from solidcloud.builder.passes.verify import verify_archive
+from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.errors import CorruptError, FormatError
 
 Change = Callable[[Columns], None]

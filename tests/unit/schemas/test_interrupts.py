@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from solidcloud.schemas import interrupts
-from solidcloud.schemas.interrupts import Interrupted, came, check, children_ignore, kept_back, taken
-from solidcloud.schemas.new_file import new_file
+from solidcloud.schemas.process import interrupts
+from solidcloud.schemas.process.interrupts import Interrupted, came, check, children_ignore, kept_back, taken
+from solidcloud.schemas.process.new_file import new_file
 
 
 @pytest.fixture(autouse=True)

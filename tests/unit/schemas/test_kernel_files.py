@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 
 import pytest
-from solidcloud.schemas.kernel_files import KernelFiles, default_folder
+from solidcloud.schemas.kernels.kernel_files import KernelFiles, default_folder
 
 NAME = "a.b-0.kernel"
 PAYLOAD = bytes(range(256)) * 8
@@ -122,7 +122,7 @@ def test_a_file_that_may_not_be_read_is_removed() -> None:
     code = (
         "import os, sys\n"
         "from pathlib import Path\n"
-        "from solidcloud.schemas.kernel_files import KernelFiles\n"
+        "from solidcloud.schemas.kernels.kernel_files import KernelFiles\n"
         "os.setgroups([]), os.setgid(65534), os.setuid(65534)\n"
         "files = KernelFiles(Path(sys.argv[1]))\n"
         "files.write('a.kernel', b'old')\n"
@@ -183,7 +183,7 @@ def test_a_full_disk_leaves_nothing(folder: Path, caplog: pytest.LogCaptureFixtu
     code = (
         "import resource, signal, sys\n"
         "from pathlib import Path\n"
-        "from solidcloud.schemas.kernel_files import KernelFiles\n"
+        "from solidcloud.schemas.kernels.kernel_files import KernelFiles\n"
         "files = KernelFiles(Path(sys.argv[1]))\n"
         "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))\n"  # as a full disk: an OSError in mid-write
@@ -239,7 +239,7 @@ def test_a_start_that_was_killed_is_noticed_once(files: KernelFiles, folder: Pat
     code = (
         "import sys, time\n"
         "from pathlib import Path\n"
-        "from solidcloud.schemas.kernel_files import KernelFiles\n"
+        "from solidcloud.schemas.kernels.kernel_files import KernelFiles\n"
         "with KernelFiles(Path(sys.argv[1])).starting():\n"
         "    print('inside', flush=True)\n"
         "    time.sleep(60)\n"

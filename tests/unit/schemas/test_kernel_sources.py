@@ -7,20 +7,20 @@ from pathlib import Path
 
 import pytest
 import solidcloud
-from solidcloud.schemas import kernel_sources
-from solidcloud.schemas.kernel_sources import source_digest
+from solidcloud.schemas.kernels import kernel_sources
+from solidcloud.schemas.kernels.kernel_sources import source_digest
 
 CODE = """
 import sys, importlib
 sys.path.insert(0, sys.argv[1])
-from solidcloud.schemas.kernel_sources import source_digest
+from solidcloud.schemas.kernels.kernel_sources import source_digest
 print(*[source_digest(name).hex() for name in sys.argv[2:]])
 """
 MODULES = [
-    "server.kernels.overlap",
-    "server.kernels.moments",
+    "server.kernels.overlap.overlap",
+    "server.kernels.motion.contact_times",
     "schemas.kernels.morton",
-    "builder.kernels.pack",
+    "builder.kernels.trees.pack_tree",
 ]
 
 
@@ -52,12 +52,18 @@ def test_an_edit_invalidates_what_depends_on_it_and_no_more(copy: Path) -> None:
         before.update(after)
         return found
 
-    assert changed("server/kernels/overlap.py") == {"server.kernels.overlap"}
-    assert changed("server/kernels/placing.py") == {"server.kernels.overlap", "server.kernels.moments"}
+    assert changed("server/kernels/overlap/overlap.py") == {"server.kernels.overlap.overlap"}
+    assert changed("server/kernels/core/pose_transform.py") == {
+        "server.kernels.overlap.overlap",
+        "server.kernels.motion.contact_times",
+    }
     assert changed("schemas/kernels/compiling.py") == set(MODULES)
-    assert changed("builder/kernels/pack.py") == {"builder.kernels.pack"}
+    assert changed("builder/kernels/trees/pack_tree.py") == {"builder.kernels.trees.pack_tree"}
     # A constant of a module that holds no kernel.
-    assert changed("schemas/voxel_grid.py") == {"server.kernels.overlap", "server.kernels.moments"}
+    assert changed("schemas/archive/voxel_grid.py") == {
+        "server.kernels.overlap.overlap",
+        "server.kernels.motion.contact_times",
+    }
     assert changed("server/scene.py") == set()
 
 
@@ -66,8 +72,8 @@ def test_the_place_of_the_package_does_not_count(copy: Path) -> None:
 
 
 def test_imports_over_several_lines_are_found() -> None:
-    """server/kernels/overlap.py imports server/kernels/placed.py in parentheses."""
-    reached = kernel_sources._reached(("server", "kernels", "overlap"))
+    """server/kernels/overlap/overlap.py imports server/kernels/core/placed_avatar.py in parentheses."""
+    reached = kernel_sources._reached(("server", "kernels", "overlap", "overlap"))
     assert {("server", "kernels", "placed"), ("schemas", "kernels", "compiling")} <= reached
 
 

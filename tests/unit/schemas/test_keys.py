@@ -1,9 +1,9 @@
 """Key expressions: what they look like, and what may not stand in one."""
 
 import pytest
-from solidcloud.schemas import keys
 from solidcloud.schemas.errors import BadRequestError
-from solidcloud.schemas.messages import WIRE_VERSION
+from solidcloud.schemas.wire import keys
+from solidcloud.schemas.wire.messages import WIRE_VERSION
 
 
 def test_keys_look_as_in_the_document():

@@ -8,11 +8,12 @@ from types import SimpleNamespace
 import msgspec
 import numpy as np
 import pytest
-from solidcloud.schemas import messages
-from solidcloud.schemas.answers import CollideAnswers, Verdict
-from solidcloud.schemas.columns import unknown
 from solidcloud.schemas.errors import BadRequestError, InternalError, TooLargeError
-from solidcloud.schemas.messages import (
+from solidcloud.schemas.scene.scene_file import json_schema
+from solidcloud.schemas.wire import messages
+from solidcloud.schemas.wire.answers import CollideAnswers, Verdict
+from solidcloud.schemas.wire.columns import unknown
+from solidcloud.schemas.wire.messages import (
     JSON,
     MSGPACK,
     AddAvatarRequest,
@@ -31,10 +32,9 @@ from solidcloud.schemas.messages import (
     make_positions,
     wire_encoding,
 )
-from solidcloud.schemas.requests import Request
-from solidcloud.schemas.scene import json_schema
+from solidcloud.schemas.wire.requests import Request
 
-SCHEMAS = Path(messages.__file__).parent
+SCHEMAS = Path(messages.__file__).parents[1]
 
 
 def some_poses(k, seed=3):
@@ -406,7 +406,7 @@ def test_json_that_cannot_be_cut_is_refused_before_it_is_decoded(value, monkeypa
     decoded = []
     real = msgspec.json.Decoder(list)
     monkeypatch.setattr(
-        "solidcloud.schemas.encoding._LIST_DECODER",
+        "solidcloud.schemas.wire.encoding._LIST_DECODER",
         SimpleNamespace(decode=lambda text: decoded.append(len(text)) or real.decode(text)),
     )
     with pytest.raises(

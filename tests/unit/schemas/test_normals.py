@@ -6,8 +6,9 @@ import naive_normals
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from solidcloud.schemas.archive.normal_reach import normal_reach
 from solidcloud.schemas.errors import BadRequestError
-from solidcloud.schemas.kernels.normals import (
+from solidcloud.schemas.kernels.normal_codes import (
     LINE,
     NONE,
     THICK,
@@ -16,7 +17,6 @@ from solidcloud.schemas.kernels.normals import (
     least_direction,
     normal_code,
 )
-from solidcloud.schemas.normals import normal_reach
 
 pytestmark = pytest.mark.interpreted
 

@@ -2,8 +2,7 @@
 
 import numpy as np
 import pytest
-from solidcloud.schemas.errors import BadRequestError
-from solidcloud.schemas.radius_model import (
+from solidcloud.schemas.archive.radius_model import (
     BORDER_SHARE,
     LOCAL_CLASSES,
     LOCAL_RADII,
@@ -15,7 +14,8 @@ from solidcloud.schemas.radius_model import (
     local_radii,
     parse_radius_model,
 )
-from solidcloud.schemas.units import UNITS_PER_METRE
+from solidcloud.schemas.archive.units import UNITS_PER_METRE
+from solidcloud.schemas.errors import BadRequestError
 
 pytestmark = pytest.mark.interpreted
 ALL = ("mean", "local", "border")

@@ -3,9 +3,9 @@
 import msgspec
 import numpy as np
 import pytest
-from solidcloud.schemas.arrays import array_fields
 from solidcloud.schemas.errors import BadRequestError, TooLargeError
-from solidcloud.schemas.messages import (
+from solidcloud.schemas.wire.arrays import array_fields
+from solidcloud.schemas.wire.messages import (
     JSON,
     MSGPACK,
     CollideRequest,
@@ -19,7 +19,7 @@ from solidcloud.schemas.messages import (
     decode_request,
     encode,
 )
-from solidcloud.schemas.requests import MAX_OBJECTS, ObjectItem, make_objects
+from solidcloud.schemas.wire.requests import MAX_OBJECTS, ObjectItem, make_objects
 
 POSES = np.tile(np.eye(4), (3, 1, 1))
 VECTORS = np.arange(9.0).reshape(3, 3)

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zstandard
-from solidcloud.schemas import row_stream
+from solidcloud.schemas.archive import row_stream
+from solidcloud.schemas.archive.row_stream import RowStream, pwrite_all
+from solidcloud.schemas.archive.zstd_frame import Expansion, pack, unpack
 from solidcloud.schemas.errors import BadRequestError, CorruptError
-from solidcloud.schemas.frames import Expansion, pack, unpack
-from solidcloud.schemas.row_stream import RowStream, pwrite_all
 
 
 @pytest.mark.parametrize("cuts", [[], [1], [300, 301, 999]])

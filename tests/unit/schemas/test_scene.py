@@ -6,10 +6,10 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from solidcloud.schemas import scene as scene_module
-from solidcloud.schemas.effects import Ground, Slide, Step, Stop, Sweep, Through, ThroughBox
 from solidcloud.schemas.errors import BadRequestError
-from solidcloud.schemas.scene import (
+from solidcloud.schemas.scene import scene_file as scene_module
+from solidcloud.schemas.scene.effect_options import Ground, Slide, Step, Stop, Sweep, Through, ThroughBox
+from solidcloud.schemas.scene.scene_file import (
     ArchiveItem,
     SceneFile,
     Spawn,
@@ -23,7 +23,7 @@ from solidcloud.schemas.scene import (
     up_of,
 )
 
-SCHEMAS = Path(scene_module.__file__).parent
+SCHEMAS = Path(scene_module.__file__).parents[1]
 TOP = 'format = 1\n[[archives]]\npath = "hall"\n'
 
 

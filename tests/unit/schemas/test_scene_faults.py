@@ -2,7 +2,7 @@
 
 import pytest
 from solidcloud.schemas.errors import BadRequestError
-from solidcloud.schemas.scene import parse_scene
+from solidcloud.schemas.scene.scene_file import parse_scene
 
 TOP = 'format = 1\n[[archives]]\npath = "hall"\n'
 EFFECT = TOP + '[[effects]]\neffect = "{}"\n'

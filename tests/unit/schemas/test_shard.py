@@ -8,11 +8,11 @@ import h5py
 import numpy as np
 import pytest
 from six_scans import rewrite_index
-from solidcloud.schemas.archive import Archive
-from solidcloud.schemas.codec import encode_voxel
+from solidcloud.schemas.archive.archive import Archive
+from solidcloud.schemas.archive.codec import encode_voxel
+from solidcloud.schemas.archive.index_file import write_index
+from solidcloud.schemas.archive.shard import DATASETS, file_checksum, shard_name, write_shard
 from solidcloud.schemas.errors import CorruptError, FormatError
-from solidcloud.schemas.index_file import write_index
-from solidcloud.schemas.shard import DATASETS, file_checksum, shard_name, write_shard
 
 
 def test_hdf5_says_what_a_shard_is(built: Path) -> None:

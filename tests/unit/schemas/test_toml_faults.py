@@ -6,8 +6,8 @@ import tomllib
 import msgspec
 import pytest
 from solidcloud.schemas.errors import BadRequestError
-from solidcloud.schemas.scene import parse_scene
-from solidcloud.schemas.toml_faults import decode, line_of, nearest, shown
+from solidcloud.schemas.scene.scene_file import parse_scene
+from solidcloud.schemas.scene.toml_faults import decode, line_of, nearest, shown
 
 TOP = 'format = 1\n[[archives]]\npath = "hall"\n'
 

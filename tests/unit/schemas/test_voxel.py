@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from scans import WITH_POINTS, make_steps
 from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.octree import VoxelPoints, build_voxel
-from solidcloud.schemas.errors import CorruptError
-from solidcloud.schemas.voxel import (
+from solidcloud.builder.voxel.voxel_octree import VoxelPoints, build_voxel
+from solidcloud.schemas.archive.voxel import (
     CELL_BITS,
     MAX_DEGREE,
     MAX_LEAF,
@@ -19,6 +18,7 @@ from solidcloud.schemas.voxel import (
     link_nodes,
     top_shift,
 )
+from solidcloud.schemas.errors import CorruptError
 
 STEPS = 1000  # no power of two, so that cells stick out of the voxel
 

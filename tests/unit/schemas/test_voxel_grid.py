@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from solidcloud.schemas.errors import BadRequestError
-from solidcloud.schemas.units import UNITS_PER_METRE
-from solidcloud.schemas.voxel_grid import (
+from solidcloud.schemas.archive.units import UNITS_PER_METRE
+from solidcloud.schemas.archive.voxel_grid import (
     KEY_BIAS,
     MAX_VOXEL_STEPS,
     Lattice,
@@ -16,6 +15,7 @@ from solidcloud.schemas.voxel_grid import (
     voxel_coordinates,
     voxel_keys,
 )
+from solidcloud.schemas.errors import BadRequestError
 
 UTM = (512345.678901, 5612345.123456, -7.25)
 VOXEL_COORDINATES = st.tuples(*[st.integers(-KEY_BIAS, KEY_BIAS - 1)] * 3)

@@ -7,9 +7,9 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-import solidcloud.schemas.new_file as new_file_module
+import solidcloud.schemas.process.new_file as new_file_module
+from solidcloud.schemas.archive.vtkhdf import VtkPoints, read_points, vtk_file
 from solidcloud.schemas.errors import CorruptError
-from solidcloud.schemas.vtkhdf import VtkPoints, read_points, vtk_file
 
 COLUMNS = {"scan": np.dtype("<u2"), "intensity": np.dtype("<f4")}
 

@@ -12,7 +12,7 @@ from bench.build_watch import Sample, Watched
 from bench.results import Part
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import build_archive
-from solidcloud.builder.plan import Stage
+from solidcloud.builder.plan.build_plan import Stage
 
 ROLLUP = """55b859773000-7ffce90ef000 ---p 00000000 00:00 0                          [rollup]
 Rss:                1672 kB

@@ -15,17 +15,17 @@ from chaos_cases.lives import Quiet
 from chaos_cases.report import Limits, _violations
 from msgspec.structs import replace
 from rogues.tools import zeros
-from solidcloud.schemas.answers import (
+from solidcloud.schemas.wire.answers import (
     CollideAnswers,
     ContactsAnswers,
     DistanceAnswers,
     Verdict,
     WithinAnswers,
 )
-from solidcloud.schemas.columns import check_answers, unknown
-from solidcloud.schemas.encoding import decode_answer, encode
-from solidcloud.schemas.messages import CollideRequest, WithinRequest
-from solidcloud.schemas.moves import Moved
+from solidcloud.schemas.wire.columns import check_answers, unknown
+from solidcloud.schemas.wire.encoding import decode_answer, encode
+from solidcloud.schemas.wire.messages import CollideRequest, WithinRequest
+from solidcloud.schemas.wire.moves import Moved
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,7 @@ import socket
 import numpy as np
 import pytest
 from project_scripts import load_script
-from solidcloud.schemas.answers import Verdict
+from solidcloud.schemas.wire.answers import Verdict
 
 
 @pytest.fixture(scope="module")

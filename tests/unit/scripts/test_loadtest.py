@@ -19,8 +19,8 @@ from load.server import Memory
 from load.traces import Trace
 from load.voxels import Voxels
 from numpy.typing import NDArray
-from solidcloud.schemas.answers import Verdict
-from solidcloud.schemas.stats import StatsAnswer
+from solidcloud.schemas.wire.answers import Verdict
+from solidcloud.schemas.wire.stats import StatsAnswer
 
 CLEAR, CONTACT, UNKNOWN = (int(v) for v in (Verdict.CLEAR, Verdict.CONTACT, Verdict.UNKNOWN))
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from solidcloud.builder.made.figure import figure_points
 from solidcloud.builder.made.town import POINTS_PER_FACADE, town_lots
 from solidcloud.builder.made.truth import SceneTruth
-from solidcloud.server.avatar import make_avatar
+from solidcloud.server.avatars.avatar_model import make_avatar
 
 MOVING = ("stroll", "run", "tour", "crowd")
 SECONDS, USERS = 40.0, 4

@@ -107,7 +107,7 @@ def test_every_kernel_file_is_planned_and_every_test_planned_is_there() -> None:
     kernels = {
         path.relative_to(trial.ROOT).as_posix()
         for package in trial.PACKAGES
-        for path in (trial.ROOT / package / "kernels").glob("*.py")
+        for path in (trial.ROOT / package / "kernels").rglob("*.py")
         if path.name != "__init__.py"
     }
     assert set(TESTS) | set(NONE) == kernels

@@ -25,10 +25,10 @@ from load.simulate import (
 from load.traces import Centers, Trace, save
 from numpy.typing import NDArray
 from project_scripts import load_script
-from solidcloud.schemas.voxel_grid import voxel_keys
-from solidcloud.server.kernels.reach import SceneIndex
-from solidcloud.server.neighbourhood import AHEAD
-from solidcloud.server.policies import POLICIES
+from solidcloud.schemas.archive.voxel_grid import voxel_keys
+from solidcloud.server.kernels.core.voxels_in_reach import SceneIndex
+from solidcloud.server.residency.eviction import POLICIES
+from solidcloud.server.residency.motion_prediction import AHEAD
 
 SCRIPTS = Path(__file__).parents[3] / "scripts"
 STEP, VOXEL_STEPS, EDGE = 0.01, 200, 2.0

@@ -11,11 +11,11 @@ import scans
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.made.figure import figure_points
 from solidcloud.builder.pipeline import build_archive
-from solidcloud.schemas.archive import Archive
+from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.errors import InternalError
-from solidcloud.server.report.accuracy import judge, warnings_of
-from solidcloud.server.report.accuracy_arithmetic import VOLUME, check_judge, measure_plain
-from solidcloud.server.report.accuracy_case import (
+from solidcloud.server.report.accuracy.accuracy import judge, warnings_of
+from solidcloud.server.report.accuracy.accuracy_arithmetic import VOLUME, check_judge, measure_plain
+from solidcloud.server.report.accuracy.accuracy_case import (
     LEAST_OFF,
     MOST_OFF,
     REACH,
@@ -25,9 +25,9 @@ from solidcloud.server.report.accuracy_case import (
     turned_ground,
     unknown_regions,
 )
-from solidcloud.server.report.accuracy_engine import UNSPENT, Archives, Exact, Setting, judge_engine
-from solidcloud.server.report.accuracy_plan import Plan
-from solidcloud.server.report.accuracy_row import BUDGET, DEGREE, TOLERANCE, Row
+from solidcloud.server.report.accuracy.accuracy_engine import UNSPENT, Archives, Exact, Setting, judge_engine
+from solidcloud.server.report.accuracy.accuracy_plan import Plan
+from solidcloud.server.report.accuracy.accuracy_row import BUDGET, DEGREE, TOLERANCE, Row
 
 PLAN = Plan(frames=40, near_tangent=20, plain_frames=10, loops=1)
 CONFIG = BuildConfig(resolution=1e-3, radius=0.01, jobs=1)

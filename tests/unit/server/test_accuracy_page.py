@@ -9,17 +9,25 @@ from pathlib import Path
 import numpy as np
 import pytest
 from solidcloud.builder.config import BuildConfig
-from solidcloud.server.report import accuracy_picture
-from solidcloud.server.report.accuracy_arithmetic import PRIMITIVE, VOLUME, plain_settings
-from solidcloud.server.report.accuracy_engine import engine_settings, radius_settings
-from solidcloud.server.report.accuracy_labels import place_labels
-from solidcloud.server.report.accuracy_page import table, write_page
-from solidcloud.server.report.accuracy_picture import draw_charts, points_of
-from solidcloud.server.report.accuracy_plan import BRIEF
-from solidcloud.server.report.accuracy_report import Report
-from solidcloud.server.report.accuracy_row import PLAIN, RADIUS, SHEET, STEP, TOLERANCE, Row, mark_front
-from solidcloud.server.report.accuracy_words import KNOBS, findings, leak_at
-from solidcloud.server.report.spheres import load_pyplot
+from solidcloud.server.report.accuracy import accuracy_picture
+from solidcloud.server.report.accuracy.accuracy_arithmetic import PRIMITIVE, VOLUME, plain_settings
+from solidcloud.server.report.accuracy.accuracy_engine import engine_settings, radius_settings
+from solidcloud.server.report.accuracy.accuracy_labels import place_labels
+from solidcloud.server.report.accuracy.accuracy_page import table, write_page
+from solidcloud.server.report.accuracy.accuracy_picture import draw_charts, points_of
+from solidcloud.server.report.accuracy.accuracy_plan import BRIEF
+from solidcloud.server.report.accuracy.accuracy_report import Report
+from solidcloud.server.report.accuracy.accuracy_row import (
+    PLAIN,
+    RADIUS,
+    SHEET,
+    STEP,
+    TOLERANCE,
+    Row,
+    mark_front,
+)
+from solidcloud.server.report.accuracy.accuracy_words import KNOBS, findings, leak_at
+from solidcloud.server.report.common.sphere_pictures import load_pyplot
 
 PLAIN_BUILD = BuildConfig(resolution=1e-4)
 FACTS = {

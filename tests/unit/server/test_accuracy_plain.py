@@ -7,10 +7,10 @@ import naive
 import numpy as np
 import pytest
 import scans
-from solidcloud.schemas.archive import Archive
-from solidcloud.server.avatar import AvatarModel, make_avatar
-from solidcloud.server.report.accuracy_arithmetic import ARITHMETICS
-from solidcloud.server.report.accuracy_volumes import (
+from solidcloud.schemas.archive.archive import Archive
+from solidcloud.server.avatars.avatar_model import AvatarModel, make_avatar
+from solidcloud.server.report.accuracy.accuracy_arithmetic import ARITHMETICS
+from solidcloud.server.report.accuracy.accuracy_volumes import (
     PRIMITIVES,
     VOLUMES,
     Kind,
@@ -19,8 +19,8 @@ from solidcloud.server.report.accuracy_volumes import (
     distances,
     make_plain,
 )
-from solidcloud.server.report.kernels.descent import SLACK
-from solidcloud.server.report.kernels.pairs import CUBES, FLOAT32_WORLD, FLOAT64, INTEGERS
+from solidcloud.server.report.kernels.plain_descent import SLACK
+from solidcloud.server.report.kernels.plain_pairs import CUBES, FLOAT32_WORLD, FLOAT64, INTEGERS
 
 pytestmark = pytest.mark.interpreted
 FARTHEST = 0.5

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 from solidcloud.builder.config import BuildConfig
-from solidcloud.server.report import accuracy_felt, accuracy_timing
-from solidcloud.server.report.accuracy import write_rows
-from solidcloud.server.report.accuracy_engine import engine_settings, length_name, radius_settings
-from solidcloud.server.report.accuracy_felt import measure_felt, measure_made
-from solidcloud.server.report.accuracy_plan import BRIEF, FULL, Plan
-from solidcloud.server.report.accuracy_report import Report
-from solidcloud.server.report.accuracy_row import (
+from solidcloud.server.report.accuracy import accuracy_felt, accuracy_timing
+from solidcloud.server.report.accuracy.accuracy import write_rows
+from solidcloud.server.report.accuracy.accuracy_engine import engine_settings, length_name, radius_settings
+from solidcloud.server.report.accuracy.accuracy_felt import measure_felt, measure_made
+from solidcloud.server.report.accuracy.accuracy_plan import BRIEF, FULL, Plan
+from solidcloud.server.report.accuracy.accuracy_report import Report
+from solidcloud.server.report.accuracy.accuracy_row import (
     BUDGET,
     COLUMNS,
     DEGREE,
@@ -31,9 +31,9 @@ from solidcloud.server.report.accuracy_row import (
     judge_verdicts,
     mark_front,
 )
-from solidcloud.server.report.accuracy_timing import Timed, take_times
-from solidcloud.server.report.doorway import Doorway
-from solidcloud.server.report.leak import Leak
+from solidcloud.server.report.accuracy.accuracy_timing import Timed, take_times
+from solidcloud.server.report.common.doorway import Doorway
+from solidcloud.server.report.common.leak import Leak
 
 
 def test_early_late_and_unknown_are_told_apart() -> None:

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from solidcloud.schemas.archive.voxel_grid import KEY_BIAS
 from solidcloud.schemas.kernels.morton import morton_encode
-from solidcloud.schemas.voxel_grid import KEY_BIAS
-from solidcloud.server.kernels.ahead import (
+from solidcloud.server.kernels.core.voxels_in_reach import SceneIndex
+from solidcloud.server.kernels.prediction.track_prediction import (
     MOST_CELLS,
     Motion,
     distance_to_ways,
@@ -15,7 +16,6 @@ from solidcloud.server.kernels.ahead import (
     rows_ahead,
     rows_in_reach,
 )
-from solidcloud.server.kernels.reach import SceneIndex
 
 pytestmark = pytest.mark.interpreted
 

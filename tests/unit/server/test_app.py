@@ -6,7 +6,8 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from solidcloud.schemas.answers import (
+from solidcloud.schemas.errors import BadRequestError, FormatError
+from solidcloud.schemas.wire.answers import (
     CollideAnswers,
     CollidePart,
     ContactsAnswers,
@@ -16,9 +17,8 @@ from solidcloud.schemas.answers import (
     SweepAnswers,
     WithinAnswers,
 )
-from solidcloud.schemas.errors import BadRequestError, FormatError
-from solidcloud.schemas.keys import User
-from solidcloud.schemas.messages import (
+from solidcloud.schemas.wire.keys import User
+from solidcloud.schemas.wire.messages import (
     JSON,
     MSGPACK,
     AddAvatarRequest,
@@ -42,12 +42,12 @@ from solidcloud.schemas.messages import (
     decode_answer,
     encode,
 )
-from solidcloud.schemas.requests import ObjectItem
-from solidcloud.server import app as app_module
-from solidcloud.server.app import Service
-from solidcloud.server.config import ServerConfig
-from solidcloud.server.served import Full
-from solidcloud.server.stop import Stop
+from solidcloud.schemas.wire.requests import ObjectItem
+from solidcloud.server.runtime.stop_flag import Stop
+from solidcloud.server.served.served_scene import Full
+from solidcloud.server.service import service as app_module
+from solidcloud.server.service.server_config import ServerConfig
+from solidcloud.server.service.service import Service
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "end_to_end"))
 from fake_server import FloorScene, floor_simulation, floor_verdicts

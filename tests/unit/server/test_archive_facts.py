@@ -9,10 +9,10 @@ import pytest
 from scans import make_scan, write_xyz
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import build_archive
-from solidcloud.schemas.archive import Archive
-from solidcloud.schemas.index_file import write_index
-from solidcloud.server.cli import run
-from solidcloud.server.store import Store
+from solidcloud.schemas.archive.archive import Archive
+from solidcloud.schemas.archive.index_file import write_index
+from solidcloud.server.cli.main import run
+from solidcloud.server.residency.voxel_store import Store
 
 WKT = 'PROJCS["UTM",\n  UNIT["metre",1]]'
 

@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from solidcloud.server.arena import ALIGNMENT, ArenaBuffer
+from solidcloud.server.residency.arena import ALIGNMENT, ArenaBuffer
 
 pytestmark = pytest.mark.interpreted
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import scans
 from solidcloud.schemas.errors import BadRequestError, TooLargeError
-from solidcloud.schemas.messages import MAX_AVATAR_POINTS
-from solidcloud.server.avatar import AvatarModel, make_avatar
-from solidcloud.server.kernels.layout import LANES
+from solidcloud.schemas.wire.messages import MAX_AVATAR_POINTS
+from solidcloud.server.avatars.avatar_model import AvatarModel, make_avatar
+from solidcloud.server.kernels.core.voxel_layout import LANES
 
 pytestmark = pytest.mark.interpreted
 

@@ -5,12 +5,12 @@ import threading
 import numpy as np
 import pytest
 from solidcloud.schemas.errors import BadRequestError, TooLargeError, UnknownAvatarError
-from solidcloud.schemas.seals import avatar_digest
-from solidcloud.server import avatars as avatars_module
-from solidcloud.server.answering_avatars import noted
-from solidcloud.server.avatar import make_avatar
-from solidcloud.server.avatar_limits import EVERYBODY, AvatarLimits
-from solidcloud.server.avatars import Avatars, bytes_of
+from solidcloud.schemas.wire.seals import avatar_digest
+from solidcloud.server.avatars import client_avatars as avatars_module
+from solidcloud.server.avatars.avatar_model import make_avatar
+from solidcloud.server.avatars.client_avatars import Avatars, bytes_of
+from solidcloud.server.served.answering_avatars import noted
+from solidcloud.server.served.avatar_limits import EVERYBODY, AvatarLimits
 
 LIMITS = AvatarLimits(bytes=100_000, bytes_by_client=60_000, avatars=10, avatars_by_client=4, clients=3)
 BODY = np.random.default_rng(5).uniform(-1, 1, (500, 3))  # some 29 kB

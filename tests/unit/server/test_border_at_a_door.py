@@ -6,8 +6,8 @@ import pytest
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.made.sheet import Sheet, make_sheet
 from solidcloud.builder.pipeline import build_archive
-from solidcloud.server.report.doorway import doorway_error
-from solidcloud.server.report.leak import leak
+from solidcloud.server.report.common.doorway import doorway_error
+from solidcloud.server.report.common.leak import leak
 from solidcloud.server.scene import Scene
 
 

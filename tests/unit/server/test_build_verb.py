@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import solidcloud.builder.pipeline as pipeline
 from solidcloud.builder.config import BuildConfig
-from solidcloud.server.cli import run
+from solidcloud.server.cli.main import run
 
 
 @pytest.fixture

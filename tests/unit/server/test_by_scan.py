@@ -8,9 +8,9 @@ import cases_contacts
 import numpy as np
 import pytest
 from effect_frames import flip_a_byte
-from solidcloud.server.avatar import make_avatar
-from solidcloud.server.by_scan import ANY_SCAN, ScanGaps, gaps_by_scan
-from solidcloud.server.effort import Effort
+from solidcloud.server.avatars.avatar_model import make_avatar
+from solidcloud.server.queries.context.query_budget import Effort
+from solidcloud.server.queries.distance_by_scan import ANY_SCAN, ScanGaps, gaps_by_scan
 
 BALL = make_avatar([[0.0, 0, 0], [0.02, 0, 0]], 0.1)
 POSE = cases.pose_of(np.eye(3), np.array([0.5, 0.0, 0.13]))

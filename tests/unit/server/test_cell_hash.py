@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from solidcloud.server.kernels.clusters import find_slot, make_cells
-from solidcloud.server.stop import NEVER
+from solidcloud.server.kernels.contacts.contact_clusters import find_slot, make_cells
+from solidcloud.server.runtime.stop_flag import NEVER
 
 pytestmark = pytest.mark.interpreted
 

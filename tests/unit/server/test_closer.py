@@ -5,7 +5,7 @@ from decimal import Decimal, localcontext
 
 import numpy as np
 import pytest
-from solidcloud.server.kernels.closer import CERTAIN, compare_gaps
+from solidcloud.server.kernels.core.gap_order import CERTAIN, compare_gaps
 
 pytestmark = pytest.mark.interpreted
 

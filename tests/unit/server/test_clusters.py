@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from naive_contacts import Pair, clusters_of, gap_key
-from solidcloud.server.kernels.clusters import (
+from solidcloud.server.kernels.contacts.contact_clusters import (
     CELLS,
     CLUSTER,
     DROP,
@@ -26,7 +26,7 @@ from solidcloud.server.kernels.clusters import (
     make_cells,
     sort_rows,
 )
-from solidcloud.server.stop import NEVER
+from solidcloud.server.runtime.stop_flag import NEVER
 
 pytestmark = pytest.mark.interpreted
 

@@ -13,14 +13,14 @@ import pytest
 import scans
 from coarse_tops import ROOM, Made, open_made, scattered
 from numpy.typing import NDArray
-from solidcloud.builder.radius import voxel_points
+from solidcloud.builder.voxel.point_radius import voxel_points
+from solidcloud.schemas.archive.radius_model import LOCAL_CLASSES, class_radii
 from solidcloud.schemas.errors import CorruptError
-from solidcloud.schemas.radius_model import LOCAL_CLASSES, class_radii
-from solidcloud.server.avatar import make_avatar
-from solidcloud.server.coarse import SLOT_BYTES, Coarse, settle
-from solidcloud.server.kernels.coarse import MOST_NODES
-from solidcloud.server.kernels.layout import CLASS_SHIFT, COUNT, COUNTED, FIRST
-from solidcloud.server.store import Store
+from solidcloud.server.avatars.avatar_model import make_avatar
+from solidcloud.server.kernels.core.voxel_layout import CLASS_SHIFT, COUNT, COUNTED, FIRST
+from solidcloud.server.kernels.overlap.coarse_overlap import MOST_NODES
+from solidcloud.server.residency.coarse_bounds import SLOT_BYTES, Coarse, settle
+from solidcloud.server.residency.voxel_store import Store
 
 
 @pytest.fixture

@@ -10,9 +10,9 @@ import scans
 from numpy.typing import NDArray
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import build_archive
-from solidcloud.schemas.answers import Verdict
-from solidcloud.schemas.archive import Archive
+from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.errors import BadRequestError, BadTransformError, TooLargeError
+from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.scene import Scene
 
 CLEAR, CONTACT, UNKNOWN = Verdict

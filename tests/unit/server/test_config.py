@@ -2,8 +2,8 @@
 
 import pytest
 from solidcloud.schemas.errors import BadRequestError
-from solidcloud.server.config import ServerConfig
-from solidcloud.server.endpoints import is_loopback
+from solidcloud.server.network.endpoints import is_loopback
+from solidcloud.server.service.server_config import ServerConfig
 
 
 @pytest.mark.parametrize(

@@ -14,18 +14,18 @@ from cases_contacts import ScanCase, compare, open_case, tight
 from numpy.typing import NDArray
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import build_archive
-from solidcloud.schemas.answers import ContactsAnswers, Verdict
 from solidcloud.schemas.errors import BadRequestError, BadTransformError, SolidcloudError, TooLargeError
-from solidcloud.schemas.requests import MAX_CONTACTS
-from solidcloud.server import contacts as contacts_module
-from solidcloud.server.avatar import make_avatar
-from solidcloud.server.contacts import contacts
-from solidcloud.server.describe import describe
-from solidcloud.server.effort import Effort, make_effort
-from solidcloud.server.kernels.layout import LANES
-from solidcloud.server.request import make_scene_data
-from solidcloud.server.residency import Residency
-from solidcloud.server.store import Store
+from solidcloud.schemas.wire.answers import ContactsAnswers, Verdict
+from solidcloud.schemas.wire.requests import MAX_CONTACTS
+from solidcloud.server.archives.archive_info import describe
+from solidcloud.server.avatars.avatar_model import make_avatar
+from solidcloud.server.kernels.core.voxel_layout import LANES
+from solidcloud.server.queries import contacts as contacts_module
+from solidcloud.server.queries.contacts import contacts
+from solidcloud.server.queries.context.query_budget import Effort, make_effort
+from solidcloud.server.queries.context.query_context import make_scene_data
+from solidcloud.server.residency.voxel_cache import Residency
+from solidcloud.server.residency.voxel_store import Store
 
 CLEAR, CONTACT, UNKNOWN = Verdict
 COST = (

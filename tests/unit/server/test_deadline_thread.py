@@ -5,9 +5,9 @@ import time
 import weakref
 
 import pytest
-from solidcloud.server import deadlines as deadlines_module
-from solidcloud.server.deadlines import Deadlines
-from solidcloud.server.stop import Stop
+from solidcloud.server.runtime import deadlines as deadlines_module
+from solidcloud.server.runtime.deadlines import Deadlines
+from solidcloud.server.runtime.stop_flag import Stop
 
 pytestmark = pytest.mark.interpreted
 DEADLINE = 20.0

@@ -12,16 +12,17 @@ import numpy as np
 import pytest
 import scans
 from numpy.typing import NDArray
-from solidcloud.schemas.answers import Verdict
-from solidcloud.server import bounded, rounds
-from solidcloud.server.avatar import make_avatar
-from solidcloud.server.collide import collide
-from solidcloud.server.contacts import contacts
-from solidcloud.server.distance import distance
-from solidcloud.server.effort import LOAD_SHARE, Effort
-from solidcloud.server.request import SceneData
-from solidcloud.server.sweep import sweep
-from solidcloud.server.within import within
+from solidcloud.schemas.wire.answers import Verdict
+from solidcloud.server.avatars.avatar_model import make_avatar
+from solidcloud.server.queries.collide import collide
+from solidcloud.server.queries.contacts import contacts
+from solidcloud.server.queries.context import anytime_search as bounded
+from solidcloud.server.queries.context import front_to_back as rounds
+from solidcloud.server.queries.context.query_budget import LOAD_SHARE, Effort
+from solidcloud.server.queries.context.query_context import SceneData
+from solidcloud.server.queries.distance import distance
+from solidcloud.server.queries.sweep import sweep
+from solidcloud.server.queries.within import within
 
 pytestmark = pytest.mark.interpreted
 CLEAR, CONTACT, UNKNOWN = Verdict

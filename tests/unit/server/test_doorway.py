@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from solidcloud.builder.made.figure import figure_points
 from solidcloud.builder.made.truth import DoorTruth, FacadeTruth
 from solidcloud.schemas.errors import BadRequestError
-from solidcloud.server.report import doorway
-from solidcloud.server.report.doorway import doorway_error
+from solidcloud.server.report.common import doorway
+from solidcloud.server.report.common.doorway import doorway_error
 from solidcloud.server.scene import Scene
 
 ORIGIN = (400_000.0, -20.0, 7.0)

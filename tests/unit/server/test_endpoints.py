@@ -2,7 +2,7 @@
 
 import pytest
 from solidcloud.schemas.errors import BadRequestError
-from solidcloud.server.endpoints import canonical, check_endpoint, zenoh_words
+from solidcloud.server.network.endpoints import canonical, check_endpoint, zenoh_words
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
-from solidcloud.server.fair_queues import Bounds, FairQueues, Offer, State, Ticket
+from solidcloud.server.service.fair_queues import Bounds, FairQueues, Offer, State, Ticket
 
 BOUNDS = Bounds(workers=2, slow=1, waits=4, requests=100, size=1000, by_turn=50, first=0)
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from solidcloud.schemas.errors import BadDataError
-from solidcloud.server.report.floor_walk import LAYER, SOLE, floor_walk
+from solidcloud.server.report.common.floor_walk import LAYER, SOLE, floor_walk
 
 
 def hall(rng: np.random.Generator, turned: bool = False) -> np.ndarray:

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from fake_server import floor_simulation
 from solidcloud.schemas.errors import BadRequestError, CorruptError, FormatError
-from solidcloud.schemas.keys import User
-from solidcloud.schemas.moves import Wish
-from solidcloud.server.frame_log import (
+from solidcloud.schemas.wire.keys import User
+from solidcloud.schemas.wire.moves import Wish
+from solidcloud.server.served.served_scene import Turn
+from solidcloud.server.simulation.replay_log import (
     MAGIC,
     Begin,
     Dropped,
@@ -20,7 +21,6 @@ from solidcloud.server.frame_log import (
     Reloaded,
     read_log,
 )
-from solidcloud.server.served import Turn
 
 pytestmark = pytest.mark.interpreted
 

@@ -6,12 +6,12 @@ import time
 import numpy as np
 import pytest
 from fake_server import floor_simulation
-from solidcloud.schemas.encoding import JSON, MSGPACK, decode_answer, encode
 from solidcloud.schemas.errors import BusyError
-from solidcloud.schemas.keys import User
-from solidcloud.schemas.messages import ErrorReply
-from solidcloud.schemas.moves import State, Wish
-from solidcloud.server.frames import Frames, Mailboxes
+from solidcloud.schemas.wire.encoding import JSON, MSGPACK, decode_answer, encode
+from solidcloud.schemas.wire.keys import User
+from solidcloud.schemas.wire.messages import ErrorReply
+from solidcloud.schemas.wire.moves import State, Wish
+from solidcloud.server.service.command_mailboxes import Frames, Mailboxes
 
 pytestmark = pytest.mark.interpreted
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scans
-from solidcloud.builder import rebuild
-from solidcloud.server.cli import run
+from solidcloud.builder.edit import rebuild_voxels as rebuild
+from solidcloud.server.cli.main import run
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

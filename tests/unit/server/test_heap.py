@@ -12,7 +12,7 @@ _PROGRAM = """
 import os
 from pathlib import Path
 import numpy as np
-from solidcloud.server.heap import give_back_freed_memory, give_back_large_blocks
+from solidcloud.server.runtime.process_heap import give_back_freed_memory, give_back_large_blocks
 
 def held():
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6

@@ -11,19 +11,19 @@ import numpy as np
 import pytest
 import scans
 from forged import Columns, forge
-from solidcloud.schemas.answers import Verdict
-from solidcloud.schemas.archive import Archive
-from solidcloud.schemas.voxel_grid import voxel_coordinates
-from solidcloud.server.avatar import make_avatar
-from solidcloud.server.collide import collide
-from solidcloud.server.effort import EXACT
-from solidcloud.server.left_out import LeftOut
-from solidcloud.server.near import near
-from solidcloud.server.probe import Probe
-from solidcloud.server.request import make_scene_data
-from solidcloud.server.residency import Residency
+from solidcloud.schemas.archive.archive import Archive
+from solidcloud.schemas.archive.voxel_grid import voxel_coordinates
+from solidcloud.schemas.wire.answers import Verdict
+from solidcloud.server.archives.masked_archive import LeftOut
+from solidcloud.server.avatars.avatar_model import make_avatar
+from solidcloud.server.queries.collide import collide
+from solidcloud.server.queries.context.query_budget import EXACT
+from solidcloud.server.queries.context.query_context import make_scene_data
+from solidcloud.server.queries.resident_distance import near
+from solidcloud.server.queries.resident_motion import Probe
+from solidcloud.server.residency.voxel_cache import Residency
+from solidcloud.server.residency.voxel_store import Store
 from solidcloud.server.scene import Scene
-from solidcloud.server.store import Store
 
 BALL = np.zeros((1, 3))
 RADIUS = 0.001
@@ -42,7 +42,7 @@ class Hidden(NamedTuple):
 
 def points_of(archive: Archive, row: int) -> np.ndarray:
     """The points of a voxel (n, 3) [voxel steps]."""
-    from solidcloud.builder.radius import voxel_points
+    from solidcloud.builder.voxel.point_radius import voxel_points
 
     return voxel_points(*archive.read_voxel(row)).astype(np.int64)
 

@@ -5,8 +5,8 @@ import stat
 
 import pytest
 from solidcloud.schemas.errors import BadRequestError
-from solidcloud.server.key_files import find_key, key_paths, published_key, read_given_key
-from solidcloud.server.verbs.serve import serve
+from solidcloud.server.cli.commands.serve_command import serve
+from solidcloud.server.network.key_files import find_key, key_paths, published_key, read_given_key
 
 ENDPOINT = "tcp/127.0.0.1:7447"
 

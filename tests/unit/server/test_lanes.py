@@ -8,15 +8,15 @@ import time
 from contextlib import contextmanager, suppress
 
 import pytest
-from solidcloud.server import lanes as lanes_module
-from solidcloud.server.config import ServerConfig
-from solidcloud.server.fair_queues import Offer, Ticket
-from solidcloud.server.jobs import Wire
-from solidcloud.server.lanes import Lane
-from solidcloud.server.served import Answer, Full
-from solidcloud.server.threads import start_thread
-from solidcloud.server.tokens import Tokens
-from solidcloud.server.watchdog import lower_priority
+from solidcloud.server.runtime.threads import start_thread
+from solidcloud.server.runtime.watchdog import lower_priority
+from solidcloud.server.served.served_scene import Answer, Full
+from solidcloud.server.service import request_lanes as lanes_module
+from solidcloud.server.service.fair_queues import Offer, Ticket
+from solidcloud.server.service.jobs import Wire
+from solidcloud.server.service.liveliness_tokens import Tokens
+from solidcloud.server.service.request_lanes import Lane
+from solidcloud.server.service.server_config import ServerConfig
 
 DEADLINE = 20.0
 ANSWER = Answer(b"", "msgpack", True)

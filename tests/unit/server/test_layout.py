@@ -6,11 +6,10 @@ import cases
 import numpy as np
 import pytest
 import scans
-from solidcloud.builder.radius import voxel_points
-from solidcloud.schemas.archive import Archive
-from solidcloud.schemas.radius_model import RADIUS_CLASSES
-from solidcloud.server.arena import ArenaBuffer
-from solidcloud.server.kernels.layout import (
+from solidcloud.builder.voxel.point_radius import voxel_points
+from solidcloud.schemas.archive.archive import Archive
+from solidcloud.schemas.archive.radius_model import RADIUS_CLASSES
+from solidcloud.server.kernels.core.voxel_layout import (
     BLOCK_WORDS,
     COUNT,
     FIRST,
@@ -19,7 +18,8 @@ from solidcloud.server.kernels.layout import (
     resident_bytes,
     scan_run,
 )
-from solidcloud.server.store import Store
+from solidcloud.server.residency.arena import ArenaBuffer
+from solidcloud.server.residency.voxel_store import Store
 
 pytestmark = pytest.mark.interpreted
 
@@ -99,7 +99,8 @@ def _points_below(node: int, links: object, count: np.ndarray) -> list[int]:
 
 
 def test_a_lane_each_is_room_for_a_figure_a_class() -> None:
-    # kernels/priority.py keeps thresholds by radius class in a scratch of as many floats as a block has lanes.
+    # kernels/nearest/best_first_search.py keeps thresholds by radius class in a scratch of as many
+    # floats as a block has lanes.
     assert RADIUS_CLASSES <= LANES
 
 

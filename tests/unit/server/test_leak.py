@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from solidcloud.builder.made.places import WallPlaces
-from solidcloud.server.report import leak as report
-from solidcloud.server.report.leak import leak, leak_depths
+from solidcloud.server.report.common import leak as report
+from solidcloud.server.report.common.leak import leak, leak_depths
 from solidcloud.server.scene import Scene
 
 PROBE = 0.05

@@ -12,11 +12,11 @@ import pytest
 from boxed import BODY, DOOR, ROOM, STEP, build, in_boxes, open_without, two_scans
 from msgspec.structs import asdict
 from numpy.typing import NDArray
-from solidcloud.builder.radius import voxel_points
-from solidcloud.schemas.archive import Archive
-from solidcloud.schemas.columns import array_fields
-from solidcloud.schemas.effects import ThroughBox
-from solidcloud.server.left_out import LeftOut
+from solidcloud.builder.voxel.point_radius import voxel_points
+from solidcloud.schemas.archive.archive import Archive
+from solidcloud.schemas.scene.effect_options import ThroughBox
+from solidcloud.schemas.wire.columns import array_fields
+from solidcloud.server.archives.masked_archive import LeftOut
 from solidcloud.server.scene import Scene
 
 

@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 from boxed import BODY, DOOR, build, in_boxes, open_without, two_scans
 from numpy.typing import NDArray
-from solidcloud.builder.radius import voxel_points
-from solidcloud.schemas.archive import Archive
-from solidcloud.schemas.effects import ThroughBox
+from solidcloud.builder.voxel.point_radius import voxel_points
+from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.errors import BadRequestError, BadTransformError, SolidcloudError
-from solidcloud.server import left_out
-from solidcloud.server.left_out import LeftOut
-from solidcloud.server.posed import moved
+from solidcloud.schemas.scene.effect_options import ThroughBox
+from solidcloud.server.archives import masked_archive as left_out
+from solidcloud.server.archives.masked_archive import LeftOut
+from solidcloud.server.archives.rigid_transform import moved
 from solidcloud.server.scene import Scene
 
 
@@ -171,7 +171,8 @@ def test_voxels_that_lie_in_a_box_whole_are_not_read(
 def test_a_scene_without_boxes_imports_nothing_of_it(whole: Path) -> None:
     program = (
         "import sys; from solidcloud.server.scene import Scene; Scene.open(sys.argv[1]).close(); "
-        "print(*(m for m in sys.modules if m.endswith(('left_out', 'without', 'builder.octree', 'through'))))"
+        "names = ('masked_archive', 'masked_voxel', 'voxel_octree', 'through_effect'); "
+        "print(*(m for m in sys.modules if m.endswith(names)))"
     )
     done = partial(subprocess.run, capture_output=True, text=True, check=True)(
         [sys.executable, "-c", program, str(whole)]

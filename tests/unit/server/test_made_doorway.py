@@ -11,8 +11,8 @@ import pytest
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.made.figure import figure_points
 from solidcloud.builder.made.truth import DoorTruth, FacadeTruth
-from solidcloud.server.report import made_doorway
-from solidcloud.server.report.made_doorway import FINEST, WIDEST, MadeDoor, made_doorways, passes
+from solidcloud.server.report.common import made_doorway
+from solidcloud.server.report.common.made_doorway import FINEST, WIDEST, MadeDoor, made_doorways, passes
 from solidcloud.server.scene import Scene
 
 

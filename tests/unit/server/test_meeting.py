@@ -9,11 +9,11 @@ import naive_sweep
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from solidcloud.server.avatar import AvatarModel, make_avatar
-from solidcloud.server.kernels import meeting as kernel
-from solidcloud.server.kernels import meeting_placed as placed
-from solidcloud.server.kernels import near_bodies
-from solidcloud.server.stop import NEVER
+from solidcloud.server.avatars.avatar_model import AvatarModel, make_avatar
+from solidcloud.server.kernels.bodies import body_sweep as kernel
+from solidcloud.server.kernels.bodies import moving_bodies as placed
+from solidcloud.server.kernels.bodies import near_bodies
+from solidcloud.server.runtime.stop_flag import NEVER
 from swept import turned
 
 pytestmark = pytest.mark.interpreted

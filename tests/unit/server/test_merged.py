@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from solidcloud.schemas.answers import (
+from solidcloud.schemas.wire.answers import (
     CollideAnswers,
     ContactsAnswers,
     DistanceAnswers,
@@ -12,9 +12,9 @@ from solidcloud.schemas.answers import (
     SweepAnswers,
     Verdict,
 )
-from solidcloud.schemas.arrays import array_fields
-from solidcloud.schemas.columns import unknown
-from solidcloud.server.merged import carried, limited, merged
+from solidcloud.schemas.wire.arrays import array_fields
+from solidcloud.schemas.wire.columns import unknown
+from solidcloud.server.archives.merge_answers import carried, limited, merged
 
 CLEAR, CONTACT, UNKNOWN = (int(v) for v in Verdict)
 INF = np.inf

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from solidcloud.schemas.answers import CollideAnswers, Cost
-from solidcloud.schemas.keys import public_id
-from solidcloud.schemas.stats import TIME_BOUNDS, Times, UserStats
-from solidcloud.server import metrics as metrics_module
-from solidcloud.server.metrics import BOUNDS, Histogram, Metrics, times_of
+from solidcloud.schemas.wire.answers import CollideAnswers, Cost
+from solidcloud.schemas.wire.keys import public_id
+from solidcloud.schemas.wire.stats import TIME_BOUNDS, Times, UserStats
+from solidcloud.server.observability import metrics as metrics_module
+from solidcloud.server.observability.metrics import BOUNDS, Histogram, Metrics, times_of
 
 
 class Clock:

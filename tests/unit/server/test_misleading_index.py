@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import scans
 from forged import Columns, forge
-from solidcloud.builder.verify import verify_archive
-from solidcloud.schemas.answers import Verdict
-from solidcloud.schemas.archive import Archive
+from solidcloud.builder.passes.verify import verify_archive
+from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.errors import MisleadingIndexError
+from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.scene import Scene
 
 BALL = np.zeros((1, 3))
@@ -45,7 +45,7 @@ def places(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, np.ndarray, 
 
 def points_of(archive: Archive, row: int) -> np.ndarray:
     """The points of a voxel (n, 3) [voxel steps]."""
-    from solidcloud.builder.radius import voxel_points
+    from solidcloud.builder.voxel.point_radius import voxel_points
 
     return voxel_points(*archive.read_voxel(row)).astype(np.int64)
 

@@ -5,8 +5,8 @@ import naive_sweep
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from solidcloud.server.kernels.motion import make_motion, poses_on, sine_cosine
-from solidcloud.server.kernels.placing import SIMILARITY_TOLERANCE
+from solidcloud.server.kernels.core.pose_transform import SIMILARITY_TOLERANCE
+from solidcloud.server.kernels.motion.screw_motion import make_motion, poses_on, sine_cosine
 
 FRACTIONS = np.array([0.0, 1e-18, 1e-9, 0.1, 0.25, 0.5, 0.7, 1 - 1e-9, 1 - 2.0**-53, 1.0])
 ORIGIN = np.zeros(3)
@@ -61,7 +61,7 @@ def test_the_ends_are_the_bits_given(rng: np.random.Generator) -> None:
 
 
 def test_computed_points_lie_within_slip_of_the_ideal_motion(rng: np.random.Generator) -> None:
-    """What the proof of kernels/sweep.py takes for granted, against 60 digits; by how much is kept below a quarter."""
+    """What the proof of sweep_interval.py takes for granted, against 60 digits; by how much is kept below a quarter."""
     worst = 0.0
     for first, last in motions(rng):
         box = np.array([[-3.0, -1, 0], [1, 2, 20]])

@@ -6,8 +6,8 @@ import cases
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from solidcloud.server.avatar import make_avatar
-from solidcloud.server.kernels import moving as kernel
+from solidcloud.server.avatars.avatar_model import make_avatar
+from solidcloud.server.kernels.motion import moving_avatar as kernel
 
 pytestmark = pytest.mark.interpreted
 

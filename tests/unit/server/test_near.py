@@ -5,13 +5,13 @@ from pathlib import Path
 import cases
 import numpy as np
 import pytest
-from solidcloud.schemas.answers import DistanceAnswers, Verdict
 from solidcloud.schemas.errors import BadTransformError
-from solidcloud.server import near as module
-from solidcloud.server.avatar import make_avatar
-from solidcloud.server.distance import distance
-from solidcloud.server.effort import Effort
-from solidcloud.server.near import QUICK_REACH, QUICK_ROWS, near
+from solidcloud.schemas.wire.answers import DistanceAnswers, Verdict
+from solidcloud.server.avatars.avatar_model import make_avatar
+from solidcloud.server.queries import resident_distance as module
+from solidcloud.server.queries.context.query_budget import Effort
+from solidcloud.server.queries.distance import distance
+from solidcloud.server.queries.resident_distance import QUICK_REACH, QUICK_ROWS, near
 from solidcloud.server.scene import Scene
 
 BALL = make_avatar([[0.0, 0, 0]], 0.1)

@@ -3,10 +3,17 @@
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from solidcloud.schemas.voxel_grid import voxel_keys
-from solidcloud.server.kernels.reach import SceneIndex
-from solidcloud.server.kernels.walks import MOST_POSES, STALE, merge_wanted
-from solidcloud.server.neighbourhood import AHEAD, EXPIRY, FEW_USERS, MOST_USERS, Neighbourhood, Wanted
+from solidcloud.schemas.archive.voxel_grid import voxel_keys
+from solidcloud.server.kernels.core.voxels_in_reach import SceneIndex
+from solidcloud.server.kernels.prediction.user_tracks import MOST_POSES, STALE, merge_wanted
+from solidcloud.server.residency.motion_prediction import (
+    AHEAD,
+    EXPIRY,
+    FEW_USERS,
+    MOST_USERS,
+    Neighbourhood,
+    Wanted,
+)
 
 pytestmark = pytest.mark.interpreted
 
@@ -329,7 +336,7 @@ def test_of_too_many_users_the_one_not_heard_of_for_longest_is_forgotten(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     assert MOST_USERS >= FEW_USERS
-    monkeypatch.setattr("solidcloud.server.neighbourhood.MOST_USERS", 3)
+    monkeypatch.setattr("solidcloud.server.residency.motion_prediction.MOST_USERS", 3)
     around = make()
     users = [("client", str(number)) for number in range(5)]
     for when, number in enumerate((0, 1, 2, 0, 3, 4)):

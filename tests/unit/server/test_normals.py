@@ -17,14 +17,14 @@ import pytest
 import scans
 from numpy.typing import NDArray
 from solidcloud.schemas.errors import BadRequestError, CorruptError
-from solidcloud.schemas.kernels.normals import LINE, NONE, THICK, decode_normal
-from solidcloud.server.kernels.normals import code_at, find_voxel, stored_code_at
-from solidcloud.server.left_out import LeftOut
-from solidcloud.server.normals import Normals, warm
-from solidcloud.server.opened import Opened
-from solidcloud.server.request import with_stop
-from solidcloud.server.stop import Stop, StoppedError
-from solidcloud.server.store import Store
+from solidcloud.schemas.kernels.normal_codes import LINE, NONE, THICK, decode_normal
+from solidcloud.server.archives.archive_generation import Opened
+from solidcloud.server.archives.masked_archive import LeftOut
+from solidcloud.server.kernels.rays.stored_normals import code_at, find_voxel, stored_code_at
+from solidcloud.server.queries.context.query_context import with_stop
+from solidcloud.server.queries.surface_normals import Normals, warm
+from solidcloud.server.residency.voxel_store import Store
+from solidcloud.server.runtime.stop_flag import Stop, StoppedError
 
 pytestmark = pytest.mark.interpreted
 
@@ -265,7 +265,7 @@ def test_a_stop_ends_a_wait_for_a_voxel_and_no_request_has_that_of_another(tmp_p
 def test_nobody_imports_it_but_who_asks() -> None:
     """A scene that calls for no normals has none of their code in memory."""
     code = (
-        "import sys; import solidcloud.server.scene, solidcloud.server.app; "
+        "import sys; import solidcloud.server.scene, solidcloud.server.service.service; "
         "print([name for name in sys.modules if name.startswith('solidcloud') and 'normals' in name])"
     )
     env = {**os.environ, "NUMBA_DISABLE_JIT": "1"}

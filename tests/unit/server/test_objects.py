@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 import scans
 from numpy.typing import NDArray
-from solidcloud.schemas.answers import Verdict
 from solidcloud.schemas.errors import BadRequestError, BadTransformError
-from solidcloud.server.avatar import make_avatar
-from solidcloud.server.effort import Effort
-from solidcloud.server.objects import SCENE_GROUP, objects
-from solidcloud.server.request import SceneData, make_scene_data
-from solidcloud.server.residency import Residency
-from solidcloud.server.stop import Stop
-from solidcloud.server.store import Store
+from solidcloud.schemas.wire.answers import Verdict
+from solidcloud.server.avatars.avatar_model import make_avatar
+from solidcloud.server.queries.context.query_budget import Effort
+from solidcloud.server.queries.context.query_context import SceneData, make_scene_data
+from solidcloud.server.queries.objects import SCENE_GROUP, objects
+from solidcloud.server.residency.voxel_cache import Residency
+from solidcloud.server.residency.voxel_store import Store
+from solidcloud.server.runtime.stop_flag import Stop
 
 CLEAR, CONTACT, UNKNOWN = Verdict
 BALL = make_avatar([[0.0, 0, 0]], 0.5)

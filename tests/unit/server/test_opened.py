@@ -11,8 +11,8 @@ import cases
 import numpy as np
 import pytest
 import scans
+from solidcloud.schemas.archive.index_file import INDEX_NAME
 from solidcloud.schemas.errors import BadRequestError, BusyError, FormatError, SolidcloudError
-from solidcloud.schemas.index_file import INDEX_NAME
 from solidcloud.server import scene as scene_module
 from solidcloud.server.scene import Scene
 

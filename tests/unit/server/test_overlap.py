@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import scans
 from numpy.typing import NDArray
-from solidcloud.server.kernels.layout import LANES
+from solidcloud.server.kernels.core.voxel_layout import LANES
 from solidcloud.server.scene import Scene
 
 

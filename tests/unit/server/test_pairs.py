@@ -8,10 +8,10 @@ import naive
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from solidcloud.server.avatar import AvatarModel, make_avatar
-from solidcloud.server.kernels import pairs as kernel
-from solidcloud.server.kernels.layout import LANES
-from solidcloud.server.stop import NEVER
+from solidcloud.server.avatars.avatar_model import AvatarModel, make_avatar
+from solidcloud.server.kernels.bodies import body_pairs as kernel
+from solidcloud.server.kernels.core.voxel_layout import LANES
+from solidcloud.server.runtime.stop_flag import NEVER
 
 pytestmark = pytest.mark.interpreted
 interpreted_only = pytest.mark.skipif(

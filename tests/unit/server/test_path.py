@@ -6,10 +6,10 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
-from solidcloud.schemas.answers import CollideAnswers, CollidePart
 from solidcloud.schemas.errors import BadTransformError
-from solidcloud.server import path as path_module
-from solidcloud.server.path import largest_part, path_parts
+from solidcloud.schemas.wire.answers import CollideAnswers, CollidePart
+from solidcloud.server.queries import path as path_module
+from solidcloud.server.queries.path import largest_part, path_parts
 
 
 def answers(start, stop, seconds=0.0):

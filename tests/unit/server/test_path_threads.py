@@ -4,7 +4,7 @@ import threading
 
 import pytest
 from solidcloud.schemas.errors import BadRequestError
-from solidcloud.server.path_threads import PathThreads
+from solidcloud.server.runtime.path_threads import PathThreads
 
 pytestmark = pytest.mark.interpreted
 DEADLINE = 20.0

@@ -9,9 +9,9 @@ import naive
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from solidcloud.server.avatar import make_avatar
-from solidcloud.server.kernels import placed as kernel
-from solidcloud.server.kernels.layout import LANES
+from solidcloud.server.avatars.avatar_model import make_avatar
+from solidcloud.server.kernels.core import placed_avatar as kernel
+from solidcloud.server.kernels.core.voxel_layout import LANES
 
 pytestmark = pytest.mark.interpreted
 

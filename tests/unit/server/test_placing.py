@@ -7,8 +7,8 @@ import naive
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from solidcloud.server.kernels import placing
-from solidcloud.server.kernels.layout import BLOCK_WORDS, SceneArrays
+from solidcloud.server.kernels.core import pose_transform as placing
+from solidcloud.server.kernels.core.voxel_layout import BLOCK_WORDS, SceneArrays
 
 pytestmark = pytest.mark.interpreted
 

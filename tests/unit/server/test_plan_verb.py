@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scans import write_las
-from solidcloud.server.cli import run
-from solidcloud.server.verbs.plan import time_text
+from solidcloud.server.cli.commands.plan_command import time_text
+from solidcloud.server.cli.main import run
 
 
 def test_a_number_of_points_is_planned_for(capsys: pytest.CaptureFixture[str]) -> None:

@@ -6,8 +6,8 @@ import cases
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from solidcloud.server.kernels import placing
-from solidcloud.server.stop import NEVER
+from solidcloud.server.kernels.core import pose_transform as placing
+from solidcloud.server.runtime.stop_flag import NEVER
 
 pytestmark = pytest.mark.interpreted
 

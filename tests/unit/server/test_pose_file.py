@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from solidcloud.schemas.errors import BadRequestError, ScanError
-from solidcloud.server.pose_file import read_poses, write_poses
+from solidcloud.server.cli.input.pose_file import read_poses, write_poses
 
 HEADER = "t,x,y,z,qw,qx,qy,qz\n"
 

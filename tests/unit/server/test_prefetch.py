@@ -6,9 +6,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from fake_store import BLOCK, FakeStore
-from solidcloud.server.neighbourhood import User, Wanted
-from solidcloud.server.prefetch import Prefetcher
-from solidcloud.server.residency import Residency
+from solidcloud.server.residency.motion_prediction import User, Wanted
+from solidcloud.server.residency.prefetch import Prefetcher
+from solidcloud.server.residency.voxel_cache import Residency
 
 pytestmark = pytest.mark.interpreted
 PATIENCE = 20.0  # [s], for what takes microseconds when it is right

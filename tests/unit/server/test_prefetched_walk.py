@@ -7,10 +7,10 @@ import cases
 import numpy as np
 import pytest
 import scans
-from solidcloud.schemas.answers import Verdict
 from solidcloud.schemas.errors import BadRequestError, BadTransformError
-from solidcloud.server.coarse import SLOT_BYTES
-from solidcloud.server.policies import POLICIES
+from solidcloud.schemas.wire.answers import Verdict
+from solidcloud.server.residency.coarse_bounds import SLOT_BYTES
+from solidcloud.server.residency.eviction import POLICIES
 from solidcloud.server.scene import Scene
 
 SCAN = scans.make_scan("noise", 9, 30_000)

@@ -11,16 +11,16 @@ import pytest
 import scans
 import swept
 from numpy.typing import NDArray
-from solidcloud.schemas.answers import Verdict
-from solidcloud.server import probe as module
-from solidcloud.server.avatar import make_avatar
-from solidcloud.server.collide import collide
-from solidcloud.server.effort import EXACT, Effort
-from solidcloud.server.kernels import probing as kernel
-from solidcloud.server.kernels.placing import SIMILARITY_TOLERANCE
-from solidcloud.server.probe import Probe, Swept
-from solidcloud.server.request import SceneData
-from solidcloud.server.sweep import sweep
+from solidcloud.schemas.wire.answers import Verdict
+from solidcloud.server.avatars.avatar_model import make_avatar
+from solidcloud.server.kernels.core.pose_transform import SIMILARITY_TOLERANCE
+from solidcloud.server.kernels.motion import sweep_resident as kernel
+from solidcloud.server.queries import resident_motion as module
+from solidcloud.server.queries.collide import collide
+from solidcloud.server.queries.context.query_budget import EXACT, Effort
+from solidcloud.server.queries.context.query_context import SceneData
+from solidcloud.server.queries.resident_motion import Probe, Swept
+from solidcloud.server.queries.sweep import sweep
 
 Poses = NDArray[np.float64]
 COUNT = 12

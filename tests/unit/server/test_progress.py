@@ -8,8 +8,8 @@ from itertools import count
 
 import pytest
 from rich.console import Console
-from solidcloud.server import progress
-from solidcloud.server.progress import (
+from solidcloud.server.cli.output import progress_display as progress
+from solidcloud.server.cli.output.progress_display import (
     Bars,
     JsonLines,
     Lines,

@@ -13,10 +13,10 @@ pytest.importorskip("prometheus_client")
 
 from prometheus_client.parser import text_string_to_metric_families
 from solidcloud.schemas.errors import BadRequestError, SolidcloudError
-from solidcloud.schemas.stats import StatsAnswer, Times, UserStats
-from solidcloud.server.config import ServerConfig
-from solidcloud.server.metrics import Histogram
-from solidcloud.server.prometheus import FEW_USERS, metrics_served
+from solidcloud.schemas.wire.stats import StatsAnswer, Times, UserStats
+from solidcloud.server.observability.metrics import Histogram
+from solidcloud.server.observability.prometheus import FEW_USERS, metrics_served
+from solidcloud.server.service.server_config import ServerConfig
 
 FIELDS = [name for name, kind in get_type_hints(StatsAnswer).items() if kind is int]
 
@@ -154,10 +154,10 @@ def test_a_missing_library_is_named_with_its_extra(monkeypatch: pytest.MonkeyPat
             raise ModuleNotFoundError(f"No module named {name!r}", name="prometheus_client")
         return real(name, *arguments, **more)
 
-    monkeypatch.delitem(sys.modules, "solidcloud.server.prometheus")
+    monkeypatch.delitem(sys.modules, "solidcloud.server.observability.prometheus")
     monkeypatch.setattr(builtins, "__import__", without)
     with pytest.raises(SolidcloudError, match=r"prometheus_client.*pip install 'solidcloud\[metrics\]'"):
-        importlib.import_module("solidcloud.server.prometheus")
+        importlib.import_module("solidcloud.server.observability.prometheus")
 
 
 def test_times_that_say_nothing_have_all_buckets() -> None:

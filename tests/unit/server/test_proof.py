@@ -9,15 +9,15 @@ import cases
 import numpy as np
 import pytest
 import scans
-from solidcloud.server import rounds
-from solidcloud.server.avatar import make_avatar
-from solidcloud.server.collide import collide
-from solidcloud.server.effort import make_effort
-from solidcloud.server.kernels.reach import Reach
-from solidcloud.server.opened import Opened
-from solidcloud.server.proof import Bounds
-from solidcloud.server.stop import Stop
-from solidcloud.server.store import Store
+from solidcloud.server.archives.archive_generation import Opened
+from solidcloud.server.avatars.avatar_model import make_avatar
+from solidcloud.server.kernels.core.voxels_in_reach import Reach
+from solidcloud.server.queries.collide import collide
+from solidcloud.server.queries.context import front_to_back as rounds
+from solidcloud.server.queries.context.query_budget import make_effort
+from solidcloud.server.residency.index_proof import Bounds
+from solidcloud.server.residency.voxel_store import Store
+from solidcloud.server.runtime.stop_flag import Stop
 
 pytestmark = pytest.mark.interpreted
 
@@ -101,7 +101,7 @@ def test_a_ray_begins_again_where_another_request_proves_a_voxel_meanwhile(
     opened: Opened, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The voxel's box may have been read half: by the time its proof is looked at, all are proved."""
-    from solidcloud.server.rays import raycast
+    from solidcloud.server.queries.raycast import raycast
 
     lists, next_rows, listed = rounds._list, rounds._next_rows, 0
 
@@ -141,7 +141,7 @@ def test_what_the_index_has_in_reach_is_loaded_first_where_there_is_a_deadline(
     for row in range(len(center)):
         pose = np.eye(4)[None]
         pose[0, :3, 3] = header.lattice.to_world(bounds.index_boxes.low[row])
-        from solidcloud.server.request import check_request
+        from solidcloud.server.queries.context.query_context import check_request
 
         reach = check_request(data, avatar, pose, data.radius_units)
         doubted = bounds.rows_to_prove(reach, bounds.unproved)
@@ -155,7 +155,7 @@ def test_what_the_index_has_in_reach_is_loaded_first_where_there_is_a_deadline(
 
 
 def test_warming_compiles_what_a_proof_takes(opened: Opened, monkeypatch: pytest.MonkeyPatch) -> None:
-    from solidcloud.server import proof
+    from solidcloud.server.residency import index_proof as proof
 
     tightened, tighten = list[int](), proof.tighten
 

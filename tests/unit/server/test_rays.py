@@ -15,15 +15,15 @@ import scans
 from numpy.typing import NDArray
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import build_archive
-from solidcloud.schemas.answers import Verdict
-from solidcloud.schemas.archive import Archive
+from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.errors import BadRequestError
-from solidcloud.server.effort import Effort
-from solidcloud.server.rays import raycast
-from solidcloud.server.request import SceneData, make_scene_data
-from solidcloud.server.residency import Residency
-from solidcloud.server.store import Store
-from solidcloud.server.within import within
+from solidcloud.schemas.wire.answers import Verdict
+from solidcloud.server.queries.context.query_budget import Effort
+from solidcloud.server.queries.context.query_context import SceneData, make_scene_data
+from solidcloud.server.queries.raycast import raycast
+from solidcloud.server.queries.within import within
+from solidcloud.server.residency.voxel_cache import Residency
+from solidcloud.server.residency.voxel_store import Store
 
 CLEAR, CONTACT, UNKNOWN = Verdict
 X, Y = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)

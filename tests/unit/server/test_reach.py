@@ -8,13 +8,18 @@ import numpy as np
 import pytest
 import scans
 from numpy.typing import NDArray
-from solidcloud.schemas.archive import Archive
-from solidcloud.server.avatar import AvatarModel, make_avatar
-from solidcloud.server.kernels.reach import Reach, find_key
-from solidcloud.server.request import SceneData, check_request, make_scene_data, to_units
-from solidcloud.server.residency import Residency
+from solidcloud.schemas.archive.archive import Archive
+from solidcloud.server.avatars.avatar_model import AvatarModel, make_avatar
+from solidcloud.server.kernels.core.voxels_in_reach import Reach, find_key
+from solidcloud.server.queries.context.query_context import (
+    SceneData,
+    check_request,
+    make_scene_data,
+    to_units,
+)
+from solidcloud.server.residency.voxel_cache import Residency
+from solidcloud.server.residency.voxel_store import Store
 from solidcloud.server.scene import Scene
-from solidcloud.server.store import Store
 
 
 def find(data: SceneData, avatar: AvatarModel, poses: NDArray[np.float64], margin: float) -> Reach:

@@ -6,10 +6,10 @@ import cases
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from solidcloud.schemas.archive.voxel_grid import KEY_BIAS
 from solidcloud.schemas.kernels.morton import morton_encode
-from solidcloud.schemas.voxel_grid import KEY_BIAS
-from solidcloud.server.kernels import placing
-from solidcloud.server.kernels.reach import Reach, SceneIndex, find_reach, voxels_in_reach
+from solidcloud.server.kernels.core import pose_transform as placing
+from solidcloud.server.kernels.core.voxels_in_reach import Reach, SceneIndex, find_reach, voxels_in_reach
 
 pytestmark = pytest.mark.interpreted
 

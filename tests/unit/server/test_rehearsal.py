@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from solidcloud.schemas.answers import Verdict
-from solidcloud.schemas.kernel_files import KernelFiles
 from solidcloud.schemas.kernels.compiling import kernel_files
+from solidcloud.schemas.kernels.kernel_files import KernelFiles
 from solidcloud.schemas.kernels.morton import morton_decode
+from solidcloud.schemas.wire.answers import Verdict
+from solidcloud.server.cli.commands.rehearsal import check_answers, rehearse
 from solidcloud.server.scene import Scene
-from solidcloud.server.verbs.rehearsal import check_answers, rehearse
 
 ARCHIVE = Path(__file__).parents[2] / "golden" / "archive-4"
 compiled = pytest.mark.skipif(

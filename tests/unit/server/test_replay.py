@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from fake_server import floor_simulation
 from solidcloud.schemas.errors import BadRequestError
-from solidcloud.schemas.keys import User
-from solidcloud.schemas.moves import Moved, Wish
-from solidcloud.server.frame_log import Begin, Entered, Frame, FrameLog, Points, Record, read_log
-from solidcloud.server.replay import replay
-from solidcloud.server.served import Turn
+from solidcloud.schemas.wire.keys import User
+from solidcloud.schemas.wire.moves import Moved, Wish
+from solidcloud.server.served.served_scene import Turn
+from solidcloud.server.simulation.replay import replay
+from solidcloud.server.simulation.replay_log import Begin, Entered, Frame, FrameLog, Points, Record, read_log
 
 pytestmark = pytest.mark.interpreted
 

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 import scans
 from fake_store import BLOCK, FakeStore
-from solidcloud.schemas.answers import Verdict
 from solidcloud.schemas.errors import BadRequestError
-from solidcloud.schemas.requests import QuestionOptions
-from solidcloud.server.policies import POLICIES
-from solidcloud.server.residency import Held, Residency
+from solidcloud.schemas.wire.answers import Verdict
+from solidcloud.schemas.wire.requests import QuestionOptions
+from solidcloud.server.residency.eviction import POLICIES
+from solidcloud.server.residency.voxel_cache import Held, Residency
+from solidcloud.server.runtime.stop_flag import NEVER
 from solidcloud.server.scene import Scene
-from solidcloud.server.stop import NEVER
 
 pytestmark = pytest.mark.interpreted
 DEADLINE = 20.0  # [s], for what takes microseconds when it is right

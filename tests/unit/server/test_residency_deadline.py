@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import scans
 from fake_store import BLOCK, FakeStore
-from solidcloud.server.request import as_held
-from solidcloud.server.residency import _LOOK_SECONDS, Held, Residency
+from solidcloud.server.queries.context.query_context import as_held
+from solidcloud.server.residency.voxel_cache import _LOOK_SECONDS, Held, Residency
+from solidcloud.server.runtime.stop_flag import Stop
 from solidcloud.server.scene import Scene
-from solidcloud.server.stop import Stop
 
 pytestmark = pytest.mark.interpreted
 PATIENCE = 20.0  # [s], for what takes microseconds when it is right

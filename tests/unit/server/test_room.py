@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from solidcloud.server.arena import ALIGNMENT as BLOCK
-from solidcloud.server.arena import ArenaBuffer
-from solidcloud.server.policies import make_policy
-from solidcloud.server.room import AROUND, Room
+from solidcloud.server.residency.allocator import AROUND, Room
+from solidcloud.server.residency.arena import ALIGNMENT as BLOCK
+from solidcloud.server.residency.arena import ArenaBuffer
+from solidcloud.server.residency.eviction import make_policy
 
 pytestmark = pytest.mark.interpreted
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from solidcloud.server.scan_bounds import Bodies, Points, Rays, box_of, lying_outside, outside_line
+from solidcloud.server.cli.input.scan_bounds import Bodies, Points, Rays, box_of, lying_outside, outside_line
 
 LOW, HIGH = np.array([-1.0, -2.0, 0.0]), np.array([4.0, 3.0, 5.0])
 

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from solidcloud.schemas.answers import Verdict
 from solidcloud.schemas.errors import (
     BadRequestError,
     CorruptError,
@@ -17,7 +16,9 @@ from solidcloud.schemas.errors import (
     ScanError,
     UnknownAvatarError,
 )
-from solidcloud.schemas.messages import (
+from solidcloud.schemas.scene.scene_file import parse_scene
+from solidcloud.schemas.wire.answers import Verdict
+from solidcloud.schemas.wire.messages import (
     JSON,
     MSGPACK,
     AvatarInfo,
@@ -27,12 +28,11 @@ from solidcloud.schemas.messages import (
     decode_answer,
     encode,
 )
-from solidcloud.schemas.scene import parse_scene
-from solidcloud.server import scene_file
-from solidcloud.server.cli import run
+from solidcloud.server.cli.main import run
+from solidcloud.server.cli.scene_files.scene_check import check_scene_file
 from solidcloud.server.scene import Scene
-from solidcloud.server.scene_check import check_scene_file
-from solidcloud.server.scene_file import (
+from solidcloud.server.scenes import open_scene as scene_file
+from solidcloud.server.scenes.open_scene import (
     at_place,
     is_scene_file,
     normals_asked,
@@ -40,7 +40,7 @@ from solidcloud.server.scene_file import (
     share_budget,
     store_opener,
 )
-from solidcloud.server.several import SeveralScenes
+from solidcloud.server.scenes.placed_archives import SeveralScenes
 
 pytestmark = pytest.mark.interpreted
 

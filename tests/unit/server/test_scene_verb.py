@@ -7,9 +7,9 @@ import shutil
 from pathlib import Path
 
 import pytest
-from solidcloud.schemas.scene import parse_scene, read_scene
-from solidcloud.server.cli import run
-from solidcloud.server.scene_file import is_scene_file
+from solidcloud.schemas.scene.scene_file import parse_scene, read_scene
+from solidcloud.server.cli.main import run
+from solidcloud.server.scenes.open_scene import is_scene_file
 
 pytestmark = pytest.mark.interpreted
 

@@ -5,8 +5,8 @@ from types import SimpleNamespace
 
 import pytest
 import zenoh
-from solidcloud.server.session_transport import SceneSessions
-from solidcloud.server.tokens import Tokens
+from solidcloud.server.service.liveliness_tokens import Tokens
+from solidcloud.server.service.session_transport import SceneSessions
 
 pytestmark = pytest.mark.interpreted
 

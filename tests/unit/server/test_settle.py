@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from coarse_tops import ROOM, Made, open_made, rows_of, scattered
 from numpy.typing import NDArray
-from solidcloud.schemas.radius_model import LOCAL_CLASSES
-from solidcloud.server.avatar import make_avatar
-from solidcloud.server.coarse import Coarse, settle
-from solidcloud.server.effort import NO_LIMIT
-from solidcloud.server.kernels.coarse import any_to_settle
-from solidcloud.server.kernels.overlap import CLEAR, CONTACT, overlap_poses
+from solidcloud.schemas.archive.radius_model import LOCAL_CLASSES
+from solidcloud.server.avatars.avatar_model import make_avatar
+from solidcloud.server.kernels.overlap.coarse_overlap import any_to_settle
+from solidcloud.server.kernels.overlap.overlap import CLEAR, CONTACT, overlap_poses
+from solidcloud.server.queries.context.query_budget import NO_LIMIT
+from solidcloud.server.residency.coarse_bounds import Coarse, settle
 
 
 @pytest.fixture

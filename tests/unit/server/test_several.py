@@ -8,10 +8,10 @@ import naive
 import numpy as np
 import pytest
 from halves import BODY, COUNT, RADIUS, STEP, Built, exact_pose, near, several
-from solidcloud.schemas.arrays import array_fields
-from solidcloud.server.posed import inverse_of, moved, under
+from solidcloud.schemas.wire.arrays import array_fields
+from solidcloud.server.archives.rigid_transform import inverse_of, moved, under
 from solidcloud.server.scene import Scene
-from solidcloud.server.several import SeveralScenes
+from solidcloud.server.scenes.placed_archives import SeveralScenes
 
 # What answers say of the cost, and of bounds, which are each archive's own.
 COSTS = ("node_visits", "point_tests", "voxels_missing", "outside", "steps")

@@ -4,8 +4,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from solidcloud.server import several_path
-from solidcloud.server.stop import NEVER, Stop
+from solidcloud.server.runtime.stop_flag import NEVER, Stop
+from solidcloud.server.scenes import placed_paths as several_path
 
 pytestmark = pytest.mark.interpreted
 

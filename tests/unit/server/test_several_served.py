@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from halves import BODY, COUNT, OPTIONS, RADIUS, STEP, Built, exact_pose, near, several
 from msgspec import structs
-from solidcloud.schemas.archive import Archive
+from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.errors import BadRequestError, BadTransformError, FormatError, UnknownAvatarError
-from solidcloud.schemas.keys import public_id
-from solidcloud.server.app import Service
-from solidcloud.server.config import ServerConfig
-from solidcloud.server.posed import archive_pose, inverse_of, moved, under
+from solidcloud.schemas.wire.keys import public_id
+from solidcloud.server.archives.rigid_transform import archive_pose, inverse_of, moved, under
 from solidcloud.server.scene import Scene
-from solidcloud.server.several import SeveralScenes
+from solidcloud.server.scenes.placed_archives import SeveralScenes
+from solidcloud.server.service.server_config import ServerConfig
+from solidcloud.server.service.service import Service
 
 
 @pytest.fixture(scope="module")

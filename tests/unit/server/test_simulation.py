@@ -6,7 +6,6 @@ import threading
 import numpy as np
 import pytest
 from fake_server import FloorScene, floor_simulation
-from solidcloud.schemas.effects import Ground, Stop
 from solidcloud.schemas.errors import (
     BadRequestError,
     BadTransformError,
@@ -14,14 +13,15 @@ from solidcloud.schemas.errors import (
     InternalError,
     UnknownAvatarError,
 )
-from solidcloud.schemas.keys import User, public_id
-from solidcloud.schemas.moves import FRAME_SECONDS, Moved, State, Wish
-from solidcloud.schemas.scene import SceneFile, Spawn, scene_of
-from solidcloud.server.avatar_limits import EVERYBODY
+from solidcloud.schemas.scene.effect_options import Ground, Stop
+from solidcloud.schemas.scene.scene_file import SceneFile, Spawn, scene_of
+from solidcloud.schemas.wire.keys import User, public_id
+from solidcloud.schemas.wire.moves import FRAME_SECONDS, Moved, State, Wish
 from solidcloud.server.client import Client
 from solidcloud.server.scene import Scene
-from solidcloud.server.served import SceneLike, Turn
-from solidcloud.server.simulation import SILENT_SECONDS, Simulation
+from solidcloud.server.served.avatar_limits import EVERYBODY
+from solidcloud.server.served.served_scene import SceneLike, Turn
+from solidcloud.server.simulation.simulation import SILENT_SECONDS, Simulation
 
 pytestmark = pytest.mark.interpreted
 

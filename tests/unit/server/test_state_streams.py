@@ -1,10 +1,10 @@
 """The open queries of one scene: their room, and what is kept for one that is still to come."""
 
 import pytest
-from solidcloud.schemas.keys import User
-from solidcloud.server import state_streams
-from solidcloud.server.served import Answer
-from solidcloud.server.state_streams import IDLE_SECONDS, StateStreams
+from solidcloud.schemas.wire.keys import User
+from solidcloud.server.served.served_scene import Answer
+from solidcloud.server.service import state_streams
+from solidcloud.server.service.state_streams import IDLE_SECONDS, StateStreams
 
 pytestmark = pytest.mark.interpreted
 

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import build_archive
-from solidcloud.schemas.answers import Verdict
-from solidcloud.server import path
-from solidcloud.server.effort import EXACT
+from solidcloud.schemas.wire.answers import Verdict
+from solidcloud.server.queries import path
+from solidcloud.server.queries.context.query_budget import EXACT
+from solidcloud.server.runtime.stop_flag import NEVER, Stop
 from solidcloud.server.scene import Scene
-from solidcloud.server.stop import NEVER, Stop
 
 INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
 CLEAR, CONTACT, UNKNOWN = Verdict

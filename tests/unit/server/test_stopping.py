@@ -14,14 +14,15 @@ import numpy as np
 import pytest
 import scans
 import stops
-from solidcloud.server.avatar import make_avatar
-from solidcloud.server.effort import EXACT, Effort
-from solidcloud.server.kernels import overlap, stopping
-from solidcloud.server.objects import find_pairs
-from solidcloud.server.request import with_stop
-from solidcloud.server.residency import Residency
-from solidcloud.server.stop import NEVER, Stop, StoppedError
-from solidcloud.server.sweep import sweep
+from solidcloud.server.avatars.avatar_model import make_avatar
+from solidcloud.server.kernels.core import stop_flag_checks as stopping
+from solidcloud.server.kernels.overlap import overlap
+from solidcloud.server.queries.context.query_budget import EXACT, Effort
+from solidcloud.server.queries.context.query_context import with_stop
+from solidcloud.server.queries.objects import find_pairs
+from solidcloud.server.queries.sweep import sweep
+from solidcloud.server.residency.voxel_cache import Residency
+from solidcloud.server.runtime.stop_flag import NEVER, Stop, StoppedError
 from stops import CLEAR, CONTACT, UNKNOWN, Asked
 
 INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
@@ -214,7 +215,7 @@ def test_a_flag_set_meanwhile_ends_a_kernel_soon(crowded: Callable[[int, int], A
 
 @pytest.mark.skipif(INTERPRETED, reason="to build the avatar takes too long")
 def test_a_budget_ends_a_kernel_that_does_not_look_at_the_clock(crowded: Callable[[int, int], Asked]) -> None:
-    from solidcloud.server.effort import make_effort
+    from solidcloud.server.queries.context.query_budget import make_effort
 
     asked = crowded(MANY, 1)._replace(margin=1.0)
     begin = time.perf_counter()
@@ -231,7 +232,7 @@ def test_a_budget_ends_a_kernel_that_does_not_look_at_the_clock(crowded: Callabl
 
 @pytest.mark.interpreted
 def test_pairs_of_objects_are_those_of_a_sort_by_two_keys(asked: Asked) -> None:
-    from solidcloud.server.objects import _check
+    from solidcloud.server.queries.objects import _check
 
     n = len(asked.poses)
     both = np.full(n, 0xFFFFFFFF, np.uint32)

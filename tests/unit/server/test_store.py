@@ -7,11 +7,11 @@ import cases
 import numpy as np
 import pytest
 import scans
-from solidcloud.schemas import voxel as voxel_module
-from solidcloud.schemas.codec import encode_voxel
+from solidcloud.schemas.archive import voxel as voxel_module
+from solidcloud.schemas.archive.codec import encode_voxel
 from solidcloud.schemas.errors import CorruptError, FormatError, MisleadingIndexError
-from solidcloud.server.arena import ArenaBuffer
-from solidcloud.server.store import Store
+from solidcloud.server.residency.arena import ArenaBuffer
+from solidcloud.server.residency.voxel_store import Store
 
 
 @pytest.fixture

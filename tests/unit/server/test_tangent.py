@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import work
 from numpy.typing import NDArray
-from solidcloud.schemas.answers import Verdict
+from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.scene import Scene
 
 pytestmark = pytest.mark.interpreted

@@ -5,7 +5,7 @@ import threading
 from pathlib import Path
 
 import pytest
-from solidcloud.server.threads import start_thread
+from solidcloud.server.runtime.threads import start_thread
 
 pytestmark = pytest.mark.interpreted
 

@@ -1,7 +1,7 @@
 """Which clients have a turn of their own."""
 
 import pytest
-from solidcloud.server.tokens import ANONYMOUS, Tokens
+from solidcloud.server.service.liveliness_tokens import ANONYMOUS, Tokens
 
 pytestmark = pytest.mark.interpreted
 

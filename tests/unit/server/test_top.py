@@ -7,9 +7,18 @@ from typing import Any, get_type_hints
 import pytest
 from rich.console import Console
 from solidcloud.schemas.errors import BusyError
-from solidcloud.schemas.stats import StatsAnswer, Times, UserStats
-from solidcloud.server import top
-from solidcloud.server.top import MOST_ROWS, Look, budget_line, plain, rate, rate_text, seconds_text, watch
+from solidcloud.schemas.wire.stats import StatsAnswer, Times, UserStats
+from solidcloud.server.cli.output import top_display as top
+from solidcloud.server.cli.output.top_display import (
+    MOST_ROWS,
+    Look,
+    budget_line,
+    plain,
+    rate,
+    rate_text,
+    seconds_text,
+    watch,
+)
 
 
 class Told:

@@ -2,7 +2,7 @@
 
 import json
 
-from solidcloud.server.zenoh_settings import session_config
+from solidcloud.server.network.zenoh_settings import session_config
 
 
 def test_sessions_find_nobody_and_are_found_by_nobody():

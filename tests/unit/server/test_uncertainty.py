@@ -5,7 +5,13 @@ import statistics
 
 import numpy as np
 import pytest
-from solidcloud.server.uncertainty import FARTHEST, LEFT_OUT, contact_probability, each_alone, together
+from solidcloud.server.simulation.world.contact_probability import (
+    FARTHEST,
+    LEFT_OUT,
+    contact_probability,
+    each_alone,
+    together,
+)
 
 # Upper tails of the normal distribution, from tables (Abramowitz and Stegun, table 26.1; 26.2 for the last).
 TAILS = {

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from solidcloud.server.vectors import (
+from solidcloud.server.simulation.world.vectors import (
     dot,
     level,
     lowest_of,

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from solidcloud.server.kernels.voxel_tree import FAN, Lists, list_voxels, make_voxel_tree
-from solidcloud.server.stop import NEVER
+from solidcloud.server.kernels.core.voxel_tree import FAN, Lists, list_voxels, make_voxel_tree
+from solidcloud.server.runtime.stop_flag import NEVER
 
 pytestmark = pytest.mark.interpreted
 

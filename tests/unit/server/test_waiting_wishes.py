@@ -1,9 +1,9 @@
 """Wishes that wait to be read: clients in turn, each bounded."""
 
 import pytest
-from solidcloud.schemas.keys import User
-from solidcloud.server import waiting_wishes
-from solidcloud.server.waiting_wishes import WaitingWishes
+from solidcloud.schemas.wire.keys import User
+from solidcloud.server.service import waiting_commands as waiting_wishes
+from solidcloud.server.service.waiting_commands import WaitingWishes
 
 pytestmark = pytest.mark.interpreted
 

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import build_archive
-from solidcloud.schemas.answers import Verdict
-from solidcloud.schemas.archive import Archive
+from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.errors import BadRequestError, InternalError
-from solidcloud.server.pose_file import write_poses
-from solidcloud.server.report import walkthrough
-from solidcloud.server.report.case import Case, archive_points, given_case
-from solidcloud.server.report.path_figure import contact_spans, rolling_median
-from solidcloud.server.report.spheres import Spheres, level_spheres, render_spheres
-from solidcloud.server.report.walkthrough import PLAIN, SLAB, Structure
+from solidcloud.schemas.wire.answers import Verdict
+from solidcloud.server.cli.input.pose_file import write_poses
+from solidcloud.server.report.common.paper_case import Case, archive_points, given_case
+from solidcloud.server.report.common.sphere_pictures import Spheres, level_spheres, render_spheres
+from solidcloud.server.report.walk import walkthrough
+from solidcloud.server.report.walk.path_figure import contact_spans, rolling_median
+from solidcloud.server.report.walk.walkthrough import PLAIN, SLAB, Structure
 
 SEED = 7
 STEP = 1e-3

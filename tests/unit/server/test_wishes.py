@@ -5,10 +5,9 @@ import math
 import numpy as np
 import pytest
 from solidcloud.schemas.errors import BadRequestError, BadTransformError, UnknownAvatarError
-from solidcloud.schemas.moves import FRAME_SECONDS, MoveRequest, Wish
-from solidcloud.schemas.scene import Spawn
-from solidcloud.server.vectors import rotation
-from solidcloud.server.wishes import (
+from solidcloud.schemas.scene.scene_file import Spawn
+from solidcloud.schemas.wire.moves import FRAME_SECONDS, MoveRequest, Wish
+from solidcloud.server.simulation.world.motion_commands import (
     LONGEST_FRAME,
     check_rigid,
     first_pose,
@@ -16,6 +15,7 @@ from solidcloud.server.wishes import (
     spawn_pose,
     wished_pose,
 )
+from solidcloud.server.simulation.world.vectors import rotation
 
 pytestmark = pytest.mark.interpreted
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import work
 from numpy.typing import NDArray
-from solidcloud.schemas.answers import Verdict
+from solidcloud.schemas.wire.answers import Verdict
 
 pytestmark = pytest.mark.interpreted
 

@@ -9,14 +9,14 @@ import numpy as np
 import pushed
 import pytest
 from pushed import at
-from solidcloud.schemas.answers import Verdict
-from solidcloud.schemas.scene import ArchiveItem, SceneFile
-from solidcloud.server.avatar import make_avatar
-from solidcloud.server.effects.frame import Hit
-from solidcloud.server.probe import Probe, Swept
+from solidcloud.schemas.scene.scene_file import ArchiveItem, SceneFile
+from solidcloud.schemas.wire.answers import Verdict
+from solidcloud.server.avatars.avatar_model import make_avatar
+from solidcloud.server.queries.resident_motion import Probe, Swept
+from solidcloud.server.runtime.stop_flag import NEVER
 from solidcloud.server.scene import Scene
-from solidcloud.server.stop import NEVER
-from solidcloud.server.world import World
+from solidcloud.server.simulation.world.collision_world import World
+from solidcloud.server.simulation.world.frame import Hit
 
 BALL = make_avatar([[0.0, 0, 0]], 0.2)
 # A quarter turn about z, and a shift.
@@ -82,7 +82,7 @@ def test_an_archive_at_a_pose_is_met_where_it_lies_and_first_comes_first(tmp_pat
 @pytest.mark.interpreted
 def test_avatars_that_were_dropped_are_let_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     case = pushed.build(tmp_path, pushed.plane((0, -0.4, -0.4), (0, 0.4, 0.4)))
-    monkeypatch.setattr("solidcloud.server.world._PROBED_POINTS", 100)
+    monkeypatch.setattr("solidcloud.server.simulation.world.collision_world._PROBED_POINTS", 100)
     with Scene.open(case.archive) as scene:
         world, points = world_of((scene, None)), []
         for count in (1, 40, 40, 40, 200, 200, 3, 1):

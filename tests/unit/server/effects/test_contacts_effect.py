@@ -8,11 +8,12 @@ import pytest
 import scans
 from effect_frames import body_of, flip_a_byte, report, world_of
 from numpy.typing import NDArray
-from solidcloud.schemas.effects import Contacts, Proximity
-from solidcloud.schemas.moves import ContactsReport
-from solidcloud.server.avatar import make_avatar
-from solidcloud.server.effects import contacts, proximity
+from solidcloud.schemas.scene.effect_options import Contacts, Proximity
+from solidcloud.schemas.wire.moves import ContactsReport
+from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.scene import Scene
+from solidcloud.server.simulation.effects import contacts_effect as contacts
+from solidcloud.server.simulation.effects import proximity_effect as proximity
 
 BALL = make_avatar([[0.0, 0, 0]], 0.1)
 ROW = np.column_stack([np.arange(0, 4, 0.1), np.zeros(40), np.zeros(40)])

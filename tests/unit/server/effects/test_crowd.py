@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from moving_bodies import INTERPRETED, Stage, at, ball, box, staged, touch
 from numpy.typing import NDArray
-from solidcloud.schemas.effects import AnyEffect, Crowd, Slide, Stop, Sweep
 from solidcloud.schemas.errors import BadRequestError
-from solidcloud.server.avatar import make_avatar
-from solidcloud.server.effects import crowd
-from solidcloud.server.effects.frame import Body
-from solidcloud.server.kernels.meeting_placed import Scratch
+from solidcloud.schemas.scene.effect_options import AnyEffect, Crowd, Slide, Stop, Sweep
+from solidcloud.server.avatars.avatar_model import make_avatar
+from solidcloud.server.kernels.bodies.moving_bodies import Scratch
+from solidcloud.server.simulation.effects import crowd_effect as crowd
+from solidcloud.server.simulation.world.frame import Body
 
 SMALL = ball(0.2, 12 if INTERPRETED else 60)
 CONTINUOUS: list[AnyEffect] = [Stop(), Sweep()]
@@ -204,9 +204,9 @@ def test_a_margin_beyond_reason_is_refused(tmp_path: Path) -> None:
 def test_what_is_not_declared_is_not_imported() -> None:
     program = """
 import sys
-import solidcloud.server.effects.pipeline, solidcloud.server.effects.stop, solidcloud.server.effects.sweep
-names = ["effects." + name for name in ("crowd", "objects", "bodies", "blocking")]
-names += ["kernels." + name for name in ("meeting", "meeting_placed", "near_bodies")]
+from solidcloud.server.simulation.effects import pipeline, stop_effect, sweep_effect
+names = ["simulation.effects." + name for name in ("crowd_effect", "objects_effect", "bodies", "blocking")]
+names += ["kernels.bodies." + name for name in ("body_sweep", "moving_bodies", "near_bodies")]
 print([name for name in names if "solidcloud.server." + name in sys.modules])
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)

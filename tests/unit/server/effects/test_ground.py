@@ -9,11 +9,11 @@ import pytest
 from effect_frames import flip_a_byte
 from numpy.typing import NDArray
 from pushed import APART, INTERPRETED, RADIUS, Play, at, play
-from solidcloud.schemas.answers import Verdict
-from solidcloud.schemas.archive import Archive
-from solidcloud.schemas.effects import Ground, Slide, Step, Stop, Sweep
-from solidcloud.schemas.moves import Moved
-from solidcloud.server.effects.frame import Body
+from solidcloud.schemas.archive.archive import Archive
+from solidcloud.schemas.scene.effect_options import Ground, Slide, Step, Stop, Sweep
+from solidcloud.schemas.wire.answers import Verdict
+from solidcloud.schemas.wire.moves import Moved
+from solidcloud.server.simulation.world.frame import Body
 
 FRAMES = 60 if not INTERPRETED else 30
 CLEARANCE = 0.03

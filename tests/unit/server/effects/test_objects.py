@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 from moving_bodies import INTERPRETED, Stage, at, ball, box, room, staged, touch
 from numpy.typing import NDArray
-from solidcloud.schemas.answers import Verdict
-from solidcloud.schemas.effects import AnyEffect, Crowd, Ground, Objects, Slide, Stop, Sweep
 from solidcloud.schemas.errors import BadRequestError, BadTransformError
-from solidcloud.schemas.scene import ObjectItem
-from solidcloud.server.avatar import make_avatar
-from solidcloud.server.effects.bodies import Bodies
-from solidcloud.server.effects.frame import Body
-from solidcloud.server.effort import EXACT
-from solidcloud.server.stop import Stop as Ending
-from solidcloud.server.stop import StoppedError
+from solidcloud.schemas.scene.effect_options import AnyEffect, Crowd, Ground, Objects, Slide, Stop, Sweep
+from solidcloud.schemas.scene.scene_file import ObjectItem
+from solidcloud.schemas.wire.answers import Verdict
+from solidcloud.server.avatars.avatar_model import make_avatar
+from solidcloud.server.queries.context.query_budget import EXACT
+from solidcloud.server.runtime.stop_flag import Stop as Ending
+from solidcloud.server.runtime.stop_flag import StoppedError
+from solidcloud.server.simulation.effects.bodies import Bodies
+from solidcloud.server.simulation.world.frame import Body
 
 COARSE = INTERPRETED
 USER = ball(0.2, 12 if COARSE else 60)

@@ -9,29 +9,29 @@ import numpy as np
 import pushed
 import pytest
 from pushed import at, play
-from solidcloud.schemas.effects import Ground, Proximity, Slide, Step, Stop, Sweep
 from solidcloud.schemas.errors import BadTransformError
-from solidcloud.schemas.moves import Moved
-from solidcloud.schemas.scene import Limits
-from solidcloud.server.avatar import make_avatar
-from solidcloud.server.effects.frame import Frame, Runner
-from solidcloud.server.world import World
+from solidcloud.schemas.scene.effect_options import Ground, Proximity, Slide, Step, Stop, Sweep
+from solidcloud.schemas.scene.scene_file import Limits
+from solidcloud.schemas.wire.moves import Moved
+from solidcloud.server.avatars.avatar_model import make_avatar
+from solidcloud.server.simulation.world.collision_world import World
+from solidcloud.server.simulation.world.frame import Frame, Runner
 
 BALL = make_avatar([[0.0, 0, 0]], 0.2)
 
 IMPORTED = """
 import sys
-from solidcloud.schemas.effects import *
-from solidcloud.schemas.scene import ArchiveItem, SceneFile
-from solidcloud.server.effects.pipeline import make_pipeline
+from solidcloud.schemas.scene.effect_options import *
+from solidcloud.schemas.scene.scene_file import ArchiveItem, SceneFile
+from solidcloud.server.simulation.effects.pipeline import make_pipeline
 from solidcloud.server.scene import Scene
-from solidcloud.server.world import World
+from solidcloud.server.simulation.world.collision_world import World
 import numpy as np
 file = SceneFile(format=1, archives=[ArchiveItem(path="x")], effects=[Stop(), {effects}])
 with Scene.open(sys.argv[1]) as scene:
     pipeline = make_pipeline(file, World(scene, file))
-names = [name.rpartition(".")[2] for name in sys.modules if name.startswith("solidcloud.server.effects.")]
-print(*sorted(names), "solidcloud.server.normals" in sys.modules)
+names = [name.rpartition(".")[2] for name in sys.modules if name.startswith("solidcloud.server.simulation.effects.")]
+print(*sorted(names), "solidcloud.server.queries.surface_normals" in sys.modules)
 """
 
 
@@ -56,7 +56,11 @@ def floor(tmp_path_factory: pytest.TempPathFactory) -> cases.Case:
 @pytest.mark.interpreted
 @pytest.mark.parametrize(
     ("effects", "imported"),
-    [("", "stop"), ("Sweep()", "stop sweep"), ("Sweep(), Slide()", "slide stop sweep")],
+    [
+        ("", "stop_effect"),
+        ("Sweep()", "stop_effect sweep_effect"),
+        ("Sweep(), Slide()", "slide_effect stop_effect sweep_effect"),
+    ],
 )
 def test_what_is_not_declared_is_not_imported(floor: cases.Case, effects: str, imported: str) -> None:
     code = IMPORTED.format(effects=effects)
@@ -67,7 +71,7 @@ def test_what_is_not_declared_is_not_imported(floor: cases.Case, effects: str, i
         check=True,
         timeout=200,
     )
-    shared = {"frame", "going", "pipeline"}
+    shared = {"motion", "pipeline"}
     names = run.stdout.split()
     assert [name for name in names[:-1] if name not in shared] == imported.split()
     assert names[-1] == str("slide" in imported), "normals are for what slides"

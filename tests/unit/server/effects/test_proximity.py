@@ -9,14 +9,14 @@ import pytest
 import scans
 from effect_frames import body_of, flip_a_byte, report, world_of
 from numpy.typing import NDArray
-from solidcloud.schemas.effects import Proximity
-from solidcloud.schemas.moves import ProximityReport
-from solidcloud.schemas.scene import parse_scene
-from solidcloud.server.avatar import make_avatar
-from solidcloud.server.effects.apart import KEPT, went
-from solidcloud.server.effects.proximity import make
-from solidcloud.server.effort import Effort
+from solidcloud.schemas.scene.effect_options import Proximity
+from solidcloud.schemas.scene.scene_file import parse_scene
+from solidcloud.schemas.wire.moves import ProximityReport
+from solidcloud.server.avatars.avatar_model import make_avatar
+from solidcloud.server.queries.context.query_budget import Effort
 from solidcloud.server.scene import Scene
+from solidcloud.server.simulation.effects.proximity_effect import make
+from solidcloud.server.simulation.effects.separation_cache import KEPT, went
 
 BALL = make_avatar([[0.0, 0, 0]], 0.1)
 GRID = np.stack(np.meshgrid(np.arange(0, 1, 0.05), np.arange(0, 1, 0.05), [0.0]), axis=-1).reshape(-1, 3)

@@ -7,10 +7,10 @@ import numpy as np
 import pushed
 import pytest
 from pushed import INTERPRETED, RADIUS, at, play
-from solidcloud.schemas.answers import Verdict
-from solidcloud.schemas.effects import Slide, Stop, Sweep
-from solidcloud.server.avatar import make_avatar
-from solidcloud.server.effects.slide import clip
+from solidcloud.schemas.scene.effect_options import Slide, Stop, Sweep
+from solidcloud.schemas.wire.answers import Verdict
+from solidcloud.server.avatars.avatar_model import make_avatar
+from solidcloud.server.simulation.effects.slide_effect import clip
 
 BALL = make_avatar([[0.0, 0, 0]], 0.2)
 TOUCH = RADIUS + 0.2

@@ -8,12 +8,12 @@ import pushed
 import pytest
 from effect_frames import flip_a_byte
 from pushed import APART, RADIUS, at, play
-from solidcloud.schemas.answers import Verdict
-from solidcloud.schemas.archive import Archive
-from solidcloud.schemas.effects import Slide, Stop, Sweep
+from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.errors import BadRequestError
-from solidcloud.schemas.scene import Limits
-from solidcloud.server.avatar import make_avatar
+from solidcloud.schemas.scene.effect_options import Slide, Stop, Sweep
+from solidcloud.schemas.scene.scene_file import Limits
+from solidcloud.schemas.wire.answers import Verdict
+from solidcloud.server.avatars.avatar_model import make_avatar
 
 BALL = make_avatar([[0.0, 0, 0]], 0.2)
 TOUCH = RADIUS + 0.2  # from a scan point's centre

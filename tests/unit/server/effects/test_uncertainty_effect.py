@@ -16,15 +16,15 @@ from msgspec import structs
 from numpy.typing import NDArray
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import build_archive
-from solidcloud.schemas.answers import Verdict
-from solidcloud.schemas.effects import Uncertainty
 from solidcloud.schemas.errors import BadRequestError
-from solidcloud.schemas.moves import UncertaintyReport
-from solidcloud.server.avatar import make_avatar
-from solidcloud.server.effects import uncertainty as module
-from solidcloud.server.effects.uncertainty import check, make, scan_names
+from solidcloud.schemas.scene.effect_options import Uncertainty
+from solidcloud.schemas.wire.answers import Verdict
+from solidcloud.schemas.wire.moves import UncertaintyReport
+from solidcloud.server.avatars.avatar_model import make_avatar
+from solidcloud.server.runtime.stop_flag import NEVER
 from solidcloud.server.scene import Scene
-from solidcloud.server.stop import NEVER
+from solidcloud.server.simulation.effects import uncertainty_effect as module
+from solidcloud.server.simulation.effects.uncertainty_effect import check, make, scan_names
 
 RADIUS = 0.01
 BODY = np.array([[x, 0.0, z] for x in (-0.1, 0.0, 0.1) for z in (0.0, 0.2)])

@@ -1,0 +1,217 @@
+"""Closest points by descent of a bounding sphere hierarchy, exact over integers."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ....schemas.kernels import compiling as nb
+from ....schemas.kernels.rows import LANES
+from ..points.voxel_records import U, read_leaf
+from ..trees.bounding_sphere import ceil_sqrt
+
+FAR = np.int64(1) << np.int64(62)
+
+
+class SearchTree(NamedTuple):
+    """A bounding sphere hierarchy with its points, all in one integer frame.
+
+    center: (n, 3) int64.
+    radius: (n,) int64.
+    first: (n,) int32, first child, or first point of a leaf node.
+    count: (n,) uint8.
+    is_leaf: (n,) bool.
+    points: (p, 3) int64.
+    """
+
+    center: NDArray[np.int64]
+    radius: NDArray[np.int64]
+    first: NDArray[np.int32]
+    count: NDArray[np.uint8]  # type: ignore[assignment]  # hides tuple.count, which is never called
+    is_leaf: NDArray[np.bool_]
+    points: NDArray[np.int64]
+
+
+@nb.njit(nogil=True, cache=True)
+def _distance2(a, i, x, y, z):
+    dx, dy, dz = a[i, 0] - x, a[i, 1] - y, a[i, 2] - z
+    return dx * dx + dy * dy + dz * dz
+
+
+@nb.njit(nogil=True, cache=True)
+def closest_other(tree, queries, best):
+    """Lower best (q,) int64 to the squared distance of the closest point *distinct* from each query.
+
+    queries: (q, 3) int64, in the tree's frame.
+    best: the known upper bound on entry, FAR for none.
+    A point equal to its query is skipped: duplicates are not neighbours (NUMERICS.md case 28). A
+    node is pruned when center distance > radius + best distance, with all rounding in the direction
+    that loses no closer point.
+    """
+    stack = np.empty(1280, np.int64)  # 80 levels of at most 16 children
+    for q in range(queries.shape[0]):
+        x, y, z = queries[q, 0], queries[q, 1], queries[q, 2]
+        found = best[q]
+        limit = ceil_sqrt(found)
+        stack[0] = 0
+        depth = 1
+        while depth > 0:
+            depth -= 1
+            node = stack[depth]
+            bound = tree.radius[node] + limit
+            if bound < 1 << 31 and _distance2(tree.center, node, x, y, z) > bound * bound:
+                continue
+            first, count = tree.first[node], int(tree.count[node])
+            if tree.is_leaf[node]:
+                for i in range(first, first + count):
+                    d2 = _distance2(tree.points, i, x, y, z)
+                    if 0 < d2 < found:
+                        found = d2
+                        limit = ceil_sqrt(found)
+                continue
+            closest, closest_d2 = -1, FAR
+            for child in range(first, first + count):
+                d2 = _distance2(tree.center, child, x, y, z)
+                if d2 < closest_d2:
+                    closest, closest_d2 = child, d2
+            # Visit the closest child first: its points prune most of the others.
+            for child in range(first, first + count):
+                if child != closest:
+                    stack[depth] = child
+                    depth += 1
+            stack[depth] = closest
+            depth += 1
+        best[q] = found
+
+
+class Spheres(NamedTuple):
+    """The bounds of an opened record (schemas/archive/voxel.py Nodes).
+
+    center: (3, n) uint16.
+    radius: (n,) uint16.
+    unit: int64, voxel steps per unit in the top hierarchy.
+    """
+
+    center: NDArray[np.uint16]
+    radius: NDArray[np.uint16]
+    unit: np.int64
+
+
+# Differences are clamped to this before they are squared: three squares then fit into int32. A
+# clamped difference is larger than any distance that this path searches for.
+_CLAMP = 26754
+# Factor that lowers a bound by more than its float64 rounding error.
+_SURE = 1 - 1e-14
+
+
+@nb.njit(nogil=True, inline="always")
+def _nearest_lane(lanes, held, x, y, z, found):
+    """Return the least non-zero squared distance of points from (x, y, z), at most `found`; int64.
+
+    lanes: (3, LANES), the first `held` are points.
+    """
+    if found <= _CLAMP * _CLAMP:
+        # Cast to int32 at every step, because numba widens to int64: eight lanes per instruction.
+        far = np.int32(_CLAMP)
+        qx, qy, qz = np.int32(x), np.int32(y), np.int32(z)
+        least = np.int32(0x7FFFFFFF)
+        for j in range(held):
+            dx = np.int32(min(max(np.int32(lanes[U(0), j] - qx), -far), far))
+            dy = np.int32(min(max(np.int32(lanes[U(1), j] - qy), -far), far))
+            dz = np.int32(min(max(np.int32(lanes[U(2), j] - qz), -far), far))
+            d2 = np.int32(np.int32(dx * dx) + np.int32(np.int32(dy * dy) + np.int32(dz * dz)))
+            least = np.int32(min(least, d2 if d2 > 0 else np.int32(0x7FFFFFFF)))
+        return min(found, np.int64(least))
+    for j in range(held):
+        dx, dy, dz = lanes[U(0), j] - x, lanes[U(1), j] - y, lanes[U(2), j] - z
+        d2 = dx * dx + dy * dy + dz * dz
+        if d2 > 0:
+            found = min(found, d2)
+    return found
+
+
+@nb.njit(nogil=True, inline="always")
+def _ask_leaf(leaves, node, queries, a, b, lanes, best):
+    """Lower best[a:b] by the points of a leaf node; return the greatest of them."""
+    held, cell, farthest = read_leaf(leaves, node, lanes), U(leaves.cell[node]), np.int64(0)
+    x = np.int64(leaves.cell_low[U(0), cell]) + np.int64(leaves.block_low[U(0), node])
+    y = np.int64(leaves.cell_low[U(1), cell]) + np.int64(leaves.block_low[U(1), node])
+    z = np.int64(leaves.cell_low[U(2), cell]) + np.int64(leaves.block_low[U(2), node])
+    for q in range(U(a), U(b)):
+        found = _nearest_lane(
+            lanes, held, queries[q, U(0)] - x, queries[q, U(1)] - y, queries[q, U(2)] - z, best[q]
+        )
+        best[q] = found
+        farthest = max(farthest, found)
+    return farthest
+
+
+@nb.njit(nogil=True, cache=True)
+def closest_in_record(leaves, spheres, queries, groups, home, best):
+    """Lower best (q,) int64 to the squared distance of the closest *distinct* point of a record.
+
+    queries: (q, 3) int64 [voxel steps], at most 2^31 from any point.
+    groups: (g + 1,) int64; queries groups[i] to groups[i + 1] are processed together and should lie
+    close to each other.
+    home: (g,) int64, the leaf node that contains a group, which is visited first, or -1.
+    best: the known upper bound on entry, FAR for none.
+    Points at FAR or beyond are not found. A point equal to its query is skipped: duplicates are not
+    neighbours (NUMERICS.md case 28). A node is pruned when it is certainly farther from the group's
+    box than the largest best of its queries.
+    """
+    center, radius, unit = spheres
+    stack, bounds = np.empty(1280, np.int64), np.empty(1280, np.float64)  # 80 levels of at most 16 children
+    lanes = np.empty((3, LANES), np.int32)
+    for g in range(groups.shape[0] - 1):
+        a, b = groups[g], groups[g + 1]
+        lx, ly, lz = queries[a, 0], queries[a, 1], queries[a, 2]
+        hx, hy, hz = lx, ly, lz
+        farthest = np.int64(0)
+        for q in range(a, b):
+            lx, hx = min(lx, queries[q, 0]), max(hx, queries[q, 0])
+            ly, hy = min(ly, queries[q, 1]), max(hy, queries[q, 1])
+            lz, hz = min(lz, queries[q, 2]), max(hz, queries[q, 2])
+            farthest = max(farthest, best[q])
+        if home[g] >= 0:
+            farthest = _ask_leaf(leaves, U(home[g]), queries, a, b, lanes, best)
+        reach = np.sqrt(np.float64(farthest))
+        stack[0], bounds[0], depth = 0, 0.0, 1
+        while depth > 0:
+            depth -= 1
+            node = U(stack[depth])
+            if bounds[depth] > reach:
+                continue
+            if leaves.is_leaf[node]:
+                if np.int64(node) != home[g]:
+                    farthest = _ask_leaf(leaves, node, queries, a, b, lanes, best)
+                    reach = np.sqrt(np.float64(farthest))
+                continue
+            nearest, least = depth, np.inf
+            for child in range(U(leaves.first[node]), U(leaves.first[node]) + U(leaves.count[node])):
+                scale, cell = np.int64(1), leaves.cell[child]
+                x, y, z = (
+                    np.int64(center[U(0), child]),
+                    np.int64(center[U(1), child]),
+                    np.int64(center[U(2), child]),
+                )
+                if cell < 0:
+                    scale, x, y, z = unit, x * unit, y * unit, z * unit
+                else:
+                    low = leaves.cell_low
+                    x, y, z = x + low[U(0), U(cell)], y + low[U(1), U(cell)], z + low[U(2), U(cell)]
+                dx = np.float64(max(lx - x, x - hx, 0))
+                dy = np.float64(max(ly - y, y - hy, 0))
+                dz = np.float64(max(lz - z, z - hz, 0))
+                bound = np.sqrt(dx * dx + dy * dy + dz * dz) * _SURE - np.float64(
+                    np.int64(radius[child]) * scale
+                )
+                if bound <= reach:
+                    if bound < least:
+                        nearest, least = depth, bound
+                    stack[depth], bounds[depth] = child, bound
+                    depth += 1
+            # Visit the closest child first: its points prune most of the others.
+            if least < np.inf:
+                last = depth - 1
+                stack[nearest], stack[last] = stack[last], stack[nearest]
+                bounds[nearest], bounds[last] = bounds[last], bounds[nearest]

@@ -1,0 +1,5 @@
+"""Kernels over points: quantisation, Morton order, hashing, voxel records.
+
+May import schemas.
+Begin with spool_rows.py.
+"""

@@ -1,0 +1,142 @@
+"""Work units of the build pass: consecutive voxels -> one shard file.
+
+They are pure and idempotent, and run in any process.
+"""
+
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...schemas.archive.codec import encode_voxel
+from ...schemas.archive.normal_reach import normal_reach
+from ...schemas.archive.radius_model import RADIUS_CLASSES
+from ...schemas.archive.shard import shard_name, write_shard
+from ...schemas.archive.voxel_grid import Lattice
+from ...schemas.process.interrupts import check
+from ..config import BuildConfig, shard_points
+from ..spool.spool import Spool
+from ..voxel.dense_voxel import BuiltVoxel, build_dense, is_dense
+from ..voxel.voxel_octree import build_voxel, gather_voxel
+from .radius_classes import ALL_CODES, voxel_classes
+
+
+class ShardUnit(NamedTuple):
+    """Shard to write. number, generation: of its name.  keys: of its voxels, ascending.
+
+    points: total number in its voxels.  spool: source of the points.
+    most_near: points around a voxel that may be held beside it, see radius_classes.py.  folder:
+    destination of the shard.
+    """
+
+    number: int
+    generation: int
+    keys: tuple[int, ...]
+    points: int
+    spool: Spool
+    lattice: Lattice
+    config: BuildConfig
+    most_near: int
+    archive_id: bytes
+    folder: Path
+
+
+class Shard(NamedTuple):
+    """Shard as written. rows: of the index.  size: of the file [bytes].
+
+    checksum: `file_checksum` of all its bytes.  radius_counts: (32,) int64, points of each radius
+    class.
+    radius_capped: see schemas/archive/index.py Header.
+    """
+
+    name: str
+    rows: NDArray
+    size: int
+    checksum: int
+    radius_counts: NDArray[np.int64]
+    radius_capped: int
+
+
+def plan_shards(keys: NDArray[np.uint64], counts: NDArray[np.int64]) -> list[tuple[tuple[int, ...], int]]:
+    """Cut voxels into runs of about `shard_points` points; return (keys, points) of each.
+
+    keys: ascending.  counts: points of each voxel. The result is a function of the points alone,
+    which makes the archive independent of the number of jobs.
+    """
+    most = shard_points(int(counts.sum()))
+    plans: list[tuple[tuple[int, ...], int]] = []
+    held: list[int] = []
+    points = 0
+    for key, count in zip(keys.tolist(), counts.tolist(), strict=True):
+        if held and points + count > most:
+            plans.append((tuple(held), points))
+            held, points = [], 0
+        held.append(key)
+        points += count
+    if held:
+        plans.append((tuple(held), points))
+    return plans
+
+
+class _ClassCounts:
+    """Finder and counter of the radius classes of a unit's voxels.
+
+    of: (32,) int64, points of each class.  capped: points with too few neighbours.
+    """
+
+    def __init__(self, unit: ShardUnit) -> None:
+        """Start with zero counts."""
+        self.unit = unit
+        self.of, self.capped = np.zeros(RADIUS_CLASSES, np.int64), 0
+
+    def find(
+        self, key: int, local: NDArray[np.int32], codes: range = ALL_CODES, times: int = 1
+    ) -> NDArray[np.uint8]:
+        """Return the classes (n,) of points (n, 3) of a voxel, see `voxel_classes`.
+
+        times: number of times that each point occurs and is counted.
+        """
+        unit = self.unit
+        found = voxel_classes(key, local, unit.config.models, unit.spool, unit.most_near, codes)
+        self.of += times * np.bincount(found.of_point, minlength=RADIUS_CLASSES)
+        self.capped += times * found.few
+        return found.of_point
+
+
+def build_shard(unit: ShardUnit) -> Shard:
+    """Gather, build, compress and write the voxels of one shard, one at a time."""
+    classes = None if unit.config.models == {"mean"} else _ClassCounts(unit)
+    path = unit.folder / shard_name(unit.number, unit.generation)
+    version = 4 if "normal" in unit.config.keep else 1 if classes is None else 2
+    rows, checksum = write_shard(path, unit.number, unit.archive_id, _voxels(unit, classes), version=version)
+    counts, capped = (
+        (np.zeros(RADIUS_CLASSES, np.int64), 0) if classes is None else (classes.of, classes.capped)
+    )
+    return Shard(path.name, rows, path.stat().st_size, checksum, counts, capped)
+
+
+def _voxels(unit: ShardUnit, classes: _ClassCounts | None) -> Iterator[BuiltVoxel]:
+    """Yield each voxel of a unit, built, with its record and the bounds of its points."""
+    for key in unit.keys:
+        check()
+        if is_dense(unit.spool.count(key), unit.config):
+            classify = None if classes is None else partial(classes.find, key)
+            yield build_dense(key, unit.spool, unit.config, unit.archive_id, unit.folder, classify)
+            continue
+        points = gather_voxel(unit.spool.rows(key))
+        low, high = (edge(points.local, axis=0).astype(np.int64) for edge in (np.min, np.max))
+        if classes is not None:
+            points = points._replace(radius_class=classes.find(key, points.local))
+        if "normal" in unit.config.keep:
+            from ..voxel.point_normals import (
+                voxel_normals,
+            )  # most builds have no use for its kernels, and do not load them
+
+            square = normal_reach(unit.config.normal_reach, unit.lattice.step, len(points.local))
+            points = points._replace(normal=voxel_normals(points.local, square))
+        voxel = build_voxel(key, points, unit.lattice.voxel_steps, unit.config)
+        del points
+        yield BuiltVoxel(voxel, encode_voxel(voxel, unit.archive_id), low, high)

@@ -1,0 +1,268 @@
+"""First pass over scans: finds bounds, counts, hashes and faults, then chooses the common lattice.
+
+A scan that can seek is surveyed in ranges of its points, in any process, and its file's SHA-256 in
+another.
+"""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...schemas.archive.voxel_grid import MAX_COORDINATE, MAX_VOXEL_STEPS, MIN_STEP, Lattice, make_lattice
+from ...schemas.errors import ScanError
+from ..config import DEFAULT_STEP, BuildConfig
+from ..kernels.points.spool_rows import usable_bounds
+from ..run.passing_errors import raise_passing
+from ..sources.common.scan import NOT_FINITE, Scan, sha256_of
+from ..sources.common.scan import Lattice as SourceLattice
+
+# A header's bounds are trusted if no point lies farther outside than this [m]: they are rounded,
+# but not by more.
+BOUNDS_WITHIN = 0.01
+
+# Least and most points of a range. A worker takes 2 s for 2^24 points. A small scan is also cut,
+# which gives two workers something to do. A file is cut into about RANGES ranges, on every machine.
+RANGE_POINTS = (1 << 20, 1 << 24)
+RANGES = 32
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Survey:
+    """Result of the first pass for one scan.
+
+    scan: its reader.  sha256: of its file.  count: usable points.
+    low, high: (3,) float64 world [m] of these; infinite if there are none.  not_finite: points left
+    out.
+    fault: why the scan cannot be used, or "".
+    region: (2, 3) world [m] that a faulty scan may have covered; None: not known.
+    empty: leaving the scan out loses no points.  parts: results of its ranges.
+    """
+
+    scan: Scan | None
+    path: Path
+    sha256: str
+    count: int
+    low: NDArray[np.float64]
+    high: NDArray[np.float64]
+    not_finite: int
+    fault: str = ""
+    region: NDArray[np.float64] | None = None
+    empty: bool = False
+    parts: "tuple[Part, ...]" = ()
+
+    @property
+    def dropped(self) -> dict[str, int]:
+        """Return the points left out, by reason. These include non-finite and too distant ones."""
+        found = sum((Counter(part.dropped) for part in self.parts), Counter[str]())
+        found[NOT_FINITE] += self.not_finite
+        return {reason: count for reason, count in found.items() if count}
+
+    @property
+    def unclean(self) -> int:
+        """Return how many points, or triangles of a sampled mesh, were left out as not finite."""
+        return self.dropped.get(NOT_FINITE, 0)
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """Result for a range of a scan. dropped: reason -> points that the reader left out.
+
+    fault: why it could not be read to its end, or "".
+    """
+
+    start: int
+    stop: int | None
+    count: int
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+    not_finite: int
+    dropped: dict[str, int]
+    fault: str
+
+
+class RangeUnit(NamedTuple):
+    """Range of a scan to survey; 0 to None for a scan that cannot seek.
+
+    points: approximate number.
+    """
+
+    scan: Scan
+    start: int
+    stop: int | None
+    points: int
+
+
+def ranges(scan: Scan, points: int) -> list[RangeUnit]:
+    """Cut a scan into ranges. points: approximate total of all scans; it sets their size."""
+    count = scan.declared_count
+    if not scan.seekable or not count:
+        return [RangeUnit(scan, 0, None, count or 0)]
+    least, most = RANGE_POINTS
+    step = min(max(points // RANGES, least), most)
+    return [
+        RangeUnit(scan, start, min(start + step, count), min(step, count - start))
+        for start in range(0, count, step)
+    ]
+
+
+def survey_range(unit: RangeUnit) -> Part:
+    """Read a range of a scan once. A faulty scan is a result; only transient errors are raised."""
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    count = seen = 0
+    fault = ""
+    try:
+        for block in unit.scan.blocks(start=unit.start, stop=unit.stop):
+            count += usable_bounds(block.xyz, MAX_COORDINATE, low, high)
+            seen += len(block.xyz)
+    except ScanError as error:
+        raise_passing(error, unit.scan.path)
+        fault = str(error)
+    return Part(
+        unit.start,
+        unit.stop,
+        count,
+        tuple(low.tolist()),
+        tuple(high.tolist()),
+        seen - count,
+        dict(unit.scan.dropped),
+        fault,
+    )
+
+
+def dump_part(part: Part) -> dict[str, Any]:
+    """Convert a part to its journal entry."""
+    return asdict(part)
+
+
+def load_part(noted: dict[str, Any]) -> Part:
+    """Convert a journal entry to a part."""
+    return Part(**{**noted, "low": tuple(noted["low"]), "high": tuple(noted["high"])})
+
+
+def hash_file(path: Path) -> tuple[str, str]:
+    """Return (SHA-256 of a file, ""), or ("", why it cannot be read)."""
+    try:
+        return sha256_of(path), ""
+    except ScanError as error:
+        raise_passing(error, path)
+        return "", str(error)
+
+
+def joined(scan: Scan, parts: Sequence[Part], sha256: tuple[str, str]) -> Survey:
+    """Combine the results of a scan's ranges and of `hash_file` to its survey."""
+    low = np.min([part.low for part in parts], axis=0)
+    high = np.max([part.high for part in parts], axis=0)
+    count, not_finite = sum(part.count for part in parts), sum(part.not_finite for part in parts)
+    digest, unread = sha256
+    fault = unread or next((part.fault for part in parts if part.fault), "")
+    if fault:
+        return Survey(
+            scan,
+            scan.path,
+            digest,
+            0,
+            low,
+            high,
+            not_finite,
+            fault,
+            _region(scan, low, high),
+            False,
+            tuple(parts),
+        )
+    fault = (
+        ""
+        if count
+        else f"{scan.path}: scan {scan.index} holds no usable point, expected at least one: leave it out"
+    )
+    nothing_lost = count == 0 and not_finite == 0
+    region = None if count or nothing_lost else _region(scan, low, high)
+    return Survey(
+        scan, scan.path, digest, count, low, high, not_finite, fault, region, nothing_lost, tuple(parts)
+    )
+
+
+def survey_scan(scan: Scan) -> Survey:
+    """Survey one scan in this process: bounds, counts, and whether it can be read to its end."""
+    parts = [survey_range(unit) for unit in ranges(scan, scan.declared_count or 0)]
+    return joined(scan, parts, hash_file(scan.path))
+
+
+def unopened(path: Path, fault: str, region: NDArray[np.float64] | None = None) -> Survey:
+    """Return the survey of a file that cannot be opened, or that holds no scan if `fault` is empty.
+
+    region: (2, 3) world [m], where its points may have been; None: not known.
+    """
+    none = np.zeros(3)
+    if not fault:
+        fault = f"{path}: holds no scan, expected at least one: leave it out"
+        return Survey(None, path, "", 0, none, none, 0, fault, None, empty=True)
+    return Survey(None, path, "", 0, none, none, 0, fault, region)
+
+
+def _region(scan: Scan, low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """Return where a truncated scan may have had points: its header's bounds and the points read.
+
+    The result is None, not known, if there are no such bounds, or if a point read lies outside
+    them, which shows that they are wrong.
+    """
+    if scan.bounds is None:
+        return None
+    if (low < scan.bounds[0] - BOUNDS_WITHIN).any() or (high > scan.bounds[1] + BOUNDS_WITHIN).any():
+        return None
+    return np.stack([np.minimum(scan.bounds[0], low), np.maximum(scan.bounds[1], high)])
+
+
+def choose_lattice(surveys: list[Survey], config: BuildConfig) -> tuple[Lattice, str]:
+    """Choose the lattice of a dataset.
+
+    Return it and the source of its step: "given", "sources" or "default".
+
+    The origin is exactly the least coordinate on each axis. A scene moved by a shift that float64
+    holds exactly is therefore quantised to the same integers (NUMERICS.md case 1). Raise
+    BadRequestError for impossible sizes.
+    """
+    origin = np.min([s.low for s in surveys], axis=0)
+    step, source = config.resolution, "given"
+    if step is None:
+        step, source = _shared_step(surveys), "sources"
+    if source == "sources" and not (
+        step and max(MIN_STEP, config.voxel / MAX_VOXEL_STEPS) <= step <= config.voxel
+    ):
+        step, source = DEFAULT_STEP, "default"
+    assert step is not None
+    return make_lattice(origin, step, config.voxel), source
+
+
+def _shared_step(surveys: list[Survey]) -> float | None:
+    """Return the `shared_step` of the surveyed scans."""
+    return shared_step([s.scan.lattice for s in surveys if s.scan is not None])
+
+
+def shared_step(lattices: Sequence[SourceLattice | None]) -> float | None:
+    """Return the step of the lattice that contains all sources, or None.
+
+    The sources need the same scale, and offsets that differ by whole steps.
+    """
+    if not lattices or any(lattice is None for lattice in lattices):
+        return None
+    first = lattices[0]
+    assert first is not None
+    step = first.scale[0]
+    for lattice in lattices:
+        assert lattice is not None
+        if any(scale != step for scale in lattice.scale):
+            return None
+        apart = (np.array(lattice.offset) - np.array(first.offset)) / step
+        # Offsets are decimal text rounded to float64. This explains a millionth of a step; more is
+        # another lattice.
+        if (
+            not np.isfinite(apart).all()
+            or (np.abs(apart - np.rint(apart)) > 1e-6 * np.maximum(1, np.abs(apart) * 1e-9)).any()
+        ):
+            return None
+    return float(step)

@@ -1,0 +1,232 @@
+"""Execution of pure work units in this process, in a process pool, or on a cluster.
+
+Results come in the order of the units.
+"""
+
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from types import TracebackType
+from typing import Any, Protocol, Self, TypeVar
+
+from ...schemas.errors import SolidcloudError
+from ...schemas.process.interrupts import check, children_ignore
+from .progress import Progress
+
+Unit = TypeVar("Unit")
+Result = TypeVar("Result")
+Ticket = TypeVar("Ticket")
+
+# With fewer points, a second process costs more (1 to 2 s to start and to load the kernels) than it
+# saves.
+POINTS_WORTH_A_PROCESS = 4_000_000
+# Per process: most units handed out and not done, and most results that wait for earlier ones.
+WAITING, AHEAD = 4, 64
+# How often a wait for a unit checks for an interrupt.
+ASK_SECONDS = 0.1
+
+
+class Executor(Protocol):
+    """Map a picklable function over work units. A context manager.
+
+    jobs: number of units that can run at a time.  at_once: number that do run at a time, lower than
+    `jobs` if memory is short.
+    """
+
+    jobs: int
+    at_once: int
+
+    def __enter__(self) -> Self:
+        """Return the executor itself."""
+        ...
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Stop the executor; after a failure, without starting the waiting units."""
+        ...
+
+    def map(
+        self,
+        function: Callable[[Unit], Result],
+        units: Sequence[Unit],
+        progress: Progress,
+        size: Callable[[Unit], int],
+    ) -> Iterator[Result]:
+        """Yield function(unit) for each unit, in order.
+
+        Progress advances by size(unit) as units finish.
+
+        An exception of a unit is raised here and ends the iteration.
+        """
+        ...
+
+
+class Hands(Protocol[Ticket]):
+    """Remote execution of units. A ticket represents a unit that was handed out.
+
+    jobs, at_once: as for `Executor`.
+    """
+
+    jobs: int
+    at_once: int
+
+    def hand_out(self, function: Callable[[Any], Any], unit: Any) -> Ticket:
+        """Start function(unit) and return its ticket."""
+        ...
+
+    def done(self, tickets: Sequence[Ticket]) -> Iterable[Ticket]:
+        """Wait until at least one unit is done; return the tickets of those that are."""
+        ...
+
+    def result(self, ticket: Ticket) -> Any:
+        """Return the result of a unit that is done; raise the exception that it raised."""
+        ...
+
+
+def results_in_order(
+    hands: Hands[Ticket],
+    function: Callable[[Unit], Result],
+    units: Sequence[Unit],
+    progress: Progress,
+    size: Callable[[Unit], int],
+) -> Iterator[Result]:
+    """Yield function(unit) for each unit, in order, executed by `hands`.
+
+    Progress advances by size(unit) as units finish. Some units are handed out ahead, which keeps
+    processes from waiting for a long unit of another. The number of results that wait for their
+    turn is bounded by AHEAD per process. A unit that fails ends the iteration at once. If `at_once`
+    is less than `jobs`, only that many units are handed out at a time.
+    """
+    most = WAITING * hands.jobs if hands.at_once >= hands.jobs else hands.at_once
+    running: dict[Ticket, int] = {}
+    results: dict[int, Result] = {}
+    given = 0
+    for taken in range(len(units)):
+        while taken not in results:
+            while given < len(units) and len(running) < most and given - taken < AHEAD * hands.jobs:
+                running[hands.hand_out(function, units[given])] = given
+                given += 1
+            for ticket in hands.done(list(running)):
+                number = running.pop(ticket)
+                results[number] = hands.result(ticket)
+                progress.advance(size(units[number]))
+        yield results.pop(taken)
+
+
+def worker_count(jobs: int, points: int) -> int:
+    """Return the number of processes: `jobs`, or for 0 one per core if there are enough points."""
+    if jobs:
+        return jobs
+    return min(os.cpu_count() or 1, max(1, points // POINTS_WORTH_A_PROCESS))
+
+
+def _begin_worker() -> None:
+    """Ignore SIGINT, because the builder stops its workers.
+
+    End this worker if the builder is killed.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})  # blocked since the process started
+    threading.Thread(target=_end_with_builder, daemon=True).start()
+
+
+def _end_with_builder() -> None:
+    """Wait for the builder to end, then exit.
+
+    Otherwise a worker would wait for its next unit forever and keep its memory.
+    """
+    builder = multiprocessing.parent_process()
+    if builder is not None:
+        builder.join()
+        os._exit(1)
+
+
+class ProcessExecutor:
+    """Map a picklable function over work units in child processes; one job starts none."""
+
+    def __init__(self, jobs: int) -> None:
+        """Start `jobs` processes, or none for a single job."""
+        self.jobs = jobs
+        self.at_once = jobs
+        # Spawn, not fork: a fork copies locks that other threads hold, such as those of a progress
+        # bar.
+        context = multiprocessing.get_context("spawn")
+        self._pool = (
+            ProcessPoolExecutor(jobs, mp_context=context, initializer=_begin_worker) if jobs > 1 else None
+        )
+
+    def __enter__(self) -> Self:
+        """Return the executor itself."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Stop the processes.
+
+        After a failure the waiting units are not started; after an interrupt the processes end at
+        once.
+        """
+        if self._pool is None:
+            return
+        if kind is not None and not issubclass(kind, Exception):
+            # The running units are repeated later. A unit may take a minute, too long to wait after
+            # Ctrl-C.
+            for process in list((self._pool._processes or {}).values()):
+                process.terminate()
+        self._pool.shutdown(wait=True, cancel_futures=kind is not None)
+
+    def map(
+        self,
+        function: Callable[[Unit], Result],
+        units: Sequence[Unit],
+        progress: Progress,
+        size: Callable[[Unit], int],
+    ) -> Iterator[Result]:
+        """Yield the results, as `Executor` and `results_in_order` describe."""
+        if self._pool is None:
+            for unit in units:
+                check()
+                result = function(unit)
+                check()
+                yield result
+                progress.advance(size(unit))
+            return
+        yield from results_in_order(self, function, units, progress, size)
+
+    def hand_out(self, function: Callable[[Unit], Result], unit: Unit) -> Future[Result]:
+        """Submit a unit, as `Hands` describes."""
+        assert self._pool is not None
+        with _worker_deaths(), children_ignore():
+            return self._pool.submit(function, unit)
+
+    def done(self, tickets: Sequence[Future[Any]]) -> Iterable[Future[Any]]:
+        """Wait until units are done, as `Hands` describes."""
+        while True:
+            check()
+            if done := wait(tickets, ASK_SECONDS, FIRST_COMPLETED).done:
+                return done
+
+    def result(self, ticket: Future[Any]) -> Any:
+        """Return the result of a unit, as `Hands` describes."""
+        with _worker_deaths():
+            return ticket.result()
+
+
+@contextmanager
+def _worker_deaths() -> Iterator[None]:
+    """Turn the death of a worker, noticed when submitting or waiting, into a helpful error."""
+    try:
+        yield
+    except BrokenProcessPool:
+        check()  # a signal to the whole process group also ends the workers
+        raise SolidcloudError(
+            "a worker process ended abruptly: out of memory, or an error that cannot be sent here? give fewer "
+            "--jobs or a smaller --memory; the same command resumes the build"
+        ) from None

@@ -1,0 +1,27 @@
+"""Transient errors of reading a scan, which are no fault of the scan.
+
+A scan left out because of such an error would be left out of the archive for good.
+"""
+
+import errno
+from pathlib import Path
+
+from ...schemas.errors import ScanError
+from ...schemas.process.interrupts import check
+
+# Errors of a disk, a network or an overloaded machine.
+PASSING = frozenset(
+    {errno.EIO, errno.EMFILE, errno.ENFILE, errno.ENODEV, errno.ENXIO, errno.ESTALE, errno.ETIMEDOUT,
+     errno.ENOTCONN, errno.EHOSTDOWN, errno.EHOSTUNREACH, errno.EREMOTEIO}
+)  # fmt: skip
+
+
+def raise_passing(error: ScanError, path: Path) -> None:
+    """Raise Interrupted or the OSError if a file could not be read for a transient reason.
+
+    Lack of memory is detected where it occurs, in every pass (sources/common/scan.py `library_errors`).
+    """
+    check()
+    cause = error.__cause__
+    if isinstance(cause, OSError) and cause.errno in PASSING:
+        raise OSError(cause.errno, cause.strerror, str(path)) from None

@@ -1,0 +1,94 @@
+"""OBJ and STL readers: the vertices of meshes as points, in file order, duplicates included.
+
+The vertices are read here, in blocks. trimesh, which surface.py uses for sampling, holds the whole
+mesh; its OBJ loader omits vertices that no face uses and splits vertices that have two texture
+coordinates.
+"""
+
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from ..common.scan import Block, Scan, SeekableScan, library_errors, read_records, scan_error
+from ..common.text_rows import keyword_rows
+
+# A binary STL: 80 bytes of anything, the number of triangles (uint32), then a record each.
+STL_HEADER_BYTES = 84
+STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+
+
+class VertexLines(Scan):
+    """The vertices of an OBJ or ASCII STL file: three numbers after a keyword."""
+
+    def __init__(self, path: Path, keyword: str) -> None:
+        super().__init__(path, "mesh")
+        self._keyword = keyword
+
+    def _read(self, block_points: int) -> Iterator[Block]:
+        with self.path.open("rb") as file:
+            for rows in keyword_rows(file, self.path, self._keyword):
+                for start in range(0, len(rows), block_points):
+                    yield Block(rows[start : start + block_points], None)
+
+
+class BinaryStl(SeekableScan):
+    """The corners of the triangles of a binary STL."""
+
+    def __init__(self, path: Path, triangles: int) -> None:
+        super().__init__(path, "mesh", declared_count=3 * triangles)
+
+    def _read_between(self, block_points: int, start: int, stop: int) -> Iterator[Block]:
+        first, past = start // 3, -(-stop // 3)
+        with self.path.open("rb") as file:
+            file.seek(STL_HEADER_BYTES + first * STL_TRIANGLE.itemsize)
+            at = 3 * first
+            for record in read_records(
+                file, self.path, STL_TRIANGLE, past - first, block_points // 3, "triangles"
+            ):
+                corners = record["corners"].reshape(-1, 3).astype(np.float64)
+                end = at + len(corners)
+                corners = corners[max(0, start - at) : len(corners) - max(0, end - stop)]
+                at = end
+                for k in range(0, len(corners), block_points):
+                    yield Block(corners[k : k + block_points], None)
+
+
+def open_obj(path: Path) -> list[Scan]:
+    """Return the one scan of an OBJ file, its vertices. Raises ScanError."""
+    return [VertexLines(path, "v")]
+
+
+def open_stl(path: Path) -> list[Scan]:
+    """Return the one scan of an STL file, the corners of its triangles, binary or ASCII.
+
+    Reads the first and last bytes of the file only. Raises ScanError.
+    """
+    size = path.stat().st_size
+    with library_errors(path), path.open("rb") as file:
+        start = file.read(1024)
+        # Many binary files begin with "solid" too: their first 80 bytes may hold anything.
+        if start.lstrip().startswith(b"solid") and (b"facet" in start or b"endsolid" in start):
+            _check_ascii_end(file, path, size)
+            return [VertexLines(path, "vertex")]
+    if len(start) < STL_HEADER_BYTES:
+        raise _truncated_stl(path, f"{size} bytes", f"a header of {STL_HEADER_BYTES}")
+    (triangles,) = struct.unpack_from("<I", start, 80)
+    held = (size - STL_HEADER_BYTES) // STL_TRIANGLE.itemsize
+    if triangles > held:
+        raise _truncated_stl(path, f"{held} triangles at most", f"the {triangles} its header declares")
+    return [BinaryStl(path, triangles)]
+
+
+def _check_ascii_end(file: BinaryIO, path: Path, size: int) -> None:
+    """Check that an ASCII STL ends with the line that ends its last solid. Raises ScanError."""
+    file.seek(max(0, size - 1024))
+    lines = file.read().strip().splitlines()
+    if not lines or not lines[-1].lstrip().startswith(b"endsolid"):
+        raise _truncated_stl(path, f"a last line {lines[-1][:60] if lines else b''!r}", "'endsolid'")
+
+
+def _truncated_stl(path: Path, found: str, expected: str) -> Exception:
+    return scan_error(path, found, expected, "fetch the file again, it is truncated or no STL")

@@ -1,0 +1,250 @@
+"""PCD reader, the format of the Point Cloud Library: ASCII, binary or compressed.
+
+Only the fields x, y, z and intensity are read. Organised clouds store directions without a return
+as NaN points in their grid; these are dropped as NO_RETURN.
+
+VIEWPOINT is applied as the scan's pose, as the library's own viewer does.
+"""
+
+import struct
+from collections.abc import Iterator
+from io import BufferedReader
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..common.scan import (
+    BLOCK_BYTES,
+    INTENSITY_NAMES,
+    NO_RETURN,
+    Block,
+    Scan,
+    SeekableScan,
+    apply_pose,
+    library_errors,
+    quaternion_pose,
+    read_records,
+    scan_error,
+)
+from ..common.text_rows import is_number, number_rows
+from .lzf import LzfStream
+
+# Maximum bytes of a header. A real one has a few hundred bytes; a file without a DATA line in this
+# range is not a PCD file.
+LONGEST_HEADER = 1 << 16
+KINDS = ("ascii", "binary", "binary_compressed")
+TYPES = {("F", 4): "<f4", ("F", 8): "<f8", **{(t, n): f"<{t.lower()}{n}" for t in "IU" for n in (1, 2, 4, 8)}}
+# Maximum decompressed bytes per compressed byte: a reference of three bytes stands for at most 264
+# [LZF].
+MOST_EXPANSION = 88
+
+
+class Field(NamedTuple):
+    """One field to read.
+
+    offset: bytes from the start of the record.
+    column: number of its first value in a text row.
+    """
+
+    offset: int
+    column: int
+    type: str
+
+
+class Header(NamedTuple):
+    """Header of a PCD file. fields: x, y, z, and the intensity where there is one."""
+
+    fields: tuple[Field, ...]
+    record_bytes: int
+    columns: int
+    points: int
+    pose: NDArray[np.float64]
+    kind: str
+    start: int  # byte offset of the data
+    lines: int  # number of header lines
+
+
+def _block(scan: Scan, columns: list[NDArray[Any]]) -> Block:
+    """Build a block from the columns x, y, z and optionally intensity, (n,) each; drops NaN points."""
+    xyz = np.stack(columns[:3], axis=1, dtype=np.float64, casting="unsafe")
+    intensity = columns[3].astype(np.float32) if len(columns) > 3 else None
+    hit = np.asarray(~np.isnan(xyz).any(axis=1))
+    lost = len(hit) - int(np.count_nonzero(hit))
+    if lost:
+        scan.dropped[NO_RETURN] = scan.dropped.get(NO_RETURN, 0) + lost
+        xyz, intensity = xyz[hit], None if intensity is None else intensity[hit]
+    return Block(apply_pose(scan.pose, xyz), intensity)
+
+
+class BinaryPcd(SeekableScan):
+    """The points of a binary PCD file, stored record by record."""
+
+    def __init__(self, path: Path, header: Header) -> None:
+        super().__init__(path, "pcd", declared_count=header.points, pose=header.pose)
+        self._header = header
+
+    def _read_between(self, block_points: int, start: int, stop: int) -> Iterator[Block]:
+        header = self._header
+        names = "xyzi"[: len(header.fields)]
+        record = np.dtype(
+            {
+                "names": list(names),
+                "formats": [field.type for field in header.fields],
+                "offsets": [field.offset for field in header.fields],
+                "itemsize": header.record_bytes,
+            }
+        )
+        with self.path.open("rb") as file:
+            file.seek(header.start + start * header.record_bytes)
+            for records in read_records(file, self.path, record, stop - start, block_points, "points"):
+                yield _block(self, [records[name] for name in names])
+
+
+class CompressedPcd(Scan):
+    """The points of a compressed PCD file: one stream with the columns one after the other."""
+
+    def __init__(self, path: Path, header: Header, past: int) -> None:
+        """Create the scan; past is the offset of the first byte after the compressed data."""
+        super().__init__(path, "pcd", declared_count=header.points, pose=header.pose)
+        self._header, self._past = header, past
+
+    def _read(self, block_points: int) -> Iterator[Block]:
+        header = self._header
+        with self.path.open("rb") as file:
+            # Decode once to find where the last column begins, then decode all columns side by
+            # side, each from its start.
+            streams: dict[int, LzfStream] = {}
+            stream, at = LzfStream(self.path, header.start + 8, self._past), 0
+            for field in sorted(header.fields):
+                # A field of several values stores the values of one point together: read the first
+                # of each.
+                stream.skip(file, field.offset * header.points - at)
+                at = field.offset * header.points
+                streams[field.offset] = stream.fork()
+            sizes = [np.dtype(field.type).itemsize for field in header.fields]
+            for start in range(0, header.points, block_points):
+                count = min(block_points, header.points - start)
+                yield _block(
+                    self,
+                    [
+                        streams[field.offset].read(file, count * size).view(field.type)
+                        for field, size in zip(header.fields, sizes, strict=True)
+                    ],
+                )
+
+
+class AsciiPcd(Scan):
+    """The points of an ASCII PCD file."""
+
+    def __init__(self, path: Path, header: Header) -> None:
+        super().__init__(path, "pcd", declared_count=header.points, pose=header.pose)
+        self._header = header
+
+    def _read(self, block_points: int) -> Iterator[Block]:
+        header, seen = self._header, 0
+        if not header.points:
+            return
+        with self.path.open("rb") as file:
+            file.seek(header.start)
+            for rows in number_rows(
+                file, self.path, columns=header.columns, delimiter=None, first_line=header.lines + 1,
+                limit=header.points,
+            ):  # fmt: skip
+                seen += len(rows)
+                for start in range(0, len(rows), block_points):
+                    part = rows[start : start + block_points]
+                    yield _block(self, [part[:, field.column] for field in header.fields])
+        if seen < header.points:
+            raise _truncated(self.path, f"{seen} points", f"the {header.points} its header declares")
+
+
+def open_pcd(path: Path) -> list[Scan]:
+    """Return the one scan of a PCD file; reads its header only. Raises ScanError."""
+    with library_errors(path), path.open("rb") as file:
+        header = _read_header(file, path)
+        left = file.seek(0, 2) - header.start
+        if header.kind == "binary_compressed":
+            return [CompressedPcd(path, header, _compressed_end(file, path, header, left))]
+        least = 2 * header.columns if header.kind == "ascii" else header.record_bytes
+        if header.points * least > left + (header.kind == "ascii"):  # the last row may lack its line end
+            raise _truncated(path, f"{left // least} points at most", f"the {header.points} declared")
+        return [(AsciiPcd if header.kind == "ascii" else BinaryPcd)(path, header)]
+
+
+def _compressed_end(file: BufferedReader, path: Path, header: Header, left: int) -> int:
+    """Return the offset of the first byte after the compressed data; checks both of its sizes."""
+    file.seek(header.start)
+    packed, unpacked = struct.unpack("<II", file.read(8).ljust(8, b"\0"))
+    if 8 + packed > left:
+        raise _truncated(path, f"{left} bytes of data", f"{8 + packed}")
+    if unpacked != header.points * header.record_bytes or unpacked > packed * MOST_EXPANSION:
+        raise _truncated(
+            path,
+            f"{unpacked} bytes in {packed} compressed",
+            f"the {header.points * header.record_bytes} of {header.points} points",
+        )
+    return header.start + 8 + int(packed)
+
+
+def _truncated(path: Path, found: str, expected: str) -> Exception:
+    return scan_error(path, found, expected, "fetch the file again, it is truncated or damaged")
+
+
+def _read_header(file: BufferedReader, path: Path) -> Header:
+    """Read and check the header. Raises ScanError."""
+    entries: dict[str, list[str]] = {}
+    lines = 0
+    while "DATA" not in entries:
+        raw = file.readline(LONGEST_HEADER)
+        lines += 1
+        words = raw.decode("latin-1").split()
+        if not raw or file.tell() > LONGEST_HEADER:
+            raise scan_error(
+                path, f"{lines - 1} lines and no DATA", "the header of a PCD file", "check that this is one"
+            )
+        if words and not words[0].startswith("#"):
+            entries[words[0].upper()] = words[1:]
+
+    def refuse(name: str, expected: str) -> Exception:
+        found = " ".join([name, *entries.get(name, ["missing"])])[:80]
+        return scan_error(path, found, expected, "check what wrote this file, and that it is whole")
+
+    def numbers(name: str, count: int, default: list[str] | None = None) -> list[int]:
+        words = entries.get(name, default) or []
+        if len(words) != count or not all(w.isdecimal() and len(w) <= 15 for w in words):
+            raise refuse(name, f"{count} whole numbers")
+        return [int(word) for word in words]
+
+    names = [name.lower() for name in entries.get("FIELDS", entries.get("COLUMNS", []))]
+    sizes = numbers("SIZE", len(names))
+    counts = numbers("COUNT", len(names), ["1"] * len(names))
+    types = [t.upper() for t in entries.get("TYPE", [])]
+    if len(types) != len(names) or any(k not in TYPES for k in zip(types, sizes, strict=True)):
+        raise refuse("TYPE", "F of 4 or 8 bytes, I or U of 1, 2, 4 or 8, for each field")
+    if any(names.count(axis) != 1 for axis in "xyz"):
+        raise refuse("FIELDS", "x, y and z once each")
+    if any(counts[names.index(axis)] != 1 for axis in "xyz"):
+        raise refuse("COUNT", "1 of x, y and z")
+    (width,), (height,) = numbers("WIDTH", 1), numbers("HEIGHT", 1)
+    if numbers("POINTS", 1, [str(width * height)]) != [width * height]:
+        raise refuse("POINTS", f"WIDTH times HEIGHT, {width * height}")
+    kind = " ".join(entries["DATA"])
+    if kind not in KINDS:
+        raise refuse("DATA", " or ".join(KINDS))
+    view = entries.get("VIEWPOINT", ["0", "0", "0", "1", "0", "0", "0"])
+    if len(view) != 7 or not all(map(is_number, view)):
+        raise refuse("VIEWPOINT", "seven numbers")
+    place = [float(word) for word in view]
+    record_bytes = sum(size * count for size, count in zip(sizes, counts, strict=True))
+    if not 0 < record_bytes <= BLOCK_BYTES:
+        raise refuse("COUNT", f"records of at most {BLOCK_BYTES} bytes")
+    wanted = [*"xyz", *(n for n in INTENSITY_NAMES if names.count(n) == 1 and counts[names.index(n)] == 1)]
+    fields = []
+    for name in wanted[:4]:
+        k = names.index(name)
+        offset = sum(size * count for size, count in zip(sizes[:k], counts[:k], strict=True))
+        fields.append(Field(offset, sum(counts[:k]), TYPES[types[k], sizes[k]]))
+    pose = quaternion_pose(path, 0, place[3:], place[:3])
+    return Header(tuple(fields), record_bytes, sum(counts), width * height, pose, kind, file.tell(), lines)

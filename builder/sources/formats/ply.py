@@ -1,0 +1,181 @@
+"""PLY reader: the vertices of one file, ASCII or binary of either byte order.
+
+plyfile reads the header. This module reads the body in blocks, because plyfile reads faces one by
+one and ASCII vertices into one array of the size that the header claims.
+"""
+
+import io
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..common.scan import (
+    INTENSITY_NAMES,
+    Block,
+    Scan,
+    SeekableScan,
+    library_errors,
+    read_records,
+    reader_library,
+    scan_error,
+)
+from ..common.text_rows import LONGEST_LINE, number_rows
+
+# Maximum bytes of a header. A real one has a few hundred bytes.
+LONGEST_HEADER = 1 << 20
+
+
+class Header(NamedTuple):
+    """Description of a PLY file's vertices, from its header."""
+
+    record: np.dtype[np.void]  # layout of one vertex in a binary file
+    points: int
+    start: int  # byte offset of the body
+    skip: int  # size of the data before the vertices: bytes in a binary file, lines in an ASCII one
+    lines: int  # number of header lines
+    ascii: bool
+    intensity: str | None  # the property's name
+
+
+class BinaryPly(SeekableScan):
+    """The vertices of one binary PLY file."""
+
+    def __init__(self, path: Path, header: Header) -> None:
+        super().__init__(path, "ply", declared_count=header.points)
+        self._header = header
+
+    def _read_between(self, block_points: int, start: int, stop: int) -> Iterator[Block]:
+        header = self._header
+        with self.path.open("rb") as file:
+            file.seek(header.start + header.skip + start * header.record.itemsize)
+            for record in read_records(
+                file, self.path, header.record, stop - start, block_points, "vertices"
+            ):
+                yield _block(record, header.intensity)
+
+
+def _skip_lines(file: BinaryIO, lines: int) -> None:
+    """Read past lines of any length, in bounded memory; stops at the end of the file."""
+    while lines and (piece := file.readline(LONGEST_LINE)):
+        lines -= piece.endswith(b"\n")
+
+
+class AsciiPly(Scan):
+    """The vertices of one PLY file in text."""
+
+    def __init__(self, path: Path, header: Header) -> None:
+        super().__init__(path, "ply", declared_count=header.points)
+        self._header = header
+
+    def _read(self, block_points: int) -> Iterator[Block]:
+        header = self._header
+        if not header.points:
+            return
+        # Rows become float64 records with the vertex's property names, like the records of a binary
+        # file.
+        names = header.record.names or ()
+        row = np.dtype([(name, np.float64) for name in names])
+        seen = 0
+        with self.path.open("rb") as file:
+            file.seek(header.start)
+            _skip_lines(file, header.skip)
+            for rows in number_rows(
+                file,
+                self.path,
+                columns=len(names),
+                delimiter=None,
+                first_line=header.lines + header.skip + 1,
+                limit=header.points,
+            ):
+                seen += len(rows)
+                for start in range(0, len(rows), block_points):
+                    yield _block(rows.view(row)[start : start + block_points, 0], header.intensity)
+        if seen < header.points:
+            raise _truncated(self.path, seen, header.points)
+
+
+def _block(record: NDArray[np.void], intensity: str | None) -> Block:
+    """Convert vertex records to a block."""
+    xyz = np.empty((len(record), 3))
+    for axis, name in enumerate("xyz"):
+        xyz[:, axis] = record[name]
+    return Block(xyz, record[intensity].astype(np.float32) if intensity else None)
+
+
+def open_ply(path: Path) -> list[Scan]:
+    """Return the one scan of a PLY file; reads its header only. Raises ScanError."""
+    with library_errors(path), path.open("rb") as file:
+        header = _read_header(file, path)
+        least = 2 * len(header.record.names or ()) if header.ascii else header.record.itemsize
+        left = path.stat().st_size - header.start - (0 if header.ascii else header.skip)
+        # The last ASCII row may lack its line end; allow one byte for it.
+        if header.points * least > left + header.ascii:
+            raise _truncated(path, max(0, left // least), header.points)
+        return [(AsciiPly if header.ascii else BinaryPly)(path, header)]
+
+
+def _truncated(path: Path, found: int, declared: int) -> Exception:
+    return scan_error(
+        path,
+        f"the file ends after {found} vertices at most",
+        f"the {declared} its header declares",
+        "fetch the file again, it is truncated",
+    )
+
+
+def _read_header(file: BinaryIO, path: Path) -> Header:
+    """Read and check the header; leaves the file position at the start of the body."""
+    lines: list[str] = []
+    counts: list[int] = []
+    while not lines or lines[-1] != "end_header":
+        raw = file.readline(LONGEST_HEADER)
+        # Some writers leave blanks at the ends of lines ("ply "), which plyfile refuses.
+        line = raw.decode("ascii", "replace").strip()
+        if (not lines and line != "ply") or not raw or file.tell() > LONGEST_HEADER:
+            raise scan_error(
+                path,
+                f"line {len(lines) + 1} is {line[:60]!r}",
+                "a PLY header, from 'ply' to 'end_header'",
+                "check that this is a PLY file",
+            )
+        words = line.split()
+        if len(words) == 3 and words[0] == "element" and words[2].isdecimal():
+            counts.append(int(words[2]))
+            # plyfile reads the declared number of records. Declare none: only the header is needed.
+            line = f"element {words[1]} 0"
+        lines.append(line)
+    start = file.tell()
+    plyfile = reader_library("plyfile", path)
+    ply = plyfile.PlyData.read(io.BytesIO(("\n".join(lines) + "\n").encode("ascii")))
+    if "vertex" not in ply:
+        found = ", ".join(element.name for element in ply) or "none"
+        raise scan_error(
+            path, f"elements: {found}", "an element 'vertex'", "check that this is a PLY of points"
+        )
+    skip = 0
+    for element, count in zip(ply, counts, strict=True):
+        lists = any(isinstance(item, plyfile.PlyListProperty) for item in element.properties)
+        if lists and (element.name == "vertex" or not ply.text):
+            raise scan_error(
+                path,
+                f"element {element.name!r} has a list property and comes no later than the vertices",
+                "vertices of fixed size, first in the file",
+                "write the PLY with its vertices first and no lists in them",
+            )
+        if element.name == "vertex":
+            break
+        skip += count if ply.text else count * element.dtype().itemsize
+    record = element.dtype("=" if ply.text else ply.byte_order)
+    missing = [name for name in "xyz" if name not in record.names]
+    if missing:
+        raise scan_error(
+            path,
+            f"vertices without {', '.join(missing)}",
+            "properties x, y and z",
+            "check what wrote this file",
+        )
+    intensity = next((name for name in record.names if name.lower() in INTENSITY_NAMES), None)
+    return Header(record, count, start, skip, len(lines), ply.text, intensity)

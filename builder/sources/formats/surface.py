@@ -1,0 +1,128 @@
+"""Points spread over the triangles of a mesh: OBJ, STL and PLY with faces (by trimesh), and GLB."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..common.scan import NOT_FINITE, Block, Scan, reader_library, scan_error
+from .glb import GlbScan
+
+# Steps of the additive sequence in two dimensions with the plastic number 1.3247...: the known
+# sequence of this kind whose points keep farthest apart (Roberts 2018, "The unreasonable
+# effectiveness of quasirandom sequences"). Any other pair of irrationals is correct too, but clumps
+# more.
+STEP_U = 0.7548776662466927
+STEP_V = 0.5698402909980532
+
+# A damaged vertex makes a surface of any size. More points than SAMPLES_ANYWAY + SAMPLES_A_BYTE per
+# byte of the file are taken as damage. This allows 800 points per triangle of a binary STL (50
+# bytes), and ten million for a hall of a dozen triangles.
+SAMPLES_A_BYTE = 16
+SAMPLES_ANYWAY = 10**7
+
+# Maximum file size that trimesh loads [bytes]. It holds a mesh whole: reading an OBJ takes about
+# five times its file size.
+LARGEST_MESH = 512 << 20
+
+
+class SurfaceSamples(Scan):
+    """Sample points of a mesh's surface, area / spacing**2 of them."""
+
+    def __init__(self, vertices: Scan, spacing: float) -> None:
+        """Create the scan.
+
+        vertices: the same file as points.
+        spacing: side of the square that one point represents [m].
+        """
+        super().__init__(vertices.path, "mesh")
+        self.up = vertices.up
+        self._vertices = vertices
+        self._spacing = spacing
+
+    def _read(self, block_points: int) -> Iterator[Block]:
+        """Yield the samples.
+
+        Sample k lies in the triangle at which the cumulative area reaches k + 1/2 samples, at the
+        k-th point of the sequence. The number of points in a triangle therefore follows its area
+        within one, no random number is drawn, and only the mesh and the cumulative sum of its areas
+        are held.
+        """
+        corners = self._triangles()
+        area = (
+            np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
+        )
+        # A triangle with a non-finite corner has no area to sample.
+        lost = int(np.count_nonzero(~np.isfinite(area)))
+        if lost:
+            self.dropped[NOT_FINITE] = lost
+        with np.errstate(over="ignore"):
+            total = np.cumsum(np.where(np.isfinite(area), area, 0.0))
+        wanted = total[-1] / self._spacing**2 if len(total) else 0.0
+        size = self.path.stat().st_size
+        most = SAMPLES_ANYWAY + SAMPLES_A_BYTE * size
+        if not wanted <= most:
+            raise scan_error(
+                self.path,
+                f"a surface of {total[-1]:.3g} square lengths, {wanted:.3g} points",
+                f"at most {most} points from a file of {size} bytes",
+                "check the mesh and its units, give a larger --spacing, or subdivide its triangles",
+            )
+        count = int(np.ceil(wanted))
+        for start in range(0, count, block_points):
+            k = np.arange(start, min(start + block_points, count), dtype=np.float64)
+            face = np.searchsorted(total, (k + 0.5) * (total[-1] / count), side="right")
+            face = np.minimum(face, len(total) - 1)
+            u, v = _unit_triangle((0.5 + STEP_U * k) % 1.0, (0.5 + STEP_V * k) % 1.0)
+            a, b, c = corners[face, 0], corners[face, 1], corners[face, 2]
+            yield Block(a + u[:, None] * (b - a) + v[:, None] * (c - a), None)
+
+    def _triangles(self) -> NDArray[np.float64]:
+        """Return the corners of all triangles, (n, 3, 3). Raises ScanError."""
+        corners = (
+            self._vertices.triangles() if isinstance(self._vertices, GlbScan) else _by_trimesh(self.path)
+        )
+        # trimesh returns nothing for a file without faces, whether it has vertices or not.
+        if not len(corners) and any(len(block.xyz) for block in self._vertices.blocks()):
+            raise scan_error(
+                self.path, "vertices and no faces", "a mesh to sample", "build it without --spacing"
+            )
+        return corners
+
+
+def _by_trimesh(path: Path) -> NDArray[np.float64]:
+    """Return the corners of all triangles of an OBJ, STL or PLY file, (n, 3, 3). Raises ScanError."""
+    size = path.stat().st_size
+    if size > LARGEST_MESH:
+        raise scan_error(
+            path,
+            f"a mesh of {size} bytes",
+            f"at most {LARGEST_MESH} to sample",
+            "split it, or build it without --spacing",
+        )
+    trimesh = reader_library("trimesh", path)
+    # With materials, trimesh would open any file that the OBJ names.
+    mesh = trimesh.load_mesh(path, process=False, skip_materials=True)
+    faces = np.asarray(mesh.faces) if hasattr(mesh, "faces") else np.empty((0, 3), np.int64)
+    vertices = np.asarray(mesh.vertices, np.float64)
+    if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices)):
+        raise scan_error(
+            path,
+            f"a face with vertex {faces.max()} (counted from 0) of {len(vertices)}",
+            "faces between its own vertices",
+            "fetch the file again, it is truncated or damaged",
+        )
+    return np.asarray(vertices[faces], np.float64)
+
+
+def _unit_triangle(u: Any, v: Any) -> tuple[Any, Any]:
+    """Map the unit square onto the triangle u + v <= 1, areas kept in proportion.
+
+    u, v: (n,) float64 in [0, 1). Returns the same. After Heitz 2019, "A low-distortion map between
+    triangle and square": folding the square along its diagonal would overlay two point sets.
+    """
+    upper = v > u
+    half_u, half_v = u / 2, v / 2
+    return np.where(upper, half_u, u - half_v), np.where(upper, v - half_u, half_v)

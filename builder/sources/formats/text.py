@@ -1,0 +1,158 @@
+"""Text scans, one point a line: XYZ, TXT, CSV, and PTS without counts.
+
+The first lines of the file determine the layout:
+- The file begins with optional comments ("#" or "//" first) and blank lines, then an optional
+  header row of names. Rows of numbers follow, separated by blanks, commas or semicolons, with LF or
+  CRLF.
+- A first line that is one whole number is the count of points. It is checked against the rows:
+  fewer rows mean a truncated file, more rows a broken one.
+- x, y and z are the columns with these names in the header (a row, or a comment with as many
+  names as there are columns), else the first three.
+- The intensity is the column that the header names intensity or scalar_intensity. A PTS file
+  needs no header: its fourth column is the intensity where its rows have 4 or 7 numbers (x y z i, x
+  y z i r g b); with 6 the fourth is red. In any other file without a header a fourth column may
+  mean anything and is ignored.
+"""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO, NamedTuple
+
+import numpy as np
+
+from ..common.scan import INTENSITY_NAMES, Block, Scan, library_errors, scan_error
+from ..common.text_rows import LONGEST_LINE, is_number, number_rows, split_row
+
+# Maximum lines before the first row of numbers; a file with a longer preamble is not a point list.
+LONGEST_PREAMBLE = 1000
+
+
+class Layout(NamedTuple):
+    """Positions of the numbers in a text scan."""
+
+    start: int  # byte offset of the first row
+    line: int  # its line number
+    columns: int
+    delimiter: str | None
+    xyz: tuple[int, int, int]  # column numbers
+    intensity: int | None
+    points: int | None  # the count that the first line declares
+
+
+class TextScan(Scan):
+    """The points of one text file."""
+
+    def __init__(self, path: Path, layout: Layout | None) -> None:
+        """Create the scan; layout is None for a file without rows."""
+        super().__init__(path, "text", declared_count=layout.points if layout else 0)
+        self._layout = layout
+
+    def _read(self, block_points: int) -> Iterator[Block]:
+        if self._layout is None:
+            return
+        layout = self._layout
+        seen = 0
+        with self.path.open("rb") as file:
+            file.seek(layout.start)
+            for rows in number_rows(
+                file, self.path, columns=layout.columns, delimiter=layout.delimiter, first_line=layout.line
+            ):
+                seen += len(rows)
+                for start in range(0, len(rows), block_points):
+                    part = rows[start : start + block_points]
+                    intensity = None
+                    if layout.intensity is not None:
+                        intensity = part[:, layout.intensity].astype(np.float32)
+                    yield Block(np.ascontiguousarray(part[:, layout.xyz]), intensity)
+        if layout.points is not None and seen != layout.points:
+            raise scan_error(
+                self.path,
+                f"{seen} points",
+                f"the {layout.points} its first line declares",
+                "fetch the file again, it may be truncated"
+                if seen < layout.points
+                else "correct its first line",
+            )
+
+
+def open_text(path: Path) -> list[Scan]:
+    """Return the one scan of a text file; reads its first lines only. Raises ScanError."""
+    with library_errors(path), path.open("rb") as file:
+        return [TextScan(path, _find_layout(file, path))]
+
+
+def _find_layout(file: BinaryIO, path: Path) -> Layout | None:
+    """Read the file up to the first row of numbers; None where there is no such row."""
+    names: tuple[int, str] | None = None  # the header row: its line number and text
+    comment = ""  # the last comment, which may name the columns
+    count: int | None = None
+    for line in range(1, LONGEST_PREAMBLE + 1):
+        start = file.tell()
+        raw = file.readline(LONGEST_LINE)
+        if not raw:
+            if names or count:
+                raise scan_error(path, "no rows of numbers", "one point a line", "fetch the file again")
+            return None
+        text = raw.decode("utf-8-sig", "replace").strip()
+        if text.startswith(("#", "//")):
+            comment = text.lstrip("#/ \t")
+            continue
+        if not text:
+            continue
+        delimiter = ";" if ";" in text else "," if "," in text else None
+        fields = split_row(text, delimiter)
+        if count is None and names is None and len(fields) == 1 and fields[0].isdecimal():
+            count = int(fields[0])
+        elif any(map(is_number, fields)):
+            return _layout_of(
+                path, fields, delimiter, Layout(start, line, 0, None, (0, 1, 2), None, count), names, comment
+            )
+        elif names is None:
+            names = (line, text)
+        else:
+            raise scan_error(path, f"line {line} is {text[:60]!r}", "numbers", "leave one header row only")
+    raise scan_error(
+        path,
+        f"no row of numbers in {LONGEST_PREAMBLE} lines",
+        "one point a line",
+        "check that this is a scan",
+    )
+
+
+def _layout_of(
+    path: Path,
+    fields: list[str],
+    delimiter: str | None,
+    found: Layout,
+    names: tuple[int, str] | None,
+    comment: str,
+) -> Layout:
+    """Complete the layout from the first row of numbers and the header. Raises ScanError."""
+    if len(fields) < 3 or not all(map(is_number, fields)):
+        raise scan_error(
+            path,
+            f"line {found.line} is {' '.join(fields)[:60]!r}",
+            "at least three numbers (x, y, z)",
+            "check that this is a point list, one point a line",
+        )
+    layout = found._replace(columns=len(fields), delimiter=delimiter)
+    called = _split_names(names[1] if names else comment)
+    if names is None and (len(called) != len(fields) or not {"x", "y", "z"} <= set(called)):
+        pts_intensity = path.suffix.lower() == ".pts" and len(fields) in (4, 7)
+        return layout._replace(intensity=3 if pts_intensity else None)
+    if len(called) != len(fields) or any(called.count(axis) != 1 for axis in "xyz"):
+        line, text = names or (0, comment)
+        raise scan_error(
+            path,
+            f"line {line} names the columns {text[:60]!r} over rows of {len(fields)}",
+            "a name for each column, with x, y and z once each",
+            "correct that line",
+        )
+    intensity = next((called.index(name) for name in INTENSITY_NAMES if name in called), None)
+    return layout._replace(xyz=(called.index("x"), called.index("y"), called.index("z")), intensity=intensity)
+
+
+def _split_names(text: str) -> list[str]:
+    """Return the names of a header row, in lower case, without quotes."""
+    delimiter = ";" if ";" in text else "," if "," in text else None
+    return [name.strip().strip("\"'").lower() for name in text.split(delimiter)]

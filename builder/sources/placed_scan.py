@@ -1,0 +1,129 @@
+"""Scan placed in the world: converted to metres, turned to z up, moved by a pose, in float64."""
+
+import copy
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .common.scan import BOUNDS_MARGIN, Block, Lattice, Scan, apply_pose, checked_bounds
+
+# Length units [m]. "us-ft": the US survey foot, which older state plane coordinates use.
+METRES = {
+    "m": 1.0,
+    "mm": 1e-3,
+    "cm": 1e-2,
+    "dm": 1e-1,
+    "km": 1e3,
+    "in": 0.0254,
+    "ft": 0.3048,
+    "us-ft": 1200 / 3937,
+    "yd": 0.9144,
+}
+# Up axis -> source axis of the world's x, y and z, and the sign of each: rotations, never
+# reflections.
+TURNS: dict[str, tuple[tuple[int, int, int], tuple[int, int, int]]] = {
+    "z": ((0, 1, 2), (1, 1, 1)),
+    "y": ((0, 2, 1), (1, -1, 1)),
+    "x": ((1, 2, 0), (1, 1, 1)),
+}
+_IDENTITY = np.eye(4)
+
+
+def placed(
+    scan: Scan,
+    *,
+    pose: NDArray[np.float64] | None = None,
+    units: str | None = None,
+    up: str | None = None,
+    scale: float = 1.0,
+) -> Scan:
+    """Return a scan at a pose, in metres, with z up; the scan itself where no coordinate changes.
+
+    pose: (4, 4), scan in metres with z up -> world; None or the scan's own pose: keep the scan's
+    pose.
+    units: a key of METRES; None: the scan's own.
+    up: a key of TURNS; None: the scan's own.
+    scale: an additional factor, above 0.
+    """
+    units, up = units or scan.units, up or scan.up
+    if pose is not None and np.array_equal(pose, scan.pose):
+        pose = None
+    if pose is None and METRES[units] * scale == 1 and up == "z":
+        if (scan.units, scan.up) != (units, up):
+            scan = copy.copy(scan)
+            scan.units, scan.up = units, up
+        return scan
+    return PlacedScan(scan, pose, units, up, scale)
+
+
+class PlacedScan(Scan):
+    """A scan scaled to metres, turned to z up, and moved by the given pose, in this order.
+
+    Without a given pose the scan keeps its own, which is applied first, in the file's own units and
+    axes. A given pose replaces the scan's own. Each number is multiplied once, axes are exchanged
+    exactly, then `apply_pose` runs: a point gets the same bits in any block. `pose` combines all
+    steps, including the scale.
+    """
+
+    def __init__(
+        self, inner: Scan, given: NDArray[np.float64] | None, units: str, up: str, scale: float
+    ) -> None:
+        bounds = inner.bounds
+        if given is not None and not np.array_equal(inner.pose, _IDENTITY):
+            # Readers apply the scan's own pose: use a copy without one. Its bounds were in the
+            # world frame and no longer apply.
+            inner, bounds = copy.copy(inner), None
+            inner.pose, inner.bounds = _IDENTITY, None
+        self._inner = inner
+        self._factor = METRES[units] * scale
+        self._axes, self._signs = TURNS[up]
+        self._given = _IDENTITY if given is None else given
+        turn = np.eye(4)
+        turn[:3, :3] = np.eye(3)[list(self._axes)] * self._factor * np.array(self._signs)[:, None]
+        super().__init__(
+            inner.path,
+            inner.format,
+            index=inner.index,
+            declared_count=inner.declared_count,
+            pose=self._given @ turn @ inner.pose,
+            lattice=self._lattice(),
+            bounds=None if bounds is None else self._bounds(bounds),
+        )
+        self.units, self.up, self.crs, self.seekable = units, up, inner.crs, inner.seekable
+
+    def _read(self, block_points: int) -> Iterator[Block]:
+        return self._read_range(block_points, 0, None)
+
+    def _read_range(self, block_points: int, start: int, stop: int | None) -> Iterator[Block]:
+        for block in self._inner.blocks(block_points, start, stop):
+            self.dropped = self._inner.dropped
+            yield Block(apply_pose(self._given, self._turned(block.xyz)), block.intensity)
+        self.dropped = self._inner.dropped
+
+    def _turned(self, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the points in metres with z up, (n, 3); changing a sign is exact, hence one rounding."""
+        turned = np.empty_like(xyz)
+        with np.errstate(over="ignore"):  # values beyond float64 become infinite; the caller counts them
+            for axis, (source, sign) in enumerate(zip(self._axes, self._signs, strict=True)):
+                np.multiply(xyz[:, source], sign * self._factor, out=turned[:, axis])
+        return turned
+
+    def _lattice(self) -> Lattice | None:
+        """Return the source's lattice with its axes exchanged; None where points are moved off it."""
+        inner = self._inner.lattice
+        if inner is None or self._factor != 1 or not np.array_equal(self._given, _IDENTITY):
+            return None
+        (i, j, k), (a, b, c) = self._axes, self._signs
+        scale, offset = inner.scale, inner.offset
+        return Lattice((scale[i], scale[j], scale[k]), (a * offset[i], b * offset[j], c * offset[k]))
+
+    def _bounds(self, bounds: NDArray[np.float64]) -> NDArray[np.float64] | None:
+        """Return a box (2, 3) that encloses every point of the box `bounds` (2, 3) once placed."""
+        corners = np.array(
+            [[bounds[k, 0], bounds[m, 1], bounds[n, 2]] for k in (0, 1) for m in (0, 1) for n in (0, 1)]
+        )
+        moved = apply_pose(self._given, self._turned(corners))
+        return checked_bounds(
+            np.stack([moved.min(axis=0) - BOUNDS_MARGIN, moved.max(axis=0) + BOUNDS_MARGIN])
+        )

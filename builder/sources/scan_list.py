@@ -1,0 +1,409 @@
+"""List of the scans that a build reads: made from headers, written as TOML, and read back.
+
+`inspect` makes entries of files and folders. `write_scan_list` and `read_scan_list` write and read
+a file of them. `inputs` opens what a build reads: files and folders as they are, or a list with its
+edits. Points are read only from the text of PTX and PTS files, where the second scan can be found
+only by reading past the first, and from small scans without declared bounds (coincident_scans.py).
+"""
+
+import math
+import os
+import re
+import sys
+import tomllib
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import tomli_w
+from numpy.typing import NDArray
+
+from ...schemas.errors import BadRequestError, ScanError
+from ...schemas.process.new_file import sync_folder
+from ..run.passing_errors import raise_passing
+from ..run.progress import Progress, Silent
+from .coincident_scans import coincident_scan
+from .common.scan import Scan, sha256_of
+from .placed_scan import METRES, TURNS, placed
+from .scan_files import header_bounds, open_scans, scan_files
+
+SUFFIX = ".toml"
+VERSION = 1
+
+# Code points that represent bytes of a file name that is not UTF-8.
+_BROKEN_NAME = re.compile("[\ud800-\udfff]")
+
+HEAD = """\
+# Scans for `solidcloud build`, as their headers describe them. Edit by hand:
+#   use    false leaves a scan out: the archive has no information about its region.
+#   units  unit of length in the file: {units}.
+#   scale  additional factor of the coordinates.
+#   up     axis of the file that points up: z, y or x. Scans are turned to make it z.
+#   pose   four rows of four: where the scan is, in metres with z up, after units, scale and up. The value
+#          written here is the file's own pose, in its own units; unchanged or removed, it is applied first.
+# For information only: count, low and high (declared bounds in the file's units), crs, sha256, fault.
+"""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScanEntry:
+    """Entry of a scan list.
+
+    path, index: file, and number of the scan in it, from 0.  format: as in `Scan`, "" if not known.
+    count: points that the header declares; None: not declared.
+    bounds: (2, 3) as declared, in the file's units, in its frame or where its pose puts it; None:
+    not declared.
+    pose: (4, 4), or None.  units, up: keys of METRES and TURNS.  scale: additional factor.
+    crs: text of the coordinate reference system, or "".  sha256: of the file, "" if not requested.
+    use: whether a build reads the scan.  fault: why it cannot be read, or "".
+    warning: what looks wrong, or ""; not written to a list.
+    """
+
+    path: Path
+    index: int = 0
+    format: str = ""
+    count: int | None = None
+    bounds: NDArray[np.float64] | None = None
+    pose: NDArray[np.float64] | None = None
+    units: str = "m"
+    up: str = "z"
+    scale: float = 1.0
+    crs: str = ""
+    sha256: str = ""
+    use: bool = True
+    fault: str = ""
+    warning: str = ""
+
+
+class Input(NamedTuple):
+    """File of a build: its scans, opened and placed, or the fault that prevents it.
+
+    region: (2, 3) world [m], where the points of a file that cannot be opened may have been; None:
+    not known.
+    """
+
+    path: Path
+    scans: list[Scan]
+    fault: str = ""
+    region: NDArray[np.float64] | None = None
+
+
+def inspect(
+    paths: Iterable[Path], *, with_sha256: bool = False, progress: Progress | None = None
+) -> list[ScanEntry]:
+    """List the scans of files and folders by their headers, in the order of `scan_files`.
+
+    A file that cannot be read, or that holds no scan (possible in E57), becomes an entry with a
+    fault. Raise ScanError for a path that does not exist and a folder without scans,
+    BadRequestError for a file that is named twice.
+    """
+    files = scan_files(paths)
+    _check_once((path, 0) for path in files)
+    progress = progress or Silent()
+    progress.start("inspect", len(files), "files")
+    entries: list[ScanEntry] = []
+    for path in files:
+        entries += _inspect_file(path, with_sha256)
+        progress.advance(1)
+    progress.finish()
+    return entries
+
+
+def _inspect_file(path: Path, with_sha256: bool) -> list[ScanEntry]:
+    """List the scans of one file."""
+    digest = ""
+    try:
+        digest = sha256_of(path) if with_sha256 else ""
+        scans = open_scans(path)
+    except ScanError as error:
+        return [ScanEntry(path, bounds=header_bounds(path), sha256=digest, fault=str(error))]
+    if not scans:
+        return [ScanEntry(path, sha256=digest, fault=f"{path}: holds no scan, expected at least one")]
+    return [
+        ScanEntry(
+            path,
+            scan.index,
+            scan.format,
+            scan.declared_count,
+            scan.bounds,
+            None if np.array_equal(scan.pose, np.eye(4)) else scan.pose,
+            scan.units,
+            scan.up,
+            1.0,
+            scan.crs,
+            digest,
+            fault=scan.fault,
+            warning=coincident_scan(scan),
+        )
+        for scan in scans
+    ]
+
+
+def write_scan_list(path: Path, entries: Sequence[ScanEntry]) -> None:
+    """Write a list of scans as TOML, with paths relative to it.
+
+    Replaces an existing file atomically.
+
+    Raise BadRequestError for a file name that is not UTF-8, which TOML cannot hold.
+    """
+    folder = Path(path).parent
+    tables = [_table(entry, folder) for entry in entries]
+    head = HEAD.format(units=", ".join(METRES))
+    text = head + "\n" + tomli_w.dumps({"version": VERSION, "scan": tables})
+    for entry in entries:
+        if _BROKEN_NAME.search(str(entry.path)):
+            raise BadRequestError(
+                f"{str(entry.path)!r}: the file name is not UTF-8, which a list cannot hold: rename the file, or build "
+                "without a list"
+            )
+    # Other broken text is informational only: replace what is not UTF-8.
+    data = _BROKEN_NAME.sub("\ufffd", text).encode()
+    temporary = Path(path).with_name(f".{Path(path).name}.{os.getpid()}.tmp")
+    try:
+        with temporary.open("wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+        sync_folder(Path(path).parent)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _table(entry: ScanEntry, folder: Path) -> dict[str, Any]:
+    """Make the table of one scan, without unknown values."""
+    low, high = ([], []) if entry.bounds is None else entry.bounds.tolist()
+    table = {
+        "path": _relative(entry.path, folder),
+        "index": entry.index,
+        "use": entry.use,
+        "units": entry.units,
+        "scale": float(entry.scale),
+        "up": entry.up,
+        "pose": [] if entry.pose is None else entry.pose.tolist(),
+        "format": entry.format,
+        "count": entry.count,
+        "low": low,
+        "high": high,
+        "crs": entry.crs,
+        "sha256": entry.sha256,
+        "fault": entry.fault,
+    }
+    return {name: value for name, value in table.items() if value not in (None, "", [])}
+
+
+def _relative(path: Path, folder: Path) -> str:
+    """Return a path relative to a folder, with slashes."""
+    seen = os.path.relpath(os.path.abspath(path), os.path.abspath(folder))
+    if seen.startswith(".."):
+        # If the folder is reached by a link, ".." leads elsewhere.
+        seen = os.path.relpath(path.resolve(), folder.resolve())
+    return Path(seen).as_posix()
+
+
+def read_scan_list(path: Path) -> list[ScanEntry]:
+    """Read a list of scans, possibly edited by hand. Opens no scan.
+
+    Raise BadRequestError that names the file, the scan and the field, what was found and what was
+    expected.
+    """
+    path = Path(path)
+    text = ""
+    try:
+        text = path.read_bytes().decode()
+        document = tomllib.loads(text)
+    except (OSError, ValueError) as error:
+        found = _long_number(text) or error
+        raise BadRequestError(
+            f"{path}: {found}, expected a list of scans: correct it, or write it with `solidcloud inspect`"
+        ) from error
+    unknown = sorted(set(document) - {"version", "scan"})
+    if unknown or document.get("version", VERSION) != VERSION or not isinstance(document.get("scan"), list):
+        found = f"unknown {unknown[0]}" if unknown else f"version {_shown(document.get('version'))}"
+        raise BadRequestError(f"{path}: {found}, expected version = {VERSION} and a [[scan]] for each scan")
+    entries = [_entry(path, number, table) for number, table in enumerate(document["scan"], 1)]
+    seen: dict[tuple[str, int], int] = {}
+    for number, entry in enumerate(entries, 1):
+        first = seen.setdefault((os.path.realpath(entry.path), entry.index), number)
+        if first != number:
+            raise BadRequestError(
+                f"{path}: scan {number} ({entry.path}, index {entry.index}): the same as scan {first}, "
+                "expected each scan once: remove one"
+            )
+    return entries
+
+
+def _long_number(text: str) -> str:
+    """Return the position of a number with more digits than Python reads, or "".
+
+    Python's own error does not tell the line.
+    """
+    most = sys.get_int_max_str_digits()
+    found = re.search(rf"[0-9_]{{{most + 1},}}", text) if most else None
+    if found is None:
+        return ""
+    line = text.count("\n", 0, found.start()) + 1
+    return f"a number of {len(found[0])} digits (at line {line})"
+
+
+def _shown(value: Any) -> str:
+    """Return the beginning of a value as text for a message."""
+    try:
+        return str(value)[:80]
+    except ValueError:  # a hexadecimal number may be too long to be converted to decimal
+        return "a number of very many digits"
+
+
+class _Field(NamedTuple):
+    """Constraint on a field of a table. good: predicate of valid values."""
+
+    expected: str
+    good: Any
+
+
+def _is_number(value: Any) -> bool:
+    if isinstance(value, int):  # TOML integers have any length
+        return not isinstance(value, bool) and abs(value) <= sys.float_info.max
+    return isinstance(value, float) and math.isfinite(value)
+
+
+def _is_numbers(value: Any, length: int) -> bool:
+    return isinstance(value, list) and len(value) == length and all(map(_is_number, value))
+
+
+def _is_pose(value: Any) -> bool:
+    rows = isinstance(value, list) and len(value) == 4 and all(_is_numbers(row, 4) for row in value)
+    return rows and list(value[3]) == [0, 0, 0, 1] and np.linalg.matrix_rank(np.array(value, float)) == 4
+
+
+def _is_whole(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 1 << 63
+
+
+_TEXT = _Field("text in quotes", lambda value: isinstance(value, str))
+_FIELDS = {
+    "path": _Field(
+        "the path of a file, seen from the list", lambda v: isinstance(v, str) and v and "\0" not in v
+    ),
+    "index": _Field("a whole number, 0 or more, of 63 bits", _is_whole),
+    "use": _Field("true or false", lambda value: isinstance(value, bool)),
+    "units": _Field(" or ".join(METRES), lambda value: isinstance(value, str) and value in METRES),
+    "scale": _Field("a number above 0", lambda value: _is_number(value) and value > 0),
+    "up": _Field(" or ".join(TURNS), lambda value: isinstance(value, str) and value in TURNS),
+    "pose": _Field("four rows of four numbers that move points, the last 0 0 0 1", _is_pose),
+    "format": _TEXT,
+    "count": _Field("a whole number, 0 or more, of 63 bits", _is_whole),
+    "low": _Field("three numbers", lambda value: _is_numbers(value, 3)),
+    "high": _Field("three numbers", lambda value: _is_numbers(value, 3)),
+    "crs": _TEXT,
+    "sha256": _TEXT,
+    "fault": _TEXT,
+}
+
+
+def _entry(path: Path, number: int, table: Any) -> ScanEntry:
+    """Make an entry from a table; check every field."""
+    name = table.get("path", "without path") if isinstance(table, dict) else "no table"
+    where = f"{path}: scan {number} ({name})"
+    if not isinstance(table, dict) or "path" not in table:
+        raise BadRequestError(f'{where}: no path, expected the path of its file: give path = "..."')
+    for field, value in table.items():
+        if field not in _FIELDS:
+            raise BadRequestError(
+                f"{where}: unknown field {field!r}, expected one of {', '.join(_FIELDS)}: correct or remove it"
+            )
+        if not _FIELDS[field].good(value):
+            raise BadRequestError(
+                f"{where}: {field} is {_shown(value)!r}, expected {_FIELDS[field].expected}: correct it"
+            )
+    if ("low" in table) != ("high" in table):
+        raise BadRequestError(f"{where}: low or high alone, expected both or none: remove it")
+    return ScanEntry(
+        path.parent / table["path"],
+        table.get("index", 0),
+        table.get("format", ""),
+        table.get("count"),
+        np.array([table["low"], table["high"]], np.float64) if "low" in table else None,
+        np.array(table["pose"], np.float64) if "pose" in table else None,
+        table.get("units", "m"),
+        table.get("up", "z"),
+        float(table.get("scale", 1.0)),
+        table.get("crs", ""),
+        table.get("sha256", ""),
+        table.get("use", True),
+        table.get("fault", ""),
+    )
+
+
+def inputs(paths: Sequence[Path], spacing: float | None = None) -> list[Input]:
+    """Open what a build reads: files, folders and lists of scans (.toml).
+
+    Scans are placed in metres with z up. spacing: of sampled meshes [m].  A file that cannot be
+    opened is kept with its fault, so that all faults are named together. Raise ScanError for a path
+    that does not exist and a folder without scans, BadRequestError for a broken list and for a scan
+    that is named twice, OSError if a file cannot be opened for a transient reason (passing_errors.py).
+    """
+    found: list[Input] = []
+    for path in map(Path, paths):
+        if path.suffix.lower() != SUFFIX or path.is_dir():
+            found += [_opened(file, None, spacing) for file in scan_files([path])]
+            continue
+        used = [entry for entry in read_scan_list(path) if entry.use]
+        if not used:
+            raise BadRequestError(f"{path}: no scan to use, expected at least one: set use = true")
+        files: dict[Path, list[ScanEntry]] = {}
+        for entry in used:
+            files.setdefault(entry.path, []).append(entry)
+        found += [_opened(file, entries, spacing) for file, entries in files.items()]
+    _check_once((item.path, index) for item in found for index in [s.index for s in item.scans] or [0])
+    return found
+
+
+def _check_once(scans: Iterable[tuple[Path, int]]) -> None:
+    """Raise BadRequestError for a scan (file, index) that occurs twice, even by different paths."""
+    seen: dict[tuple[str, int], Path] = {}
+    for path, index in scans:
+        key = os.path.realpath(path), index
+        if key in seen:
+            raise BadRequestError(
+                f"{path}: scan {index} is named twice, as that of {seen[key]} too, expected each once: leave one out"
+            )
+        seen[key] = path
+
+
+def _opened(path: Path, entries: list[ScanEntry] | None, spacing: float | None) -> Input:
+    """Open one file with its listed scans; None: all of them, unchanged."""
+
+    @cache
+    def scans_spaced(factor: float) -> list[Scan]:
+        # A mesh is sampled in its own units.
+        return open_scans(path, spacing=None if spacing is None else spacing / factor)
+
+    try:
+        if entries is None:
+            return Input(path, [placed(scan) for scan in scans_spaced(1.0)])
+        scans = []
+        for entry in entries:
+            listed = scans_spaced(METRES[entry.units] * entry.scale)
+            if entry.index >= len(listed):
+                raise ScanError(
+                    f"{path}: holds {len(listed)} scans, expected one of index {entry.index}: correct the list"
+                )
+            scan = placed(
+                listed[entry.index], pose=entry.pose, units=entry.units, up=entry.up, scale=entry.scale
+            )
+            scan.crs = entry.crs or scan.crs
+            scans.append(scan)
+        return Input(path, scans)
+    except ScanError as error:
+        raise_passing(error, path)
+        region = header_bounds(path)
+        moved = entries is not None and any(
+            (entry.units, entry.up, entry.scale) != ("m", "z", 1.0) or entry.pose is not None
+            for entry in entries
+        )
+        # The header's bounds do not apply after a list has moved the scan.
+        return Input(path, [], str(error), None if moved else region)

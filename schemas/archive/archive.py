@@ -1,0 +1,249 @@
+"""Reader of archives: folders with `index.h5` and `shards/`. index_file.py and shard.py write them.
+
+FORMAT.md documents the same; change both together. Records are read by offsets, so that neither
+HDF5's lock nor its parser stands between a server and a record.
+"""
+
+import contextlib
+import os
+import stat
+from collections.abc import Collection, Iterator
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import CorruptError, FormatError
+from ..process.interrupts import check
+from .codec import (
+    OPTIONAL_COLUMNS,
+    OpenRecord,
+    OpenTree,
+    RecordShape,
+    open_record,
+    open_tree,
+    point_dtype,
+)
+from .index import read_header
+from .index_file import INDEX_NAME, read_columns
+from .index_limits import check_voxels
+from .shard import DATASETS, SHARD_FOLDER, SHARD_NAME
+from .voxel import Links, VoxelData
+from .voxel_grid import voxel_coordinates
+
+
+class Archive:
+    """Archive opened for reading. Several threads may share it; it is a context manager.
+
+    header: see Header.  voxels: the index's rows, sorted by key.
+    coordinates: (v, 3) int64, voxel coordinates.
+    """
+
+    def __init__(self, folder: str | os.PathLike[str]) -> None:
+        """Open the archive in `folder`.
+
+        Raises FormatError or CorruptError naming the file and the fault.
+        """
+        self.folder = Path(folder)
+        self._descriptors: list[int] = []
+        while True:
+            index = self._index_file()
+            try:
+                self._open()
+                return
+            except FormatError:
+                # `add` and `remove` replace the index and then delete the shards that it no longer
+                # names. If the index was replaced meanwhile, try again.
+                if self._index_file() == index:
+                    raise
+
+    def _index_file(self) -> tuple[int, int] | None:
+        """Return the identity and write time of the index file; None if there is none."""
+        with contextlib.suppress(OSError):
+            found = (self.folder / INDEX_NAME).stat()
+            return found.st_ino, found.st_mtime_ns
+        return None
+
+    def _open(self) -> None:
+        """Read the index and open the shards that it names."""
+        path = self.folder / INDEX_NAME
+        if not path.is_file():
+            raise FormatError(
+                f"{self.folder}: no archive here ({INDEX_NAME} not found): build one with `solidcloud build`"
+            )
+        try:
+            archive_id, columns = read_columns(path)
+            self.header = read_header(archive_id, columns)
+            self.voxels = columns["voxels"]
+            self._shape_dtype = point_dtype(
+                scan_index=self.header.scan_index,
+                intensity=self.header.intensity,
+                radius_class=self.header.radius_class,
+                normal=self.header.normals,
+            )
+            self._shards = [
+                (bytes(name).decode("ascii", "replace"), int(size)) for name, size in columns["shards"]
+            ]
+            self._check_shards()
+            check_voxels(columns, self._shape_dtype.itemsize)
+        except (OSError, KeyError, ValueError, TypeError, AttributeError, RuntimeError) as error:
+            raise FormatError(
+                f"{path}: not a readable archive index ({error}): restore or rebuild it"
+            ) from error
+        self.coordinates = voxel_coordinates(self.voxels["key"])
+        counts = self.header.radius_counts
+        self._classes = (
+            sum(1 << c for c in np.flatnonzero(counts).tolist()) if self.header.radius_class else None
+        )
+        # Open all shards now: if the archive is replaced later, this reader keeps the generation it
+        # opened.
+        try:
+            for number in range(len(self._shards)):
+                self._descriptors.append(os.open(self.shard_path(number), os.O_RDONLY | os.O_CLOEXEC))
+        except OSError as error:
+            self.close()
+            raise FormatError(f"{error.filename}: cannot be opened ({error.strerror}): check it") from error
+
+    def _check_shards(self) -> None:
+        """Check that every shard exists under a valid name with the length that the index states.
+
+        Raises FormatError.
+        """
+        if len({name for name, _ in self._shards}) < len(self._shards):
+            raise FormatError(f"{self.folder}: the index names a shard twice: restore or rebuild it")
+        for name, size in self._shards:
+            path = self.folder / SHARD_FOLDER / name
+            if not SHARD_NAME.fullmatch(name):
+                raise FormatError(
+                    f"{self.folder}: shard name {name!r} in the index: not written by solidcloud"
+                )
+            try:
+                held = path.stat()
+            except OSError:
+                held = None
+            if held is None or not stat.S_ISREG(held.st_mode):
+                raise FormatError(f"{path}: missing: restore it or rebuild the archive")
+            if held.st_size != size:
+                raise FormatError(
+                    f"{path}: {held.st_size} bytes, expected {size}: truncated? restore or rebuild it"
+                )
+
+    def __enter__(self) -> "Archive":
+        """Return the archive."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close the shards."""
+        self.close()
+
+    def close(self) -> None:
+        """Close the shards. Nothing can be read afterwards."""
+        while self._descriptors:
+            os.close(self._descriptors.pop())
+
+    def shard_path(self, number: int) -> Path:
+        """Return the path of shard `number`."""
+        return self.folder / SHARD_FOLDER / self._shards[number][0]
+
+    def shards(self) -> list[tuple[str, int]]:
+        """Return the name and bytes of each shard file, in the order of their numbers."""
+        return list(self._shards)
+
+    def shard_count(self) -> int:
+        """Return the number of shard files."""
+        return len(self._shards)
+
+    def read_frames(self, row: int) -> tuple[bytes, bytes, bytes]:
+        """Read the three frames (cells, nodes, points) of the voxel in index row `row`.
+
+        Raises CorruptError, naming file, voxel and dataset, if a frame is not the one in the index.
+        """
+        return self._read_frame(row, 0), self._read_frame(row, 1), self._read_frame(row, 2)
+
+    def _read_frame(self, row: int, i: int) -> bytes:
+        """Read the frame of dataset `i` of a voxel, as `read_frames` does."""
+        if not self._descriptors:
+            raise ValueError(f"{self.folder}: the archive is closed")
+        check()
+        entry = self.voxels[row]
+        size, offset = int(entry["frame_bytes"][i]), int(entry["frame_offset"][i])
+        frame = os.pread(self._descriptors[int(entry["shard"])], size, offset)
+        if len(frame) != size or frame[-4:] != int(entry["frame_checksum"][i]).to_bytes(4, "little"):
+            raise CorruptError(
+                f"{self.where(row)}, {DATASETS[i]}: {len(frame)} bytes that do not match the index, expected {size}",
+                (self.shard_path(int(entry["shard"])),),
+            )
+        return frame
+
+    def where(self, row: int) -> str:
+        """Return the location of the record of index row `row`, for messages."""
+        entry = self.voxels[row]
+        x, y, z = self.coordinates[row]
+        return f"{self.shard_path(int(entry['shard']))}: voxel ({x}, {y}, {z})"
+
+    @contextlib.contextmanager
+    def locating(self, row: int) -> Iterator[None]:
+        """Add the location of row `row`'s record, and what to do, to a CorruptError raised inside."""
+        try:
+            yield
+        except CorruptError as error:
+            raise type(error)(
+                f"{self.where(row)}: {error}: restore the shard or rebuild the archive",
+                (self.shard_path(int(self.voxels["shard"][row])),),
+            ) from error
+
+    def open_voxel(
+        self,
+        row: int,
+        frames: tuple[bytes, bytes, bytes] | None = None,
+        columns: Collection[str] = OPTIONAL_COLUMNS,
+    ) -> OpenRecord:
+        """Decompress the voxel in index row `row`; its points stay unread.
+
+        frames: the voxel's frames if they have been read already.
+        columns: optional columns wanted; others are not held.
+        Raises CorruptError naming the location.
+        """
+        frames = frames or self.read_frames(row)
+        with self.locating(row):
+            return open_record(
+                *frames,
+                self._shape(row),
+                int(self.voxels["key"][row]),
+                self.header.archive_id,
+                self.header.lattice.voxel_steps,
+                columns,
+            )
+
+    def open_tree(self, row: int) -> OpenTree:
+        """Read the hierarchy of the voxel in index row `row`, without its points.
+
+        Raises CorruptError naming the location.
+        """
+        cells, nodes = self._read_frame(row, 0), self._read_frame(row, 1)
+        with self.locating(row):
+            return open_tree(
+                cells,
+                nodes,
+                self._shape(row),
+                int(self.voxels["key"][row]),
+                self.header.archive_id,
+                self.header.lattice.voxel_steps,
+            )
+
+    def _shape(self, row: int) -> RecordShape:
+        """Return the shape that the index states for the record of index row `row`."""
+        entry = self.voxels[row]
+        cells, nodes, points = entry["rows"].tolist()
+        bounds = np.stack([entry["low"], entry["high"]])
+        return RecordShape(
+            cells, nodes, points, self._shape_dtype, int(entry["leaves"]), bounds, self._classes
+        )
+
+    def read_voxel(self, row: int) -> tuple[VoxelData, Links]:
+        """Read, decompress and check the voxel in index row `row`.
+
+        Raises CorruptError naming the location.
+        """
+        record = self.open_voxel(row)
+        with self.locating(row):
+            return record.decode()

@@ -1,0 +1,119 @@
+"""Radius models: they determine the radius of the sphere around each scan point for a query.
+
+`mean` is the paper's: one radius for all points of a dataset ([Fig12] section 7). `local` and
+`border` are its future work (section 8): radii that follow the spacing around each point, and
+smaller ones on the rim of a surface. The archive stores one byte per point for them, the radius
+class: the local class in the low four bits, and RIM_BIT if the point is on a rim. A model maps
+classes to radii only at query time, so one archive serves all models.
+"""
+
+import re
+from collections.abc import Collection
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import BadRequestError
+from .units import UNITS_PER_METRE
+
+# Models that `solidcloud build --radius` can store.
+STORED_MODELS = ("mean", "local", "border")
+
+LOCAL_CLASSES = 16
+RIM_BIT = 16
+RADIUS_CLASSES = 32
+# Radius of each local class [micrometres]: 1 mm to 32 mm, each 2^(1/3) of the one before, so that
+# rounding up adds 26 % at most. The table is the same in every archive, so that a class depends on
+# nothing but a point's neighbours. Integers, so that every builder separates two classes at exactly
+# the same distance.
+LOCAL_RADII = (
+    1000, 1260, 1587, 2000, 2520, 3175, 4000, 5040, 6350, 8000, 10079, 12699, 16000, 20159, 25398, 32000
+)  # fmt: skip
+# A pair reaches 16 m at most, both radii and the margin together (server/kernels/core/pose_transform.py). A
+# scan point may take half of that.
+MAX_RADIUS = 8.0
+# Share of its radius that `border` leaves to a rim point.
+BORDER_SHARE = 0.5
+
+# A number as in JSON, with the decimal point also allowed at either end. Python's float would also
+# accept `0_8` for 8, spaces and `nan`.
+_NUMBER = re.compile(r"-?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
+
+_EXPECTED = (
+    "expected mean, local, border or local+border, each with an optional factor (local:0.8), or fixed:METRES"
+)
+
+
+class RadiusModel(NamedTuple):
+    """Parsed radius model of a query.
+
+    local, border: the classes that apply.  factor: applied to all radii.
+    fixed: one radius for all points [m]; None: stored ones.
+    """
+
+    local: bool
+    border: bool
+    factor: float
+    fixed: float | None
+
+
+def local_radii() -> NDArray[np.float64]:
+    """Return the radius (16,) [m] of each local class, ascending."""
+    return np.array(LOCAL_RADII) / 1e6
+
+
+def parse_radius_model(text: str) -> RadiusModel:
+    """Parse a radius model: `mean`, `local:0.8`, `local+border`, `fixed:0.01`.
+
+    Raises BadRequestError.
+    """
+    name, colon, number = text.partition(":")
+    parts = name.split("+")
+    known = {"mean", "fixed"} if len(parts) == 1 else set()
+    if len(set(parts)) < len(parts) or not set(parts) <= known | {"local", "border"}:
+        raise BadRequestError(f"radius model {text!r}: {_EXPECTED}")
+    factor = 1.0
+    if colon or name == "fixed":
+        if not _NUMBER.fullmatch(number):
+            raise BadRequestError(f"radius model {text!r}: {_EXPECTED}")
+        factor = float(number)
+    if not 0 <= factor <= MAX_RADIUS:  # false for NaN, too
+        raise BadRequestError(f"radius model {text!r}: expected a number from 0 to {MAX_RADIUS}")
+    if name == "fixed":
+        return RadiusModel(False, False, 1.0, factor)
+    return RadiusModel("local" in parts, "border" in parts, factor, None)
+
+
+def class_radii(text: str | None, radius: float, stored: Collection[str]) -> NDArray[np.int64]:
+    """Return the radii of scan points under a model, in exact units.
+
+    The shape is (1,) if all points have the same radius, else (32,), indexed by radius class.
+    text: as `parse_radius_model` takes it; None: the archive's one radius.
+    radius: that radius [m].  stored: the models that the archive holds.
+    A class with a larger local class, or without RIM_BIT, never has a smaller radius. The largest
+    local class among some points, with RIM_BIT if all of them have it, therefore gives an upper
+    bound of their radii. The archive's own radius is always accepted, however large; each pose is
+    checked later for the reach that this radius leaves.
+    Raises BadRequestError for a model that the archive does not hold.
+    """
+    model = RadiusModel(False, False, 1.0, None) if text is None else parse_radius_model(text)
+    missing = [name for name in ("local", "border") if getattr(model, name) and name not in stored]
+    if missing:
+        held = ",".join(name for name in STORED_MODELS if name in stored)
+        raise BadRequestError(
+            f"radius model {text!r}: this archive holds {held}: ask for one of those, "
+            f"or build it with --radius {','.join([held, *missing])}"
+        )
+    metres = np.full(1, radius if model.fixed is None else model.fixed)
+    if model.local or model.border:
+        classes = np.arange(RADIUS_CLASSES)
+        metres = local_radii()[classes % LOCAL_CLASSES] if model.local else np.full(RADIUS_CLASSES, metres[0])
+        if model.border:
+            metres = np.where(classes & RIM_BIT, metres * BORDER_SHARE, metres)
+    metres = metres * model.factor
+    if metres.max() > max(MAX_RADIUS, radius):
+        raise BadRequestError(
+            f"radius model {text!r}: radii up to {metres.max():g} m: expected at most {MAX_RADIUS} m"
+        )
+    return np.rint(metres * UNITS_PER_METRE).astype(np.int64)

@@ -1,0 +1,151 @@
+"""Writer of shards: HDF5 files with the records of many voxels.
+
+A shard is verified by offsets before it is given its name. FORMAT.md documents the same; change
+both together. archive.py reads shards by offsets, so that neither HDF5's lock nor its parser stands
+between a server and a record.
+"""
+
+import base64
+import functools
+import os
+import re
+import zlib
+from collections.abc import Iterable
+from pathlib import Path
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import CorruptError
+from ..process.interrupts import check
+from ..process.new_file import new_file, publish, temporary_path
+from .codec import CELL_DTYPE, NODE_DTYPE, Record, voxel_point_dtype
+from .index import VOXEL_DTYPE
+from .voxel import VoxelData
+from .zstd_frame import Frame
+
+SHARD_FOLDER = "shards"
+ZSTD_FILTER = 32015  # registered with the HDF Group
+DATASETS = ("cells", "nodes", "points")
+# Block size for reading back a shard that was just written [bytes].
+READ_BYTES = 1 << 20
+
+# An HDF5 file of 463 bytes with one dataset, x, of one int8 in one chunk; made with a filter class
+# registered as "zstd" through ctypes. h5py has no other way to name a filter. Without a name, HDF5
+# writes the name that a loaded plugin gives itself, or none, so two builds would differ.
+_PROPERTIES = (
+    rb"c-rgqaB<`1lHy|K;9!7(|4?wA5yCfsinmX3)${jo31U*1u$&<q8CNg~A!~#IE+z(`5o|mRK#H;AFwA@p2C4zY86rtwCjl*B6"
+    rb"k%XsVgv%H9E@h>VPF*CfblsPSb?r$=H`}VU}RzfIgk-7!(Yn^W>poJq%bgp6v{9#umDvcnTQfP480743lx@TKLG&yO*Ul"
+)
+
+SHARD_NAME = re.compile(r"[0-9]{1,9}-[0-9]{1,9}\.h5")
+
+
+def shard_name(number: int, generation: int = 0) -> str:
+    """Return the file name of a shard inside SHARD_FOLDER."""
+    return f"{generation}-{number:06d}.h5"
+
+
+@functools.cache
+def _creation_properties() -> h5py.h5p.PropDCID:
+    """Return the creation properties of a record's dataset; callers must copy them.
+
+    They are: shuffle, then an optional filter zstd named "zstd", and no stored times.
+    """
+    image = zlib.decompress(base64.b85decode(_PROPERTIES))
+    return h5py.h5d.open(h5py.h5f.open_file_image(image), b"x").get_create_plist()
+
+
+def _write_frame(group: h5py.Group, name: str, frame: Frame, rows: int, dtype: np.dtype) -> tuple[int, int]:
+    """Write one dataset of one chunk from its frame; return the chunk's offset and size [bytes]."""
+    properties = _creation_properties().copy()
+    properties.set_chunk((rows,))
+    space = h5py.h5s.create_simple((rows,))
+    kind = h5py.h5t.py_create(dtype, logical=True)
+    dataset = h5py.h5d.create(group.id, name.encode(), kind, space, properties)
+    dataset.write_direct_chunk((0,), frame)
+    chunk = dataset.get_chunk_info(0)
+    return chunk.byte_offset, chunk.size
+
+
+def write_shard(
+    path: Path,
+    number: int,
+    archive_id: bytes,
+    voxels: Iterable[tuple[VoxelData, Record, NDArray[np.int64], NDArray[np.int64]]],
+    *,
+    version: int = 1,
+) -> tuple[NDArray, int]:
+    """Write one shard; return its index rows (VOXEL_DTYPE) and its `file_checksum`.
+
+    voxels: per voxel its data, its record, and the bounds low, high (3,) of its points [voxel
+    steps, inclusive].
+    version: of the format, as the index will state it.
+    The file is verified by offsets before it is given its name.
+    """
+    rows = []
+    with new_file(path) as file:
+        file.attrs["format"] = np.bytes_("solidcloud shard")
+        file.attrs["format_version"] = np.uint32(version)
+        file.attrs["archive_id"] = np.frombuffer(archive_id, np.uint8)
+        parent = file.create_group("voxels", track_times=False)
+        for voxel, record, low, high in voxels:
+            dtypes = (CELL_DTYPE, NODE_DTYPE, voxel_point_dtype(voxel))
+            group = parent.create_group(f"{voxel.key:016x}", track_times=False)
+            counts = (record.cell_rows, record.node_rows, record.point_rows)
+            frames = (record.cells, record.nodes, record.points)
+            row = np.zeros((), VOXEL_DTYPE)
+            row["key"], row["shard"], row["rows"], row["low"], row["high"] = (
+                voxel.key,
+                number,
+                counts,
+                low,
+                high,
+            )
+            row["leaves"] = record.leaf_rows
+            for i, name in enumerate(DATASETS):
+                offset, size = _write_frame(group, name, frames[i], counts[i], dtypes[i])
+                row["frame_offset"][i], row["frame_bytes"][i] = offset, size
+                row["frame_checksum"][i] = int.from_bytes(frames[i][-4:], "little")
+            rows.append(row)
+            file.check()
+    table = np.array(rows, VOXEL_DTYPE)
+    temporary = temporary_path(path)
+    try:
+        checksum = _verify_frames(temporary, table)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+    publish(path)
+    return table, checksum
+
+
+def file_checksum(path: Path) -> int:
+    """Return the CRC-32 of a file's bytes.
+
+    It covers HDF5's own structures, which the checksums of records do not.
+    """
+    checksum, buffer = 0, memoryview(bytearray(READ_BYTES))
+    with open(path, "rb", buffering=0) as file:
+        while got := file.readinto(buffer):
+            check()
+            checksum = zlib.crc32(buffer[:got], checksum)
+    return checksum
+
+
+def _verify_frames(path: Path, table: NDArray) -> int:
+    """Check the end of every frame of a shard by its offset; return the shard's `file_checksum`.
+
+    A full disk may go unnoticed until here.
+    """
+    with open(path, "rb") as file:
+        for row in table:
+            for i, name in enumerate(DATASETS):
+                end = int(row["frame_offset"][i]) + int(row["frame_bytes"][i])
+                checksum = os.pread(file.fileno(), 4, end - 4)
+                if checksum != int(row["frame_checksum"][i]).to_bytes(4, "little"):
+                    raise CorruptError(
+                        f"{path}: voxel {int(row['key']):#x}, {name}: differs from what was written: is the disk full?"
+                    )
+    return file_checksum(path)

@@ -1,0 +1,365 @@
+"""Scene file `scene.toml`: archives, avatars, objects and limits of a scene, and its effects.
+
+`solidcloud serve` and `solidcloud scene check` read it; SCENE.md documents it. Paths are relative
+to the file.
+"""
+
+import inspect
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import msgspec
+from msgspec import structs
+
+from ..archive.radius_model import parse_radius_model
+from ..archive.voxel_grid import MAX_COORDINATE
+from ..errors import BadRequestError
+from ..wire.keys import check_name
+from .effect_options import AnyEffect, Stop, Through, Vector
+from .toml_faults import MOST_BYTES, decode, fault, nearest, shown
+
+SUFFIX = ".toml"
+FORMAT = 1
+# A pose may be written with seven digits: one that is rigid within this is made rigid (NUMERICS.md
+# case 4).
+_ALMOST_RIGID = 1e-6
+# A pose that is rigid within this stays as it is; the server requires 1e-9 (NUMERICS.md N6).
+_RIGID = 1e-12
+
+Matrix = Annotated[list[Annotated[list[float], msgspec.Meta(min_length=4, max_length=4)]], msgspec.Meta(min_length=4, max_length=4)]  # fmt: skip  # noqa: E501
+# Python's `$` also matches before a final line end.
+SceneName = Annotated[
+    str,
+    msgspec.Meta(
+        pattern=r"^[A-Za-z0-9._-]{1,64}$(?!\n)", description="1 to 64 of A-Z, a-z, 0-9, '.', '_' and '-'"
+    ),
+]
+PathText = Annotated[str, msgspec.Meta(min_length=1)]
+ItemName = Annotated[str, msgspec.Meta(min_length=1, max_length=64)]
+
+
+def identity() -> list[list[float]]:
+    """Return the identity pose."""
+    return [[float(row == column) for column in range(4)] for row in range(4)]
+
+
+class _Part(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Base class of the file's tables. Unknown fields are refused."""
+
+
+class ArchiveItem(_Part, frozen=True):
+    """Archive of a scene.
+
+    path: its folder.  pose: archive to world, rigid, row-major.
+    """
+
+    path: PathText
+    pose: Matrix = msgspec.field(default_factory=identity)
+
+
+class AvatarItem(_Part, frozen=True):
+    """Avatar that every user may use.
+
+    file: a scan or mesh of it.
+    radius: of its points [m]; omitted: half the mean closest-point distance.
+    """
+
+    name: SceneName
+    file: PathText
+    radius: Annotated[float, msgspec.Meta(ge=0, le=8)] | None = None
+
+
+class ObjectItem(_Part, frozen=True):
+    """Dynamic object.
+
+    avatar: its shape, one of `avatars`.  pose: the initial pose.
+    kind: `kinematic`: a user sets its pose; `pushed`: users push it.
+    """
+
+    name: ItemName
+    avatar: ItemName
+    pose: Matrix = msgspec.field(default_factory=identity)
+    kind: Literal["kinematic", "pushed"] = "kinematic"
+
+
+class Spawn(_Part, frozen=True):
+    """Initial pose of users.
+
+    position: of the avatar's origin, world [m].
+    heading: rotation about up [degrees].
+    """
+
+    position: Vector
+    heading: float = 0.0
+
+
+class Limits(_Part, frozen=True):
+    """Limits of a scene's cost.
+
+    users: at the same time.
+    frame_ms: time for one user's frame; effects beyond it are skipped, except `stop`, `sweep`,
+    `objects` and `crowd`.
+    frame_visits: the same limit in node visits, independent of a clock.
+    longest_move: farthest motion of a frame [m].
+    """
+
+    users: Annotated[int, msgspec.Meta(ge=1, le=1024)] = 64
+    frame_ms: Annotated[float, msgspec.Meta(gt=0, le=10_000)] | None = None
+    frame_visits: Annotated[int, msgspec.Meta(gt=0, le=1 << 62)] | None = None
+    longest_move: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 100.0
+
+
+class SceneFile(_Part, frozen=True):
+    """Content of a scene file.
+
+    format: 1.  up: against gravity; any length but zero.
+    radius_model: for the scan's spheres, one that the archives hold; omitted: each archive's one
+    radius.
+    effects: in any order; the server runs them in a fixed order.
+    """
+
+    format: Literal[1]
+    archives: Annotated[list[ArchiveItem], msgspec.Meta(min_length=1)]
+    name: SceneName | None = None
+    up: Vector = (0.0, 0.0, 1.0)
+    radius_model: str | None = None
+    avatars: list[AvatarItem] = []
+    objects: list[ObjectItem] = []
+    spawn: Spawn | None = None
+    limits: Limits = Limits()
+    effects: list[AnyEffect] = msgspec.field(default_factory=lambda: [Stop()])
+
+
+def scene_of(archive: str) -> SceneFile:
+    """Return the scene of an archive without a file: the archive and `stop`."""
+    return SceneFile(format=1, archives=[ArchiveItem(path=archive)])
+
+
+def effect_name(effect: AnyEffect) -> str:
+    """Return the name of an effect in the file and in answers."""
+    return str(type(effect).__struct_config__.tag)
+
+
+def up_of(scene: SceneFile) -> Vector:
+    """Return the unit vector against gravity."""
+    length = math.hypot(*scene.up)
+    x, y, z = (value / length for value in scene.up)
+    return x, y, z
+
+
+def scene_name(scene: SceneFile, path: Path) -> str:
+    """Return a scene's name for clients: its `name`, else the file's name without suffix.
+
+    Raises BadRequestError if the latter is not a valid name.
+    """
+    if scene.name is not None:
+        return scene.name
+    try:
+        return check_name(path.stem, "the file's name")
+    except BadRequestError as error:
+        raise BadRequestError(f"{path}: {error}: give the scene a `name`") from None
+
+
+def read_scene(path: Path) -> SceneFile:
+    """Read a scene file and check everything that needs no archive.
+
+    Raises BadRequestError with file, place, what was found and what is allowed.
+    """
+    if path.suffix != SUFFIX:
+        raise BadRequestError(
+            f"{path}: expected a scene file, with a name that ends in {SUFFIX}: `serve` recognises it by that"
+        )
+    try:
+        with open(path, "rb") as file:
+            text = file.read(MOST_BYTES + 1)  # limits the read if a scan was given by mistake
+    except OSError as error:
+        raise BadRequestError(
+            f"{path}: {error.strerror}: expected a scene file: make one with: solidcloud scene new"
+        ) from None
+    return parse_scene(text, str(path))
+
+
+def parse_scene(text: bytes, where: str) -> SceneFile:
+    """Parse a scene file's bytes and orthonormalise its poses to the last digits.
+
+    where: the file's name, for errors.
+    """
+    scene = decode(text, SceneFile, where)
+    for place, said in _faults(scene):
+        raise fault(where, place, said, text)
+    return structs.replace(scene, archives=_rigid(scene.archives), objects=_rigid(scene.objects))
+
+
+def check_scene(scene: SceneFile, where: str) -> None:
+    """Check what the types cannot express; raise BadRequestError.
+
+    Names must be unique and defined, required effects present, poses rigid.
+    """
+    for place, said in _faults(scene):
+        raise fault(where, place, said)
+
+
+def json_schema() -> str:
+    """Return the JSON Schema of a scene file, for editors of TOML.
+
+    `json/Scene.json` holds the same text.
+    """
+    schema = msgspec.json.schema(SceneFile)
+    for definition in schema["$defs"].values():
+        # Python 3.13 strips a docstring's indentation, earlier versions do not; cleandoc gives the
+        # same text on all.
+        definition["description"] = inspect.cleandoc(definition["description"])
+    text = msgspec.json.format(msgspec.json.encode(schema, order="sorted"), indent=2)
+    return text.decode() + "\n"
+
+
+def _faults(scene: SceneFile) -> Iterator[tuple[str, str]]:
+    """Yield the place and the explanation of each fault."""
+    if scene.name is not None:
+        try:
+            check_name(scene.name, "name")
+        except BadRequestError as error:
+            yield "$.name", str(error)
+    names = [effect_name(effect) for effect in scene.effects]
+    yield from _twice(names, "effects", "effect")
+    for number, effect in enumerate(scene.effects):
+        missing = [needed for needed in effect.needs if needed not in names]
+        if missing:
+            add = " and ".join(f'[[effects]] effect = "{needed}"' for needed in missing)
+            less = " and ".join(f"`{needed}`" for needed in missing)
+            yield (
+                f"$.effects[{number}]",
+                f"`{names[number]}` requires {less}: add {add}, or leave it out",
+            )
+        if isinstance(effect, Through):
+            yield from _boxes(effect, f"$.effects[{number}].boxes")
+    yield from _twice([item.name for item in scene.avatars], "avatars", "name")
+    yield from _twice([item.name for item in scene.objects], "objects", "name")
+    yield from _objects(scene, names)
+    for number, archive in enumerate(scene.archives):
+        yield from _path(archive.path, f"$.archives[{number}].path")
+        yield from _pose(archive.pose, f"$.archives[{number}].pose")
+    for number, avatar in enumerate(scene.avatars):
+        yield from _path(avatar.file, f"$.avatars[{number}].file")
+    for number, thing in enumerate(scene.objects):
+        yield from _pose(thing.pose, f"$.objects[{number}].pose")
+    if not 1e-100 < math.hypot(*scene.up) < 1e100:  # outside, squares overflow or underflow
+        yield "$.up", f"found {list(scene.up)}: expected a direction, of any length but zero"
+    if scene.spawn is not None:
+        yield from _position(scene.spawn.position, "$.spawn.position")
+    if scene.radius_model is not None:
+        try:
+            parse_radius_model(scene.radius_model)
+        except BadRequestError as error:
+            yield "$.radius_model", str(error)
+
+
+def _objects(scene: SceneFile, effects: list[str]) -> Iterator[tuple[str, str]]:
+    """Yield faults of objects with an unknown shape, or without the effect `objects`."""
+    known = [item.name for item in scene.avatars]
+    for number, item in enumerate(scene.objects):
+        if item.avatar not in known:
+            listed = f"one of {', '.join(map(shown, known))}" if known else "it in [[avatars]]"
+            close = nearest(item.avatar, known)
+            yield (
+                f"$.objects[{number}].avatar",
+                f"{shown(item.avatar)} is not an avatar of the scene: expected {listed}{close}",
+            )
+    if scene.objects and "objects" not in effects:
+        yield (
+            "$.objects",
+            f"found {len(scene.objects)} without the effect `objects`: "
+            'add [[effects]] effect = "objects", or leave them out',
+        )
+
+
+def _twice(names: list[str], what: str, field: str) -> Iterator[tuple[str, str]]:
+    """Yield faults of names that occur twice."""
+    for number, name in enumerate(names):
+        if name in names[:number]:
+            first = f"$.{what}[{names.index(name)}]"
+            yield f"$.{what}[{number}].{field}", f"{shown(name)} is a duplicate: expected once, as in {first}"
+
+
+def _boxes(effect: Through, place: str) -> Iterator[tuple[str, str]]:
+    """Yield faults of boxes that are inverted, too far away, or named like another."""
+    for number, box in enumerate(effect.boxes):
+        yield from _position(box.low, f"{place}[{number}].low")
+        yield from _position(box.high, f"{place}[{number}].high")
+        if not all(low <= high for low, high in zip(box.low, box.high, strict=True)):
+            yield (
+                f"{place}[{number}]",
+                f"box {shown(box.name)} from {list(box.low)} to {list(box.high)}: expected low <= high along each axis",
+            )
+    yield from _twice([box.name for box in effect.boxes], place[2:], "name")
+
+
+def _path(path: str, place: str) -> Iterator[tuple[str, str]]:
+    """Yield the fault of a path that no file can have."""
+    if "\0" in path:
+        yield place, f"found {shown(path)}: expected a path, without the character NUL"
+
+
+def _position(position: Vector, place: str) -> Iterator[tuple[str, str]]:
+    """Yield the fault of a position that no archive's lattice reaches."""
+    if not all(abs(value) <= MAX_COORDINATE for value in position):
+        yield place, f"found {list(position)}: expected coordinates within {MAX_COORDINATE:g} m"
+
+
+def _pose(pose: list[list[float]], place: str) -> Iterator[tuple[str, str]]:
+    """Yield the fault of a pose that is not rigid, or that shifts too far."""
+    if pose[3] != [0.0, 0.0, 0.0, 1.0]:
+        yield (
+            f"{place}[3]",
+            f"found {pose[3]}: expected the last row 0 0 0 1: a pose is 4 rows of 4, row-major",
+        )
+        return
+    gram = _gram(pose)
+    off = max(abs(gram[row][column] - (row == column)) for row in range(3) for column in range(3))
+    if not off <= _ALMOST_RIGID:  # false for NaN, too
+        yield (
+            place,
+            f"scales or shears, by {off:.2g}: expected a rotation and a shift, within {_ALMOST_RIGID:g}",
+        )
+    elif _determinant(pose) < 0:
+        yield place, "mirrors: expected a rotation and a shift"
+    else:
+        yield from _position((pose[0][3], pose[1][3], pose[2][3]), place)
+
+
+def _gram(pose: list[list[float]]) -> list[list[float]]:
+    """Return the Gram matrix of the rows of a pose's rotation; the identity for an exact rotation."""
+    return [
+        [sum(a * b for a, b in zip(one[:3], other[:3], strict=True)) for other in pose[:3]]
+        for one in pose[:3]
+    ]
+
+
+def _determinant(pose: list[list[float]]) -> float:
+    """Return the determinant of a pose's rotation."""
+    (a, b, c, _), (d, e, f, _), (g, h, i, _) = pose[:3]
+    return a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
+
+
+def _rigid(items: list[Any]) -> list[Any]:
+    """Return archives or objects with their rotations orthonormalised to the last digits.
+
+    The iteration (3 R - R R' R) / 2 squares the distance of R from the nearest rotation: two steps
+    suffice from 1e-6.
+    """
+    made = []
+    for item in items:
+        pose = item.pose
+        for _ in range(2):
+            gram = _gram(pose)
+            if all(abs(gram[i][j] - (i == j)) <= _RIGID for i in range(3) for j in range(3)):
+                break
+            pose = [
+                [1.5 * pose[i][j] - 0.5 * sum(gram[i][k] * pose[k][j] for k in range(3)) for j in range(3)]
+                + [pose[i][3]]
+                for i in range(3)
+            ] + [pose[3]]
+        made.append(item if pose is item.pose else structs.replace(item, pose=pose))
+    return made

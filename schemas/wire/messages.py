@@ -1,0 +1,318 @@
+"""Message types of the wire protocol, gathered from their modules, and their JSON Schemas.
+
+WIRE.md documents this file, requests.py, answers.py, moves.py, stats.py and encoding.py. No zenoh
+here.
+"""
+
+import inspect
+from typing import Annotated, Any
+
+import msgspec
+import numpy as np
+
+from ..errors import ErrorCode
+from .answers import (
+    CollideAnswers,
+    CollidePart,
+    ContactsAnswers,
+    ContactsPart,
+    DistanceAnswers,
+    DistancePart,
+    ObjectsAnswers,
+    RaycastAnswers,
+    SweepAnswers,
+    SweepPart,
+    WithinAnswers,
+)
+from .arrays import ArrayType, Poses, Positions, array_fields
+from .columns import check_answers
+from .encoding import (
+    JSON,
+    MAX_MESSAGE_BYTES,
+    MSGPACK,
+    decode_answer,
+    decode_request,
+    encode,
+    wire_encoding,
+)
+from .moves import Moved, MoveRequest, State, Wish
+from .requests import (
+    MAX_AVATAR_POINTS,
+    MAX_POSES,
+    AddAvatarRequest,
+    CollideRequest,
+    ContactsRequest,
+    DistanceRequest,
+    ObjectsRequest,
+    PathRequest,
+    RaycastRequest,
+    Request,
+    SweepRequest,
+    WithinRequest,
+    make_poses,
+    make_positions,
+)
+from .stats import StatsAnswer, StatsRequest, UserStats
+
+# Everything that a reader of messages needs, regardless of the module that defines it.
+__all__ = [
+    "JSON",
+    "MAX_AVATAR_POINTS",
+    "MAX_MESSAGE_BYTES",
+    "MAX_POSES",
+    "MESSAGES",
+    "MSGPACK",
+    "WIRE_VERSION",
+    "AddAvatarRequest",
+    "AvatarInfo",
+    "CollideRequest",
+    "ContactsRequest",
+    "DistanceRequest",
+    "ErrorReply",
+    "MoveRequest",
+    "Moved",
+    "ObjectInfo",
+    "ObjectsRequest",
+    "PathRequest",
+    "Poses",
+    "Positions",
+    "RaycastRequest",
+    "ReloadAnswer",
+    "SceneInfo",
+    "ScenesAnswer",
+    "SourceInfo",
+    "SpawnInfo",
+    "State",
+    "StatsAnswer",
+    "StatsRequest",
+    "SweepRequest",
+    "UserStats",
+    "Wish",
+    "WithinRequest",
+    "check_answers",
+    "decode_answer",
+    "decode_request",
+    "encode",
+    "json_schemas",
+    "make_poses",
+    "make_positions",
+    "wire_encoding",
+]
+
+WIRE_VERSION = 1
+
+
+class ScenesAnswer(msgspec.Struct, frozen=True):
+    """Scenes that one server serves."""
+
+    scenes: list[str]
+    wire_version: int = WIRE_VERSION
+    format_version: int = 0
+
+
+class AvatarInfo(msgspec.Struct, frozen=True):
+    """Avatar as the server stores it.
+
+    points: number of points.  radius: of every point [m].
+    bounding_radius: radius of a sphere around the avatar's points and their radii [m].
+    Both radii are null in what a `Client` returns as long as no server has answered.
+    """
+
+    name: str
+    points: int
+    radius: float | None = None
+    bounding_radius: float | None = None
+
+
+class SourceInfo(msgspec.Struct, frozen=True):
+    """One scan that was built into the archive.
+
+    index: index of the scan inside its file.  sha256: of the file, hexadecimal.
+    count: points stored.  pose: 4x4 row-major, scan to world.
+    skipped: points left out, by reason.
+    fault: why none of the scan is in the archive (any more), or "".
+    """
+
+    path: str
+    index: int
+    sha256: str
+    count: int
+    format: str
+    pose: list[list[float]]
+    skipped: dict[str, int]
+    fault: str = ""
+
+
+class SpawnInfo(msgspec.Struct, frozen=True):
+    """Initial pose of a scene's users.
+
+    position: of the avatar's origin, world [m].  heading: about `up` [degrees].
+    """
+
+    position: tuple[float, float, float]
+    heading: float = 0.0
+
+
+class ObjectInfo(msgspec.Struct, frozen=True):
+    """Dynamic object of a scene.
+
+    avatar: its shape, one of the scene's avatars.  pose: 4x4 row-major, the initial pose.
+    kind: `kinematic`: a user sets its pose; `pushed`: users push it. A reader treats any other
+    value as kinematic.
+    """
+
+    name: str
+    avatar: str
+    pose: list[list[float]]
+    kind: str = "kinematic"
+
+
+class SceneInfo(msgspec.Struct, frozen=True):
+    """Description of a scene: counts, bounds, lattice, radius and sources.
+
+    bounds: [[x, y, z] low, [x, y, z] high], world [m].  origin: of the lattice, world [m].
+    lattice_step, voxel_size, radius, radius_error (standard error of `radius`): [m].
+    lattice_source: "sources", "given" or "default".
+    moved_max: farthest distance that a point moved onto the lattice [m].
+    radius_sample: number of points over which the closest-point distance was averaged.
+    degree, leaf: of the hierarchies.  skipped: scans left out with `--skip-bad`.
+    record_bytes: of all records on disk.  resident_bytes: of the whole archive, decoded.
+    effects: effects that the scene's frames simulate; no others are simulated.
+    unknown: boxes (like `bounds`) of scans left out, where nothing is called clear.
+    unknown_everywhere: true if the bounds of one of these scans are not known.
+    radius_models: models that are stored and that a query may request.
+    generation: how often scans were added or removed since the build.
+    radius_now: what `radius` would be if it were measured over the points of this generation [m];
+    radius_now_error: its standard error [m]; null: not known.
+    avatars: the scene's own avatars, which every client may use by name.
+    up: unit vector against gravity.  spawn: where users start; null: each user chooses.
+    objects: dynamic objects and their initial poses.
+    default_radius_model: model of a query that names none; null: `radius`.
+    """
+
+    scene: str
+    format_version: int
+    wire_version: int
+    points: int
+    voxels: int
+    bounds: list[list[float]]
+    origin: list[float]
+    lattice_step: float
+    lattice_source: str
+    voxel_size: float
+    radius: float
+    radius_model: str
+    radius_error: float
+    radius_sample: int
+    moved_max: float
+    degree: int
+    leaf: int
+    sources: list[SourceInfo]
+    skipped: list[str]
+    record_bytes: int
+    resident_bytes: int
+    effects: list[str] = []
+    unknown: list[list[list[float]]] = []
+    unknown_everywhere: bool = False
+    radius_models: list[str] = []
+    generation: int = 0
+    radius_now: float | None = None
+    radius_now_error: float | None = None
+    avatars: list[AvatarInfo] = []
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    spawn: SpawnInfo | None = None
+    objects: list[ObjectInfo] = []
+    default_radius_model: str | None = None
+
+
+class ReloadAnswer(msgspec.Struct, frozen=True):
+    """Result of a reload: the generation that the scene serves now.
+
+    generation_before, generation_after: of the archive; equal if nothing was added or removed.
+    points: in the archive now.  seconds: from the request until the new generation was swapped in.
+    """
+
+    scene: str
+    generation_before: int
+    generation_after: int
+    points: int
+    seconds: float = 0.0
+
+
+class ErrorReply(msgspec.Struct, frozen=True):
+    """Reason why a request was not answered. A reader treats an unknown code as `internal`."""
+
+    code: Annotated[str, msgspec.Meta(extra_json_schema={"enum": [str(code) for code in ErrorCode]})]
+    message: str
+
+
+MESSAGES: tuple[type, ...] = (
+    ScenesAnswer,
+    SceneInfo,
+    AddAvatarRequest,
+    AvatarInfo,
+    CollideRequest,
+    CollideAnswers,
+    DistanceRequest,
+    DistanceAnswers,
+    ContactsRequest,
+    ContactsAnswers,
+    SweepRequest,
+    SweepAnswers,
+    RaycastRequest,
+    RaycastAnswers,
+    WithinRequest,
+    WithinAnswers,
+    ObjectsRequest,
+    ObjectsAnswers,
+    PathRequest,
+    CollidePart,
+    DistancePart,
+    ContactsPart,
+    SweepPart,
+    MoveRequest,
+    Moved,
+    Wish,
+    State,
+    ReloadAnswer,
+    StatsRequest,
+    StatsAnswer,
+    ErrorReply,
+)
+
+
+def json_schemas() -> dict[str, str]:
+    """Return the JSON Schema of every message by the name of its type.
+
+    `schemas/json/` holds the same texts.
+    """
+    texts = {}
+    for kind in MESSAGES:
+        components = msgspec.json.schema(kind, schema_hook=lambda _: {"type": "array"})
+        for definition in components["$defs"].values():
+            # Python 3.13 strips a docstring's indentation, earlier versions do not; cleandoc gives
+            # the same text on all.
+            definition["description"] = inspect.cleandoc(definition["description"])
+        properties = components["$defs"][kind.__name__]["properties"]
+        for name, of in array_fields(kind).items():
+            default: dict[str, Any] = {"default": []} if "default" in properties[name] else {}
+            properties[name] = _array_schema(of, nullable=not issubclass(kind, Request)) | default
+        text = msgspec.json.format(msgspec.json.encode(components, order="sorted"), indent=2)
+        texts[kind.__name__] = text.decode() + "\n"
+    return texts
+
+
+def _array_schema(of: ArrayType, nullable: bool) -> dict[str, Any]:
+    """Return the JSON Schema of an array: nested lists, and the bytes per row in MessagePack."""
+    dtype, tail, row_bytes = of
+    schema: dict[str, Any] = {
+        "type": {"f": "number", "u": "integer", "i": "integer", "b": "boolean"}[dtype.kind]
+    }
+    if dtype.kind == "f" and nullable:
+        schema["type"] = ["number", "null"]
+    if dtype.kind in "ui":
+        schema |= {"minimum": int(np.iinfo(dtype).min), "maximum": int(np.iinfo(dtype).max)}
+    for length in reversed(tail):
+        schema = {"type": "array", "items": schema, "minItems": length, "maxItems": length}
+    note = f"{dtype.name}; in MessagePack a bin, {row_bytes} bytes an item"
+    return {"type": "array", "items": schema, "description": note}

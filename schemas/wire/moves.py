@@ -1,0 +1,225 @@
+"""Messages of one frame of one avatar: the motion command, and the resulting motion.
+
+WIRE.md says when each is sent.
+What an effect reports is a field of `Moved` that is omitted if the scene does not declare the
+effect.
+"""
+
+import math
+from collections.abc import Iterable
+
+import msgspec
+import numpy as np
+
+from ..errors import BadRequestError
+from .answers import Verdict
+from .arrays import Poses
+from .requests import Count, Length, Name, Request, check_one_pose, make_poses
+
+Vector = tuple[float, float, float]
+
+LONGEST_SECONDS = 10.0
+# Default duration of a frame, 30 of which make a second [s].
+FRAME_SECONDS = 1 / 30
+
+
+class MoveRequest(Request, frozen=True, kw_only=True):
+    """Compute where an avatar gets from one pose towards another, and what it touches; stateless.
+
+    avatar: the name under which it was added.
+    pose_from, pose_to: (1, 4, 4) float64, avatar to world, rigid.
+    seconds: duration of the frame, which gravity depends on, at most 10 [s].
+    """
+
+    avatar: Name
+    pose_from: Poses
+    pose_to: Poses
+    seconds: Length = FRAME_SECONDS
+
+    def __post_init__(self) -> None:
+        Request.__post_init__(self)
+        check_one_pose("pose_from", self.pose_from)
+        check_one_pose("pose_to", self.pose_to)
+        if self.seconds > LONGEST_SECONDS:
+            raise BadRequestError(f"seconds is {self.seconds}: expected {LONGEST_SECONDS:g} at most")
+
+
+class Wish(Request, frozen=True, kw_only=True):
+    """Motion command: the pose or the velocity that a user wants; sent 30 to 90 times a second.
+
+    It has either `pose` or `velocity`.
+    seq: greater in every command; a command whose seq is not greater than the last one's is
+    dropped.
+    time: time of the command on the client's clock, which must not go backwards [s].
+    pose: (1, 4, 4) float64, avatar to world, rigid.  velocity: world [m/s].
+    turn: about the scene's up axis [rad/s], with velocity.
+    objects: poses (4, 4) row-major of the scene's objects that this user moves.
+    """
+
+    seq: Count
+    time: Length
+    pose: Poses = msgspec.field(default_factory=lambda: make_poses(np.empty((0, 4, 4))))
+    velocity: Vector | None = None
+    turn: float = 0.0
+    objects: dict[str, list[list[float]]] = msgspec.field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        Request.__post_init__(self)
+        if len(self.pose) == (self.velocity is not None):
+            raise BadRequestError("a wish with both or neither of pose and velocity: expected exactly one")
+        if len(self.pose):
+            check_one_pose("pose", self.pose)
+        _check_finite("velocity", self.velocity or ())
+        _check_finite("turn", [self.turn])
+        for name, rows in self.objects.items():
+            if [len(row) for row in rows] != [4, 4, 4, 4]:
+                raise BadRequestError(f"object {name!r}: expected a pose of 4 rows of 4 numbers")
+            _check_finite(f"pose of object {name!r}", [number for row in rows for number in row])
+
+
+def _check_finite(what: str, numbers: Iterable[float]) -> None:
+    """Raise BadRequestError for NaN or infinity, for which no answer is defined (NUMERICS.md N7)."""
+    for number in numbers:
+        if not math.isfinite(number):
+            raise BadRequestError(f"{what} holds {number}: expected finite numbers")
+
+
+class Touched(msgspec.Struct, frozen=True, omit_defaults=True):
+    """One obstacle that stopped a motion.
+
+    place: of the scan point, world [m].  normal: the contact normal, where estimated.
+    what: "" for the scene, else the object or user.
+    unknown: nothing was touched, but the way ahead is not known to be clear.
+    """
+
+    place: Vector
+    normal: Vector | None = None
+    what: str = ""
+    unknown: bool = False
+
+
+class GroundReport(msgspec.Struct, frozen=True, omit_defaults=True):
+    """Report of the effect `ground`.
+
+    on_ground: the avatar is standing.  speed: of falling [m/s].
+    normal: of the surface on which the avatar stands.
+    """
+
+    on_ground: bool
+    speed: float = 0.0
+    normal: Vector | None = None
+
+
+class ProximityReport(msgspec.Struct, frozen=True, omit_defaults=True):
+    """Report of the effect `proximity`, as an answer of `distance`.
+
+    distance: signed [m]; null: beyond reach.
+    """
+
+    distance: float | None = None
+    avatar: Vector | None = None
+    cloud: Vector | None = None
+    normal: Vector | None = None
+    unknown: bool = False
+
+
+class ContactCluster(msgspec.Struct, frozen=True):
+    """One cluster of contacts, in the report of the effect `contacts`.
+
+    count: pairs.  deepest: signed distance of the deepest pair [m].
+    avatar, cloud: centres of that pair, world [m].
+    """
+
+    count: int
+    deepest: float
+    avatar: Vector
+    cloud: Vector
+
+
+class ContactsReport(msgspec.Struct, frozen=True, omit_defaults=True):
+    """Report of the effect `contacts`.
+
+    clusters: deepest first.  total: number of clusters, listed or not.
+    """
+
+    clusters: list[ContactCluster] = []
+    total: int = 0
+    unknown: bool = False
+
+
+class UncertaintyReport(msgspec.Struct, frozen=True, omit_defaults=True):
+    """Report of the effect `uncertainty`.
+
+    probability: of contact.
+    scans: probability for each scan alone, by its file; only scans that matter.
+    """
+
+    probability: float
+    scans: dict[str, float] = {}
+    unknown: bool = False
+
+
+class ObjectsReport(msgspec.Struct, frozen=True, omit_defaults=True):
+    """Report of the effect `objects`.
+
+    poses: row-major, of the objects that moved.
+    touching: pairs that touch; "" is the scene, other names are of objects.
+    """
+
+    poses: dict[str, list[list[float]]] = {}
+    touching: list[tuple[str, str]] = []
+
+
+class CrowdReport(msgspec.Struct, frozen=True, omit_defaults=True):
+    """Report of the effect `crowd`.
+
+    met: number of other users that stopped this one.
+    """
+
+    met: int = 0
+
+
+class Moved(msgspec.Struct, frozen=True, eq=False, kw_only=True, omit_defaults=True):
+    """Result of one frame.
+
+    pose: (1, 4, 4) float64, the avatar's pose now.
+    verdict: of that pose, a value of `Verdict`; also UNKNOWN if the way ahead is not known to be
+    clear, and the avatar went no farther than it is.
+    left: part of the commanded motion not carried out [m].  touched: obstacles that stopped it.
+    simulated: effects, in the order in which they ran.
+    skipped: effects for which the frame's budget was too small.
+    stepped: height climbed by `step` [m].
+    ground, proximity, contacts, uncertainty, objects, crowd: the report of each effect.
+    unknown: the frame needed data that could not be examined; with it, any of these fields might
+    differ.
+    """
+
+    pose: Poses
+    verdict: int = int(Verdict.CLEAR)
+    left: float = 0.0
+    touched: list[Touched] = []
+    simulated: list[str] = []
+    skipped: list[str] = []
+    stepped: float = 0.0
+    ground: GroundReport | None = None
+    proximity: ProximityReport | None = None
+    contacts: ContactsReport | None = None
+    uncertainty: UncertaintyReport | None = None
+    objects: ObjectsReport | None = None
+    crowd: CrowdReport | None = None
+    unknown: bool = False
+
+
+class State(Moved, frozen=True, eq=False, kw_only=True, omit_defaults=True):
+    """`Moved`, as sent to the user who sent the motion command.
+
+    seq, time: of the motion command.  frame: the server's frame number, increasing.
+    late: motion commands dropped so far because a newer one had arrived.
+    seconds: time that the frame took in the server.
+    """
+
+    seq: int
+    time: float
+    frame: int
+    late: int = 0
+    seconds: float = 0.0

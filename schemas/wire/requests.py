@@ -1,0 +1,434 @@
+"""Request types, and the checks that they pass when they are made.
+
+A request is checked when it is made, so a client fails before it sends what a server would refuse.
+"""
+
+import math
+import operator
+from collections.abc import Mapping, Sequence
+from functools import cache
+from typing import Annotated, Any, Literal, TypedDict, get_type_hints
+
+import msgspec
+import numpy as np
+
+from ..archive.radius_model import parse_radius_model
+from ..errors import BadRequestError, TooLargeError
+from .arrays import Poses, Positions
+
+# Limits of the protocol. They bound what one request can cost a server: 24 MB of points, 12.8 MB of
+# poses (a sweep's twice that), all below the largest message. If they were raised, a server of
+# version 1 would drop the larger messages unanswered.
+MAX_AVATAR_POINTS = 1_000_000
+MAX_POSES = 100_000
+# All pairs of this many objects fit into one answer: 19 MB.
+MAX_OBJECTS = 2048
+# Pairs listed for a pose. With this many, one pose's answer is 7 MB.
+MAX_CONTACTS = 10_000
+
+ALL_GROUPS = 0xFFFFFFFF
+
+Name = Annotated[str, msgspec.Meta(min_length=1, max_length=64)]
+Length = Annotated[float, msgspec.Meta(ge=0)]
+Duration = Annotated[float, msgspec.Meta(ge=0, description="milliseconds")]
+Count = Annotated[int, msgspec.Meta(ge=0, le=1 << 62)]
+Bits = Annotated[int, msgspec.Meta(ge=0, le=ALL_GROUPS)]
+ModelName = Annotated[str, msgspec.Meta(min_length=1, max_length=64)]
+PathOperation = Literal["collide", "distance", "contacts", "sweep"]
+
+# Parameters of each operation along a path, besides the avatar, the poses, the tolerance and the
+# budgets.
+PATH_PARAMETERS: dict[str, tuple[str, ...]] = {
+    "collide": ("margin",),
+    "distance": ("reach",),
+    "contacts": ("limit", "margin", "cluster_distance"),
+    "sweep": ("margin",),
+}
+
+_FLOAT64 = np.dtype("<f8")
+
+
+class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Base class of requests. Unknown fields are refused.
+
+    An ignored field could have changed the answer.
+    """
+
+    def __post_init__(self) -> None:
+        for name, check in _checks(type(self)):
+            value = getattr(self, name)
+            if value is not None:
+                check(name, value)
+
+
+class AddAvatarRequest(Request, frozen=True):
+    """Add an avatar for this client.
+
+    name: 1 to 64 characters.  points: (n, 3) float64, in the avatar's frame [m].
+    radius: of every point [m], finite and >= 0; null: half the mean closest-point distance of
+    `points`.
+    """
+
+    name: Name
+    points: Positions
+    radius: Length | None = None
+
+
+class Question(Request, frozen=True, kw_only=True):
+    """Parameters that every query takes.
+
+    tolerance: how early contact may be reported, and how far apart bounds may lie [m]; 0: exact.
+    budget_ms: time for loading and computing together [ms]; null: no limit.
+    budget_visits: node visits per pose (ray, point, motion); null: no limit.
+    radius_model: sizes of the scan's spheres: mean, local, border or local+border, each with an
+    optional factor as in local:0.8, or fixed:METRES; null: the scene's default.
+    """
+
+    tolerance: Length = 0.0
+    budget_ms: Duration | None = None
+    budget_visits: Count | None = None
+    radius_model: ModelName | None = None
+
+
+class QuestionOptions(TypedDict, total=False):
+    """Fields of `Question` as keyword arguments, for this module and every query method."""
+
+    tolerance: float
+    budget_ms: float | None
+    budget_visits: int | None
+    radius_model: str | None
+
+
+def is_bounded(options: Mapping[str, Any]) -> bool:
+    """Return True if the options of a query allow anything but an exact answer."""
+    return bool(options.get("tolerance")) or any(
+        options.get(name) is not None for name in ("budget_ms", "budget_visits")
+    )
+
+
+class CollideRequest(Question, frozen=True):
+    """Test, for each pose, if an avatar touches the scene.
+
+    avatar: the name under which it was added.
+    poses: (k, 4, 4) float64, avatar to world, row-major, metres.
+    margin: distance below which two spheres count as in contact [m], finite and >= 0.
+    """
+
+    avatar: Name
+    poses: Poses
+    margin: Length = 0.0
+
+
+class DistanceRequest(Question, frozen=True):
+    """Measure, for each pose, the distance from an avatar to the scene, and its nearest points.
+
+    avatar, poses: as in CollideRequest.
+    reach: farthest distance worth reporting [m], finite and >= 0.
+    """
+
+    avatar: Name
+    poses: Poses
+    reach: Length
+
+
+class ContactsRequest(Question, frozen=True):
+    """List, for each pose, the pairs of points in contact.
+
+    avatar, poses, margin: as in CollideRequest.
+    limit: maximum number of pairs listed per pose, deepest first; at most 10,000.
+    cluster_distance: scan points at most this far apart belong to one cluster [m]; null: the
+    server's default.
+    """
+
+    avatar: Name
+    poses: Poses
+    limit: Annotated[int, msgspec.Meta(ge=0, le=MAX_CONTACTS)] = 100
+    margin: Length = 0.0
+    cluster_distance: Length | None = None
+
+
+class SweepRequest(Question, frozen=True, kw_only=True):
+    """Find, for each motion between two poses, the first contact of an avatar with the scene.
+
+    avatar, margin: as in CollideRequest.
+    pose_from, pose_to: (k, 4, 4) float64, avatar to world, equally many.
+    tolerance: how far a point of the avatar may move within the reported interval [m].
+    """
+
+    avatar: Name
+    pose_from: Poses
+    pose_to: Poses
+    margin: Length = 0.0
+    tolerance: Length = 1e-6
+
+    def __post_init__(self) -> None:
+        Request.__post_init__(self)
+        _same_length(self, "pose_from", "pose_to")
+
+
+class RaycastRequest(Question, frozen=True):
+    """Find, for each ray, the first scan point whose sphere it hits.
+
+    origins, directions: (k, 3) float64, world [m], equally many; a direction may have any length
+    but 0.
+    reach: length of the rays [m], finite and >= 0.
+    """
+
+    origins: Positions
+    directions: Positions
+    reach: Length
+
+    def __post_init__(self) -> None:
+        Request.__post_init__(self)
+        _same_length(self, "origins", "directions")
+
+
+class WithinRequest(Question, frozen=True):
+    """Find, for each given point, the nearest scan point.
+
+    points: (k, 3) float64, world [m].
+    reach: farthest distance worth reporting [m], finite and >= 0.
+    """
+
+    points: Positions
+    reach: Length
+
+
+class ObjectItem(Request, frozen=True):
+    """One avatar among several in an ObjectsRequest.
+
+    avatar: the name under which it was added.
+    group: bits of the groups to which it belongs.  mask: bits of the groups with which it collides.
+    """
+
+    avatar: Name
+    group: Bits = 1
+    mask: Bits = ALL_GROUPS
+
+
+class ObjectsRequest(Question, frozen=True):
+    """Test several avatars against the scene and against each other.
+
+    objects: at most 2,048; an avatar may be named more than once.
+    poses: (n, 4, 4) float64, one per object.  margin: as in CollideRequest.
+    """
+
+    objects: list[ObjectItem]
+    poses: Poses
+    margin: Length = 0.0
+
+    def __post_init__(self) -> None:
+        Request.__post_init__(self)
+        _same_length(self, "objects", "poses")
+        _check_count(self.objects)
+
+
+class PathRequest(Request, frozen=True):
+    """Run one query along a path; the answers arrive in parts.
+
+    avatar: the name under which it was added.  poses: (k, 4, 4) float64, at most 100,000.
+    op: "collide", "distance", "contacts" or "sweep"; a sweep has k - 1 motions, each from one pose
+    to the next.
+    The other parameters are null where `op` does not take them, or for their default. "distance"
+    requires `reach`. `budget_ms` is for the whole path.
+    """
+
+    avatar: Name
+    poses: Poses
+    op: PathOperation = "collide"
+    margin: Length | None = None
+    reach: Length | None = None
+    limit: Annotated[int, msgspec.Meta(ge=0, le=MAX_CONTACTS)] | None = None
+    cluster_distance: Length | None = None
+    tolerance: Length | None = None
+    budget_ms: Duration | None = None
+    budget_visits: Count | None = None
+    radius_model: ModelName | None = None
+
+    def __post_init__(self) -> None:
+        Request.__post_init__(self)
+        self.parameters()
+
+    def parameters(self) -> dict[str, Any]:
+        """Return the parameters given for `op`.
+
+        Raises BadRequestError for a parameter that `op` does not take, or for a missing one.
+        """
+        names = [name for name in self.__struct_fields__ if name not in ("avatar", "poses", "op")]
+        given = {name: value for name in names if (value := getattr(self, name)) is not None}
+        check_path_parameters(self.op, given)
+        return given
+
+
+def check_path_parameters(op: str, parameters: dict[str, Any]) -> None:
+    """Check that `op` takes these parameters along a path and has all that it requires.
+
+    Raises BadRequestError otherwise.
+    """
+    if op not in PATH_PARAMETERS:
+        raise BadRequestError(f"op {op!r} along a path: expected one of {', '.join(PATH_PARAMETERS)}")
+    taken = (*PATH_PARAMETERS[op], *Question.__struct_fields__)
+    for name in parameters:
+        if name not in taken:
+            raise BadRequestError(
+                f"{name} is not a parameter of {op} along a path: it takes {', '.join(taken)}"
+            )
+    if op == "distance" and parameters.get("reach") is None:
+        raise BadRequestError("distance along a path needs reach, the farthest distance worth reporting [m]")
+
+
+def make_positions(points: Any, what: str = "points") -> Positions:
+    """Return an avatar's points as the wire has them: (n, 3) float64, finite [m].
+
+    Raises BadRequestError or TooLargeError.
+    """
+    array = make_vectors(points, what)
+    if len(array) > MAX_AVATAR_POINTS:
+        raise TooLargeError(f"avatar of {len(array)} points: at most {MAX_AVATAR_POINTS}: thin it out first")
+    return array
+
+
+def make_vectors(vectors: Any, what: str) -> Positions:
+    """Return vectors as the wire has them: (n, 3) float64, finite.
+
+    what: name of the vectors for the BadRequestError raised otherwise.
+    """
+    array = _as_float64(what, vectors)
+    if array.ndim != 2 or array.shape[1] != 3:
+        raise BadRequestError(f"{what} of shape {array.shape}: expected (n, 3)")
+    try:
+        check_finite(what, array)
+    except ValueError as error:
+        raise BadRequestError(str(error)) from None
+    return array  # type: ignore[return-value]
+
+
+def make_poses(poses: Any, what: str = "poses") -> Poses:
+    """Return poses as the wire has them: (k, 4, 4) float64.
+
+    Only the shape is checked here; the server checks that poses are rigid.
+    """
+    array = _as_float64(what, poses)
+    if array.ndim != 3 or array.shape[1:] != (4, 4):
+        raise BadRequestError(f"{what} of shape {array.shape}: expected (k, 4, 4), avatar to world")
+    return array  # type: ignore[return-value]
+
+
+def check_one_pose(what: str, poses: Poses) -> None:
+    """Raise BadRequestError unless there is exactly one pose."""
+    if poses.shape != (1, 4, 4):
+        raise BadRequestError(f"{what} of shape {poses.shape}: expected (1, 4, 4), avatar to world")
+
+
+def make_objects(objects: Sequence[Sequence[Any]]) -> tuple[list[ObjectItem], Poses]:
+    """Return objects and their poses as the wire has them.
+
+    objects: (name, pose, group = 1, mask = all groups), poses (4, 4) float64.
+    Raises BadRequestError naming an invalid object, TooLargeError for more than `MAX_OBJECTS`.
+    """
+    _check_count(objects)
+    items = []
+    for number, entry in enumerate(objects):
+        if not 2 <= len(entry) <= 4:
+            raise BadRequestError(
+                f"object {number} of {len(entry)} values: expected name, pose and optionally group and mask"
+            )
+        items.append(ObjectItem(entry[0], *(_as_bits(number, value) for value in entry[2:])))
+    if not items:
+        return items, make_poses(np.zeros((0, 4, 4)))
+    return items, make_poses([entry[1] for entry in objects])
+
+
+def _check_count(objects: Sequence[Any]) -> None:
+    """Raise TooLargeError for more objects than one request may hold."""
+    if len(objects) > MAX_OBJECTS:
+        raise TooLargeError(f"{len(objects)} objects: at most {MAX_OBJECTS}: send several requests")
+
+
+def _as_bits(number: int, value: Any) -> int:
+    """Return a group or mask as an integer, or raise BadRequestError."""
+    try:
+        return operator.index(value)
+    except TypeError:
+        raise BadRequestError(f"object {number}: group or mask {value!r}: expected an integer") from None
+
+
+def check_finite(name: str, array: np.ndarray) -> None:
+    """Raise ValueError for NaN or infinity, for which no answer is defined (NUMERICS.md N7)."""
+    # For one pose this takes a third of the time of `np.isfinite(array).all()`.
+    if 0 in np.isfinite(array).tobytes():
+        where = [int(i) for i in np.argwhere(~np.isfinite(array))[0]]
+        raise ValueError(f"{name}{where} is {array[tuple(where)]}, expected finite numbers")
+
+
+def _as_float64(name: str, values: Any) -> np.ndarray:
+    """Return numbers as a C-ordered little-endian float64 array, or raise BadRequestError."""
+    try:
+        return np.ascontiguousarray(values, _FLOAT64)
+    except (TypeError, ValueError) as error:
+        raise BadRequestError(f"{name}: {error}: expected an array of numbers") from None
+
+
+def _check_name(_: str, name: str) -> None:
+    """Raise BadRequestError for an avatar name that is empty or too long."""
+    if not 1 <= len(name) <= 64:
+        raise BadRequestError(f"avatar {name[:64]!r} of {len(name)} characters: expected 1 to 64")
+
+
+def _check_model(_: str, text: str) -> None:
+    """Raise BadRequestError for an invalid radius model."""
+    parse_radius_model(text)
+
+
+def _check_length(what: str, value: float) -> None:
+    """Raise BadRequestError for a negative or non-finite length (NUMERICS.md N7, cases 14, 15)."""
+    if not 0 <= value < math.inf:
+        raise BadRequestError(f"{what} is {value}: expected a finite number of metres, 0 or more")
+
+
+def _check_duration(what: str, value: float) -> None:
+    """Raise BadRequestError for a negative or non-finite duration."""
+    if not 0 <= value < math.inf:
+        raise BadRequestError(f"{what} is {value}: expected milliseconds, 0 or more")
+
+
+def _check_integer(what: str, value: int, most: int) -> None:
+    """Raise BadRequestError for anything but an integer from 0 to `most`."""
+    try:
+        fits = 0 <= operator.index(value) <= most
+    except TypeError:
+        fits = False
+    if not fits:
+        raise BadRequestError(f"{what} is {value}: expected an integer from 0 to {most}")
+
+
+def _same_length(request: Request, first: str, second: str) -> None:
+    """Raise BadRequestError unless two fields have equally many elements."""
+    a, b = len(getattr(request, first)), len(getattr(request, second))
+    if a != b:
+        raise BadRequestError(f"{a} {first} and {b} {second}: expected as many of each")
+
+
+@cache
+def _checks(kind: type[Request]) -> tuple[tuple[str, Any], ...]:
+    """Return the checks of a request's fields, derived from their types.
+
+    Arrays are checked where they are read.
+    """
+    found: list[tuple[str, Any]] = []
+    for name, hint in get_type_hints(kind, include_extras=True).items():
+        kinds = {hint, *getattr(hint, "__args__", ())}
+        if Name in kinds:
+            found.append((name, _check_name))
+        elif ModelName in kinds:
+            found.append((name, _check_model))
+        elif Length in kinds:
+            found.append((name, _check_length))
+        elif Duration in kinds:
+            found.append((name, _check_duration))
+        else:
+            for one in kinds:
+                for meta in getattr(one, "__metadata__", ()):
+                    if getattr(meta, "le", None) is not None:
+                        found.append((name, lambda what, value, le=meta.le: _check_integer(what, value, le)))
+    return tuple(found)

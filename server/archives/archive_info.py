@@ -1,0 +1,134 @@
+"""What a scene says of itself: what its archive holds, as `info`, and what it keeps in memory, as `stats`."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from msgspec import structs
+
+from ...schemas.archive.index import Header
+from ...schemas.scene.effect_order import ORDER
+from ...schemas.scene.scene_file import SceneFile, effect_name, up_of
+from ...schemas.wire.messages import (
+    WIRE_VERSION,
+    AvatarInfo,
+    ObjectInfo,
+    SceneInfo,
+    SourceInfo,
+    SpawnInfo,
+    StatsAnswer,
+)
+from ...schemas.wire.stats import AvatarStats
+from ..observability.metrics import Metrics, times_of
+from ..residency.voxel_cache import Residency
+from ..residency.voxel_store import Store
+
+
+def describe(store: Store, name: str) -> SceneInfo:
+    """What the archive of `store` holds: counts, bounds, lattice, radius, sources. Reads no voxel."""
+    header = store.archive.header
+    lattice, now = header.lattice, header.radius_now
+    return SceneInfo(
+        scene=name,
+        format_version=header.format_version,
+        wire_version=WIRE_VERSION,
+        points=header.points,
+        voxels=len(store.sizes),
+        bounds=lattice.to_world(np.stack([header.low, header.high])).tolist(),
+        origin=list(lattice.origin),
+        lattice_step=lattice.step,
+        lattice_source=header.lattice_source,
+        voxel_size=lattice.voxel_size,
+        radius=header.radius,
+        radius_model=header.radius_model,
+        radius_models=list(header.models),
+        radius_error=header.radius_error,
+        radius_sample=header.radius_sample,
+        moved_max=header.moved_max,
+        degree=header.degree,
+        leaf=header.leaf,
+        sources=[
+            SourceInfo(s.path, s.index, s.sha256, s.count, s.format, s.pose.tolist(), s.skipped, s.fault)
+            for s in header.sources[: listed_sources(header)]
+        ],
+        skipped=[s.fault for s in header.sources if s.fault],
+        record_bytes=int(store.archive.voxels["frame_bytes"].sum(dtype=np.int64)),
+        resident_bytes=int(store.sizes.sum()),
+        unknown=[lattice.to_world(box).tolist() for box in header.unknown],
+        unknown_everywhere=header.unknown_everywhere,
+        generation=header.generation,
+        radius_now=now.radius if now else None,
+        radius_now_error=now.error if now else None,
+    )
+
+
+def listed_sources(header: Header) -> int:
+    """How many sources an archive lists: a point's scan_index is a row of them, so what was left out stays in its place
+    where others stand behind."""
+    return max((number for number, s in enumerate(header.sources, 1) if not s.fault), default=0)
+
+
+def describe_scene(info: SceneInfo, file: SceneFile, avatars: Sequence[AvatarInfo] = ()) -> SceneInfo:
+    """What is said of a scene besides its archives: what its file calls for. avatars: the scene's own."""
+    spawn = file.spawn
+    return structs.replace(
+        info,
+        effects=run_order(file),
+        avatars=list(avatars),
+        up=up_of(file),
+        spawn=None if spawn is None else SpawnInfo(spawn.position, spawn.heading),
+        objects=[ObjectInfo(item.name, item.avatar, item.pose, item.kind) for item in file.objects],
+        default_radius_model=file.radius_model,
+    )
+
+
+def run_order(file: SceneFile) -> list[str]:
+    """The names of a scene's effects as they run: what is left out of the scene is when it is opened, before all."""
+    declared = {effect_name(effect) for effect in file.effects}
+    if len(declared) < 2:
+        return list(declared)
+    return [name for name in ("through", *ORDER) if name in declared]
+
+
+def make_stats(
+    store: Store,
+    name: str,
+    residency: Residency,
+    metrics: Metrics,
+    *,
+    coarse_bytes: int = 0,
+    avatars: AvatarStats = AvatarStats(),  # noqa: B008  # frozen
+    keys: bool = False,
+) -> StatsAnswer:
+    """What a scene keeps in memory of the archive of `store`, and how it did so far.
+
+    coarse_bytes: of coarse tops, beside the residency's budget.  avatars: of the clients' avatars.
+    keys: name the resident voxels, too.
+    """
+    total, users = metrics.snapshot()
+    counts = total.counts
+    resident = None
+    if keys:
+        rows = np.flatnonzero(residency.where[:, 0] >= 0)
+        resident = np.sort(store.archive.voxels["key"][rows]).tolist()
+    return StatsAnswer(
+        scene=name,
+        generation=store.archive.header.generation,
+        policy=residency.policy.name,
+        budget_bytes=residency.budget_bytes + coarse_bytes,
+        resident_bytes=residency.resident_bytes,
+        coarse_bytes=coarse_bytes,
+        voxels=len(store.sizes),
+        resident=residency.resident,
+        kept=len(residency.kept),
+        requests=counts.requests,
+        answers=counts.answers,
+        unknown=counts.unknown,
+        waited=counts.waited,
+        load_seconds=times_of(residency.load_times(), total.loads.times()),
+        stall_seconds=counts.stalls.times(),
+        engine_seconds=total.engine.times(),
+        users=users,
+        keys=resident,
+        avatars=avatars,
+        **structs.asdict(residency.counters()),
+    )

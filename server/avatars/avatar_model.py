@@ -1,0 +1,99 @@
+"""An avatar: the user's body as spheres, and its hierarchy, built by the code that builds a voxel's."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ...builder.voxel.point_radius import build_local, mean_closest_distance
+from ...schemas.archive.voxel_grid import MAX_COORDINATE
+from ...schemas.errors import BadRequestError
+from ...schemas.wire.messages import make_positions
+from ..kernels.core.avatar_front import MAX_FRONT
+from ..kernels.core.pose_transform import Avatar
+from ..kernels.core.voxel_layout import LANES
+
+# Children a node of an avatar's tree; as for voxels, see BuildConfig.degree.
+DEGREE = 8
+
+
+class AvatarModel(NamedTuple):
+    """An avatar as added.
+
+    points: (n, 3) float64, avatar frame [m], as given.  radius: of each point's sphere [m].
+    arrays: what the kernels read.  rows: (b, LANES) int32, the row of `points` that each lane of a block is.
+    digest: `avatar_digest` of an avatar that a client added; empty for one of the scene's own.
+    """
+
+    points: NDArray[np.float64]
+    radius: float
+    arrays: Avatar
+    rows: NDArray[np.int32]
+    digest: bytes = b""
+
+    @property
+    def bounding_radius(self) -> float:
+        """Radius of a sphere around all of the avatar's spheres [m]."""
+        return float(self.arrays.radius[0]) + self.radius if len(self.arrays.radius) else 0.0
+
+
+def make_avatar(points: ArrayLike, radius: float | None = None) -> AvatarModel:
+    """Build an avatar from points (n, 3) [m]; n may be 0, which touches nothing.
+
+    radius: of every point's sphere [m], zero or more; None: half the mean closest-point distance ([Fig12] section
+    7), over distinct points on their own lattice of 2^-20 m; one point alone needs a radius given.
+    """
+    array = make_positions(points).copy()  # the caller may go on writing into theirs
+    if len(array) and np.abs(array).max() > MAX_COORDINATE:
+        raise BadRequestError(
+            f"avatar coordinate {np.abs(array).max():g} m: expected within {MAX_COORDINATE:g} m"
+        )
+    if radius is not None and not (np.isfinite(radius) and radius >= 0):
+        raise BadRequestError(f"avatar radius {radius!r}: expected zero or a positive length in metres")
+    if not len(array):
+        empty = Avatar(
+            np.empty((0, 3)),
+            np.empty(0),
+            np.empty(0, np.int32),
+            np.empty(0, np.int32),
+            np.empty((0, 3, LANES)),
+            np.empty((4, 0)),
+            0,
+        )
+        return AvatarModel(array, float(radius or 0.0), empty, np.empty((0, LANES), np.int32))
+    local = build_local(array, leaf=LANES, degree=DEGREE)
+    if radius is None:
+        radius = mean_closest_distance(local) / 2
+        if radius == 0.0:
+            raise BadRequestError(
+                "avatar of a single distinct point: no closest-point distance: give a radius"
+            )
+    tree, bounds = local.hierarchy.tree, local.hierarchy.bounds
+    leaves = int(tree.levels[-2])
+    first = np.empty(len(tree.begin), np.int32)
+    first[:leaves] = (
+        1 + np.concatenate([[0], np.cumsum(tree.count[:leaves], dtype=np.int64)[:-1]]) if leaves else 0
+    )
+    first[leaves:] = ~np.arange(len(tree.begin) - leaves)
+    # The last point of a block is repeated to its end.
+    last = tree.end[leaves:, None] - 1
+    rows = tree.order[np.minimum(tree.begin[leaves:, None] + np.arange(LANES), last)]
+    lanes = array[rows].transpose(0, 2, 1)
+    # The lattice point lies within sqrt(3) steps of the point as given: two steps more hold it, rounding included.
+    center = np.asarray(local.low + bounds.center * local.step)
+    node_radius = np.asarray((bounds.radius + 2) * local.step, np.float64)
+    # The deepest level that fits: the leaf nodes, for avatars of up to some 8,000 points.
+    sizes = np.diff(tree.levels)
+    level = int(np.flatnonzero(sizes <= MAX_FRONT)[-1])
+    front = slice(int(tree.levels[level]), int(tree.levels[level + 1]))
+    arrays = Avatar(
+        center,
+        node_radius,
+        first,
+        tree.count.astype(np.int32),
+        np.ascontiguousarray(lanes),
+        # Not in the order concatenate leaves it in: of an array in another order numba compiles every kernel anew.
+        np.ascontiguousarray(np.concatenate([center[front].T, node_radius[None, front]])),
+        front.start,
+    )
+    return AvatarModel(array, float(radius), arrays, np.ascontiguousarray(rows, np.int32))

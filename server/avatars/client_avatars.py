@@ -1,0 +1,227 @@
+"""The avatars of a scene's clients: who has which, what they take of memory, and how much they may."""
+
+import threading
+import time
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager, nullcontext
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ...schemas.errors import BadRequestError, TooLargeError, UnknownAvatarError
+from ...schemas.wire.messages import make_positions
+from ...schemas.wire.seals import avatar_digest
+from ...schemas.wire.stats import AvatarStats
+from ..served.answering_avatars import note
+from ..served.avatar_limits import EVERYBODY, THIS_PROCESS, AvatarLimits
+from .avatar_model import AvatarModel, make_avatar
+
+# What the arrays of an avatar take, at most [bytes]: 53.5 a point were measured, and one block for a few points.
+_BYTES_A_POINT, _LEAST_BYTES = 56, 1200
+_OWN = (EVERYBODY, THIS_PROCESS)
+# Avatars of more points are built one at a time: while one is built it takes three times its bytes.
+_LARGE = 50_000
+
+
+class _Held(NamedTuple):
+    """What the avatars of all clients take. bytes: of their arrays.  avatars, clients: numbers."""
+
+    bytes: int
+    avatars: int
+    clients: int
+
+
+class _Entry:
+    """One avatar. model: None while it is built.  asked: the radius it was added with.  used: when it was last [s]."""
+
+    __slots__ = ("asked", "bytes", "model", "used")
+
+    def __init__(self, count: int, asked: float | None) -> None:
+        self.model: AvatarModel | None = None
+        self.asked = asked
+        self.bytes = _LEAST_BYTES + _BYTES_A_POINT * count
+        self.used = time.monotonic()
+
+
+class Avatars:
+    """Avatars by client and name. Thread-safe.
+
+    limits: None: no limits. The avatars of the scene and those of this process (`EVERYBODY`, `THIS_PROCESS`) stay, and
+    are neither limited nor counted.
+    """
+
+    def __init__(self, limits: AvatarLimits | None = None) -> None:
+        """Make a table without avatars."""
+        self.limits = limits
+        self._changed = threading.Condition()
+        self._large = threading.Lock()  # held while a large avatar is built
+        self._clients: dict[str, dict[str, _Entry]] = {}
+
+    def get(self, name: str, client: str) -> AvatarModel:
+        """Return a client's avatar, or the scene's own, and note it. Raises UnknownAvatarError."""
+        with self._changed:
+            for owner in (client, EVERYBODY):
+                entry = self._clients.get(owner, {}).get(name)
+                if entry is not None and entry.model is not None:
+                    entry.used = time.monotonic()
+                    note(entry.model.digest)
+                    return entry.model
+        raise UnknownAvatarError(f"avatar {name!r} is not known: add it with add_avatar first")
+
+    def add(self, name: str, points: ArrayLike, radius: float | None, client: str) -> AvatarModel:
+        """Build an avatar of points (n, 3) [m] and keep it; the same one again is not built again.
+
+        One named as one of the scene's own must be it, and shares its arrays. Raises BadRequestError where the name is
+        taken by another avatar, TooLargeError where it is over the limits.
+        """
+        array = make_positions(points)
+        shared = None if client == EVERYBODY else self._scene_avatar(name)
+        if shared is not None:
+            self._check_same(name, shared, array, radius)
+        entry = _Entry(len(array) if shared is None else 0, radius)
+        with self._reserved(name, client, len(array), entry) as entry:
+            if entry.model is None:
+                model = _built(self._large, array, radius) if shared is None else shared.model
+                assert model is not None, "the scene's own avatars are complete"
+                digest = b"" if client == EVERYBODY else avatar_digest(model.points, model.radius)
+                with self._changed:
+                    entry.model, entry.used = model._replace(digest=digest), time.monotonic()
+                    if shared is None:
+                        entry.bytes = bytes_of(model)
+            known = entry.model
+        self._check_same(name, entry, array, radius)
+        return known
+
+    def _scene_avatar(self, name: str) -> _Entry | None:
+        """Return the entry of one of the scene's own avatars; None where there is none of this name."""
+        with self._changed:
+            entry = self._clients.get(EVERYBODY, {}).get(name)
+            return None if entry is None or entry.model is None else entry
+
+    def _check_same(
+        self, name: str, entry: _Entry, points: NDArray[np.float64], radius: float | None
+    ) -> None:
+        """Raise BadRequestError unless an avatar that is known is that of these points and radius."""
+        known = entry.model
+        assert known is not None
+        same = np.array_equal(known.points, points)
+        if same and radius is None and entry.asked is not None:
+            # The radius that the points make may be the one that was asked for: only building the avatar tells.
+            radius = _built(self._large, points, None).radius
+        if not same or (radius is not None and radius != known.radius):
+            raise BadRequestError(
+                f"avatar {name!r} exists with other points or another radius: use another name"
+            )
+
+    def drop_client(self, client: str) -> None:
+        """Forget the avatars of a client."""
+        with self._changed:
+            self._clients.pop(client, None)
+
+    def drop_unused(self, alive: Collection[str], seconds: float) -> int:
+        """Forget avatars that were not used for so long [s], but for those of clients in `alive`; return how many."""
+        before, dropped = time.monotonic() - seconds, 0
+        with self._changed:
+            for client, entries in list(self._clients.items()):
+                if client in _OWN or client in alive:
+                    continue
+                for name in [n for n, e in entries.items() if e.model is not None and e.used < before]:
+                    del entries[name]
+                    dropped += 1
+                if not entries:
+                    del self._clients[client]
+        return dropped
+
+    def stats(self) -> AvatarStats:
+        """Return what the avatars of all clients take, and the limits."""
+        with self._changed:
+            held = self._held()
+        limits = self.limits
+        if limits is None:
+            return AvatarStats(*held)
+        return AvatarStats(
+            *held,
+            max_bytes=limits.bytes,
+            max_bytes_by_client=limits.bytes_by_client,
+            max_avatars=limits.avatars,
+            max_avatars_by_client=limits.avatars_by_client,
+            max_clients=limits.clients,
+        )
+
+    def _held(self) -> _Held:
+        own = [entries for client, entries in self._clients.items() if client not in _OWN]
+        each = [entry.bytes for entries in own for entry in entries.values()]
+        return _Held(sum(each), len(each), len(own))
+
+    @contextmanager
+    def _reserved(self, name: str, client: str, count: int, new: _Entry) -> Iterator[_Entry]:
+        """Yield the entry of a name: one that is known, or a new one, counted while it is built and kept if it was.
+
+        count: of the avatar's points.
+        """
+        with self._changed:
+            while True:
+                entries = self._clients.get(client, {})
+                entry = entries.get(name)
+                if entry is None or entry.model is not None:
+                    break
+                self._changed.wait()  # another request builds it
+            if entry is None:
+                entry = new
+                if client not in _OWN:
+                    self._check(name, count, entry.bytes, client)
+                self._clients.setdefault(client, entries)[name] = entry
+        try:
+            yield entry
+        finally:
+            with self._changed:
+                if entry.model is None:
+                    self._remove(entry, name, client)
+                self._changed.notify_all()
+
+    def _remove(self, entry: _Entry, name: str, client: str) -> None:
+        entries = self._clients.get(client, {})
+        if entries.get(name) is entry:
+            del entries[name]
+            if not entries:
+                del self._clients[client]
+
+    def _check(self, name: str, count: int, size: int, client: str) -> None:
+        """Raise TooLargeError where one more avatar is over the limits."""
+        limits = self.limits
+        if limits is None:
+            return
+        held = self._held()
+        own = self._clients.get(client, {})
+        own_bytes = sum(entry.bytes for entry in own.values())
+        for found, more, most, what, then in (
+            (own_bytes, size, limits.bytes_by_client, "bytes of this client's avatars", "thin it out"),
+            (len(own), 1, limits.avatars_by_client, "avatars of this client", "use one of them again"),
+            (
+                held.bytes,
+                size,
+                limits.bytes,
+                "bytes of all clients' avatars",
+                "thin it out, or try again later",
+            ),
+            (held.avatars, 1, limits.avatars, "avatars of all clients", "try again later"),
+            (held.clients, not own, limits.clients, "clients with avatars", "try again later"),
+        ):
+            if found + more > most:
+                raise TooLargeError(
+                    f"avatar {name!r} of {count} points: {found} {what} are there, this one makes it {found + more}, "
+                    f"at most {most} are allowed: {then}"
+                )
+
+
+def _built(large: threading.Lock, points: NDArray[np.float64], radius: float | None) -> AvatarModel:
+    """Build an avatar. large: held while it is, if it is a large one."""
+    with large if len(points) > _LARGE else nullcontext():
+        return make_avatar(points, radius)
+
+
+def bytes_of(model: AvatarModel) -> int:
+    """Return what the arrays of an avatar take of memory [bytes]."""
+    arrays = [model.points, model.rows, *(each for each in model.arrays if isinstance(each, np.ndarray))]
+    return sum(array.nbytes for array in arrays)

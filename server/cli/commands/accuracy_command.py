@@ -1,0 +1,48 @@
+"""`solidcloud accuracy`: measure accuracy against query time."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from .command_options import needs_extra
+from .interruptible import interruptible
+
+
+def accuracy(
+    archive: Annotated[
+        Path | None, typer.Argument(help="Folder of an archive; default: one built from a generated façade.")
+    ] = None,
+    avatar: Annotated[
+        Path | None, typer.Option(help="Points of the avatar; default: a generated human figure.")
+    ] = None,
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder of the report.")] = Path("report"),
+    full: Annotated[bool, typer.Option("--full", help="More settings, poses and repetitions.")] = False,
+) -> None:
+    """Measure what accuracy costs in query time.
+
+    Varies one setting at a time. Writes a table, an HTML page and charts.
+    """
+    import tempfile
+
+    from ....schemas.process.os_errors import writing
+
+    with needs_extra("made"):
+        from ...report.accuracy.accuracy import run as measure
+    from ...report.accuracy.accuracy_plan import BRIEF, FULL
+    from ...report.accuracy.accuracy_words import findings
+    from ..output.progress_display import progress_listener
+
+    with (
+        interruptible(),
+        writing(output),
+        tempfile.TemporaryDirectory(prefix="solidcloud-accuracy-") as scratch,
+        progress_listener() as bars,
+    ):
+        report = measure(output, Path(scratch), FULL if full else BRIEF, bars, archive, avatar)
+    for line in (
+        *report.facts["warnings"],
+        *findings(report.rows, report.facts["poses_judged_by_every_pair"]),
+    ):
+        print(line)
+    print(f"wrote {output / 'accuracy.html'}, accuracy.csv, accuracy.json and charts")

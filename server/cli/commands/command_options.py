@@ -1,0 +1,57 @@
+"""Helpers that the verbs share: common options, sizes in bytes, missing libraries, errors, JSON."""
+
+import json
+import re
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from ....schemas.errors import BadRequestError, SolidcloudError
+
+ArchivePath = Annotated[Path, typer.Argument(help="Folder of an archive.")]
+KeyFile = Annotated[
+    Path | None,
+    typer.Option(help="File with the server's key; default: the key that a server of this user has stored."),
+]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")]
+
+
+def parse_bytes(text: str, option: str) -> int:
+    """Parse a size such as 512MB or 2GB into bytes (powers of 1024).
+
+    Raises BadRequestError, which names the option.
+    """
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([KMGT]?)i?B?", text.strip(), re.IGNORECASE)
+    if not match:
+        raise BadRequestError(f"{option} {text!r}: expected a size such as 512MB or 2GB")
+    return int(float(match[1]) * 1024 ** " KMGT".index(match[2].upper() or " "))
+
+
+@contextmanager
+def needs_extra(name: str) -> Iterator[None]:
+    """Raise SolidcloudError naming the extra to install if one of its libraries is missing."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        if (error.name or "").startswith("solidcloud"):
+            raise
+        raise SolidcloudError(
+            f"the library {error.name!r} is not installed: pip install 'solidcloud[{name}]'"
+        ) from None
+
+
+def complain(message: str, code: int) -> int:
+    """Print an error on standard error and return the exit code.
+
+    The message becomes one line; only indented lines, as in lists, stay on lines of their own.
+    """
+    print("error: " + re.sub(r"\s*\n(?!  )", " ", message.rstrip()), file=sys.stderr)
+    return code
+
+
+def print_json(value: Any) -> None:
+    print(json.dumps(value, indent=1, allow_nan=False))

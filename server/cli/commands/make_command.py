@@ -1,0 +1,92 @@
+"""`solidcloud make`: test scans with known ground truth, avatars and walks."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from .command_options import needs_extra
+from .interruptible import interruptible
+
+ScanOutput = Annotated[
+    Path,
+    typer.Option(
+        "-o", "--output", help=".laz, .las or .e57 file, or a folder for one LAZ file per scanner station."
+    ),
+]
+Seed = Annotated[int, typer.Option(help="Random seed; the same seed gives the same points.")]
+
+
+def make_facade(
+    output: ScanOutput,
+    points: Annotated[int, typer.Option(help="Exact number of points of the scan.")] = 587_923,
+    seed: Seed = 2012,
+    door: Annotated[float, typer.Option(help="Clear width of the main door [m].")] = 1.60,
+) -> None:
+    """Make a scan of a Gothic façade by casting rays.
+
+    Its ground truth is written beside the scan, as NAME.truth.json.
+    """
+    with needs_extra("made"):
+        from ....builder.made.scenes import make_facade as make_it
+    from ....schemas.process.os_errors import writing
+    from ..output.progress_display import progress_listener
+
+    with interruptible(), writing(output), progress_listener() as bars:
+        made = make_it(output, points=points, seed=seed, door=door, progress=bars.made)
+    print(f"{made.points:,} points in {output}, ground truth in {made.truth}")
+
+
+def make_town(
+    output: ScanOutput,
+    points: Annotated[
+        int, typer.Option(help="Exact number of points of all scans; it determines the number of façades.")
+    ],
+    seed: Seed = 2012,
+) -> None:
+    """Make scans of a town of façades, each as dense as that of make facade.
+
+    The ground truth is written beside the scans, as NAME.truth.json.
+    """
+    with needs_extra("made"):
+        from ....builder.made.scenes import make_town as make_it
+    from ....schemas.process.os_errors import writing
+    from ..output.progress_display import progress_listener
+
+    with interruptible(), writing(output), progress_listener() as bars:
+        made = make_it(output, points=points, seed=seed, progress=bars.made)
+    print(f"{made.points:,} points in {output}, ground truth in {made.truth}")
+
+
+def make_figure(
+    output: Annotated[Path, typer.Option("-o", "--output", help=".obj or .ply file to write.")],
+    points: Annotated[int, typer.Option(help="Exact number of points of the figure.")] = 3617,
+    seed: Seed = 2012,
+    height: Annotated[float, typer.Option(help="Height of the figure [m].")] = 1.75,
+) -> None:
+    """Make an avatar: a human figure in mid-stride."""
+    from ....builder.made.figure import figure_points, write_figure
+    from ....schemas.process.os_errors import writing
+
+    with interruptible(), writing(output):
+        write_figure(output, figure_points(points, seed, height))
+    print(f"{points:,} points in {output}")
+
+
+def make_walk(
+    truth: Annotated[Path, typer.Argument(help="NAME.truth.json, as make facade writes it.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="CSV file of poses to write.")],
+    frames: Annotated[int, typer.Option(min=2, help="Number of poses, 30 per second.")] = 1200,
+) -> None:
+    """Write the poses of a walk through a façade of make facade.
+
+    The columns are t,x,y,z,qw,qx,qy,qz, as solidcloud query reads them.
+    """
+    from ....builder.made.truth import read_truth
+    from ....builder.made.walk import walk_poses
+    from ....schemas.process.os_errors import writing
+    from ..input.pose_file import write_poses
+
+    with interruptible(), writing(output):
+        write_poses(output, *walk_poses(read_truth(truth).facades[0], frames))
+    print(f"{frames} poses in {output}")

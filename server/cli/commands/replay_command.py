@@ -1,0 +1,51 @@
+"""`solidcloud replay`: simulate the frames of a log again and compare them bit for bit."""
+
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from .command_options import AsJson, parse_bytes, print_json
+
+
+def replay(
+    log: Annotated[Path, typer.Argument(help="Log written by solidcloud serve --log.")],
+    what: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="[ARCHIVE|SCENE.toml]",
+            help="The archive or scene file that was served; default: the path in the log.",
+        ),
+    ] = None,
+    cache: Annotated[str, typer.Option(help="Memory bound of decoded voxels.")] = "512MB",
+    as_json: AsJson = False,
+) -> int:
+    """Simulate a log's frames again and compare their poses bit for bit. Exit code 1 if any differ."""
+    from ...scenes.open_scene import open_scene
+    from ...simulation.replay import check_same
+    from ...simulation.replay import replay as replay_log
+    from ...simulation.replay_log import Begin, read_log
+    from ..input.point_file import read_avatar
+
+    records = read_log(log)
+    begin = next(records)
+    assert isinstance(begin, Begin), "read_log checks this"
+    path = Path(begin.path) if what is None else what
+    with open_scene(
+        path, read_points=read_avatar, name=begin.scene, budget_bytes=parse_bytes(cache, "--cache")
+    ) as scene:
+        simulation: Any = scene.simulation
+        if not check_same(begin, simulation, path):
+            print(f"warning: {path} is not the scene file that was logged", file=sys.stderr)
+        found = replay_log(simulation, records)
+    if as_json:
+        first = None if found.first is None else str(found.first)
+        print_json({**found._asdict(), "first": first})
+        return int(found.different > 0)
+    print(f"{found.frames} frames, {found.turns} turns: {found.different or 'none'} different")
+    if found.first is not None:
+        print(f"first: {found.first}")
+    if found.reloaded is not None:
+        print(f"stopped before frame {found.reloaded}: the scene was reloaded there")
+    return int(found.different > 0)

@@ -1,0 +1,54 @@
+"""`solidcloud scene new` and `scene check`: create a scene file and check one."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from .command_options import AsJson, print_json
+
+
+def new(
+    archives: Annotated[list[Path], typer.Argument(help="Folders of archives.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Scene file to write.")] = Path("scene.toml"),
+    name: Annotated[
+        str | None, typer.Option(help="Scene name for clients; default: the file name without suffix.")
+    ] = None,
+    avatar: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="Points of an avatar that all users may use; its name derives from the file name; may be repeated."
+        ),
+    ] = None,
+    effects: Annotated[
+        str, typer.Option(help="Effects to enable, separated by commas; the others are commented out.")
+    ] = "stop",
+    force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
+) -> None:
+    """Write a scene file with every field explained."""
+    import shlex
+
+    from ..scene_files.scene_new import new_scene
+
+    wanted = [effect.strip() for effect in effects.split(",") if effect.strip()]
+    new_scene(out, archives, avatar or [], effects=wanted, name=name, force=force)
+    print(f"{out}: written; edit it, then: {shlex.join(['solidcloud', 'scene', 'check', str(out)])}")
+
+
+def check(
+    file: Annotated[Path, typer.Argument(help="Scene file.")],
+    as_json: AsJson = False,
+) -> None:
+    """Check a scene file and describe the scene and its effects in their order.
+
+    Exit code 2: the file is invalid. Exit code 3: an archive or avatar it names is invalid.
+    """
+    from ..input.point_file import read_avatar
+    from ..output.console import print_facts
+    from ..scene_files.scene_check import check_scene_file, scene_facts, scene_json
+
+    checked = check_scene_file(file, read_avatar)
+    if as_json:
+        print_json(scene_json(checked))
+    else:
+        print_facts(scene_facts(checked))

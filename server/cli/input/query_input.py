@@ -1,0 +1,204 @@
+"""Queries of `solidcloud query`: their options, the input files and the requests made from them."""
+
+from collections.abc import Callable, Iterator
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ....schemas.errors import BadRequestError
+from ....schemas.wire.answers import PATH_ANSWERS, Cost
+from ....schemas.wire.columns import join, without_part
+from ....schemas.wire.moves import LONGEST_SECONDS, Moved
+from ....schemas.wire.requests import PATH_PARAMETERS, Question
+from .pose_file import read_objects, read_poses, read_rays
+from .scan_bounds import Bodies, Places, Points, Rays, box_of
+
+# Required and optional options of each query, besides the scene and the options common to all.
+_OPTIONS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "collide": (("avatar", "poses"), ("radius", "margin")),
+    "distance": (("avatar", "poses", "reach"), ("radius",)),
+    "contacts": (("avatar", "poses"), ("radius", "margin", "limit", "cluster_distance")),
+    "sweep": (("avatar", "poses"), ("radius", "margin")),
+    "raycast": (("rays", "reach"), ()),
+    "within": (("points", "reach"), ()),
+    "objects": (("objects",), ("radius", "margin")),
+    "move": (("avatar", "poses"), ("radius",)),
+    "path": (("avatar", "poses"), ("radius", "along", "margin", "reach", "limit", "cluster_distance")),
+}
+
+
+_OF_ALL = Question.__struct_fields__
+
+ReadPoints = Callable[[Path], NDArray[np.float64]]
+
+
+class Asker(Protocol):
+    """A `Client` or a `Scene`. Queries without a method here are called by name."""
+
+    def add_avatar(self, *what: Any) -> Any: ...
+    def sweep(self, *what: Any, **parameters: Any) -> Any: ...
+    def objects(self, *what: Any, **parameters: Any) -> Any: ...
+    def path(self, *what: Any, **parameters: Any) -> Any: ...
+    def move(self, *what: Any) -> Moved: ...
+
+
+class Asked(NamedTuple):
+    """Answers to a query or to a part of it.
+
+    labels: description of the item of each answer.  times: of each item [s], if it is a pose or motion.
+    places: positions of all items of the whole query, even if these answers are a part of it.
+    """
+
+    labels: list[str]
+    times: list[float]
+    answers: Cost
+    places: Places
+
+
+class Query(NamedTuple):
+    """A query and its checked options.
+
+    op: the query's name.  along: the query made along a path, if op is "path".
+    given: the options that were given.
+    """
+
+    op: str
+    along: str
+    given: dict[str, Any]
+
+
+def check_query(op: str, options: dict[str, Any]) -> Query:
+    """Return the query for the options that are not None.
+
+    Raises BadRequestError, which names an option that the query does not take or one that is missing.
+    """
+    if op not in _OPTIONS:
+        raise BadRequestError(f"--op {op}: expected one of {', '.join(_OPTIONS)}")
+    needed, others = _OPTIONS[op]
+    given = {name: value for name, value in options.items() if value is not None}
+    along = given.get("along", "collide")
+    if op == "path":
+        if along not in PATH_PARAMETERS:
+            raise BadRequestError(f"--along {along}: expected one of {', '.join(PATH_PARAMETERS)}")
+        needed, others = _OPTIONS[along][0], (*_OPTIONS[along][1], "along")
+    asked = f"--op path --along {along}" if op == "path" else f"--op {op}"
+    # The budget of a frame is set by the scene, not by the request.
+    others = others if op == "move" else (*others, *_OF_ALL)
+    takes = ", ".join(map(_option, (*needed, *others)))
+    for name in given:
+        if name not in (*needed, *others):
+            raise BadRequestError(f"{_option(name)} is not an option of {asked}: it takes {takes}")
+    for name in needed:
+        if name not in given:
+            raise BadRequestError(f"{asked} needs {_option(name)}: it takes {takes}")
+    return Query(op, along, given)
+
+
+def ask(scene: Asker, query: Query, read_points: ReadPoints) -> Iterator[Asked]:
+    """Make a query and yield its answers at once, or in parts for a path.
+
+    read_points: returns the points (n, 3) of a file [m].
+    """
+    given = dict(query.given)
+    parameters = {name: value for name, value in given.items() if name not in ("along", *_FILES)}
+    if query.op == "objects":
+        yield _ask_objects(scene, given["objects"], read_points, parameters, given.get("radius"))
+        return
+    if query.op in ("raycast", "within"):
+        what = read_rays(given["rays"]) if query.op == "raycast" else (read_points(given["points"]),)
+        answers = getattr(scene, query.op)(*what, **parameters)
+        word, kind = ("ray", Rays) if query.op == "raycast" else ("point", Points)
+        labels = [f"{word} {number}" for number in range(len(answers))]
+        yield Asked(labels, [], answers, kind(*what, given["reach"]))  # type: ignore[call-arg]
+        return
+    times, poses = read_poses(given["poses"])
+    op = query.along if query.op == "path" else query.op
+    labels, begins = _labels(op, times.tolist())
+    places = _add_body(scene, query, read_points, poses, moving=op == "sweep")
+    if query.op == "path":
+        for part in scene.path("avatar", poses, op, **parameters):
+            which = slice(part.first, part.first + len(part))
+            yield Asked(labels[which], begins[which], without_part(PATH_ANSWERS[op], part), places)
+    elif op == "sweep":
+        yield Asked(labels, begins, scene.sweep("avatar", poses[:-1], poses[1:], **parameters), places)
+    else:
+        yield Asked(labels, begins, getattr(scene, op)("avatar", poses, **parameters), places)
+
+
+def ask_moves(
+    scene: Asker, query: Query, read_points: ReadPoints
+) -> tuple[Places, Iterator[tuple[str, Moved]]]:
+    """Simulate one frame from each pose towards the next; frames do not depend on one another.
+
+    A frame lasts from the time of one pose to that of the next. Returns the positions of the motions,
+    and an iterator over the frames: a label and the result of each.
+    """
+    times, poses = read_poses(query.given["poses"])
+    places = _add_body(scene, query, read_points, poses, moving=True)
+    labels, _ = _labels("sweep", times.tolist())
+
+    def frames() -> Iterator[tuple[str, Moved]]:
+        for number, (label, seconds) in enumerate(zip(labels, np.diff(times).tolist(), strict=True)):
+            pose_from, pose_to = poses[number : number + 1], poses[number + 1 : number + 2]
+            yield label, scene.move("avatar", pose_from, pose_to, min(seconds, LONGEST_SECONDS))
+
+    return places, frames()
+
+
+def joined(found: list[Asked]) -> Asked:
+    """Join the parts of one query's answers."""
+    labels = [label for part in found for label in part.labels]
+    times = [time for part in found for time in part.times]
+    return Asked(labels, times, join([part.answers for part in found]), found[0].places)
+
+
+def _add_body(
+    scene: Asker, query: Query, read_points: ReadPoints, poses: NDArray[np.float64], *, moving: bool
+) -> Bodies:
+    """Add the avatar of a query and return its positions at each pose, or between each pose and the next."""
+    points = read_points(query.given["avatar"])
+    radius = scene.add_avatar("avatar", points, query.given.get("radius")).radius
+    reach = query.given.get("reach", query.given.get("margin", 0.0))
+    ends = (poses[:-1], poses[1:]) if moving else (poses, poses)
+    return Bodies(box_of(points)[None], np.array([radius or 0.0]), reach, *ends)
+
+
+_FILES = ("avatar", "radius", "poses", "rays", "points", "objects")
+
+
+def _ask_objects(
+    scene: Asker, path: Path, read_points: ReadPoints, parameters: dict[str, Any], radius: float | None
+) -> Asked:
+    """Query the objects of a file."""
+    rows = read_objects(path)
+    names = {
+        avatar: f"avatar-{number}" for number, avatar in enumerate(dict.fromkeys(row.avatar for row in rows))
+    }
+    bodies = {}
+    for avatar, name in names.items():
+        points = read_points(avatar)
+        bodies[avatar] = box_of(points), scene.add_avatar(name, points, radius).radius or 0.0
+    answers = scene.objects(
+        [(names[row.avatar], row.pose, row.group, row.mask) for row in rows], **parameters
+    )
+    boxes = np.array([bodies[row.avatar][0] for row in rows]).reshape(-1, 2, 3)
+    radii = np.array([bodies[row.avatar][1] for row in rows], np.float64)
+    poses = np.array([row.pose for row in rows]).reshape(-1, 4, 4)
+    places = Bodies(boxes, radii, parameters.get("margin", 0.0), poses, poses)
+    labels = [f"object {number} {row.avatar.name}" for number, row in enumerate(rows)]
+    return Asked(labels, [], answers, places)
+
+
+def _labels(op: str, times: list[float]) -> tuple[list[str], list[float]]:
+    """Return the label of each answer and the time at which its item begins [s]."""
+    if op != "sweep":
+        return [f"{time:10.3f} s" for time in times], times
+    return [f"{begin:10.3f} .. {end:10.3f} s" for begin, end in pairwise(times)], times[:-1]
+
+
+def _option(name: str) -> str:
+    """Return the command-line option for a parameter."""
+    return "--" + name.replace("_", "-")

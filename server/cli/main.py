@@ -1,0 +1,141 @@
+"""The command `solidcloud`: its subcommands (verbs) and its exit codes.
+
+Every verb imports its dependencies inside its function: `--help` must print without loading numpy.
+Exit codes: 0 success; 1 failure; 2 invalid request; 3 invalid data; 130 interrupted.
+"""
+
+import contextlib
+import signal
+import sys
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import typer
+
+from ...schemas.errors import BadRequestError, SolidcloudError
+from ...schemas.process.interrupts import taken
+from ...schemas.process.os_errors import os_error_line
+from .commands import accuracy_command as accuracy
+from .commands import archive_command as archive
+from .commands import build_command as build
+from .commands import edit_command as generation
+from .commands import export_command as export
+from .commands import inspect_command as inspect
+from .commands import make_command as make
+from .commands import plan_command as plan
+from .commands import query_command as query
+from .commands import replay_command as replay
+from .commands import scene_command as scene
+from .commands import serve_command as serve
+from .commands import top_command as top
+from .commands.command_options import complain
+
+# Rich markup is off: importing it doubles the time of --help, to more than the 0.3 s allowed.
+app = typer.Typer(
+    help="Collision queries on scanned point clouds: build an archive, serve it, query it.",
+    add_completion=False,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+)
+makers = typer.Typer(
+    help="Generate test scans with known ground truth, avatars and walks.", rich_markup_mode=None
+)
+app.add_typer(makers, name="make")
+makers.command("facade")(make.make_facade)
+makers.command("town")(make.make_town)
+makers.command("figure")(make.make_figure)
+makers.command("walk")(make.make_walk)
+scenes = typer.Typer(help="Create a scene file, or check one.", rich_markup_mode=None)
+app.add_typer(scenes, name="scene")
+scenes.command("new")(scene.new)
+scenes.command("check")(scene.check)
+verb: Callable[..., int | None]
+for verb in (
+    inspect.inspect,
+    build.build,
+    archive.info,
+    archive.validate,
+    serve.serve,
+    accuracy.accuracy,
+    query.query,
+):
+    app.command()(verb)
+for verb in (
+    export.export,
+    generation.add,
+    generation.remove,
+    generation.reload,
+    plan.plan,
+    top.top,
+    replay.replay,
+):
+    app.command()(verb)
+
+# Verbs that wait for a server or for a user: an interrupt ends them immediately. All other verbs
+# compute, and end at their next interrupt check.
+WAITING = frozenset({"serve", "query", "reload", "top"})
+
+
+def main() -> None:
+    """Run the command and exit."""
+    code = run(sys.argv[1:])
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # all output is printed: only Python's shutdown remains
+    sys.exit(code)
+
+
+def run(arguments: Sequence[str]) -> int:
+    """Run the command with these arguments and return its exit code.
+
+    An error is printed as one line, not as a traceback.
+    """
+    try:
+        command, name, rest = _find_verb(arguments or ["--help"])
+        with contextlib.nullcontext() if name.split()[-1] in WAITING else taken():
+            return _run(command, name, rest)
+    except SolidcloudError as error:
+        return complain(str(error), error.exit_code)
+    except typer.TyperException as error:
+        context = getattr(error, "ctx", None)
+        command = context.command_path if context else "solidcloud"
+        return complain(
+            f"{error.format_message().rstrip('.')}: see {command} --help", BadRequestError.exit_code
+        )
+    except (KeyboardInterrupt, typer.Abort) as error:
+        print(": ".join(filter(None, ("interrupted", str(error)))), file=sys.stderr)
+        return 130
+    except BrokenPipeError:
+        # The reader of the output closed the pipe. Python would raise again when it flushes at exit.
+        sys.stdout = None
+        return 1
+    except OSError as error:
+        return complain(os_error_line(error), 1)
+    except MemoryError as error:
+        return complain(f"out of memory{f' ({error})' if str(error) else ''}: close other programs", 1)
+
+
+def _run(command: Any, name: str, arguments: list[str]) -> int:
+    """Run one verb and return its exit code. typer's own `main` prints nothing on an interrupt."""
+    try:
+        with command.make_context(name, arguments) as context:
+            code = command.invoke(context)
+    except typer.Exit as left:
+        code = left.exit_code
+    return code if isinstance(code, int) else 0
+
+
+def _find_verb(arguments: Sequence[str]) -> tuple[Any, str, list[str]]:
+    """Return the command that the first arguments name, its full name, and the remaining arguments.
+
+    typer would parse the options of `solidcloud` first and load pydantic for it, although there are
+    none: half of the time that `solidcloud build --help` takes.
+    """
+    command: Any = typer.main.get_command(app)
+    name, rest = "solidcloud", list(arguments)
+    while rest and rest[0] in getattr(command, "commands", ()):
+        command = command.commands[rest[0]]
+        name += f" {rest.pop(0)}"
+    return command, name, rest
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,208 @@
+"""Text lines and JSON values for the answers of all queries."""
+
+import math
+from collections.abc import Iterator
+from itertools import groupby
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ....schemas.wire.answers import (
+    CollideAnswers,
+    ContactsAnswers,
+    Cost,
+    DistanceAnswers,
+    ObjectsAnswers,
+    RaycastAnswers,
+    SweepAnswers,
+    Verdict,
+    WithinAnswers,
+)
+from ....schemas.wire.arrays import array_fields
+from ....schemas.wire.moves import Moved
+
+_NAMES = {int(verdict): verdict.name.lower() for verdict in Verdict}
+_TOTALS = ("engine_seconds", "hits", "misses", "resident", "resident_bytes", "faults", "wait_seconds", "late")
+_OBJECTS = ("pairs_tested", "pairs_filtered", "pair_visits", "pair_tests")
+_WORDS = {SweepAnswers: "motions", RaycastAnswers: "rays", WithinAnswers: "points", ObjectsAnswers: "objects"}
+
+
+def answer_lines(labels: list[str], times: list[float], answers: Any) -> Iterator[str]:
+    """Yield one line per answer: label, verdict and result. For `collide`, one line per run of equal verdicts.
+
+    labels: (k,), what each answer is about.  times: (k,) [s], for `collide` only.
+    """
+    if isinstance(answers, CollideAnswers):
+        yield from _stretches(times, answers)
+        return
+    for i, label in enumerate(labels):
+        yield f"{label}  {_NAMES[int(answers.verdict[i])]:<8}{_figure(answers, i)}".rstrip()
+    if isinstance(answers, ObjectsAnswers):
+        for (first, second), verdict in zip(
+            answers.pairs.tolist(), answers.pair_verdict.tolist(), strict=True
+        ):
+            yield f"objects {first} and {second}  {_NAMES[verdict]}"
+
+
+def word_of(answers: Any) -> str:
+    """Return the plural noun for the items that the answers are about, such as "poses"."""
+    return next((word for kind, word in _WORDS.items() if isinstance(answers, kind)), "poses")
+
+
+def summary_line(answers: Any, outside: NDArray[np.bool_] | None = None) -> str:
+    """Return the count of each verdict, the count outside the scan if any, and the engine time."""
+    counts = ", ".join(f"{(answers.verdict == verdict).sum()} {verdict.name.lower()}" for verdict in Verdict)
+    if outside is not None and outside.any():
+        counts += f", {outside.sum()} outside the scan"
+    return f"{len(answers)} {word_of(answers)}: {counts}; {answers.engine_seconds * 1e3:.2f} ms in the engine"
+
+
+def unknown_line(answers: Any, unanswered: int) -> str:
+    """Return a sentence with the number of answers that the server called unknown and the reason.
+
+    unanswered: the number of unknown answers that never arrived; they are not counted.
+    Returns "" if there are no others.
+    """
+    count = int((answers.verdict == Verdict.UNKNOWN).sum()) - unanswered
+    if count <= 0:
+        return ""
+    if answers.faults:
+        more = len(answers.faults) - 1
+        why = answers.faults[0] + (f" (and {more} more)" if more else "")
+    elif answers.stopped:
+        why = answers.stopped
+    elif answers.late:
+        why = f"{len(answers.late)} voxels were not loaded in time"
+    else:
+        why = "the budget was spent, or a scan that the build left out is in reach"
+    return f"{count} of {len(answers)} {word_of(answers)} are unknown: {why}"
+
+
+def move_line(label: str, moved: Moved) -> str:
+    """Format the result of a frame: verdict, final position, remaining motion, first obstacle, skipped effects."""
+    line = f"{label}  {_NAMES[moved.verdict]:<8}at {_place(moved.pose[0, :3, 3])}"
+    if moved.left:
+        line += f", {moved.left:.4f} m left"
+    if moved.touched:
+        line += f", touching {_place(np.array(moved.touched[0].place))}"
+    if moved.skipped:
+        line += f", without {', '.join(moved.skipped)}"
+    return line
+
+
+def answers_json(
+    times: list[float], answers: Cost, outside: NDArray[np.bool_] | None = None
+) -> dict[str, Any]:
+    """Convert answers to the object that --json prints. Infinite and NaN values become null.
+
+    times: (k,) [s], or empty.  outside: (k,), mask of the items outside the scan; None if not known.
+    """
+    k = len(answers)  # type: ignore[arg-type]
+    rows: list[dict[str, Any]] = [{"t": t} for t in times] or [{} for _ in range(k)]
+    for name, of in array_fields(type(answers)).items():
+        column = getattr(answers, name)
+        if len(column) == k and not _of_pairs(answers, name):
+            values = _plain(column, vectors=bool(of.tail))
+            for row, value in zip(rows, values, strict=True):
+                row[name] = _NAMES[value] if name == "verdict" else value
+    totals = {name: getattr(answers, name) for name in _TOTALS}
+    totals["outside_scan"] = None if outside is None else int(outside.sum())
+    for row, lies in zip(rows, [] if outside is None else outside.tolist(), strict=outside is not None):
+        row["outside_scan"] = lies
+    if isinstance(answers, ContactsAnswers):
+        for i, row in enumerate(rows):
+            row |= {"contacts": _rows(answers, "pair", i), "clusters": _rows(answers, "cluster", i)}
+    if isinstance(answers, ObjectsAnswers):
+        found = zip(answers.pairs.tolist(), answers.pair_verdict.tolist(), strict=True)
+        totals["pairs"] = [{"objects": pair, "verdict": _NAMES[verdict]} for pair, verdict in found]
+        totals |= {name: getattr(answers, name) for name in _OBJECTS}
+    return {"answers": rows, **totals}
+
+
+def _stretches(times: list[float], answers: CollideAnswers) -> Iterator[str]:
+    """Yield one line per run of equal verdicts."""
+    found = zip(times, answers.verdict.tolist(), strict=True)
+    for verdict, group in groupby(found, key=lambda pair: pair[1]):
+        stretch = [t for t, _ in group]
+        span = f"{stretch[0]:10.3f} .. {stretch[-1]:10.3f} s"
+        yield f"{span}  {_NAMES[verdict]}, {len(stretch)} poses"
+
+
+def _figure(answers: Cost, i: int) -> str:
+    """Format the result of one answer, without its verdict."""
+    if isinstance(answers, DistanceAnswers):
+        if not math.isfinite(answers.signed_distance[i]):
+            return _beyond(answers, i)
+        bounds = "" if answers.exact[i] else f", at least {answers.lower[i]:.6f} m"
+        where = f"from {_place(answers.witness_avatar[i])} to {_place(answers.witness_cloud[i])}"
+        return f"{answers.signed_distance[i]:.6f} m {where}{bounds}"
+    if isinstance(answers, RaycastAnswers | WithinAnswers):
+        if not math.isfinite(answers.distance[i]):
+            return _beyond(answers, i)
+        where = answers.hit[i] if isinstance(answers, RaycastAnswers) else answers.cloud_point[i]
+        bounds = "" if answers.exact[i] else f", at least {answers.lower[i]:.6f} m"
+        return f"{answers.distance[i]:.6f} m at {_place(where)}{bounds}"
+    if isinstance(answers, SweepAnswers):
+        if not math.isfinite(answers.upper[i]):
+            return "" if answers.lower[i] >= 1 else f"clear up to {answers.lower[i]:.9f} of the motion"
+        span = f"from {answers.lower[i]:.9f} to {answers.upper[i]:.9f} of the motion"
+        return f"{span}, at {_place(answers.witness_cloud[i])}"
+    if isinstance(answers, ContactsAnswers) and answers.pairs_found[i]:
+        clusters = _slice(answers.cluster_starts, i)
+        text = f"{answers.pairs_found[i]} pairs in {clusters.stop - clusters.start} clusters"
+        if clusters.start < clusters.stop:
+            deepest = clusters.start
+            text += f", {answers.cluster_deepest[deepest]:.6f} m at {_place(answers.cluster_cloud[deepest])}"
+        return text
+    return ""
+
+
+def _beyond(answers: Any, i: int) -> str:
+    """Format an answer whose query found nothing within its reach."""
+    return f"nothing within {answers.lower[i]:.6f} m" if answers.lower[i] > 0 else ""
+
+
+def _place(point: Any) -> str:
+    """Format a point [m]."""
+    return " ".join(f"{value:.4f}" for value in point)
+
+
+def _of_pairs(answers: Cost, name: str) -> bool:
+    """Return whether a column does not have one element per answer, even if its length equals theirs."""
+    if isinstance(answers, ContactsAnswers):
+        own = ("verdict", "exact", "pairs_found", "outside", "voxels_missing", "node_visits", "point_tests")
+        return name not in own
+    return isinstance(answers, ObjectsAnswers) and name in ("pairs", "pair_verdict")
+
+
+def _rows(answers: ContactsAnswers, what: str, i: int) -> list[dict[str, Any]]:
+    """Return the contacts ("pair") or clusters ("cluster") of one pose."""
+    pairs = ("avatar_point", "cloud_point", "signed_distance", "avatar_index", "scan_index", "cluster")
+    names = (
+        {name: name for name in pairs}
+        if what == "pair"
+        else {
+            name: name.removeprefix("cluster_")
+            for name in array_fields(ContactsAnswers)
+            if name.startswith("cluster_") and name != "cluster_starts"
+        }
+    )
+    which = _slice(getattr(answers, f"{what}_starts"), i)
+    columns = [_plain(getattr(answers, name)[which], vectors=False) for name in names]
+    return [dict(zip(names.values(), row, strict=True)) for row in zip(*columns, strict=True)]
+
+
+def _slice(starts: Any, i: int) -> slice:
+    """Return the rows of pose i."""
+    return slice(int(starts[i]), int(starts[i + 1]))
+
+
+def _plain(column: Any, *, vectors: bool) -> list[Any]:
+    """Convert a column to JSON values; elements that are not finite become None."""
+    values: list[Any] = column.tolist()
+    if column.dtype.kind != "f" or np.isfinite(column).all():
+        return values
+    if vectors:
+        return [value if all(map(math.isfinite, value)) else None for value in values]
+    return [value if math.isfinite(value) else None for value in values]

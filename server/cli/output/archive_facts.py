@@ -1,0 +1,92 @@
+"""Names and values that describe archives and exports, for printing in two columns.
+
+Of an archive, these are the details beyond those in `SceneInfo`.
+"""
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+from .console import bytes_text, print_facts
+
+if TYPE_CHECKING:
+    # These modules load numba and HDF5; a table needs neither.
+    from ....builder.export.export_archive import Exported
+    from ....schemas.archive.index import Source
+    from ...residency.voxel_store import Store
+
+
+def print_export(done: "Exported") -> None:
+    """Print the summary of a completed export."""
+    print_facts(_export_facts(done))
+
+
+def _export_facts(done: "Exported") -> Iterator[tuple[str, str]]:
+    yield "file", f"{done.file}, {done.format}, {bytes_text(done.bytes)}"
+    yield "points", f"{done.points:,}"
+    if done.low is not None and done.high is not None:
+        low, high = (" ".join(f"{v:.4f}" for v in corner) for corner in (done.low, done.high))
+        yield "bounds", f"{low} .. {high} m"
+    for note in done.notes:
+        yield "note", note
+
+
+def archive_details(store: "Store") -> dict[str, Any]:
+    """Return the details that `info` adds to a scene's description, in JSON types.
+
+    densest: the voxel with the most points, their number and its decoded size in bytes.
+    scans: for each source that declares any of them, its number and: scanner (origin [m]), crs,
+    units, up.
+    preview: size of the ParaView file in bytes; None if it does not exist.
+    warnings: sentences about scans that look wrong.
+    """
+    from ....builder.sources.coincident_scans import coincident_sources
+    from ....schemas.archive.vtkhdf import PREVIEW_NAME
+
+    archive = store.archive
+    points = archive.voxels["rows"][:, 2]
+    densest = int(points.argmax())
+    preview = archive.folder / PREVIEW_NAME
+    return {
+        "densest": {
+            "voxel": archive.coordinates[densest].tolist(),
+            "points": int(points[densest]),
+            "resident_bytes": int(store.sizes[densest]),
+        },
+        "scans": [
+            {"number": number, **said}
+            for number, source in enumerate(archive.header.sources)
+            if not source.fault and (said := _of_source(source))
+        ],
+        "preview": preview.stat().st_size if preview.exists() else None,
+        "warnings": list(coincident_sources(archive.header.sources)),
+    }
+
+
+def _of_source(source: "Source") -> dict[str, Any]:
+    """Return a scan's scanner position, coordinate system, units and up axis, where not the default."""
+    scanner = source.pose[:3, 3].tolist()
+    return {
+        **({"scanner": scanner} if any(scanner) else {}),
+        **({"crs": source.crs} if source.crs else {}),
+        **({"units": source.units} if source.units != "m" else {}),
+        **({"up": source.up} if source.up != "z" else {}),
+    }
+
+
+def detail_facts(details: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    """Yield the result of `archive_details` as names and texts."""
+    densest = details["densest"]
+    decoded = bytes_text(densest["resident_bytes"])
+    yield "densest", f"voxel {tuple(densest['voxel'])}, {densest['points']:,} points, {decoded} decoded"
+    for scan in details["scans"]:
+        if "scanner" in scan:
+            yield f"scan {scan['number']}", f"scanner at {' '.join(f'{v:.3f}' for v in scan['scanner'])} m"
+        if "units" in scan or "up" in scan:
+            yield f"scan {scan['number']}", f"read as {scan.get('units', 'm')}, {scan.get('up', 'z')} up"
+    for crs in sorted({scan["crs"] for scan in details["scans"] if "crs" in scan}):
+        scans = sum(scan.get("crs") == crs for scan in details["scans"])
+        yield "system", f"{' '.join(crs.split())[:300]} ({scans} of the scans)"
+    if details["preview"] is not None:
+        yield "preview", f"preview.vtkhdf for ParaView, {bytes_text(details['preview'])}"
+    for warning in details["warnings"]:
+        yield "warning", warning

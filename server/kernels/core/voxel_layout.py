@@ -1,0 +1,244 @@
+"""Layout of one voxel in the arena of resident voxels, as the overlap kernel reads it.
+
+The arena is one buffer with three views: float32 words, int32 words and uint16 halfwords. A voxel
+takes three runs. It takes a fourth run where the archive keeps scan numbers (`--keep scan`), and
+another one where a scene requests normals:
+
+- rows: (n, 12) words, one row a node: center x, y, z, radius [voxel steps], the slab's normal x, y,
+  z, its length, least and greatest dot(normal, point - center); then two int32: the first child
+  row, or ~block for a leaf node; a word whose low byte is the number of children or points and
+  whose next byte is the node's radius class. 48 bytes, four rows to three cache lines;
+- blocks: (b, 4) int32, one block a leaf node: low corner x, y, z of the box of its points [voxel
+  steps], number of points. (b, 12) where the archive keeps radius classes: the classes of the
+  block's points follow, four to an int32, the first in its low byte;
+- lanes: (b, 3, LANES) halfwords: x[], y[], z[] of the block's points, relative to that corner. The
+  last point is repeated to the end, which lets a test of all lanes work without a mask;
+- scans: (b, LANES) halfwords, the scan each point came from (`scan_run`); absent where the archive
+  does not keep it;
+- normals: (b, LANES) halfwords, the code of each point's normal (`normal_run`); present only where
+  the archive has normals and a scene requests them.
+
+For the façade this is 8.7 bytes a point, 6 of them the points (scripts/bench_engine --only memory).
+Scans take 2 more and radius classes 1.1 more, where kept.
+
+The radius class of a node (schemas/archive/radius_model.py) is the largest local class of the points below
+it, with RIM_BIT where all of them have it. It is the class of the largest sphere below the node
+under every radius model.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ....schemas.archive.radius_model import LOCAL_CLASSES, RIM_BIT
+from ....schemas.archive.voxel import MAX_LEAF
+from ....schemas.kernels import compiling as nb
+from .borrowing_kernels import borrowing
+
+# 32 uint16 lanes become 32 float32 in one vector loop. LLVM unrolls loops of 8 or 16 constant
+# iterations and then does not vectorise them, which costs several times as much a pair.
+LANES = MAX_LEAF
+ROW_WORDS = 12
+BLOCK_WORDS = 4
+# Index in a block of the first word of radius classes, where they are kept: four classes to a word.
+CLASSES = BLOCK_WORDS
+CLASSED_BLOCK_WORDS = BLOCK_WORDS + LANES // 4
+FIRST, COUNT = 10, 11  # columns of a row that hold int32
+# A row's COUNT: the low byte is the number of children or points; the radius class starts at this
+# bit.
+COUNTED = 0xFF
+CLASS_SHIFT = 8
+LOCAL_MASK = LOCAL_CLASSES - 1
+
+
+class Arena(NamedTuple):
+    """One buffer, three views: words (float32), ints (int32), halves (uint16)."""
+
+    words: NDArray[np.float32]
+    ints: NDArray[np.int32]
+    halves: NDArray[np.uint16]
+
+
+class SceneArrays(NamedTuple):
+    """Arrays of a scene that the kernels read.
+
+    words, ints, halves: the arena (voxel_layout.py).
+    where: (v, 3) int64, the starts of a voxel's rows, blocks and lanes in the arena; -1: not
+    resident.
+    coordinates: (v, 3) int64, voxel coordinates.
+    origin: (3,) float64 [m].  step: [m].
+    block_words: words of a block, with or without radius classes.
+    drop: (1,) or (RADIUS_CLASSES,) int64, the largest radius minus the radius of each class, exact
+    units; one element where all spheres have the same radius.
+    stop: (1,) int64, the request's stop flag (stop_flag_checks.py).
+    """
+
+    words: NDArray[np.float32]
+    ints: NDArray[np.int32]
+    halves: NDArray[np.uint16]
+    where: NDArray[np.int64]
+    coordinates: NDArray[np.int64]
+    origin: NDArray[np.float64]
+    step: float
+    units_per_step: float
+    voxel_steps: int
+    block_words: int
+    drop: NDArray[np.int64]
+    stop: NDArray[np.int64]
+
+
+def block_words(radius_class: bool) -> int:
+    """Return the number of words of a block in an archive with or without radius classes."""
+    return CLASSED_BLOCK_WORDS if radius_class else BLOCK_WORDS
+
+
+def resident_bytes(
+    nodes: NDArray[np.int64],
+    leaves: NDArray[np.int64],
+    *,
+    with_scan: bool = False,
+    with_class: bool = False,
+    with_normal: bool = False,
+) -> NDArray[np.int64]:
+    """Return the bytes (v,) that voxels take in the arena, multiples of 16.
+
+    nodes, leaves: the number of nodes of each voxel, and how many of them are leaf nodes.
+    with_scan, with_class, with_normal: whether scan numbers, radius classes and normals are kept.
+    """
+    halves = LANES * (3 + with_scan + with_normal)
+    return 4 * ROW_WORDS * nodes + 4 * block_words(with_class) * leaves + 2 * halves * leaves
+
+
+@nb.njit(nogil=True, cache=True)
+def scan_run(where, voxel, block_words):
+    """Return the offset of a resident voxel's scans [halves], in an archive that keeps them.
+
+    They follow its lanes, LANES a block.
+    """
+    leaves = (where[voxel, 2] // 2 - where[voxel, 1]) // block_words
+    return where[voxel, 2] + leaves * 3 * LANES
+
+
+@nb.njit(nogil=True, cache=True)
+def normal_run(where, voxel, block_words, with_scan):
+    """Return the offset of a resident voxel's normals [halves], where they are kept.
+
+    They follow its scans (its lanes where there are no scans), LANES a block.
+    """
+    leaves = (where[voxel, 2] // 2 - where[voxel, 1]) // block_words
+    return where[voxel, 2] + leaves * LANES * (4 if with_scan else 3)
+
+
+@borrowing
+def node_class(ints, row, mask):
+    """Return the index of a scene node into `drop`. mask: the number of classes minus one."""
+    return np.uint64(ints[np.uint64(row + COUNT)] >> CLASS_SHIFT) & mask
+
+
+@borrowing
+def point_class(ints, block_at, lane, mask):
+    """Return the index into `drop` of a point of the block at `block_at`.
+
+    mask: the number of classes minus one. Where blocks hold no classes, this reads whatever follows
+    the block in the arena, and the mask of 0 discards it.
+    """
+    word = ints[np.uint64(block_at + CLASSES + lane // 4)]
+    return np.uint64(word >> (8 * (lane % 4))) & mask
+
+
+@nb.njit(nogil=True, cache=True)
+def _outward(value, up):
+    """Round an int32 to float32, never down if `up`, else never up: a bound stays a bound."""
+    narrow = np.float32(value)
+    if abs(value) <= 1 << 24:  # exact
+        return narrow
+    if up and np.float64(narrow) < np.float64(value):
+        return np.nextafter(narrow, np.float32(np.inf))
+    if not up and np.float64(narrow) > np.float64(value):
+        return np.nextafter(narrow, np.float32(-np.inf))
+    return narrow
+
+
+@nb.njit(nogil=True, cache=True)
+def lay_out(voxel, links, arena, at_bytes, block_words, where):
+    """Write the rows and blocks of a checked voxel into the arena, from byte `at_bytes` on.
+
+    at_bytes: a multiple of 16.
+    voxel: (cells, nodes, top_shift) of schemas/archive/codec.py `OpenRecord`; center is therefore (3, n).
+    links: its Links without the height.
+    Writes where (3,) int64: first row [words], first block [ints], first lane [halves]. The points
+    belong at the first lane (schemas/archive/codec.py, `OpenRecord.read_points`).
+    """
+    cells, nodes, top_shift = voxel
+    first, is_leaf, cell_of = links
+    words, ints, _ = arena
+    n = first.shape[0]
+    # Unsigned: see schemas/kernels/rows.py.
+    row = np.uint64(at_bytes // 4)
+    block_at = row + np.uint64(n * ROW_WORDS)
+    where[0], where[1] = row, block_at
+    block = np.int32(0)
+    for i in range(np.uint64(n)):
+        top = cell_of[i] < 0
+        cell = np.uint64(0) if top else np.uint64(cell_of[i])
+        unit = np.int32(1) << np.int32(top_shift) if top else np.int32(1)
+        square = np.int32(0)
+        for k in range(np.uint64(3)):
+            # Integers below 2^24: a voxel has at most 2^21 steps, a cell 2^16.
+            low = np.int32(0) if top else cells.low[k, cell]
+            words[row + k] = np.float32(low + np.int32(nodes.center[k, i]) * unit)
+            component = np.int32(nodes.normal[k, i])
+            words[row + np.uint64(4) + k] = np.float32(component)
+            square += component * component
+        words[row + np.uint64(3)] = np.float32(np.int32(nodes.radius[i]) * unit)
+        # The next float32 up, as np.nextafter returns it for a non-negative number; calling that
+        # costs 5 ns.
+        length = np.float32(np.sqrt(np.float64(square)))
+        ints[row + np.uint64(7)] = length.view(np.int32) + np.int32(1)
+        # A node whose normal is zero has no slab. The numbers a record holds there must not exclude
+        # points.
+        least = nodes.slab[np.uint64(0), i] if square > 0 else np.int32(0)
+        most = nodes.slab[np.uint64(1), i] if square > 0 else np.int32(0)
+        words[row + np.uint64(8)] = _outward(least, False)
+        words[row + np.uint64(9)] = _outward(most, True)
+        ints[row + np.uint64(FIRST)] = ~block if is_leaf[i] else first[i]
+        ints[row + np.uint64(COUNT)] = np.int32(nodes.count[i])
+        row += np.uint64(ROW_WORDS)
+        if is_leaf[i]:
+            for k in range(np.uint64(3)):
+                ints[block_at + k] = cells.low[k, cell] + np.int32(nodes.block_low[k, i])
+            ints[block_at + np.uint64(3)] = np.int32(nodes.count[i])
+            block_at += np.uint64(block_words)
+            block += np.int32(1)
+    where[2] = np.uint64(2) * block_at
+
+
+@nb.njit(nogil=True, cache=True)
+def lay_classes(links, classes, ints, where):
+    """Write the radius classes of a voxel that `lay_out` wrote: of its points, then of its nodes.
+
+    links: as for `lay_out`.  classes: (b, LANES) uint8, from `OpenRecord.read_classes`, in the
+    order of the blocks.  where: (3,) int64, see `lay_out`.
+    """
+    first, is_leaf, _ = links
+    block = classes.shape[0]
+    for node in range(first.shape[0] - 1, -1, -1):  # children follow their parents
+        row = where[0] + node * ROW_WORDS
+        largest, all_rim = np.int64(0), np.int64(RIM_BIT)
+        if is_leaf[node]:
+            block -= 1
+            at = where[1] + block * CLASSED_BLOCK_WORDS + CLASSES
+            for word in range(LANES // 4):
+                packed = np.int64(0)
+                for k in range(4):
+                    packed |= np.int64(classes[block, 4 * word + k]) << (8 * k)
+                ints[at + word] = packed
+            for lane in range(LANES):  # lanes after the last point repeat it and change nothing
+                own = np.int64(classes[block, lane])
+                largest, all_rim = np.int64(max(largest, own & LOCAL_MASK)), all_rim & own
+        else:
+            for child in range(first[node], first[node] + (ints[row + COUNT] & COUNTED)):
+                own = np.int64(ints[where[0] + child * ROW_WORDS + COUNT]) >> CLASS_SHIFT
+                largest, all_rim = np.int64(max(largest, own & LOCAL_MASK)), all_rim & own
+        ints[row + COUNT] = (ints[row + COUNT] & COUNTED) | ((largest | all_rim) << CLASS_SHIFT)

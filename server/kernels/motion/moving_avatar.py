@@ -1,0 +1,191 @@
+"""Avatar moving along one chord: both ends placed in float32, as placed_avatar.py places one pose."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ....schemas.kernels import compiling as nb
+from ..core.borrowing_kernels import borrowing
+from ..core.pose_transform import Avatar, largest_term, place
+from ..core.voxel_layout import LANES, SceneArrays
+from ..overlap.overlap import STACK
+from .screw_motion import Motion
+
+# Error of float32 sums along a chord: w + t d, with t from two dot products and a quotient, is off
+# by less than 24 U32 of |w| + |d|.
+CHORD_ERROR = 32.0
+ONE = np.float32(1.0)
+ZERO = np.float32(0.0)
+
+
+class Moving(NamedTuple):
+    """Avatar along one chord, float32 steps from `frame`, a lattice point; scratch of one call.
+
+    nodes: (8, a): x[], y[], z[] at the beginning of the chord, radius[], the displacement to its
+    end x[], y[], z[], and 1 / its square.
+    lanes: (b, 3, LANES), ways: (b, 4, LANES), the same of the points.
+    stamp: (b,) int64, the chord a block was placed for.  frame: (3,) int64.
+    ends: (2, 4, 4), shifts: (2, 3), poses at the ends and t - O.
+    pose, shift: (4, 4), (3,), the one pose that is tested with integers.
+    pair: (6,) int64, block, lane, voxel, lane_at, block_at, j of one pair of points (placed_avatar.py).
+    best: (6,), that of the earliest contact found.
+    first: (3,) float64, fractions of the chord, inf: never: when a contact is first possible; when
+    `pair` certainly touches; the one of the two that prunes. On a chord worth halving, `pair` is
+    the first that may touch; else it is the first that certainly touches.
+    limits: (2, c) float32, of the chord by radius class: reach plus error [steps], and `far`
+    (placed_avatar.py). It is one array because a job is passed on whole: with the four of `ByClass`, a
+    motion of the walk took a quarter longer.
+    counters: (4,) int64, node visits, point tests, chords placed, largest number of visits.
+    gap, way, keep, off, stack: scratch.
+    """
+
+    nodes: NDArray[np.float32]
+    lanes: NDArray[np.float32]
+    ways: NDArray[np.float32]
+    stamp: NDArray[np.int64]
+    frame: NDArray[np.int64]
+    ends: NDArray[np.float64]
+    shifts: NDArray[np.float64]
+    pose: NDArray[np.float64]
+    shift: NDArray[np.float64]
+    pair: NDArray[np.int64]
+    best: NDArray[np.int64]
+    first: NDArray[np.float64]
+    limits: NDArray[np.float32]
+    counters: NDArray[np.int64]
+    gap: NDArray[np.float64]
+    way: NDArray[np.float64]
+    keep: NDArray[np.bool_]
+    off: NDArray[np.float32]
+    stack: NDArray[np.int64]
+
+
+class Job(NamedTuple):
+    """One motion of one avatar in one scene.
+
+    motion: Motion.  avatar: Avatar.  scene: SceneArrays.  moving: Moving.
+    radius: of the avatar's points [m].  scale: of the poses.
+    In exact units: other_units: the scan's largest radius plus the margin; units: these plus the
+    avatar's radius at either end, the larger; loose: how much that may vary on the way. The reach
+    of a pair is less by its `SceneArrays.drop`.
+    """
+
+    motion: Motion
+    avatar: Avatar
+    scene: SceneArrays
+    moving: Moving
+    radius: float
+    scale: float
+    other_units: int
+    units: np.int64
+    loose: float
+
+
+class Chord(NamedTuple):
+    """One interval.
+
+    t0, t1: fractions.  inner, outer: U - band, U + band, exact units, with U of the scan's largest
+    sphere.
+    final: halving is useless.
+    """
+
+    t0: float
+    t1: float
+    inner: float
+    outer: float
+    final: bool
+
+
+@nb.njit(nogil=True, cache=True)
+def make_moving(avatar, drop):
+    """Allocate scratch for one avatar, not empty, and the radius classes of `SceneArrays.drop`."""
+    blocks = avatar.points.shape[0]
+    return Moving(
+        np.empty((8, avatar.center.shape[0]), np.float32),
+        np.empty((blocks, 3, LANES), np.float32),
+        np.empty((blocks, 4, LANES), np.float32),
+        np.full(blocks, -1, np.int64),
+        np.empty(3, np.int64),
+        np.empty((2, 4, 4)),
+        np.empty((2, 3)),
+        np.empty((4, 4)),
+        np.empty(3),
+        np.zeros(6, np.int64),
+        np.zeros(6, np.int64),
+        np.empty(3),
+        np.empty((2, drop.shape[0]), np.float32),
+        np.zeros(4, np.int64),
+        np.empty(3),
+        np.empty(3),
+        np.empty(LANES, np.bool_),
+        np.empty(3, np.float32),
+        np.empty((STACK, 2), np.int64),
+    )
+
+
+@borrowing
+def _inverse(x, y, z):
+    """Return 1 / (x^2 + y^2 + z^2), or 0 for a vector too short to matter or to divide by.
+
+    The limit is a length of 10^-10 steps.
+    """
+    square = x * x + y * y + z * z
+    return np.float32(ONE / square) if square > np.float32(1e-20) else ZERO
+
+
+@borrowing
+def place_nodes(avatar, scale, speed, moving, scene):
+    """Place an avatar's nodes at both ends of a chord; fill shifts, frame and nodes.
+
+    speed: the farthest any point moves on the chord [m]. Returns (extent, farthest) for
+    `make_limits`.
+    """
+    per_step = 1.0 / scene.step
+    nodes, frame = moving.nodes, moving.frame
+    begin, end, shift0, shift1 = moving.ends[0], moving.ends[1], moving.shifts[0], moving.shifts[1]
+    x, y, z = avatar.center[0, 0], avatar.center[0, 1], avatar.center[0, 2]
+    for r in range(3):
+        shift0[r] = begin[r, 3] - scene.origin[r]
+        shift1[r] = end[r, 3] - scene.origin[r]
+        middle = 0.5 * (place(begin, shift0, r, x, y, z) + place(end, shift1, r, x, y, z))
+        frame[r] = np.int64(np.rint(middle * per_step))
+    farthest = max(largest_term(begin, shift0, x, y, z), largest_term(end, shift1, x, y, z)) * per_step
+    longest = (speed * per_step) ** 2
+    count = avatar.center.shape[0]
+    for r in range(3):
+        base = np.float64(frame[r]) * scene.step
+        for i in range(count):
+            x, y, z = avatar.center[i, 0], avatar.center[i, 1], avatar.center[i, 2]
+            world = place(begin, shift0, r, x, y, z)
+            nodes[r, i] = np.float32((world - base) * per_step)
+            nodes[4 + r, i] = np.float32((place(end, shift1, r, x, y, z) - world) * per_step)
+    for i in range(count):
+        x, y, z = nodes[4, i], nodes[5, i], nodes[6, i]
+        nodes[7, i] = _inverse(x, y, z)
+        longest = max(longest, np.float64(x) * x + np.float64(y) * y + np.float64(z) * z)
+    longest = math.sqrt(longest) * (1.0 + 1e-6)
+    extent = avatar.radius[0] * scale * per_step + 1.0 + longest
+    for i in range(count):
+        # The added 1e-6 is that of placed_avatar.py; it also covers a scale within 1e-9 of 1, or of the
+        # other end's.
+        nodes[3, i] = np.float32(avatar.radius[i] * scale * per_step * (1.0 + 1e-6) + extent * 1e-6)
+    return extent + CHORD_ERROR * longest, farthest + extent
+
+
+@borrowing
+def place_block(avatar, block, moving, scene):
+    """Place the points of one leaf node of the avatar at both ends of a chord."""
+    per_step = 1.0 / scene.step
+    lanes, ways, points = moving.lanes, moving.ways, avatar.points
+    for r in range(3):
+        base = np.float64(moving.frame[r]) * scene.step
+        for j in range(LANES):
+            x, y, z = points[block, 0, j], points[block, 1, j], points[block, 2, j]
+            world = place(moving.ends[0], moving.shifts[0], r, x, y, z)
+            lanes[block, r, j] = np.float32((world - base) * per_step)
+            end = place(moving.ends[1], moving.shifts[1], r, x, y, z)
+            ways[block, r, j] = np.float32((end - world) * per_step)
+    for j in range(LANES):
+        ways[block, 3, j] = _inverse(ways[block, 0, j], ways[block, 1, j], ways[block, 2, j])

@@ -1,0 +1,241 @@
+"""First contact of a moving avatar with a scene: two hierarchies, one of them moving.
+
+This extends [Fig12] section 6 to time by conservative advancement (Mirtich 1996; Zhang, Redon, Lee,
+Kim 2007; Tang, Kim, Manocha 2009, C2A). The bound of an advance comes from the directions of the
+motion, not from a maximum speed. Over an interval [t0, t1], every avatar point x is taken to move
+straight from a0 = M(t0) x to a1 = M(t1) x, in proportion to time. One descent finds the first
+moment at which any straight-moving sphere could touch, and the first at which one must. Each pair
+has its own reach: where scan points have radius classes, one descent handles spheres of several
+sizes, and a subtree is pruned by its largest sphere.
+
+Proof. Let a*(t) be the ideal motion of x, b a scan point, U the reach of these two, all in exact
+units.
+ 1. |a*(t) - chord of a*| <= B (t1 - t0)^2 / 8, B the greatest |a*''| of any point (`bend`).
+ 2. A computed coordinate vector, at t, t0 and t1, lies within `slip` of a* (screw_motion.py).
+ 3. Rounding to whole units moves a by at most sqrt(3) / 2, and b is an integer.
+Therefore |a - b|, as NUMERICS.md N5 defines it under M(t), differs from the distance D(t) of b from
+the chord by at most
+
+    band = sqrt(3) / 2 + B (t1 - t0)^2 / 8 + 2 slip.
+
+While D > U + band nothing touches; once D <= U - band the pair touches. D is the distance of a
+point on a line from a fixed point: both moments are roots of a quadratic. They are computed from
+the point of closest approach, whose rounding is relative to the lengths and not to their squares. A
+node's sphere moves straight with its centre: |lerp(x) - lerp(c)| is convex in t and therefore never
+exceeds the radius. Node pairs are pruned by the least distance of the centre's chord, up to the
+earliest certain contact found so far, in float32 with the error bound of placed_avatar.py enlarged by 32
+half units in the last place of the chord.
+
+The resulting interval is halved and quartered until its ends are within the tolerance, or until B
+(t1 - t0)^2 / 8 is negligible beside rounding; what is undecided then is a graze. The pairs that are
+examined in float64 may differ from tree to tree. Their results do not, and the least result is
+taken: no tree, voxel or order therefore changes an answer.
+"""
+
+import math
+
+import numpy as np
+
+from ....schemas.archive.units import UNITS_PER_METRE
+from ..core.borrowing_kernels import borrowing
+from ..core.placed_avatar import ONE_SLACK, SLACK, make_limits
+from ..core.stop_flag_checks import stopped
+from ..core.voxel_layout import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, node_class, point_class
+from .contact_times import INFINITE, try_pair
+from .moving_avatar import ZERO, Chord, place_block, place_nodes
+from .screw_motion import pose_at
+
+# Halving an interval whose sagitta is below this many units is useless: rounding alone contributes
+# 0.87 to the band.
+LEAST_SAGITTA = 0.25
+
+
+@borrowing
+def _nodes_meet(words, row, x, y, z, dx, dy, dz, inverse, radius, latest, room):
+    """Return whether a moving sphere comes within `room` of a node's points, by the node's bounds.
+
+    The sphere moves from (x, y, z) by (dx, dy, dz); its way up to the fraction `latest` counts.
+    room: reach plus error. Tests the sphere, then the slab. All float32.
+    """
+    wx, wy, wz = x - words[row], y - words[row + 1], z - words[row + 2]
+    span = radius + room
+    both = words[row + 3] + span
+    t = min(max(-(wx * dx + wy * dy + wz * dz) * inverse, ZERO), latest)
+    ex, ey, ez = wx + t * dx, wy + t * dy, wz + t * dz
+    if ex * ex + ey * ey + ez * ez > both * both * ONE_SLACK:
+        return False
+    nx, ny, nz = words[row + 4], words[row + 5], words[row + 6]
+    begin = nx * wx + ny * wy + nz * wz
+    end = begin + latest * (nx * dx + ny * dy + nz * dz)
+    wide = words[row + 7] * (span + SLACK * both + SLACK * both)
+    return min(begin, end) <= words[row + 9] + wide and max(begin, end) >= words[row + 8] - wide
+
+
+@borrowing
+def _latest(moving):
+    """Return the fraction of the chord that still matters, float32, rounded up."""
+    return np.float32(min(moving.first[2] * (1.0 + 1e-6) + 1e-30, 1.0))
+
+
+@borrowing
+def _leaves(job, chord, voxel, block, row):
+    """Update moving.first with all pairs of a leaf node of the avatar and one of the scene.
+
+    As in overlap.py: avatar points are tested against the node's bound, then against its points,
+    each in one vector loop.
+    """
+    scene, moving = job.scene, job.moving
+    words, ints, halves = scene.words, scene.ints, scene.halves
+    lanes, ways, keep, off = moving.lanes, moving.ways, moving.keep, moving.off
+    limits, mask = moving.limits, np.uint64(scene.drop.shape[0] - 1)
+    largest = node_class(ints, row, mask)  # class of the spheres in the scene's block
+    room, far = limits[0, largest], limits[1, largest]
+    latest = _latest(moving)
+    cx, cy, cz = words[row] + off[0], words[row + 1] + off[1], words[row + 2] + off[2]
+    nx, ny, nz = words[row + 4], words[row + 5], words[row + 6]
+    both = words[row + 3] + room
+    wide = words[row + 7] * (room + SLACK * both + SLACK * both)
+    least, most = words[row + 8] - wide, words[row + 9] + wide
+    square = both * both * ONE_SLACK
+    for j in range(LANES):
+        dx, dy, dz = ways[block, 0, j], ways[block, 1, j], ways[block, 2, j]
+        wx, wy, wz = lanes[block, 0, j] - cx, lanes[block, 1, j] - cy, lanes[block, 2, j] - cz
+        t = min(max(-(wx * dx + wy * dy + wz * dz) * ways[block, 3, j], ZERO), latest)
+        ex, ey, ez = wx + t * dx, wy + t * dy, wz + t * dz
+        begin = nx * wx + ny * wy + nz * wz
+        end = begin + latest * (nx * dx + ny * dy + nz * dz)
+        keep[j] = (
+            (ex * ex + ey * ey + ez * ez <= square) & (min(begin, end) <= most) & (max(begin, end) >= least)
+        )
+    scene_block = ~ints[row + FIRST]
+    block_at = scene.where[voxel, 1] + scene_block * scene.block_words
+    lane_at = scene.where[voxel, 2] + scene_block * 3 * LANES
+    lx = off[0] + np.float32(ints[block_at])
+    ly = off[1] + np.float32(ints[block_at + 1])
+    lz = off[2] + np.float32(ints[block_at + 2])
+    for lane in range(LANES):
+        if not keep[lane]:
+            continue
+        x, y, z = lanes[block, 0, lane] - lx, lanes[block, 1, lane] - ly, lanes[block, 2, lane] - lz
+        dx, dy, dz, inverse = (
+            ways[block, 0, lane],
+            ways[block, 1, lane],
+            ways[block, 2, lane],
+            ways[block, 3, lane],
+        )
+        moving.counters[1] += LANES
+        touched = False
+        for j in range(LANES):
+            wx = x - np.float32(halves[lane_at + j])
+            wy = y - np.float32(halves[lane_at + LANES + j])
+            wz = z - np.float32(halves[lane_at + 2 * LANES + j])
+            t = min(max(-(wx * dx + wy * dy + wz * dz) * inverse, ZERO), latest)
+            ex, ey, ez = wx + t * dx, wy + t * dy, wz + t * dz
+            touched |= ex * ex + ey * ey + ez * ez <= far
+        if not touched:
+            continue
+        for j in range(LANES):
+            wx = x - np.float32(halves[lane_at + j])
+            wy = y - np.float32(halves[lane_at + LANES + j])
+            wz = z - np.float32(halves[lane_at + 2 * LANES + j])
+            t = min(max(-(wx * dx + wy * dy + wz * dz) * inverse, ZERO), latest)
+            ex, ey, ez = wx + t * dx, wy + t * dy, wz + t * dz
+            square = ex * ex + ey * ey + ez * ez
+            if square <= far and square <= limits[1, point_class(ints, block_at, j, mask)]:
+                try_pair(job, chord, (block, lane, voxel, lane_at, block_at, j))
+                latest = _latest(moving)
+
+
+@borrowing
+def _sweep_voxel(job, chord, voxel):
+    """Update moving.first with one resident voxel by a joint descent, depth first.
+
+    Returns whether to continue: not when nothing can be earlier, when the visits are spent, or when
+    the scene's stop flag is set.
+    """
+    avatar, scene, moving = job.avatar, job.scene, job.moving
+    words, ints = scene.words, scene.ints
+    base = scene.where[voxel, 0]
+    rooms, mask = moving.limits[0], np.uint64(scene.drop.shape[0] - 1)
+    nodes, off, stack, counters = moving.nodes, moving.off, moving.stack, moving.counters
+    for r in range(3):
+        off[r] = np.float32(scene.coordinates[voxel, r] * scene.voxel_steps - moving.frame[r])
+    counters[0] += 1
+    latest = _latest(moving)
+    stack[0, 0], stack[0, 1] = 0, base
+    depth = 0
+    if _nodes_meet(
+        words, base, nodes[0, 0] - off[0], nodes[1, 0] - off[1], nodes[2, 0] - off[2],
+        nodes[4, 0], nodes[5, 0], nodes[6, 0], nodes[7, 0], nodes[3, 0], latest,
+        rooms[node_class(ints, base, mask)],
+    ):  # fmt: skip
+        depth = 1
+    while depth > 0:
+        if counters[0] > counters[3] or stopped(scene.stop):
+            return False
+        depth -= 1
+        a, row = stack[depth, 0], stack[depth, 1]
+        a_first, b_first = avatar.first[a], ints[row + FIRST]
+        if a_first < 0 and b_first < 0:
+            block = ~a_first
+            if moving.stamp[block] != counters[2]:
+                place_block(avatar, block, moving, scene)
+                moving.stamp[block] = counters[2]
+            _leaves(job, chord, voxel, block, row)
+            if moving.first[2] <= 0.0:
+                return False
+            latest = _latest(moving)
+        elif b_first < 0 or (a_first >= 0 and nodes[3, a] > words[row + 3]):
+            counters[0] += avatar.count[a]
+            room = rooms[node_class(ints, row, mask)]
+            for child in range(a_first, a_first + avatar.count[a]):
+                if _nodes_meet(
+                    words, row, nodes[0, child] - off[0], nodes[1, child] - off[1], nodes[2, child] - off[2],
+                    nodes[4, child], nodes[5, child], nodes[6, child], nodes[7, child], nodes[3, child],
+                    latest, room,
+                ):  # fmt: skip
+                    stack[depth, 0], stack[depth, 1] = child, row
+                    depth += 1
+        else:
+            x, y, z = nodes[0, a] - off[0], nodes[1, a] - off[1], nodes[2, a] - off[2]
+            dx, dy, dz, inverse = nodes[4, a], nodes[5, a], nodes[6, a], nodes[7, a]
+            counters[0] += ints[row + COUNT] & COUNTED
+            for i in range(ints[row + COUNT] & COUNTED):
+                child_row = base + (b_first + i) * ROW_WORDS
+                room = rooms[node_class(ints, child_row, mask)]
+                if _nodes_meet(words, child_row, x, y, z, dx, dy, dz, inverse, nodes[3, a], latest, room):
+                    stack[depth, 0], stack[depth, 1] = a, child_row
+                    depth += 1
+    return True
+
+
+@borrowing
+def search(job, t0, t1, rows):
+    """Descend once over the interval [t0, t1], through those voxels of `rows` that are resident.
+
+    Fills moving.first and moving.pair. Returns (whether the search was complete, whether halving
+    the interval is useless).
+    """
+    motion, scene, moving = job.motion, job.scene, job.moving
+    pose_at(motion, t0, moving.ends[0])
+    pose_at(motion, t1, moving.ends[1])
+    length = t1 - t0
+    sagitta = motion.bend * length * length / 8.0 * UNITS_PER_METRE
+    band = (0.8661 + job.loose + sagitta + 2.0 * motion.slip * UNITS_PER_METRE) * (1.0 + 1e-9)
+    chord = Chord(
+        t0, t1, np.float64(job.units) - band, np.float64(job.units) + band, sagitta <= LEAST_SAGITTA
+    )
+    extent, farthest = place_nodes(job.avatar, job.scale, motion.speed * length, moving, scene)
+    widest = np.int64(math.ceil(chord.outer)) + 1
+    for c in range(scene.drop.shape[0]):
+        limits = make_limits(
+            widest - scene.drop[c], scene.units_per_step, extent, farthest, scene.voxel_steps
+        )
+        moving.limits[0, c], moving.limits[1, c] = limits.reach + limits.error, limits.far
+    moving.counters[2] += 1
+    moving.first[0], moving.first[1], moving.first[2] = INFINITE, INFINITE, INFINITE
+    for row in rows:
+        if scene.where[row, 0] >= 0 and not _sweep_voxel(job, chord, row):
+            break
+    spent = moving.counters[0] > moving.counters[3] or stopped(scene.stop)
+    return not (spent and moving.first[2] > 0.0), chord.final

@@ -1,0 +1,5 @@
+"""Nearest pairs: distance, distance by scan, search in order of distance.
+
+May import server.kernels.core, server.kernels.overlap, schemas.
+Begin with nearest_search.py.
+"""

@@ -1,0 +1,414 @@
+"""Nearest pair by priority, within a budget: a search that can stop at any time with a valid bound.
+
+The search is best first, with a heap of node pairs, as in Hubbard, "Approximating polyhedra with
+spheres for time-critical collision detection" (1996), and Klein and Zachmann, "ADB-Trees:
+controlling the error of time-critical collision detection" (2003). The error of an answer is at
+most the distance of the best pair minus the least lower bound of the open pairs. The search
+therefore opens the pair of the least lower bound next. Among pairs of equal bound it opens the one
+with the least upper bound, which is the likeliest to hold a contact.
+
+The order of visits depends on the request alone. A larger budget therefore continues what a smaller
+one began, and no bound gets worse (NUMERICS.md case 30). All state lies in arrays: the search can
+be suspended and resumed. Pairs that do not fit the heap are searched depth first, to the end,
+before the heap continues: memory is bounded, and no pair is dropped.
+
+Where scan points have spheres of several sizes, all bounds are bounds of |a - b| + drop
+(nearest_pair.py). Below a node, no drop is less than that of its radius class, and the drop of some
+point is at most the class's `sure` drop.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ....schemas.archive.radius_model import RIM_BIT
+from ....schemas.kernels import compiling as nb
+from ..core.borrowing_kernels import borrowing
+from ..core.placed_avatar import SLACK, Placed, make_placed, place_block, place_nodes
+from ..core.pose_transform import MAX_REACH_UNITS
+from ..core.stop_flag_checks import NO_LIMIT, stopped
+from ..core.vector_lanes import any_near, keep_near
+from ..core.voxel_layout import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, node_class
+from ..overlap.overlap import STACK
+from .nearest_pair import (
+    Best,
+    found_units,
+    lower_bound,
+    make_best,
+    search_lanes,
+    set_cut,
+)
+from .nearest_search import box_gap
+
+# The search continues; no pair is open; the answer is known to the requested accuracy; the budget
+# of visits is spent.
+OPEN, DONE, ENOUGH, SPENT = range(4)
+NO_VOXEL = -1  # in place of a row: the voxel has not been visited
+
+
+class Known(NamedTuple):
+    """Results for k poses, accumulated over the pieces of a request.
+
+    square, pair, drop, gap: of `Nearest`.
+    lower: (k,) float64 [steps], a lower bound of |a - b| + drop of everything left open; inf:
+    nothing was.
+    upper: (k,) float64 [steps], an upper bound of |a - b| + drop of some pair.
+    spent: (k,) bool, the budget has ended a search. Further pieces then get no budget; otherwise a
+    larger budget would see less of them.
+    """
+
+    square: NDArray[np.int64]
+    pair: NDArray[np.int64]
+    drop: NDArray[np.int64]
+    gap: NDArray[np.float64]
+    lower: NDArray[np.float64]
+    upper: NDArray[np.float64]
+    spent: NDArray[np.bool_]
+
+
+class Search(NamedTuple):
+    """Search that can be resumed; scratch of one request.
+
+    keys: (h + STACK, 2) float32, lower and upper bound of a pair [steps], without the error of
+    placing.
+    pairs: (h + STACK, 3) int64: avatar node, row or NO_VOXEL, voxel. The first h are the heap; the
+    others are the stack of pairs that did not fit the heap.
+    sizes: (2,) int64, of heap and stack.
+    bounds: (4,) float64 [steps]: lower and upper bound of the answer, lower bound of the stack,
+    error of placing.
+    status: (1,) int64.
+    drops: (2, n) float32 [steps], by radius class of a node: a lower bound of the drop of every
+    point below it, rounded down; an upper bound of the drop of some point, rounded up.
+    """
+
+    keys: NDArray[np.float32]
+    pairs: NDArray[np.int64]
+    sizes: NDArray[np.int64]
+    bounds: NDArray[np.float64]
+    status: NDArray[np.int64]
+    drops: NDArray[np.float32]
+    placed: Placed
+    best: Best
+
+
+class Goal(NamedTuple):
+    """Conditions that end a search.
+
+    first: end at the first pair within reach plus `early` (`collide`).
+    early: exact units by which a pair may exceed the reach and still be accepted, with `first`.
+    enough: (k,) float64 [steps], with `first`: a pair whose upper bound is at most this is accepted
+    although the pair itself is not known.
+    tolerance: without `first`, the difference of the bounds at which the search ends [steps].
+    visits: node visits a pose.
+    """
+
+    first: bool
+    early: int
+    enough: NDArray[np.float64]
+    tolerance: float
+    visits: int
+
+
+@nb.njit(nogil=True, cache=True)
+def make_search(avatar, scene, heap):
+    """Allocate scratch for one avatar (not empty) and a heap of `heap` pairs."""
+    drop = scene.drop
+    mask = drop.shape[0] - 1
+    drops = np.empty((2, drop.shape[0]), np.float32)
+    for c in range(drop.shape[0]):
+        # Some point has the node's local class, on a rim or not; where not all are on a rim, one
+        # that is not on a rim may have any class.
+        sure = min(drop[(c | RIM_BIT) & mask], drop[c & RIM_BIT & mask])
+        drops[0, c] = np.float32(np.float64(drop[c]) / scene.units_per_step * (1.0 - 1e-6))
+        drops[1, c] = np.float32(np.float64(sure) / scene.units_per_step * (1.0 + 1e-6))
+    return Search(
+        np.empty((heap + STACK, 2), np.float32), np.empty((heap + STACK, 3), np.int64), np.zeros(2, np.int64),
+        np.zeros(4), np.zeros(1, np.int64), drops, make_placed(avatar), make_best(drop),
+    )  # fmt: skip
+
+
+@borrowing
+def _sift_up(keys, pairs, at):
+    """Move the pair at the end of a heap up to its place."""
+    key, tie, a, row, voxel = keys[at, 0], keys[at, 1], pairs[at, 0], pairs[at, 1], pairs[at, 2]
+    while at > 0:
+        parent = (at - 1) // 2
+        if keys[parent, 0] < key or (keys[parent, 0] == key and keys[parent, 1] <= tie):
+            break
+        keys[at, 0], keys[at, 1] = keys[parent, 0], keys[parent, 1]
+        pairs[at, 0], pairs[at, 1], pairs[at, 2] = pairs[parent, 0], pairs[parent, 1], pairs[parent, 2]
+        at = parent
+    keys[at, 0], keys[at, 1], pairs[at, 0], pairs[at, 1], pairs[at, 2] = key, tie, a, row, voxel
+
+
+@borrowing
+def _drop_top(keys, pairs, size):
+    """Remove the top of a heap of `size` pairs."""
+    last = size - 1
+    key, tie, a, row, voxel = keys[last, 0], keys[last, 1], pairs[last, 0], pairs[last, 1], pairs[last, 2]
+    at = 0
+    while 2 * at + 1 < last:
+        child = 2 * at + 1
+        right = child + 1
+        if right < last and (
+            keys[right, 0] < keys[child, 0]
+            or (keys[right, 0] == keys[child, 0] and keys[right, 1] < keys[child, 1])
+        ):
+            child = right
+        if key < keys[child, 0] or (key == keys[child, 0] and tie <= keys[child, 1]):
+            break
+        keys[at, 0], keys[at, 1] = keys[child, 0], keys[child, 1]
+        pairs[at, 0], pairs[at, 1], pairs[at, 2] = pairs[child, 0], pairs[child, 1], pairs[child, 2]
+        at = child
+    keys[at, 0], keys[at, 1], pairs[at, 0], pairs[at, 1], pairs[at, 2] = key, tie, a, row, voxel
+
+
+@borrowing
+def _low(words, row, x, y, z, radius, drop):
+    """Return `lower_bound`, at least 0, plus the drop. No two centres are nearer than 0."""
+    return max(lower_bound(words, row, x, y, z, radius), np.float32(0.0)) + drop
+
+
+@borrowing
+def _upper_bound(words, row, x, y, z, radius):
+    """Return an upper bound of the distance of some sphere point from some node point.
+
+    Arguments as for `lower_bound`. The sphere and the node hold at least one point each.
+    """
+    dx, dy, dz = x - words[row], y - words[row + 1], z - words[row + 2]
+    both = np.sqrt(dx * dx + dy * dy + dz * dz) + (words[row + 3] + radius)
+    return both + SLACK * both
+
+
+@nb.njit(nogil=True, cache=True)
+def _begin(poses, avatar, scene, index, reach, i, search, goal, known, counts):
+    """Start a search for pose i: all voxels in reach, with bounds from the index."""
+    best, placed = search.best, search.placed
+    best.frame[0], best.frame[1] = place_nodes(avatar, poses[i], reach.scales[i], placed, scene)
+    best.frame[2], best.frame[3] = scene.units_per_step, scene.voxel_steps
+    best.units[0] = reach.units[i] + min(goal.early, MAX_REACH_UNITS - reach.units[i])
+    best.found[0], best.found[7] = known.square[i], known.drop[i]
+    best.found[1:7] = known.pair[i]
+    best.counters[:3] = 0
+    set_cut(best.cut, best.far, best.frame, best.drop, reach.units[i])
+    search.bounds[0], search.bounds[1], search.bounds[2], search.bounds[3] = 0.0, np.inf, 0.0, best.frame[4]
+    within = best.units[0] if best.found[0] < 0 else found_units(best.found)
+    # `collide` searches nodes for pairs within reach, and accepts a pair slightly beyond if it
+    # meets one. `squares`, a scratch of LANES, holds a cut for each of at most RADIUS_CLASSES,
+    # which are as many.
+    set_cut(best.squares if goal.first else best.cut, best.far, best.frame, best.drop, within)
+    search.sizes[0], search.sizes[1], search.status[0] = 0, 0, OPEN
+    keys, pairs = search.keys, search.pairs
+    for at in range(reach.starts[i], reach.starts[i + 1]):
+        voxel = reach.rows[at]
+        root = avatar.radius[0] * reach.scales[i]
+        gap = box_gap(root, placed, best.frame[1], scene, index, voxel)
+        if scene.where[voxel, 0] < 0:
+            counts[0, i] += np.uint32(1)
+            known.gap[i] = min(known.gap[i], gap)
+            continue
+        size = search.sizes[0]
+        drop = search.drops[0, node_class(scene.ints, scene.where[voxel, 0], best.mask)]
+        keys[size, 0], keys[size, 1] = np.float32(gap * (1.0 - 1e-6)) + drop, np.float32(np.inf)
+        pairs[size, 0], pairs[size, 1], pairs[size, 2] = 0, NO_VOXEL, voxel
+        _sift_up(keys, pairs, size)
+        search.sizes[0] = size + 1
+
+
+@borrowing
+def _enough(goal, enough, best, bounds):
+    """Return whether the answer is known as accurately as requested."""
+    if goal.first:
+        return best.found[0] >= 0 or bounds[1] <= enough
+    if best.found[0] < 0 or goal.tolerance <= 0.0:
+        return False
+    found = math.sqrt(np.float64(best.found[0])) + np.float64(best.found[7])
+    return found / best.frame[2] - bounds[0] <= goal.tolerance
+
+
+@borrowing
+def _put(keys, pairs, sizes, heap, spilling, cut, bounds, parent, low, high, a, row, voxel):
+    """Add a pair to the heap, or to the stack if spilling.
+
+    low, high: its bounds.  parent: the lower bound of its parent.  cut: pairs above it are useless.
+    """
+    bounds[1] = min(bounds[1], np.float64(high) + bounds[3])
+    # A lower bound of the parent is one of the child.
+    low = max(low, parent)
+    if low > cut:
+        return
+    at = heap + sizes[1] if spilling else sizes[0]
+    keys[at, 0], keys[at, 1] = low, high
+    pairs[at, 0], pairs[at, 1], pairs[at, 2] = a, row, voxel
+    if spilling:
+        sizes[1] += 1
+    else:
+        sizes[0] += 1
+        _sift_up(keys, pairs, at)
+
+
+@borrowing
+def _go_on(m, pose, avatar, scene, search, goal, enough, budget, until):
+    """Visit node pairs until the search ends, or `until` pairs are visited; set the status.
+
+    budget: how many visits are allowed.
+    """
+    words, ints, halves, where, coordinates = (
+        scene.words,
+        scene.ints,
+        scene.halves,
+        scene.where,
+        scene.coordinates,
+    )
+    placed, best = search.placed, search.best
+    nodes, lanes, stamp, frame_at, shift = (
+        placed.nodes,
+        placed.lanes,
+        placed.stamp,
+        placed.frame,
+        placed.shift,
+    )
+    found, cut, far, frame, corner, keep = best.found, best.cut, best.far, best.frame, best.corner, best.keep
+    squares, counters, units, drop, mask = best.squares, best.counters, best.units[0], best.drop, best.mask
+    drops, largest = search.drops, np.argmin(drop)
+    keys, pairs, sizes, bounds = search.keys, search.pairs, search.sizes, search.bounds
+    avatar_first, avatar_count, points = avatar.first, avatar.count, avatar.points
+    heap = keys.shape[0] - STACK
+    while True:
+        limit = cut[largest]
+        if sizes[1] == 0 and (sizes[0] == 0 or keys[0, 0] > limit):
+            search.status[0] = DONE
+            return
+        least = np.float64(keys[0, 0]) if sizes[1] == 0 else bounds[2]
+        bounds[0] = max(bounds[0], least * (1.0 - 2e-6) - bounds[3])
+        if _enough(goal, enough, best, bounds):
+            search.status[0] = ENOUGH
+            return
+        if counters[0] >= until:
+            return
+        if stopped(scene.stop):
+            search.status[0] = SPENT
+            return
+        at = 0 if sizes[1] == 0 else heap + sizes[1] - 1
+        key, a, row, voxel = keys[at, 0], pairs[at, 0], pairs[at, 1], pairs[at, 2]
+        a_first = avatar_first[a]
+        b_first = 0 if row == NO_VOXEL else np.int64(ints[row + FIRST])
+        leaves = row != NO_VOXEL and a_first < 0 and b_first < 0
+        avatar_side = b_first < 0 or (a_first >= 0 and row != NO_VOXEL and nodes[3, a] > words[row + 3])
+        cost = np.int64(1)
+        if row != NO_VOXEL and not leaves:
+            cost = np.int64(avatar_count[a]) if avatar_side else np.int64(ints[row + COUNT] & COUNTED)
+        if counters[0] + cost > budget:
+            search.status[0] = SPENT
+            return
+        # A nearer pair may have overtaken a pair on the stack; visits are counted nevertheless.
+        counters[0] += cost
+        spilling = sizes[1] > 0 or sizes[0] - 1 + cost > heap
+        if sizes[1] > 0:
+            sizes[1] -= 1
+        else:
+            bounds[2] = np.float64(key)
+            _drop_top(keys, pairs, sizes[0])
+            sizes[0] -= 1
+        if key > limit:
+            continue
+        base = where[voxel, 0]
+        for r in range(3):
+            corner[r] = coordinates[voxel, r] * scene.voxel_steps
+        off_x = np.float32(corner[0] - frame_at[0])
+        off_y = np.float32(corner[1] - frame_at[1])
+        off_z = np.float32(corner[2] - frame_at[2])
+        x, y, z = nodes[0, a] - off_x, nodes[1, a] - off_y, nodes[2, a] - off_z
+        c = node_class(ints, base if row == NO_VOXEL else row, mask)
+        if row == NO_VOXEL:
+            low = _low(words, base, x, y, z, nodes[3, a], drops[0, c])
+            high = _upper_bound(words, base, x, y, z, nodes[3, a]) + drops[1, c]
+            _put(keys, pairs, sizes, heap, spilling, limit, bounds, key, low, high, a, base, voxel)
+        elif leaves:
+            block, scene_block = ~a_first, ~b_first
+            if stamp[block] != pose:
+                place_block(avatar, m, block, placed, scene)
+                stamp[block] = pose
+            block_at = where[voxel, 1] + scene_block * scene.block_words
+            lane_at = where[voxel, 2] + scene_block * 3 * LANES
+            lx, ly = off_x + np.float32(ints[block_at]), off_y + np.float32(ints[block_at + 1])
+            lz = off_z + np.float32(ints[block_at + 2])
+            keep_near(lanes, block, words, row, off_x, off_y, off_z, cut[c], keep)
+            for lane in range(avatar_count[a]):
+                if not keep[lane]:
+                    continue
+                px, py, pz = (
+                    lanes[block, 0, lane] - lx,
+                    lanes[block, 1, lane] - ly,
+                    lanes[block, 2, lane] - lz,
+                )
+                counters[1] += LANES
+                if any_near(halves, lane_at, px, py, pz, far[c]):
+                    search_lanes(
+                        points, m, shift, block, lane, ints, halves, corner, block_at, lane_at, c, px, py, pz,
+                        frame, units, squares, found, cut, far, drop, mask,
+                    )  # fmt: skip
+        elif avatar_side:
+            for child in range(a_first, a_first + cost):
+                x, y, z = nodes[0, child] - off_x, nodes[1, child] - off_y, nodes[2, child] - off_z
+                low = _low(words, row, x, y, z, nodes[3, child], drops[0, c])
+                high = _upper_bound(words, row, x, y, z, nodes[3, child]) + drops[1, c]
+                _put(keys, pairs, sizes, heap, spilling, limit, bounds, key, low, high, child, row, voxel)
+        else:
+            for number in range(cost):
+                child = base + (b_first + number) * ROW_WORDS
+                c = node_class(ints, child, mask)
+                low = _low(words, child, x, y, z, nodes[3, a], drops[0, c])
+                high = _upper_bound(words, child, x, y, z, nodes[3, a]) + drops[1, c]
+                _put(keys, pairs, sizes, heap, spilling, limit, bounds, key, low, high, a, child, voxel)
+
+
+@nb.njit(nogil=True, cache=True)
+def end_search(search, i, known, counts):
+    """Add the results of a search to what is known of pose i."""
+    best = search.best
+    known.square[i], known.drop[i] = best.found[0], best.found[7]
+    known.pair[i] = best.found[1:7]
+    known.upper[i] = min(known.upper[i], search.bounds[1])
+    known.spent[i] |= search.status[0] == SPENT
+    if search.status[0] != DONE:
+        known.lower[i] = min(known.lower[i], search.bounds[0])
+    counts[1, i] += np.uint32(best.counters[0])
+    counts[2, i] += np.uint32(best.counters[1])
+
+
+@nb.njit(nogil=True, cache=True)
+def go_on(poses, avatar, scene, index, reach, i, fresh, until, search, goal, known, counts):
+    """Search for the nearest pair of pose i: from the start if `fresh`, else from where it stopped.
+
+    poses: (k, 4, 4), checked.  avatar: not empty.  reach: Reach of the poses; a voxel in it that is
+    not resident is counted as missing.  until: the number of visits, in this piece, at which to
+    suspend.
+    Once the search has ended, its results are added to known and counts (3, k) uint32; for a
+    suspended search, `end_search` does that. Returns the status.
+    """
+    if fresh:
+        _begin(poses, avatar, scene, index, reach, i, search, goal, known, counts)
+    budget = np.int64(0) if known.spent[i] else goal.visits - np.int64(counts[1, i])
+    _go_on(poses[i], i, avatar, scene, search, goal, goal.enough[i], budget, until)
+    if search.status[0] != OPEN:
+        end_search(search, i, known, counts)
+    return search.status[0]
+
+
+@nb.njit(nogil=True, cache=True)
+def search_poses(poses, avatar, scene, index, reach, which, heap, goal, known, counts):
+    """Run `go_on` to the end for the poses numbered in `which`.
+
+    One call answers a request without a deadline.
+    """
+    search = make_search(avatar, scene, heap)
+    for number in range(which.shape[0]):
+        if stopped(scene.stop):
+            known.lower[which[number]] = 0.0
+            continue
+        go_on(
+            poses, avatar, scene, index, reach, which[number], True, np.int64(NO_LIMIT), search, goal, known, counts
+        )  # fmt: skip

@@ -1,0 +1,5 @@
+"""Rays and points against the scene: raycast, nearest point, normals.
+
+May import server.kernels.core, schemas.
+Begin with rays.py.
+"""

@@ -1,0 +1,5 @@
+"""Zenoh basics of server and client: endpoints, session settings, keys, replies.
+
+May import server.served, schemas.
+Begin with zenoh_settings.py.
+"""

@@ -1,0 +1,5 @@
+"""Counters of a scene, and their Prometheus text.
+
+May import schemas.
+Begin with metrics.py.
+"""

@@ -1,0 +1,6 @@
+"""Query engines, one file a query, each a pure function over one archive.
+
+May import server.avatars, server.kernels, server.queries.context, server.residency, server.runtime,
+schemas.
+Begin with collide.py.
+"""

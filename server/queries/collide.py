@@ -1,0 +1,127 @@
+"""`collide`: does an avatar touch the scene, one verdict a pose? One request -> one result."""
+
+import time
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ...schemas.archive.units import UNITS_PER_METRE
+from ...schemas.wire.answers import CollideAnswers
+from ..avatars.avatar_model import AvatarModel
+from ..kernels.core.voxels_in_reach import Reach
+from ..kernels.overlap.overlap import CLEAR, CONTACT, UNKNOWN, answer_resident, overlap_poses
+from ..residency.coarse_bounds import settle
+from .context.anytime_search import collide_bounded
+from .context.proved_reach import find_proved_reach
+from .context.query_budget import EXACT, NO_LIMIT, Effort
+from .context.query_context import SceneData, as_held, in_unknown, kernel_poses, pieces, refuse, to_units
+from .context.query_cost import Spent
+
+# An avatar up to this size is answered under the residency's lock when a request holds one pose: 20 µs for the
+# 3,617 points of the walk. A larger one could keep others waiting, and gains little.
+QUICK_POINTS = 1 << 13
+
+
+def _answer_at_once(
+    data: SceneData, avatar: AvatarModel, poses: NDArray[np.float64], other_units: int, begin: float
+) -> CollideAnswers | None:
+    """Answer one pose in one kernel call, as its voxels are resident nearly always; None: they are not.
+
+    scripts/bench_walk shows what a call of one pose costs on top of the test itself.
+    """
+    residency = data.residency
+    rows, outside = np.empty(64, np.int64), np.zeros(1, bool)
+    verdict, counts = np.zeros(1, np.uint8), np.zeros((3, 1), np.uint32)
+    with residency.still():
+        fault, pose, found, needed = answer_resident(
+            poses,
+            avatar.arrays,
+            avatar.radius,
+            other_units,
+            data.arrays,
+            data.broad,
+            rows,
+            outside,
+            verdict,
+            counts,
+        )
+        if needed > 0:
+            residency.use(rows[:needed].tolist())
+    refuse(fault, pose, found)
+    if needed < 0:
+        return None
+    return CollideAnswers(
+        verdict, outside, counts[0], counts[1], counts[2], engine_seconds=time.perf_counter() - begin,
+        hits=needed, resident=residency.resident, resident_bytes=residency.resident_bytes,
+    )  # fmt: skip
+
+
+def collide(
+    data: SceneData, avatar: AvatarModel, poses: ArrayLike, margin: float = 0.0, effort: Effort = EXACT
+) -> CollideAnswers:
+    """Whether the avatar touches the scene under each pose.
+
+    poses: (k, 4, 4) float64, avatar to world, rigid or with a uniform scale, bits used as given.
+    margin: distance below or at which two spheres are called in contact [m].
+    effort: with a budget, see `collide_bounded`; with a tolerance alone the answer is exact, and has bounds.
+    CONTACT, CLEAR or UNKNOWN (a voxel in reach cannot be read, or a scan was left out there, and no contact was
+    found elsewhere); the definition is NUMERICS.md N5. Raises BadRequestError, BadTransformError, TooLargeError.
+    """
+    if effort.limited:
+        return collide_bounded(data, avatar, poses, margin, effort)
+    begin = time.perf_counter()
+    array = kernel_poses(poses)
+    margin_units = to_units(margin, "margin")
+    other_units = data.radius_units + margin_units
+    k = len(array)
+    unseen = data.nothing_clear or len(data.unknown) > 0
+    if k == 1 and len(avatar.points) <= QUICK_POINTS and not unseen and effort.tolerance == 0:
+        answers = _answer_at_once(data, avatar, array, other_units, begin)
+        if answers is not None:
+            return answers
+    residency, spent = data.residency, Spent(begin)
+
+    def settled(reach: Reach) -> Reach:
+        if data.coarse is None or not len(avatar.points):
+            return reach
+        return settle(data.arrays, data.coarse.arrays, avatar.arrays, array, reach)[0]
+
+    reach = find_proved_reach(data, avatar, array, other_units, effort, spent, settled)
+    verdict, counts = np.zeros(k, np.uint8), np.zeros((3, k), np.uint32)
+    # An empty avatar is clear, whatever is unknown here.
+    for which, rows, part in (
+        pieces(reach, residency, effort.share, effort.stop) if len(avatar.points) else ()
+    ):
+        if effort.stop:
+            verdict[which[verdict[which] == CLEAR]] = UNKNOWN
+            continue
+        with residency.hold(rows, effort.loads_until(), scan=effort.scan, stop=effort.stop) as held:
+            seen = as_held(data, held)
+            overlap_poses(array, avatar.arrays, seen.arrays, part, which, NO_LIMIT, verdict, counts)
+        spent.add(held)
+    if (data.nothing_clear or unseen) and len(avatar.points):  # a load may have found the index wrong
+        lost = in_unknown(reach.boxes, data.unknown, data.nothing_clear)
+        verdict[lost & (verdict == CLEAR)] = UNKNOWN
+    return CollideAnswers(
+        verdict, reach.outside, counts[0], counts[1], counts[2], **spent.cost(data),
+        **_bounds(verdict, reach.units - margin_units, margin, margin_units, effort),
+    )  # fmt: skip
+
+
+def _bounds(
+    verdict: NDArray[np.uint8], radii: NDArray[np.int64], margin: float, margin_units: int, effort: Effort
+) -> dict[str, Any]:
+    """The bounds of `CollideAnswers` that verdicts alone give; none where no tolerance asks for them.
+
+    radii: (k,) of avatar's and scan's largest spheres together, exact units: no pair is deeper.  margin: [m];
+    margin_units: what it was rounded to, up or down, and what the verdicts go by.
+    """
+    if effort.tolerance == 0:
+        return {}
+    rounded = margin_units / UNITS_PER_METRE
+    return {
+        "lower": np.where(verdict == CLEAR, min(margin, rounded), -radii / UNITS_PER_METRE),
+        "upper": np.where(verdict == CONTACT, max(margin, rounded), np.inf),
+        "exact": verdict != UNKNOWN,
+    }

@@ -1,0 +1,244 @@
+"""`contacts`: all pairs of spheres in contact, the deepest listed, all of them gathered into clusters.
+
+What users of clash detection ask for: not that two things touch, which `collide` says, but where, how deep, and how
+many places it is.
+"""
+
+import math
+import operator
+import time
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ...schemas.archive.units import UNITS_PER_METRE
+from ...schemas.errors import BadRequestError, TooLargeError
+from ...schemas.wire.answers import ContactsAnswers, Verdict
+from ...schemas.wire.requests import MAX_CONTACTS
+from ..avatars.avatar_model import AvatarModel
+from ..kernels.contacts.contact_clusters import (
+    CELLS,
+    CENTER,
+    CLUSTER,
+    CLUSTERS,
+    DROP,
+    HIGH,
+    LISTED,
+    LOW,
+    PAIRS,
+    POINT,
+    RECORD,
+    ROW,
+    SCAN,
+    SQUARE,
+    TAG,
+    Memory,
+    make_cells,
+)
+from ..kernels.contacts.contact_pairs import Asked, Tally, gather_contacts
+from ..kernels.core.voxel_layout import LANES
+from ..kernels.core.voxels_in_reach import Reach
+from ..kernels.overlap.overlap import STACK
+from ..runtime.stop_flag import NEVER
+from .context.proved_reach import find_proved_reach
+from .context.query_budget import EXACT, Effort
+from .context.query_context import SceneData, as_held, in_unknown, kernel_poses, pieces, to_units
+from .context.query_cost import Spent
+from .distance import signed_from_square
+
+# Pairs and clusters that one request may list, all poses together [bytes]; some three times as much is needed for a
+# moment, to make columns of them. The wire's largest message holds an eighth of it.
+MOST_BYTES = 256 << 20
+# Node visits between two looks at the clock, about a millisecond; and at what is listed, where there is no deadline.
+SLICE_VISITS = 1 << 15
+SIZE_VISITS = 1 << 19
+# Cells there is room for at first, a power of two and LANES or more; a kernel doubles them as it needs, up to
+# MOST_CELLS, which take 200 MB.
+FIRST_CELLS, MOST_CELLS = 256, 1 << 20
+
+
+def contacts(
+    data: SceneData,
+    avatar: AvatarModel,
+    poses: ArrayLike,
+    limit: int = 100,
+    margin: float = 0.0,
+    cluster_distance: float | None = None,
+    effort: Effort = EXACT,
+) -> ContactsAnswers:
+    """All pairs in contact under each pose: counted, the deepest `limit` listed, gathered into clusters.
+
+    poses, margin: as for `collide`.  limit: pairs listed a pose, 0 to MAX_CONTACTS; all are counted.
+    cluster_distance: edge of the grid cells that touched scan points fall in [m], rounded up to whole lattice steps,
+    at least one; cells lie on multiples of it from the dataset's origin. None: twice r_a + r_b + margin, r_b of the
+    largest sphere that the radius model has. Touched cells that share a face, an edge or a corner are one cluster:
+    points at most this far apart always are in one cluster, and points of two clusters are farther apart than it along
+    an axis.
+    Deepest is where |a - b| - r_a - r_b is least, r_b of the scan point's own sphere, compared exactly and not by the
+    rounded figure. Coincident points are pairs each. Ties go by scan point, avatar centre, avatar row, scan number.
+    effort: a budget leaves pairs out, and says so in `exact`; what is listed then is in contact, but there may be
+    deeper. A tolerance changes nothing: counting has no end that it would allow earlier.
+    CONTACT where a pair was found; else CLEAR, or UNKNOWN where not all in reach was looked at.
+    Raises BadRequestError, BadTransformError, TooLargeError.
+    """
+    begin = time.perf_counter()
+    array = kernel_poses(poses)
+    limit = _checked_limit(limit)
+    margin_units = to_units(margin, "margin")
+    edge_units = None if cluster_distance is None else to_units(cluster_distance, "cluster_distance")
+    spent = Spent(begin)
+    reach = find_proved_reach(data, avatar, array, data.radius_units + margin_units, effort, spent)
+    k = len(array)
+    tally = Tally(
+        np.zeros((3, k), np.int64), np.zeros(k, np.int64), np.zeros(k, bool), np.zeros((k, 4), np.int64)
+    )
+    memory = _empty_memory(limit)
+    if len(avatar.points):
+        edges = _edges(reach, edge_units, data.arrays.units_per_step)
+        asked = Asked(avatar.rows, edges, data.keeps_scan, limit, effort.visits, MOST_CELLS)
+        parts = list(pieces(reach, data.residency, effort.share, effort.stop))
+        for number, (which, rows, part) in enumerate(parts):
+            # A pose in several pieces is alone in each of them, and they follow one another.
+            closes = (
+                number + 1 == len(parts) or len(which) > 1 or parts[number + 1][0].tolist() != which.tolist()
+            )
+            if effort.spent:
+                memory = _gather(data, avatar, array, part, which, asked, closes, effort, memory, tally)
+                continue
+            with data.residency.hold(rows, effort.loads_until(), scan=effort.scan, stop=effort.stop) as held:
+                seen = as_held(data, held)
+                memory = _gather(seen, avatar, array, part, which, asked, closes, effort, memory, tally)
+            spent.add(held)
+    columns = _columns(data, reach, margin_units, tally, memory, len(avatar.points) > 0)
+    return ContactsAnswers(**columns, **spent.cost(data))
+
+
+def _checked_limit(limit: int) -> int:
+    """The number of pairs to list, as an int. Raises BadRequestError."""
+    try:
+        number = operator.index(limit)
+    except TypeError:
+        number = -1
+    if isinstance(limit, bool) or not 0 <= number <= MAX_CONTACTS:
+        raise BadRequestError(
+            f"limit {limit!r}: expected a whole number of pairs a pose, 0 to {MAX_CONTACTS}"
+        )
+    return number
+
+
+def _edges(reach: Reach, edge_units: int | None, units_per_step: float) -> NDArray[np.int64]:
+    """The edge (k,) of a cell under each pose [steps]. reach: its units are of the largest sphere."""
+    units = 2 * reach.units if edge_units is None else np.full(len(reach.units), edge_units)
+    steps = units / units_per_step
+    whole = np.rint(steps)
+    # A distance that is a whole number of steps but for its rounding is that number.
+    steps = np.where(np.abs(steps - whole) <= 1e-9 * whole + 1.0 / units_per_step, whole, np.ceil(steps))
+    return np.asarray(np.maximum(steps, 1.0).astype(np.int64))
+
+
+def _empty_memory(limit: int) -> Memory:
+    """Nothing found yet, nothing begun."""
+    return Memory(
+        make_cells(FIRST_CELLS, NEVER.flag), np.empty((limit, RECORD), np.int64), np.array([0, 0, 0, 0, -1]),
+        np.zeros(3, np.int64), np.empty((STACK, 2), np.int64), np.empty((0, RECORD), np.int64),
+        np.empty((0, CLUSTER), np.int64),
+    )  # fmt: skip
+
+
+def _gather(
+    data: SceneData,
+    avatar: AvatarModel,
+    poses: NDArray[np.float64],
+    part: Reach,
+    which: NDArray[np.int64],
+    asked: Asked,
+    closes: bool,
+    effort: Effort,
+    memory: Memory,
+    tally: Tally,
+) -> Memory:
+    """Answer one piece, to its end or to the deadline; what is left then is cut."""
+    memory.cursor[:] = 0, -1, 0
+    pause = SIZE_VISITS if effort.deadline == math.inf else SLICE_VISITS
+    while memory.cursor[0] < len(which):
+        if effort.spent:
+            asked = asked._replace(visits=-1)
+        memory = gather_contacts(
+            poses, avatar.arrays, data.arrays, part, which, asked, closes, pause, memory, tally
+        )
+        _check_room(memory)
+    return memory
+
+
+def _check_room(memory: Memory) -> None:
+    """TooLargeError where more is listed than a request may list, or a pose touches more cells than there may be."""
+    if memory.sizes[CELLS] + LANES > MOST_CELLS:
+        raise TooLargeError(
+            f"a pose touches {memory.sizes[CELLS]} cells or more, {MOST_CELLS - LANES} is the most: ask for "
+            "a larger cluster_distance"
+        )
+    pairs, clusters = int(memory.sizes[LISTED]), int(memory.sizes[CLUSTERS])
+    if 8 * (pairs * RECORD + clusters * CLUSTER) > MOST_BYTES:
+        raise TooLargeError(
+            f"{pairs} pairs and {clusters} clusters listed, more than the {MOST_BYTES >> 20} MiB of a request: ask for "
+            "fewer poses, a smaller limit or a larger cluster_distance"
+        )
+
+
+def _by_pose(rows: NDArray[np.int64], runs: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The rows of each pose's run (k, 2) first, count, one behind the other; with where each begins (k + 1,)."""
+    starts = np.concatenate([[0], np.cumsum(runs[:, 1])])
+    taken = np.arange(starts[-1]) + np.repeat(runs[:, 0] - starts[:-1], runs[:, 1])
+    return starts, rows[taken]
+
+
+def _columns(
+    data: SceneData, reach: Reach, margin_units: int, tally: Tally, memory: Memory, has_points: bool
+) -> dict[str, Any]:
+    """The fields of `ContactsAnswers` but the cost of the request."""
+    exact = ~tally.cut & (tally.counts[0] == 0)
+    if has_points:  # an empty avatar is clear, whatever is unknown here
+        exact &= ~in_unknown(reach.boxes, data.unknown, data.nothing_clear)
+    verdict = np.where(exact, Verdict.CLEAR, Verdict.UNKNOWN)
+    verdict[tally.pairs > 0] = Verdict.CONTACT
+    pair_starts, pairs = _by_pose(memory.pairs, tally.runs[:, :2])
+    cluster_starts, clusters = _by_pose(memory.clusters, tally.runs[:, 2:])
+    radii = reach.units - margin_units
+    avatar_point, cloud_point, signed = _places(data, pairs, np.repeat(radii, np.diff(pair_starts)))
+    cluster_avatar, cluster_cloud, deepest = _places(
+        data, clusters, np.repeat(radii, np.diff(cluster_starts))
+    )
+    low, high = clusters[:, LOW : LOW + 3], clusters[:, HIGH : HIGH + 3]
+    missing, visits, tests = np.minimum(tally.counts, np.iinfo(np.uint32).max).astype(np.uint32)
+    return {
+        "verdict": verdict.astype(np.uint8), "exact": exact, "pairs_found": tally.pairs,
+        "pair_starts": pair_starts, "avatar_point": avatar_point, "cloud_point": cloud_point,
+        "signed_distance": signed, "avatar_index": pairs[:, ROW].astype(np.int32),
+        "scan_index": pairs[:, SCAN].astype(np.int32), "cluster": pairs[:, TAG].astype(np.int32),
+        "cluster_starts": cluster_starts, "cluster_count": clusters[:, PAIRS].copy(), "cluster_deepest": deepest,
+        "cluster_avatar": cluster_avatar, "cluster_cloud": cluster_cloud,
+        "cluster_scan": clusters[:, SCAN].astype(np.int32),
+        "cluster_low": _to_world(data, low), "cluster_high": _to_world(data, high),
+        "outside": reach.outside, "voxels_missing": missing, "node_visits": visits, "point_tests": tests,
+    }  # fmt: skip
+
+
+def _to_world(data: SceneData, lattice: NDArray[np.int64]) -> NDArray[np.float64]:
+    """World positions (n, 3) [m] of lattice points, as schemas/archive/voxel_grid.py Lattice.to_world."""
+    return np.asarray(lattice * data.arrays.step + data.arrays.origin)
+
+
+def _places(
+    data: SceneData, records: NDArray[np.int64], radii: NDArray[np.int64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Avatar centres and scan points (n, 3), world [m], and signed distances (n,) [m] of records of pairs.
+
+    radii: (n,) int64, r_a + r_b with the largest sphere's r_b, exact units.
+    """
+    avatar = records[:, CENTER : CENTER + 3] / UNITS_PER_METRE + data.arrays.origin
+    return (
+        avatar,
+        _to_world(data, records[:, POINT : POINT + 3]),
+        signed_from_square(records[:, SQUARE], radii - records[:, DROP]),
+    )

@@ -1,0 +1,231 @@
+"""`collide` and `distance` with a budget, and a tolerance or none: bounds that hold whenever the search stops.
+
+See kernels/nearest/best_first_search.py for the search. Without a deadline one kernel call answers
+a request, and the same request gets
+the same answer. With one, the time left is shared among the poses left, and looked at between slices of the search.
+"""
+
+import math
+import time
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ....schemas.archive.units import UNITS_PER_METRE
+from ....schemas.wire.answers import CollideAnswers, Cost, DistanceAnswers, Verdict
+from ...avatars.avatar_model import AvatarModel
+from ...kernels.core.pose_transform import MAX_REACH_UNITS
+from ...kernels.core.voxels_in_reach import Reach
+from ...kernels.nearest.best_first_search import (
+    OPEN,
+    Goal,
+    Known,
+    end_search,
+    go_on,
+    make_search,
+    search_poses,
+)
+from ...kernels.nearest.nearest_pair import Nearest
+from ...runtime.stop_flag import Stop
+from .proved_reach import find_proved_reach
+from .query_budget import Effort
+from .query_context import SceneData, as_held, in_unknown, kernel_poses, pieces, to_units
+from .query_cost import Spent
+from .signed_distance import distance_columns, signed_bound, signed_from_square, unknown_gaps
+
+# Pairs the heap holds before the search turns depth first: half a megabyte a request.
+HEAP_PAIRS = 1 << 14
+# Node visits between two looks at the clock: some 20 to 100 µs.
+SLICE_VISITS = 2000
+# Voxels in reach of poses that are given up, looked up at a time: some 10 MB.
+LEFT_AT_A_TIME = 1 << 16
+# Bounds are widened by some exact units when they become metres; a tolerance below that is none.
+TOLERANCE_SLACK = 8.0
+
+
+class _Gathered(NamedTuple):
+    """What a request has found out: known, counts (3, k) uint32, and the fields of `Cost`."""
+
+    known: Known
+    counts: NDArray[np.uint32]
+    cost: Cost
+
+
+def _search_until(
+    data: SceneData,
+    avatar: AvatarModel,
+    array: NDArray[np.float64],
+    part: Reach,
+    which: NDArray[np.int64],
+    heap: int,
+    goal: Goal,
+    effort: Effort,
+    known: Known,
+    counts: NDArray[np.uint32],
+) -> None:
+    """Search for the poses `which`, each with its share of the time left. data: its arrays as held."""
+    deadline = effort.deadline
+    search = make_search(avatar.arrays, data.arrays, heap)
+    for done, pose in enumerate(which.tolist()):
+        now = time.perf_counter()
+        if effort.spent:
+            _leave_open(data, part, which[done:], effort.stop, known, counts)
+            return
+        share = now + (deadline - now) / (len(which) - done)
+        fresh, until = True, SLICE_VISITS
+        while True:
+            status = go_on(
+                array, avatar.arrays, data.arrays, data.broad, part, pose, fresh, until, search, goal, known, counts
+            )  # fmt: skip
+            if status != OPEN:
+                break
+            if effort.stop or time.perf_counter() >= share:
+                end_search(search, pose, known, counts)
+                break
+            fresh, until = False, until + SLICE_VISITS
+
+
+def _leave_open(
+    data: SceneData,
+    part: Reach,
+    left: NDArray[np.int64],
+    stop: Stop,
+    known: Known,
+    counts: NDArray[np.uint32],
+) -> None:
+    """Give up the poses `left`, all at once: a kernel call for each took a deadline of 5 ms to half a second.
+
+    Their bounds are what the index alone says: box to box, as in `unknown_gaps`. Once the stop is set, nothing is said.
+    """
+    if stop:
+        known.lower[left] = 0.0
+        return
+    lengths = part.starts[left + 1] - part.starts[left]
+    poses = np.repeat(left, lengths)
+    behind = np.concatenate([[0], np.cumsum(lengths)])
+    at = np.arange(behind[-1]) + np.repeat(part.starts[left] - behind[:-1], lengths)
+    own = (part.units / data.arrays.units_per_step)[:, None]
+    low, high = part.boxes[:, 0] + own, part.boxes[:, 1] - own
+    for begin in range(0, len(at), LEFT_AT_A_TIME):
+        if stop:
+            known.lower[poses[begin:]] = 0.0
+            return
+        pose, voxel = poses[begin : begin + LEFT_AT_A_TIME], part.rows[at[begin : begin + LEFT_AT_A_TIME]]
+        apart = np.maximum(data.broad.low[voxel] - high[pose], low[pose] - data.broad.high[voxel])
+        np.maximum(apart, 0.0, out=apart)
+        np.minimum.at(known.lower, pose, np.sqrt((apart * apart).sum(axis=1)) * (1.0 - 1e-9))
+        np.add.at(counts[0], pose, (data.arrays.where[voxel, 0] < 0).astype(np.uint32))
+
+
+def _gather(
+    data: SceneData,
+    avatar: AvatarModel,
+    array: NDArray[np.float64],
+    reach: Reach,
+    goal: Goal,
+    effort: Effort,
+    spent: Spent,
+) -> _Gathered:
+    """Search for all poses, piece by piece. What it takes is added to `spent`."""
+    k = len(array)
+    known = Known(
+        np.full(k, -1, np.int64), np.zeros((k, 6), np.int64), np.zeros(k, np.int64), np.full(k, math.inf),
+        np.full(k, math.inf), np.full(k, math.inf), np.zeros(k, bool),
+    )  # fmt: skip
+    counts = np.zeros((3, k), np.uint32)
+    residency = data.residency
+    for which, rows, part in (
+        pieces(reach, residency, effort.share, effort.stop) if len(avatar.points) else ()
+    ):
+        if effort.stop:
+            _leave_open(data, part, which, effort.stop, known, counts)
+            continue
+        heap = max(HEAP_PAIRS, int(np.diff(part.starts).max(initial=0)))
+        with residency.hold(rows, effort.loads_until(), scan=effort.scan, stop=effort.stop) as held:
+            seen = as_held(data, held)
+            if effort.deadline < math.inf:
+                _search_until(seen, avatar, array, part, which, heap, goal, effort, known, counts)
+            else:
+                search_poses(
+                    array, avatar.arrays, seen.arrays, data.broad, part, which, heap, goal, known, counts
+                )
+        spent.add(held)
+    return _Gathered(known, counts, Cost(**spent.cost(data)))
+
+
+def _fields(cost: Cost) -> dict[str, Any]:
+    return {name: getattr(cost, name) for name in Cost.__struct_fields__}
+
+
+def _upper(data: SceneData, known: Known, radii: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Signed distances (k,) [m] that some pair surely has at most; inf where no pair was bounded.
+
+    radii: (k,) of avatar's and scan's largest spheres together, exact units.
+    """
+    found = signed_from_square(np.maximum(known.square, 0), radii - known.drop)
+    signed = np.where(known.square >= 0, found, np.inf)
+    steps = known.upper * data.arrays.step * (1.0 + 1e-12)
+    return np.minimum(signed, steps - radii / UNITS_PER_METRE + 2.0 / UNITS_PER_METRE)
+
+
+def distance_bounded(
+    data: SceneData, avatar: AvatarModel, poses: ArrayLike, reach: float, effort: Effort
+) -> DistanceAnswers:
+    """`distance` (see there) with a budget, with a tolerance or without.
+
+    Ends when the bounds lie within the tolerance, or when the budget is spent; the bounds hold either way. A pair is
+    found before the tolerance ends anything; where the budget ended it first there may be none, `upper` can say
+    all the same that one is in reach.
+    """
+    array = kernel_poses(poses)
+    reach_units = to_units(reach, "reach")
+    spent = Spent(time.perf_counter())
+    around = find_proved_reach(data, avatar, array, data.radius_units + reach_units, effort, spent)
+    tolerance = max(0.0, effort.tolerance - TOLERANCE_SLACK / UNITS_PER_METRE) / data.arrays.step
+    goal = Goal(False, 0, np.zeros(len(array)), tolerance, effort.visits)
+    known, counts, cost = _gather(data, avatar, array, around, goal, effort, spent)
+    if len(avatar.points):
+        np.minimum(known.gap, unknown_gaps(data, around), out=known.gap)
+    # What was left open is as what is missing: somewhere, no nearer than that.
+    np.minimum(known.gap, known.lower, out=known.gap)
+    upper = _upper(data, known, around.units - reach_units)
+    nearest = Nearest(known.square, known.pair, known.drop, known.gap)
+    columns = distance_columns(data, around, float(reach), reach_units, nearest, counts, upper)
+    return DistanceAnswers(**columns, **_fields(cost))
+
+
+def collide_bounded(
+    data: SceneData, avatar: AvatarModel, poses: ArrayLike, margin: float, effort: Effort
+) -> CollideAnswers:
+    """`collide` (see there) with a budget, with a tolerance or without.
+
+    CONTACT where a pair is within the margin, or within margin and tolerance (then not `exact`); CLEAR where surely
+    none is; else UNKNOWN: the budget was spent, or something in reach is missing.
+    """
+    array = kernel_poses(poses)
+    margin_units = to_units(margin, "margin")
+    spent = Spent(time.perf_counter())
+    around = find_proved_reach(data, avatar, array, data.radius_units + margin_units, effort, spent)
+    radii = around.units - margin_units
+    early = math.floor(min(effort.tolerance * UNITS_PER_METRE, float(MAX_REACH_UNITS)))
+    # Sums of float64 on both sides of a comparison: some units of slack make it one of the true numbers.
+    certain = (around.units - TOLERANCE_SLACK) / data.arrays.units_per_step
+    enough = np.asarray((around.units + early - TOLERANCE_SLACK) / data.arrays.units_per_step, np.float64)
+    goal = Goal(True, early, enough, 0.0, effort.visits)
+    known, counts, cost = _gather(data, avatar, array, around, goal, effort, spent)
+    upper = _upper(data, known, radii)
+    found = known.square >= 0
+    truly = (found & (known.square <= (around.units - known.drop) ** 2)) | (known.upper <= certain)
+    contact = truly | found | (known.upper <= enough)
+    lost = (counts[0] > 0) | (known.lower < math.inf)
+    if len(avatar.points):
+        lost |= in_unknown(around.boxes, data.unknown, data.nothing_clear)
+        np.minimum(known.gap, unknown_gaps(data, around), out=known.gap)
+    floor = signed_bound(np.minimum(known.gap, known.lower), data, radii)
+    lower = np.minimum(np.maximum(floor, -radii / UNITS_PER_METRE), np.minimum(upper, margin))
+    verdict = np.where(contact, Verdict.CONTACT, np.where(lost, Verdict.UNKNOWN, Verdict.CLEAR))
+    return CollideAnswers(
+        verdict.astype(np.uint8), around.outside, counts[0], counts[1], counts[2], lower, upper,
+        truly | (verdict == Verdict.CLEAR), **_fields(cost),
+    )  # fmt: skip

@@ -1,0 +1,267 @@
+"""What every question about a scene shares: what it reads, poses checked, voxels in reach held piece by piece."""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ....schemas.archive.archive import Archive
+from ....schemas.archive.radius_model import class_radii
+from ....schemas.archive.units import UNITS_PER_METRE
+from ....schemas.archive.voxel_grid import MAX_COORDINATE
+from ....schemas.errors import BadRequestError, BadTransformError, SolidcloudError, TooLargeError
+from ....schemas.wire.requests import make_poses
+from ...avatars.avatar_model import AvatarModel
+from ...kernels.core import pose_transform as placing
+from ...kernels.core.voxel_layout import SceneArrays, block_words
+from ...kernels.core.voxels_in_reach import Reach, SceneIndex, find_reach
+from ...residency.coarse_bounds import Coarse
+from ...residency.index_proof import Bounds
+from ...residency.voxel_cache import Held, Residency
+from ...runtime.stop_flag import NEVER, Stop, StoppedError
+
+# Voxels in reach of all poses of one request: 128 MB of row numbers. The index would make gigabytes of them for 100,000
+# poses whose reach covers thousands of voxels.
+MOST_ROWS = 1 << 24
+# Rows looked at between two looks at the stop flag.
+_MARKED_AT_ONCE = 1 << 18
+
+_POSE_FAULTS: dict[int, tuple[type[SolidcloudError], str]] = {
+    placing.NOT_FINITE: (BadRequestError, "holds {}: expected finite numbers"),
+    placing.BAD_LAST_ROW: (BadTransformError, "has a last row that is not 0 0 0 1: give row-major 4x4 poses"),
+    placing.MIRRORED: (
+        BadTransformError,
+        "mirrors (determinant {:g}): expected a rotation, with a uniform scale at most",
+    ),
+    placing.SHEARED: (
+        BadTransformError,
+        "shears, or scales its axes differently (by {:g}, relative): expected a rotation, with a uniform scale at "
+        "most, within 1e-9: renormalise it",
+    ),
+    placing.BAD_SCALE: (BadTransformError, "scales by {:g}: expected 0.001 to 1000"),
+    placing.TOO_FAR: (BadTransformError, "translates by {:g} m: expected within 1e9 m"),
+    placing.LONG_REACH: (
+        BadRequestError,
+        "has radii and margin, or reach, that add up to {:g} m: expected at most 16 m: give a smaller one",
+    ),
+    placing.LARGE_AVATAR: (
+        TooLargeError,
+        "makes the avatar with its reach extend {:g} m: more than this scene's lattice can place exactly: split it",
+    ),
+}
+
+
+class SceneData(NamedTuple):
+    """What every question about one scene reads; made once, by `make_scene_data`.
+
+    arrays: what the kernels read.  bounds: boxes around the points of each voxel; broad: its index, which the broad
+    phase reads.  radius_units: of the largest sphere of a scan point, exact units.  unknown: (u, 2, 3) int64, lattice
+    boxes of scans left out; unknown_everywhere: also elsewhere.  keeps_scan: whether the arena holds the scan each
+    point came from.  coarse: what is known of voxels that are not in memory; None: nothing is.
+    """
+
+    residency: Residency
+    arrays: SceneArrays
+    bounds: Bounds
+    broad: SceneIndex
+    radius_units: int
+    unknown: NDArray[np.int64]
+    unknown_everywhere: bool
+    keeps_scan: bool
+    coarse: Coarse | None = None
+
+    @property
+    def nothing_clear(self) -> bool:
+        """Whether no place is known to be clear: a scan was left out anywhere, or a load found the index wrong."""
+        return self.unknown_everywhere or self.residency.misled
+
+
+def kernel_poses(poses: ArrayLike) -> NDArray[np.float64]:
+    """Poses (k, 4, 4) as kernels take them: numba would compile them anew for a read-only array. BadRequestError."""
+    array = make_poses(poses)
+    return array if array.flags.writeable else array.copy()
+
+
+def to_units(metres: float, what: str) -> int:
+    """A length in exact units, rounded once (NUMERICS.md N5). Raises BadRequestError for a negative or absurd one."""
+    if not 0 <= metres <= MAX_COORDINATE:  # not so for NaN either; kernels take the result as int64
+        raise BadRequestError(f"{what} {metres!r}: expected zero or a positive length in metres")
+    return round(metres * UNITS_PER_METRE)  # half to even
+
+
+def make_scene_data(
+    archive: Archive, residency: Residency, bounds: Bounds | None = None, coarse: Coarse | None = None
+) -> SceneData:
+    """What the questions read of an archive whose voxels `residency` holds; radii are the archive's one figure.
+
+    bounds: those of its voxels, where somebody else has use for them too. Loads prove them from now on.
+    """
+    bounds = Bounds(archive) if bounds is None else bounds
+    residency.proved = bounds.prove
+    header = archive.header
+    lattice = header.lattice
+    arrays = SceneArrays(
+        *residency.buffer.arena,
+        residency.where,
+        archive.coordinates,
+        np.array(lattice.origin),
+        lattice.step,
+        lattice.units_per_step,
+        lattice.voxel_steps,
+        block_words(header.radius_class),
+        np.zeros(1, np.int64),
+        NEVER.flag,
+    )
+    return SceneData(
+        residency,
+        arrays,
+        bounds,
+        bounds.index,
+        to_units(header.radius, "radius of the archive"),
+        header.unknown,
+        header.unknown_everywhere,
+        header.scan_index,
+        coarse,
+    )
+
+
+def with_radius_model(data: SceneData, archive: Archive, text: str | None) -> SceneData:
+    """The same scene with the radii of a model (schemas/archive/radius_model.py); None: the archive's one figure.
+
+    Raises BadRequestError for a model that is none, or that the archive does not hold.
+    """
+    header = archive.header
+    radii = class_radii(text, header.radius, header.models)
+    # Of the classes that there are: on a dense scan all are small, and so is what is in reach. A node may have a class
+    # that no point has; its points' spheres are none the larger.
+    largest = int(radii[header.radius_counts > 0].max()) if len(radii) > 1 else int(radii[0])
+    drop = np.maximum(largest - radii, 0)
+    return data._replace(arrays=data.arrays._replace(drop=drop), radius_units=largest)
+
+
+def with_stop(data: SceneData, stop: Stop) -> SceneData:
+    """Return the same scene for a request that `stop` ends early, and no other stop."""
+    return (
+        data if data.arrays.stop is stop.flag else data._replace(arrays=data.arrays._replace(stop=stop.flag))
+    )
+
+
+def _empty_reach(k: int, rows: int) -> Reach:
+    """A `Reach` to be filled for k poses with room for so many voxel rows."""
+    return Reach(
+        np.empty(k), np.empty(k, np.int64), np.zeros(k + 1, np.int64), np.empty(rows, np.int64), np.empty((k, 2, 3)),
+        np.zeros(k, bool),
+    )  # fmt: skip
+
+
+def refuse(fault: int, pose: int, found: float) -> None:
+    """Raise what a fault that `find_reach` found stands for, if it is one."""
+    if fault != placing.GOOD:
+        error, text = _POSE_FAULTS[fault]
+        raise error(f"pose {pose} {text.format(found)}")
+
+
+def check_request(
+    data: SceneData, avatar: AvatarModel, poses: NDArray[np.float64], other_units: int
+) -> Reach:
+    """The voxels in reach of each pose (k, 4, 4); none for an empty avatar.
+
+    Raises BadRequestError, BadTransformError or TooLargeError naming the pose, TooLargeError for more than MOST_ROWS
+    voxels in reach of all poses, and StoppedError.
+    """
+    needed = 16 * len(poses) + 64
+    while True:
+        reach = _empty_reach(len(poses), needed)
+        fault, pose, found, needed = find_reach(
+            poses, avatar.arrays, avatar.radius, other_units, data.arrays, data.broad, reach
+        )
+        refuse(fault, pose, found)
+        if needed < 0:
+            raise StoppedError
+        if needed <= len(reach.rows):
+            return reach
+        if needed > MOST_ROWS:
+            raise TooLargeError(
+                f"{needed} voxels in reach of {len(poses)} poses: at most {MOST_ROWS} in a request: ask about fewer "
+                "poses, or with a smaller margin or reach"
+            )
+
+
+def pieces(
+    reach: Reach, residency: Residency, share: float = 1.0, stop: Stop = NEVER
+) -> Iterator[tuple[NDArray[np.int64], list[int], Reach]]:
+    """Cut a request into pieces whose voxels fit the budget: (pose numbers, voxel rows, reach) each.
+
+    share: of the budget, what a piece may take, but for a voxel that alone takes more.  stop: once it is set, the last
+    piece has all poses that are left, and no voxels.
+
+    Nearly always one piece. A pose that alone reaches more than the budget is looked at voxel by voxel run
+    (NUMERICS.md case 23), and so appears in several pieces.
+    """
+    k = len(reach.scales)
+    rows = reach.rows[: reach.starts[k]]
+    everything = (distinct_rows(rows, len(residency.where), stop) if k > 1 else rows).tolist()
+    budget = int(residency.buffer.total_bytes * share)
+    if residency.bytes_of(everything) <= budget:
+        yield np.arange(k), everything, reach
+        return
+    which: list[int] = []
+    held: dict[int, None] = {}
+    held_bytes = 0
+    for pose in range(k):
+        if stop:
+            yield np.concatenate([np.array(which, np.int64), np.arange(pose, k)]), [], reach
+            return
+        own = reach.rows[reach.starts[pose] : reach.starts[pose + 1]].tolist()
+        fresh = [row for row in own if row not in held]
+        if which and held_bytes + residency.bytes_of(fresh) > budget:
+            yield np.array(which), list(held), reach
+            which, held, held_bytes, fresh = [], {}, 0, own
+        if residency.bytes_of(own) <= budget:
+            which.append(pose)
+            held.update(dict.fromkeys(fresh))
+            held_bytes += residency.bytes_of(fresh)
+            continue
+        for part in residency.parts_that_fit(own, budget):
+            yield np.array([pose]), part, _only(reach, pose, part)
+    if which:
+        yield np.array(which), list(held), reach
+
+
+def distinct_rows(rows: NDArray[np.int64], voxels: int, stop: Stop) -> NDArray[np.int64]:
+    """Return the distinct values of `rows`, ascending; not all of them where the stop is set meanwhile."""
+    if len(rows) <= _MARKED_AT_ONCE:
+        return np.unique(rows)  # a sort in numpy lets other threads run meanwhile
+    met = np.zeros(voxels, bool)
+    for begin in range(0, len(rows), _MARKED_AT_ONCE):
+        if stop:
+            break
+        met[rows[begin : begin + _MARKED_AT_ONCE]] = True
+    return np.flatnonzero(met)
+
+
+def _only(reach: Reach, pose: int, rows: list[int]) -> Reach:
+    """The same request with the voxels of one pose replaced by some of them."""
+    starts = np.zeros_like(reach.starts)
+    starts[pose + 1 :] = len(rows)
+    return reach._replace(starts=starts, rows=np.array(rows, np.int64))
+
+
+def as_held(data: SceneData, held: Held) -> SceneData:
+    """What a kernel may read while `held`: what is late is not resident, though it may become so meanwhile."""
+    if not held.late:
+        return data
+    where = data.arrays.where.copy()  # rows that others write now are not among those held, or late
+    where[list(held.late)] = -1
+    return data._replace(arrays=data.arrays._replace(where=where))
+
+
+def in_unknown(boxes: NDArray[np.float64], unknown: NDArray[np.int64], everywhere: bool) -> NDArray[np.bool_]:
+    """Which boxes (k, 2, 3) of reach meet a region (u, 2, 3) whose scan was left out."""
+    if everywhere:
+        return np.ones(len(boxes), bool)
+    met = np.zeros(len(boxes), bool)
+    for low, high in unknown:
+        met |= ((boxes[:, 0] <= high) & (boxes[:, 1] >= low)).all(axis=1)
+    return met

@@ -1,0 +1,105 @@
+"""Squares of integers -> signed distances in metres, and the bounds of what was not looked at.
+
+The definition, in the integers of NUMERICS.md N5: with D2 = |a - b|^2 and r = r_a + r_b, the pair's own radii, each
+rounded once to exact units, of all pairs of placed avatar centre a and scan point b the one with the least gap
+sqrt(D2) - r, compared exactly; its signed distance is
+
+    (D2 - r^2) / (sqrt(D2) + r) / 2^26 m
+
+The difference in int64, the rest in float64, in this order; 0 where D2 and r are. That is sqrt(D2) - r without
+cancellation: it is negative, zero or positive as the spheres overlap, touch or do not. No pair has a lesser gap, so it
+is positive exactly where no pair of spheres is in contact. Where all scan points have one radius, the pair is that with
+the least D2.
+"""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ....schemas.archive.units import UNITS_PER_METRE
+from ....schemas.wire.answers import Verdict
+from ...kernels.core.voxels_in_reach import Reach
+from ...kernels.nearest.nearest_pair import Nearest
+from .query_context import SceneData
+
+
+def signed_from_square(square: NDArray[np.int64], radii: NDArray[np.int64]) -> NDArray[np.float64]:
+    """The signed distances (k,) [m] of pairs with |a - b|^2 = square and r_a + r_b = radii, exact units."""
+    above = (square - radii * radii).astype(np.float64)
+    both = np.sqrt(square.astype(np.float64)) + radii.astype(np.float64)
+    return np.divide(above, both, out=np.zeros(len(square)), where=both > 0) / UNITS_PER_METRE
+
+
+def signed_bound(
+    steps: NDArray[np.float64], data: SceneData, radii: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Signed distances (k,) [m] that are surely not above what centres at least `steps` apart have.
+
+    radii: (k,) of avatar's and scan's largest spheres together, exact units.
+    """
+    metres = steps * data.arrays.step * (1.0 - 1e-12)
+    return metres - radii / UNITS_PER_METRE - 2.0 / UNITS_PER_METRE
+
+
+def unknown_gaps(data: SceneData, reach: Reach) -> NDArray[np.float64]:
+    """How far (k,) an avatar's centres are at least from any region whose scan was left out [steps]; inf: none."""
+    k = len(reach.scales)
+    if data.nothing_clear:
+        return np.zeros(k)
+    # The boxes hold the avatar's centres and the reach around them.
+    own = (reach.units / data.arrays.units_per_step)[:, None]
+    low, high = reach.boxes[:, 0] + own, reach.boxes[:, 1] - own
+    gaps = np.full(k, np.inf)
+    for region_low, region_high in data.unknown:
+        apart = np.maximum(np.maximum(region_low - high, low - region_high), 0.0)
+        gaps = np.minimum(gaps, np.sqrt((apart * apart).sum(axis=1)) * (1.0 - 1e-9))
+    return gaps
+
+
+def distance_columns(
+    data: SceneData,
+    reach: Reach,
+    farthest: float,
+    reach_units: int,
+    nearest: Nearest,
+    counts: NDArray[np.uint32],
+    upper: NDArray[np.float64] | None = None,
+) -> dict[str, Any]:
+    """The fields of `DistanceAnswers` that say where the nearest pair is.
+
+    farthest: the reach asked for [m].  reach_units: the same, exact units.  nearest: what was found; its gap counts
+    missing voxels, unknown regions and what was not looked at.  upper: (k,) [m], where more is known than the
+    pair found says.
+    """
+    radii = reach.units - reach_units  # of the largest spheres
+    found = nearest.square >= 0
+    signed = np.where(found, signed_from_square(np.maximum(nearest.square, 0), radii - nearest.drop), np.inf)
+    floor = np.maximum(signed_bound(nearest.gap, data, radii), -radii / UNITS_PER_METRE)
+    # `farthest` itself may be a rounding above what the reach is in exact units.
+    exact = floor >= np.where(found, signed, farthest)
+    upper = signed if upper is None else np.where(exact, signed, np.where(upper <= farthest, upper, np.inf))
+    lower = np.where(exact, np.minimum(signed, farthest), np.minimum(np.minimum(upper, floor), farthest))
+    verdict = np.where(upper <= 0, Verdict.CONTACT, np.where(lower > 0, Verdict.CLEAR, Verdict.UNKNOWN))
+    verdict[exact & (signed > 0)] = Verdict.CLEAR
+    origin = data.arrays.origin
+    difference = (nearest.pair[:, 3:] - _units_of(data, nearest.pair[:, :3])).astype(np.float64)
+    length = np.sqrt(np.maximum(nearest.square, 0).astype(np.float64))[:, None]
+    normal = np.divide(difference, length, out=np.zeros((len(found), 3)), where=length > 0)
+    nowhere = ~found
+    witness_avatar = nearest.pair[:, 3:] / UNITS_PER_METRE + origin
+    witness_cloud = (
+        nearest.pair[:, :3] * data.arrays.step + origin
+    )  # as schemas/archive/voxel_grid.py Lattice.to_world
+    for column in (normal, witness_avatar, witness_cloud):
+        column[nowhere] = np.nan
+    return {
+        "verdict": verdict.astype(np.uint8), "signed_distance": signed, "lower": lower, "upper": upper.copy(),
+        "exact": exact, "witness_avatar": witness_avatar, "witness_cloud": witness_cloud, "normal": normal,
+        "outside": reach.outside, "voxels_missing": counts[0], "node_visits": counts[1], "point_tests": counts[2],
+    }  # fmt: skip
+
+
+def _units_of(data: SceneData, lattice: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Exact units (k, 3) of lattice points: one product, half to even (NUMERICS.md N5)."""
+    return np.rint(lattice.astype(np.float64) * data.arrays.units_per_step).astype(np.int64)

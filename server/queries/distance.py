@@ -1,0 +1,72 @@
+"""`distance`: how far an avatar is from the scene, and where.
+
+One request -> one result. signed_distance.py defines it.
+"""
+
+import math
+import time
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ...schemas.wire.answers import DistanceAnswers
+from ..avatars.avatar_model import AvatarModel
+from ..kernels.nearest.nearest_pair import Nearest
+from ..kernels.nearest.nearest_search import nearest_poses
+from .context.anytime_search import distance_bounded
+from .context.proved_reach import find_proved_reach
+from .context.query_budget import EXACT, NO_LIMIT, Effort
+from .context.query_context import SceneData, as_held, kernel_poses, pieces, to_units
+from .context.query_cost import Spent
+from .context.signed_distance import distance_columns, signed_from_square, unknown_gaps
+
+__all__ = ["distance", "signed_from_square"]
+
+
+def distance(
+    data: SceneData, avatar: AvatarModel, poses: ArrayLike, reach: float, effort: Effort = EXACT
+) -> DistanceAnswers:
+    """How far the avatar is from the scene under each pose, up to `reach` [m].
+
+    poses: (k, 4, 4) float64, avatar to world, rigid or with a uniform scale.  reach: pairs whose spheres are farther
+    apart than this do not count; with the largest radii at most 16 m. Where a voxel in reach is missing, or a scan was
+    left out, the distance is that of the nearest pair looked at, exact only if what is missing can hold no nearer one.
+    Raises BadRequestError, BadTransformError, TooLargeError.
+    """
+    if effort.limited:
+        return distance_bounded(data, avatar, poses, reach, effort)
+    begin = time.perf_counter()
+    array = kernel_poses(poses)
+    reach_units = to_units(reach, "reach")
+    k = len(array)
+    residency, spent = data.residency, Spent(begin)
+    around = find_proved_reach(data, avatar, array, data.radius_units + reach_units, effort, spent)
+    nearest = Nearest(
+        np.full(k, -1, np.int64), np.zeros((k, 6), np.int64), np.zeros(k, np.int64), np.full(k, math.inf)
+    )
+    counts = np.zeros((3, k), np.uint32)
+    if len(avatar.points):
+        for which, rows, part in pieces(around, residency, effort.share, effort.stop):
+            if effort.stop:
+                nearest.gap[which] = 0.0
+                continue
+            with residency.hold(rows, effort.loads_until(), scan=effort.scan, stop=effort.stop) as held:
+                seen = as_held(data, held)
+                nearest_poses(
+                    array,
+                    avatar.arrays,
+                    seen.arrays,
+                    data.broad,
+                    part,
+                    reach_units,
+                    which,
+                    NO_LIMIT,
+                    nearest,
+                    counts,
+                )
+            spent.add(held)
+        np.minimum(nearest.gap, unknown_gaps(data, around), out=nearest.gap)
+    return DistanceAnswers(
+        **distance_columns(data, around, float(reach), reach_units, nearest, counts),
+        **spent.cost(data),
+    )

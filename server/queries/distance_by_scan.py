@@ -1,0 +1,65 @@
+"""How near each scan of an archive comes to an avatar under one pose: what noise of scans is asked of."""
+
+import time
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..avatars.avatar_model import AvatarModel
+from ..kernels.nearest.nearest_by_scan import Nearer, nearest_by_scan
+from .context.proved_reach import find_proved_reach
+from .context.query_budget import EXACT, Effort
+from .context.query_context import SceneData, as_held, in_unknown, kernel_poses, pieces, to_units
+from .context.query_cost import Spent
+
+# The number of a point's scan where the archive does not keep it.
+ANY_SCAN = -1
+
+
+class ScanGaps(NamedTuple):
+    """gaps: least signed gap [m] of each scan that comes within the margin, by its row in `SceneInfo.sources`.
+
+    exact: whether all in reach was looked at.  node_visits, point_tests: what it took.
+    """
+
+    gaps: dict[int, float]
+    exact: bool
+    node_visits: int = 0
+    point_tests: int = 0
+
+
+def gaps_by_scan(
+    data: SceneData, avatar: AvatarModel, pose: ArrayLike, margin: float, scans: int, effort: Effort = EXACT
+) -> ScanGaps:
+    """The least signed gap of every scan to the avatar under a pose (4, 4), where it is at most `margin` [m].
+
+    data: of an archive that keeps the scan of each point.  scans: so many there are. The pairs are those in contact by
+    `contacts` with that margin, and a scan's gap is that of its deepest pair, but for the last bits: of pairs whose
+    gaps are the same but for the rounding of the figure, either. A point whose number no scan has counts as of
+    ANY_SCAN.  effort: a budget leaves pairs out, and says so in `exact`.
+    Raises BadRequestError, BadTransformError, TooLargeError.
+    """
+    poses = kernel_poses(np.asarray(pose)[None])
+    margin_units = to_units(margin, "margin")
+    units = data.radius_units + margin_units
+    reach = find_proved_reach(data, avatar, poses, units, effort, Spent(time.perf_counter()))
+    if not len(avatar.points):
+        return ScanGaps({}, True)
+    nearer = Nearer(np.full(scans + 1, np.inf), np.full(scans + 1, reach.units[0]))
+    counts, exact = np.zeros(3, np.int64), True
+    for _, rows, part in pieces(reach, data.residency, effort.share, effort.stop):
+        if effort.spent:
+            exact = False
+            break
+        with data.residency.hold(rows, effort.loads_until(), scan=effort.scan, stop=effort.stop) as held:
+            arrays = as_held(data, held).arrays
+            exact &= bool(
+                nearest_by_scan(
+                    poses, avatar.arrays, arrays, part, margin_units, effort.visits, nearer, counts
+                )
+            )
+    exact &= counts[0] == 0 and not in_unknown(reach.boxes, data.unknown, data.nothing_clear)[0]
+    found = np.flatnonzero(nearer.gaps < np.inf).tolist()
+    gaps = {ANY_SCAN if number == scans else number: float(nearer.gaps[number]) for number in found}
+    return ScanGaps(gaps, bool(exact), int(counts[1]), int(counts[2]))

@@ -1,0 +1,235 @@
+"""`objects`: several avatars at once, against the scene and against one another. One request -> one result.
+
+Nothing is kept between requests: a door or a vehicle is an object of the request, with its pose of the moment.
+"""
+
+import time
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ...schemas.archive.units import UNITS_PER_METRE
+from ...schemas.errors import BadRequestError, BadTransformError
+from ...schemas.wire.answers import ObjectsAnswers
+from ..avatars.avatar_model import AvatarModel
+from ..kernels.bodies.body_pairs import CLEAR, UNKNOWN, bound_objects, sweep_and_prune, touch_pairs
+from ..kernels.core.pose_transform import MAX_REACH_UNITS, check_poses
+from ..runtime.stop_flag import NEVER
+from .collide import collide
+from .context.query_budget import EXACT, Effort
+from .context.query_context import SceneData, kernel_poses, refuse, to_units, with_stop
+from .context.query_cost import Spent
+
+# The scene's own group: an object whose mask lacks this bit is not tested against the scene.
+SCENE_GROUP = 1 << 31
+# Pairs between two looks at a deadline.
+TIMED_PAIRS = 64
+# How far from the dataset's origin an object may be put [m]: exact units of 2^37 m do not fit 63 bits. Against the
+# scene nothing so far is ever compared; objects are compared wherever they are.
+MAX_PLACE = 1e11
+
+
+class Placing(NamedTuple):
+    """n objects, checked. models: the distinct avatars.  model_of: (n,) int64.  poses: (n, 4, 4).  groups, masks: (n,)
+    uint32.  scales: (n,).  units: (n,) int64, radii as placed, exact units.  margin_units: of each pair."""
+
+    models: list[AvatarModel]
+    model_of: NDArray[np.int64]
+    poses: NDArray[np.float64]
+    groups: NDArray[np.uint32]
+    masks: NDArray[np.uint32]
+    scales: NDArray[np.float64]
+    units: NDArray[np.int64]
+    margin_units: int
+
+
+class Met(NamedTuple):
+    """What objects do to one another; the fields of `ObjectsAnswers`."""
+
+    pairs: NDArray[np.int32]
+    pair_verdict: NDArray[np.uint8]
+    pairs_tested: int
+    pairs_filtered: int
+    pair_visits: int
+    pair_tests: int
+
+
+def objects(
+    data: SceneData,
+    avatars: Sequence[AvatarModel],
+    poses: ArrayLike,
+    groups: ArrayLike,
+    masks: ArrayLike,
+    margin: float = 0.0,
+    effort: Effort = EXACT,
+) -> ObjectsAnswers:
+    """Which of n objects touch the scene, and which touch one another.
+
+    avatars: n, of which several may be the same.  poses: (n, 4, 4) float64, avatar to world.  groups, masks: (n,)
+    uint32, bits: a pair is tested when each one's group has a bit in common with the other's mask. The scene's group is
+    SCENE_GROUP, its mask all.  margin: of each pair, and of each object with the scene [m].
+    Contact is as NUMERICS.md N5 has it, of two objects too: kernels/bodies/body_pairs.py; a radius
+    model is of the scan's spheres
+    and of no object's. No tolerance is used, as these answers could not say where they are early by it; visits are
+    counted an object and a pair. Pairs that a budget cuts off are listed as UNKNOWN.
+    Raises BadRequestError, BadTransformError, TooLargeError.
+    """
+    begin = time.perf_counter()
+    placing = _check(data, avatars, poses, groups, masks, margin)
+    n = len(placing.poses)
+    verdict, outside, counts = np.zeros(n, np.uint8), np.zeros(n, bool), np.zeros((3, n), np.uint32)
+    spent = Spent(begin)
+    for number, model in enumerate(placing.models):
+        rows = np.flatnonzero((placing.model_of == number) & ((placing.masks & SCENE_GROUP) > 0))
+        if not len(rows):
+            continue
+        if effort.spent:
+            verdict[rows] = UNKNOWN
+            continue
+        found = collide(data, model, placing.poses[rows], margin, effort._replace(tolerance=0.0))
+        verdict[rows], outside[rows] = found.verdict, found.outside
+        counts[:, rows] = found.voxels_missing, found.node_visits, found.point_tests
+        spent.add_cost(found, data)
+    met = _meet(placing, data.arrays.origin, effort)
+    return ObjectsAnswers(
+        verdict, outside, counts[0], counts[1], counts[2], *met, **spent.cost(data)
+    )  # fmt: skip
+
+
+def _check(
+    data: SceneData,
+    avatars: Sequence[AvatarModel],
+    poses: ArrayLike,
+    groups: ArrayLike,
+    masks: ArrayLike,
+    margin: float,
+) -> Placing:
+    """Return the objects of a request; all poses are admitted and all reaches are within what squares in 63 bits allow.
+
+    This takes milliseconds for the most objects of a request, and so does not look at the stop.
+    """
+    data = with_stop(data, NEVER)
+    array = kernel_poses(poses)
+    n = len(array)
+    group, mask = np.asarray(groups, np.uint32), np.asarray(masks, np.uint32)
+    if not len(avatars) == n == len(group) == len(mask):
+        raise BadRequestError(
+            f"{len(avatars)} avatars, {n} poses, {len(group)} groups, {len(mask)} masks: expected as many of each"
+        )
+    distinct = {id(avatar): avatar for avatar in avatars}
+    numbers = {key: number for number, key in enumerate(distinct)}
+    model_of = np.array([numbers[id(avatar)] for avatar in avatars], np.int64)
+    margin_units = to_units(margin, "margin")
+    scales, units = np.empty(n), np.empty(n, np.int64)
+    for number, model in enumerate(distinct.values()):
+        rows = np.flatnonzero(model_of == number)
+        scale, unit = np.ones(len(rows)), np.zeros(len(rows), np.int64)
+        fault, pose, found = check_poses(
+            array[rows], model.arrays.radius, model.radius, 0, data.arrays, scale, unit
+        )
+        refuse(fault, int(rows[pose]), found)
+        scales[rows], units[rows] = scale, unit
+        _check_places(model, array, rows, scale, data.arrays.origin)
+    if n > 1:
+        first, second = (int(row) for row in np.argsort(-units, kind="stable")[:2])
+        together = int(units[first] + units[second]) + margin_units
+        if together > MAX_REACH_UNITS:
+            raise BadRequestError(
+                f"objects {first} and {second} have radii and margin that add up to {together / UNITS_PER_METRE:g} m: "
+                "expected at most 16 m: give a smaller margin or radius"
+            )
+    return Placing(list(distinct.values()), model_of, array, group, mask, scales, units, margin_units)
+
+
+def _check_places(
+    model: AvatarModel,
+    poses: NDArray[np.float64],
+    rows: NDArray[np.int64],
+    scales: NDArray[np.float64],
+    origin: NDArray[np.float64],
+) -> None:
+    """Raise BadTransformError for an object, of those of one avatar, that is put too far away for exact units."""
+    if not len(model.points):
+        return
+    center = np.abs(poses[rows, :3, :3]) @ np.abs(model.arrays.center[0]) + np.abs(
+        poses[rows, :3, 3] - origin
+    )
+    farthest = center.max(axis=1) + scales * model.arrays.radius[0]
+    if (farthest > MAX_PLACE).any():
+        i = int(farthest.argmax())
+        raise BadTransformError(
+            f"object {rows[i]} reaches {farthest[i]:g} m from the dataset's origin: expected within {MAX_PLACE:g} m"
+        )
+
+
+def find_pairs(placing: Placing, origin: NDArray[np.float64]) -> tuple[NDArray[np.int64], int]:
+    """Return pairs (p, 2) of objects that could touch and may, first < second, ascending; and how many more may not.
+
+    Sweep and prune, along the axis on which the objects' root spheres are spread farthest. This takes milliseconds for
+    the most objects of a request, and so does not look at the stop.
+    """
+    full = [number for number, model in enumerate(placing.models) if len(model.points)]
+    present = np.flatnonzero(np.isin(placing.model_of, full))
+    low, high = np.zeros((len(placing.poses), 3)), np.zeros((len(placing.poses), 3))
+    for number in full:
+        rows = np.flatnonzero(placing.model_of == number)
+        bound_objects(
+            placing.models[number].arrays, placing.poses, rows, placing.scales, placing.units, origin,
+            placing.margin_units, low, high,
+        )  # fmt: skip
+    if len(present) < 2:
+        return np.empty((0, 2), np.int64), 0
+    axis = int(np.argmax(np.ptp(low[present] + high[present], axis=0)))
+    axes = [axis, (axis + 1) % 3, (axis + 2) % 3]
+    low, high = np.ascontiguousarray(low[:, axes]), np.ascontiguousarray(high[:, axes])
+    order = present[np.argsort(low[present, 0], kind="stable")]
+    capacity = 8 * len(present)
+    while True:
+        pairs = np.empty((capacity, 2), np.int32)
+        found, filtered = sweep_and_prune(order, low, high, placing.groups, placing.masks, NEVER.flag, pairs)
+        if found <= capacity:
+            break
+        capacity = found
+    # One number a pair: a sort by two keys takes ten times as long.
+    n = len(placing.poses)
+    numbers = np.sort(pairs[:found, 0].astype(np.int64) * n + pairs[:found, 1])
+    return np.column_stack((numbers // n, numbers % n)), filtered
+
+
+def _meet(placing: Placing, origin: NDArray[np.float64], effort: Effort) -> Met:
+    """Test the pairs, those of the same two avatars in one kernel call unless there is a deadline."""
+    pairs, filtered = find_pairs(placing, origin)
+    kinds = placing.model_of[pairs]
+    # As contact is symmetric, each two avatars need be met in one order only.
+    turned = kinds[:, 0] > kinds[:, 1]
+    ordered = np.where(turned[:, None], pairs[:, ::-1], pairs)
+    models = len(placing.models)
+    # One number a kind: sorting rows of two would keep the interpreter, for a second where there are 10^6 pairs.
+    kind = kinds.min(axis=1) * models + kinds.max(axis=1)
+    order = np.argsort(kind, kind="stable")
+    firsts = np.flatnonzero(np.diff(kind[order], prepend=-1))
+    verdict = np.full(len(pairs), UNKNOWN, np.uint8)
+    counters = np.zeros(2, np.int64)
+    tested = 0
+    for first, last in zip(firsts.tolist(), [*firsts[1:].tolist(), len(order)], strict=False):
+        if effort.spent:
+            break
+        rows = order[first:last]
+        a, b = divmod(int(kind[rows[0]]), models)
+        step = TIMED_PAIRS if effort.deadline < np.inf else len(rows)
+        for begin in range(0, len(rows), step):
+            if effort.spent:
+                break
+            part = rows[begin : begin + step]
+            found = np.empty(len(part), np.uint8)
+            touch_pairs(
+                placing.models[a].arrays, placing.models[b].arrays, placing.poses, placing.scales, placing.units,
+                ordered[part], placing.margin_units, origin, effort.visits, effort.stop.flag, found, counters,
+            )  # fmt: skip
+            verdict[part] = found
+            tested += len(part)
+    listed = verdict != CLEAR
+    visits, tests = counters.tolist()
+    return Met(pairs[listed].astype(np.int32), verdict[listed], tested, filtered, visits, tests)

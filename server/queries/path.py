@@ -1,0 +1,175 @@
+"""`path`: one question asked along thousands of poses, its answers in parts, order kept.
+
+Parts are computed by a few threads ahead of whoever takes them; kernels hold no GIL. How many answers a part holds
+follows from how long they took so far, so that the first part comes soon and no part keeps others waiting for long.
+What is answered does not depend on it, cost counters of a part apart.
+"""
+
+import math
+import time
+from collections import deque
+from collections.abc import Callable, Generator
+from concurrent.futures import Executor, Future
+from typing import Any, Protocol
+
+import numpy as np
+
+from ...schemas.errors import SolidcloudError
+from ...schemas.wire.answers import PATH_ANSWERS, ContactsAnswers, Cost, Part
+from ...schemas.wire.arrays import Poses
+from ...schemas.wire.columns import as_part, in_pieces
+from ...schemas.wire.requests import check_path_parameters
+from ..avatars.avatar_model import AvatarModel
+from ..kernels.core.pose_transform import check_poses
+from ..runtime.deadlines import stop_at
+from ..runtime.stop_flag import NEVER, Stop
+from .collide import collide
+from .contacts import contacts
+from .context.query_budget import make_effort
+from .context.query_context import SceneData, kernel_poses, refuse, to_units, with_stop
+from .distance import distance
+from .stopped_answers import ask_until_stopped, unknown_part
+from .sweep import sweep
+
+# Parts computed at a time, by default.
+PATH_THREADS = 2
+# Answers in a part. The first is small, so that it comes soon; later ones take about PART_SECONDS. At 1,024 answers the
+# overhead of a part, a few tenths of a millisecond with zenoh, is a few per cent of the fastest question.
+FIRST_PART = 64
+LARGEST_PART = 1024
+PART_SECONDS = 0.01
+# Of a part's answer, under the largest message even as JSON; a contact takes 68 bytes and its cluster up to 116. There
+# may be more clusters than contacts listed, so what a part holds is looked at again when it is there.
+_PART_BYTES = 8 << 20
+_CONTACT_BYTES = 184
+
+Ask = Callable[[int, int], Cost]
+
+
+class AskPart(Protocol):
+    """Answers [start, end) of a path. part: the flag of the part that they are in; None: they are a part."""
+
+    def __call__(self, start: int, end: int, part: Stop | None = None) -> Cost: ...
+
+
+def path_question(
+    data: SceneData,
+    avatar: AvatarModel,
+    poses: Poses,
+    op: str,
+    parameters: dict[str, Any],
+    stop: Stop = NEVER,
+) -> tuple[AskPart, int]:
+    """Return what answers [start, stop) of a path, and how many answers there are. The budget's time begins now.
+
+    poses: (k, 4, 4) float64.  parameters: of `op`, tolerance and budgets included.  stop: ends the path early; a part
+    that takes longer than its `part_seconds` ends alone, see `AskPart`. All poses are checked here, so that an error
+    names one by its place on the path. BadRequestError, BadTransformError, TooLargeError.
+    """
+    given = {name: value for name, value in parameters.items() if value is not None}
+    check_path_parameters(op, given)
+    budgets = {name: given.pop(name) for name in ("budget_ms", "budget_visits") if name in given}
+    tolerance = given.pop("tolerance", 1e-6 if op == "sweep" else 0.0)
+    # Nobody stays along a path; what users stand in, at most half of the cache (prefetch.py), can stay beside it.
+    effort = make_effort(tolerance, **budgets, stop=stop)._replace(scan=True, share=0.5)
+    poses = kernel_poses(poses)  # copied once if at all, or every part would copy its own
+    other = (
+        to_units(given["reach"], "reach")
+        if op == "distance"
+        else to_units(given.get("margin", 0.0), "margin")
+    )
+    scales, units = np.empty(len(poses)), np.empty(len(poses), np.int64)
+    other += data.radius_units
+    fault, pose, found = check_poses(
+        poses, avatar.arrays.radius, avatar.radius, other, with_stop(data, effort.stop).arrays, scales, units
+    )
+    refuse(fault, pose, found)
+
+    question: Any = {"collide": collide, "distance": distance, "contacts": contacts, "sweep": sweep}[op]
+    if op == "sweep":
+        given["tolerance"] = tolerance
+
+    def ask(start: int, end: int, part: Stop | None = None) -> Cost:
+        if effort.spent:
+            return unknown_part(PATH_ANSWERS[op], end - start, effort)
+        what = [poses[start:end], poses[start + 1 : end + 1]] if op == "sweep" else [poses[start:end]]
+        own = effort._replace(stop=part_stop(effort.stop, stop.part_seconds) if part is None else part)
+        return ask_until_stopped(
+            question,
+            end - start,
+            own,
+            lambda: question(with_stop(data, own.stop), avatar, *what, **given, effort=own),
+        )
+
+    return ask, max(0, len(poses) - 1) if op == "sweep" else len(poses)
+
+
+def part_stop(stop: Stop, seconds: float) -> Stop:
+    """Return the flag of a part that begins now: set with the path's, or once the part has taken so many seconds."""
+    if seconds == math.inf:
+        return stop
+    part = stop.part()
+    reason = f"a part took longer than {seconds:g} s, the most that this server spends on one"
+    stop_at(part, time.perf_counter() + seconds, reason)
+    return part
+
+
+def largest_part(op: str, parameters: dict[str, Any]) -> int:
+    """How many answers of `op` a part may hold, so that it fits a message."""
+    if op != "contacts":
+        return LARGEST_PART
+    limit = parameters.get("limit")
+    return min(
+        LARGEST_PART, max(1, _PART_BYTES // (_CONTACT_BYTES * max(1, 100 if limit is None else limit)))
+    )
+
+
+def path_parts(
+    ask: Ask, total: int, most: int = LARGEST_PART, pool: Executor | None = None, ahead: int = 1
+) -> Generator[Part, None, None]:
+    """The parts of a path in order; at least one, empty if the path is.
+
+    most: answers in a part.  pool: computes parts, up to `ahead` of them before they are taken; None: each is computed
+    when it is asked for. A generator: closing it leaves what is being computed to end by itself.
+    """
+    waiting: deque[tuple[int, Future[Cost]]] = deque()
+    size, start = min(FIRST_PART, most), 0
+    try:
+        while waiting or start < max(1, total):
+            while pool is not None and start < max(1, total) and len(waiting) < ahead:
+                stop = min(start + size, total)
+                waiting.append((start, pool.submit(_ask_part, ask, start, stop)))
+                start = max(1, stop)
+            if pool is None:
+                first, stop = start, min(start + size, total)
+                answers = _ask_part(ask, first, stop)
+                start = max(1, stop)
+            else:
+                first, future = waiting.popleft()
+                answers = future.result()
+            for piece in (
+                in_pieces(answers, _PART_BYTES) if isinstance(answers, ContactsAnswers) else [answers]
+            ):
+                yield as_part(piece, first, total)
+                first += len(piece)  # type: ignore[arg-type]
+            size = _next_size(size, answers, most)
+    finally:
+        for _, future in waiting:
+            future.cancel()
+
+
+def _ask_part(ask: Ask, start: int, stop: int) -> Cost:
+    """The answers for [start, stop); an error says where on the path."""
+    try:
+        return ask(start, stop)
+    except SolidcloudError as error:
+        if start == 0:
+            raise
+        raise type(error)(f"in the part of the path that begins at {start}: {error}") from None
+
+
+def _next_size(size: int, answers: Any, most: int) -> int:
+    """How many answers the next part is to hold, by what these took; at most four times as many as before."""
+    each = answers.engine_seconds / max(1, len(answers))
+    fitting = most if each <= 0 else int(PART_SECONDS / each)
+    return max(1, min(fitting, 4 * size, most))

@@ -1,0 +1,108 @@
+"""`raycast`: the first scan point's sphere that each ray hits. One request -> one result."""
+
+import time
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ...schemas.archive.units import UNITS_PER_METRE
+from ...schemas.errors import BadRequestError
+from ...schemas.wire.answers import RaycastAnswers
+from ...schemas.wire.requests import make_vectors
+from ..kernels.core.pose_transform import MAX_REACH_UNITS
+from ..kernels.core.voxel_tree import Lists
+from ..kernels.rays.rays import Nearest, Rays, follow_rays
+from .context.front_to_back import finish, look, make_origins
+from .context.query_budget import EXACT, Effort
+from .context.query_context import SceneData, to_units
+from .context.query_cost import Spent
+
+# Differences within this reach are exact in float64: 2^53 units are 134,000 km.
+MAX_RAY_REACH = 1e6
+
+
+def make_directions(values: ArrayLike) -> NDArray[np.float64]:
+    """Unit vectors (k, 3): divided by the largest component, then by the root of (x x + y y) + z z, float64.
+
+    Raises BadRequestError for one that is zero or not finite.
+    """
+    array = make_vectors(values, "directions")
+    largest = np.abs(array).max(axis=1, initial=0.0)
+    if (largest == 0.0).any():
+        raise BadRequestError(f"direction {int(np.argmin(largest))} is zero: expected a vector of any length")
+    scaled = array / largest[:, None]
+    x, y, z = scaled.T
+    return np.ascontiguousarray(scaled / np.sqrt((x * x + y * y) + z * z)[:, None])
+
+
+def raycast(
+    data: SceneData, origins: ArrayLike, directions: ArrayLike, reach: float, effort: Effort = EXACT
+) -> RaycastAnswers:
+    """The first sphere of the scan that each ray meets, each of the radius its point has under the radius model.
+
+    origins: (k, 3) float64, world [m].  directions: (k, 3), of any length but zero.  reach: how far along [m], at
+    most MAX_RAY_REACH. The definition is in kernels/rays/rays.py. A ray is `outside` when either end of it, o or
+    o + reach u in exact units, leaves the box of all scan points.
+    CONTACT: a sphere is hit; CLEAR: none; UNKNOWN: none found, but something in reach could not be looked at, or was
+    not within the budget. Where that might hide a nearer hit, `exact` is false and `lower` says how near; with a
+    tolerance `lower` may be below `upper` by as much. Raises BadRequestError.
+    """
+    spent = Spent(time.perf_counter())
+    world, units = make_origins(data, origins, "origins")
+    unit = make_directions(directions)
+    if len(world) != len(unit):
+        raise BadRequestError(f"{len(world)} origins and {len(unit)} directions: expected as many")
+    if not 0 <= reach <= MAX_RAY_REACH:
+        raise BadRequestError(f"reach {reach!r}: expected 0 to {MAX_RAY_REACH:g} metres")
+    if data.radius_units > MAX_REACH_UNITS:
+        raise BadRequestError("the scan's radius is over 16 m: rays cannot be told exactly against it")
+    reach_units = to_units(reach, "reach")
+    tolerance = effort.tolerance * UNITS_PER_METRE
+
+    def kernel(
+        first: int,
+        last: int,
+        lists: Lists,
+        cursor: NDArray[np.int64],
+        held: NDArray[np.bool_],
+        best: Nearest,
+    ) -> None:
+        rays = Rays(units[first:last], unit[first:last], reach_units, data.radius_units)
+        follow_rays(rays, lists, cursor, held, data.arrays, tolerance, effort.visits, best)
+
+    best = look(data, units, unit, reach_units, data.radius_units, effort, kernel, spent)
+    verdict, lower, upper, exact = finish(best.value, best.unseen, reach_units)
+    hit, cloud, normal = _where(data, world, units, unit, best)
+    ends = np.stack([units.astype(np.float64), units + float(reach_units) * unit])
+    low, high = (
+        np.rint(b * data.arrays.units_per_step) for b in (data.broad.scene_low, data.broad.scene_high)
+    )
+    return RaycastAnswers(
+        verdict, upper, lower, upper.copy(), exact, hit, cloud, normal,
+        ((ends < low) | (ends > high)).any(axis=(0, 2)), *best.counts,
+        **spent.cost(data),
+    )  # fmt: skip
+
+
+def _where(
+    data: SceneData,
+    world: NDArray[np.float64],
+    units: NDArray[np.int64],
+    unit: NDArray[np.float64],
+    best: Nearest,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """hit, cloud_point and normal (k, 3), NaN where nothing is hit.
+
+    hit: origin + distance u, world.  normal: along t u - d, exact units, as the sphere's centre sees the hit; where
+    they coincide, against the ray.
+    """
+    touched = np.isfinite(best.value)
+    hit, cloud, normal = (np.full((len(world), 3), np.nan) for _ in range(3))
+    t, u, lattice = best.value[touched][:, None], unit[touched], best.lattice[touched]
+    hit[touched] = world[touched] + (t / UNITS_PER_METRE) * u
+    cloud[touched] = lattice * data.arrays.step + data.arrays.origin
+    d = np.rint(lattice * data.arrays.units_per_step).astype(np.int64) - units[touched]
+    away = t * u - d
+    length = np.sqrt((away * away).sum(axis=1))[:, None]
+    normal[touched] = np.where(length > 0, away / np.where(length > 0, length, 1.0), -u)
+    return hit, cloud, normal

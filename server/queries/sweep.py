@@ -1,0 +1,264 @@
+"""`sweep`: when does an avatar on its way from one pose to another first touch the scene? One request -> one result."""
+
+import time
+
+import msgspec
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ...schemas.archive.units import UNITS_PER_METRE
+from ...schemas.archive.voxel_grid import MAX_COORDINATE
+from ...schemas.errors import BadRequestError, BadTransformError
+from ...schemas.wire.answers import SweepAnswers, Verdict
+from ..avatars.avatar_model import AvatarModel
+from ..kernels.core.pose_transform import SIMILARITY_TOLERANCE, check_poses
+from ..kernels.core.voxels_in_reach import Reach
+from ..kernels.motion.sweep_advance import Progress, avatar_box, look_around, plan_segments, sweep_segments
+from ..residency.index_proof import ENTRIES_AT_ONCE
+from ..runtime.stop_flag import Stop
+from .context.proved_reach import prove
+from .context.query_budget import EXACT, Effort
+from .context.query_context import SceneData, as_held, kernel_poses, pieces, refuse, to_units
+from .context.query_cost import Spent
+
+# Motions of one kernel call where there is a deadline: it is looked at between calls.
+_PER_CALL = 64
+
+
+def _check(
+    data: SceneData,
+    avatar: AvatarModel,
+    first: NDArray[np.float64],
+    last: NDArray[np.float64],
+    other_units: int,
+) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
+    """Check the poses of k motions. Returns, each (k,), the larger scale and reach of either end, the latter in exact
+    units and to the scan's largest sphere, and by how many units the reach may differ on the way."""
+    k = len(first)
+    scales, units = np.ones((2, k)), np.zeros((2, k), np.int64)  # a stop may leave some as they are
+    for end, poses in enumerate((first, last)):
+        fault, pose, found = check_poses(
+            poses, avatar.arrays.radius, avatar.radius, other_units, data.arrays, scales[end], units[end]
+        )
+        refuse(fault, pose, found)
+    apart = np.abs(scales[1] - scales[0]) > SIMILARITY_TOLERANCE * scales[0]
+    if apart.any():
+        i = int(apart.argmax())
+        raise BadTransformError(
+            f"motion {i} begins at scale {scales[0, i]:g} and ends at {scales[1, i]:g}: expected one scale "
+            "within 1e-9: a rigid motion changes no size"
+        )
+    # On the way the scale lies between those of the ends. Well within 1e-9 of 1 it is 1 all the
+    # way (pose_transform.py).
+    rigid = np.ones(k, bool)
+    for poses in (first, last):
+        rigid &= np.abs((poses[:, :3, :3] ** 2).sum(axis=(1, 2)) / 3.0 - 1.0) <= SIMILARITY_TOLERANCE
+    most = units.max(axis=0)
+    loose = np.where(rigid, 0.0, most - units.min(axis=0) + 2.0)
+    loose[~rigid] += 2.0 * SIMILARITY_TOLERANCE * scales.max(axis=0)[~rigid] * avatar.radius * UNITS_PER_METRE
+    return scales.max(axis=0), most, loose
+
+
+def _from_origin(
+    data: SceneData, first: NDArray[np.float64], last: NDArray[np.float64]
+) -> tuple[SceneData, NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Scene and poses with the dataset's origin at zero, and where it was, world [m].
+
+    A pose on the way is computed, and rounded, there: a scene at map coordinates answers as it does at the origin, bit
+    for bit (NUMERICS.md case 1), and its poses on the way are as fine. The ends are what they are: t - O, N5.
+    """
+    origin = data.arrays.origin
+    first, last = first.copy(), last.copy()
+    for poses in (first, last):
+        poses[:, :3, 3] -= origin
+    return data._replace(arrays=data.arrays._replace(origin=np.zeros(3))), first, last, origin
+
+
+def _answers(
+    progress: Progress, frozen: NDArray[np.float64], counts: NDArray[np.uint32], outside: NDArray[np.bool_],
+    tolerance: float,
+) -> SweepAnswers:  # fmt: skip
+    """The answers, from how far each motion came. frozen: (k,) up to where it was proved that nothing touches."""
+    touches = progress.upper < np.inf
+    verdict = np.full(len(frozen), Verdict.UNKNOWN, np.uint8)
+    verdict[touches] = Verdict.CONTACT
+    verdict[~touches & (frozen >= 1.0)] = Verdict.CLEAR
+    with np.errstate(invalid="ignore"):
+        moved = progress.speed * (progress.upper - frozen)
+    exact = (verdict == Verdict.CLEAR) | (touches & ((moved <= tolerance) | (progress.upper == frozen)))
+    return SweepAnswers(
+        verdict=verdict, lower=frozen, upper=progress.upper, exact=exact,
+        witness_avatar=progress.witness[:, 0].copy(), witness_cloud=progress.witness[:, 1].copy(),
+        steps=counts[3], outside=outside, voxels_missing=counts[0], node_visits=counts[1], point_tests=counts[2],
+    )  # fmt: skip
+
+
+def sweep(
+    data: SceneData,
+    avatar: AvatarModel,
+    pose_from: ArrayLike,
+    pose_to: ArrayLike,
+    margin: float = 0.0,
+    tolerance: float = 1e-6,
+    effort: Effort = EXACT,
+) -> SweepAnswers:
+    """When the avatar first touches the scene on the screw motion (kernels/motion/screw_motion.py)
+    from one pose to the other.
+
+    The motion is that of the dataset's frame: its translations are t - O (NUMERICS.md N5). Each scan point has its own
+    sphere, as the radius model of `data` has it, the whole way.
+    pose_from, pose_to: (k, 4, 4) float64, avatar to world, rigid or of one scale, bits used as given.
+    margin: distance below or at which two spheres are called in contact [m].  tolerance: how far any avatar point may
+    go between `lower` and `upper` [m]; that of `effort` where it is larger.
+    CONTACT in [lower, upper]; CLEAR; UNKNOWN from `lower` on: something is missing there, the effort was spent, or a
+    graze of some hundredths of a micrometre cannot be told from a touch. A contact found after such a place is CONTACT
+    all the same, with exact=False. With a budget of visits what is clear stays clear under a larger one; a contact may
+    not: it may be spent on a doubt before it. Raises BadRequestError, BadTransformError, TooLargeError.
+    """
+    begin = time.perf_counter()
+    if not 0.0 <= tolerance <= MAX_COORDINATE:
+        raise BadRequestError(f"tolerance {tolerance!r}: expected zero or a positive length in metres")
+    tolerance = max(tolerance, effort.tolerance)
+    first, last = kernel_poses(pose_from), kernel_poses(pose_to)
+    if len(first) != len(last):
+        raise BadRequestError(f"{len(first)} poses to begin at and {len(last)} to end at: expected as many")
+    k = len(first)
+    other_units = data.radius_units + to_units(margin, "margin")
+    scales, units, loose = _check(data, avatar, first, last, other_units)
+    data, first, last, origin = _from_origin(data, first, last)
+    progress = Progress(
+        np.zeros(k), np.ones(k), np.ones(k), np.full(k, np.inf), np.zeros(k), np.full((k, 2, 3), np.nan),
+        np.full(k, effort.visits, np.int64),
+    )  # fmt: skip
+    counts, outside = np.zeros((4, k), np.uint32), np.zeros(k, bool)
+    proved = np.ones(k)
+    if not len(avatar.points) or not k:
+        return _answers(progress, proved, counts, outside, tolerance)
+    bounds, residency, spent, box = data.bounds, data.residency, Spent(begin), avatar_box(avatar.arrays)
+    starts, rows = np.zeros(k + 1, np.int64), np.empty(16 * k + 64, np.int64)
+    which = np.arange(k)
+    asked: set[int] = set()  # rows that were loaded to prove the index
+    while len(which):
+        begun = progress.at.copy()
+        unproved = bounds.unproved
+        planned = box, first, last, avatar.arrays, scales, units, data.arrays
+        needed = plan_segments(*planned, data.broad, which, progress, starts, rows)
+        if needed < 0:
+            break
+        if needed > len(rows):
+            rows = np.empty(2 * needed, np.int64)
+            continue
+        if unproved and bounds.unsettled(rows[:needed], unproved).any():
+            # By the boxes of the index some may be out of reach, and segments are then others.
+            by_index = progress._replace(
+                at=begun.copy(), end=progress.end.copy(), speed=progress.speed.copy()
+            )
+            index_starts, index_rows = starts.copy(), np.empty_like(rows)
+            count = plan_segments(*planned, bounds.index_boxes, which, by_index, index_starts, index_rows)
+            if not 0 <= count <= len(index_rows):
+                index_starts[:] = 0
+            doubted = _hidden_rows(
+                (starts, rows), (index_starts, index_rows), len(bounds.proved), effort.stop
+            )
+            new = set(doubted) - asked
+            if new:
+                asked |= new
+                prove(data, sorted(row for row in new if not bounds.proved[row]), effort, spent)
+                progress.at[:] = begun
+                continue
+        progress.lower[which] = progress.end[which]
+        boxes = np.empty((k, 2, 3))  # of no use here
+        around = Reach(scales, units, starts, rows, boxes, outside)
+        for part, held_rows, reach in pieces(around, residency, effort.share, effort.stop):
+            chunk = len(part) if effort.deadline == np.inf else _PER_CALL
+            if effort.stop:
+                progress.lower[part] = np.minimum(progress.lower[part], progress.at[part])
+                continue
+            with residency.hold(held_rows, effort.loads_until(), scan=effort.scan, stop=effort.stop) as held:
+                seen = as_held(data, held)
+                for at in range(0, len(part), chunk):
+                    if effort.spent:
+                        progress.visits[part[at:]] = -1
+                    sweep_segments(
+                        box, first, last, avatar.arrays, avatar.radius, other_units, scales, units, loose,
+                        seen.arrays, data.broad, reach.starts, reach.rows, part[at : at + chunk], tolerance, progress,
+                        counts,
+                    )  # fmt: skip
+            spent.add(held)
+        which = _next_round(which, progress, proved)
+        if effort.stop:
+            break
+    # Those that were stopped on their way: nothing is known beyond.
+    proved[which] = np.minimum(proved[which], progress.at[which])
+    until = np.minimum(progress.upper, 1.0)
+    lost = np.empty(k)
+    look_around(
+        box,
+        first,
+        last,
+        avatar.arrays,
+        scales,
+        units,
+        data.arrays,
+        data.broad,
+        data.unknown,
+        until,
+        outside,
+        lost,
+    )
+    if data.nothing_clear:
+        lost[:] = 0.0
+    met = lost <= until
+    proved[met] = np.minimum(proved, lost)[met]
+    # The avatar's centre as the definition has it, in exact units, as `distance` and `contacts` name it.
+    progress.witness[:, 0] = np.rint(progress.witness[:, 0] * UNITS_PER_METRE) / UNITS_PER_METRE
+    progress.witness[:] += origin
+    answers = _answers(progress, proved, counts, outside, tolerance)
+    return msgspec.structs.replace(answers, **spent.cost(data))
+
+
+def _hidden_rows(
+    planned: tuple[NDArray[np.int64], NDArray[np.int64]],
+    by_index: tuple[NDArray[np.int64], NDArray[np.int64]],
+    voxels: int,
+    stop: Stop,
+) -> list[int]:
+    """Return the distinct rows, ascending, that a motion has in reach as planned and not by the index.
+
+    planned, by_index: starts (k + 1,) and rows of k motions.  stop: once it is set, some may be left out.
+    """
+    hidden: NDArray[np.bool_] = np.zeros(voxels, bool)
+    starts, _ = planned
+    begin, k = 0, len(starts) - 1
+    while begin < k and not stop:
+        end = int(np.searchsorted(starts, starts[begin] + ENTRIES_AT_ONCE, side="right")) - 1
+        end = min(max(end, begin + 1), k)
+        own, known = (_pairs(*lists, begin, end, voxels) for lists in (planned, by_index))
+        hidden[np.setdiff1d(own, known) % voxels] = True
+        begin = end
+    found: list[int] = np.flatnonzero(hidden).tolist()
+    return found
+
+
+def _pairs(
+    starts: NDArray[np.int64], rows: NDArray[np.int64], begin: int, end: int, voxels: int
+) -> NDArray[np.int64]:
+    """Return motion and voxel of each row of motions [begin, end) as one number: motion * voxels + voxel."""
+    motions = np.repeat(np.arange(begin, end), np.diff(starts[begin : end + 1]))
+    return np.asarray(motions * voxels + rows[starts[begin] : starts[end]], np.int64)
+
+
+def _next_round(
+    which: NDArray[np.int64], progress: Progress, proved: NDArray[np.float64]
+) -> NDArray[np.int64]:
+    """Take up what a round of segments found; returns the motions that go on.
+
+    proved: (k,) up to where nothing touches, 1 while nothing has stood against it: the first doubt fixes it.
+    """
+    at, end, lower = progress.at[which], progress.end[which], progress.lower[which]
+    touches = progress.upper[which] < np.inf
+    looked = at < 1.0  # else nothing was left in reach
+    doubt = looked & ((lower < end) | touches) & (proved[which] >= 1.0)
+    proved[which[doubt]] = lower[doubt]
+    progress.at[which] = np.where(looked, end, at)
+    return which[looked & ~touches & (end < 1.0) & (progress.visits[which] >= 0)]

@@ -1,0 +1,62 @@
+"""`within`: the scan point nearest to each loose point. One request -> one result."""
+
+import time
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ...schemas.archive.units import UNITS_PER_METRE
+from ...schemas.errors import BadRequestError
+from ...schemas.wire.answers import WithinAnswers
+from ..kernels.core.pose_transform import MAX_REACH_UNITS
+from ..kernels.core.voxel_tree import Lists
+from ..kernels.rays.nearest_point import search_points
+from ..kernels.rays.rays import Nearest
+from .context.front_to_back import finish, look, make_origins
+from .context.query_budget import EXACT, Effort
+from .context.query_context import SceneData, to_units
+from .context.query_cost import Spent
+
+
+def within(data: SceneData, points: ArrayLike, reach: float, effort: Effort = EXACT) -> WithinAnswers:
+    """The scan point nearest to each of k loose points, centre to centre: no radius and no radius model matters.
+
+    points: (k, 3) float64, world [m].  reach: inclusive [m], at most 16. The definition is in
+    kernels/rays/nearest_point.py. A
+    point is `outside` when its reach, a cube of exact units, leaves the box of all scan points.
+    Verdicts, bounds and effort as in `raycast`. Raises BadRequestError.
+    """
+    spent = Spent(time.perf_counter())
+    _, units = make_origins(data, points, "points")
+    reach_units = to_units(reach, "reach")
+    if reach_units > MAX_REACH_UNITS:
+        raise BadRequestError(f"reach {reach!r}: expected at most 16 m: squares of more do not fit 63 bits")
+    tolerance = effort.tolerance * UNITS_PER_METRE
+
+    def kernel(
+        first: int,
+        last: int,
+        lists: Lists,
+        cursor: NDArray[np.int64],
+        held: NDArray[np.bool_],
+        best: Nearest,
+    ) -> None:
+        search_points(
+            units[first:last], reach_units, lists, cursor, held, data.arrays, tolerance, effort.visits, best
+        )
+
+    best = look(data, units, None, reach_units, 0, effort, kernel, spent)
+    near = np.where(best.square >= 0, np.sqrt(np.maximum(best.square, 0).astype(np.float64)), np.inf)
+    verdict, lower, upper, exact = finish(near, best.unseen, reach_units)
+    cloud: NDArray[np.float64] = np.full((len(units), 3), np.nan)
+    touched = best.square >= 0
+    cloud[touched] = best.lattice[touched] * data.arrays.step + data.arrays.origin
+    low, high = (
+        np.rint(b * data.arrays.units_per_step).astype(np.int64)
+        for b in (data.broad.scene_low, data.broad.scene_high)
+    )
+    outside = ((units - reach_units < low) | (units + reach_units > high)).any(axis=1)
+    return WithinAnswers(
+        verdict, upper, lower, upper.copy(), exact, cloud, outside, *best.counts,
+        **spent.cost(data),
+    )  # fmt: skip

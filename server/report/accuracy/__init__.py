@@ -1,0 +1,6 @@
+"""`solidcloud accuracy`: what each setting costs and what it gets wrong.
+
+May import server.avatars, server.cli.input, server.kernels, server.report.common,
+server.report.kernels, server.residency, server/scene.py, builder, schemas.
+Begin with accuracy.py.
+"""

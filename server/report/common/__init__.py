@@ -1,0 +1,5 @@
+"""Test cases and pictures that several reports share.
+
+May import server.cli.input, server/scene.py, builder, schemas.
+Begin with paper_case.py.
+"""

@@ -1,0 +1,363 @@
+"""One plain descent of two hierarchies, its node test and its leaf test exchangeable: like compared with like.
+
+Scalar and depth first, as figures 5 and 6 of [Fig12], corrected as
+server/kernels/overlap/overlap.py says: a leaf is never
+opened, of two inner nodes the one of the larger sphere is. Node tests are float64, inclusive and widened by SLACK, so
+that none loses a contact: what a bounding volume changes is how often it says "perhaps".
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ....schemas.archive.units import UNITS_PER_METRE
+from ....schemas.kernels import compiling as nb
+from ...kernels.core.borrowing_kernels import borrowing
+from ...kernels.core.pose_transform import place
+from ...kernels.core.voxel_layout import LANES
+from .plain_pairs import (
+    CUBES,
+    Lanes,
+    blocks_gap,
+    blocks_touch,
+    make_lanes,
+    make_limits,
+    place_points,
+    take_points,
+)
+
+SPHERE, SLAB, BOX, SPHERE_AND_BOX = range(4)
+# Rounding of two points to exact units, and of float64 sums up to 10^7 m: node tests are widened by so much [m].
+SLACK = 4.0 / UNITS_PER_METRE
+# A pair is pushed for each child, at most 16, of one of its nodes: two trees of 80 levels fit.
+STACK = 2 * 80 * 15 + 16
+CUBE_REACH = math.sqrt(3.0)  # a cube's corner, in half sides
+
+
+class Body(NamedTuple):
+    """An avatar's hierarchy, avatar frame [m]; a nodes, b leaf nodes.
+
+    center: (a, 3), radius: (a,).  middle, half: (a, 3), the box of the node's points.  first: (a,) int32, first
+    child or ~block.  count: (a,) int32, children or points.  points: (b, 3, LANES) float64.
+    """
+
+    center: NDArray[np.float64]
+    radius: NDArray[np.float64]
+    middle: NDArray[np.float64]
+    half: NDArray[np.float64]
+    first: NDArray[np.int32]
+    count: NDArray[np.int32]  # type: ignore[assignment]  # hides tuple.count, which nobody calls
+    points: NDArray[np.float64]
+
+
+class Forest(NamedTuple):
+    """The hierarchies of a scene's voxels as stored, metres from the dataset's origin; n nodes, b leaf nodes.
+
+    center, radius, middle, half, first, count: as of Body.  normal: (n, 3), norm: (n,), slab: (n, 2), least and
+    greatest dot(normal, point - center) [m].  roots: (v,) int64.  low: (b, 3) int64 and steps: (b, 3, LANES)
+    uint16: lattice points.
+    """
+
+    center: NDArray[np.float64]
+    radius: NDArray[np.float64]
+    normal: NDArray[np.float64]
+    norm: NDArray[np.float64]
+    slab: NDArray[np.float64]
+    middle: NDArray[np.float64]
+    half: NDArray[np.float64]
+    first: NDArray[np.int32]
+    count: NDArray[np.int32]  # type: ignore[assignment]  # as above
+    roots: NDArray[np.int64]
+    low: NDArray[np.int64]
+    steps: NDArray[np.uint16]
+
+
+class Scratch(NamedTuple):
+    """Scratch of one call. center, middle, half: (a, 3), the avatar's nodes as placed.  placed: its blocks.
+
+    taken: one of the scene's.  shift: (3,), t - O.  frame: (3,) int64.  stack: (STACK, 2): avatar node, scene node.
+    keep: (LANES,).
+    """
+
+    center: NDArray[np.float64]
+    middle: NDArray[np.float64]
+    half: NDArray[np.float64]
+    placed: Lanes
+    taken: Lanes
+    shift: NDArray[np.float64]
+    frame: NDArray[np.int64]
+    stack: NDArray[np.int64]
+    keep: NDArray[np.bool_]
+
+
+@nb.njit(nogil=True, cache=True)
+def make_scratch(body):
+    """Scratch for one avatar (not empty)."""
+    shape = body.center.shape
+    return Scratch(
+        np.empty(shape), np.empty(shape), np.empty(shape), make_lanes(body.points.shape[0]), make_lanes(1), np.empty(3),
+        np.empty(3, np.int64), np.empty((STACK, 2), np.int64), np.zeros(LANES, np.bool_),
+    )  # fmt: skip
+
+
+@borrowing
+def bounds_meet(kind, body_radius, center, middle, half, a, forest, b, reach):
+    """Whether points below node a of the avatar may come within `reach` [m] of points below node b of the scene.
+
+    center, middle, half: (nodes, 3), the avatar's spheres and boxes as placed.
+    """
+    if kind == BOX:
+        return (
+            (abs(middle[a, 0] - forest.middle[b, 0]) <= half[a, 0] + forest.half[b, 0] + reach)
+            & (abs(middle[a, 1] - forest.middle[b, 1]) <= half[a, 1] + forest.half[b, 1] + reach)
+            & (abs(middle[a, 2] - forest.middle[b, 2]) <= half[a, 2] + forest.half[b, 2] + reach)
+        )
+    span = body_radius[a] + reach
+    if kind == SPHERE_AND_BOX:
+        square = 0.0
+        for r in range(3):
+            gap = abs(center[a, r] - forest.middle[b, r]) - forest.half[b, r]
+            if gap > 0.0:
+                square += gap * gap
+        return square <= span * span
+    dx, dy, dz = (
+        center[a, 0] - forest.center[b, 0],
+        center[a, 1] - forest.center[b, 1],
+        center[a, 2] - forest.center[b, 2],
+    )
+    both = span + forest.radius[b]
+    if dx * dx + dy * dy + dz * dz > both * both:
+        return False
+    if kind == SPHERE:
+        return True
+    along = forest.normal[b, 0] * dx + forest.normal[b, 1] * dy + forest.normal[b, 2] * dz
+    room = forest.norm[b] * span
+    return (along <= forest.slab[b, 1] + room) & (along >= forest.slab[b, 0] - room)
+
+
+@borrowing
+def keep_points(kind, points, block, count, m, shift, forest, b, reach, keep):
+    """Mark in keep (LANES,) which of the first `count` points of the avatar's block may come within `reach` of points
+    below node b of the scene, as its bound tells. Returns how many do."""
+    kept = 0
+    for i in range(LANES):
+        x = place(m, shift, 0, points[block, 0, i], points[block, 1, i], points[block, 2, i])
+        y = place(m, shift, 1, points[block, 0, i], points[block, 1, i], points[block, 2, i])
+        z = place(m, shift, 2, points[block, 0, i], points[block, 1, i], points[block, 2, i])
+        if kind in (BOX, SPHERE_AND_BOX):
+            meets = (
+                (abs(x - forest.middle[b, 0]) <= forest.half[b, 0] + reach)
+                & (abs(y - forest.middle[b, 1]) <= forest.half[b, 1] + reach)
+                & (abs(z - forest.middle[b, 2]) <= forest.half[b, 2] + reach)
+            )
+        else:
+            dx, dy, dz = x - forest.center[b, 0], y - forest.center[b, 1], z - forest.center[b, 2]
+            both = forest.radius[b] + reach
+            meets = dx * dx + dy * dy + dz * dz <= both * both
+            if kind == SLAB:
+                along = forest.normal[b, 0] * dx + forest.normal[b, 1] * dy + forest.normal[b, 2] * dz
+                room = forest.norm[b] * reach
+                meets &= (along <= forest.slab[b, 1] + room) & (along >= forest.slab[b, 0] - room)
+        keep[i] = meets & (i < count)
+        kept += 1 if keep[i] else 0
+    return kept
+
+
+@borrowing
+def _lower_bound(body_radius, center, a, forest, b):
+    """How far points below two nodes are apart at least [m], by their spheres; may be negative."""
+    square = 0.0
+    for r in range(3):
+        apart = center[a, r] - forest.center[b, r]
+        square += apart * apart
+    return math.sqrt(square) - body_radius[a] - forest.radius[b]
+
+
+@borrowing
+def _place_nodes(kind, m, shift, body, center, middle, half):
+    """Place what `kind` asks of the avatar's nodes: spheres' centres, or boxes around the turned boxes.
+
+    Such a box's half side is the sum of the old ones, each by the size of its part of the turn: Arvo, "Transforming
+    axis-aligned bounding boxes", Graphics Gems (1990).
+    """
+    for i in range(body.center.shape[0]):
+        for r in range(3):
+            center[i, r] = place(m, shift, r, body.center[i, 0], body.center[i, 1], body.center[i, 2])
+            if kind == BOX:
+                middle[i, r] = place(m, shift, r, body.middle[i, 0], body.middle[i, 1], body.middle[i, 2])
+                half[i, r] = (
+                    abs(m[r, 0]) * body.half[i, 0]
+                    + abs(m[r, 1]) * body.half[i, 1]
+                    + abs(m[r, 2]) * body.half[i, 2]
+                )
+
+
+@borrowing
+def _begin(leaf, m, body, units, reach, lattice, shift, frame):
+    """Choose the frame of one pose; fills shift and frame, returns its Limits."""
+    farthest = 0.0
+    for r in range(3):
+        shift[r] = m[r, 3] - lattice.origin[r]
+        root = place(m, shift, r, body.center[0, 0], body.center[0, 1], body.center[0, 2])
+        frame[r] = np.int64(np.rint(root / lattice.step))
+        farthest = max(farthest, abs(shift[r]) + abs(root))
+    extent = body.radius[0] / lattice.step + 1.0
+    return make_limits(leaf, units, reach, extent, farthest / lattice.step + extent, lattice)
+
+
+@nb.njit(nogil=True, cache=True)
+def descend(poses, body, forest, lattice, units, reach, node, leaf, sift, verdict, counts):
+    """Whether the avatar touches the scene under rigid poses (k, 4, 4), by one kind of node test and of leaf test.
+
+    units, reach: r_a + r_b, exact and in metres.  node: SPHERE .. SPHERE_AND_BOX.  leaf: FLOAT32
+    .. CUBES (plain_pairs.py).
+    sift: of two leaf nodes, whether the avatar's points are held against the other's bound before they are against
+    its points, as the server does; [Fig12] tests all pairs. Writes verdict (k,) bool and counts (2, k) int64: node
+    tests, pair tests.
+    """
+    work = make_scratch(body)
+    _descend(poses, body, forest, lattice, units, reach, node, leaf, sift, verdict, counts, work)
+
+
+@borrowing
+def _descend(poses, body, forest, lattice, units, reach, node, leaf, sift, verdict, counts, work):
+    """`descend`, with its scratch."""
+    center, middle, half, placed, taken, shift, frame, stack, keep = work
+    # A sphere that holds a cube is larger than it; a box that holds cubes is not.
+    span = reach * (CUBE_REACH if leaf == CUBES and node != BOX else 1.0) + SLACK
+    for k in range(poses.shape[0]):
+        m = poses[k]
+        limits = _begin(leaf, m, body, units, reach, lattice, shift, frame)
+        _place_nodes(node, m, shift, body, center, middle, half)
+        tests, pairs = 0, 0
+        touched = False
+        for root in forest.roots:
+            stack[0, 0], stack[0, 1] = 0, root
+            depth = 1
+            while depth > 0 and not touched:
+                depth -= 1
+                a, b = stack[depth, 0], stack[depth, 1]
+                tests += 1
+                if not bounds_meet(node, body.radius, center, middle, half, a, forest, b, span):
+                    continue
+                first_a, first_b = body.first[a], forest.first[b]
+                if first_a < 0 and first_b < 0:
+                    block, at = ~first_a, ~first_b
+                    kept = int(body.count[a])
+                    if sift:
+                        kept = keep_points(node, body.points, block, kept, m, shift, forest, b, span, keep)
+                        if kept == 0:
+                            continue
+                    else:
+                        for i in range(LANES):
+                            keep[i] = i < kept
+                    if placed.stamp[block] != k:
+                        place_points(leaf, body.points, m, shift, frame, block, lattice, placed)
+                        placed.stamp[block] = k
+                    take_points(leaf, forest.low, forest.steps, frame, at, lattice, taken)
+                    pairs += kept * int(forest.count[b])
+                    touched = blocks_touch(
+                        leaf, m, shift, body.points, block, keep, forest.low, forest.steps, at, lattice,
+                        placed, taken, limits,
+                    )  # fmt: skip
+                elif first_b < 0 or (first_a >= 0 and body.radius[a] > forest.radius[b]):
+                    for i in range(body.count[a]):
+                        stack[depth, 0], stack[depth, 1] = first_a + i, b
+                        depth += 1
+                else:
+                    for i in range(forest.count[b]):
+                        stack[depth, 0], stack[depth, 1] = a, first_b + i
+                        depth += 1
+            if touched:
+                break
+        verdict[k] = touched
+        counts[0, k], counts[1, k] = tests, pairs
+
+
+@nb.njit(nogil=True, cache=True)
+def nearest(poses, body, forest, lattice, units, reach, farthest, leaf, found):
+    """The signed distance found (k,) [m] of the avatar under rigid poses (k, 4, 4), as one kind of leaf test has it.
+
+    farthest: what is farther is not looked for, and gets `farthest` [m]. The spheres prune, whatever the leaf test.
+    """
+    work = make_scratch(body)
+    _nearest(poses, body, forest, lattice, units, reach, farthest, leaf, found, work)
+
+
+@borrowing
+def _nearest(poses, body, forest, lattice, units, reach, farthest, leaf, found, work):
+    """`nearest`, with its scratch."""
+    center, middle, half, placed, taken, shift, frame, stack, _ = work
+    span = reach * (CUBE_REACH if leaf == CUBES else 1.0) + SLACK
+    for k in range(poses.shape[0]):
+        m = poses[k]
+        limits = _begin(leaf, m, body, units, reach, lattice, shift, frame)
+        _place_nodes(SPHERE, m, shift, body, center, middle, half)
+        best = farthest
+        for root in forest.roots:
+            stack[0, 0], stack[0, 1] = 0, root
+            depth = 1
+            while depth > 0:
+                depth -= 1
+                a, b = stack[depth, 0], stack[depth, 1]
+                if _lower_bound(body.radius, center, a, forest, b) - span > best:
+                    continue
+                first_a, first_b = body.first[a], forest.first[b]
+                if first_a < 0 and first_b < 0:
+                    block, at = ~first_a, ~first_b
+                    if placed.stamp[block] != k:
+                        place_points(leaf, body.points, m, shift, frame, block, lattice, placed)
+                        placed.stamp[block] = k
+                    take_points(leaf, forest.low, forest.steps, frame, at, lattice, taken)
+                    best = min(best, blocks_gap(leaf, block, body.count[a], lattice, placed, taken, limits))
+                elif first_b < 0 or (first_a >= 0 and body.radius[a] > forest.radius[b]):
+                    for i in range(body.count[a]):
+                        stack[depth, 0], stack[depth, 1] = first_a + i, b
+                        depth += 1
+                else:
+                    for i in range(forest.count[b]):
+                        stack[depth, 0], stack[depth, 1] = a, first_b + i
+                        depth += 1
+        found[k] = best
+
+
+@nb.njit(nogil=True, cache=True)
+def box_nodes(first, count, leaf_low, leaf_high, low, high):
+    """The boxes low, high (n, 3) of nodes from those of their leaf nodes (b, 3).
+
+    first: (n,) int32, first child or ~block; children stand behind their parents.  count: (n,) children.
+    """
+    for i in range(first.shape[0] - 1, -1, -1):
+        if first[i] < 0:
+            low[i], high[i] = leaf_low[~first[i]], leaf_high[~first[i]]
+            continue
+        low[i], high[i] = low[first[i]], high[first[i]]
+        for child in range(first[i] + 1, first[i] + count[i]):
+            for r in range(3):
+                low[i, r] = min(low[i, r], low[child, r])
+                high[i, r] = max(high[i, r], high[child, r])
+
+
+@nb.njit(nogil=True, cache=True)
+def brute_touch(m, points, scene_units, units, origin):
+    """The definition (NUMERICS.md N5), every pair: avatar points (n, 3) [m] under a pose m, scan (s, 3) exact units."""
+    shift, at = np.empty(3), np.empty(3, np.int64)
+    for r in range(3):
+        shift[r] = m[r, 3] - origin[r]
+    for i in range(points.shape[0]):
+        for r in range(3):
+            at[r] = np.int64(
+                np.rint(place(m, shift, r, points[i, 0], points[i, 1], points[i, 2]) * UNITS_PER_METRE)
+            )
+        for j in range(scene_units.shape[0]):
+            dx, dy, dz = (
+                abs(scene_units[j, 0] - at[0]),
+                abs(scene_units[j, 1] - at[1]),
+                abs(scene_units[j, 2] - at[2]),
+            )
+            # Farther along one axis is farther; the squares of the others fit 63 bits.
+            if dx <= units and dy <= units and dz <= units and dx * dx + dy * dy + dz * dz <= units * units:
+                return True
+    return False

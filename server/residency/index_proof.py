@@ -1,0 +1,118 @@
+"""Bounds of voxels: what the index says of them, and what their records have proved.
+
+The broad phase leaves a voxel unread where no box around its points is in reach. The index says which box that is, and
+an index may be forged: its checksum says that it is the one that was written, and no more. A voxel's cell of the grid
+cannot be wrong, because a record is refused where a point lies outside it. So the box of a voxel is its cell until its
+record has been loaded and found to be what the index says; from then on, evicted or not, it is the one in the index.
+"""
+
+import threading
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...schemas.archive.archive import Archive
+from ..kernels.core.voxel_tree import VoxelTree, make_voxel_tree, tighten
+from ..kernels.core.voxels_in_reach import Reach, SceneIndex
+from ..runtime.stop_flag import NEVER, Stop
+
+_Int64 = NDArray[np.int64]
+
+# Entries of a reach between two looks at the stop: some milliseconds of work, and 200 bytes each.
+ENTRIES_AT_ONCE = 1 << 15
+
+
+class Bounds:
+    """Boxes around the points of each of the v voxels of an opened archive. Thread-safe.
+
+    index: the boxes that the broad phase reads: of a voxel that is not proved its cell, of one that is proved the box
+    in the index. A box only becomes smaller, one number at a time; a reader without the lock may see some of its
+    numbers before the change and some after.
+    index_boxes: the boxes in the index, proved or not.
+    proved: (v,) bool, the voxels whose record has the points where the index places them.
+    unproved: how many are not proved. Read it before `index`, and give it to `unsettled` afterwards.
+    """
+
+    def __init__(self, archive: Archive) -> None:
+        """Begin with no voxel proved."""
+        header = archive.header
+        steps = header.lattice.voxel_steps
+        base = archive.coordinates * steps
+        keys = archive.voxels["key"].astype(np.uint64)
+        boxes = (base + archive.voxels["low"], base + archive.voxels["high"])
+        self.index = SceneIndex(keys, base, base + (steps - 1), header.low, header.high)
+        self.index_boxes = SceneIndex(keys, *boxes, header.low, header.high)
+        self.proved: NDArray[np.bool_] = np.zeros(len(keys), bool)
+        self.unproved = len(keys)
+        self._order = np.empty(len(keys), np.int64)  # rows in the order in which they were proved
+        self._unknown = header.unknown
+        self._lock = threading.Lock()
+        self._trees: tuple[VoxelTree, VoxelTree] | None = None
+
+    def prove(self, row: int) -> None:
+        """Note that the record of a voxel was read and has its points where the index places them."""
+        if self.proved[row]:
+            return
+        low, high = self.index_boxes.low[row], self.index_boxes.high[row]
+        with self._lock:
+            if self.proved[row]:
+                return
+            self.index.low[row], self.index.high[row] = low, high
+            if self._trees is not None:
+                tighten(self._trees[0], row, low, high)
+            self._order[len(self._order) - self.unproved] = row
+            self.unproved -= 1
+            self.proved[row] = True  # last: `unsettled` reads it first
+
+    def unsettled(self, rows: _Int64, unproved: int) -> NDArray[np.bool_]:
+        """Return (n,) bool: which of n rows may have been read with a box other than that of the index.
+
+        unproved: as it was before the boxes were read. A voxel proved since then counts: its box may have been read
+        while it changed.
+        """
+        found = ~self.proved[rows]
+        # A voxel that was found proved has left `unproved` before.
+        voxels = len(self._order)
+        since = self._order[voxels - unproved : voxels - self.unproved]
+        if len(since):
+            found |= np.isin(rows, since)
+        return found
+
+    def trees(self) -> tuple[VoxelTree, VoxelTree]:
+        """Return trees over the boxes of `index` and of `index_boxes`, for rays and loose points; the first call makes
+        them."""
+        trees = self._trees
+        if trees is None:
+            with self._lock:
+                trees = self._trees
+                if trees is None:
+                    trees = (
+                        make_voxel_tree(self.index.low, self.index.high, self._unknown),
+                        make_voxel_tree(self.index_boxes.low, self.index_boxes.high, self._unknown),
+                    )
+                    self._trees = trees
+        return trees
+
+    def rows_to_prove(self, reach: Reach, unproved: int, stop: Stop = NEVER) -> list[int]:
+        """Return the distinct rows, ascending, that `reach` holds, but would not hold by the boxes of the index.
+
+        reach: of k poses, by `index`.  unproved: as it was before the reach was computed.  stop: once it is set, some
+        may be left out.
+        """
+        hidden = np.zeros(len(self.proved), bool)
+        entries = int(reach.starts[-1]) if unproved else 0
+        for begin in range(0, entries, ENTRIES_AT_ONCE):
+            if stop:
+                break
+            rows = reach.rows[begin : min(begin + ENTRIES_AT_ONCE, entries)]
+            at = np.flatnonzero(self.unsettled(rows, unproved) & ~hidden[rows])
+            if not len(at):
+                continue
+            rows = rows[at]
+            boxes = reach.boxes[np.searchsorted(reach.starts, begin + at, side="right") - 1]
+            center, span = boxes.mean(axis=1), (boxes[:, 1, 0] - boxes[:, 0, 0]) / 2
+            low, high = self.index_boxes.low[rows], self.index_boxes.high[rows]
+            gap = np.maximum(np.maximum(low - center, center - high), 0.0)
+            hidden[rows[(gap * gap).sum(axis=1) > span * span]] = True
+        found: list[int] = np.flatnonzero(hidden).tolist()
+        return found

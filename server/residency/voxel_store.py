@@ -1,0 +1,95 @@
+"""Index row -> decoded voxel, written into the arena. Safe to call from several threads."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...schemas.archive.archive import Archive
+from ...schemas.archive.codec import OPTIONAL_COLUMNS
+from ...schemas.archive.voxel import top_shift
+from ..kernels.core.voxel_layout import (
+    LANES,
+    Arena,
+    block_words,
+    lay_classes,
+    lay_out,
+    normal_run,
+    resident_bytes,
+    scan_run,
+)
+
+
+class Store:
+    """An archive's voxels by index row.
+
+    archive: see schemas/archive/archive.py.  sizes: (v,) int64, bytes of each voxel once decoded.
+    with_normals: whether those include normals.
+    """
+
+    def __init__(
+        self,
+        folder: str | Path,
+        open_archive: Callable[[str | Path], Archive] = Archive,
+        normals: float | None = None,
+    ) -> None:
+        """Open the archive in `folder`; open_archive: how. Raises FormatError or CorruptError.
+
+        normals: the reach of those that will be asked for [m]; where the archive has them, they are loaded too.
+        """
+        self.archive = open_archive(folder)
+        rows, header = self.archive.voxels, self.archive.header
+        self.with_normals = header.normals and header.normal_reach == normals
+        self._columns = [name for name in OPTIONAL_COLUMNS if name != "normal" or self.with_normals]
+        self.sizes = resident_bytes(
+            rows["rows"][:, 1].astype(np.int64),
+            rows["leaves"].astype(np.int64),
+            with_scan=header.scan_index,
+            with_class=header.radius_class,
+            with_normal=self.with_normals,
+        )
+
+    def load(self, row: int, arena: Arena, offset: int) -> NDArray[np.int64]:
+        """Read, check and lay out the voxel of index row `row` at byte `offset` of the arena.
+
+        Returns where its runs are (3,) int64, see voxel_layout.py. Raises CorruptError, OSError.
+        """
+        return self.decode(row, self.archive.read_frames(row), arena, offset)
+
+    def decode(
+        self, row: int, frames: tuple[bytes, bytes, bytes], arena: Arena, offset: int
+    ) -> NDArray[np.int64]:
+        """`load` from the frames already read (`Archive.read_frames`), for the benchmark to time alone."""
+        record = self.archive.open_voxel(row, frames, self._columns)
+        leaves = record.leaves
+        where = np.empty(3, np.int64)
+        shift = np.int64(top_shift(record.voxel_steps))
+        voxel = (record.cells, record.nodes, shift)
+        header = self.archive.header
+        words = block_words(header.radius_class)
+        lay_out(voxel, record.tree, arena, np.int64(offset), words, where)
+        lanes = arena.halves[where[2] :]
+        with self.archive.locating(row):
+            record.read_points(lanes[: leaves * 3 * LANES].reshape(leaves, 3, LANES))
+        if header.radius_class:
+            classes = np.empty((leaves, LANES), np.uint8)
+            with self.archive.locating(row):
+                record.read_classes(classes)
+            lay_classes(record.tree, classes, arena.ints, where)
+        if header.scan_index:
+            scans = arena.halves[scan_run(where[None], 0, words) :]
+            record.read_scans(scans[: leaves * LANES].reshape(leaves, LANES))
+        if self.with_normals:
+            normals = arena.halves[normal_run(where[None], 0, words, header.scan_index) :]
+            with self.archive.locating(row):
+                record.read_normals(normals[: leaves * LANES].reshape(leaves, LANES))
+        return where
+
+    def close(self) -> None:
+        """Close the archive's files."""
+        self.archive.close()
+
+
+# Opens the archive in a folder.
+OpenStore = Callable[[str | Path], Store]

@@ -1,0 +1,254 @@
+"""Opening of an archive or of everything that a scene file names. Errors name the file and the place in it.
+
+Modules that a scene does not need are not imported: several archives, masked archives.
+"""
+
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from msgspec import structs
+from numpy.typing import NDArray
+
+from ...schemas.archive.index import NORMAL_REACH
+from ...schemas.archive.radius_model import class_radii
+from ...schemas.archive.units import UNITS_PER_METRE
+from ...schemas.errors import BadRequestError, SolidcloudError
+from ...schemas.scene.effect_options import Crowd, Ground, Objects, Slide, Through, Uncertainty
+from ...schemas.scene.scene_file import SUFFIX, SceneFile, identity, read_scene, scene_name
+from ...schemas.wire.messages import AvatarInfo, SceneInfo
+from ..archives.archive_info import describe
+from ..avatars.avatar_model import make_avatar
+from ..kernels.core.pose_transform import MAX_REACH_UNITS
+from ..residency.arena import ArenaBuffer
+from ..residency.voxel_store import OpenStore, Store
+from ..scene import DEFAULT_BUDGET, Scene
+from ..served.served_scene import SceneLike
+from ..simulation.assembly import simulate
+from ..simulation.simulation import Stage
+
+# Maximum radius of avatars that may collide with one another [m]: two of them and a margin stay
+# within the reach of a pair (simulation/effects/bodies.py).
+MOST_BODY_RADIUS = MAX_REACH_UNITS / 4 / UNITS_PER_METRE
+
+ReadPoints = Callable[[Path], NDArray[np.float64]]
+
+
+class Found(NamedTuple):
+    """One archive of a scene.
+
+    info: its description.  sizes: (v,) int64, decoded size of each voxel [bytes].
+    keeps_scan: it stores the scan of each point.
+    normal_reach: of the normals it stores [m]; 0: it stores none.
+    """
+
+    folder: Path
+    info: SceneInfo
+    sizes: NDArray[np.int64]
+    keeps_scan: bool
+    normal_reach: float
+
+
+class FoundAvatar(NamedTuple):
+    """One avatar of a scene. points: (n, 3), of its file [m]."""
+
+    file: Path
+    points: NDArray[np.float64]
+    info: AvatarInfo
+
+
+def is_scene_file(path: Path) -> bool:
+    """Return whether a path, existing or not, is that of a scene file. Otherwise it is an archive's folder."""
+    return path.suffix == SUFFIX and not path.is_dir()
+
+
+@contextmanager
+def open_scene(
+    path: str | Path,
+    *,
+    read_points: ReadPoints,
+    name: str | None = None,
+    budget_bytes: int = DEFAULT_BUDGET,
+    policy: str = "lru",
+) -> Iterator[SceneLike]:
+    """Open an archive or a scene file, and close it at the end of the block.
+
+    read_points: returns the points (n, 3) of a file [m].
+    name: of the scene, for clients; None: the name in the scene file, else that of the file or folder.
+    budget_bytes: of decoded voxels, all archives together.  policy: eviction policy, see eviction.py.
+    Raises BadRequestError for an invalid scene file, FormatError, CorruptError or ScanError for
+    invalid files that it names.
+    """
+    path = Path(path)
+    if not is_scene_file(path):
+        with Scene.open(path, name, budget_bytes=budget_bytes, policy=policy) as scene:
+            yield scene
+        return
+    file = read_scene(path)
+    name = name or scene_name(file, path)
+    found = find_archives(file, path)
+    avatars = read_avatars(file, path, read_points)
+    own = {item.name: (a.points, a.info.radius) for item, a in zip(file.avatars, avatars, strict=True)}
+    with ExitStack() as stack:
+        served = _open_archives(file, path, name, found, budget_bytes, policy, stack)
+        with at_place(path, "$.effects"):
+            simulation = simulate(served, file, own)
+        yield stack.enter_context(simulation)
+
+
+def find_archives(file: SceneFile, path: Path) -> list[Found]:
+    """Return the archives that a scene file names, after checking their indexes.
+
+    Also checks that each archive stores what the scene file requires.
+    path: of the scene file, for errors and for relative paths.
+    Raises FormatError, CorruptError or BadRequestError.
+    """
+    found = []
+    for number, item in enumerate(file.archives):
+        with at_place(path, f"$.archives[{number}].path"):
+            store = Store(_beside(path, item.path), normals=normals_asked(file))
+        try:
+            header = store.archive.header
+            if file.radius_model is not None:
+                with at_place(path, f"$.radius_model: {store.archive.folder}"):
+                    class_radii(file.radius_model, header.radius, header.models)
+            info = describe(store, store.archive.folder.name)
+            found.append(
+                Found(store.archive.folder, info, store.sizes, header.scan_index, header.normal_reach)
+            )
+        finally:
+            store.close()
+    _check_noise(file, path, found)
+    return found
+
+
+def read_avatars(file: SceneFile, path: Path, read_points: ReadPoints) -> list[FoundAvatar]:
+    """Return the avatars that a scene file names. Raises BadRequestError and the errors of `read_points`."""
+    found = []
+    meet = any(isinstance(effect, Objects | Crowd) for effect in file.effects)
+    for number, item in enumerate(file.avatars):
+        avatar_file = _beside(path, item.file)
+        with at_place(path, f"$.avatars[{number}].file"):
+            points = read_points(avatar_file)
+        with at_place(path, f"$.avatars[{number}]"):
+            model = make_avatar(points, item.radius)
+            if meet and model.radius > MOST_BODY_RADIUS:
+                raise BadRequestError(
+                    f"avatar radius {model.radius:g} m: expected at most {MOST_BODY_RADIUS:g} m with the effect "
+                    "`objects` or `crowd`, under which avatars collide with others"
+                )
+        info = AvatarInfo(item.name, len(points), model.radius, model.bounding_radius)
+        found.append(FoundAvatar(avatar_file, points, info))
+    return found
+
+
+def store_opener(file: SceneFile, number: int) -> OpenStore:
+    """Return the function that opens the folder of archive `number`.
+
+    It loads normals if effects need them, and leaves out the points that the effect `through` removes.
+    """
+    reach = normals_asked(file)
+    for effect in file.effects:
+        if isinstance(effect, Through):
+            from ..simulation.effects.through_effect import store_without
+
+            return store_without(effect, file.archives[number].pose, reach)
+    return partial(Store, normals=reach)
+
+
+def normals_asked(file: SceneFile) -> float | None:
+    """Return the reach of the normals that a scene's effects need [m]; None: they need none."""
+    for effect in file.effects:
+        if isinstance(effect, Slide):
+            return effect.normal_reach
+    return NORMAL_REACH if any(isinstance(effect, Ground) for effect in file.effects) else None
+
+
+def share_budget(budget_bytes: int, sizes: list[NDArray[np.int64]]) -> list[int]:
+    """Divide a cache budget among archives.
+
+    Each archive gets the size of its largest voxel. The rest is divided in proportion to the total sizes.
+    sizes: for each archive (v,), the decoded size of each voxel [bytes].
+    Raises BadRequestError if the largest voxels together exceed the budget.
+    """
+    if len(sizes) == 1:
+        return [budget_bytes]  # `Residency` reports a budget that is too small
+    least = [ArenaBuffer.rounded(int(each.max(initial=0))) for each in sizes]
+    rest = budget_bytes - sum(least)
+    if rest < 0:
+        raise BadRequestError(
+            f"cache of {budget_bytes} bytes: the largest voxels of {len(sizes)} archives take {sum(least)}: give a "
+            "larger --cache, or build with a smaller --voxel"
+        )
+    whole = [int(each.sum()) for each in sizes]
+    return [low + rest * size // max(sum(whole), 1) for low, size in zip(least, whole, strict=True)]
+
+
+def _open_archives(
+    file: SceneFile,
+    path: Path,
+    name: str,
+    found: list[Found],
+    budget_bytes: int,
+    policy: str,
+    stack: ExitStack,
+) -> Stage:
+    """Open the archives as one scene. They are closed when `stack` is."""
+    with at_place(path, "$.archives"):
+        budgets = share_budget(budget_bytes, [each.sizes for each in found])
+    scenes = []
+    for number, (each, budget) in enumerate(zip(found, budgets, strict=True)):
+        with at_place(path, f"$.archives[{number}]"):
+            scene = Scene.open(
+                each.folder,
+                name,
+                budget_bytes=budget,
+                policy=policy,
+                open_store=store_opener(file, number),
+                radius_model=file.radius_model,
+            )
+        scenes.append(stack.enter_context(scene))
+    poses = [None if item.pose == identity() else np.array(item.pose) for item in file.archives]
+    if len(scenes) == 1 and poses[0] is None:
+        return scenes[0]
+    from .placed_archives import SeveralScenes
+
+    with at_place(path, "$.archives"):
+        return SeveralScenes(list(zip(scenes, poses, strict=True)), name)
+
+
+def _beside(path: Path, named: str) -> Path:
+    """Return a path that a scene file names, relative to its folder, without resolving the links in it.
+
+    Links are followed at each opening, and a reload finds their new targets.
+    """
+    folder, there = path.parent.resolve(), Path(named)
+    while there.parts[:1] == ("..",):
+        folder, there = folder.parent, Path(*there.parts[1:])
+    return folder / there
+
+
+def _check_noise(file: SceneFile, path: Path, found: list[Found]) -> None:
+    """Check the effect `uncertainty`. Raises BadRequestError if it gives noise for an unknown scan."""
+    for number, effect in enumerate(file.effects):
+        if isinstance(effect, Uncertainty):
+            from ..simulation.effects.uncertainty_effect import check
+
+            sources = [source for each in found for source in each.info.sources]
+            with at_place(path, f"$.effects[{number}]"):
+                check(effect, structs.replace(found[0].info, sources=sources))
+
+
+@contextmanager
+def at_place(path: Path, place: str) -> Iterator[None]:
+    """Prefix errors raised in this block with the scene file and the place in it."""
+    try:
+        yield
+    except SolidcloudError as error:
+        error.args = (f"{path}: {place}: {error}",)
+        raise
+    except OSError as error:
+        raise BadRequestError(f"{path}: {place}: {error}") from None

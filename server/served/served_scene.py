@@ -1,0 +1,111 @@
+"""What is served: what a service asks its questions of, and what simulates its frames."""
+
+from collections.abc import Collection, Iterator, Sequence
+from enum import Enum
+from typing import Any, NamedTuple, Protocol
+
+from ...schemas.errors import SolidcloudError
+from ...schemas.wire.answers import (
+    CollideAnswers,
+    ContactsAnswers,
+    DistanceAnswers,
+    ObjectsAnswers,
+    Part,
+    RaycastAnswers,
+    SweepAnswers,
+    WithinAnswers,
+)
+from ...schemas.wire.keys import User
+from ...schemas.wire.messages import AvatarInfo, ReloadAnswer, SceneInfo, StatsAnswer
+from ...schemas.wire.moves import Moved, State, Wish
+from ..runtime.stop_flag import Stop
+from .avatar_limits import AvatarLimits
+
+
+class Full(Enum):
+    """What a server has no more room for."""
+
+    REQUESTS = "requests in flight, of all clients"
+    OWN_REQUESTS = "requests in flight, of one client"
+    PATHS = "paths"
+    STATES = "queries for states"
+
+
+class Answer(NamedTuple):
+    """What is sent: its bytes, their encoding, and whether it is an answer or an error.
+
+    about: the digests of the client's own avatars that answered, joined; its seal names them.
+    """
+
+    payload: bytes
+    encoding: str
+    ok: bool
+    about: bytes = b""
+
+
+class Turn(NamedTuple):
+    """What one user wishes in one frame. late: its wishes that were dropped so far because a newer one had come."""
+
+    user: User
+    wish: Wish
+    late: int = 0
+
+
+class Outcome(NamedTuple):
+    """What came of a turn. state: where the user is now, or why that was not said.  about: as in `Answer`."""
+
+    user: User
+    state: State | SolidcloudError
+    about: bytes = b""
+
+
+class Simulates(Protocol):
+    """What simulates the frames of users that walk a scene; thread-safe."""
+
+    @property
+    def most_users(self) -> int: ...
+    @property
+    def users(self) -> list[User]: ...
+    def step(
+        self,
+        turns: Sequence[Turn],
+        now: float | None = None,
+        *,
+        stops: Sequence[Stop] | None = None,
+    ) -> list[Outcome]: ...
+    def end(self, user: User) -> None: ...
+    def end_client(self, client: str) -> None: ...
+    def warm(self) -> None: ...
+
+
+class SceneLike(Protocol):
+    """What a service asks its questions of; thread-safe. Raises SolidcloudErrors for what it refuses.
+
+    The questions take what those of `Scene` do. Each notes the avatars that answer it (answering_avatars.py) in the
+    thread that calls it, before it returns. simulation: of its users' frames; None: it has none.
+    """
+
+    name: str
+
+    @property
+    def simulation(self) -> Simulates | None: ...
+    def info(self) -> SceneInfo: ...
+    def add_avatar(
+        self, name: str, points: Any, radius: float | None = None, *, client: str = ""
+    ) -> AvatarInfo: ...
+    def collide(self, *what: Any, **effort: Any) -> CollideAnswers: ...
+    def distance(self, *what: Any, **effort: Any) -> DistanceAnswers: ...
+    def contacts(self, *what: Any, **effort: Any) -> ContactsAnswers: ...
+    def sweep(self, *what: Any, **effort: Any) -> SweepAnswers: ...
+    def raycast(self, *what: Any, **effort: Any) -> RaycastAnswers: ...
+    def within(self, *what: Any, **effort: Any) -> WithinAnswers: ...
+    def objects(self, *what: Any, **effort: Any) -> ObjectsAnswers: ...
+    def path(self, *what: Any, **parameters: Any) -> Iterator[Part]: ...
+    def move(self, *what: Any, **parameters: Any) -> Moved: ...
+    def limit_avatars(self, limits: AvatarLimits) -> None: ...
+    def drop_unused_avatars(self, alive: Collection[str], seconds: float) -> None: ...
+    def drop_client(self, client: str) -> None: ...
+    def reload(self) -> ReloadAnswer: ...
+    def stats(self, keys: bool = False) -> StatsAnswer: ...
+    def warm(self) -> None: ...
+    def close(self) -> None: ...

@@ -1,0 +1,412 @@
+"""Builds a server of its parts, warms them, starts them and stops them, in that order.
+
+`Service` is what is between the bytes of the wire and the scenes; `serve` is what the command runs.
+"""
+
+import logging
+import signal
+import socket
+import sys
+import threading
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from typing import Any, NamedTuple
+
+from ...schemas.errors import (
+    BadRequestError,
+    ErrorCode,
+    SolidcloudError,
+    TooLargeError,
+    UnknownAvatarError,
+    UnknownSceneError,
+)
+from ...schemas.wire import keys
+from ...schemas.wire.messages import (
+    MAX_MESSAGE_BYTES,
+    MSGPACK,
+    WIRE_VERSION,
+    AddAvatarRequest,
+    CollideRequest,
+    ContactsRequest,
+    DistanceRequest,
+    ErrorReply,
+    MoveRequest,
+    ObjectsRequest,
+    PathRequest,
+    RaycastRequest,
+    ReloadAnswer,
+    ScenesAnswer,
+    StatsRequest,
+    SweepRequest,
+    WithinRequest,
+    decode_request,
+    encode,
+    wire_encoding,
+)
+from ...schemas.wire.requests import Question
+from ..runtime.deadlines import start_deadlines
+from ..runtime.process_heap import give_back_large_blocks
+from ..runtime.stop_flag import NEVER, Stop
+from ..runtime.threads import start_thread
+from ..served.answering_avatars import noted
+from ..served.served_scene import Answer, Full, SceneLike
+from .command_mailboxes import Frames
+from .server_config import ServerConfig
+from .transport import Transport
+
+log = logging.getLogger(__name__)
+
+
+class _Operation(NamedTuple):
+    """How an operation with a payload is answered.
+
+    request: its type.  counted: the field whose length is bounded by `ServerConfig.max_poses`, "" for none.
+    ask: a scene, the request, the client and the stop flag to an answer, or to the parts of one.
+    """
+
+    request: type
+    counted: str
+    ask: Callable[[SceneLike, Any, str, Stop], Any]
+
+
+def _effort(request: Question, stop: Stop) -> dict[str, Any]:
+    """Return the options of a question to a scene."""
+    return {"stop": stop, **{name: getattr(request, name) for name in Question.__struct_fields__}}
+
+
+def _ask_objects(scene: SceneLike, request: ObjectsRequest, client: str, stop: Stop) -> Any:
+    items = zip(request.objects, request.poses, strict=True)
+    listed = [(item.avatar, pose, item.group, item.mask) for item, pose in items]
+    return scene.objects(listed, request.margin, client=client, **_effort(request, stop))
+
+
+_OPERATIONS = {
+    "add_avatar": _Operation(
+        AddAvatarRequest, "", lambda s, r, c, stop: s.add_avatar(r.name, r.points, r.radius, client=c)
+    ),
+    "collide": _Operation(
+        CollideRequest,
+        "poses",
+        lambda s, r, c, stop: s.collide(r.avatar, r.poses, r.margin, client=c, **_effort(r, stop)),
+    ),
+    "distance": _Operation(
+        DistanceRequest,
+        "poses",
+        lambda s, r, c, stop: s.distance(r.avatar, r.poses, r.reach, client=c, **_effort(r, stop)),
+    ),
+    "contacts": _Operation(
+        ContactsRequest,
+        "poses",
+        lambda s, r, c, stop: s.contacts(
+            r.avatar, r.poses, r.limit, r.margin, r.cluster_distance, client=c, **_effort(r, stop)
+        ),
+    ),
+    "sweep": _Operation(
+        SweepRequest,
+        "pose_from",
+        lambda s, r, c, stop: s.sweep(
+            r.avatar, r.pose_from, r.pose_to, r.margin, client=c, **_effort(r, stop)
+        ),
+    ),
+    "raycast": _Operation(
+        RaycastRequest,
+        "origins",
+        lambda s, r, c, stop: s.raycast(r.origins, r.directions, r.reach, **_effort(r, stop)),
+    ),
+    "within": _Operation(
+        WithinRequest, "points", lambda s, r, c, stop: s.within(r.points, r.reach, **_effort(r, stop))
+    ),
+    "objects": _Operation(ObjectsRequest, "poses", _ask_objects),
+    "move": _Operation(
+        MoveRequest,
+        "",
+        lambda s, r, c, stop: s.move(r.avatar, r.pose_from, r.pose_to, r.seconds, client=c, stop=stop),
+    ),
+    "path": _Operation(
+        PathRequest,
+        "poses",
+        lambda s, r, c, stop: s.path(r.avatar, r.poses, r.op, client=c, stop=stop, **r.parameters()),
+    ),
+}
+
+
+class Service:
+    """Answers the wire's questions by asking scenes. Thread-safe; never raises: an error is an answer too."""
+
+    def __init__(self, scenes: Sequence[SceneLike], config: ServerConfig) -> None:
+        names = [keys.check_name(scene.name, "scene") for scene in scenes]
+        if len(set(names)) != len(names):
+            raise BadRequestError(f"scenes {', '.join(names)}: each needs a name of its own")
+        self._scenes = {scene.name: scene for scene in scenes}
+        self._config = config
+        self._frames: dict[str, Frames] = {}
+        self.left_at_work = False  # once it is served no more: whether a request did not end in time
+        for scene in scenes:
+            scene.limit_avatars(config.avatar_limits)
+
+    def scenes(self, encoding: str | None) -> Answer:
+        """Which scenes are served here."""
+        formats = {scene.info().format_version for scene in self._scenes.values()}
+        answer = ScenesAnswer(sorted(self._scenes), WIRE_VERSION, max(formats, default=0))
+        try:
+            stated = wire_encoding(encoding)
+            return Answer(encode(answer, stated), stated, True)
+        except SolidcloudError as error:
+            return self._error(encoding, error.code, str(error))
+
+    def answer(
+        self, key: str, payload: bytes, encoding: str | None, stop: Stop | None = None
+    ) -> Answer | Iterator[Answer]:
+        """Return the answer to the question asked under this key; an iterator where it comes in parts.
+
+        stop: ends the work early once it is set; what was not reached then is unknown.
+        """
+        avatars: list[bytes] = []
+        try:
+            stated = wire_encoding(encoding)
+            with noted(avatars):
+                found = self._ask(key, payload, stated, NEVER if stop is None else stop)
+            about = b"".join(avatars)
+            if isinstance(found, Iterator):
+                return self._parts(key, found, stated, about)
+            return self._encoded(found, stated, about)
+        except Exception as error:
+            return self._failed(key, encoding, error, b"".join(avatars))
+
+    def _parts(self, key: str, parts: Iterator[Any], encoding: str, about: bytes) -> Iterator[Answer]:
+        """Parts as answers; an error is the last one."""
+        try:
+            for part in parts:
+                yield self._encoded(part, encoding, about)
+        except Exception as error:
+            yield self._failed(key, encoding, error, about)
+
+    def _encoded(self, message: Any, encoding: str, about: bytes) -> Answer:
+        """A message as an answer. TooLargeError: its receiver would drop it unread."""
+        payload = encode(message, encoding)
+        # zenoh's own part of the message takes some of it, far less than this.
+        if len(payload) > MAX_MESSAGE_BYTES - (1 << 16):
+            raise TooLargeError(
+                f"the answer takes {len(payload)} bytes, a message holds {MAX_MESSAGE_BYTES}: ask for less at a time"
+            )
+        return Answer(payload, encoding, True, about)
+
+    def _failed(self, key: str, encoding: str | None, error: Exception, about: bytes) -> Answer:
+        """What went wrong as an answer; what is no SolidcloudError is logged, and told by its kind alone.
+
+        about: of the avatars that were looked up; where one is not known, the answer is about none.
+        """
+        if isinstance(error, SolidcloudError):
+            answer = self._error(encoding, error.code, str(error))
+            return answer if isinstance(error, UnknownAvatarError) else answer._replace(about=about)
+        log.error("a request failed for no reason of its own: %s", key, exc_info=error)
+        answer = self._error(
+            encoding, ErrorCode.INTERNAL, f"{type(error).__name__} in the server: its log says more"
+        )
+        return answer._replace(about=about)
+
+    def busy(self, encoding: str | None, full: Full) -> Answer:
+        """Return the answer to a question that there is no room for. full: which limit was reached."""
+        as_one = "(all clients without a liveliness token count as one)"
+        config = self._config
+        message = {
+            Full.REQUESTS: f"up to {config.max_in_flight} requests are in flight here: ask again later",
+            Full.OWN_REQUESTS: (
+                f"{config.max_in_flight_by_client} requests of this client are in flight, the most that this server "
+                f"takes {as_one}: wait for answers"
+            ),
+            Full.PATHS: (
+                f"this server answers up to {config.max_paths} paths at a time, {max(1, config.max_paths // 2)} of one "
+                f"client {as_one}: ask again when one has ended"
+            ),
+            Full.STATES: "as many queries for states are open as this scene has room for: ask again later",
+        }[full]
+        return self._error(encoding, ErrorCode.BUSY, message)
+
+    def client_gone(self, scene: str, client: str) -> None:
+        """Forget the avatars of a client that went, and end its bodies."""
+        if (frames := self._frames.get(scene)) is not None:
+            frames.client_gone(client)
+        self._scenes[scene].drop_client(client)
+
+    def drop_unused(self, scene: str, alive: Collection[str]) -> None:
+        """Forget avatars that were not used for long, but for those of clients in `alive`."""
+        self._scenes[scene].drop_unused_avatars(alive, self._config.avatar_seconds)
+
+    def frames(
+        self,
+        scene: str,
+        publish: Callable[[keys.User, Answer], None],
+        turn: Callable[[str], str] = str,
+    ) -> Frames | None:
+        """Return the sessions of a scene, whose states are sent by `publish`; None: it simulates nothing.
+
+        turn: returns the turn of a client (liveliness_tokens.py); by default each has its own.
+        """
+        simulation = self._scenes[scene].simulation
+        if simulation is None:
+            return None
+        frames = Frames(simulation, publish, self._config.max_request_seconds, turn)
+        return self._frames.setdefault(scene, frames)
+
+    def warm(self) -> None:
+        """Warm every scene, so that the first client does not wait for compilers."""
+        start_deadlines()
+        for scene in self._scenes.values():
+            log.info("warming %s: the first start on a machine compiles, for a minute or two", scene.name)
+            (scene.simulation or scene).warm()
+
+    def _ask(self, key: str, payload: bytes, encoding: str, stop: Stop) -> Any:
+        """Put one question to the scene its key names."""
+        route = keys.parse_question(key)
+        scene = self._scenes.get(route.scene)
+        if scene is None:
+            served = ", ".join(sorted(self._scenes))
+            raise UnknownSceneError(f"scene {route.scene!r} is not served here; served: {served}")
+        operation = _OPERATIONS.get(route.operation)
+        if operation is None:
+            if route.operation == "stats":
+                asked = decode_request(StatsRequest, payload, encoding) if payload else StatsRequest()
+                return scene.stats(asked.keys)
+            if payload:
+                raise BadRequestError(
+                    f"{route.operation} with a payload of {len(payload)} bytes: expected none"
+                )
+            # As an answer in one part: whoever sends parts has a thread for it, and nobody else waits meanwhile.
+            return self._reload(scene) if route.operation == "reload" else scene.info()
+        request: Any = decode_request(operation.request, payload, encoding)
+        self._check_size(operation, request)
+        return operation.ask(scene, request, route.client, stop)
+
+    def _reload(self, scene: SceneLike) -> Iterator[ReloadAnswer]:
+        """Reload one scene when the answer is asked for; what goes wrong is logged here, and raised."""
+        try:
+            answer = scene.reload()
+        except Exception as error:
+            log.error("%s is not reloaded, what was served is served on: %s", scene.name, error)
+            raise
+        log.info(
+            "reloaded %s in %.1f s: generation %d, was %d; %d points",
+            scene.name, answer.seconds, answer.generation_after, answer.generation_before, answer.points,
+        )  # fmt: skip
+        yield answer
+
+    def reload(self) -> None:
+        """Reload every scene, one after the other; what goes wrong is logged, and that scene served on as it was."""
+        for scene in self._scenes.values():
+            with suppress(Exception):
+                next(self._reload(scene))
+
+    def _check_size(self, operation: _Operation, request: Any) -> None:
+        """TooLargeError for more than this server takes."""
+        if operation.counted:
+            count, most = len(getattr(request, operation.counted)), self._config.max_poses
+            if count > most:
+                raise TooLargeError(f"{count} {operation.counted} in a request: at most {most}: split them")
+        elif operation.request is AddAvatarRequest and len(request.points) > self._config.max_avatar_points:
+            most = self._config.max_avatar_points
+            raise TooLargeError(f"avatar of {len(request.points)} points: at most {most}: thin it out first")
+
+    def _error(self, encoding: str | None, code: ErrorCode, message: str) -> Answer:
+        """An error as an answer, in the encoding that was stated if it is one."""
+        try:
+            stated = wire_encoding(encoding)
+        except BadRequestError:
+            stated = MSGPACK
+        return Answer(encode(ErrorReply(code, message), stated), stated, False)
+
+
+@contextmanager
+def serving(scenes: Sequence[SceneLike], config: ServerConfig) -> Iterator[Service]:
+    """Serve scenes while inside; they stay the caller's, to be closed after.
+
+    Entered once everything is warm and reachable. SolidcloudError: a scene or the endpoint is unusable.
+    """
+    service = Service(scenes, config)
+    service.warm()
+    transport = Transport([scene.name for scene in scenes], service, config)
+    try:
+        with transport:
+            yield service
+    finally:
+        service.left_at_work = transport.left_at_work
+
+
+def serve(
+    scenes: Sequence[SceneLike], config: ServerConfig, ready: Callable[[], object] = lambda: None
+) -> bool:
+    """Serve scenes until SIGTERM or SIGINT, then answer what was accepted and return. Main thread only.
+
+    Returns whether all requests have ended; where one has not, closing its scene waits for it.
+    ready: called once all is warm and reachable.
+    SIGHUP: what is in the archives' folders now is served from then on, see `Scene.reload`.
+    """
+    give_back_large_blocks()
+    # A thread in pure Python may keep the interpreter for 5 ms by default while a reply waits for it.
+    sys.setswitchinterval(0.0005)
+    if config.insecure:
+        log.warning("--insecure: whoever reaches %s may ask anything, unauthenticated", config.listen)
+    with (
+        _signalled(signal.SIGTERM, signal.SIGINT, signal.SIGHUP) as signals,
+        _metrics(scenes, config),
+        serving(scenes, config) as service,
+        _reloader(service) as wanted,
+    ):
+        ready()
+        names = ", ".join(scene.name for scene in scenes)
+        print(f"serving {names} at {config.listen}", flush=True)
+        while signals.recv(1)[0] == signal.SIGHUP:
+            wanted.set()
+    return not service.left_at_work
+
+
+@contextmanager
+def _metrics(scenes: Sequence[SceneLike], config: ServerConfig) -> Iterator[None]:
+    """Serve the metrics of scenes where the configuration says so; from the start, so that a fault is early."""
+    if not config.metrics_port:
+        yield
+        return
+    from ..observability.prometheus import metrics_served  # its library is an extra
+
+    with metrics_served(scenes, config.metrics_host, config.metrics_port) as where:
+        log.info("metrics at %s", where)
+        yield
+
+
+@contextmanager
+def _reloader(service: Service) -> Iterator[threading.Event]:
+    """A thread that reloads all scenes each time the event is set, so that a stop need not wait for it to come back."""
+    wanted, ended = threading.Event(), threading.Event()
+
+    def run() -> None:
+        while wanted.wait() and not ended.is_set():
+            wanted.clear()
+            service.reload()
+
+    # A reload that is under way at the end is given up when its scene is closed (`Scene.close` waits for that).
+    start_thread("reload", run)
+    try:
+        yield wanted
+    finally:
+        ended.set()
+        wanted.set()
+
+
+@contextmanager
+def _signalled(*numbers: signal.Signals) -> Iterator[socket.socket]:
+    """A socket that has something to read once one of the signals came, in place of what they did before.
+
+    Not an event that a handler sets: the system may hand the signal to one of zenoh's threads, and then a main
+    thread that waits for a lock is not woken to run the handler.
+    """
+    reader, writer = socket.socketpair()
+    with reader, writer:
+        writer.setblocking(False)
+        before = {number: signal.signal(number, lambda *_: None) for number in numbers}
+        descriptor = signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
+        try:
+            yield reader
+        finally:
+            signal.set_wakeup_fd(descriptor)
+            for number, handler in before.items():
+                signal.signal(number, handler)

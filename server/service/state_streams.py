@@ -1,0 +1,141 @@
+"""The queries under which clients hear the states of their users: one long query a user, answered with many replies.
+
+A state is sent to the client that asked for it and to nobody else. A subscription could not be bound to one client: a
+wildcard includes every client's key, and would tell its holder the ids in them.
+"""
+
+import threading
+import time
+from collections import OrderedDict
+from collections.abc import Callable
+
+import zenoh
+
+from ...schemas.wire.keys import User
+from ...schemas.wire.seals import Sealer
+from ..network.replies import send_reply
+from ..served.served_scene import Answer
+
+# A query whose user had no state for so long makes room for another's [s].
+IDLE_SECONDS = 60.0
+# How long a state waits for the query that it is the reply to [s]: a first wish may come before it.
+_KEPT_SECONDS = 5.0
+
+
+class _Stream:
+    """One open query. used: when it was opened or last replied to, on the monotonic clock [s].  number: of replies.
+
+    last: the answer sent last.
+    """
+
+    __slots__ = ("_key", "_sealer", "last", "number", "query", "used")
+
+    def __init__(self, query: zenoh.Query, sealer: Sealer | None) -> None:
+        self.query, self._key, self._sealer = query, query.key_expr, sealer
+        self.used = time.monotonic()
+        self.number = 0
+        self.last: Answer | None = None
+
+    def reply(self, answer: Answer) -> bool:
+        """Send one reply; return False where the client is gone."""
+        self.last = answer
+        sent = send_reply(self.query, self._key, answer, self._sealer, self.number)
+        self.number += 1
+        return sent
+
+
+class StateStreams:
+    """The open queries of one scene. Thread-safe; no method blocks, since states are dropped and never wait."""
+
+    def __init__(self, most: int, turn: Callable[[str], str] = str) -> None:
+        """most: queries that are open at a time; one turn has half of them at most.
+
+        turn: returns the turn of a client (liveliness_tokens.py); by default each has its own.
+        """
+        self._most, self._turn = most, turn
+        self._streams: OrderedDict[User, _Stream] = OrderedDict()  # the one used last comes last
+        self._kept: OrderedDict[User, tuple[float, Answer]] = OrderedDict()
+        self._closed = False
+        self._lock = threading.Lock()
+
+    def open(self, user: User, query: zenoh.Query, sealer: Sealer | None) -> bool:
+        """Send the user's states as replies to this query from now on, and end an earlier query of the user.
+
+        Returns False where there is no room: then the query is still the caller's to answer.
+        """
+        with self._lock:
+            if self._closed or not self._make_room(user):
+                return False
+            before = self._end(user)
+            self._streams[user] = stream = _Stream(query, sealer)
+            stream.last = None if before is None else before.last
+            when, answer = self._kept.pop(user, (0.0, None))
+            if answer is not None and time.monotonic() - when < _KEPT_SECONDS:
+                stream.reply(answer)
+        return True
+
+    def send(self, user: User, answer: Answer) -> None:
+        """Send what is said to a user. Without an open query it is kept for a short while."""
+        with self._lock:
+            stream = self._streams.get(user)
+            if stream is None:
+                self._keep(user, answer)
+                return
+            stream.used = time.monotonic()
+            self._streams.move_to_end(user)
+            if not stream.reply(answer):
+                self._end(user)
+
+    def send_again(self, user: User) -> None:
+        """Send what was said to a user last once more: it may have been dropped on the way."""
+        with self._lock:
+            stream = self._streams.get(user)
+            if stream is not None and stream.last is not None and not stream.reply(stream.last):
+                self._end(user)
+
+    def forget(self, user: User) -> None:
+        """Forget what was said to a user, who left."""
+        with self._lock:
+            if (stream := self._streams.get(user)) is not None:
+                stream.last = None
+
+    def end_client(self, client: str) -> None:
+        """End the queries of a client that is gone."""
+        with self._lock:
+            for user in [user for user in self._streams if user.client == client]:
+                self._end(user)
+
+    def close(self) -> None:
+        """End all queries; no more are opened."""
+        with self._lock:
+            self._closed = True
+            for user in list(self._streams):
+                self._end(user)
+
+    def _make_room(self, user: User) -> bool:
+        """End queries until one of this user has room. The oldest of its turn goes first, then one that is idle."""
+        if user in self._streams:
+            return True
+        turn = self._turn(user.client)
+        own = [other for other in self._streams if self._turn(other.client) == turn]
+        if len(own) >= max(1, self._most // 2):
+            self._end(own[0])
+        if len(self._streams) >= self._most:
+            oldest, stream = next(iter(self._streams.items()))
+            if time.monotonic() - stream.used < IDLE_SECONDS:
+                return False
+            self._end(oldest)
+        return True
+
+    def _keep(self, user: User, answer: Answer) -> None:
+        self._kept.pop(user, None)
+        self._kept[user] = (time.monotonic(), answer)
+        if len(self._kept) > self._most:
+            self._kept.popitem(last=False)
+
+    def _end(self, user: User) -> _Stream | None:
+        """Tell a client that no more replies come to its query. Return what was its stream."""
+        stream = self._streams.pop(user, None)
+        if stream is not None:
+            stream.query.drop()
+        return stream

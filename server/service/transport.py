@@ -1,0 +1,224 @@
+"""Bytes in, bytes out over zenoh: the server's only user of it. What the bytes mean is the service's matter.
+
+zenoh hands queries to a bounded channel; our own threads take them from there, since nothing may block in
+one of its callbacks. What these threads do is in request_lanes.py.
+"""
+
+import logging
+import os
+import threading
+import time
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from functools import partial
+from types import TracebackType
+from typing import Any, Protocol, Self
+
+import zenoh
+
+from ...schemas.errors import BadRequestError, SolidcloudError
+from ...schemas.wire import keys
+from ...schemas.wire.seals import Sealer
+from ..network.endpoints import zenoh_words
+from ..network.key_files import published_key
+from ..network.replies import sealer_of, send_reply
+from ..network.zenoh_settings import session_config
+from ..runtime.threads import start_thread
+from ..served.served_scene import Answer
+from .jobs import Wire
+from .liveliness_tokens import Tokens
+from .request_lanes import Lane, Questions
+from .server_config import ServerConfig
+from .session_transport import SceneSessions, Sessions
+
+log = logging.getLogger(__name__)
+
+# Queries that zenoh may hand over before a thread takes them; a full channel holds up zenoh's receiver, which
+# is what bounds memory in a storm. The threads empty it at once, into `FairQueues` or with `busy`.
+_CHANNEL = 1024
+# How long a stop waits, twice, for threads whose work was given up [s]. Kernels look at a stop every few milliseconds;
+# a reply to a client that takes none waits for `wait_before_close`.
+_GIVE_UP_SECONDS = 0.4
+# How often it looks whether a thread has begun that is about to [s].
+_NEXT_SECONDS = 0.001
+
+# zenoh's threads that send, of which it has one by default. The one that closes the link of a client that takes no
+# replies is held for `wait_before_close`, and with one thread all other clients wait meanwhile.
+_RUNTIME = "(tx: (worker_threads: 16))"
+
+
+class ServiceLike(Sessions, Questions, Protocol):
+    """What a transport carries questions to. No method raises: an error is an answer too."""
+
+    def scenes(self, encoding: str | None) -> Answer: ...
+
+
+class Transport:
+    """Carries questions to a service and its answers back, from `__enter__` until `__exit__`.
+
+    SolidcloudError on entry when the endpoint cannot be listened on. Leaving it stops accepting, answers
+    what was accepted (up to `config.stop_seconds`), gives up the rest, then closes.
+    """
+
+    def __init__(self, scenes: Sequence[str], service: ServiceLike, config: ServerConfig) -> None:
+        self._scenes, self._service, self._config = tuple(scenes), service, config
+        self._threads: list[threading.Thread] = []
+        self._lock = threading.Lock()
+        self._declared: list[Any] = []
+        self._lanes: list[Lane] = []
+        self._sessions: list[SceneSessions] = []
+        self.left_at_work = False  # once it was left: whether threads did not end in time
+
+    def __enter__(self) -> Self:
+        with ExitStack() as stack:
+            session = stack.enter_context(self._open())
+            # Once the endpoint is ours: the key of a server that is still there is not written over.
+            self._key = stack.enter_context(published_key(self._config.listen, self._config.key_file))
+            for scene in self._scenes:
+                stack.callback(self._declare_scene(session, scene).close)
+            self._declare_scenes(session)
+            # Last: whoever sees the token may ask at once.
+            for scene in self._scenes:
+                key = keys.server_alive_key(scene, str(session.zid()))
+                self._declared.append(session.liveliness().declare_token(key))
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        with self._stack:
+            # The tokens first. An undeclared queryable's channel still hands out what it holds, then ends.
+            for declared in reversed(self._declared):
+                declared.undeclare()
+            if not self._wait(self._config.stop_seconds):
+                log.warning("not all is answered after %g s: the rest is given up", self._config.stop_seconds)
+                for lane in self._lanes:
+                    lane.give_up()
+                for sessions in self._sessions:
+                    sessions.give_up()
+                self._wait(_GIVE_UP_SECONDS)
+        # Closing the session ends what waits for a client that takes nothing. A thread that is still at work when the
+        # interpreter ends, inside zenoh, would abort the process.
+        if not self._wait(_GIVE_UP_SECONDS):
+            self.left_at_work = True
+            log.error("stopped with threads at work")
+
+    def _wait(self, seconds: float) -> bool:
+        """Wait for all requests and threads, for so long at most; return whether they have ended."""
+        deadline = time.monotonic() + seconds
+        while True:
+            # One may have started another, for a path, before it ended. Where none is left and requests are in flight,
+            # a watchdog is about to start the next.
+            alive = [thread for thread in list(self._threads) if thread.is_alive()]
+            if not alive and not any(lane.in_flight for lane in self._lanes):
+                return True
+            left = deadline - time.monotonic()
+            if left <= 0:
+                return False
+            if alive:
+                alive[0].join(left)
+            else:
+                time.sleep(_NEXT_SECONDS)
+
+    def _open(self) -> zenoh.Session:
+        """A session that listens; SolidcloudError when it cannot."""
+        os.environ.setdefault("ZENOH_RUNTIME", _RUNTIME)  # read when the process opens its first session
+        try:
+            return zenoh.open(session_config(listen=self._config.listen))
+        except zenoh.ZError as error:
+            said = zenoh_words(error)
+            hint = "is another server there? try another port" if "in use" in said else "try another endpoint"
+            raise SolidcloudError(f"cannot listen on {self._config.listen}: {said}: {hint}") from None
+
+    def _declare_scene(self, session: zenoh.Session, scene: str) -> Lane:
+        """Answer the questions about one scene, and watch which clients come and go."""
+        # history: also of clients that were connected before this line.
+        watch = session.liveliness().declare_subscriber(
+            keys.clients_alive_key(scene), zenoh.handlers.FifoChannel(_CHANNEL), history=True
+        )
+        self._declared.append(watch)
+        queryable = session.declare_queryable(
+            keys.questions_key(scene), zenoh.handlers.FifoChannel(_CHANNEL), complete=True
+        )
+        self._declared.append(queryable)
+        tokens = Tokens(self._config.max_in_flight)
+        lane = Lane(
+            self._service,
+            scene,
+            self._config,
+            queryable.handler,
+            partial(_at_hand, queryable.handler),
+            self._start,
+            Wire(_encoding, self._sealer, send_reply),
+            tokens,
+        )
+        self._lanes.append(lane)
+        sessions = SceneSessions(session, scene, self._service, self._start, self._sealer, tokens)
+        self._sessions.append(sessions)
+        self._declared += sessions.declared
+        self._start(f"{scene}-watch", _watch, watch.handler, tokens, lane, sessions)
+        lane.start()
+        return lane
+
+    def _declare_scenes(self, session: zenoh.Session) -> None:
+        """Answer which scenes are served."""
+        queryable = session.declare_queryable(
+            keys.scenes_key(), zenoh.handlers.FifoChannel(_CHANNEL), complete=True
+        )
+        self._declared.append(queryable)
+
+        def take(queries: Any) -> None:
+            for query in queries:
+                try:
+                    with query:
+                        # Under its own key: a wider one that matches is no server's.
+                        sealer = self._sealer(query, keys.scenes_key(), b"")
+                        send_reply(query, keys.scenes_key(), self._service.scenes(_encoding(query)), sealer)
+                except Exception:  # of this query alone
+                    log.exception("a query for the scenes")
+
+        self._start("scenes", take, queryable.handler)
+
+    def _sealer(self, query: zenoh.Query, key_expression: str, request: bytes) -> Sealer | None:
+        """What seals the replies to a query with this server's key."""
+        return sealer_of(query, self._key, key_expression, request)
+
+    def _start(self, name: str, run: Callable[..., None], *arguments: Any) -> None:
+        """A thread that is waited for at the end."""
+        thread = start_thread(name, run, *arguments)
+        with self._lock:
+            self._threads = [other for other in self._threads if other.is_alive()] + [thread]
+
+
+def _watch(samples: Any, tokens: Tokens, lane: Lane, sessions: SceneSessions) -> None:
+    """Tell a lane and the sessions of its scene which clients come and go. A thread's work."""
+    for sample in samples:
+        try:
+            client = keys.parse_client_alive(str(sample.key_expr))
+        except BadRequestError as error:
+            log.debug("a token of no client: %s", error)
+            continue
+        try:
+            if sample.kind == zenoh.SampleKind.DELETE:
+                tokens.gone(client)
+                sessions.client_gone(client)
+                lane.client_gone(client)
+            else:
+                tokens.here(client)
+        except Exception:  # of this client alone
+            log.exception("client %s", client)
+
+
+def _at_hand(queries: Any) -> zenoh.Query | None:
+    """Take a query from a channel without waiting; return None where there is none, or the channel has ended."""
+    try:
+        query: zenoh.Query | None = queries.try_recv()
+    except zenoh.ZError:
+        return None
+    return query
+
+
+def _encoding(query: zenoh.Query) -> str | None:
+    """The encoding a query states, if any."""
+    return None if query.encoding is None else str(query.encoding)

@@ -1,0 +1,248 @@
+"""Blocking: the bodies of a scene that obstruct one mover, as an `Obstacle` of one frame.
+
+First, one kernel call of some microseconds tests the bounds of all bodies against those of the
+motion; usually none is near. Then the near bodies are tested exactly (kernels/bodies/body_sweep.py,
+kernels/bodies/body_pairs.py).
+
+A body that the mover overlaps when the frame begins blocks only a translation against
+`Bodies.way_out`. A translation along it, across it, up or down is permitted, and so is a turn.
+Bodies that came to overlap, by their initial poses or because a motion command placed an object
+there, can therefore separate, and none is ever trapped.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ....schemas.archive.units import UNITS_PER_METRE
+from ....schemas.wire.answers import Verdict
+from ...avatars.avatar_model import AvatarModel, make_avatar
+from ...kernels.bodies.body_sweep import sweep_bodies
+from ...kernels.bodies.near_bodies import find_near
+from ...runtime.stop_flag import NEVER, Stop
+from ..world.frame import Body, Frame, Hit, Pose, Vec
+from ..world.vectors import dot, level, size, turned_by
+from .bodies import USER, Bodies, Shape
+
+# Tolerance for a translation across what is overlapped: rounding does not count as going deeper.
+_ACROSS = 1e-9
+
+
+class _First(NamedTuple):
+    """First body that ends a motion.
+
+    row: of the body.  witness: (2, 3) centres of the two spheres, world [m].  point: of the body's
+    model that touches.
+    """
+
+    row: int
+    fraction: float
+    witness: NDArray[np.float64]
+    point: int
+
+
+class Blocking:
+    """Bodies of some kinds, as obstacles for one mover and one frame."""
+
+    def __init__(
+        self, name: str, bodies: Bodies, wanted: int, mover: str, model: AvatarModel, start: Pose,
+        *, user: bool = True, margin_units: int = 0, skip: str = "", stop: Stop = NEVER,
+    ) -> None:  # fmt: skip
+        """Prepare the obstacle.
+
+        name: of the effect.  wanted: kinds, bits.  mover: its name.  user: whether the mover is a
+        user, or an object.
+        start: its pose when the frame begins.  margin_units: distance to keep, exact units.  skip:
+        a user that does not block.
+        stop: of the frame; once it is set, results are meaningless.
+        """
+        self.name = name
+        self._bodies, self._wanted, self._margin_units = bodies, wanted, margin_units
+        self._mover, self._user, self._skip, self._stop = mover, user, skip, stop
+        self._model, self._start = model, start.copy()
+        self._layout = bodies.layout
+        self._overlapped: dict[int, bool] = {}
+        self._hits: list[Hit] = []
+
+    def sweep(self, avatar: AvatarModel, pose_from: Pose, pose_to: Pose, tolerance: float) -> Hit | None:
+        """Return what ends the motion first; see `Obstacle`. Ties go to the lowest row."""
+        hit = self._sweep(avatar, pose_from, pose_to, tolerance)
+        if hit is not None:
+            self._hits.append(hit)
+        return hit
+
+    def touches(self, avatar: AvatarModel, pose: Pose) -> Hit | None:
+        """Return what is touched at a pose, the lowest row.
+
+        avatar and cloud of the hit are the two bodies' centres, level.
+        """
+        hit = self._touches(avatar, pose)
+        if hit is not None:
+            self._hits.append(hit)
+        return hit
+
+    def is_own(self, hit: Hit) -> bool:
+        """Return whether this obstacle reported the hit."""
+        return any(hit is own for own in self._hits)
+
+    def _sweep(self, avatar: AvatarModel, pose_from: Pose, pose_to: Pose, tolerance: float) -> Hit | None:
+        """Implement `sweep`."""
+        bodies = self._bodies
+        with bodies.lock:
+            shape = bodies.shape_of(avatar)
+            ends = self._from_origin(pose_from), self._from_origin(pose_to)
+            rows = self._near(shape, *ends)
+            while len(rows):
+                first = self._first(shape, ends, rows, tolerance)
+                if first is None:
+                    break
+                if first.fraction > 0.0 or not self._is_overlapped(first.row):
+                    return self._goes_deeper(shape, pose_from, pose_to) or self._hit_of(first)
+                rows = rows[rows != first.row]
+            return self._goes_deeper(shape, pose_from, pose_to)
+
+    def _touches(self, avatar: AvatarModel, pose: Pose) -> Hit | None:
+        """Implement `touches`."""
+        bodies = self._bodies
+        with bodies.lock:
+            shape = bodies.shape_of(avatar)
+            there = self._from_origin(pose)
+            rows = self._near(shape, there, there)
+            if len(rows):
+                rows = rows[bodies.touching(shape, pose, rows, self._margin_units, self._stop)]
+            for row in rows.tolist():
+                if not self._is_overlapped(row):
+                    return self._hit_at(shape, pose, row)
+            return self._goes_deeper(shape, self._start, pose)
+
+    def overlaps(self, avatar: AvatarModel, pose: Pose) -> bool:
+        """Return whether any body is touched at a pose, whatever the margin.
+
+        Bodies that were touched when the frame began count too.
+        """
+        bodies = self._bodies
+        with bodies.lock:
+            shape = bodies.shape_of(avatar)
+            there = self._from_origin(pose)
+            rows = self._in_reach(shape, there, there)
+            return bool(len(rows) and bodies.touching(shape, pose, rows, 0, self._stop).any())
+
+    def give_way(self, frame: Frame, hit: Hit, to: Pose) -> bool:
+        """Return False: none of these bodies gives way."""
+        return False
+
+    def _in_reach(self, shape: Shape, first: Pose, last: Pose) -> NDArray[np.int64]:
+        """Return the rows that a motion, relative to the origin, could meet."""
+        bodies = self._bodies
+        rows = np.empty(len(bodies.names), np.int64)
+        if not len(rows) or not len(shape.model.points):
+            return rows[:0]
+        own = bodies.row_of(self._mover, user=self._user)
+        more = shape.model.radius + self._margin_units / UNITS_PER_METRE
+        count = find_near(shape.box, first, last, more, bodies.bounds, bodies.kinds, self._wanted, own, rows)
+        return rows[:count]
+
+    def _near(self, shape: Shape, first: Pose, last: Pose) -> NDArray[np.int64]:
+        """Return the rows of `_in_reach`, except those overlapped when the frame began."""
+        bodies = self._bodies
+        if self._layout != bodies.layout:
+            self._layout, self._overlapped = bodies.layout, {}
+        found = self._in_reach(shape, first, last)
+        left_out = [row for row, overlapped in self._overlapped.items() if overlapped]
+        if self._skip:
+            left_out.append(bodies.row_of(self._skip, user=True))
+        return found[~np.isin(found, left_out)] if len(found) and left_out else found
+
+    def _from_origin(self, pose: Pose) -> Pose:
+        """Return a pose with its translation relative to the bodies' origin."""
+        there = np.array(pose, np.float64, order="C")
+        there[:3, 3] -= self._bodies.origin
+        return there
+
+    def _first(
+        self, shape: Shape, ends: tuple[Pose, Pose], rows: NDArray[np.int64], tolerance: float
+    ) -> "_First | None":
+        """Return what ends a motion first among the bodies of these rows."""
+        bodies, numbers = self._bodies, self._bodies.numbers[rows]
+        best: _First | None = None
+        until = np.inf
+        while len(rows):
+            same = numbers == numbers[0]
+            other = bodies.shapes[int(rows[0])]
+            if len(other.model.points):
+                witness, named = np.empty((2, 3)), np.empty(2, np.int64)
+                row, fraction = sweep_bodies(
+                    shape.model.arrays, shape.box, shape.units, *ends, other.model.arrays, bodies.poses,
+                    other.units, rows[same], bodies.origin, self._margin_units, tolerance, until, witness, named,
+                    bodies.scratch, self._stop.flag,
+                )  # fmt: skip
+                if row >= 0:
+                    best, until = (
+                        _First(row, fraction, witness, int(other.model.rows[named[0], named[1]])),
+                        fraction,
+                    )
+            rows, numbers = rows[~same], numbers[~same]
+        return best
+
+    def _hit_of(self, first: "_First") -> Hit:
+        """Return the hit of the body that ended a motion, with its normal for an object."""
+        bodies, row, (own, other) = self._bodies, first.row, first.witness
+        normal = bodies.shapes[row].normal_at(first.point)
+        if normal is not None:
+            normal = turned_by(bodies.poses[row], normal)
+            normal = -normal if dot(normal, own - other) < 0.0 else normal
+        return Hit(first.fraction, Verdict.CONTACT, own, other, bodies.names[row], normal=normal)
+
+    def _is_overlapped(self, row: int) -> bool:
+        """Return whether the mover touched a body when the frame began."""
+        found = self._overlapped.get(row)
+        if found is None:
+            bodies = self._bodies
+            shape = bodies.shape_of(self._model)
+            touching = bodies.touching(shape, self._start, np.array([row]), self._margin_units, self._stop)
+            found = self._overlapped[row] = bool(touching[0])
+        return found
+
+    def _goes_deeper(self, shape: Shape, pose_from: Pose, pose_to: Pose) -> Hit | None:
+        """Return a hit of a body, overlapped at the start, that a motion goes deeper into.
+
+        A motion does so if its translation is directed against the body's `_out`. None: no body.
+        """
+        way = pose_to[:3, 3] - pose_from[:3, 3]
+        for row in sorted(row for row, overlapped in self._overlapped.items() if overlapped):
+            out = self._out(row)
+            if dot(way, out) < -_ACROSS * size(out) * size(way):
+                center = shape.center(pose_from)
+                return Hit(0.0, Verdict.CONTACT, center, center - out, self._bodies.names[row])
+        return None
+
+    def _out(self, row: int) -> Vec:
+        """Return the direction out of a body that the mover overlapped when the frame began."""
+        bodies = self._bodies
+        center = bodies.shape_of(self._model).center(self._start)
+        return bodies.way_out(row, self._mover if self._user else "", center)
+
+    def _hit_at(self, shape: Shape, pose: Pose, row: int) -> Hit:
+        """Return the hit of a body touched at a pose.
+
+        The time of contact is unknown; the body's centre therefore gives the position, as seen from
+        the frame's start.
+        """
+        bodies, center = self._bodies, shape.center(pose)
+        out = shape.center(self._start) - bodies.shapes[row].center(bodies.poses[row])
+        return Hit(0.0, Verdict.CONTACT, center, center - level(out, bodies.up), bodies.names[row])
+
+
+def warm() -> None:
+    """Compile the kernels before the first request needs them."""
+    model = make_avatar([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]], 0.05)
+    bodies = Bodies(np.zeros(3), np.array([0.0, 0.0, 1.0]))
+    poses = [np.eye(4), np.eye(4)]
+    poses[1][0, 3] = 1.0
+    for name, pose in zip("ab", poses, strict=True):
+        bodies[name] = Body(name, model, pose)
+    blocking = Blocking("", bodies, USER, "a", model, poses[0])
+    blocking.sweep(model, poses[0], poses[1], 1e-6)
+    blocking.touches(model, poses[1])
+    bodies.shape_of(model).normal_at(0)

@@ -1,0 +1,364 @@
+"""Bodies: everything that moves in one scene, users and objects, with their current poses.
+
+Each simulation has one. It updates the bodies like a dict of its users (`bodies[user] = body` after
+each frame, `pop`), and passes on the poses at which motion commands place objects (`tell`). Effects
+query it through `Blocking` (blocking.py).
+"""
+
+import threading
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ....schemas.archive.units import UNITS_PER_METRE
+from ....schemas.errors import BadRequestError, BadTransformError
+from ....schemas.kernels.normal_codes import NONE, decode_normal, normal_code
+from ...avatars.avatar_model import AvatarModel
+from ...kernels.bodies.body_pairs import CONTACT, touch_pairs
+from ...kernels.bodies.moving_bodies import make_scratch
+from ...kernels.bodies.near_bodies import bound_body
+from ...kernels.core.pose_transform import MAX_REACH_UNITS, SIMILARITY_TOLERANCE
+from ...kernels.core.stop_flag_checks import NO_LIMIT
+from ...queries.context.query_context import kernel_poses, to_units
+from ...runtime.stop_flag import NEVER, Stop
+from ..world.frame import Body, Pose, Vec
+from ..world.vectors import level, turned_back, turned_by
+
+USER, TOLD, PUSHED = 1, 2, 4  # kinds, one bit each
+# Points this near to one another form a body's surface [m], as `slide` and `ground` define it for
+# scans.
+_SURFACE = 0.08
+# Number of cached shapes of avatars that belong to no body, beyond which they are dropped.
+_MOST_LOOSE = 64
+
+
+class Shape(NamedTuple):
+    """Avatar's model with the data of the broad phase.
+
+    box: (2, 3) of its points [m], zeros where it has none.  units: its radius, exact units.
+    number: of it among its `Bodies`.  normals: those computed so far, by point.
+    """
+
+    model: AvatarModel
+    box: NDArray[np.float64]
+    units: int
+    number: int
+    normals: dict[int, Vec | None]
+
+    def center(self, pose: Pose) -> Vec:
+        """Return the placed centre of its box."""
+        placed: Vec = turned_by(pose, 0.5 * (self.box[0] + self.box[1])) + pose[:3, 3]
+        return placed
+
+    def normal_at(self, point: int) -> Vec | None:
+        """Return the unit normal of its surface at a point, or its opposite; None if none.
+
+        The normal is in the avatar frame. It is computed as for a scan
+        (schemas/kernels/normal_codes.py), with exact units as the lattice.
+        """
+        if point not in self.normals:
+            points = self.model.points
+            apart = points - points[point]
+            near = np.rint(apart[(apart * apart).sum(axis=1) <= _SURFACE**2] * UNITS_PER_METRE).astype(
+                np.int64
+            )
+            x, y, z = near.T
+            products = [x * x, y * y, z * z, y * z, z * x, x * y]
+            code = normal_code(np.array([len(near), *(c.sum() for c in (x, y, z, *products))], np.int64))
+            self.normals[point] = None if code == NONE else np.array(decode_normal(code))
+        return self.normals[point]
+
+
+class Bodies:
+    """Bodies by row: the initial objects, then users in order of arrival.
+
+    origin: (3,), the scene's origin, relative to which bodies are placed [m].  up: (3,) unit.
+    lock: held during queries and changes, because a move that keeps no state may run at the same
+    time as a frame.
+    Rows: names; kinds (n,) uint8; poses (n, 4, 4), world; bounds (n, 2, 3), relative to the origin,
+    radius included; shapes; numbers (n,) of shapes; changed: the clock at the last move.
+    clock: counts moves.  layout: counts arrivals and departures of bodies, after which rows change.
+    """
+
+    def __init__(self, origin: Vec, up: Vec, begin: "Callable[[Bodies], None] | None" = None) -> None:
+        """Create an empty set of bodies.
+
+        begin: adds the initial objects on first use, because avatars are loaded after effects.
+        """
+        self._begin = begin
+        self.origin, self.up = np.array(origin, np.float64), np.array(up, np.float64)
+        self.lock = threading.RLock()
+        self.scratch = make_scratch(1, 1)
+        self.names: list[str] = []
+        self.kinds = np.empty(0, np.uint8)
+        self.poses = np.empty((0, 4, 4))
+        self.bounds = np.empty((0, 2, 3))
+        self.numbers = np.empty(0, np.int64)
+        self.shapes: list[Shape] = []
+        self.changed: list[int] = []
+        self.clock = self.layout = 0
+        self._rows: dict[tuple[bool, str], int] = {}
+        self._users: dict[Hashable, Body] = {}
+        self._known: dict[int, Shape] = {}
+        self._numbered = 0
+        # By user and object, see `_remember_way`.
+        self._came_from: dict[tuple[str, str], Vec] = {}
+
+    # --- shapes --------------------------------------------------------------------------------
+
+    def shape_of(self, model: AvatarModel) -> Shape:
+        """Return the cached shape of a model."""
+        shape = self._known.get(id(model.points))
+        if shape is not None and shape.model.arrays is model.arrays and shape.model.radius == model.radius:
+            return shape
+        if len(self._known) > _MOST_LOOSE + len(self.names):
+            self._known = {id(kept.model.points): kept for kept in self.shapes}
+        box = np.zeros((2, 3))
+        if len(model.points):
+            box = np.array([model.points.min(axis=0), model.points.max(axis=0)])
+        units = to_units(model.radius, "radius")
+        if units > MAX_REACH_UNITS // 4:
+            raise BadRequestError(
+                f"avatar radius {model.radius:g} m: expected at most 4 m with crowd or objects"
+            )
+        nodes = max(len(model.arrays.radius), self.scratch.moving.shape[1])
+        blocks = max(len(model.arrays.points), len(self.scratch.lanes))
+        if nodes > self.scratch.moving.shape[1] or blocks > len(self.scratch.lanes):
+            counters = self.scratch.counters
+            self.scratch = make_scratch(nodes, blocks)
+            self.scratch.counters[:] = counters
+        shape = self._known[id(model.points)] = Shape(model, box, units, self._numbered, {})
+        self._numbered += 1
+        return shape
+
+    # --- arrivals and departures ---------------------------------------------------------------
+
+    def begin(self) -> None:
+        """Add the initial objects, once. Raise the error of an invalid object on each call.
+
+        Without its objects, a scene would let users walk through them.
+        """
+        with self.lock:
+            begin, self._begin = self._begin, None
+            if begin is None:
+                return
+            try:
+                begin(self)
+            except BaseException:
+                self._begin = begin
+                for row in reversed(range(len(self.names))):
+                    self._remove(row)
+                raise
+
+    def __setitem__(self, user: Hashable, body: Body) -> None:
+        """Add a user, or update its body's pose."""
+        with self.lock:
+            self.begin()
+            self._users[user] = body
+            row = self._rows.get((True, body.name))
+            if row is None:
+                self._add(body.name, USER, body.avatar, body.pose)
+                return
+            if self.shapes[row].model is not body.avatar:
+                self.shapes[row] = self.shape_of(body.avatar)
+                self.numbers[row] = self.shapes[row].number
+            self._put(row, body.pose)
+
+    def pop(self, user: Hashable, default: Body | None = None) -> Body | None:
+        """Remove a user and return its body."""
+        with self.lock:
+            body = self._users.pop(user, default)
+            if body is not None and (True, body.name) in self._rows:
+                self._remove(self._rows[True, body.name])
+            return body
+
+    def remembers(self, body: Body) -> bool:
+        """Return whether this is the body of a present user.
+
+        The body of a move that keeps no state is a different one.
+        """
+        return any(body is known for known in self._users.values())
+
+    def add_object(self, name: str, model: AvatarModel, pose: Pose, *, pushed: bool) -> None:
+        """Add an object at its initial pose; BadTransformError unless the pose is rigid."""
+        with self.lock:
+            self._add(name, PUSHED if pushed else TOLD, model, _checked(name, pose))
+
+    def row_of(self, name: str, *, user: bool) -> int:
+        """Return the row of a user or an object, or -1."""
+        return self._rows.get((user, name), -1)
+
+    def _add(self, name: str, kind: int, model: AvatarModel, pose: Pose) -> None:
+        """Append a row."""
+        row = len(self.names)
+        shape = self.shape_of(model)
+        self.names.append(name)
+        self.shapes.append(shape)
+        self.changed.append(0)
+        self.kinds = np.append(self.kinds, np.uint8(kind))
+        self.numbers = np.append(self.numbers, shape.number)
+        self.poses = np.concatenate([self.poses, np.eye(4)[None]])
+        self.bounds = np.concatenate([self.bounds, np.zeros((1, 2, 3))])
+        self._rows[kind == USER, name] = row
+        self.layout += 1
+        self._put(row, pose, begun=True)
+
+    def _remove(self, row: int) -> None:
+        """Remove a row; the numbers of later rows decrease by one."""
+        name = self.names[row]
+        for rows in (self.names, self.shapes, self.changed):
+            del rows[row]  # type: ignore[attr-defined]
+        self.kinds, self.numbers = np.delete(self.kinds, row), np.delete(self.numbers, row)
+        self.poses, self.bounds = np.delete(self.poses, row, axis=0), np.delete(self.bounds, row, axis=0)
+        self._rows = {(bool(self.kinds[at] == USER), each): at for at, each in enumerate(self.names)}
+        self._came_from = {key: way for key, way in self._came_from.items() if key[0] != name}
+        self.layout += 1
+
+    # --- poses ---------------------------------------------------------------------------------
+
+    def standing(self) -> tuple[int, NDArray[np.float64]]:
+        """Return the layout and the poses (n, 4, 4) of all bodies now, for `put_back`."""
+        with self.lock:
+            return self.layout, self.poses.copy()
+
+    def put_back(self, standing: tuple[int, NDArray[np.float64]]) -> None:
+        """Restore the poses that `standing` returned, if the bodies are still the same."""
+        layout, poses = standing
+        with self.lock:
+            if layout == self.layout:
+                for row in np.flatnonzero((poses != self.poses).any(axis=(1, 2))).tolist():
+                    self._put(row, poses[row])
+
+    def put(self, row: int, pose: Pose) -> None:
+        """Set the pose of a body."""
+        with self.lock:
+            self._put(row, pose)
+
+    def _put(self, row: int, pose: Pose, begun: bool = False) -> None:
+        """Implement `put`. begun: the body is new."""
+        if not begun and (self.poses[row] == pose).all():
+            return
+        self.poses[row] = pose
+        shape = self.shapes[row]
+        if len(shape.model.points):
+            bound_body(shape.box, self.poses[row], self.origin, shape.model.radius, self.bounds[row])
+        else:
+            self.bounds[row, 0], self.bounds[row, 1] = np.inf, -np.inf
+        if not begun:
+            self.clock += 1
+            self.changed[row] = self.clock
+
+    def tell(self, poses: Mapping[str, Sequence[Sequence[float]]], stop: Stop = NEVER) -> Callable[[], None]:
+        """Place objects where a motion command puts them, even into users.
+
+        A user that is touched then starts its next frame in contact.
+        poses: (4, 4) row-major by name. All are checked before any is set: BadRequestError,
+        BadTransformError.
+        Returns a function that restores the poses, for a motion command that is refused or stopped
+        later.
+        """
+        with self.lock:
+            self.begin()
+            checked = [(self._told(name), _checked(name, poses[name])) for name in sorted(poses)]
+            came_from, stood = dict(self._came_from), [(row, self.poses[row].copy()) for row, _ in checked]
+            for (row, pose), (_, before) in zip(checked, stood, strict=True):
+                self._put(row, pose)
+                self._remember_way(row, before, stop)
+
+        def put_back() -> None:
+            with self.lock:
+                for row, before in stood:
+                    self._put(row, before)
+                self._came_from = came_from
+
+        return put_back
+
+    def _told(self, name: str) -> int:
+        """Return the row of an object that motion commands may place, else BadRequestError."""
+        row = self.row_of(name, user=False)
+        if row < 0 or self.kinds[row] != TOLD:
+            told = [each for each, kind in zip(self.names, self.kinds, strict=True) if kind == TOLD]
+            found = "is not in this scene" if row < 0 else "is pushed by users and cannot be placed"
+            raise BadRequestError(
+                f"object {name!r} {found}: expected a kinematic object: {', '.join(told) or 'there is none'}"
+            )
+        return row
+
+    def _remember_way(self, thing: int, before: Pose, stop: Stop) -> None:
+        """Store the direction from which a placed object has moved into users.
+
+        The direction is in the object's frame; `way_out` uses it.
+        """
+        bounds, now = self.bounds, self.poses[thing]
+        apart = (bounds[:, 0] > bounds[thing, 1]) | (bounds[:, 1] < bounds[thing, 0])
+        near = np.flatnonzero((self.kinds == USER) & ~apart.any(axis=1))
+        if not len(near):
+            return
+        touching = self.touching(self.shapes[thing], now, near, 0, stop)
+        touching &= ~self.touching(self.shapes[thing], before, near, 0, stop)
+        for row in near[touching].tolist():
+            center = self.shapes[row].center(self.poses[row])
+            own = [turned_back(pose, center - pose[:3, 3]) for pose in (before, now)]
+            self._came_from[self.names[row], self.names[thing]] = own[0] - own[1]
+
+    def way_out(self, row: int, user: str, center: Vec) -> Vec:
+        """Return the level direction in which a mover gets free of a body it overlaps; zeros: any.
+
+        The direction is away from the body's centre. For an object that was moved into a user, it
+        is the direction the object came from, which does not lead through it.
+        center: of the mover.  user: the mover's name, "" for an object.
+        """
+        came_from = self._came_from.get((user, self.names[row])) if self.kinds[row] != USER else None
+        pose = self.poses[row]
+        way = center - self.shapes[row].center(pose) if came_from is None else turned_by(pose, came_from)
+        return level(way, self.up)
+
+    def touching(
+        self, shape: Shape, pose: Pose, rows: NDArray[np.int64], margin_units: int, stop: Stop = NEVER
+    ) -> NDArray[np.bool_]:
+        """Return whether an avatar at a pose touches the bodies of each of rows (m,).
+
+        The definition decides. The result is meaningless once `stop` is set.
+        """
+        found = np.zeros(len(rows), bool)
+        if not len(shape.model.points):
+            return found
+        poses = np.concatenate([pose[None], self.poses[rows]])
+        scales = np.ones(len(poses))
+        units = np.array([shape.units, *(self.shapes[row].units for row in rows.tolist())], np.int64)
+        numbers = self.numbers[rows]
+        for number in np.unique(numbers).tolist():
+            at = np.flatnonzero(numbers == number)
+            model = self.shapes[int(rows[at[0]])].model
+            if not len(model.points):
+                continue
+            pairs = np.stack([np.zeros(len(at), np.int64), at + 1], axis=1)
+            verdict = np.empty(len(at), np.uint8)
+            touch_pairs(
+                shape.model.arrays, model.arrays, poses, scales, units, pairs, margin_units, self.origin, NO_LIMIT,
+                stop.flag, verdict, self.scratch.counters,
+            )  # fmt: skip
+            found[at] = verdict == CONTACT
+        return found
+
+
+def _checked(name: str, pose: Sequence[Sequence[float]] | Pose) -> Pose:
+    """Return the pose (4, 4) of an object; raise an error unless it is rigid.
+
+    Raises BadRequestError or BadTransformError.
+    """
+    array = np.array(pose, np.float64)
+    if array.shape != (4, 4):
+        raise BadRequestError(f"object {name!r}: pose of shape {array.shape}: expected 4 rows of 4 numbers")
+    array = kernel_poses(array[None])[0]
+    if not np.isfinite(array).all() or np.abs(array[:3, 3]).max() > 1e9:
+        raise BadRequestError(f"object {name!r}: expected finite numbers, and a position within 1e9 m")
+    off = float(np.abs(array[:3, :3] @ array[:3, :3].T - np.eye(3)).max())
+    if array[3].tolist() != [0, 0, 0, 1] or off > SIMILARITY_TOLERANCE or np.linalg.det(array[:3, :3]) < 0:
+        raise BadTransformError(
+            f"object {name!r}: its pose is not rigid (off by {off:g}): expected a row-major 4x4 pose, a rotation and a "
+            "translation, within 1e-9"
+        )
+    return array

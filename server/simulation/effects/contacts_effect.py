@@ -1,0 +1,59 @@
+"""Effect `contacts`: report what the avatar touches, or nearly touches, in clusters, deepest first.
+
+It reports each frame, on the scene as scanned; users and dynamic objects are not included.
+"""
+
+from collections.abc import Iterator
+from typing import Any
+
+from ....schemas.scene.effect_options import Contacts
+from ....schemas.wire.answers import ContactsAnswers
+from ....schemas.wire.moves import ContactCluster, ContactsReport
+from ..world.frame import Frame
+from .separation_cache import farther
+
+
+def make(effect: Contacts, world: Any) -> "ContactsRunner":
+    """Create the effect of a scene."""
+    return ContactsRunner(effect)
+
+
+class ContactsRunner:
+    """Effect that reports the clusters of `contacts` at the frame's pose.
+
+    Its pairs are counted, not listed.
+    """
+
+    name = "contacts"
+
+    def __init__(self, effect: Contacts) -> None:
+        """Create the effect as declared."""
+        self._effect = effect
+
+    def run(self, frame: Frame) -> None:
+        """Search, and write the report."""
+        frame.reports[self.name] = self._report(frame)
+
+    def _report(self, frame: Frame) -> ContactsReport:
+        """Return the report; after an incomplete search, what was found, with `unknown`."""
+        effect = self._effect
+        # Most frames have no contact; finding that out costs a fifth of gathering nothing.
+        if farther(frame, effect.margin):
+            return ContactsReport()
+        of_archives = frame.world.contacts(
+            frame.body.avatar, frame.pose, 0, effect.margin, effect.cluster_distance, effort=frame.effort
+        )
+        clusters = [cluster for answers in of_archives for cluster in _clusters(answers)]
+        if len(of_archives) > 1:
+            clusters.sort(key=lambda cluster: cluster.deepest)
+        exact = all(answers.exact[0] for answers in of_archives)
+        return ContactsReport(clusters[: effect.limit], len(clusters), not exact)
+
+
+def _clusters(answers: ContactsAnswers) -> Iterator[ContactCluster]:
+    """Yield the clusters of one archive, deepest first."""
+    columns = (
+        answers.cluster_count, answers.cluster_deepest, answers.cluster_avatar, answers.cluster_cloud
+    )  # fmt: skip
+    for count, deepest, avatar, cloud in zip(*(column.tolist() for column in columns), strict=True):
+        yield ContactCluster(count, deepest, tuple(avatar), tuple(cloud))

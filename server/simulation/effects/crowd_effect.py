@@ -1,0 +1,68 @@
+"""Effect `crowd`: users do not walk through one another.
+
+The other users stand where they are now. Those whose turn came earlier in this frame have already
+moved, in the order of the simulation, which its log records. A user that is met blocks, and does
+not move. Users that overlap, for example because they began in one place, may separate but not move
+deeper (blocking.py).
+"""
+
+from typing import Any
+
+from ....schemas.errors import BadRequestError
+from ....schemas.scene.effect_options import Crowd
+from ....schemas.wire.moves import CrowdReport
+from ...queries.context.query_context import to_units
+from ..world.frame import Frame, Hit, Pose
+from .blocking import Blocking, warm
+from .bodies import USER, Bodies
+
+# Largest permitted margin [m].
+_MOST_MARGIN = 8.0
+
+
+def make(effect: Crowd, world: Any) -> "CrowdRunner":
+    """Create the effect of a scene."""
+    if effect.margin > _MOST_MARGIN:
+        raise BadRequestError(f"margin {effect.margin:g} m of crowd: expected at most {_MOST_MARGIN:g} m")
+    warm()
+    with world as seen:
+        bodies = Bodies(seen[0].data.arrays.origin, world.up)
+    return CrowdRunner(bodies, to_units(effect.margin, "margin"))
+
+
+class CrowdRunner:
+    """Effect that adds the other users to the obstacles of a frame.
+
+    bodies: the simulation updates them, and may replace them by those of another effect.
+    """
+
+    name = "crowd"
+
+    def __init__(self, bodies: Bodies, margin_units: int) -> None:
+        """Create the effect. margin_units: distance between users, exact units."""
+        self.bodies, self._margin_units = bodies, margin_units
+
+    def run(self, frame: Frame) -> None:
+        """Add the other users to the obstacles; the report counts those that block."""
+        self.bodies.begin()
+        frame.reports[self.name] = CrowdReport()
+        frame.obstacles.append(Others(self.name, self.bodies, frame, self._margin_units))
+
+
+class Others(Blocking):
+    """Obstacle of the other users; counts those that ended a motion."""
+
+    def __init__(self, name: str, bodies: Bodies, frame: Frame, margin_units: int) -> None:
+        """Create the obstacle for a frame's mover."""
+        body, stop = frame.body, frame.effort.stop
+        super().__init__(
+            name, bodies, USER, body.name, body.avatar, body.pose, margin_units=margin_units, stop=stop
+        )
+        self._met: set[str] = set()
+
+    def give_way(self, frame: Frame, hit: Hit, to: Pose) -> bool:
+        """Count the user that was met; return False, as users do not give way."""
+        if self.is_own(hit):
+            self._met.add(hit.what)
+            frame.reports[self.name] = CrowdReport(len(self._met))
+        return False

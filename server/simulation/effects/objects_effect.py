@@ -1,0 +1,188 @@
+"""Effect `objects`: dynamic objects block users; pushable ones give way where there is space.
+
+Motion commands place a kinematic object (`Bodies.tell`), whatever is at that pose. A pushed object
+is moved by the user whose motion it ended: by the remaining translation, level, as far as the
+object touches nothing on its way. Then the user follows. The object has no momentum: it never moves
+farther than its user's motion command, and stands when nobody pushes. An object that touches the
+scene where it stands, such as the floor, does not move: place it clear of the scene.
+
+Contacts of objects are recomputed only for those that have moved (contact as in server/queries/objects.py).
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from ....schemas.scene.effect_options import Objects
+from ....schemas.scene.scene_file import ObjectItem
+from ....schemas.wire.answers import Verdict
+from ....schemas.wire.moves import ObjectsReport
+from ...queries.context.query_budget import Effort
+from ..world.frame import Frame, Hit, Pose, Vec, moved_by
+from ..world.vectors import dot, level, size
+from .blocking import Blocking, warm
+from .bodies import PUSHED, TOLD, USER, Bodies
+
+# A pushed object keeps this distance from what stops it, along its way [m], as `stop` does for
+# users.
+_SKIN = 0.002
+# Largest distance any point may move between the last moment known to be clear and a touch [m].
+_TOLERANCE = 1e-5
+# A push that would move an object by less than this does not move it [m].
+_LEAST = 1e-4
+# Cosine: an object moves where it is pushed within 60 degrees of head on; otherwise users slide
+# along it.
+_HEAD_ON = 0.5
+
+
+def make(effect: Objects, world: Any) -> "ObjectsRunner":
+    """Create the effect of a scene.
+
+    Raises BadRequestError for invalid objects.
+    """
+    warm()
+    return ObjectsRunner(world, world.file.objects)
+
+
+class ObjectsRunner:
+    """Effect that adds the scene's objects to the obstacles of a frame.
+
+    bodies: the simulation updates its users in them.  world: of the scene.  Not thread-safe, except
+    for queries of `Bodies`.
+    """
+
+    name = "objects"
+
+    def __init__(self, world: Any, items: Sequence[ObjectItem]) -> None:
+        """Create the effect. items: the objects at their initial poses."""
+        self._world = world
+        with world as seen:
+            self.bodies = Bodies(seen[0].data.arrays.origin, world.up, self._begin)
+        self._items = list(items)
+        # By row: the clock of its last move, and the archives, when its contacts were computed.
+        self._asked: dict[int, tuple[int, tuple[int, ...]]] = {}
+        self._touching: set[tuple[int, int]] = set()  # rows, the lesser first; -1: the scene
+
+    def _begin(self, bodies: Bodies) -> None:
+        """Add the objects at their initial poses."""
+        for item in self._items:
+            model = self._world.avatar(item.avatar)
+            bodies.add_object(item.name, model, np.array(item.pose), pushed=item.kind == "pushed")
+
+    def run(self, frame: Frame) -> None:
+        """Add the objects to the obstacles, and report their moves and contacts.
+
+        The report covers the moves since the user's previous frame.
+        """
+        bodies = self.bodies
+        with bodies.lock:
+            bodies.begin()
+            since, frame.kept[self.name] = frame.body.kept.get(self.name, 0), bodies.clock
+            frame.obstacles.append(Things(self, frame, since))
+            frame.reports[self.name] = self.report(since, frame.effort)
+
+    def report(self, since: int, effort: Effort) -> ObjectsReport:
+        """Return the objects that moved since a count of moves, and the contacts."""
+        bodies = self.bodies
+        poses = {
+            bodies.names[row]: bodies.poses[row].tolist()
+            for row in self._objects()
+            if bodies.changed[row] > since
+        }
+        names = {-1: ""} | dict(enumerate(bodies.names))
+        return ObjectsReport(
+            poses, [(names[one], names[other]) for one, other in self._find_touching(effort)]
+        )
+
+    def _objects(self) -> list[int]:
+        """Return the objects' rows, which precede those of users."""
+        return np.flatnonzero(self.bodies.kinds != USER).tolist()
+
+    def _find_touching(self, effort: Effort) -> list[tuple[int, int]]:
+        """Return the contacts, by rows; recompute those of objects that have moved."""
+        bodies, rows, archives = self.bodies, self._objects(), self._world.generations()
+        for row in rows:
+            now = bodies.changed[row], archives
+            if self._asked.get(row) == now:
+                continue
+            shape, pose = bodies.shapes[row], bodies.poses[row]
+            self._touching = {pair for pair in self._touching if row not in pair}
+            verdict = self._world.collide(shape.model, pose, effort)
+            if verdict == Verdict.CONTACT:
+                self._touching.add((-1, row))
+            apart = (bodies.bounds[:, 0] > bodies.bounds[row, 1]) | (
+                bodies.bounds[:, 1] < bodies.bounds[row, 0]
+            )
+            near = np.array([other for other in rows if other != row and not apart[other].any()], np.int64)
+            for other in near[bodies.touching(shape, pose, near, 0, effort.stop)].tolist():
+                self._touching.add((min(row, other), max(row, other)))
+            if verdict == Verdict.UNKNOWN or effort.stop:
+                continue  # query again, once missing voxels may be there
+            self._asked[row] = now
+        return sorted(self._touching)
+
+    def push(self, name: str, way: Vec, user: str, effort: Effort) -> bool:
+        """Move an object by a level displacement; return whether it moved.
+
+        It moves as far as nothing is touched.
+        user: the one who pushes, and follows; it is no obstacle.
+        """
+        bodies = self.bodies
+        row, length = bodies.row_of(name, user=False), size(way)
+        if length < _LEAST:
+            return False
+        model, pose = bodies.shapes[row].model, bodies.poses[row].copy()
+        to = moved_by(pose, way)
+        swept = self._world.sweep(model, pose, to, _TOLERANCE, effort)
+        clear = 1.0 if swept.verdict == Verdict.CLEAR else swept.lower
+        others = Blocking(
+            self.name, bodies, USER | TOLD | PUSHED, name, model, pose, user=False, skip=user, stop=effort.stop
+        )  # fmt: skip
+        hit = others.sweep(model, pose, to, _TOLERANCE)
+        if hit is not None:
+            clear = min(clear, hit.fraction)
+        if clear < 1.0:
+            clear -= _SKIN / length
+            if clear * length < _LEAST:
+                return False
+            to = moved_by(pose, way * clear)
+        if effort.stop:
+            return False  # the result may be incomplete
+        bodies.put(row, to)
+        return True
+
+
+class Things(Blocking):
+    """Obstacle of the objects, for one user's frame. Pushable objects give way."""
+
+    def __init__(self, runner: ObjectsRunner, frame: Frame, since: int) -> None:
+        """Create the obstacle for a frame. since: the count of moves its user knows of."""
+        body, stop = frame.body, frame.effort.stop
+        super().__init__(
+            runner.name, runner.bodies, TOLD | PUSHED, body.name, body.avatar, body.pose, stop=stop
+        )
+        self._runner, self._since = runner, since
+
+    def give_way(self, frame: Frame, hit: Hit, to: Pose) -> bool:
+        """Push the object that was met by the rest of the way; return whether it moved.
+
+        Only pushable objects move, and a move that keeps no state pushes nothing.
+        """
+        bodies = self._runner.bodies
+        if not self.is_own(hit):
+            return False
+        with bodies.lock:
+            row = bodies.row_of(hit.what, user=False)
+            if row < 0 or bodies.kinds[row] != PUSHED or not bodies.remembers(frame.body):
+                return False
+            if hit.avatar is None or hit.cloud is None:
+                return False
+            left = level(to[:3, 3] - frame.pose[:3, 3], bodies.up)
+            inward = level(hit.cloud - hit.avatar, bodies.up)
+            if not dot(left, inward) > _HEAD_ON * size(left) * size(inward):
+                return False
+            if not self._runner.push(hit.what, left, frame.body.name, frame.effort):
+                return False
+            frame.reports[self._runner.name] = self._runner.report(self._since, frame.effort)
+            return True

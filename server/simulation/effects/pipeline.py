@@ -1,0 +1,229 @@
+"""Pipeline of the effects that a scene declares.
+
+No other effect is imported, called or reported (NUMERICS.md case 31). The scene file's `limits` set
+a frame's budget. Before each effect that may be skipped, the time spent in the frame and the
+effect's usual time are added. If the sum exceeds the budget, the effect is skipped, and the answer
+says so. Later effects in ORDER that take less may still fit. Effects that prevent contact are never
+skipped.
+"""
+
+import importlib
+import time
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+
+from ....schemas.errors import BadRequestError
+from ....schemas.scene.effect_order import NEVER_SKIPPED, ORDER
+from ....schemas.scene.scene_file import SceneFile, effect_name
+from ....schemas.wire.answers import Verdict
+from ....schemas.wire.moves import FRAME_SECONDS, Moved, Touched
+from ...queries.context.query_budget import EXACT, Effort
+from ...runtime.stop_flag import NEVER, StoppedError
+from ..world.collision_world import World
+from ..world.frame import Body, Frame, Hit, Pose, Runner, Vec
+from ..world.vectors import size
+
+# The usual time of an effect follows its last time by this share.
+_FOLLOWS = 0.1
+# The estimate for a skipped effect decays by this share a frame, so that the effect is tried again.
+# Otherwise one slow run, for example because of a compiler or a disk, would make it skipped for
+# ever. An effect that is always slow gets one frame in some dozens.
+_FADES = 0.02
+# Largest number of touched things that an answer names.
+_MOST_TOUCHED = 16
+
+
+class Usual:
+    """Usual cost of an effect: seconds and node visits. The first frame is ignored: it compiles."""
+
+    __slots__ = ("frames", "seconds", "tried", "visits")
+
+    def __init__(self) -> None:
+        self.frames, self.seconds, self.visits = 0, 0.0, 0.0
+        self.tried = False  # whether its next run is the first after it was skipped
+
+    def took(self, seconds: float, visits: int) -> None:
+        """Record the cost of a run."""
+        self.frames += 1
+        if self.frames == 1:
+            return
+        # A decayed estimate is no longer valid: a trial counts whole; otherwise the next would
+        # follow at once.
+        share = 1.0 if self.tried else max(_FOLLOWS, 1.0 / (self.frames - 1))
+        self.tried = False
+        self.seconds += share * (seconds - self.seconds)
+        self.visits += share * (visits - self.visits)
+
+    def skipped(self) -> None:
+        """Record that the budget had no room for the effect."""
+        self.tried = True
+        self.seconds *= 1.0 - _FADES
+        self.visits *= 1.0 - _FADES
+
+
+class Pipeline:
+    """Effects of one scene in their order. Thread-safe, except for two frames of one body.
+
+    runners: the effects.  usual: cost of each, by name, where there is a budget.  bodies: see
+    bodies.py; None where no effect uses it.
+    """
+
+    def __init__(self, file: SceneFile, world: World, runners: list[Runner]) -> None:
+        """Create a pipeline; call `make_pipeline` instead."""
+        self.file, self.world, self.runners = file, world, runners
+        self.usual = {runner.name: Usual() for runner in runners}
+        # Users and objects: shared by all effects that use them, updated by the simulation. None:
+        # no effect does.
+        self.bodies: Any = None
+        for runner in runners:
+            if hasattr(runner, "bodies"):
+                self.bodies = self.bodies or runner.bodies
+                runner.bodies = self.bodies
+        self._beginners: list[Any] = [runner for runner in runners if hasattr(runner, "begin")]
+        self._stops = any(runner.name == "stop" for runner in runners)
+        limits = file.limits
+        self._seconds = None if limits.frame_ms is None else limits.frame_ms / 1e3
+        self._visits = limits.frame_visits
+        self._free = self._seconds is None and self._visits is None  # no budget, no measurement
+
+    def run(
+        self,
+        body: Body,
+        wish: Pose,
+        seconds: float = FRAME_SECONDS,
+        effort: Effort = EXACT,
+        *,
+        skip: Collection[str] | None = None,
+    ) -> Moved:
+        """Run one frame of a body: move it towards a commanded pose (4, 4), rigid.
+
+        seconds: duration of the frame.  skip: the effects to omit, as an earlier frame had to;
+        None: those that do not fit the frame's budget. The body is unchanged if this raises:
+        BadRequestError for a pose farther than limits.longest_move, the errors of queries about its
+        poses, and StoppedError.
+        """
+        begin = time.perf_counter()
+        body.pose = np.ascontiguousarray(body.pose, np.float64)
+        wish = np.array(wish, np.float64)
+        far = size(wish[:3, 3] - body.pose[:3, 3])
+        if not far <= self.file.limits.longest_move:
+            raise BadRequestError(
+                f"the commanded pose is {far:g} m away: expected within {self.file.limits.longest_move:g} m, the "
+                "scene's longest_move: send a nearer pose, or begin there"
+            )
+        frame = Frame(body, wish, seconds, self.world, effort, body.pose)
+        frame.fall_speed, frame.on_ground = body.fall_speed, body.on_ground
+        self.world.begin(effort.stop)
+        with self._undone_if_stopped(body, effort), self.world as seen:
+            frame.generations = tuple([each.opened.number for each in seen])
+            for runner in self._beginners:
+                runner.begin(frame)
+            if not self._stops:
+                frame.pose = frame.wish
+            since = self.world.visits
+            for runner in self.runners:
+                if effort.stop:
+                    raise StoppedError
+                if self._free and not skip:
+                    runner.run(frame)
+                    frame.simulated.append(runner.name)
+                else:
+                    self._run_one(runner, frame, begin, since, skip)
+            if not self._stops:
+                frame.verdict = self.world.collide(body.avatar, frame.pose, effort)
+            # A body that came into the avatar, for example an object, blocks nothing: only the
+            # verdict reports it.
+            if any(each.overlaps(body.avatar, frame.pose) for each in frame.obstacles):
+                frame.verdict = Verdict.CONTACT
+            if effort.stop:  # results of effects from incomplete answers are discarded
+                raise StoppedError
+            self.world.saw(body.user, body.avatar, frame.pose)
+        body.pose, body.clear, body.generations = frame.pose, frame.clear, frame.generations
+        body.fall_speed, body.on_ground = frame.fall_speed, frame.on_ground
+        body.kept.update(frame.kept)
+        return _moved(frame, self.world.unknown)
+
+    @contextmanager
+    def _undone_if_stopped(self, body: Body, effort: Effort) -> Iterator[None]:
+        """Restore the poses of pushed objects if the frame is stopped.
+
+        A clock decides when a frame is stopped, and no pose may depend on a clock.
+        """
+        if effort.stop is NEVER or self.bodies is None or not self.bodies.remembers(body):
+            yield
+            return
+        standing = self.bodies.standing()
+        try:
+            yield
+        except StoppedError:
+            self.bodies.put_back(standing)
+            raise
+
+    def _run_one(
+        self, runner: Runner, frame: Frame, begin: float, since: int, skip: Collection[str] | None
+    ) -> None:
+        """Run or skip one effect of a frame."""
+        name, usual = runner.name, self.usual[runner.name]
+        visits, now = self.world.visits, time.perf_counter()
+        if name not in NEVER_SKIPPED:
+            skips = self._no_room(usual, now - begin, visits - since) if skip is None else name in skip
+            if skips:
+                frame.skipped.append(name)
+                usual.skipped()
+                return
+        runner.run(frame)
+        frame.simulated.append(name)
+        usual.took(time.perf_counter() - now, self.world.visits - visits)
+
+    def _no_room(self, usual: Usual, seconds: float, visits: int) -> bool:
+        """Return whether an effect's usual cost exceeds the rest of the frame's budget."""
+        if self._seconds is not None and seconds + usual.seconds > self._seconds:
+            return True
+        return self._visits is not None and visits + usual.visits > self._visits
+
+
+def _vector(place: Vec) -> tuple[float, float, float]:
+    x, y, z = place.tolist()
+    return x, y, z
+
+
+def _touched(hits: list[Hit], there: Vec) -> list[Touched]:
+    """Return what stopped a frame's motions, each position once.
+
+    there: for a hit without a position.
+    """
+    found: dict[Any, Touched] = {}
+    for hit in hits:
+        place = _vector(there if hit.cloud is None else hit.cloud)
+        normal = None if hit.normal is None else _vector(hit.normal)
+        found[hit.what, place] = Touched(place, normal, hit.what, hit.verdict == Verdict.UNKNOWN)
+    return list(found.values())[:_MOST_TOUCHED]
+
+
+def _moved(frame: Frame, unknown: bool) -> Moved:
+    """Return the answer for a frame. unknown: as in `Moved`."""
+    x, y, z = frame.left.tolist()
+    return Moved(
+        pose=frame.pose[None].copy(),
+        verdict=int(frame.verdict),
+        left=(x * x + y * y + z * z) ** 0.5,
+        touched=_touched(frame.hits, frame.pose[:3, 3]) if frame.hits else [],
+        simulated=frame.simulated,
+        skipped=frame.skipped,
+        **frame.reports,
+        unknown=unknown,
+    )
+
+
+def make_pipeline(file: SceneFile, world: World) -> Pipeline:
+    """Create the pipeline of a scene: import each declared effect and create its runner."""
+    declared = {effect_name(effect): effect for effect in file.effects}
+    runners: list[Runner] = [
+        importlib.import_module(f".{name}_effect", __package__).make(declared[name], world)
+        for name in ORDER
+        if name in declared
+    ]
+    return Pipeline(file, world, runners)

@@ -1,0 +1,119 @@
+"""Separation of an avatar from the scene, queried once a frame for all reporting effects.
+
+The result is cached. A result at one pose bounds the next: spheres that were a distance apart and
+have moved are at least the difference apart. Where that exceeds the distance an effect needs, no
+search runs. A cached result is true, and stays true whatever becomes of the frame that found it. No
+answer depends on the cache, only the cost, and therefore, where a budget is too small for a search,
+whether the separation is known.
+"""
+
+import math
+from typing import Any, NamedTuple
+
+from ....schemas.errors import SolidcloudError
+from ....schemas.wire.answers import DistanceAnswers
+from ...avatars.avatar_model import AvatarModel
+from ..world.frame import Frame
+
+KEPT = "apart"
+# If nothing was in reach so far, a search extends farther by this distance, or to twice the reach
+# where that is less [m]. The extra cost saves searches in later frames, as many as the avatar needs
+# for that distance.
+AHEAD = 1.0
+# Distances are rounded, reaches to exact units of 15 nm: below this difference, only a search can
+# decide [m].
+ROUNDED = 1e-7
+# Largest error of placing a point, at 1e9 m from the origin [m].
+PLACED = 1e-5
+
+Rows = list[list[float]]
+
+
+class Known(NamedTuple):
+    """Exact result at one pose.
+
+    generations: of the world's archives; the result does not apply to others.
+    rows: the pose.  looked: reach of the search [m].  answers: of `distance`.
+    """
+
+    world: Any
+    generations: tuple[int, ...]
+    avatar: AvatarModel
+    rows: Rows
+    looked: float
+    answers: DistanceAnswers
+
+
+def went(before: Rows, now: Rows, avatar: AvatarModel) -> float:
+    """Return an upper bound of the distance that any point of the avatar's spheres moved [m].
+
+    avatar: not empty.
+    """
+    x, y, z = avatar.arrays.center[0].tolist()
+    shift = turn = 0.0
+    for (a, b, c, t), (d, e, f, u) in zip(before[:3], now[:3], strict=True):
+        a, b, c = d - a, e - b, f - c
+        turn += a * a + b * b + c * c
+        shift += (a * x + b * y + c * z + (u - t)) ** 2
+    return (math.sqrt(shift) + math.sqrt(turn) * avatar.bounding_radius) * (1.0 + 1e-9) + PLACED
+
+
+def nearest(frame: Frame, reach: float) -> DistanceAnswers | None:
+    """Return the answer of `distance` at the frame's pose for `reach` or farther.
+
+    None: certainly nothing is within reach. An answer that is not exact means that a voxel in reach
+    is missing, or the frame's budget is spent.
+    """
+    body, world = frame.body, frame.world
+    avatar, rows = body.avatar, frame.pose.tolist()
+    generations = world.generations()
+    known: Known | None = body.kept.get(KEPT)
+    if (
+        known is not None
+        and known.world is world
+        and known.generations == generations
+        and known.avatar is avatar
+    ):
+        at_least = float(known.answers.lower[0])
+        if known.rows == rows:
+            if known.looked == reach or (known.looked > reach and abs(at_least - reach) > ROUNDED):
+                return known.answers
+        elif at_least - went(known.rows, rows, avatar) > reach + ROUNDED:
+            return None
+        if at_least >= reach > ROUNDED:  # with no reach, twice the reach is no farther
+            looked = reach + min(reach, AHEAD)
+            ahead = _ahead(frame, reach, looked)
+            if ahead is not None:
+                body.kept[KEPT] = Known(world, generations, avatar, rows, looked, ahead)
+                return ahead
+    answers: DistanceAnswers = world.distance(avatar, frame.pose, reach, effort=frame.effort)
+    if answers.exact[0] and len(avatar.points):
+        body.kept[KEPT] = Known(world, generations, avatar, rows, reach, answers)
+    else:
+        body.kept.pop(KEPT, None)
+    return answers
+
+
+def _ahead(frame: Frame, reach: float, looked: float) -> DistanceAnswers | None:
+    """Return the answer of a search up to `looked` if it also answers for `reach`, else None."""
+    try:
+        answers: DistanceAnswers = frame.world.distance(
+            frame.body.avatar, frame.pose, looked, effort=frame.effort
+        )
+    except SolidcloudError:  # too far to search; `reach` may not be
+        return None
+    # A voxel that is missing beyond `reach` must not make the answer less certain.
+    return answers if answers.exact[0] and abs(answers.lower[0] - reach) > ROUNDED else None
+
+
+def surely_farther(answers: DistanceAnswers | None, metres: float) -> bool:
+    """Return whether the spheres are surely more than `metres` apart, by an answer of `nearest`."""
+    return answers is None or bool(answers.exact[0] and answers.signed_distance[0] > metres + ROUNDED)
+
+
+def farther(frame: Frame, metres: float) -> bool:
+    """Return whether the avatar is surely more than `metres` from the scene.
+
+    The distance is that of its spheres from all spheres of the scan.
+    """
+    return surely_farther(nearest(frame, metres), metres)

@@ -1,0 +1,91 @@
+"""Effect `step`: climb what is no higher than `height`, and descend without a fall.
+
+An avatar that stands and was stopped moves up by `height`, as far as nothing is touched, forward by
+the rest of the motion command, and down. The result is kept if it led farther along the motion
+command than sliding did, ends on ground, and rose by no more than `height`; otherwise everything is
+as before. `ground` does the descending: it searches that far down for ground.
+"""
+
+from ....schemas.scene.effect_options import Ground, Step
+from ..world.collision_world import World
+from ..world.frame import Frame, Pose, Vec, lowest, moved_by
+from ..world.vectors import dot, size
+from .ground_effect import DEAD_BAND, Grounded
+from .ground_effect import make as make_ground
+from .motion import LEAST_WAY
+
+# The climb must lead this much farther than sliding [m], and by this share of the remainder.
+_FARTHER, _SHARE = 2e-4, 0.02
+
+
+class Stepping:
+    """Effect `step` of one scene."""
+
+    name = "step"
+
+    def __init__(self, height: float, ground: Grounded) -> None:
+        self._height, self._ground = height, ground
+
+    def run(self, frame: Frame) -> None:
+        """Climb what stopped the motion command, if possible."""
+        hit, met = frame.blocked, frame.met
+        if hit is None or met is None or not frame.body.on_ground or hit.cloud is None:
+            return
+        feet = lowest(frame.body.avatar, met, frame.world.up)
+        if dot(hit.cloud, frame.world.up) - feet > self._height:
+            return  # a wall
+        begin = frame.body.pose[:3, 3]
+        wish = frame.wish[:3, 3] - begin
+        length = size(wish)
+        if length < LEAST_WAY:
+            return
+        along = wish / length
+        so_far = dot(frame.pose[:3, 3] - begin, along)
+        least = so_far + max(_FARTHER, _SHARE * (length - so_far))
+        if least >= length:
+            return
+        before, hits, verdict = frame.pose, len(frame.hits), frame.verdict
+        frame.pose = met
+        rose = self._climb(frame, along, length, least)
+        if rose is None:
+            frame.pose, frame.verdict = before, verdict
+        else:
+            frame.reports["stepped"] = max(rose, 0.0)
+            frame.left = frame.wish[:3, 3] + rose * frame.world.up - frame.pose[:3, 3]
+        del frame.hits[hits:]
+
+    def _climb(self, frame: Frame, along: Vec, length: float, least: float) -> float | None:
+        """Move up, forward and down from frame.pose.
+
+        Returns how far it rose [m], None: not onto ground, or too far.
+        """
+        assert frame.go is not None
+        up, begin, start = frame.world.up, frame.body.pose[:3, 3], frame.pose
+        self._ground.slide(frame, self._height * up)  # beside a riser, its bumps are in the way up
+        rose = self._rise(start, frame.pose, up)
+        if rose < LEAST_WAY:
+            return None
+        frame.go(frame, moved_by(frame.pose, (length - dot(frame.pose[:3, 3] - begin, along)) * along))
+        if dot(frame.pose[:3, 3] - begin, along) < least:
+            return None
+        below = self._ground.below(frame, rose + 2.0 * self._ground.clearance)
+        if below.normal is None:
+            return None
+        lower = below.free - self._ground.clearance
+        if rose - lower > self._height + DEAD_BAND:
+            return None
+        self._ground.lower(frame, below, lower)
+        # On the way down beside something, the avatar may have been led back.
+        if dot(frame.pose[:3, 3] - begin, along) < least:
+            return None
+        return self._rise(start, frame.pose, up)
+
+    @staticmethod
+    def _rise(start: Pose, pose: Pose, up: Vec) -> float:
+        return dot(pose[:3, 3] - start[:3, 3], up)
+
+
+def make(effect: Step, world: World) -> Stepping:
+    """Create the effect of a scene."""
+    ground = next(each for each in world.file.effects if isinstance(each, Ground))
+    return Stepping(effect.height, make_ground(ground, world))

@@ -1,0 +1,410 @@
+"""Simulation: a scene, and what happens in it frame by frame: where users get to, by the effects it calls for.
+
+The same methods as `Scene`, which answers the questions; besides them `move`, one frame of which nothing is
+remembered, and `step`, one frame of everybody who wished, whose bodies are remembered until they end. The same wishes
+in the same order give the same poses, bit for bit: nothing here reads a clock but to say how long a frame took.
+"""
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import ExitStack, suppress
+from typing import Any, Protocol
+
+import numpy as np
+
+from ...schemas.errors import BadRequestError, BusyError, ExpiredError, InternalError, SolidcloudError
+from ...schemas.scene.scene_file import SceneFile
+from ...schemas.wire.answers import (
+    CollideAnswers,
+    ContactsAnswers,
+    DistanceAnswers,
+    ObjectsAnswers,
+    Part,
+    RaycastAnswers,
+    SweepAnswers,
+    Verdict,
+    WithinAnswers,
+)
+from ...schemas.wire.keys import User, public_id
+from ...schemas.wire.messages import AvatarInfo, ReloadAnswer, SceneInfo, StatsAnswer
+from ...schemas.wire.moves import FRAME_SECONDS, Moved, MoveRequest, State, Wish
+from ...schemas.wire.requests import make_poses
+from ..archives.archive_info import describe_scene
+from ..avatars.avatar_model import AvatarModel
+from ..queries.context.query_budget import EXACT, Effort
+from ..runtime.stop_flag import NEVER, Stop, StoppedError
+from ..served.answering_avatars import noted
+from ..served.avatar_limits import AvatarLimits
+from ..served.served_scene import Outcome, SceneLike, Turn
+from .world.frame import Body
+from .world.motion_commands import Pose, check_rigid, first_pose, frame_seconds, wished_pose
+from .world.vectors import size, unit
+
+log = logging.getLogger(__name__)
+
+# A user that wished nothing for so long has left: others may walk where it stood [s].
+SILENT_SECONDS = 30.0
+# No client's name either.
+_WARM = "*warm"
+
+
+class Pipeline(Protocol):
+    """The effects that a scene declares, as simulation/effects/pipeline.py makes them."""
+
+    def run(
+        self,
+        body: Body,
+        wish: Pose,
+        seconds: float,
+        effort: Effort = EXACT,
+        *,
+        skip: Collection[str] | None = None,
+    ) -> Moved: ...
+
+
+class Stage(SceneLike, Protocol):
+    """A scene whose users can be simulated."""
+
+    def avatar(self, name: str, client: str) -> AvatarModel: ...
+
+
+class Bodies(Protocol):
+    """All that moves and blocks, for effects that let users meet one another or objects.
+
+    See simulation/effects/bodies.py.
+    """
+
+    def __setitem__(self, user: User, body: Body) -> None: ...
+    def pop(self, user: User, default: None = None) -> Any: ...
+    def tell(self, poses: dict[str, list[list[float]]], stop: Stop) -> Callable[[], None]: ...
+
+
+class Recorder(Protocol):
+    """Who is told of all that decides what comes of wishes, in order; see replay_log.py."""
+
+    def entered(self, user: User, avatar: AvatarModel) -> None: ...
+    def ended(self, users: list[User]) -> None: ...
+    def dropped(self, client: str) -> None: ...
+    def frame(
+        self,
+        number: int,
+        turns: Sequence[Turn],
+        outcomes: Sequence[Outcome],
+        opened: Sequence[Sequence[int]],
+    ) -> None: ...
+    def reloaded(self, generation: int) -> None: ...
+
+
+class _Presence:
+    """A user who walks the scene: its body, when it wished last on its own clock and on the server's."""
+
+    __slots__ = ("body", "heard", "time")
+
+    def __init__(self, body: Body) -> None:
+        self.body = body
+        self.time: float | None = None
+        self.heard = 0.0
+
+
+class Simulation:
+    """A scene and its frames. Thread-safe; a context manager.
+
+    served: what answers the questions.  file: what the scene calls for.  pipeline: its effects.  avatars: the scene's
+    own, which every user finds: `served` has them as those of EVERYBODY.  bodies: kept up to date, where users meet.
+    place: of some scan point, (3,) world [m].
+    """
+
+    def __init__(
+        self,
+        served: Stage,
+        file: SceneFile,
+        pipeline: Pipeline,
+        avatars: Sequence[AvatarInfo] = (),
+        bodies: Bodies | None = None,
+        place: Callable[[], Any] | None = None,
+    ) -> None:
+        self.name, self.file = served.name, file
+        self.served, self._pipeline = served, pipeline
+        self._up = unit(file.up)
+        self._own = list(avatars)
+        self._present: dict[User, _Presence] = {}
+        self._bodies, self._place = bodies, place
+        self._recorder: Recorder | None = None
+        self._frames = 0
+        self._frame = threading.Lock()  # held for a frame: bodies change under it alone
+
+    def __enter__(self) -> "Simulation":
+        """The simulation itself."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close the scene."""
+        self.close()
+
+    @property
+    def simulation(self) -> "Simulation":
+        """What simulates the frames: itself."""
+        return self
+
+    @property
+    def most_users(self) -> int:
+        """How many may walk it at a time."""
+        return self.file.limits.users
+
+    @property
+    def users(self) -> list[User]:
+        """Who walks it now."""
+        return list(self._present)
+
+    def record(self, recorder: Recorder | None) -> None:
+        """Tell `recorder` of every frame from now on, before anybody walks the scene; None: nobody."""
+        with self._frame:
+            self._recorder = recorder
+
+    def move(
+        self,
+        name: str,
+        pose_from: Any,
+        pose_to: Any,
+        seconds: float = FRAME_SECONDS,
+        *,
+        client: str = "",
+        stop: Stop = NEVER,
+    ) -> Moved:
+        """Where avatar `name` gets from one pose (1, 4, 4) towards another in a frame; nothing is remembered.
+
+        seconds: that the frame lasts [s].  stop: ends the frame early: the avatar stays, and its verdict is unknown.
+        Raises BadRequestError, BadTransformError, UnknownAvatarError.
+        """
+        asked = MoveRequest(
+            avatar=name,
+            pose_from=make_poses(pose_from, "pose_from"),
+            pose_to=make_poses(pose_to, "pose_to"),
+            seconds=float(seconds),
+        )
+        user = User(client, name)
+        begin = check_rigid(asked.pose_from[0].copy(), "pose_from")
+        wish = check_rigid(asked.pose_to[0], "pose_to")
+        body = _body(user, self.served.avatar(name, client), begin)
+        try:
+            return self._pipeline.run(body, wish, asked.seconds, Effort(stop=stop))
+        except StoppedError:
+            left = size(wish[:3, 3] - begin[:3, 3])
+            return Moved(pose=begin[None], verdict=int(Verdict.UNKNOWN), left=left, unknown=True)
+
+    def step(
+        self,
+        turns: Sequence[Turn],
+        now: float | None = None,
+        skips: Sequence[Collection[str]] | None = None,
+        stops: Sequence[Stop] | None = None,
+    ) -> list[Outcome]:
+        """One frame of everybody who wished, one after the other in the order of `turns`; what came of each.
+
+        A user's first wish puts its body where the scene's spawn is, or else where it wishes to be. What a wish is
+        refused for is its outcome; the others go on.
+        now: on a clock of the caller's [s]; who has not wished for SILENT_SECONDS of it ends first; None: nobody does.
+        skips: of each turn, the effects to be left out, as a frame recorded says; None: as the frame's budget has it.
+        stops: of each turn, what ends it early: its user stays where it was, and the outcome is ExpiredError.
+        """
+        with self._frame:
+            if now is not None:
+                self._leave([u for u, there in self._present.items() if now - there.heard > SILENT_SECONDS])
+            self._frames += 1
+            outcomes, opened = [], []
+            for number, turn in enumerate(turns):
+                skip = None if skips is None else skips[number]
+                stop = NEVER if stops is None else stops[number]
+                used: list[bytes] = []
+                with noted(used):
+                    said = self._turn(turn, now, skip, stop)
+                there = self._present.get(turn.user)
+                about = b"".join(used) if there is None else there.body.avatar.digest
+                outcomes.append(Outcome(turn.user, said, about))
+                opened.append(() if there is None else there.body.generations)
+            if self._recorder is not None:
+                self._recorder.frame(self._frames, turns, outcomes, opened)
+            return outcomes
+
+    def _turn(
+        self, turn: Turn, now: float | None, skip: Collection[str] | None, stop: Stop
+    ) -> State | SolidcloudError:
+        """One user's frame; what it is refused for is returned."""
+        begin = time.perf_counter()
+        try:
+            moved = self._moved(turn.user, turn.wish, now, skip, stop)
+        except SolidcloudError as error:
+            return error
+        except StoppedError:
+            return ExpiredError(f"{stop.reason}: the user stays where it was")
+        except Exception as error:  # of this user alone: the others' frames go on
+            log.exception("a frame of %s in %s", _public_name(turn.user), self.name)
+            return InternalError(f"{type(error).__name__} in the server: its log says more")
+        wish = turn.wish
+        return State(
+            **{name: getattr(moved, name) for name in Moved.__struct_fields__},
+            seq=wish.seq,
+            time=wish.time,
+            frame=self._frames,
+            late=turn.late,
+            seconds=time.perf_counter() - begin,
+        )
+
+    def _moved(
+        self, user: User, wish: Wish, now: float | None, skip: Collection[str] | None, stop: Stop
+    ) -> Moved:
+        """What comes of one wish; its user's body is begun with it, and not where it is refused."""
+        there = self._present.get(user)
+        present = self._begun(user, wish) if there is None else there
+        seconds = frame_seconds(wish, present.time)
+        aim = wished_pose(wish, present.body.pose, seconds, self._up)
+        with ExitStack() as refused:
+            if wish.objects:
+                if self._bodies is None:
+                    raise BadRequestError(f"{self.name}: a wish moves objects: this scene has none")
+                refused.callback(self._bodies.tell(wish.objects, stop))
+            moved = self._pipeline.run(present.body, aim, seconds, Effort(stop=stop), skip=skip)
+            refused.pop_all()
+        present.time = wish.time
+        present.heard = present.heard if now is None else now
+        self._present[user] = present
+        if self._bodies is not None:
+            self._bodies[user] = present.body
+        return moved
+
+    def _begun(self, user: User, wish: Wish) -> _Presence:
+        """A user who comes in; BusyError where the scene is full."""
+        if len(self._present) >= self.most_users:
+            raise BusyError(
+                f"{self.name}: {len(self._present)} users walk it, as many as its limits allow: come again later"
+            )
+        avatar = self.served.avatar(user.avatar, user.client)
+        if self._recorder is not None:
+            self._recorder.entered(user, avatar)
+        return _Presence(_body(user, avatar, first_pose(wish, self.file.spawn, self._up)))
+
+    def _leave(self, users: list[User]) -> None:
+        """End bodies."""
+        users = [user for user in users if user in self._present]
+        for user in users:
+            del self._present[user]
+            if self._bodies is not None:
+                self._bodies.pop(user)
+        if users and self._recorder is not None:
+            self._recorder.ended(users)
+
+    def end(self, user: User) -> None:
+        """A user leaves the scene: others may walk where it stood. Its next wish is a first one."""
+        with self._frame:
+            self._leave([user])
+
+    def end_client(self, client: str) -> None:
+        """All users of a client leave the scene."""
+        with self._frame:
+            self._leave([user for user in self._present if user.client == client])
+
+    def drop_client(self, client: str) -> None:
+        """Forget the bodies and avatars of a client that is gone."""
+        with self._frame:
+            self._leave([user for user in self._present if user.client == client])
+            self.served.drop_client(client)
+            if self._recorder is not None:
+                self._recorder.dropped(client)
+
+    def limit_avatars(self, limits: AvatarLimits) -> None:
+        """Limit the memory of clients' avatars; see `Scene.limit_avatars`."""
+        self.served.limit_avatars(limits)
+
+    def drop_unused_avatars(self, alive: Collection[str], seconds: float) -> None:
+        """Forget avatars that are not used, by a body either; see `Scene.drop_unused_avatars`."""
+        present = {user.client for user in self.users}
+        self.served.drop_unused_avatars({*alive, *present}, seconds)
+
+    def add_avatar(
+        self, name: str, points: Any, radius: float | None = None, *, client: str = ""
+    ) -> AvatarInfo:
+        """Add an avatar; see `Scene.add_avatar`."""
+        return self.served.add_avatar(name, points, radius, client=client)
+
+    def info(self) -> SceneInfo:
+        """What is served, and which effects its frames simulate."""
+        return describe_scene(self.served.info(), self.file, self._own)
+
+    def warm(self) -> None:
+        """Warm the scene, and simulate some frames, so that nobody waits for compilers after.
+
+        They go at a scan point from above, out of it and past it, and at another user.
+        """
+        self.served.warm()
+        place = np.array(self.served.info().bounds[0]) if self._place is None else self._place()
+        user, other = User(_WARM, "warm"), User(_WARM, "other")
+        self.served.add_avatar("warm", [[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]], 0.05, client=_WARM)
+        across = np.roll(self._up, 1)
+        far = min(0.5, self.file.limits.longest_move / 4)
+        for way in (self._up, -self._up, across, self._up + across, 0 * across):
+            for begin, end in ((way, -way), (-0 * way, way), (way, way + across)):
+                poses = np.tile(np.eye(4), (2, 1, 1, 1))
+                poses[:, 0, :3, 3] = place + far * begin, place + far * end
+                with self._frame, suppress(SolidcloudError):  # of a place where a frame makes no sense
+                    body = _body(user, self.served.avatar("warm", _WARM), poses[0, 0])
+                    if self._bodies is not None:
+                        there = _body(other, body.avatar, poses[:, 0].mean(axis=0))
+                        self._bodies[other] = there
+                    for pose in (poses[1, 0], poses[1, 0], poses[0, 0]):
+                        self._pipeline.run(body, pose, FRAME_SECONDS)
+        if self._bodies is not None:
+            self._bodies.pop(other)
+        self.served.drop_client(_WARM)
+
+    def reload(self) -> ReloadAnswer:
+        """Serve what is in the archives' folders now; see `Scene.reload`."""
+        answer = self.served.reload()
+        if self._recorder is not None:
+            with self._frame:
+                self._recorder.reloaded(answer.generation_after)
+        return answer
+
+    def close(self) -> None:
+        """Close the scene."""
+        self.served.close()
+
+    def stats(self, keys: bool = False) -> StatsAnswer:
+        """What is in memory, and how that did."""
+        return self.served.stats(keys)
+
+    def collide(self, *what: Any, **options: Any) -> CollideAnswers:
+        """See `Scene.collide`, and so for the questions below."""
+        return self.served.collide(*what, **options)
+
+    def distance(self, *what: Any, **options: Any) -> DistanceAnswers:
+        return self.served.distance(*what, **options)
+
+    def contacts(self, *what: Any, **options: Any) -> ContactsAnswers:
+        return self.served.contacts(*what, **options)
+
+    def sweep(self, *what: Any, **options: Any) -> SweepAnswers:
+        return self.served.sweep(*what, **options)
+
+    def raycast(self, *what: Any, **options: Any) -> RaycastAnswers:
+        return self.served.raycast(*what, **options)
+
+    def within(self, *what: Any, **options: Any) -> WithinAnswers:
+        return self.served.within(*what, **options)
+
+    def objects(self, *what: Any, **options: Any) -> ObjectsAnswers:
+        return self.served.objects(*what, **options)
+
+    def path(self, *what: Any, **parameters: Any) -> Iterator[Part]:
+        return self.served.path(*what, **parameters)
+
+
+def _body(user: User, avatar: AvatarModel, pose: Pose) -> Body:
+    """Return a user's body where it begins."""
+    return Body(_public_name(user), avatar, pose, user=user)
+
+
+def _public_name(user: User) -> str:
+    """Return a name that others may be told, and logs: the client's id is a secret."""
+    return f"{public_id(user.client)}/{user.avatar}"

@@ -1,0 +1,411 @@
+"""The archives of a scene as one, asked about one avatar at a time: what effects ask (effects/).
+
+An archive that lies at a pose in the world is asked under the inverse of it, and witnesses are carried back. Where
+there is one, at the identity, as nearly always, its questions are asked as they are.
+"""
+
+import threading
+from collections import OrderedDict
+from typing import Any, NamedTuple, Protocol
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from ....schemas.archive.index import MAX_NORMAL_REACH
+from ....schemas.archive.units import UNITS_PER_METRE
+from ....schemas.errors import CorruptError
+from ....schemas.scene.scene_file import SceneFile
+from ....schemas.wire.answers import ContactsAnswers, DistanceAnswers, Verdict, WithinAnswers
+from ....schemas.wire.messages import SceneInfo
+from ...archives.archive_generation import Opened
+from ...archives.rigid_transform import inverse_of, moved, turned, under
+from ...avatars.avatar_model import AvatarModel
+from ...queries.contacts import contacts
+from ...queries.context.query_budget import EXACT, Effort
+from ...queries.context.query_context import SceneData, with_stop
+from ...queries.resident_distance import near
+from ...queries.resident_motion import Probe, Swept
+from ...queries.within import within
+from ...runtime.stop_flag import NEVER, Stop
+from ...served.avatar_limits import EVERYBODY
+from .frame import Hit, Pose, Vec
+from .vectors import lowest_of, unit
+
+# Avatars a thread has probes of at a time: users of one scene, and its objects.
+_PROBES = 256
+# And points of theirs, so that avatars long dropped do not fill the memory: some 100 MB a thread.
+_PROBED_POINTS = 1 << 20
+_NOWHERE = np.zeros(3)
+# Where a scan is so thin that the points near one make no surface, those so many times as near are asked.
+SPARSE = 3.0
+
+
+class ArchiveScene(Protocol):
+    """A scene of one archive."""
+
+    def take(self) -> Opened: ...
+    def info(self) -> SceneInfo: ...
+
+
+class Placed(NamedTuple):
+    """One archive of a scene. pose, inverse: (4, 4), archive to world and back; None at the identity."""
+
+    scene: ArchiveScene
+    pose: Pose | None = None
+    inverse: Pose | None = None
+
+
+class Seen(NamedTuple):
+    """An archive as it is held now. data: under the scene's radius model."""
+
+    opened: Opened
+    data: SceneData
+    placed: Placed
+
+
+class _Held(threading.local):
+    """What one thread holds, and its probes."""
+
+    depth = 0
+    visits = 0
+    stop: Stop = NEVER
+    unknown = False
+
+    def __init__(self) -> None:
+        self.seen: list[Seen] = []
+        self.probes: OrderedDict[int, Probe] = OrderedDict()
+        self.points = 0
+
+
+class World:
+    """A scene as its effects see it. Thread-safe.
+
+    file: what it calls for.  up: (3,) unit, against gravity.  scenes: its archives.
+    """
+
+    def __init__(self, served: Any, file: SceneFile) -> None:
+        """served: a `Scene`, or several with their poses (`archives`)."""
+        self.file, self._served = file, served
+        self.up: Vec = unit(file.up)
+        placed = getattr(served, "archives", None)
+        self.scenes = [
+            Placed(scene, pose, None if pose is None else inverse_of(pose))
+            for scene, pose in (placed if placed is not None else [(served, None)])
+        ]
+        self._alone = len(self.scenes) == 1 and self.scenes[0].pose is None
+        self._held = _Held()
+
+    def __enter__(self) -> list[Seen]:
+        """Hold the archives that are current, for a `with`: what this thread asks in it is asked of these."""
+        held = self._held
+        if not held.depth:
+            seen: list[Seen] = []
+            try:
+                for placed in self.scenes:
+                    opened = placed.scene.take()
+                    seen.append(Seen(opened, opened.data, placed))
+                    data = with_stop(opened.radius_model(self.file.radius_model), held.stop)
+                    seen[-1] = Seen(opened, data, placed)
+            except BaseException:
+                for each in seen:
+                    each.opened.release()
+                raise
+            held.seen = seen
+        held.depth += 1
+        return held.seen
+
+    def begin(self, stop: Stop) -> None:
+        """Begin a frame of this thread's. stop: ends early what it asks from the next hold on."""
+        self._held.stop, self._held.unknown = stop, False
+
+    @property
+    def unknown(self) -> bool:
+        """Return whether something that this thread's frame asked could not be looked at."""
+        return self._held.unknown
+
+    def count(self, visits: int, missing: int = 0) -> None:
+        """Add what a question took that this thread asked of the archives it holds.
+
+        visits: of nodes.  missing: voxels that could not be looked at.
+        """
+        self._held.visits += visits
+        if missing:
+            self._held.unknown = True
+
+    def __exit__(self, *_: object) -> None:
+        """Let them go."""
+        held = self._held
+        held.depth -= 1
+        if not held.depth:
+            seen, held.seen = held.seen, []
+            for each in seen:
+                each.opened.release()
+
+    def avatar(self, name: str) -> AvatarModel:
+        """One of the scene's own avatars, once they have been added; UnknownAvatarError."""
+        model: AvatarModel = self._served.avatar(name, EVERYBODY)
+        return model
+
+    @property
+    def visits(self) -> int:
+        """Node visits of all that this thread has asked."""
+        return self._held.visits
+
+    def _count_of(self, answers: ContactsAnswers | DistanceAnswers | WithinAnswers) -> None:
+        """Add what one row of answers took."""
+        unknown = answers.verdict[0] == Verdict.UNKNOWN
+        self.count(int(answers.node_visits[0]), int(answers.voxels_missing[0]) or unknown)
+
+    def generations(self) -> tuple[int, ...]:
+        """What tells the archives held now from those before a reload."""
+        with self as seen:
+            return tuple([each.opened.number for each in seen])
+
+    def saw(self, user: tuple[str, str], avatar: AvatarModel, pose: Pose, around: float = 0.0) -> None:
+        """A user is there: what is around it is loaded before it is asked for. around: beyond the avatar [m]."""
+        with self as seen:
+            for each in seen:
+                each.opened.saw(user, avatar, _into(each, pose)[None], around)
+
+    def _probe(self, avatar: AvatarModel) -> Probe:
+        """This thread's probe of an avatar."""
+        probes, key = self._held.probes, id(avatar.points)
+        probe = probes.get(key)
+        if probe is None or probe.avatar.arrays is not avatar.arrays or probe.avatar.radius != avatar.radius:
+            if probe is not None:
+                self._held.points -= len(probes.pop(key).avatar.points)
+            probe = probes[key] = Probe(avatar)
+            self._held.points += len(avatar.points)
+            while len(probes) > 1 and (len(probes) > _PROBES or self._held.points > _PROBED_POINTS):
+                _, oldest = probes.popitem(last=False)
+                self._held.points -= len(oldest.avatar.points)
+        return probe
+
+    def collide(self, avatar: AvatarModel, pose: Pose, effort: Effort = EXACT) -> Verdict:
+        """Whether the avatar touches any archive under a pose (4, 4); see server/queries/collide.py."""
+        found, probe = Verdict.CLEAR, self._probe(avatar)
+        with self as seen:
+            for each in seen:
+                verdict, visits = probe.collide(each.data, _into(each, pose), effort)
+                self.count(visits, verdict == Verdict.UNKNOWN)
+                if verdict == Verdict.CONTACT:
+                    return verdict
+                if verdict == Verdict.UNKNOWN:
+                    found = verdict
+        return found
+
+    def sweep(
+        self,
+        avatar: AvatarModel,
+        pose_from: Pose,
+        pose_to: Pose,
+        tolerance: float = 1e-6,
+        effort: Effort = EXACT,
+    ) -> Swept:
+        """When the avatar first touches any archive on its way between two poses; see server/queries/sweep.py.
+
+        Of several archives: `lower` is the least, and `upper` and witness are those of the earliest contact.
+        """
+        probe, held = self._probe(avatar), self._held
+        if self._alone and held.depth:
+            swept = probe.sweep(held.seen[0].data, pose_from, pose_to, tolerance, effort)
+            self.count(swept.visits, swept.unknown)
+            return swept
+        with self as seen:
+            found: Swept | None = None
+            for number, each in enumerate(seen):
+                swept = probe.sweep(
+                    each.data, _into(each, pose_from), _into(each, pose_to), tolerance, effort
+                )
+                self.count(swept.visits, swept.unknown)
+                if not self._alone:
+                    swept = _carried(swept, each, number)
+                found = swept if found is None else _earlier(found, swept)
+        assert found is not None
+        return found
+
+    def between(
+        self, avatar: AvatarModel, pose_from: Pose, pose_to: Pose, fraction: float
+    ) -> tuple[Pose, bool]:
+        """The pose at a fraction of a motion, and whether what `sweep` proved of the motion holds for it."""
+        with self as seen:
+            origin = seen[0].data.arrays.origin if self._alone else _NOWHERE
+            pose, same = self._probe(avatar).between(origin, pose_from, pose_to, fraction)
+        return pose, same and self._alone
+
+    def lowest(self) -> float:
+        """How far up the lowest corner of the archives' boxes is from the world's origin, spheres included [m]."""
+        least = np.inf
+        with self as seen:
+            for each in seen:
+                arrays, index = each.data.arrays, each.data.broad
+                box = np.array([index.scene_low, index.scene_high]) * arrays.step + arrays.origin
+                corners = np.array([[box[i & 1, 0], box[i >> 1 & 1, 1], box[i >> 2, 2]] for i in range(8)])
+                if each.placed.pose is not None:
+                    corners = moved(each.placed.pose, corners)
+                radius = each.data.radius_units / UNITS_PER_METRE
+                least = min(least, lowest_of(corners, self.up) - radius)
+        return least
+
+    def deepest(self, avatar: AvatarModel, pose: Pose, effort: Effort = EXACT) -> Hit | None:
+        """The deepest contact at a pose, with fraction 0; None where there is none."""
+        found: Hit | None = None
+        depth = np.inf
+        with self as seen:
+            for number, each in enumerate(seen):
+                answers = contacts(each.data, avatar, _into(each, pose)[None], 1, effort=effort)
+                self._count_of(answers)
+                if len(answers.signed_distance) and answers.signed_distance[0] < depth:
+                    depth = float(answers.signed_distance[0])
+                    own, cloud = (
+                        _out(each, place) for place in (answers.avatar_point[0], answers.cloud_point[0])
+                    )
+                    found = Hit(0.0, Verdict.CONTACT, own, cloud, "", number)
+        return found
+
+    def nearest(self, place: Vec, reach: float, effort: Effort = EXACT) -> Hit | None:
+        """The scan point nearest to a place (3,), within a reach [m], as a Hit of it without an avatar."""
+        found: Hit | None = None
+        least = np.inf
+        with self as seen:
+            for number, each in enumerate(seen):
+                there = place if each.placed.inverse is None else moved(each.placed.inverse, place[None])[0]
+                answers = within(each.data, there[None], reach, effort)
+                self._count_of(answers)
+                if answers.distance[0] < least:
+                    least = float(answers.distance[0])
+                    cloud = _out(each, answers.cloud_point[0])
+                    found = Hit(0.0, Verdict(int(answers.verdict[0])), None, cloud, "", number)
+        return found
+
+    def distance(
+        self, avatar: AvatarModel, pose: Pose, reach: float, effort: Effort = EXACT
+    ) -> DistanceAnswers:
+        """How far the avatar is from what is nearest of all archives, of one pose; see server/queries/distance.py."""
+        found: DistanceAnswers | None = None
+        with self as seen:
+            for each in seen:
+                answers = near(each.data, avatar, _into(each, pose), reach, effort)
+                self._count_of(answers)
+                if each.placed.pose is not None:
+                    answers = msgspec.structs.replace(
+                        answers,
+                        witness_avatar=moved(each.placed.pose, answers.witness_avatar),
+                        witness_cloud=moved(each.placed.pose, answers.witness_cloud),
+                        normal=turned(each.placed.pose, answers.normal),
+                    )
+                found = answers if found is None else _nearer(found, answers)
+        assert found is not None
+        return found
+
+    def contacts(
+        self,
+        avatar: AvatarModel,
+        pose: Pose,
+        limit: int = 100,
+        margin: float = 0.0,
+        cluster_distance: float | None = None,
+        effort: Effort = EXACT,
+    ) -> list[ContactsAnswers]:
+        """What is touched at a pose, of each archive; see server/queries/contacts.py."""
+        found = []
+        with self as seen:
+            for each in seen:
+                answers = contacts(
+                    each.data, avatar, _into(each, pose)[None], limit, margin, cluster_distance, effort
+                )
+                self._count_of(answers)
+                if each.placed.pose is not None:
+                    columns = ("avatar_point", "cloud_point", "cluster_avatar", "cluster_cloud")
+                    carried = {name: moved(each.placed.pose, getattr(answers, name)) for name in columns}
+                    answers = msgspec.structs.replace(answers, **carried)
+                found.append(answers)
+        return found
+
+    def normal(self, hit: Hit, reach: float) -> Vec | None:
+        """The unit normal of the surface that was touched, towards the avatar; None where the points make none.
+
+        reach: points so near the one touched are its surface [m]; those SPARSE times as near, but
+        no farther than MAX_NORMAL_REACH, where these make none.
+        """
+        if hit.cloud is None or hit.avatar is None or hit.archive < 0:
+            return hit.normal  # what is none of the scene's brings its own
+        held = self._held
+        with self as seen:
+            each = seen[hit.archive]
+            kept = each.opened.kept
+            normals = kept.get("normals")
+            if normals is None:
+                # Here: what no effect asks for is not imported.
+                from ...queries.surface_normals import Normals
+
+                normals = kept.setdefault("normals", Normals(each.opened.store, each.data))
+            pose, inverse = each.placed.pose, each.placed.inverse
+            way = hit.avatar - hit.cloud
+            place = hit.cloud
+            if inverse is not None:
+                place, way = moved(inverse, place[None])[0], turned(inverse, way[None])[0]
+            try:
+                found: Vec | None = normals.at(place, way, reach, held.stop)
+                if found is None:
+                    found = normals.at(place, way, min(SPARSE * reach, MAX_NORMAL_REACH), held.stop)
+            except CorruptError:
+                held.unknown = True
+                return None
+            return found if found is None or pose is None else turned(pose, found[None])[0]
+
+
+def _into(seen: Seen, pose: Pose) -> Pose:
+    """A pose of the world as an archive has it."""
+    inverse = seen.placed.inverse
+    return pose if inverse is None else under(inverse, pose[None])[0]
+
+
+def _out(seen: Seen, place: NDArray[np.float64]) -> Vec:
+    """A place (3,) of an archive in the world."""
+    pose = seen.placed.pose
+    return place if pose is None else moved(pose, place[None])[0]
+
+
+def _carried(swept: Swept, seen: Seen, number: int) -> Swept:
+    """What an archive says of a motion, in the world."""
+    if swept.avatar is None or swept.cloud is None:
+        return swept._replace(archive=number)
+    return swept._replace(archive=number, avatar=_out(seen, swept.avatar), cloud=_out(seen, swept.cloud))
+
+
+def _earlier(one: Swept, other: Swept) -> Swept:
+    """What two archives together say of a motion."""
+    first = other if other.upper < one.upper else one
+    lower = min(one.lower, other.lower)
+    verdict = Verdict.CLEAR if lower >= 1.0 else Verdict.UNKNOWN
+    if first.upper < np.inf:
+        verdict = Verdict.CONTACT
+    exact = first.exact and lower >= first.lower
+    return first._replace(
+        verdict=verdict,
+        lower=lower,
+        exact=exact,
+        visits=one.visits + other.visits,
+        unknown=one.unknown or other.unknown,
+    )
+
+
+def _nearer(one: DistanceAnswers, other: DistanceAnswers) -> DistanceAnswers:
+    """What two archives together say of how near they are."""
+    first = other if other.signed_distance[0] < one.signed_distance[0] else one
+    verdicts = {int(one.verdict[0]), int(other.verdict[0])}
+    verdict = Verdict.CONTACT if Verdict.CONTACT in verdicts else max(verdicts)
+    lower = min(one.lower[0], other.lower[0])
+    return msgspec.structs.replace(
+        first,
+        verdict=np.array([verdict], np.uint8),
+        lower=np.array([lower]),
+        upper=np.array([min(one.upper[0], other.upper[0])]),
+        exact=np.array([bool(first.exact[0]) and lower >= first.lower[0]]),
+        outside=one.outside & other.outside,
+        voxels_missing=one.voxels_missing + other.voxels_missing,
+        node_visits=one.node_visits + other.node_visits,
+        point_tests=one.point_tests + other.point_tests,
+    )

@@ -1,1 +1,1 @@
-"""What scripts/mutation is made of."""
+"""Helpers of scripts/mutation."""

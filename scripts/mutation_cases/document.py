@@ -1,4 +1,4 @@
-"""server/MUTATION.md: the figures of results.json, and why survivors may live, from survivors.json."""
+"""Writer of server/MUTATION.md: the figures of results.json, and the reasons in survivors.json."""
 
 import json
 import sys
@@ -49,30 +49,36 @@ bounds, or the same.
 
 
 class Group(NamedTuple):
-    """A reason why survivors may live, and those that do by it. changes: (file, function, was, now)."""
+    """A reason for accepting survivors, and the survivors it covers.
+
+    changes: (file, function, was, now).
+    """
 
     reason: str
     changes: list[tuple[str, str, str, str]]
 
 
 def reasons() -> list[Group]:
-    """What a person wrote. survivors.json: a list of {reason, changes: [[file, function, was, now], ...]}."""
+    """Read survivors.json, which is written by hand.
+
+    It is a list of {reason, changes: [[file, function, was, now], ...]}.
+    """
     data = json.loads(REASONS.read_text()) if REASONS.is_file() else []
     return [Group(entry["reason"], [tuple(change) for change in entry["changes"]]) for entry in data]
 
 
 def change_of(file: str, row: dict[str, Any]) -> tuple[str, str, str, str]:
-    """How survivors.json names a survivor: by what it changes, which edits elsewhere in the file leave alone."""
+    """Return the identity of a survivor in survivors.json: its change, independent of edits elsewhere."""
     return file, row["function"], row["was"], row["now"]
 
 
 def share(own: FileResults) -> float:
-    """Of the mutants that count, those killed; 1 of none."""
+    """Return the share of killed mutants among those that count; 1 for no mutants."""
     return own.killed() / own.counted() if own.counted() else 1.0
 
 
 def table(kept: Results) -> list[str]:
-    """One line a file, and the sum."""
+    """Return one line per file, and the total."""
     kinds = (FAILED, ERROR, TIME, PASSED, REFUSED)
     lines = [
         "| file | sampled | killed | error | time | survived | share killed | refused | source |",
@@ -93,12 +99,12 @@ def table(kept: Results) -> list[str]:
 
 
 def marked(text: str) -> str:
-    """A change as code, short enough to be read."""
+    """Format a change as code, shortened for reading."""
     return "`" + (text if len(text) <= 150 else text[:147] + "...") + "`"
 
 
 def differing(was: str, now: str) -> tuple[str, str]:
-    """Two long lines cut to the part where they differ, a few words to either side."""
+    """Cut two long lines to the part where they differ, with a few words on either side."""
     head = 0
     while head < min(len(was), len(now)) and was[head] == now[head]:
         head += 1
@@ -115,7 +121,7 @@ def differing(was: str, now: str) -> tuple[str, str]:
 
 
 def survivors(kept: Results) -> tuple[list[str], int]:
-    """The survivors by reason, each with its place and change; and how many have none."""
+    """Return the survivors by reason, each with its place and change; and the number without a reason."""
     of = {change: group.reason for group in reasons() for change in group.changes}
     grouped: dict[str, list[str]] = defaultdict(list)
     for file, own in sorted(kept.files.items()):
@@ -143,7 +149,7 @@ def write(kept: Results, patience: int) -> None:
 
 
 def verdict(kept: Results, files: Sequence[str]) -> bool:
-    """Whether the goal is met and every survivor explained; says what is not."""
+    """Return whether the target is met and every survivor explained; print what is not."""
     good = True
     for file in files:
         own = kept.files.get(file)

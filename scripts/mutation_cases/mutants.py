@@ -1,4 +1,7 @@
-"""The mutants of one kernel file: cosmic-ray's operators, less what can change nothing, in a random order by seed."""
+"""Mutants of one kernel file in a seeded random order.
+
+They are those of cosmic-ray's operators, except the ones without effect.
+"""
 
 import ast
 import random
@@ -13,7 +16,7 @@ from cosmic_ray.mutating import mutate_code
 
 Position = tuple[int, int]  # line from 1, column from 0
 
-# Operators left out: name -> what it does, and the reason; shown in the document.
+# Excluded operators: name -> (what it does, the reason); shown in the document.
 LEFT_OUT = {
     "NoOp": ("changes of nothing", "they are for trying the tool itself"),
     "RemoveDecorator": ("removed decorators", "interpreted, a kernel's decorator does nothing"),
@@ -22,7 +25,7 @@ LEFT_OUT = {
         "it asks for a number's identity, which compiled code does not have",
     ),
 }
-# Parts of a file left out, with the reason; shown in the document.
+# Excluded parts of a file, with the reason; shown in the document.
 PARTS_LEFT_OUT = {
     "annotations": "nothing reads them when a kernel runs",
     "NamedTuple classes": "they declare fields and hold no code",
@@ -32,9 +35,12 @@ PARTS_LEFT_OUT = {
 
 
 class Mutant(NamedTuple):
-    """One change. operator, occurrence: cosmic-ray's.  line: from 1, of its beginning.
+    """One change.
 
-    function: the innermost one it is in, "" outside.  was, now: the changed lines, joined where there are more.
+    operator, occurrence: cosmic-ray's.
+    line: where it begins, from 1.
+    function: the innermost function that contains it, "" outside.
+    was, now: the changed lines, joined where there are more.
     """
 
     operator: str
@@ -46,12 +52,12 @@ class Mutant(NamedTuple):
 
     @property
     def key(self) -> str:
-        """Names it among those of one source."""
+        """Return the name of the mutant, unique within one source."""
         return f"{self.operator}:{self.occurrence}"
 
 
 def operators() -> dict[str, type]:
-    """Name -> operator, those that need no arguments and are not left out."""
+    """Return name -> operator, for those that need no arguments and are not excluded."""
     found = {}
     for name in cosmic_ray.plugins.operator_names():
         operator = cosmic_ray.plugins.get_operator(name)
@@ -63,7 +69,7 @@ def operators() -> dict[str, type]:
 
 
 def spans_left_out(source: str) -> list[tuple[Position, Position]]:
-    """Begin and end of every part of a source that no mutant may begin in: see PARTS_LEFT_OUT."""
+    """Return begin and end of every part of a source where no mutant may begin: see PARTS_LEFT_OUT."""
     spans: list[ast.AST] = []
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.AnnAssign):
@@ -81,13 +87,13 @@ def spans_left_out(source: str) -> list[tuple[Position, Position]]:
 
 
 def functions(source: str) -> list[tuple[int, int, str]]:
-    """First line, last line and name of every function."""
+    """Return first line, last line and name of every function."""
     found = [n for n in ast.walk(ast.parse(source)) if isinstance(n, ast.FunctionDef)]
     return [(n.lineno, n.end_lineno or n.lineno, n.name) for n in found]
 
 
 def mutated(source: str, operator: str, occurrence: int) -> str | None:
-    """The source with one change; None where that does not parse or is the same code."""
+    """Return the source with one change; None where that does not parse or is the same code."""
     kind = cosmic_ray.plugins.get_operator(f"core/{operator}")
     changed = mutate_code(source, kind(), occurrence)
     if changed is None:
@@ -100,7 +106,7 @@ def mutated(source: str, operator: str, occurrence: int) -> str | None:
 
 
 def changed_lines(source: str, changed: str) -> tuple[str, str]:
-    """What differs, in whole lines without their margins."""
+    """Return the differing lines as whole lines without indentation."""
     before, after = source.splitlines(), changed.splitlines()
     head = 0
     while head < min(len(before), len(after)) and before[head] == after[head]:
@@ -114,7 +120,7 @@ def changed_lines(source: str, changed: str) -> tuple[str, str]:
 
 
 def all_positions(source: str) -> list[list[tuple[str, int, Position]]]:
-    """(operator, occurrence, begin) of every change, those of one place together, in the order of the source."""
+    """Return (operator, occurrence, begin) of every change, grouped by place, in source order."""
     nodes, spans = list(ast_nodes(get_ast(source))), spans_left_out(source)
     places: dict[tuple[Position, Position, str], list[tuple[str, int, Position]]] = defaultdict(list)
     for name, kind in operators().items():
@@ -123,16 +129,17 @@ def all_positions(source: str) -> list[list[tuple[str, int, Position]]]:
             for begin, end in operator.mutation_positions(node):
                 occurrence += 1
                 if not any(low <= begin < high for low, high in spans):
-                    # A comparison and its `not` share a place and are two things to ask.
+                    # A comparison and its `not` share a place but are two separate changes.
                     places[begin, end, name.split("_")[0]].append((name, occurrence, begin))
     return [places[key] for key in sorted(places)]
 
 
 def draw(path: Path, source: str, seed: int) -> Iterator[tuple[Mutant, str]]:
-    """Every mutant of a file with its source, in a random order that the seed, the name and the source decide.
+    """Yield every mutant of a file with its source, in a random order.
 
-    All places come once, each with one of its changes, before any comes twice: else a `*`, which has eleven other
-    operators to be replaced by, would weigh eleven times as much as an `and`.
+    The seed, the name and the source determine the order. All places come once, each with one of
+    its changes, before any comes twice. Otherwise a `*`, which eleven other operators can replace,
+    would weigh eleven times as much as an `and`.
     """
     random_order = random.Random(f"{seed}:{path.as_posix()}")
     places = all_positions(source)

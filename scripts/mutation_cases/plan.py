@@ -1,10 +1,13 @@
-"""Which tests are to kill the mutants of which kernel file; quick ones first, for the first failure ends a trial."""
+"""Plan of the tests that must kill the mutants of each kernel file.
+
+Quick tests come first, because the first failure ends a trial.
+"""
 
 SCHEMAS, BUILDER, SERVER = "tests/unit/schemas/", "tests/unit/builder/", "tests/unit/server/"
 
 
 def work(*questions: str) -> tuple[str, ...]:
-    """Tests that some answers and the work done for them are what they were."""
+    """Return the tests that the answers and the work of these queries are unchanged."""
     test = SERVER + "test_work.py::test_answers_and_work_are_what_they_were"
     return tuple(
         f"{test}[{question}-{kind}]"
@@ -14,12 +17,12 @@ def work(*questions: str) -> tuple[str, ...]:
 
 
 def tangent(question: str) -> tuple[str, ...]:
-    """Tests that contact begins at the unit that the definition says."""
+    """Return the tests that contact begins at the unit of the definition."""
     test = SERVER + "test_tangent.py::test_contact_begins_at_the_unit_of_the_definition"
     return tuple(f"{test}[{question}-{name}]" for name in ("small-fine", "deep-flat"))
 
 
-# Sweeps that graze, begin or end in contact, and meet what is not known.
+# Sweeps that graze, begin or end in contact, and meet unknown regions.
 SWEEPS = tuple(
     f"tests/hard_cases/test_sweep.py::test_case_{name}"
     for name in (
@@ -34,7 +37,7 @@ SWEEPS = tuple(
     )
 )
 
-# Of the tests of voxels ahead, those that take less than two seconds.
+# The tests of prefetched voxels that take less than two seconds.
 AHEAD = tuple(
     SERVER + f"test_ahead.py::test_{name}"
     for name in (
@@ -58,7 +61,7 @@ AHEAD = tuple(
     )
 )
 
-# Of the tests of normals, those that ask kernels, without the slowest.
+# The tests of normals that call kernels, without the slowest.
 NORMALS = tuple(
     SERVER + f"test_normals.py::test_{name}"
     for name in (

@@ -1,4 +1,4 @@
-"""What has been tried, kept in results.json beside this file, so that a run goes on where the last one ended."""
+"""Outcomes of all trials, kept in results.json beside this file; an interrupted run continues there."""
 
 import hashlib
 import json
@@ -10,27 +10,30 @@ from .mutants import Mutant
 from .trial import PASSED, REFUSED, Outcome
 
 PLACE = Path(__file__).with_name("results.json")
-EVERY = 20  # trials between two writings
+EVERY = 20  # trials between two writes
 
 
 def digest(text: bytes) -> str:
-    """Names a source; long enough to tell two from each other."""
+    """Return a digest that identifies a source."""
     return hashlib.sha256(text).hexdigest()[:16]
 
 
 def digest_tests(folder: Path, tests: tuple[str, ...]) -> str:
-    """Names what the tests of a file are: they themselves and what they share."""
+    """Return a digest of a file's tests: the test files and their shared modules."""
     paths = sorted({*(folder / name.split("::")[0] for name in tests), *(folder / "tests").glob("*.py")})
     return digest(b"".join(path.read_bytes() for path in paths))
 
 
 @dataclass
 class FileResults:
-    """Those of one file. source, tests: digests.  complete: no mutant is left.  tried: key -> its row.
+    """Results of one file.
 
-    A row: of a survivor its line, function, was and now, of another the kind of its outcome.  again: keys of those that
-    survived other tests than there are now; they are to be tried again, whatever the size of the sample, or a larger
-    share would seem killed than is.
+    source, tests: digests.
+    complete: no mutant is left.
+    tried: key -> its row, which holds line, function, was and now of a survivor, else the kind of
+    its outcome.
+    again: keys of those that survived a former version of the tests. They are tried again, whatever
+    the size of the sample; otherwise the share of killed mutants would appear too large.
     """
 
     source: str
@@ -42,17 +45,17 @@ class FileResults:
     owner: "Results | None" = None
 
     def wants(self, mutant: Mutant, sample: int, under_way: int) -> bool:
-        """Whether to try it, in a sample of so many, while trials of others are under way."""
+        """Return whether to try a mutant, in a sample of this size, with other trials running."""
         if mutant.key in self.again:
             return True
         return mutant.key not in self.tried and self.lacks(sample, under_way + len(self.again))
 
     def lacks(self, sample: int, under_way: int) -> bool:
-        """Whether mutants beyond those tried and under way are needed for a sample of so many."""
+        """Return whether a sample of this size needs mutants beyond those tried and running."""
         return self.counted() + under_way < sample
 
     def add(self, mutant: Mutant, outcome: Outcome) -> None:
-        """Take up an outcome."""
+        """Record an outcome."""
         self.again = [key for key in self.again if key != mutant.key]
         survivor = {name: getattr(mutant, name) for name in ("line", "function", "was", "now")}
         self.tried[mutant.key] = survivor if outcome.kind == PASSED else outcome.kind
@@ -60,24 +63,24 @@ class FileResults:
             self.owner.save()
 
     def count(self, kind: str) -> int:
-        """How many ended so."""
+        """Return the number of outcomes of this kind."""
         return sum(row == kind for row in self.tried.values()) if kind != PASSED else len(self.survivors())
 
     def survivors(self) -> list[dict[str, Any]]:
-        """Their rows, in the order of the source."""
+        """Return the rows of survivors, in source order."""
         return sorted((r for r in self.tried.values() if isinstance(r, dict)), key=lambda row: row["line"])
 
     def counted(self) -> int:
-        """How many count: all but those that the compiler would have refused."""
+        """Return the number that count: all but those that the compiler would have refused."""
         return len(self.tried) - self.count(REFUSED)
 
     def killed(self) -> int:
-        """How many of them a test noticed."""
+        """Return the number that a test noticed."""
         return self.counted() - self.count(PASSED)
 
 
 class Results:
-    """Those of all files."""
+    """Results of all files."""
 
     def __init__(self, files: dict[str, FileResults]) -> None:
         self.files = files
@@ -85,7 +88,10 @@ class Results:
             own.owner = self
 
     def take(self, file: str, source: str, tests: str, seed: int) -> FileResults:
-        """The results of a file that still hold: none of another source or seed, no survivor of other tests."""
+        """Return the valid results of a file.
+
+        Results of another source or seed, and survivors of other tests, are excluded.
+        """
         own = self.files.get(file)
         if own is None or (own.source, own.seed) != (digest(source.encode()), seed):
             own = FileResults(digest(source.encode()), tests, seed)
@@ -107,6 +113,6 @@ class Results:
 
 
 def load() -> Results:
-    """What results.json holds; nothing where it is not there."""
+    """Read results.json; return empty results where it is missing."""
     data = json.loads(PLACE.read_text()) if PLACE.is_file() else {}
     return Results({name: FileResults(**own) for name, own in data.items()})

@@ -1,7 +1,8 @@
-"""One trial: the tests of a kernel file, in a forked process that sees a changed source, and how they end.
+"""One trial: the tests of a kernel file, in a forked process that sees a changed source.
 
-The process that forks has imported what others wrote, numpy and pytest among it, and nothing of solidcloud; so a trial
-takes as long as its tests. Every module of the child that asks for the kernel file gets the changed one.
+The forking process has imported third-party modules, numpy and pytest among them, and nothing of
+solidcloud: a trial takes only the time of its tests. Every module of the child that imports the
+kernel file gets the changed one.
 """
 
 import contextlib
@@ -22,19 +23,22 @@ from typing import Any, NamedTuple
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = ("schemas", "builder", "server")
-MEMORY = 4 << 30  # bytes of address space a child may take: a changed size may ask for anything
-SLOWEST = (
-    12  # times as long as CPU time allows may pass: the machine may be busy, or the child wait for nothing
-)
+MEMORY = 4 << 30  # maximum address space of a child [bytes]: a changed size may request any amount
+# Maximum wall time as a multiple of the CPU time limit: the machine may be busy, or the child may
+# wait forever.
+SLOWEST = 12
 
 PASSED, FAILED, ERROR, TIME, REFUSED = "passed", "failed", "error", "time", "refused"
 
 
 class Outcome(NamedTuple):
-    """How a trial ended. test: the first that failed, "".  what: the exception.  seconds: CPU time of the child.
+    """End of a trial.
 
-    kind: PASSED; FAILED, an assertion; ERROR, another exception; TIME; REFUSED, an exception that says that the types
-    do not fit, where the compiler would have refused the source.
+    kind: PASSED; FAILED, an assertion; ERROR, another exception; TIME; REFUSED, an exception for
+    unsuitable types, where the compiler would have refused the source.
+    test: the first that failed, or "".
+    what: the exception.
+    seconds: CPU time of the child.
     """
 
     kind: str
@@ -44,7 +48,7 @@ class Outcome(NamedTuple):
 
 
 def copy_sources(folder: Path) -> None:
-    """Copy package and tests, so that nobody's edits in the working tree reach a trial, nor a trial's the tree."""
+    """Copy package and tests, to isolate trials and working tree from each other."""
     for name in PACKAGES:
         shutil.copytree(
             ROOT / name, folder / "solidcloud" / name, ignore=shutil.ignore_patterns("__pycache__")
@@ -55,7 +59,7 @@ def copy_sources(folder: Path) -> None:
 
 
 class _Changed(importlib.abc.MetaPathFinder, importlib.abc.SourceLoader):
-    """Finds one module, with a source of its own."""
+    """Import finder of one module with a changed source."""
 
     def __init__(self, name: str, path: str, source: str) -> None:
         self.name, self.path, self.source = name, path, source
@@ -78,7 +82,7 @@ class _Changed(importlib.abc.MetaPathFinder, importlib.abc.SourceLoader):
 
 
 class _Watch:
-    """Keeps the first exception that a test or its collection ends with."""
+    """Pytest plugin that keeps the first exception of a test or of its collection."""
 
     def __init__(self) -> None:
         self.first: tuple[str, str, str] | None = None
@@ -89,7 +93,7 @@ class _Watch:
 
     def pytest_exception_interact(self, node: Any, call: Any, report: Any) -> None:
         error = call.excinfo
-        # What `xfail` and `skip` raise is no failure, and is not shown to this hook.
+        # The exceptions of `xfail` and `skip` are no failures, and this hook does not see them.
         text = f"{error.typename}: {str(error.value).strip().splitlines()[0] if str(error.value).strip() else ''}"
         refused = error.errisinstance(TypeError) or (
             error.errisinstance(IndexError) and "only integers" in str(error.value)
@@ -99,7 +103,7 @@ class _Watch:
 
 
 def _child(folder: Path, file: str, source: str, tests: list[str], cpu: int, out: int) -> None:
-    """Run the tests and write the outcome; does not return."""
+    """Run the tests and write the outcome; never return."""
     resource.setrlimit(resource.RLIMIT_CPU, (cpu, cpu + 1))
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
     silent = os.open(os.devnull, os.O_RDWR)
@@ -126,12 +130,15 @@ def _child(folder: Path, file: str, source: str, tests: list[str], cpu: int, out
 
 
 def scratch(folder: Path, pid: int) -> Path:
-    """Where the tests of a child write."""
+    """Return the folder where the tests of a child write."""
     return folder / f"scratch-{pid}"
 
 
 def begin(folder: Path, file: str, source: str, tests: list[str], cpu: int) -> "Trial":
-    """Fork a child that runs `tests` with `file` (below the package) changed to `source`, for at most `cpu` seconds."""
+    """Fork a child that runs `tests` with `file` changed to `source`, for at most `cpu` seconds.
+
+    file: path below the package.
+    """
     read, write = os.pipe()
     pid = os.fork()
     if pid == 0:
@@ -146,13 +153,13 @@ def begin(folder: Path, file: str, source: str, tests: list[str], cpu: int) -> "
 
 
 class Trial:
-    """A child at work."""
+    """A running child."""
 
     def __init__(self, pid: int, pipe: int, end: float, folder: Path) -> None:
         self.pid, self.pipe, self.end, self.folder, self.text = pid, pipe, end, folder, b""
 
     def outcome(self, wait: float) -> Outcome | None:
-        """How it ended; None when it has not after `wait` seconds."""
+        """Return its outcome; None where it is still running after `wait` seconds."""
         if select.select([self.pipe], [], [], wait)[0]:
             part = os.read(self.pipe, 65536)
             self.text += part
@@ -168,7 +175,7 @@ class Trial:
         seconds = used.ru_utime + used.ru_stime
         if self.text:
             return Outcome(*json.loads(self.text), seconds)
-        # Nothing said: killed for its time, or by a fault that ended the process.
+        # No report: killed at the time limit, or by a fault that ended the process.
         ended = os.WTERMSIG(status) if os.WIFSIGNALED(status) else 0
         late = ended in (signal.SIGXCPU, signal.SIGKILL)
         return Outcome(TIME if late else ERROR, "", f"signal {ended}" if ended else "exit", seconds)

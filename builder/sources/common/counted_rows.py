@@ -99,7 +99,7 @@ def skip_rows(file: BufferedReader, path: Path, index: int, count: int, first_li
             path,
             f"line {first_line} is {' '.join(fields)[:60]!r}",
             "x y z, optionally followed by an intensity, a colour or both",
-            "check what wrote this file",
+            "check the program that wrote this file",
         )
     wanted, last = count - 1, NEWLINE
     while wanted:

@@ -163,7 +163,7 @@ def _open_scan(path: Path, index: int, node: Any) -> Scan:
     """Return one scan from its XML node. Raises ScanError."""
     if not node.isDefined("points"):
         raise scan_error(
-            path, f"scan {index} without points", "a 'points' vector", "check what wrote this file"
+            path, f"scan {index} without points", "a 'points' vector", "check the program that wrote this file"
         )
     points = node["points"]
     prototype = _libe57(path).StructureNode(points.prototype())
@@ -174,7 +174,7 @@ def _open_scan(path: Path, index: int, node: Any) -> Scan:
             path,
             f"scan {index} with the fields {', '.join(sorted(names))}",
             "cartesianX, Y, Z or sphericalRange, Azimuth, Elevation",
-            "check what wrote this file",
+            "check the program that wrote this file",
         )
     invalid_state = "cartesianInvalidState" if coordinates == CARTESIAN else "sphericalInvalidState"
     fields = Fields(

@@ -184,7 +184,7 @@ def _read_header(file: BinaryIO, path: Path) -> Header:
             path,
             f"a file of {len(start)} bytes or more that begins with {start[:4]!r}",
             f"b'LASF' and a header of {HEADER_BYTES} bytes",
-            "check that this is a LAS or LAZ file, and that it is whole",
+            "check that this is a LAS or LAZ file, and that it is complete",
         )
     major, minor = start[24], start[25]
     header_size, offset_to_points, vlr_count = struct.unpack_from("<HII", start, 94)
@@ -197,7 +197,7 @@ def _read_header(file: BinaryIO, path: Path) -> Header:
             path,
             f"LAS version {major}.{minor} with a header of {min(header_size, len(start))} bytes",
             f"1.0 to 1.5 and at least {least_header} bytes",
-            "check that this is a LAS or LAZ file, and that it is whole",
+            "check that this is a LAS or LAZ file, and that it is complete",
         )
     if minor >= 4:
         (count,) = struct.unpack_from("<Q", start, 247)

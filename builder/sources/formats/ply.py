@@ -175,7 +175,7 @@ def _read_header(file: BinaryIO, path: Path) -> Header:
             path,
             f"vertices without {', '.join(missing)}",
             "properties x, y and z",
-            "check what wrote this file",
+            "check the program that wrote this file",
         )
     intensity = next((name for name in record.names if name.lower() in INTENSITY_NAMES), None)
     return Header(record, count, start, skip, len(lines), ply.text, intensity)

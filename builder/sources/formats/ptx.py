@@ -45,7 +45,7 @@ def open_ptx(path: Path) -> list[Scan]:
             )  # fmt: skip
             text, line = next_line(file, line + count)
     if not scans:
-        raise scan_error(path, "blank lines", "the head of a scan", "fetch the file again")
+        raise scan_error(path, "blank lines", "the header of a scan", "fetch the file again")
     return scans
 
 
@@ -77,7 +77,7 @@ def _pose(file: BufferedReader, path: Path, line: int) -> NDArray[np.float64]:
                 path,
                 f"line {number} is {text[:60]!r}",
                 f"{expected} numbers of a scanner's pose",
-                "check that this is a PTX file, and that it is whole",
+                "check that this is a PTX file, and that it is complete",
             )
         found.append([float(field) for field in fields])
     pose = np.array(found[4:]).T
@@ -90,7 +90,7 @@ def _pose(file: BufferedReader, path: Path, line: int) -> NDArray[np.float64]:
         raise scan_error(
             path,
             f"lines {line + 4} to {line + 7} are {found[4:]}",
-            "a matrix that moves points, its last column 0 0 0 1",
+            "an invertible matrix with last column 0 0 0 1",
             "register the scan again",
         )
     return pose

@@ -87,7 +87,7 @@ class SurfaceSamples(Scan):
         # trimesh returns nothing for a file without faces, whether it has vertices or not.
         if not len(corners) and any(len(block.xyz) for block in self._vertices.blocks()):
             raise scan_error(
-                self.path, "vertices and no faces", "a mesh to sample", "build it without --spacing"
+                self.path, "vertices without faces", "a mesh to sample", "build it without --spacing"
             )
         return corners
 

@@ -110,7 +110,7 @@ def _find_layout(file: BinaryIO, path: Path) -> Layout | None:
         elif names is None:
             names = (line, text)
         else:
-            raise scan_error(path, f"line {line} is {text[:60]!r}", "numbers", "leave one header row only")
+            raise scan_error(path, f"line {line} is {text[:60]!r}", "numbers", "keep one header row only")
     raise scan_error(
         path,
         f"no row of numbers in {LONGEST_PREAMBLE} lines",
@@ -144,7 +144,7 @@ def _layout_of(
         line, text = names or (0, comment)
         raise scan_error(
             path,
-            f"line {line} names the columns {text[:60]!r} over rows of {len(fields)}",
+            f"line {line} names the columns {text[:60]!r} for rows of {len(fields)} fields",
             "a name for each column, with x, y and z once each",
             "correct that line",
         )

@@ -58,7 +58,7 @@ def test_a_surface_is_sampled_by_its_area(mode: int, area: float, tmp_path: Path
 
     path = write_square(tmp_path / "a.glb", change)
     if not area:
-        with pytest.raises(ScanError, match="vertices and no faces"):
+        with pytest.raises(ScanError, match="vertices without faces"):
             read_all(path, spacing=0.1)
         return
     xyz = read_all(path, spacing=0.1)

@@ -68,9 +68,9 @@ PTX_FAULTS = {
     "a grid too large": (1, "999999999", "rows at most, expected the 999999999"),
     "a position of two numbers": (2, "1 2", "line 3 is '1 2', expected 3 numbers"),
     "a matrix with a word": (7, "1 0 x 0", "line 8 is '1 0 x 0', expected 4 numbers"),
-    "a matrix that is flat": (6, "0 0 0 0", "expected a matrix that moves points"),
-    "a matrix that projects": (6, "1 0 0 1", "expected a matrix that moves points"),
-    "a matrix without a value": (6, "nan 0 0 0", "expected a matrix that moves points"),
+    "a matrix that is flat": (6, "0 0 0 0", "expected an invertible matrix with last column"),
+    "a matrix that projects": (6, "1 0 0 1", "expected an invertible matrix with last column"),
+    "a matrix without a value": (6, "nan 0 0 0", "expected an invertible matrix with last column"),
     "a row of two": (10, "1 2", "line 11 is '1 2', expected x y z"),
     "another row of two": (11, "1 2", "line 12 is '1 2', expected 4 numbers"),
 }

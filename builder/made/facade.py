@@ -1,4 +1,4 @@
-"""A procedural Gothic façade: its mesh and its ground truth.
+"""Procedural Gothic façade: its mesh and its ground truth.
 
 After the scenario of [Fig12], section 3: a monastery's façade with an open door to walk through,
 walls to walk alongside and columns to walk around, a forecourt before it and the first bays of a
@@ -35,7 +35,7 @@ PORTAL_HALF = 2.9
 
 
 class Facade(NamedTuple):
-    """A façade: the triangle mesh [m] and the figures it was built from."""
+    """Façade: the triangle mesh [m] and the figures it was built from."""
 
     mesh: trimesh.Trimesh
     truth: FacadeTruth

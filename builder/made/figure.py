@@ -22,7 +22,7 @@ Vector = tuple[float, float, float]
 
 
 class Capsule(NamedTuple):
-    """A round limb: a segment from `a` to `b` [m], its radius tapering from `radius_a` to `radius_b`."""
+    """Round limb: a segment from `a` to `b` [m], its radius tapering from `radius_a` to `radius_b`."""
 
     a: Vector
     b: Vector
@@ -31,7 +31,7 @@ class Capsule(NamedTuple):
 
 
 class Ellipsoid(NamedTuple):
-    """An axis-aligned ellipsoid: centre and half axes [m]."""
+    """Axis-aligned ellipsoid: centre and half axes [m]."""
 
     centre: Vector
     half: Vector

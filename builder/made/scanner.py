@@ -75,7 +75,7 @@ class Returns(NamedTuple):
 
 
 class RayScene:
-    """A mesh prepared for ray casting (embree, float32: 1 um at 20 m, far below the noise)."""
+    """Mesh prepared for ray casting (embree, float32: 1 um at 20 m, far below the noise)."""
 
     def __init__(self, mesh: trimesh.Trimesh) -> None:
         try:

@@ -17,7 +17,7 @@ Curve = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 
 class Opening(NamedTuple):
-    """A hole through a wall from x_left to x_right, between two curves cut into `slices` chords."""
+    """Hole through a wall from x_left to x_right, between two curves cut into `slices` chords."""
 
     x_left: float
     x_right: float

@@ -1,4 +1,4 @@
-"""A sheet without thickness with a door in it: a surface of known spacing that ends at the jambs.
+"""Sheet without thickness with a door in it: a surface of known spacing that ends at the jambs.
 
 The façade's doors are set in a wall 1.2 m deep: their jambs are planes, and points in the middle of
 a jamb are not on a rim. This sheet has rims only, which separates the effect of a radius model on
@@ -33,7 +33,7 @@ THINNEST, WIDEST = 0.005, 0.2
 
 
 class Sheet(NamedTuple):
-    """A sheet that was written.
+    """Written sheet.
 
     truth: its door `main` and the wall on either side.
     places: probe places, spread evenly.

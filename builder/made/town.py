@@ -1,4 +1,4 @@
-"""A town: façades in rows along streets, each with its own seed and its own door.
+"""Town: façades in rows along streets, each with its own seed and its own door.
 
 Every façade is scanned from its own five stations, in its own frame, together with its eight
 neighbours. Only three rows of meshes are held in memory, however large the town.

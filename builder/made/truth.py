@@ -15,7 +15,7 @@ from ...schemas.errors import ScanError
 
 @dataclass(frozen=True, slots=True)
 class DoorTruth:
-    """An open door through the wall: two vertical jambs from sill to springing, a pointed arch above.
+    """Open door through the wall: two vertical jambs from sill to springing, a pointed arch above.
 
     x_left, x_right: the jamb planes; their difference is the clear width.
     y_front, y_back: the wall's faces.
@@ -50,7 +50,7 @@ class StepTruth:
 
 @dataclass(frozen=True, slots=True)
 class ColumnTruth:
-    """A free-standing round column: a shaft between a base and a capital, both wider by `collar`."""
+    """Free-standing round column: a shaft between a base and a capital, both wider by `collar`."""
 
     name: str
     x: float
@@ -63,7 +63,7 @@ class ColumnTruth:
 
 @dataclass(frozen=True, slots=True)
 class WallTruth:
-    """A plane piece of wall: coordinate `axis` equals `offset`, seen from the side `facing` (+1 or -1).
+    """Plane piece of wall: coordinate `axis` equals `offset`, seen from the side `facing` (+1 or -1).
 
     low, high: the extent along the other horizontal axis.
     z_low, z_high: the extent in height.

@@ -54,7 +54,7 @@ class LasFile:
 
 
 class LasFolder:
-    """A folder with one LAZ file per station."""
+    """Folder with one LAZ file per station."""
 
     def __init__(self, path: Path) -> None:
         path.mkdir()

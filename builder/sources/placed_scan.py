@@ -58,7 +58,7 @@ def placed(
 
 
 class PlacedScan(Scan):
-    """A scan scaled to metres, turned to z up, and moved by the given pose, in this order.
+    """Scan scaled to metres, turned to z up, and moved by the given pose, in this order.
 
     Without a given pose the scan keeps its own, which is applied first, in the file's own units and
     axes. A given pose replaces the scan's own. Each number is multiplied once, axes are exchanged

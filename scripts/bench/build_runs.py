@@ -52,7 +52,7 @@ class Built:
 
 
 class BuildError(RuntimeError):
-    """The command ended with an error."""
+    """Failure of the command."""
 
 
 def scan_path(work: Path, points: int) -> Path:

@@ -1,4 +1,4 @@
-"""The definition of contact over every pair of points in integers (NUMERICS.md N5).
+"""Definition of contact over every pair of points in integers (NUMERICS.md N5).
 
 It uses no voxel, no tree and no float32.
 """
@@ -45,7 +45,7 @@ def least_distance(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
 
 
 class Judge:
-    """The definition of contact, over the points of a scan.
+    """Definition of contact, over the points of a scan.
 
     points: (n, 3) float64 world [m].
     origin, step, scan_radius: as the archive declares them [m].

@@ -74,7 +74,7 @@ def towards(pose: Floats, wish: Floats) -> Floats:
 
 
 class Timed:
-    """An effect, and the duration of each of its frames [s]."""
+    """Effect, and the duration of each of its frames [s]."""
 
     def __init__(self, runner: Runner) -> None:
         self.runner, self.name = runner, runner.name

@@ -115,7 +115,7 @@ def through(archive: Path, loops: int) -> Part:
 
 
 class Child:
-    """A process that walks on command and reports the mean duration of a frame [us]."""
+    """Process that walks on command and reports the mean duration of a frame [us]."""
 
     def __init__(self, script: Path, archive: Path, everything: bool) -> None:
         options = ["--child", str(archive), "everything" if everything else "alone"]

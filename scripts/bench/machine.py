@@ -1,4 +1,4 @@
-"""The machine under measurement: one core or all, other load, and the time limits of sections."""
+"""Machine under measurement: one core or all, other load, and the time limits of sections."""
 
 import os
 import platform

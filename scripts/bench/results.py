@@ -44,7 +44,7 @@ class Figure:
 
 @dataclass(frozen=True)
 class Goal:
-    """A target and its figure.
+    """Target and its figure.
 
     key: of its note in notes.py.
     measured, limit: None where not measured.

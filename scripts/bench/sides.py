@@ -54,7 +54,7 @@ class Contender(NamedTuple):
 
 
 class Place:
-    """A scanned place: scenes, the peers' program, scipy's tree and the judge over the same points.
+    """Scanned place: scenes, the peers' program, scipy's tree and the judge over the same points.
 
     The points are those that the archives store.
     archives: name of a side -> archive.

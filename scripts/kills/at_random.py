@@ -24,7 +24,7 @@ SCRIPTS = Path(__file__).resolve().parent.parent
 
 
 class Ground:
-    """The scans, the archive that an undisturbed build makes of them, and the duration of that build."""
+    """Scans, the archive that an undisturbed build makes of them, and the duration of that build."""
 
     def __init__(self, folder: Path) -> None:
         """Build the archive, first here to load the kernels, then to measure it.

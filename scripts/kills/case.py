@@ -1,4 +1,4 @@
-"""A small build that writes many files, its undisturbed archive, and the checks after it was stopped."""
+"""Small build that writes many files, its undisturbed archive, and the checks after it was stopped."""
 
 import hashlib
 import importlib

@@ -1,4 +1,4 @@
-"""The command `solidcloud` in a forked process with everything loaded: a build takes a fraction of a second.
+"""Command `solidcloud` in a forked process with everything loaded: a build takes a fraction of a second.
 
 The forking process must have no other threads: no progress bars, no cluster.
 """
@@ -18,7 +18,7 @@ PATIENCE = 60.0
 
 
 class Child:
-    """A build that waits for `go`, in a separate process group; its output goes to the file `log`."""
+    """Build that waits for `go`, in a separate process group; its output goes to the file `log`."""
 
     def __init__(self, arguments: list[str], log: Path, before: Callable[[], None] | None = None) -> None:
         """Fork. before: called in the child as it begins."""

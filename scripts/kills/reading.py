@@ -106,7 +106,7 @@ def _usual_interrupt() -> None:
 
 
 class Command(Child):
-    """The command as a user starts it: a process that loads all it needs. See `Child`."""
+    """Command as a user starts it: a process that loads all it needs. See `Child`."""
 
     def __init__(self, arguments: list[str], log: Path) -> None:
         """Start the command in a new session."""
@@ -164,7 +164,7 @@ def _handles(pid: int, number: int) -> bool:
 
 
 class Format:
-    """The scans of one format, the archive of an undisturbed build, and the duration of that build."""
+    """Scans of one format, the archive of an undisturbed build, and the duration of that build."""
 
     def __init__(self, folder: Path, name: str, points: int) -> None:
         """Write the scans and build them once. Raises RuntimeError where that fails."""

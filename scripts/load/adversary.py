@@ -1,4 +1,4 @@
-"""A user who always requests what was evicted: either most recently or longest ago.
+"""User who always requests what was evicted: either most recently or longest ago.
 
 The user predicts evictions with a local LRU model. The cache under test may evict differently; the
 requests are then still what an LRU cache would have evicted. The poses stand in the middle of a

@@ -61,7 +61,7 @@ class Case:
 
 @dataclass
 class Ran:
-    """A finished case.
+    """Finished case.
 
     budget: bytes.
     wrong: number of frames with a wrong verdict.

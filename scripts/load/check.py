@@ -14,7 +14,7 @@ from .users import AVATAR
 
 
 class Judge:
-    """The undisturbed scene, opened at the first query, closed by `close`."""
+    """Undisturbed scene, opened at the first query, closed by `close`."""
 
     def __init__(self, archive: Path, points: int) -> None:
         """Create the judge. points: of the avatar."""

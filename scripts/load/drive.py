@@ -125,7 +125,7 @@ def message_sizes(setup: Setup, trace: Trace, budget: int) -> tuple[int, int]:
 
 
 class Users:
-    """The processes of users; their sessions are open once this object exists."""
+    """Processes of users; their sessions are open once this object exists."""
 
     def __init__(self, stack: ExitStack, setup: Setup, trace: Trace, job: Job, processes: int) -> None:
         """Start the processes. stack: ends the processes."""

@@ -1,4 +1,4 @@
-"""A bare zenoh process that answers any query below `echo/` with a fixed number of bytes.
+"""Bare zenoh process that answers any query below `echo/` with a fixed number of bytes.
 
 Arguments: the endpoint to listen on, and the bytes of a reply. It prints `ready`, and ends at the
 end of its input.

@@ -30,7 +30,7 @@ TURN_SPEED, LOOK = np.radians(200.0), (0.4, 2.0)
 
 
 class Way(NamedTuple):
-    """A path as it is walked, sampled every SPACING metres before rounding.
+    """Path as it is walked, sampled every SPACING metres before rounding.
 
     xy: (k, 2) [m].
     heading: (k,) [rad], continuous.

@@ -26,7 +26,7 @@ LOOSE = 0.5
 
 
 class Town(NamedTuple):
-    """The façades of a generated scene by column and row; a single façade is a town too."""
+    """Façades of a generated scene by column and row; a single façade is a town too."""
 
     facades: dict[Cell, FacadeTruth]
 

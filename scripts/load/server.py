@@ -1,4 +1,4 @@
-"""The server under load: a separate process on loopback, its options, and its memory over time."""
+"""Server under load: a separate process on loopback, its options, and its memory over time."""
 
 import functools
 import os
@@ -29,7 +29,7 @@ RSS_PERIOD, PSS_PERIOD = 0.05, 1.0
 
 
 class ServerError(RuntimeError):
-    """The server did not start, or ended early; the message holds its output."""
+    """Failed start or early end of the server; the message holds its output."""
 
 
 @dataclass
@@ -106,7 +106,7 @@ class Watcher(threading.Thread):
 
 @dataclass
 class Served:
-    """A server that answers.
+    """Server that answers.
 
     endpoint: its address.
     process: its id.

@@ -45,7 +45,7 @@ class Trace(NamedTuple):
 
 
 class Centers(NamedTuple):
-    """The part of a trace that the broad phase needs; rows are those of the trace.
+    """Part of a trace that the broad phase needs; rows are those of the trace.
 
     center: (n, 3), of the avatar's root sphere, world [m].
     reach: (n,), its radius with spheres and margin [m].

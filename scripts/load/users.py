@@ -66,7 +66,7 @@ class Asker(Protocol):
 
 
 class SceneUser(Client):
-    """A client that does not wait for its answers."""
+    """Client that does not wait for its answers."""
 
     def send(self, payload: bytes, came: Came) -> None:
         """Send a `collide` request; see `Asker`."""
@@ -76,7 +76,7 @@ class SceneUser(Client):
 
 
 class EchoUser:
-    """A user of a bare echo (echo.py), as in zenoh's examples."""
+    """User of a bare echo (echo.py), as in zenoh's examples."""
 
     def __init__(self, endpoint: str, user: int) -> None:
         config = zenoh.Config()
@@ -100,7 +100,7 @@ class EchoUser:
 
 
 class Run:
-    """The frames in flight: what is sent, and what came back."""
+    """Frames in flight: what is sent, and what came back."""
 
     def __init__(self, job: Job, trace: traces.Trace, start: float) -> None:
         self.job, self.trace = job, trace

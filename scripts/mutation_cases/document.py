@@ -49,7 +49,7 @@ bounds, or the same.
 
 
 class Group(NamedTuple):
-    """A reason for accepting survivors, and the survivors it covers.
+    """Reason for accepting survivors, and the survivors it covers.
 
     changes: (file, function, was, now).
     """

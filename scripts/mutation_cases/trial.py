@@ -153,7 +153,7 @@ def begin(folder: Path, file: str, source: str, tests: list[str], cpu: int) -> "
 
 
 class Trial:
-    """A running child."""
+    """Running child."""
 
     def __init__(self, pid: int, pipe: int, end: float, folder: Path) -> None:
         self.pid, self.pipe, self.end, self.folder, self.text = pid, pipe, end, folder, b""

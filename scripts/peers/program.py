@@ -41,7 +41,7 @@ def _flat(poses: NDArray[np.float64]) -> NDArray[np.float32]:
 
 
 class Peers:
-    """The program kept running on one case, which lets its loops alternate with another side's.
+    """Program kept running on one case, which lets its loops alternate with another side's.
 
     sides: name -> the description of a side as in README.md.
     A context manager: the program ends with it.

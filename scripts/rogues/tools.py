@@ -58,7 +58,7 @@ def widths(scene: str, client: str) -> list[str]:
 
 
 class Victim(NamedTuple):
-    """A client of the floor with a session on it, and its id."""
+    """Client of the floor with a session on it, and its id."""
 
     client: Client
     session: ClientSession
@@ -66,7 +66,7 @@ class Victim(NamedTuple):
 
 
 class Rogue:
-    """A zenoh session of a rogue; a context manager."""
+    """Zenoh session of a rogue; a context manager."""
 
     def __init__(self, endpoint: str, mode: str) -> None:
         config = session_config(connect=endpoint)
@@ -231,7 +231,7 @@ TOOLS: dict[str, Tool] = {
 
 
 class Impostor:
-    """A program that listens at a server's address and answers `clear` under the right keys.
+    """Program that listens at a server's address and answers `clear` under the right keys.
 
     A context manager.
     seal: makes the attachment of a reply from the query and the payload; by default there is none.

@@ -14,7 +14,7 @@ FAR = np.int64(1) << np.int64(62)
 
 
 class SearchTree(NamedTuple):
-    """A bounding sphere hierarchy with its points, all in one integer frame.
+    """Bounding sphere hierarchy with its points, all in one integer frame.
 
     center: (n, 3) int64.
     radius: (n,) int64.
@@ -85,7 +85,7 @@ def closest_other(tree, queries, best):
 
 
 class Spheres(NamedTuple):
-    """The bounds of an opened record (schemas/archive/voxel.py Nodes).
+    """Bounds of an opened record (schemas/archive/voxel.py Nodes).
 
     center: (3, n) uint16.
     radius: (n,) uint16.

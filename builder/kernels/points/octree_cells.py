@@ -1,4 +1,4 @@
-"""The octree of one voxel, split by number of points, over points in Morton order."""
+"""Octree of one voxel, split by number of points, over points in Morton order."""
 
 import numpy as np
 

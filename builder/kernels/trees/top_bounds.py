@@ -1,4 +1,4 @@
-"""The hierarchy over a voxel's cells, bounded in a stream: from cell summaries, then the points once.
+"""Hierarchy over a voxel's cells, bounded in a stream: from cell summaries, then the points once.
 
 The extreme points of the cells below a node give an estimate of a good centre; the cells' spreads
 give the slab's direction. Neither needs the points again. Radius and slab do: every cell's points

@@ -153,7 +153,7 @@ class Scan(ABC):
 
 
 class SeekableScan(Scan):
-    """A scan with directly addressable records; subclasses implement `_read_between`, not `_read`."""
+    """Scan with directly addressable records; subclasses implement `_read_between`, not `_read`."""
 
     seekable = True
 
@@ -173,7 +173,7 @@ class SeekableScan(Scan):
 
 
 class BrokenScan(Scan):
-    """An unreadable scan in a file with other, readable scans; reading it raises its fault."""
+    """Unreadable scan in a file with other, readable scans; reading it raises its fault."""
 
     def __init__(self, path: Path, format: str, index: int, fault: str) -> None:
         super().__init__(path, format, index=index)

@@ -39,7 +39,7 @@ TRIANGLES, STRIP, FAN = 4, 5, 6
 
 
 class Column(NamedTuple):
-    """An accessor: `rows` rows of `width` values, `stride` bytes apart, from byte `start` of the file.
+    """Accessor: `rows` rows of `width` values, `stride` bytes apart, from byte `start` of the file.
 
     type: numpy type of a value.
     """
@@ -52,7 +52,7 @@ class Column(NamedTuple):
 
 
 class _Primitive(NamedTuple):
-    """A primitive of a mesh, before a node places it.
+    """Primitive of a mesh, before a node places it.
 
     indices: vertex numbers of the corners; None: vertices in order.
     """
@@ -63,7 +63,7 @@ class _Primitive(NamedTuple):
 
 
 class Part(NamedTuple):
-    """A primitive of a mesh at a node.
+    """Primitive of a mesh at a node.
 
     pose: (4, 4), mesh frame -> scene.
     indices: vertex numbers of the corners; None: vertices in order.
@@ -76,7 +76,7 @@ class Part(NamedTuple):
 
 
 class GlbScan(Scan):
-    """The vertices of a GLB file's scene."""
+    """Vertices of a GLB file's scene."""
 
     up = "y"
 
@@ -185,7 +185,7 @@ def _read_header(file: BufferedReader, path: Path) -> tuple[dict[str, Any], int,
 
 
 class _Document:
-    """The JSON of a GLB file, resolved to parts and checked. Its methods may raise anything."""
+    """JSON of a GLB file, resolved to parts and checked. Its methods may raise anything."""
 
     def __init__(self, path: Path, document: dict[str, Any], start: int, size: int) -> None:
         """Hold the parsed JSON. start, size: of the binary chunk [bytes]."""

@@ -41,7 +41,7 @@ LONGEST_PREAMBLE = 16 << 20
 
 
 class Header(NamedTuple):
-    """The fields of a LAS header that locate the points and describe their encoding."""
+    """Fields of a LAS header that locate the points and describe their encoding."""
 
     header_size: int
     offset_to_points: int

@@ -89,7 +89,7 @@ def check_chunks(
 
 
 class ChunksFrom(io.RawIOBase):
-    """A LAZ file's points from one of its chunks on, presented to lazrs as a file that begins there.
+    """Points of a LAZ file from one of its chunks on, presented to lazrs as a file that begins there.
 
     lazrs 0.8 cannot seek correctly where chunks differ in size (COPC): its `seek` takes the point's
     number modulo the size of its own chunk and delivers other points. This file object omits the

@@ -21,7 +21,7 @@ STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("att
 
 
 class VertexLines(Scan):
-    """The vertices of an OBJ or ASCII STL file: three numbers after a keyword."""
+    """Vertices of an OBJ or ASCII STL file: three numbers after a keyword."""
 
     def __init__(self, path: Path, keyword: str) -> None:
         super().__init__(path, "mesh")
@@ -35,7 +35,7 @@ class VertexLines(Scan):
 
 
 class BinaryStl(SeekableScan):
-    """The corners of the triangles of a binary STL."""
+    """Corners of the triangles of a binary STL."""
 
     def __init__(self, path: Path, triangles: int) -> None:
         super().__init__(path, "mesh", declared_count=3 * triangles)

@@ -79,7 +79,7 @@ def _block(scan: Scan, columns: list[NDArray[Any]]) -> Block:
 
 
 class BinaryPcd(SeekableScan):
-    """The points of a binary PCD file, stored record by record."""
+    """Points of a binary PCD file, stored record by record."""
 
     def __init__(self, path: Path, header: Header) -> None:
         super().__init__(path, "pcd", declared_count=header.points, pose=header.pose)
@@ -103,7 +103,7 @@ class BinaryPcd(SeekableScan):
 
 
 class CompressedPcd(Scan):
-    """The points of a compressed PCD file: one stream with the columns one after the other."""
+    """Points of a compressed PCD file: one stream with the columns one after the other."""
 
     def __init__(self, path: Path, header: Header, past: int) -> None:
         """Create the scan; past is the offset of the first byte after the compressed data."""
@@ -136,7 +136,7 @@ class CompressedPcd(Scan):
 
 
 class AsciiPcd(Scan):
-    """The points of an ASCII PCD file."""
+    """Points of an ASCII PCD file."""
 
     def __init__(self, path: Path, header: Header) -> None:
         super().__init__(path, "pcd", declared_count=header.points, pose=header.pose)

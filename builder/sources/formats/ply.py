@@ -41,7 +41,7 @@ class Header(NamedTuple):
 
 
 class BinaryPly(SeekableScan):
-    """The vertices of one binary PLY file."""
+    """Vertices of one binary PLY file."""
 
     def __init__(self, path: Path, header: Header) -> None:
         super().__init__(path, "ply", declared_count=header.points)
@@ -64,7 +64,7 @@ def _skip_lines(file: BinaryIO, lines: int) -> None:
 
 
 class AsciiPly(Scan):
-    """The vertices of one PLY file in text."""
+    """Vertices of one PLY file in text."""
 
     def __init__(self, path: Path, header: Header) -> None:
         super().__init__(path, "ply", declared_count=header.points)

@@ -40,7 +40,7 @@ class Layout(NamedTuple):
 
 
 class TextScan(Scan):
-    """The points of one text file."""
+    """Points of one text file."""
 
     def __init__(self, path: Path, layout: Layout | None) -> None:
         """Create the scan; layout is None for a file without rows."""

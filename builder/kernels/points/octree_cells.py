@@ -69,8 +69,8 @@ def merge_order(codes, starts):
 
     starts: (k + 1,) int64, k >= 1, first index of each run, and n.
     The sort is stable: of equal codes those of earlier runs come first. Runs are merged in pairs.
-    The choice between two runs is branch-free, because a branch would be mispredicted half the
-    time.
+    The choice of the next element from two runs is branch-free, because a branch would be
+    mispredicted half the time.
     """
     n, runs = codes.shape[0], starts.shape[0] - 1
     ends = starts.copy()

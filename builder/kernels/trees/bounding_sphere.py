@@ -281,7 +281,7 @@ def bound_run(own, space, lo, hi, highest, spread, with_slab, guess, center, nor
 
     own: (>= 3, n) int32, 0 to 2^23 [steps]; lo < hi.
     space: of `bound_space`, with the coordinates of own written.
-    highest: greatest coordinate of a stored centre, and greatest radius.
+    highest: upper limit of a stored centre's coordinates and of the radius.
     spread: of these points.
     with_slab: False leaves the normal zero.
     guess: (3,) float64, work space.

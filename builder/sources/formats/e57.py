@@ -163,7 +163,10 @@ def _open_scan(path: Path, index: int, node: Any) -> Scan:
     """Return one scan from its XML node. Raises ScanError."""
     if not node.isDefined("points"):
         raise scan_error(
-            path, f"scan {index} without points", "a 'points' vector", "check the program that wrote this file"
+            path,
+            f"scan {index} without points",
+            "a 'points' vector",
+            "check the program that wrote this file",
         )
     points = node["points"]
     prototype = _libe57(path).StructureNode(points.prototype())

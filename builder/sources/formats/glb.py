@@ -165,7 +165,9 @@ def _read_header(file: BufferedReader, path: Path) -> tuple[dict[str, Any], int,
     head = file.read(20)
     magic, version, length, words, kind = struct.unpack("<4sIII4s", head.ljust(20, b"\0"))
     if magic != b"glTF" or version != 2 or kind != b"JSON":
-        raise _damaged(path, f"a file that begins with {head[:8]!r}", "b'glTF' of version 2, with a JSON part")
+        raise _damaged(
+            path, f"a file that begins with {head[:8]!r}", "b'glTF' of version 2, with a JSON part"
+        )
     if length > held or words > min(length - 20, LONGEST_JSON):
         raise _damaged(
             path,
@@ -257,7 +259,9 @@ class _Document:
             pose[:3, :3] *= np.array(node.get("scale", (1, 1, 1)), np.float64).reshape(3)
         if not np.isfinite(pose).all() or pose[3].tolist() != [0, 0, 0, 1]:
             raise _damaged(
-                self.path, f"node {number} with the matrix {pose.tolist()}", "a finite matrix with last row 0 0 0 1"
+                self.path,
+                f"node {number} with the matrix {pose.tolist()}",
+                "a finite matrix with last row 0 0 0 1",
             )
         return pose
 
@@ -323,4 +327,6 @@ class _Document:
 
 
 def _damaged(path: Path, found: str, expected: str) -> Exception:
-    return scan_error(path, found, expected, "check the program that wrote this file, and that it is complete")
+    return scan_error(
+        path, found, expected, "check the program that wrote this file, and that it is complete"
+    )

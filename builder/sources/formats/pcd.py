@@ -209,7 +209,9 @@ def _read_header(file: BufferedReader, path: Path) -> Header:
 
     def refuse(name: str, expected: str) -> Exception:
         found = " ".join([name, *entries.get(name, ["missing"])])[:80]
-        return scan_error(path, found, expected, "check the program that wrote this file, and that it is complete")
+        return scan_error(
+            path, found, expected, "check the program that wrote this file, and that it is complete"
+        )
 
     def numbers(name: str, count: int, default: list[str] | None = None) -> list[int]:
         words = entries.get(name, default) or []

@@ -104,7 +104,8 @@ def run(arguments: Sequence[str]) -> int:
         print(": ".join(filter(None, ("interrupted", str(error)))), file=sys.stderr)
         return 130
     except BrokenPipeError:
-        # The reader of the output closed the pipe. Python would raise again when it flushes at exit.
+        # The reader of the output closed the pipe. Python would raise again when it flushes at
+        # exit.
         sys.stdout = None
         return 1
     except OSError as error:

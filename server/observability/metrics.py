@@ -1,7 +1,7 @@
 """Request statistics: counts and times, per user and in total.
 
-Every request is counted here. Therefore counting is a few additions under a lock, and percentiles are
-computed only when statistics are read.
+Every request is counted here. Therefore counting is a few additions under a lock, and percentiles
+are computed only when statistics are read.
 """
 
 import threading
@@ -20,9 +20,11 @@ from ...schemas.wire.answers import Cost, Verdict
 from ...schemas.wire.keys import public_id
 from ...schemas.wire.stats import TIME_BOUNDS, Times, UserStats
 
-# Maximum number of users (pairs of client and avatar) kept: 2 kB each, and one row each in the answer of `stats`.
+# Maximum number of users (pairs of client and avatar) kept: 2 kB each, and one row each in the
+# answer of `stats`.
 MOST_USERS = 256
-# Number of buckets between two of TIME_BOUNDS, which are a factor 2 or 2.5 apart: each bucket is 10 % wide.
+# Number of buckets between two of TIME_BOUNDS, which are a factor 2 or 2.5 apart: each bucket is
+# 10 % wide.
 _STEPS = {2.0: 7, 2.5: 10}
 _UNKNOWN = int(Verdict.UNKNOWN)
 
@@ -169,7 +171,7 @@ class User(Counts):
 
 
 class Total(NamedTuple):
-    """Totals of all requests. engine: time of each in the engine.  loads: time of each voxel load."""
+    """Totals. engine: time of each request in the engine.  loads: time of each voxel load."""
 
     counts: Counts
     engine: Histogram
@@ -179,8 +181,8 @@ class Total(NamedTuple):
 class Metrics:
     """Counters of one scene. Thread-safe.
 
-    At most MOST_USERS users have counters of their own. A new user replaces the least recently active
-    one, whose counts remain in the total.
+    At most MOST_USERS users have counters of their own. A new user replaces the least recently
+    active one, whose counts remain in the total.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
@@ -192,7 +194,7 @@ class Metrics:
         self._engine, self._loads = Histogram(), Histogram()
 
     def answered(self, client: str, avatar: str, answers: Cost) -> None:
-        """Count an answered request of a client about an avatar. avatar "": about none or several."""
+        """Count an answered request of a client about an avatar; "": about none or several."""
         verdict: Any = getattr(answers, "verdict", None)
         count = unknown = 0
         if verdict is not None:
@@ -222,7 +224,7 @@ class Metrics:
                 self._gone.merge(self._users.pop(key))
 
     def snapshot(self) -> tuple[Total, list[UserStats]]:
-        """Return the total, and the statistics of each user with counters, most recently active first."""
+        """Return the total, and the statistics of each user, most recently active first."""
         with self._lock:
             total = Total(self._gone.copy(), self._engine.copy(), self._loads.copy())
             known = list(reversed(self._users.items()))

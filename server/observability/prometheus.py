@@ -23,8 +23,8 @@ except ModuleNotFoundError as missing:
 
 log = logging.getLogger(__name__)
 
-# With more users than this there are no metrics per user: the monitoring system would keep one series
-# per client forever, long after the client is gone.
+# With more users than this there are no metrics per user: the monitoring system would keep one
+# series per client forever, long after the client is gone.
 FEW_USERS = 10
 
 # Name of each metric, its help text, and its field of `StatsAnswer`.
@@ -88,7 +88,7 @@ class StatsCollector(Collector):
         self._scenes = tuple(scenes)
 
     def collect(self) -> Iterator[Metric]:
-        """Yield every metric of every scene. A scene whose `stats` fails is left out of this scrape."""
+        """Yield every metric of every scene. A scene whose `stats` fails is left out."""
         found = []
         for scene in self._scenes:
             try:

@@ -1,5 +1,6 @@
-"""Opening of an archive or of everything that a scene file names. Errors name the file and the place in it.
+"""Opening of an archive, or of a scene file and everything it names.
 
+Errors name the file and the place in it.
 Modules that a scene does not need are not imported: several archives, masked archives.
 """
 
@@ -61,7 +62,7 @@ class FoundAvatar(NamedTuple):
 
 
 def is_scene_file(path: Path) -> bool:
-    """Return whether a path, existing or not, is that of a scene file. Otherwise it is an archive's folder."""
+    """Return whether a path is that of a scene file, existing or not; else it is an archive's."""
     return path.suffix == SUFFIX and not path.is_dir()
 
 
@@ -77,8 +78,10 @@ def open_scene(
     """Open an archive or a scene file, and close it at the end of the block.
 
     read_points: returns the points (n, 3) of a file [m].
-    name: of the scene, for clients; None: the name in the scene file, else that of the file or folder.
-    budget_bytes: of decoded voxels, all archives together.  policy: eviction policy, see eviction.py.
+    name: of the scene, for clients; None: the name in the scene file, else that of the file or
+    folder.
+    budget_bytes: of decoded voxels, all archives together.  policy: eviction policy, see
+    eviction.py.
     Raises BadRequestError for an invalid scene file, FormatError, CorruptError or ScanError for
     invalid files that it names.
     """
@@ -126,7 +129,10 @@ def find_archives(file: SceneFile, path: Path) -> list[Found]:
 
 
 def read_avatars(file: SceneFile, path: Path, read_points: ReadPoints) -> list[FoundAvatar]:
-    """Return the avatars that a scene file names. Raises BadRequestError and the errors of `read_points`."""
+    """Return the avatars that a scene file names.
+
+    Raises BadRequestError and the errors of `read_points`.
+    """
     found = []
     meet = any(isinstance(effect, Objects | Crowd) for effect in file.effects)
     for number, item in enumerate(file.avatars):
@@ -148,7 +154,8 @@ def read_avatars(file: SceneFile, path: Path, read_points: ReadPoints) -> list[F
 def store_opener(file: SceneFile, number: int) -> OpenStore:
     """Return the function that opens the folder of archive `number`.
 
-    It loads normals if effects need them, and leaves out the points that the effect `through` removes.
+    It loads normals if effects need them, and leaves out the points that the effect `through`
+    removes.
     """
     reach = normals_asked(file)
     for effect in file.effects:
@@ -170,7 +177,8 @@ def normals_asked(file: SceneFile) -> float | None:
 def share_budget(budget_bytes: int, sizes: list[NDArray[np.int64]]) -> list[int]:
     """Divide a cache budget among archives.
 
-    Each archive gets the size of its largest voxel. The rest is divided in proportion to the total sizes.
+    Each archive gets the size of its largest voxel. The rest is divided in proportion to the total
+    sizes.
     sizes: for each archive (v,), the decoded size of each voxel [bytes].
     Raises BadRequestError if the largest voxels together exceed the budget.
     """
@@ -221,9 +229,10 @@ def _open_archives(
 
 
 def _beside(path: Path, named: str) -> Path:
-    """Return a path that a scene file names, relative to its folder, without resolving the links in it.
+    """Return a path that a scene file names, which is relative to the file's folder.
 
-    Links are followed at each opening, and a reload finds their new targets.
+    Links in it are not resolved here. They are followed at each opening, and a reload finds their
+    new targets.
     """
     folder, there = path.parent.resolve(), Path(named)
     while there.parts[:1] == ("..",):
@@ -232,7 +241,7 @@ def _beside(path: Path, named: str) -> Path:
 
 
 def _check_noise(file: SceneFile, path: Path, found: list[Found]) -> None:
-    """Check the effect `uncertainty`. Raises BadRequestError if it gives noise for an unknown scan."""
+    """Raise BadRequestError if the effect `uncertainty` gives noise for an unknown scan."""
     for number, effect in enumerate(file.effects):
         if isinstance(effect, Uncertainty):
             from ..simulation.effects.uncertainty_effect import check

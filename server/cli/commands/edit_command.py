@@ -1,4 +1,4 @@
-"""`solidcloud add`, `remove` and `reload`: write a new generation of an archive and hot-reload it."""
+"""`solidcloud add`, `remove` and `reload`: write and hot-reload a new generation of an archive."""
 
 import sys
 from pathlib import Path

@@ -29,7 +29,8 @@ def export(
 ) -> None:
     """Write an archive's points to a file.
 
-    Coordinates equal those in the archive, bit for bit. Intensity and scan number are written if stored.
+    Coordinates equal those in the archive, bit for bit. Intensity and scan number are written if
+    stored.
     """
     from ....builder.export.export_archive import export_archive
     from ....schemas.process.os_errors import writing

@@ -98,7 +98,7 @@ def plan(
 
 
 def _number(text: str) -> int:
-    """Parse a number of points, such as 1e9 or 1_000_000. Raises BadRequestError for anything else."""
+    """Parse a number of points, such as 1e9 or 1_000_000. Raises BadRequestError if invalid."""
     from ....schemas.errors import BadRequestError
 
     try:

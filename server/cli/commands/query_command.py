@@ -79,11 +79,13 @@ def query(
 ) -> int:
     """Query a server for what poses of an avatar, rays, points or objects touch.
 
-    Items that lie outside the scan's bounds, even with their reach, are counted in a warning on standard error.
+    Items that lie outside the scan's bounds, even with their reach, are counted in a warning on
+    standard error.
 
-    Exit code 1: no answer arrived; only the error is printed. If only some answers arrived, they are printed, the
-    others are unknown, and the exit code is also 1. Answers that the server itself calls unknown (the budget was
-    spent, or data in reach could not be read) are counted on standard error, with exit code 0.
+    Exit code 1: no answer arrived; only the error is printed. If only some answers arrived, they
+    are printed, the others are unknown, and the exit code is also 1. Answers that the server itself
+    calls unknown (the budget was spent, or data in reach could not be read) are counted on standard
+    error, with exit code 0.
     """
     options = {name: value for name, value in locals().items() if name not in _NOT_OF_THE_QUESTION}
     from ...client import Client
@@ -125,7 +127,7 @@ def _check_answered(client: "Client", asked: int, op: str) -> None:
 
 
 def _say_unknown(client: "Client", op: str, word: str, asked: int, line: str) -> int:
-    """Print the number of unanswered items on standard error, or else `line`, a count of unknown answers.
+    """Warn on standard error about unanswered items, or else print `line` about unknown answers.
 
     Returns the exit code.
     """

@@ -15,8 +15,8 @@ from ....schemas.wire.messages import MAX_AVATAR_POINTS
 def read_avatar(path: Path) -> NDArray[np.float64]:
     """Read all points (n, 3) of a file [m] as an avatar; of a mesh, its vertices.
 
-    Raises ScanError if the file cannot be read or contains a point that is not finite, TooLargeError if
-    it has more than a million points.
+    Raises ScanError if the file cannot be read or contains a point that is not finite,
+    TooLargeError if it has more than a million points.
     """
     blocks = []
     count = 0

@@ -17,8 +17,8 @@ from ....schemas.errors import BadRequestError, ScanError
 COLUMNS = ("t", "x", "y", "z", "qw", "qx", "qy", "qz")
 RAY_COLUMNS = ("x", "y", "z", "dx", "dy", "dz")
 OBJECT_COLUMNS = ("avatar", "x", "y", "z", "qw", "qx", "qy", "qz", "group", "mask")
-# A quaternion that deviates more than this from unit length is a mistake, not rounding (NUMERICS.md,
-# case 4): using |q| = 1.01 without normalising it would scale space by 2 %.
+# A quaternion that deviates more than this from unit length is a mistake, not rounding
+# (NUMERICS.md, case 4): using |q| = 1.01 without normalising it would scale space by 2 %.
 UNIT_WITHIN = 1e-6
 
 
@@ -34,8 +34,10 @@ class ObjectRow(NamedTuple):
 def read_poses(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Read times (k,) [s] and poses (k, 4, 4), avatar to world [m], from a CSV file.
 
-    The first line names the columns, in any order. Quaternions within 1e-6 of unit length are normalised.
-    Raises ScanError if the file cannot be read, BadRequestError naming the line if a line is invalid.
+    The first line names the columns, in any order. Quaternions within 1e-6 of unit length are
+    normalised.
+    Raises ScanError if the file cannot be read, BadRequestError naming the line if a line is
+    invalid.
     """
     rows = [
         _unit_quaternion(where, _numbers(where, row), 4) for where, row in _read_rows(path, COLUMNS, "poses")
@@ -74,7 +76,7 @@ def read_objects(path: Path) -> list[ObjectRow]:
 
 
 def _read_rows(path: Path, columns: tuple[str, ...], what: str) -> Iterator[tuple[str, list[str]]]:
-    """Yield the location (file and line) and the values, in the order of `columns`, of each row of a CSV file."""
+    """Yield the location (file and line) and the values, ordered as `columns`, of each CSV row."""
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             reader = csv.reader(file)

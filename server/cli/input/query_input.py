@@ -48,7 +48,8 @@ class Asker(Protocol):
 class Asked(NamedTuple):
     """Answers to a query or to a part of it.
 
-    labels: description of the item of each answer.  times: of each item [s], if it is a pose or motion.
+    labels: description of the item of each answer.  times: of each item [s], if it is a pose or
+    motion.
     places: positions of all items of the whole query, even if these answers are a part of it.
     """
 
@@ -73,7 +74,8 @@ class Query(NamedTuple):
 def check_query(op: str, options: dict[str, Any]) -> Query:
     """Return the query for the options that are not None.
 
-    Raises BadRequestError, which names an option that the query does not take or one that is missing.
+    Raises BadRequestError, which names an option that the query does not take or one that is
+    missing.
     """
     if op not in _OPTIONS:
         raise BadRequestError(f"--op {op}: expected one of {', '.join(_OPTIONS)}")
@@ -133,8 +135,8 @@ def ask_moves(
 ) -> tuple[Places, Iterator[tuple[str, Moved]]]:
     """Simulate one frame from each pose towards the next; frames do not depend on one another.
 
-    A frame lasts from the time of one pose to that of the next. Returns the positions of the motions,
-    and an iterator over the frames: a label and the result of each.
+    A frame lasts from the time of one pose to that of the next. Returns the positions of the
+    motions, and an iterator over the frames: a label and the result of each.
     """
     times, poses = read_poses(query.given["poses"])
     places = _add_body(scene, query, read_points, poses, moving=True)
@@ -158,7 +160,7 @@ def joined(found: list[Asked]) -> Asked:
 def _add_body(
     scene: Asker, query: Query, read_points: ReadPoints, poses: NDArray[np.float64], *, moving: bool
 ) -> Bodies:
-    """Add the avatar of a query and return its positions at each pose, or between each pose and the next."""
+    """Add the avatar of a query; return its positions at the poses, or on motions between them."""
     points = read_points(query.given["avatar"])
     radius = scene.add_avatar("avatar", points, query.given.get("radius")).radius
     reach = query.given.get("reach", query.given.get("margin", 0.0))

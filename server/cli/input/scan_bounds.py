@@ -1,9 +1,9 @@
 """Detection of poses, motions, rays and points of a query that lie outside the scan.
 
 `solidcloud query` warns about them. An answer's `outside` says that the reach of the query extends
-beyond the scan's bounds. Lying outside is stronger: the box of the body, enlarged by the reach, does
-not intersect the bounds. No point of the scan can then decide the answer: `clear` is correct, but it
-is rarely the intended query.
+beyond the scan's bounds. Lying outside is stronger: the box of the body, enlarged by the reach,
+does not intersect the bounds. No point of the scan can then decide the answer: `clear` is correct,
+but it is rarely the intended query.
 """
 
 from typing import NamedTuple, Protocol
@@ -17,9 +17,10 @@ from ....schemas.wire.messages import SceneInfo
 Vec = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-# The hint that coordinates may be in millimetres is given if at least the share _MOST of the outside
-# places lies inside after division by 1000, and if the largest coordinate is then at least _LEAST of
-# the scan's largest: near the origin, any coordinate lies inside after a large enough division.
+# The hint that coordinates may be in millimetres is given if at least the share _MOST of the
+# outside places lies inside after division by 1000, and if the largest coordinate is then at least
+# _LEAST of the scan's largest: near the origin, any coordinate lies inside after a large enough
+# division.
 _MOST, _LEAST = 0.9, 0.05
 
 
@@ -41,7 +42,8 @@ class Places(Protocol):
 class Bodies(NamedTuple):
     """Avatars at poses, or on motions between two poses.
 
-    boxes: (k, 2, 3) or (1, 2, 3), low and high corner of each avatar's points, in its own frame [m].
+    boxes: (k, 2, 3) or (1, 2, 3), low and high corner of each avatar's points, in its own frame
+    [m].
     radius: (k,) or (1,), of the avatars' points [m].  reach: of the query, beyond the radius [m].
     pose_from, pose_to: (k, 4, 4), avatar to world; the same array for avatars that do not move.
     """
@@ -53,7 +55,7 @@ class Bodies(NamedTuple):
     pose_to: Vec
 
     def outside(self, low: Vec, high: Vec, scale: float = 1.0) -> Mask:
-        """Return the mask of the bodies that do not intersect the box low, high (3,) [m] during their motion."""
+        """Return the mask of bodies that miss the box low, high (3,) [m] during their motion."""
         poses = [_scaled(pose, scale) for pose in (self.pose_from, self.pose_to)]
         ends = [self._boxes_at(pose) for pose in poses]
         # A point on a screw motion stays in the box around its two end positions, enlarged by half
@@ -71,7 +73,7 @@ class Bodies(NamedTuple):
         return _largest(self.pose_from[:, :3, 3], self.pose_to[:, :3, 3])
 
     def _boxes_at(self, poses: Vec) -> tuple[Vec, Vec]:
-        """Return the low and high corners (k, 3) of world boxes that enclose the bodies at poses (k, 4, 4)."""
+        """Return the corners (k, 3) of world boxes around the bodies at poses (k, 4, 4)."""
         turn = poses[:, :3, :3]
         middle, half = (self.boxes[:, 0] + self.boxes[:, 1]) / 2, (self.boxes[:, 1] - self.boxes[:, 0]) / 2
         grown = self.radius * np.linalg.norm(turn[:, :, 0], axis=1) + self.reach
@@ -99,7 +101,7 @@ class Rays(NamedTuple):
     reach: float
 
     def outside(self, low: Vec, high: Vec, scale: float = 1.0) -> Mask:
-        """Return the mask of the rays that do not intersect the box low, high (3,) [m] within their reach."""
+        """Return the mask of rays that miss the box low, high (3,) [m] within their reach."""
         origins = self.origins * scale
         unit = self.directions / np.linalg.norm(self.directions, axis=1)[:, None]
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -148,8 +150,9 @@ def lying_outside(places: Places, leaves: Mask, verdicts: NDArray[np.uint8], inf
 
 
 def outside_line(places: Places, outside: Mask, info: SceneInfo, word: str) -> str:
-    """Return a sentence with the number of places outside, and a hint if they may be in millimetres.
+    """Return a sentence with the number of places outside, and a hint about millimetres.
 
+    The hint is given if most places would lie inside after division by 1000.
     word: plural noun for the places.
     """
     low, high = (" ".join(f"{value:.3f}" for value in corner) for corner in info.bounds)

@@ -29,8 +29,9 @@ _WORDS = {SweepAnswers: "motions", RaycastAnswers: "rays", WithinAnswers: "point
 
 
 def answer_lines(labels: list[str], times: list[float], answers: Any) -> Iterator[str]:
-    """Yield one line per answer: label, verdict and result. For `collide`, one line per run of equal verdicts.
+    """Yield one line per answer: label, verdict and result.
 
+    For `collide`, there is one line per run of equal verdicts.
     labels: (k,), what each answer is about.  times: (k,) [s], for `collide` only.
     """
     if isinstance(answers, CollideAnswers):
@@ -80,7 +81,10 @@ def unknown_line(answers: Any, unanswered: int) -> str:
 
 
 def move_line(label: str, moved: Moved) -> str:
-    """Format the result of a frame: verdict, final position, remaining motion, first obstacle, skipped effects."""
+    """Format the result of a frame.
+
+    The line has the verdict, final position, remaining motion, first obstacle and skipped effects.
+    """
     line = f"{label}  {_NAMES[moved.verdict]:<8}at {_place(moved.pose[0, :3, 3])}"
     if moved.left:
         line += f", {moved.left:.4f} m left"
@@ -96,7 +100,8 @@ def answers_json(
 ) -> dict[str, Any]:
     """Convert answers to the object that --json prints. Infinite and NaN values become null.
 
-    times: (k,) [s], or empty.  outside: (k,), mask of the items outside the scan; None if not known.
+    times: (k,) [s], or empty.  outside: (k,), mask of the items outside the scan; None if not
+    known.
     """
     k = len(answers)  # type: ignore[arg-type]
     rows: list[dict[str, Any]] = [{"t": t} for t in times] or [{} for _ in range(k)]
@@ -169,7 +174,7 @@ def _place(point: Any) -> str:
 
 
 def _of_pairs(answers: Cost, name: str) -> bool:
-    """Return whether a column does not have one element per answer, even if its length equals theirs."""
+    """Return whether a column does not have one element per answer, whatever its length."""
     if isinstance(answers, ContactsAnswers):
         own = ("verdict", "exact", "pairs_found", "outside", "voxels_missing", "node_visits", "point_tests")
         return name not in own

@@ -63,7 +63,7 @@ def archive_details(store: "Store") -> dict[str, Any]:
 
 
 def _of_source(source: "Source") -> dict[str, Any]:
-    """Return a scan's scanner position, coordinate system, units and up axis, where not the default."""
+    """Return a scan's scanner position, coordinate system, units and up axis, if not default."""
     scanner = source.pose[:3, 3].tolist()
     return {
         **({"scanner": scanner} if any(scanner) else {}),

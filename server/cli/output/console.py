@@ -53,7 +53,7 @@ def bytes_text(count: float) -> str:
 
 
 def length_text(metres: float) -> str:
-    """Format a small length in millimetres. Below one picometre it is rounding error and prints as 0."""
+    """Format a small length in millimetres. Below one picometre (rounding error) it prints as 0."""
     return f"{metres * 1e3 if metres >= 1e-12 else 0.0:.4g} mm"
 
 

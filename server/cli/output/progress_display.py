@@ -17,12 +17,14 @@ from rich.text import Text
 
 from ....schemas.process.interrupts import check
 
-# Rates average over this window: work completes in chunks of a second or two, and disk speed varies.
+# Rates average over this window: work completes in chunks of a second or two, and disk speed
+# varies.
 RATE_SECONDS = 30.0
 # Work reported within this time of a stage's start was done earlier, by an interrupted build, and
 # does not count for the rate.
 HEAD_START_SECONDS = 0.05
-# Interval between two lines of one stage without a terminal, as text for people and as JSON for programs.
+# Interval between two lines of one stage without a terminal, as text for people and as JSON for
+# programs.
 LINE_SECONDS, JSON_SECONDS = 10.0, 1.0
 
 
@@ -84,7 +86,7 @@ class Pace:
 
 
 class Listener:
-    """Receiver of progress reports that displays nothing, base class of those that do; a context manager.
+    """Receiver of progress reports and context manager. Subclasses display the reports.
 
     Implements the protocol `builder.progress.Progress` and the callback of `builder.made`.
     """
@@ -147,7 +149,7 @@ class Listener:
 
 
 class Bars(Listener):
-    """Progress bars for a terminal: one per stage, with the amount done, the rate and the remaining time.
+    """Progress bars for a terminal, one per stage, with amount done, rate and remaining time.
 
     Only the line of the current stage is redrawn, four times a second. Completed stages and other
     output are printed above it. The columns have fixed widths, 79 characters in all.
@@ -207,7 +209,7 @@ class _Cell(ProgressColumn):
 
 
 class Lines(Listener):
-    """Plain text lines, without a terminal: one at a stage's start, one every 10 s, one at its end."""
+    """Plain text lines, without a terminal: at a stage's start, every 10 s, and at its end."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic, stream: TextIO | None = None) -> None:
         super().__init__(clock)
@@ -241,7 +243,7 @@ class Lines(Listener):
 
 
 class JsonLines(Listener):
-    """JSON lines for programs: one object at a stage's start, every second, at its end, and on failure.
+    """JSON lines for programs: at a stage's start, every second, at its end, and on failure.
 
     time: ISO 8601, UTC.  event: "start", "progress", "end" or "failed".
     stage: its name; null outside any stage.
@@ -295,7 +297,7 @@ class JsonLines(Listener):
 
 @contextmanager
 def progress_listener(log_json: bool = False) -> Iterator[Listener]:
-    """Yield a progress display on standard error: JSON if `log_json`, bars on a terminal, else lines."""
+    """Yield a progress display: JSON if `log_json`, bars on a terminal, else plain lines."""
     console = Console(stderr=True)
     listener: Listener
     if log_json:
@@ -309,7 +311,7 @@ def progress_listener(log_json: bool = False) -> Iterator[Listener]:
 
 
 def count_text(count: float) -> str:
-    """Format a count in at most seven characters: up to 99,999 in full, then 100 k, 12.3 M, 4.56 G."""
+    """Format a count in at most seven characters: 99,999, then 100 k, 12.3 M, 4.56 G."""
     if count < 99_999.5:
         return f"{count:,.0f}" if count >= 10 or count == int(count) else f"{count:.1f}"
     power = min(3, (len(str(round(count))) - 1) // 3)

@@ -16,7 +16,8 @@ from .console import bytes_text
 # Maximum number of users shown, the most recently active.
 MOST_ROWS = 16
 BAR = 30
-# Maximum delay of Ctrl-C: a signal delivered to one of zenoh's threads does not wake the main thread.
+# Maximum delay of Ctrl-C: a signal delivered to one of zenoh's threads does not wake the main
+# thread.
 NAP_SECONDS = 0.2
 
 # Label of each counter, and its field of `StatsAnswer`.
@@ -54,9 +55,9 @@ class Look(NamedTuple):
 
 
 def rate(before: Look | None, now: Look, field: str) -> float | None:
-    """Return the increase per second of a counter of StatsAnswer between two samples; None if not known.
+    """Return the increase per second of a counter of StatsAnswer between two samples.
 
-    It is not known if the counter fell: another server answers, or another generation is served.
+    Returns None if the counter fell: another server answers, or another generation is served.
     """
     if before is None:
         return None

@@ -1,4 +1,4 @@
-"""Checks and description of a scene file for `solidcloud scene check`: archives, avatars, order of effects."""
+"""Checks and description of a scene file, for `solidcloud scene check`."""
 
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,6 +1,8 @@
-"""Text of a new scene file: the given archives and avatars, and every other field commented out with its default.
+"""Text of a new scene file.
 
-The text is generated from the types in schemas/scene/scene_file.py and effects.py, so that no field is missing.
+The file has the given archives and avatars, and every other field commented out with its default.
+The text is generated from the types in schemas/scene/scene_file.py and effects.py, so that no field is
+missing.
 """
 
 import inspect
@@ -56,7 +58,7 @@ def scene_text(begin: Beginning) -> str:
 
 
 def toml_value(value: Any) -> str:
-    """Format a value as TOML: any value that msgspec converts from the scene file's types, except None.
+    """Format a value as TOML: any value of the scene file's types, as built-in types, except None.
 
     Raises BadRequestError for text that is not Unicode, such as a file name in another encoding.
     """

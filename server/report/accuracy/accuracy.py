@@ -130,12 +130,12 @@ def measure(
 
 
 def with_slabs(ground: Ground) -> BuildConfig:
-    """Return the ground's build configuration with slabs: the plain descent compares bounds with and without them."""
+    """Return the ground's configuration with slabs, which the plain descent needs."""
     return replace(ground.config, with_slab=True)
 
 
 def judge(ground: Ground, config: BuildConfig, archives: Archives, plan: Plan) -> Exact:
-    """Return the reference: the server's exact verdicts and distances on the archive of `config`."""
+    """Return the reference answers: the server's exact ones on the archive of `config`."""
     scene = archives.scene(config)
     tangent = tangent_poses(scene, ground.judged, plan.near_tangent)
     distance = scene.distance(AVATAR, ground.judged, REACH).signed_distance
@@ -198,7 +198,7 @@ def measure_made_scenes(settings: list[Setting], scratch: Path, plan: Plan, prog
 
 
 def measure_turned(ground: Ground, scratch: Path, plan: Plan, progress: Progress) -> list[Row]:
-    """Measure bounding volumes and primitives on the rotated scene, whose walls are not parallel to the axes.
+    """Measure bounding volumes and primitives on a scene whose walls are oblique to the axes.
 
     Axis-aligned walls favour boxes; the orientation does not matter to spheres.
     """

@@ -56,7 +56,7 @@ def plain_settings() -> list[tuple[str, Kind]]:
 def measure_plain(
     archive: Archive, ground: Ground, exact: Exact, plan: Plan, tick: Tick, *, only: tuple[str, ...] = ()
 ) -> list[Row]:
-    """Measure errors and times of each setting of the plain descent on `ground`; return one row each.
+    """Measure errors and times of the settings of the plain descent; return one row each.
 
     only: the knobs to measure; empty: all.
     Raises InternalError if an exact kind, or a bounding volume, changes an answer.
@@ -97,9 +97,10 @@ def _judge(plain: Plain, knob: str, kind: Kind, ground: Ground, exact: Exact) ->
 
 
 def check_judge(archive: Archive, ground: Ground, exact: Exact, poses: int) -> int:
-    """Check the reference verdicts against brute force: every pair of points, in integers, at `poses` poses.
+    """Check the reference verdicts against brute force at `poses` poses.
 
-    Half of the poses are near-tangent, if there are enough. Returns the number of poses compared.
+    Brute force tests every pair of points in integers. Half of the poses are near-tangent, if there
+    are enough. Returns the number of poses compared.
     Raises InternalError if a verdict differs.
     """
     scene = _scene_units(archive)

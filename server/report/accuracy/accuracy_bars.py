@@ -1,4 +1,4 @@
-"""Bar charts of the accuracy report: bounding volumes, each knob by itself, and the sheet with a door."""
+"""Bar charts of the accuracy report: bounding volumes, each knob, and the sheet with a door."""
 
 import io
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ MODEL_COLOURS = {
 
 
 def draw_volumes(rows: Sequence[Row], target: Path) -> Path:
-    """Draw the times of the bounding volumes and point primitives, with axis-aligned and rotated walls."""
+    """Draw the times of bounding volumes and primitives, with axis-aligned and rotated walls."""
     pyplot = load_pyplot()
     groups = [knob for knob in (VOLUME, PRIMITIVE) if any(row.knob == knob for row in rows)]
     figure, panels = pyplot.subplots(

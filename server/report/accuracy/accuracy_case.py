@@ -1,4 +1,4 @@
-"""Test data of the accuracy report: a scene, an avatar, and the poses at which settings are compared."""
+"""Test data of the accuracy report: scene, avatar, and poses at which settings are compared."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -34,7 +34,8 @@ REACH = 0.5
 SIDEWAYS, UPWARDS = 0.2, 0.2
 # Absolute signed distance of near-tangent poses, from one exact unit to a micrometre [m].
 LEAST_OFF, MOST_OFF = 1.5e-8, 1e-6
-# Maximum number of moves along the nearest pair's normal: after a move another pair may be the nearest.
+# Maximum number of moves along the nearest pair's normal: after a move another pair may be the
+# nearest.
 TANGENT_STEPS = 12
 # Rotation that makes the façade's walls oblique to the axes: about z, then about x [rad].
 TURN, TILT = np.deg2rad(33.0), np.deg2rad(21.0)
@@ -69,7 +70,7 @@ class Ground(NamedTuple):
 
     @property
     def judged(self) -> Floats:
-        """Return the poses (2 k, 4, 4) at which verdicts and distances are compared with the reference."""
+        """Return the poses (2 k, 4, 4) of the comparison with the reference answers."""
         return np.concatenate([self.walk, self.around])
 
 
@@ -85,7 +86,7 @@ def made_ground(plan: Plan, avatar: Path | None, folder: Path) -> Ground:
 
 
 def given_ground(archive: Path, plan: Plan, avatar: Path | None, folder: Path) -> Ground:
-    """Write the points nearest to an archive's middle voxel to `folder`, and plan a straight walk over them.
+    """Write the points nearest to an archive's middle voxel to `folder`, with a straight walk.
 
     They are built with the archive's options and its radius: fewer points would have another mean.
     Raises BadDataError if there is no floor to stand on.
@@ -106,7 +107,7 @@ def given_ground(archive: Path, plan: Plan, avatar: Path | None, folder: Path) -
 
 
 def config_of(header: Header) -> BuildConfig:
-    """Return the options that build an archive's points again with the same radius, lattice and nodes."""
+    """Return options that build an archive's points again with its radius, lattice and nodes."""
     options = header.options
     return BuildConfig(
         voxel=header.lattice.voxel_size, resolution=header.lattice.step, radius=header.radius, degree=header.degree,
@@ -130,7 +131,10 @@ def unknown_regions(header: Header) -> tuple[str, ...]:
 
 
 def turned_ground(ground: Ground, folder: Path) -> Ground:
-    """Return the scene and poses rotated together so that no wall is parallel to an axis, without ground truth."""
+    """Return the scene and poses, rotated together so that no wall is parallel to an axis.
+
+    The result has no ground truth.
+    """
     c, s, c2, s2 = np.cos(TURN), np.sin(TURN), np.cos(TILT), np.sin(TILT)
     turn = np.array([[1, 0, 0], [0, c2, -s2], [0, s2, c2]]) @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
     middle = ground.walk[:, :3, 3].mean(axis=0)
@@ -152,8 +156,8 @@ def turned_ground(ground: Ground, folder: Path) -> Ground:
 def tangent_poses(scene: Scene, poses: Floats, count: int) -> Floats:
     """Return poses (<= count, 4, 4) whose signed distance is within MOST_OFF of 0, on either side.
 
-    Each pose is moved along the contact normal of its nearest pair, as `distance` returns it, until its
-    signed distance is as small as drawn at random. Poses that do not converge are left out.
+    Each pose is moved along the contact normal of its nearest pair, as `distance` returns it, until
+    its signed distance is as small as drawn at random. Poses that do not converge are left out.
     scene: with the avatar added.
     """
     rng = np.random.default_rng([SEED, 0x7A])
@@ -173,7 +177,7 @@ def tangent_poses(scene: Scene, poses: Floats, count: int) -> Floats:
 
 
 def judged_contact(scene: Scene, poses: Floats) -> NDArray[np.bool_]:
-    """Return the exact verdicts (k,) of poses: contact or not. Raises BadDataError if one is unknown."""
+    """Return whether poses (k,) are in contact, exactly. Raises BadDataError if one is unknown."""
     verdict = scene.collide(AVATAR, poses).verdict
     if (verdict == Verdict.UNKNOWN).any():
         raise BadDataError(

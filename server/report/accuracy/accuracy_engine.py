@@ -1,4 +1,4 @@
-"""Measurement of the server's engine: tolerance, budget, radius model, lattice step, degree, leaf size, slabs."""
+"""Measurement of the server's engine, for each knob: tolerance, budget, radius model and others."""
 
 import contextlib
 import math
@@ -41,8 +41,8 @@ Bools = NDArray[np.bool_]
 Tick = Callable[[], None]
 
 DECODE_LOOPS = 3
-# A budget of node visits that is never spent. A tolerance without a budget is answered exactly; with
-# a budget, the engine uses the search that may stop within the tolerance.
+# A budget of node visits that is never spent. A tolerance without a budget is answered exactly;
+# with a budget, the engine uses the search that may stop within the tolerance.
 UNSPENT = 1 << 40
 
 
@@ -71,17 +71,20 @@ class Setting(NamedTuple):
 
 
 def engine_settings(plan: Plan, plain: BuildConfig, radius: float) -> list[Setting]:
-    """Return one setting per value of each knob, including its default; everything else is the default.
+    """Return one setting per value of each knob, with defaults for everything else.
+
+    The values include each knob's default.
 
     plain: the ground's configuration, with a lattice step; its values are the defaults.
-    radius: result of the model `mean` for `plain` [m]. Other builds use it as a fixed radius. A coarser
-    lattice then changes only the lattice, not the mean distance of the points that are left.
+    radius: result of the model `mean` for `plain` [m]. Other builds use it as a fixed radius. A
+    coarser lattice then changes only the lattice, not the mean distance of the points that are
+    left.
     """
     found: list[Setting] = []
     step = plain.resolution or DEFAULT_STEP
 
     def held(default: bool, **changes: Any) -> BuildConfig:
-        """Return a build with the radius of the default; the default itself is returned unchanged."""
+        """Return a build with the default's radius; the default itself is unchanged."""
         return plain if default else replace(plain, radius=radius, **changes)
 
     def add(
@@ -113,7 +116,10 @@ def engine_settings(plan: Plan, plain: BuildConfig, radius: float) -> list[Setti
 
 
 def radius_settings(plan: Plan, plain: BuildConfig, radius: float) -> list[Setting]:
-    """Return the settings of the radius models, each with the plan's factors; `fixed` with rounded radii."""
+    """Return the settings of the radius models with the plan's factors.
+
+    The radii of `fixed` are rounded.
+    """
     config = replace(plain, models=frozenset({"mean", "local", "border"}))
     found = []
     for model in ("mean", "local", "border", "local+border"):
@@ -175,7 +181,7 @@ class Archives:
         return self._scenes[key]
 
     def figures(self, config: BuildConfig) -> tuple[int, float]:
-        """Return the size of the archive's files [bytes] and the time to read and decode all its voxels [s]."""
+        """Return the size of an archive's files [bytes] and the time to decode all voxels [s]."""
         self.scene(config)
         return self._figures[_key(config)]
 
@@ -191,7 +197,7 @@ def _key(config: BuildConfig) -> tuple[Any, ...]:
 
 
 def decode_seconds(folder: Path) -> float:
-    """Return the time to read, check and lay out all voxels of an archive, the best of DECODE_LOOPS [s]."""
+    """Return the least of DECODE_LOOPS times to read, check and lay out all voxels [s]."""
     store = Store(folder)
     try:
         best = math.inf

@@ -1,4 +1,4 @@
-"""Measurement of the two errors that a user notices: doorways that are too narrow, and walls that leak."""
+"""Measurement of the two errors that users notice: doorways too narrow, and walls that leak."""
 
 import math
 from collections.abc import Callable
@@ -56,7 +56,7 @@ def measure_felt(
 
 
 def measure_made(settings: list[Setting], folder: Path, plan: Plan, tick: Callable[[], None]) -> None:
-    """Fill in the doorway error of the plan's models, measured on generated doors of decreasing width.
+    """Fill in the doorway errors measured on generated doors, for the plan's models.
 
     The other doorway error, of doorway.py, is inferred from one wide door.
     folder: an empty folder for the façades.  tick: called after each façade.

@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 
 FONT = 9.0
-# Distances of a label from its anchor, in points: beside it first, then farther away with a line to it.
+# Distances of a label from its anchor, in points: beside it first, then farther away with a line to
+# it.
 NEAR, FAR, FARTHER = 11.0, 27.0, 45.0
 TURNS = 16
 # Half the size of a star or a ring, in points.

@@ -1,4 +1,4 @@
-"""HTML page of the accuracy report: self-contained, with embedded pictures and explanations of its terms."""
+"""HTML page of the accuracy report, with embedded pictures and explanations of its terms."""
 
 import base64
 import math
@@ -24,7 +24,8 @@ th{text-align:right;vertical-align:bottom;white-space:normal}th:first-child,td:f
 tr.default{background:#efe9dc;font-weight:600}.noisy{color:#a05a00}dt{font-weight:600}dd{margin:0 0 .5rem 1rem}
 """
 
-# Column headings of a table, in the order of `_cells`. Columns that are empty in all rows are left out.
+# Column headings of a table, in the order of `_cells`. Columns that are empty in all rows are left
+# out.
 HEADS = (
     "setting", "time per pose [µs]", "p50 of groups", "p99 of groups", "ratio to default", "early", "late", "unknown",
     "near-tangent: early", "late", "unknown", "distance error, max [mm]", "mean [mm]", "no pair found",
@@ -77,7 +78,7 @@ def write_page(report: Report, charts: dict[str, Path], target: Path) -> None:
 
 
 def front_rows(rows: Sequence[Row]) -> list[Row]:
-    """Return the rows on a Pareto front, with the knob in their names; the default settings appear once."""
+    """Return the rows on a Pareto front, named by knob and setting; the defaults appear once."""
     chosen = [row for row in rows if row.front]
     first = next((row for row in chosen if row.default), None)
     return [

@@ -1,4 +1,4 @@
-"""Charts of the accuracy report: time against error, one labelled point per setting, with the Pareto front."""
+"""Charts of the accuracy report: time against error, with labelled settings and Pareto front."""
 
 import math
 from collections.abc import Sequence
@@ -91,8 +91,9 @@ def draw_charts(rows: Sequence[Row], ground: str, out: Path) -> dict[str, Path]:
 
 
 def points_of(rows: Sequence[Row], error: str) -> list[Point]:
-    """Return the points of a chart of time against an error: the engine's settings, the default first and once.
+    """Return the points of a chart of time against an error.
 
+    They are the engine's settings, with the default once and first.
     Radius models are included without factors: a factor trades one felt error for the other, which
     another panel shows.
     """
@@ -113,7 +114,7 @@ def points_of(rows: Sequence[Row], error: str) -> list[Point]:
 
 
 def is_scaled(row: Row) -> bool:
-    """Return whether a radius model has a factor, or is a fixed radius that is not close to the mean."""
+    """Return whether a radius model has a factor, or is a fixed radius far from the mean."""
     return row.factor not in (None, 1.0)
 
 
@@ -125,7 +126,10 @@ def label_of(row: Row) -> str:
 
 
 def draw_scatter(rows: Sequence[Row], errors: tuple[str, ...], ground: str, target: Path) -> Path:
-    """Draw time against two errors. For the felt errors, also draw one against the other, and bounding volumes."""
+    """Draw time against two errors.
+
+    For the felt errors, also draw one against the other, and the times of bounding volumes.
+    """
     pyplot = load_pyplot()
     felt = "leak" in errors
     figure, panels = pyplot.subplots(
@@ -250,7 +254,7 @@ def _front(panel: Any, points: list[tuple[float, float]]) -> None:
 
 
 def _trade(panel: Any, rows: Sequence[Row]) -> Wanted:
-    """Draw the doorway error against the leak, one line per radius model over its factors; return the labels."""
+    """Draw the doorway error against the leak, one line per radius model; return the labels."""
     anchors: list[tuple[float, float]] = []
     labels, colours = [], []
     for name, colour in MODEL_COLOURS.items():
@@ -317,7 +321,7 @@ def _merged(places: list[tuple[float, float]], labels: list[str], rows: list[Row
 
 
 def _short(names: list[str]) -> list[str]:
-    """Combine labels at one place, one line per knob: "search within 1 mm, 2 mm", "lattice 1 cm"."""
+    """Combine labels at one place, one line per knob, such as "search within 1 mm, 2 mm"."""
     lines: dict[str, list[str]] = {}
     for name in names:
         knob = next((knob for knob in ("search within", "lattice") if name.startswith(f"{knob} ")), name)

@@ -10,19 +10,20 @@ class Plan:
     """Settings to measure, one knob at a time, and the number of measurements of each.
 
     points: of the generated façade.  most_points: maximum number taken from a given archive.
-    frames: poses of the walk, on which times are measured. Verdicts and distances are compared at these
-    and at as many poses with random offsets from the walk.
+    frames: poses of the walk, on which times are measured. Verdicts and distances are compared at
+    these and at as many poses with random offsets from the walk.
     near_tangent: poses within a micrometre of touching.
     brute: poses at which the reference itself is checked, by a test of every pair of points.
     plain_frames: poses of the walk on which the plain descent is timed.
     loops: timed repetitions of each setting, all settings in turn.
-    chunk: consecutive poses timed as one call, for the percentiles: the time of a call with one pose
-    would be mostly overhead.
+    chunk: consecutive poses timed as one call, for the percentiles: the time of a call with one
+    pose would be mostly overhead.
     tolerances [m].  budgets [node visits].  steps: of the lattice [m].
-    factors: on the radii of each radius model.  places: number of places where the leak is measured.
+    factors: on the radii of each radius model.  places: number of places where the leak is
+    measured.
     alone: a tolerance without a budget, which is answered exactly [m].
-    made_models: radius models whose doorway error is measured on generated doors, which takes 12 to 20
-    façades; empty: none.
+    made_models: radius models whose doorway error is measured on generated doors, which takes 12 to
+    20 façades; empty: none.
     """
 
     points: int = PAPER_POINTS

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 Bools = NDArray[np.bool_]
 Floats = NDArray[np.float64]
 
-# Measured with the server's engine, or with the plain descent of report/kernels/plain_descent.py. The times of the
-# two are not comparable.
+# Measured with the server's engine, or with the plain descent of report/kernels/plain_descent.py. The times of
+# the two are not comparable.
 ENGINE, PLAIN = "engine", "plain descent"
 
 # Knobs of the server's engine.
@@ -21,7 +21,8 @@ SHEET = "radius model, a thin sheet with a door"
 STEP, DEGREE, LEAF, NODES = "lattice step", "degree", "leaf size", "bounding volume"
 # Suffix of a tolerance without a budget, which is answered exactly.
 ALONE = ", alone"
-# Knobs in the charts of time against error. Degree and leaf size change no answer and hardly any time.
+# Knobs in the charts of time against error. Degree and leaf size change no answer and hardly any
+# time.
 SHOWN = (TOLERANCE, BUDGET, RADIUS, STEP, NODES)
 
 
@@ -32,7 +33,8 @@ class Row:
     knob, setting: the parameter that is varied, and its value.
     value: the setting as a number, if it is one.  default: it is the server's default.
     by: ENGINE or PLAIN.  scene: where it was measured.
-    factor: of a radius model, on its radii; of a fixed radius, its approximate ratio to the mean radius.
+    factor: of a radius model, on its radii; of a fixed radius, its approximate ratio to the mean
+    radius.
     mean_us, p50_us, p99_us: time per pose [us], see accuracy_timing.py.
     times: ratio of mean_us to that of the default setting timed with it.  noise: see Timed.
     poses: number of judged poses.  early: of these, contact where the exact answer is clear.
@@ -120,8 +122,8 @@ ERRORS = {
 
 FELT_ERRORS = ("doorway", "leak")
 
-# Times that differ by less than this factor count as equal: times of one archive built twice differed
-# by 6 % on a busy machine.
+# Times that differ by less than this factor count as equal: times of one archive built twice
+# differed by 6 % on a busy machine.
 ALIKE = 1.1
 
 
@@ -137,7 +139,10 @@ def judge_verdicts(row: Row, contact: Bools, unknown: Bools, exact: Bools, *, ta
 
 
 def judge_distances(row: Row, found: Floats, exact: Floats) -> None:
-    """Enter into the row the errors of distances (k,) [m]; inf: no pair was found, which is left out."""
+    """Enter into the row the errors of distances (k,) [m].
+
+    Infinite distances, where no pair was found, are left out.
+    """
     both = np.isfinite(found) & np.isfinite(exact)
     row.distance_missing = int((~np.isfinite(found) & np.isfinite(exact)).sum())
     if both.any():
@@ -148,10 +153,10 @@ def judge_distances(row: Row, found: Floats, exact: Floats) -> None:
 def error_of(row: Row, error: str) -> float | None:
     """Return the size of an error of ERRORS; inf if nothing passes, None if it was not measured.
 
-    A door that is too wide is as wrong as one that is too narrow. A ball stopped before the wall does not
-    leak. Another radius model defines another scene, and its verdicts and distances are not wrong where
-    they differ from those of `mean`. If a budget leaves answers unknown, the leak is None: an unknown
-    answer stops the ball, not the wall.
+    A door that is too wide is as wrong as one that is too narrow. A ball stopped before the wall
+    does not leak. Another radius model defines another scene, and its verdicts and distances are
+    not wrong where they differ from those of `mean`. If a budget leaves answers unknown, the leak
+    is None: an unknown answer stops the ball, not the wall.
     """
     if error == "leak" and row.unknown:
         return None
@@ -166,8 +171,8 @@ def error_of(row: Row, error: str) -> float | None:
 def unbeaten(places: Sequence[tuple[float, ...]]) -> list[bool]:
     """Return which (time, error, ...) are on the Pareto front.
 
-    One tuple beats another if it is as fast, as good in every error, and better in at least one of all.
-    Times within the factor ALIKE of each other count as equal: such differences are noise.
+    One tuple beats another if it is as fast, as good in every error, and better in at least one of
+    all. Times within the factor ALIKE of each other count as equal: such differences are noise.
     """
 
     def beats(other: tuple[float, ...], one: tuple[float, ...]) -> bool:
@@ -179,7 +184,7 @@ def unbeaten(places: Sequence[tuple[float, ...]]) -> list[bool]:
 
 
 def mark_front(rows: Sequence[Row], knobs: Sequence[str]) -> None:
-    """Mark the rows of `knobs` on the Pareto front of each error, and of both FELT_ERRORS together."""
+    """Mark the rows of `knobs` on the Pareto front of each error, and of both FELT_ERRORS."""
     for name, errors in (*((error, (error,)) for error in ERRORS), ("doorway and leak", FELT_ERRORS)):
         known = []
         for row in rows:

@@ -17,12 +17,13 @@ from .accuracy_row import SHEET, Row
 
 MODELS = ("mean", "border")
 FACTORS = (1.0, 2.0, 3.0)
-# Spacing of the points [m]: that of a partition or a shop window's frame in a laser scan from a few metres.
+# Spacing of the points [m]: that of a partition or a shop window's frame in a laser scan from a few
+# metres.
 SPACING = 0.03
 
 
 def measure_sheet(folder: Path, tick: Callable[[], None]) -> list[Row]:
-    """Measure the doorway error and the leak of MODELS with FACTORS, on the sheet of builder/made/sheet.py.
+    """Measure the sheet of builder/made/sheet.py: doorway error and leak of MODELS with FACTORS.
 
     Times are not measured here, but on the façade.
     folder: receives the sheet and its archive.  tick: called after each row.

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Ask = Callable[[Floats], Any]
 
-# A setting is marked as noisy if its median repetition took this much longer than its best: other work
-# ran on the machine.
+# A setting is marked as noisy if its median repetition took this much longer than its best: other
+# work ran on the machine.
 NOISY = 1.3
 
 
@@ -20,7 +20,8 @@ NOISY = 1.3
 class Timed:
     """One setting and its times.
 
-    ask: queries poses (k, 4, 4).  chunk: number of consecutive poses in a run, which is timed as one call.
+    ask: queries poses (k, 4, 4).  chunk: number of consecutive poses in a run, which is timed as
+    one call.
     loops: for each repetition (runs,), the time of each run [s].
     """
 
@@ -30,7 +31,10 @@ class Timed:
 
     @property
     def best(self) -> Floats:
-        """Return the shortest time of each run (runs,) [s]: a disturbance rarely hits a run in every repetition."""
+        """Return the shortest time of each run (runs,) [s].
+
+        A disturbance by other work rarely hits a run in every repetition.
+        """
         return np.min(self.loops, axis=0)
 
     @property
@@ -40,7 +44,7 @@ class Timed:
 
     @property
     def noise(self) -> float:
-        """Return the ratio of the median repetition to the sum of the best runs: 1 on a quiet machine."""
+        """Return the ratio of the median repetition to the best runs: 1 on a quiet machine."""
         return float(np.median([loop.sum() for loop in self.loops]) / self.best.sum())
 
     def percentile(self, share: float) -> float:
@@ -53,8 +57,8 @@ def take_times(
 ) -> None:
     """Time all subjects on the same poses, `loops` times in turn.
 
-    Before each measurement all poses are queried untimed: the previous subject has changed the contents
-    of the processor's caches, and the very first call may compile.
+    Before each measurement all poses are queried untimed: the previous subject has changed the
+    contents of the processor's caches, and the very first call may compile.
     tick: called after each measurement.
     """
     chunk = min(chunk, len(poses))

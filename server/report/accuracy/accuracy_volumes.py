@@ -1,9 +1,9 @@
-"""Comparison of bounding volumes (sphere, sphere with slab, box) and of points as cubes, by one plain descent.
+"""Comparison of bounding volumes, and of points as spheres or cubes, by one plain descent.
 
 [Fig12] reports that its authors first used a cube for each point, as wide as the mean closest-point
 distance, and leaves open whether groups of spheres bound tighter than groups of cubes. Both are
-measured here in the same way: with the same trees, the same order of descent, and boxes measured from
-the points. Only the test of two nodes, or of two points, differs.
+measured here in the same way: with the same trees, the same order of descent, and boxes measured
+from the points. Only the test of two nodes, or of two points, differs.
 """
 
 from typing import NamedTuple
@@ -34,7 +34,10 @@ Floats = NDArray[np.float64]
 
 
 class Kind(NamedTuple):
-    """A way to test nodes and points. name: for tables.  node, leaf, sift: see report/kernels/plain_descent.py."""
+    """A way to test nodes and points.
+
+    name: for tables.  node, leaf, sift: see report/kernels/plain_descent.py.
+    """
 
     name: str
     node: int
@@ -96,7 +99,7 @@ def ask(plain: Plain, kind: Kind, poses: Floats) -> Found:
 
 
 def distances(plain: Plain, kind: Kind, poses: Floats, farthest: float) -> Floats:
-    """Return signed distances (k,) [m] by the leaf test of `kind`; `farthest` if nothing is nearer."""
+    """Return signed distances (k,) [m] by the leaf test of `kind`, at most `farthest`."""
     found = np.empty(len(poses))
     nearest(
         poses, plain.body, plain.forest, plain.lattice, plain.units, plain.reach, farthest, kind.leaf, found
@@ -114,7 +117,10 @@ def _make_body(avatar: AvatarModel) -> Body:
 def _boxes(
     first: NDArray[np.int32], count: NDArray[np.int32], leaf_low: Floats, leaf_high: Floats
 ) -> tuple[Floats, Floats]:
-    """Return centres and half sides (n, 3) of the nodes' boxes, exact except the last bit, which SLACK covers."""
+    """Return centres and half sides (n, 3) of the nodes' boxes.
+
+    They are exact except the last bit, which SLACK covers.
+    """
     low, high = np.empty((len(first), 3)), np.empty((len(first), 3))
     box_nodes(first, count, leaf_low, leaf_high, low, high)
     return (low + high) / 2, (high - low) / 2

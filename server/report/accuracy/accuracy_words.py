@@ -1,4 +1,4 @@
-"""Texts of the accuracy report: terms, one paragraph per knob, and sentences that summarise the results."""
+"""Texts of the accuracy report: terms, a paragraph per knob, and a summary of the results."""
 
 import math
 from collections.abc import Sequence
@@ -45,7 +45,8 @@ CHARTS = {
     "by a slab, and by axis-aligned boxes; and with a cube in place of each point's sphere.",
 }
 
-# Why `local` leaks less than `mean` at the same doorway error, but not less than half; on the generated façade.
+# Why `local` leaks less than `mean` at the same doorway error, but not less than half; on the
+# generated façade.
 LEFT = (
     "The effect of density is gone: the median leak no longer grows with the spacing of points. The rest is due to "
     "random gaps between points, and to one jamb of the door that is scanned as sparsely as the sparsest wall."
@@ -125,8 +126,8 @@ def _exact(rows: Sequence[Row], brute: int) -> str:
     plain = _find(rows, ARITHMETIC, "integers")
     if plain is None or not brute:
         return said
-    # The exact answer is the reference, and its own count of wrong verdicts means nothing. The agreement
-    # of other methods does.
+    # The exact answer is the reference, and its own count of wrong verdicts means nothing. The
+    # agreement of other methods does.
     wrong = plain.early + plain.late + plain.tangent_early + plain.tangent_late
     agree = "agree" if not wrong else f"disagree {wrong} times"
     return (
@@ -163,8 +164,9 @@ def _alike(one: float, other: float) -> bool:
 
 
 def _ratio(row: Row, of: str = "", base: Row | None = None) -> str:
-    """Describe the ratio of a row's time to that of its knob's default, or of `base`, considering noise.
+    """Describe the ratio of a row's time to that of its knob's default, or of `base`.
 
+    Differences within noise are called equal.
     of: name of what it is compared with; empty if the sentence already contains it.
     """
     times = (row.times if base is None else (row.mean_us or 0.0) / (base.mean_us or math.inf)) or 0.0
@@ -221,7 +223,8 @@ def _radius(rows: Sequence[Row]) -> str:
 def _equal_door(rows: Sequence[Row]) -> str:
     """Compare the leaks of `mean` and `local` at the same doorway error, that of `mean`.
 
-    A factor trades one error for the other: models with different doorway errors are not comparable.
+    A factor trades one error for the other: models with different doorway errors are not
+    comparable.
     """
     mean = _find(rows, RADIUS)
     if mean is None or mean.doorway_mm is None or mean.leak_p99_mm is None:
@@ -243,8 +246,8 @@ def _equal_door(rows: Sequence[Row]) -> str:
 def leak_at(rows: Sequence[Row], model: str, doorway: float) -> float | None:
     """Interpolate the 99th percentile of the leak [mm] of a radius model at a doorway error [mm].
 
-    The interpolation is linear between the model's factors. Returns None if the measured doorway errors
-    do not enclose the given one.
+    The interpolation is linear between the model's factors. Returns None if the measured doorway
+    errors do not enclose the given one.
     """
     known = sorted(
         (r.doorway_mm, r.leak_p99_mm)

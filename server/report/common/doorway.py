@@ -1,9 +1,9 @@
 """Doorway error: extra width that a door of the generated façade needs before the figure passes.
 
-The width of the figure includes its own spheres. The error is due to the scan and to the spheres of the
-scan's points. It is inferred from one wide door: the narrowest door that lets the figure pass is
-narrower than this door by the free play on both sides. The jambs are independent of one another, and
-the play is measured for each separately.
+The width of the figure includes its own spheres. The error is due to the scan and to the spheres of
+the scan's points. It is inferred from one wide door: the narrowest door that lets the figure pass
+is narrower than this door by the free play on both sides. The jambs are independent of one another,
+and the play is measured for each separately.
 """
 
 import math
@@ -19,21 +19,22 @@ from ....builder.made.truth import DoorTruth, FacadeTruth
 from ....schemas.wire.answers import Verdict
 from ...scene import Scene
 
-# Resolution of the play on each side [m]; the width of the door has an uncertainty of twice that, half a
-# millimetre.
+# Resolution of the play on each side [m]; the width of the door has an uncertainty of twice that,
+# half a millimetre.
 FINEST = 0.00025
-# Distance of poses along the passage [m]. Between two poses, the contact of two spheres is missed by up to
-# ALONG² / 8 divided by the sum of their radii: 0.15 mm with those of figure and façade.
+# Distance of poses along the passage [m]. Between two poses, the contact of two spheres is missed
+# by up to ALONG² / 8 divided by the sum of their radii: 0.15 mm with those of figure and façade.
 ALONG = 0.005
-# Heights of the soles above the sill [m]. They are large because a jamb, not the floor, must stop the
-# figure: spheres thicken the floor as well, and under a tolerance of 10 cm the figure would be in contact
-# with it. The result is the mean over several heights: the widest parts of the figure meet random points
-# of the jambs, which makes a difference of 5 mm from one height to the next.
+# Heights of the soles above the sill [m]. They are large because a jamb, not the floor, must stop
+# the figure: spheres thicken the floor as well, and under a tolerance of 10 cm the figure would be
+# in contact with it. The result is the mean over several heights: the widest parts of the figure meet
+# random points of the jambs, which makes a difference of 5 mm from one height to the next.
 LIFTS = (0.24, 0.28, 0.32, 0.36)
 # The search on each side begins this far before the true jamb [m].
 OUTSIDE = 0.05
-# The search ends this far past the true jamb [m]. It is the limit of a negative error on one side, where
-# spheres are so small that the figure slips between them. Farther inside, a wall contains no points.
+# The search ends this far past the true jamb [m]. It is the limit of a negative error on one side,
+# where spheres are so small that the figure slips between them. Farther inside, a wall contains no
+# points.
 INSIDE = 0.10
 
 
@@ -52,7 +53,7 @@ class Doorway(NamedTuple):
 
 @lru_cache(1)
 def made_figure() -> NDArray[np.float64]:
-    """Return the points (n, 3) of the generated figure [m]; cached, because it takes half a second."""
+    """Return the points (n, 3) of the generated figure [m]; cached, as it takes half a second."""
     figure = figure_points()
     figure.setflags(write=False)
     return figure
@@ -70,11 +71,11 @@ def doorway_error(
 ) -> Doorway:
     """Measure the doorway error of a door for the generated figure, upright and along the middle.
 
-    The figure moves straight through the door, shifted to a side. A pose that is not clear stops it. The
-    largest shift with which it passes is the play on this side, found by bisection.
+    The figure moves straight through the door, shifted to a side. A pose that is not clear stops
+    it. The largest shift with which it passes is the play on this side, found by bisection.
     scene: of a scan of the façade.
-    avatar_name: of the figure in the scene. It is added if missing; BadRequestError if the name belongs
-    to another avatar.
+    avatar_name: of the figure in the scene. It is added if missing; BadRequestError if the name
+    belongs to another avatar.
     door: name of the door.  The other parameters are those of `Scene.collide`.
     """
     figure = made_figure()
@@ -122,7 +123,8 @@ def _play(
     while stopped - free > FINEST:
         stopping = stops(poses, side * guess)
         if stopping.any():
-            # A pose that is clear here is also clear farther from this jamb, and is not tested again.
+            # A pose that is clear here is also clear farther from this jamb, and is not tested
+            # again.
             stopped, poses = guess, poses[stopping]
         else:
             free = guess
@@ -133,8 +135,9 @@ def _play(
 def passage(
     door: DoorTruth, lift: float, origin: tuple[float, float, float], figure: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return poses (k, 4, 4) along the door's middle, ALONG apart, from in front of the jambs to behind them.
+    """Return poses (k, 4, 4) along the door's middle, from in front of the jambs to behind them.
 
+    The poses are ALONG apart.
     lift: height of the soles above the sill [m].  origin: of the façade.
     """
     y = np.arange(door.y_front - figure[:, 1].max(), door.y_back - figure[:, 1].min() + ALONG, ALONG)

@@ -10,18 +10,19 @@ FRAMES, RATE = 1200, 30.0
 SOLE = 0.03
 # Half width of the squares in which the floor is detected, and their spacing along the path [m].
 HALF, SPACING = 0.75, 0.25
-# Height of a layer [m], and the minimum number of points of a dense layer, as a share of the fullest layer's.
+# Height of a layer [m], and the minimum number of points of a dense layer, as a share of the
+# fullest layer's.
 LAYER, DENSE = 0.05, 0.2
 # Share of points at either end of an axis that is ignored as outliers.
 OUTLIERS = 0.02
 
 
 def floor_walk(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return times (1200,) [s] and poses (1200, 4, 4), avatar to world, of a walk through points (n, 3) [m].
+    """Return the times (1200,) [s] and poses (1200, 4, 4) of a walk through points (n, 3) [m].
 
-    The walk has 30 poses per second. It follows the longer horizontal axis, at the median of the other.
-    The avatar faces its direction of motion, with its feet SOLE above the lowest dense layer of points
-    around it.
+    Poses are avatar to world. The walk has 30 poses per second. It follows the longer horizontal
+    axis, at the median of the other. The avatar faces its direction of motion, with its feet SOLE
+    above the lowest dense layer of points around it.
     Raises BadDataError if there are too few points to detect a floor.
     """
     low, high = (
@@ -62,7 +63,10 @@ def _floor(heights: NDArray[np.float64]) -> float:
 
 
 def _smooth(floors: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Smooth floors by medians of five, which remove single holes and boxes, then means of five, which make ramps."""
+    """Smooth the heights of the floor along the path.
+
+    Medians of five remove single holes and boxes; then means of five make ramps.
+    """
     padded = np.pad(floors, 2, mode="edge")
     medians = np.median(np.lib.stride_tricks.sliding_window_view(padded, 5), axis=1)
     padded = np.pad(medians, 2, mode="edge")

@@ -1,8 +1,9 @@
 """Leak of a wall of scanned points: the depth that a spherical probe reaches before it is stopped.
 
-The probe is pushed along the normal into places of the generated façade's walls, whose true surface is
-known. At a hole of radius g between points of radius r, a probe of radius R touches first when its
-foremost point is R - sqrt((R + r)² - g²) past the surface. If g is larger than R + r, it passes through.
+The probe is pushed along the normal into places of the generated façade's walls, whose true surface
+is known. At a hole of radius g between points of radius r, a probe of radius R touches first when
+its foremost point is R - sqrt((R + r)² - g²) past the surface. If g is larger than R + r, it passes
+through.
 """
 
 from typing import NamedTuple
@@ -17,8 +18,9 @@ from ...scene import Scene
 
 PROBE = "leak probe"
 RADIUS = 0.05
-# Distance of the probe's centre from the wall at the start [m]: large enough for point radii of 25 cm, and
-# for tolerances of 10 cm with usual radii. The places are free of other surfaces for 15 cm to the sides.
+# Distance of the probe's centre from the wall at the start [m]: large enough for point radii of 25
+# cm, and for tolerances of 10 cm with usual radii. The places are free of other surfaces for 15 cm
+# to the sides.
 START = 0.30
 # Resolution of the first contact [m], unless a larger tolerance is given.
 FINEST = 1e-6
@@ -27,10 +29,10 @@ __all__ = ["Leak", "WallPlaces", "leak", "leak_places"]
 
 
 class Leak(NamedTuple):
-    """Distribution, over all places, of the depth of the probe's foremost point past the true surface.
+    """Distribution over all places of the depth of the probe past the true surface.
 
-    p50, p99, worst: [mm], negative before the surface. A probe that passes through counts as its diameter,
-    the depth at which all of it is past the surface.
+    p50, p99, worst: [mm], negative before the surface. A probe that passes through counts as its
+    diameter, the depth at which all of it is past the surface.
     passed: share of places where it passes through.
     """
 
@@ -41,7 +43,10 @@ class Leak(NamedTuple):
 
 
 def leak_places(truth: SceneTruth, places: int = 2000, seed: int = 2012) -> WallPlaces:
-    """Return places on the façade's walls, from dense to four times as sparse; see builder/made/places.py."""
+    """Return places on the façade's walls, from dense to four times as sparse.
+
+    See builder/made/places.py.
+    """
     return wall_places(truth, places, seed)
 
 
@@ -73,7 +78,9 @@ def leak_depths(
     tolerance: float = 0.0,
     budget_visits: int | None = None,
 ) -> NDArray[np.float64]:
-    """Return the depths (k,) of the probe's foremost point past the true surface when it is stopped [m].
+    """Return the depths (k,) past the true surface at which the probe is stopped [m].
+
+    A depth is that of its foremost point.
 
     The probe is stopped where its motion is no longer proved clear. 2 RADIUS if nothing stops it.
     """

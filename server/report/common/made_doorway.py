@@ -1,11 +1,12 @@
-"""Doorway error measured directly: façades with doors of decreasing width are generated, scanned and walked through.
+"""Doorway error measured directly, on generated façades with doors of decreasing width.
 
 doorway.py infers the same error from one wide door. The two differ where a narrow door is scanned
-differently. The scanner stations do not move, and see the jambs of a narrow door at a smaller angle and
-therefore with fewer points. A ray that grazes the near edge of one jamb and continues to the other gives a
-mixed return in the middle of the passage: zero to five such points were found in doors of 0.59 to 0.61 m
-scanned with two seeds. Such a point stops the figure whatever its radius: with the generated façade's usual
-seed all radius models give 87 mm, and requiring two of three scans to agree gives 86 mm.
+differently. The scanner stations do not move, and see the jambs of a narrow door at a smaller angle
+and therefore with fewer points. A ray that grazes the near edge of one jamb and continues to the
+other gives a mixed return in the middle of the passage: zero to five such points were found in
+doors of 0.59 to 0.61 m scanned with two seeds. Such a point stops the figure whatever its radius:
+with the generated façade's usual seed all radius models give 87 mm, and requiring two of three
+scans to agree gives 86 mm.
 """
 
 import math
@@ -34,7 +35,7 @@ AVATAR = "figure"
 
 
 class MadeDoor(NamedTuple):
-    """A generated façade with a door of some width: its scene, with the figure added, and its ground truth."""
+    """A generated façade: its scene, with the figure added, and its ground truth."""
 
     scene: Scene
     truth: FacadeTruth
@@ -49,11 +50,12 @@ def made_doorways(
     seed: int = 2012,
     tick: Callable[[], None] = lambda: None,
 ) -> dict[str, Doorway]:
-    """Return, for each radius model, the narrowest generated main door that the figure passes along the middle.
+    """Return, for each radius model, the narrowest generated main door that the figure passes.
 
-    The width is found by bisection between 0.5 m and WIDEST, which takes about 12 façades for the first
-    model. Façades are reused for the other models.
-    folder: an empty folder for scans and archives.  config: of the builds; must store the radius models.
+    The figure moves along the middle. The width is found by bisection between 0.5 m and WIDEST,
+    which takes about 12 façades for the first model. Façades are reused for the other models.
+    folder: an empty folder for scans and archives.  config: of the builds; must store the radius
+    models.
     points, seed: of the façades.  tick: called after each façade.
     """
     made: dict[float, MadeDoor] = {}
@@ -81,7 +83,7 @@ def made_doorways(
 
 
 def passes(door: MadeDoor, model: str) -> bool:
-    """Return whether the figure passes the middle of the main door at half of the heights LIFTS or more."""
+    """Return whether the figure passes the main door at half of the heights LIFTS or more."""
     figure = made_figure()
     clear = 0
     for lift in LIFTS:
@@ -92,7 +94,7 @@ def passes(door: MadeDoor, model: str) -> bool:
 
 
 def _narrowest(passing: Callable[[float], bool]) -> float:
-    """Return the least passing width found [m], within FINEST of one that fails; infinite if WIDEST fails."""
+    """Return the least passing width [m], within FINEST; infinite if WIDEST fails."""
     if not passing(WIDEST):
         return math.inf
     blocked, passed = NARROWEST_DOOR, WIDEST

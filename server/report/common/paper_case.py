@@ -38,7 +38,10 @@ class Case(NamedTuple):
 
 
 def made_case(folder: Path, voxel: float = PAPER_VOXEL) -> Case:
-    """Generate the façade of the paper's size in `folder`; with the figure of 3,617 points and the walk of 40 s."""
+    """Generate the façade of the paper's size, with the figure of 3,617 points and a walk of 40 s.
+
+    folder: receives the scan.
+    """
     scan = folder / "facade.laz"
     make_facade(scan, points=PAPER_POINTS)
     times, poses = walk_poses(build_facade().truth)

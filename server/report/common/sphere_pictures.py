@@ -1,4 +1,4 @@
-"""Figure 8 of [Fig12]: rendering of the bounding spheres of one level of every partition's hierarchy."""
+"""Figure 8 of [Fig12]: the bounding spheres of one level of every partition's hierarchy."""
 
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,9 +18,11 @@ WIDTH = 1800
 class Spheres(NamedTuple):
     """The s spheres of one level.
 
-    center: (s, 3) float64, world frame [m].  radius: (s,) float64 [m], including the radius of the points.
+    center: (s, 3) float64, world frame [m].  radius: (s,) float64 [m], including the radius of the
+    points.
     partition: (s,) int64, the leaf cell, numbered over all voxels.
-    ended: (s,) bool, the sphere is a leaf node of a tree that ends above the level, and is drawn instead.
+    ended: (s,) bool, the sphere is a leaf node of a tree that ends above the level, and is drawn
+    instead.
     """
 
     center: NDArray[np.float64]
@@ -30,9 +32,10 @@ class Spheres(NamedTuple):
 
 
 def level_spheres(folder: Path, level: int) -> Spheres:
-    """Return the spheres of a level of the BSH of every leaf cell (the paper's partition) of an archive.
+    """Return the spheres of one level of every leaf cell's BSH (the paper's partition).
 
-    A tree that ends earlier contributes its leaf nodes. The top BSH, over the cells, is not included.
+    A tree that ends earlier contributes its leaf nodes. The top BSH, over the cells, is not
+    included.
     level: 1 is the root.
     """
     if level < 1:
@@ -70,7 +73,7 @@ def level_spheres(folder: Path, level: int) -> Spheres:
 
 
 def _view() -> NDArray[np.float64]:
-    """Return the rows right, up and towards the eye (3, 3), unit vectors in the world frame; z is up."""
+    """Return unit vectors (3, 3) in the world frame: right, up and towards the eye; z is up."""
     toward = np.array(
         [np.sin(AZIMUTH) * np.cos(ELEVATION), -np.cos(AZIMUTH) * np.cos(ELEVATION), np.sin(ELEVATION)]
     )
@@ -138,7 +141,7 @@ def draw_spheres(spheres: Spheres, title: str, target: Path) -> None:
 
 
 def load_pyplot() -> Any:
-    """Return matplotlib's pyplot, set to draw to files. Raises SolidcloudError if it is not installed."""
+    """Return matplotlib's pyplot for drawing to files. Raises SolidcloudError if it is missing."""
     try:
         import matplotlib
 

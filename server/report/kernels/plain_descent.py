@@ -1,9 +1,9 @@
-"""One plain descent of two hierarchies, its node test and its leaf test exchangeable: like compared with like.
+"""Plain descent of two hierarchies with exchangeable node and leaf tests, for fair comparisons.
 
-Scalar and depth first, as figures 5 and 6 of [Fig12], corrected as
-server/kernels/overlap/overlap.py says: a leaf is never
-opened, of two inner nodes the one of the larger sphere is. Node tests are float64, inclusive and widened by SLACK, so
-that none loses a contact: what a bounding volume changes is how often it says "perhaps".
+The descent is scalar and depth-first, as in figures 5 and 6 of [Fig12], with the correction
+described in server/kernels/overlap/overlap.py: a leaf is never opened, and of two inner nodes the one with
+the larger sphere is. Node tests are in float64, inclusive and widened by SLACK. Therefore no test
+loses a contact, and a bounding volume only changes the number of node pairs that are not excluded.
 """
 
 import math
@@ -29,18 +29,22 @@ from .plain_pairs import (
 )
 
 SPHERE, SLAB, BOX, SPHERE_AND_BOX = range(4)
-# Rounding of two points to exact units, and of float64 sums up to 10^7 m: node tests are widened by so much [m].
+# Widening of node tests [m]: covers the rounding of two points to exact units, and of float64 sums
+# up to 10^7 m.
 SLACK = 4.0 / UNITS_PER_METRE
-# A pair is pushed for each child, at most 16, of one of its nodes: two trees of 80 levels fit.
+# Size of the stack. Opening a pair pushes one pair per child, at most 16: two trees of 80 levels
+# fit.
 STACK = 2 * 80 * 15 + 16
-CUBE_REACH = math.sqrt(3.0)  # a cube's corner, in half sides
+CUBE_REACH = math.sqrt(3.0)  # distance of a cube's corner from its centre, in half sides
 
 
 class Body(NamedTuple):
-    """An avatar's hierarchy, avatar frame [m]; a nodes, b leaf nodes.
+    """An avatar's hierarchy of a nodes and b leaf nodes, avatar frame [m].
 
-    center: (a, 3), radius: (a,).  middle, half: (a, 3), the box of the node's points.  first: (a,) int32, first
-    child or ~block.  count: (a,) int32, children or points.  points: (b, 3, LANES) float64.
+    center: (a, 3), radius: (a,), bounding spheres.  middle, half: (a, 3), boxes of the nodes'
+    points.
+    first: (a,) int32, first child or ~block.  count: (a,) int32, number of children or points.
+    points: (b, 3, LANES) float64.
     """
 
     center: NDArray[np.float64]
@@ -53,11 +57,13 @@ class Body(NamedTuple):
 
 
 class Forest(NamedTuple):
-    """The hierarchies of a scene's voxels as stored, metres from the dataset's origin; n nodes, b leaf nodes.
+    """Hierarchies of a scene's voxels as stored, with n nodes and b leaf nodes.
 
-    center, radius, middle, half, first, count: as of Body.  normal: (n, 3), norm: (n,), slab: (n, 2), least and
-    greatest dot(normal, point - center) [m].  roots: (v,) int64.  low: (b, 3) int64 and steps: (b, 3, LANES)
-    uint16: lattice points.
+    Coordinates are metres from the dataset's origin.
+    center, radius, middle, half, first, count: as in Body.
+    normal: (n, 3).  norm: (n,), its length.
+    slab: (n, 2), least and greatest dot(normal, point - center) [m].  roots: (v,) int64.
+    low: (b, 3) int64 and steps: (b, 3, LANES) uint16: lattice points.
     """
 
     center: NDArray[np.float64]
@@ -75,10 +81,11 @@ class Forest(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """Scratch of one call. center, middle, half: (a, 3), the avatar's nodes as placed.  placed: its blocks.
+    """Working memory of one call.
 
-    taken: one of the scene's.  shift: (3,), t - O.  frame: (3,) int64.  stack: (STACK, 2): avatar node, scene node.
-    keep: (LANES,).
+    center, middle, half: (a, 3), the avatar's nodes under the pose.  placed: the avatar's blocks.
+    taken: one block of the scene.  shift: (3,), t - O.  frame: (3,) int64.
+    stack: (STACK, 2): avatar node, scene node.  keep: (LANES,).
     """
 
     center: NDArray[np.float64]
@@ -94,7 +101,7 @@ class Scratch(NamedTuple):
 
 @nb.njit(nogil=True, cache=True)
 def make_scratch(body):
-    """Scratch for one avatar (not empty)."""
+    """Allocate the working memory for one avatar, which must have points."""
     shape = body.center.shape
     return Scratch(
         np.empty(shape), np.empty(shape), np.empty(shape), make_lanes(body.points.shape[0]), make_lanes(1), np.empty(3),
@@ -104,9 +111,9 @@ def make_scratch(body):
 
 @borrowing
 def bounds_meet(kind, body_radius, center, middle, half, a, forest, b, reach):
-    """Whether points below node a of the avatar may come within `reach` [m] of points below node b of the scene.
+    """Return whether points below avatar node a may be within `reach` of points below scene node b.
 
-    center, middle, half: (nodes, 3), the avatar's spheres and boxes as placed.
+    reach: [m].  center, middle, half: (nodes, 3), the avatar's spheres and boxes under the pose.
     """
     if kind == BOX:
         return (
@@ -139,8 +146,11 @@ def bounds_meet(kind, body_radius, center, middle, half, a, forest, b, reach):
 
 @borrowing
 def keep_points(kind, points, block, count, m, shift, forest, b, reach, keep):
-    """Mark in keep (LANES,) which of the first `count` points of the avatar's block may come within `reach` of points
-    below node b of the scene, as its bound tells. Returns how many do."""
+    """Mark the points of an avatar block that may be within `reach` of points below scene node b.
+
+    Uses the bound of node b. Considers the first `count` points. Writes keep (LANES,). Returns the
+    number of marked points.
+    """
     kept = 0
     for i in range(LANES):
         x = place(m, shift, 0, points[block, 0, i], points[block, 1, i], points[block, 2, i])
@@ -167,7 +177,10 @@ def keep_points(kind, points, block, count, m, shift, forest, b, reach, keep):
 
 @borrowing
 def _lower_bound(body_radius, center, a, forest, b):
-    """How far points below two nodes are apart at least [m], by their spheres; may be negative."""
+    """Return a lower bound of the distance of points below two nodes [m], by their spheres.
+
+    It may be negative.
+    """
     square = 0.0
     for r in range(3):
         apart = center[a, r] - forest.center[b, r]
@@ -177,10 +190,11 @@ def _lower_bound(body_radius, center, a, forest, b):
 
 @borrowing
 def _place_nodes(kind, m, shift, body, center, middle, half):
-    """Place what `kind` asks of the avatar's nodes: spheres' centres, or boxes around the turned boxes.
+    """Transform the avatar's nodes to the pose.
 
-    Such a box's half side is the sum of the old ones, each by the size of its part of the turn: Arvo, "Transforming
-    axis-aligned bounding boxes", Graphics Gems (1990).
+    Writes the spheres' centres and, for BOX, boxes around the rotated boxes.
+    The half side of such a box is the sum of the old half sides, weighted by the absolute elements
+    of the rotation: Arvo, "Transforming axis-aligned bounding boxes", Graphics Gems (1990).
     """
     for i in range(body.center.shape[0]):
         for r in range(3):
@@ -196,7 +210,7 @@ def _place_nodes(kind, m, shift, body, center, middle, half):
 
 @borrowing
 def _begin(leaf, m, body, units, reach, lattice, shift, frame):
-    """Choose the frame of one pose; fills shift and frame, returns its Limits."""
+    """Choose the coordinate frame of one pose. Writes shift and frame, returns the Limits."""
     farthest = 0.0
     for r in range(3):
         shift[r] = m[r, 3] - lattice.origin[r]
@@ -209,13 +223,14 @@ def _begin(leaf, m, body, units, reach, lattice, shift, frame):
 
 @nb.njit(nogil=True, cache=True)
 def descend(poses, body, forest, lattice, units, reach, node, leaf, sift, verdict, counts):
-    """Whether the avatar touches the scene under rigid poses (k, 4, 4), by one kind of node test and of leaf test.
+    """Test whether the avatar touches the scene under rigid poses (k, 4, 4).
 
-    units, reach: r_a + r_b, exact and in metres.  node: SPHERE .. SPHERE_AND_BOX.  leaf: FLOAT32
-    .. CUBES (plain_pairs.py).
-    sift: of two leaf nodes, whether the avatar's points are held against the other's bound before they are against
-    its points, as the server does; [Fig12] tests all pairs. Writes verdict (k,) bool and counts (2, k) int64: node
-    tests, pair tests.
+    Uses one kind of node test and one of leaf test.
+    units, reach: r_a + r_b, in exact units and in metres.
+    node: SPHERE .. SPHERE_AND_BOX.  leaf: FLOAT32 .. CUBES (plain_pairs.py).
+    sift: for two leaf nodes, first test the avatar's points against the bound of the scene's node,
+    as the server does; [Fig12] tests all pairs.
+    Writes verdict (k,) bool and counts (2, k) int64: node tests, pair tests.
     """
     work = make_scratch(body)
     _descend(poses, body, forest, lattice, units, reach, node, leaf, sift, verdict, counts, work)
@@ -223,9 +238,9 @@ def descend(poses, body, forest, lattice, units, reach, node, leaf, sift, verdic
 
 @borrowing
 def _descend(poses, body, forest, lattice, units, reach, node, leaf, sift, verdict, counts, work):
-    """`descend`, with its scratch."""
+    """Do the work of `descend`, with given working memory."""
     center, middle, half, placed, taken, shift, frame, stack, keep = work
-    # A sphere that holds a cube is larger than it; a box that holds cubes is not.
+    # A sphere around a cube is larger than the cube; a box around cubes is not.
     span = reach * (CUBE_REACH if leaf == CUBES and node != BOX else 1.0) + SLACK
     for k in range(poses.shape[0]):
         m = poses[k]
@@ -278,9 +293,11 @@ def _descend(poses, body, forest, lattice, units, reach, node, leaf, sift, verdi
 
 @nb.njit(nogil=True, cache=True)
 def nearest(poses, body, forest, lattice, units, reach, farthest, leaf, found):
-    """The signed distance found (k,) [m] of the avatar under rigid poses (k, 4, 4), as one kind of leaf test has it.
+    """Compute the signed distances (k,) [m] of the avatar under rigid poses (k, 4, 4).
 
-    farthest: what is farther is not looked for, and gets `farthest` [m]. The spheres prune, whatever the leaf test.
+    leaf: kind of leaf test, FLOAT32 .. CUBES (plain_pairs.py).
+    farthest: reach of the search [m], and the result where nothing is nearer. Pruning always uses
+    the spheres. Writes found (k,).
     """
     work = make_scratch(body)
     _nearest(poses, body, forest, lattice, units, reach, farthest, leaf, found, work)
@@ -288,7 +305,7 @@ def nearest(poses, body, forest, lattice, units, reach, farthest, leaf, found):
 
 @borrowing
 def _nearest(poses, body, forest, lattice, units, reach, farthest, leaf, found, work):
-    """`nearest`, with its scratch."""
+    """Do the work of `nearest`, with given working memory."""
     center, middle, half, placed, taken, shift, frame, stack, _ = work
     span = reach * (CUBE_REACH if leaf == CUBES else 1.0) + SLACK
     for k in range(poses.shape[0]):
@@ -325,9 +342,10 @@ def _nearest(poses, body, forest, lattice, units, reach, farthest, leaf, found, 
 
 @nb.njit(nogil=True, cache=True)
 def box_nodes(first, count, leaf_low, leaf_high, low, high):
-    """The boxes low, high (n, 3) of nodes from those of their leaf nodes (b, 3).
+    """Compute the boxes low, high (n, 3) of nodes from those of their leaf nodes (b, 3).
 
-    first: (n,) int32, first child or ~block; children stand behind their parents.  count: (n,) children.
+    first: (n,) int32, first child or ~block; children follow their parents.
+    count: (n,), number of children.
     """
     for i in range(first.shape[0] - 1, -1, -1):
         if first[i] < 0:
@@ -342,7 +360,10 @@ def box_nodes(first, count, leaf_low, leaf_high, low, high):
 
 @nb.njit(nogil=True, cache=True)
 def brute_touch(m, points, scene_units, units, origin):
-    """The definition (NUMERICS.md N5), every pair: avatar points (n, 3) [m] under a pose m, scan (s, 3) exact units."""
+    """Test for contact by definition (NUMERICS.md N5): every pair of points.
+
+    points: (n, 3), of the avatar [m], under the pose m.  scene_units: (s, 3), exact units.
+    """
     shift, at = np.empty(3), np.empty(3, np.int64)
     for r in range(3):
         shift[r] = m[r, 3] - origin[r]
@@ -357,7 +378,8 @@ def brute_touch(m, points, scene_units, units, origin):
                 abs(scene_units[j, 1] - at[1]),
                 abs(scene_units[j, 2] - at[2]),
             )
-            # Farther along one axis is farther; the squares of the others fit 63 bits.
+            # A pair out of reach along one axis is out of reach. These tests also keep the squares
+            # within 63 bits.
             if dx <= units and dy <= units and dz <= units and dx * dx + dy * dy + dz * dz <= units * units:
                 return True
     return False

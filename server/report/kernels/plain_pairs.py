@@ -1,7 +1,7 @@
-"""Two leaf nodes in five kinds of arithmetic, and as cubes: do they hold a pair in contact, how near are they?
+"""Contact and distance tests of two leaf nodes, in five kinds of arithmetic and with cubes.
 
-All are plain loops over blocks of LANES points, the last one repeated to the end, so that what differs is the
-arithmetic alone. Coordinates are float64 metres from the dataset's origin until a kind makes its own of them.
+All are plain loops over blocks of LANES points, padded with the last point: only the arithmetic
+differs. Coordinates are float64 metres from the dataset's origin until a kind converts them.
 """
 
 import math
@@ -17,16 +17,17 @@ from ...kernels.core.pose_transform import lattice_to_units, place, to_units
 from ...kernels.core.voxel_layout import LANES
 
 FLOAT32, FLOAT64, CERTIFIED, INTEGERS, FLOAT32_WORLD, CUBES = range(6)
-# Where FLOAT32_WORLD has the dataset's origin stand, wherever that is: UTM zone 32, central Europe [m].
+# Position to which FLOAT32_WORLD moves the dataset's origin [m]: UTM zone 32, central Europe.
 MAP_X, MAP_Y = 500_000.0, 5_600_000.0
 U32 = 2.0**-24  # half a unit in the last place of 1, float32
 
 
 class Lanes(NamedTuple):
-    """The points of blocks in the three types that kinds use; scratch.
+    """Working memory for points of blocks, in the three types that the kinds use.
 
-    narrow: (b, 3, LANES) float32, steps from a frame near the avatar, or metres on the map.  wide: float64 [m].
-    units: int64, exact units.  stamp: (b,) int64, the pose that a block was placed for.
+    narrow: (b, 3, LANES) float32, steps from a frame near the avatar, or map coordinates [m].
+    wide: (b, 3, LANES) float64 [m].  units: (b, 3, LANES) int64, exact units.
+    stamp: (b,) int64, the pose for which a block was transformed.
     """
 
     narrow: NDArray[np.float32]
@@ -36,7 +37,10 @@ class Lanes(NamedTuple):
 
 
 class Lattice(NamedTuple):
-    """Where lattice steps are. origin: (3,) float64 world [m].  step: [m].  units_per_step: exact units."""
+    """Lattice of a dataset.
+
+    origin: (3,) float64, world frame [m].  step: [m].  units_per_step: exact units.
+    """
 
     origin: NDArray[np.float64]
     step: float
@@ -44,9 +48,12 @@ class Lattice(NamedTuple):
 
 
 class Limits(NamedTuple):
-    """The thresholds of one pose. units: r_a + r_b, exact.  reach: the same [m], not rounded.
+    """Thresholds of one pose.
 
-    square: of the reach in `narrow`'s unit.  near, far: what float32 certifies, squares [steps].
+    units: r_a + r_b in exact units.  reach: the same [m], not rounded.
+    square: square of the reach in the unit of `narrow`.
+    near, far: squares of distances [steps²] up to which float32 certifies contact, and above which
+    it certifies that there is none.
     """
 
     units: int
@@ -58,7 +65,7 @@ class Limits(NamedTuple):
 
 @nb.njit(nogil=True, cache=True)
 def make_lanes(blocks):
-    """Scratch for so many blocks, none placed."""
+    """Allocate working memory for a number of blocks, marked as not transformed."""
     shape = (blocks, 3, LANES)
     return Lanes(
         np.empty(shape, np.float32), np.empty(shape), np.empty(shape, np.int64), np.full(blocks, -1, np.int64)
@@ -67,12 +74,15 @@ def make_lanes(blocks):
 
 @borrowing
 def make_limits(kind, units, reach, extent, farthest, lattice):
-    """The thresholds of one pose. units, reach: see Limits.  extent: how far the avatar's points are from the frame,
-    farthest: from the origin [steps].
+    """Return the thresholds of one pose.
 
-    The error of a difference of float32 coordinates, in steps: both points' rounding to exact units, half a unit
-    each; the float32 of the avatar's coordinate, U32 of its size, and of the difference, of a pair in reach; float64
-    sums, some 2^-53 of the farthest. Scene coordinates from the frame are whole numbers, exact below 2^24.
+    units, reach: see Limits.  extent, farthest: greatest distance of the avatar's points from the
+    frame and from the origin [steps].
+
+    The error of a difference of float32 coordinates, in steps, has these parts: the rounding of
+    both points to exact units, half a unit each; the float32 rounding of the avatar's coordinate,
+    U32 of its size, and of the difference, for a pair in reach; float64 sums, some 2^-53 of the
+    farthest. Scene coordinates relative to the frame are integers, exact below 2^24.
     """
     steps = np.float64(units) / lattice.units_per_step
     error = 1.1 / lattice.units_per_step + U32 * (extent + 2.0 * steps + 1.0) + farthest * 2.0**-49
@@ -86,7 +96,10 @@ def make_limits(kind, units, reach, extent, farthest, lattice):
 
 @borrowing
 def place_points(kind, points, m, shift, frame, block, lattice, lanes):
-    """Place a block of the avatar, points (b, 3, LANES) float64 [m], as `kind` has it. frame: (3,) int64 lattice."""
+    """Transform a block of the avatar to the pose, in the coordinates of `kind`.
+
+    points: (b, 3, LANES) float64 [m].  frame: (3,) int64 [lattice steps].
+    """
     for r in range(3):
         base = np.float64(frame[r]) * lattice.step
         offset = MAP_X if r == 0 else MAP_Y if r == 1 else 0.0
@@ -104,7 +117,10 @@ def place_points(kind, points, m, shift, frame, block, lattice, lanes):
 
 @borrowing
 def take_points(kind, low, steps, frame, block, lattice, lanes):
-    """Make block 0 of `lanes` of a scene's block, as `kind` has it. low: (b, 3) int64, steps: (b, 3, LANES) uint16."""
+    """Convert a scene's block to the coordinates of `kind`, in block 0 of `lanes`.
+
+    low: (b, 3) int64.  steps: (b, 3, LANES) uint16.
+    """
     for r in range(3):
         base, offset = low[block, r], MAP_X if r == 0 else MAP_Y if r == 1 else 0.0
         for j in range(LANES):
@@ -121,7 +137,7 @@ def take_points(kind, low, steps, frame, block, lattice, lanes):
 
 @borrowing
 def _any_within(one, i, other, square):
-    """Whether point i of one (3, LANES) is within the root of `square` of any of other (3, LANES)."""
+    """Return whether point i of `one` is within sqrt(square) of a point of `other`, (3, LANES)."""
     x, y, z = one[0, i], one[1, i], one[2, i]
     touched = False
     for j in range(LANES):
@@ -132,7 +148,7 @@ def _any_within(one, i, other, square):
 
 @borrowing
 def _within(one, keep, other, square):
-    """Whether any of the points marked in keep (LANES,) is, see `_any_within`; floats of either width, or integers."""
+    """Return whether `_any_within` holds for a point marked in keep (LANES,), float or integer."""
     for i in range(LANES):
         if not keep[i]:
             continue
@@ -143,7 +159,10 @@ def _within(one, keep, other, square):
 
 @borrowing
 def _cubes_meet(one, keep, other, reach):
-    """Whether cubes whose half sides add up to `reach` meet: of one those in keep, any of other, exact units."""
+    """Return whether a cube of `one` marked in keep meets a cube of `other` [exact units].
+
+    reach: sum of the half sides of two cubes.
+    """
     for i in range(LANES):
         if not keep[i]:
             continue
@@ -159,7 +178,10 @@ def _cubes_meet(one, keep, other, reach):
 
 @borrowing
 def _settle(m, shift, points, block, i, low, steps, at, lattice, body, scene, limits):
-    """Point i, which float32 leaves open or near: whether any pair of it is near, or by the integers in contact."""
+    """Decide whether point i is in contact with a point of the scene's block.
+
+    A pair within `near` is in contact. A pair between `near` and `far` is decided in integers.
+    """
     x, y, z = body[0, i], body[1, i], body[2, i]
     for j in range(LANES):
         dx, dy, dz = scene[0, j] - x, scene[1, j] - y, scene[2, j] - z
@@ -180,8 +202,11 @@ def _settle(m, shift, points, block, i, low, steps, at, lattice, body, scene, li
 
 @borrowing
 def blocks_touch(kind, m, shift, points, block, keep, low, steps, at, lattice, placed, taken, limits):
-    """Whether a placed block of the avatar holds, among the points in keep (LANES,), one in contact with a point of the
-    scene's block `at`, which `taken` holds; as `kind` computes it."""
+    """Return whether a marked point of an avatar block is in contact with the scene's block `at`.
+
+    keep: (LANES,), marks the points.
+    placed: holds the avatar's block.  taken: holds the scene's block.  kind: the arithmetic.
+    """
     if kind in (FLOAT32, FLOAT32_WORLD):
         return _within(placed.narrow[block], keep, taken.narrow[0], limits.square)
     if kind == FLOAT64:
@@ -203,7 +228,7 @@ def blocks_touch(kind, m, shift, points, block, keep, low, steps, at, lattice, p
 
 @borrowing
 def _least_square(one, i, other):
-    """The least square of point i of one (3, LANES) to any of other (3, LANES)."""
+    """Return the least squared distance of point i of `one` to points of `other`, (3, LANES)."""
     x, y, z = one[0, i], one[1, i], one[2, i]
     dx, dy, dz = other[0, 0] - x, other[1, 0] - y, other[2, 0] - z
     least = dx * dx + dy * dy + dz * dz
@@ -215,7 +240,11 @@ def _least_square(one, i, other):
 
 @borrowing
 def _cube_gap(one, i, other, reach):
-    """Least gap [exact units] of cubes whose half sides add up to `reach`, negative where they overlap."""
+    """Return the least distance of cube i of `one` to the cubes of `other` [exact units].
+
+    It is negative if they overlap.
+    reach: sum of the half sides of two cubes.
+    """
     least = np.inf
     for j in range(LANES):
         gaps, inside = 0.0, -np.inf
@@ -229,7 +258,10 @@ def _cube_gap(one, i, other, reach):
 
 @borrowing
 def blocks_gap(kind, block, count, lattice, placed, taken, limits):
-    """The least signed distance [m] of spheres (of cubes: CUBES) in two blocks, as `kind` computes it."""
+    """Return the least signed distance [m] of spheres, or for CUBES of cubes, in two blocks.
+
+    kind: the arithmetic.
+    """
     least = np.inf
     for i in range(count):
         if kind in (FLOAT32, CERTIFIED):

@@ -1,7 +1,7 @@
-"""Comparison of cells of one height ([Fig12] section 8) with the plain octree of section 4
-(builder/voxel/balance_cells.py).
+"""Comparison of cells of one height ([Fig12] section 8) with the octree of section 4.
 
-The walk is timed with each kind of cells in turn. The verdicts must be equal.
+The walk is timed with each kind of cells (see builder/voxel/balance_cells.py) in turn. The verdicts must be
+equal.
 """
 
 import contextlib
@@ -23,8 +23,8 @@ from ....schemas.wire.answers import Verdict
 from ..common.paper_case import Case
 from .walkthrough import AVATAR, Say, open_whole
 
-# Kind of cells and maximum number of points of a cell: octrees with several limits (some of which make
-# most trees one height by splitting alone), and balanced cells.
+# Kind of cells and maximum number of points of a cell: octrees with several limits (some of which
+# make most trees one height by splitting alone), and balanced cells.
 PLANS = (
     ("octree", 4096),
     ("octree", 2048),
@@ -39,7 +39,8 @@ PLANS = (
 class CellPlan:
     """One way to divide voxels into cells, with its measurements.
 
-    kind, cell_points: of BuildConfig.  heights: number of levels of a cell's tree -> number of cells.
+    kind, cell_points: of BuildConfig.  heights: number of levels of a cell's tree -> number of
+    cells.
     build_seconds: the least of the builds.  loops: (loops,) [s], all poses in one call.
     node_visits, point_tests: mean per pose.
     """

@@ -1,9 +1,9 @@
-"""Demonstration: build a scan, serve it, walk through it over zenoh; results in walk.json and walk.png.
+"""Demonstration: build a scan, serve it, walk through it; write walk.json and walk.png.
 
     python -m solidcloud.server.report.walk.demo_walk OUT [SCAN...] [--realtime]
 
-Without scans a façade is generated, and the walk is that of [Fig12] section 3: 40 s, 1,200 poses of a
-figure of 3,617 points. `scripts/demo` runs this module.
+Without scans a façade is generated, and the walk is that of [Fig12] section 3: 40 s, 1,200 poses of
+a figure of 3,617 points. `scripts/demo` runs this module.
 """
 
 import argparse
@@ -32,7 +32,8 @@ from ..common.floor_walk import floor_walk
 from .server_process import served
 from .walk_frames import Frames, Walk
 
-# Number of points read again from the scans, for the picture and to detect a floor in scans without ground truth.
+# Number of points read again from the scans, for the picture and to detect a floor in scans without
+# ground truth.
 PICTURE_POINTS = 600_000
 
 
@@ -62,9 +63,11 @@ def main() -> None:
 
 
 def demonstrate(out: Path, scans: Sequence[Path] = (), *, realtime: bool = False) -> dict[str, Any]:
-    """Build, serve and walk; write walk.json and walk.png into the folder `out`; return the content of walk.json.
+    """Build, serve and walk; write walk.json and walk.png into the folder `out`.
 
-    scans: of a place with z up [m]; empty: a façade is generated.  realtime: one frame every 1/30 s.
+    Returns the content of walk.json.
+    scans: of a place with z up [m]; empty: a façade is generated.  realtime: one frame every 1/30
+    s.
     """
     out.mkdir(parents=True, exist_ok=True)
     facade = None if scans else make_scan(out)
@@ -101,8 +104,8 @@ def make_scan(out: Path) -> Path:
 def take_walk(client: Client, walk: Walk, *, realtime: bool) -> Frames:
     """Query one pose after another, as a viewer does for each of its frames.
 
-    There is no progress bar: its thread would hold the interpreter for milliseconds, which would count as
-    round-trip time.
+    There is no progress bar: its thread would hold the interpreter for milliseconds, which would
+    count as round-trip time.
     """
     answers: list[CollideAnswers] = []
     round_trip = np.empty(len(walk.poses))
@@ -125,7 +128,7 @@ def take_walk(client: Client, walk: Walk, *, realtime: bool) -> Frames:
 
 
 def make_report(walk: Walk, frames: Frames, info: SceneInfo, avatar_points: int) -> dict[str, Any]:
-    """Return the content of walk.json: a summary and each frame. Names of times end in their unit."""
+    """Return the content of walk.json: a summary and each frame. Time names end in their unit."""
     names = [verdict.name.lower() for verdict in Verdict]
     summary = {
         "path": walk.path,

@@ -12,7 +12,10 @@ PAPER_MB = {4: 39.46, 6: 36.84, 8: 35.21, 10: 45.95, 12: 45.15, 14: 36.50, 16: 4
 
 
 def paper_rows(degrees: tuple[int, ...]) -> list[dict[str, Any]]:
-    """Return the rows of the paper's table 1. Its frames include rendering; its Mb are read as 10^6 bytes."""
+    """Return the rows of the paper's table 1.
+
+    Its frames include rendering; its Mb are read as 10^6 bytes.
+    """
     return [
         {
             "degree": degree,

@@ -1,4 +1,4 @@
-"""Figure 7 of [Fig12]: frame rate along the path for each degree, with and without a collision test."""
+"""Figure 7 of [Fig12]: frame rate along the path per degree, with and without a collision test."""
 
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -43,9 +43,11 @@ def draw_path(
     paper_fps: dict[int, float],
     target: Path,
 ) -> None:
-    """Write the figure as PNG: the loop of 30 frames per second, then one panel of test times per kind of node.
+    """Write the figure as PNG.
 
-    times: (k,) [s].  curves: kind -> one curve per degree.  without: (k,) [s], without a collision test.
+    It shows the loop of 30 frames per second, and one panel of test times per kind of node.
+    times: (k,) [s].  curves: kind -> one curve per degree.  without: (k,) [s], without a collision
+    test.
     contact: (k,) bool.  paper_fps: degree -> mean frames per second in the paper's table 1.
     """
     pyplot = load_pyplot()

@@ -10,8 +10,8 @@ from pathlib import Path
 
 from ....schemas.errors import SolidcloudError
 
-# Enough to load the libraries and compile every kernel on two slow cores. A server that takes longer is
-# considered hung.
+# Enough to load the libraries and compile every kernel on two slow cores. A server that takes
+# longer is considered hung.
 READY_SECONDS = 300.0
 STOP_SECONDS = 15.0
 
@@ -55,8 +55,8 @@ def free_port() -> int:
 
 def _wait_ready(process: "subprocess.Popen[str]", archive: Path) -> None:
     """Wait until the server reports that it serves."""
-    # The timer kills the server, which closes its output and ends readline(): the only way to wait for a
-    # line with a deadline on every system.
+    # The timer kills the server, which closes its output and ends readline(): the only way to wait
+    # for a line with a deadline on every system.
     timer = threading.Timer(READY_SECONDS, process.kill)
     timer.start()
     try:

@@ -16,8 +16,8 @@ from .walk_frames import Frames, Walk
 COLOURS = {Verdict.CLEAR: "#1f7a8c", Verdict.CONTACT: "#d62839", Verdict.UNKNOWN: "#e0a100"}
 PAPER, INK = "#fbfaf7", "#2f2a26"
 STONE = LinearSegmentedColormap.from_list("stone", [PAPER, "#d9cfc1", "#a08e78", "#5b4d40"])
-# The figure is drawn at most MOST times: in the middle of the CONTACTS longest contacts, and at regular
-# intervals, at least the share APART of the walk from one another.
+# The figure is drawn at most MOST times: in the middle of the CONTACTS longest contacts, and at
+# regular intervals, at least the share APART of the walk from one another.
 MOST, CONTACTS, APART = 8, 4, 0.07
 # Pixels along the longest extent; the plan, where walls are lines, has half as many.
 PIXELS = 700
@@ -141,7 +141,10 @@ def _draw_points(
     extent: tuple[NDArray[np.float64], NDArray[np.float64]],
     pixels: int,
 ) -> None:
-    """Draw points as an image of their density on a logarithmic scale. shown: horizontal and vertical axis."""
+    """Draw points as an image of their density on a logarithmic scale.
+
+    shown: horizontal and vertical axis.
+    """
     low, high = extent
     pixel = float((high - low).max()) / pixels
     edges = [np.arange(low[axis], high[axis] + pixel, pixel) for axis in shown]

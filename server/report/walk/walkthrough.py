@@ -1,7 +1,7 @@
-"""Repetition of the experiment of [Fig12] section 7: time of a collision test along the walk, for each degree.
+"""Repetition of [Fig12] section 7: time of a collision test along the walk, for each degree.
 
-Produces table 1, figure 7 and figure 8 of the paper on a generated scene instead of the Batalha scan.
-CAVEATS lists the other differences.
+Produces table 1, figure 7 and figure 8 of the paper on a generated scene instead of the Batalha
+scan. CAVEATS lists the other differences.
 """
 
 import contextlib
@@ -33,7 +33,8 @@ from .path_figure import Curve, draw_path
 
 DEGREES = (4, 6, 8, 10, 12, 14, 16)
 FRAME_RATE = 30.0
-# Untimed calls before the timed ones: the first few calls after other work took several times as long.
+# Untimed calls before the timed ones: the first few calls after other work took several times as
+# long.
 WARM_FRAMES = 30
 # Degrees within this factor of the best count as equal: times of three runs differed by up to 4 %.
 NEAR = 1.05
@@ -56,7 +57,8 @@ Say = Callable[[str], None]
 class Structure:
     """One hierarchy with its measurements.
 
-    kind: SLAB, nodes are spheres cut by slabs, or PLAIN, the paper's spheres.  folder: of its archive.
+    kind: SLAB, nodes are spheres cut by slabs, or PLAIN, the paper's spheres.  folder: of its
+    archive.
     frames: (loops, k) [s], one call per frame.  loops: (loops,) [s], all frames in one call.
     verdict: (k,) uint8.  node_visits, point_tests: mean per pose.
     resident_bytes: of all decoded voxels.  archive_bytes: of the archive's files.
@@ -77,7 +79,7 @@ class Structure:
 
     @property
     def frame_median(self) -> NDArray[np.float64]:
-        """Return the time of each frame (k,) [s]: the median of the loops, which removes random disturbances."""
+        """Return the time of each frame (k,) [s]: the median of the loops."""
         return np.median(self.frames, axis=0)
 
 
@@ -99,7 +101,8 @@ def build_structures(case: Case, degrees: tuple[int, ...], folder: Path, say: Sa
     return found
 
 
-# --- measuring ------------------------------------------------------------------------------------------
+# --- measuring
+# ------------------------------------------------------------------------------------------
 
 
 def time_frames(scene: Scene, avatar: str, poses: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -129,8 +132,8 @@ def measure(case: Case, structures: list[Structure], loops: int, say: Say) -> ND
     """Time every structure with warm caches, all structures in turn in each loop.
 
     The order spreads disturbances by other work over all structures.
-    Returns the time of each frame without a collision test (k,) [s]: the same call, with an avatar without
-    points.
+    Returns the time of each frame without a collision test (k,) [s]: the same call, with an avatar
+    without points.
     Raises InternalError if two structures answer differently, SolidcloudError if poses are unknown.
     """
     with contextlib.ExitStack() as stack:
@@ -147,7 +150,8 @@ def measure(case: Case, structures: list[Structure], loops: int, say: Say) -> ND
             say(f"walking, loop {loop + 1} of {loops}")
             without.append(time_frames(scenes[0], NOBODY, case.poses))
             for i, scene in enumerate(scenes):
-                # The previous structure has changed the contents of the processor's caches: one untimed call.
+                # The previous structure has changed the contents of the processor's caches: one
+                # untimed call.
                 scene.collide(AVATAR, case.poses)
                 begin = time.perf_counter()
                 scene.collide(AVATAR, case.poses)
@@ -159,7 +163,7 @@ def measure(case: Case, structures: list[Structure], loops: int, say: Say) -> ND
 
 
 def _first_answers(case: Case, structure: Structure, scene: Scene) -> None:
-    """Fill in the answers and sizes of one structure; every voxel of the walk is resident afterwards."""
+    """Fill in the answers and sizes of one structure; load every voxel of the walk."""
     scene.add_avatar(AVATAR, case.avatar)
     answers = scene.collide(AVATAR, case.poses)
     if (answers.verdict == Verdict.UNKNOWN).any() or answers.faults:
@@ -177,7 +181,7 @@ def _first_answers(case: Case, structure: Structure, scene: Scene) -> None:
 
 
 def check_verdicts(structures: list[Structure]) -> None:
-    """Raise InternalError if verdicts differ: no degree and no kind of node may change an answer."""
+    """Raise InternalError if verdicts differ: no degree or kind of node may change an answer."""
     first = structures[0]
     for other in structures[1:]:
         differing = np.flatnonzero(first.verdict != other.verdict)
@@ -189,7 +193,8 @@ def check_verdicts(structures: list[Structure]) -> None:
             )
 
 
-# --- the report -----------------------------------------------------------------------------------------
+# --- the report
+# -----------------------------------------------------------------------------------------
 
 
 def loop_fps(seconds: NDArray[np.float64], rate: float = FRAME_RATE) -> float:
@@ -203,8 +208,10 @@ def loop_fps(seconds: NDArray[np.float64], rate: float = FRAME_RATE) -> float:
 def table_row(structure: Structure) -> dict[str, Any]:
     """Return one row of table 1.
 
-    frame_ms: one call per frame; mean over frames of the loops' median, in frame_ms_best of their minimum.
-    batch_ms: all frames in one call, per frame; median of the loops, in batch_ms_best their minimum.
+    frame_ms: one call per frame; mean over frames of the loops' median, in frame_ms_best of their
+    minimum.
+    batch_ms: all frames in one call, per frame; median of the loops, in batch_ms_best their
+    minimum.
     """
     s, k = structure, structure.frames.shape[1]
     frame = s.frame_median
@@ -283,7 +290,10 @@ def make_report(case: Case, structures: list[Structure], without: NDArray[np.flo
 def write_report(
     report: dict[str, Any], case: Case, structures: list[Structure], without: NDArray[np.float64], out: Path
 ) -> None:
-    """Write walkthrough.json, table1.csv (the paper's rows last) and figure7.csv (median time of each frame)."""
+    """Write walkthrough.json, table1.csv and figure7.csv.
+
+    table1.csv ends with the paper's rows; figure7.csv holds the median time of each frame.
+    """
     (out / "walkthrough.json").write_text(json.dumps(report, indent=1) + "\n")
     with open(out / "table1.csv", "w", newline="") as file:
         writer = csv.DictWriter(file, list(report["table1"][0]))

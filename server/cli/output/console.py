@@ -1,4 +1,4 @@
-"""Terminal output of results, on standard output. Progress of running work is in `progress_display.py`."""
+"""Terminal output of results, on standard output; `progress_display.py` shows running work."""
 
 from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING

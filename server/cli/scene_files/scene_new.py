@@ -17,8 +17,8 @@ from ...archives.archive_info import describe
 from ...residency.voxel_store import Store
 from .scene_text import Beginning, scene_text
 
-# Characters that an avatar's name must not contain (schemas/scene/scene_file.py, SceneName), and its maximum
-# length.
+# Characters that an avatar's name must not contain (schemas/scene/scene_file.py, SceneName), and
+# its maximum length.
 _NO_NAME = re.compile(r"[^A-Za-z0-9._-]+")
 _LONGEST_NAME = 64
 

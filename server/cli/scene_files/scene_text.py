@@ -1,8 +1,8 @@
 """Text of a new scene file.
 
 The file has the given archives and avatars, and every other field commented out with its default.
-The text is generated from the types in schemas/scene/scene_file.py and effects.py, so that no field is
-missing.
+The text is generated from the types in schemas/scene/scene_file.py and effect_options.py, so that
+no field is missing.
 """
 
 import inspect

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 Bools = NDArray[np.bool_]
 Floats = NDArray[np.float64]
 
-# Measured with the server's engine, or with the plain descent of report/kernels/plain_descent.py. The times of
-# the two are not comparable.
+# Measured with the server's engine, or with the plain descent of report/kernels/plain_descent.py.
+# The times of the two are not comparable.
 ENGINE, PLAIN = "engine", "plain descent"
 
 # Knobs of the server's engine.

@@ -27,8 +27,8 @@ FINEST = 0.00025
 ALONG = 0.005
 # Heights of the soles above the sill [m]. They are large because a jamb, not the floor, must stop
 # the figure: spheres thicken the floor as well, and under a tolerance of 10 cm the figure would be
-# in contact with it. The result is the mean over several heights: the widest parts of the figure meet
-# random points of the jambs, which makes a difference of 5 mm from one height to the next.
+# in contact with it. The result is the mean over several heights: the widest parts of the figure
+# meet random points of the jambs, which makes a difference of 5 mm from one height to the next.
 LIFTS = (0.24, 0.28, 0.32, 0.36)
 # The search on each side begins this far before the true jamb [m].
 OUTSIDE = 0.05

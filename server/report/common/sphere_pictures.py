@@ -45,7 +45,8 @@ def level_spheres(folder: Path, level: int) -> Spheres:
         lattice, radius = archive.header.lattice, archive.header.radius
         for row, coordinate in enumerate(archive.coordinates):
             voxel, links = archive.read_voxel(row)
-            # The roots of the cells' trees follow the top BSH, in cell order (schemas/archive/voxel.py).
+            # The roots of the cells' trees follow the top BSH, in cell order
+            # (schemas/archive/voxel.py).
             count = voxel.nodes.count.astype(np.int64)
             top = len(count) - int(voxel.cells.nodes.sum(dtype=np.int64))
             chosen, at = np.arange(top, top + len(voxel.cells.nodes)), 1

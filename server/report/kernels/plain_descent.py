@@ -1,9 +1,10 @@
 """Plain descent of two hierarchies with exchangeable node and leaf tests, for fair comparisons.
 
 The descent is scalar and depth-first, as in figures 5 and 6 of [Fig12], with the correction
-described in server/kernels/overlap/overlap.py: a leaf is never opened, and of two inner nodes the one with
-the larger sphere is. Node tests are in float64, inclusive and widened by SLACK. Therefore no test
-loses a contact, and a bounding volume only changes the number of node pairs that are not excluded.
+described in server/kernels/overlap/overlap.py: a leaf is never opened, and of two inner nodes the
+one with the larger sphere is. Node tests are in float64, inclusive and widened by SLACK. Therefore
+no test loses a contact, and a bounding volume only changes the number of node pairs that are not
+excluded.
 """
 
 import math

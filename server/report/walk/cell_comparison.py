@@ -1,7 +1,7 @@
 """Comparison of cells of one height ([Fig12] section 8) with the octree of section 4.
 
-The walk is timed with each kind of cells (see builder/voxel/balance_cells.py) in turn. The verdicts must be
-equal.
+The walk is timed with each kind of cells (see builder/voxel/balance_cells.py) in turn. The verdicts
+must be equal.
 """
 
 import contextlib

@@ -9,7 +9,7 @@ therefore be built one after the other; they give the same cells as the whole vo
 The cells are spilled to files in this order. Then the top hierarchy is packed over the cells. In
 the order of the top hierarchy, the cells are read once more to bound it and to write the rows of
 the record. The resulting voxel equals the one that voxel_octree.py builds of the same points, row for row
-(tests/unit/builder/test_dense.py); only its frames are compressed as streams.
+(tests/unit/builder/voxel/test_dense_voxel.py); only its frames are compressed as streams.
 
 Memory holds a part of DENSE_POINTS and at most some 300 bytes per cell. All points at one lattice
 position form one cell, however many there are. If there are more than a part holds (a heap), only

@@ -8,7 +8,7 @@ SCHEMAS, BUILDER, SERVER = "tests/unit/schemas/", "tests/unit/builder/", "tests/
 
 def work(*questions: str) -> tuple[str, ...]:
     """Return the tests that the answers and the work of these queries are unchanged."""
-    test = SERVER + "test_work.py::test_answers_and_work_are_what_they_were"
+    test = SERVER + "queries/test_work.py::test_answers_and_work_are_what_they_were"
     return tuple(
         f"{test}[{question}-{kind}]"
         for kind in ("fine", "classed", "flat", "broken")
@@ -18,7 +18,7 @@ def work(*questions: str) -> tuple[str, ...]:
 
 def tangent(question: str) -> tuple[str, ...]:
     """Return the tests that contact begins at the unit of the definition."""
-    test = SERVER + "test_tangent.py::test_contact_begins_at_the_unit_of_the_definition"
+    test = SERVER + "queries/test_tangent.py::test_contact_begins_at_the_unit_of_the_definition"
     return tuple(f"{test}[{question}-{name}]" for name in ("small-fine", "deep-flat"))
 
 
@@ -39,7 +39,7 @@ SWEEPS = tuple(
 
 # The tests of prefetched voxels that take less than two seconds.
 AHEAD = tuple(
-    SERVER + f"test_ahead.py::test_{name}"
+    SERVER + f"kernels/prediction/test_track_prediction.py::test_{name}"
     for name in (
         "straight_and_even_is_seen_as_such",
         "acceleration_is_seen",
@@ -63,7 +63,7 @@ AHEAD = tuple(
 
 # The tests of normals that call kernels, without the slowest.
 NORMALS = tuple(
-    SERVER + f"test_normals.py::test_{name}"
+    SERVER + f"queries/test_surface_normals.py::test_{name}"
     for name in (
         "what_is_stored_is_what_is_found_at_first_use",
         "where_no_point_is_there_is_no_normal",
@@ -77,109 +77,126 @@ NORMALS = tuple(
 )
 
 TESTS: dict[str, tuple[str, ...]] = {
-    "schemas/kernels/links.py": (SCHEMAS + "test_links.py",),
-    "schemas/kernels/morton.py": (SCHEMAS + "test_morton.py",),
-    "schemas/kernels/normal_codes.py": (SCHEMAS + "test_normals.py",),
-    "schemas/kernels/rows.py": (SCHEMAS + "test_rows.py",),
-    "builder/kernels/points/bisection.py": (BUILDER + "test_bisection.py",),
+    "schemas/kernels/links.py": (SCHEMAS + "kernels/test_links.py",),
+    "schemas/kernels/morton.py": (SCHEMAS + "kernels/test_morton.py",),
+    "schemas/kernels/normal_codes.py": (SCHEMAS + "kernels/test_normal_codes.py",),
+    "schemas/kernels/rows.py": (SCHEMAS + "kernels/test_rows.py",),
+    "builder/kernels/points/bisection.py": (BUILDER + "kernels/points/test_bisection.py",),
     "builder/kernels/trees/bounding_sphere.py": (
-        BUILDER + "test_bounding_sphere.py::test_a_bound_is_as_tight_as_its_guess",
-        BUILDER + "test_bounding_sphere.py::test_a_guess_whose_radius_does_not_fit_is_given_up_for_the_box",
-        BUILDER + "test_bounding_sphere.py::test_what_stood_in_the_arrays_before_is_not_read",
-        BUILDER + "test_bounding_sphere.py::test_ceil_sqrt_is_exact",
-        BUILDER + "test_bounding_sphere.py::test_degenerate_sets_are_bounded",
-        BUILDER + "test_bounding_sphere.py::test_a_flat_set_has_a_thin_slab",
-        BUILDER + "test_bounding_sphere.py::test_bounds_of_scans_enclose",
-        BUILDER + "test_bounding_sphere.py::test_spreads_of_parts_join_to_that_of_all",
-        BUILDER + "test_bounding_sphere.py::test_the_direction_of_least_variance_is_an_eigenvector",
+        BUILDER + "kernels/trees/test_bounding_sphere.py::test_a_bound_is_as_tight_as_its_guess",
         BUILDER
-        + "test_bounding_sphere.py::test_a_direction_is_found_at_once_where_one_variance_is_the_least",
+        + "kernels/trees/test_bounding_sphere.py::test_a_guess_whose_radius_does_not_fit_is_given_up_for_the_box",
+        BUILDER + "kernels/trees/test_bounding_sphere.py::test_what_stood_in_the_arrays_before_is_not_read",
+        BUILDER + "kernels/trees/test_bounding_sphere.py::test_ceil_sqrt_is_exact",
+        BUILDER + "kernels/trees/test_bounding_sphere.py::test_degenerate_sets_are_bounded",
+        BUILDER + "kernels/trees/test_bounding_sphere.py::test_a_flat_set_has_a_thin_slab",
+        BUILDER + "kernels/trees/test_bounding_sphere.py::test_bounds_of_scans_enclose",
+        BUILDER + "kernels/trees/test_bounding_sphere.py::test_spreads_of_parts_join_to_that_of_all",
+        BUILDER
+        + "kernels/trees/test_bounding_sphere.py::test_the_direction_of_least_variance_is_an_eigenvector",
+        BUILDER
+        + "kernels/trees/test_bounding_sphere.py::test_a_direction_is_found_at_once_where_one_variance_is_the_least",
     ),
-    "builder/kernels/neighbours/filter_counts.py": (BUILDER + "test_filter_kernels.py",),
+    "builder/kernels/neighbours/filter_counts.py": (BUILDER + "kernels/neighbours/test_filter_counts.py",),
     "builder/kernels/neighbours/point_classes.py": (
-        BUILDER + "test_classes_kernels.py",
-        BUILDER + "test_classes.py::test_the_kernel_and_the_judge_agree_at_the_edge_of_each_rule",
-        BUILDER + "test_classes.py::test_the_twelfth_neighbour_decides_and_at_the_limit_is_within",
-        BUILDER + "test_classes.py::test_a_mean_at_the_limit_is_no_rim",
+        BUILDER + "kernels/neighbours/test_point_classes.py",
+        BUILDER
+        + "passes/test_radius_classes.py::test_the_kernel_and_the_judge_agree_at_the_edge_of_each_rule",
+        BUILDER
+        + "passes/test_radius_classes.py::test_the_twelfth_neighbour_decides_and_at_the_limit_is_within",
+        BUILDER + "passes/test_radius_classes.py::test_a_mean_at_the_limit_is_no_rim",
     ),
     "builder/kernels/neighbours/nearest_neighbours.py": (
-        BUILDER + "test_neighbours.py::test_what_is_inserted_is_among_the_first_in_order",
-        BUILDER + "test_neighbours.py::test_the_distance_of_a_box_is_that_of_its_nearest_place",
-        BUILDER + "test_neighbours.py::test_the_closest_equal_brute_force",
-        BUILDER + "test_neighbours.py::test_ties_go_to_lesser_coordinates",
-        BUILDER + "test_neighbours.py::test_a_distance_at_the_limit_counts",
-        BUILDER + "test_neighbours.py::test_boxes_hold_their_points",
-        BUILDER + "test_neighbours.py::test_the_order_of_points_changes_nothing",
-    ),
-    "builder/kernels/points/content_hash.py": (BUILDER + "test_content.py",),
-    "builder/kernels/neighbours/enclosure.py": (BUILDER + "test_enclosure.py",),
-    "builder/kernels/neighbours/nearest_points.py": (BUILDER + "test_nearest.py",),
-    "builder/kernels/points/voxel_records.py": (BUILDER + "test_records.py",),
-    "builder/kernels/neighbours/box_tree.py": (BUILDER + "test_boxes.py",),
-    "builder/kernels/points/occupied_cubes.py": (BUILDER + "test_cubes.py",),
-    "builder/kernels/points/lzf_decoder.py": (BUILDER + "test_lzf.py",),
-    "builder/kernels/neighbours/estimate_normals.py": (
-        BUILDER + "test_normals.py::test_codes_are_those_of_the_definition",
-        BUILDER + "test_normals.py::test_sums_at_the_bound_are_exact",
         BUILDER
-        + "test_normals.py::test_sums_of_boxes_are_those_of_their_points_and_of_those_that_fit_no_reach_zeros",
-        BUILDER + "test_normals.py::test_order_changes_nothing_and_a_heap_costs_what_a_point_does",
+        + "kernels/neighbours/test_nearest_neighbours.py::test_what_is_inserted_is_among_the_first_in_order",
+        BUILDER
+        + "kernels/neighbours/test_nearest_neighbours.py::test_the_distance_of_a_box_is_that_of_its_nearest_place",
+        BUILDER + "kernels/neighbours/test_nearest_neighbours.py::test_the_closest_equal_brute_force",
+        BUILDER + "kernels/neighbours/test_nearest_neighbours.py::test_ties_go_to_lesser_coordinates",
+        BUILDER + "kernels/neighbours/test_nearest_neighbours.py::test_a_distance_at_the_limit_counts",
+        BUILDER + "kernels/neighbours/test_nearest_neighbours.py::test_boxes_hold_their_points",
+        BUILDER + "kernels/neighbours/test_nearest_neighbours.py::test_the_order_of_points_changes_nothing",
+    ),
+    "builder/kernels/points/content_hash.py": (BUILDER + "kernels/points/test_content_hash.py",),
+    "builder/kernels/neighbours/enclosure.py": (BUILDER + "kernels/neighbours/test_enclosure.py",),
+    "builder/kernels/neighbours/nearest_points.py": (BUILDER + "kernels/neighbours/test_nearest_points.py",),
+    "builder/kernels/points/voxel_records.py": (BUILDER + "kernels/points/test_voxel_records.py",),
+    "builder/kernels/neighbours/box_tree.py": (BUILDER + "kernels/neighbours/test_box_tree.py",),
+    "builder/kernels/points/occupied_cubes.py": (BUILDER + "kernels/points/test_occupied_cubes.py",),
+    "builder/kernels/points/lzf_decoder.py": (BUILDER + "kernels/points/test_lzf_decoder.py",),
+    "builder/kernels/neighbours/estimate_normals.py": (
+        BUILDER + "voxel/test_point_normals.py::test_codes_are_those_of_the_definition",
+        BUILDER + "voxel/test_point_normals.py::test_sums_at_the_bound_are_exact",
+        BUILDER
+        + "voxel/test_point_normals.py"
+        + "::test_sums_of_boxes_are_those_of_their_points_and_of_those_that_fit_no_reach_zeros",
+        BUILDER
+        + "voxel/test_point_normals.py::test_order_changes_nothing_and_a_heap_costs_what_a_point_does",
     ),
     "builder/kernels/points/octree_cells.py": (
-        BUILDER + "test_octree.py::test_cells_are_runs_of_the_sorted_codes",
-        BUILDER + "test_octree.py::test_a_cell_is_split_only_when_it_must_be",
-        BUILDER + "test_octree.py::test_a_cell_may_be_full",
-        BUILDER + "test_octree.py::test_points_on_cell_borders_are_in_one_cell",
-        BUILDER + "test_octree.py::test_sorted_runs_are_merged_stably",
+        BUILDER + "kernels/points/test_octree_cells.py::test_cells_are_runs_of_the_sorted_codes",
+        BUILDER + "kernels/points/test_octree_cells.py::test_a_cell_is_split_only_when_it_must_be",
+        BUILDER + "kernels/points/test_octree_cells.py::test_a_cell_may_be_full",
+        BUILDER + "kernels/points/test_octree_cells.py::test_points_on_cell_borders_are_in_one_cell",
+        BUILDER + "kernels/points/test_octree_cells.py::test_sorted_runs_are_merged_stably",
     ),
-    "builder/kernels/trees/pack_tree.py": (BUILDER + "test_pack.py",),
-    "builder/kernels/points/cell_spill.py": (BUILDER + "test_spill.py",),
-    "builder/kernels/points/spool_rows.py": (BUILDER + "test_spool_kernels.py",),
-    "builder/kernels/trees/top_bounds.py": (BUILDER + "test_top_kernels.py", BUILDER + "test_top.py"),
-    "builder/kernels/trees/build_tree.py": (BUILDER + "test_trees.py",),
-    "server/kernels/core/pose_transform.py": (SERVER + "test_pose_checks.py", SERVER + "test_placing.py"),
+    "builder/kernels/trees/pack_tree.py": (BUILDER + "kernels/trees/test_pack_tree.py",),
+    "builder/kernels/points/cell_spill.py": (BUILDER + "kernels/points/test_cell_spill.py",),
+    "builder/kernels/points/spool_rows.py": (BUILDER + "kernels/points/test_spool_rows.py",),
+    "builder/kernels/trees/top_bounds.py": (
+        BUILDER + "kernels/trees/test_top_bounds.py",
+        BUILDER + "voxel/test_top_hierarchy.py",
+    ),
+    "builder/kernels/trees/build_tree.py": (BUILDER + "kernels/trees/test_build_tree.py",),
+    "server/kernels/core/pose_transform.py": (
+        SERVER + "kernels/core/test_pose_checks.py",
+        SERVER + "kernels/core/test_pose_transform.py",
+    ),
     "server/kernels/core/voxels_in_reach.py": (
-        SERVER + "test_reach_rows.py",
-        SERVER + "test_reach.py::test_find_key_finds_what_is_there_and_nothing_else",
+        SERVER + "kernels/core/test_voxels_in_reach_rows.py",
+        SERVER + "kernels/core/test_voxels_in_reach.py::test_find_key_finds_what_is_there_and_nothing_else",
     ),
-    "server/kernels/bodies/body_pairs.py": (SERVER + "test_pairs.py",),
-    "server/kernels/motion/screw_motion.py": (SERVER + "test_motion.py", *work("sweep")),
+    "server/kernels/bodies/body_pairs.py": (SERVER + "kernels/bodies/test_body_pairs.py",),
+    "server/kernels/motion/screw_motion.py": (SERVER + "kernels/motion/test_screw_motion.py", *work("sweep")),
     "server/kernels/prediction/track_prediction.py": AHEAD,
     "server/kernels/motion/sweep_advance.py": (*work("sweep", "sweep bounded"), *SWEEPS),
-    "server/kernels/core/gap_order.py": (SERVER + "test_closer.py", *work("distance")),
+    "server/kernels/core/gap_order.py": (SERVER + "kernels/core/test_gap_order.py", *work("distance")),
     "server/kernels/nearest/nearest_pair.py": work("distance", "distance deep", "distance bounded"),
     "server/kernels/overlap/coarse_overlap.py": (
-        SERVER + "test_coarse.py::test_the_nodes_of_a_top_enclose_all_points",
-        SERVER + "test_coarse.py::test_filled_and_remembered_are_the_same_rows",
-        SERVER + "test_coarse.py::test_no_point_has_a_larger_sphere_than_its_node_says",
-        SERVER + "test_settle.py",
+        SERVER + "residency/test_coarse_bounds.py::test_the_nodes_of_a_top_enclose_all_points",
+        SERVER + "residency/test_coarse_bounds.py::test_filled_and_remembered_are_the_same_rows",
+        SERVER + "residency/test_coarse_bounds.py::test_no_point_has_a_larger_sphere_than_its_node_says",
+        SERVER + "kernels/overlap/test_settle.py",
     ),
     "server/kernels/contacts/contact_pairs.py": (*work("contacts", "contacts deep"), *tangent("contacts")),
     "server/kernels/core/avatar_front.py": work("collide", "distance"),
     "server/kernels/core/vector_lanes.py": work("distance", "distance deep", "bounded deep"),
     "server/kernels/core/voxel_layout.py": (
-        SERVER + "test_outward.py",
-        SERVER + "test_layout.py",
+        SERVER + "kernels/core/test_outward.py",
+        SERVER + "kernels/core/test_voxel_layout.py",
         *work("collide", "contacts"),
     ),
     "server/kernels/motion/contact_times.py": (*work("sweep", "sweep bounded"), *SWEEPS),
-    "server/kernels/motion/moving_avatar.py": (SERVER + "test_moving.py", *work("sweep", "sweep bounded")),
-    "server/kernels/nearest/nearest_by_scan.py": (SERVER + "test_by_scan.py",),
+    "server/kernels/motion/moving_avatar.py": (
+        SERVER + "kernels/motion/test_moving_avatar.py",
+        *work("sweep", "sweep bounded"),
+    ),
+    "server/kernels/nearest/nearest_by_scan.py": (SERVER + "queries/test_distance_by_scan.py",),
     "server/kernels/nearest/nearest_search.py": work("distance", "distance deep"),
     "server/kernels/nearest/nearest_resident.py": (
-        SERVER + "test_near.py",
+        SERVER + "queries/test_resident_distance.py",
         "tests/property/test_near.py::test_one_pose_has_the_bits_of_distance",
     ),
-    "server/kernels/bodies/body_sweep.py": (SERVER + "test_meeting.py",),
-    "server/kernels/bodies/moving_bodies.py": (SERVER + "test_meeting.py",),
-    "server/kernels/bodies/near_bodies.py": (SERVER + "test_meeting.py",),
+    "server/kernels/bodies/body_sweep.py": (SERVER + "kernels/bodies/test_body_sweep.py",),
+    "server/kernels/bodies/moving_bodies.py": (SERVER + "kernels/bodies/test_body_sweep.py",),
+    "server/kernels/bodies/near_bodies.py": (SERVER + "kernels/bodies/test_body_sweep.py",),
     "server/kernels/rays/stored_normals.py": NORMALS,
     "server/kernels/overlap/overlap.py": (
         *work("collide", "collide deep", "collide one"),
         *tangent("collide"),
     ),
     "server/kernels/core/placed_avatar.py": (
-        SERVER + "test_placed.py",
+        SERVER + "kernels/core/test_placed_avatar.py",
         *tangent("collide"),
         *work("collide"),
     ),
@@ -187,18 +204,18 @@ TESTS: dict[str, tuple[str, ...]] = {
         *work("bounded deep", "collide bounded", "distance bounded"),
         *tangent("bounded"),
     ),
-    "server/kernels/motion/sweep_resident.py": (SERVER + "test_probe.py",),
+    "server/kernels/motion/sweep_resident.py": (SERVER + "queries/test_resident_motion.py",),
     "server/kernels/rays/rays.py": work("raycast", "raycast bounded"),
     "server/kernels/motion/sweep_interval.py": work("sweep", "sweep bounded"),
-    "server/kernels/core/voxel_tree.py": (SERVER + "test_voxel_tree.py",),
-    "server/kernels/prediction/user_tracks.py": (SERVER + "test_neighbourhood.py",),
+    "server/kernels/core/voxel_tree.py": (SERVER + "kernels/core/test_voxel_tree.py",),
+    "server/kernels/prediction/user_tracks.py": (SERVER + "residency/test_motion_prediction.py",),
     "server/kernels/rays/nearest_point.py": (
         *work("within", "within bounded"),
-        SERVER + "test_within_exact.py",
+        SERVER + "queries/test_within_exact.py",
     ),
     "server/kernels/contacts/contact_clusters.py": (
-        SERVER + "test_clusters.py",
-        SERVER + "test_cell_hash.py",
+        SERVER + "kernels/contacts/test_contact_clusters.py",
+        SERVER + "kernels/contacts/test_cell_hash.py",
         *work("contacts"),
     ),
 }

@@ -20,7 +20,13 @@ def digest(text: bytes) -> str:
 
 def digest_tests(folder: Path, tests: tuple[str, ...]) -> str:
     """Return a digest of a file's tests: the test files and their shared modules."""
-    paths = sorted({*(folder / name.split("::")[0] for name in tests), *(folder / "tests").glob("*.py")})
+    paths = sorted(
+        {
+            *(folder / name.split("::")[0] for name in tests),
+            *(folder / "tests").glob("*.py"),
+            *(folder / "tests" / "support").glob("*.py"),
+        }
+    )
     return digest(b"".join(path.read_bytes() for path in paths))
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-# float64 decides nothing nearer to tangency than this [m]; tests/naive.py does.
+# float64 decides nothing nearer to tangency than this [m]; tests/support/naive.py does.
 FLOAT64_BAND = 1e-6
 SHOWN = 20
 

@@ -7,11 +7,11 @@ import sys
 from collections import Counter
 from pathlib import Path
 
-import cases
+import archive_cases
 import mixed_requests
 import numpy as np
 import pytest
-import scans
+import synthetic_scans
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.server.scene import Scene
 
@@ -21,10 +21,10 @@ INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
 @pytest.fixture(scope="module")
 def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An archive of many voxels and small trees, its points of several radii."""
-    points = scans.make_scan(*mixed_requests.SCAN)
+    points = synthetic_scans.make_scan(*mixed_requests.SCAN)
     models = frozenset({"mean", "local", "border"})
     folder = tmp_path_factory.mktemp("mixed")
-    return cases.build(folder, points, voxel=0.3, leaf=8, cell_points=20, models=models).archive
+    return archive_cases.build(folder, points, voxel=0.3, leaf=8, cell_points=20, models=models).archive
 
 
 @pytest.mark.case(

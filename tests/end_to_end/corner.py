@@ -3,10 +3,10 @@
 from contextlib import contextmanager
 from functools import partial
 
-import cases
-import classes
+import archive_cases
 import numpy as np
-import scans
+import radius_class_archives
+import synthetic_scans
 from msgspec import structs
 from solidcloud.schemas.wire.answers import (
     CollideAnswers,
@@ -35,10 +35,10 @@ from solidcloud.server.service.server_config import ServerConfig
 from solidcloud.server.service.service import serving
 
 BODY = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.0, 0.2, 0], [0.05, 0.05, 0.3]])
-POINTS = scans.make_scan("corner", 4, 300)
+POINTS = synthetic_scans.make_scan("corner", 4, 300)
 RNG = np.random.default_rng(11)
-POSES = cases.near_poses(RNG, POINTS, BODY, 40, 0.1)
-ENDS = cases.near_poses(RNG, POINTS, BODY, 40, 0.1)
+POSES = archive_cases.near_poses(RNG, POINTS, BODY, 40, 0.1)
+ENDS = archive_cases.near_poses(RNG, POINTS, BODY, 40, 0.1)
 RAYS = POINTS[:30] + RNG.normal(0, 0.5, (30, 3))
 TOWARDS = np.where(np.arange(30)[:, None] % 2, POINTS[:30] - RAYS, RNG.normal(size=(30, 3)))
 OBJECTS = [("al", POSES[0]), ("bo", POSES[0], 2), ("al", POSES[1], 4, 1), ("bo", POSES[2], 1, 0xFFFFFFFE)]
@@ -138,8 +138,8 @@ def same(one, other):
 @contextmanager
 def opened(folder):
     """The corner as a scene, built below `folder`, with avatars of its own and of the client "plain"."""
-    with classes.any_classes():
-        case = cases.build(folder, POINTS, models=classes.STORED)
+    with radius_class_archives.any_classes():
+        case = archive_cases.build(folder, POINTS, models=radius_class_archives.STORED)
     with Scene.open(case.archive, "hall") as scene:
         add_avatars(scene)
         add_avatars(scene, client="plain")

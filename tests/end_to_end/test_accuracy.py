@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import scans
+import synthetic_scans
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import build_archive
 from solidcloud.server.cli import main as cli
@@ -122,7 +122,7 @@ def test_an_archive_that_is_given_is_walked_over_and_has_no_doors(tmp_path: Path
     floor = np.column_stack([rng.uniform(0, 8, 9000), rng.uniform(0, 3, 9000), rng.normal(0, 0.002, 9000)])
     # The walk goes through the middle of all points, y = 2.33 m: the wall is a shoulder's width beside it.
     wall = np.column_stack([rng.uniform(0, 8, 5000), np.full(5000, 2.73), rng.uniform(0, 2, 5000)])
-    scan = scans.write_ply(tmp_path / "hall.ply", np.concatenate([floor, wall]))
+    scan = synthetic_scans.write_ply(tmp_path / "hall.ply", np.concatenate([floor, wall]))
     build_archive(
         [scan], tmp_path / "hall", BuildConfig(voxel=2.0, resolution=1e-3, degree=5, leaf=20, radius=0.03)
     )

@@ -7,11 +7,11 @@ import threading
 import time
 from pathlib import Path
 
-import cases
+import archive_cases
 import naive
 import numpy as np
 import pytest
-import scans
+import synthetic_scans
 from solidcloud.builder.edit.edit_archive import add_scans, remove_scans
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.cli.main import run
@@ -22,15 +22,15 @@ from solidcloud.server.service.service import serving
 from test_reload import endpoint as endpoint  # the fixture
 
 BODY = np.array([[0.0, 0, 0], [0.1, 0, 0.1]])
-HALL = np.vstack([[[0.0, 0, 0], [2, 2, 2]], scans.make_scan("plane", 1, 400)]).round(3)
-CHAIR = scans.make_scan("pillar", 2, 200).round(3)
+HALL = np.vstack([[[0.0, 0, 0], [2, 2, 2]], synthetic_scans.make_scan("plane", 1, 400)]).round(3)
+CHAIR = synthetic_scans.make_scan("pillar", 2, 200).round(3)
 
 
 @pytest.fixture
 def hall(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Path:
     """An archive of one scan, beside it another scan."""
-    scans.write_ply(tmp_path / "hall.ply", HALL)
-    scans.write_ply(tmp_path / "chair.ply", CHAIR)
+    synthetic_scans.write_ply(tmp_path / "hall.ply", HALL)
+    synthetic_scans.write_ply(tmp_path / "chair.ply", CHAIR)
     options = ["--voxel", "0.5", "--resolution", "0.001", "--keep", "scan", "--jobs", "1", "--radius", "0.02"]
     assert run(["build", str(tmp_path / "hall.ply"), "-o", str(tmp_path / "hall"), *options]) == 0
     capsys.readouterr()
@@ -69,7 +69,7 @@ def test_scans_are_added_and_removed(hall: Path, capsys: pytest.CaptureFixture[s
 def test_points_that_are_left_out_are_said_or_refused(hall: Path, capsys: pytest.CaptureFixture[str]) -> None:
     points = CHAIR.copy()
     points[[3, 5, 8]] = np.nan
-    holes = str(scans.write_ply(hall.parent / "holes.ply", points))
+    holes = str(synthetic_scans.write_ply(hall.parent / "holes.ply", points))
     assert run(["add", str(hall), holes, "--strict"]) == 3
     assert "holes.ply: 3 points that are not finite, expected none with --strict" in capsys.readouterr().err
     assert told(["add", str(hall), holes], capsys)["skipped"] == {"not finite": 3}
@@ -111,7 +111,7 @@ def test_a_change_that_was_killed_keeps_nobody_off(
     if following == "remove":
         assert run(["add", str(hall), chair]) == 0
         (hall.parent / "chair.ply").rename(hall.parent / "old.ply")
-        scans.write_ply(hall.parent / "chair.ply", CHAIR[:100])
+        synthetic_scans.write_ply(hall.parent / "chair.ply", CHAIR[:100])
     with start_adding(hall) as process:
         process.kill()
     assert (hall.parent / ".hall.changing").is_dir(), "nobody could tidy up"
@@ -135,8 +135,8 @@ def test_a_change_that_was_killed_keeps_nobody_off(
 def test_the_stored_figure_stays_and_info_says_how_far_it_is_off(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    scans.write_ply(tmp_path / "one.ply", HALL)
-    scans.write_ply(tmp_path / "two.ply", HALL + 0.011)
+    synthetic_scans.write_ply(tmp_path / "one.ply", HALL)
+    synthetic_scans.write_ply(tmp_path / "two.ply", HALL + 0.011)
     target = str(tmp_path / "x")
     assert run(["build", str(tmp_path / "one.ply"), "-o", target, "--voxel", "0.5", "--jobs", "1"]) == 0
     capsys.readouterr()
@@ -155,7 +155,7 @@ def test_the_stored_figure_stays_and_info_says_how_far_it_is_off(
 def test_an_archive_grows_and_shrinks_while_it_is_served(hall: Path, endpoint: str) -> None:
     """Nothing is lost meanwhile, and what is answered is true of a generation that was there."""
     rng = np.random.default_rng(6)
-    poses = cases.near_poses(rng, np.vstack([HALL, CHAIR]), BODY, 150, 0.1)
+    poses = archive_cases.near_poses(rng, np.vstack([HALL, CHAIR]), BODY, 150, 0.1)
     place = (np.zeros(3), 0.001, 0.02)
     truths = [
         naive.collide(points, *place, BODY, 0.01, poses).astype(np.uint8)

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-import scans
+import synthetic_scans
 from kills.reading import FORMATS
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.server.cli.main import run
@@ -56,8 +56,8 @@ def laz(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder of a LAZ file of several chunks, and of a small scan that can always be read."""
     folder = tmp_path_factory.mktemp("laz")
     rng = np.random.default_rng(3)
-    scans.write_las(folder / "hall.laz", rng.integers(0, 8000, (120_000, 3)))
-    scans.write_xyz(folder / "few.xyz", rng.uniform(0, 8, (40, 3)).round(3))
+    synthetic_scans.write_las(folder / "hall.laz", rng.integers(0, 8000, (120_000, 3)))
+    synthetic_scans.write_xyz(folder / "few.xyz", rng.uniform(0, 8, (40, 3)).round(3))
     return folder
 
 

@@ -5,7 +5,7 @@ They lie in the folder that SOLIDCLOUD_SCANS names and are skipped where it is u
 
 from pathlib import Path
 
-import cases
+import archive_cases
 import naive
 import numpy as np
 import pytest
@@ -36,7 +36,7 @@ def test_poses_near_surfaces_by_the_definition(
     points = source_points(real_scans / name)
     size = float(np.ptp(points, axis=0).max()) / part
     avatar = rng.uniform(-size, size, (150, 3)) * [0.3, 0.3, 1.0]
-    poses = cases.near_poses(rng, points, avatar, 60, size * farthest)
+    poses = archive_cases.near_poses(rng, points, avatar, 60, size * farthest)
     with Scene.open(tmp_path / "archive") as scene:
         info = scene.info()
         scene.add_avatar("avatar", avatar, size / 100)
@@ -70,7 +70,7 @@ def route(corners: list[tuple[float, float]]) -> NDArray[np.float64]:
 
 def upright(places: NDArray[np.float64]) -> NDArray[np.float64]:
     """Poses (k, 4, 4) of an avatar that stands on the floor at places (k, 2)."""
-    return np.array([cases.pose_of(UPRIGHT, np.array([x, FLOOR, z])) for x, z in places])
+    return np.array([archive_cases.pose_of(UPRIGHT, np.array([x, FLOOR, z])) for x, z in places])
 
 
 def grid(radius: float, low: float, high: float, gap: float) -> NDArray[np.float64]:

@@ -12,10 +12,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-import cases
+import archive_cases
 import numpy as np
 import pytest
-import scans
+import synthetic_scans
 from numpy.typing import NDArray
 from solidcloud.schemas.errors import BusyError, FormatError, UnknownSceneError
 from solidcloud.schemas.wire.answers import Verdict
@@ -49,9 +49,12 @@ def generations(tmp_path_factory: pytest.TempPathFactory) -> Generations:
     folder = tmp_path_factory.mktemp("generations")
     rng = np.random.default_rng(5)
     # The corners of all make the lattice the same for both.
-    shared = np.vstack([scans.make_scan("plane", 1, 500), [[0, 0, 0], [2, 2, 2]]])
-    built = [cases.build(folder, np.vstack([shared, scans.make_scan("noise", n, 500)])) for n in (2, 3)]
-    poses = cases.near_poses(rng, built[0].points, BODY, 300, 0.2)
+    shared = np.vstack([synthetic_scans.make_scan("plane", 1, 500), [[0, 0, 0], [2, 2, 2]]])
+    built = [
+        archive_cases.build(folder, np.vstack([shared, synthetic_scans.make_scan("noise", n, 500)]))
+        for n in (2, 3)
+    ]
+    poses = archive_cases.near_poses(rng, built[0].points, BODY, 300, 0.2)
     verdicts = np.array([case.judge(BODY, RADIUS, poses) for case in built]).astype(np.uint8)
     assert (verdicts[0] != verdicts[1]).sum() > 50 and (verdicts[0] == verdicts[1]).sum() > 50
     return Generations((built[0].archive, built[1].archive), poses, verdicts)

@@ -14,11 +14,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
 
-import cases
+import archive_cases
 import msgspec
 import numpy as np
 import pytest
-import scans
+import synthetic_scans
 from solidcloud.schemas.errors import BadRequestError, BusyError
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.schemas.wire.keys import public_id, question_key
@@ -50,8 +50,8 @@ KEY = question_key("floor", "c", "stats")
 @pytest.fixture(scope="module")
 def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An archive of several voxels."""
-    points = np.vstack([scans.make_scan("plane", 1, 500), [[0, 0, 0], [9, 9, 9]]])
-    return cases.build(tmp_path_factory.mktemp("stats"), points).archive
+    points = np.vstack([synthetic_scans.make_scan("plane", 1, 500), [[0, 0, 0], [9, 9, 9]]])
+    return archive_cases.build(tmp_path_factory.mktemp("stats"), points).archive
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import cases
+import archive_cases
 import numpy as np
 import pytest
 from floor import DEADLINE, eventually
@@ -54,7 +54,7 @@ def room() -> np.ndarray:
 @pytest.fixture(scope="module")
 def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The room's archive."""
-    return cases.build(tmp_path_factory.mktemp("room"), room(), voxel=2.0).archive
+    return archive_cases.build(tmp_path_factory.mktemp("room"), room(), voxel=2.0).archive
 
 
 @pytest.fixture(scope="module")
@@ -280,7 +280,7 @@ def test_a_log_is_not_written_over(
 def test_a_log_of_another_archive_is_refused(
     logged: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    other = cases.build(tmp_path, room()[:500]).archive
+    other = archive_cases.build(tmp_path, room()[:500]).archive
     assert run(["replay", str(logged[1]), str(other)]) == 2
     assert "of generation 0: expected archive" in capsys.readouterr().err
     assert run(["replay", str(tmp_path / "none.log")]) == 3

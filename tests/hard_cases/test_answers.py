@@ -7,11 +7,11 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-import cases
+import archive_cases
 import numpy as np
 import pytest
 import same_answers
-import scans
+import synthetic_scans
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import build_archive
 from solidcloud.schemas.archive.archive import Archive
@@ -44,8 +44,8 @@ def elsewhere(code: str, *arguments: str, **environment: str) -> str:
 @pytest.mark.interpreted
 def test_case_21_empty_outside_not_loaded_skipped(tmp_path: Path) -> None:
     good = np.array([[0.0, 0, 0], [4.0, 0, 0], [4.0, 0, 4.0]])
-    scan = scans.write_ply(tmp_path / "good.ply", good)
-    scans.write_las(
+    scan = synthetic_scans.write_ply(tmp_path / "good.ply", good)
+    synthetic_scans.write_las(
         tmp_path / "bad.las", np.array([[0, 0, 0]] * 50 + [[1000, 1000, 1000]] * 50), offset=(9, 0, 0)
     )
     os.truncate(tmp_path / "bad.las", (tmp_path / "bad.las").stat().st_size - 40)
@@ -60,7 +60,9 @@ def test_case_21_empty_outside_not_loaded_skipped(tmp_path: Path) -> None:
     places = [(2.0, 0, 2.0), (-5.0, 0, 0), (4.0, 0.005, 0), (9.5, 0.5, 0.5), (4.0, 0, 4.0)]
     with Scene.open(tmp_path / "archive") as scene:
         scene.add_avatar("ball", POINT, 0.1)
-        answers = scene.collide("ball", np.array([cases.pose_of(np.eye(3), np.array(p)) for p in places]))
+        answers = scene.collide(
+            "ball", np.array([archive_cases.pose_of(np.eye(3), np.array(p)) for p in places])
+        )
     #                                 empty  outside  corrupt  skipped  contact
     assert answers.verdict.tolist() == [0, 0, 2, 2, 1]
     assert answers.outside.tolist() == [True, True, True, True, True]
@@ -70,7 +72,7 @@ def test_case_21_empty_outside_not_loaded_skipped(tmp_path: Path) -> None:
 @pytest.mark.case(22, "10^7 points are refused as too large; the next avatar is not")
 @pytest.mark.interpreted
 def test_case_22_an_avatar_over_the_cap_is_refused(tmp_path: Path) -> None:
-    with Scene.open(cases.build(tmp_path, POINT).archive) as scene:
+    with Scene.open(archive_cases.build(tmp_path, POINT).archive) as scene:
         with pytest.raises(TooLargeError, match=f"at most {MAX_AVATAR_POINTS}"):
             scene.add_avatar("crowd", np.broadcast_to(np.zeros(3), (10_000_000, 3)), 0.1)
         assert scene.add_avatar("one", POINT, 0.1).points == 1
@@ -83,11 +85,11 @@ def test_case_22_an_avatar_over_the_cap_is_refused(tmp_path: Path) -> None:
 @pytest.mark.interpreted
 def test_case_23_a_pose_that_reaches_hundreds_of_voxels(tmp_path: Path) -> None:
     grid = np.stack(np.meshgrid(*[np.arange(8.0)] * 3), axis=-1).reshape(-1, 3)
-    case = cases.build(tmp_path, grid, voxel=1.0, resolution=0.5, radius=0.01)
+    case = archive_cases.build(tmp_path, grid, voxel=1.0, resolution=0.5, radius=0.01)
     ball = np.array([[3.5, 3.5, 3.5], [-3.5, -3.5, -3.5], [3.5, -3.5, 3.5]])
-    middle = cases.pose_of(np.eye(3), np.array([3.5, 3.5, 3.5]))
-    beside = cases.pose_of(np.eye(3), np.array([3.5, 3.5, 3.515]))
-    beyond = cases.pose_of(np.eye(3), np.array([3.5, 3.5, 3.525]))
+    middle = archive_cases.pose_of(np.eye(3), np.array([3.5, 3.5, 3.5]))
+    beside = archive_cases.pose_of(np.eye(3), np.array([3.5, 3.5, 3.515]))
+    beyond = archive_cases.pose_of(np.eye(3), np.array([3.5, 3.5, 3.525]))
     with Scene.open(case.archive) as scene:
         one = int(scene.residency.bytes_of([0]))
     for voxels in (1, 7, 200):
@@ -108,7 +110,9 @@ def test_case_23_a_pose_that_reaches_hundreds_of_voxels(tmp_path: Path) -> None:
 )
 @pytest.mark.skipif(INTERPRETED, reason="the other side of this comparison is the interpreted one")
 def test_case_24_compiled_equals_interpreted(tmp_path: Path) -> None:
-    case = cases.build(tmp_path, scans.make_scan(*same_answers.SCAN), leaf=8, cell_points=30)
+    case = archive_cases.build(
+        tmp_path, synthetic_scans.make_scan(*same_answers.SCAN), leaf=8, cell_points=30
+    )
     here = json.loads(same_answers.answers(case.archive))
     code = "import same_answers, sys, pathlib; print(same_answers.answers(pathlib.Path(sys.argv[1])))"
     there = json.loads(elsewhere(code, str(case.archive), NUMBA_DISABLE_JIT="1"))
@@ -122,11 +126,14 @@ def test_case_24_compiled_equals_interpreted(tmp_path: Path) -> None:
 )
 @pytest.mark.skipif(INTERPRETED, reason="the other side of this comparison is the interpreted one")
 def test_case_24_an_archive_built_interpreted_has_the_same_bytes(tmp_path: Path) -> None:
-    case = cases.build(tmp_path, scans.make_scan(*same_answers.SCAN), leaf=8, cell_points=30, radius=None)
+    case = archive_cases.build(
+        tmp_path, synthetic_scans.make_scan(*same_answers.SCAN), leaf=8, cell_points=30, radius=None
+    )
     code = (
-        "import cases, scans, same_answers, sys, pathlib\n"
+        "import archive_cases, synthetic_scans, same_answers, sys, pathlib\n"
         "folder = pathlib.Path(sys.argv[1])\n"
-        "cases.build(folder, scans.make_scan(*same_answers.SCAN), leaf=8, cell_points=30, radius=None)"
+        "scan = synthetic_scans.make_scan(*same_answers.SCAN)\n"
+        "archive_cases.build(folder, scan, leaf=8, cell_points=30, radius=None)"
     )
     other = tmp_path / "other"
     other.mkdir()
@@ -144,10 +151,10 @@ def test_case_24_an_archive_built_interpreted_has_the_same_bytes(tmp_path: Path)
 def test_case_25_any_number_of_threads_gives_the_same_answers(
     tmp_path: Path, rng: np.random.Generator
 ) -> None:
-    case = cases.build(tmp_path, scans.make_scan("corner", 5, 600), voxel=0.3)
+    case = archive_cases.build(tmp_path, synthetic_scans.make_scan("corner", 5, 600), voxel=0.3)
     avatar = rng.uniform(-0.2, 0.2, (30, 3))
     count = 30 if INTERPRETED else 500
-    poses = cases.near_poses(rng, case.points, avatar, count, 0.15)
+    poses = archive_cases.near_poses(rng, case.points, avatar, count, 0.15)
     expected = case.judge(avatar, 0.01, poses).astype(np.uint8)
     for threads in (1, 2, 4):
         with Scene.open(case.archive, budget_bytes=1 << 20) as scene, ThreadPoolExecutor(threads) as pool:
@@ -168,19 +175,22 @@ def test_case_25_any_number_of_threads_gives_the_same_answers(
 @pytest.mark.interpreted
 def test_case_29_either_tree_may_be_the_taller(tmp_path: Path, rng: np.random.Generator) -> None:
     """collide(A, B, M) == collide(B, A, M^-1), for a small and a tall tree and quarter turns."""
-    step = cases.BINARY_STEP
-    small = np.rint(scans.make_scan("noise", 1, 3) / step) * step
-    tall = np.rint(scans.make_scan("plane", 2, 150) / step) * step
+    step = archive_cases.BINARY_STEP
+    small = np.rint(synthetic_scans.make_scan("noise", 1, 3) / step) * step
+    tall = np.rint(synthetic_scans.make_scan("plane", 2, 150) / step) * step
     options = {"resolution": step, "radius": 4 * step, "leaf": 1, "degree": 2}
-    first, second = cases.build(tmp_path, small, **options), cases.build(tmp_path, tall, **options)
+    first, second = (
+        archive_cases.build(tmp_path, small, **options),
+        archive_cases.build(tmp_path, tall, **options),
+    )
     turn = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
     poses, back = [], []
     for _ in range(12 if INTERPRETED else 200):
         a, b = small[rng.integers(3)], tall[rng.integers(150)]
-        poses.append(cases.pose_of(turn, a - turn @ b + rng.integers(-7, 8, 3) * step))
-        back.append(cases.pose_of(turn.T, -turn.T @ poses[-1][:3, 3]))
-    one = cases.ask(first, tall, 4 * step, np.array(poses))
-    other = cases.ask(second, small, 4 * step, np.array(back))
+        poses.append(archive_cases.pose_of(turn, a - turn @ b + rng.integers(-7, 8, 3) * step))
+        back.append(archive_cases.pose_of(turn.T, -turn.T @ poses[-1][:3, 3]))
+    one = archive_cases.ask(first, tall, 4 * step, np.array(poses))
+    other = archive_cases.ask(second, small, 4 * step, np.array(back))
     assert one.tolist() == other.tolist()
     assert one.tolist() == first.judge(tall, 4 * step, np.array(poses)).astype(int).tolist()
     assert 0 < one.sum() < len(one)

@@ -6,11 +6,11 @@ from collections.abc import Iterator
 from fractions import Fraction
 from pathlib import Path
 
-import cases
+import archive_cases
 import minimal_ball
 import numpy as np
 import pytest
-import scans
+import synthetic_scans
 from numpy.typing import NDArray
 from solidcloud.builder.passes.verify import verify_archive
 from solidcloud.builder.voxel.point_radius import voxel_points
@@ -45,14 +45,16 @@ DEGENERATE = {
 @pytest.mark.interpreted
 @pytest.mark.parametrize("name", DEGENERATE)
 def test_case_08_degenerate_sets_have_bounds(tmp_path: Path, rng: np.random.Generator, name: str) -> None:
-    points = np.array(DEGENERATE[name]) * cases.BINARY_STEP
+    points = np.array(DEGENERATE[name]) * archive_cases.BINARY_STEP
     for options in ({"leaf": 4, "degree": 2}, {"cell_points": 8}, {"with_slab": False}):
-        case = cases.build(tmp_path, points, resolution=cases.BINARY_STEP, radius=0.002, **options)
+        case = archive_cases.build(
+            tmp_path, points, resolution=archive_cases.BINARY_STEP, radius=0.002, **options
+        )
         report = verify_archive(case.archive, exact=True)
         assert report.faults == () and report.exact_nodes == report.nodes > 0
         avatar = rng.uniform(-0.02, 0.02, (5, 3))
-        poses = cases.near_poses(rng, points, avatar, 6 if INTERPRETED else 30, 0.01)
-        found = cases.ask(case, avatar, 0.002, poses)
+        poses = archive_cases.near_poses(rng, points, avatar, 6 if INTERPRETED else 30, 0.01)
+        found = archive_cases.ask(case, avatar, 0.002, poses)
         assert found.tolist() == case.judge(avatar, 0.002, poses).astype(int).tolist()
     with Archive(case.archive) as archive:
         extent = (archive.header.high - archive.header.low).max()
@@ -93,13 +95,13 @@ def stored_nodes(
     18, "every node of the test scenes, as stored and as the server holds it (float32): proved in fractions"
 )
 @pytest.mark.interpreted
-@pytest.mark.parametrize("kind", scans.WITH_POINTS)
+@pytest.mark.parametrize("kind", synthetic_scans.WITH_POINTS)
 @pytest.mark.parametrize("voxel", [0.5, 8.0, 70.0])
 def test_case_18_every_node_encloses_its_points(tmp_path: Path, kind: str, voxel: float) -> None:
     # Of 70 m and a step of 0.1 mm a voxel has 2^20 steps: the top tree's unit is 16 of them.
     count = 60 if INTERPRETED else 250
-    points = scans.make_scan(kind, 4, count) * (voxel if voxel > 8 else 1)
-    case = cases.build(tmp_path, points, voxel=voxel, leaf=5, degree=3, cell_points=20)
+    points = synthetic_scans.make_scan(kind, 4, count) * (voxel if voxel > 8 else 1)
+    case = archive_cases.build(tmp_path, points, voxel=voxel, leaf=5, degree=3, cell_points=20)
     nodes = 0
     with Archive(case.archive) as archive, Scene.open(case.archive) as scene:
         rows = list(range(len(archive.voxels)))
@@ -134,9 +136,9 @@ def test_case_18_every_node_encloses_its_points(tmp_path: Path, kind: str, voxel
 )
 @pytest.mark.interpreted
 @pytest.mark.parametrize("far", [0.0, 1e5])
-@pytest.mark.parametrize("kind", scans.WITH_POINTS)
+@pytest.mark.parametrize("kind", synthetic_scans.WITH_POINTS)
 def test_case_18_every_node_of_an_avatar_encloses_its_points(kind: str, far: float) -> None:
-    points = scans.make_scan(kind, 9, 60 if INTERPRETED else 300) + far
+    points = synthetic_scans.make_scan(kind, 9, 60 if INTERPRETED else 300) + far
     model = make_avatar(points, 0.01)
     arrays, rows = model.arrays, model.rows
     own: dict[int, list[int]] = {}
@@ -180,5 +182,7 @@ def tightness(archive: Path) -> NDArray[np.float64]:
 def test_case_20_leaf_spheres_are_near_the_minimal_ball(tmp_path: Path, kind: str) -> None:
     # Found: at most 1.030 on each of these and on the façade, 1.01 on average.
     count = 600 if INTERPRETED else 3000
-    ratio = tightness(cases.build(tmp_path, scans.make_scan(kind, 5, count), voxel=2.5).archive)
+    ratio = tightness(
+        archive_cases.build(tmp_path, synthetic_scans.make_scan(kind, 5, count), voxel=2.5).archive
+    )
     assert ratio.size >= count / 100 and ratio.max() <= 1.25

@@ -12,12 +12,12 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import cases
+import archive_cases
 import msgspec
 import numpy as np
 import pytest
 import same_answers
-import scans
+import synthetic_scans
 from solidcloud.schemas.scene.effect_order import ORDER
 from solidcloud.schemas.scene.scene_file import SceneFile
 from solidcloud.schemas.wire.messages import MSGPACK, CollideRequest, encode
@@ -124,7 +124,7 @@ print(json.dumps(found))
 @pytest.mark.interpreted
 def test_case_31_of_all_effects_only_those_declared_are_imported_and_say_something(tmp_path: Path) -> None:
     floor = np.stack(np.meshgrid(np.arange(-3, 4), np.arange(-3, 4), [0]), axis=-1).reshape(-1, 3) * 0.1
-    case = cases.build(tmp_path, floor, radius=0.05)
+    case = archive_cases.build(tmp_path, floor, radius=0.05)
     done = subprocess.run(
         [sys.executable, "-W", "ignore", "-c", FRAMES, str(case.archive), json.dumps(ALONE)],
         env=os.environ | {"NUMBA_DISABLE_JIT": "1"}, capture_output=True, text=True, check=True, timeout=240,
@@ -160,7 +160,7 @@ def test_case_31_of_all_effects_only_those_declared_are_imported_and_say_somethi
 )
 @pytest.mark.interpreted
 def test_case_31_what_is_not_declared_is_not_imported(tmp_path: Path) -> None:
-    case = cases.build(tmp_path, np.zeros((1, 3)), radius=0.1)
+    case = archive_cases.build(tmp_path, np.zeros((1, 3)), radius=0.1)
     done = subprocess.run(
         [sys.executable, "-W", "ignore", "-c", ASK, str(case.archive)],
         env=os.environ | {"NUMBA_DISABLE_JIT": "1"}, capture_output=True, text=True, check=True, timeout=120,
@@ -197,9 +197,11 @@ def test_case_31_what_is_not_declared_is_not_imported(tmp_path: Path) -> None:
 def test_case_31_what_else_a_scene_holds_costs_a_question_nothing(
     tmp_path: Path, rng: np.random.Generator
 ) -> None:
-    case = cases.build(tmp_path, scans.make_scan(*same_answers.SCAN), leaf=8, cell_points=30)
+    case = archive_cases.build(
+        tmp_path, synthetic_scans.make_scan(*same_answers.SCAN), leaf=8, cell_points=30
+    )
     body, other = rng.uniform(-0.2, 0.2, (2, 20, 3))
-    poses = cases.near_poses(rng, case.points, body, 6 if INTERPRETED else 60, 0.2)
+    poses = archive_cases.near_poses(rng, case.points, body, 6 if INTERPRETED else 60, 0.2)
     replies = []
     for beside in ("nothing", "others", "effects"):
         with Scene.open(case.archive, "scene") as scene:

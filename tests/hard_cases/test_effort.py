@@ -2,10 +2,10 @@
 
 from pathlib import Path
 
-import cases
+import archive_cases
 import numpy as np
 import pytest
-import scans
+import synthetic_scans
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.queries.context.anytime_search import collide_bounded, distance_bounded
 from solidcloud.server.queries.context.query_budget import NO_LIMIT, Effort
@@ -20,9 +20,9 @@ CLEAR, CONTACT, UNKNOWN = Verdict
 )
 @pytest.mark.interpreted
 def test_case_30_a_budget_takes_nothing_back(tmp_path: Path, rng: np.random.Generator) -> None:
-    case = cases.build(tmp_path, scans.make_scan("corner", 7, 300), voxel=0.7, leaf=4)
+    case = archive_cases.build(tmp_path, synthetic_scans.make_scan("corner", 7, 300), voxel=0.7, leaf=4)
     avatar = rng.uniform(-0.2, 0.2, (30, 3))
-    poses = cases.near_poses(rng, case.points, avatar, 25, 0.3)
+    poses = archive_cases.near_poses(rng, case.points, avatar, 25, 0.3)
     truth = case.judge(avatar, 0.01, poses)
     known = np.full(len(poses), UNKNOWN)
     with Scene.open(case.archive) as scene:
@@ -42,10 +42,10 @@ def test_case_30_a_budget_takes_nothing_back(tmp_path: Path, rng: np.random.Gene
 @pytest.mark.interpreted
 def test_case_30_early_by_at_most_the_tolerance(tmp_path: Path) -> None:
     # One point, one ball of 0.25 m: contact begins at a distance of exactly 0.25 m, and early at 0.25 m + 1/8 m.
-    case = cases.build(tmp_path, np.zeros((1, 3)), radius=0.0, resolution=cases.BINARY_STEP)
+    case = archive_cases.build(tmp_path, np.zeros((1, 3)), radius=0.0, resolution=archive_cases.BINARY_STEP)
     unit = 2.0**-26
     away = np.array([0.25, 0.25 + unit, 0.375 - unit, 0.375, 0.375 + unit, 0.5])
-    poses = np.array([cases.pose_of(np.eye(3), np.array([0.0, 0.0, z])) for z in away])
+    poses = np.array([archive_cases.pose_of(np.eye(3), np.array([0.0, 0.0, z])) for z in away])
     with Scene.open(case.archive) as scene:
         scene.add_avatar("ball", np.zeros((1, 3)), 0.25)
         data, model = scene._data, scene.avatar("ball", "")
@@ -63,9 +63,9 @@ def test_case_30_early_by_at_most_the_tolerance(tmp_path: Path) -> None:
 @pytest.mark.case(30, "what is not loaded when the time is over is unknown, never clear")
 @pytest.mark.interpreted
 def test_case_30_what_is_not_resident_by_the_deadline_is_unknown(tmp_path: Path) -> None:
-    case = cases.build(tmp_path, np.array([[0.0, 0, 0], [2.0, 0, 0]]), voxel=1.0, resolution=1e-3)
+    case = archive_cases.build(tmp_path, np.array([[0.0, 0, 0], [2.0, 0, 0]]), voxel=1.0, resolution=1e-3)
     places = [(0.5, 0, 0), (1.5, 0, 0), (1.0, 5.0, 0)]
-    poses = np.array([cases.pose_of(np.eye(3), np.array(place)) for place in places])
+    poses = np.array([archive_cases.pose_of(np.eye(3), np.array(place)) for place in places])
     with Scene.open(case.archive) as scene:
         scene.add_avatar("ball", np.zeros((1, 3)), 0.1)
         data, model = scene._data, scene.avatar("ball", "")

@@ -3,11 +3,11 @@
 import os
 from pathlib import Path
 
-import cases
-import cases_contacts
+import archive_cases
+import contact_cases
 import numpy as np
 import pytest
-import scans
+import synthetic_scans
 from numpy.typing import NDArray
 from solidcloud.schemas.wire.answers import Cost, Verdict
 from solidcloud.schemas.wire.arrays import array_fields
@@ -44,8 +44,8 @@ def questions(scene: Scene, shift: NDArray[np.float64], seed: int) -> dict[str, 
     body, box = dyadic(rng.uniform(-0.2, 0.2, (9, 3))), dyadic(rng.uniform(-0.1, 0.1, (40, 3)))
     scene.add_avatar("body", body, 0.01)
     scene.add_avatar("box", box, 0.003)
-    points = scans.make_scan("corner", 3, 300)
-    poses = np.concatenate([cases.near_poses(rng, points, body, count, 0.08, s) for s in (1.0, 0.5)])
+    points = synthetic_scans.make_scan("corner", 3, 300)
+    poses = np.concatenate([archive_cases.near_poses(rng, points, body, count, 0.08, s) for s in (1.0, 0.5)])
     poses[:, :3, 3] = dyadic(poses[:, :3, 3]) + shift
     ends = poses[rng.permutation(count)]
     starts = dyadic(rng.uniform(0, 2, (4 * count, 3)))
@@ -71,14 +71,17 @@ def questions(scene: Scene, shift: NDArray[np.float64], seed: int) -> dict[str, 
 @pytest.mark.parametrize("shift", SHIFTS)
 def test_case_01_every_question_answers_as_at_the_origin(tmp_path: Path, shift: tuple[int, int, int]) -> None:
     moved = np.array(shift, float)
-    points = np.rint(scans.make_scan("corner", 3, 300) / cases.BINARY_STEP) * cases.BINARY_STEP
-    options = {"resolution": cases.BINARY_STEP, "voxel": 0.375, "leaf": 8, "radius": 0.01}
+    points = (
+        np.rint(synthetic_scans.make_scan("corner", 3, 300) / archive_cases.BINARY_STEP)
+        * archive_cases.BINARY_STEP
+    )
+    options = {"resolution": archive_cases.BINARY_STEP, "voxel": 0.375, "leaf": 8, "radius": 0.01}
     found, files = [], []
     for place in (np.zeros(3), moved):
         rng = np.random.default_rng(1)  # the same points into the same of two files
         folder = tmp_path / str(len(found))
         folder.mkdir()
-        case = cases_contacts.open_case(folder, points + place, rng, **options)
+        case = contact_cases.open_case(folder, points + place, rng, **options)
         case.store.close()
         with Scene.open(case.store.archive.folder, "scene") as scene:
             found.append(questions(scene, place, 7))

@@ -5,13 +5,13 @@ import os
 from fractions import Fraction
 from pathlib import Path
 
-import cases
+import archive_cases
 import naive
 import naive_distance
 import naive_rays
 import numpy as np
 import pytest
-import scans
+import synthetic_scans
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import build_archive
 from solidcloud.schemas.archive.archive import Archive
@@ -33,22 +33,25 @@ def test_case_01_map_coordinates_answer_as_the_origin_does(
     tmp_path: Path, rng: np.random.Generator, shift: tuple[int, int, int]
 ) -> None:
     # Millimetres as multiples of 2^-10 m, so that the shift is exact; float32 would keep 3 of 1,000 there.
-    line = np.arange(60.0)[:, None] * [cases.BINARY_STEP, 0, 0]
+    line = np.arange(60.0)[:, None] * [archive_cases.BINARY_STEP, 0, 0]
     avatar = np.rint(rng.uniform(-0.1, 0.1, (6, 3)) * 2.0**20) * 2.0**-20
-    poses = cases.near_poses(rng, line, avatar, 12, 0.02)
+    poses = archive_cases.near_poses(rng, line, avatar, 12, 0.02)
     poses[:, :3, 3] = np.rint(poses[:, :3, 3] * 2.0**20) * 2.0**-20
     moved = poses.copy()
     moved[:, :3, 3] += shift
-    options = {"resolution": cases.BINARY_STEP, "radius": 0.002, "voxel": 0.0625, "leaf": 4}
-    near, far = cases.build(tmp_path, line, **options), cases.build(tmp_path, line + shift, **options)
+    options = {"resolution": archive_cases.BINARY_STEP, "radius": 0.002, "voxel": 0.0625, "leaf": 4}
+    near, far = (
+        archive_cases.build(tmp_path, line, **options),
+        archive_cases.build(tmp_path, line + shift, **options),
+    )
     with Archive(near.archive) as one, Archive(far.archive) as other:
         assert (np.array(other.header.lattice.origin) - one.header.lattice.origin).tolist() == list(shift)
         for column in ("key", "low", "high", "rows", "leaves"):
             assert (one.voxels[column] == other.voxels[column]).all()
         assert other.header.points == 60 and other.header.moved_max == 0.0
     for margin in (0.0, 0.004):
-        verdicts = cases.ask(near, avatar, 0.003, poses, margin)
-        assert verdicts.tolist() == cases.ask(far, avatar, 0.003, moved, margin).tolist()
+        verdicts = archive_cases.ask(near, avatar, 0.003, poses, margin)
+        assert verdicts.tolist() == archive_cases.ask(far, avatar, 0.003, moved, margin).tolist()
         assert verdicts.tolist() == far.judge(avatar, 0.003, moved, margin).astype(int).tolist()
 
 
@@ -57,19 +60,19 @@ def test_case_01_map_coordinates_answer_as_the_origin_does(
 )
 @pytest.mark.interpreted
 def test_case_03_scale_grows_radii_and_shear_is_refused(tmp_path: Path) -> None:
-    case = cases.build(tmp_path, POINT, radius=0.25, resolution=cases.BINARY_STEP)
+    case = archive_cases.build(tmp_path, POINT, radius=0.25, resolution=archive_cases.BINARY_STEP)
     turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     # Twice the avatar's 0.5 m, plus 0.25 m: tangent at 1.25 m.
-    poses = [cases.pose_of(2 * turn, np.array([x, 0, 0])) for x in (1.25, 1.25 + 2.0**-26)]
-    assert cases.ask(case, POINT, 0.5, np.array(poses)).tolist() == [1, 0]
-    poses = [cases.pose_of(turn / 4, np.array([0, x, 0])) for x in (0.375, 0.375 + 2.0**-26)]
-    assert cases.ask(case, POINT, 0.5, np.array(poses)).tolist() == [1, 0]
+    poses = [archive_cases.pose_of(2 * turn, np.array([x, 0, 0])) for x in (1.25, 1.25 + 2.0**-26)]
+    assert archive_cases.ask(case, POINT, 0.5, np.array(poses)).tolist() == [1, 0]
+    poses = [archive_cases.pose_of(turn / 4, np.array([0, x, 0])) for x in (0.375, 0.375 + 2.0**-26)]
+    assert archive_cases.ask(case, POINT, 0.5, np.array(poses)).tolist() == [1, 0]
     # Column norms are no bound: these two columns are of length 1 and 1.414, the stretch is 1.618.
     sheared, mirrored = np.eye(4), np.diag([1.0, 1, -1, 1])
     sheared[0, 1] = 1.0
     for pose in (sheared, mirrored, np.diag([1.0, 1.0, 1.0 + 1e-6, 1.0])):
         with pytest.raises(BadTransformError):
-            cases.ask(case, POINT, 0.5, pose[None])
+            archive_cases.ask(case, POINT, 0.5, pose[None])
 
 
 @pytest.mark.case(
@@ -79,16 +82,18 @@ def test_case_03_scale_grows_radii_and_shear_is_refused(tmp_path: Path) -> None:
 @pytest.mark.interpreted
 def test_case_06_near_tangent_pairs_are_decided_exactly(tmp_path: Path, rng: np.random.Generator) -> None:
     count = 200 if INTERPRETED else 10_000
-    case = cases.build(tmp_path, np.array([[5e5, 5.6e6, 0.0]]), radius=0.3)
+    case = archive_cases.build(tmp_path, np.array([[5e5, 5.6e6, 0.0]]), radius=0.3)
     avatar = np.array([[0.7, -1.1, 0.4]])
     away = rng.normal(size=(count, 3))
     away *= 0.5 / np.linalg.norm(away, axis=1)[:, None]
-    poses = np.array([cases.pose_of(cases.random_rotation(rng), np.zeros(3)) for _ in range(count)])
+    poses = np.array(
+        [archive_cases.pose_of(archive_cases.random_rotation(rng), np.zeros(3)) for _ in range(count)]
+    )
     # Placed within a few units of 2^-26 m of tangency; placing rounds at 5.6e6 m by 1e-9 m more.
     poses[:, :3, 3] = case.points[0] + away - np.einsum("kij,j->ki", poses[:, :3, :3], avatar[0])
     poses[:, :3, 3] += rng.integers(-3, 4, (count, 3)) * 2.0**-26
     expected = case.judge(avatar, 0.2, poses)
-    assert cases.ask(case, avatar, 0.2, poses).tolist() == expected.astype(int).tolist()
+    assert archive_cases.ask(case, avatar, 0.2, poses).tolist() == expected.astype(int).tolist()
     # That the pairs are as near as meant: float64, well meant, gets some of them wrong.
     placed = np.einsum("kij,j->ki", poses[:, :3, :3], avatar[0]) + (poses[:, :3, 3] - case.points[0])
     assert ((placed**2).sum(axis=1) <= (0.3 + 0.2) ** 2).tolist() != expected.tolist()
@@ -102,12 +107,14 @@ def test_case_06_near_tangent_pairs_are_decided_exactly(tmp_path: Path, rng: np.
 @pytest.mark.interpreted
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e300, 1.1e9])
 def test_case_14_what_is_not_finite_reaches_no_kernel(tmp_path: Path, bad: float) -> None:
-    points = np.concatenate([scans.make_scan("plane", 1, 20), np.full((2, 3), bad), [[bad, 0.0, 0.0]]])
-    case = cases.build(tmp_path, points)
+    points = np.concatenate(
+        [synthetic_scans.make_scan("plane", 1, 20), np.full((2, 3), bad), [[bad, 0.0, 0.0]]]
+    )
+    case = archive_cases.build(tmp_path, points)
     with Archive(case.archive) as archive:
         assert archive.header.points == 20 and archive.header.sources[0].skipped == {"not finite": 3}
         assert np.isfinite(archive.header.lattice.origin).all()
-    scan = scans.write_ply(tmp_path / "strict.ply", points)
+    scan = synthetic_scans.write_ply(tmp_path / "strict.ply", points)
     with pytest.raises(ScanError, match="3 points that are not finite"):
         build_archive([scan], tmp_path / "strict", BuildConfig(strict=True, jobs=1))
     with Scene.open(case.archive) as scene:
@@ -129,20 +136,22 @@ def test_case_14_what_is_not_finite_reaches_no_kernel(tmp_path: Path, bad: float
 )
 @pytest.mark.interpreted
 def test_case_15_radii_of_zero_and_less(tmp_path: Path) -> None:
-    case = cases.build(tmp_path, POINT, radius=0.0)
+    case = archive_cases.build(tmp_path, POINT, radius=0.0)
     unit = 2.0**-26
-    poses = np.array([cases.pose_of(np.eye(3), np.array([x, 0, 0])) for x in (0.0, 0.4 * unit, unit, 1e-9)])
+    poses = np.array(
+        [archive_cases.pose_of(np.eye(3), np.array([x, 0, 0])) for x in (0.0, 0.4 * unit, unit, 1e-9)]
+    )
     for radius in (0.0, 5e-324, 1e-300, 0.49 * unit):
         # All of these are 0 units: contact is where the integers coincide, and nowhere else.
-        assert cases.ask(case, POINT, radius, poses).tolist() == [1, 1, 0, 1]
-    assert cases.ask(case, POINT, 0.51 * unit, poses).tolist() == [1, 1, 1, 1]
+        assert archive_cases.ask(case, POINT, radius, poses).tolist() == [1, 1, 0, 1]
+    assert archive_cases.ask(case, POINT, 0.51 * unit, poses).tolist() == [1, 1, 1, 1]
     for negative in (-5e-324, -0.1):
         with pytest.raises(BadRequestError):
-            cases.ask(case, POINT, negative, poses)
+            archive_cases.ask(case, POINT, negative, poses)
         with pytest.raises(BadRequestError):
-            cases.ask(case, POINT, 0.0, poses, negative)
+            archive_cases.ask(case, POINT, 0.0, poses, negative)
     with pytest.raises(BadRequestError, match="--radius"):
-        cases.build(tmp_path, POINT, radius=-0.1)
+        archive_cases.build(tmp_path, POINT, radius=-0.1)
 
 
 @pytest.mark.case(
@@ -151,14 +160,14 @@ def test_case_15_radii_of_zero_and_less(tmp_path: Path) -> None:
 @pytest.mark.interpreted
 def test_case_16_coordinates_up_to_their_bound_overflow_nothing(tmp_path: Path) -> None:
     corners = np.array([[-1e9, -1e9, -1e9], [1e9, 1e9, 1e9], [1e9, -1e9, 0.0]])
-    case = cases.build(tmp_path, corners, voxel=2000.0, resolution=1e-3, radius=8.0)
+    case = archive_cases.build(tmp_path, corners, voxel=2000.0, resolution=1e-3, radius=8.0)
     # 2 * 10^9 m from the origin float64 rounds a lattice point by up to 8 units of the definition, 0.12 um.
     at = np.concatenate([corners, corners - np.sign(corners + 1) * [15.75, 0, 0], corners * [0.5, 1, 1]])
     at = np.concatenate([at, corners - np.sign(corners + 1) * [16.0 + 1e-6, 0, 0]])
-    poses = np.array([cases.pose_of(np.eye(3), place) for place in at])
+    poses = np.array([archive_cases.pose_of(np.eye(3), place) for place in at])
     expected = case.judge(POINT, 8.0, poses)
     assert expected.tolist() == [True] * 6 + [False] * 6
-    assert cases.ask(case, POINT, 8.0, poses).tolist() == expected.astype(int).tolist()
+    assert archive_cases.ask(case, POINT, 8.0, poses).tolist() == expected.astype(int).tolist()
 
 
 @pytest.mark.case(
@@ -169,10 +178,10 @@ def test_case_16_coordinates_up_to_their_bound_overflow_nothing(tmp_path: Path) 
 def test_case_17_the_expanded_square_is_not_what_decides(tmp_path: Path, rng: np.random.Generator) -> None:
     count = 150 if INTERPRETED else 2000
     base = np.array([5e5, 5.6e6, 100.0])
-    case = cases.build(tmp_path, base[None], radius=0.01, resolution=cases.BINARY_STEP)
+    case = archive_cases.build(tmp_path, base[None], radius=0.01, resolution=archive_cases.BINARY_STEP)
     away = rng.normal(size=(count, 3))
     away *= (rng.uniform(0.001, 0.06, count) / np.linalg.norm(away, axis=1))[:, None]
-    poses = np.array([cases.pose_of(np.eye(3), base + a) for a in away])
+    poses = np.array([archive_cases.pose_of(np.eye(3), base + a) for a in away])
     a, b = poses[:, :3, 3], case.points[0]
     expanded = (a * a).sum(axis=1) - 2 * (a @ b) + b @ b
     truth = case.judge(POINT, 0.02, poses)
@@ -198,9 +207,11 @@ def test_case_19_the_lattice_moves_contact_by_its_declared_band(
     tmp_path: Path, rng: np.random.Generator
 ) -> None:
     step = 0.01
-    case = cases.build(tmp_path, scans.make_scan("noise", 3, 150), resolution=step, radius=0.05)
+    case = archive_cases.build(
+        tmp_path, synthetic_scans.make_scan("noise", 3, 150), resolution=step, radius=0.05
+    )
     avatar = rng.uniform(-0.2, 0.2, (5, 3))
-    poses = cases.near_poses(rng, case.points, avatar, 150, 0.14)
+    poses = archive_cases.near_poses(rng, case.points, avatar, 150, 0.14)
     with Scene.open(case.archive) as scene:
         info = scene.info()
         # Farthest a point moved along an axis; in all, and with the rounding to exact units.
@@ -226,10 +237,10 @@ def test_case_19_the_lattice_moves_contact_by_its_declared_band(
 @pytest.mark.case(16, "a reach of 2^30 units is accepted, more is refused")
 @pytest.mark.interpreted
 def test_case_16_reach_is_bounded_so_that_squares_fit(tmp_path: Path) -> None:
-    case = cases.build(tmp_path, POINT, radius=8.0, resolution=1e-2, voxel=8.0)
+    case = archive_cases.build(tmp_path, POINT, radius=8.0, resolution=1e-2, voxel=8.0)
     diagonal = np.full(3, 16.0 / math.sqrt(3))
-    poses = np.array([cases.pose_of(np.eye(3), diagonal * f) for f in (1 - 1e-7, 1 + 1e-7)])
-    assert cases.ask(case, POINT, 8.0, poses).tolist() == [1, 0]
+    poses = np.array([archive_cases.pose_of(np.eye(3), diagonal * f) for f in (1 - 1e-7, 1 + 1e-7)])
+    assert archive_cases.ask(case, POINT, 8.0, poses).tolist() == [1, 0]
     assert naive.reach_units(poses[0], 8.0, 8.0, 0.0) == 1 << 30
     with pytest.raises(BadRequestError, match="at most 16 m"):
-        cases.ask(case, POINT, 8.0 + 2.0**-26, poses)
+        archive_cases.ask(case, POINT, 8.0 + 2.0**-26, poses)

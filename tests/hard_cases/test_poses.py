@@ -3,11 +3,11 @@
 import os
 from pathlib import Path
 
-import cases
+import archive_cases
 import h5py
 import numpy as np
 import pytest
-import scans
+import synthetic_scans
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.archive.index_file import INDEX_NAME
 from solidcloud.schemas.errors import BadRequestError, BadTransformError
@@ -29,8 +29,8 @@ COLUMNS = "t,x,y,z,qw,qx,qy,qz\n"
 )
 def test_case_02_an_origin_comes_back_to_the_bit(tmp_path: Path, place: tuple[float, float, float]) -> None:
     lowest = np.array(place)
-    points = np.concatenate([lowest[None], lowest + np.abs(scans.make_scan("noise", 2, 20))])
-    case = cases.build(tmp_path, points, resolution=0.1 / 3, radius=0.1 / 7)
+    points = np.concatenate([lowest[None], lowest + np.abs(synthetic_scans.make_scan("noise", 2, 20))])
+    case = archive_cases.build(tmp_path, points, resolution=0.1 / 3, radius=0.1 / 7)
     expected = lowest.tobytes()
     with Archive(case.archive) as archive:
         header = archive.header
@@ -79,9 +79,9 @@ def test_case_04_quaternions_are_normalised_or_refused(tmp_path: Path, rng: np.r
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
-    case = cases.build(tmp_path, POINT, radius=0.5)
+    case = archive_cases.build(tmp_path, POINT, radius=0.5)
     with pytest.raises(BadTransformError):
-        cases.ask(case, POINT, 0.5, stretched[None])
+        archive_cases.ask(case, POINT, 0.5, stretched[None])
 
 
 @pytest.mark.case(
@@ -93,7 +93,9 @@ def test_case_05_a_pose_updated_a_million_times_closes(tmp_path: Path) -> None:
     count, chunk = (10_000, 1_000) if INTERPRETED else (1_000_000, 100_000)
     # Turned about z by a millionth of a full turn at a time and renormalised; a body point 10 m out.
     step = np.exp(2j * np.pi / count).item()
-    case = cases.build(tmp_path, np.array([[10.0, 0, 0], [0, 10.0, 0], [-10.0, 0.05, 0]]), radius=0.01)
+    case = archive_cases.build(
+        tmp_path, np.array([[10.0, 0, 0], [0, 10.0, 0], [-10.0, 0.05, 0]]), radius=0.01
+    )
     turn, verdicts, last = 1.0 + 0.0j, [], np.eye(4)
     with Scene.open(case.archive) as scene:
         scene.add_avatar("body", np.array([[10.0, 0, 0.02]]), 0.01 - 1e-6)

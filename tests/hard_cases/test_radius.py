@@ -4,10 +4,10 @@ import math
 import os
 from pathlib import Path
 
-import cases
+import archive_cases
 import numpy as np
 import pytest
-import scans
+import synthetic_scans
 from solidcloud.schemas.archive.archive import Archive
 
 INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
@@ -21,13 +21,13 @@ INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
 @pytest.mark.parametrize("kind", ["plane", "noise", "duplicates"])
 @pytest.mark.parametrize("voxel", [0.0625, 8.0])
 def test_case_28_the_mean_distance_is_that_of_brute_force(tmp_path: Path, kind: str, voxel: float) -> None:
-    step = cases.BINARY_STEP
-    steps = scans.make_steps(kind, 6, 60 if INTERPRETED else 200, 1024).astype(np.int64)
+    step = archive_cases.BINARY_STEP
+    steps = synthetic_scans.make_steps(kind, 6, 60 if INTERPRETED else 200, 1024).astype(np.int64)
     steps -= steps.min(axis=0)
     # Every third point again, and pairs one step apart on either side of borders of the grid of voxels.
     edge = round(voxel / step) * np.arange(1, 4)[:, None] * [1, 1, 1]
     steps = np.concatenate([steps, steps[::3], edge[edge[:, 0] < 1024], edge[edge[:, 0] < 1024] - [1, 0, 0]])
-    case = cases.build(
+    case = archive_cases.build(
         tmp_path, steps * step, voxel=voxel, resolution=step, radius=None, cell_points=9, leaf=4
     )
     distinct = np.unique(steps, axis=0)

@@ -5,18 +5,18 @@ import subprocess
 import sys
 from pathlib import Path
 
-import cases
+import archive_cases
+import judged_sweeps
 import numpy as np
 import pytest
-import scans
-import swept
-from motions import at, turn_z
+import synthetic_scans
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.errors import BadRequestError, BadTransformError
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.queries.collide import collide
 from solidcloud.server.queries.context.query_budget import Effort
+from sweep_poses import at, turn_z
 
 INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
 POINT = np.zeros((1, 3))
@@ -31,36 +31,38 @@ UNIT = 2.0**-26
 @pytest.mark.parametrize("length", [0.01, 1.0, 100.0, 10_000.0])
 def test_case_26_ways_from_a_centimetre_to_ten_kilometres(tmp_path: Path, length: float) -> None:
     # Touches 0.3 m before the wall's point, at 7/8 of the way.
-    case = cases.build(tmp_path, POINT, radius=0.25, resolution=cases.BINARY_STEP)
+    case = archive_cases.build(tmp_path, POINT, radius=0.25, resolution=archive_cases.BINARY_STEP)
     first, last = at(-0.3 - length * 0.875), at(-0.3 + length * 0.125)
     turned = last.copy()
     turned[0, :3, :3] = turn_z(1.0)
-    with swept.opened(case) as data:
+    with judged_sweeps.opened(case) as data:
         for end in (last, turned):
-            answers = swept.ask(data, POINT, 0.05, first, end)
+            answers = judged_sweeps.ask(data, POINT, 0.05, first, end)
             if end is last:
                 assert answers.exact[0] and abs(answers.upper[0] - 0.875) * length < 1e-6
                 assert (answers.upper[0] - answers.lower[0]) * length <= 1e-6
-                swept.judge(case, data, POINT, 0.05, first, end, answers, samples=100)
-            back = swept.ask(data, POINT, 0.05, at(-length - 0.3001), at(-0.3001))
+                judged_sweeps.judge(case, data, POINT, 0.05, first, end, answers, samples=100)
+            back = judged_sweeps.ask(data, POINT, 0.05, at(-length - 0.3001), at(-0.3001))
             assert back.verdict[0] == Verdict.CLEAR and back.lower[0] == 1 and back.upper[0] == np.inf
 
 
 @pytest.mark.case(26, "a motion of length zero: the verdict of collide, exact to the unit")
 @pytest.mark.interpreted
 def test_case_26_zero_motion_is_the_static_answer(tmp_path: Path, rng: np.random.Generator) -> None:
-    case = cases.build(tmp_path, scans.make_scan("plane", 1, 60), radius=0.0)
+    case = archive_cases.build(tmp_path, synthetic_scans.make_scan("plane", 1, 60), radius=0.0)
     body = rng.uniform(-0.2, 0.2, (8, 3))
     count = 10 if INTERPRETED else 100
-    poses = np.concatenate([cases.near_poses(rng, case.points, body, count, 0.2, s) for s in (1.0, 0.5)])
-    with swept.opened(case) as data:
+    poses = np.concatenate(
+        [archive_cases.near_poses(rng, case.points, body, count, 0.2, s) for s in (1.0, 0.5)]
+    )
+    with judged_sweeps.opened(case) as data:
         origin = data.arrays.origin
         for pose in poses:
-            least, _ = cases.least_reach(case, body, pose, origin, 1e-4)
+            least, _ = archive_cases.least_reach(case, body, pose, origin, 1e-4)
             for units in (least - 1, least):  # one unit apart, and one verdict
                 if units < 0:
                     continue
-                answers = swept.ask(data, body, 0.0, pose[None], pose[None], margin=units * UNIT)
+                answers = judged_sweeps.ask(data, body, 0.0, pose[None], pose[None], margin=units * UNIT)
                 static = collide(data, make_avatar(body, 0.0), pose[None], units * UNIT)
                 assert answers.verdict.tolist() == static.verdict.tolist() == [int(units >= least)]
                 assert answers.exact[0] and answers.outside.tolist() == static.outside.tolist()
@@ -73,12 +75,12 @@ def test_case_26_zero_motion_is_the_static_answer(tmp_path: Path, rng: np.random
 @pytest.mark.interpreted
 def test_case_26_contact_at_the_very_end_and_at_the_very_beginning(tmp_path: Path) -> None:
     # Tangent, to the unit, at one end of the way and nowhere else.
-    case = cases.build(tmp_path, POINT, radius=0.25, resolution=cases.BINARY_STEP)
-    with swept.opened(case) as data:
-        there = swept.ask(data, POINT, 0.5, at(2.0), at(0.75))
-        short = swept.ask(data, POINT, 0.5, at(2.0), at(0.75 + 4 * UNIT))
-        away = swept.ask(data, POINT, 0.5, at(0.75), at(2.0))
-        clear = swept.ask(data, POINT, 0.5, at(0.75 + 4 * UNIT), at(2.0))
+    case = archive_cases.build(tmp_path, POINT, radius=0.25, resolution=archive_cases.BINARY_STEP)
+    with judged_sweeps.opened(case) as data:
+        there = judged_sweeps.ask(data, POINT, 0.5, at(2.0), at(0.75))
+        short = judged_sweeps.ask(data, POINT, 0.5, at(2.0), at(0.75 + 4 * UNIT))
+        away = judged_sweeps.ask(data, POINT, 0.5, at(0.75), at(2.0))
+        clear = judged_sweeps.ask(data, POINT, 0.5, at(0.75 + 4 * UNIT), at(2.0))
     assert there.verdict[0] == Verdict.CONTACT and there.upper[0] == 1 and there.exact[0]
     assert 0 < (1 - there.lower[0]) * 1.25 <= 1e-6
     assert short.verdict[0] == clear.verdict[0] == Verdict.CLEAR
@@ -89,8 +91,8 @@ def test_case_26_contact_at_the_very_end_and_at_the_very_beginning(tmp_path: Pat
 @pytest.mark.interpreted
 def test_case_26_a_graze_is_unknown_or_found_never_clear(tmp_path: Path) -> None:
     """Past a sphere by so many units: well apart is clear, well inside exact, between them nothing is claimed."""
-    case = cases.build(tmp_path, POINT, radius=0.25, resolution=cases.BINARY_STEP)
-    with swept.opened(case) as data:
+    case = archive_cases.build(tmp_path, POINT, radius=0.25, resolution=archive_cases.BINARY_STEP)
+    with judged_sweeps.opened(case) as data:
         for units, said, exact in (
             (-60_000, Verdict.CONTACT, True),
             (-10, Verdict.CONTACT, False),
@@ -99,9 +101,9 @@ def test_case_26_a_graze_is_unknown_or_found_never_clear(tmp_path: Path) -> None
             (1, Verdict.CLEAR, True),
         ):
             first, last = at(-0.5, 0.75 + units * UNIT), at(0.5, 0.75 + units * UNIT)
-            answers = swept.ask(data, POINT, 0.5, first, last)
+            answers = judged_sweeps.ask(data, POINT, 0.5, first, last)
             assert answers.verdict[0] == said and answers.exact[0] == exact, units
-            swept.judge(case, data, POINT, 0.5, first, last, answers, samples=201)
+            judged_sweeps.judge(case, data, POINT, 0.5, first, last, answers, samples=201)
             if said == Verdict.UNKNOWN:
                 assert 0.499 < answers.lower[0] < 0.5
             assert answers.steps[0] < 100
@@ -111,11 +113,11 @@ def test_case_26_a_graze_is_unknown_or_found_never_clear(tmp_path: Path) -> None
 @pytest.mark.interpreted
 def test_case_26_contact_beyond_a_graze_is_found(tmp_path: Path) -> None:
     points = np.array([[0.0, 0, 0], [2.0, 0.5, 0]])
-    case = cases.build(tmp_path, points, radius=0.25, resolution=cases.BINARY_STEP)
+    case = archive_cases.build(tmp_path, points, radius=0.25, resolution=archive_cases.BINARY_STEP)
     first, last = at(-1.0, 0.75 + 0.6 * UNIT), at(3.0, 0.75 + 0.6 * UNIT)
-    with swept.opened(case) as data:
-        answers = swept.ask(data, POINT, 0.5, first, last)
-        swept.judge(case, data, POINT, 0.5, first, last, answers)
+    with judged_sweeps.opened(case) as data:
+        answers = judged_sweeps.ask(data, POINT, 0.5, first, last)
+        judged_sweeps.judge(case, data, POINT, 0.5, first, last, answers)
     assert answers.verdict[0] == Verdict.CONTACT and not answers.exact[0]
     assert answers.lower[0] < 0.25 < 0.5 < answers.upper[0]
 
@@ -127,16 +129,18 @@ def test_case_26_contact_beyond_a_graze_is_found(tmp_path: Path) -> None:
 @pytest.mark.interpreted
 def test_case_26_turns_alone(tmp_path: Path, rng: np.random.Generator) -> None:
     """A rod that turns about one end, up to half a turn, against pillars around it."""
-    case = cases.build(tmp_path, scans.make_scan("pillar", 5, 400), radius=0.01)
+    case = archive_cases.build(tmp_path, synthetic_scans.make_scan("pillar", 5, 400), radius=0.01)
     rod = np.linspace(0, 0.6, 40)[:, None] * [1.0, 0, 0]
     count = 60
-    first = np.array([cases.pose_of(turn_z(a), np.array([0.5, 1.0, 1.0])) for a in rng.uniform(0, 7, count)])
+    first = np.array(
+        [archive_cases.pose_of(turn_z(a), np.array([0.5, 1.0, 1.0])) for a in rng.uniform(0, 7, count)]
+    )
     last = first.copy()
     for i, angle in enumerate([*rng.uniform(-3, 3, count - 4), np.pi, -np.pi, np.pi - 1e-9, np.pi - 1e-15]):
         last[i, :3, :3] = turn_z(angle) @ first[i, :3, :3]
-    with swept.opened(case) as data:
-        answers = swept.ask(data, rod, 0.005, first, last)
-        swept.judge(case, data, rod, 0.005, first, last, answers)
+    with judged_sweeps.opened(case) as data:
+        answers = judged_sweeps.ask(data, rod, 0.005, first, last)
+        judged_sweeps.judge(case, data, rod, 0.005, first, last, answers)
     assert 10 < (answers.verdict == Verdict.CONTACT).sum() < count - 5
     assert (answers.verdict != Verdict.UNKNOWN).all() and answers.exact.all()
 
@@ -150,24 +154,24 @@ def test_case_23_a_way_through_more_than_the_cache_holds(tmp_path: Path, rng: np
     """Segment by segment, and a segment piece by piece; what lies beyond the contact is never loaded."""
     points = rng.uniform(0, 1, (6000, 3)) * [60.0, 2, 2]
     points = points[(np.abs(points[:, 1:] - 1).max(axis=1) > 0.3) | (points[:, 0] > 50)]
-    case = cases.build(tmp_path, points, voxel=1.0, radius=0.05)
+    case = archive_cases.build(tmp_path, points, voxel=1.0, radius=0.05)
     body = rng.uniform(-0.1, 0.1, (10, 3))
     first, last = at(-1.0, 1.0, 1.0), at(61.0, 1.0, 1.0)
     last[0, :3, :3] = turn_z(0.02)
-    with swept.opened(case) as data:
-        wide = swept.ask(data, body, 0.02, first, last)
+    with judged_sweeps.opened(case) as data:
+        wide = judged_sweeps.ask(data, body, 0.02, first, last)
         loaded = data.residency.misses
-        swept.judge(case, data, body, 0.02, first, last, wide)
+        judged_sweeps.judge(case, data, body, 0.02, first, last, wide)
     assert wide.verdict[0] == Verdict.CONTACT and 0.7 < wide.upper[0] < 0.9
     with Archive(case.archive) as archive:
         voxels = len(archive.voxels)
     largest = 1 << 12
-    with swept.opened(case, largest) as data:
+    with judged_sweeps.opened(case, largest) as data:
         assert data.residency.bytes_of(range(voxels)) > 8 * largest
-        tight = swept.ask(data, body, 0.02, first, last)
+        tight = judged_sweeps.ask(data, body, 0.02, first, last)
     assert (tight.lower[0], tight.upper[0]) == (wide.lower[0], wide.upper[0]) and tight.exact[0]
-    with swept.opened(case) as data:
-        found = swept.ask(data, body, 0.02, last, at(-1.0, 1.0, 1.0))
+    with judged_sweeps.opened(case) as data:
+        found = judged_sweeps.ask(data, body, 0.02, last, at(-1.0, 1.0, 1.0))
         assert found.verdict[0] == Verdict.CONTACT and found.upper[0] < 0.2
         assert data.residency.misses < 0.6 * loaded
 
@@ -178,14 +182,14 @@ def test_case_21_what_is_missing_is_unknown_from_there_on(tmp_path: Path, rng: n
     points = np.concatenate(
         [rng.uniform(0, 0.4, (40, 3)), rng.uniform([2.0, 0, 0], [2.4, 0.4, 0.4], (40, 3))]
     )
-    case = cases.build(tmp_path, points, voxel=0.5, radius=0.01)
+    case = archive_cases.build(tmp_path, points, voxel=0.5, radius=0.01)
     with Archive(case.archive) as archive:
         lattice = archive.header.lattice
         beyond = np.flatnonzero(
             lattice.to_world(archive.coordinates * lattice.voxel_steps)[:, 0] > 1
         ).tolist()
-    with swept.opened(case) as data:
-        clear = swept.ask(data, POINT, 0.01, at(-1, -0.2, 0.2), at(4, -0.2, 0.2))
+    with judged_sweeps.opened(case) as data:
+        clear = judged_sweeps.ask(data, POINT, 0.01, at(-1, -0.2, 0.2), at(4, -0.2, 0.2))
         assert clear.verdict[0] == Verdict.CLEAR and clear.outside[0]
         load = data.residency._store.load
 
@@ -198,11 +202,11 @@ def test_case_21_what_is_missing_is_unknown_from_there_on(tmp_path: Path, rng: n
         for row in np.flatnonzero(data.residency.where[:, 0] >= 0).tolist():
             data.residency._evict(row)
         # Past it within reach: its points are at x 2 to 2.4.
-        beside = swept.ask(data, POINT, 0.01, at(-1, 0.2, 0.6), at(4, 0.2, 0.6), margin=0.3)
-        through = swept.ask(data, POINT, 0.01, at(1, 0.2, 0.2), at(4, 0.2, 0.2), margin=0.3)
-        before = swept.ask(data, POINT, 0.01, at(-1, 0.2, 0.2), at(4, 0.2, 0.2), margin=0.3)
-        after = swept.ask(data, POINT, 0.01, at(4, 0.2, 0.2), at(-1, 0.2, 0.2), margin=0.3)
-        apart = swept.ask(data, POINT, 0.01, at(-1, -0.2, 0.2), at(1.0, -0.2, 0.2))
+        beside = judged_sweeps.ask(data, POINT, 0.01, at(-1, 0.2, 0.6), at(4, 0.2, 0.6), margin=0.3)
+        through = judged_sweeps.ask(data, POINT, 0.01, at(1, 0.2, 0.2), at(4, 0.2, 0.2), margin=0.3)
+        before = judged_sweeps.ask(data, POINT, 0.01, at(-1, 0.2, 0.2), at(4, 0.2, 0.2), margin=0.3)
+        after = judged_sweeps.ask(data, POINT, 0.01, at(4, 0.2, 0.2), at(-1, 0.2, 0.2), margin=0.3)
+        apart = judged_sweeps.ask(data, POINT, 0.01, at(-1, -0.2, 0.2), at(1.0, -0.2, 0.2))
     assert beside.verdict[0] == Verdict.CONTACT
     assert through.verdict[0] == Verdict.UNKNOWN and through.voxels_missing[0] >= 1 and through.faults
     # Points begin within 0.1 m of x = 2, their cell, within which they may be anywhere, at 1.5.
@@ -216,20 +220,20 @@ def test_case_21_what_is_missing_is_unknown_from_there_on(tmp_path: Path, rng: n
 @pytest.mark.case(21, "regions of scans left out: unknown from there on along the motion")
 @pytest.mark.interpreted
 def test_case_21_regions_of_scans_left_out(tmp_path: Path) -> None:
-    case = cases.build(tmp_path, POINT, radius=0.25, resolution=cases.BINARY_STEP)
+    case = archive_cases.build(tmp_path, POINT, radius=0.25, resolution=archive_cases.BINARY_STEP)
     box = np.array([[[2.0, -1, -1], [3.0, 1, 1]]])
-    with swept.opened(case) as data:
+    with judged_sweeps.opened(case) as data:
         steps = np.rint((box - data.arrays.origin) / data.arrays.step).astype(np.int64)
         partly = data._replace(unknown=steps)
         nowhere = data._replace(unknown_everywhere=True)
         reached = (
-            swept.ask(partly, POINT, 0.5, at(6.0, 1.5), at(1.0, 1.5)),
-            swept.ask(partly, POINT, 0.5, at(6.0), at(-6.0)),
+            judged_sweeps.ask(partly, POINT, 0.5, at(6.0, 1.5), at(1.0, 1.5)),
+            judged_sweeps.ask(partly, POINT, 0.5, at(6.0), at(-6.0)),
         )
-        before = swept.ask(partly, POINT, 0.5, at(-2.0), at(2.0))
-        beside = swept.ask(partly, POINT, 0.5, at(6.0, 4.0), at(-6.0, 4.0))
-        lost = swept.ask(nowhere, POINT, 0.5, at(6.0, 4.0), at(-6.0, 4.0))
-        found = swept.ask(nowhere, POINT, 0.5, at(6.0), at(-6.0))
+        before = judged_sweeps.ask(partly, POINT, 0.5, at(-2.0), at(2.0))
+        beside = judged_sweeps.ask(partly, POINT, 0.5, at(6.0, 4.0), at(-6.0, 4.0))
+        lost = judged_sweeps.ask(nowhere, POINT, 0.5, at(6.0, 4.0), at(-6.0, 4.0))
+        found = judged_sweeps.ask(nowhere, POINT, 0.5, at(6.0), at(-6.0))
     assert reached[0].verdict[0] == Verdict.UNKNOWN
     assert abs(reached[0].lower[0] * 5 - 2.25) < 0.02
     assert reached[1].verdict[0] == Verdict.CONTACT and not reached[1].exact[0]
@@ -243,24 +247,24 @@ def test_case_21_regions_of_scans_left_out(tmp_path: Path) -> None:
 @pytest.mark.case(3, "motions that change size or shear, and unequal numbers of ends, are refused")
 @pytest.mark.interpreted
 def test_case_03_motions_that_change_size_are_refused(tmp_path: Path) -> None:
-    case = cases.build(tmp_path, POINT, radius=0.25)
+    case = archive_cases.build(tmp_path, POINT, radius=0.25)
     grown, nearly, sheared = at(1.0), at(1.0), at(1.0)
     grown[0, :3, :3] *= 1.001
     nearly[0, :3, :3] *= 1 + 0.4e-9
     sheared[0, 0, 1] = 0.1
-    with swept.opened(case) as data:
+    with judged_sweeps.opened(case) as data:
         with pytest.raises(BadTransformError, match=r"motion 0 begins at scale 1 and ends at 1\.001"):
-            swept.ask(data, POINT, 0.5, at(2.0), grown)
+            judged_sweeps.ask(data, POINT, 0.5, at(2.0), grown)
         with pytest.raises(BadTransformError, match="shears"):
-            swept.ask(data, POINT, 0.5, sheared, at(2.0))
+            judged_sweeps.ask(data, POINT, 0.5, sheared, at(2.0))
         with pytest.raises(BadRequestError, match="1 poses to begin at and 2 to end at"):
-            swept.ask(data, POINT, 0.5, at(2.0), np.concatenate([at(1.0), at(0.0)]))
+            judged_sweeps.ask(data, POINT, 0.5, at(2.0), np.concatenate([at(1.0), at(0.0)]))
         for bad in (np.nan, -1.0, np.inf):
             with pytest.raises(BadRequestError):
-                swept.ask(data, POINT, 0.5, at(2.0), at(1.0), tolerance=bad)
-        assert swept.ask(data, POINT, 0.5, at(2.0), nearly).verdict[0] == Verdict.CLEAR
-        assert len(swept.ask(data, POINT, 0.5, at(0.0)[:0], at(0.0)[:0])) == 0
-        empty = swept.ask(data, np.empty((0, 3)), 0.5, at(2.0), at(-2.0))
+                judged_sweeps.ask(data, POINT, 0.5, at(2.0), at(1.0), tolerance=bad)
+        assert judged_sweeps.ask(data, POINT, 0.5, at(2.0), nearly).verdict[0] == Verdict.CLEAR
+        assert len(judged_sweeps.ask(data, POINT, 0.5, at(0.0)[:0], at(0.0)[:0])) == 0
+        empty = judged_sweeps.ask(data, np.empty((0, 3)), 0.5, at(2.0), at(-2.0))
         assert empty.verdict[0] == Verdict.CLEAR and empty.lower[0] == 1
 
 
@@ -269,31 +273,32 @@ def test_case_03_motions_that_change_size_are_refused(tmp_path: Path) -> None:
 def test_case_30_a_tolerance_widens_the_interval_and_no_more(
     tmp_path: Path, rng: np.random.Generator
 ) -> None:
-    case = cases.build(tmp_path, scans.make_scan("corner", 2, 60), radius=0.01)
+    case = archive_cases.build(tmp_path, synthetic_scans.make_scan("corner", 2, 60), radius=0.01)
     body = rng.uniform(-0.1, 0.1, (6, 3))
     count = 4 if INTERPRETED else 40
-    first = cases.near_poses(rng, case.points, body, count, 0.4)
-    last = cases.near_poses(rng, case.points, body, count, 0.2)
-    with swept.opened(case) as data:
-        fine = swept.ask(data, body, 0.01, first, last)
+    first = archive_cases.near_poses(rng, case.points, body, count, 0.4)
+    last = archive_cases.near_poses(rng, case.points, body, count, 0.2)
+    with judged_sweeps.opened(case) as data:
+        fine = judged_sweeps.ask(data, body, 0.01, first, last)
         for tolerance in (1e-4, 1e-2):
-            coarse = swept.ask(data, body, 0.01, first, last, tolerance=tolerance)
-            same = swept.ask(data, body, 0.01, first, last, effort=Effort(tolerance=tolerance))
+            coarse = judged_sweeps.ask(data, body, 0.01, first, last, tolerance=tolerance)
+            same = judged_sweeps.ask(data, body, 0.01, first, last, effort=Effort(tolerance=tolerance))
             assert coarse.lower.tolist() == same.lower.tolist()
             assert coarse.verdict.tolist() == fine.verdict.tolist()
             assert (coarse.lower <= fine.upper).all() and (fine.lower <= coarse.upper).all()
             assert coarse.steps.sum() <= fine.steps.sum()
-            swept.judge(case, data, body, 0.01, first, last, coarse, tolerance=tolerance, samples=20)
+            judged_sweeps.judge(case, data, body, 0.01, first, last, coarse, tolerance=tolerance, samples=20)
 
 
 SCRIPT = """
-import pathlib, sys, cases, numpy as np, scans, swept
+import pathlib, sys, archive_cases, numpy as np, synthetic_scans, judged_sweeps
 rng = np.random.default_rng(5)
-case = cases.Case(pathlib.Path(sys.argv[1]), np.empty((0, 3)))
+case = archive_cases.Case(pathlib.Path(sys.argv[1]), np.empty((0, 3)))
 body = rng.uniform(-0.1, 0.1, (4, 3))
-first, last = (cases.near_poses(rng, scans.make_scan("corner", 2, 60), body, 6, 0.3) for _ in range(2))
-with swept.opened(case) as data:
-    found = swept.ask(data, body, 0.01, first, last)
+corner = synthetic_scans.make_scan("corner", 2, 60)
+first, last = (archive_cases.near_poses(rng, corner, body, 6, 0.3) for _ in range(2))
+with judged_sweeps.opened(case) as data:
+    found = judged_sweeps.ask(data, body, 0.01, first, last)
 print([column.tobytes().hex() for column in (found.verdict, found.lower, found.upper, found.witness_avatar)])
 """
 
@@ -302,8 +307,8 @@ print([column.tobytes().hex() for column in (found.verdict, found.lower, found.u
     24, "bounds and witnesses of sweeps equal the interpreter's", compiled_only="it runs both itself"
 )
 def test_case_24_compiled_and_interpreted_agree_bit_for_bit(tmp_path: Path) -> None:
-    case = cases.build(tmp_path, scans.make_scan("corner", 2, 60), radius=0.01)
-    path = os.pathsep.join([str(Path(swept.__file__).parent), os.environ.get("PYTHONPATH", "")])
+    case = archive_cases.build(tmp_path, synthetic_scans.make_scan("corner", 2, 60), radius=0.01)
+    path = os.pathsep.join([str(Path(judged_sweeps.__file__).parent), os.environ.get("PYTHONPATH", "")])
     said = [
         subprocess.run(
             [sys.executable, "-W", "ignore", "-c", SCRIPT, str(case.archive)],

@@ -3,15 +3,15 @@
 import os
 from pathlib import Path
 
-import cases
+import archive_cases
+import judged_sweeps
 import naive_sweep
 import numpy as np
 import pytest
-import swept
-from motions import at, turn_z, wall
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.queries.collide import collide
+from sweep_poses import at, turn_z, wall
 
 INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
 POINT = np.zeros((1, 3))
@@ -27,7 +27,7 @@ def test_case_26_no_thin_wall_is_missed(tmp_path: Path, rng: np.random.Generator
 
     Poses 1 m apart, and that is what stepping has, meet few of them.
     """
-    case = cases.build(tmp_path, wall(1.0, 0.02), radius=0.011, voxel=1.0)
+    case = archive_cases.build(tmp_path, wall(1.0, 0.02), radius=0.011, voxel=1.0)
     body, radius = rng.uniform(-0.05, 0.05, (20, 3)), 0.01
     count = 50 if INTERPRETED else 500
     first, last = np.empty((2, count, 4, 4))
@@ -36,24 +36,24 @@ def test_case_26_no_thin_wall_is_missed(tmp_path: Path, rng: np.random.Generator
         way = rng.normal(size=3) * [1, 0.2, 0.2]
         way *= rng.uniform(10, 100) / np.linalg.norm(way)
         through = np.array([0, *rng.uniform(-0.35, 0.35, 2)])
-        start = cases.random_rotation(rng)
+        start = archive_cases.random_rotation(rng)
         # Half of them turn about the middle of the way.
-        first[i] = cases.pose_of(start, through - way)
-        last[i] = cases.pose_of(start if i % 2 else turn_z(rng.uniform(-1, 1)) @ start, through + way)
+        first[i] = archive_cases.pose_of(start, through - way)
+        last[i] = archive_cases.pose_of(start if i % 2 else turn_z(rng.uniform(-1, 1)) @ start, through + way)
         if not i % 2:
             middle = naive_sweep.pose_at(first[i], last[i], 0.5)[:3, 3]
             for pose in (first[i], last[i]):
                 pose[:3, 3] += through - middle
-    with swept.opened(case) as data:
-        answers = swept.ask(data, body, radius, first, last)
+    with judged_sweeps.opened(case) as data:
+        answers = judged_sweeps.ask(data, body, radius, first, last)
         model = make_avatar(body, radius)
         for i in range(count):
             steps = np.linspace(0, 1, int(np.linalg.norm(last[i] - first[i])) + 1)
             poses = np.array([naive_sweep.pose_at(first[i], last[i], t) for t in steps])
             stepped += (collide(data, model, poses).verdict == Verdict.CONTACT).any()
         some = slice(0, count, 25)
-        part = swept.ask(data, body, radius, first[some], last[some])
-        swept.judge(case, data, body, radius, first[some], last[some], part, samples=40)
+        part = judged_sweeps.ask(data, body, radius, first[some], last[some])
+        judged_sweeps.judge(case, data, body, radius, first[some], last[some], part, samples=40)
     assert (answers.verdict == Verdict.CONTACT).all()
     assert answers.exact.mean() > 0.98
     assert stepped < count / 2
@@ -68,7 +68,7 @@ def test_case_26_a_wall_of_a_millimetre_is_met_on_any_way(
     tmp_path: Path, rng: np.random.Generator, length: float
 ) -> None:
     # Spheres of 1 mm, 0.7 mm apart: no hole among them, and nothing behind them.
-    case = cases.build(tmp_path, wall(0.03, 0.0007), radius=0.0005, resolution=1e-5)
+    case = archive_cases.build(tmp_path, wall(0.03, 0.0007), radius=0.0005, resolution=1e-5)
     count = 6 if INTERPRETED else 100
     way = rng.normal(size=(count, 3)) * [1, 0.3, 0.3]
     way *= length * np.sign(way[:, :1]) / np.linalg.norm(way, axis=1)[:, None]
@@ -82,11 +82,11 @@ def test_case_26_a_wall_of_a_millimetre_is_met_on_any_way(
         middle = naive_sweep.pose_at(first[i], last[i], float(part[i, 0]))[:3, 3]
         first[i, :3, 3] += through[i] - middle
         last[i, :3, 3] += through[i] - middle
-    with swept.opened(case) as data:
-        answers = swept.ask(data, POINT, 0.0001, first, last)
+    with judged_sweeps.opened(case) as data:
+        answers = judged_sweeps.ask(data, POINT, 0.0001, first, last)
         some = slice(0, count, 10)
-        part_of = swept.ask(data, POINT, 0.0001, first[some], last[some])
-        swept.judge(case, data, POINT, 0.0001, first[some], last[some], part_of, samples=20)
+        part_of = judged_sweeps.ask(data, POINT, 0.0001, first[some], last[some])
+        judged_sweeps.judge(case, data, POINT, 0.0001, first[some], last[some], part_of, samples=20)
     assert (answers.verdict == Verdict.CONTACT).all()
     assert answers.exact.mean() > 0.98
 
@@ -98,21 +98,23 @@ def test_case_26_a_wall_of_a_millimetre_is_met_on_any_way(
 @pytest.mark.interpreted
 def test_case_26_along_a_wall_and_round_in_place(tmp_path: Path, rng: np.random.Generator) -> None:
     """A centimetre, or a micrometre, from a wall all the way: no crawling, and no claim too many."""
-    case = cases.build(tmp_path, wall(4.0, 0.05), radius=0.03, voxel=2.0, resolution=cases.BINARY_STEP)
+    case = archive_cases.build(
+        tmp_path, wall(4.0, 0.05), radius=0.03, voxel=2.0, resolution=archive_cases.BINARY_STEP
+    )
     angle = np.arange(60) * np.pi / 30
     ring = np.stack([np.cos(angle), np.sin(angle), np.zeros(60)], axis=1) * 0.3
-    with swept.opened(case) as data:
+    with judged_sweeps.opened(case) as data:
         for gap, most in ((1e-2, 40), (1e-4, 200), (1e-6, 600)):
             first, last = at(0.33 + gap, -1.0), at(0.33 + gap, 1.0)
-            straight = swept.ask(data, ring, 0.0, first, last)
+            straight = judged_sweeps.ask(data, ring, 0.0, first, last)
             last[0, :3, :3] = turn_z(-3.0)
-            rolling = swept.ask(data, ring, 0.0, first, last)
+            rolling = judged_sweeps.ask(data, ring, 0.0, first, last)
             last[0, :3, 3], last[0, :3, :3] = first[0, :3, 3], turn_z(3.0)
-            turning = swept.ask(data, ring, 0.0, first, last)
+            turning = judged_sweeps.ask(data, ring, 0.0, first, last)
             assert straight.verdict[0] == Verdict.CLEAR and straight.steps[0] <= 4
             assert turning.verdict[0] == Verdict.CLEAR and turning.steps[0] <= most, turning.steps
-            swept.judge(case, data, ring, 0.0, first, last, turning)
+            judged_sweeps.judge(case, data, ring, 0.0, first, last, turning)
             # Its axis is not the ring's: it swings into the wall.
             assert rolling.verdict[0] == Verdict.CONTACT and rolling.steps[0] <= most
             last[0, :3, 3], last[0, :3, :3] = [0.33 + gap, 1.0, 0.0], turn_z(-3.0)
-            swept.judge(case, data, ring, 0.0, first, last, rolling)
+            judged_sweeps.judge(case, data, ring, 0.0, first, last, rolling)

@@ -5,15 +5,15 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import cases
+import archive_cases
 import naive_distance
 import numpy as np
 import pytest
-from clouds import KINDS, TREES, cloud
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from judged import judge_collide, judge_distance
+from judged_distance import judge_collide, judge_distance
 from numpy.typing import NDArray
+from point_clouds import KINDS, TREES, cloud
 from solidcloud.schemas.wire.answers import CollideAnswers, DistanceAnswers, Verdict
 from solidcloud.server.queries.context import anytime_search as bounded
 from solidcloud.server.queries.context.anytime_search import collide_bounded, distance_bounded
@@ -37,12 +37,12 @@ def test_bounds_hold_and_a_larger_budget_never_gives_worse(
 ) -> None:
     rng = np.random.default_rng(seed)
     points, avatar = cloud(rng, kind, 300), cloud(rng, body, 50) * rng.uniform(0.05, 0.5)
-    poses = cases.near_poses(rng, points, avatar, 20, 0.6)
+    poses = archive_cases.near_poses(rng, points, avatar, 20, 0.6)
     tolerance = float(rng.choice([0.0, 1e-3, 0.03, 0.3]))
     margin, reach = float(rng.choice([0.0, 0.02, 0.2])), float(rng.choice([0.05, 1.0]))
     with TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
         patch.setattr(bounded, "HEAP_PAIRS", heap)
-        case = cases.build(Path(folder), points, voxel=voxel, **tree)
+        case = archive_cases.build(Path(folder), points, voxel=voxel, **tree)
         with Scene.open(case.archive) as scene:
             info = scene.info()
             scene.add_avatar("avatar", avatar, 0.02)
@@ -86,10 +86,10 @@ def test_in_pieces_and_in_slices_the_bounds_hold_as_well(seed: int, kind: str, t
     """A cache of two voxels; and a deadline far away, so that the search is left and resumed."""
     rng = np.random.default_rng(seed)
     points, avatar = cloud(rng, kind, 300), cloud(rng, "sphere", 50) * 0.3
-    poses = cases.near_poses(rng, points, avatar, 12, 0.6)
+    poses = archive_cases.near_poses(rng, points, avatar, 12, 0.6)
     with TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
         patch.setattr(bounded, "SLICE_VISITS", 7)
-        case = cases.build(Path(folder), points, voxel=0.5, **tree)
+        case = archive_cases.build(Path(folder), points, voxel=0.5, **tree)
         with Scene.open(case.archive) as scene:
             info = scene.info()
             budget = 2 * max(scene.residency.bytes_of([row]) for row in range(info.voxels))

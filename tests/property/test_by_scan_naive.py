@@ -5,17 +5,17 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import cases
-import cases_contacts
-import classes
+import archive_cases
+import contact_cases
 import naive
 import naive_contacts
 import numpy as np
 import pytest
-from clouds import KINDS, TREES, cloud
+import radius_class_archives
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from point_clouds import KINDS, TREES, cloud
 from solidcloud.server.avatars.avatar_model import AvatarModel, make_avatar
 from solidcloud.server.queries.contacts import contacts
 from solidcloud.server.queries.context.query_budget import Effort
@@ -25,7 +25,7 @@ SCANS = 4
 
 
 def judge(
-    case: cases_contacts.ScanCase, model: AvatarModel, pose: NDArray[np.float64], margin: float
+    case: contact_cases.ScanCase, model: AvatarModel, pose: NDArray[np.float64], margin: float
 ) -> dict[int, float]:
     """The least gap of each scan within the margin, of all pairs."""
     lattice = case.store.archive.header.lattice
@@ -45,9 +45,9 @@ def judge(
     seed=st.integers(0, 2**32 - 1),
     kind=st.sampled_from(KINDS),
     body=st.sampled_from(KINDS),
-    model=st.sampled_from(classes.MODELS),
+    model=st.sampled_from(radius_class_archives.MODELS),
     voxel=st.sampled_from([0.07, 0.5, 4.0]),
-    step=st.sampled_from([1e-4, cases.BINARY_STEP, 1e-2]),
+    step=st.sampled_from([1e-4, archive_cases.BINARY_STEP, 1e-2]),
     far=st.sampled_from([0.0, 5e5, 6.4e6]),
     margin=st.sampled_from([0.0, 0.02, 0.4]),
     tree=TREES,
@@ -59,13 +59,14 @@ def test_the_least_gap_of_each_scan_is_that_of_the_definition(
     rng = np.random.default_rng(seed)
     points = cloud(rng, kind, 250) + far * rng.uniform(-1, 1, 3)
     avatar = make_avatar(cloud(rng, body, 30) * 0.3, float(rng.choice([0.0, 0.01])))
-    poses = cases.near_poses(rng, points, avatar.points, 8, 0.1)
+    poses = archive_cases.near_poses(rng, points, avatar.points, 8, 0.1)
     voxel = np.ceil(voxel / step) * step
-    with TemporaryDirectory() as folder, classes.any_classes():
-        case = cases_contacts.open_case(
-            Path(folder), points, rng, scan_count=SCANS, voxel=voxel, resolution=step, models=classes.STORED, **tree
+    with TemporaryDirectory() as folder, radius_class_archives.any_classes():
+        case = contact_cases.open_case(
+            Path(folder), points, rng, scan_count=SCANS, voxel=voxel, resolution=step,
+            models=radius_class_archives.STORED, **tree
         )  # fmt: skip
-        case = cases_contacts.with_model(case, model)
+        case = contact_cases.with_model(case, model)
         with closing(case.store):
             for pose in poses:
                 expected = judge(case, avatar, pose, margin)
@@ -82,12 +83,12 @@ def test_the_least_gap_of_each_scan_is_that_of_the_definition(
 
 def test_a_cache_too_small_for_all_at_once_changes_no_gap(tmp_path: Path, rng: np.random.Generator) -> None:
     points = cloud(rng, "noise", 2000)
-    case = cases_contacts.open_case(tmp_path, points, rng, scan_count=3, voxel=0.5)
+    case = contact_cases.open_case(tmp_path, points, rng, scan_count=3, voxel=0.5)
     avatar = make_avatar(rng.uniform(-0.5, 0.5, (60, 3)), 0.02)
     with closing(case.store):
         largest = max(case.data.residency.bytes_of([row]) for row in range(len(case.data.broad.keys)))
-        small = cases_contacts.tight(case, 2 * largest)
-        for pose in cases.near_poses(rng, points, avatar.points, 5, 0.1):
+        small = contact_cases.tight(case, 2 * largest)
+        for pose in archive_cases.near_poses(rng, points, avatar.points, 5, 0.1):
             whole = gaps_by_scan(case.data, avatar, pose, 0.1, 3)
             assert gaps_by_scan(small.data, avatar, pose, 0.1, 3) == whole
             assert whole.exact and len(whole.gaps) == 3
@@ -101,8 +102,8 @@ def test_a_wall_that_one_scan_saw_costs_few_tests_of_points(tmp_path: Path, rng:
     avatar = make_avatar(np.column_stack([rng.uniform(-0.3, 0.3, (500, 2)), np.zeros(500)]), 0.01)
     # Tilted by 3 degrees: all of it is within the margin of 4 cm, and the nearest pair is at an edge.
     c, s = np.cos(0.05), np.sin(0.05)
-    pose = cases.pose_of(np.array([[1, 0, 0], [0, c, -s], [0, s, c]]), np.array([0.5, 0.5, 0.04]))
-    case = cases_contacts.open_case(tmp_path, wall, rng, scan_count=1, voxel=2.0)
+    pose = archive_cases.pose_of(np.array([[1, 0, 0], [0, c, -s], [0, s, c]]), np.array([0.5, 0.5, 0.04]))
+    case = contact_cases.open_case(tmp_path, wall, rng, scan_count=1, voxel=2.0)
     with closing(case.store):
         found = gaps_by_scan(case.data, avatar, pose, 0.04, 1)
         all_pairs = contacts(case.data, avatar, pose[None], 0, 0.04)

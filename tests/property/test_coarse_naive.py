@@ -4,16 +4,16 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import cases
-import classes
+import archive_cases
 import numpy as np
 import pytest
-import scans
-from clouds import COUNTS, FAR, KINDS, OFF, SCALES, STEPS, TREES, cloud
+import radius_class_archives
+import synthetic_scans
 from coarse_tops import Made, least_margin, open_made
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from point_clouds import COUNTS, FAR, KINDS, OFF, SCALES, STEPS, TREES, cloud
 from solidcloud.builder.voxel.point_radius import voxel_points
 from solidcloud.schemas.archive.radius_model import class_radii
 from solidcloud.server.avatars.avatar_model import AvatarModel, make_avatar
@@ -99,10 +99,10 @@ def test_nothing_in_contact_is_settled(
     )
     radius = float(step * rng.choice([0, 0.5, 9]))
     with TemporaryDirectory() as folder:
-        case = cases.build(
+        case = archive_cases.build(
             Path(folder), points, voxel=step * voxel_steps, resolution=step, radius=radius, **tree
         )
-        poses = cases.near_poses(rng, points, avatar.points, 8, extent, scale)
+        poses = archive_cases.near_poses(rng, points, avatar.points, 8, extent, scale)
         judge(open_made(case.archive), None, avatar, poses, rng)
 
 
@@ -112,7 +112,7 @@ def test_nothing_in_contact_is_settled(
     kind=st.sampled_from(KINDS),
     count=st.sampled_from([2, 33, 300]),
     body=st.sampled_from(KINDS),
-    model=st.sampled_from(classes.MODELS),
+    model=st.sampled_from(radius_class_archives.MODELS),
     voxel=st.sampled_from([0.5, 4.0]),
     scale=st.sampled_from([1.0, 0.3]),
     tree=TREES,
@@ -129,23 +129,30 @@ def test_nothing_in_contact_is_settled_whatever_the_radii(
 ) -> None:
     rng = np.random.default_rng(seed)
     points, avatar = cloud(rng, kind, count), make_avatar(cloud(rng, body, 20) * 0.3, 0.01)
-    with TemporaryDirectory() as folder, classes.any_classes():
-        case = cases.build(Path(folder), points, voxel=voxel, models=classes.STORED, **tree)
-        poses = cases.near_poses(rng, points, avatar.points, 8, 0.3, scale)
+    with TemporaryDirectory() as folder, radius_class_archives.any_classes():
+        case = archive_cases.build(
+            Path(folder), points, voxel=voxel, models=radius_class_archives.STORED, **tree
+        )
+        poses = archive_cases.near_poses(rng, points, avatar.points, 8, 0.3, scale)
         judge(open_made(case.archive, model), model, avatar, poses, rng)
 
 
 @pytest.mark.interpreted
 @pytest.mark.parametrize("model", [None, "local+border:0.3"])
-@pytest.mark.parametrize("kind", scans.WITH_POINTS)
+@pytest.mark.parametrize("kind", synthetic_scans.WITH_POINTS)
 def test_of_every_kind_of_scan_clear_pairs_are_settled(
     tmp_path: Path, rng: np.random.Generator, kind: str, model: str | None
 ) -> None:
-    with classes.any_classes():
-        case = cases.build(
-            tmp_path, scans.make_scan(kind, 11, 60), voxel=1.0, leaf=4, degree=3, models=classes.STORED
+    with radius_class_archives.any_classes():
+        case = archive_cases.build(
+            tmp_path,
+            synthetic_scans.make_scan(kind, 11, 60),
+            voxel=1.0,
+            leaf=4,
+            degree=3,
+            models=radius_class_archives.STORED,
         )
     avatar = make_avatar(rng.uniform(-0.2, 0.2, (9, 3)), 0.01)
-    poses = cases.near_poses(rng, case.points, avatar.points, 10, 0.5)
+    poses = archive_cases.near_poses(rng, case.points, avatar.points, 10, 0.5)
     settled, clear = judge(open_made(case.archive, model), model, avatar, poses, rng)
     assert 3 * settled > clear > 0

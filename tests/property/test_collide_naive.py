@@ -8,21 +8,32 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import cases
+import archive_cases
 import naive
 import numpy as np
 import pytest
-import scans
-from clouds import COUNTS, FAR, KINDS, OFF, SCALES, STEPS, TREES, VOXEL_STEPS, cloud, signed_permutations
+import synthetic_scans
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from point_clouds import (
+    COUNTS,
+    FAR,
+    KINDS,
+    OFF,
+    SCALES,
+    STEPS,
+    TREES,
+    VOXEL_STEPS,
+    cloud,
+    signed_permutations,
+)
 from solidcloud.server.scene import Scene
 
 
-def build(points: NDArray[np.float64], folder: str, **options: Any) -> cases.Case:
+def build(points: NDArray[np.float64], folder: str, **options: Any) -> archive_cases.Case:
     """An archive in a folder of hypothesis's example."""
-    return cases.build(Path(folder), points, **options)
+    return archive_cases.build(Path(folder), points, **options)
 
 
 @settings(max_examples=60, deadline=None, derandomize=True)
@@ -65,10 +76,10 @@ def test_contact_begins_where_the_definition_says(
         with Scene.open(case.archive) as scene:
             info = scene.info()
             scene.add_avatar("avatar", avatar, float(radius))
-            for pose in cases.near_poses(rng, points, avatar, 12, extent, scale):
+            for pose in archive_cases.near_poses(rng, points, avatar, 12, extent, scale):
                 if np.abs(pose[:3, 3]).max() > 1e9:
                     continue
-                least, _ = cases.least_reach(case, avatar, pose, info.origin, step)
+                least, _ = archive_cases.least_reach(case, avatar, pose, info.origin, step)
                 given_units = naive.reach_units(pose, float(radius), info.radius, 0.0)
                 for reach in (least - 1, least, least + 1):
                     if not max(given_units, 0) <= reach <= 1 << 30:
@@ -84,7 +95,7 @@ def test_contact_begins_where_the_definition_says(
 def test_no_tree_voxel_order_or_thread_changes_an_answer(seed: int, kind: str, margin: float) -> None:
     rng = np.random.default_rng(seed)
     points, avatar = cloud(rng, kind, 300), cloud(rng, "sphere", 60) * 0.2
-    poses = cases.near_poses(rng, points, avatar, 60, 0.15)
+    poses = archive_cases.near_poses(rng, points, avatar, 60, 0.15)
     expected: list[int] | None = None
     with TemporaryDirectory() as folder:
         for options in (
@@ -107,7 +118,7 @@ def test_no_tree_voxel_order_or_thread_changes_an_answer(seed: int, kind: str, m
 def test_either_may_be_the_scan(seed: int, kinds: tuple[str, str]) -> None:
     """collide(A, B, M) == collide(B, A, M^-1) for M exactly invertible (NUMERICS.md case 29), to the unit."""
     rng = np.random.default_rng(seed)
-    step, radii = cases.BINARY_STEP, (3 * cases.BINARY_STEP, 7 * cases.BINARY_STEP)
+    step, radii = archive_cases.BINARY_STEP, (3 * archive_cases.BINARY_STEP, 7 * archive_cases.BINARY_STEP)
     clouds = [
         np.rint(cloud(rng, kind, count) / step) * step for kind, count in zip(kinds, (8, 400), strict=True)
     ]
@@ -124,8 +135,8 @@ def test_either_may_be_the_scan(seed: int, kinds: tuple[str, str]) -> None:
                 turn = turns[rng.integers(24)]
                 a, b = (c[rng.integers(len(c))] for c in clouds)
                 # b of the second cloud comes to lie a whole number of steps beside a of the first.
-                pose = cases.pose_of(turn, a - turn @ b + rng.integers(-14, 15, 3) * step)
-                back = cases.pose_of(turn.T, -turn.T @ pose[:3, 3])
+                pose = archive_cases.pose_of(turn, a - turn @ b + rng.integers(-14, 15, 3) * step)
+                back = archive_cases.pose_of(turn.T, -turn.T @ pose[:3, 3])
                 one = first.collide("avatar", pose[None]).verdict[0]
                 assert one == second.collide("avatar", back[None]).verdict[0]
                 placed = clouds[1] @ turn.T + pose[:3, 3]
@@ -141,7 +152,7 @@ def test_far_from_the_origin_is_as_at_the_origin(seed: int, shift: tuple[int, in
     rng = np.random.default_rng(seed)
     points = np.rint(cloud(rng, "plane", 300) * 2.0**20) * 2.0**-20
     avatar = cloud(rng, "noise", 50) * 0.2
-    poses = cases.near_poses(rng, points, avatar, 60, 0.2)
+    poses = archive_cases.near_poses(rng, points, avatar, 60, 0.2)
     poses[:, :3, 3] = np.rint(poses[:, :3, 3] * 2.0**20) * 2.0**-20
     moved = poses.copy()
     moved[:, :3, 3] += shift
@@ -159,11 +170,13 @@ def test_far_from_the_origin_is_as_at_the_origin(seed: int, shift: tuple[int, in
 
 
 @pytest.mark.interpreted
-@pytest.mark.parametrize("kind", scans.WITH_POINTS)
+@pytest.mark.parametrize("kind", synthetic_scans.WITH_POINTS)
 def test_a_few_poses_of_every_kind_of_scan(tmp_path: Path, rng: np.random.Generator, kind: str) -> None:
-    case = cases.build(tmp_path, scans.make_scan(kind, 11, 60), radius=0.05)
+    case = archive_cases.build(tmp_path, synthetic_scans.make_scan(kind, 11, 60), radius=0.05)
     avatar = rng.uniform(-0.2, 0.2, (9, 3))
-    poses = np.concatenate([cases.near_poses(rng, case.points, avatar, 8, 0.3, s) for s in (1.0, 0.4)])
+    poses = np.concatenate(
+        [archive_cases.near_poses(rng, case.points, avatar, 8, 0.3, s) for s in (1.0, 0.4)]
+    )
     expected = case.judge(avatar, 0.05, poses, 0.02)
-    assert cases.ask(case, avatar, 0.05, poses, 0.02).tolist() == expected.astype(int).tolist()
+    assert archive_cases.ask(case, avatar, 0.05, poses, 0.02).tolist() == expected.astype(int).tolist()
     assert expected.any() and not expected.all()

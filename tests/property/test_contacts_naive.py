@@ -4,13 +4,13 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import cases
+import archive_cases
 import numpy as np
 import pytest
-from cases_contacts import ScanCase, compare, open_case, tight
-from clouds import COUNTS, FAR, KINDS, SCALES, STEPS, TREES, VOXEL_STEPS, cloud, signed_permutations
+from contact_cases import ScanCase, compare, open_case, tight
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from point_clouds import COUNTS, FAR, KINDS, SCALES, STEPS, TREES, VOXEL_STEPS, cloud, signed_permutations
 from solidcloud.schemas.wire.answers import ContactsAnswers
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.queries import contacts as contacts_module
@@ -60,7 +60,7 @@ def test_every_pair_and_cluster_is_the_definitions(
         for share in (0.0, 0.02, 0.2, 1.0):
             margin = min(extent * share * rng.uniform(0.5, 1), 10.0)
             distance = rng.choice([None, 0.0, 3 * step, 0.05 * extent, extent])
-            poses = cases.near_poses(rng, points, avatar, 3, margin + radius, scale)
+            poses = archive_cases.near_poses(rng, points, avatar, 3, margin + radius, scale)
             if np.abs(poses[:, :3, 3]).max() <= 1e9:
                 compare(case, avatar, float(radius), poses, limit, float(margin), distance)
 
@@ -70,13 +70,13 @@ def test_every_pair_and_cluster_is_the_definitions(
 def test_ties_go_by_point_then_centre_then_row_then_scan(seed: int, limit: int, tree: dict[str, Any]) -> None:
     """Points and avatar on one coarse grid, many of them several times, under poses that keep the grid."""
     rng = np.random.default_rng(seed)
-    step = cases.BINARY_STEP
+    step = archive_cases.BINARY_STEP
     points = rng.integers(-3, 4, (150, 3)) * (4 * step) + 64 * step
     avatar = rng.integers(-2, 3, (40, 3)) * (4 * step)
     turns = signed_permutations()
     poses = np.array(
         [
-            cases.pose_of(turns[rng.integers(24)], 64 * step + 4 * step * rng.integers(-2, 3, 3))
+            archive_cases.pose_of(turns[rng.integers(24)], 64 * step + 4 * step * rng.integers(-2, 3, 3))
             for _ in range(4)
         ]
     )
@@ -105,7 +105,7 @@ def rich_question(case: ScanCase, seed: int) -> tuple[np.ndarray, float, np.ndar
     """An avatar, its radius, poses, a limit and a margin, with some hundred pairs a pose in several clusters."""
     rng = np.random.default_rng(seed)
     avatar = cloud(rng, "sphere", 60) * 0.4
-    poses = cases.near_poses(rng, case.points, avatar, 5, 0.02)
+    poses = archive_cases.near_poses(rng, case.points, avatar, 5, 0.02)
     return avatar, 0.02, poses, 50, 0.03
 
 

@@ -4,16 +4,27 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import cases
+import archive_cases
 import naive
 import naive_distance
 import numpy as np
 import pytest
-import scans
-from clouds import COUNTS, FAR, KINDS, OFF, SCALES, STEPS, TREES, VOXEL_STEPS, cloud, signed_permutations
+import synthetic_scans
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from judged import compare
+from judged_distance import compare
+from point_clouds import (
+    COUNTS,
+    FAR,
+    KINDS,
+    OFF,
+    SCALES,
+    STEPS,
+    TREES,
+    VOXEL_STEPS,
+    cloud,
+    signed_permutations,
+)
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.scene import Scene
 
@@ -50,11 +61,11 @@ def test_distance_and_witnesses_are_those_of_the_definition(
     points = cloud(rng, kind, count) * extent + far * rng.uniform(-1, 1, 3)
     avatar = cloud(rng, body, 40) * (extent / scale * rng.uniform(0.01, 0.5)) + off * rng.uniform(-1, 1, 3)
     radius, scan_radius = float(step / scale * rng.choice([0, 0.7, 9])), float(step * rng.choice([0, 0.5, 9]))
-    poses = cases.near_poses(rng, points, avatar, 16, 2 * extent, scale)
+    poses = archive_cases.near_poses(rng, points, avatar, 16, 2 * extent, scale)
     poses = poses[np.abs(poses[:, :3, 3]).max(axis=1) < 1e9]
     reach = float(extent * 10.0 ** rng.uniform(-2, 1))
     with TemporaryDirectory() as folder:
-        case = cases.build(
+        case = archive_cases.build(
             Path(folder), points, voxel=step * voxel_steps, resolution=step, radius=scan_radius, **tree
         )
         with Scene.open(case.archive) as scene:
@@ -93,7 +104,10 @@ def test_no_tree_voxel_order_or_budget_changes_an_answer(seed: int, kind: str) -
     avatar = np.rint(cloud(rng, "sphere", 60) * 4) / 32
     turns = signed_permutations()
     poses = np.array(
-        [cases.pose_of(turns[rng.integers(24)], np.rint(rng.uniform(-24, 24, 3)) / 16) for _ in range(40)]
+        [
+            archive_cases.pose_of(turns[rng.integers(24)], np.rint(rng.uniform(-24, 24, 3)) / 16)
+            for _ in range(40)
+        ]
     )
     expected = None
     with TemporaryDirectory() as folder:
@@ -103,7 +117,7 @@ def test_no_tree_voxel_order_or_budget_changes_an_answer(seed: int, kind: str) -
             {"voxel": 0.25, "degree": 16, "leaf": 32, "cell_points": 10, "with_slab": False},
             {"voxel": 0.5, "degree": 5, "leaf": 7, "cell_points": 10},
         ):
-            case = cases.build(Path(folder), rng.permutation(points), resolution=2.0**-6, **options)
+            case = archive_cases.build(Path(folder), rng.permutation(points), resolution=2.0**-6, **options)
             with Scene.open(case.archive) as scene:
                 info = scene.info()
                 budget = 2 * max(scene.residency.bytes_of([row]) for row in range(info.voxels))
@@ -123,7 +137,7 @@ def test_no_tree_voxel_order_or_budget_changes_an_answer(seed: int, kind: str) -
 def test_either_may_be_the_scan(seed: int, kinds: tuple[str, str]) -> None:
     """distance(A, B, M) == distance(B, A, M^-1) for M exactly invertible (NUMERICS.md case 29)."""
     rng = np.random.default_rng(seed)
-    step, radii = cases.BINARY_STEP, (3 * cases.BINARY_STEP, 7 * cases.BINARY_STEP)
+    step, radii = archive_cases.BINARY_STEP, (3 * archive_cases.BINARY_STEP, 7 * archive_cases.BINARY_STEP)
     clouds = [
         np.rint(cloud(rng, kind, count) / step) * step for kind, count in zip(kinds, (8, 400), strict=True)
     ]
@@ -132,12 +146,12 @@ def test_either_may_be_the_scan(seed: int, kinds: tuple[str, str]) -> None:
     for _ in range(30):
         turn = turns[rng.integers(24)]
         a, b = (c[rng.integers(len(c))] for c in clouds)
-        poses.append(cases.pose_of(turn, a - turn @ b + rng.integers(-300, 301, 3) * step))
-    back = [cases.pose_of(p[:3, :3].T, -p[:3, :3].T @ p[:3, 3]) for p in poses]
+        poses.append(archive_cases.pose_of(turn, a - turn @ b + rng.integers(-300, 301, 3) * step))
+    back = [archive_cases.pose_of(p[:3, :3].T, -p[:3, :3].T @ p[:3, 3]) for p in poses]
     with TemporaryDirectory() as folder:
         signed = []
         for own, other, way in ((0, 1, poses), (1, 0, back)):
-            case = cases.build(
+            case = archive_cases.build(
                 Path(folder), clouds[own], resolution=step, radius=radii[own], leaf=2, degree=2
             )
             with Scene.open(case.archive) as scene:
@@ -147,9 +161,9 @@ def test_either_may_be_the_scan(seed: int, kinds: tuple[str, str]) -> None:
 
 
 def test_collide_is_distance_within_the_margin(tmp_path: Path, rng: np.random.Generator) -> None:
-    case = cases.build(tmp_path, scans.make_scan("corner", 3, 2000), voxel=0.4)
+    case = archive_cases.build(tmp_path, synthetic_scans.make_scan("corner", 3, 2000), voxel=0.4)
     avatar = rng.uniform(-0.2, 0.2, (60, 3))
-    poses = cases.near_poses(rng, case.points, avatar, 300, 0.4)
+    poses = archive_cases.near_poses(rng, case.points, avatar, 300, 0.4)
     with Scene.open(case.archive) as scene:
         scene.add_avatar("avatar", avatar, 0.01)
         found = scene.distance("avatar", poses, 0.3)
@@ -163,9 +177,11 @@ def test_collide_is_distance_within_the_margin(tmp_path: Path, rng: np.random.Ge
 def test_more_ties_than_are_kept_until_the_end(tmp_path: Path, rng: np.random.Generator) -> None:
     """Two planes, every point of one above a point of the other: all pairs tie, and the least by coordinates counts."""
     grid = np.stack(np.meshgrid(np.arange(12), np.arange(12), [0]), -1).reshape(-1, 3) / 16
-    case = cases.build(tmp_path, rng.permutation(grid), resolution=2.0**-6, radius=0.0, leaf=4, degree=2)
+    case = archive_cases.build(
+        tmp_path, rng.permutation(grid), resolution=2.0**-6, radius=0.0, leaf=4, degree=2
+    )
     shifts = [(0, 0, 2), (2, -3, 2), (0, 1, -5), (1, 1, 0)]
-    poses = np.array([cases.pose_of(np.eye(3), np.array(shift) / 16) for shift in shifts])
+    poses = np.array([archive_cases.pose_of(np.eye(3), np.array(shift) / 16) for shift in shifts])
     with Scene.open(case.archive) as scene:
         info = scene.info()
         scene.add_avatar("avatar", rng.permutation(grid), 0.0)
@@ -176,11 +192,13 @@ def test_more_ties_than_are_kept_until_the_end(tmp_path: Path, rng: np.random.Ge
 
 
 @pytest.mark.interpreted
-@pytest.mark.parametrize("kind", scans.WITH_POINTS)
+@pytest.mark.parametrize("kind", synthetic_scans.WITH_POINTS)
 def test_a_few_poses_of_every_kind_of_scan(tmp_path: Path, rng: np.random.Generator, kind: str) -> None:
-    case = cases.build(tmp_path, scans.make_scan(kind, 11, 60), radius=0.05)
+    case = archive_cases.build(tmp_path, synthetic_scans.make_scan(kind, 11, 60), radius=0.05)
     avatar = rng.uniform(-0.2, 0.2, (9, 3))
-    poses = np.concatenate([cases.near_poses(rng, case.points, avatar, 6, 0.5, s) for s in (1.0, 0.4)])
+    poses = np.concatenate(
+        [archive_cases.near_poses(rng, case.points, avatar, 6, 0.5, s) for s in (1.0, 0.4)]
+    )
     with Scene.open(case.archive) as scene:
         info = scene.info()
         scene.add_avatar("avatar", avatar, 0.05)
@@ -192,12 +210,14 @@ def test_a_few_poses_of_every_kind_of_scan(tmp_path: Path, rng: np.random.Genera
 
 def test_an_avatar_whose_front_is_inner_nodes(tmp_path: Path, rng: np.random.Generator) -> None:
     # 10,000 points: more leaf nodes than a front holds, so that the avatar's side is descended as well.
-    points = scans.make_scan("corner", 5, 300)
-    case = cases.build(tmp_path, points, leaf=4, degree=3)
+    points = synthetic_scans.make_scan("corner", 5, 300)
+    case = archive_cases.build(tmp_path, points, leaf=4, degree=3)
     direction = rng.normal(size=(10_000, 3))
     avatar = direction / np.linalg.norm(direction, axis=1)[:, None] * rng.uniform(0.2, 0.21, (10_000, 1))
     low, high = points.min(axis=0) - 0.3, points.max(axis=0) + 0.3
-    poses = np.stack([cases.pose_of(cases.random_rotation(rng), rng.uniform(low, high)) for _ in range(12)])
+    poses = np.stack(
+        [archive_cases.pose_of(archive_cases.random_rotation(rng), rng.uniform(low, high)) for _ in range(12)]
+    )
     with Scene.open(case.archive) as scene:
         info = scene.info()
         scene.add_avatar("avatar", avatar, 0.002)

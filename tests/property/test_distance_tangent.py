@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-import cases
+import archive_cases
 import naive
 import naive_distance
 import numpy as np
@@ -44,8 +44,8 @@ def test_ten_million_pairs_none_wrong(tmp_path: Path, rng: np.random.Generator) 
     step, steps = 1e-6, 1 << 21
     points = rng.uniform(-1, 1, (100, 3))
     avatar = rng.uniform(-0.5, 0.5, (100, 3))
-    case = cases.build(tmp_path, points, voxel=step * steps, resolution=step, radius=0.01)
-    poses = cases.near_poses(rng, points, avatar, 950, 1.0)
+    case = archive_cases.build(tmp_path, points, voxel=step * steps, resolution=step, radius=0.01)
+    poses = archive_cases.near_poses(rng, points, avatar, 950, 1.0)
     with Scene.open(case.archive) as scene:
         scene.add_avatar("avatar", avatar, 0.02)
         origin = scene.info().origin
@@ -56,8 +56,8 @@ def test_ten_million_pairs_none_wrong(tmp_path: Path, rng: np.random.Generator) 
     # The near-tangent ones: the points of a sphere, on the lattice, seen from all around its centre.
     out = rng.normal(size=(1000, 3))
     shell = np.rint(out / np.linalg.norm(out, axis=1)[:, None] * 0.3 / step) * step
-    case = cases.build(tmp_path, shell, voxel=step * steps, resolution=step, radius=0.1)
-    poses = np.array([cases.pose_of(np.eye(3), rng.uniform(-0.2, 0.2, 3) * step) for _ in range(500)])
+    case = archive_cases.build(tmp_path, shell, voxel=step * steps, resolution=step, radius=0.1)
+    poses = np.array([archive_cases.pose_of(np.eye(3), rng.uniform(-0.2, 0.2, 3) * step) for _ in range(500)])
     with Scene.open(case.archive) as scene:
         scene.add_avatar("avatar", np.zeros((1, 3)), 0.1)
         origin = scene.info().origin

@@ -7,10 +7,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import cases
+import archive_cases
 import numpy as np
 import pytest
-from clouds import KINDS, cloud
+from point_clouds import KINDS, cloud
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.queries.context.anytime_search import collide_bounded, distance_bounded
@@ -42,8 +42,8 @@ def test_a_larger_budget_takes_nothing_back(tmp_path: Path, seed: int, tolerance
     """Of poses that are looked at piece by piece, in a cache of two voxels; of rays and loose points at once."""
     rng = np.random.default_rng(seed)
     points, avatar = cloud(rng, rng.choice(KINDS[:-1]), 200), cloud(rng, "noise", 60) * 0.3
-    case = cases.build(tmp_path, points, voxel=0.6, leaf=1, cell_points=20)
-    poses = cases.near_poses(rng, points, avatar, 20, 0.4)
+    case = archive_cases.build(tmp_path, points, voxel=0.6, leaf=1, cell_points=20)
+    poses = archive_cases.near_poses(rng, points, avatar, 20, 0.4)
     store = Store(case.archive)
     data = make_scene_data(store.archive, Residency(store, 2 * int(store.sizes.max()) + 128))
     model = make_avatar(avatar, 0.02)

@@ -13,18 +13,18 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
-import cases
+import archive_cases
 import numpy as np
 import pytest
-from clouds import KINDS, cloud, signed_permutations
 from numpy.typing import NDArray
+from point_clouds import KINDS, cloud, signed_permutations
 from solidcloud.server.scene import Scene
 
 # Scenes of an archive, far apart, so that 200 draws take 20 builds.
 SCENES = 10
 ARCHIVES = 2 if os.environ.get("NUMBA_DISABLE_JIT") == "1" else 20
 APART = 64 * 1024  # [STEP]
-STEP = cases.BINARY_STEP
+STEP = archive_cases.BINARY_STEP
 POINTS, BODY = 40, 12
 RADIUS, MARGIN = 0.01, 2.0**-8
 
@@ -64,7 +64,7 @@ def draw(seed: int) -> tuple[Drawn, Contacts]:
     for number in range(SCENES):
         lattice = np.rint(cloud(rng, KINDS[(seed + number) % len(KINDS)], POINTS) * 0.25 / STEP)
         lattice += [number * APART, 0, 0]
-        poses.append(cases.near_poses(rng, lattice * STEP, body, 1, 0.03, (1.0, 0.5)[number % 2])[0])
+        poses.append(archive_cases.near_poses(rng, lattice * STEP, body, 1, 0.03, (1.0, 0.5)[number % 2])[0])
         lattices.append(lattice.astype(np.int64))
     asked = np.array(poses)
     asked[:, :3, 3] = np.rint(asked[:, :3, 3] * 2.0**20) * 2.0**-20
@@ -76,7 +76,7 @@ def contacts(drawn: Drawn, shift: NDArray[np.float64] | float = 0.0) -> Contacts
     """How often which row of the body touches which lattice point under which pose; shift: of the scene [m]."""
     found: Contacts = Counter()
     with TemporaryDirectory() as folder:
-        case = cases.build(
+        case = archive_cases.build(
             Path(folder), drawn.lattice * STEP + shift, resolution=STEP, radius=RADIUS, **drawn.options
         )
         with Scene.open(case.archive) as scene:

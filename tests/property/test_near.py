@@ -6,15 +6,15 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import cases
-import classes
+import archive_cases
 import numpy as np
 import pytest
-import scans
-from clouds import KINDS, TREES, cloud
+import radius_class_archives
+import synthetic_scans
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from point_clouds import KINDS, TREES, cloud
 from solidcloud.schemas.errors import SolidcloudError
 from solidcloud.schemas.wire.answers import DistanceAnswers
 from solidcloud.server.avatars.avatar_model import AvatarModel, make_avatar
@@ -68,7 +68,7 @@ def both_ways(
     body=st.sampled_from(KINDS),
     far=st.sampled_from([0.0, 5e5, 6.4e6]),
     scale=st.sampled_from([1.0, 1.0, 0.3, 7.0]),
-    step=st.sampled_from([cases.BINARY_STEP, 1e-4, 1e-2]),
+    step=st.sampled_from([archive_cases.BINARY_STEP, 1e-4, 1e-2]),
     reach=st.sampled_from([0.0, 1e-3, 0.1, 0.5, QUICK_REACH, 3.0]),
     tree=TREES,
 )
@@ -78,28 +78,28 @@ def test_one_pose_has_the_bits_of_distance(
     rng = np.random.default_rng(seed)
     points = cloud(rng, kind, 40 if INTERPRETED else 400) + far * rng.uniform(-1, 1, 3)
     avatar = make_avatar(cloud(rng, body, 30) * 0.2, float(rng.choice([0.0, 0.01])))
-    poses = cases.near_poses(rng, points, avatar.points, 3 if INTERPRETED else 12, 1.0, scale)
+    poses = archive_cases.near_poses(rng, points, avatar.points, 3 if INTERPRETED else 12, 1.0, scale)
     with TemporaryDirectory() as folder:
-        case = cases.build(Path(folder), points, voxel=1.0, resolution=step, radius=step, **tree)
+        case = archive_cases.build(Path(folder), points, voxel=1.0, resolution=step, radius=step, **tree)
         with Scene.open(case.archive) as scene:
             both_ways(scene._data, avatar, poses, reach, Counted())
 
 
 def test_near_and_distance_agree_under_every_radius_model(tmp_path: Path, rng: np.random.Generator) -> None:
-    points = scans.make_scan("corner", 3, 600)
-    with classes.any_classes():
-        case = cases.build(tmp_path, points, voxel=0.5, models=classes.STORED)
+    points = synthetic_scans.make_scan("corner", 3, 600)
+    with radius_class_archives.any_classes():
+        case = archive_cases.build(tmp_path, points, voxel=0.5, models=radius_class_archives.STORED)
     avatar = make_avatar(rng.uniform(-0.2, 0.2, (40, 3)), 0.01)
-    poses = cases.near_poses(rng, case.points, avatar.points, 60, 0.5)
+    poses = archive_cases.near_poses(rng, case.points, avatar.points, 60, 0.5)
     counted = Counted()
     with Scene.open(case.archive) as scene:
-        for model in classes.MODELS:
+        for model in radius_class_archives.MODELS:
             both_ways(scene._opened.radius_model(model), avatar, poses, 0.1, counted)
     assert counted.nothing > 20 and counted.touching > 20
 
 
 def test_what_is_refused_is_refused_in_the_same_words(tmp_path: Path) -> None:
-    case = cases.build(tmp_path, np.zeros((1, 3)))
+    case = archive_cases.build(tmp_path, np.zeros((1, 3)))
     avatar = make_avatar([[0.0, 0, 0]], 0.1)
     shear, mirror, gone = np.eye(4), np.diag([1.0, 1, -1, 1]), np.eye(4)
     shear[0, 1], gone[0, 3] = 0.1, np.nan

@@ -4,16 +4,16 @@ import math
 from collections.abc import Iterator
 from pathlib import Path
 
-import cases
+import archive_cases
 import naive
 import naive_objects
 import numpy as np
 import pytest
-import scans
-from clouds import signed_permutations
+import synthetic_scans
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from point_clouds import signed_permutations
 from solidcloud.server.avatars.avatar_model import AvatarModel, make_avatar
 from solidcloud.server.queries.context.query_context import SceneData, make_scene_data
 from solidcloud.server.queries.objects import SCENE_GROUP, objects
@@ -27,8 +27,8 @@ ORIGIN_SHIFT = 3.0
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SceneData]:
     """A scene of 60 points, far enough from the origin for its own not to be zero."""
-    points = scans.make_scan("noise", 11, 60) + ORIGIN_SHIFT
-    case = cases.build(tmp_path_factory.mktemp("objects"), points, radius=0.05)
+    points = synthetic_scans.make_scan("noise", 11, 60) + ORIGIN_SHIFT
+    case = archive_cases.build(tmp_path_factory.mktemp("objects"), points, radius=0.05)
     store = Store(case.archive)
     yield make_scene_data(store.archive, Residency(store, 64 << 20))
     store.close()
@@ -48,9 +48,9 @@ def at_random(
     rng: np.random.Generator, body: NDArray[np.float64], box: float, scale: float
 ) -> NDArray[np.float64]:
     """A pose that puts the body's middle somewhere in a box around the scene's origin."""
-    turn = cases.random_rotation(rng) * scale
+    turn = archive_cases.random_rotation(rng) * scale
     middle = body.mean(axis=0) if len(body) else np.zeros(3)
-    return cases.pose_of(turn, rng.uniform(-box, box, 3) + ORIGIN_SHIFT - turn @ middle)
+    return archive_cases.pose_of(turn, rng.uniform(-box, box, 3) + ORIGIN_SHIFT - turn @ middle)
 
 
 @settings(max_examples=25, deadline=None, derandomize=True)
@@ -132,7 +132,7 @@ def test_it_does_not_matter_which_of_two_is_moved(data: SceneData, seed: int, ki
     origin = data.arrays.origin
     bodies = [np.rint(body(rng, kind) * 2.0**20) * 2.0**-20 for kind in kinds]
     models = [make_avatar(points, 3 * 2.0**-20) for points in bodies]
-    still = cases.pose_of(np.eye(3), origin)  # t - O is then zero, and every product exact
+    still = archive_cases.pose_of(np.eye(3), origin)  # t - O is then zero, and every product exact
     for turn in [signed_permutations()[i] for i in rng.integers(24, size=4)]:
         shift = np.rint(rng.uniform(-0.4, 0.4, 3) * 2.0**20) * 2.0**-20
         moved, back = np.eye(4), np.eye(4)
@@ -163,7 +163,7 @@ def test_thousands_of_small_objects_as_all_pairs_say(data: SceneData, rng: np.ra
     ]
     centers[n // 2 :] = centers[: n // 2] + away
     centers = rng.permutation(centers)
-    poses = np.array([cases.pose_of(np.eye(3), c + data.arrays.origin) for c in centers])
+    poses = np.array([archive_cases.pose_of(np.eye(3), c + data.arrays.origin) for c in centers])
     groups, masks = 1 << rng.integers(0, 3, n), rng.choice([1, 6, 7, 7], n)
     answers = objects(data, [make_avatar([[0.0, 0, 0]], radius)] * n, poses, groups, masks)
     units = naive.placed_units(np.zeros((1, 3)), poses[0], data.arrays.origin)
@@ -204,7 +204,9 @@ def test_tangent_objects_touch_and_one_unit_apart_do_not(data: SceneData) -> Non
     for far in (0.0, 2.0**26):
         for more, touch in ((0.0, True), (2.0**-26, False), (-(2.0**-26), True)):
             places = np.array([[far, far, -far], [far + 3 / 64 + more, far + 4 / 64, -far + 12 / 64]])
-            poses = np.array([cases.pose_of(np.eye(3), place + data.arrays.origin) for place in places])
+            poses = np.array(
+                [archive_cases.pose_of(np.eye(3), place + data.arrays.origin) for place in places]
+            )
             if (poses[:, :3, 3] - data.arrays.origin != places).any():
                 continue  # the origin takes bits of the place
             for order in ([0, 1], [1, 0]):
@@ -234,11 +236,11 @@ def test_against_the_scene_as_each_alone(data: SceneData, rng: np.random.Generat
 
 def test_a_scene_path_is_not_needed(tmp_path: Path) -> None:
     """Objects far outside the dataset meet all the same."""
-    case = cases.build(tmp_path, scans.make_scan("plane", 1, 50))
+    case = archive_cases.build(tmp_path, synthetic_scans.make_scan("plane", 1, 50))
     store = Store(case.archive)
     far = make_scene_data(store.archive, Residency(store, 1 << 20))
     ball = make_avatar([[0.0, 0, 0]], 0.5)
-    poses = np.array([cases.pose_of(np.eye(3), np.array([x, 5e6, -4e6])) for x in (0.0, 0.9, 1.95)])
+    poses = np.array([archive_cases.pose_of(np.eye(3), np.array([x, 5e6, -4e6])) for x in (0.0, 0.9, 1.95)])
     answers = objects(far, [ball] * 3, poses, [1] * 3, [ALL] * 3)
     assert answers.pairs.tolist() == [[0, 1]] and answers.outside.all() and answers.misses == 0
     assert objects(far, [ball] * 3, poses, [1] * 3, [ALL] * 3, 0.06).pairs.tolist() == [[0, 1], [1, 2]]

@@ -5,12 +5,12 @@ Nobody is in contact at the end, nobody is on the other side, no energy appears,
 
 from pathlib import Path
 
-import cases
+import archive_cases
+import effect_rooms
 import numpy as np
-import pushed
 import pytest
+from effect_rooms import INTERPRETED, Play, play
 from numpy.typing import NDArray
-from pushed import INTERPRETED, Play, play
 from solidcloud.schemas.scene.effect_options import AnyEffect, Ground, Slide, Step, Stop, Sweep
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.simulation.world.frame import Body
@@ -24,9 +24,9 @@ LEAST, MOST = 0.01, 50.0
 
 
 @pytest.fixture(scope="module")
-def rooms(tmp_path_factory: pytest.TempPathFactory) -> cases.Case:
+def rooms(tmp_path_factory: pytest.TempPathFactory) -> archive_cases.Case:
     """Two rooms side by side, with a wall of one layer of points between them."""
-    return pushed.build(tmp_path_factory.mktemp("rooms"), pushed.room(SIZE, half=True))
+    return effect_rooms.build(tmp_path_factory.mktemp("rooms"), effect_rooms.room(SIZE, half=True))
 
 
 def pushes(rng: np.random.Generator, count: int) -> NDArray[np.float64]:
@@ -45,7 +45,7 @@ def push(game: Play, body: Body, rng: np.random.Generator, count: int, turn: flo
     for number, way in enumerate(pushes(rng, count)):
         before = body.pose[:3, 3].copy()
         angle = rng.uniform(-turn, turn)
-        turned = pushed.at(0, 0, 0, angle)[:3, :3] @ body.pose[:3, :3]
+        turned = effect_rooms.at(0, 0, 0, angle)[:3, :3] @ body.pose[:3, :3]
         turned = np.linalg.qr(turned)[0] * np.sign(np.diag(np.linalg.qr(turned)[1]))
         moved = game.go(body, way, turned if turn else None)
         gone = body.pose[:3, 3] - before
@@ -59,7 +59,7 @@ def push(game: Play, body: Body, rng: np.random.Generator, count: int, turn: flo
     return poses
 
 
-def check(game: Play, rooms: cases.Case, body: Body, poses: NDArray[np.float64]) -> None:
+def check(game: Play, rooms: archive_cases.Case, body: Body, poses: NDArray[np.float64]) -> None:
     """No pose is in contact, none is in the other room or outside."""
     game.scene.add_avatar("pushed", body.avatar.points, body.avatar.radius)
     assert (game.scene.collide("pushed", poses).verdict == Verdict.CLEAR).all()
@@ -70,7 +70,7 @@ def check(game: Play, rooms: cases.Case, body: Body, poses: NDArray[np.float64])
 
 def in_room(game: Play) -> Body:
     """A body in the room at x > 0."""
-    return game.body(pushed.body_box(), pushed.at(SIZE / 4, 0.05, 0.02))
+    return game.body(effect_rooms.body_box(), effect_rooms.at(SIZE / 4, 0.05, 0.02))
 
 
 @pytest.mark.interpreted
@@ -84,7 +84,7 @@ def in_room(game: Play) -> Body:
     ],
 )
 def test_nobody_is_pushed_into_or_through_a_wall(
-    rooms: cases.Case, rng: np.random.Generator, effects: tuple[AnyEffect, ...], turn: float
+    rooms: archive_cases.Case, rng: np.random.Generator, effects: tuple[AnyEffect, ...], turn: float
 ) -> None:
     with play(rooms.archive, *effects) as game:
         body = in_room(game)
@@ -92,7 +92,7 @@ def test_nobody_is_pushed_into_or_through_a_wall(
 
 
 @pytest.mark.slow
-def test_nor_by_a_hundred_thousand_pushes(rooms: cases.Case, rng: np.random.Generator) -> None:
+def test_nor_by_a_hundred_thousand_pushes(rooms: archive_cases.Case, rng: np.random.Generator) -> None:
     with play(rooms.archive, Stop(), Sweep(), Slide()) as game:
         body = in_room(game)
         check(game, rooms, body, push(game, body, rng, MANY, 0.3))
@@ -104,7 +104,7 @@ def test_nor_by_a_hundred_thousand_pushes(rooms: cases.Case, rng: np.random.Gene
     [((1, 0, 0), 0.05), ((1, 1, 0), 0.05), ((1, 1, 1), 0.05), ((0.3, 0.9, 0.2), 0.05), ((-1, -1, 1), 3.0)],
 )
 def test_who_pushes_into_walls_creases_and_corners_does_not_tremble(
-    rooms: cases.Case, way: tuple[float, float, float], length: float
+    rooms: archive_cases.Case, way: tuple[float, float, float], length: float
 ) -> None:
     with play(rooms.archive, Stop(), Sweep(), Slide()) as game:
         body = in_room(game)
@@ -122,9 +122,9 @@ def test_who_pushes_into_walls_creases_and_corners_does_not_tremble(
 
 @pytest.mark.interpreted
 @pytest.mark.parametrize("effects", [(), (Slide(), Ground(), Step())])
-def test_at_rest_not_a_bit_moves(rooms: cases.Case, effects: tuple[AnyEffect, ...]) -> None:
+def test_at_rest_not_a_bit_moves(rooms: archive_cases.Case, effects: tuple[AnyEffect, ...]) -> None:
     with play(rooms.archive, Stop(), Sweep(), *effects) as game:
-        body = game.body(pushed.person(), pushed.at(SIZE / 4, 0.05, -SIZE / 2 + 0.2, 0.3))
+        body = game.body(effect_rooms.person(), effect_rooms.at(SIZE / 4, 0.05, -SIZE / 2 + 0.2, 0.3))
         for _ in range(30):
             game.go(body, (0.0, 0.0, 0.0))
         rests = body.pose.tobytes()
@@ -138,7 +138,7 @@ def test_at_rest_not_a_bit_moves(rooms: cases.Case, effects: tuple[AnyEffect, ..
 def test_the_same_wishes_give_the_same_bits_whatever_is_in_memory(
     tmp_path: Path, rng: np.random.Generator
 ) -> None:
-    case = pushed.build(tmp_path, pushed.room(SIZE), voxel=0.5)
+    case = effect_rooms.build(tmp_path, effect_rooms.room(SIZE), voxel=0.5)
     ways = pushes(rng, 400 if not INTERPRETED else 3)
     ways *= np.minimum(1.0, 0.2 / np.linalg.norm(ways, axis=1))[:, None]
     walks, budget = [], 1 << 26

@@ -5,15 +5,15 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import cases
-import classes
+import archive_cases
 import naive
 import numpy as np
 import pytest
-from clouds import KINDS, TREES, cloud
+import radius_class_archives
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from point_clouds import KINDS, TREES, cloud
 from solidcloud.schemas.errors import BadRequestError
 from solidcloud.server.scene import Scene
 
@@ -40,7 +40,7 @@ def least_margin(a: NDArray[np.int64], scan: NDArray[np.int64], radii: NDArray[n
     kind=st.sampled_from(KINDS),
     count=st.sampled_from([2, 33, 300]),
     body=st.sampled_from(KINDS),
-    model=st.sampled_from(classes.MODELS),
+    model=st.sampled_from(radius_class_archives.MODELS),
     voxel=st.sampled_from([0.07, 0.5, 4.0]),
     scale=st.sampled_from([1.0, 0.3]),
     tree=TREES,
@@ -57,14 +57,16 @@ def test_contact_begins_where_the_definition_says(
 ) -> None:
     rng = np.random.default_rng(seed)
     points, avatar = cloud(rng, kind, count), cloud(rng, body, 20) * 0.3
-    with TemporaryDirectory() as folder, classes.any_classes():
-        case = cases.build(Path(folder), points, voxel=voxel, models=classes.STORED, **tree)
-        stored, radii = classes.stored_radii(case.archive, model)
+    with TemporaryDirectory() as folder, radius_class_archives.any_classes():
+        case = archive_cases.build(
+            Path(folder), points, voxel=voxel, models=radius_class_archives.STORED, **tree
+        )
+        stored, radii = radius_class_archives.stored_radii(case.archive, model)
         with Scene.open(case.archive) as scene:
             info = scene.info()
             scene.add_avatar("avatar", avatar, 0.01)
             b = naive.scan_units(stored, info.lattice_step)
-            poses = cases.near_poses(rng, points, avatar, 12, 0.3, scale)
+            poses = archive_cases.near_poses(rng, points, avatar, 12, 0.3, scale)
             for pose in poses:
                 own = naive.reach_units(pose, 0.01, 0.0, 0.0)
                 least = least_margin(naive.placed_units(avatar, pose, info.origin), b, radii, own)
@@ -80,7 +82,7 @@ def test_contact_begins_where_the_definition_says(
 
 @pytest.mark.interpreted
 def test_a_model_the_archive_does_not_hold_is_refused(tmp_path: Path) -> None:
-    case = cases.build(tmp_path, np.zeros((1, 3)), models=frozenset({"mean", "local"}))
+    case = archive_cases.build(tmp_path, np.zeros((1, 3)), models=frozenset({"mean", "local"}))
     pose = np.eye(4)[None]
     with Scene.open(case.archive) as scene:
         scene.add_avatar("avatar", [[0.0, 0, 0.0]], 0.01)
@@ -95,8 +97,8 @@ def test_a_model_the_archive_does_not_hold_is_refused(tmp_path: Path) -> None:
 def test_reach_is_that_of_the_largest_sphere_there_is(tmp_path: Path) -> None:
     # A grid of 1 cm: spheres of a few millimetres, though the ladder goes to 32 mm.
     grid = np.stack(np.meshgrid(*[np.arange(6) * 0.01] * 3), axis=-1).reshape(-1, 3)
-    case = cases.build(tmp_path, grid, models=frozenset({"mean", "local"}), radius=0.02)
-    _, radii = classes.stored_radii(case.archive, "local")
+    case = archive_cases.build(tmp_path, grid, models=frozenset({"mean", "local"}), radius=0.02)
+    _, radii = radius_class_archives.stored_radii(case.archive, "local")
     with Scene.open(case.archive) as scene:
         data = scene._opened.radius_model("local")
         assert data.radius_units == radii.max() < 0.02 * naive.UNITS

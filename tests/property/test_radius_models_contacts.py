@@ -4,15 +4,15 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import cases
-import classes
+import archive_cases
 import numpy as np
 import pytest
-from cases_contacts import ScanCase, compare, open_case, tight, with_model
-from clouds import KINDS, TREES, cloud, signed_permutations
+import radius_class_archives
+from contact_cases import ScanCase, compare, open_case, tight, with_model
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from point_clouds import KINDS, TREES, cloud, signed_permutations
 from solidcloud.schemas.archive.radius_model import RIM_BIT, local_radii
 from solidcloud.schemas.wire.answers import ContactsAnswers
 from solidcloud.server.avatars.avatar_model import make_avatar
@@ -27,7 +27,7 @@ from solidcloud.server.queries.context.query_budget import Effort, make_effort
     kind=st.sampled_from(KINDS),
     count=st.sampled_from([2, 33, 300]),
     body=st.sampled_from(KINDS),
-    model=st.sampled_from([*classes.MODELS, "local", "local+border", "border:0"]),
+    model=st.sampled_from([*radius_class_archives.MODELS, "local", "local+border", "border:0"]),
     voxel=st.sampled_from([0.07, 0.5, 4.0]),
     scale=st.sampled_from([1.0, 0.3]),
     limit=st.sampled_from([0, 1, 7, 10_000]),
@@ -48,11 +48,13 @@ def test_every_pair_and_cluster_is_the_definitions(
 ) -> None:
     rng = np.random.default_rng(seed)
     points, avatar = cloud(rng, kind, count), cloud(rng, body, 30) * 0.3
-    with TemporaryDirectory() as folder, classes.any_classes():
-        case = open_case(Path(folder), points, rng, kept=kept, voxel=voxel, models=classes.STORED, **tree)
+    with TemporaryDirectory() as folder, radius_class_archives.any_classes():
+        case = open_case(
+            Path(folder), points, rng, kept=kept, voxel=voxel, models=radius_class_archives.STORED, **tree
+        )
         case = with_model(case, model)
         for margin in (0.0, 0.05, 0.4):
-            poses = cases.near_poses(rng, points, avatar, 3, 0.05 + margin, scale)
+            poses = archive_cases.near_poses(rng, points, avatar, 3, 0.05 + margin, scale)
             distance = rng.choice([None, 0.0, 0.03, 0.5])
             compare(case, avatar, 0.01, poses, limit, margin, distance)
 
@@ -67,16 +69,16 @@ def rims(local: NDArray[np.int32]) -> NDArray[np.uint8]:
 def test_equal_gaps_of_unlike_spheres_go_by_the_rule(seed: int, limit: int, tree: dict[str, Any]) -> None:
     """Radii of two steps and of one, on a grid of one step: gaps are equal by the dozen, roots whole and not."""
     rng = np.random.default_rng(seed)
-    step = cases.BINARY_STEP
+    step = archive_cases.BINARY_STEP
     points = rng.integers(-4, 5, (200, 3)) * step + 64 * step
     avatar = rng.integers(-3, 4, (25, 3)) * step
     turns = signed_permutations()
     shifts = 64 * step + step * rng.integers(-2, 3, (3, 3))
-    poses = np.array([cases.pose_of(turns[rng.integers(24)], shift) for shift in shifts])
-    with TemporaryDirectory() as folder, classes.any_classes(rims):
+    poses = np.array([archive_cases.pose_of(turns[rng.integers(24)], shift) for shift in shifts])
+    with TemporaryDirectory() as folder, radius_class_archives.any_classes(rims):
         case = open_case(
             Path(folder), points, rng, scan_count=3, resolution=step, voxel=step * 17, radius=2 * step,
-            models=classes.STORED, **tree,
+            models=radius_class_archives.STORED, **tree,
         )  # fmt: skip
         case = with_model(case, "border")
         assert set((case.radii / (step * 2**26)).tolist()) == {1.0, 2.0}
@@ -90,10 +92,10 @@ def rich(tmp_path_factory: pytest.TempPathFactory) -> ScanCase:
     """A scene of two scans in many voxels, each point of any class."""
     rng = np.random.default_rng(5)
     points = np.concatenate([cloud(rng, "plane", 1500), cloud(rng, "noise", 1500)])
-    with classes.any_classes():
+    with radius_class_archives.any_classes():
         return open_case(
             tmp_path_factory.mktemp("rich"), points, rng, voxel=0.3, resolution=1e-4, degree=3, leaf=9,
-            models=classes.STORED,
+            models=radius_class_archives.STORED,
         )  # fmt: skip
 
 
@@ -101,7 +103,7 @@ def rich_question(case: ScanCase, seed: int) -> tuple[np.ndarray, float, np.ndar
     """An avatar, its radius, poses, a limit and a margin."""
     rng = np.random.default_rng(seed)
     avatar = cloud(rng, "sphere", 60) * 0.4
-    return avatar, 0.02, cases.near_poses(rng, case.points, avatar, 4, 0.02), 50, 0.04
+    return avatar, 0.02, archive_cases.near_poses(rng, case.points, avatar, 4, 0.02), 50, 0.04
 
 
 def listed(answers: ContactsAnswers, pose: int) -> set[tuple[Any, ...]]:
@@ -152,10 +154,10 @@ def test_spheres_that_are_large_elsewhere_cost_no_point_tests(rich: ScanCase) ->
 def test_the_larger_sphere_is_the_deeper_though_farther(tmp_path: Path, rng: np.random.Generator) -> None:
     small, large = local_radii()[[4, 15]]
     points = np.array([[2 * small, 0.0, 0.0], [-0.9 * small, 0.0, 0.0]])
-    with classes.any_classes(lambda local: np.where(local[:, 0] > 0, 15, 4).astype(np.uint8)):
-        case = open_case(tmp_path, points, rng, scan_count=1, voxel=0.5, models=classes.STORED)
+    with radius_class_archives.any_classes(lambda local: np.where(local[:, 0] > 0, 15, 4).astype(np.uint8)):
+        case = open_case(tmp_path, points, rng, scan_count=1, voxel=0.5, models=radius_class_archives.STORED)
     case = with_model(case, "local")
-    pose = cases.pose_of(np.eye(3), np.zeros(3))[None]
+    pose = archive_cases.pose_of(np.eye(3), np.zeros(3))[None]
     answers = compare(case, np.zeros((1, 3)), 0.0, pose)
     assert np.allclose(answers.signed_distance, [2 * small - large, -0.1 * small], atol=2e-4)
     assert (answers.cloud_point[:, 0] > 0).tolist() == [True, False]

@@ -5,17 +5,17 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import cases
-import classes
+import archive_cases
 import naive
 import naive_distance
 import numpy as np
 import pytest
-from clouds import KINDS, TREES, cloud
+import radius_class_archives
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from judged import compare, judge_collide, judge_distance
+from judged_distance import compare, judge_collide, judge_distance
 from numpy.typing import NDArray
+from point_clouds import KINDS, TREES, cloud
 from solidcloud.schemas.archive.radius_model import RIM_BIT
 from solidcloud.schemas.wire.answers import CollideAnswers, DistanceAnswers, Verdict
 from solidcloud.server.queries.context import anytime_search as bounded
@@ -23,7 +23,7 @@ from solidcloud.server.queries.context.query_budget import NO_LIMIT
 from solidcloud.server.scene import Scene
 
 # `local` and `border` as they are: spheres as large as the cloud, so that avatars are inside most of them.
-MODELS = (*classes.MODELS, "local", "local+border", "border:0.5")
+MODELS = (*radius_class_archives.MODELS, "local", "local+border", "border:0.5")
 BUDGETS = (0, 5, 30, 200, NO_LIMIT - 1)
 
 
@@ -40,7 +40,7 @@ def signed_of(judged: list[naive_distance.Expected | None]) -> NDArray[np.float6
     body=st.sampled_from(KINDS),
     model=st.sampled_from(MODELS),
     voxel=st.sampled_from([0.07, 0.5, 4.0]),
-    step=st.sampled_from([1e-4, cases.BINARY_STEP, 1e-2]),
+    step=st.sampled_from([1e-4, archive_cases.BINARY_STEP, 1e-2]),
     scale=st.sampled_from([1.0, 0.3]),
     tree=TREES,
 )
@@ -58,16 +58,17 @@ def test_distance_is_that_of_the_least_gap(
     rng = np.random.default_rng(seed)
     points, avatar = cloud(rng, kind, count), cloud(rng, body, 30) * 0.3
     radius = float(rng.choice([0.0, 0.01]))
-    poses = cases.near_poses(rng, points, avatar, 12, 0.6, scale)
-    if step == cases.BINARY_STEP:  # all on the lattice: ties abound
+    poses = archive_cases.near_poses(rng, points, avatar, 12, 0.6, scale)
+    if step == archive_cases.BINARY_STEP:  # all on the lattice: ties abound
         points, avatar = np.rint(points * 16) / 16, np.rint(avatar * 16) / 16
         poses[:, :3, :3], poses[:, :3, 3] = np.eye(3) * scale, np.rint(poses[:, :3, 3] * 16) / 16
     reach = float(10.0 ** rng.uniform(-2, 0.5))
-    with TemporaryDirectory() as folder, classes.any_classes():
-        case = cases.build(
-            Path(folder), points, voxel=math.ceil(voxel / step) * step, resolution=step, models=classes.STORED, **tree
+    with TemporaryDirectory() as folder, radius_class_archives.any_classes():
+        case = archive_cases.build(
+            Path(folder), points, voxel=math.ceil(voxel / step) * step, resolution=step,
+            models=radius_class_archives.STORED, **tree
         )  # fmt: skip
-        stored, radii = classes.stored_radii(case.archive, model)
+        stored, radii = radius_class_archives.stored_radii(case.archive, model)
         with Scene.open(case.archive) as scene:
             scan = (stored, scene.info().origin, step, radii, avatar, radius)
             scene.add_avatar("avatar", avatar, radius)
@@ -114,13 +115,19 @@ def test_bounds_hold_and_a_larger_budget_never_gives_worse(
     """cache: so many of the largest voxel, so that poses are looked at in pieces."""
     rng = np.random.default_rng(seed)
     points, avatar = cloud(rng, kind, 300), cloud(rng, body, 50) * rng.uniform(0.05, 0.5)
-    poses = cases.near_poses(rng, points, avatar, 20, 0.6)
+    poses = archive_cases.near_poses(rng, points, avatar, 20, 0.6)
     tolerance = float(rng.choice([0.0, 1e-3, 0.03, 0.3]))
     margin, reach = float(rng.choice([0.0, 0.02, 0.2])), float(rng.choice([0.05, 1.0]))
-    with TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch, classes.any_classes():
+    with (
+        TemporaryDirectory() as folder,
+        pytest.MonkeyPatch.context() as patch,
+        radius_class_archives.any_classes(),
+    ):
         patch.setattr(bounded, "HEAP_PAIRS", heap)
-        case = cases.build(Path(folder), points, voxel=voxel, models=classes.STORED, **tree)
-        stored, radii = classes.stored_radii(case.archive, model)
+        case = archive_cases.build(
+            Path(folder), points, voxel=voxel, models=radius_class_archives.STORED, **tree
+        )
+        stored, radii = radius_class_archives.stored_radii(case.archive, model)
         with Scene.open(case.archive) as scene:
             info = scene.info()
             most = max(scene.residency.bytes_of([row]) for row in range(info.voxels))
@@ -160,14 +167,19 @@ def test_an_avatar_whose_front_is_inner_nodes(tmp_path: Path, rng: np.random.Gen
     points = cloud(rng, "plane", 500) * [1, 1, 0.1]
     direction = rng.normal(size=(10_000, 3))
     avatar = direction / np.linalg.norm(direction, axis=1)[:, None] * rng.uniform(0.2, 0.21, (10_000, 1))
-    poses = np.stack([cases.pose_of(cases.random_rotation(rng), rng.uniform(-1.2, 1.2, 3)) for _ in range(8)])
-    with classes.any_classes():
-        case = cases.build(tmp_path, points, leaf=4, degree=3, models=classes.STORED)
+    poses = np.stack(
+        [
+            archive_cases.pose_of(archive_cases.random_rotation(rng), rng.uniform(-1.2, 1.2, 3))
+            for _ in range(8)
+        ]
+    )
+    with radius_class_archives.any_classes():
+        case = archive_cases.build(tmp_path, points, leaf=4, degree=3, models=radius_class_archives.STORED)
     with Scene.open(case.archive) as scene:
         info = scene.info()
         scene.add_avatar("avatar", avatar, 0.002)
         for model in ("local:0.2", "local+border"):
-            stored, radii = classes.stored_radii(case.archive, model)
+            stored, radii = radius_class_archives.stored_radii(case.archive, model)
             scan = (stored, info.origin, info.lattice_step, radii)
             judged = naive_distance.distance_by_radii(*scan, avatar, 0.002, poses, 0.3)
             compare(scene.distance("avatar", poses, 0.3, radius_model=model), judged, 0.3)
@@ -179,17 +191,19 @@ def test_a_small_sphere_in_front_of_a_large_one(tmp_path: Path, rng: np.random.G
     """The nearest centre is not that of the nearest sphere."""
     grid = np.stack(np.meshgrid(np.arange(8), np.arange(8), [0, 1]), -1).reshape(-1, 3) * 0.2
     avatar = grid[:9] - grid[4]
-    with classes.any_classes():
-        case = cases.build(tmp_path, grid, resolution=2.0**-8 / 5, radius=0.25, models=classes.STORED)
+    with radius_class_archives.any_classes():
+        case = archive_cases.build(
+            tmp_path, grid, resolution=2.0**-8 / 5, radius=0.25, models=radius_class_archives.STORED
+        )
     shifts = np.array([(9, 9, 10), (7, -3, 9), (6, 5, -5), (7, 7, 6), (4, 4, 2)]) / 10
-    poses = np.array([cases.pose_of(np.eye(3), shift) for shift in shifts])
-    poses = np.concatenate([poses, cases.near_poses(rng, grid, avatar, 15, 0.8)])
+    poses = np.array([archive_cases.pose_of(np.eye(3), shift) for shift in shifts])
+    poses = np.concatenate([poses, archive_cases.near_poses(rng, grid, avatar, 15, 0.8)])
     farther = 0
     with Scene.open(case.archive) as scene:
         info = scene.info()
         scene.add_avatar("avatar", avatar, 0.0)
         for model in ("local", "border"):
-            stored, radii = classes.stored_radii(case.archive, model)
+            stored, radii = radius_class_archives.stored_radii(case.archive, model)
             scan = (stored, info.origin, info.lattice_step, radii)
             judged = naive_distance.distance_by_radii(*scan, avatar, 0.0, poses, 2.0)
             compare(scene.distance("avatar", poses, 2.0, radius_model=model), judged, 2.0)
@@ -210,18 +224,23 @@ def test_gaps_that_tie_across_classes_and_a_unit_less(tmp_path: Path, rim_right:
     points = np.array([[-far, 0, 0], [far - half, 0, 0]])
     if not rim_right:
         points = -points
-    with classes.any_classes(
+    with radius_class_archives.any_classes(
         lambda local: np.where((local[:, 0] > 512) == rim_right, RIM_BIT, 0).astype(np.uint8)
     ):
-        case = cases.build(
-            tmp_path, points, voxel=4.0, resolution=cases.BINARY_STEP, radius=2 * half, models=classes.STORED
+        case = archive_cases.build(
+            tmp_path,
+            points,
+            voxel=4.0,
+            resolution=archive_cases.BINARY_STEP,
+            radius=2 * half,
+            models=radius_class_archives.STORED,
         )
     poses = np.array(
-        [cases.pose_of(np.eye(3), np.array([units / naive.UNITS, 0, 0])) for units in (-1, 0, 1)]
+        [archive_cases.pose_of(np.eye(3), np.array([units / naive.UNITS, 0, 0])) for units in (-1, 0, 1)]
     )
     with Scene.open(case.archive) as scene:
         info = scene.info()
-        stored, radii = classes.stored_radii(case.archive, "border")
+        stored, radii = radius_class_archives.stored_radii(case.archive, "border")
         assert sorted(radii.tolist()) == [1 << 21, 1 << 22]
         scene.add_avatar("avatar", [[0.0, 0, 0]], 0.0)
         scan = (stored, info.origin, info.lattice_step, radii)
@@ -237,12 +256,22 @@ def test_gaps_that_tie_across_classes_and_a_unit_less(tmp_path: Path, rim_right:
 def test_the_class_of_a_node_may_be_that_of_no_point(tmp_path: Path) -> None:
     """A large sphere halved by the rim beside a small one off it: no upper bound may count on a whole one."""
     points = np.array([[0.0, 0, 0], [2.0**-10, 0, 0]])
-    with classes.any_classes(lambda local: np.where(local[:, 0] % 2 == 0, 15 | RIM_BIT, 0).astype(np.uint8)):
-        case = cases.build(tmp_path, points, voxel=4.0, resolution=cases.BINARY_STEP, models=classes.STORED)
-    poses = np.array([cases.pose_of(np.eye(3), np.array([0, 0, z])) for z in (0.08, 0.0915, 0.1, 0.15, 0.3)])
+    with radius_class_archives.any_classes(
+        lambda local: np.where(local[:, 0] % 2 == 0, 15 | RIM_BIT, 0).astype(np.uint8)
+    ):
+        case = archive_cases.build(
+            tmp_path,
+            points,
+            voxel=4.0,
+            resolution=archive_cases.BINARY_STEP,
+            models=radius_class_archives.STORED,
+        )
+    poses = np.array(
+        [archive_cases.pose_of(np.eye(3), np.array([0, 0, z])) for z in (0.08, 0.0915, 0.1, 0.15, 0.3)]
+    )
     with Scene.open(case.archive) as scene:
         info = scene.info()
-        stored, radii = classes.stored_radii(case.archive, "local+border")
+        stored, radii = radius_class_archives.stored_radii(case.archive, "local+border")
         scene.add_avatar("avatar", [[0.0, 0, 0]], 0.0)
         scan = (stored, info.origin, info.lattice_step, radii, np.zeros((1, 3)), 0.0)
         signed = signed_of(naive_distance.distance_by_radii(*scan, poses, 1.0))

@@ -4,18 +4,18 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import cases
-import classes
+import archive_cases
 import naive
 import naive_objects
 import naive_rays
 import numpy as np
 import pytest
-from cases_rays import KINDS, opened, same_points, same_rays, some_rays
-from clouds import TREES, cloud
+import radius_class_archives
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from point_clouds import TREES, cloud
+from ray_cases import KINDS, opened, same_points, same_rays, some_rays
 from solidcloud.schemas.archive.radius_model import RIM_BIT
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.queries.context.query_budget import Effort
@@ -23,7 +23,7 @@ from solidcloud.server.queries.objects import SCENE_GROUP, objects
 from solidcloud.server.queries.raycast import raycast
 from solidcloud.server.queries.within import within
 
-MODELS = (*classes.MODELS, "local", "local+border", "border:0")
+MODELS = (*radius_class_archives.MODELS, "local", "local+border", "border:0")
 
 
 @settings(max_examples=20, deadline=None, derandomize=True)
@@ -32,7 +32,7 @@ MODELS = (*classes.MODELS, "local", "local+border", "border:0")
     kind=st.sampled_from(KINDS),
     count=st.sampled_from([1, 2, 33, 300, 900]),
     model=st.sampled_from(MODELS),
-    step=st.sampled_from([1e-6, cases.BINARY_STEP, 1e-4, 1e-2]),
+    step=st.sampled_from([1e-6, archive_cases.BINARY_STEP, 1e-4, 1e-2]),
     voxel_steps=st.sampled_from([7, 1000, 70_000]),
     far=st.sampled_from([0.0, 5e5, 1e8]),
     tree=TREES,
@@ -52,11 +52,16 @@ def test_the_first_sphere_is_the_definitions(
         far = 0.0
     extent = step * voxel_steps * rng.uniform(0.1, 3)
     points = cloud(rng, kind, count) * extent + far * rng.uniform(-1, 1, 3)
-    with TemporaryDirectory() as folder, classes.any_classes():
-        case = cases.build(
-            Path(folder), points, voxel=step * voxel_steps, resolution=step, models=classes.STORED, **tree
+    with TemporaryDirectory() as folder, radius_class_archives.any_classes():
+        case = archive_cases.build(
+            Path(folder),
+            points,
+            voxel=step * voxel_steps,
+            resolution=step,
+            models=radius_class_archives.STORED,
+            **tree,
         )
-        stored, units = classes.stored_radii(case.archive, model)
+        stored, units = radius_class_archives.stored_radii(case.archive, model)
         with opened(case, model=model) as data:
             space = data.arrays.origin, data.arrays.step
             lattice = stored * data.arrays.step + data.arrays.origin
@@ -79,9 +84,11 @@ def test_the_first_sphere_is_the_definitions(
 def test_bounded_rays_hold_the_first_sphere(seed: int, kind: str, model: str, tree: dict[str, Any]) -> None:
     rng = np.random.default_rng(seed)
     points = cloud(rng, kind, 600)
-    with TemporaryDirectory() as folder, classes.any_classes():
-        case = cases.build(Path(folder), points, resolution=1e-4, models=classes.STORED, **tree)
-        stored, units = classes.stored_radii(case.archive, model)
+    with TemporaryDirectory() as folder, radius_class_archives.any_classes():
+        case = archive_cases.build(
+            Path(folder), points, resolution=1e-4, models=radius_class_archives.STORED, **tree
+        )
+        stored, units = radius_class_archives.stored_radii(case.archive, model)
         with opened(case, model=model) as data:
             lattice, radii = stored * data.arrays.step + data.arrays.origin, units / naive.UNITS
             o, d = some_rays(rng, lattice, 1.0, radii, 70)
@@ -113,9 +120,9 @@ def test_a_larger_sphere_behind_is_hit_before_a_small_one(tmp_path: Path) -> Non
     def rims(local: NDArray[np.int32]) -> NDArray[np.uint8]:
         return np.where(local[:, 0] == 0, RIM_BIT, 0).astype(np.uint8)
 
-    with classes.any_classes(rims):
-        case = cases.build(
-            tmp_path, points, voxel=2.0, resolution=2.0**-10, radius=0.25, models=classes.STORED
+    with radius_class_archives.any_classes(rims):
+        case = archive_cases.build(
+            tmp_path, points, voxel=2.0, resolution=2.0**-10, radius=0.25, models=radius_class_archives.STORED
         )
     o, d = [[-1.0, 0.0, 0.0], [-1.0, 0.0, 1.0]], [[1.0, 0.0, 0.0], [1.0, 0.0, 0.0]]
     unit = 2.0**-26
@@ -138,17 +145,20 @@ def test_objects_touch_the_scene_by_its_own_spheres_and_one_another_as_ever(
     tmp_path: Path, rng: np.random.Generator
 ) -> None:
     points = cloud(rng, "noise", 400) + 3.0
-    with classes.any_classes():
-        case = cases.build(tmp_path, points, models=classes.STORED)
+    with radius_class_archives.any_classes():
+        case = archive_cases.build(tmp_path, points, models=radius_class_archives.STORED)
     bodies = [cloud(rng, "sphere", 60) * 0.2, cloud(rng, "noise", 20) * 0.05, np.empty((0, 3))]
     models, of = [make_avatar(body, 0.02) for body in bodies], rng.integers(3, size=60)
     poses = np.array(
-        [cases.pose_of(cases.random_rotation(rng), rng.uniform(-1, 1, 3) + 3.0) for _ in range(60)]
+        [
+            archive_cases.pose_of(archive_cases.random_rotation(rng), rng.uniform(-1, 1, 3) + 3.0)
+            for _ in range(60)
+        ]
     )
     everything = np.full(60, SCENE_GROUP | 1)
     seen = {}
     for model in ("local", "local+border:0.5", "border:3", None):
-        stored, units = classes.stored_radii(case.archive, model)
+        stored, units = radius_class_archives.stored_radii(case.archive, model)
         with opened(case, model=model) as data:
             space = stored, data.arrays.step, units
             expected = naive_objects.touching_scene(

@@ -5,17 +5,17 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import cases
-import classes
+import archive_cases
+import judged_sweeps
 import naive
 import numpy as np
 import pytest
-import scans
-import swept
-from clouds import TREES
+import radius_class_archives
+import synthetic_scans
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from point_clouds import TREES
 from solidcloud.schemas.archive.radius_model import LOCAL_CLASSES, RADIUS_CLASSES
 from solidcloud.schemas.wire.answers import SweepAnswers, Verdict
 from solidcloud.server.avatars.avatar_model import make_avatar
@@ -35,7 +35,7 @@ def columns(answers: SweepAnswers, names: tuple[str, ...] = FOUND) -> list[str]:
 @settings(max_examples=25, deadline=None, derandomize=True)
 @given(
     seed=st.integers(0, 2**32 - 1),
-    kind=st.sampled_from(swept.CLOUDS),
+    kind=st.sampled_from(judged_sweeps.CLOUDS),
     step=st.sampled_from([1e-4, 1e-2]),
     far=st.sampled_from([0.0, 6.4e6]),
     scale=st.sampled_from([1.0, 1.0, 0.3, 7.0]),
@@ -43,7 +43,7 @@ def columns(answers: SweepAnswers, names: tuple[str, ...] = FOUND) -> list[str]:
     turn=st.sampled_from([0.0, 1e-6, 0.1, np.pi]),
     margin=st.sampled_from([0.0, 0.02]),
     effort=st.sampled_from([Effort(), Effort(), Effort(tolerance=1e-3), Effort(visits=60)]),
-    model=st.sampled_from(classes.MODELS),
+    model=st.sampled_from(radius_class_archives.MODELS),
     tree=TREES,
 )
 def test_no_sampled_pose_contradicts_the_answer(
@@ -61,19 +61,23 @@ def test_no_sampled_pose_contradicts_the_answer(
 ) -> None:
     """Nor does `collide`, of a motion that stands still."""
     rng = np.random.default_rng(seed)
-    points = scans.make_scan(kind, seed, 120) + far
+    points = synthetic_scans.make_scan(kind, seed, 120) + far
     avatar, radius = rng.uniform(-0.2, 0.2, (9, 3)) / scale, float(rng.choice([0, 1e-3, 0.03])) / scale
-    first, last = swept.motions(rng, points, avatar, 8, float(rng.choice([0.05, 0.3])), way, turn, scale)
+    first, last = judged_sweeps.motions(
+        rng, points, avatar, 8, float(rng.choice([0.05, 0.3])), way, turn, scale
+    )
     tolerance = max(1e-6, effort.tolerance)
-    with TemporaryDirectory() as folder, classes.any_classes():
-        case = cases.build(Path(folder), points, resolution=step, models=classes.STORED, **tree)
-        with swept.opened(case, model=model) as data:
-            answers = swept.ask(data, avatar, radius, first, last, margin=margin, effort=effort)
-            swept.judge(
+    with TemporaryDirectory() as folder, radius_class_archives.any_classes():
+        case = archive_cases.build(
+            Path(folder), points, resolution=step, models=radius_class_archives.STORED, **tree
+        )
+        with judged_sweeps.opened(case, model=model) as data:
+            answers = judged_sweeps.ask(data, avatar, radius, first, last, margin=margin, effort=effort)
+            judged_sweeps.judge(
                 case, data, avatar, radius, first, last, answers, margin=margin, tolerance=tolerance, model=model,
                 samples=20,
             )  # fmt: skip
-            still = swept.ask(data, avatar, radius, first, first, margin=margin)
+            still = judged_sweeps.ask(data, avatar, radius, first, first, margin=margin)
             assert (
                 still.verdict.tolist()
                 == collide(data, make_avatar(avatar, radius), first, margin).verdict.tolist()
@@ -85,14 +89,14 @@ def test_no_sampled_pose_contradicts_the_answer(
 def test_a_motion_that_stands_still_touches_from_the_very_unit_on(
     tmp_path: Path, rng: np.random.Generator, model: str
 ) -> None:
-    points, avatar = scans.make_scan("noise", 5, 60), rng.uniform(-0.1, 0.1, (4, 3))
-    with classes.any_classes():
-        case = cases.build(tmp_path, points, models=classes.STORED)
-    stored, radii = classes.stored_radii(case.archive, model)
+    points, avatar = synthetic_scans.make_scan("noise", 5, 60), rng.uniform(-0.1, 0.1, (4, 3))
+    with radius_class_archives.any_classes():
+        case = archive_cases.build(tmp_path, points, models=radius_class_archives.STORED)
+    stored, radii = radius_class_archives.stored_radii(case.archive, model)
     found = 0
-    with swept.opened(case, model=model) as data:
+    with judged_sweeps.opened(case, model=model) as data:
         b = naive.scan_units(stored, data.arrays.step)
-        for pose in cases.near_poses(rng, points, avatar, 10, 0.1):
+        for pose in archive_cases.near_poses(rng, points, avatar, 10, 0.1):
             apart = naive.placed_units(avatar, pose, data.arrays.origin)[:, None] - b
             roots = [
                 [math.isqrt(int(square) - 1) + 1 for square in row] for row in (apart * apart).sum(axis=2)
@@ -102,13 +106,15 @@ def test_a_motion_that_stands_still_touches_from_the_very_unit_on(
                 continue
             found += 1
             for margin in (least - 1, least):
-                answers = swept.ask(data, avatar, 0.0, pose[None], pose[None], margin=margin / naive.UNITS)
+                answers = judged_sweeps.ask(
+                    data, avatar, 0.0, pose[None], pose[None], margin=margin / naive.UNITS
+                )
                 assert answers.verdict[0] == (margin == least) and answers.exact[0]
     assert found > 3
 
 
 @settings(max_examples=20, deadline=None, derandomize=True)
-@given(seed=st.integers(0, 2**32 - 1), model=st.sampled_from(classes.MODELS), tree=TREES)
+@given(seed=st.integers(0, 2**32 - 1), model=st.sampled_from(radius_class_archives.MODELS), tree=TREES)
 def test_a_point_going_straight_touches_when_the_quadratic_says(
     seed: int, model: str | None, tree: dict[str, Any]
 ) -> None:
@@ -119,11 +125,11 @@ def test_a_point_going_straight_touches_when_the_quadratic_says(
     first[:, :3, 3] = rng.normal(size=(30, 3))
     first[:, :3, 3] *= 1.2 / np.linalg.norm(first[:, :3, 3], axis=1)[:, None]
     last[:, :3, 3] = -first[:, :3, 3] + rng.normal(size=(30, 3)) * 0.3
-    with TemporaryDirectory() as folder, classes.any_classes():
-        case = cases.build(Path(folder), points, models=classes.STORED, **tree)
-        with swept.opened(case, model=model) as data:
-            answers = swept.ask(data, point, radius, first, last)
-            stored, units = classes.stored_radii(case.archive, model)
+    with TemporaryDirectory() as folder, radius_class_archives.any_classes():
+        case = archive_cases.build(Path(folder), points, models=radius_class_archives.STORED, **tree)
+        with judged_sweeps.opened(case, model=model) as data:
+            answers = judged_sweeps.ask(data, point, radius, first, last)
+            stored, units = radius_class_archives.stored_radii(case.archive, model)
             places = data.arrays.origin + stored * data.arrays.step
     begin, way = first[:, None, :3, 3] - places, (last - first)[:, None, :3, 3]
     a, b = (way * way).sum(axis=2), (begin * way).sum(axis=2)
@@ -152,27 +158,31 @@ def test_a_point_going_straight_touches_when_the_quadratic_says(
 @settings(max_examples=8, deadline=None, derandomize=True)
 @given(
     seed=st.integers(0, 2**32 - 1),
-    kind=st.sampled_from(swept.CLOUDS),
+    kind=st.sampled_from(judged_sweeps.CLOUDS),
     turn=st.sampled_from([0.0, 0.3, 2.0]),
-    model=st.sampled_from(classes.MODELS[:3]),
+    model=st.sampled_from(radius_class_archives.MODELS[:3]),
 )
 def test_no_tree_nor_order_changes_an_answer(seed: int, kind: str, turn: float, model: str) -> None:
     """To the last bit, and the witness with it, but for motions that begin in contact: of those any pair may be it."""
     rng = np.random.default_rng(seed)
-    points, avatar = scans.make_scan(kind, seed, 300), rng.uniform(-0.2, 0.2, (60, 3))
-    first, last = swept.motions(rng, points, avatar, 40, 0.4, 0.5, turn)
+    points, avatar = synthetic_scans.make_scan(kind, seed, 300), rng.uniform(-0.2, 0.2, (60, 3))
+    first, last = judged_sweeps.motions(rng, points, avatar, 40, 0.4, 0.5, turn)
     expected: list[str] | None = None
-    with TemporaryDirectory() as folder, classes.any_classes():
+    with TemporaryDirectory() as folder, radius_class_archives.any_classes():
         for options in (
             {"degree": 8, "leaf": 32},
             {"degree": 2, "leaf": 1},
             {"degree": 16, "leaf": 7, "cell_points": 10, "with_slab": False},
         ):
-            case = cases.build(
-                Path(folder), rng.permutation(points), resolution=1e-3, models=classes.STORED, **options
+            case = archive_cases.build(
+                Path(folder),
+                rng.permutation(points),
+                resolution=1e-3,
+                models=radius_class_archives.STORED,
+                **options,
             )
-            with swept.opened(case, model=model) as data:
-                answers = swept.ask(data, rng.permutation(avatar), 0.01, first, last)
+            with judged_sweeps.opened(case, model=model) as data:
+                answers = judged_sweeps.ask(data, rng.permutation(avatar), 0.01, first, last)
             answers.witness_avatar[answers.upper == 0] = answers.witness_cloud[answers.upper == 0] = 0
             if expected is None:
                 expected = columns(answers)
@@ -184,13 +194,13 @@ def test_classes_of_one_radius_cost_and_answer_as_one_radius_does(
     tmp_path: Path, rng: np.random.Generator, turn: float
 ) -> None:
     """To the last bit, and by the same visits: what classes prune by is what one radius is pruned by."""
-    points, avatar = scans.make_scan("corner", 3, 500), rng.uniform(-0.2, 0.2, (40, 3))
-    with classes.any_classes():
-        case = cases.build(tmp_path, points, models=classes.STORED)
-    first, last = swept.motions(rng, points, avatar, 100, 0.4, 0.5, turn)
-    with swept.opened(case) as data:
+    points, avatar = synthetic_scans.make_scan("corner", 3, 500), rng.uniform(-0.2, 0.2, (40, 3))
+    with radius_class_archives.any_classes():
+        case = archive_cases.build(tmp_path, points, models=radius_class_archives.STORED)
+    first, last = judged_sweeps.motions(rng, points, avatar, 100, 0.4, 0.5, turn)
+    with judged_sweeps.opened(case) as data:
         alike = data._replace(arrays=data.arrays._replace(drop=np.zeros(RADIUS_CLASSES, np.int64)))
-        one, many = (swept.ask(which, avatar, 0.01, first, last) for which in (data, alike))
+        one, many = (judged_sweeps.ask(which, avatar, 0.01, first, last) for which in (data, alike))
     assert columns(one, FOUND + COUNTED) == columns(many, FOUND + COUNTED)
     assert {int(Verdict.CLEAR), int(Verdict.CONTACT)} <= set(one.verdict.tolist())
 
@@ -204,17 +214,17 @@ def test_a_large_sphere_makes_no_work_where_spheres_are_small(
     tmp_path: Path, rng: np.random.Generator
 ) -> None:
     """One in the voxel is of 160 mm and all others of 5 mm: motions near the others cost as if it were not there."""
-    points, avatar = scans.make_scan("plane", 3, 2000) + 5.0, rng.uniform(-0.1, 0.1, (200, 3))
+    points, avatar = synthetic_scans.make_scan("plane", 3, 2000) + 5.0, rng.uniform(-0.1, 0.1, (200, 3))
     points = np.concatenate([points, points.min(axis=0, keepdims=True) - 1.5])
-    with classes.any_classes(one_large):
-        case = cases.build(tmp_path, points, voxel=64.0, models=classes.STORED)
-    radii = classes.stored_radii(case.archive, "local:5")[1]
+    with radius_class_archives.any_classes(one_large):
+        case = archive_cases.build(tmp_path, points, voxel=64.0, models=radius_class_archives.STORED)
+    radii = radius_class_archives.stored_radii(case.archive, "local:5")[1]
     assert np.unique(radii, return_counts=True)[1].tolist() == [2000, 1]
-    first, last = swept.motions(rng, points[:-1], avatar, 50, 0.15, 0.02, 0.1)
+    first, last = judged_sweeps.motions(rng, points[:-1], avatar, 50, 0.15, 0.02, 0.1)
     visits = {}
     for model in ("local:5", "fixed:0.005"):
-        with swept.opened(case, model=model) as data:
-            visits[model] = int(swept.ask(data, avatar, 0.0, first, last).node_visits.sum())
+        with judged_sweeps.opened(case, model=model) as data:
+            visits[model] = int(judged_sweeps.ask(data, avatar, 0.0, first, last).node_visits.sum())
     assert 1000 < visits["local:5"] < 1.2 * visits["fixed:0.005"]
 
 
@@ -223,10 +233,10 @@ def test_a_large_sphere_makes_no_work_where_spheres_are_small(
 def test_a_path_asks_of_each_part_what_a_scene_answers(
     tmp_path: Path, rng: np.random.Generator, model: str
 ) -> None:
-    points, avatar = scans.make_scan("corner", 7, 60), rng.uniform(-0.2, 0.2, (5, 3))
-    with classes.any_classes():
-        case = cases.build(tmp_path, points, models=classes.STORED)
-    poses = cases.near_poses(rng, points, avatar, 9, 0.1)
+    points, avatar = synthetic_scans.make_scan("corner", 7, 60), rng.uniform(-0.2, 0.2, (5, 3))
+    with radius_class_archives.any_classes():
+        case = archive_cases.build(tmp_path, points, models=radius_class_archives.STORED)
+    poses = archive_cases.near_poses(rng, points, avatar, 9, 0.1)
     with Scene.open(case.archive) as scene:
         scene.add_avatar("avatar", avatar, 0.01)
         alone = scene.sweep("avatar", poses[:-1], poses[1:], radius_model=model)
@@ -234,5 +244,5 @@ def test_a_path_asks_of_each_part_what_a_scene_answers(
         other = scene.sweep("avatar", poses[:-1], poses[1:])
     assert [columns(part) for part in parts] == [columns(alone)]
     assert columns(alone) != columns(other) and (alone.upper > 0).any()
-    with swept.opened(case, model=model) as data:
-        swept.judge(case, data, avatar, 0.01, poses[:-1], poses[1:], alone, model=model, samples=15)
+    with judged_sweeps.opened(case, model=model) as data:
+        judged_sweeps.judge(case, data, avatar, 0.01, poses[:-1], poses[1:], alone, model=model, samples=15)

@@ -5,24 +5,24 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import cases
+import archive_cases
 import naive
 import naive_rays
 import numpy as np
 import pytest
-import scans
-from cases_rays import KINDS, opened, same_points, same_rays, some_rays
-from clouds import FAR, STEPS, TREES, VOXEL_STEPS, cloud
+import synthetic_scans
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from point_clouds import FAR, STEPS, TREES, VOXEL_STEPS, cloud
+from ray_cases import KINDS, opened, same_points, same_rays, some_rays
 from solidcloud.server.kernels.rays.rays import first_meeting
 from solidcloud.server.queries.context.query_context import SceneData
 from solidcloud.server.queries.raycast import raycast
 from solidcloud.server.queries.within import within
 
 
-def stored(case: cases.Case, data: SceneData) -> NDArray[np.float64]:
+def stored(case: archive_cases.Case, data: SceneData) -> NDArray[np.float64]:
     """The case's points (n, 3) as the archive has them, world."""
     origin, step = data.arrays.origin, data.arrays.step
     return np.asarray(naive.lattice_of(case.points, origin, step) * step + origin)
@@ -56,7 +56,7 @@ def test_rays_and_points_are_answered_as_defined(
     points = cloud(rng, kind, count) * extent + far * rng.uniform(-1, 1, 3)
     radius = min(step * thick, 8.0)
     with TemporaryDirectory() as folder:
-        case = cases.build(
+        case = archive_cases.build(
             Path(folder), points, voxel=step * voxel_steps, resolution=step, radius=radius, **tree
         )
         with opened(case) as data:
@@ -86,7 +86,9 @@ def test_no_tree_voxel_order_or_cache_changes_an_answer(seed: int, kind: str) ->
             {"voxel": 0.5, "degree": 2, "leaf": 1},
             {"voxel": 0.2, "degree": 16, "leaf": 32, "cell_points": 10, "with_slab": False},
         ):
-            case = cases.build(Path(folder), rng.permutation(points), resolution=1e-3, radius=0.02, **options)
+            case = archive_cases.build(
+                Path(folder), rng.permutation(points), resolution=1e-3, radius=0.02, **options
+            )
             for budget in (64 << 20, None):  # None: no more than the largest voxel
                 with opened(case) as data:
                     largest = max(data.residency.bytes_of([row]) for row in range(len(data.arrays.where)))
@@ -110,7 +112,7 @@ def test_far_from_the_origin_is_as_at_the_origin(seed: int, shift: tuple[int, in
     answers = []
     with TemporaryDirectory() as folder:
         for by in (np.zeros(3), np.array(shift)):
-            with opened(cases.build(Path(folder), points + by, radius=0.02)) as data:
+            with opened(archive_cases.build(Path(folder), points + by, radius=0.02)) as data:
                 rays, loose = raycast(data, o + by, d, 4.0), within(data, o + by, 3.0)
                 columns = rays.distance, rays.normal, rays.outside, rays.node_visits, rays.point_tests
                 answers.append([c.tobytes() for c in (*columns, loose.distance, loose.node_visits)])
@@ -164,7 +166,7 @@ def test_of_spheres_hit_at_once_the_least_point_is_named(tmp_path: Path, leaf: i
     corners = np.array([[0, h, -h], [0, h, h], [0, -h, -h], [0, -h, h]])
     for points, least in ((corners, (0, -h, -h)), (corners[[0, 1, 3]], (0, -h, h))):
         for order in (points, points[::-1]):
-            case = cases.build(
+            case = archive_cases.build(
                 tmp_path, np.concatenate([order, [[1, 1, 1]]]), resolution=2.0**-10, radius=0.125, leaf=leaf
             )
             with opened(case) as data:
@@ -178,7 +180,7 @@ def test_of_spheres_hit_at_once_the_least_point_is_named(tmp_path: Path, leaf: i
 def test_reach_is_inclusive_to_the_unit(tmp_path: Path) -> None:
     """Lengths of 3, 4, 12 and 13: at the reach, one unit of 2^-26 m short of it, and one beyond."""
     unit = 2.0**-26
-    case = cases.build(tmp_path, np.array([[0.0, 0, 0], [1, 1, 1]]), resolution=2.0**-10, radius=0.25)
+    case = archive_cases.build(tmp_path, np.array([[0.0, 0, 0], [1, 1, 1]]), resolution=2.0**-10, radius=0.25)
     away = np.array([[3.0, 4, 12]]) / 64
     with opened(case) as data:
         for more, found in ((0, 1), (unit, 1), (-unit, 0)):
@@ -190,9 +192,9 @@ def test_reach_is_inclusive_to_the_unit(tmp_path: Path) -> None:
 
 
 @pytest.mark.interpreted
-@pytest.mark.parametrize("kind", scans.WITH_POINTS)
+@pytest.mark.parametrize("kind", synthetic_scans.WITH_POINTS)
 def test_a_few_rays_of_every_kind_of_scan(tmp_path: Path, rng: np.random.Generator, kind: str) -> None:
-    case = cases.build(tmp_path, scans.make_scan(kind, 11, 60), radius=0.05)
+    case = archive_cases.build(tmp_path, synthetic_scans.make_scan(kind, 11, 60), radius=0.05)
     with opened(case) as data:
         lattice = stored(case, data)
         space = data.arrays.origin, data.arrays.step

@@ -4,11 +4,11 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import cases
+import archive_cases
+import judged_sweeps
 import numpy as np
 import pytest
-import scans
-import swept
+import synthetic_scans
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from solidcloud.schemas.wire.answers import Verdict
@@ -20,8 +20,8 @@ from solidcloud.server.queries.context.query_budget import Effort
 @settings(max_examples=60, deadline=None, derandomize=True)
 @given(
     seed=st.integers(0, 2**32 - 1),
-    kind=st.sampled_from(swept.CLOUDS),
-    step=st.sampled_from([1e-5, 1e-4, cases.BINARY_STEP, 1e-2]),
+    kind=st.sampled_from(judged_sweeps.CLOUDS),
+    step=st.sampled_from([1e-5, 1e-4, archive_cases.BINARY_STEP, 1e-2]),
     far=st.sampled_from([0.0, 5e5, 6.4e6]),
     scale=st.sampled_from([1.0, 1.0, 0.3, 7.0]),
     way=st.sampled_from([0.0, 1e-3, 0.1, 2.0]),
@@ -45,16 +45,20 @@ def test_no_sampled_pose_contradicts_the_answer(
     tree: dict[str, Any],
 ) -> None:
     rng = np.random.default_rng(seed)
-    points = scans.make_scan(kind, seed, 120) + far
+    points = synthetic_scans.make_scan(kind, seed, 120) + far
     avatar, radius = rng.uniform(-0.2, 0.2, (9, 3)) / scale, float(rng.choice([0, 1e-3, 0.03])) / scale
     near = float(rng.choice([0.05, 0.3]))
-    first, last = swept.motions(rng, points, avatar, 8, near, way, turn, scale)
+    first, last = judged_sweeps.motions(rng, points, avatar, 8, near, way, turn, scale)
     with TemporaryDirectory() as folder:
-        case = cases.build(Path(folder), points, resolution=step, radius=float(rng.choice([0, 0.01])), **tree)
-        with swept.opened(case) as data:
-            answers = swept.ask(data, avatar, radius, first, last, margin=margin, tolerance=tolerance)
-            swept.judge(case, data, avatar, radius, first, last, answers, margin=margin, tolerance=tolerance)
-            back = swept.ask(data, avatar, radius, first, first, margin=margin)
+        case = archive_cases.build(
+            Path(folder), points, resolution=step, radius=float(rng.choice([0, 0.01])), **tree
+        )
+        with judged_sweeps.opened(case) as data:
+            answers = judged_sweeps.ask(data, avatar, radius, first, last, margin=margin, tolerance=tolerance)
+            judged_sweeps.judge(
+                case, data, avatar, radius, first, last, answers, margin=margin, tolerance=tolerance
+            )
+            back = judged_sweeps.ask(data, avatar, radius, first, first, margin=margin)
             model = make_avatar(avatar, radius)
             assert back.verdict.tolist() == collide(data, model, first, margin).verdict.tolist()
     assert (answers.verdict != Verdict.UNKNOWN).all() or kind == "duplicates" or radius + margin < 2e-3
@@ -62,13 +66,15 @@ def test_no_sampled_pose_contradicts_the_answer(
 
 @settings(max_examples=10, deadline=None, derandomize=True)
 @given(
-    seed=st.integers(0, 2**32 - 1), kind=st.sampled_from(swept.CLOUDS), turn=st.sampled_from([0.0, 0.3, 2.0])
+    seed=st.integers(0, 2**32 - 1),
+    kind=st.sampled_from(judged_sweeps.CLOUDS),
+    turn=st.sampled_from([0.0, 0.3, 2.0]),
 )
 def test_no_tree_voxel_or_order_changes_an_answer(seed: int, kind: str, turn: float) -> None:
     """To the last bit, and the witness with it, but for motions that begin in contact: of those any pair may be it."""
     rng = np.random.default_rng(seed)
-    points, avatar = scans.make_scan(kind, seed, 300), rng.uniform(-0.2, 0.2, (60, 3))
-    first, last = swept.motions(rng, points, avatar, 40, 0.4, 0.5, turn)
+    points, avatar = synthetic_scans.make_scan(kind, seed, 300), rng.uniform(-0.2, 0.2, (60, 3))
+    first, last = judged_sweeps.motions(rng, points, avatar, 40, 0.4, 0.5, turn)
     expected: list[Any] | None = None
     with TemporaryDirectory() as folder:
         for options in (
@@ -76,9 +82,9 @@ def test_no_tree_voxel_or_order_changes_an_answer(seed: int, kind: str, turn: fl
             {"voxel": 0.25, "degree": 2, "leaf": 1},
             {"voxel": 0.9, "degree": 16, "leaf": 32, "cell_points": 10, "with_slab": False},
         ):
-            case = cases.build(Path(folder), rng.permutation(points), resolution=1e-3, **options)
-            with swept.opened(case) as data:
-                answers = swept.ask(data, rng.permutation(avatar), 0.01, first, last)
+            case = archive_cases.build(Path(folder), rng.permutation(points), resolution=1e-3, **options)
+            with judged_sweeps.opened(case) as data:
+                answers = judged_sweeps.ask(data, rng.permutation(avatar), 0.01, first, last)
             moving = answers.upper > 0
             found = [answers.verdict, answers.lower, answers.upper, answers.exact, answers.outside]
             found += [answers.witness_avatar[moving], answers.witness_cloud[moving]]
@@ -94,9 +100,9 @@ def test_far_from_the_origin_is_as_at_the_origin(seed: int, turn: float) -> None
     """The way between exactly shifted poses rounds differently, by 10^-9 m at 5 * 10^6 m: no more may differ."""
     rng = np.random.default_rng(seed)
     shift = np.array([5e5, 5.6e6, 100.0])
-    points = np.rint(scans.make_scan("corner", seed, 300) * 2.0**20) * 2.0**-20
+    points = np.rint(synthetic_scans.make_scan("corner", seed, 300) * 2.0**20) * 2.0**-20
     avatar = rng.uniform(-0.2, 0.2, (30, 3))
-    first, last = swept.motions(rng, points, avatar, 40, 0.3, 0.3, turn)
+    first, last = judged_sweeps.motions(rng, points, avatar, 40, 0.3, 0.3, turn)
     for poses in (first, last):
         poses[:, :3, 3] = np.rint(poses[:, :3, 3] * 2.0**20) * 2.0**-20
     moved = first.copy(), last.copy()
@@ -105,9 +111,9 @@ def test_far_from_the_origin_is_as_at_the_origin(seed: int, turn: float) -> None
     with TemporaryDirectory() as folder:
         found = []
         for place, (a, b) in ((points, (first, last)), (points + shift, moved)):
-            case = cases.build(Path(folder), place, resolution=cases.BINARY_STEP)
-            with swept.opened(case) as data:
-                found.append(swept.ask(data, avatar, 0.01, a, b))
+            case = archive_cases.build(Path(folder), place, resolution=archive_cases.BINARY_STEP)
+            with judged_sweeps.opened(case) as data:
+                found.append(judged_sweeps.ask(data, avatar, 0.01, a, b))
     one, other = found
     assert one.verdict.tolist() == other.verdict.tolist()
     touches = one.verdict == Verdict.CONTACT
@@ -121,15 +127,15 @@ def test_far_from_the_origin_is_as_at_the_origin(seed: int, turn: float) -> None
 def test_a_budget_never_makes_a_false_claim(seed: int, visits: int) -> None:
     """Case 30: with fewer visits the bounds are wider, and still hold; what is clear stays clear."""
     rng = np.random.default_rng(seed)
-    points, avatar = scans.make_scan("corner", seed, 300), rng.uniform(-0.2, 0.2, (30, 3))
-    first, last = swept.motions(rng, points, avatar, 20, 0.3, 0.5, 0.5)
+    points, avatar = synthetic_scans.make_scan("corner", seed, 300), rng.uniform(-0.2, 0.2, (30, 3))
+    first, last = judged_sweeps.motions(rng, points, avatar, 20, 0.3, 0.5, 0.5)
     with TemporaryDirectory() as folder:
-        case = cases.build(Path(folder), points)
-        with swept.opened(case) as data:
-            full = swept.ask(data, avatar, 0.01, first, last)
-            part = swept.ask(data, avatar, 0.01, first, last, effort=Effort(visits=visits))
-            late = swept.ask(data, avatar, 0.01, first, last, effort=Effort(deadline=0.0))
-            swept.judge(case, data, avatar, 0.01, first, last, part, samples=20)
+        case = archive_cases.build(Path(folder), points)
+        with judged_sweeps.opened(case) as data:
+            full = judged_sweeps.ask(data, avatar, 0.01, first, last)
+            part = judged_sweeps.ask(data, avatar, 0.01, first, last, effort=Effort(visits=visits))
+            late = judged_sweeps.ask(data, avatar, 0.01, first, last, effort=Effort(deadline=0.0))
+            judged_sweeps.judge(case, data, avatar, 0.01, first, last, part, samples=20)
     assert (part.node_visits <= visits + 64).all()
     clear = part.verdict == Verdict.CLEAR
     assert (full.verdict[clear] == Verdict.CLEAR).all()
@@ -142,13 +148,13 @@ def test_a_budget_never_makes_a_false_claim(seed: int, visits: int) -> None:
 
 @pytest.mark.interpreted
 def test_a_few_motions_of_every_sort(tmp_path: Path, rng: np.random.Generator) -> None:
-    case = cases.build(tmp_path, scans.make_scan("corner", 11, 60), radius=0.05)
+    case = archive_cases.build(tmp_path, synthetic_scans.make_scan("corner", 11, 60), radius=0.05)
     avatar = rng.uniform(-0.2, 0.2, (5, 3))
     verdicts = []
-    with swept.opened(case) as data:
+    with judged_sweeps.opened(case) as data:
         for way, turn, scale in ((0.3, 0.0, 1.0), (0.0, 1.0, 1.0), (0.3, 0.5, 0.4)):
-            first, last = swept.motions(rng, case.points, avatar, 5, 0.5, way, turn, scale)
-            answers = swept.ask(data, avatar, 0.05, first, last)
-            swept.judge(case, data, avatar, 0.05, first, last, answers, samples=20)
+            first, last = judged_sweeps.motions(rng, case.points, avatar, 5, 0.5, way, turn, scale)
+            answers = judged_sweeps.ask(data, avatar, 0.05, first, last)
+            judged_sweeps.judge(case, data, avatar, 0.05, first, last, answers, samples=20)
             verdicts += answers.verdict.tolist()
     assert {int(Verdict.CLEAR), int(Verdict.CONTACT)} <= set(verdicts)

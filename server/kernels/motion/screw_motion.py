@@ -141,7 +141,7 @@ def make_motion(first, last, box, origin):
     beginning, apart from F, therefore hold for all of it.
     slip: entries of E(t A) and p(t) - p0 are off by some 30 half units in the last place of s and
     |p1 - p0|; placing and shifting add 4 of the largest term (measured by
-    tests/unit/server/test_motion.py). The stated bound is twice that.
+    tests/unit/server/kernels/motion/test_screw_motion.py). The stated bound is twice that.
     """
     w, x, y, z = _quaternion(first, last)
     sine = math.sqrt(x * x + y * y + z * z)

@@ -5,7 +5,7 @@ import pkgutil
 import threading
 from concurrent.futures import ThreadPoolExecutor
 
-import cases
+import archive_cases
 import numpy as np
 import pytest
 import zenoh
@@ -103,7 +103,7 @@ def compiled():
 
 
 def test_who_asks_after_warming_waits_for_no_compiler(tmp_path):
-    with Scene.open(cases.build(tmp_path, POINTS).archive) as scene:
+    with Scene.open(archive_cases.build(tmp_path, POINTS).archive) as scene:
         scene.warm()
         before = compiled()
         add_avatars(scene)

@@ -11,12 +11,12 @@ import solidcloud.builder.config as config
 import solidcloud.builder.passes.survey as survey
 import solidcloud.builder.pipeline as pipeline
 import solidcloud.builder.spool.spool_pass as partition
-from scans import make_scan, write_las, write_ply, write_xyz
 from small_builds import build, content, six_files
 from solidcloud.builder.passes.verify import verify_archive
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.archive.shard import ZSTD_FILTER
 from solidcloud.schemas.errors import BadRequestError, ScanError
+from synthetic_scans import make_scan, write_las, write_ply, write_xyz
 
 
 def records(archive: Path) -> list[tuple[int, bytes, bytes]]:

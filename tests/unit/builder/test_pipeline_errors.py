@@ -13,13 +13,13 @@ import pytest
 import solidcloud.builder.config as config
 import solidcloud.builder.passes.resumable_passes as passes
 import solidcloud.builder.pipeline as pipeline
-from scans import make_scan, write_las, write_ply, write_xyz
 from small_builds import build, content, six_files
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.passes.verify import verify_archive
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.errors import BadRequestError, CorruptError, ScanError, SolidcloudError
 from solidcloud.server.scene import Scene
+from synthetic_scans import make_scan, write_las, write_ply, write_xyz
 
 
 @pytest.fixture
@@ -353,7 +353,7 @@ def test_a_header_that_cannot_be_right_leaves_all_unknown(tmp_path: Path) -> Non
     write_xyz(good, make_scan("plane", 5, 200))
     raw = np.random.default_rng(1).integers(0, 1000, (500, 3))
     # Bounds of zeros, as writers leave them that do not know; and a damaged scale, by which no point is finite
-    # though the bounds look right. (Bounds that points read refute: test_partition.py.)
+    # though the bounds look right. (Bounds that points read refute: test_spool_pass.py.)
     for name, patch in (
         ("zero", (179, np.zeros(6))),
         ("scale", (131, np.full(3, 1e308))),

@@ -5,7 +5,7 @@ import time
 from pathlib import Path
 from types import SimpleNamespace
 
-import cases
+import archive_cases
 import numpy as np
 import pytest
 from chaos_cases import board as b
@@ -35,7 +35,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory):
 
     x, y = np.meshgrid(np.arange(-2, 2, 0.1), np.arange(-2, 2, 0.1))
     points = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
-    case = cases.build(tmp_path_factory.mktemp("floor"), points, voxel=1.0, resolution=1e-3)
+    case = archive_cases.build(tmp_path_factory.mktemp("floor"), points, voxel=1.0, resolution=1e-3)
     with Scene.open(case.archive) as scene:
         yield scene, points
 
@@ -113,7 +113,7 @@ def test_a_frame_that_is_not_simulated_whole_says_nothing() -> None:
 def test_a_frame_said_to_be_clear_with_something_unknown_is_judged_by_where_it_ends(scene, tmp_path) -> None:
     _, points = scene
     for name in ("first", "second"):
-        cases.build(tmp_path, points, voxel=1.0, resolution=1e-3).archive.rename(tmp_path / name)
+        archive_cases.build(tmp_path, points, voxel=1.0, resolution=1e-3).archive.rename(tmp_path / name)
     above, on = np.eye(4)[None], np.eye(4)[None]
     above[0, 2, 3] = 1.0
     claims = [{"avatar": "ball", "pose": pose.tolist(), "served": 3} for pose in (above, on, above)]

@@ -139,7 +139,7 @@ folder, file = Path({str(tmp_path)!r}), "schemas/kernels/morton.py"
 trial.copy_sources(folder)
 source = (folder / "solidcloud" / file).read_text()
 assert {change[0]!r} in source
-own = trial.begin(folder, file, source.replace(*{change!r}, 1), ["tests/unit/schemas/test_morton.py"], 4)
+own = trial.begin(folder, file, source.replace(*{change!r}, 1), ["tests/unit/schemas/kernels/test_morton.py"], 4)
 while not (outcome := own.outcome(1.0)):
     pass
 print(outcome.kind)

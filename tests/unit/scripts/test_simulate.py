@@ -7,10 +7,10 @@ import sys
 from pathlib import Path
 from types import ModuleType
 
-import cases
+import archive_cases
 import numpy as np
 import pytest
-import scans
+import synthetic_scans
 from load.simulate import (
     NOBODY,
     SWEEP_SECONDS,
@@ -315,7 +315,9 @@ def test_ahead_is_read_by_name(script: ModuleType) -> None:
 def test_a_recorded_trace_is_replayed_against_an_archive(
     script: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    case = cases.build(tmp_path, scans.make_scan("noise", 5, 2000) * 4, voxel=0.5, resolution=1e-3)
+    case = archive_cases.build(
+        tmp_path, synthetic_scans.make_scan("noise", 5, 2000) * 4, voxel=0.5, resolution=1e-3
+    )
     way = np.tile(np.eye(4), (90, 1, 1))
     way[:, :3, 3] = np.column_stack([np.linspace(0, 8, 90), np.full((90, 2), 3.0)])
     save(tmp_path / "stroll.npz", Trace(np.zeros(90, np.int64), np.arange(90) / 30, way))

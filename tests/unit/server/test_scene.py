@@ -4,10 +4,10 @@ import os
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-import cases
+import archive_cases
 import numpy as np
 import pytest
-import scans
+import synthetic_scans
 from solidcloud.schemas.errors import BadRequestError, FormatError, UnknownAvatarError
 from solidcloud.server.scene import Scene
 
@@ -18,12 +18,14 @@ HERE = np.eye(4)[None]
 @pytest.fixture
 def scene(tmp_path: Path) -> Scene:
     """A scene of a few voxels."""
-    return Scene.open(cases.build(tmp_path, scans.make_scan("corner", 4, 300)).archive, "hall")
+    return Scene.open(
+        archive_cases.build(tmp_path, synthetic_scans.make_scan("corner", 4, 300)).archive, "hall"
+    )
 
 
 def test_info_says_what_was_built(scene: Scene) -> None:
     info = scene.info()
-    points = scans.make_scan("corner", 4, 300)
+    points = synthetic_scans.make_scan("corner", 4, 300)
     assert (info.scene, info.points, info.radius, info.lattice_step) == ("hall", 300, 0.01, 1e-4)
     assert info.origin == points.min(axis=0).tolist()
     assert np.abs(np.array(info.bounds) - [points.min(axis=0), points.max(axis=0)]).max() <= 0.5001e-4
@@ -32,7 +34,7 @@ def test_info_says_what_was_built(scene: Scene) -> None:
 
 
 def test_the_folder_names_the_scene(tmp_path: Path) -> None:
-    with Scene.open(cases.build(tmp_path, np.zeros((1, 3))).archive) as scene:
+    with Scene.open(archive_cases.build(tmp_path, np.zeros((1, 3))).archive) as scene:
         assert scene.name == "archive0"
 
 
@@ -87,7 +89,7 @@ def test_one_of_many_that_add_the_same_name_wins(scene: Scene) -> None:
 
 
 def test_a_budget_too_small_for_a_voxel_is_refused_and_closes_the_files(tmp_path: Path) -> None:
-    archive = cases.build(tmp_path, scans.make_scan("corner", 4, 300)).archive
+    archive = archive_cases.build(tmp_path, synthetic_scans.make_scan("corner", 4, 300)).archive
     before = len(os.listdir("/proc/self/fd")) if Path("/proc/self/fd").is_dir() else 0
     with pytest.raises(BadRequestError, match="larger --cache"):
         Scene.open(archive, budget_bytes=100)
@@ -102,7 +104,7 @@ def test_what_is_no_archive_is_refused(tmp_path: Path) -> None:
 
 def test_counters_add_up(scene: Scene, rng: np.random.Generator) -> None:
     scene.add_avatar("al", BODY, 0.01)
-    poses = cases.near_poses(rng, scans.make_scan("corner", 4, 300), BODY, 20, 0.1)
+    poses = archive_cases.near_poses(rng, synthetic_scans.make_scan("corner", 4, 300), BODY, 20, 0.1)
     first, second = scene.collide("al", poses), scene.collide("al", poses)
     # Of some voxels it is the cell alone that is in reach: they are read once.
     assert (first.hits, second.misses) == (0, 0) and first.misses >= second.hits > 0
@@ -123,8 +125,10 @@ def test_warming_loads_a_voxel_and_leaves_no_avatar(scene: Scene) -> None:
 
 def test_a_scan_so_thin_that_its_radius_is_large_answers_every_way(tmp_path: Path) -> None:
     # Points 20 m apart: a mean radius of 10 m, more than a request may ask for, and yet the figure of the scene.
-    case = cases.build(tmp_path, np.array([[0.0, 0, 0], [20, 0, 0], [40, 0, 0]]), voxel=32.0, radius=None)
-    poses = np.array([cases.pose_of(np.eye(3), np.array([0.0, 0, z])) for z in (10.0, 10.5)])
+    case = archive_cases.build(
+        tmp_path, np.array([[0.0, 0, 0], [20, 0, 0], [40, 0, 0]]), voxel=32.0, radius=None
+    )
+    poses = np.array([archive_cases.pose_of(np.eye(3), np.array([0.0, 0, z])) for z in (10.0, 10.5)])
     with Scene.open(case.archive) as scene:
         assert scene.info().radius == 10.0
         scene.add_avatar("al", np.zeros((1, 3)), 0.25)

@@ -1,0 +1,133 @@
+"""Requests of every question, mixed, as bytes, and the replies' bytes with costs and times taken out.
+
+python mixed_requests.py ARCHIVE COUNT prints a checksum of each reply: run in another process, they must be the same.
+"""
+
+import hashlib
+import json
+import sys
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import archive_cases
+import msgspec
+import numpy as np
+import synthetic_scans
+from numpy.typing import NDArray
+from solidcloud.schemas.wire.answers import (
+    CollideAnswers,
+    ContactsAnswers,
+    DistanceAnswers,
+    ObjectsAnswers,
+    RaycastAnswers,
+    SweepAnswers,
+    WithinAnswers,
+)
+from solidcloud.schemas.wire.messages import (
+    MSGPACK,
+    AddAvatarRequest,
+    CollideRequest,
+    ContactsRequest,
+    DistanceRequest,
+    ObjectsRequest,
+    RaycastRequest,
+    SweepRequest,
+    WithinRequest,
+    decode_answer,
+    encode,
+)
+from solidcloud.schemas.wire.requests import ObjectItem, Question
+from solidcloud.server.scene import Scene
+from solidcloud.server.service.server_config import ServerConfig
+from solidcloud.server.service.service import Service
+
+SCAN = ("corner", 21, 500)
+MODELS = ("mean:1.5", "local", "border", "local+border:0.8", "fixed:0.004")
+ANSWERS = {
+    "collide": CollideAnswers,
+    "distance": DistanceAnswers,
+    "contacts": ContactsAnswers,
+    "sweep": SweepAnswers,
+    "raycast": RaycastAnswers,
+    "within": WithinAnswers,
+    "objects": ObjectsAnswers,
+}
+# What depends on the clock and on what is resident: times and counters of the cache.
+COSTS = {
+    "engine_seconds": 0.0,
+    "wait_seconds": 0.0,
+    "hits": 0,
+    "misses": 0,
+    "resident": 0,
+    "resident_bytes": 0,
+}
+
+
+def question(
+    rng: np.random.Generator, points: NDArray[np.float64], body: NDArray[np.float64]
+) -> tuple[str, Question]:
+    """Any question, exact or within a budget of visits, of the spheres of any radius model."""
+    poses = archive_cases.near_poses(
+        rng, points, body, int(rng.integers(1, 4)), 0.15, float(rng.choice([1.0, 0.5]))
+    )
+    effort: dict[str, Any] = {"tolerance": 1e-3, "budget_visits": 100} if rng.random() < 0.2 else {}
+    if rng.random() < 0.5:
+        effort["radius_model"] = str(rng.choice(MODELS))
+    op = str(rng.choice(list(ANSWERS)))
+    starts = rng.uniform(0, 2, (2, 3))
+    asked: Question
+    if op == "collide":
+        asked = CollideRequest("body", poses, 0.002, **effort)
+    elif op == "distance":
+        asked = DistanceRequest("body", poses, 0.2, **effort)
+    elif op == "contacts":
+        asked = ContactsRequest("body", poses, 10, 0.01, **effort)
+    elif op == "sweep":
+        asked = SweepRequest(avatar="body", pose_from=poses, pose_to=poses[::-1].copy(), **effort)
+    elif op == "raycast":
+        asked = RaycastRequest(starts, points[rng.integers(len(points), size=2)] - starts, 2.0, **effort)
+    elif op == "within":
+        asked = WithinRequest(starts, 0.3, **effort)
+    else:
+        asked = ObjectsRequest([ObjectItem("body")] * len(poses), poses, 0.01, **effort)
+    return op, asked
+
+
+def requests(count: int) -> list[tuple[str, bytes]]:
+    """Operations and payloads."""
+    rng = np.random.default_rng(25)
+    body, points = rng.uniform(-0.15, 0.15, (12, 3)), synthetic_scans.make_scan(*SCAN)
+    found = [("add_avatar", encode(AddAvatarRequest("body", body, 0.01), MSGPACK))]
+    for _ in range(count):
+        op, asked = question(rng, points, body)
+        found.append((op, encode(asked, MSGPACK)))
+    return found
+
+
+def checksums(
+    archive: Path, asked: Sequence[tuple[str, bytes]], threads: int, budget_bytes: int
+) -> list[str]:
+    """A checksum of each reply's bytes, costs aside; the first request is answered before the others."""
+    with Scene.open(archive, "scene", budget_bytes=budget_bytes) as scene:
+        service = Service([scene], ServerConfig())
+
+        def reply(request: tuple[str, bytes]) -> str:
+            op, payload = request
+            answer = service.answer(f"solidcloud/1/scene/scene/c/{op}", payload, MSGPACK)
+            assert answer.ok, answer.payload
+            if op not in ANSWERS:
+                return ""
+            plain = msgspec.structs.replace(decode_answer(ANSWERS[op], answer.payload, MSGPACK), **COSTS)
+            return hashlib.sha256(encode(plain, MSGPACK)).hexdigest()[:16]
+
+        reply(asked[0])
+        with ThreadPoolExecutor(threads) as pool:
+            found = list(pool.map(reply, asked[1:]))
+        scene.residency.check()
+    return found
+
+
+if __name__ == "__main__":
+    print(json.dumps(checksums(Path(sys.argv[1]), requests(int(sys.argv[2])), 1, 1 << 26)))

@@ -1,0 +1,70 @@
+"""What the tests of several archives share: the archives of two halves of a scan and of the whole, scenes of some."""
+
+import os
+from pathlib import Path
+from typing import Any
+
+import archive_cases
+import numpy as np
+import synthetic_scans
+from numpy.typing import NDArray
+from point_clouds import signed_permutations
+from solidcloud.server.scene import Scene
+from solidcloud.server.scenes.placed_archives import SeveralScenes
+
+STEP = archive_cases.BINARY_STEP
+
+
+BODY = np.array([[0.0, 0, 0], [0.125, 0, 0], [0.0, 0.25, 0], [0.0625, 0.0625, 0.125]])
+RADIUS = 0.02
+OPTIONS: dict[str, Any] = {
+    "resolution": STEP, "leaf": 8, "degree": 3, "cell_points": 24, "keep": frozenset({"scan"}),
+}  # fmt: skip
+COUNT = 12 if os.environ.get("NUMBA_DISABLE_JIT") == "1" else 60
+
+
+def halves() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Two scans on one lattice with points of each beside those of the other, and no point in both."""
+    points = np.rint(
+        np.vstack([synthetic_scans.make_scan("corner", 8, 300), synthetic_scans.make_scan("noise", 9, 300)])
+        / STEP
+    )
+    points = np.unique(np.maximum(points, 1.0), axis=0) * STEP
+    points = points[np.random.default_rng(3).permutation(len(points))]
+    # The least coordinates of both are 0, so that both lattices begin there.
+    first = np.vstack([[[0.0, 0, 0]], points[::2]])
+    second = np.vstack([[[0.0, 1, 1], [1, 0.0, 1], [1, 1, 0.0]], points[1::2]])
+    return first, second
+
+
+class Built:
+    """Archives of the halves, and of both; each its own scan."""
+
+    def __init__(self, folder: Path) -> None:
+        self.points = halves()
+        self.first, self.second = (
+            archive_cases.build(folder, part, **OPTIONS).archive for part in self.points
+        )
+        self.whole = archive_cases.build(folder, np.vstack(self.points), **OPTIONS).archive
+
+
+def several(*archives: tuple[Path, Any], **options: Any) -> SeveralScenes:
+    """A scene of archives at poses, with an avatar."""
+    scene = SeveralScenes([(Scene.open(path, "part", **options), pose) for path, pose in archives], "hall")
+    scene.add_avatar("al", BODY, RADIUS)
+    return scene
+
+
+def near(rng: np.random.Generator, points: NDArray[np.float64], count: int = COUNT) -> NDArray[np.float64]:
+    """Poses of any turn, translations on a lattice, some of which touch."""
+    poses = archive_cases.near_poses(rng, points, BODY, count, 0.09)
+    poses[:, :3, 3] = np.rint(poses[:, :3, 3] / STEP) * STEP
+    return poses
+
+
+def exact_pose(rng: np.random.Generator) -> NDArray[np.float64]:
+    """A pose that float64 inverts exactly: a turn by right angles, a shift by lattice steps."""
+    turns = signed_permutations()
+    return archive_cases.pose_of(
+        turns[rng.integers(len(turns))], np.rint(rng.uniform(-9, 9, 3) / STEP) * STEP
+    )

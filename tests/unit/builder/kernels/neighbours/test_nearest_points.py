@@ -1,0 +1,175 @@
+"""The closest point by descent: trees made by hand, every tie and border of a bound, and how little is looked at."""
+
+import os
+
+import numpy as np
+import pytest
+from opened_records import open_points, open_scan, points_of
+from solidcloud.builder.kernels.neighbours.nearest_points import (
+    FAR,
+    SearchTree,
+    closest_in_record,
+    closest_other,
+)
+from solidcloud.builder.voxel.record_points import leaves_of, spheres_of
+from solidcloud.builder.voxel.voxel_octree import VoxelPoints
+from solidcloud.schemas.archive.codec import OpenRecord
+
+pytestmark = pytest.mark.interpreted
+interpreted_only = pytest.mark.skipif(
+    os.environ.get("NUMBA_DISABLE_JIT") != "1", reason="compiled code reads arrays unseen"
+)
+
+
+class Counted(np.ndarray):
+    """An array that counts how often an element of it is read."""
+
+    reads = 0
+
+    def __getitem__(self, key: object) -> object:
+        Counted.reads += 1
+        return np.asarray(super().__getitem__(key))[()]  # type: ignore[index]
+
+
+def tree_of(points: np.ndarray, leaf: int = 3, degree: int = 3) -> SearchTree:
+    """A tree over points in the order given, bounds rounded up, level by level from the root."""
+    runs = [(a, min(a + leaf, len(points))) for a in range(0, len(points), leaf)]
+    levels = [[(a, b, a, b - a, True) for a, b in runs]]
+    while len(levels[0]) > 1:
+        below = levels[0]
+        groups = [(i, min(i + degree, len(below))) for i in range(0, len(below), degree)]
+        levels.insert(0, [(below[i][0], below[j - 1][1], i, j - i, False) for i, j in groups])
+    rows, begins = [], np.cumsum([0, *map(len, levels)]).tolist()
+    for level, behind in zip(levels, begins[1:], strict=False):
+        rows += [(a, b, first if last else behind + first, n, last) for a, b, first, n, last in level]
+    center = np.array([(points[a:b].min(axis=0) + points[a:b].max(axis=0)) // 2 for a, b, *_ in rows])
+    radius = [
+        int(np.ceil(np.sqrt(((points[a:b] - c) ** 2).sum(axis=1).max())))
+        for (a, b, *_), c in zip(rows, center, strict=True)
+    ]
+    return SearchTree(
+        center, np.array(radius), np.array([r[2] for r in rows], np.int32),
+        np.array([r[3] for r in rows], np.uint8), np.array([r[4] for r in rows]), points,
+    )  # fmt: skip
+
+
+def brute(points: np.ndarray, queries: np.ndarray) -> np.ndarray:
+    """Squared distances to the closest distinct points."""
+    d2 = ((queries[:, None] - points) ** 2).sum(axis=2)
+    return np.where(d2 > 0, d2, FAR).min(axis=1)
+
+
+@pytest.mark.parametrize("side", [4, 30, 1000, 1 << 20])
+@pytest.mark.parametrize("count", [1, 2, 9, 60])
+def test_the_closest_is_that_of_brute_force(side: int, count: int) -> None:
+    rng = np.random.default_rng([side, count])
+    points = rng.integers(0, side, (count, 3))
+    points = points[np.lexsort(points.T)]
+    queries = np.concatenate([points, rng.integers(-side, 2 * side, (40, 3))])
+    best = np.full(len(queries), FAR)
+    closest_other(tree_of(points), queries, best)
+    expected = brute(points, queries)
+    assert best.tolist() == expected.tolist()
+    known = np.clip(expected - rng.integers(-1, 2, len(queries)), 0, FAR)
+    lowered = known.copy()
+    closest_other(tree_of(points), queries, lowered)
+    assert lowered.tolist() == np.minimum(known, expected).tolist()
+
+
+def test_far_apart_nothing_overflows() -> None:
+    """Distances whose squares take 62 bits, where a bound's square would not fit."""
+    points = np.array([[0, 0, 0], [1 << 30, 0, 0], [1 << 30, 1 << 30, 1 << 30]])
+    best = np.full(3, FAR)
+    closest_other(tree_of(points, leaf=1), points, best)
+    assert best.tolist() == [1 << 60, 1 << 60, 2 << 60]
+
+
+@interpreted_only
+@pytest.mark.parametrize(("kind", "centers", "points"), [("line", 11664, 3648), ("volume", 57468, 29940)])
+def test_as_little_is_looked_at_as_ever(kind: str, centers: int, points: int) -> None:
+    """What a bound is for: reads of coordinates, of 200 points by themselves; brute force takes 120,000 of points."""
+    rng = np.random.default_rng(5)
+    cloud = rng.integers(0, 1000, (200, 3)) if kind == "volume" else np.arange(200)[:, None] * [90, 0, 0]
+    if kind == "volume":
+        cloud = cloud[np.lexsort([*cloud.T, *(cloud // 250).T])]
+    tree, best, found = tree_of(cloud, leaf=4), np.full(len(cloud), FAR), []
+    for name in ("center", "points"):
+        Counted.reads = 0
+        best[:] = FAR
+        closest_other(tree._replace(**{name: getattr(tree, name).view(Counted)}), cloud, best)
+        found.append(Counted.reads)
+    assert best.tolist() == brute(cloud, cloud).tolist()
+    assert found == [centers, points]
+
+
+def asked(
+    record: OpenRecord, queries: np.ndarray, best: np.ndarray, homes: np.ndarray | None = None
+) -> np.ndarray:
+    """What `closest_in_record` makes of best: queries one by one, or with the leaf node of each, a node's together."""
+    starts = np.arange(len(queries)) if homes is None else np.flatnonzero(np.diff(homes, prepend=-1))
+    home = np.full(len(starts), -1, np.int32) if homes is None else homes[starts].astype(np.int32)
+    lowered = best.copy()
+    groups = np.append(starts, len(queries)).astype(np.int64)
+    closest_in_record(leaves_of(record), spheres_of(record), queries, groups, home, lowered)
+    return lowered
+
+
+@pytest.mark.parametrize("kind", ["plane", "noise", "duplicates", "pillar", "one point"])
+@pytest.mark.parametrize("steps", [50, 4000, 200_000, 1 << 21])
+@pytest.mark.parametrize("cells", ["octree", "balanced"])
+def test_the_closest_in_a_record_is_that_of_brute_force(kind: str, steps: int, cells: str) -> None:
+    record = open_scan(kind, 2, 120, steps, cells=cells)
+    points, nodes = points_of(record)
+    rng = np.random.default_rng(3)
+    far = np.full(len(points), FAR)
+    expected = brute(points, points)
+    assert asked(record, points, far, nodes).tolist() == expected.tolist()
+    others = np.concatenate([points[:30], rng.integers(-2 * steps, 3 * steps, (30, 3))])
+    expected = brute(points, others)
+    assert asked(record, others, np.full(len(others), FAR)).tolist() == expected.tolist()
+    # What is known before is never raised, and what is farther out is not found.
+    known = np.clip(expected - rng.integers(-1, 2, len(others)), 0, FAR)
+    assert asked(record, others, known).tolist() == np.minimum(known, expected).tolist()
+
+
+def test_the_closest_in_a_record_is_found_from_very_far_off() -> None:
+    """Where squares take 62 bits; and none where they would not fit."""
+    record = open_points(VoxelPoints(np.array([[0, 0, 0], [9, 0, 0], [100, 50, 7]], np.int32)), 1000)
+    away = (1 << 31) - 1
+    queries = np.array([[away, 0, 0], [0, -away, 0], [-(1 << 31), 0, 0], [9, 1 << 30, 1 << 30]])
+    found = asked(record, queries, np.full(4, FAR)).tolist()
+    assert found == [
+        (away - 100) ** 2 + 50**2 + 7**2,
+        away**2,
+        FAR,
+        (2 << 60) - 2 * 50 * (1 << 30) - 2 * 7 * (1 << 30) + 91**2 + 50**2 + 7**2,
+    ]
+
+
+def test_long_differences_are_told_from_clamped_ones() -> None:
+    """Around the greatest difference that three squares of fit 32 bits, on every axis."""
+    for far in (26753, 26754, 26755, 46340, 65535):
+        for axis in range(3):
+            points = np.zeros((2, 3), np.int32)
+            points[1, axis] = far
+            record = open_points(VoxelPoints(points), 1 << 17, leaf=32)
+            for known in (int(FAR), far * far + 1, far * far, 26754**2, 26754**2 + 1):
+                expected = min(known, far * far)
+                stored, nodes = points_of(record)
+                assert asked(record, stored, np.full(2, known), nodes).tolist() == [expected] * 2
+
+
+@interpreted_only
+@pytest.mark.parametrize(("kind", "most"), [("plane", 4000), ("noise", 8000)])
+def test_as_little_of_a_record_is_looked_at_as_ever(kind: str, most: int) -> None:
+    """Reads of coordinates of centres, of 300 points asked leaf node by leaf node; it was 3,177 and 6,177."""
+    record = open_scan(kind, 4, 300, 4000)
+    points, nodes = points_of(record)
+    spheres, best = spheres_of(record), np.full(len(points), FAR)
+    starts = np.flatnonzero(np.diff(nodes, prepend=-1))
+    Counted.reads = 0
+    counted = spheres._replace(center=spheres.center.view(Counted))
+    groups = np.append(starts, len(points))
+    closest_in_record(leaves_of(record), counted, points, groups, nodes[starts].astype(np.int32), best)
+    assert best.tolist() == brute(points, points).tolist()
+    assert 300 < Counted.reads < most

@@ -1,0 +1,180 @@
+"""Points read from a record's own bytes are those that decoding gives: all, in a box, or by their hash."""
+
+import numpy as np
+import pytest
+from opened_records import open_points, open_scan, points_of
+from solidcloud.builder.kernels.points.content_hash import SEEDS, content_sum
+from solidcloud.builder.kernels.points.voxel_records import (
+    first_of_each,
+    link_parents,
+    measure_points,
+    point_hash,
+    point_hashes,
+    sum_places,
+)
+from solidcloud.builder.voxel.record_points import Taken, hash_limit, leaves_of, taken
+from solidcloud.builder.voxel.voxel_octree import VoxelPoints
+from solidcloud.schemas.archive.codec import OpenRecord
+
+pytestmark = pytest.mark.interpreted
+
+BASE = np.array([-(1 << 40) + 3, 7, (1 << 35) + 5])
+
+
+def joined(parts: list[Taken]) -> Taken:
+    """Blocks as one."""
+    return Taken(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def hash_by_hand(point: list[int]) -> int:
+    """The hash of one lattice point in Python's integers."""
+    mask, h = (1 << 64) - 1, 0
+    for w in point:
+        h ^= w & mask
+        for factor in (0xFF51AFD7ED558CCD, 0xC4CEB9FE1A85EC53):
+            h ^= h >> 33
+            h = h * factor & mask
+        h ^= h >> 33
+    return h
+
+
+@pytest.mark.parametrize("kind", ["plane", "noise", "duplicates", "one point"])
+@pytest.mark.parametrize("steps", [1000, 1 << 21])
+@pytest.mark.parametrize("block", [32, 70, 1000])
+def test_all_points_come_in_blocks_leaf_node_by_leaf_node(kind: str, steps: int, block: int) -> None:
+    record = open_scan(kind, 3, 150, steps)
+    points, nodes = points_of(record)
+    parts = list(taken(record, BASE, block=block))
+    assert max(len(p.rows) for p in parts) <= block and min(len(p.rows) for p in parts) > 0
+    found, order = joined(parts), np.argsort(nodes, kind="stable")
+    assert found.rows.tolist() == order.tolist()
+    assert found.xyz.tolist() == points[order].tolist()
+    assert found.nodes.tolist() == nodes[order].tolist()
+
+
+@pytest.mark.parametrize("cells", ["octree", "balanced"])
+def test_a_box_has_its_corners(cells: str) -> None:
+    record = open_scan("noise", 4, 200, 60, cells=cells)
+    points, _ = points_of(record)
+    box = np.array([[4, 5, 12], [43, 51, 50]])
+    inside = ((points >= box[0]) & (points <= box[1])).all(axis=1)
+    assert 20 < inside.sum() < 150
+    box = np.stack([points[inside].min(axis=0), points[inside].max(axis=0)])  # with points on every face
+    found = joined(list(taken(record, BASE, box=box + BASE)))
+    assert sorted(found.rows.tolist()) == np.flatnonzero(inside).tolist()
+    assert list(taken(record, BASE, box=box + BASE + 1000)) == []
+
+
+@pytest.mark.parametrize("share", [0.03, 0.4, 0.97])
+def test_a_share_is_chosen_by_the_hash_of_lattice_coordinates(share: float) -> None:
+    record = open_scan("corner", 5, 300, 4000)
+    points, _ = points_of(record)
+    lattice = (points + BASE).tolist()
+    hashes = [hash_by_hand(p) for p in lattice]
+    assert [int(point_hash(*map(np.int64, p))) for p in lattice[:20]] == hashes[:20]
+    chosen = [h < int(share * 2.0**64) for h in hashes]
+    assert abs(sum(chosen) / 300 - share) < 0.1
+    found = joined(list(taken(record, BASE, limit=hash_limit(share), block=40)))
+    assert sorted(found.rows.tolist()) == np.flatnonzero(chosen).tolist()
+    assert point_hashes(points + BASE).tolist() == hashes
+    assert hash_limit(1.0) == hash_limit(7.0) == 0 < hash_limit(1e-30)
+
+
+def test_of_equal_points_in_a_leaf_node_a_share_has_the_first() -> None:
+    points = np.repeat(np.array([[5, 6, 7], [900, 6, 7], [5, 6, 900]], np.int32), [40, 1, 3], axis=0)
+    record = open_points(VoxelPoints(points), 1000)
+    parts = joined(list(taken(record, BASE, limit=np.uint64((1 << 64) - 1))))
+    stored, nodes = points_of(record)
+    expected = sorted({(int(node), *point) for node, point in zip(nodes, stored.tolist(), strict=True)})
+    assert sorted((int(n), *p) for n, p in zip(parts.nodes, parts.xyz.tolist(), strict=True)) == expected
+    assert len(expected) >= 5 + 2
+    first = first_of_each(parts.xyz)
+    assert sorted(parts.xyz[first].tolist()) == sorted(np.unique(points, axis=0).tolist())
+
+
+@pytest.mark.parametrize("width", [1, 2, 3])
+def test_equal_points_are_told_from_those_beside_them(width: int) -> None:
+    """Leaf nodes in which points differ by a step, and equal ones are followed by others."""
+    points = (
+        np.random.default_rng(width).integers(0, 1 + np.arange(width, width + 3), (60, 3)).astype(np.int32)
+    )
+    record = open_points(VoxelPoints(points), 1000)
+    stored, nodes = points_of(record)
+    found = joined(list(taken(record, BASE, limit=np.uint64((1 << 64) - 1))))
+    rows = [
+        min(np.flatnonzero((nodes == node) & (stored == point).all(axis=1)).tolist())
+        for node, point in {(int(n), tuple(p)) for n, p in zip(nodes, stored.tolist(), strict=True)}
+    ]
+    assert len(rows) < 60 and sorted(found.rows.tolist()) == sorted(rows)
+
+
+def test_places_that_differ_by_a_bit_are_told_apart() -> None:
+    """Of coordinates whose bits meet where the three are packed into one number; few, so that slots collide."""
+    rng = np.random.default_rng(7)
+    for _ in range(150):
+        xyz = rng.choice([0, 1, 2, 1 << 20, (1 << 21) - 1], (8, 3)).astype(np.int32)
+        xyz[4:] = xyz[:4]
+        xyz[4:, rng.integers(0, 3)] = rng.choice([0, 1, 1 << 20], 4)
+        expected = np.zeros(8, bool)
+        expected[np.unique(xyz, axis=0, return_index=True)[1]] = True
+        assert first_of_each(xyz).tolist() == expected.tolist()
+
+
+def test_the_first_of_each_place_is_told() -> None:
+    rng = np.random.default_rng(6)
+    xyz = rng.integers(0, 1 << 21, (60, 3)).astype(np.int32)[rng.integers(0, 60, 300)]
+    xyz[::50] = (1 << 21) - 1
+    expected = np.zeros(300, bool)
+    expected[np.unique(xyz, axis=0, return_index=True)[1]] = True
+    assert first_of_each(xyz).tolist() == expected.tolist()
+    assert first_of_each(xyz[:0]).tolist() == []
+
+
+@pytest.mark.parametrize("kind", ["plane", "pillar", "duplicates", "one point"])
+@pytest.mark.parametrize("steps", [1000, 70_000, 1 << 21])
+def test_points_are_measured(kind: str, steps: int) -> None:
+    record = open_scan(kind, 7, 150, steps)
+    low, high = np.empty(3, np.int64), np.empty(3, np.int64)
+    assert measure_points(leaves_of(record), np.int64(steps), low, high)
+    points, _ = points_of(record)
+    assert (low.tolist(), high.tolist()) == (points.min(axis=0).tolist(), points.max(axis=0).tolist())
+
+
+@pytest.mark.parametrize("kind", ["plane", "duplicates"])
+def test_the_places_of_a_record_are_summed(kind: str) -> None:
+    record = open_scan(kind, 7, 150, 70_000)
+    points, _ = points_of(record)
+    columns = np.ascontiguousarray((points + BASE).T).view(np.uint64)
+    assert int(sum_places(leaves_of(record), BASE, SEEDS[1])) == int(content_sum(columns, SEEDS[1]))
+
+
+def spoilt(record: OpenRecord, plane: int, row: int, value: int) -> OpenRecord:
+    """The record with one byte of its points another."""
+    planes = record.planes.copy()
+    planes[plane, row] = value
+    planes.flags.writeable = False
+    return record._replace(planes=planes)
+
+
+@pytest.mark.parametrize("plane", [1, 3, 5])
+def test_a_point_outside_its_cell_is_found(plane: int) -> None:
+    record = open_scan("noise", 8, 150, 1 << 12)
+    low, high = np.empty(3, np.int64), np.empty(3, np.int64)
+    for row in (0, 77, 149):
+        assert not measure_points(
+            leaves_of(spoilt(record, plane, row, 255)), np.int64(record.voxel_steps), low, high
+        )
+    # Inside its cell, which ends beyond the voxel.
+    record = open_points(VoxelPoints(np.array([[0, 0, 0], [599, 0, 0]], np.int32)), 600)
+    assert measure_points(leaves_of(record), np.int64(600), low, high) and high.tolist() == [599, 0, 0]
+    assert not measure_points(leaves_of(record), np.int64(599), low, high)
+
+
+def test_parents_are_those_whose_children_they_are() -> None:
+    record = open_scan("corner", 9, 200, 5000)
+    first, is_leaf, _ = record.tree
+    parents = link_parents(first, record.nodes.count, is_leaf)
+    assert parents[0] == -1 and (parents[1:] >= 0).all()
+    for node in np.flatnonzero(~is_leaf).tolist():
+        children = np.flatnonzero(parents == node).tolist()
+        assert children == list(range(int(first[node]), int(first[node]) + int(record.nodes.count[node])))

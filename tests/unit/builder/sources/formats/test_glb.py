@@ -1,0 +1,147 @@
+"""GLB: nodes and their places, what is shared, sampled surfaces, documents that lie."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scan_formats import glb_document, glb_vertices, write_glb
+from solidcloud.builder.sources.formats import glb
+from solidcloud.builder.sources.scan_files import open_scans
+from solidcloud.schemas.errors import ScanError
+
+SQUARE = np.array([[0.0, 0, 1], [2, 0, 1], [2, 2, 1], [0, 2, 1]])
+CORNERS = np.array([0, 1, 2, 0, 2, 3], "<u2")
+
+
+def read_all(path: Path, spacing: float | None = None, block_points: int = 1 << 18) -> np.ndarray:
+    blocks = [block.xyz for scan in open_scans(path, spacing=spacing) for block in scan.blocks(block_points)]
+    return np.concatenate([np.empty((0, 3)), *blocks])
+
+
+def write_square(path: Path, change: Callable[[dict], object] = lambda d: None) -> Path:
+    document = glb_document(4, 6)
+    change(document)
+    return write_glb(path, document, glb_vertices(SQUARE) + CORNERS.tobytes())
+
+
+def test_vertices_are_where_the_nodes_put_them(tmp_path: Path) -> None:
+    def change(document: dict) -> None:
+        document["nodes"] = [
+            {"children": [1, 2], "translation": [10, 0, 0]},
+            {"mesh": 0, "scale": [2, 2, 2], "rotation": [0, 0, 1, 0]},
+            {"mesh": 0, "matrix": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 5, 0, 1]},
+            {"mesh": 0},  # in no scene
+        ]
+
+    path = write_square(tmp_path / "a.glb", change)
+    expected = np.concatenate([SQUARE * [-2, -2, 2] + np.array([10, 0, 0]), SQUARE + np.array([10, 5, 0])])
+    assert np.array_equal(read_all(path), expected)
+    assert np.array_equal(read_all(path, block_points=3), expected)
+    assert open_scans(path)[0].declared_count == 8 and open_scans(path)[0].up == "y"
+
+
+def test_parts_that_share_their_vertices_give_them_once(tmp_path: Path) -> None:
+    def change(document: dict) -> None:
+        (primitive,) = document["meshes"][0]["primitives"]
+        document["meshes"][0]["primitives"] = [primitive, {**primitive, "material": 1}]
+
+    assert np.array_equal(read_all(write_square(tmp_path / "a.glb", change)), SQUARE)
+
+
+# The six corners are two triangles; as a strip a third that covers the first and a flat one; as a fan two flat ones.
+@pytest.mark.parametrize(("mode", "area"), [(4, 4.0), (5, 6.0), (6, 4.0), (0, 0.0)])
+def test_a_surface_is_sampled_by_its_area(mode: int, area: float, tmp_path: Path) -> None:
+
+    def change(document: dict) -> None:
+        document["meshes"][0]["primitives"][0]["mode"] = mode
+
+    path = write_square(tmp_path / "a.glb", change)
+    if not area:
+        with pytest.raises(ScanError, match="vertices without faces"):
+            read_all(path, spacing=0.1)
+        return
+    xyz = read_all(path, spacing=0.1)
+    assert (xyz[:, 2] == 1).all() and xyz[:, :2].min() >= 0 and xyz[:, :2].max() <= 2
+    assert abs(len(xyz) - area / 0.01) <= 1
+
+
+LIES: dict[str, tuple[Callable[[dict], object], str]] = {
+    "more vertices": (lambda d: d["accessors"][0].update(count=5), "5 rows of 12 bytes, 16 apart"),
+    "a view beyond": (lambda d: d["bufferViews"][0].update(byteLength=9999), "within the 76 bytes"),
+    "a place beyond": (lambda d: d["accessors"][0].update(byteOffset=8), "from byte 8 of 64"),
+    "a stride too short": (lambda d: d["bufferViews"][0].update(byteStride=8), "8 apart"),
+    "a negative count": (
+        lambda d: d["accessors"][0].update(count=-1),
+        "the number -1, expected a whole number",
+    ),
+    "vertices of 16 bits": (lambda d: d["accessors"][0].update(componentType=5122), "VEC3 of type 5122"),
+    "no such accessor": (lambda d: d["accessors"].pop(), "number 1 of 1 accessors"),
+    "no such mesh": (lambda d: d["nodes"][0].update(mesh=3), "number 3 of 1 meshes"),
+    "a circle": (lambda d: d["nodes"][0].update(children=[0]), "node 0 twice"),
+    "another file": (lambda d: d["buffers"][0].update(uri="/etc/hostname"), "in another file"),
+    "Draco": (
+        lambda d: d["meshes"][0]["primitives"][0].update(extensions={"KHR_draco_mesh_compression": {}}),
+        "compressed by Draco",
+    ),
+    "instances": (
+        lambda d: d.update(extensionsRequired=["KHR_materials_unlit", "EXT_mesh_gpu_instancing"]),
+        "requires the extension EXT_mesh_gpu_instancing, expected plain meshes",
+    ),
+    "sparse": (lambda d: d["accessors"][0].update(sparse={"count": 1}), "not sparse"),
+    "a matrix that projects": (lambda d: d["nodes"][0].update(matrix=[1.0] * 16), "node 0 with the matrix"),
+    "a turn that stretches": (lambda d: d["nodes"][0].update(rotation=[0, 0, 1, 1]), "quaternion of length"),
+    "a list for an object": (lambda d: d.update(nodes=[[]]), "expected"),
+}
+
+
+@pytest.mark.parametrize("lie", LIES)
+def test_a_document_that_lies_is_refused(lie: str, tmp_path: Path) -> None:
+    change, message = LIES[lie]
+    path = write_square(tmp_path / "a.glb", change)
+    with pytest.raises(ScanError, match=message):
+        open_scans(path)
+
+
+def test_parts_of_shared_meshes_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A few words are parts without end, a hundred thousand nodes of a mesh of as many primitives."""
+
+    def scene(nodes: int, primitives: int, meshless: int = 0) -> Callable[[dict], object]:
+        def change(document: dict) -> None:
+            document["nodes"] = [{"mesh": 0}] * nodes + [{}] * meshless
+            document["scenes"] = [{"nodes": list(range(nodes + meshless))}]
+            document["meshes"][0]["primitives"] *= primitives
+
+        return change
+
+    parsed = []
+    whole = glb._Document._primitive
+
+    def counted(document: glb._Document, primitive: dict) -> object:
+        parsed.append(primitive)
+        return whole(document, primitive)
+
+    monkeypatch.setattr(glb._Document, "_primitive", counted)
+    with pytest.raises(ScanError, match="over 65536 primitives at nodes, expected at most that many"):
+        open_scans(write_square(tmp_path / "a.glb", scene(2, 40_000)))
+    assert len(parsed) == 40_000, "the second node's are not taken up, nor a mesh parsed anew"
+    parsed.clear()
+    with pytest.raises(ScanError, match="over 65536 primitives"):
+        open_scans(write_square(tmp_path / "b.glb", scene(1, 70_000)))
+    assert not parsed
+    monkeypatch.setattr(glb, "MOST_PARTS", 6)
+    with pytest.raises(ScanError, match="over 6 nodes"):
+        open_scans(write_square(tmp_path / "c.glb", scene(1, 1, meshless=6)))
+    assert open_scans(write_square(tmp_path / "d.glb", scene(3, 2, meshless=3)))[0].declared_count == 4
+
+
+def test_extensions_of_materials_change_nothing(tmp_path: Path) -> None:
+    path = write_square(tmp_path / "a.glb", lambda d: d.update(extensionsRequired=["KHR_texture_transform"]))
+    assert np.array_equal(read_all(path), SQUARE)
+
+
+def test_a_triangle_of_no_vertex_is_refused(tmp_path: Path) -> None:
+    path = write_glb(tmp_path / "a.glb", glb_document(4, 6), glb_vertices(SQUARE) + (CORNERS + 1).tobytes())
+    assert len(read_all(path)) == 4
+    with pytest.raises(ScanError, match="a triangle with vertex 4, expected 4 at most"):
+        read_all(path, spacing=0.1)

@@ -1,0 +1,398 @@
+"""What every scan reader must do, whatever the format: the same truth written in each, read back whole,
+in small blocks, and with its end cut off. The expected points never pass through the code under test."""
+
+import hashlib
+import os
+import pickle
+import subprocess
+import sys
+import tracemalloc
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import laspy
+import numpy as np
+import plyfile
+import pye57
+import pytest
+from scan_formats import (
+    glb_document,
+    glb_vertices,
+    ptx_scan,
+    write_glb,
+    write_pcd,
+    write_pts,
+)
+from solidcloud.builder.sources.common.scan import Scan, sha256_of
+from solidcloud.builder.sources.scan_files import READERS, header_bounds, open_scans, scan_files
+from solidcloud.schemas.errors import BadRequestError, ScanError
+
+COUNT = 1000  # no multiple of the small block, 7
+
+
+class Truth(NamedTuple):
+    """Points within 50 m of a place far from the origin, and their intensities (whole numbers)."""
+
+    xyz: np.ndarray
+    intensity: np.ndarray
+
+
+@pytest.fixture(scope="module")
+def truth() -> Truth:
+    rng = np.random.default_rng(20240611)
+    xyz = rng.uniform(-50.0, 50.0, (COUNT, 3)) + np.array([1000.0, -2000.0, 30.0])
+    return Truth(xyz, rng.integers(0, 2000, COUNT).astype(np.float32))
+
+
+def write_las(path: Path, truth: Truth) -> None:
+    header = laspy.LasHeader(version="1.4", point_format=6)
+    header.scales, header.offsets = [0.001] * 3, [990.5, -1990.25, 0.125]
+    las = laspy.LasData(header)
+    las.x, las.y, las.z = truth.xyz.T
+    las.intensity = truth.intensity.astype(np.uint16)
+    las.write(path, laz_backend=laspy.LazBackend.Lazrs)
+
+
+def write_e57(path: Path, truth: Truth) -> None:
+    with pye57.E57(str(path), mode="w") as file:
+        x, y, z = (truth.xyz - [1000.0, -2000.0, 30.0]).T
+        columns = {"cartesianX": x, "cartesianY": y, "cartesianZ": z, "intensity": truth.intensity}
+        file.write_scan_raw(columns, translation=np.array([1000.0, -2000.0, 30.0]))
+
+
+def write_ply(path: Path, truth: Truth, *, text: bool, byte_order: str, real: str = "f8") -> None:
+    vertex = np.empty(
+        COUNT, [("x", real), ("y", real), ("z", real), ("red", "u1"), ("scalar_Intensity", "f4")]
+    )
+    vertex["x"], vertex["y"], vertex["z"] = truth.xyz.T
+    vertex["red"], vertex["scalar_Intensity"] = 7, truth.intensity
+    face = np.array([([0, 1, 2],)], dtype=[("vertex_indices", "i4", (3,))])
+    elements = [plyfile.PlyElement.describe(vertex, "vertex"), plyfile.PlyElement.describe(face, "face")]
+    plyfile.PlyData(elements, text=text, byte_order=byte_order).write(path)
+
+
+def rows_of(truth: Truth, separator: str, end: str = "\n") -> str:
+    columns = np.column_stack([truth.xyz, truth.intensity])
+    return "".join(separator.join(map(repr, row)) + end for row in columns.tolist())
+
+
+def write_obj(path: Path, truth: Truth) -> None:
+    lines = [f"v {x!r} {y!r} {z!r}\nvn 0 0 1\n" for x, y, z in truth.xyz.tolist()]
+    path.write_text("# a comment\nmtllib none.mtl\n" + "".join(lines) + "f 1//1 2//2 3//3\n")
+
+
+def write_stl(path: Path, truth: Truth) -> None:
+    """The corners of a triangle for each three points; the last point is left over and repeated."""
+    corners = np.concatenate([truth.xyz, truth.xyz[-1:], truth.xyz[-1:]]).reshape(-1, 9)
+    record = np.zeros(len(corners), "<f4, (9,)<f4, <u2")
+    record = record.astype([("normal", "<f4", 3), ("corners", "<f4", 9), ("attribute", "<u2")])
+    record["corners"] = corners
+    path.write_bytes(b"solid but binary".ljust(80) + np.uint32(len(corners)).tobytes() + record.tobytes())
+
+
+def write_ascii_stl(path: Path, truth: Truth) -> None:
+    corners = np.concatenate([truth.xyz, truth.xyz[-1:], truth.xyz[-1:]]).reshape(-1, 3, 3)
+    text = "solid a\n"
+    for triangle in corners.tolist():
+        vertices = "".join(f"   vertex {x!r} {y!r} {z!r}\n" for x, y, z in triangle)
+        text += f" facet normal 0 0 0\n  outer loop\n{vertices}  endloop\n endfacet\n"
+    path.write_text(text + "endsolid a\n")
+
+
+class Case(NamedTuple):
+    """One way to write the truth down."""
+
+    name: str
+    write: Callable[[Path, Truth], None]
+    error: float  # what the format's own rounding may do to a coordinate [m]
+    intensity: bool
+    repeats: int = 0  # points the format adds at the end
+
+
+SINGLE = 2.0**-13  # half a float32 step at 2,050 m, and a little
+CASES = [
+    Case("a.las", write_las, 0.0005 + 1e-9, True),
+    Case("a.laz", write_las, 0.0005 + 1e-9, True),
+    Case("a.e57", write_e57, 4e-6, True),  # float32 within 50 m of the station
+    Case("little.ply", lambda p, t: write_ply(p, t, text=False, byte_order="<"), 0.0, True),
+    Case("big.ply", lambda p, t: write_ply(p, t, text=False, byte_order=">"), 0.0, True),
+    Case("single.ply", lambda p, t: write_ply(p, t, text=False, byte_order="<", real="f4"), SINGLE, True),
+    # plyfile writes doubles with 18 digits, floats as well.
+    Case("ascii.ply", lambda p, t: write_ply(p, t, text=True, byte_order="="), 0.0, True),
+    Case("blanks.xyz", lambda p, t: p.write_text(rows_of(t, "  \t")) and None, 0.0, False),
+    Case("count.pts", lambda p, t: p.write_text(f"{COUNT}\n" + rows_of(t, " ")) and None, 0.0, True),
+    Case(
+        "header.csv", lambda p, t: p.write_text('"X",Y,z,Intensity\n' + rows_of(t, ",")) and None, 0.0, True
+    ),
+    Case("crlf.txt", lambda p, t: p.write_bytes(rows_of(t, ";", "\r\n").encode()) and None, 0.0, False),
+    Case("a.pts", lambda p, t: write_pts(p, [(t.xyz, t.intensity)]) and None, 0.0, True),
+    Case("a.ptx", lambda p, t: p.write_text(ptx_scan(t.xyz, t.intensity, columns=8)) and None, 0.0, True),
+    Case("ascii.pcd", lambda p, t: write_pcd(p, *t, "ascii") and None, 0.0, True),
+    Case("binary.pcd", lambda p, t: write_pcd(p, *t, "binary") and None, 0.0, True),
+    Case("packed.pcd", lambda p, t: write_pcd(p, *t, "binary_compressed") and None, 0.0, True),
+    Case(
+        "a.glb", lambda p, t: write_glb(p, glb_document(COUNT), glb_vertices(t.xyz)) and None, SINGLE, False
+    ),
+    Case("a.obj", write_obj, 0.0, False),
+    Case("binary.stl", write_stl, SINGLE, False, 2),
+    Case("ascii.stl", write_ascii_stl, 0.0, False, 2),
+]
+
+
+@pytest.fixture(params=CASES, ids=[case.name for case in CASES])
+def case(request: pytest.FixtureRequest) -> Case:
+    return request.param
+
+
+@pytest.fixture
+def written(case: Case, truth: Truth, tmp_path: Path) -> Path:
+    path = tmp_path / case.name
+    case.write(path, truth)
+    return path
+
+
+def read(scan: Scan, block_points: int = 1 << 18) -> tuple[np.ndarray, np.ndarray | None]:
+    """All points of a scan, and their intensities; checks each block's size and types."""
+    blocks = list(scan.blocks(block_points))
+    for block in blocks:
+        assert block.xyz.dtype == np.float64 and block.xyz.shape[1] == 3
+        assert len(block.xyz) <= block_points
+        assert block.intensity is None or (block.intensity.dtype == np.float32)
+        assert block.intensity is None or block.intensity.shape == block.xyz.shape[:1]
+    xyz = np.concatenate([np.empty((0, 3)), *(block.xyz for block in blocks)])
+    intensities = [block.intensity for block in blocks if block.intensity is not None]
+    return xyz, np.concatenate(intensities) if intensities else None
+
+
+def test_every_point_is_read_as_it_was_written(case: Case, written: Path, truth: Truth) -> None:
+    (scan,) = open_scans(written)
+    xyz, intensity = read(scan)
+    expected = np.concatenate([truth.xyz, np.repeat(truth.xyz[-1:], case.repeats, axis=0)])
+    assert xyz.shape == expected.shape
+    assert np.abs(xyz - expected).max() <= case.error
+    assert (intensity is not None) == case.intensity
+    if intensity is not None:
+        assert np.array_equal(intensity, truth.intensity)
+    assert scan.declared_count in (None, len(expected))
+    assert scan.dropped == {}
+
+
+def test_small_blocks_give_the_same_bits_as_large_ones(case: Case, written: Path) -> None:
+    (scan,) = open_scans(written)
+    xyz, intensity = read(scan)
+    for block_points in (7, 1):
+        small_xyz, small_intensity = read(scan, block_points)
+        assert np.array_equal(small_xyz.view(np.uint64), xyz.view(np.uint64))
+        assert (intensity is None) == (small_intensity is None)
+        assert intensity is None or np.array_equal(small_intensity, intensity)
+
+
+SEEKABLE = {"a.las", "a.laz", "little.ply", "big.ply", "single.ply", "binary.stl", "binary.pcd"}
+
+
+def test_a_range_gives_the_points_that_a_run_through_gives_there(case: Case, written: Path) -> None:
+    (scan,) = open_scans(written)
+    assert scan.seekable == (case.name in SEEKABLE)
+    if not scan.seekable:
+        for start, stop in ((1, None), (0, 5)):
+            with pytest.raises(ValueError, match="cannot seek"):
+                list(scan.blocks(100, start, stop))
+        return
+    xyz, intensity = read(scan)
+    for start, stop in (
+        (0, None),
+        (0, 0),
+        (0, 1),
+        (1, 5),
+        (499, 731),
+        (998, 1000),
+        (700, None),
+        (1000, 1000),
+    ):
+        blocks = list(scan.blocks(100, start, stop))
+        assert all(0 < len(block.xyz) <= 100 for block in blocks)
+        assert np.array_equal(np.concatenate([np.empty((0, 3)), *(b.xyz for b in blocks)]), xyz[start:stop])
+        for block, at in zip(blocks, np.cumsum([start, *(len(b.xyz) for b in blocks)]), strict=False):
+            assert intensity is None or np.array_equal(block.intensity, intensity[at : at + len(block.xyz)])
+    for start, stop in ((-1, 5), (5, 4), (0, len(xyz) + 1)):
+        with pytest.raises(ValueError, match=f"of a scan of {len(xyz)}"):
+            list(scan.blocks(100, start, stop))
+
+
+def test_a_block_stays_as_it_is_when_the_next_one_is_read(written: Path) -> None:
+    (scan,) = open_scans(written)
+    blocks = scan.blocks(100)
+    first = next(blocks)
+    before = first.xyz.copy()
+    intensity = None if first.intensity is None else first.intensity.copy()
+    list(blocks)
+    assert np.array_equal(first.xyz, before)
+    assert intensity is None or np.array_equal(first.intensity, intensity)
+
+
+@pytest.mark.parametrize("kept", [0.04, 0.5, 0.97])
+def test_a_truncated_file_is_an_error(case: Case, written: Path, truth: Truth, kept: float) -> None:
+    whole = written.read_bytes()
+    end = int(len(whole) * kept)
+    if written.suffix in (".xyz", ".txt", ".csv", ".obj"):
+        # Text that declares no count shows a cut only within a row's x or y: cut in the middle of an x.
+        keyword = b"\nv " if written.suffix == ".obj" else b"\n"
+        end = whole.rfind(keyword, 0, end) + len(keyword) + 3
+    written.write_bytes(whole[:end])
+    with pytest.raises(ScanError, match="expected") as caught:
+        for scan in open_scans(written):
+            read(scan)
+    assert str(caught.value).startswith(f"{written}: ")
+
+
+def test_a_file_that_shrinks_after_it_was_opened_is_an_error(case: Case, written: Path) -> None:
+    scans = open_scans(written)
+    written.write_bytes(written.read_bytes()[: written.stat().st_size // 2])
+    if case.name in {"blanks.xyz", "header.csv", "crlf.txt", "a.obj", "ascii.stl"}:
+        pytest.skip("text that declares no count: what is left of it is a scan, or breaks within a row")
+    with pytest.raises(ScanError, match="expected"):
+        for scan in scans:
+            read(scan)
+
+
+def test_memory_is_that_of_a_block_and_not_of_the_file(
+    case: Case, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of 30,000 points, 0.7 MB as float64, in blocks of 500; text in pieces of 16 kB."""
+    for module in ("rows", "counted"):
+        monkeypatch.setattr(f"solidcloud.builder.sources.{module}.CHUNK_BYTES", 1 << 14)
+    monkeypatch.setattr("solidcloud.builder.sources.formats.lzf.PIECE_BYTES", 1 << 12)
+    rng = np.random.default_rng(3)
+    count = 30_016  # three points a triangle and one; whole columns of 8
+    many = Truth(rng.uniform(-50, 50, (count, 3)), rng.integers(0, 99, count).astype(np.float32))
+    path = tmp_path / case.name
+    monkeypatch.setattr(sys.modules[__name__], "COUNT", count)
+    case.write(path, many)
+    next(open_scans(path)[0].blocks(500))  # what is loaded or compiled on first use
+    tracemalloc.start()
+    seen = sum(len(block.xyz) for scan in open_scans(path) for block in scan.blocks(500))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert seen >= count
+    assert peak < 250_000
+
+
+def test_a_scan_can_be_sent_to_another_process(written: Path) -> None:
+    (scan,) = open_scans(written)
+    sent = pickle.loads(pickle.dumps(scan))
+    assert np.array_equal(read(sent)[0], read(scan)[0])
+
+
+@pytest.mark.parametrize("suffix", sorted(READERS))
+def test_an_empty_file_is_an_error(suffix: str, tmp_path: Path) -> None:
+    path = tmp_path / f"a{suffix}"
+    path.touch()
+    with pytest.raises(ScanError, match="an empty file"):
+        open_scans(path)
+
+
+@pytest.mark.parametrize("suffix", sorted(READERS))
+def test_garbage_is_an_error_and_bounds_of_it_are_unknown(suffix: str, tmp_path: Path) -> None:
+    path = tmp_path / f"a{suffix}"
+    path.write_bytes(np.random.default_rng(7).bytes(20_000))
+    assert header_bounds(path) is None
+    with pytest.raises(ScanError):
+        for scan in open_scans(path):
+            read(scan)
+
+
+def test_a_missing_file_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(ScanError, match="no such file or folder, expected a scan: check the path"):
+        open_scans(tmp_path / "gone.las")
+    with pytest.raises(ScanError, match="no such file"):
+        scan_files([tmp_path / "gone"])
+    with pytest.raises(ScanError, match="gone"):
+        sha256_of(tmp_path / "gone.las")
+
+
+def test_an_unknown_suffix_names_the_known_ones(tmp_path: Path) -> None:
+    path = tmp_path / "a.rcp"
+    path.write_text("1\n1\n")
+    with pytest.raises(ScanError, match=r"'\.rcp', expected one of \.las \.laz \.e57 \.ply .*\.stl"):
+        open_scans(path)
+
+
+def test_a_folder_is_no_scan(tmp_path: Path) -> None:
+    (tmp_path / "a.las").mkdir()
+    with pytest.raises(ScanError, match="folder"):
+        open_scans(tmp_path / "a.las")
+
+
+def test_suffixes_may_be_in_capitals(truth: Truth, tmp_path: Path) -> None:
+    path = tmp_path / "A.XYZ"
+    path.write_text(rows_of(truth, " "))
+    assert np.array_equal(read(open_scans(path)[0])[0], truth.xyz)
+
+
+def test_a_folder_gives_its_scans_sorted_and_files_stay_as_given(tmp_path: Path) -> None:
+    for name in ("b/z.laz", "b/a.LAS", "a/deep/er/x.e57", "a/readme.md", "c.ply", "c.FLS"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    odd = tmp_path / "a" / "readme.md"
+    below = [tmp_path / name for name in ("a/deep/er/x.e57", "b/a.LAS", "b/z.laz", "c.FLS", "c.ply")]
+    assert scan_files([odd, tmp_path]) == [odd, *below]
+    with pytest.raises(ScanError, match=r"the suffix '\.fls', expected one of"):
+        open_scans(tmp_path / "c.FLS")
+    (tmp_path / "none").mkdir()
+    with pytest.raises(ScanError, match="a folder without scans"):
+        scan_files([tmp_path / "none"])
+
+
+@pytest.mark.parametrize("spacing", [0.0, -1.0, float("nan"), float("inf")])
+def test_a_spacing_that_is_no_length_is_refused(spacing: float, tmp_path: Path) -> None:
+    with pytest.raises(BadRequestError, match="spacing"):
+        open_scans(tmp_path / "a.obj", spacing=spacing)
+
+
+def test_a_block_holds_at_least_a_point(written: Path) -> None:
+    with pytest.raises(ValueError, match="block_points is 0"):
+        list(open_scans(written)[0].blocks(0))
+
+
+def test_the_hash_is_sha256_of_the_bytes(tmp_path: Path) -> None:
+    path = tmp_path / "a.xyz"
+    path.write_bytes(b"1 2 3\n" * 50_000)
+    assert sha256_of(path) == hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def test_importing_the_readers_imports_no_format_library() -> None:
+    code = (
+        "import sys, solidcloud.builder.sources;"
+        "print(sorted({'laspy', 'lazrs', 'pye57', 'plyfile', 'trimesh'} & set(sys.modules)))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=os.sep
+    )
+    assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize(
+    ("name", "library"), [("a.laz", "lazrs"), ("a.e57", "pye57"), ("little.ply", "plyfile")]
+)
+def test_a_missing_library_says_what_to_install(
+    name: str, library: str, truth: Truth, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / name
+    next(case for case in CASES if case.name == name).write(path, truth)
+    monkeypatch.setitem(sys.modules, library, None)
+    with pytest.raises(ScanError, match=r"pip install 'solidcloud\[readers\]'"):
+        for scan in open_scans(path):
+            read(scan)
+
+
+def test_an_error_of_a_library_keeps_its_cause(truth: Truth, tmp_path: Path) -> None:
+    path = tmp_path / "a.e57"
+    write_e57(path, truth)
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+    with pytest.raises(ScanError, match="checksum") as caught:
+        for scan in open_scans(path):
+            read(scan)
+    assert isinstance(caught.value.__cause__, pye57.libe57.E57Exception)

@@ -1,0 +1,404 @@
+"""The list of scans: what headers say, written and read back, edited by hand, wrong edits; what a build opens."""
+
+import json
+import os
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import synthetic_scans
+import tomli_w
+from scan_formats import glb_document, glb_vertices, ptx_scan, write_e57, write_glb
+from solidcloud.builder.sources import scan_list
+from solidcloud.builder.sources.common.scan import library_errors, sha256_of
+from solidcloud.builder.sources.scan_list import ScanEntry, inputs, inspect, read_scan_list, write_scan_list
+from solidcloud.schemas.archive.archive import Archive
+from solidcloud.schemas.errors import BadRequestError, ScanError, SolidcloudError
+from solidcloud.server.cli.main import run
+
+POSE = np.array([[0.0, -1, 0, 10], [1, 0, 0, 20], [0, 0, 1, 30], [0, 0, 0, 1]])
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A LAS, a PTX of two scans, an E57 that is damaged, a text, all below one folder."""
+    folder = tmp_path / "campaign"
+    (folder / "deep").mkdir(parents=True)
+    raw = np.random.default_rng(1).integers(0, 1000, (50, 3))
+    synthetic_scans.write_las(folder / "a.las", raw)
+    xyz = raw[:20] * 0.01 + 1
+    (folder / "b.ptx").write_text(ptx_scan(xyz, np.ones(20), POSE) + ptx_scan(xyz[:7], np.ones(7)))
+    path = write_e57(folder / "deep" / "c.e57", [{"columns": {f"cartesian{a}": xyz[:, 0] for a in "XYZ"}}])
+    data = bytearray(path.read_bytes())
+    data[-100] ^= 1
+    path.write_bytes(data)
+    synthetic_scans.write_xyz(folder / "deep" / "d.xyz", xyz)
+    return folder
+
+
+def points(inputs_: list[scan_list.Input]) -> np.ndarray:
+    blocks = [block.xyz for item in inputs_ for scan in item.scans for block in scan.blocks()]
+    return np.concatenate([np.empty((0, 3)), *blocks])
+
+
+def edit(path: Path, change: dict[str, Any], number: int = 0) -> None:
+    """Set fields of one scan of a list; None removes one."""
+    import tomllib
+
+    document = tomllib.loads(path.read_text())
+    document["scan"][number].update(change)
+    for name in [name for name, value in document["scan"][number].items() if value is None]:
+        del document["scan"][number][name]
+    path.write_text(tomli_w.dumps(document))
+
+
+def test_headers_say_what_scans_there_are(folder: Path) -> None:
+    las, first, second, broken, text = inspect([folder])
+    assert (las.path, las.format, las.count, las.fault) == (folder / "a.las", "las", 50, "")
+    assert las.bounds is not None and las.pose is None
+    assert (first.index, first.format, first.count) == (0, "ptx", 20) and np.array_equal(first.pose, POSE)
+    assert (second.index, second.count, second.pose) == (1, 7, None)
+    assert "checksum" in broken.fault and broken.format == ""
+    assert (text.format, text.count, text.sha256) == ("text", None, "")
+
+
+def test_hashes_are_of_the_files_where_asked(folder: Path) -> None:
+    for entry in inspect([folder], with_sha256=True):
+        assert entry.sha256 == sha256_of(entry.path)
+
+
+def same(a: ScanEntry, b: ScanEntry) -> bool:
+    arrays = all(
+        np.array_equal(x, y) if x is not None and y is not None else x is y
+        for x, y in ((a.bounds, b.bounds), (a.pose, b.pose))
+    )
+    names = ("index", "format", "count", "units", "up", "scale", "crs", "sha256", "use", "fault")
+    return arrays and all(getattr(a, name) == getattr(b, name) for name in names) and a.path.samefile(b.path)
+
+
+@pytest.mark.parametrize("place", ["scans.toml", "deep/scans.toml", "../scans.toml"])
+def test_a_list_is_read_back_as_it_was_written(place: str, folder: Path) -> None:
+    entries = inspect([folder], with_sha256=True)
+    odd = ScanEntry(
+        folder / "a.las", 9, "las", 0, np.array([[0.1, 2, 3], [4, 5, 1e300]]), POSE, "us-ft", "y", 0.3, 'X["ü"]\n"',
+        "ab", False, "why",
+    )  # fmt: skip
+    write_scan_list(folder / place, [*entries, odd])
+    read = read_scan_list(folder / place)
+    assert len(read) == 6 and all(map(same, [*entries, odd], read))
+
+
+def test_paths_in_a_list_move_with_it(folder: Path, tmp_path: Path) -> None:
+    write_scan_list(folder / "scans.toml", inspect([folder / "a.las"]))
+    assert 'path = "a.las"' in (folder / "scans.toml").read_text()
+    folder.rename(tmp_path / "elsewhere")
+    (item,) = inputs([tmp_path / "elsewhere" / "scans.toml"])
+    assert item.path == tmp_path / "elsewhere" / "a.las" and len(points([item])) == 50
+
+
+def test_what_is_edited_is_what_is_built(folder: Path) -> None:
+    path = folder / "scans.toml"
+    write_scan_list(path, inspect([folder / "a.las", folder / "b.ptx"]))
+    before = points(inputs([path]))
+    assert np.array_equal(before, points(inputs([folder / "a.las", folder / "b.ptx"])))
+    edit(path, {"units": "mm", "up": "y", "crs": "EPSG:2056"}, 0)
+    edit(path, {"pose": np.eye(4).tolist()}, 1)
+    edit(path, {"use": False}, 2)
+    las, ptx = inputs([path])
+    x, y, z = before[:50].T
+    assert np.array_equal(points([las]), np.column_stack([x, -z, y]) * 0.001)
+    assert (las.scans[0].crs, las.scans[0].units, las.scans[0].up) == ("EPSG:2056", "mm", "y")
+    assert len(ptx.scans) == 1
+    turned = points([ptx])
+    assert (
+        np.abs(
+            before[50:70] - np.column_stack([10 - turned[:, 1], 20 + turned[:, 0], 30 + turned[:, 2]])
+        ).max()
+        < 1e-9
+    )
+
+
+def test_only_the_scans_that_are_listed_are_built(folder: Path) -> None:
+    path = folder / "scans.toml"
+    write_scan_list(path, [e for e in inspect([folder / "b.ptx"]) if e.index == 1])
+    (item,) = inputs([path])
+    assert [scan.index for scan in item.scans] == [1] and len(points([item])) == 7
+
+
+def test_faults_are_kept_for_all_of_them_to_be_named(folder: Path) -> None:
+    (folder / "e.las").write_bytes(b"LASF")
+    write_scan_list(folder / "scans.toml", inspect([folder]))
+    edit(folder / "scans.toml", {"index": 5}, 2)
+    for paths, bad in (([folder], 2), ([folder / "scans.toml"], 3)):
+        found = inputs(paths)
+        faults = {item.path.name: item.fault for item in found if item.fault}
+        assert len(faults) == bad and "checksum" in faults["c.e57"] and "b'LASF'" in faults["e.las"]
+    assert "holds 2 scans, expected one of index 5" in faults["b.ptx"]
+    assert sum(len(item.scans) for item in found) == 2
+
+
+def test_a_header_says_where_a_broken_scan_was_unless_the_list_puts_it_elsewhere(folder: Path) -> None:
+    las = folder / "a.las"
+    bounds = inspect([las])[0].bounds
+    las.write_bytes(las.read_bytes()[:600])
+    write_scan_list(folder / "scans.toml", inspect([las]))
+    assert np.array_equal(inputs([folder / "scans.toml"])[0].region, bounds)
+    assert np.array_equal(inputs([las])[0].region, bounds)
+    edit(folder / "scans.toml", {"units": "ft"})
+    assert inputs([folder / "scans.toml"])[0].region is None
+
+
+def test_a_scan_that_is_named_twice_is_refused(folder: Path, tmp_path: Path) -> None:
+    """By its file and its folder, a link, or a list beside them; its points would count twice in silence."""
+    las, link = folder / "a.las", tmp_path / "link.las"
+    link.symlink_to(las)
+    for twice in ([folder, las], [las, folder / "deep" / ".." / "a.las"], [las, link], [folder / "deep"] * 2):
+        with pytest.raises(BadRequestError, match=r"scan 0 is named twice, as that of .*: leave one out"):
+            inputs(twice)
+        with pytest.raises(BadRequestError, match="is named twice"):
+            inspect(twice)
+    path = tmp_path / "scans.toml"
+    write_scan_list(path, [ScanEntry(folder / "b.ptx", index) for index in (0, 1)])
+    assert [len(item.scans) for item in inputs([path, las])] == [2, 1]
+    with pytest.raises(BadRequestError, match=r"b\.ptx: scan 0 is named twice"):
+        inputs([path, folder / "b.ptx"])
+
+
+def test_a_list_that_cannot_be_written_leaves_the_one_there_was(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "lists" / "scans.toml"
+    path.parent.mkdir()
+    write_scan_list(path, inspect([folder]))
+    before = path.read_bytes()
+    odd = folder / os.fsdecode(b"odd\xff.xyz")
+    odd.write_text("1 2 3\n")
+    with pytest.raises(BadRequestError, match=r"odd\\udcff\.xyz'.* not UTF-8"):
+        write_scan_list(path, inspect([folder]))
+    assert [p.read_bytes() for p in path.parent.iterdir()] == [before]
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", full)
+        with pytest.raises(OSError, match="No space"):
+            write_scan_list(path, [])
+    assert [p.read_bytes() for p in path.parent.iterdir()] == [before]
+
+
+def test_a_number_that_no_float_holds_is_refused(folder: Path) -> None:
+    path = folder / "scans.toml"
+    path.write_text(f"[[scan]]\npath = 'a.las'\nscale = 1{'0' * 400}\n")
+    with pytest.raises(BadRequestError, match=r"scale is '1000.*, expected a number above 0"):
+        read_scan_list(path)
+
+
+LONG = {
+    "decimal": ("scale = " + "9" * 5000, r"a number of 5000 digits \(at line 4\), expected a list of scans"),
+    "hexadecimal": (
+        "scale = 0x" + "f" * 5000,
+        "scan 1 .*: scale is 'a number of very many digits', expected a num",
+    ),
+    "in a list": (
+        f"low = [0x{'f' * 5000}, 0, 0]",
+        "low is 'a number of very many digits', expected three num",
+    ),
+    "index": ("index = " + "9" * 400, r"index is '9{80}', expected a whole number, 0 or more, of 63 bits"),
+    "count": ("count = 0x" + "f" * 5000, "count is 'a number of very many digits', expected a whole number"),
+}
+
+
+@pytest.mark.parametrize("name", LONG)
+def test_a_number_without_end_is_refused_by_its_place(name: str, tmp_path: Path) -> None:
+    line, message = LONG[name]
+    path = tmp_path / "scans.toml"
+    path.write_text(f"version = 1\n[[scan]]\npath = 'a.las'\n{line}\n")
+    with pytest.raises(BadRequestError, match=message):
+        read_scan_list(path)
+    path.write_text(f"version = 0x{'f' * 5000}\n")
+    with pytest.raises(BadRequestError, match=r"version a number of very many digits, expected version = 1"):
+        read_scan_list(path)
+
+
+@pytest.mark.parametrize("error", [OSError(5, "Input/output error"), MemoryError()])
+def test_a_file_that_cannot_be_opened_just_now_is_not_left_out(
+    error: Exception, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(path: Path, **_: Any) -> Any:
+        with library_errors(path):
+            raise error
+
+    monkeypatch.setattr(scan_list, "open_scans", fails)
+    with pytest.raises((OSError, SolidcloudError), match=r"Input/output error|out of memory") as caught:
+        inputs([folder / "a.las"])
+    assert not isinstance(caught.value, ScanError)
+
+
+def test_a_missing_file_of_a_list_is_a_fault_and_of_the_command_an_error(folder: Path) -> None:
+    write_scan_list(folder / "scans.toml", inspect([folder]))
+    (folder / "a.las").unlink()
+    assert "no such file" in inputs([folder / "scans.toml"])[0].fault
+    with pytest.raises(ScanError, match="no such file"):
+        inputs([folder / "a.las"])
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("path", 3, r"scan 1 \(3\): path is '3', expected the path of a file"),
+        ("path", None, r"scan 1 \(without path\): no path, expected the path"),
+        ("index", -1, r"scan 1 \(a.las\): index is '-1', expected a whole number"),
+        ("index", True, "index is 'True', expected a whole number"),
+        ("use", "no", "use is 'no', expected true or false"),
+        ("units", "feet", "units is 'feet', expected m or mm or .* or us-ft"),
+        ("scale", 0, "scale is '0', expected a number above 0"),
+        ("scale", float("nan"), "scale is 'nan', expected a number above 0"),
+        ("up", "Y", "up is 'Y', expected z or y or x"),
+        ("pose", [[1, 0, 0, 0]] * 3, "pose is .*, expected four rows of four numbers"),
+        ("pose", np.zeros((4, 4)).tolist(), "pose is .*, expected four rows of four numbers"),
+        (
+            "pose",
+            np.diag([1.0, 1, 0, 1]).tolist(),
+            "pose is .*, expected four rows of four numbers that move",
+        ),
+        (
+            "pose",
+            np.diag([1.0, 1, float("inf"), 1]).tolist(),
+            "pose is .*, expected four rows of four numbers",
+        ),
+        ("pose", "identity", "pose is 'identity', expected four rows"),
+        ("low", [1, 2], r"low is '\[1, 2\]', expected three numbers"),
+        ("low", None, "low or high alone"),
+        ("crs", 4326, "crs is '4326', expected text in quotes"),
+        ("unit", "m", "unknown field 'unit', expected one of path, index"),
+    ],
+)
+def test_a_wrong_edit_is_refused_by_file_scan_and_field(
+    field: str, value: object, message: str, folder: Path
+) -> None:
+    path = folder / "scans.toml"
+    write_scan_list(path, inspect([folder / "a.las"]))
+    edit(path, {field: value})
+    with pytest.raises(BadRequestError, match=message) as caught:
+        read_scan_list(path)
+    assert str(caught.value).startswith(f"{path}: ")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("version = 1\n[[scan]]\npath = \n", "line 3"),
+        ("version = 2\nscan = []\n", "version 2, expected version = 1"),
+        ("scans = []\n", "unknown scans"),
+        ("version = 1\n", "expected version = 1 and a"),
+        ("version = 1\nscan = [1]\n", "no path"),
+        ("version = 1\nscan = []\n", "no scan to use"),
+        (
+            '[[scan]]\npath = "a"\n[[scan]]\npath = "b"\n[[scan]]\npath = "a"\n',
+            r"scan 3 \(.*\): the same as scan 1",
+        ),
+        ('[[scan]]\npath = "a"\n[[scan]]\npath = "b/../a"\n', r"scan 2 \(.*\): the same as scan 1"),
+        ('[[scan]]\npath = "a.las"\nuse = false\n', "no scan to use"),
+        ("\udcff", "expected a list of scans"),
+    ],
+)
+def test_a_file_that_is_no_list_is_refused(text: str, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "scans.toml"
+    path.write_bytes(text.encode("utf-8", "surrogateescape"))
+    with pytest.raises(BadRequestError, match=message):
+        inputs([path])
+
+
+def test_a_mesh_is_sampled_in_metres_whatever_its_units(tmp_path: Path) -> None:
+    square = np.array([[0.0, 0, 1], [2000, 0, 1], [2000, 2000, 1], [0, 2000, 1]])
+    corners = np.array([0, 1, 2, 0, 2, 3], "<u2")
+    write_glb(tmp_path / "a.glb", glb_document(4, 6), glb_vertices(square) + corners.tobytes())
+    write_scan_list(tmp_path / "scans.toml", inspect([tmp_path / "a.glb"]))
+    edit(tmp_path / "scans.toml", {"units": "mm"})
+    xyz = points(inputs([tmp_path / "scans.toml"], 0.1))
+    assert abs(len(xyz) - 400) <= 1
+    # glTF has y up: the square in its xy plane stands upright, and its front looks to -y.
+    assert (xyz[:, 1] == -0.001).all() and xyz[:, 2].max() <= 2 and xyz[:, 2].max() > 1.9
+
+
+def test_the_command_writes_a_list_and_names_broken_files(
+    folder: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(folder)
+    assert run(["inspect", "."]) == 3
+    out, err = capsys.readouterr()
+    assert "5 scans in 4 files, 1 broken: 77 points and those of 1 scans" in out
+    assert "c.e57" in err and "checksum" in err
+    assert len(read_scan_list(folder / "scans.toml")) == 5
+    edit(folder / "scans.toml", {"use": False}, 3)
+    before = (folder / "scans.toml").read_bytes()
+    assert run(["inspect", "a.las"]) == 0
+    assert (folder / "scans.toml").read_bytes() == before and "was not changed" in capsys.readouterr().err
+    assert run(["inspect", "a.las", "-o", "scans.toml"]) == 2
+    assert run(["inspect", "a.las", "-o", "scans.toml", "--overwrite"]) == 0
+    assert len(read_scan_list(folder / "scans.toml")) == 1
+    assert run(["inspect", "nowhere"]) == 3
+
+
+def test_the_command_prints_json(
+    folder: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(folder)
+    assert run(["inspect", "a.las", "b.ptx", "--json", "--sha256"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert [entry["count"] for entry in found] == [50, 20, 7]
+    assert found[0]["sha256"] == sha256_of(folder / "a.las") and found[1]["pose"] == POSE.tolist()
+    assert not (folder / "scans.toml").exists()
+
+
+def test_the_crs_of_a_las_and_an_e57_is_in_the_list(folder: Path) -> None:
+    wkt = 'PROJCS["WGS 84 / UTM zone 17N"]'
+    record = struct.pack("<2x16sHH32x", b"LASF_Projection", 2112, len(wkt) + 1) + wkt.encode() + b"\0"
+    keys = struct.pack("<12H", 1, 1, 0, 2, 1024, 0, 1, 1, 3072, 0, 1, 32617)
+    old = struct.pack("<2x16sHH32x", b"LASF_Projection", 34735, len(keys)) + keys
+    for name, vlr, expected in (("w", record, wkt), ("k", old, "model 1; projected EPSG 32617")):
+        data = bytearray((folder / "a.las").read_bytes())
+        header_size, start = struct.unpack_from("<HI", data, 94)
+        (count,) = struct.unpack_from("<I", data, 100)
+        struct.pack_into("<II", data, 96, start + len(vlr), count + 1)
+        data[header_size:header_size] = vlr
+        (folder / f"{name}.las").write_bytes(data)
+        (entry,) = inspect([folder / f"{name}.las"])
+        assert (entry.crs, entry.count, entry.fault) == (expected, 50, "")
+    columns = {f"cartesian{axis}": np.arange(3.0) for axis in "XYZ"}
+    write_e57(folder / "p.e57", [{"columns": columns}], crs=wkt)
+    assert inspect([folder / "p.e57"])[0].crs == wkt
+
+
+def test_a_build_names_every_broken_file_on_a_line_of_its_own(
+    folder: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(folder)
+    (folder / "e.las").write_bytes(b"LASF")
+    (folder / "deep" / "d.xyz").write_text("1 2 3\n4 5\n")  # broken behind what its header says
+    assert run(["build", ".", "-o", "archive", "--jobs", "1"]) == 3
+    lines = [line for line in capsys.readouterr().err.splitlines() if "expected" in line]
+    named = [next(name for name in ("c.e57", "d.xyz", "e.las") if name in line) for line in lines]
+    assert sorted(named) == ["c.e57", "d.xyz", "e.las"]
+    assert lines[0].startswith("error: ") and not (folder / "archive").exists()
+    assert not [path for path in folder.iterdir() if path.name.startswith(".")]
+
+
+def test_a_build_may_leave_broken_files_out(
+    folder: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(folder)
+    assert run(["inspect", "."]) == 3
+    edit(folder / "scans.toml", {"crs": "EPSG:2056", "up": "y"}, 0)
+    assert run(["build", "scans.toml", "-o", "archive", "--jobs", "1", "--skip-bad"]) == 0
+    assert "left out" in capsys.readouterr().err
+    with Archive(folder / "archive") as archive:
+        header = archive.header
+    assert header.points == 50 + 20 + 7 + 20 and header.unknown_everywhere
+    kept = {(Path(s.path).name, s.index): s for s in header.sources}
+    las, ptx, broken = kept["a.las", 0], kept["b.ptx", 0], kept["c.e57", 0]
+    assert (las.crs, las.up, las.units) == ("EPSG:2056", "y", "m") and (ptx.crs, ptx.up) == ("", "z")
+    assert np.array_equal(ptx.pose, POSE) and "checksum" in broken.fault

@@ -1,0 +1,185 @@
+"""An archive somebody has stays readable: the committed one holds what the JSON beside it says, to the bit."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import naive_classes
+import naive_normals
+import numpy as np
+import pytest
+from solidcloud.builder.config import BuildConfig
+from solidcloud.builder.edit.edit_archive import add_scans, remove_scans
+from solidcloud.builder.passes.verify import verify_archive
+from solidcloud.builder.pipeline import build_archive
+from solidcloud.builder.voxel.point_radius import voxel_points
+from solidcloud.schemas.archive.archive import Archive
+from solidcloud.schemas.archive.radius_model import RADIUS_CLASSES, RIM_BIT
+from solidcloud.schemas.kernels.normal_codes import LINE, THICK, decode_normal
+
+GOLDEN = Path(__file__).resolve().parents[3] / "golden"
+
+
+# The archives of each format version, and how many of the scans went into them.
+SCANS = {"archive": 2, "archive-2": 3, "archive-3": 3, "archive-4": 3}
+NORMAL_REACH = {"archive-4": 0.3}
+
+
+@pytest.fixture(params=SCANS)
+def name(request: pytest.FixtureRequest) -> str:
+    """Of each golden archive."""
+    return request.param
+
+
+@pytest.fixture
+def expected(name: str) -> dict[str, Any]:
+    """The committed values."""
+    return json.loads((GOLDEN / f"{name}.json").read_text())
+
+
+@pytest.mark.interpreted
+def test_the_golden_archive_holds_what_is_written_beside_it(name: str, expected: dict[str, Any]) -> None:
+    assert verify_archive(GOLDEN / name, deep=True).faults == ()
+    with Archive(GOLDEN / name) as archive:
+        header = archive.header
+        assert header.format_version == expected.get("format_version", 1)
+        assert list(header.models) == expected.get("models", ["mean"])
+        assert header.radius_counts.tolist() == expected.get("radius_counts", [0] * RADIUS_CLASSES)
+        assert header.radius_capped == expected.get("radius_capped", 0)
+        assert header.normal_reach == NORMAL_REACH.get(name, 0.0)
+        now = header.radius_now
+        assert header.generation == expected.get("generation", 0)
+        assert (
+            [now.radius.hex(), now.error.hex(), now.sample] == expected["radius_now"]
+            if now
+            else ("radius_now" not in expected)
+        )
+        assert [shard for shard, _ in archive.shards()] == expected.get("shards", ["0-000000.h5"])
+        assert header.archive_id.hex() == expected["archive_id"]
+        assert [value.hex() for value in header.lattice.origin] == expected["origin"]
+        assert header.lattice.step.hex() == expected["step"]
+        assert header.lattice.voxel_steps == expected["voxel_steps"]
+        assert header.points == expected["points"]
+        assert [header.low.tolist(), header.high.tolist()] == expected["bounds"]
+        assert header.radius.hex() == expected["radius"]
+        assert header.radius_sample == expected["radius_sample"]
+        assert header.moved_max.hex() == expected["moved_max"]
+        assert [[s.path, s.index, s.format, s.sha256, s.count] for s in header.sources] == expected["sources"]
+        assert len(archive.voxels) == len(expected["voxels"]) > 1
+        for row, voxel in enumerate(expected["voxels"]):
+            entry = archive.voxels[row]
+            data, links = archive.read_voxel(row)
+            assert archive.coordinates[row].tolist() == voxel["coordinate"]
+            assert entry["rows"].tolist() == voxel["rows"]
+            assert int(entry["leaves"]) == voxel["leaves"]
+            assert [entry["low"].tolist(), entry["high"].tolist()] == [voxel["low"], voxel["high"]]
+            assert links.height == voxel["height"]
+            cells = np.column_stack([data.cells.low, data.cells.log2_size])
+            assert cells.tolist() == voxel["cells"]
+            assert (None if data.normal is None else data.normal.tolist()) == voxel.get("normals")
+
+
+def golden_points(folder: Path) -> np.ndarray:
+    """Lattice point, scan and intensity of every point of an archive, (n, 5), in an order of their own."""
+    rows = []
+    with Archive(folder) as archive:
+        for row in range(len(archive.voxels)):
+            voxel, links = archive.read_voxel(row)
+            local = voxel_points(voxel, links)
+            lattice = local + archive.coordinates[row] * archive.header.lattice.voxel_steps
+            rows.append(np.column_stack([lattice, voxel.scan_index, voxel.intensity]))
+    table = np.concatenate(rows)
+    return table[np.lexsort(table.T)]
+
+
+def golden_classes(folder: Path) -> dict[tuple[int, ...], int]:
+    """The radius class of each place of an archive that has some."""
+    classes: dict[tuple[int, ...], int] = {}
+    with Archive(folder) as archive:
+        for row in range(len(archive.voxels)):
+            voxel, links = archive.read_voxel(row)
+            assert voxel.radius_class is not None
+            lattice = (
+                voxel_points(voxel, links) + archive.coordinates[row] * archive.header.lattice.voxel_steps
+            )
+            for point, found in zip(lattice.tolist(), voxel.radius_class.tolist(), strict=True):
+                assert classes.setdefault(tuple(point), found) == found
+    return classes
+
+
+@pytest.mark.parametrize("name", ["archive-2", "archive-3"])
+def test_the_golden_archive_holds_the_radius_classes_of_its_points(name: str) -> None:
+    classes = golden_classes(GOLDEN / name)
+    judged = naive_classes.judge(np.array(list(classes)), "0.001")
+    assert classes == {point: found.local + RIM_BIT * found.rim for point, found in judged.items()}
+
+
+def test_the_golden_archive_holds_the_normals_of_its_points() -> None:
+    square, found = 300**2, 0
+    with Archive(GOLDEN / "archive-4") as archive:
+        assert archive.header.lattice.step == 0.001
+        for row in range(len(archive.voxels)):
+            voxel, links = archive.read_voxel(row)
+            points = voxel_points(voxel, links)
+            assert voxel.normal is not None
+            for at, code in zip(points, voxel.normal.tolist(), strict=True):
+                judged = naive_normals.find(points, at, square)
+                few = judged is None or judged.count < 3
+                if (
+                    few
+                    or judged.values[1] <= LINE * judged.values[2]
+                    or judged.values[0] > THICK * judged.values[1]
+                ):
+                    assert code == 0
+                    continue
+                assert naive_normals.angle(np.array(decode_normal(code)), judged.normal) < 0.56
+                found += 1
+    assert found > 100
+
+
+def test_the_golden_archive_holds_the_points_of_its_scans(name: str, expected: dict[str, Any]) -> None:
+    built = 2 if name == "archive-3" else SCANS[name]  # before any was added: they make the origin
+    tables, lows = [], []
+    assert len(expected["sources"]) == SCANS[name]
+    for number, (path, *_, count) in enumerate(expected["sources"]):
+        rows = np.loadtxt(GOLDEN / path, skiprows=1)
+        # Millimetres from UTM 512345, 5612345 and -0.25 m: the numbers the scans were made of.
+        steps = np.rint((rows[:, :3] - [512345, 5612345, -0.25]) * 1000)
+        lows.append(steps.min(axis=0))
+        if count:  # not removed
+            tables.append(np.column_stack([steps, np.full(len(rows), number), rows[:, 3]]))
+    table = np.concatenate(tables)
+    table[:, :3] -= np.min(lows[:built], axis=0)
+    assert np.array_equal(golden_points(GOLDEN / name), table[np.lexsort(table.T)])
+
+
+def test_a_build_today_gives_the_golden_points_and_cells(
+    name: str, expected: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(GOLDEN)  # the archive keeps paths as given
+    config = BuildConfig(
+        voxel=1.0, resolution=0.001, leaf=8, degree=3, cell_points=40, keep=frozenset({"scan", "intensity"}), jobs=1,
+        models=frozenset(expected.get("models", ["mean"])),
+    )  # fmt: skip
+    if name in NORMAL_REACH:
+        config = replace(config, keep=config.keep | {"normal"}, normal_reach=NORMAL_REACH[name])
+    scans = [Path(f"scan-{number}.xyz") for number in range(SCANS[name])]
+    if name == "archive-3":
+        build_archive(scans[1::-1], tmp_path / "a", config)
+        add_scans(tmp_path / "a", scans[2:], jobs=1)
+        remove_scans(tmp_path / "a", ["scan-1.xyz"], jobs=1)
+    else:
+        build_archive(scans[::-1], tmp_path / "a", config)
+    assert np.array_equal(golden_points(tmp_path / "a"), golden_points(GOLDEN / name))
+    if name in ("archive-2", "archive-3"):
+        assert golden_classes(tmp_path / "a") == golden_classes(GOLDEN / name)
+    with Archive(tmp_path / "a") as new, Archive(GOLDEN / name) as golden:
+        assert repr(new.header) == repr(golden.header)
+        assert new.header.archive_id.hex() == expected["archive_id"]
+        for row in range(len(golden.voxels)):
+            a, b = new.read_voxel(row)[0], golden.read_voxel(row)[0]
+            # In what order cells stand below one node of the top hierarchy is free.
+            assert sorted(zip(*(c.tolist() for c in a.cells), strict=True)) == sorted(
+                zip(*(c.tolist() for c in b.cells), strict=True)
+            )

@@ -1,0 +1,93 @@
+"""A trial of compiled kernels where the last start did not come to its end."""
+
+import os
+import pickle
+import shutil
+import signal
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from solidcloud.schemas.kernels.compiling import kernel_files
+from solidcloud.schemas.kernels.kernel_files import KernelFiles
+from solidcloud.schemas.kernels.morton import morton_decode
+from solidcloud.schemas.wire.answers import Verdict
+from solidcloud.server.cli.commands.rehearsal import check_answers, rehearse
+from solidcloud.server.scene import Scene
+
+ARCHIVE = Path(__file__).parents[4] / "golden" / "archive-4"
+compiled = pytest.mark.skipif(
+    os.environ.get("NUMBA_DISABLE_JIT") == "1", reason="interpreted kernels are not kept"
+)
+
+
+class Crash:
+    """What crashes as it is unpickled: written as it is, its digest is right."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return exec, (f"import os; os.kill(os.getpid(), {int(signal.SIGSEGV)})",)
+
+
+@compiled
+def test_kernels_that_crash_are_wiped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    morton_decode(np.zeros(1, np.uint64))  # compiled, or loaded: it is kept now
+    files = KernelFiles(tmp_path / "solidcloud-kernels")
+    for path in kernel_files().folder.glob("*.morton_decode-*"):
+        files.write(path.name, pickle.dumps(Crash()))
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    rehearse(ARCHIVE, files)
+    assert list(files.folder.iterdir()) == []
+    (said,) = (record.getMessage() for record in caplog.records)
+    assert "SIGSEGV" in said and str(files.folder) in said
+
+
+@compiled
+def test_a_trial_that_hangs_is_one_that_failed(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    files = KernelFiles(tmp_path)
+    files.write("a.kernel", b"")
+    rehearse(ARCHIVE, files, seconds=0.01)
+    assert list(tmp_path.iterdir()) == []
+    assert "not done within 0.01 s" in caplog.records[0].getMessage()
+
+
+@compiled
+@pytest.mark.timeout(900)  # alone, with an empty cache, it compiles every kernel of the server
+def test_kernels_that_are_right_are_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    with Scene.open(ARCHIVE) as scene:
+        scene.warm()
+        check_answers(scene)
+    shutil.copytree(kernel_files().folder, tmp_path / "solidcloud-kernels")
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    files = KernelFiles(tmp_path / "solidcloud-kernels")
+    before = set(os.listdir(files.folder))
+    rehearse(ARCHIVE, files)
+    assert caplog.records == []
+    assert before <= set(os.listdir(files.folder))  # a rehearsal simulates frames too
+
+
+@compiled
+def test_an_archive_that_is_none_is_not_the_kernels_fault(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    files = KernelFiles(tmp_path)
+    files.write("a.kernel", b"")
+    rehearse(tmp_path / "nothing", files)
+    assert files.read("a.kernel") == b""
+    assert caplog.records == []
+
+
+@pytest.mark.parametrize("lie", list(Verdict))
+def test_wrong_answers_are_noticed(lie: Verdict) -> None:
+    class Lying(Scene):
+        def collide(self, *what: Any, **parameters: Any) -> Any:
+            answers = super().collide(*what, **parameters)
+            answers.verdict[:] = lie
+            return answers
+
+    with Lying.open(ARCHIVE) as scene, pytest.raises(AssertionError):
+        check_answers(scene)

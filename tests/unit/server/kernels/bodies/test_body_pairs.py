@@ -1,0 +1,248 @@
+"""Pairs of placed avatars by the kernels alone: boxes, the sweep over them, the definition to the unit, the work."""
+
+import math
+import os
+
+import archive_cases
+import naive
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from solidcloud.server.avatars.avatar_model import AvatarModel, make_avatar
+from solidcloud.server.kernels.bodies import body_pairs as kernel
+from solidcloud.server.kernels.core.voxel_layout import LANES
+from solidcloud.server.runtime.stop_flag import NEVER
+
+pytestmark = pytest.mark.interpreted
+interpreted_only = pytest.mark.skipif(
+    os.environ.get("NUMBA_DISABLE_JIT") != "1", reason="compiled code calls functions unseen"
+)
+
+ORIGIN = np.array([3.0, -20.0, 500.0])
+UNIT = 2.0**-26
+
+
+# --- the sweep ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_pairs_of_boxes_are_those_of_all_pairs(seed: int) -> None:
+    """Whole numbers, so that sides lie upon each other."""
+    rng = np.random.default_rng(seed)
+    n = 14
+    low = rng.integers(0, 8, (n, 3)).astype(float)
+    high = low + rng.integers(0, 4, (n, 3))
+    groups, masks = rng.integers(0, 8, (2, n)).astype(np.uint32)
+    meet, stopped = [], 0
+    for i in range(n):
+        for j in range(i + 1, n):
+            if (low[i] <= high[j]).all() and (low[j] <= high[i]).all():
+                let = groups[i] & masks[j] and groups[j] & masks[i]
+                meet += [[i, j]] if let else []
+                stopped += not let
+    assert meet or stopped
+    order = np.argsort(low[:, 0], kind="stable")
+    for room in (len(meet) + 1, len(meet), 1, 0):
+        pairs = np.full((room, 2), -1, np.int32)
+        found = kernel.sweep_and_prune(order, low, high, groups, masks, NEVER.flag, pairs)
+        assert found == (len(meet), stopped)
+        written = [row for row in pairs.tolist() if row != [-1, -1]]
+        assert len(written) == min(room, len(meet)) and all(row in meet for row in written)
+        if room >= len(meet):
+            assert sorted(written) == meet and pairs[len(meet) :].tolist() == [[-1, -1]] * (room - len(meet))
+
+
+# --- boxes ----------------------------------------------------------------------------------------------
+
+
+def placed(
+    model: AvatarModel, pose: NDArray[np.float64]
+) -> tuple[NDArray[np.int64], NDArray[np.float64], float]:
+    """An avatar's points in exact units; where its root's centre is, from the origin, and the root's radius [m]."""
+    scale = naive.scale_of(pose)
+    center = pose[:3, :3] @ model.arrays.center[0] + (pose[:3, 3] - ORIGIN)
+    return naive.placed_units(model.points, pose, ORIGIN), center, float(model.arrays.radius[0]) * scale
+
+
+@pytest.mark.parametrize(("far", "scale"), [(0.0, 1.0), (1e6, 0.2), (1e8, 30.0)])
+def test_boxes_hold_the_spheres_and_half_the_margin_and_little_more(
+    rng: np.random.Generator, far: float, scale: float
+) -> None:
+    model = make_avatar(rng.uniform(-1, 1, (20, 3)) + np.array([5, 0, 0]), 0.125)
+    poses = np.array(
+        [
+            archive_cases.pose_of(
+                archive_cases.random_rotation(rng) * scale, rng.uniform(-1, 1, 3) * far + ORIGIN
+            )
+            for _ in range(4)
+        ]
+    )
+    scales = np.array([naive.scale_of(pose) for pose in poses])
+    units = np.array([naive.reach_units(pose, model.radius, 0.0, 0.0) for pose in poses])
+    low, high = np.full((4, 3), 9e99), np.full((4, 3), 9e99)
+    margin = 1_000_001  # of it half a unit is in either box
+    which = np.array([3, 0, 1])
+    kernel.bound_objects(model.arrays, poses, which, scales, units, ORIGIN, margin, low, high)
+    assert (low[2] == 9e99).all() and (high[2] == 9e99).all()
+    for i in which:
+        points, center, radius = placed(model, poses[i])
+        reach = int(units[i]) + margin / 2
+        assert (low[i] / UNIT <= points.min(axis=0) - reach).all()
+        assert (high[i] / UNIT >= points.max(axis=0) + reach).all()
+        # Not larger than the root's ball with reach by more than rounding: its bounds and two units, widened by 1e-8.
+        extent = radius * (1 + 1e-8) + reach * UNIT
+        size = np.abs(poses[i][:3, 3]).max() + 20 * scale
+        slack = 2 * UNIT + size * 2.0**-49
+        assert np.abs(low[i] - (center - extent)).max() <= 2 * slack
+        assert np.abs(high[i] - (center + extent)).max() <= 2 * slack
+        assert (high[i] - low[i] >= 2 * (extent + 1.9 * UNIT)).all()
+
+
+# --- two avatars ----------------------------------------------------------------------------------------
+
+
+class Asked:
+    """Two avatars under two poses, asked with a reach; and what the definition says."""
+
+    def __init__(self, a: AvatarModel, b: AvatarModel, poses: NDArray[np.float64]) -> None:
+        self.a, self.b, self.poses = a, b, poses
+        self.scales = np.array([naive.scale_of(pose) for pose in poses])
+        one, other = (naive.placed_units(m.points, p, ORIGIN) for m, p in zip((a, b), poses, strict=True))
+        square = naive.least_square(one, other)
+        self.least = math.isqrt(square - 1) + 1 if square else 0
+
+    def ask(self, reach: int, visits: int = 1 << 40, turned: bool = False) -> tuple[int, int, int]:
+        """The verdict, node visits and pairs of points tested, with radii and margin adding up to `reach` units."""
+        units = np.array([reach // 2, reach // 3])
+        verdict, counters = np.full(1, 9, np.uint8), np.array([100, 200])
+        a, b, pair = (self.b, self.a, [1, 0]) if turned else (self.a, self.b, [0, 1])
+        kernel.touch_pairs(
+            a.arrays, b.arrays, self.poses, self.scales, units, np.array([pair]), reach - int(units.sum()),
+            ORIGIN, visits, NEVER.flag, verdict, counters,
+        )  # fmt: skip
+        return int(verdict[0]), int(counters[0]) - 100, int(counters[1]) - 200
+
+
+def asked(
+    seed: int, counts: tuple[int, int], far: float = 0.0, scale: float = 1.0, apart: float = 1.2
+) -> Asked:
+    """Two shells of so many points whose middles are `apart` from each other, `far` from the origin [m]."""
+    rng = np.random.default_rng(seed)
+    models = []
+    for count in counts:
+        points = rng.normal(size=(count, 3))
+        models.append(make_avatar(0.5 * points / np.sqrt((points * points).sum(axis=1))[:, None], 0.0))
+    away = rng.normal(size=3)
+    at = rng.uniform(-1, 1, 3) * far
+    away *= apart * scale / math.sqrt(float(away @ away))
+    poses = [
+        archive_cases.pose_of(archive_cases.random_rotation(rng) * scale, ORIGIN + at + d)
+        for d in (0 * away, away)
+    ]
+    return Asked(*models, np.array(poses))
+
+
+COUNTS = [(1, 1), (5, 40), (40, 5), (33, 33), (300, 8), (300, 300)]
+
+
+@pytest.mark.parametrize("counts", COUNTS)
+@pytest.mark.parametrize(("far", "scale"), [(0.0, 1.0), (1e5, 0.01), (1e8, 3.0)])
+def test_contact_begins_at_the_unit_the_definition_says(
+    counts: tuple[int, int], far: float, scale: float
+) -> None:
+    case = asked(sum(counts), counts, far, scale)
+    for turned in (False, True):
+        assert case.ask(case.least, turned=turned)[0] == kernel.CONTACT
+        assert case.ask(case.least - 1, turned=turned)[0] == kernel.CLEAR
+        assert case.ask(case.least * 9 // 8, turned=turned)[0] == kernel.CONTACT
+        assert case.ask(case.least * 7 // 8, turned=turned)[0] == kernel.CLEAR
+
+
+def test_points_upon_each_other_touch_without_any_reach() -> None:
+    model = make_avatar(np.eye(3), 0.0)
+    case = Asked(model, model, np.array([archive_cases.pose_of(np.eye(3), ORIGIN)] * 2))
+    assert case.least == 0 and case.ask(0)[0] == kernel.CONTACT
+
+
+def test_a_pair_farther_along_one_axis_than_any_reach_is_clear() -> None:
+    """2^33 units along an axis: its square is 2^66, which 64 bits would take for 0."""
+    ball = make_avatar([[0.0, 0, 0]], 0.0)
+    poses = np.array([archive_cases.pose_of(np.eye(3), ORIGIN + d) for d in ([0, 0, 0], [0, 128.0, 0])])
+    case = Asked(ball, ball, poses)
+    lanes = np.zeros(3)
+    shift = [pose[:3, 3] - ORIGIN for pose in poses]
+    for reach in (1, 1 << 30):
+        arguments = (ball.arrays, poses[0], shift[0], 0, 0, ball.arrays, poses[1], shift[1], 0, 0, reach)
+        assert not kernel._points_touch(*arguments)
+        assert case.ask(reach)[0] == kernel.CLEAR
+    # 16 m, the farthest reach: to the unit.
+    poses[1, :3, 3] = ORIGIN + np.array([0, 16.0, 0])
+    assert Asked(ball, ball, poses).ask(1 << 30)[0] == kernel.CONTACT
+    assert Asked(ball, ball, poses).ask((1 << 30) - 1)[0] == kernel.CLEAR
+    assert not lanes.any()
+
+
+def test_a_budget_leaves_a_pair_open_and_takes_nothing_back() -> None:
+    case = asked(1, (300, 300))
+    for reach, verdict in ((case.least, kernel.CONTACT), (case.least - 1, kernel.CLEAR)):
+        _, visits, _ = case.ask(reach)
+        said = [case.ask(reach, budget)[0] for budget in range(visits + 2)]
+        open_until = said.count(kernel.UNKNOWN)
+        assert said == [kernel.UNKNOWN] * open_until + [verdict] * (len(said) - open_until)
+        assert 1 <= open_until <= visits
+        assert case.ask(reach, 0)[1] == 1
+    far = asked(1, (300, 300), apart=9.0)
+    assert far.ask(case.least, 0) == (kernel.CLEAR, 1, 0)
+
+
+# Node visits and pairs of points tested, at the least reach that is contact and one unit below. All that bounds leave
+# out is in them: less is better, and more is to be known.
+WORK = [
+    ((1, 1), (1, 32), (1, 32)),
+    ((5, 40), (3, 32), (3, 32)),
+    ((40, 5), (3, 64), (3, 192)),
+    ((33, 33), (5, 96), (5, 96)),
+    ((300, 8), (8, 64), (8, 192)),
+    ((300, 300), (20, 288), (47, 1920)),
+]
+
+
+@pytest.mark.parametrize(("counts", "touching", "clear"), WORK)
+def test_the_work_is_what_it_was(
+    counts: tuple[int, int], touching: tuple[int, int], clear: tuple[int, int]
+) -> None:
+    case = asked(sum(counts), counts)
+    assert case.ask(case.least)[1:] == touching
+    assert case.ask(case.least - 1)[1:] == clear
+
+
+@interpreted_only
+@pytest.mark.parametrize(("far", "exact"), [(0.0, 2), (1e5, 2), (1e8, 2)])
+def test_integers_decide_only_what_float32_cannot(
+    monkeypatch: pytest.MonkeyPatch, far: float, exact: int
+) -> None:
+    """How many pairs of points the band leaves to integers; a thousand units off the least reach, and on it."""
+    calls = [0]
+    definition = kernel._points_touch
+
+    def counted(*arguments: object) -> bool:
+        calls[0] += 1
+        return bool(definition(*arguments))
+
+    monkeypatch.setattr(kernel, "_points_touch", counted)
+    case = asked(3, (33, 40), far)
+    for reach in (case.least - 1000, case.least - 1, case.least, case.least + 1000):
+        case.ask(reach)
+    assert calls[0] == exact
+    calls[0] = 0
+    case.ask(case.least * 2)
+    case.ask(case.least // 2)
+    assert calls[0] == 0
+
+
+def test_lanes_repeat_the_last_point() -> None:
+    """A leaf node of one point and one of a full block, on either side."""
+    for counts in ((1, LANES), (LANES, 1), (2, LANES - 1)):
+        case = asked(7, counts)
+        assert case.ask(case.least)[0] == kernel.CONTACT
+        assert case.ask(case.least - 1)[0] == kernel.CLEAR

@@ -1,0 +1,131 @@
+"""The broad phase: every voxel that holds a point in reach is listed, and not many more."""
+
+from pathlib import Path
+
+import archive_cases
+import naive
+import numpy as np
+import pytest
+import synthetic_scans
+from numpy.typing import NDArray
+from solidcloud.schemas.archive.archive import Archive
+from solidcloud.server.avatars.avatar_model import AvatarModel, make_avatar
+from solidcloud.server.kernels.core.voxels_in_reach import Reach, find_key
+from solidcloud.server.queries.context.query_context import (
+    SceneData,
+    check_request,
+    make_scene_data,
+    to_units,
+)
+from solidcloud.server.residency.voxel_cache import Residency
+from solidcloud.server.residency.voxel_store import Store
+from solidcloud.server.scene import Scene
+
+
+def find(data: SceneData, avatar: AvatarModel, poses: NDArray[np.float64], margin: float) -> Reach:
+    """The voxels in reach of a request."""
+    return check_request(data, avatar, poses, data.radius_units + to_units(margin, "margin"))
+
+
+def open_data(case: archive_cases.Case) -> SceneData:
+    """What `collide` reads of an archive."""
+    store = Store(case.archive)
+    return make_scene_data(store.archive, Residency(store, 1 << 24))
+
+
+def listed(reach: Reach, pose: int) -> list[int]:
+    """The voxel rows of one pose."""
+    return reach.rows[reach.starts[pose] : reach.starts[pose + 1]].tolist()
+
+
+@pytest.mark.interpreted
+def test_find_key_finds_what_is_there_and_nothing_else() -> None:
+    keys = np.array([0, 3, 4, 2**63 + 5], np.uint64)
+    assert [find_key(keys, np.uint64(k)) for k in (0, 3, 4, 2**63 + 5)] == [0, 1, 2, 3]
+    assert [find_key(keys, np.uint64(k)) for k in (1, 5, 2**63, 2**64 - 1)] == [-1] * 4
+    assert find_key(keys[:0], np.uint64(0)) == -1
+
+
+@pytest.mark.parametrize(
+    ("shift", "scale", "margin"), [(0.0, 1.0, 0.0), (5.6e6, 0.05, 0.1), (0.0, 30.0, 0.0), (-1e8, 1.0, 3.0)]
+)
+def test_no_voxel_in_reach_is_left_out(
+    tmp_path: Path, rng: np.random.Generator, shift: float, scale: float, margin: float
+) -> None:
+    case = archive_cases.build(
+        tmp_path, synthetic_scans.make_scan("noise", 5, 900) + shift, voxel=0.25, resolution=1e-3
+    )
+    avatar = rng.uniform(-0.2, 0.2, (30, 3))
+    data, model = open_data(case), make_avatar(avatar, 0.02)
+    poses = archive_cases.near_poses(rng, case.points, avatar, 40, 0.5, scale)
+    reach = find(data, model, poses, margin)
+    with Archive(case.archive) as archive:
+        lattice, step = archive.header.lattice, archive.header.lattice.step
+    integers = naive.lattice_of(case.points, lattice.origin, step)
+    units, voxels = naive.scan_units(integers, step), integers // lattice.voxel_steps
+    for i, pose in enumerate(poses):
+        placed = naive.placed_units(avatar, pose, lattice.origin)
+        most = naive.reach_units(pose, 0.02, 0.01, margin)
+        # Any point in reach of any avatar point, in contact or not: its voxel must be listed.
+        apart = np.abs(placed[:, None] - units)
+        within = (apart <= most).all(axis=2)
+        near = (within & ((np.where(within[..., None], apart, 0) ** 2).sum(axis=2) <= most**2)).any(axis=0)
+        needed = {tuple(v) for v in voxels[near].tolist()}
+        rows = listed(reach, i)
+        found = {tuple(v) for v in data.arrays.coordinates[rows].tolist()}
+        assert needed <= found and len(found) == len(rows)
+        # And each one listed has its box within reach of the sphere around the avatar.
+        center = placed.mean(axis=0)
+        ball = np.linalg.norm(placed - center, axis=1).max() * 2 + most * 1.001 + 2 * step * naive.UNITS
+        low, high = data.broad.low[rows] * step * naive.UNITS, data.broad.high[rows] * step * naive.UNITS
+        gap = np.maximum(np.maximum(low - center, center - high), 0)
+        assert (np.linalg.norm(gap, axis=1) <= ball).all()
+
+
+def test_more_voxels_than_expected_are_all_listed(tmp_path: Path) -> None:
+    # 343 voxels of one point; one pose reaches nearly all, several times what room is made for at first.
+    grid = np.stack(np.meshgrid(*[np.arange(7.0)] * 3), axis=-1).reshape(-1, 3)
+    case = archive_cases.build(tmp_path, grid, voxel=1.0, resolution=0.5)
+    data = open_data(case)
+    for row in range(343):
+        data.bounds.prove(row)
+    reach = find(data, make_avatar([[3.0, 3, 3]], 3.0), np.eye(4)[None], 1.5)
+    apart = np.linalg.norm(grid - 3, axis=1)
+    assert 300 < (apart <= 4.51).sum() <= len(listed(reach, 0)) <= (apart <= 5.1).sum()
+
+
+def _place(x: float, y: float = 0.5, z: float = 0.5) -> NDArray[np.float64]:
+    return archive_cases.pose_of(np.eye(3), np.array([x, y, z]))
+
+
+def test_outside_is_where_the_reach_leaves_the_bounds(tmp_path: Path) -> None:
+    corners = np.array([[0.0, 0, 0], [2.0, 2, 2], [1.0, 1, 1]])
+    data = open_data(archive_cases.build(tmp_path, corners, resolution=1e-3))
+    poses = np.array(
+        [_place(1.0), _place(0.14), _place(0.06), _place(-0.05), _place(50.0), _place(1.0, z=1.95)]
+    )
+    reach = find(data, make_avatar([[0.0, 0, 0]], 0.09), poses, 0.0)
+    assert reach.outside.tolist() == [False, False, True, True, True, True]
+    assert listed(reach, 4) == []
+
+
+def test_a_request_without_poses_reaches_nothing(tmp_path: Path) -> None:
+    data = open_data(archive_cases.build(tmp_path, np.zeros((1, 3))))
+    reach = find(data, make_avatar([[0.0, 0, 0]], 0.1), np.empty((0, 4, 4)), 0.0)
+    assert len(reach.outside) == 0 and reach.starts.tolist() == [0]
+
+
+def test_terms_that_cancel_leave_no_voxel_out(tmp_path: Path, rng: np.random.Generator) -> None:
+    # The avatar lies 10^9 m off its pose's own origin: a placed coordinate is off by half a step of rounding.
+    case = archive_cases.build(tmp_path, np.zeros((1, 3)), voxel=1e-5, resolution=1e-6, radius=0.0)
+    avatar = rng.uniform(-3e5, 3e5, (1, 3))
+    with Scene.open(case.archive) as scene:
+        scene.add_avatar("avatar", avatar, 0.0)
+        for _ in range(200):
+            turn = archive_cases.random_rotation(rng) * 999.0
+            pose = archive_cases.pose_of(turn, -turn @ avatar[0])
+            least, _ = archive_cases.least_reach(case, avatar, pose, case.points[0], 1e-6)
+            for units, verdict in ((least, 1), (least - 1, 0)):
+                if units >= 0:
+                    answers = scene.collide("avatar", pose[None], units * 2.0**-26)
+                    assert answers.verdict[0] == verdict, (pose.tolist(), units)

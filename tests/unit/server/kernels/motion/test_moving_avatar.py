@@ -1,0 +1,82 @@
+"""An avatar at both ends of a chord, by the kernels alone: where it is, its ways, and what its bounds allow for."""
+
+from typing import NamedTuple
+
+import archive_cases
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from solidcloud.server.avatars.avatar_model import make_avatar
+from solidcloud.server.kernels.motion import moving_avatar as kernel
+
+pytestmark = pytest.mark.interpreted
+
+U32 = 2.0**-24
+STEP = 2.0**-10
+
+
+class Lattice(NamedTuple):
+    """What placing reads of a scene."""
+
+    origin: NDArray[np.float64]
+    step: float
+
+
+SCENE = Lattice(np.array([7.0, -50.0, 300.0]), STEP)
+
+
+@pytest.mark.parametrize(("far", "scale"), [(0.0, 1.0), (1e4, 0.25), (1e6, 4.0)])
+@pytest.mark.parametrize(("way", "more"), [(0.0, 0.0), (0.05, 0.0), (3.0, 2.0)])
+def test_an_avatar_is_placed_at_both_ends(
+    rng: np.random.Generator, far: float, scale: float, way: float, more: float
+) -> None:
+    """more: by how much farther than its nodes' centres some point may go, a part of the speed given [m]."""
+    model = make_avatar(rng.uniform(-0.4, 0.4, (100, 3)), 0.01)
+    avatar, found = model.arrays, kernel.make_moving(model.arrays, np.zeros(1, np.int64))
+    at = SCENE.origin + rng.uniform(-1, 1, 3) * far
+    ends = [
+        archive_cases.pose_of(archive_cases.random_rotation(rng) * scale, at + d * way) for d in (-1.0, 1.0)
+    ]
+    if not way:
+        ends[1] = ends[0]
+    found.ends[0], found.ends[1] = ends
+    shifts = [pose[:3, 3] - SCENE.origin for pose in ends]
+    exact = [
+        (avatar.center @ pose[:3, :3].T + shift) / STEP for pose, shift in zip(ends, shifts, strict=True)
+    ]
+    ways = exact[1] - exact[0]
+    fastest = float(np.sqrt((ways**2).sum(axis=1)).max())
+    speed = (fastest + more / STEP) * STEP if more else fastest * STEP * 0.5
+    extent, farthest = kernel.place_nodes(avatar, scale, speed, found, SCENE)
+
+    assert found.shifts.tolist() == [shift.tolist() for shift in shifts]
+    assert found.frame.tolist() == np.rint((exact[0][0] + exact[1][0]) / 2).astype(int).tolist()
+    largest = max(
+        (np.abs(pose[:3, :3] * avatar.center[0]).sum(axis=1) + np.abs(shift)).max()
+        for pose, shift in zip(ends, shifts, strict=True)
+    )
+    longest = max(fastest, speed / STEP) * (1 + 1e-6)
+    size = avatar.radius[0] * scale / STEP + 1 + longest
+    assert extent == pytest.approx(size + kernel.CHORD_ERROR * longest, rel=1e-7)
+    assert farthest == pytest.approx(largest / STEP + size, rel=1e-7)
+
+    rounding = size * U32 + farthest * 2.0**-49
+    assert np.abs(found.nodes[:3].T - (exact[0] - found.frame)).max() <= rounding
+    assert np.abs(found.nodes[4:7].T - ways).max() <= rounding
+    inverse = np.array(
+        [1 / s if s > 1e-20 else 0.0 for s in (found.nodes[4:7].astype(float) ** 2).sum(axis=0)]
+    )
+    assert np.abs(found.nodes[7] - inverse).max() <= 8 * U32 * inverse.max()
+    wide = found.nodes[3] - avatar.radius * scale / STEP
+    assert (wide >= size * U32).all() and wide.max() <= 3e-6 * size
+    assert (found.stamp == -1).all()
+    for block in range(len(avatar.points)):
+        found.lanes[:] = found.ways[:] = np.nan
+        kernel.place_block(avatar, block, found, SCENE)
+        points = [
+            avatar.points[block].T @ pose[:3, :3].T + shift for pose, shift in zip(ends, shifts, strict=True)
+        ]
+        lanes, moved = points[0] / STEP - found.frame, (points[1] - points[0]) / STEP
+        assert np.abs(found.lanes[block].T - lanes).max() <= rounding
+        assert np.abs(found.ways[block, :3].T - moved).max() <= rounding
+        assert np.isnan(np.delete(found.ways, block, axis=0)).all()

@@ -1,0 +1,156 @@
+"""Which pairs of pose and voxel coarse tops settle, and which they leave to those who look closer."""
+
+from itertools import chain
+from pathlib import Path
+
+import archive_cases
+import numpy as np
+import pytest
+import radius_class_archives
+from coarse_tops import ROOM, Made, open_made, rows_of, scattered
+from numpy.typing import NDArray
+from solidcloud.schemas.archive.radius_model import LOCAL_CLASSES
+from solidcloud.server.avatars.avatar_model import make_avatar
+from solidcloud.server.kernels.overlap.coarse_overlap import any_to_settle
+from solidcloud.server.kernels.overlap.overlap import CLEAR, CONTACT, overlap_poses
+from solidcloud.server.queries.context.query_budget import NO_LIMIT
+from solidcloud.server.residency.coarse_bounds import Coarse, settle
+
+
+@pytest.fixture
+def made(tmp_path: Path) -> Made:
+    """Eight voxels; see there."""
+    return scattered(tmp_path)
+
+
+def corner(folder: Path) -> Made:
+    """Two walls and a floor, one voxel, and room between them."""
+    side = np.stack(np.meshgrid(*[np.linspace(0.05, 3.95, 60)] * 2), axis=-1).reshape(-1, 2)
+    flat = np.column_stack([side, np.full(len(side), 0.05)])
+    scan = np.concatenate([np.roll(flat, shift, axis=1) for shift in range(3)])
+    return open_made(archive_cases.build(folder, scan, voxel=16.0, radius=0.02, resolution=1e-3).archive)
+
+
+def shifted(*places: tuple[float, float, float]) -> NDArray[np.float64]:
+    """Poses (k, 4, 4) that only shift."""
+    return np.array([archive_cases.pose_of(np.eye(3), np.array(place)) for place in places])
+
+
+BODY = make_avatar(np.random.default_rng(1).uniform([-0.2, -0.2, 0.1], [0.2, 0.2, 0.5], (400, 3)), 0.01)
+
+
+@pytest.mark.interpreted
+def test_a_pose_between_walls_is_settled_and_one_at_a_wall_is_not(tmp_path: Path) -> None:
+    made = corner(tmp_path)
+    poses = shifted((2, 2, 2), (2, 2, -0.1), (0.1, 2, 2), (1.5, 2.5, 1.5))
+    reach = made.reach(BODY, poses)
+    assert rows_of(reach) == [[0]] * 4
+    found, settled = settle(made.arrays, made.coarse.arrays, BODY.arrays, poses, reach)
+    assert found is reach and settled == 0  # no voxel has a slot
+    made.fill()
+    found, settled = settle(made.arrays, made.coarse.arrays, BODY.arrays, poses, reach)
+    assert (rows_of(found), settled) == ([[], [0], [0], []], 2)
+    for name in ("scales", "units", "boxes", "outside"):
+        assert getattr(found, name) is getattr(reach, name)
+    resident = made.resident(0)
+    found, settled = settle(resident.arrays, made.coarse.arrays, BODY.arrays, poses, reach)
+    assert found is reach and settled == 0
+
+
+@pytest.mark.interpreted
+def test_feet_above_a_floor_are_settled_by_their_points(tmp_path: Path) -> None:
+    made = corner(tmp_path)
+    made.fill()
+    # 4 cm, and then so low that they are in contact. The sphere around the body reaches below the floor in both.
+    lowest = float(BODY.points[:, 2].min())
+    poses = shifted((2, 2, 0.05 + 0.04 - lowest), (2, 2, 0.05 + 0.02 - lowest))
+    assert made.settled(BODY, poses) == ([[0], [0]], [[0], []])
+    verdict, counts = np.zeros(2, np.uint8), np.zeros((3, 2), np.uint32)
+    reach = made.reach(BODY, poses)
+    overlap_poses(poses, BODY.arrays, made.resident(0).arrays, reach, np.arange(2), NO_LIMIT, verdict, counts)
+    assert verdict.tolist() == [CLEAR, CONTACT]
+
+
+def test_an_avatar_of_many_points_is_settled_by_its_front(tmp_path: Path) -> None:
+    made = corner(tmp_path)
+    made.fill()
+    many = make_avatar(np.random.default_rng(2).uniform(-0.2, 0.2, (20_000, 3)), 0.005)
+    assert many.arrays.first[many.arrays.front_first] >= 0  # inner nodes
+    poses = shifted((2, 2, 2), (2, 2, 0.24), (0.8, 0.8, 0.8))
+    assert made.settled(many, poses) == ([[0]] * 3, [[0], [], [0]])
+
+
+@pytest.mark.interpreted
+def test_an_avatar_without_points_has_nothing_to_settle(made: Made) -> None:
+    made.fill()
+    avatar, poses = make_avatar(np.empty((0, 3))), np.eye(4)[None]
+    reach = made.reach(make_avatar([[0.0, 0, 0]], 0.01), poses)._replace(starts=np.zeros(2, np.int64))
+    found, settled = settle(made.arrays, made.coarse.arrays, avatar.arrays, poses, reach)
+    assert found is reach and settled == 0
+
+
+@pytest.mark.interpreted
+def test_resident_voxels_and_those_without_a_slot_stay(made: Made, rng: np.random.Generator) -> None:
+    avatar = make_avatar(rng.uniform(-0.3, 0.3, (40, 3)), 0.01)
+    poses = shifted(*rng.uniform(0, 2, (30, 3)).tolist())
+    made.fill(3)
+    before, gone = made.resident(0, 2).settled(avatar, poses)
+    assert any({0, 2, 3} & set(rows) for rows in before)
+    assert not any({0, 2, 3} & set(rows) for rows in gone)
+    _, all_gone = made.settled(avatar, poses)
+    assert gone == [[row for row in rows if row not in (0, 2)] for rows in all_gone]
+    assert 0 < sum(map(len, gone)) < sum(map(len, all_gone)) < sum(map(len, before))
+
+
+@pytest.mark.interpreted
+def test_what_is_settled_of_a_long_avatar_is_clear(made: Made, rng: np.random.Generator) -> None:
+    """A rod, much of which is far from its middle: along each axis, at random places."""
+    made.fill()
+    everything = made.resident(*range(made.voxels))
+    for axis in range(3):
+        rod = make_avatar(
+            np.roll(np.column_stack([np.linspace(-0.6, 0.6, 40), np.zeros((40, 2))]), axis, axis=1), 0.01
+        )
+        poses = shifted(*rng.uniform(0, 2, (30, 3)).tolist())
+        before, gone = made.settled(rod, poses)
+        assert 0 < sum(map(len, gone)) < sum(map(len, before))
+        starts = np.cumsum([0, *map(len, gone)])
+        reach = made.reach(rod, poses)._replace(starts=starts, rows=np.array(list(chain(*gone)), np.int64))
+        verdict, counts = np.zeros(30, np.uint8), np.zeros((3, 30), np.uint32)
+        overlap_poses(poses, rod.arrays, everything.arrays, reach, np.arange(30), NO_LIMIT, verdict, counts)
+        assert (verdict == CLEAR).all()
+
+
+@pytest.mark.interpreted
+def test_only_what_is_not_resident_and_has_a_slot_is_worth_asking() -> None:
+    """Also at the very beginning of the arena, and of the slots."""
+    where = np.array([[-1, -1, -1], [0, 0, 0], [-1, -1, -1]])
+    slot = np.array([0, 1, -1], np.int32)
+    for rows, worth in (([0], True), ([1], False), ([2], False), ([1, 2], False), ([2, 1, 0], True)):
+        assert any_to_settle(where, slot, np.array(rows), len(rows)) is worth
+    assert not any_to_settle(where, slot, np.array([1, 0]), 1), "of the first alone"
+
+
+@pytest.mark.interpreted
+def test_radii_of_a_model_are_those_of_the_nodes(tmp_path: Path) -> None:
+    # Two plates: the lower one of small spheres, the upper one of the largest.
+    side = np.stack(np.meshgrid(*[np.linspace(0, 1, 12)] * 2), axis=-1).reshape(-1, 2)
+    scan = np.concatenate([np.column_stack([side, np.full(len(side), z)]) for z in (0.1, 1.0)])
+    with radius_class_archives.any_classes(lambda local: _small_below(local)):
+        case = archive_cases.build(tmp_path, scan, voxel=8.0, models=radius_class_archives.STORED, leaf=8)
+    made = open_made(case.archive, "local")
+    made.remember(0)
+    avatar = make_avatar([[0.0, 0, 0], [0.01, 0, 0]], 0.001)
+    # 20 mm below either plate: clear of spheres of 1 mm, not of such of 32.
+    poses = shifted((0.5, 0.5, 0.1 - 0.02), (0.5, 0.5, 1.0 - 0.02))
+    assert made.settled(avatar, poses) == ([[0], [0]], [[0], []])
+    filled = made._replace(coarse=Coarse(made.voxels, ROOM))  # knows no better than that all are large
+    filled.fill()
+    assert filled.settled(avatar, poses) == ([[0], [0]], [[], []])
+    poses[:, 2, 3] -= 0.02
+    assert filled.settled(avatar, poses[1:]) == ([[0]], [[0]])
+
+
+def _small_below(local: NDArray[np.int32]) -> NDArray[np.uint8]:
+    """The least class in the lower half metre of what is built, the largest above. The lattice begins at the scan."""
+    return np.where(local[:, 2] < 5000, 0, LOCAL_CLASSES - 1).astype(np.uint8)

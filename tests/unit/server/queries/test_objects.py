@@ -1,0 +1,156 @@
+"""`objects`: budgets, groups, and what is refused."""
+
+import time
+from collections.abc import Iterator
+
+import archive_cases
+import numpy as np
+import pytest
+import synthetic_scans
+from numpy.typing import NDArray
+from solidcloud.schemas.errors import BadRequestError, BadTransformError
+from solidcloud.schemas.wire.answers import Verdict
+from solidcloud.server.avatars.avatar_model import make_avatar
+from solidcloud.server.queries.context.query_budget import Effort
+from solidcloud.server.queries.context.query_context import SceneData, make_scene_data
+from solidcloud.server.queries.objects import SCENE_GROUP, objects
+from solidcloud.server.residency.voxel_cache import Residency
+from solidcloud.server.residency.voxel_store import Store
+from solidcloud.server.runtime.stop_flag import Stop
+
+CLEAR, CONTACT, UNKNOWN = Verdict
+BALL = make_avatar([[0.0, 0, 0]], 0.5)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SceneData]:
+    """A plane of 50 points."""
+    case = archive_cases.build(tmp_path_factory.mktemp("objects"), synthetic_scans.make_scan("plane", 1, 50))
+    store = Store(case.archive)
+    yield make_scene_data(store.archive, Residency(store, 64 << 20))
+    store.close()
+
+
+def at(*places: float) -> NDArray[np.float64]:
+    """Poses along x, above the plane."""
+    return np.array([archive_cases.pose_of(np.eye(3), np.array([x, 0.0, 30.0])) for x in places])
+
+
+def test_a_pair_needs_each_group_in_the_other_mask(data: SceneData) -> None:
+    for groups, masks, touch in [
+        ((1, 1), (1, 1), True),
+        ((1, 2), (2, 1), True),
+        ((1, 2), (2, 2), False),
+        ((1, 2), (1, 1), False),
+        ((0, 1), (1, 1), False),
+        ((6, 1), (3, 4), True),
+        ((SCENE_GROUP, SCENE_GROUP), (SCENE_GROUP, SCENE_GROUP), True),
+    ]:
+        answers = objects(data, [BALL, BALL], at(0, 0.5), groups, masks)
+        assert answers.pairs.tolist() == ([[0, 1]] if touch else [])
+        assert (answers.pairs_tested, answers.pairs_filtered) == ((1, 0) if touch else (0, 1))
+    assert objects(data, [BALL, BALL], at(0, 1.5), [1, 1], [1, 1]).pairs_tested == 0
+
+
+class Counting(Stop):
+    """A stop that counts how often it is looked at."""
+
+    looks = 0
+
+    def __bool__(self) -> bool:
+        """Count a look."""
+        self.looks += 1
+        return super().__bool__()
+
+
+def test_stopped_only_pairs_that_could_touch_are_listed_and_none_is_looked_for(data: SceneData) -> None:
+    models = [make_avatar([[0.0, 0, 0]], 0.5) for _ in range(40)]
+    places = [0.01 * i for i in range(20)] + [100.0 + 0.01 * i for i in range(20)]
+    groups = np.array([1, 2] * 20, np.uint32)
+    stop = Counting()
+    stop.set("the client is gone")
+    found = objects(data, models, at(*places), groups, groups, effort=Effort(stop=stop))
+    expected = [
+        [i, j] for i in range(40) for j in range(i + 1, 40) if (i - j) % 2 == 0 and (i < 20) == (j < 20)
+    ]
+    assert found.pairs.tolist() == expected and (found.pair_verdict == UNKNOWN).all()
+    assert found.pairs_tested == 0 and found.pairs_filtered == 200
+    assert stop.looks < 100, "180 kinds of pairs are gone through"
+
+
+def test_pairs_cut_off_by_a_budget_are_listed_as_unknown(data: SceneData, rng: np.random.Generator) -> None:
+    shell = rng.normal(size=(2000, 3))
+    model = make_avatar(shell / np.linalg.norm(shell, axis=1)[:, None], 0.001)
+    poses = np.array(
+        [
+            archive_cases.pose_of(np.eye(3), rng.uniform(-1.5, 1.5, 3) + np.array([0, 0, 30]))
+            for _ in range(12)
+        ]
+    )
+    ones = np.ones(12, int)
+    truth = {tuple(pair) for pair in objects(data, [model] * 12, poses, ones, ones).pairs.tolist()}
+    unknown = []
+    for visits in (0, 10, 100, 1000, 10**6):
+        answers = objects(data, [model] * 12, poses, ones, ones, effort=Effort(visits=visits))
+        said = dict(zip(map(tuple, answers.pairs.tolist()), answers.pair_verdict.tolist(), strict=True))
+        assert {pair for pair, verdict in said.items() if verdict == CONTACT} <= truth <= set(said)
+        unknown.append(sum(verdict == UNKNOWN for verdict in said.values()))
+    assert len(truth) < unknown[0] <= answers.pairs_tested and unknown[-1] == 0
+    assert unknown == sorted(unknown, reverse=True) and unknown[0] > unknown[3] > 0
+
+
+def test_a_deadline_that_has_passed_leaves_all_unknown(data: SceneData) -> None:
+    late = Effort(deadline=time.perf_counter() - 1)
+    answers = objects(data, [BALL] * 3, at(0, 0.5, 9), [1] * 3, [1, 1 | SCENE_GROUP, 1], effort=late)
+    assert answers.verdict.tolist() == [CLEAR, UNKNOWN, CLEAR]
+    assert answers.pairs.tolist() == [[0, 1]] and answers.pair_verdict.tolist() == [UNKNOWN]
+    assert answers.pairs_tested == 0 and answers.misses == 0
+    soon = Effort(deadline=time.perf_counter() + 600)
+    answers = objects(data, [BALL] * 300, np.repeat(at(0), 300, axis=0), [1] * 300, [1] * 300, effort=soon)
+    assert len(answers.pairs) == 300 * 299 // 2 and (answers.pair_verdict == CONTACT).all()
+
+
+def test_a_budget_holds_against_the_scene_too(data: SceneData) -> None:
+    pose = archive_cases.pose_of(np.eye(3), synthetic_scans.make_scan("plane", 1, 50)[0])[None]
+    said = [
+        objects(data, [BALL], pose, [1], [SCENE_GROUP], effort=Effort(visits=visits)).verdict[0]
+        for visits in (0, 10**6)
+    ]
+    assert said == [UNKNOWN, CONTACT]
+
+
+def test_an_object_beyond_the_exact_units_is_refused(data: SceneData) -> None:
+    """Coordinates of 2^37 m and more have no int64 in exact units: two points 2 mm apart were one."""
+    far = make_avatar([[9e8, 0, 0]], 0.0)
+    poses = at(0, 0.002)
+    poses[:, :3, :3] *= 8
+    assert objects(data, [far] * 2, poses, [1] * 2, [1] * 2, 0.0021).pairs.tolist() == [[0, 1]]
+    assert objects(data, [far] * 2, poses, [1] * 2, [1] * 2, 0.0019).pairs.tolist() == []
+    poses[:, :3, :3] *= 125
+    with pytest.raises(BadTransformError, match=r"object 0 reaches 9e\+11 m"):
+        objects(data, [far] * 2, poses, [1] * 2, [1] * 2, 0.0019)
+
+
+def test_what_is_refused(data: SceneData) -> None:
+    for arguments, error, text in [
+        (([BALL], at(0, 1), [1, 1], [1, 1]), BadRequestError, "1 avatars, 2 poses"),
+        (([BALL], at(0), [1, 1], [1]), BadRequestError, "2 groups"),
+        (([BALL], np.eye(4), [1], [1]), BadRequestError, "shape"),
+        (([BALL] * 2, at(0, 1), [1, 1], [1, 1], -1.0), BadRequestError, "margin"),
+        (([BALL] * 2, at(0, 1), [1, 1], [1, 1], 15.5), BadRequestError, "add up to 16.5 m"),
+        (([BALL] * 2, at(0, np.nan), [1, 1], [1, 1]), BadRequestError, "pose 1 holds nan"),
+        (
+            (
+                [BALL, make_avatar([[0, 0, 1.0]], 1), BALL],
+                at(0, 1, 2) * [[[1], [1], [-1], [1]]],
+                [1] * 3,
+                [1] * 3,
+            ),
+            BadTransformError,
+            "pose 0 mirrors",
+        ),
+    ]:
+        with pytest.raises(error, match=text):
+            objects(data, *arguments)
+    assert len(objects(data, [], np.empty((0, 4, 4)), [], [])) == 0
+    assert objects(data, [BALL], at(0), [1], [1], 15.5).verdict.tolist() == [CLEAR]

@@ -1,0 +1,266 @@
+"""`raycast` and `within`: what is missing, what a budget cuts off, what is loaded, and what is refused."""
+
+import math
+import os
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+
+import archive_cases
+import numpy as np
+import pytest
+import synthetic_scans
+from numpy.typing import NDArray
+from solidcloud.builder.config import BuildConfig
+from solidcloud.builder.pipeline import build_archive
+from solidcloud.schemas.archive.archive import Archive
+from solidcloud.schemas.errors import BadRequestError
+from solidcloud.schemas.wire.answers import Verdict
+from solidcloud.server.queries.context.query_budget import Effort
+from solidcloud.server.queries.context.query_context import SceneData, make_scene_data
+from solidcloud.server.queries.raycast import raycast
+from solidcloud.server.queries.within import within
+from solidcloud.server.residency.voxel_cache import Residency
+from solidcloud.server.residency.voxel_store import Store
+
+CLEAR, CONTACT, UNKNOWN = Verdict
+X, Y = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)
+
+
+@contextmanager
+def opened(archive: Path, budget: int = 64 << 20) -> Iterator[SceneData]:
+    """What the questions read of an archive."""
+    store = Store(archive)
+    try:
+        yield make_scene_data(store.archive, Residency(store, budget))
+    finally:
+        store.close()
+
+
+def flip_a_byte(archive: Path, voxel: tuple[int, int, int]) -> None:
+    """Damage the points of one voxel's record."""
+    with Archive(archive) as index:
+        row = int(np.flatnonzero((index.coordinates == voxel).all(axis=1))[0])
+        entry, path = index.voxels[row], index.shard_path(int(index.voxels[row]["shard"]))
+    with open(path, "r+b") as file:
+        offset = int(entry["frame_offset"][2]) + int(entry["frame_bytes"][2]) // 2
+        byte = os.pread(file.fileno(), 1, offset)[0]
+        os.pwrite(file.fileno(), bytes([byte ^ 1]), offset)
+
+
+@pytest.fixture
+def beads(tmp_path: Path) -> Path:
+    """Points every 10 cm from x = 0 to 3.9 m, radius 1 cm, a voxel a metre."""
+    row = np.column_stack([np.arange(0, 4, 0.1), np.zeros(40), np.zeros(40)])
+    return archive_cases.build(tmp_path, row, voxel=1.0, resolution=1e-3, radius=0.01).archive
+
+
+@pytest.fixture(scope="module")
+def noise(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Points in 2 m, in voxels of 25 cm."""
+    points = synthetic_scans.make_scan("noise", 2, 3000)
+    return archive_cases.build(tmp_path_factory.mktemp("noise"), points, voxel=0.25, radius=0.03).archive
+
+
+def free_rays(rng: np.random.Generator, count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Rays that start in and around the noise."""
+    return rng.uniform(-0.5, 2.5, (count, 3)), rng.normal(size=(count, 3))
+
+
+@pytest.mark.interpreted
+def test_the_first_sphere_is_hit_and_no_more_is_loaded(beads: Path) -> None:
+    with opened(beads) as data:
+        answers = raycast(data, [(-1.0, 0, 0), (0.5, 0, 0), (0.55, 0, 0), (-1, 1.5, 0)], [X] * 4, 100)
+        assert answers.verdict.tolist() == [CONTACT, CONTACT, CONTACT, CLEAR]
+        np.testing.assert_allclose(answers.distance[:3], [0.99, 0, 0.04], atol=1e-7)
+        np.testing.assert_allclose(answers.hit[:3, 0], [-0.01, 0.5, 0.59], atol=1e-7)
+        np.testing.assert_allclose(answers.cloud_point[:3, 0], [0, 0.5, 0.6], atol=1e-9)
+        np.testing.assert_array_equal(answers.normal[:3], [[-1, 0, 0]] * 3)
+        assert np.isnan(answers.hit[3]).all() and answers.lower[3] == 100 and math.isinf(answers.upper[3])
+        assert (answers.misses, answers.hits, answers.resident) == (1, 0, 1)
+        assert answers.outside.all() and answers.exact.all()
+        again = raycast(data, [(-1.0, 0, 0)], [X], 100)
+        assert (again.misses, again.hits) == (0, 1)
+        # Through the cells of all voxels, whose points are away: that is not believed before they were read.
+        through = [raycast(data, [(-1, 0.5, 0)], [X], 100) for _ in range(2)]
+        assert [(one.verdict[0], one.misses, one.node_visits[0]) for one in through] == [
+            (CLEAR, 3, 0),
+            (CLEAR, 0, 0),
+        ]
+        inside = raycast(data, [(0.55, 0, 0)], [X], 0.03)
+        assert inside.verdict.tolist() == [CLEAR] and not inside.outside[0]
+        assert raycast(data, [(0.55, 0, 0)], [X], 4.0).outside[0]
+        data.residency.check()
+
+
+@pytest.mark.interpreted
+def test_a_missing_voxel_is_unknown_unless_a_hit_is_nearer(beads: Path) -> None:
+    flip_a_byte(beads, (1, 0, 0))
+    origins = [(-1.0, 0, 0), (1.05, 0, 0), (1.55, -1, 0), (1.55, -1, 0.5), (1.55, -1, 1.5), (5.0, 0, 0)]
+    with opened(beads) as data:
+        for _ in range(2):  # read once, remembered after
+            answers = raycast(data, origins, [X, X, Y, Y, Y, (-2.0, 0, 0)], 10)
+            # The fourth passes the missing voxel's points by the index, but not its cell.
+            assert answers.verdict.tolist() == [CONTACT, CONTACT, UNKNOWN, UNKNOWN, CLEAR, CONTACT]
+            assert answers.exact.tolist() == [True, False, False, False, True, True]
+            assert answers.voxels_missing.tolist() == [0, 1, 1, 1, 0, 0]
+            assert len(answers.faults) == 1
+            # Beyond the missing voxel a sphere is hit for certain; whether it is the first one is not.
+            np.testing.assert_allclose(answers.upper[1], 0.94, atol=1e-7)
+            assert answers.lower[1] == 0 and 0.98 < answers.lower[2] <= 0.99 and math.isinf(answers.upper[2])
+        near = within(data, [(0.95, 0, 0), (0.95, 0.3, 0), (1.5, 0.1, 0), (1.5, 0.1, 2), (2.3, 0.1, 0)], 0.7)
+        assert near.verdict.tolist() == [CONTACT, CONTACT, CONTACT, CLEAR, CONTACT]
+        assert near.exact.tolist() == [False, False, False, True, True]
+        assert near.voxels_missing.tolist() == [1, 1, 1, 0, 0]
+        np.testing.assert_allclose(near.lower[[0, 2]], [0.05, 0.0], atol=2e-3)
+        assert (near.lower[:3] <= [0.05, math.hypot(0.05, 0.3), 0.1]).all()
+        assert within(data, [(1.5, 0.1, 0)], 0.2).verdict.tolist() == [UNKNOWN]
+        data.residency.check()
+
+
+def test_a_region_left_out_is_unknown(tmp_path: Path) -> None:
+    good = synthetic_scans.write_ply(tmp_path / "good.ply", synthetic_scans.make_scan("noise", 1, 200))
+    raw = np.random.default_rng(1).integers(0, 1001, (500, 3))
+    raw[:2] = [[0, 0, 0], [1000, 1000, 1000]]
+    synthetic_scans.write_las(tmp_path / "broken.las", raw, offset=(10.0, 10.0, 10.0))
+    os.truncate(tmp_path / "broken.las", (tmp_path / "broken.las").stat().st_size // 2)
+    options = BuildConfig(skip_bad=True, jobs=1, resolution=1e-3, radius=0.1)
+    build_archive([good, tmp_path / "broken.las"], tmp_path / "archive", options)
+    with opened(tmp_path / "archive") as data:
+        origins = [(5.0, 10.5, 10.5), (5.0, 10.5, 10.5), (5.0, 11.05, 10.5), (5.0, 11.2, 10.5), (-5.0, 1, 1)]
+        answers = raycast(data, origins, [X, (-1, 0, 0), X, X, (1, 0.01, 0.02)], 100)
+        assert answers.verdict.tolist() == [UNKNOWN, CLEAR, UNKNOWN, CLEAR, CONTACT]
+        assert 4.89 < answers.lower[0] <= 4.9 and answers.exact.tolist() == [False, True, False, True, True]
+        near = within(data, [(9.9, 10.5, 10.5), (9.9, 10.5, 10.5), (5, 5, 5)], 0.2)
+        assert near.verdict.tolist() == [UNKNOWN, UNKNOWN, CLEAR]
+        assert within(data, [(9.9, 10.5, 10.5)], 0.09).verdict.tolist() == [CLEAR]
+
+
+def test_where_all_is_unknown_only_hits_are_said(tmp_path: Path) -> None:
+    good = synthetic_scans.write_ply(tmp_path / "good.ply", synthetic_scans.make_scan("plane", 1, 200))
+    (tmp_path / "broken.e57").write_bytes(b"ASTM-E57" + bytes(100))
+    options = BuildConfig(skip_bad=True, jobs=1, resolution=1e-3, radius=0.1)
+    build_archive([good, tmp_path / "broken.e57"], tmp_path / "archive", options)
+    with opened(tmp_path / "archive") as data:
+        answers = raycast(data, [(1.0, 1, 9), (1.0, 1, 9)], [(0, 0, -1), (0, 0, 1)], 100)
+        assert answers.verdict.tolist() == [CONTACT, UNKNOWN] and not answers.exact.any()
+        assert answers.lower.tolist() == [0, 0]
+        assert within(data, [(1.0, 1, 9)], 1).verdict.tolist() == [UNKNOWN]
+
+
+@pytest.mark.parametrize("question", ["raycast", "within"])
+def test_budgets_and_tolerances_bound_the_truth(noise: Path, rng: np.random.Generator, question: str) -> None:
+    origins, directions = free_rays(rng, 300)
+
+    def ask(effort: Effort):  # type: ignore[no-untyped-def]
+        if question == "raycast":
+            return raycast(data, origins, directions, 2.0, effort)
+        return within(data, origins, 0.35, effort)
+
+    with opened(noise) as data:
+        truth = ask(Effort())
+        assert 50 < truth.verdict.sum() < 290
+        before = np.full(300, UNKNOWN)
+        for visits in (0, 1, 8, 30, 100, 400, 3000, 10**6):
+            cut = ask(Effort(visits=visits))
+            assert (cut.lower <= np.minimum(truth.distance, truth.lower)).all()
+            assert (cut.upper >= truth.upper).all()
+            assert (cut.distance[cut.exact] == truth.distance[cut.exact]).all()
+            for verdict in (CLEAR, CONTACT):  # what is clear at a small budget stays clear at a larger one
+                assert (cut.verdict[before == verdict] == verdict).all()
+            assert (truth.verdict[cut.verdict == CONTACT] == CONTACT).all()
+            assert (truth.verdict[cut.verdict == CLEAR] == CLEAR).all()
+            assert (cut.node_visits <= visits + 17).all()
+            before = cut.verdict
+            if visits == 0:
+                # Where no voxel is in reach the index alone says so.
+                assert cut.misses == 0 and (cut.verdict == UNKNOWN).sum() > 100
+        assert cut.exact.all()
+        for tolerance in (1e-3, 0.05, 0.5):
+            loose = ask(Effort(tolerance=tolerance))
+            assert (loose.lower <= truth.lower).all() and (loose.upper >= truth.upper).all()
+            assert (loose.verdict == truth.verdict).all()
+            hit = loose.verdict == CONTACT
+            assert (loose.upper - loose.lower)[hit].max() <= tolerance
+            assert (loose.distance[loose.exact] == truth.distance[loose.exact]).all()
+        assert loose.node_visits.sum() < truth.node_visits.sum() and not loose.exact.all()
+
+
+def test_a_deadline_that_has_passed_leaves_all_unknown_and_loads_nothing(noise: Path) -> None:
+    with opened(noise) as data:
+        late = Effort(deadline=time.perf_counter() - 1)
+        rays, near = raycast(data, [(-1.0, 1, 1)], [X], 9, late), within(data, [(1.0, 1, 1)], 9, late)
+        for answers in (rays, near):
+            assert answers.verdict.tolist() == [UNKNOWN] and answers.lower.tolist() == [0]
+            assert answers.misses == 0
+
+
+def test_what_is_loaded_too_late_is_unknown(beads: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    load = Store.load
+
+    def slow(self, *arguments):  # type: ignore[no-untyped-def]
+        time.sleep(0.4)
+        return load(self, *arguments)
+
+    monkeypatch.setattr(Store, "load", slow)
+    with opened(beads) as data:
+        origins = [(x, -1.0, 0.0) for x in (0.0, 1.0, 2.0, 3.0)]
+        answers = raycast(data, origins, [Y] * 4, 5, Effort(deadline=time.perf_counter() + 0.2))
+        late = answers.verdict == UNKNOWN
+        assert late.sum() >= 3 and (answers.verdict[~late] == CONTACT).all() and answers.exact[~late].all()
+        assert (answers.lower[late] <= 0.99).all() and not answers.exact[late].any() and answers.resident <= 1
+        data.residency.check()
+        assert raycast(data, origins, [Y] * 4, 5).verdict.tolist() == [CONTACT] * 4
+
+
+def test_threads_that_share_a_small_cache_are_answered_alike(noise: Path, rng: np.random.Generator) -> None:
+    origins, directions = free_rays(rng, 200)
+    with opened(noise) as data:
+        expected = raycast(data, origins, directions, 3.0).distance.tobytes()
+        expected_near = within(data, origins, 1.0).distance.tobytes()
+        budget = 3 * max(data.residency.bytes_of([row]) for row in range(len(data.arrays.where)))
+    with opened(noise, budget) as data, ThreadPoolExecutor(4) as pool:
+        for answers in pool.map(lambda _: raycast(data, origins, directions, 3.0), range(6)):
+            assert answers.distance.tobytes() == expected
+            assert answers.resident_bytes <= budget
+        for near in pool.map(lambda _: within(data, origins, 1.0), range(6)):
+            assert near.distance.tobytes() == expected_near
+        data.residency.check()
+        assert data.residency.evictions > 0
+
+
+def test_nothing_asked_is_nothing_answered(noise: Path) -> None:
+    with opened(noise) as data:
+        assert len(raycast(data, np.empty((0, 3)), np.empty((0, 3)), 1)) == 0
+        assert len(within(data, np.empty((0, 3)), 1)) == 0
+
+
+@pytest.mark.parametrize(
+    ("origins", "directions", "reach", "text"),
+    [
+        ([(0.0, 0, 0)], [(0.0, 0, 0)], 1, "direction 0 is zero"),
+        ([(0.0, 0, 0)], [(0.0, math.nan, 0)], 1, "expected finite"),
+        ([(0.0, 0, 0)], [(0.0, math.inf, 0)], 1, "expected finite"),
+        ([(0.0, math.nan, 0)], [X], 1, "expected finite"),
+        ([(0.0, 2e9, 0)], [X], 1, "within 1e"),
+        ([(0.0, 0, 0)], [X, X], 1, "1 origins and 2 directions"),
+        ([(0.0, 0)], [(1.0, 0)], 1, "shape"),
+        ([(0.0, 0, 0)], [X], -1, "reach"),
+        ([(0.0, 0, 0)], [X], math.nan, "reach"),
+        ([(0.0, 0, 0)], [X], 2e6, "reach"),
+        ([("a", 0, 0)], [X], 1, "numbers"),
+    ],
+)
+def test_what_is_refused_of_rays(noise: Path, origins, directions, reach, text) -> None:  # type: ignore[no-untyped-def]
+    with opened(noise) as data, pytest.raises(BadRequestError, match=text):
+        raycast(data, origins, directions, reach)
+
+
+@pytest.mark.parametrize(
+    ("points", "reach"), [([(0.0, 0, 0)], 16.01), ([(0, 0, math.inf)], 1), ([(0, 0, 0)], -1)]
+)
+def test_what_is_refused_of_points(noise: Path, points, reach) -> None:  # type: ignore[no-untyped-def]
+    with opened(noise) as data, pytest.raises(BadRequestError):
+        within(data, points, reach)

@@ -1,0 +1,131 @@
+"""`near`: which poses one kernel call answers, and which are left to `distance`."""
+
+from pathlib import Path
+
+import archive_cases
+import numpy as np
+import pytest
+from solidcloud.schemas.errors import BadTransformError
+from solidcloud.schemas.wire.answers import DistanceAnswers, Verdict
+from solidcloud.server.avatars.avatar_model import make_avatar
+from solidcloud.server.queries import resident_distance as module
+from solidcloud.server.queries.context.query_budget import Effort
+from solidcloud.server.queries.distance import distance
+from solidcloud.server.queries.resident_distance import QUICK_REACH, QUICK_ROWS, near
+from solidcloud.server.scene import Scene
+
+BALL = make_avatar([[0.0, 0, 0]], 0.1)
+ROW = np.column_stack([np.arange(0, 4, 0.1), np.zeros(40), np.zeros(40)])
+
+
+class Left:
+    """`distance`, counted."""
+
+    def __init__(self, patch: pytest.MonkeyPatch) -> None:
+        self.count, self._ask = 0, module.distance
+        patch.setattr(module, "distance", self)
+
+    def __call__(self, *arguments: object) -> DistanceAnswers:
+        """Count and answer."""
+        self.count += 1
+        return self._ask(*arguments)  # type: ignore[arg-type]
+
+
+def above(x: float, z: float) -> np.ndarray:
+    """The ball over the row."""
+    return archive_cases.pose_of(np.eye(3), np.array([x, 0, z]))
+
+
+@pytest.mark.interpreted
+def test_what_is_resident_is_answered_in_one_call_and_counted_as_used(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    left = Left(monkeypatch)
+    case = archive_cases.build(tmp_path, ROW, voxel=1.0, resolution=1e-3)
+    with Scene.open(case.archive) as scene:
+        first = near(scene._data, BALL, above(0.5, 0.3), 0.5)
+        assert left.count == 1 and first.misses > 0, "it has to be loaded"
+        again = near(scene._data, BALL, above(0.5, 0.3), 0.5)
+        assert left.count == 1 and again.misses == 0 and again.hits == first.misses + first.hits
+        assert again.signed_distance.tolist() == pytest.approx([0.19], abs=1e-6)
+        assert again.witness_cloud[0].tolist() == pytest.approx([0.5, 0, 0], abs=1e-3)
+        assert scene.residency.hits == again.hits
+        scene.residency.check()
+
+
+@pytest.mark.interpreted
+def test_what_one_call_cannot_answer_is_left_to_distance(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    left = Left(monkeypatch)
+    case = archive_cases.build(tmp_path, ROW, voxel=1.0, resolution=1e-3)
+    with Scene.open(case.archive) as scene:
+        data = scene._data
+        near(data, BALL, above(2.0, 0.0), QUICK_REACH)
+        left.count = 0
+        near(data, BALL, above(2.0, 0.0), QUICK_REACH)
+        assert left.count == 0
+        near(data, BALL, above(2.0, 0.0), QUICK_REACH + 0.01)
+        assert left.count == 1, "too far to keep others waiting"
+        near(data, BALL, above(2.0, 0.0), 0.1, Effort(visits=1))
+        assert left.count == 2, "a budget"
+        box = np.array([[[0, 0, 0], [9, 9, 9]]], np.int64)
+        answers = near(data._replace(unknown=box), BALL, above(2.0, 0.0), 0.1)
+        assert left.count == 3 and answers.exact.tolist() == [True], "a scan left out, elsewhere"
+        answers = near(data._replace(unknown_everywhere=True), BALL, above(2.0, 0.3), 0.1)
+        assert left.count == 4 and answers.verdict.tolist() == [Verdict.UNKNOWN]
+
+
+@pytest.mark.interpreted
+def test_an_empty_avatar_is_near_nothing(tmp_path: Path) -> None:
+    case = archive_cases.build(tmp_path, ROW, voxel=1.0, resolution=1e-3)
+    with Scene.open(case.archive) as scene:
+        answers = near(scene._data, make_avatar(np.empty((0, 3))), np.eye(4), 0.5)
+    assert answers.verdict.tolist() == [Verdict.CLEAR] and answers.signed_distance.tolist() == [np.inf]
+    assert answers.lower.tolist() == [0.5] and np.isnan(answers.normal).all()
+
+
+@pytest.mark.interpreted
+def test_a_pose_that_cannot_be_written_to_is_taken(tmp_path: Path) -> None:
+    case = archive_cases.build(tmp_path, ROW, voxel=1.0, resolution=1e-3)
+    pose = above(0.5, 0.3)
+    pose.setflags(write=False)
+    with Scene.open(case.archive) as scene:
+        found = [
+            near(scene._data, BALL, p, 0.5).signed_distance[0] for p in (pose, np.asfortranarray(pose), pose)
+        ]
+    assert len(set(found)) == 1 and np.isfinite(found[0])
+
+
+@pytest.mark.interpreted
+@pytest.mark.parametrize("radius", [0.0, 0.1])
+def test_centres_that_coincide_are_as_distance_says(tmp_path: Path, radius: float) -> None:
+    case = archive_cases.build(tmp_path, ROW, voxel=1.0, resolution=1e-3, radius=radius)
+    ball = make_avatar([[0.0, 0, 0]], radius)
+    with Scene.open(case.archive) as scene:
+        data, pose = scene._data, above(0.5, 0.0)
+        expected = distance(data, ball, pose[None], 0.5)
+        found = near(data, ball, pose, 0.5)
+    assert found.hits == expected.misses > 0
+    assert found.signed_distance.tolist() == expected.signed_distance.tolist()
+    assert found.signed_distance[0] == pytest.approx(-2 * radius, abs=1e-7)
+    assert found.normal.tolist() == expected.normal.tolist() == [[0.0, 0.0, 0.0]]
+    assert found.verdict.tolist() == [Verdict.CONTACT]
+
+
+@pytest.mark.interpreted
+def test_more_voxels_than_one_call_looks_into_are_left_to_distance(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    left = Left(monkeypatch)
+    row = np.zeros((QUICK_ROWS + 1, 3))
+    row[:, 0] = 0.02 + 0.05 * np.arange(QUICK_ROWS + 1)
+    case = archive_cases.build(tmp_path, row, voxel=0.05, resolution=1e-3)
+    with Scene.open(case.archive) as scene:
+        data = scene._data
+        for reach, calls in ((2.0, 1), (2.0, 2), (1.0, 2)):
+            found = near(data, BALL, above(1.62, 0.3), reach)
+            assert left.count == calls and found.signed_distance.tolist() == pytest.approx([0.19], abs=1e-3)
+        assert found.hits < QUICK_ROWS
+        with pytest.raises(BadTransformError):
+            near(data, BALL, np.diag([1.0, 1, -1, 1]), 0.1)

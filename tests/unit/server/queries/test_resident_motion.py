@@ -1,0 +1,188 @@
+"""One motion, one pose in a kernel call: the answers of `sweep` and `collide` to the last bit."""
+
+import os
+from pathlib import Path
+from typing import Any
+
+import archive_cases
+import judged_sweeps
+import naive_sweep
+import numpy as np
+import pytest
+import synthetic_scans
+from numpy.typing import NDArray
+from solidcloud.schemas.wire.answers import Verdict
+from solidcloud.server.avatars.avatar_model import make_avatar
+from solidcloud.server.kernels.core.pose_transform import SIMILARITY_TOLERANCE
+from solidcloud.server.kernels.motion import sweep_resident as kernel
+from solidcloud.server.queries import resident_motion as module
+from solidcloud.server.queries.collide import collide
+from solidcloud.server.queries.context.query_budget import EXACT, Effort
+from solidcloud.server.queries.context.query_context import SceneData
+from solidcloud.server.queries.resident_motion import Probe, Swept
+from solidcloud.server.queries.sweep import sweep
+
+Poses = NDArray[np.float64]
+COUNT = 12
+INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
+
+
+def same(probe: Probe, data: SceneData, first: Poses, last: Poses, tolerance: float = 1e-6) -> list[Swept]:
+    """What a probe says of motions (k, 4, 4), asserted to be what `sweep` says."""
+    answers = sweep(data, probe.avatar, first, last, tolerance=tolerance)
+    found = []
+    for i in range(len(first)):
+        one = probe.sweep(data, first[i], last[i], tolerance, EXACT)
+        assert one.verdict == answers.verdict[i] and one.visits == answers.node_visits[i]
+        assert (one.lower, one.upper, one.exact) == (answers.lower[i], answers.upper[i], answers.exact[i])
+        if not data.nothing_clear and not len(data.unknown):
+            assert one.unknown == (one.verdict == Verdict.UNKNOWN or one.missing > 0)
+        if one.verdict == Verdict.CONTACT:
+            np.testing.assert_array_equal(one.avatar, answers.witness_avatar[i])
+            np.testing.assert_array_equal(one.cloud, answers.witness_cloud[i])
+        else:
+            assert one.avatar is None and one.cloud is None
+        found.append(one)
+    return found
+
+
+@pytest.mark.interpreted
+@pytest.mark.parametrize("name", ["plane", "corner", "noise", "one point"])
+@pytest.mark.parametrize("far", [0.0, 2.0**18])
+def test_motions_and_poses_are_answered_to_the_last_bit(
+    tmp_path: Path, rng: np.random.Generator, name: str, far: float
+) -> None:
+    points = synthetic_scans.make_scan(name, 5, 200) + far
+    case = archive_cases.build(tmp_path, points, resolution=archive_cases.BINARY_STEP)
+    avatar = make_avatar(rng.uniform(-0.2, 0.2, (12, 3)), 0.02)
+    first, last = judged_sweeps.motions(rng, points, avatar.points, COUNT, 0.3, 0.2, 0.5)
+    last[::3, :3, :3] = first[::3, :3, :3]
+    last[1] = first[1]
+    probe = Probe(avatar)
+    with judged_sweeps.opened(case) as fresh:  # loads
+        loaded = [probe.sweep(fresh, one, other, 1e-6, EXACT) for one, other in zip(first, last, strict=True)]
+    with judged_sweeps.opened(case) as data:
+        for own, expected in zip(loaded, same(probe, data, first, last), strict=True):
+            assert own[:3] == expected[:3]
+        found = same(probe, data, first, last)
+        assert {each.verdict for each in found} >= {Verdict.CONTACT}
+        verdicts = collide(data, avatar, first)
+        for i in range(COUNT):
+            assert probe.collide(data, first[i], EXACT) == (verdicts.verdict[i], verdicts.node_visits[i])
+
+
+@pytest.mark.interpreted
+def test_what_is_no_quick_question_is_answered_as_well(tmp_path: Path, rng: np.random.Generator) -> None:
+    points = synthetic_scans.make_scan("plane", 5, 200)
+    case = archive_cases.build(tmp_path, points)
+    with judged_sweeps.opened(case) as data:
+        first, last = judged_sweeps.motions(rng, points, np.zeros((1, 3)), 4, 0.3, 0.2, 0.5)
+        assert all(
+            each.verdict == Verdict.CLEAR
+            for each in same(Probe(make_avatar(np.zeros((0, 3)))), data, first, last)
+        )
+        long = last.copy()
+        long[:, :3, 3] += [60.0, 0, 0]
+        large = first.copy()
+        large[:, :3, :3] *= 2.0
+        probe = Probe(make_avatar([[0.0, 0, 0], [0.1, 0, 0]], 0.05))
+        same(probe, data, first, long)
+        same(probe, data, large, large)
+        spent = Effort(visits=0)
+        assert probe.sweep(data, first[0], last[0], 1e-6, spent).verdict != Verdict.CLEAR
+        unseen = data._replace(unknown_everywhere=True)
+        for seen in (unseen, data._replace(unknown=np.array([[[-(10**6)] * 3, [10**6] * 3]]))):
+            assert {each.verdict for each in same(probe, seen, first, last)} <= {
+                Verdict.UNKNOWN,
+                Verdict.CONTACT,
+            }
+            assert probe.collide(seen, first[0], EXACT)[0] != Verdict.CLEAR
+
+
+@pytest.mark.interpreted
+def test_the_pose_between_is_the_sweeps(tmp_path: Path, rng: np.random.Generator) -> None:
+    probe = Probe(make_avatar([[0.0, 0, 0], [0.1, 0, 0]], 0.05))
+    first, last = judged_sweeps.motions(rng, np.zeros((1, 3)), probe.avatar.points, 8, 0.3, 2.0, 2.0)
+    for one, other in zip(first, last, strict=True):
+        for fraction in (0.0, 0.3, 1.0):
+            pose, holds = probe.between(np.zeros(3), one, other, fraction)
+            assert holds
+            np.testing.assert_allclose(pose, naive_sweep.pose_at(one, other, fraction), atol=1e-12)
+        pose, _ = probe.between(np.array([1e6, 0, 0]), one, other, 0.0)
+        np.testing.assert_allclose(pose, one, atol=1e-9)
+
+
+@pytest.mark.interpreted
+def test_what_is_resident_rigid_and_short_is_asked_in_one_call(
+    tmp_path: Path, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    points = synthetic_scans.make_scan("plane", 5, 200)
+    case = archive_cases.build(tmp_path, points)
+    first, last = judged_sweeps.motions(rng, points, np.zeros((1, 3)), 6, 0.3, 0.2, 0.5)
+    probe, left = Probe(make_avatar([[0.0, 0, 0], [0.1, 0, 0]], 0.05)), []
+
+    def counted(*arguments: Any, **options: Any) -> Any:
+        left.append(arguments)
+        return sweep(*arguments, **options)
+
+    with judged_sweeps.opened(case) as data:
+        same(probe, data, first, last)
+        monkeypatch.setattr(module, "sweep", counted)
+        used = data.residency.hits
+        same(probe, data, first, last)
+        assert not left and data.residency.hits > used
+        turned = np.tile(np.diag([0.0, 0.0, 1.0, 1.0]), (6, 1, 1))
+        turned[:, 0, 1], turned[:, 1, 0] = -1.0, 1.0
+        turned[:, :3, 3] = first[:, :3, 3]
+        same(probe, data, turned, turned)
+        assert not left
+        # Of a scale that `sweep` takes to be 1 only just: it says whether it is.
+        for size, calls in ((1 + 0.2 * SIMILARITY_TOLERANCE, 0), (1 + 0.4 * SIMILARITY_TOLERANCE, 6)):
+            scaled = first.copy()
+            scaled[:, :3, :3] *= size
+            left.clear()
+            same(probe, data, scaled, scaled)
+            assert len(left) == calls
+
+
+@pytest.mark.interpreted
+def test_a_motion_that_would_keep_others_waiting_is_left_to_sweep(
+    tmp_path: Path, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    points = synthetic_scans.make_scan("plane", 5, 200)
+    case = archive_cases.build(tmp_path, points)
+    first, last = judged_sweeps.motions(rng, points, np.zeros((1, 3)), 6, 0.3, 0.2, 0.5)
+    probe, left = Probe(make_avatar([[0.0, 0, 0], [0.1, 0, 0]], 0.05)), []
+
+    def counted(*arguments: Any, **options: Any) -> Any:
+        left.append(arguments)
+        return sweep(*arguments, **options)
+
+    with judged_sweeps.opened(case) as data:
+        looked = [each.visits for each in same(probe, data, first, last)]
+        # Compiled, a kernel has taken the figure up already.
+        monkeypatch.setattr(kernel, "MOST_QUICK_VISITS", 3)
+        monkeypatch.setattr(module, "sweep", counted)
+        same(probe, data, first, last)
+        assert max(looked) > 3 and (len(left) > 0) == INTERPRETED
+
+
+@pytest.mark.interpreted
+def test_a_pose_between_holds_where_the_origin_comes_off_again(rng: np.random.Generator) -> None:
+    probe = Probe(make_avatar([[0.0, 0, 0], [0.1, 0, 0]], 0.05))
+    said = set()
+    for size in (0.1, 1e3, 1e6):
+        for _ in range(20):
+            origin = rng.uniform(-size, size, 3)
+            first, last = judged_sweeps.motions(rng, origin[None], probe.avatar.points, 1, 0.3, 0.5, 0.5)
+            one, other = first[0].copy(), last[0].copy()
+            one[:3, 3] -= origin
+            other[:3, 3] -= origin
+            near, _ = probe.between(np.zeros(3), one, other, 0.3)
+            pose, holds = probe.between(origin, first[0], last[0], 0.3)
+            there = near[:3, 3] + origin
+            np.testing.assert_array_equal(pose[:3, 3], there)
+            assert holds == bool((there - origin == near[:3, 3]).all())
+            for r in range(3):
+                said.add(float(np.sign(there[r] - origin[r] - near[r, 3])))
+    assert said == {-1.0, 0.0, 1.0}

@@ -1,0 +1,174 @@
+"""The accuracy report's judge, poses and guards, on a small hall."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import synthetic_scans
+from solidcloud.builder.config import BuildConfig
+from solidcloud.builder.made.figure import figure_points
+from solidcloud.builder.pipeline import build_archive
+from solidcloud.schemas.archive.archive import Archive
+from solidcloud.schemas.errors import InternalError
+from solidcloud.server.report.accuracy.accuracy import judge, warnings_of
+from solidcloud.server.report.accuracy.accuracy_arithmetic import VOLUME, check_judge, measure_plain
+from solidcloud.server.report.accuracy.accuracy_case import (
+    LEAST_OFF,
+    MOST_OFF,
+    REACH,
+    Ground,
+    config_of,
+    given_ground,
+    turned_ground,
+    unknown_regions,
+)
+from solidcloud.server.report.accuracy.accuracy_engine import UNSPENT, Archives, Exact, Setting, judge_engine
+from solidcloud.server.report.accuracy.accuracy_plan import Plan
+from solidcloud.server.report.accuracy.accuracy_row import BUDGET, DEGREE, TOLERANCE, Row
+
+PLAN = Plan(frames=40, near_tangent=20, plain_frames=10, loops=1)
+CONFIG = BuildConfig(resolution=1e-3, radius=0.01, jobs=1)
+
+
+class Judged:
+    """A hall with a wall along its middle, and what the judge says of it."""
+
+    def __init__(self, folder: Path) -> None:
+        rng = np.random.default_rng(9)
+        floor = np.column_stack(
+            [rng.uniform(0, 6, 4000), rng.uniform(0, 2, 4000), rng.normal(0, 0.002, 4000)]
+        )
+        # The walk goes through the middle of all points, y = 1.25 m: the wall is a shoulder's width beside it.
+        wall = np.column_stack([rng.uniform(0, 6, 1000), np.full(1000, 1.65), rng.uniform(0, 2, 1000)])
+        scan = synthetic_scans.write_ply(folder / "hall.ply", np.concatenate([floor, wall]))
+        build_archive([scan], folder / "hall", BuildConfig(voxel=1.0, resolution=1e-3, jobs=1))
+        self.folder = folder / "work"
+        self.folder.mkdir()
+        avatar = folder / "figure.ply"
+        synthetic_scans.write_ply(avatar, figure_points(200))
+        self.ground: Ground = given_ground(folder / "hall", PLAN, avatar, self.folder)
+        self.archives = Archives(self.ground, self.folder)
+        self.exact: Exact = judge(self.ground, CONFIG, self.archives, PLAN)
+        self.archive = Archive(self.archives.folder(CONFIG))
+
+
+@pytest.fixture(scope="module")
+def judged(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Judged]:
+    made = Judged(tmp_path_factory.mktemp("judged"))
+    yield made
+    made.archive.close()
+    made.archives.__exit__()
+
+
+def test_both_verdicts_are_among_the_judged_poses(judged: Judged) -> None:
+    assert 0 < judged.exact.contact.sum() < len(judged.exact.contact) == 80
+
+
+def test_an_archive_is_built_again_as_it_was(judged: Judged, tmp_path: Path) -> None:
+    given = BuildConfig(
+        voxel=1.5, resolution=2e-3, radius=0.031, degree=5, leaf=9, cells="balanced", cell_points=200,
+        with_slab=False, models=frozenset({"mean", "local"}), jobs=1,
+    )  # fmt: skip
+    build_archive([judged.ground.scan], tmp_path / "given", given)
+    ground = given_ground(tmp_path / "given", PLAN, None, tmp_path)
+    with (
+        Archives(ground, tmp_path) as archives,
+        Archive(archives.folder(ground.config)) as again,
+        Archive(tmp_path / "given") as first,
+    ):
+        assert again.header.options == first.header.options
+        for name in ("radius", "degree", "leaf", "models", "points"):
+            assert getattr(again.header, name) == getattr(first.header, name), name
+        assert again.header.lattice == first.header.lattice
+        assert config_of(first.header) == ground.config and ground.warnings == ()
+
+
+def test_what_is_not_measured_is_said(judged: Judged) -> None:
+    header, exact = judged.archive.header, judged.exact
+    one = replace(header, unknown=np.zeros((1, 2, 3), np.int64))
+    assert "unknown in 1 region." in unknown_regions(one)[0]
+    assert (
+        "unknown in 2 regions." in unknown_regions(replace(header, unknown=np.zeros((2, 2, 3), np.int64)))[0]
+    )
+    assert "unknown everywhere" in unknown_regions(replace(one, unknown_everywhere=True))[0]
+    assert unknown_regions(header) == () and warnings_of(judged.ground, exact) == []
+    ground = judged.ground._replace(warnings=("left out",))
+    for changed, said in (
+        ({"contact": np.zeros(80, bool)}, "None of the 80 judged poses touches"),
+        ({"contact": np.ones(80, bool)}, "All 80 judged poses touch"),
+        ({"tangent": exact.tangent[:0]}, "No pose was found within a micrometre"),
+    ):
+        first, second = warnings_of(ground, exact._replace(**changed))
+        assert first == "left out" and second.startswith(said)
+
+
+def test_near_tangent_poses_are_within_a_micrometre_on_either_side(judged: Judged) -> None:
+    scene = judged.archives.scene(CONFIG)
+    off = scene.distance("avatar", judged.exact.tangent_poses, REACH).signed_distance
+    assert len(off) >= 10 and np.abs(off).max() <= MOST_OFF and np.abs(off).min() >= LEAST_OFF / 4
+    assert (off > 0).any() and (off < 0).any()
+    assert ((off <= 0) == judged.exact.tangent).all()
+
+
+def test_every_pair_of_points_agrees_with_the_judge_and_would_say_if_not(judged: Judged) -> None:
+    exact = judged.exact
+    assert check_judge(judged.archive, judged.ground, exact, 20) == 20
+    for wrong in (exact._replace(contact=~exact.contact), exact._replace(tangent=~exact.tangent)):
+        with pytest.raises(InternalError, match="every pair of points finds the opposite"):
+            check_judge(judged.archive, judged.ground, wrong, 20)
+
+
+def test_a_volume_that_changed_an_answer_would_be_an_error(judged: Judged) -> None:
+    rows = measure_plain(judged.archive, judged.ground, judged.exact, PLAN, lambda: None, only=(VOLUME,))
+    assert len(rows) == 4 and all(row.times and row.poses == 80 for row in rows)
+    wrong = judged.exact._replace(contact=~judged.exact.contact)
+    with pytest.raises(InternalError, match="verdicts differ from the server's"):
+        measure_plain(judged.archive, judged.ground, wrong, PLAN, lambda: None, only=(VOLUME,))
+
+
+@pytest.mark.parametrize(
+    ("knob", "contact", "said", "options"),
+    [
+        (DEGREE, False, "differ from", {}),
+        (TOLERANCE, False, "differ from", {}),
+        (TOLERANCE, False, "differ from", {"tolerance": 0.01}),
+        (TOLERANCE, True, "called clear", {"tolerance": 0.01, "budget_visits": UNSPENT}),
+        (BUDGET, True, "called clear", {"budget_visits": UNSPENT}),
+    ],
+)
+def test_a_knob_that_changed_what_it_must_not_would_be_an_error(
+    judged: Judged, knob: str, contact: bool, said: str, options: dict[str, Any]
+) -> None:
+    everywhere = np.full(len(judged.exact.contact), contact)
+    wrong = judged.exact._replace(contact=everywhere)
+    for exact, fails in ((judged.exact, False), (wrong, True)):
+        settings = [Setting(Row(knob, "as it is"), CONFIG, options)]
+        if fails:
+            with pytest.raises(InternalError, match=said):
+                judge_engine(settings, judged.archives, judged.ground, exact, lambda: None)
+        else:
+            judge_engine(settings, judged.archives, judged.ground, exact, lambda: None)
+            row = settings[0].row
+            assert row.late == row.unknown == 0 and row.decode_ms
+            assert (row.early > 0) == (options == {"tolerance": 0.01, "budget_visits": UNSPENT})
+
+
+def test_the_turned_scene_is_the_same_scene(judged: Judged, tmp_path: Path) -> None:
+    turned = turned_ground(judged.ground, tmp_path)
+    with Archives(turned, tmp_path) as archives:
+        found = archives.scene(CONFIG).distance("avatar", turned.judged, REACH).signed_distance
+    near = np.isfinite(found) & np.isfinite(judged.exact.distance)
+    # Points are put on the lattice anew: either is moved by sqrt(3) / 2 steps at most.
+    assert near.sum() > 40 and np.abs(found - judged.exact.distance)[near].max() <= 3**0.5 * 1e-3
+    walls = np.abs(turned.walk[0, :3, :3])
+    assert ((walls > 0.05) & (walls < 0.97)).sum() >= 7, "an axis stayed an axis"
+
+
+def test_of_a_large_archive_the_voxels_around_its_middle_are_taken(judged: Judged, tmp_path: Path) -> None:
+    few = given_ground(judged.folder.parent / "hall", Plan(most_points=3000, frames=40), None, tmp_path)
+    assert "of 5,000 points" in few.name and few.truth is None and len(few.walk) == 40
+    taken = int(few.name.split(", ", 1)[1].split(" ")[0].replace(",", ""))
+    assert 0 < taken <= 3000

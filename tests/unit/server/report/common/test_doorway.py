@@ -1,0 +1,125 @@
+"""The doorway's error, on made jambs: against brute force over every pair, and figures that follow from the making."""
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+
+import archive_cases
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from solidcloud.builder.made.figure import figure_points
+from solidcloud.builder.made.truth import DoorTruth, FacadeTruth
+from solidcloud.schemas.errors import BadRequestError
+from solidcloud.server.report.common import doorway
+from solidcloud.server.report.common.doorway import doorway_error
+from solidcloud.server.scene import Scene
+
+ORIGIN = (400_000.0, -20.0, 7.0)
+RADIUS = 0.012
+# A door 0.8 m wide in a wall 0.3 m thick, its middle at x = 0.1.
+DOOR = DoorTruth("main", -0.3, 0.5, 0.0, 0.3, 0.2, 2.5, 2.9)
+TRUTH = FacadeTruth(1, ORIGIN, 0.2, (DOOR,), (), (), ())
+FIGURE = figure_points()
+
+
+def jambs(rng: np.random.Generator, spacing: float, noise: float) -> NDArray[np.float64]:
+    """Points of both jambs, the façade's frame: a jittered grid, and noise across."""
+    sides = []
+    for x in (DOOR.x_left, DOOR.x_right):
+        y, z = np.meshgrid(
+            np.arange(0.0, 0.3, spacing), np.arange(DOOR.sill, DOOR.springing, spacing), indexing="ij"
+        )
+        side = np.column_stack([np.full(y.size, x), y.ravel(), z.ravel()])
+        side[:, 1:] += rng.uniform(-0.3, 0.3, (len(side), 2)) * spacing
+        side[:, 0] += rng.normal(0.0, noise, len(side))
+        sides.append(side)
+    return np.rint(np.concatenate(sides) * 1e4) / 1e4
+
+
+def narrowest(points: NDArray[np.float64], radius: float, figure_radius: float) -> float:
+    """The narrowest door by brute force: the figure is drawn through along y without a step."""
+    reach = radius + figure_radius
+    middle = (DOOR.x_left + DOOR.x_right) / 2
+    play = 0.0
+    for lift in doorway.LIFTS:
+        for side in (-1, 1):
+            jamb = points[side * (points[:, 0] - middle) > 0]
+            best = math.inf
+            for x, _, z in FIGURE:
+                under = reach**2 - (jamb[:, 2] - (z + DOOR.sill + lift)) ** 2
+                near = under >= 0
+                if near.any():
+                    gap = side * (jamb[near, 0] - middle) - side * x - np.sqrt(under[near])
+                    best = min(best, float(gap.min()))
+            play += best / len(doorway.LIFTS)
+    return DOOR.width - play
+
+
+@pytest.fixture(scope="module")
+def dense(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Scene, NDArray[np.float64]]]:
+    """Jambs of points 2 cm apart, noise of 2 mm, at map coordinates, and those points in the façade's frame."""
+    points = jambs(np.random.default_rng(2012), 0.02, 0.002)
+    archive = archive_cases.build(
+        tmp_path_factory.mktemp("dense"), points + ORIGIN, voxel=8.0, radius=RADIUS
+    ).archive
+    with Scene.open(archive) as scene:
+        yield scene, points
+
+
+@pytest.mark.parametrize("model, radius", [(None, RADIUS), ("mean:2", 2 * RADIUS), ("fixed:0.003", 0.003)])
+def test_narrowest_door_is_that_of_brute_force(
+    dense: tuple[Scene, NDArray[np.float64]], model: str | None, radius: float
+) -> None:
+    scene, points = dense
+    found = doorway_error(scene, "figure", TRUTH, radius_model=model)
+    own = scene.add_avatar("figure", FIGURE).radius
+    judged = narrowest(points, radius, own)
+    # Bisection says a door too wide, by a quarter of a millimetre a side; steps of 5 mm one too narrow, by as little.
+    missed = 2 * doorway.ALONG**2 / 8 / (radius + own)
+    assert judged - missed - 1e-4 <= found.narrowest <= judged + 2 * doorway.FINEST
+    assert found.width == pytest.approx(np.ptp(FIGURE[:, 0]) + 2 * own, abs=1e-12)
+    assert found.error == pytest.approx(1000 * (found.narrowest - found.width), abs=1e-9)
+
+
+def test_jambs_without_noise_cost_their_spheres_and_no_more(tmp_path: Path) -> None:
+    """Points so dense that each side of the figure meets one squarely: the error is two radii."""
+    points = jambs(np.random.default_rng(7), 0.008, 0.0)
+    archive = archive_cases.build(tmp_path, points + ORIGIN, voxel=8.0, radius=RADIUS).archive
+    with Scene.open(archive) as scene:
+        assert doorway_error(scene, "figure", TRUTH).error == pytest.approx(2000 * RADIUS, abs=1.0)
+
+
+def test_tolerance_makes_the_door_narrower_by_at_most_itself_a_side(
+    dense: tuple[Scene, NDArray[np.float64]],
+) -> None:
+    """In the search that a budget asks for, here one that is never spent; a tolerance alone is answered exactly."""
+    scene, _ = dense
+    exact = doorway_error(scene, "figure", TRUTH).error
+    loose = doorway_error(scene, "figure", TRUTH, tolerance=0.02, budget_visits=1 << 40).error
+    assert doorway_error(scene, "figure", TRUTH, tolerance=0.02).error == exact
+    assert exact + 1.0 < loose <= exact + 2 * 20 + 0.5
+
+
+def test_figure_that_is_stopped_in_the_middle_needs_an_infinite_door(
+    dense: tuple[Scene, NDArray[np.float64]],
+) -> None:
+    scene, _ = dense
+    found = doorway_error(scene, "figure", TRUTH, radius_model="fixed:0.2")
+    assert math.isinf(found.narrowest) and math.isinf(found.error)
+    # Unknown is not clear.
+    assert math.isinf(doorway_error(scene, "figure", TRUTH, budget_visits=1).error)
+
+
+def test_figure_that_meets_nothing_slips_as_far_as_is_looked(tmp_path: Path) -> None:
+    far = np.array([[50.0, 0.0, 0.0], [50.5, 0.0, 0.0]])
+    archive = archive_cases.build(tmp_path, far + ORIGIN, voxel=8.0, radius=RADIUS).archive
+    with Scene.open(archive) as scene:
+        assert doorway_error(scene, "figure", TRUTH).error == pytest.approx(-2000 * doorway.INSIDE, abs=0.5)
+
+
+def test_another_figure_of_that_name_is_refused(dense: tuple[Scene, NDArray[np.float64]]) -> None:
+    scene, _ = dense
+    scene.add_avatar("child", figure_points(100), 0.02)
+    with pytest.raises(BadRequestError, match="'child' exists"):
+        doorway_error(scene, "child", TRUTH)

@@ -1,0 +1,312 @@
+"""Residency: one load a voxel, every waiter answered, pins respected, never a byte over the budget."""
+
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import archive_cases
+import numpy as np
+import pytest
+import synthetic_scans
+from fake_store import BLOCK, FakeStore
+from solidcloud.schemas.errors import BadRequestError
+from solidcloud.schemas.wire.answers import Verdict
+from solidcloud.schemas.wire.requests import QuestionOptions
+from solidcloud.server.residency.eviction import POLICIES
+from solidcloud.server.residency.voxel_cache import Held, Residency
+from solidcloud.server.runtime.stop_flag import NEVER
+from solidcloud.server.scene import Scene
+
+pytestmark = pytest.mark.interpreted
+DEADLINE = 20.0  # [s], for what takes microseconds when it is right
+
+
+def take(residency: Residency, rows: list[int]) -> Held:
+    """Hold rows for a moment."""
+    with residency.hold(rows) as held:
+        for row in rows:
+            assert (residency.where[row, 0] >= 0) or held.faults
+        assert held.waited > 0 or not held.misses
+        return held._replace(waited=0.0)
+
+
+def resident(residency: Residency) -> list[int]:
+    """The rows whose voxels are resident."""
+    return np.flatnonzero(residency.where[:, 0] >= 0).tolist()
+
+
+def test_a_budget_below_the_largest_voxel_is_refused() -> None:
+    with pytest.raises(BadRequestError, match="the largest voxel takes 192"):
+        Residency(FakeStore([1, 3]), 3 * BLOCK - 1)
+    assert Residency(FakeStore([]), 0).resident == 0
+
+
+def test_the_least_recently_used_goes_first() -> None:
+    store = FakeStore([1] * 5)
+    residency = Residency(store, 3 * BLOCK)
+    for row in (0, 1, 2, 0, 3):
+        take(residency, [row])
+    assert resident(residency) == [0, 2, 3]
+    assert (residency.hits, residency.misses, residency.evictions) == (1, 4, 1)
+    assert take(residency, [2, 4]) == Held(1, 1, ())
+    assert resident(residency) == [2, 3, 4] and store.loads == {0: 1, 1: 1, 2: 1, 3: 1, 4: 1}
+    assert residency.resident_bytes == 3 * BLOCK
+    residency.check()
+
+
+def test_more_than_the_budget_at_once_is_refused() -> None:
+    residency = Residency(FakeStore([2, 2]), 3 * BLOCK)
+    with pytest.raises(ValueError, match="ask in pieces"), residency.hold([0, 1]):
+        pass
+    residency.check()
+
+
+def test_room_in_pieces_between_own_voxels_is_made_whole() -> None:
+    store = FakeStore([1, 1, 1, 1, 3])
+    residency = Residency(store, 4 * BLOCK)
+    take(residency, [0, 1, 2, 3])
+    # Row 1 lies in the middle: what is free beside it is enough for row 4, but not in one run.
+    with residency.hold([1, 4]) as held:
+        assert held.misses == 1
+        for row in (1, 4):
+            run = residency.buffer.arena.ints[int(residency.where[row, 0]) :][: store.sizes[row] // 4]
+            assert (run == row).all()
+    assert resident(residency) == [1, 4] and store.loads[1] == 1
+    residency.check()
+
+
+def test_a_request_waits_for_pinned_room_and_then_goes_on() -> None:
+    store = FakeStore([2, 2])
+    residency = Residency(store, 3 * BLOCK)
+    with ThreadPoolExecutor(1) as pool:
+        with residency.hold([0]):
+            other = pool.submit(take, residency, [1])
+            assert not store.wait_for_load(1, 0.05), "there is no room while row 0 is held"
+            assert resident(residency) == [0]
+        assert other.result(DEADLINE) == Held(0, 1, ())
+    assert resident(residency) == [1]
+
+
+def test_requests_that_need_each_others_room_both_end() -> None:
+    residency = Residency(FakeStore([1] * 8), 4 * BLOCK)
+    left, right = [0, 1, 2, 3], [2, 3, 4, 5]
+    with ThreadPoolExecutor(8) as pool:
+        jobs = [pool.submit(take, residency, (left, right)[i % 2]) for i in range(400)]
+        assert sum(sum(job.result(DEADLINE)[:2]) for job in jobs) == 1600
+    residency.check()
+
+
+def test_one_load_however_many_wait() -> None:
+    store = FakeStore([1])
+    store.gate.clear()
+    residency = Residency(store, BLOCK)
+    with ThreadPoolExecutor(8) as pool:
+        jobs = [pool.submit(take, residency, [0]) for _ in range(8)]
+        assert store.wait_for_load(0, DEADLINE)
+        store.gate.set()
+        held = [job.result(DEADLINE) for job in jobs]
+    assert store.loads == {0: 1}
+    assert sorted(h.misses for h in held) == [0] * 7 + [1]
+    residency.check()
+
+
+@pytest.mark.parametrize("fault", ["corrupt", "unreadable"])
+def test_every_waiter_hears_of_a_load_that_fails(fault: str) -> None:
+    store = FakeStore([1, 1])
+    store.faults[0] = fault
+    store.gate.clear()
+    residency = Residency(store, 2 * BLOCK)
+    ready = threading.Barrier(8)
+
+    def wait_and_leave(_: int) -> Held:
+        with residency.hold([0, 1]) as held:
+            assert residency.where[0, 0] == -1 and residency.where[1, 0] >= 0
+            ready.wait(DEADLINE)  # all inside at once
+        return held
+
+    with ThreadPoolExecutor(8) as pool:
+        jobs = [pool.submit(wait_and_leave, i) for i in range(8)]
+        assert store.wait_for_load(0, DEADLINE)
+        store.gate.set()
+        faults = [job.result(DEADLINE).faults for job in jobs]
+    assert all(len(f) == 1 and "file.h5: voxel 0" in f[0] for f in faults)
+    assert store.loads[0] == 1, "nobody tries again while somebody holds it"
+    residency.check()
+    del store.faults[0]
+    again = take(residency, [0])
+    if fault == "corrupt":  # the same bytes would be read again
+        assert again.faults and store.loads[0] == 1
+    else:
+        assert not again.faults and store.loads[0] == 2 and resident(residency) == [0, 1]
+
+
+def test_a_failed_voxel_does_not_appear_under_who_began_without_it() -> None:
+    store = FakeStore([1])
+    store.faults[0] = "unreadable"
+    residency = Residency(store, BLOCK)
+    with residency.hold([0]) as first:
+        del store.faults[0]
+        with residency.hold([0]) as second:
+            assert first.faults == second.faults != ()
+            assert residency.where[0].tolist() == [-1, -1, -1]
+    assert take(residency, [0]).faults == ()
+
+
+def test_a_load_that_raises_anything_else_leaves_nothing_behind() -> None:
+    store = FakeStore([1, 1, 1])
+    store.faults[1] = "out of memory"
+    residency = Residency(store, 3 * BLOCK)
+    with pytest.raises(MemoryError), residency.hold([0, 1, 2]):
+        pass
+    residency.check()
+    assert resident(residency) == [0] and residency.resident_bytes == BLOCK
+    del store.faults[1]
+    assert take(residency, [0, 1, 2]) == Held(1, 2, ())
+
+
+def test_who_waits_for_a_load_that_raises_is_answered() -> None:
+    store = FakeStore([1])
+    store.faults[0] = "out of memory"
+    store.gate.clear()
+    residency = Residency(store, BLOCK)
+    with ThreadPoolExecutor(2) as pool:
+        first = pool.submit(take, residency, [0])
+        assert store.wait_for_load(0, DEADLINE)
+        second = pool.submit(take, residency, [0])
+        while residency._pins.get(0, 0) < 2:
+            pass
+        store.gate.set()
+        with pytest.raises(MemoryError):
+            first.result(DEADLINE)
+        assert "MemoryError" in second.result(DEADLINE).faults[0]
+    residency.check()
+
+
+@pytest.mark.parametrize("broken", ["bytes", "overlap", "lost run", "where", "pin"])
+def test_check_finds_what_is_broken(broken: str) -> None:
+    residency = Residency(FakeStore([1, 1, 1]), 3 * BLOCK)
+    take(residency, [0, 1])
+    residency.check()
+    if broken == "bytes":
+        residency._room.used_bytes += BLOCK
+    elif broken == "overlap":
+        residency._room.offsets[1] = residency._room.offsets[0]
+    elif broken == "lost run":
+        residency.buffer.allocate(BLOCK)
+    elif broken == "where":
+        residency.where[1] = -1
+    else:
+        residency._pins[1] = 0
+    with pytest.raises(AssertionError):
+        residency.check()
+
+
+@pytest.mark.parametrize("policy", POLICIES)
+def test_eight_threads_and_a_tiny_budget_change_no_answer(
+    tmp_path: Path, rng: np.random.Generator, policy: str
+) -> None:
+    case = archive_cases.build(tmp_path, synthetic_scans.make_scan("noise", 9, 1500), voxel=0.4, leaf=8)
+    avatar = rng.uniform(-0.2, 0.2, (40, 3))
+    poses = archive_cases.near_poses(rng, case.points, avatar, 160, 0.04)
+    expected = case.judge(avatar, 0.005, poses).astype(int)
+    assert 40 < expected.sum() < 120
+    # Requests of one pose, which are answered at once where all is resident, and of two, which hold their voxels.
+    parts = [np.sort(part) for part in np.array_split(rng.permutation(len(poses)), 110)] * 3
+    with Scene.open(case.archive) as scene:
+        everything = scene.info().resident_bytes
+    with Scene.open(case.archive, budget_bytes=everything // 6, policy=policy) as scene:
+        over, unknown = [], []
+
+        def ask(number: int) -> list[int]:
+            """A request of a user of its own thread; every third one does not wait."""
+            part, client = parts[number], str(threading.get_ident())
+            scene.add_avatar("avatar", avatar, 0.005, client=client)
+            options: QuestionOptions = {"budget_ms": 0.0} if number % 3 == 0 else {}
+            answers = scene.collide("avatar", poses[part], client=client, **options)
+            over.append(scene.stats().resident_bytes + scene.stats().coarse_bytes > everything // 6)
+            late = answers.verdict == Verdict.UNKNOWN
+            unknown.append(int(late.sum()))
+            assert not late.any() or options
+            assert answers.late or not late.any() or not answers.misses
+            return np.where(late, expected[part], answers.verdict).tolist()
+
+        with ThreadPoolExecutor(8) as pool:
+            verdicts = list(pool.map(ask, range(len(parts))))
+        scene.residency.check()
+        stats = scene.stats()
+        assert scene.residency.evictions > 0 and not any(over) and sum(unknown) > 0
+        assert stats.requests == len(parts) and stats.unknown == sum(unknown)
+        assert sum(user.requests for user in stats.users) == stats.requests
+        assert sum(user.misses for user in stats.users) <= stats.misses
+        assert stats.prefetched == stats.used + stats.wasted + len(scene.residency._accounts.fresh)
+        assert policy != "lru" or stats.prefetched == 0
+    for part, verdict in zip(parts, verdicts, strict=True):
+        assert verdict == expected[part].tolist()
+
+
+def test_an_error_while_room_is_made_leaves_nothing_pinned(monkeypatch: pytest.MonkeyPatch) -> None:
+    store = FakeStore([1, 1, 1, 1, 2, 2])
+    residency = Residency(store, 4 * BLOCK)
+    take(residency, [0, 1, 2, 3])
+    made = residency._room.make
+
+    def make(row: int, *what: object, **more: object) -> bool:
+        """Room for the first, and no memory for the second."""
+        if row == 5:
+            raise MemoryError("no room to look for room")
+        return made(row, *what, **more)  # type: ignore[arg-type]
+
+    with monkeypatch.context() as patched:
+        patched.setattr(residency._room, "make", make)
+        with pytest.raises(MemoryError), residency.hold([4, 5]):
+            pass
+    assert not residency._pins and not residency._loading and residency._demands == 0
+    residency.check()
+    assert take(residency, [4, 5]) == Held(0, 2, ()) and store.loads[4] == 1
+
+
+def test_a_voxel_known_to_be_corrupt_is_not_waited_for() -> None:
+    store = FakeStore([1, 1])
+    store.faults[0] = "corrupt"
+    residency = Residency(store, 2 * BLOCK)
+    take(residency, [0, 1])
+    with residency.hold([0, 1]) as held:
+        assert held.faults and (held.hits, held.misses, held.waited) == (1, 0, 0.0)
+
+
+def test_parts_that_fit_look_at_each_row_once() -> None:
+    looks = 0
+
+    class Counting(list[int]):
+        def __getitem__(self, row: int) -> int:  # type: ignore[override]
+            nonlocal looks
+            looks += 1
+            return super().__getitem__(row)
+
+    blocks = [1, 2, 1, 4, 9, 1, 1, 1, 1, 1] * 100
+    residency = Residency(FakeStore(blocks), 9 * BLOCK)
+    residency._sizes = Counting(residency._sizes)
+    parts = list(residency.parts_that_fit(range(len(blocks)), 4 * BLOCK))
+    assert [row for part in parts for row in part] == list(range(len(blocks)))
+    assert parts[:4] == [[0, 1, 2], [3], [4], [5, 6, 7, 8]], "a row that takes more stands alone"
+    assert looks == len(blocks)
+    assert list(residency.parts_that_fit([], BLOCK)) == []
+
+
+def test_a_load_that_two_could_not_wait_for_is_owed_until_it_is_done() -> None:
+    """One leaves it to the other, who leaves too: it is still to be loaded."""
+    store = FakeStore([1, 1])
+    residency = Residency(store, 2 * BLOCK)
+    told: list[None] = []
+    residency.owed = lambda: told.append(None)
+    # Reserved by one whose deadline comes before the load begins.
+    residency._reserve([1], float("inf"), False, NEVER)
+    residency._pin([1])  # another waits for it
+    residency._leave([1])
+    residency._owed[1] = None
+    assert residency.take_owed() is None, "who waits may load it"
+    residency.release([1])
+    residency.release([1])
+    residency._demands -= 1
+    assert told and residency.take_owed() == 1
+    residency.check()

@@ -1,0 +1,189 @@
+"""Residency with deadlines: what is late is missing for who asked and nobody else; every load is begun by someone."""
+
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import archive_cases
+import numpy as np
+import pytest
+import synthetic_scans
+from fake_store import BLOCK, FakeStore
+from solidcloud.server.queries.context.query_context import as_held
+from solidcloud.server.residency.voxel_cache import _LOOK_SECONDS, Held, Residency
+from solidcloud.server.runtime.stop_flag import Stop
+from solidcloud.server.scene import Scene
+
+pytestmark = pytest.mark.interpreted
+PATIENCE = 20.0  # [s], for what takes microseconds when it is right
+
+
+def soon(seconds: float = 0.05) -> float:
+    """A deadline."""
+    return time.perf_counter() + seconds
+
+
+def take(residency: Residency, rows: list[int], deadline: float = float("inf")) -> Held:
+    """Hold rows for a moment; what is not late is there, and whole."""
+    with residency.hold(rows, deadline) as held:
+        for row in set(rows) - set(held.late):
+            first = int(residency.where[row, 0])
+            assert first >= 0
+            assert (residency.buffer.arena.ints[first : first + BLOCK // 4] == row).all()
+    assert held.waited > 0 or not (held.misses or held.late)
+    return held._replace(waited=0.0)
+
+
+def test_after_the_deadline_no_load_is_begun() -> None:
+    store = FakeStore([1] * 4)
+    residency = Residency(store, 4 * BLOCK)
+    take(residency, [1])
+    assert take(residency, [0, 1, 2], deadline=0.0) == Held(1, 2, (), (0, 2))
+    assert store.loads == {1: 1} and residency.resident == 1
+    residency.check()
+    assert take(residency, [0, 1, 2]) == Held(1, 2, ()), "and who has time gets them"
+    assert take(residency, [0, 1, 2], deadline=0.0) == Held(3, 0, ()), "what is there is not late"
+
+
+def test_a_deadline_of_ages_is_waited_for() -> None:
+    """Longer than a lock can be waited for: `budget_ms` has no upper end."""
+    store = FakeStore([1])
+    residency = Residency(store, BLOCK)
+    store.gate.clear()
+    with ThreadPoolExecutor(2) as pool:
+        loader = pool.submit(take, residency, [0])
+        assert store.wait_for_load(0, PATIENCE)
+        other = pool.submit(take, residency, [0], 1e300)
+        while not other.done() and not residency._changed._waiters:  # type: ignore[attr-defined]
+            time.sleep(0.001)
+        store.gate.set()
+        assert loader.result(PATIENCE) == Held(0, 1, ())
+        assert other.result(PATIENCE).late == ()
+
+
+def test_a_load_of_another_is_waited_for_until_the_deadline_and_goes_on() -> None:
+    store = FakeStore([1])
+    residency = Residency(store, BLOCK)
+    store.gate.clear()
+    with ThreadPoolExecutor(1) as pool:
+        loader = pool.submit(take, residency, [0])
+        assert store.wait_for_load(0, PATIENCE)
+        with residency.hold([0], soon()) as held:
+            assert held.late == (0,) and held.faults == ()
+            assert residency.where[0, 0] == -1
+            store.gate.set()
+            assert loader.result(PATIENCE) == Held(0, 1, ())
+            assert residency.where[0, 0] >= 0, "it became resident while one holds it as late"
+            residency.check()
+    assert store.loads == {0: 1}
+
+
+def test_a_load_that_was_not_begun_is_taken_over_by_who_waits_for_it() -> None:
+    store = FakeStore([1, 1])
+    residency = Residency(store, 2 * BLOCK)
+    store.gate.clear()
+    with ThreadPoolExecutor(2) as pool:
+        deadline = soon(0.2)
+        hurried = pool.submit(take, residency, [0, 1], deadline)
+        assert store.wait_for_load(0, PATIENCE)
+        patient = pool.submit(take, residency, [1])
+        while residency._pins.get(1, 0) < 2 or time.perf_counter() < deadline:
+            time.sleep(0.001)
+        store.gate.set()
+        assert hurried.result(PATIENCE).late in ((1,), ()), "unless the other was faster to load it"
+        assert patient.result(PATIENCE).late == ()
+    assert store.loads == {0: 1, 1: 1}
+    residency.check()
+
+
+def test_who_waits_for_room_waits_until_the_deadline() -> None:
+    store = FakeStore([1, 1, 1])
+    residency = Residency(store, 2 * BLOCK)
+    with residency.hold([0, 1]):
+        assert take(residency, [1, 2], soon()) == Held(1, 0, (), (2,))
+        residency.check()
+    assert store.loads == {0: 1, 1: 1}
+    assert take(residency, [1, 2], soon(PATIENCE)).late == ()
+
+
+def test_a_stopped_request_is_owed_nothing() -> None:
+    """Its client is gone, or the server stops: only a deadline leaves loads to the prefetcher."""
+    residency = Residency(FakeStore([1] * 4), 4 * BLOCK)
+    told: list[str] = []
+    residency.owed = lambda: told.append("owed")
+    stop = Stop()
+    stop.set("the client is gone")
+    with residency.hold([0, 1], stop=stop) as held:
+        assert held.late == (0, 1)
+    assert residency.take_owed() is None
+    with residency.hold([2], 0.0, stop=stop) as held:
+        assert held.late == (2,)
+    assert residency.take_owed() == 2
+    residency.check()
+
+
+def test_who_waits_for_room_tries_again_only_when_something_changed(monkeypatch: pytest.MonkeyPatch) -> None:
+    residency = Residency(FakeStore([1, 1, 1]), 2 * BLOCK)
+    tries: list[list[int]] = []
+    allocate = residency._allocate_all
+    monkeypatch.setattr(
+        residency, "_allocate_all", lambda rows, scan: tries.append(rows) or allocate(rows, scan)
+    )
+    stop = Stop()
+    with ThreadPoolExecutor(1) as pool:
+        with residency.hold([0, 1]):
+            waiter = pool.submit(lambda: residency.acquire([2], stop=stop))
+            time.sleep(20 * _LOOK_SECONDS)
+            assert tries.count([2]) <= 1
+        assert waiter.result(PATIENCE).late == ()
+    assert tries.count([2]) == 2
+    residency.release([2])
+    with ThreadPoolExecutor(1) as pool, residency.hold([0, 1]):
+        waiter = pool.submit(lambda: residency.acquire([2], stop=stop))
+        time.sleep(4 * _LOOK_SECONDS)
+        stop.set("the client is gone")
+        assert waiter.result(PATIENCE).late == (2,)
+        residency.release([2])
+    residency.check()
+
+
+def test_what_is_corrupt_is_a_fault_and_not_late() -> None:
+    store = FakeStore([1, 1])
+    store.faults[0] = "corrupt"
+    residency = Residency(store, 2 * BLOCK)
+    with residency.hold([0]) as held:
+        assert held.late == () and len(held.faults) == 1
+    with residency.hold([0, 1], 0.0) as held:
+        assert held.late == (1,) and len(held.faults) == 1
+
+
+def test_many_in_a_hurry_leave_nobody_without_an_answer() -> None:
+    store = FakeStore([1, 2, 1, 1, 3, 1, 2, 1])
+    residency = Residency(store, 5 * BLOCK)
+
+    def one(seed: int) -> tuple[Held, bool]:
+        rng = np.random.default_rng(seed)
+        rows = rng.permutation(8)[: rng.integers(1, 3)].tolist()
+        hurried = bool(rng.integers(2))
+        return take(
+            residency, rows, soon(rng.choice([0.0, 1e-5, 1e-4])) if hurried else float("inf")
+        ), hurried
+
+    with ThreadPoolExecutor(8) as pool:
+        for held, hurried in pool.map(one, range(600), timeout=10 * PATIENCE):
+            assert hurried or not held.late
+    residency.check()
+    assert not residency._pins and not residency._loading and not residency._left
+
+
+def test_a_kernel_does_not_see_what_comes_late(tmp_path: Path) -> None:
+    case = archive_cases.build(tmp_path, synthetic_scans.make_scan("plane", 1, 200), voxel=0.5)
+    with Scene.open(case.archive) as scene:
+        data, rows = scene._data, list(range(scene.info().voxels))
+        with data.residency.hold(rows[:1]), data.residency.hold(rows, 0.0) as held:
+            assert held.late == tuple(rows[1:]) and len(rows) > 2
+            seen = as_held(data, held)
+            with data.residency.hold(rows) as all_of_them:
+                assert (data.arrays.where[:, 0] >= 0).all() and as_held(data, all_of_them) is data
+                assert (seen.arrays.where[rows[1:]] == -1).all() and seen.arrays.where[0, 0] >= 0
+        data.residency.check()

@@ -1,0 +1,139 @@
+"""Several archives as one, asked about one avatar: where they lie, which is met first, and what is held."""
+
+import gc
+import weakref
+from pathlib import Path
+from types import SimpleNamespace
+
+import effect_rooms
+import numpy as np
+import pytest
+from effect_rooms import at
+from solidcloud.schemas.scene.scene_file import ArchiveItem, SceneFile
+from solidcloud.schemas.wire.answers import Verdict
+from solidcloud.server.avatars.avatar_model import make_avatar
+from solidcloud.server.queries.resident_motion import Probe, Swept
+from solidcloud.server.runtime.stop_flag import NEVER
+from solidcloud.server.scene import Scene
+from solidcloud.server.simulation.world.collision_world import World
+from solidcloud.server.simulation.world.frame import Hit
+
+BALL = make_avatar([[0.0, 0, 0]], 0.2)
+# A quarter turn about z, and a shift.
+THERE = at(2.0, 1.0, 0.5, np.pi / 2)
+THERE[:2, :2] = [[0.0, -1.0], [1.0, 0.0]]
+
+
+def world_of(*archives: tuple[Scene, np.ndarray | None]) -> World:
+    """The world of scenes at poses."""
+    file = SceneFile(format=1, archives=[ArchiveItem(path=scene.name) for scene, _ in archives])
+    return World(SimpleNamespace(archives=list(archives)), file)
+
+
+@pytest.mark.interpreted
+def test_an_archive_at_a_pose_is_met_where_it_lies_and_first_comes_first(tmp_path: Path) -> None:
+    wall = effect_rooms.plane((0, -0.8, -0.8), (0, 0.8, 0.8))
+    case = effect_rooms.build(tmp_path, wall)
+    carried = effect_rooms.build(tmp_path, wall @ THERE[:3, :3].T + THERE[:3, 3])
+    motions = [
+        (at(2, 0.3, 0.5), at(2, 1.6, 0.5)),
+        (at(2.1, 1.8, 0.4), at(2, 0.1, 0.5)),
+        (at(1, 0, 0), at(-1, 0, 0)),
+        (at(2, 0.5, 0.5), at(0, 0, 0)),
+        (at(1, 0.2, 0), at(1, 0.3, 0)),
+    ]
+    with (
+        Scene.open(case.archive) as one,
+        Scene.open(case.archive) as other,
+        Scene.open(carried.archive) as plain,
+    ):
+        world, alone = world_of((one, None), (other, THERE)), world_of((plain, None))
+        first = world_of((one, None))
+        seen = set()
+        for begin, end in motions:
+            found = world.sweep(BALL, begin, end)
+            parts = [each.sweep(BALL, begin, end) for each in (first, alone)]
+            expected = min(parts, key=lambda each: each.lower)
+            seen.add((found.verdict, found.archive if found.verdict else 0))
+            assert found.verdict == expected.verdict
+            assert found.lower == pytest.approx(expected.lower, abs=1e-6)
+            if found.cloud is None or found.avatar is None:
+                continue
+            np.testing.assert_allclose(found.cloud, expected.cloud, atol=1e-3)
+            hit = Hit(found.lower, found.verdict, found.avatar, found.cloud, "", found.archive)
+            normal = world.normal(hit, 0.1 if not effect_rooms.INTERPRETED else 0.5)
+            assert normal is not None and normal @ (found.avatar - found.cloud) > 0
+            axis = 0 if found.archive == 0 else 1
+            assert abs(normal[axis]) == pytest.approx(1.0, abs=1e-3)
+            pose, _ = world.between(BALL, begin, end, found.upper)
+            assert world.collide(BALL, pose) == Verdict.CONTACT
+            deepest = world.deepest(BALL, pose)
+            assert deepest is not None and deepest.archive == found.archive
+            nearest = world.nearest(found.cloud + 0.001, 0.05)
+            assert nearest is not None and nearest.cloud is not None and nearest.archive == found.archive
+            np.testing.assert_allclose(nearest.cloud, found.cloud, atol=1e-6)
+        assert seen == {(Verdict.CONTACT, 0), (Verdict.CONTACT, 1), (Verdict.CLEAR, 0)}
+        assert world.collide(BALL, at(2, 0.1, 0.5)) == Verdict.CLEAR
+        assert world.deepest(BALL, at(2, 0.1, 0.5)) is None
+        assert world.nearest(np.array([2.0, 0.1, 0.5]), 0.05) is None
+        assert world.lowest() == pytest.approx(-0.8 - effect_rooms.RADIUS, abs=2e-3)
+
+
+@pytest.mark.interpreted
+def test_avatars_that_were_dropped_are_let_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    case = effect_rooms.build(tmp_path, effect_rooms.plane((0, -0.4, -0.4), (0, 0.4, 0.4)))
+    monkeypatch.setattr("solidcloud.server.simulation.world.collision_world._PROBED_POINTS", 100)
+    with Scene.open(case.archive) as scene:
+        world, points = world_of((scene, None)), []
+        for count in (1, 40, 40, 40, 200, 200, 3, 1):
+            avatar = make_avatar(np.linspace([0.0, 0, 0], [0.1, 0, 0], count), 0.2)
+            points.append(weakref.ref(avatar.points))
+            for x, verdict in ((1.0, Verdict.CLEAR), (0.0, Verdict.CONTACT), (1.0, Verdict.CLEAR)):
+                assert world.collide(avatar, at(x, 0, 0)) == verdict
+        del avatar
+        gc.collect()
+        assert [len(kept()) for kept in points if kept() is not None] == [3, 1]
+
+
+@pytest.mark.interpreted
+def test_what_is_held_stays_through_a_reload_and_no_longer(tmp_path: Path) -> None:
+    case = effect_rooms.build(tmp_path, effect_rooms.plane((0, -0.4, -0.4), (0, 0.4, 0.4)))
+    with Scene.open(case.archive) as scene:
+        world = world_of((scene, None))
+        before = world.generations()
+        with world as seen:
+            opened = seen[0].opened
+            scene.reload()
+            assert world.generations() == before and not opened.ended.is_set()
+            assert world.collide(BALL, at(0.1, 0, 0)) == Verdict.CONTACT
+        assert opened.ended.wait(10)
+        assert world.generations() != before
+        assert world.collide(BALL, at(0.1, 0, 0)) == Verdict.CONTACT
+
+
+@pytest.mark.interpreted
+@pytest.mark.parametrize("unknown", [False, True])
+def test_a_contact_that_is_not_exact_is_unknown_only_where_something_was_not_looked_at(
+    tmp_path: Path, unknown: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A graze just before the contact: all was looked at."""
+    case = effect_rooms.build(tmp_path, effect_rooms.plane((0, -0.4, -0.4), (0, 0.4, 0.4)))
+    found = Swept(Verdict.CONTACT, 0.2, 0.6, exact=False, unknown=unknown)
+    monkeypatch.setattr(Probe, "sweep", lambda *_: found)
+    with Scene.open(case.archive) as scene:
+        for world in (world_of((scene, None)), world_of((scene, None), (scene, THERE))):
+            world.begin(NEVER)
+            world.sweep(BALL, at(1, 0, 0), at(0, 0, 0))
+            assert world.unknown == unknown
+
+
+@pytest.mark.interpreted
+def test_visits_add_up(tmp_path: Path) -> None:
+    case = effect_rooms.build(tmp_path, effect_rooms.plane((0, -0.4, -0.4), (0, 0.4, 0.4)))
+    with Scene.open(case.archive) as scene:
+        world = world_of((scene, None))
+        before = world.visits
+        swept = world.sweep(BALL, at(1, 0, 0), at(0, 0, 0))
+        assert world.visits == before + swept.visits and swept.visits > 0
+        world.collide(BALL, at(0.1, 0, 0))
+        assert world.visits > before + swept.visits

@@ -260,7 +260,7 @@ def test_memory_is_that_of_a_block_and_not_of_the_file(
     case: Case, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of 30,000 points, 0.7 MB as float64, in blocks of 500; text in pieces of 16 kB."""
-    for module in ("rows", "counted"):
+    for module in ("common.text_rows", "common.counted_rows"):
         monkeypatch.setattr(f"solidcloud.builder.sources.{module}.CHUNK_BYTES", 1 << 14)
     monkeypatch.setattr("solidcloud.builder.sources.formats.lzf.PIECE_BYTES", 1 << 12)
     rng = np.random.default_rng(3)

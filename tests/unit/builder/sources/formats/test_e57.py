@@ -220,7 +220,7 @@ def test_xml_that_no_scan_needs_is_refused_before_the_library_sees_it(lie: str, 
 @pytest.mark.parametrize(
     ("at", "value", "message"),
     [
-        (16, 4096, "4096 declared"),
+        (16, 4096, "4096 bytes declared"),
         (24, 1 << 40, "from byte 1099511627776 on"),
         (32, 1 << 40, "1099511627776 of XML"),
         (40, 512, "pages of 512 bytes"),

@@ -68,7 +68,7 @@ def test_a_surface_is_sampled_by_its_area(mode: int, area: float, tmp_path: Path
 
 LIES: dict[str, tuple[Callable[[dict], object], str]] = {
     "more vertices": (lambda d: d["accessors"][0].update(count=5), "5 rows of 12 bytes, 16 apart"),
-    "a view beyond": (lambda d: d["bufferViews"][0].update(byteLength=9999), "within the 76 bytes"),
+    "a view beyond": (lambda d: d["bufferViews"][0].update(byteLength=9999), "the binary part of 76 bytes"),
     "a place beyond": (lambda d: d["accessors"][0].update(byteOffset=8), "from byte 8 of 64"),
     "a stride too short": (lambda d: d["bufferViews"][0].update(byteStride=8), "8 apart"),
     "a negative count": (

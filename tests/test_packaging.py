@@ -23,9 +23,9 @@ wheel = pytest.mark.skipif(not is_wheel(), reason="an editable install, not a wh
 
 
 def sources() -> set[str]:
-    """What should be installed, as paths inside the package."""
+    """What should be installed, as paths inside the package; server/api is the package itself."""
     return {
-        path.relative_to(ROOT).as_posix()
+        path.relative_to(ROOT).as_posix().removeprefix("server/api/")
         for package in ("schemas", "builder", "server")
         for path in (ROOT / package).rglob("*")
         if path.suffix in (".py", ".md", ".json") or path.name == "py.typed"

@@ -1,0 +1,112 @@
+"""Collision detection with scanned point clouds: the public names of `import solidcloud`.
+
+`open` and `Scene` answer in this process, `connect` and `Client` over zenoh. Each name is imported
+when it is first used: `import solidcloud` alone loads no library, and `Client` loads neither numba
+nor h5py. Setuptools installs this file as the package `solidcloud`; its imports are relative to
+that. May import server.cli.input, server/client.py, server/scene.py, server.scenes and schemas.
+"""
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from contextlib import AbstractContextManager
+    from pathlib import Path
+
+    from .schemas.errors import (
+        BadDataError,
+        BadRequestError,
+        BadTransformError,
+        BusyError,
+        CorruptError,
+        DeniedError,
+        ExpiredError,
+        FormatError,
+        InternalError,
+        MisleadingIndexError,
+        ScanError,
+        SolidcloudError,
+        TooLargeError,
+        UnknownAvatarError,
+        UnknownSceneError,
+    )
+    from .schemas.wire.answers import Verdict
+    from .server.client import Client
+    from .server.scene import Scene
+    from .server.served.served_scene import SceneLike
+
+    __version__: str
+
+__all__ = [
+    "BadDataError",
+    "BadRequestError",
+    "BadTransformError",
+    "BusyError",
+    "Client",
+    "CorruptError",
+    "DeniedError",
+    "ExpiredError",
+    "FormatError",
+    "InternalError",
+    "MisleadingIndexError",
+    "ScanError",
+    "Scene",
+    "SolidcloudError",
+    "TooLargeError",
+    "UnknownAvatarError",
+    "UnknownSceneError",
+    "Verdict",
+    "__version__",
+    "connect",
+    "open",
+]
+
+_MODULES = {
+    "Client": ".server.client",
+    "Scene": ".server.scene",
+    "Verdict": ".schemas.wire.answers",
+    **{name: ".schemas.errors" for name in __all__ if name.endswith("Error")},
+}
+
+
+def open(path: "str | Path", **options: Any) -> "AbstractContextManager[SceneLike]":
+    """Open an archive folder or a scene file in this process, for a `with`.
+
+    options: name, budget_bytes and policy, as in `Scene.open`.
+    Raises BadRequestError for an invalid scene file or option, FormatError or CorruptError for an
+    invalid archive.
+    """
+    from .server.cli.input.point_file import read_avatar
+    from .server.scenes.open_scene import open_scene
+
+    return open_scene(path, read_points=read_avatar, **options)
+
+
+def connect(endpoint: str | None = None, *, scene: str, **options: Any) -> "Client":
+    """Return a client of a scene that a server at `endpoint` serves, for a `with`.
+
+    endpoint: such as tcp/127.0.0.1:7447; None: the default of `solidcloud serve`.
+    options: timeout [s] and key_file, as in `Client`.
+    """
+    from .server.client import Client
+
+    return Client(scene=scene, **options) if endpoint is None else Client(endpoint, scene=scene, **options)
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name on first use."""
+    if name == "__version__":
+        from importlib import metadata
+
+        value: Any = metadata.version("solidcloud")
+    elif name in _MODULES:
+        value = getattr(importlib.import_module(_MODULES[name], __name__), name)
+    else:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    """Return the public names and the loaded modules."""
+    return sorted({*globals(), *__all__})

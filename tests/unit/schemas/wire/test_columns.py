@@ -117,7 +117,7 @@ def test_a_part_says_where_it_belongs(kind):
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_column_of_the_wrong_length_is_an_internal_error(kind):
     good = some(kind, 4)
-    with pytest.raises(InternalError, match="for 5 asked"):
+    with pytest.raises(InternalError, match="for 5 requested"):
         check_answers(good, 5)
     for name in array_fields(kind):
         column = getattr(good, name)
@@ -138,7 +138,7 @@ def test_starts_that_do_not_rise_are_an_internal_error():
 def test_pairs_of_objects_that_were_not_asked_about_are_an_internal_error():
     good = some(ObjectsAnswers, 4)
     for bad in (4, -1):
-        with pytest.raises(InternalError, match="not asked about, of 4"):
+        with pytest.raises(InternalError, match="not requested, of 4"):
             check_answers(msgspec.structs.replace(good, pairs=np.full((3, 2), bad, np.int32)), 4)
     with pytest.raises(InternalError, match="verdict 3"):
         check_answers(msgspec.structs.replace(good, pair_verdict=np.full(3, 3, np.uint8)), 4)

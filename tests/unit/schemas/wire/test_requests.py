@@ -171,7 +171,7 @@ def test_too_many_objects_are_too_large():
         ({"op": "collide", "reach": 1.0}, "reach is not a parameter of collide"),
         ({"op": "sweep", "limit": 3}, "limit is not a parameter of sweep"),
         ({"op": "distance"}, "needs reach"),
-        ({"op": "distance", "reach": 1.0, "margin": 0.0}, "margin is no parameter"),
+        ({"op": "distance", "reach": 1.0, "margin": 0.0}, "margin is not a parameter"),
         ({"op": "contacts", "reach": 1.0}, "reach is not a parameter of contacts"),
     ],
 )

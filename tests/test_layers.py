@@ -4,6 +4,7 @@ A room is a folder of schemas/, builder/ or server/; a module at the top of one 
 """
 
 import ast
+import re
 import sys
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
@@ -339,6 +340,24 @@ def test_every_room_says_what_it_is_for_and_imports_nothing() -> None:
         assert folder == (ROOT / API).parent or len(tree.body) == 1, (
             f"{folder}/__init__.py holds more than a docstring"
         )
+
+
+def test_every_room_says_what_it_may_import() -> None:
+    for room in sorted({room_of(path.relative_to(ROOT).as_posix()) for path in sources()} - {"server/api"}):
+        if room.endswith(".py") or room in PACKAGES:
+            continue
+        package = room.split("/")[0]
+        names = {f"{package}/{name}" for name in ALLOWED.get(room, "").split()}
+        expected = {name if name.endswith(".py") else name.replace("/", ".") for name in names}
+        expected |= {"schemas"} if package != "schemas" else set()
+        expected |= (
+            {"builder.voxel"} if room in CROSSING else {"builder"} if room.startswith(COMMANDS) else set()
+        )
+        text = ast.get_docstring(ast.parse((ROOT / room / "__init__.py").read_text(encoding="utf-8"))) or ""
+        found = re.search(r"May import (.+?)\.(?:\s|$)", text, re.DOTALL)
+        assert found, room
+        said = {name for name in re.split(r",\s+", found[1]) if name != "nothing of the package"}
+        assert said == expected, room
 
 
 @pytest.mark.parametrize(

@@ -138,7 +138,6 @@ LONG = {
     "server/kernels/motion/sweep_advance.py": 436,
     "server/kernels/nearest/best_first_search.py": 414,
     "server/kernels/overlap/overlap.py": 475,
-    "server/report/walk/walkthrough.py": 406,
     "server/residency/voxel_cache.py": 535,
     "server/scene.py": 458,
     "server/scenes/placed_archives.py": 413,

@@ -137,7 +137,10 @@ def reload(
     key_file: KeyFile = None,
     as_json: AsJson = False,
 ) -> None:
-    """Make a running server load the archive's present generation without dropping requests."""
+    """Reload an archive in a running server.
+
+    The server loads the present generation of the archive without dropping requests.
+    """
     import msgspec
 
     from ...client import Client

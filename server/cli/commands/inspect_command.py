@@ -27,9 +27,9 @@ def inspect(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing scan list.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Describe scans by their headers and write an editable list of them.
+    """Describe scans and write an editable list of them.
 
-    Exit code 3: a scan is broken.
+    The description comes from the headers of the scans. Exit code 3: a scan is broken.
     """
     from ....builder.sources.scan_list import inspect as inspect_scans
     from ....builder.sources.scan_list import write_scan_list

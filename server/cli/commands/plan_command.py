@@ -58,7 +58,10 @@ def plan(
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Estimate a build: bytes, memory, time by stage, and the limits that would stop it."""
+    """Estimate the cost of a build.
+
+    Prints bytes, memory, time by stage, and the limits that would stop the build.
+    """
     from ....builder.config import BuildConfig
     from ....builder.plan.build_plan import estimate, imagined, load_rates
     from ....schemas.errors import BadRequestError

@@ -44,7 +44,7 @@ def query(
     ] = None,
     connect: Annotated[str, typer.Option(help="Zenoh endpoint of the server.")] = "tcp/127.0.0.1:7447",
     margin: Annotated[
-        float | None, typer.Option(help="Distance up to which it is contact [m]; default 0.")
+        float | None, typer.Option(help="Gap up to which two spheres count as in contact [m]; default 0.")
     ] = None,
     reach: Annotated[float | None, typer.Option(help="Maximum distance to report [m].")] = None,
     limit: Annotated[
@@ -77,7 +77,7 @@ def query(
     key_file: KeyFile = None,
     as_json: AsJson = False,
 ) -> int:
-    """Query a server for what poses of an avatar, rays, points or objects touch.
+    """Query a server about poses, rays, points or objects.
 
     Items that lie outside the scan's bounds, even with their reach, are counted in a warning on
     standard error.

@@ -198,10 +198,7 @@ def check_verdicts(structures: list[Structure]) -> None:
 
 
 def loop_fps(seconds: NDArray[np.float64], rate: float = FRAME_RATE) -> float:
-    """Return the mean frames per second of a loop synchronised to `rate`, as in the paper.
-
-    A frame takes 1/rate, or its test if that is longer.
-    """
+    """Return the mean frames per second of the paper's loop: a frame takes 1/rate, or its test."""
     return len(seconds) / float(np.maximum(seconds, 1 / rate).sum())
 
 
@@ -290,10 +287,7 @@ def make_report(case: Case, structures: list[Structure], without: NDArray[np.flo
 def write_report(
     report: dict[str, Any], case: Case, structures: list[Structure], without: NDArray[np.float64], out: Path
 ) -> None:
-    """Write walkthrough.json, table1.csv and figure7.csv.
-
-    table1.csv ends with the paper's rows; figure7.csv holds the median time of each frame.
-    """
+    """Write walkthrough.json, table1.csv (the paper's rows last) and figure7.csv (median times)."""
     (out / "walkthrough.json").write_text(json.dumps(report, indent=1) + "\n")
     with open(out / "table1.csv", "w", newline="") as file:
         writer = csv.DictWriter(file, list(report["table1"][0]))

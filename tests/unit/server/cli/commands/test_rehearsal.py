@@ -50,7 +50,7 @@ def test_a_trial_that_hangs_is_one_that_failed(tmp_path: Path, caplog: pytest.Lo
     files.write("a.kernel", b"")
     rehearse(ARCHIVE, files, seconds=0.01)
     assert list(tmp_path.iterdir()) == []
-    assert "not done within 0.01 s" in caplog.records[0].getMessage()
+    assert "did not finish within 0.01 s" in caplog.records[0].getMessage()
 
 
 @compiled

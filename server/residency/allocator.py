@@ -5,6 +5,7 @@ Not thread-safe: the residency calls it under its lock.
 
 import bisect
 import ctypes
+from collections import deque
 from collections.abc import Callable, Collection
 from itertools import islice
 
@@ -22,6 +23,9 @@ AROUND = 32
 # The same in bytes, as multiples of what is asked for: small voxels around a large one are many, and so is the work of
 # loading it.
 AROUND_SIZES = 16
+# Voxels that are found at a time to be evicted one after another: those that are pinned come first in the policy's order
+# where much is, and a search passes all of them.
+MORE = 32
 # Of the buffer, what may go beyond the bytes that are asked for before all runs are looked at.
 SLACK = 1 / 32
 
@@ -79,19 +83,22 @@ class Room:
         Free room is joined around the last victim and around the largest free run. While that is in vain, more voxels
         go, up to SLACK of the buffer; then all runs are looked at.
         """
-        victims = self._enough(size, may_go, most)
-        if victims is None:
+        found = self._enough(size, may_go, most)
+        if found is None:
             return None
+        needed, more = found
         near, slack = -1, int(self.buffer.total_bytes * SLACK)
         all_at = size + slack  # the free bytes from which on all runs are looked at
-        for victim in victims:
+        for victim in needed:
             near = self.offsets[victim]
             self._evict(victim, gone)
         while True:
             offset = self._join_around(size, may_move, near)
             if offset is not None:
                 return offset
-            victim = next(filter(may_go, islice(self.policy.victims(), most)), -1)
+            if not more:
+                more = deque(islice(filter(may_go, islice(self.policy.victims(), most)), MORE))
+            victim = more.popleft() if more else -1
             free = self.buffer.total_bytes - self.used_bytes
             if victim < 0 or free >= all_at:
                 all_at = free + slack
@@ -101,8 +108,11 @@ class Room:
             near = self.offsets[victim]  # what is pinned may lie in between
             self._evict(victim, gone)
 
-    def _enough(self, size: int, may_go: Which, most: int | None) -> list[int] | None:
-        """The voxels to go for a run of `size` bytes, in order; None where all that may are too little."""
+    def _enough(self, size: int, may_go: Which, most: int | None) -> tuple[list[int], deque[int]] | None:
+        """Return the voxels to evict for a run of `size` bytes, in order, and some of those that follow them.
+
+        None where all that may be evicted are too little.
+        """
         free, found = self.buffer.total_bytes - self.used_bytes, list[int]()
         candidates = filter(may_go, islice(self.policy.victims(), most))
         while free < size:
@@ -111,7 +121,7 @@ class Room:
                 return None
             found.append(row)
             free += self.sizes[row]
-        return found
+        return found, deque(islice(candidates, MORE))
 
     def _join_around(self, size: int, may_move: Which, near: int) -> int | None:
         """Take a run of `size` bytes, for which voxels near the offset `near`, or near the largest free run, are moved

@@ -23,11 +23,12 @@ from numpy.typing import NDArray
 
 from ...schemas.errors import BadRequestError, CorruptError, MisleadingIndexError
 from ...schemas.wire.stats import Counters
-from ..runtime.stop_flag import NEVER, Stop
+from ..runtime.stop_flag import NEVER, Stop, seconds_to
 from .allocator import Room
 from .arena import ArenaBuffer
 from .cache_stats import Accounts
 from .eviction import Policy, make_policy
+from .load_turns import LoadTurn, LoadTurns
 from .voxel_store import Store
 
 # Voxels that are looked at to find room for one that nobody waits for.
@@ -46,10 +47,6 @@ class Held(NamedTuple):
     faults: tuple[str, ...]
     late: tuple[int, ...] = ()
     waited: float = 0.0
-
-
-# How often a request that waits looks whether it is stopped [s].
-_LOOK_SECONDS = 0.005
 
 
 class Ahead(Enum):
@@ -79,17 +76,6 @@ class Hold:
     def __exit__(self, *_: object) -> None:
         """Let the voxels go."""
         self._residency.release(self._rows)
-
-
-def _seconds_to(deadline: float, stop: Stop) -> float | None:
-    """Return the seconds to wait before the next look: 0 when the time is up or the stop is set, at most the time
-    left, and at most `_LOOK_SECONDS` for a request that can be stopped. None: no limit."""
-    if stop:
-        return 0.0
-    most = math.inf if stop is NEVER else _LOOK_SECONDS
-    if deadline < math.inf:
-        most = min(most, max(0.0, deadline - time.perf_counter()))
-    return None if most == math.inf else min(most, threading.TIMEOUT_MAX)
 
 
 class Residency:
@@ -130,6 +116,7 @@ class Residency:
         self._room = Room(self.buffer, self._sizes, self.where, self.policy)
         self._lock = threading.RLock()
         self._changed = threading.Condition(self._lock)
+        self._turns = LoadTurns()
         self._pins: dict[int, int] = {}
         self._loading: set[int] = set()
         self._faults: dict[int, str] = {}  # of corrupt records, which reading again would not mend
@@ -234,6 +221,30 @@ class Residency:
     ) -> Held:
         """Begin a hold; `release` must follow, unless this raises."""
         begin = time.perf_counter()
+        turn = None if self._have_room(rows) else self._take_turn(deadline, stop)
+        try:
+            return self._acquire(rows, deadline, scan, stop, begin)
+        finally:
+            self._turns.give_back(turn)
+
+    def _have_room(self, rows: Sequence[int]) -> bool:
+        """Return whether each of these is resident or being loaded, or has a fault."""
+        offsets = self._room.offsets
+        return all(row in offsets or self._fault(row) for row in rows)
+
+    def _take_turn(self, deadline: float, stop: Stop) -> LoadTurn | None:
+        """Wait for a turn to load; the request counts as one that waits."""
+        with self._changed:
+            self._demands += 1
+        try:
+            return self._turns.take(deadline, stop)
+        finally:
+            with self._changed:
+                self._demands -= 1
+                self._changed.notify_all()
+
+    def _acquire(self, rows: Sequence[int], deadline: float, scan: bool, stop: Stop, begin: float) -> Held:
+        """Begin a hold. begin: when it was asked for, on time.perf_counter()'s clock [s]."""
         mine, hits, waits, settled = self._reserve(rows, deadline, scan, stop)
         if settled:
             return Held(len(rows), 0, ())  # all resident and pinned: nothing can change that
@@ -244,7 +255,7 @@ class Residency:
                 with self._changed:
                     while not self._settled(rows) and self._wait(deadline, stop):
                         pass
-                    late_now = _seconds_to(deadline, stop) == 0
+                    late_now = seconds_to(deadline, stop) == 0
                     wanted = [] if late_now else [row for row in rows if row in self._left]
                     if not wanted:
                         faults = tuple(fault for row in rows if (fault := self._fault(row)))
@@ -357,10 +368,10 @@ class Residency:
 
     def _wait(self, deadline: float, stop: Stop) -> bool:
         """Wait until another thread has changed something; return False when the time is up or the stop is set."""
-        while (left := _seconds_to(deadline, stop)) != 0:
+        while (left := seconds_to(deadline, stop)) != 0:
             if self._changed.wait(left):
                 break
-        return _seconds_to(deadline, stop) != 0
+        return seconds_to(deadline, stop) != 0
 
     def _pin(self, rows: Sequence[int]) -> None:
         for row in rows:
@@ -431,7 +442,7 @@ class Residency:
     def _load(self, rows: list[int], deadline: float, stop: Stop) -> None:
         """Load what this caller reserved; every row leaves `_loading`, loaded or with a fault, or is left to others."""
         for number, row in enumerate(rows):
-            if _seconds_to(deadline, stop) == 0:
+            if seconds_to(deadline, stop) == 0:
                 self._leave(rows[number:])
                 return
             try:

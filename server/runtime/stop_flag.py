@@ -6,11 +6,14 @@ read it every few microseconds and return; what they had not looked at then is `
 
 import math
 import threading
+import time
 import weakref
 
 import numpy as np
 
 _PARTS = threading.Lock()
+# How often a request that waits looks at its stop flag [s].
+_LOOK_SECONDS = 0.005
 
 
 class Stop:
@@ -77,3 +80,17 @@ NEVER: Stop = _Never()
 
 class StoppedError(Exception):
     """A request was stopped before any of its poses could be looked at. The scene answers `unknown` for all."""
+
+
+def seconds_to(deadline: float, stop: Stop) -> float | None:
+    """Return how long a request may wait before it looks again [s]; None: without limit.
+
+    deadline: on time.perf_counter()'s clock [s]. The result is 0 when the deadline or the stop flag
+    has come, and at most 5 ms for a request that can be stopped.
+    """
+    if stop:
+        return 0.0
+    most = math.inf if stop is NEVER else _LOOK_SECONDS
+    if deadline < math.inf:
+        most = min(most, max(0.0, deadline - time.perf_counter()))
+    return None if most == math.inf else min(most, threading.TIMEOUT_MAX)

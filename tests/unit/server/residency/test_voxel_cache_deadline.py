@@ -10,8 +10,8 @@ import pytest
 import synthetic_scans
 from fake_store import BLOCK, FakeStore
 from solidcloud.server.queries.context.query_context import as_held
-from solidcloud.server.residency.voxel_cache import _LOOK_SECONDS, Held, Residency
-from solidcloud.server.runtime.stop_flag import Stop
+from solidcloud.server.residency.voxel_cache import Held, Residency
+from solidcloud.server.runtime.stop_flag import _LOOK_SECONDS, Stop
 from solidcloud.server.scene import Scene
 
 pytestmark = pytest.mark.interpreted

@@ -23,8 +23,8 @@ AROUND = 32
 # The same in bytes, as multiples of what is asked for: small voxels around a large one are many, and so is the work of
 # loading it.
 AROUND_SIZES = 16
-# Voxels that are found at a time to be evicted one after another: those that are pinned come first in the policy's order
-# where much is, and a search passes all of them.
+# Victims that one search finds beyond those it needs. A search passes all pinned voxels at the front
+# of the policy's order, so that it is not repeated for each victim.
 MORE = 32
 # Of the buffer, what may go beyond the bytes that are asked for before all runs are looked at.
 SLACK = 1 / 32

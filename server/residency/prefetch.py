@@ -14,8 +14,9 @@ from collections.abc import Callable
 from typing import Self
 
 from ..runtime.threads import start_thread
+from .held import Ahead
 from .motion_prediction import Neighbourhood, User
-from .voxel_cache import Ahead, Residency
+from .voxel_cache import Residency
 
 log = logging.getLogger(__name__)
 

@@ -15,8 +15,6 @@ import time
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
-from enum import Enum
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,33 +26,12 @@ from .allocator import Room
 from .arena import ArenaBuffer
 from .cache_stats import Accounts
 from .eviction import Policy, make_policy
+from .held import Ahead, Held
 from .load_turns import LoadTurn, LoadTurns
 from .voxel_store import Store
 
 # Voxels that are looked at to find room for one that nobody waits for.
 MOST_CANDIDATES = 256
-
-
-class Held(NamedTuple):
-    """What a hold found. hits, misses: voxels resident before, and not.  faults: one sentence an unreadable voxel.
-
-    late: rows that were not resident by the deadline. They may become so while held: read `where` without them
-    (`request.as_held`).  waited: for loads, its own and others', and for room [s].
-    """
-
-    hits: int
-    misses: int
-    faults: tuple[str, ...]
-    late: tuple[int, ...] = ()
-    waited: float = 0.0
-
-
-class Ahead(Enum):
-    """What became of a load that nobody waited for."""
-
-    THERE = "it is resident, or was"
-    NO_ROOM = "nothing may go for it"
-    FAILED = "it cannot be read"
 
 
 class Hold:

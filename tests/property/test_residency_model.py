@@ -11,7 +11,8 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 from solidcloud.server.residency.eviction import POLICIES, make_policy
-from solidcloud.server.residency.voxel_cache import Ahead, Held, Residency
+from solidcloud.server.residency.held import Ahead, Held
+from solidcloud.server.residency.voxel_cache import Residency
 
 SIZES = [1, 1, 2, 3, 1, 4, 2, 1, 5, 2]  # cache lines
 BUDGET = 9

@@ -17,8 +17,9 @@ from ...kernels.core import pose_transform as placing
 from ...kernels.core.voxel_layout import SceneArrays, block_words
 from ...kernels.core.voxels_in_reach import Reach, SceneIndex, find_reach
 from ...residency.coarse_bounds import Coarse
+from ...residency.held import Held
 from ...residency.index_proof import Bounds
-from ...residency.voxel_cache import Held, Residency
+from ...residency.voxel_cache import Residency
 from ...runtime.stop_flag import NEVER, Stop, StoppedError
 
 # Voxels in reach of all poses of one request: 128 MB of row numbers. The index would make gigabytes of them for 100,000

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from ....schemas.wire.answers import Cost
-from ...residency.voxel_cache import Held
+from ...residency.held import Held
 from .query_context import SceneData
 
 

@@ -1,5 +1,6 @@
 """Residency: one load a voxel, every waiter answered, pins respected, never a byte over the budget."""
 
+import math
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -9,11 +10,14 @@ import numpy as np
 import pytest
 import synthetic_scans
 from fake_store import BLOCK, FakeStore
+from numpy.typing import NDArray
 from solidcloud.schemas.errors import BadRequestError
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.schemas.wire.requests import QuestionOptions
+from solidcloud.server.kernels.core.voxel_layout import Arena
 from solidcloud.server.residency.eviction import POLICIES
-from solidcloud.server.residency.voxel_cache import Held, Residency
+from solidcloud.server.residency.held import Held
+from solidcloud.server.residency.voxel_cache import Residency
 from solidcloud.server.runtime.stop_flag import NEVER
 from solidcloud.server.scene import Scene
 
@@ -310,3 +314,32 @@ def test_a_load_that_two_could_not_wait_for_is_owed_until_it_is_done() -> None:
     residency._demands -= 1
     assert told and residency.take_owed() == 1
     residency.check()
+
+
+def test_a_disk_that_is_stuck_keeps_no_other_request_waiting() -> None:
+    store, go = FakeStore([1, 1, 1]), threading.Event()
+    residency, load = Residency(store, 3 * BLOCK), store.load
+
+    def stuck(row: int, arena: Arena, offset: int) -> NDArray[np.int64]:
+        assert row or go.wait(DEADLINE)
+        return load(row, arena, offset)
+
+    store.load = stuck  # type: ignore[method-assign]
+    with ThreadPoolExecutor(1) as pool:
+        first = pool.submit(take, residency, [0])
+        while not residency.is_resident(0):
+            assert not first.done()
+        assert take(residency, [1]) == Held(0, 1, ()) and not first.done()
+        go.set()
+        assert first.result(DEADLINE).misses == 1
+    residency.check()
+
+
+def test_a_resident_voxel_needs_no_turn(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("solidcloud.server.residency.load_turns.MAX_TURN_SECONDS", 60.0)
+    residency = Residency(FakeStore([1, 1]), 2 * BLOCK)
+    take(residency, [0])
+    turn = residency._turns.take(math.inf, NEVER)
+    assert take(residency, [0]) == Held(1, 0, ())
+    residency._turns.give_back(turn)
+    assert take(residency, [0, 1]).misses == 1

@@ -10,7 +10,8 @@ import pytest
 import synthetic_scans
 from fake_store import BLOCK, FakeStore
 from solidcloud.server.queries.context.query_context import as_held
-from solidcloud.server.residency.voxel_cache import Held, Residency
+from solidcloud.server.residency.held import Held
+from solidcloud.server.residency.voxel_cache import Residency
 from solidcloud.server.runtime.stop_flag import _LOOK_SECONDS, Stop
 from solidcloud.server.scene import Scene
 

@@ -233,7 +233,7 @@ def library_errors(path: Path) -> Iterator[None]:
         if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM):
             raise SolidcloudError(
                 f"{path}: out of memory while reading, expected a few blocks of points to fit: give fewer --jobs "
-                "or stop other programs, then repeat the command; if that does not help, leave this file out"
+                "or stop other programs, then give the same command again; if that does not help, leave the file out"
             ) from error
         # A Rust panic inside lazrs is a BaseException subclass, not an Exception.
         if not isinstance(error, Exception) and type(error).__name__ != "PanicException":

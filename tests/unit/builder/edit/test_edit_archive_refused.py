@@ -209,7 +209,7 @@ def test_removing_needs_scans_and_leaves_one(built: Build, files: Files, tmp_pat
     )
     refused(target, BadRequestError, "no scan is named", lambda: remove_scans(target, [], jobs=1))
     remove_scans(target, ["0"], jobs=1)
-    refused(target, BadRequestError, "is no scan", lambda: remove_scans(target, ["0"], jobs=1))
+    refused(target, BadRequestError, "is not a scan", lambda: remove_scans(target, ["0"], jobs=1))
     refused(target, BadRequestError, "nothing would be left", lambda: remove_scans(target, ["1"], jobs=1))
 
 

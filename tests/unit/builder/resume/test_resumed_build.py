@@ -266,7 +266,7 @@ def test_that_memory_ran_out_is_said_and_the_same_command_goes_on(
             pipeline, stage, lambda *_: (_ for _ in ()).throw(MemoryError("Unable to allocate 9 GiB"))
         )
         with pytest.raises(
-            SolidcloudError, match=r"hall: out of memory \(Unable to.*give fewer --jobs.*goes on"
+            SolidcloudError, match=r"hall: out of memory \(Unable to.*give fewer --jobs.*resumes"
         ):
             build(tmp_path / "hall", scans)
     assert building_folder(tmp_path / "hall").exists()

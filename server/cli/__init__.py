@@ -1,5 +1,5 @@
 """The command `solidcloud`.
 
 May import server.cli.commands, builder, schemas.
-Begin with main.py; commands/ holds one file a command.
+Begin with main.py; commands/ contains one file per command.
 """

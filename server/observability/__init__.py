@@ -1,4 +1,4 @@
-"""Counters of a scene, and their Prometheus text.
+"""Counters of a scene, and their export as Prometheus metrics.
 
 May import schemas.
 Begin with metrics.py.

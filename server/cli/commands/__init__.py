@@ -1,4 +1,4 @@
-"""Commands of `solidcloud`, one file each; a command imports what it runs when it runs.
+"""Commands of `solidcloud`, one file each; a command imports its dependencies when it runs.
 
 May import server.archives, server.cli.input, server.cli.output, server.cli.scene_files,
 server/client.py, server.network, server.report.accuracy, server.residency, server.scenes,

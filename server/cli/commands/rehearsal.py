@@ -66,7 +66,7 @@ def check_answers(scene: SceneLike) -> None:
     found = scene.distance(_CLIENT, _poses(places), _REACH, client=_CLIENT)
     touches = scene.collide(_CLIENT, _poses(places), 0.0, client=_CLIENT).verdict == Verdict.CONTACT
     _require(np.array_equal(touches, found.signed_distance <= 0), "collide and distance disagree")
-    _require(not touches[-1] and found.signed_distance[-1] == np.inf, "a point where there is none")
+    _require(not touches[-1] and found.signed_distance[-1] == np.inf, "a point is found where there is none")
     points = found.witness_cloud[~np.isnan(found.witness_cloud[:, 0])]
     if len(points):
         verdicts = scene.collide(_CLIENT, _poses(points), 0.0, client=_CLIENT).verdict

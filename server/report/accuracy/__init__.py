@@ -1,4 +1,4 @@
-"""`solidcloud accuracy`: what each setting costs and what it gets wrong.
+"""`solidcloud accuracy`: query time and errors of each setting.
 
 May import server.avatars, server.cli.input, server.kernels, server.report.common,
 server.report.kernels, server.residency, server/scene.py, builder, schemas.

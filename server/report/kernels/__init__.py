@@ -1,4 +1,4 @@
-"""Plain descents that the accuracy report compares with.
+"""Compiled plain descents, with which the accuracy report compares the server's engine.
 
 May import server.kernels, builder, schemas.
 Begin with plain_descent.py.

@@ -379,8 +379,8 @@ def brute_touch(m, points, scene_units, units, origin):
                 abs(scene_units[j, 1] - at[1]),
                 abs(scene_units[j, 2] - at[2]),
             )
-            # A pair out of reach along one axis is out of reach. These tests also keep the squares
-            # within 63 bits.
+            # A pair farther apart than `units` along one axis is out of reach. These tests also
+            # keep the squares within 63 bits.
             if dx <= units and dy <= units and dz <= units and dx * dx + dy * dy + dz * dz <= units * units:
                 return True
     return False

@@ -101,8 +101,7 @@ def build_structures(case: Case, degrees: tuple[int, ...], folder: Path, say: Sa
     return found
 
 
-# --- measuring
-# ------------------------------------------------------------------------------------------
+# --- measuring ---
 
 
 def time_frames(scene: Scene, avatar: str, poses: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -193,8 +192,7 @@ def check_verdicts(structures: list[Structure]) -> None:
             )
 
 
-# --- the report
-# -----------------------------------------------------------------------------------------
+# --- the report ---
 
 
 def loop_fps(seconds: NDArray[np.float64], rate: float = FRAME_RATE) -> float:

@@ -2,14 +2,16 @@
 
     python -P side.py ARCHIVE CASE,CASE,...
 
-The interpreter determines the version. Only names that both versions have are used.
+The interpreter determines the version. Names are looked up where either version defines them.
 """
 
+import importlib
 import sys
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 DEFAULT_CASES = (
     "collide", "single", "distance", "contacts", "sweep", "raycast", "within", "frame", "round_trip", "session",
@@ -89,17 +91,21 @@ def scene_cases(archive: Path, stack: ExitStack) -> dict[str, Case]:
     }  # fmt: skip
 
 
+def find(name: str, *modules: str) -> Any:
+    """Return a name from the first of these modules that exists; versions differ in where it is defined."""
+    for module in modules:
+        try:
+            return getattr(importlib.import_module(f"solidcloud.{module}"), name)
+        except ModuleNotFoundError:
+            continue
+    raise ImportError(f"{name} is in none of {', '.join(modules)}")
+
+
 def open_walk(archive: Path, stack: ExitStack):  # type: ignore[no-untyped-def]
     """Open a scene with the effects of a walk."""
     path = scene_file(archive)
-    try:
-        from solidcloud.server.scenes.open_scene import open_scene
-    except ImportError:
-        from solidcloud import Scene  # a later version opens scene files by itself
-
-        return stack.enter_context(Scene.open(path, budget_bytes=1 << 30))
-    from solidcloud.server.cli.input.point_file import read_avatar
-
+    open_scene = find("open_scene", "server.scenes.open_scene", "server.scene_file")
+    read_avatar = find("read_avatar", "server.cli.input.point_file", "server.report.points")
     return stack.enter_context(open_scene(path, read_points=read_avatar, budget_bytes=1 << 30))
 
 
@@ -108,15 +114,10 @@ def wire_cases(archive: Path, stack: ExitStack) -> dict[str, Case]:
     import numpy as np
     from solidcloud.builder.made.figure import figure_points
 
-    try:
-        from solidcloud import Client
-        from solidcloud.server.report.walk.server_process import served
-    except ImportError:
-        from solidcloud.server.client import Client
-        from solidcloud.server.report.walk.server_process import served
-
+    client_of = find("Client", "server.client")
+    served = find("served", "server.report.walk.server_process", "server.report.serving")
     endpoint = stack.enter_context(served(scene_file(archive), "walk"))
-    client = stack.enter_context(Client(endpoint, scene="walk"))
+    client = stack.enter_context(client_of(endpoint, scene="walk"))
     client.add_avatar("al", figure_points(3617))
     far = np.eye(4)[None].copy()
     far[0, :3, 3] = 0.0, -1000.0, 0.0
@@ -140,7 +141,7 @@ def build_case(archive: Path, stack: ExitStack) -> dict[str, Case]:
     import subprocess
 
     scan = archive.parent / "town.laz"
-    run = [sys.executable, "-P", "-c", "from solidcloud.server.cli.main import main; main()"]
+    run = [str(Path(sys.executable).with_name("solidcloud"))]
     if not scan.exists():
         make = [*run, "make", "town", "--points", str(BUILD_POINTS), "-o", str(scan)]
         subprocess.run(make, check=True, stdout=sys.stderr)

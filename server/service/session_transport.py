@@ -13,6 +13,7 @@ import zenoh
 from ...schemas.errors import BadRequestError
 from ...schemas.wire import keys
 from ...schemas.wire.seals import Sealer
+from ..network.channels import take_at_hand
 from ..network.replies import send_reply
 from ..served.served_scene import Answer, Full
 from .command_mailboxes import Frames
@@ -126,7 +127,7 @@ class SceneSessions:
                 while (following := waiting.take()) is not None:
                     self._take_wish(*following, frames)
                     for _ in range(_CHANNEL):
-                        if (more := _at_hand(samples)) is None:
+                        if (more := take_at_hand(samples)) is None:
                             break
                         self._sort(more, waiting, frames)
         finally:
@@ -156,12 +157,3 @@ class SceneSessions:
                 self._streams.send_again(user)
         except Exception:  # of this wish alone
             log.exception("a wish")
-
-
-def _at_hand(samples: Any) -> zenoh.Sample | None:
-    """Take a sample from a channel without waiting; return None where there is none, or the channel has ended."""
-    try:
-        sample: zenoh.Sample | None = samples.try_recv()
-    except zenoh.ZError:
-        return None
-    return sample

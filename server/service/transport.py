@@ -19,6 +19,7 @@ import zenoh
 from ...schemas.errors import BadRequestError, SolidcloudError
 from ...schemas.wire import keys
 from ...schemas.wire.seals import Sealer
+from ..network.channels import take_at_hand
 from ..network.endpoints import zenoh_words
 from ..network.key_files import published_key
 from ..network.replies import sealer_of, send_reply
@@ -148,7 +149,7 @@ class Transport:
             scene,
             self._config,
             queryable.handler,
-            partial(_at_hand, queryable.handler),
+            partial(take_at_hand, queryable.handler),
             self._start,
             Wire(_encoding, self._sealer, send_reply),
             tokens,
@@ -208,15 +209,6 @@ def _watch(samples: Any, tokens: Tokens, lane: Lane, sessions: SceneSessions) ->
                 tokens.here(client)
         except Exception:  # of this client alone
             log.exception("client %s", client)
-
-
-def _at_hand(queries: Any) -> zenoh.Query | None:
-    """Take a query from a channel without waiting; return None where there is none, or the channel has ended."""
-    try:
-        query: zenoh.Query | None = queries.try_recv()
-    except zenoh.ZError:
-        return None
-    return query
 
 
 def _encoding(query: zenoh.Query) -> str | None:

@@ -105,9 +105,9 @@ def test_the_old_one_goes_with_its_last_reader(place: Path, replace: Replace) ->
         assert len(verdicts) == 3000 and not verdicts.any(), "one answer, of one generation"
         # A thread of its own waits for the prefetcher to end.
         until = time.monotonic() + 20.0
-        while (memory() is not None or files_open() != before) and time.monotonic() < until:
+        while (memory() is not None or files_open() > before) and time.monotonic() < until:
             time.sleep(0.001)
-        assert memory() is None and files_open() == before
+        assert memory() is None and files_open() <= before
         assert scene.collide("al", AT_ALONE).verdict.tolist() == [1]
 
 

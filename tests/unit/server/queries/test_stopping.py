@@ -151,7 +151,6 @@ LONG: dict[str, int] = {
     "collide": 20_000,
     "collide bounded": 20_000,
     "collide timed": 20_000,
-    "walk": 40_000,
     "distance": 20_000,
     "distance bounded": 20_000,
     "contacts": 400,
@@ -165,32 +164,32 @@ FEW = 3
 
 
 @pytest.fixture(scope="module")
-def crowded(tmp_path_factory: pytest.TempPathFactory) -> Callable[[int, int], Asked]:
-    """Of so many poses, a request about an avatar of so many points in the middle of as many as MANY, all resident."""
+def crowded(tmp_path_factory: pytest.TempPathFactory) -> Callable[[int], Asked]:
+    """Of so many poses, a request about an avatar of MANY points in the middle of as many, all resident."""
     rng = np.random.default_rng(3)
     folder = tmp_path_factory.mktemp("crowded")
     case = contact_cases.open_case(
         folder, rng.uniform(0, 1, (MANY, 3)), rng, scan_count=1, radius=1e-5, voxel=2.0, resolution=1e-6
     )
-    models = {n: make_avatar(rng.uniform(-0.5, 0.5, (n, 3)), 1e-6) for n in (1_000, MANY)}
+    model = make_avatar(rng.uniform(-0.5, 0.5, (MANY, 3)), 1e-6)
 
-    def make(points: int, count: int) -> Asked:
+    def make(count: int) -> Asked:
         poses = np.tile(np.eye(4), (count, 1, 1))
         poses[:, :3, 3] = 0.5 + np.random.default_rng(5).uniform(-0.1, 0.1, (count, 3))
         angle = 0.5 * np.arange(count)
         poses[:, 0, 0], poses[:, 1, 1] = np.cos(angle), np.cos(angle)
         poses[:, 0, 1], poses[:, 1, 0] = -np.sin(angle), np.sin(angle)
-        return Asked(case.data, models[points], poses, reach=0.1)
+        return Asked(case.data, model, poses, reach=0.1)
 
     return make
 
 
 @pytest.mark.skipif(INTERPRETED, reason="to build the avatar takes too long")
 @pytest.mark.parametrize("question", LONG)
-def test_a_flag_set_meanwhile_ends_a_kernel_soon(crowded: Callable[[int, int], Asked], question: str) -> None:
-    ask, size = stopped_queries.QUESTIONS[question], 1_000 if question == "walk" else MANY
-    truth = ask(crowded(size, FEW), EXACT)
-    asked, stop, when = crowded(size, LONG[question]), Stop(), []
+def test_a_flag_set_meanwhile_ends_a_kernel_soon(crowded: Callable[[int], Asked], question: str) -> None:
+    ask = stopped_queries.QUESTIONS[question]
+    truth = ask(crowded(FEW), EXACT)
+    asked, stop, when = crowded(LONG[question]), Stop(), []
 
     def end() -> None:
         when.append(time.perf_counter())
@@ -214,16 +213,16 @@ def test_a_flag_set_meanwhile_ends_a_kernel_soon(crowded: Callable[[int, int], A
 
 
 @pytest.mark.skipif(INTERPRETED, reason="to build the avatar takes too long")
-def test_a_budget_ends_a_kernel_that_does_not_look_at_the_clock(crowded: Callable[[int, int], Asked]) -> None:
+def test_a_budget_ends_a_kernel_that_does_not_look_at_the_clock(crowded: Callable[[int], Asked]) -> None:
     from solidcloud.server.queries.context.query_budget import make_effort
 
-    asked = crowded(MANY, 1)._replace(margin=1.0)
+    asked = crowded(1)._replace(margin=1.0)
     begin = time.perf_counter()
     found = stopped_queries.QUESTIONS["contacts"](asked, make_effort(budget_ms=50.0))
     assert time.perf_counter() - begin < 2.0
     assert not found.exact.any()
     # All of a sweep's motions are one kernel call here.
-    long = crowded(MANY, 2_000)
+    long = crowded(2_000)
     begin = time.perf_counter()
     found = stopped_queries.QUESTIONS["sweep"](long, make_effort(budget_ms=50.0))
     assert time.perf_counter() - begin < 2.0

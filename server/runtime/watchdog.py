@@ -8,7 +8,6 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from pathlib import Path
 
 log = logging.getLogger(__name__)
 
@@ -80,9 +79,13 @@ def cpu_seconds(thread_id: int) -> float:
 
     thread_id: as `threading.get_native_id` returns it.
     """
+    if sys.platform != "linux":
+        return math.inf
     try:
-        return int(Path(f"/proc/self/task/{thread_id}/schedstat").read_text().split()[0]) * 1e-9
-    except (OSError, ValueError, IndexError):  # the thread has ended, or this is no Linux
+        # The clock of a thread as the kernel numbers it (CPUCLOCK_PERTHREAD_MASK | CPUCLOCK_SCHED).
+        # It takes 7 µs, /proc/self/task/*/schedstat 53 µs and the interpreter's lock three times.
+        return time.clock_gettime(~thread_id << 3 | 6)
+    except OSError:  # the thread has ended
         return math.inf
 
 

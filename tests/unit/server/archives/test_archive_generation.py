@@ -1,5 +1,6 @@
 """A scene that is reloaded: which generation answers, when the old one goes, what happens where none can be opened."""
 
+import gc
 import os
 import shutil
 import time
@@ -93,6 +94,7 @@ def test_the_old_one_goes_with_its_last_reader(place: Path, replace: Replace) ->
     with Scene.open(place) as scene:
         scene.add_avatar("al", BODY, 0.01)
         scene.collide("al", ELSEWHERE)
+        gc.collect()  # closes what earlier tests left open
         before = files_open()
         memory = weakref.ref(scene.residency.buffer)
         path = scene.path("al", np.repeat(AT_ALONE, 3000, axis=0))

@@ -1,6 +1,6 @@
-"""Which voxel has which bytes of the arena, and which one goes for another.
+"""Allocator of the arena: assigns its bytes to voxels, and evicts and moves voxels to make room.
 
-Not thread-safe: the residency calls it under its lock.
+Not thread-safe: `Residency` calls it under its lock.
 """
 
 import bisect
@@ -17,30 +17,36 @@ from .eviction import Policy
 
 Which = Callable[[int], bool]
 
-# Runs to either side of a place that are looked at to join free room. A load costs the same then however many voxels
-# are resident: the search of 64 runs takes some 20 us.
+# Number of runs on either side of an offset that are searched for free bytes to join. The limit
+# makes the cost of a load independent of the number of resident voxels: searching 64 runs takes
+# some 20 µs.
 AROUND = 32
-# The same in bytes, as multiples of what is asked for: small voxels around a large one are many, and so is the work of
-# loading it.
+# The same distance in bytes, as a multiple of the requested size. A large voxel may replace many
+# small ones, and loading it takes long enough to justify the longer search.
 AROUND_SIZES = 16
-# Victims that one search finds beyond those it needs. A search passes all pinned voxels at the front
-# of the policy's order, so that it is not repeated for each victim.
+# Victims that one search finds beyond those it needs. A search skips all pinned voxels at the front
+# of the policy's order, so it is not repeated for each victim.
 MORE = 32
-# Of the buffer, what may go beyond the bytes that are asked for before all runs are looked at.
+# Share of the buffer that may be evicted beyond the requested bytes before all runs are searched.
 SLACK = 1 / 32
 
 
 class Room:
-    """The runs of the resident voxels, and of those being loaded.
+    """Allocation of the arena's bytes to the voxels that are resident or being loaded.
 
-    offsets: row -> byte offset.  where: (v, 3) int64, see Residency.  used_bytes: of all runs.  evictions: voxels that
-    went for others; moved_bytes: of voxels that were moved to join free runs.
+    A run is a contiguous range of bytes.
+    offsets: row -> byte offset.  where: (v, 3) int64, see Residency.
+    used_bytes: the total of all runs.  evictions: voxels evicted to make room for others.
+    moved_bytes: bytes of voxels that were moved to join free runs.
     """
 
     def __init__(
         self, buffer: ArenaBuffer, sizes: list[int], where: NDArray[np.int64], policy: Policy
     ) -> None:
-        """Nothing in `buffer` yet. sizes: of each row, rounded as the buffer does."""
+        """Begin with an empty `buffer`.
+
+        sizes: bytes of each row, rounded with `ArenaBuffer.rounded`.
+        """
         self.buffer, self.sizes, self.where, self.policy = buffer, sizes, where, policy
         self.offsets: dict[int, int] = {}
         self.used_bytes = self.evictions = self.moved_bytes = 0
@@ -57,11 +63,14 @@ class Room:
         scan: bool,
         most: int | None = None,
     ) -> bool:
-        """Room for a voxel that has none, at the cost of voxels that may go, in the policy's order.
+        """Allocate a run for a voxel without one, evicting others in the policy's order if needed.
 
-        may_go, may_move: of a row.  gone: told each row that went.  most: rows looked at to find those; None: all.
-        Where what may go is too little, nothing goes. Where the free room is in pieces far apart, more go than the
-        bytes need; where what stays lies in between, some may have gone for nothing.
+        Return whether the voxel has a run now.
+        may_go, may_move: whether the voxel of a row may be evicted or moved.
+        gone: called with each evicted row.  most: rows examined to find victims; None: all.
+        Nothing is evicted if evicting everything allowed would free too few bytes. If free bytes
+        are fragmented, more voxels are evicted than the size requires; if voxels that must stay lie
+        between the free runs, voxels may be evicted and the allocation still fail.
         """
         size = self.sizes[row]
         offset = self.buffer.allocate(size)
@@ -78,17 +87,18 @@ class Room:
     def _clear(
         self, size: int, may_go: Which, may_move: Which, gone: Callable[[int], None], most: int | None
     ) -> int | None:
-        """Take a run of `size` bytes, see `make`; None where there is none.
+        """Evict and move voxels for a run of `size` bytes; return its offset, or None on failure.
 
-        Free room is joined around the last victim and around the largest free run. While that is in vain, more voxels
-        go, up to SLACK of the buffer; then all runs are looked at.
+        See `make` for the parameters. Free runs are joined around the last victim and around the
+        largest free run. While that yields too little, more voxels are evicted, up to SLACK of the
+        buffer; then all runs are searched.
         """
         found = self._enough(size, may_go, most)
         if found is None:
             return None
         needed, more = found
         near, slack = -1, int(self.buffer.total_bytes * SLACK)
-        all_at = size + slack  # the free bytes from which on all runs are looked at
+        all_at = size + slack  # free bytes at which all runs are searched
         for victim in needed:
             near = self.offsets[victim]
             self._evict(victim, gone)
@@ -105,13 +115,13 @@ class Room:
                 offset = self._join(size, may_move, slice(0, len(self._runs)))
                 if offset is not None or victim < 0:
                     return offset
-            near = self.offsets[victim]  # what is pinned may lie in between
+            near = self.offsets[victim]  # pinned voxels may separate it from the other free runs
             self._evict(victim, gone)
 
     def _enough(self, size: int, may_go: Which, most: int | None) -> tuple[list[int], deque[int]] | None:
-        """Return the voxels to evict for a run of `size` bytes, in order, and some of those that follow them.
+        """Select the voxels to evict for a run of `size` bytes, in order, and some further ones.
 
-        None where all that may be evicted are too little.
+        Return None if all voxels that may be evicted are too small together.
         """
         free, found = self.buffer.total_bytes - self.used_bytes, list[int]()
         candidates = filter(may_go, islice(self.policy.victims(), most))
@@ -124,8 +134,11 @@ class Room:
         return found, deque(islice(candidates, MORE))
 
     def _join_around(self, size: int, may_move: Which, near: int) -> int | None:
-        """Take a run of `size` bytes, for which voxels near the offset `near`, or near the largest free run, are moved
-        together if need be; None where there is too little room there."""
+        """Allocate a run of `size` bytes, moving voxels together near an offset if needed.
+
+        Search around the offset `near`, unless it is negative, and around the largest free run.
+        Return the run's offset, or None if there are too few free bytes.
+        """
         offset = self.buffer.allocate(size)
         if offset is not None:
             return offset
@@ -144,15 +157,16 @@ class Room:
         return None
 
     def _join(self, size: int, may_move: Which, some: slice) -> int | None:
-        """The same among some of the runs alone, in order of place.
+        """Join free bytes within a slice of the runs, in order of offset, and allocate `size`.
 
-        Of the stretches that hold so much free room and nothing that stays, the one with the least to be moved.
+        Of the stretches with `size` free bytes and only movable voxels, choose the one with the
+        fewest bytes to move. Return the run's offset, or None if there is no such stretch.
         """
         runs = self._runs[some]
         low = self._end(some.start - 1) if some.start else 0
         high = self._runs[some.stop][0] if some.stop < len(self._runs) else self.buffer.total_bytes
         best, moves = None, 0
-        begin, at, free, held = 0, low, 0, 0  # a stretch from run `begin` on; free and held bytes in it
+        begin, at, free, held = 0, low, 0, 0  # stretch from run `begin` on; free and used bytes in it
         first = low
         for number, (offset, row) in enumerate([*runs, (high, -1)]):
             free += offset - at
@@ -182,19 +196,22 @@ class Room:
         return self.buffer.allocate(size)
 
     def _end(self, number: int) -> int:
-        """Where a run ends."""
+        """Return the offset of the end of a run."""
         offset, row = self._runs[number]
         return offset + self.sizes[row]
 
     def _move(self, row: int, offset: int, to: int) -> None:
-        """Move a voxel down; its runs are numbered from the arena's start, in words, words and halfwords."""
+        """Move a voxel to a lower offset `to`, and update its row of `where`.
+
+        A row of `where` counts from the start of the arena in words, words and halfwords.
+        """
         size = self.sizes[row]
         if to == offset:
             return
         ctypes.memmove(self._address + to, self._address + offset, size)
         self.buffer.release(offset, size)
         self.buffer.take(to, size)
-        self._runs[bisect.bisect_left(self._runs, (offset, row))] = (to, row)  # they keep their order
+        self._runs[bisect.bisect_left(self._runs, (offset, row))] = (to, row)  # the order stays
         self.offsets[row] = to
         shift = offset - to
         self.where[row] -= (shift // 4, shift // 4, shift // 2)
@@ -206,7 +223,7 @@ class Room:
         gone(row)
 
     def leave_only(self, rows: Collection[int], gone: Callable[[int], None]) -> None:
-        """Let go of every voxel but these, and move them together; nobody may use or load any."""
+        """Evict all voxels but these and move these together; no voxel may be in use or loading."""
         for row in [row for row in self.offsets if row not in rows]:
             self._evict(row, gone)
         to = 0
@@ -215,7 +232,7 @@ class Room:
             to += self.sizes[row]
 
     def forget(self, row: int, *, evicted: bool = False) -> None:
-        """Give back a voxel's room."""
+        """Release a voxel's run."""
         self.where[row] = -1
         offset = self.offsets.pop(row)
         del self._runs[bisect.bisect_left(self._runs, (offset, row))]
@@ -224,7 +241,7 @@ class Room:
         self.policy.removed(row, evicted=evicted)
 
     def check(self) -> None:
-        """Assert that runs tile the buffer and the bytes add up."""
+        """Assert that the runs tile the buffer and that their bytes add up."""
         held = sum(self.sizes[row] for row in self.offsets)
         runs = sorted(
             [(offset, self.sizes[row]) for row, offset in self.offsets.items()] + self.buffer.free_runs()

@@ -1,4 +1,4 @@
-"""The arena: one buffer that holds all resident voxels, and who has which bytes of it. Not thread-safe."""
+"""Arena: one buffer that holds all resident voxels, and its free runs. Not thread-safe."""
 
 import bisect
 
@@ -6,14 +6,15 @@ import numpy as np
 
 from ..kernels.core.voxel_layout import Arena
 
-ALIGNMENT = 64  # a cache line, so that a row never straddles two more than it must
+ALIGNMENT = 64  # a cache line: a row of the arena straddles as few cache lines as possible
 
 
 class ArenaBuffer:
-    """A buffer of fixed size, given out in runs, best fit: of the shortest free runs that suffice, the first.
+    """Best-fit allocator of a buffer of fixed size.
 
-    arena: the views the kernels read. The system commits its pages when they are first written, so a large
-    budget costs nothing until it is used.
+    A run is a contiguous range of bytes. Of the shortest free runs that suffice, the first is used.
+    arena: the views that kernels read. The system commits pages when they are first written, so a
+    large budget costs nothing until it is used.
     """
 
     def __init__(self, budget_bytes: int) -> None:
@@ -30,11 +31,11 @@ class ArenaBuffer:
 
     @staticmethod
     def rounded(size: int) -> int:
-        """The bytes a run of `size` takes."""
+        """Return the bytes that a run of `size` takes."""
         return -(-size // ALIGNMENT) * ALIGNMENT
 
     def allocate(self, size: int) -> int | None:
-        """Take a free run of `size` bytes and return its offset; None when there is none."""
+        """Allocate a run of `size` bytes and return its offset, or None if no free run suffices."""
         size = self.rounded(size)
         at = bisect.bisect_left(self._by_size, (size, -1))
         if at == len(self._by_size):
@@ -44,7 +45,7 @@ class ArenaBuffer:
         return offset
 
     def take(self, offset: int, size: int) -> None:
-        """Take a run of `size` bytes from `offset` on, all of which is free."""
+        """Allocate the run of `size` bytes at `offset`, all of which is free."""
         size = self.rounded(size)
         i = bisect.bisect_right(self._free, (offset, self.total_bytes)) - 1
         start, free = self._drop(i)
@@ -55,7 +56,7 @@ class ArenaBuffer:
             self._put(i, start, offset - start)
 
     def release(self, offset: int, size: int) -> None:
-        """Give back a run that `allocate` gave out, joining it to its free neighbours."""
+        """Release an allocated run, joining it to its free neighbours."""
         size = self.rounded(size)
         i = bisect.bisect_left(self._free, (offset, 0))
         if i < len(self._free) and offset + size == self._free[i][0]:
@@ -67,21 +68,21 @@ class ArenaBuffer:
         self._put(i, offset, size)
 
     def _put(self, i: int, offset: int, size: int) -> None:
-        """Insert a free run at place `i` in the order of offsets."""
+        """Insert a free run at position `i` in the order of offsets."""
         self._free.insert(i, (offset, size))
         bisect.insort(self._by_size, (size, offset))
 
     def _drop(self, i: int) -> tuple[int, int]:
-        """Remove the free run at place `i` in the order of offsets, and return it."""
+        """Remove the free run at position `i` in the order of offsets, and return it."""
         offset, size = self._free.pop(i)
         del self._by_size[bisect.bisect_left(self._by_size, (size, offset))]
         return offset, size
 
     def largest_run(self) -> tuple[int, int]:
-        """Return the longest free run (offset, bytes), of equals the last; (-1, 0) where nothing is free."""
+        """Return the longest free run (offset, bytes), the last of equals; (-1, 0) if none."""
         size, offset = self._by_size[-1] if self._by_size else (0, -1)
         return offset, size
 
     def free_runs(self) -> list[tuple[int, int]]:
-        """The free runs (offset, bytes), ascending."""
+        """Return the free runs (offset, bytes), ascending."""
         return list(self._free)

@@ -1,4 +1,7 @@
-"""What a residency has done so far: voxels asked for, loaded, loaded in vain, gone too soon. Kept under its lock."""
+"""Statistics of a voxel cache: hits, misses, prefetches, wasted prefetches and early evictions.
+
+`Residency` updates them under its lock.
+"""
 
 import math
 import time
@@ -7,31 +10,33 @@ from collections.abc import Collection, Sequence
 
 from ...schemas.wire.stats import Counters
 
-# `Counters.too_soon`: a voxel that is asked for again so soon after it went for another had better stayed [s].
+# A voxel requested again within this time after its eviction was evicted too soon
+# (`Counters.too_soon`) [s].
 TOO_SOON = 10.0
-# Voxels of which it is remembered for longer when they went.
+# Number of evictions whose times are kept for longer than TOO_SOON.
 MOST_WENT = 4096
-# Loads whose times are remembered.
+# Number of loads whose durations are kept.
 TIMES = 256
 
 
 class Accounts:
-    """Counts as `Counters` has them. Not thread-safe.
+    """Counts of a voxel cache; `Counters` documents them. Not thread-safe.
 
-    fresh: rows prefetched, or just being so, that nobody has asked for yet.  times: seconds of the last loads.
+    fresh: rows prefetched or being prefetched that no request has used yet.
+    times: durations of the last loads [s].
     """
 
     def __init__(self, sizes: Sequence[int]) -> None:
-        """Nothing done yet. sizes: bytes of each row."""
+        """Begin with zero counts. sizes: bytes of each row."""
         self._sizes = sizes
         self.hits = self.waits = self.misses = self.late = self.failed = self.too_soon = 0
         self.prefetched = self.prefetched_bytes = self.used = self.wasted = self.wasted_bytes = 0
         self.fresh: set[int] = set()
         self.times: deque[float] = deque(maxlen=TIMES)
-        self._went: dict[int, float] = {}  # when each voxel that was evicted went last
+        self._went: dict[int, float] = {}  # row -> time of its last eviction
 
     def found(self, rows: Sequence[int]) -> None:
-        """These were asked for and are there, or being loaded."""
+        """Count requested voxels that are resident or being loaded."""
         self.hits += len(rows)
         if self.fresh:
             known = self.fresh.intersection(rows)
@@ -39,17 +44,17 @@ class Accounts:
             self.used += len(known)
 
     def missed(self, rows: Sequence[int]) -> None:
-        """These were asked for, and who asked loads them."""
+        """Count requested voxels that the request itself loads."""
         self.misses += len(rows)
         now = time.perf_counter()
         self.too_soon += sum(now - self._went.get(row, -math.inf) < TOO_SOON for row in rows)
 
     def waited(self, rows: Sequence[int], loading: Collection[int]) -> None:
-        """Of these, which were asked for, others load some."""
+        """Count the requested voxels that other threads are loading."""
         self.waits += sum(row in loading for row in rows)
 
     def evicted(self, row: int) -> None:
-        """A voxel went for another."""
+        """Count the eviction of a voxel."""
         now = time.perf_counter()
         self._went.pop(row, None)
         self._went[row] = now  # in order of time
@@ -58,25 +63,25 @@ class Accounts:
         self._in_vain(row)
 
     def begun_ahead(self, row: int) -> None:
-        """A voxel is being loaded that nobody asked for."""
+        """Count a prefetch that begins."""
         self.fresh.add(row)
         self.prefetched += 1
         self.prefetched_bytes += self._sizes[row]
 
     def lost(self, row: int) -> None:
-        """A load failed."""
+        """Count a failed load."""
         self.failed += 1
         self._in_vain(row)
 
     def _in_vain(self, row: int) -> None:
-        """A voxel is gone; if it was prefetched and nobody asked for it, that was for nothing."""
+        """Count a wasted prefetch if the voxel was prefetched and no request has used it."""
         if row in self.fresh:
             self.fresh.discard(row)
             self.wasted += 1
             self.wasted_bytes += self._sizes[row]
 
     def counters(self, evicted: int, moved_bytes: int) -> Counters:
-        """All of them."""
+        """Return all counts."""
         return Counters(
             hits=self.hits, waits=self.waits, misses=self.misses, late=self.late, prefetched=self.prefetched,
             prefetched_bytes=self.prefetched_bytes, used=self.used, wasted=self.wasted, wasted_bytes=self.wasted_bytes,
@@ -84,6 +89,6 @@ class Accounts:
         )  # fmt: skip
 
     def check(self) -> None:
-        """Assert that they add up."""
+        """Assert that the counts add up."""
         assert self.used + self.wasted + len(self.fresh) == self.prefetched
         assert self.waits <= self.hits and self.too_soon <= self.misses

@@ -1,7 +1,8 @@
-"""Coarse tops: a few nodes of every voxel, kept in memory, that settle far and clear poses without any load.
+"""Coarse bounds: the top nodes of every voxel, kept in memory to answer clear poses without a load.
 
-[Fig12] section 4 keeps voxels in memory whole or not at all. What a descent looks at first is a small part of a voxel,
-and where it is enough, nothing has to be read: kernels/overlap/coarse_overlap.py says which part, and what it proves.
+[Fig12] section 4 keeps a voxel in memory whole or not at all. A descent begins with a small part of
+the voxel, and often that part alone proves a pose clear. kernels/overlap/coarse_overlap.py defines
+this part and what it proves.
 """
 
 import threading
@@ -25,25 +26,27 @@ from ..kernels.core.voxels_in_reach import Reach
 from ..kernels.overlap.coarse_overlap import SLOT_WORDS, CoarseArrays, any_to_settle, settle_pairs, take_top
 from .voxel_store import Store
 
-# A slot's rows, and its place in `count`.
+# Bytes of the rows of a slot and of its entry in `count`.
 SLOT_BYTES = 4 * SLOT_WORDS + 4
-# The class of which no sphere is larger, whatever the radius model (schemas/archive/radius_model.py).
+# The class with the largest spheres under every radius model (schemas/archive/radius_model.py).
 LARGEST_CLASS = LOCAL_MASK << CLASS_SHIFT
 
 
 class Coarse:
-    """The coarse tops of one scene's voxels. Thread-safe.
+    """Coarse bounds of one scene's voxels. Thread-safe.
 
-    A voxel that has one keeps it: nothing is evicted, and once there is no room, voxels that come later have none. To
-    be without costs a load; kernels read slots without a lock, so to write one again would cost a lock.
+    Slots are never evicted or overwritten: once all are taken, further voxels get none. A voxel
+    without a slot costs a load; overwriting a slot would cost a lock, because kernels read slots
+    without one.
 
-    arrays: what kernels read.  bytes: what they take, at most the budget; the same from the start.
+    arrays: what kernels read.  bytes: size of the arrays, constant and at most the budget.
     """
 
     def __init__(self, voxels: int, budget_bytes: int) -> None:
-        """Make room for so many voxels of a scene's, or as many as fit; none where the table of voxels alone does not.
+        """Reserve slots for all `voxels` of a scene, or for as many as fit in the budget.
 
-        The system commits a slot's pages when it is written.
+        There are no slots if the table with an entry for each voxel exceeds the budget by itself.
+        The system commits the pages of a slot when it is written.
         """
         slots = min(voxels, max(0, budget_bytes - 4 * voxels) // SLOT_BYTES)
         words = np.empty(slots * SLOT_WORDS, np.float32)
@@ -51,19 +54,19 @@ class Coarse:
         self.arrays = CoarseArrays(words, words.view(np.int32), slot, np.zeros(slots, np.int32))
         self.bytes = words.nbytes + slot.nbytes + self.arrays.count.nbytes
         self._lock = threading.Lock()
-        self._begun = 0  # slots that were ever given out; those given back since are in `_back`
+        self._begun = 0  # slots that were ever assigned; those returned since are in `_back`
         self._back: list[int] = []
         self._making: set[int] = set()
 
     @property
     def known(self) -> int:
-        """How many voxels have a slot."""
+        """Return the number of voxels that have coarse bounds."""
         with self._lock:
             return self._begun - len(self._back) - len(self._making)
 
     @property
     def holds_all(self) -> bool:
-        """Whether there is a slot for every voxel."""
+        """Return whether there is a slot for every voxel."""
         return len(self.arrays.count) >= len(self.arrays.slot) > 0
 
     @property
@@ -71,9 +74,10 @@ class Coarse:
         return self._begun - len(self._back) < len(self.arrays.count)
 
     def missing(self) -> Iterator[int]:
-        """The rows of voxels without a slot, ascending, while there is room. May be gone through while they are filled.
+        """Iterate over the rows of voxels without a slot, ascending, while slots are free.
 
-        Each is named once: also those that turn out to be unreadable.
+        Slots may be filled during the iteration. Each row comes once, even if its voxel turns out
+        to be unreadable.
         """
         for row in range(len(self.arrays.slot)):
             if not self._room:
@@ -82,20 +86,23 @@ class Coarse:
                 yield row
 
     def remember(self, row: int, arena: Arena, where: NDArray[np.int64]) -> None:
-        """Keep the top of a voxel that has been laid out in the arena, unless it is kept, or there is no room.
+        """Store the coarse bounds of a voxel in the arena, unless it has a slot or none is free.
 
-        where: (3,) int64, its runs (voxel_layout.py). It must stay there until this returns.
+        where: (3,) int64, the voxel's runs (voxel_layout.py). The voxel must stay there until this
+        method returns.
         """
         number = self._take(row)
         if number >= 0:
             self._write(row, number, arena, int(where[0]), 0)
 
     def fill(self, store: Store, row: int) -> None:
-        """Keep the top of a voxel of the archive, as `remember` does; its points are not read.
+        """Store the coarse bounds of a voxel of the archive, as `remember` does, without points.
 
-        The radius classes of nodes come from points: where the archive has them, the rows say the largest there is,
-        and prove a little less than those of a voxel that was remembered.
-        Raises CorruptError, OSError as `Store.load`: then it has none, and may be tried again.
+        The radius class of a node is computed from its points. If the archive has radius classes,
+        these bounds therefore assume the largest class, and prove slightly less than those stored
+        by `remember`.
+        Raise CorruptError or OSError as `Store.load` does; the voxel then has no slot, and the call
+        may be repeated.
         """
         number = self._take(row)
         if number < 0:
@@ -108,7 +115,7 @@ class Coarse:
         self._write(row, number, arena, 0, LARGEST_CLASS if store.archive.header.radius_class else 0)
 
     def _take(self, row: int) -> int:
-        """A slot for a voxel to be written into; -1: it has one, is being given one, or there is none."""
+        """Assign a slot to a voxel; return -1 if it has or is being given one, or none is free."""
         with self._lock:
             if not self._room or self.arrays.slot[row] >= 0 or row in self._making:
                 return -1
@@ -119,20 +126,21 @@ class Coarse:
             return self._begun - 1
 
     def _give_back(self, row: int, number: int) -> None:
-        """Take back a slot that nobody has seen."""
+        """Return a slot that was not published."""
         with self._lock:
             self._making.discard(row)
             self._back.append(number)
 
     def _write(self, row: int, number: int, arena: Arena, root: int, assumed: int) -> None:
-        """Write a slot, then publish it: its rows, its count, and only then where it is."""
+        """Write a slot, then publish it: first its rows, then its count, and its number last."""
         try:
             count = take_top(arena.words, arena.ints, root, np.int32(assumed), self.arrays.ints, number)
         except BaseException:
             self._give_back(row, number)
             raise
-        # Between what is written above and below the interpreter's lock was let go and this one is taken: who sees the
-        # slot's number, which is where its rows are found, sees the rows.
+        # The interpreter's lock is released and this lock is taken between the writes above and
+        # below. A thread that sees the slot's number, by which it finds the rows, therefore sees
+        # the rows too.
         with self._lock:
             self.arrays.count[number] = count
             self.arrays.slot[row] = number
@@ -140,7 +148,7 @@ class Coarse:
 
 
 def _lay_out_tree(store: Store, row: int) -> Arena:
-    """The nodes of a voxel as `Store.load` lays them out, at the beginning of an arena of their own; no points."""
+    """Lay out the nodes of a voxel, without points, as `Store.load` does, in a new arena."""
     tree = store.archive.open_tree(row)
     links = tree.links
     words = np.empty(ROW_WORDS * len(links.first) + BLOCK_WORDS * tree.leaves, np.float32)
@@ -160,11 +168,12 @@ def _lay_out_tree(store: Store, row: int) -> Arena:
 def settle(
     arrays: SceneArrays, coarse: CoarseArrays, avatar: Avatar, poses: NDArray[np.float64], reach: Reach
 ) -> tuple[Reach, int]:
-    """`reach` without the pairs of pose and voxel that coarse tops prove clear, and how many these are.
+    """Remove from `reach` the pairs of pose and voxel that coarse bounds prove clear.
 
-    poses: (k, 4, 4) float64, checked, and `reach` theirs; avatar: the one it was found for. Voxels that are resident or
-    have no slot stay, in their order. Left out are those that `overlap_poses` would find clear, and no others.
-    `reach` itself, where there is nothing to leave out.
+    Return the new reach and the number of pairs removed; return `reach` itself if none is removed.
+    poses: (k, 4, 4) float64, checked.  reach: the reach of these poses and this avatar.
+    Voxels that are resident or have no slot stay, and the order stays. Every removed pair is one
+    that `overlap_poses` would find clear.
     """
     needed = reach.starts[-1]
     if not len(coarse.count) or not any_to_settle(arrays.where, coarse.slot, reach.rows, needed):

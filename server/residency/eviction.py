@@ -1,8 +1,9 @@
-"""Which resident voxel goes first: the orders of eviction, behind one interface.
+"""Eviction policies: the orders in which resident voxels are evicted, behind one interface.
 
-No threads, no clock, no bytes of its own: the residency calls it under its lock, and scripts/simulate_cache replays
-traces with the same objects. What a policy is not told of, pins and predictions, whoever evicts looks at: `victims`
-names every resident row, and those in use are passed over.
+A policy uses no threads, no clock and no voxel data: `Residency` calls it under its lock, and
+scripts/simulate_cache replays traces with the same objects. A policy does not know about pins or
+predictions. Its caller does: `victims` yields every resident row, and the caller skips those in
+use.
 """
 
 from collections import OrderedDict, deque
@@ -16,47 +17,60 @@ from ...schemas.errors import BadRequestError
 
 POLICIES = ("lru", "lru+prefetch", "distance", "s3fifo")
 
-# Of the budget, what scans may fill while others want room: sweeps along a path, and what is asked right after a
-# teleport. With all of it, one sweep through the archive washes out what every user stands in. As much as S3-FIFO gives
-# to what is new. Ten sweeps in five minutes beside eight strollers, `scripts/simulate_cache --sweeps 10 --kinds stroll`
-# in a town of 4e7 points: the strollers miss 362 voxels, and 440 where the sweeps are not told; 326 without sweeps.
+# Share of the budget that scans may fill while other requests need room. Scans are sweeps along a
+# path, and requests right after a teleport. Without a limit, one sweep through the archive evicts
+# the voxels around every user. The share equals that of S3-FIFO's small queue. Ten sweeps in five
+# minutes beside eight strollers, `scripts/simulate_cache --sweeps 10 --kinds stroll` in a town of
+# 4e7 points: the strollers miss 362 voxels, 440 if sweeps are not marked as scans, and 326 without
+# sweeps.
 SCAN_SHARE = 0.1
-# S3-FIFO's small queue, of the budget, and the uses counted: two bits ([Yang23]).
+# S3-FIFO: the small queue's share of the budget, and the largest use count, two bits ([Yang23]).
 SMALL_SHARE = 0.1
 MOST_USES = 3
-# `distance`: rows there is room for at first; and those at the front that are put in order before the rest.
+# `distance`: initial capacity in rows, and the number of rows at the front that are sorted before
+# the others.
 FEW_ROWS, SOME_ROWS = 64, 256
 
 Nearness = Callable[[NDArray[np.int64]], NDArray[np.float64]]
 
 
 class Policy(Protocol):
-    """An order of eviction. Rows are index rows of voxels; each is added once, until it is removed."""
+    """Order of eviction.
+
+    Rows are index rows of voxels; a row is added at most once before it is removed.
+    """
 
     name: str
 
     def added(self, row: int, size: int, *, scan: bool) -> None:
-        """Room of `size` bytes was given to a row, for a demand (of a scan, or not) or to prefetch it (no scan)."""
+        """Record that `size` bytes were allocated to a row.
+
+        scan: whether a scan requested the row; False for a prefetch.
+        """
 
     def used(self, row: int, *, scan: bool) -> None:
-        """A row was demanded that is resident or being loaded."""
+        """Record that a row that is resident or being loaded was requested."""
 
     def removed(self, row: int, *, evicted: bool) -> None:
-        """A row gave its room back: evicted, or it was never loaded."""
+        """Record that the bytes of a row were released: it was evicted, or was never loaded."""
 
     def victims(self) -> Iterator[int]:
-        """Every row that has room, once, first to go first. Found as they are taken, and void after any other call."""
+        """Iterate over all rows with allocated bytes in order of eviction, each once.
+
+        The order is computed during the iteration, which any other call invalidates.
+        """
 
 
 def prefetches(name: str) -> bool:
-    """Whether voxels are loaded before they are asked for under this policy: all but [Fig12]'s."""
+    """Return whether voxels are prefetched under this policy: all but `lru`, that of [Fig12]."""
     return name != "lru"
 
 
 def make_policy(name: str, budget_bytes: int, nearness: Nearness | None = None) -> Policy:
-    """The policy of this name, empty. nearness: what `distance` goes by, see `Distance`.
+    """Make an empty policy by its name.
 
-    Raises BadRequestError for another name, ValueError for `distance` without nearness.
+    nearness: required by `distance`, see `Distance`.
+    Raise BadRequestError for an unknown name, ValueError for `distance` without nearness.
     """
     if name in ("lru", "lru+prefetch"):
         return Lru(budget_bytes, name)
@@ -70,19 +84,20 @@ def make_policy(name: str, budget_bytes: int, nearness: Nearness | None = None) 
 
 
 class Lru:
-    """Least recently used first; of scans, no more than their share.
+    """Least recently used first, with a bounded share for scans.
 
-    What a scan added stands in a queue of its own until somebody else uses it. While that queue holds more than
-    SCAN_SHARE of the budget, its oldest go before anything else; within its share it is as good as the rest.
+    A row added by a scan is also in a separate queue until another request uses it. While that
+    queue holds more than SCAN_SHARE of the budget, its oldest rows are evicted before all others;
+    within that share its rows are treated like the rest.
     """
 
     def __init__(self, budget_bytes: int, name: str = "lru") -> None:
-        """Empty."""
+        """Begin without rows."""
         self.name = name
         self._order: OrderedDict[int, int] = (
             OrderedDict()
-        )  # row -> bytes, all of them; least recently used first
-        self._scans: OrderedDict[int, int] = OrderedDict()  # those that only scans wanted
+        )  # row -> bytes, of all rows; least recently used first
+        self._scans: OrderedDict[int, int] = OrderedDict()  # the rows that only scans have used
         self._scan_bytes = 0
         self._scan_most = int(budget_bytes * SCAN_SHARE)
 
@@ -124,20 +139,25 @@ class Lru:
 
 
 class Distance:
-    """Farthest from every user's predicted way first; of those as far, least recently used first.
+    """Farthest from every user's predicted path first; of equals, least recently used first.
 
-    What a scan added needs no share: far from users it goes first as it is. Rows lie in arrays, in no order: the first
-    to go is found in one pass over them, those behind it in the order of a part, and only then of all.
+    Scans need no bounded share here: their rows are far from users and evicted first anyway. Rows
+    are stored in arrays, unsorted: the first victim is found in one pass over them, the next ones
+    by sorting a part, and only then are all rows sorted.
     """
 
     name = "distance"
 
     def __init__(self, nearness: Nearness) -> None:
-        """nearness: rows -> (n,) float64, least distance of each to any user's predicted way [m], inf: no users."""
+        """Begin without rows.
+
+        nearness: maps rows to the least distance (n,) float64 of each from any user's predicted
+        path [m]; inf without users.
+        """
         self._nearness = nearness
-        self._at: dict[int, int] = {}  # where each row is in the arrays
+        self._at: dict[int, int] = {}  # row -> its position in the arrays
         self._rows = np.empty(FEW_ROWS, np.int64)
-        self._used = np.empty(FEW_ROWS, np.int64)  # when, in uses of any
+        self._used = np.empty(FEW_ROWS, np.int64)  # value of `_uses` at the last use of the row
         self._uses = 0
 
     def added(self, row: int, size: int, *, scan: bool) -> None:
@@ -157,7 +177,7 @@ class Distance:
     def removed(self, row: int, *, evicted: bool) -> None:
         """See `Policy`."""
         at, last = self._at.pop(row), len(self._at)
-        if at < last:  # the last takes its place
+        if at < last:  # the last row takes its position
             moved = int(self._rows[last])
             self._rows[at], self._used[at], self._at[moved] = moved, self._used[last], at
 
@@ -171,7 +191,7 @@ class Distance:
         farthest = np.flatnonzero(far == far.max())
         first = int(rows[farthest[np.argmin(used[farthest])]])
         yield first
-        # Who looks further is refused the first ones, and seldom more than a few.
+        # A caller that continues could not evict the first rows; it seldom needs more than a few.
         least = np.partition(far, count - SOME_ROWS)[count - SOME_ROWS] if count > SOME_ROWS else -np.inf
         for some in (far >= least, far < least):
             at = np.flatnonzero(some)
@@ -180,7 +200,10 @@ class Distance:
 
 
 class _Queues:
-    """The queues of S3-FIFO that hold. small, main: row -> bytes, oldest first.  uses: row -> 0 to MOST_USES."""
+    """Small and main queue of S3-FIFO.
+
+    small, main: row -> bytes, oldest first.  uses: row -> use count, 0 to MOST_USES.
+    """
 
     def __init__(self, small_most: int) -> None:
         self.small: OrderedDict[int, int] = OrderedDict()
@@ -189,7 +212,7 @@ class _Queues:
         self.small_bytes, self.small_most = 0, small_most
 
     def remove(self, row: int) -> int | None:
-        """Take a row out. Returns its bytes if it was in the small queue, else None."""
+        """Remove a row; return its bytes if it was in the small queue, else None."""
         del self.uses[row]
         if row in self.main:
             del self.main[row]
@@ -199,7 +222,7 @@ class _Queues:
         return size
 
     def settle(self) -> None:
-        """Bring who goes next to the front of its queue: what was used changes its place, as algorithm 1 has it."""
+        """Move used rows until the next victim is at the front of its queue, as in algorithm 1."""
         while self.small or self.main:
             if self.small and (self.small_bytes >= self.small_most or not self.main):
                 row = next(iter(self.small))
@@ -217,10 +240,13 @@ class _Queues:
                 self.main.move_to_end(row)
 
     def victims(self) -> Iterator[int]:
-        """Who goes, one after another, were each to go; nothing changes its place. `settle`, looked up only."""
+        """Iterate over the victims in the order in which repeated evictions would select them.
+
+        This simulates `settle` between evictions without moving any row.
+        """
         small, small_bytes = iter(self.small.items()), self.small_bytes
         main = ((row, self.uses[row]) for row in self.main)
-        again: deque[tuple[int, int]] = deque()  # what was moved to the end of the main queue: row, uses left
+        again: deque[tuple[int, int]] = deque()  # moved to the end of the main queue: row, uses left
         new, old = next(small, None), next(main, None)
         while new or old:
             if new and (small_bytes >= self.small_most or not old):
@@ -242,24 +268,26 @@ class _Queues:
 
 
 class S3Fifo:
-    """S3-FIFO, in bytes: a small queue for what is new, a main queue for what was used, a ghost for what was new once.
+    """S3-FIFO, measured in bytes: a small queue for new rows, a main queue and a ghost queue.
 
-    After [Yang23] J. Yang, Y. Zhang, Z. Qiu, Y. Yue, K. V. Rashmi, "FIFO queues are all you need for cache eviction",
-    SOSP 2023, algorithm 1. New rows enter the small queue, or the main one where the ghost still knows them. What
-    leaves the small queue used more than once moves to the main one; what leaves the main queue used at all goes
-    round again, its count one less. Uses by scans are not counted, nor does a scan find anything in the ghost.
+    After [Yang23] J. Yang, Y. Zhang, Z. Qiu, Y. Yue, K. V. Rashmi, "FIFO queues are all you need
+    for cache eviction", SOSP 2023, algorithm 1. New rows enter the small queue, or the main queue
+    if the ghost queue contains them. A row at the end of the small queue that was used more than
+    once moves to the main queue. A row at the end of the main queue that was used is reinserted
+    with its count reduced by one. The ghost queue lists rows recently evicted from the small queue.
+    Uses by scans are not counted, and a scan ignores the ghost queue.
     """
 
     name = "s3fifo"
 
     def __init__(self, budget_bytes: int) -> None:
-        """Empty."""
+        """Begin without rows."""
         small_most = int(budget_bytes * SMALL_SHARE)
         self._queues = _Queues(small_most)
         self._ghost: OrderedDict[int, int] = (
             OrderedDict()
-        )  # row -> bytes, of what left the small queue unused
-        self._ghost_bytes, self._ghost_most = 0, budget_bytes - small_most  # as much as the main queue holds
+        )  # row -> bytes, of rows evicted from the small queue
+        self._ghost_bytes, self._ghost_most = 0, budget_bytes - small_most  # as large as the main queue
 
     def added(self, row: int, size: int, *, scan: bool) -> None:
         """See `Policy`."""
@@ -289,9 +317,9 @@ class S3Fifo:
             self._ghost_bytes -= self._ghost.popitem(last=False)[1]
 
     def victims(self) -> Iterator[int]:
-        """See `Policy`. To find the first, rows change places as algorithm 1 has it; those behind are only looked up.
+        """See `Policy`. Finding the first victim moves rows, as in algorithm 1; the others do not.
 
-        So whoever looks at all of them leaves the counts as they are, but for one eviction's.
+        Iterating over all rows therefore changes the counts as one eviction does.
         """
         self._queues.settle()
         yield from self._queues.victims()

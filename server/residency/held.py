@@ -1,4 +1,4 @@
-"""What the voxel cache says of a hold on voxels, and of a load that no request waits for."""
+"""Results of a hold on voxels and of a prefetch."""
 
 from enum import Enum
 from typing import NamedTuple
@@ -7,11 +7,11 @@ from typing import NamedTuple
 class Held(NamedTuple):
     """Result of a hold on voxels.
 
-    hits, misses: voxels that were resident before, and that were not.
+    hits: voxels that were resident or being loaded.  misses: voxels that were not.
     faults: one sentence for each unreadable voxel.
-    late: rows that were not resident by the deadline. They may become resident during the hold: read
-    `where` without them (`as_held`).
-    waited: time spent on loads, its own and others', and on waits for memory [s].
+    late: rows that were not resident by the deadline. They may become resident during the hold:
+    ignore them when reading `where` (`as_held`).
+    waited: time spent on loads, by this thread or others, and on waits for memory [s].
     """
 
     hits: int

@@ -1,9 +1,11 @@
-"""Bounds of voxels: what the index says of them, and what their records have proved.
+"""Bounding boxes of voxels: those in the index, used once a voxel's record has proved them.
 
-The broad phase leaves a voxel unread where no box around its points is in reach. The index says which box that is, and
-an index may be forged: its checksum says that it is the one that was written, and no more. A voxel's cell of the grid
-cannot be wrong, because a record is refused where a point lies outside it. So the box of a voxel is its cell until its
-record has been loaded and found to be what the index says; from then on, evicted or not, it is the one in the index.
+The broad phase does not read a voxel if the box around its points is out of reach. The index stores
+this box, but an index may be forged: its checksum proves only that it is the index that was
+written. A voxel's grid cell cannot be wrong, because a record with a point outside its cell is
+rejected. The broad phase therefore uses the cell as the voxel's box until the record has been
+loaded and matches the index. From then on it uses the box in the index, even after the voxel is
+evicted.
 """
 
 import threading
@@ -18,19 +20,21 @@ from ..runtime.stop_flag import NEVER, Stop
 
 _Int64 = NDArray[np.int64]
 
-# Entries of a reach between two looks at the stop: some milliseconds of work, and 200 bytes each.
+# Entries of a reach processed between two checks of the stop flag: some milliseconds of work, and
+# 200 bytes each.
 ENTRIES_AT_ONCE = 1 << 15
 
 
 class Bounds:
     """Boxes around the points of each of the v voxels of an opened archive. Thread-safe.
 
-    index: the boxes that the broad phase reads: of a voxel that is not proved its cell, of one that is proved the box
-    in the index. A box only becomes smaller, one number at a time; a reader without the lock may see some of its
-    numbers before the change and some after.
+    index: the boxes that the broad phase reads: the cell of an unproved voxel, and the box in the
+    index of a proved one. A box only shrinks, one number at a time; a reader without the lock may
+    see some of its numbers before the change and some after it.
     index_boxes: the boxes in the index, proved or not.
-    proved: (v,) bool, the voxels whose record has the points where the index places them.
-    unproved: how many are not proved. Read it before `index`, and give it to `unsettled` afterwards.
+    proved: (v,) bool, the voxels whose record has its points where the index places them.
+    unproved: the number of voxels not proved. Read it before `index`, and pass it to `unsettled`
+    afterwards.
     """
 
     def __init__(self, archive: Archive) -> None:
@@ -44,13 +48,13 @@ class Bounds:
         self.index_boxes = SceneIndex(keys, *boxes, header.low, header.high)
         self.proved: NDArray[np.bool_] = np.zeros(len(keys), bool)
         self.unproved = len(keys)
-        self._order = np.empty(len(keys), np.int64)  # rows in the order in which they were proved
+        self._order = np.empty(len(keys), np.int64)  # rows in order of their proof
         self._unknown = header.unknown
         self._lock = threading.Lock()
         self._trees: tuple[VoxelTree, VoxelTree] | None = None
 
     def prove(self, row: int) -> None:
-        """Note that the record of a voxel was read and has its points where the index places them."""
+        """Mark a voxel as proved: its record has its points where the index places them."""
         if self.proved[row]:
             return
         low, high = self.index_boxes.low[row], self.index_boxes.high[row]
@@ -65,13 +69,13 @@ class Bounds:
             self.proved[row] = True  # last: `unsettled` reads it first
 
     def unsettled(self, rows: _Int64, unproved: int) -> NDArray[np.bool_]:
-        """Return (n,) bool: which of n rows may have been read with a box other than that of the index.
+        """Return (n,) bool: which of n rows may have been read with a box not from the index.
 
-        unproved: as it was before the boxes were read. A voxel proved since then counts: its box may have been read
-        while it changed.
+        unproved: its value before the boxes were read. A voxel proved since then is included: its
+        box may have been read while it changed.
         """
         found = ~self.proved[rows]
-        # A voxel that was found proved has left `unproved` before.
+        # `prove` decrements `unproved` before it sets `proved`.
         voxels = len(self._order)
         since = self._order[voxels - unproved : voxels - self.unproved]
         if len(since):
@@ -79,8 +83,10 @@ class Bounds:
         return found
 
     def trees(self) -> tuple[VoxelTree, VoxelTree]:
-        """Return trees over the boxes of `index` and of `index_boxes`, for rays and loose points; the first call makes
-        them."""
+        """Return the trees over the boxes of `index` and `index_boxes`, for rays and single points.
+
+        The first call builds them.
+        """
         trees = self._trees
         if trees is None:
             with self._lock:
@@ -94,10 +100,11 @@ class Bounds:
         return trees
 
     def rows_to_prove(self, reach: Reach, unproved: int, stop: Stop = NEVER) -> list[int]:
-        """Return the distinct rows, ascending, that `reach` holds, but would not hold by the boxes of the index.
+        """Find the rows in `reach` that would not be in it by the boxes in the index.
 
-        reach: of k poses, by `index`.  unproved: as it was before the reach was computed.  stop: once it is set, some
-        may be left out.
+        Return them ascending, each once.
+        reach: of k poses, computed with `index`.  unproved: its value before `reach` was computed.
+        stop: once it is set, the result may be incomplete.
         """
         hidden = np.zeros(len(self.proved), bool)
         entries = int(reach.starts[-1]) if unproved else 0

@@ -1,4 +1,4 @@
-"""Turns in which requests load voxels: one request at a time, first come, first served.
+"""Turns in which requests load voxels: one request at a time, first in, first out.
 
 A load is 0.1 ms of interpreted code between some twenty calls that release the interpreter's lock.
 Threads that load at the same time take that lock from one another at every such call. On two cores,
@@ -12,7 +12,7 @@ from collections import deque
 
 from ..runtime.stop_flag import Stop, seconds_to
 
-# A turn that takes longer no longer keeps others waiting: a disk that is slow, or a wait for memory [s].
+# A turn that takes longer, for a slow disk or a wait for memory, does not block others [s].
 MAX_TURN_SECONDS = 0.025
 
 
@@ -38,8 +38,9 @@ class LoadTurns:
         self._since = 0.0  # when the current turn began, on the monotonic clock [s]
 
     def take(self, deadline: float, stop: Stop) -> LoadTurn | None:
-        """Wait for a turn, which `give_back` ends. Return None when the deadline or the stop flag comes first.
+        """Wait for a turn and return it; return None if the deadline or the stop flag comes first.
 
+        `give_back` ends the turn.
         deadline: on time.perf_counter()'s clock [s].
         """
         turn = LoadTurn()
@@ -55,17 +56,17 @@ class LoadTurns:
             if turn in self._queue:
                 self._queue.remove(turn)
                 return None
-        return turn  # it came at the last moment
+        return turn  # granted at the last moment
 
     def give_back(self, turn: LoadTurn | None) -> None:
-        """End a turn; do nothing for None or a turn that has ended or taken too long."""
+        """End a turn; do nothing for None or a turn that has ended or was superseded."""
         with self._lock:
             if turn is not None and turn is self._current:
                 self._current = None
                 self._advance()
 
     def _advance(self) -> None:
-        """Give the first in the queue its turn, unless the current one has not yet taken too long."""
+        """Grant the first request in the queue its turn, unless a turn within its time is held."""
         now = time.monotonic()
         if self._queue and (self._current is None or now - self._since >= MAX_TURN_SECONDS):
             self._current, self._since = self._queue.popleft(), now

@@ -1,11 +1,13 @@
-"""The voxels around users: where each will be, what that brings within reach, and how soon.
+"""Prediction of users' motion: which voxels will come within reach, and when.
 
-The direction of travel comes first: a quadratic in time fitted to a user's last poses (velocity, acceleration, and so
-turning), carried as far ahead as loading takes. Then the ring around where the user stands, for those who turn.
-Nothing here loads, pins or evicts, and no clock is read: `now` is the caller's, in seconds, of any one clock.
+Voxels in the direction of travel come first. A quadratic in time is fitted to a user's last poses
+(velocity and acceleration, and therefore turning) and extrapolated for as long as loading takes.
+The voxels in a ring around the user's position follow, in case the user turns. This module loads,
+pins and evicts nothing, and reads no clock: callers pass `now` in seconds, all from the same clock.
 
-Safe to call from several threads. One lock guards the poses, held for microseconds; it is taken inside whatever its
-callers hold, and nothing is taken inside it. `nearness` takes none: whoever evicts holds one that is its own.
+Thread-safe. One lock guards the poses and is held for microseconds. Callers may hold other locks
+when they take it; no lock is taken while it is held. `nearness` takes no lock: the caller that
+evicts holds its own.
 """
 
 import threading
@@ -33,42 +35,48 @@ from ..kernels.prediction.user_tracks import (
 
 User = tuple[str, str]
 
-# After this long without a pose a user is taken to be gone [s].
+# A user without a pose for this long is assumed to have left [s].
 EXPIRY = 10.0
-# Users remembered at first, twice as many each time there is no room, and at most: 2 KB each. A new one takes the place
-# of the one not heard of for longest.
+# Initial and largest capacity in users, 2 KB each. The capacity doubles when it is exhausted; at
+# the largest, a new user replaces the one whose last pose is the oldest.
 FEW_USERS, MOST_USERS = 16, 4096
 
 
 class Ahead(NamedTuple):
-    """How far ahead voxels are wanted.
+    """Parameters of prefetching: how far ahead to look.
 
-    loads: horizon as a multiple of the time one load takes, between `least` and `most` [s].  ring: wanted around where
-    a user stands, beyond reach [m].  settled: but only for who came, or teleported, so long ago [s].  most_wanted: rows
-    a user.  motion: what bounds predictions.
+    loads: horizon as a multiple of the time one load takes, clamped to `least` and `most` [s].
+    ring: width of the ring around a user's position, beyond reach, whose voxels are wanted [m].
+    settled: time a user must have been present without a teleport before the ring counts [s].
+    most_wanted: rows a user.  motion: limits of predictions.
     """
 
-    # By scripts/simulate_cache, in a town of 4e7 points (1,215 voxels of 8 m), 8 users for 300 s, a tenth of its bytes;
-    # `--ahead` for what is varied; a load takes 2.4 ms unless said. In vain: of bytes loaded ahead (stroll, run, tour).
-    #   ring 0 m: in vain 3, 2, 4 %, and the tour has 2 misses; 1: 6, 10, 8 %, none; 2: 12, 18, 11 %; 4: 37, 37, 26 %.
+    # Measured with scripts/simulate_cache in a town of 4e7 points (1,215 voxels of 8 m), 8 users
+    # for 300 s, a cache of a tenth of the bytes; `--ahead` sets the varied parameter; a load takes
+    # 2.4 ms unless stated. Percentages are wasted prefetches, of the bytes prefetched (stroll, run,
+    # tour).
+    #   ring 0 m: 3, 2, 4 %, and the tour has 2 misses; 1: 6, 10, 8 %, no misses;
+    #   2: 12, 18, 11 %; 4: 37, 37, 26 %.
     # For 120 s, counted in voxels, with a ring of 2 m:
-    #   least 1.5 s in the place of 0.5 (ring 1): in vain 15, 34, 40 % where it was 10, 13, 14; no misses either way.
-    #   loads, of 128 ms each (--load-ms 100 --mb-ms 100): 2 and 4 have one miss more than 8 (run); 8: in vain 18, 26,
-    #   23 %; 16: 24, 40, 45 %.
-    #   history 1 s in the place of 0.5, ring 0, 3 % of the bytes, loads of 79 ms: 1, 1, 5 late misses for 0, 1, 2;
-    #   without acceleration 1, 1, 3; its bound and its fading hardly matter.
-    # most_wanted only bounds: 8 were as good.
+    #   least 1.5 s instead of 0.5 (ring 1): 15, 34, 40 % instead of 10, 13, 14; no misses in
+    #   either case.
+    #   loads, of 128 ms each (--load-ms 100 --mb-ms 100): 2 and 4 have one miss more than 8 (run);
+    #   8: 18, 26, 23 %; 16: 24, 40, 45 %.
+    #   history 1 s instead of 0.5, ring 0, 3 % of the bytes, loads of 79 ms: 1, 1, 5 late misses
+    #   instead of 0, 1, 2; without acceleration 1, 1, 3; its bound and fading hardly matter.
+    # most_wanted is only a bound: 8 was as good.
     loads: float = 8.0
     least: float = 0.5
     most: float = 4.0
     ring: float = 1.0
-    # Without it, nine tenths of what was loaded ahead for users who teleport every second were in vain, 1,354 voxels.
+    # Without it, nine tenths of the prefetches for users who teleport every second were wasted,
+    # 1,354 voxels.
     settled: float = 2.0
     most_wanted: int = 128
     motion: Motion = Motion(history=0.5, speed=MOST_SPEED, acceleration=6.0, fade=0.5)
 
     def horizon(self, load_seconds: float) -> float:
-        """How far ahead to look when one load takes so long [s]."""
+        """Return how far ahead to look when one load takes `load_seconds` [s]."""
         return min(max(self.loads * load_seconds, self.least), self.most)
 
 
@@ -76,10 +84,12 @@ AHEAD = Ahead()
 
 
 class Wanted(NamedTuple):
-    """What users will need.
+    """Voxels that users will need.
 
-    rows: (n,) int64, each once, soonest first.  need: (n,) float64, seconds from now until the avatar could touch
-    it, 0: it does now. Of rows around, which the predicted way does not touch, beyond the horizon, nearest first.
+    rows: (n,) int64, each once, soonest first.
+    need: (n,) float64, seconds from now until the avatar could touch the voxel; 0: it does now.
+    Rows of the ring that the predicted path does not touch have a need beyond the horizon, nearest
+    first.
     """
 
     rows: NDArray[np.int64]
@@ -87,7 +97,7 @@ class Wanted(NamedTuple):
 
 
 class Neighbourhood:
-    """The users of one scene and what they will need of it."""
+    """Users of one scene and the voxels they will need."""
 
     def __init__(
         self,
@@ -97,7 +107,10 @@ class Neighbourhood:
         step: float,
         ahead: Ahead = AHEAD,
     ) -> None:
-        """No users yet. voxel_steps: edge of a voxel [steps].  origin (3,), step: of the lattice [m]."""
+        """Begin without users.
+
+        voxel_steps: edge of a voxel [steps].  origin (3,), step: of the lattice [m].
+        """
         self.ahead = ahead
         self._index, self._step = index, step
         self._look = Look(
@@ -105,23 +118,25 @@ class Neighbourhood:
             ahead.motion,
         )  # fmt: skip
         self._lock = threading.Lock()
-        self._users: dict[User, int] = {}  # the row of each in `_walks`, in their order
+        self._users: dict[User, int] = {}  # user -> its row in `_walks`, ascending
         self._walks = np.zeros((FEW_USERS, WALK))
-        # Of the last plan, the ways [steps] and its number; replaced, never written. And how far each row is from them
-        # [m], where it was asked since `_asked`, the number of a plan: committed by the system as rows are asked for.
+        # The predicted ways of the last plan [steps] and the plan's number; replaced, never
+        # written. `_far` is the distance of each row from these ways [m], valid where `_asked`
+        # equals the plan's number. The system commits the pages of both as rows are queried.
         self._planned = np.empty((0, PIECES + 1, 3)), 1
         self._asked, self._far = np.zeros(len(index.keys), np.int64), np.zeros(len(index.keys))
 
     @property
     def users(self) -> list[User]:
-        """Who is known, those first who came first."""
+        """Return the known users, in order of arrival."""
         return list(self._users)
 
     def saw(self, user: User, now: float, center: tuple[float, float, float], reach: float) -> bool:
-        """Remember a pose. center: of the avatar's root sphere [m].  reach: its radius with spheres and margin [m].
+        """Record a pose and return whether it is a teleport, which discards the poses before it.
 
-        Returns whether it is a teleport, after which what was before says nothing. A pose older than the last is
-        passed over, unless it is so old that the clock must be another one: then it starts afresh.
+        center: of the avatar's root sphere [m].  reach: its radius with spheres and margin [m].
+        A pose older than the last one is ignored, unless it is so old that its time must come from
+        another clock: then the track of the user restarts.
         """
         x, y, z = center
         with self._lock:
@@ -137,7 +152,10 @@ class Neighbourhood:
         centers: NDArray[np.float64],
         reaches: NDArray[np.float64],
     ) -> NDArray[np.bool_]:
-        """`saw` of n poses, one after another, of MOST_USERS at most: whether each is a teleport (n,)."""
+        """Call `saw` for n poses in order; return whether each is a teleport (n,).
+
+        n is at most MOST_USERS.
+        """
         teleports = np.empty(len(users), np.bool_)
         with self._lock:
             known = self._users
@@ -146,7 +164,7 @@ class Neighbourhood:
         return teleports
 
     def _add(self, user: User) -> int:
-        """A row for a user not seen before."""
+        """Add a user and return its row."""
         count = len(self._users)
         if count == MOST_USERS:
             silent = int(np.argmin(self._walks[:count, LAST]))
@@ -161,40 +179,43 @@ class Neighbourhood:
         return count
 
     def _drop(self, gone: Callable[[int], bool]) -> None:
-        """Forget the users of rows that are gone; the others move up, in their order."""
+        """Remove the users whose rows satisfy `gone`; the others move up, in order."""
         left = [(user, row) for user, row in self._users.items() if not gone(row)]
         if len(left) < len(self._users):
             self._walks[: len(left)] = self._walks[[row for _, row in left]]
             self._users = {user: row for row, (user, _) in enumerate(left)}
 
     def leave(self, user: User) -> None:
-        """Forget a user, if it is known."""
+        """Remove a user, if it is known."""
         with self._lock:
             row = self._users.get(user)
             self._drop(lambda other: other == row)
 
     def leave_client(self, client: str) -> None:
-        """Forget all users of a client."""
+        """Remove all users of a client."""
         with self._lock:
             rows = {row for user, row in self._users.items() if user[0] == client}
             self._drop(rows.__contains__)
 
     def expire(self, now: float, after: float = EXPIRY) -> None:
-        """Forget users whose last pose is more than `after` seconds old."""
+        """Remove users whose last pose is more than `after` seconds old."""
         with self._lock:
             silent = now - self._walks[: len(self._users), LAST] > after
             if silent.any():
                 self._drop(lambda row: bool(silent[row]))
 
     def _snapshot(self) -> NDArray[np.float64]:
-        """The walks as they are: kernels read them without the lock."""
+        """Return a copy of the tracks, which kernels read without the lock."""
         with self._lock:
             return self._walks[: len(self._users)].copy()
 
     def plan(self, now: float, load_seconds: float) -> Wanted:
-        """What users will need: each row once, when the first of them needs it; of equals, first who came first.
+        """Predict the voxels that users will need.
 
-        load_seconds: what loading one voxel takes now, queueing included: an upper percentile of what was measured.
+        Each row is listed once, with the earliest need of all users; equal needs are in order of
+        the users' arrival.
+        load_seconds: current time to load one voxel including queueing, an upper percentile of the
+        measured times.
         """
         look = self._look._replace(horizon=self.ahead.horizon(load_seconds))
         rows, need, ways = plan_walks(self._snapshot(), now, look, self._index)
@@ -202,14 +223,20 @@ class Neighbourhood:
         return Wanted(rows, need)
 
     def kept(self, now: float, after: float = EXPIRY) -> NDArray[np.int64]:
-        """The rows (n,), each once, that users can touch where they stand: by poses at most `after` seconds old."""
+        """Return the rows (n,), each once, that users can touch at their current positions.
+
+        Users whose last pose is more than `after` seconds old are ignored.
+        """
         rows: NDArray[np.int64] = rows_kept(self._snapshot(), now, after, self._look, self._index)
         return rows
 
     def rows_in_reach(
         self, centers: NDArray[np.float64], reaches: NDArray[np.float64]
     ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Starts (k + 1,) and rows: what each of k balls, centers (k, 3) and reaches (k,) [m], can touch."""
+        """Return starts (k + 1,) and rows of the voxels that each of k balls can touch.
+
+        centers: (k, 3) [m].  reaches: the radii (k,) [m].
+        """
         look = self._look
         steps = np.ascontiguousarray((centers - look.origin) / look.step)
         spans = np.ascontiguousarray(reaches / look.step * (1.0 + WIDER) + 1.0)
@@ -221,10 +248,11 @@ class Neighbourhood:
                 return starts, rows[:needed]
 
     def nearness(self, rows: ArrayLike) -> NDArray[np.float64]:
-        """How near (n,) the points' boxes of rows are to any user's way in the last plan [m]; inf: no users.
+        """Return the distance (n,) of each row's box from the nearest user's predicted path [m].
 
-        One call at a time. What was found since that plan is remembered: of 10,000 rows and 8 users finding it takes a
-        millisecond, and looking it up some 20 us (scripts/bench_cache).
+        The paths are those of the last plan; without users the distance is inf. Not thread-safe.
+        Distances are cached until the next plan: for 10,000 rows and 8 users, computing them takes
+        a millisecond, and looking them up some 20 µs (scripts/bench_cache).
         """
         each = np.asarray(rows, np.int64)
         ways, number = self._planned

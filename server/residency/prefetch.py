@@ -1,8 +1,9 @@
-"""Loads voxels before anybody asks for them, and those that somebody could not wait for: one thread a scene.
+"""Prefetching of voxels, and loads owed to requests whose deadline came first: one thread a scene.
 
-What users will need the neighbourhood says (motion_prediction.py), soonest first; the thread loads it while no request
-waits for anything, and finds out what is wanted anew each time users have moved. So what a user has turned from is not
-loaded any more; a load that has begun is finished. A voxel goes for another only if it is wanted later than that one.
+motion_prediction.py lists the voxels that users will need, soonest first. The thread loads them
+while no request waits for anything, and updates the list each time users have moved. Voxels that a
+user has turned away from are therefore not loaded any more; a load that has begun is finished. A
+prefetch evicts only voxels that are needed later than the prefetched one.
 """
 
 import logging
@@ -20,29 +21,35 @@ from .voxel_cache import Residency
 
 log = logging.getLogger(__name__)
 
-# What is wanted is found out at most so often [s]: at 5 m/s a user moves a quarter of a metre meanwhile. And with very
-# many users so seldom that it rests so many times as long as it takes: 64 of them take 0.2 ms, 512 take 3
-# (scripts/bench_cache), most of it without the interpreter.
+# The least time between two plans [s]: at 5 m/s a user moves a quarter of a metre in it. With very
+# many users a plan takes longer, and the pause after it is PLAN_REST times as long as it took: 64
+# users take 0.2 ms, 512 take 3 ms (scripts/bench_cache), most of it without the interpreter's lock.
 PLAN_SECONDS, PLAN_REST = 0.05, 10.0
-# How long nothing may be heard of a user whose voxels are kept [s].
+# The voxels of a user are kept for this long after its last pose [s]. A voxel whose prefetch failed
+# is not prefetched again for as long.
 SILENCE = 10.0
+# The longest pause [s].
 MOST_REST = 0.25
-# What is done when there is nothing to be loaded rests so many times as long as it works: it is Python in good part,
-# and who answers waits for the interpreter meanwhile.
+# A pause between pieces of idle work is this many times as long as the work: much of it is Python
+# code, and requests wait for the interpreter's lock meanwhile.
 IDLE_REST = 4.0
-# Of the budget, what is kept for who stands in it; the rest is there for whoever asks.
+# Share of the budget that is kept for users' current positions; the rest is available to all
+# requests.
 KEPT_SHARE = 0.5
-# Of the times that loads took, this share is shorter than what is reckoned with.
+# Quantile of the measured load times that predictions assume.
 USUAL = 0.9
 
 
 def _wanted_later(need: dict[int, float], than: float) -> Callable[[int], bool]:
-    """Whether a voxel is needed later than that, or by nobody."""
+    """Return a function that tells whether a row is needed later than `than`, or not at all."""
     return lambda row: need.get(row, math.inf) > than
 
 
 class Prefetcher:
-    """The thread of one residency, started when the first user is seen. A context manager. Thread-safe."""
+    """Prefetch thread of one residency. A context manager. Thread-safe.
+
+    The thread starts when the first user is seen.
+    """
 
     def __init__(
         self,
@@ -53,8 +60,13 @@ class Prefetcher:
         idle: Callable[[], bool] | None = None,
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
-        """ahead: load what will be needed; without, only what is owed, and users' voxels are kept.  idle: called again
-        and again when there is nothing to be loaded, until it returns False; some milliseconds of work each time."""
+        """Make a prefetcher without a thread.
+
+        ahead: prefetch; if False, load only owed voxels and keep users' voxels.
+        idle: called repeatedly when there is nothing to load, until it returns False; each call
+        does some milliseconds of work.
+        clock: returns the time [s].
+        """
         self._residency, self._neighbourhood, self._clock, self._ahead = (
             residency,
             neighbourhood,
@@ -63,23 +75,23 @@ class Prefetcher:
         )
         self._work = threading.Event()
         self._urgent = threading.Event()  # ends a rest
-        self._lock = threading.Lock()  # of starting and stopping
+        self._lock = threading.Lock()  # guards starting and stopping
         self._thread: threading.Thread | None = None
         self._stopped = self._seen = False
         self._idle = idle
-        self._failed: dict[int, float] = {}  # when; whoever asks for these tries again
+        self._failed: dict[int, float] = {}  # row -> time; a request for the voxel tries again
         residency.owed = self._owed
 
     def __enter__(self) -> Self:
-        """The prefetcher itself."""
+        """Return the prefetcher itself."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Stop: a load that has begun is finished."""
+        """Stop; a load that has begun is finished."""
         self.stop()
 
     def stop(self) -> None:
-        """Load nothing more, and wait for the thread."""
+        """Stop loading, and wait for the thread."""
         with self._lock:
             self._stopped, thread = True, self._thread
         self._residency.owed = None
@@ -90,14 +102,17 @@ class Prefetcher:
         self._residency.kept = frozenset()
 
     def saw(self, user: User, center: tuple[float, float, float], reach: float) -> bool:
-        """A user's avatar is around `center` [m], as far as `reach` [m]; whether it came there by no motion."""
+        """Record that a user's avatar is within `reach` [m] of `center` [m].
+
+        Return whether it teleported there.
+        """
         jumped = self._neighbourhood.saw(user, self._clock(), center, reach)
         self._seen = True
         self._wake()
         return jumped
 
     def warm(self, center: tuple[float, float, float]) -> None:
-        """Look ahead for nobody, so that compilers are done; before anybody is seen."""
+        """Make a plan for a dummy user, so that all kernels are compiled before the first user."""
         user = ("", "")
         self._neighbourhood.saw(user, self._clock(), center, 1.0)
         self._neighbourhood.plan(self._clock(), 0.0)
@@ -107,23 +122,23 @@ class Prefetcher:
         self._neighbourhood.plan(self._clock(), 0.0)
 
     def leave_client(self, client: str) -> None:
-        """Keep and load nothing more for a client's avatars."""
+        """Stop keeping and prefetching voxels for a client's avatars."""
         self._neighbourhood.leave_client(client)
         self._seen = True
         self._wake()
 
     @property
     def running(self) -> bool:
-        """Whether there is a thread to be waited for."""
+        """Return whether the thread was started."""
         return self._thread is not None
 
     def _owed(self) -> None:
-        """A load is owed: it does not wait until a rest is over."""
+        """Wake the thread for an owed load, also from a pause."""
         self._urgent.set()
         self._wake()
 
     def _wake(self) -> None:
-        """There is work."""
+        """Wake the thread, starting it if necessary."""
         if self._thread is None:
             self._start()
         if not self._work.is_set():
@@ -135,7 +150,7 @@ class Prefetcher:
                 self._thread = start_thread("prefetch", self._run)
 
     def _run(self) -> None:
-        """The thread's work."""
+        """Prefetch until stopped. Runs in the thread."""
         queue: deque[tuple[int, float]] = deque()
         need: dict[int, float] = {}
         due = -math.inf
@@ -153,43 +168,43 @@ class Prefetcher:
                 self._rest(self._use_idle_time(self._idle))
                 continue
             if self._seen:
-                self._rest(due - now)  # until they may have moved far enough to look again
+                self._rest(due - now)  # until the next plan is due
                 continue
-            # Nobody is seen any more: what they stood in is let go when their time is up.
+            # No more poses arrive: kept voxels are released after SILENCE.
             if not self._work.wait(SILENCE if self._residency.kept else None):
                 self._seen = True
             self._work.clear()
 
     def _rest(self, seconds: float) -> None:
-        """Wait, but not while something is owed or all is to stop."""
+        """Pause; an owed load or `stop` ends the pause."""
         self._urgent.wait(min(max(0.0, seconds), MOST_REST))
         self._urgent.clear()
 
     def _planned(self, now: float) -> tuple[dict[int, float], float]:
-        """What is wanted, see `_plan`, and when to look again."""
+        """Return the result of `_plan`, and the time of the next plan."""
         begin = time.thread_time()
         try:
             need = self._plan(now)
-        except Exception:  # out of memory, say: what is asked for is loaded all the same
-            log.exception("what users will need is not known")
+        except Exception:  # for example out of memory: requested voxels are loaded all the same
+            log.exception("the prefetch plan failed")
             return {}, now + MOST_REST
         return need, now + min(max(PLAN_SECONDS, PLAN_REST * (time.thread_time() - begin)), MOST_REST)
 
     def _use_idle_time(self, idle: Callable[[], bool]) -> float:
-        """Do some of what is done when there is nothing else; how long to rest then [s]."""
+        """Do one piece of idle work; return how long to pause afterwards [s]."""
         self._residency.wait_for_nobody()
         begin = time.thread_time()
         try:
             left = idle()
         except Exception:
-            log.exception("given up")
+            log.exception("idle work failed and is abandoned")
             left = False
         if not left:
             self._idle = None
         return IDLE_REST * (time.thread_time() - begin)
 
     def _step(self, queue: deque[tuple[int, float]], need: dict[int, float]) -> bool:
-        """Load one voxel; False where there is none to be loaded."""
+        """Load one voxel; return False if there is none to load."""
         residency, row = self._residency, -1
         try:
             owed = residency.take_owed()
@@ -202,18 +217,21 @@ class Prefetcher:
                     continue
                 found = residency.load_ahead(row, _wanted_later(need, at))
                 if found is Ahead.NO_ROOM:
-                    queue.clear()  # what is wanted later would have none either
+                    queue.clear()  # voxels needed later would find no room either
                 elif found is Ahead.FAILED:
                     self._failed[row] = self._clock()
                 return True
-        except Exception:  # out of memory, say: who asks for the voxel will be told
-            log.exception("a voxel is not loaded ahead")
+        except Exception:  # for example out of memory: a request for the voxel reports it
+            log.exception("a prefetch failed")
             self._failed[row] = self._clock()
             return True
         return False
 
     def _plan(self, now: float) -> dict[int, float]:
-        """What all users will need, soonest first: row -> seconds until then; what they stand in is kept."""
+        """Return the voxels that all users will need, soonest first: row -> seconds until then.
+
+        Update the set of voxels kept for users' current positions.
+        """
         times = sorted(self._residency.load_times())
         usual = times[int(USUAL * (len(times) - 1))] if times else 0.0
         self._neighbourhood.expire(now, SILENCE)
@@ -223,7 +241,7 @@ class Prefetcher:
         return need
 
     def _within_share(self, rows: list[int], need: dict[int, float]) -> frozenset[int]:
-        """Of voxels that users stand in, those that may be kept: what is needed soonest, KEPT_SHARE of the budget."""
+        """Select rows, soonest needed first, that fit together in KEPT_SHARE of the budget."""
         left = int(KEPT_SHARE * self._residency.budget_bytes)
         if self._residency.bytes_of(rows) <= left:
             return frozenset(rows)

@@ -1,12 +1,12 @@
-"""Resident voxels: decoded, never more than `budget_bytes`; who holds them, and who loads them.
+"""Cache of resident voxels, decoded, within `budget_bytes`: pins, loads and waits of requests.
 
-[Fig12] section 4: "neighbour voxels to a user's position loaded and uncompressed into a LRU queue". One load
-for a voxel however many wait for it; what a request uses is pinned until it is answered. Which voxel goes first is the
-policy's (eviction.py), which bytes it has the room's (allocator.py), and what is loaded before anybody asks for it the
-prefetcher's (prefetch.py).
+[Fig12] section 4: "neighbour voxels to a user's position loaded and uncompressed into a LRU queue".
+A voxel is loaded once, however many requests wait for it, and the voxels of a request are pinned
+until it is answered. eviction.py selects the voxels to evict, allocator.py assigns bytes, and
+prefetch.py loads voxels before a request needs them.
 
-A request takes all its voxels or none: it never waits for room while holding pins, so two requests that each
-hold half of what the other needs cannot wait for each other for ever.
+A request pins all its voxels or none: it never waits for memory while holding pins. Two requests
+that each hold half of what the other needs therefore cannot deadlock.
 """
 
 import math
@@ -30,48 +30,46 @@ from .held import Ahead, Held
 from .load_turns import LoadTurn, LoadTurns
 from .voxel_store import Store
 
-# Voxels that are looked at to find room for one that nobody waits for.
+# Voxels examined to find room for a prefetched one.
 MOST_CANDIDATES = 256
 
 
 class Hold:
-    """A hold on voxels, for a `with`; a class and not a generator, which costs a request twice as much."""
+    """Context manager of a hold on voxels. A generator would cost a request twice as much."""
 
     __slots__ = ("_deadline", "_residency", "_rows", "_scan", "_stop")
 
     def __init__(
         self, residency: "Residency", rows: Sequence[int], deadline: float, scan: bool, stop: Stop
     ) -> None:
-        """Use `Residency.hold`."""
+        """Make a hold; call `Residency.hold` instead."""
         self._residency, self._rows, self._deadline, self._scan = residency, rows, deadline, scan
         self._stop = stop
 
     def __enter__(self) -> Held:
-        """Wait until all that can be read is resident, or the deadline."""
+        """Wait until all readable voxels are resident, or for the deadline."""
         return self._residency.acquire(self._rows, self._deadline, scan=self._scan, stop=self._stop)
 
     def __exit__(self, *_: object) -> None:
-        """Let the voxels go."""
+        """Release the voxels."""
         self._residency.release(self._rows)
 
 
 class Residency:
-    """The resident voxels of one scene. Thread-safe.
+    """Resident voxels of one scene. Thread-safe.
 
-    where: (v, 3) int64, a voxel's runs in the arena, -1 when not resident; the kernels read it directly.
-    kept: rows that users stand in: they go only when a request would not fit otherwise.  owed: called when a load is
-    owed to a request whose deadline came first, see `take_owed`.  loaded: called with the row and where it is of each
-    voxel that was loaded, by the thread that did, before others know of it; took: then, with the seconds it took.
-    proved: called with the row of each voxel that was loaded, before others know of it.
-    misled: whether a record that was loaded has points that the index places elsewhere. Voxels are chosen by the index,
-    so after that it is not known what else was not chosen.
+    where: (v, 3) int64, a voxel's runs in the arena, -1 if not resident; kernels read it directly.
+    kept: rows at users' positions, evicted only if a request would not fit otherwise.
+    owed: called when a load is owed to a request whose deadline came first, see `take_owed`.
+    loaded: called with the row and the runs of each loaded voxel, by the loading thread, before the
+    voxel is visible to other threads.  took: called afterwards with the duration of the load [s].
+    proved: called with the row of each loaded voxel, before it is visible to other threads.
+    misled: whether a loaded record has points that the index places elsewhere. The index selects
+    the voxels of a query; once it is wrong, it is unknown which voxels it failed to select.
     """
 
     def __init__(self, store: Store, budget_bytes: int, policy: Policy | None = None) -> None:
-        """Reserve budget_bytes for the voxels of `store`. policy: least recently used where left out.
-
-        Raises BadRequestError when one voxel alone is larger.
-        """
+        """Reserve the budget; BadRequestError if one voxel exceeds it. policy: `lru` by default."""
         largest = ArenaBuffer.rounded(int(store.sizes.max(initial=0)))
         if budget_bytes < largest:
             raise BadRequestError(
@@ -96,66 +94,66 @@ class Residency:
         self._turns = LoadTurns()
         self._pins: dict[int, int] = {}
         self._loading: set[int] = set()
-        self._faults: dict[int, str] = {}  # of corrupt records, which reading again would not mend
-        # Of voxels that could not be read this once. Tried again only when nobody holds them any more: a voxel never
-        # becomes resident under a kernel that has begun without it.
+        self._faults: dict[int, str] = {}  # of corrupt records: permanent
+        # Temporary faults. A voxel with one is read again only after all holds on it have ended: it
+        # never becomes resident while a kernel runs that began without it.
         self._passing: dict[int, str] = {}
-        # Of those in `_loading`: reserved by one whose deadline came before the load began. Who waits takes it over.
+        # Rows in `_loading` left by a request at its deadline; one that waits takes over the load.
         self._left: set[int] = set()
         self._owed: OrderedDict[int, None] = OrderedDict()
-        self._demands = 0  # requests that wait
+        self._demands = 0  # number of requests that wait
         self._accounts = Accounts(self._sizes)
 
     @property
     def resident(self) -> int:
-        """The number of voxels resident or being loaded."""
+        """Return the number of voxels resident or being loaded."""
         return len(self._room.offsets)
 
     @property
     def resident_bytes(self) -> int:
-        """Their bytes."""
+        """Return the bytes of the voxels resident or being loaded."""
         return self._room.used_bytes
 
     @property
     def hits(self) -> int:
-        """Voxels asked for and there, or being loaded."""
+        """Return the number of requested voxels that were resident or being loaded."""
         return self._accounts.hits
 
     @property
     def misses(self) -> int:
-        """Voxels asked for and not there."""
+        """Return the number of requested voxels that were not resident."""
         return self._accounts.misses
 
     @property
     def evictions(self) -> int:
-        """Voxels that went for others."""
+        """Return the number of voxels evicted to make room for others."""
         return self._room.evictions
 
     def counters(self) -> Counters:
-        """What was done so far."""
+        """Return the statistics of the cache."""
         with self._lock:
             return self._accounts.counters(self._room.evictions, self._room.moved_bytes)
 
     def load_times(self) -> list[float]:
-        """The seconds that the last loads took, in no order."""
+        """Return the durations of the last loads [s], in no particular order."""
         with self._lock:
             return list(self._accounts.times)
 
     def recent(self) -> list[int]:
-        """The index rows of the resident voxels, those that would stay longest at the end."""
+        """Return the index rows of the resident voxels, in order of eviction."""
         with self._lock:
             return [row for row in self.policy.victims() if row not in self._loading]
 
     def is_resident(self, row: int) -> bool:
-        """Whether a voxel is resident or being loaded."""
+        """Return whether a voxel is resident or being loaded."""
         return row in self._room.offsets
 
     def bytes_of(self, rows: Sequence[int]) -> int:
-        """Bytes these voxels take when resident."""
+        """Return the bytes that these voxels take when resident."""
         return sum(self._sizes[row] for row in rows)
 
     def parts_that_fit(self, rows: Sequence[int], budget_bytes: int) -> Iterator[list[int]]:
-        """Cut rows, in their order, into parts that take at most so many bytes, but for a row that alone takes more."""
+        """Split rows, in order, into parts of at most `budget_bytes` or of one larger row."""
         part: list[int] = []
         taken = 0
         for row in rows:
@@ -168,27 +166,27 @@ class Residency:
         if part:
             yield part
 
-    # --- what a request does ------------------------------------------------------------------------------
+    # --- requests -----------------------------------------------------------------------------------------
 
     def hold(
         self, rows: Sequence[int], deadline: float = math.inf, *, scan: bool = False, stop: Stop = NEVER
     ) -> "Hold":
-        """Make the voxels of distinct index rows resident and keep them so inside a `with`, which gives a `Held`.
+        """Load the voxels of distinct index rows and pin them inside a `with` that yields a `Held`.
 
-        Together they must fit the budget. Voxels that cannot be read stay at -1 in `where` and are named in
-        the result's faults; everything else is resident. deadline: on time.perf_counter()'s clock [s]; what is not
-        resident by then is `late`. No load is begun after it, one that has begun is finished.  scan: these are passed
-        by, not stayed with: they had better not take the place of what others stay with (eviction.py).  stop: once it
-        is set the deadline has come.
+        Together they must fit in the budget. Unreadable voxels stay at -1 in `where` and are named
+        in the result's faults; all others are resident. deadline: on time.perf_counter()'s clock
+        [s]; voxels not resident by then are `late`. No load begins after it; one that has begun is
+        finished.  scan: the voxels are used in passing and should not displace those that others
+        use repeatedly (eviction.py).  stop: setting it has the effect of the deadline.
         """
         return Hold(self, rows, deadline, scan, stop)
 
     def still(self) -> AbstractContextManager[bool]:
-        """For a `with` inside which what is resident stays so, and nobody else goes on: for tens of microseconds."""
+        """Return the lock that freezes the resident set; hold it for some tens of microseconds."""
         return self._lock
 
     def use(self, rows: Sequence[int], *, scan: bool = False) -> None:
-        """Count resident voxels as used just now; inside `still`."""
+        """Record a use of resident voxels; call it inside `still`."""
         for row in rows:
             self.policy.used(row, scan=scan)
         self._accounts.found(rows)
@@ -196,7 +194,7 @@ class Residency:
     def acquire(
         self, rows: Sequence[int], deadline: float = math.inf, *, scan: bool = False, stop: Stop = NEVER
     ) -> Held:
-        """Begin a hold; `release` must follow, unless this raises."""
+        """Begin a hold; the caller must call `release` unless this raises."""
         begin = time.perf_counter()
         turn = None if self._have_room(rows) else self._take_turn(deadline, stop)
         try:
@@ -205,12 +203,12 @@ class Residency:
             self._turns.give_back(turn)
 
     def _have_room(self, rows: Sequence[int]) -> bool:
-        """Return whether each of these is resident or being loaded, or has a fault."""
+        """Return whether each row is resident, being loaded or has a fault."""
         offsets = self._room.offsets
         return all(row in offsets or self._fault(row) for row in rows)
 
     def _take_turn(self, deadline: float, stop: Stop) -> LoadTurn | None:
-        """Wait for a turn to load; the request counts as one that waits."""
+        """Wait for a turn to load; `_demands` counts the request meanwhile."""
         with self._changed:
             self._demands += 1
         try:
@@ -221,10 +219,10 @@ class Residency:
                 self._changed.notify_all()
 
     def _acquire(self, rows: Sequence[int], deadline: float, scan: bool, stop: Stop, begin: float) -> Held:
-        """Begin a hold. begin: when it was asked for, on time.perf_counter()'s clock [s]."""
+        """Begin a hold. begin: time of the call of `acquire` on time.perf_counter()'s clock [s]."""
         mine, hits, waits, settled = self._reserve(rows, deadline, scan, stop)
         if settled:
-            return Held(len(rows), 0, ())  # all resident and pinned: nothing can change that
+            return Held(len(rows), 0, ())  # all are resident, and the pins keep them so
         try:
             wanted = mine
             while True:
@@ -253,16 +251,16 @@ class Residency:
             raise
         if late and owed is not None:
             owed()
-        # Where all that is not there has long been known not to be readable, nothing was waited for.
+        # If the only missing voxels have faults known before this call, the request did not wait.
         waited = time.perf_counter() - begin if mine or waits or late else 0.0
         return Held(hits, len(mine), faults, late, waited)
 
     def _there(self, row: int) -> bool:
-        """Whether a voxel is resident and whole."""
+        """Return whether a voxel is resident and completely loaded."""
         return row in self._room.offsets and row not in self._loading
 
     def _settled(self, rows: Sequence[int]) -> bool:
-        """Whether nobody loads any of these, or one was left to be loaded."""
+        """Return whether none of these is being loaded, or a load was left to this caller."""
         loading = [row for row in rows if row in self._loading]
         return not loading or any(row in self._left for row in loading)
 
@@ -275,11 +273,11 @@ class Residency:
     def _reserve(
         self, rows: Sequence[int], deadline: float, scan: bool, stop: Stop
     ) -> tuple[list[int], int, bool, bool]:
-        """Pin all rows and make room for those to be loaded by this caller; none where there is no room in time.
+        """Pin all rows and make room for those that this caller is to load.
 
-        Returns these, how many of the others are resident or being loaded (a voxel with a fault is neither), whether
-        some of them are being loaded, and whether all is there; where not, `_demands` counts this request until it is.
-        Nothing is pinned where this raises.
+        Return the rows to load, none without room before the deadline; how many others are resident
+        or being loaded (a voxel with a fault is neither); whether some are being loaded; and
+        whether all are resident: if not, `_demands` counts this request. No pins if this raises.
         """
         if self.bytes_of(rows) > self.buffer.total_bytes:
             raise ValueError(
@@ -312,7 +310,7 @@ class Residency:
             return mine, len(there), waits, False
 
     def _all_there(self, rows: Sequence[int]) -> bool:
-        """Whether none of these, all of which have room or a fault, has a fault or is being loaded."""
+        """Return whether all rows are resident. Each must have allocated bytes or a fault."""
         if self._loading and not self._loading.isdisjoint(rows):
             return False
         return not (self._faults or self._passing) or not any(map(self._fault, rows))
@@ -320,9 +318,10 @@ class Residency:
     def _make_room(
         self, rows: Sequence[int], mine: list[int], deadline: float, scan: bool, stop: Stop
     ) -> list[int]:
-        """Room for `mine`, of `rows` that are pinned by this caller; returns those it is to load. It may wait.
+        """Make room for the rows `mine` among `rows`, which this caller has pinned; wait if needed.
 
-        None of them where the deadline comes before there is room. The rows are not pinned where this raises.
+        Return the rows to load, none if the deadline comes before there is room. If this raises,
+        the rows are no longer pinned.
         """
         while True:
             try:
@@ -335,7 +334,8 @@ class Residency:
             if self._pins or self._loading:
                 roomy = self._wait(deadline, stop)
             else:
-                # Nobody else holds anything, and yet the room is in pieces between our own voxels.
+                # No other request holds anything, but the free runs lie between this caller's
+                # voxels.
                 self._room.leave_only(set(rows), self._accounts.evicted)
                 roomy = True
             self._pin(rows)
@@ -344,7 +344,7 @@ class Residency:
                 return []
 
     def _wait(self, deadline: float, stop: Stop) -> bool:
-        """Wait until another thread has changed something; return False when the time is up or the stop is set."""
+        """Wait until another thread changes the state; return False at the deadline or on stop."""
         while (left := seconds_to(deadline, stop)) != 0:
             if self._changed.wait(left):
                 break
@@ -355,7 +355,7 @@ class Residency:
             self._pins[row] = self._pins.get(row, 0) + 1
 
     def _allocate_all(self, rows: list[int], scan: bool) -> bool:
-        """Make room for every row; all or nothing. What users stand in goes last."""
+        """Make room for every row, or for none. Voxels at users' positions are evicted last."""
         done = 0
         try:
             for row in rows:
@@ -369,7 +369,6 @@ class Residency:
         return done == len(rows)
 
     def _make_one(self, row: int, scan: bool) -> bool:
-        """Make room for a row that is asked for."""
         evicted = self._accounts.evicted
         return any(
             self._room.make(row, may_go, self._free, evicted, scan=scan)
@@ -377,11 +376,11 @@ class Residency:
         )
 
     def _free(self, row: int) -> bool:
-        """Whether nobody uses or loads a voxel."""
+        """Return whether no thread uses or loads a voxel."""
         return row not in self._pins and row not in self._loading
 
     def _idle(self, row: int) -> bool:
-        """Whether also no user stands in it."""
+        """Return whether a voxel is free and not at a user's position."""
         return row not in self._pins and row not in self._loading and row not in self.kept
 
     def _unpin(self, rows: Sequence[int]) -> None:
@@ -394,7 +393,7 @@ class Residency:
                     self._drop_left(row)
 
     def _drop_left(self, row: int) -> None:
-        """Give back the room of a voxel whose load never began."""
+        """Release the bytes of a voxel whose load never began."""
         self._left.discard(row)
         self._loading.discard(row)
         self._room.forget(row)
@@ -402,22 +401,22 @@ class Residency:
             self.owed()
 
     def _leave(self, rows: list[int]) -> None:
-        """Leave loads that have not begun to whoever else holds these rows."""
+        """Leave loads that have not begun to the other requests that hold these rows."""
         with self._changed:
             for row in rows:
                 self._left.add(row)
-                if self._pins[row] == 1:  # nobody but the caller
+                if self._pins[row] == 1:  # only the caller holds it
                     self._drop_left(row)
             self._changed.notify_all()
 
     def _fault(self, row: int) -> str:
-        """Why a voxel cannot be read, or ""."""
+        """Return why a voxel cannot be read; "" if it has no fault."""
         return self._faults.get(row, "") or self._passing.get(row, "")
 
     # --- loads --------------------------------------------------------------------------------------------
 
     def _load(self, rows: list[int], deadline: float, stop: Stop) -> None:
-        """Load what this caller reserved; every row leaves `_loading`, loaded or with a fault, or is left to others."""
+        """Load reserved rows: each leaves `_loading`, loaded or faulty, or is left to others."""
         for number, row in enumerate(rows):
             if seconds_to(deadline, stop) == 0:
                 self._leave(rows[number:])
@@ -432,14 +431,14 @@ class Residency:
                 raise
 
     def _load_one(self, row: int) -> bool:
-        """Load a voxel that room was made for; whether it is there then."""
+        """Load a voxel whose bytes are allocated; return whether it is resident then."""
         begin, where, fault, corrupt = time.perf_counter(), None, "", False
         try:
             where = self._store.load(row, self.buffer.arena, self._room.offsets[row])
             if self.proved is not None:
                 self.proved(row)
             if self.loaded is not None:
-                self.loaded(row, where)  # now, for it may go as soon as others know of it
+                self.loaded(row, where)  # now: it may be evicted once it is visible to others
         except CorruptError as error:
             fault, corrupt = str(error), True
             self.misled |= isinstance(error, MisleadingIndexError)
@@ -463,7 +462,7 @@ class Residency:
         return where is not None
 
     def _fail(self, row: int, fault: str, *, corrupt: bool = False) -> None:
-        """A load ended without a voxel. Who holds it is told; nobody else, unless it will always be so."""
+        """Record a failed load: permanently if `corrupt`, else for requests that hold the row."""
         self._accounts.lost(row)
         self._room.forget(row)
         self._loading.discard(row)
@@ -473,10 +472,10 @@ class Residency:
             self._passing[row] = f"{self._store.archive.where(row)}: {fault}"
 
     def take_owed(self) -> int | None:
-        """A voxel whose load is owed, the longest first; None where none is."""
+        """Return the voxel whose load has been owed longest; None if no load is owed."""
         with self._lock:
             for row in list(self._owed):
-                if row in self._left:  # whoever still waits for it may load it; dropped, it is owed again
+                if row in self._left:  # a waiting request may load it; if none does, it is owed again
                     continue
                 del self._owed[row]
                 if row not in self._room.offsets and not self._fault(row):
@@ -484,16 +483,16 @@ class Residency:
         return None
 
     def wait_for_nobody(self) -> None:
-        """Wait until no request waits for anything."""
+        """Wait until no request waits for voxels."""
         with self._changed:
             while self._demands:
                 self._changed.wait()
 
     def load_ahead(self, row: int, may_go: Callable[[int], bool], *, owed: bool = False) -> Ahead:
-        """Load a voxel that nobody waits for, once no request waits for anything; one that is owed at once.
+        """Load a voxel that no request waits for; unless it is owed, once no request waits at all.
 
-        may_go: whether a resident voxel may go for it, besides that nobody uses it or stands in it.  owed: somebody has
-        asked for it. Raises what a load raises that is no fault of the record.
+        may_go: whether a voxel, neither used nor at a user's position, may be evicted for it.
+        owed: whether a request asked for it. Raise load errors that are no faults of the record.
         """
         with self._changed:
             if not owed:
@@ -511,7 +510,7 @@ class Residency:
         return Ahead.THERE if self._load_one(row) else Ahead.FAILED
 
     def check(self) -> None:
-        """Assert what must always hold: bytes add up, runs neither overlap nor leave the buffer."""
+        """Assert the invariants: bytes add up, and runs neither overlap nor leave the buffer."""
         with self._changed:
             self._room.check()
             offsets = set(self._room.offsets)

@@ -1,4 +1,4 @@
-"""Index row -> decoded voxel, written into the arena. Safe to call from several threads."""
+"""Decoder that writes the voxel of an index row into the arena. Thread-safe."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -22,10 +22,10 @@ from ..kernels.core.voxel_layout import (
 
 
 class Store:
-    """An archive's voxels by index row.
+    """Voxels of an archive by index row.
 
-    archive: see schemas/archive/archive.py.  sizes: (v,) int64, bytes of each voxel once decoded.
-    with_normals: whether those include normals.
+    archive: see schemas/archive/archive.py.  sizes: (v,) int64, bytes of each decoded voxel.
+    with_normals: whether the decoded voxels include normals.
     """
 
     def __init__(
@@ -34,9 +34,10 @@ class Store:
         open_archive: Callable[[str | Path], Archive] = Archive,
         normals: float | None = None,
     ) -> None:
-        """Open the archive in `folder`; open_archive: how. Raises FormatError or CorruptError.
+        """Open the archive in `folder` with `open_archive`. Raise FormatError or CorruptError.
 
-        normals: the reach of those that will be asked for [m]; where the archive has them, they are loaded too.
+        normals: reach of the normals that queries will need [m]. They are loaded with the voxels if
+        the archive contains normals of this reach.
         """
         self.archive = open_archive(folder)
         rows, header = self.archive.voxels, self.archive.header
@@ -53,14 +54,18 @@ class Store:
     def load(self, row: int, arena: Arena, offset: int) -> NDArray[np.int64]:
         """Read, check and lay out the voxel of index row `row` at byte `offset` of the arena.
 
-        Returns where its runs are (3,) int64, see voxel_layout.py. Raises CorruptError, OSError.
+        Return the offsets of its runs (3,) int64, see voxel_layout.py. Raise CorruptError or
+        OSError.
         """
         return self.decode(row, self.archive.read_frames(row), arena, offset)
 
     def decode(
         self, row: int, frames: tuple[bytes, bytes, bytes], arena: Arena, offset: int
     ) -> NDArray[np.int64]:
-        """`load` from the frames already read (`Archive.read_frames`), for the benchmark to time alone."""
+        """Lay out a voxel like `load`, from frames already read with `Archive.read_frames`.
+
+        Separate so that the benchmark can time it.
+        """
         record = self.archive.open_voxel(row, frames, self._columns)
         leaves = record.leaves
         where = np.empty(3, np.int64)
@@ -91,5 +96,5 @@ class Store:
         self.archive.close()
 
 
-# Opens the archive in a folder.
+# Function that opens the archive in a folder.
 OpenStore = Callable[[str | Path], Store]

@@ -179,7 +179,7 @@ def goal_rows(parts: Iterable[Part], notes: dict[str, str]) -> list[dict[str, An
 def show(parts: list[Part], notes: dict[str, str], section: str = "Speed") -> None:
     """Print figures, targets with their notes, wrong verdicts and missing measurements.
 
-    section: of the README.
+    section: of scripts/FIGURES.md.
     """
     console = Console(width=150)
     for part in parts:

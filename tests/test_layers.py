@@ -138,7 +138,7 @@ LONG = {
     "server/kernels/motion/sweep_advance.py": 436,
     "server/kernels/nearest/best_first_search.py": 414,
     "server/kernels/overlap/overlap.py": 475,
-    "server/residency/voxel_cache.py": 523,
+    "server/residency/voxel_cache.py": 522,
     "server/scene.py": 458,
     "server/scenes/placed_archives.py": 413,
     "server/service/request_lanes.py": 401,

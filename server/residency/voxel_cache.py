@@ -27,7 +27,7 @@ from .arena import ArenaBuffer
 from .cache_stats import Accounts
 from .eviction import Policy, make_policy
 from .held import Ahead, Held
-from .load_turns import LoadTurn, LoadTurns
+from .load_turns import LOADS_WITHOUT_TURN, LoadTurn, LoadTurns
 from .voxel_store import Store
 
 # Voxels examined to find room for a prefetched one.
@@ -196,16 +196,16 @@ class Residency:
     ) -> Held:
         """Begin a hold; the caller must call `release` unless this raises."""
         begin = time.perf_counter()
-        turn = None if self._have_room(rows) else self._take_turn(deadline, stop)
+        turn = self._take_turn(deadline, stop) if self._missing(rows) > LOADS_WITHOUT_TURN else None
         try:
             return self._acquire(rows, deadline, scan, stop, begin)
         finally:
             self._turns.give_back(turn)
 
-    def _have_room(self, rows: Sequence[int]) -> bool:
-        """Return whether each row is resident, being loaded or has a fault."""
+    def _missing(self, rows: Sequence[int]) -> int:
+        """Return how many rows are neither resident nor being loaded, and have no fault."""
         offsets = self._room.offsets
-        return all(row in offsets or self._fault(row) for row in rows)
+        return sum(row not in offsets and not self._fault(row) for row in rows)
 
     def _take_turn(self, deadline: float, stop: Stop) -> LoadTurn | None:
         """Wait for a turn to load; `_demands` counts the request meanwhile."""

@@ -17,6 +17,7 @@ from solidcloud.schemas.wire.requests import QuestionOptions
 from solidcloud.server.kernels.core.voxel_layout import Arena
 from solidcloud.server.residency.eviction import POLICIES
 from solidcloud.server.residency.held import Held
+from solidcloud.server.residency.load_turns import LOADS_WITHOUT_TURN
 from solidcloud.server.residency.voxel_cache import Residency
 from solidcloud.server.runtime.stop_flag import NEVER
 from solidcloud.server.scene import Scene
@@ -316,7 +317,8 @@ def test_a_load_that_two_could_not_wait_for_is_owed_until_it_is_done() -> None:
     residency.check()
 
 
-def test_a_disk_that_is_stuck_keeps_no_other_request_waiting() -> None:
+def test_a_disk_that_is_stuck_keeps_no_other_request_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("solidcloud.server.residency.voxel_cache.LOADS_WITHOUT_TURN", 0)
     store, go = FakeStore([1, 1, 1]), threading.Event()
     residency, load = Residency(store, 3 * BLOCK), store.load
 
@@ -335,11 +337,18 @@ def test_a_disk_that_is_stuck_keeps_no_other_request_waiting() -> None:
     residency.check()
 
 
-def test_a_resident_voxel_needs_no_turn(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_who_misses_few_voxels_needs_no_turn(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("solidcloud.server.residency.load_turns.MAX_TURN_SECONDS", 60.0)
-    residency = Residency(FakeStore([1, 1]), 2 * BLOCK)
-    take(residency, [0])
+    store = FakeStore([1] * 20)
+    residency = Residency(store, 20 * BLOCK)
     turn = residency._turns.take(math.inf, NEVER)
-    assert take(residency, [0]) == Held(1, 0, ())
-    residency._turns.give_back(turn)
-    assert take(residency, [0, 1]).misses == 1
+    assert take(residency, list(range(LOADS_WITHOUT_TURN))) == Held(0, LOADS_WITHOUT_TURN, ())
+    assert take(residency, list(range(LOADS_WITHOUT_TURN))) == Held(LOADS_WITHOUT_TURN, 0, ())
+    with ThreadPoolExecutor(1) as pool:
+        many = pool.submit(take, residency, list(range(LOADS_WITHOUT_TURN, 20)))
+        while not residency._turns._queue:
+            assert not many.done()
+        assert set(store.loads) == set(range(LOADS_WITHOUT_TURN))
+        residency._turns.give_back(turn)
+        assert many.result(DEADLINE).misses == 20 - LOADS_WITHOUT_TURN
+    residency.check()

@@ -1,7 +1,8 @@
-"""Frames: the wishes of users on their way to a simulation, and their states on the way back. No zenoh here.
+"""Mailboxes of motion commands, and the thread that simulates frames. Independent of zenoh.
 
-A mailbox for each user holds its latest wish; a thread empties all of them, has one frame simulated, and publishes what
-came of it. It waits while nobody wishes, so that frames come at most as fast as wishes do.
+A mailbox for each user holds its latest motion command (`Wish` on the wire). A thread empties all
+mailboxes, has one frame simulated and publishes the resulting states. It waits while there are no
+motion commands, so frames come at most as fast as motion commands do.
 """
 
 import logging
@@ -23,19 +24,22 @@ from ..served.served_scene import Answer, Outcome, Simulates, Turn
 
 log = logging.getLogger(__name__)
 
-# Mailboxes for each user that a scene has room for: who comes when it is full is told so, frame by frame.
+# Mailboxes for each user that a scene has room for: a user beyond its capacity receives an error in
+# each frame.
 _BOXES_A_USER = 2
-# How often the thread that ends long frames looks [s].
+# Interval at which the watchdog checks for long frames [s].
 _LOOK_SECONDS = 0.05
 _STOPS = "the server stops"
-# Of a wish: 2,048 objects take less as MessagePack. What is more is not read, and comes into no log.
+# Largest motion command: 2,048 objects take less as MessagePack. A larger one is neither read nor
+# logged.
 _MOST_BYTES = 512 << 10
 
 
 class Post(NamedTuple):
-    """What was taken out of mailboxes. left, gone: users and clients that leave, before the turns.
+    """Contents taken out of the mailboxes.
 
-    encodings: of each turn's wish, which its state is to have.
+    left, gone: users and clients that leave; handled before the turns.
+    encodings: encoding of each turn's motion command, also used for its state.
     """
 
     left: list[User]
@@ -45,7 +49,11 @@ class Post(NamedTuple):
 
 
 class _Box:
-    """One user's mailbox. seq: of the latest wish ever.  late: wishes dropped.  wish: the one that waits."""
+    """Mailbox of one user.
+
+    seq: number of the latest motion command received.  late: number of dropped motion commands.
+    wish: the motion command that waits.
+    """
 
     __slots__ = ("encoding", "late", "seq", "wish")
 
@@ -56,36 +64,38 @@ class _Box:
 
 
 class Mailboxes:
-    """The latest wish of each user. Thread-safe; bounded, and so is the share of each turn."""
+    """Latest motion command of each user. Thread-safe; bounded in total and for each turn."""
 
     def __init__(self, most: int, turn: Callable[[str], str] = str) -> None:
-        """most: mailboxes, at a time.
+        """Make an empty set of mailboxes.
 
+        most: mailboxes at a time.
         turn: returns the turn of a client (liveliness_tokens.py); by default each has its own.
         """
         self._most, self._turn = most, turn
         self._boxes: dict[User, _Box] = {}
-        self._waiting: dict[User, None] = {}  # with a wish, in the order they came
-        self._left: dict[User, None] = {}  # each once, however often it says so
+        self._waiting: dict[User, None] = {}  # users with a motion command, in order of arrival
+        self._left: dict[User, None] = {}  # users that leave, each once
         self._gone: dict[str, None] = {}
         self._closed = False
         self._changed = threading.Condition()
 
     def put(self, user: User, wish: Wish, encoding: str = MSGPACK) -> bool:
-        """Take a wish in: it replaces one that waits. One that is older than the latest is dropped, and counted.
+        """Store a motion command, replacing one that waits; drop and count an outdated one.
 
-        Return whether it is the latest one once more. Raise BusyError where there is no room for one more user.
+        Return whether it repeats the latest one. Raise BusyError if there is no room for another
+        user.
         """
         with self._changed:
             box = self._boxes.get(user)
             if box is None:
-                # One turn may take half of the room, so that there is always some for another.
+                # One turn may take half of the mailboxes, so that some are always left for others.
                 turn = self._turn(user.client)
                 own = sum(self._turn(other.client) == turn for other in self._boxes)
                 if len(self._boxes) >= self._most or own >= max(1, self._most // 2):
                     raise BusyError(
-                        f"{len(self._boxes)} users wish to walk this scene, {own} of this client (all clients without "
-                        "a liveliness token count as one): come again later"
+                        f"{len(self._boxes)} users move in this scene, {own} of this client (all clients without "
+                        "a liveliness token count as one): try again later"
                     )
                 box = self._boxes[user] = _Box()
             if wish.seq == box.seq:
@@ -101,7 +111,7 @@ class Mailboxes:
             return False
 
     def leave(self, user: User) -> None:
-        """A user leaves; what it wished before is dropped. Who has no mailbox is not there."""
+        """Have a user leave; drop its waiting motion command. Ignore a user without a mailbox."""
         with self._changed:
             if user not in self._boxes:
                 return
@@ -110,14 +120,14 @@ class Mailboxes:
             self._changed.notify()
 
     def leave_client(self, client: str) -> None:
-        """All users of a client leave."""
+        """Have all users of a client leave."""
         with self._changed:
             self._forget([user for user in self._boxes if user.client == client])
             self._gone[client] = None
             self._changed.notify()
 
     def keep(self, users: Iterable[User]) -> None:
-        """Forget all other users but those whose wishes wait."""
+        """Remove the mailboxes of all users but these and those whose motion commands wait."""
         with self._changed:
             kept = {*users, *self._waiting}
             self._forget([user for user in self._boxes if user not in kept])
@@ -128,7 +138,7 @@ class Mailboxes:
             self._waiting.pop(user, None)
 
     def take(self) -> Post | None:
-        """All that waits, waiting for some of it; None: closed, and nothing is left."""
+        """Wait until a mailbox has contents and take all; return None once closed and empty."""
         with self._changed:
             while not (self._waiting or self._left or self._gone or self._closed):
                 self._changed.wait()
@@ -137,7 +147,7 @@ class Mailboxes:
             post = Post(list(self._left), list(self._gone), [], [])
             for user in self._waiting:
                 box = self._boxes[user]
-                assert box.wish is not None, "only boxes with a wish wait"
+                assert box.wish is not None, "only mailboxes with a motion command wait"
                 post.turns.append(Turn(user, box.wish, box.late))
                 post.encodings.append(box.encoding)
                 box.wish = None
@@ -145,19 +155,19 @@ class Mailboxes:
             return post
 
     def close(self) -> None:
-        """Take no more in; what waits is still taken."""
+        """Mark the mailboxes as closed; `take` still returns what waits."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
 
     def __len__(self) -> int:
-        """Mailboxes there are."""
+        """Return the number of mailboxes."""
         with self._changed:
             return len(self._boxes)
 
 
 class Frames:
-    """The sessions of one scene: wishes as bytes in, states as bytes out. No method raises."""
+    """Sessions of one scene: encoded motion commands in, encoded states out. No method raises."""
 
     def __init__(
         self,
@@ -168,18 +178,19 @@ class Frames:
     ) -> None:
         """Make mailboxes for the users of a simulation.
 
-        publish: sends a user's state, or why there is none; must not block.  max_seconds: what one frame of all users
-        may take; users that it did not come to by then stay where they were.  turn: as in `Mailboxes`.
+        publish: sends a user's state, or the reason why there is none; must not block.
+        max_seconds: time limit of one frame of all users; users not yet simulated by then keep
+        their poses.  turn: as in `Mailboxes`.
         """
         self._simulation, self._publish, self._max_seconds = simulation, publish, max_seconds
-        self._at_work: tuple[float, Stop] | None = None  # since when, and what ends it
+        self._at_work: tuple[float, Stop] | None = None  # start and stop flag of the running frame
         self._watchdog = Watchdog(self._look, period=_LOOK_SECONDS)
         self.most_users = simulation.most_users
         self._boxes = Mailboxes(_BOXES_A_USER * simulation.most_users, turn)
         self._given_up = False
 
     def wish(self, user: User, payload: bytes, encoding: str | None) -> bool:
-        """Take a wish in, or refuse it at once. Return whether it is the user's latest one once more."""
+        """Store a motion command or refuse it; return whether it repeats the user's latest one."""
         try:
             if not self.fits(user, len(payload), encoding):
                 return False
@@ -190,34 +201,36 @@ class Frames:
             return False
 
     def fits(self, user: User, size: int, encoding: str | None) -> bool:
-        """Return whether a wish of so many bytes is taken; refuse it otherwise."""
+        """Return whether a motion command of `size` bytes is accepted; refuse it otherwise."""
         if size > _MOST_BYTES:
-            self._send(user, TooLargeError(f"a wish of {size} bytes: at most {_MOST_BYTES}"), encoding)
+            self._send(
+                user, TooLargeError(f"motion command of {size} bytes: at most {_MOST_BYTES}"), encoding
+            )
         return size <= _MOST_BYTES
 
     def leave(self, user: User) -> None:
-        """A user leaves the scene."""
+        """Have a user leave the scene."""
         self._boxes.leave(user)
 
     def client_gone(self, client: str) -> None:
-        """All users of a client leave the scene."""
+        """Have all users of a client leave the scene."""
         self._boxes.leave_client(client)
 
     def run(self) -> None:
-        """Simulate frames until `close`. A thread's work."""
+        """Simulate frames until `close`. Runs in a thread."""
         watching = start_thread("frames-watchdog", self._watchdog.run)
         try:
             while (post := self._boxes.take()) is not None:
                 try:
                     self._frame(post)
-                except Exception:  # of this frame alone
-                    log.exception("a frame of %d users", len(post.turns))
+                except Exception:  # affects this frame only
+                    log.exception("a frame of %d users failed", len(post.turns))
         finally:
             self._watchdog.close()
             watching.join()
 
     def _look(self, now: float) -> bool:
-        """Stop a frame that has taken too long; return whether there is one at work."""
+        """Stop a frame that has taken too long; return whether a frame is running."""
         if (at_work := self._at_work) is None:
             return False
         begun, stop = at_work
@@ -226,7 +239,7 @@ class Frames:
         return True
 
     def _frame(self, post: Post) -> None:
-        """One frame, and what is said of it."""
+        """Simulate one frame and publish its states."""
         for user in post.left:
             self._simulation.end(user)
         for client in post.gone:
@@ -240,10 +253,10 @@ class Frames:
             self._boxes.keep(users)
 
     def _step(self, turns: list[Turn]) -> list[Outcome]:
-        """Simulate one frame, which the watchdog ends if it takes too long."""
+        """Simulate one frame; the watchdog stops it if it takes too long."""
         stop, now = Stop(), time.monotonic()
         self._at_work = now, stop
-        if self._given_up:  # read after the flag is there for `give_up` to set
+        if self._given_up:  # read after `_at_work` is set, so that `give_up` finds the flag
             stop.set(_STOPS)
         if self._watchdog.asleep:
             self._watchdog.wake()
@@ -255,7 +268,7 @@ class Frames:
     def _send(
         self, user: User, said: State | SolidcloudError, encoding: str | None, about: bytes = b""
     ) -> None:
-        """Publish what is said to a user; what cannot be sent is logged, for nobody waits for it.
+        """Publish a state or an error to a user; log a failure, because no caller waits for it.
 
         about: as in `Answer`.
         """
@@ -270,19 +283,19 @@ class Frames:
             else:
                 self._publish(user, Answer(encode(said, stated), stated, True, about))
         except Exception:
-            log.exception("the state of %s of client %s", user.avatar, user.client)
+            log.exception("cannot send the state of %s of client %s", user.avatar, user.client)
 
     def close(self) -> None:
-        """End `run` once what came is done; a frame that is at work is ended early."""
+        """End `run` after the motion commands received so far; stop a running frame early."""
         self._boxes.close()
         self._stop_frame()
 
     def give_up(self) -> None:
-        """End the frame at work early, and each one after it."""
+        """Stop the running frame early, and each one after it."""
         self._given_up = True
         self._stop_frame()
 
     def _stop_frame(self) -> None:
-        """End the frame at work early, if there is one."""
+        """Stop the running frame early, if there is one."""
         if (at_work := self._at_work) is not None:
             at_work[1].set(_STOPS)

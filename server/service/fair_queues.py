@@ -1,7 +1,8 @@
-"""The order in which requests are answered: one of each client at a time, the clients in turn. No zenoh here.
+"""Fair queues of requests: one request of each client at a time, clients round-robin. No zenoh.
 
-A request is *quick* until it has been at work for longer than its watcher allows, or is *slow* from the start. Quick
-requests share the workers. Slow ones keep their client's turn but hold no worker; their number is bounded too.
+A request is *quick* until it has been running for longer than its watchdog allows, or *slow* from
+the start. Quick requests share the workers. Slow ones keep their client's turn but hold no worker;
+their number is bounded too.
 """
 
 import threading
@@ -11,7 +12,7 @@ from typing import Any, NamedTuple
 
 
 class Offer(Enum):
-    """What becomes of a request that was offered."""
+    """Outcome of offering a request."""
 
     RUN = "run it now"
     START = "run it now, in a thread of its own: it is slow"
@@ -21,7 +22,7 @@ class Offer(Enum):
 
 
 class State(Enum):
-    """Where an accepted request is."""
+    """State of an accepted request."""
 
     WAITING = "in its turn's queue"
     WORKING = "holds a worker and its turn"
@@ -32,12 +33,15 @@ class State(Enum):
 
 
 class Bounds(NamedTuple):
-    """The bounds of the queues.
+    """Bounds of the queues.
 
-    workers: quick requests at work.  slow: slow requests at work.  waits: requests that hold no worker because they
-    wait, for their client to take the reply for instance.  requests, size: requests accepted and not yet answered, and
-    their bytes.  by_turn: requests of one turn.  first: bytes that a turn's only request may have to be accepted
-    always, so that nobody can keep a newcomer out.
+    workers: running quick requests.  slow: running slow requests.
+    waits: requests that hold no worker because they wait, for example for their client to accept
+    the reply.
+    requests, size: requests accepted and not yet answered, and their bytes.
+    by_turn: requests of one turn.
+    first: a turn's only request is always accepted up to this size [bytes], so that no client can
+    lock out a new one.
     """
 
     workers: int
@@ -52,9 +56,11 @@ class Bounds(NamedTuple):
 class Ticket:
     """One request in the queues.
 
-    client: whose it is.  turn: which turn it takes, by default its client's.  size: its bytes.  slow: whether it needs
-    a slow place to run.  request: anything; the queues do not look at it.  left: whether the request has given up its
-    worker; whoever carries it out must then not take another one.
+    client: the client that sent it.  turn: the turn it takes, by default its client's.
+    size: its bytes.  slow: whether it needs a slow place to run.
+    request: any object; the queues do not use it.
+    left: whether the request has given up its worker; the thread that runs it must then not start
+    another request.
     """
 
     __slots__ = ("client", "left", "request", "size", "slow", "state", "turn")
@@ -62,18 +68,18 @@ class Ticket:
     def __init__(
         self, client: str, request: Any, size: int, *, turn: str | None = None, slow: bool = False
     ) -> None:
-        """Make a ticket that is not offered yet."""
+        """Make a ticket that has not been offered."""
         self.client, self.request, self.size, self.slow = client, request, size, slow
         self.turn = client if turn is None else turn
         self.state, self.left = State.WAITING, False
 
     def __repr__(self) -> str:
-        """Return the ticket as text, for messages of tests."""
+        """Return the ticket as text, for test messages."""
         return f"Ticket({self.client!r}, {self.request!r}, {self.state.name})"
 
 
 class _Turn:
-    """The requests that take turns as one. busy: whether one of them is at work.  count: of all in flight."""
+    """Requests of one turn. busy: whether one of them is running.  count: requests in flight."""
 
     __slots__ = ("busy", "count", "waiting")
 
@@ -83,15 +89,15 @@ class _Turn:
 
 
 class FairQueues:
-    """A queue for each turn: one request of each at work, the turns in order, the whole bounded. Thread-safe.
+    """Bounded queues, one a turn, served round-robin with one running request each. Thread-safe.
 
-    A turn is a client's own, or shared by several clients. The requests of one client stay in order: while it has
-    requests in flight, new ones take the same turn. The caller bounds the number of turns: a small request of a turn
-    that has nothing in flight is always accepted.
+    A turn belongs to one client, or is shared by several clients. The requests of one client stay
+    in order: while it has requests in flight, new ones take the same turn. The caller bounds the
+    number of turns: a small request of a turn that has nothing in flight is always accepted.
 
-    Methods that make room return the tickets to be started. Each of them, and each that was offered with RUN or START,
-    is followed by one call of `finished`, or of `put_back`, or of `detach` and later `release`. So nothing that waits
-    is forgotten.
+    Methods that free a place return the tickets to start. For each of them, and for each offer
+    answered with RUN or START, the caller must call `finished` or `put_back` once, or `detach` and
+    later `release`. This guarantees that every waiting request is started.
     """
 
     def __init__(self, bounds: Bounds) -> None:
@@ -100,13 +106,13 @@ class FairQueues:
         self._lock = threading.Lock()
         self._turns: dict[str, _Turn] = {}
         self._clients: dict[str, tuple[str, int]] = {}  # client: its turn, its requests in flight
-        # Turns with something waiting and nothing at work, by what the first one needs.
+        # Turns with waiting requests and none running, by whether the first one needs a slow place.
         self._ready: dict[bool, deque[str]] = {False: deque(), True: deque()}
         self._at_work = dict.fromkeys((State.WORKING, State.SLOW, State.WAITS), 0)
         self._requests = self._bytes = 0
 
     def offer(self, ticket: Ticket, *, always: bool = False) -> Offer:
-        """Accept or refuse a request. always: accept it even where a bound is reached."""
+        """Accept or refuse a request. always: accept it even if a bound is reached."""
         with self._lock:
             ticket.turn, own = self._clients.get(ticket.client, (ticket.turn, 0))
             turn = self._turns.get(ticket.turn)
@@ -130,17 +136,16 @@ class FairQueues:
             return Offer.WAIT
 
     def finished(self, ticket: Ticket) -> list[Ticket]:
-        """End a request that is at work. Returns the tickets to be started."""
+        """End a running request; return the tickets to start."""
         with self._lock:
             self._leave(ticket, State.DONE)
             self._forget(ticket)
             return self._start_waiting()
 
     def put_back(self, ticket: Ticket) -> list[Ticket]:
-        """Put a request at work back, as a slow one under a new ticket, before all others of its turn.
+        """Requeue a running request as slow, with a new ticket, before all others of its turn.
 
-        The old ticket is over: nothing takes its place any more, and its `left` stays as it is. Returns the tickets to
-        be started.
+        The old ticket has ended and its `left` stays as it is. Return the tickets to start.
         """
         again = Ticket(ticket.client, ticket.request, ticket.size, turn=ticket.turn, slow=True)
         with self._lock:
@@ -150,9 +155,10 @@ class FairQueues:
             return self._start_waiting()
 
     def slow(self, ticket: Ticket) -> list[Ticket] | None:
-        """Have a request that has been computing for long hold a slow place, and no worker; it keeps its turn.
+        """Move a request that has been computing for long to a slow place; it keeps its turn.
 
-        Returns the tickets to be started; None: it has one, or is not at work, or all slow places are taken.
+        Return the tickets to start; None if it has a slow place, does not run, or all slow places
+        are taken.
         """
         with self._lock:
             held = ticket.state in (State.WORKING, State.WAITS)
@@ -162,9 +168,9 @@ class FairQueues:
             return self._start_waiting()
 
     def waits(self, ticket: Ticket) -> list[Ticket] | None:
-        """Take the worker, or the slow place, of a request that only waits; it keeps its turn.
+        """Free the worker or slow place of a request that only waits; it keeps its turn.
 
-        Returns the tickets to be started; None: it holds neither, or too many requests wait like this.
+        Return the tickets to start; None if it holds neither, or too many requests wait like this.
         """
         with self._lock:
             held = ticket.state in (State.WORKING, State.SLOW)
@@ -174,7 +180,7 @@ class FairQueues:
             return self._start_waiting()
 
     def detach(self, ticket: Ticket) -> list[Ticket]:
-        """Take worker and turn of a request that goes on by itself. Returns the tickets to be started."""
+        """Free worker and turn of a request that continues alone; return the tickets to start."""
         with self._lock:
             self._leave(ticket, State.DETACHED)
             return self._start_waiting()
@@ -186,9 +192,10 @@ class FairQueues:
             self._forget(ticket)
 
     def drop(self, client: str) -> tuple[list[Ticket], list[Ticket]]:
-        """Forget the waiting requests of a client.
+        """Remove the waiting requests of a client.
 
-        Returns them, and the tickets to be started: those of others of its turn may have waited behind them.
+        Return them, and the tickets to start: requests of other clients of its turn may have waited
+        behind them.
         """
         with self._lock:
             if client not in self._clients:
@@ -214,26 +221,26 @@ class FairQueues:
             return self._requests
 
     def _has_place(self, slow: bool) -> bool:
-        """Return whether one more request may be at work."""
+        """Return whether one more request may run."""
         if slow:
             return self._at_work[State.SLOW] < self._bounds.slow
         return self._at_work[State.WORKING] < self._bounds.workers
 
     def _begin(self, ticket: Ticket, turn: _Turn) -> None:
-        """Put a request to work."""
+        """Start a request."""
         ticket.state = State.SLOW if ticket.slow else State.WORKING
         ticket.left = ticket.slow
         turn.busy = True
         self._at_work[ticket.state] += 1
 
     def _move(self, ticket: Ticket, state: State) -> None:
-        """Have a request hold another place than a worker."""
+        """Move a running request from its place to another one."""
         self._at_work[ticket.state] -= 1
         self._at_work[state] += 1
         ticket.state, ticket.left = state, True
 
     def _leave(self, ticket: Ticket, state: State, *, ready: bool = True) -> None:
-        """Take what a request at work holds. ready: let the next one of its turn begin."""
+        """Free the place of a running request. ready: let the next one of its turn begin."""
         self._at_work[ticket.state] -= 1
         ticket.state = state
         turn = self._turns[ticket.turn]
@@ -242,7 +249,7 @@ class FairQueues:
             self._ready[turn.waiting[0].slow].append(ticket.turn)
 
     def _forget(self, ticket: Ticket) -> None:
-        """Count a request no longer."""
+        """Remove a request from the counts."""
         self._requests -= 1
         self._bytes -= ticket.size
         turn = self._turns[ticket.turn]
@@ -256,7 +263,7 @@ class FairQueues:
             self._clients[ticket.client] = name, own - 1
 
     def _start_waiting(self) -> list[Ticket]:
-        """Put waiting requests to work while there are places."""
+        """Start waiting requests while places are free."""
         started: list[Ticket] = []
         for slow, ready in self._ready.items():
             while ready and self._has_place(slow):

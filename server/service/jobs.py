@@ -1,4 +1,4 @@
-"""A query on its way, and what one thread does with it at present. No zenoh here."""
+"""Requests read from the wire, and the jobs of threads that carry them out. Without zenoh."""
 
 import math
 import threading
@@ -14,18 +14,21 @@ from ..runtime.watchdog import cpu_seconds
 from ..served.served_scene import Answer
 from .fair_queues import Ticket
 
-# How long a request may hold a worker [s], and compute before it is slow. More than nearly all take, and what
-# others may have to wait for it.
+# How long a request may hold a worker, and how long it may compute before it is slow [s]. Nearly
+# all requests take less, and others wait at most this long for a slow one.
 SLOW_SECONDS = 0.01
-# Payloads that are slow for sure [bytes]: building an avatar of 5,000 points takes 20 ms, reading JSON 50 ns a byte.
+# Payloads from this size on are slow [bytes]: building an avatar of 5,000 points takes 20 ms,
+# reading JSON 50 ns a byte.
 _SLOW_BYTES, _SLOW_AVATAR_BYTES, _SLOW_JSON_BYTES = 1 << 20, 1 << 17, 1 << 17
 
 
 class Wire(NamedTuple):
-    """How a lane reads and answers queries.
+    """Functions with which a lane reads and answers queries.
 
-    sealer: returns what seals the replies to a query, of its key expression and payload.  reply: sends an answer under
-    a key, sealed, with its number among the replies; False where that fails.
+    encoding: returns the encoding of a query.
+    sealer: returns the sealer of the replies to a query, given its key expression and payload.
+    reply: sends an answer under a key, sealed, with its number among the replies; returns False if
+    that fails.
     """
 
     encoding: Callable[[Any], str | None]
@@ -34,7 +37,7 @@ class Wire(NamedTuple):
 
 
 class Request:
-    """A query on its way, and what was read of it: each property of a query is a copy that costs."""
+    """Query with its properties, read once: each access to a property of a query makes a copy."""
 
     __slots__ = ("client", "encoding", "key", "key_expr", "operation", "payload", "query", "sealer")
 
@@ -47,14 +50,14 @@ class Request:
             route = keys.parse_question(self.key)
             self.client, self.operation = route.client, route.operation
         except BadRequestError:
-            self.client = self.operation = ""  # nobody's: the service will refuse it
+            self.client = self.operation = ""  # no client: the service will refuse it
         payload = query.payload
         self.payload = b"" if payload is None else payload.to_bytes()
         self.sealer = wire.sealer(query, self.key, self.payload)
 
     @property
     def slow(self) -> bool:
-        """Whether the request is slow by its size."""
+        """Return whether the request is slow because of its size."""
         size = len(self.payload)
         if size < _SLOW_AVATAR_BYTES:
             return False
@@ -62,12 +65,16 @@ class Request:
 
 
 class Job:
-    """What one thread does at present.
+    """Current work of one thread.
 
-    ticket: of the request it carries out; None: it refuses one.  takes: whether the thread takes queries from the
-    channel, so that another must take its place.  begun: when it began, or began to send [s].  again: the request is
-    to be carried out again.  ended: nobody wants the answer.  left: of a refusal, whether its thread was replaced.
-    cpu: processor time of the thread when it began [s].  low: whether the thread has a lower priority.
+    ticket: of the request; None if the thread refuses one.
+    takes: whether the thread takes queries from the channel, and must be replaced when it is slow.
+    begun: when the work or the sending of the answer began [s].
+    again: whether the request is to be carried out again.
+    ended: whether the answer is no longer wanted.
+    left: of a refusal, whether its thread was replaced.
+    cpu: processor time of the thread at the beginning [s].
+    low: whether the thread has a lower priority.
     """
 
     __slots__ = (
@@ -87,7 +94,7 @@ class Job:
     def __init__(
         self, ticket: Ticket | None, takes: bool, *, sending: bool = False, part_seconds: float = math.inf
     ) -> None:
-        """Begin. part_seconds: see `Stop`."""
+        """Begin the job in the calling thread. part_seconds: see `Stop`."""
         self.ticket, self.takes, self.sending = ticket, takes, sending
         self.begun = time.monotonic()
         self.thread_id = threading.get_native_id()
@@ -98,20 +105,20 @@ class Job:
 
     @property
     def client(self) -> str:
-        """The client whose request it is."""
+        """Return the client that sent the request; "" if there is none."""
         return "" if self.ticket is None else self.ticket.client
 
     @property
     def turn(self) -> str:
-        """The turn that the request takes."""
+        """Return the turn of the request; "" if there is none."""
         return "" if self.ticket is None else self.ticket.turn
 
     @property
     def works(self) -> bool:
-        """Whether its thread has been computing for long, and not waiting."""
+        """Return whether the thread has computed, not waited, for at least SLOW_SECONDS."""
         return cpu_seconds(self.thread_id) - self.cpu >= SLOW_SECONDS
 
     def end(self, reason: str) -> None:
-        """Stop the request for good."""
+        """Stop the request permanently."""
         self.ended = True
         self.stop.set(reason)

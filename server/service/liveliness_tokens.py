@@ -1,36 +1,37 @@
-"""The clients of one scene that have a liveliness token. No zenoh here.
+"""Clients of one scene that have a liveliness token. Independent of zenoh.
 
-Each of them has a turn of its own; all clients without a token count as one. zenoh does not tell which session a query
-comes from: `Query.source_info` holds what the asker put there, by default nothing.
+Each of them has its own turn in the fair queues; all clients without a token share one. zenoh does
+not report which session a query comes from: `Query.source_info` holds what the sender put there, by
+default nothing.
 """
 
-# The turn of all clients without a liveliness token; no client's name.
+# Turn of all clients without a liveliness token; no client has this name.
 ANONYMOUS = ""
 
 
 class Tokens:
-    """The tokens of one scene's clients. One thread calls `here` and `gone`; any thread reads.
+    """Tokens of one scene's clients. One thread calls `here` and `gone`; any thread reads.
 
-    Anybody may declare any number of tokens, so that their number is bounded: the first `most` are heeded, and as many
-    more are remembered and heeded once one of the first goes. A client whose token is not heeded is treated as one
-    without a token.
+    Any process can declare any number of tokens, so their number is bounded: the first `most` are
+    heeded, and as many more wait until one of the heeded tokens disappears. A client whose token is
+    not heeded is treated as one without a token.
     """
 
     def __init__(self, most: int) -> None:
-        """most: tokens that are heeded at a time."""
+        """Begin without tokens. most: tokens that are heeded at a time."""
         self._most = most
         self._heeded: dict[str, None] = {}
-        self._waiting: dict[str, None] = {}  # in the order they came
+        self._waiting: dict[str, None] = {}  # in order of arrival
 
     def here(self, client: str) -> None:
-        """Note that the token of a client is there."""
+        """Record that the token of a client has appeared."""
         if client in self._heeded or len(self._heeded) < self._most:
             self._heeded[client] = None
         elif len(self._waiting) < self._most:
             self._waiting[client] = None
 
     def gone(self, client: str) -> None:
-        """Note that the token of a client went."""
+        """Record that the token of a client has disappeared."""
         self._waiting.pop(client, None)
         if client not in self._heeded:
             return

@@ -1,8 +1,8 @@
-"""The way of one scene's questions from a channel to the service and back: threads, turns, deadlines. No zenoh here.
+"""Lanes: carry one scene's requests from a channel to the service and back. Without zenoh.
 
-A fixed number of worker threads take queries from the channel and answer them. A request that is at work for long, or
-whose answer its client does not take, keeps its thread and its client's turn but is no worker any more: a fresh thread
-takes the worker's place, and the slow one ends after its request.
+A fixed number of worker threads take queries from the channel and answer them. A request that runs
+for long, or whose answer its client does not accept, keeps its thread and its client's turn, but
+its thread is no longer a worker: a new thread replaces it, and the slow one ends after its request.
 """
 
 import logging
@@ -23,21 +23,21 @@ from .server_config import ServerConfig
 
 log = logging.getLogger(__name__)
 
-# Threads that wait without a worker: for a client to take a reply (zenoh closes its link after `wait_before_close`), or
-# for a voxel.
+# Most threads that wait without a worker, for a voxel, or for a client to accept a reply (zenoh
+# closes its link after `wait_before_close`).
 _MOST_WAITING = 64
-# How often avatars that nobody uses are looked for [s].
+# Interval at which unused avatars are dropped [s].
 _DROP_SECONDS = 5.0
-# How often a worker that does not wait for queries queues all that are at hand [s], and how many at a time. Where it
-# took them one by one, a newcomer's would wait in the channel for all that came before it.
+# Interval at which a busy worker queues all queries in the channel [s], and how many at a time. If
+# it took them one by one, the query of a new client would wait behind all earlier ones.
 _EMPTY_SECONDS = 0.002
 _MOST_AT_HAND = 256
-# A request of so many bytes is always accepted from a client that has nothing in flight.
+# A client without requests in flight may always send one request of at most this size [bytes].
 _FIRST_BYTES = 1 << 16
 
 
 class Questions(Protocol):
-    """What answers the questions of a lane. No method raises: an error is an answer too."""
+    """Service that answers the requests of a lane. No method raises: an error is an answer."""
 
     def answer(
         self, key: str, payload: bytes, encoding: str | None, stop: Stop
@@ -48,16 +48,16 @@ class Questions(Protocol):
 
 
 class _Gone(NamedTuple):
-    """Takes a request's place in a client's queue: the client went, after all it had asked before."""
+    """Marker in a client's queue, after all its requests: the client has disconnected."""
 
     client: str
 
 
 class Lane:
-    """The questions about one scene, from the channel to the service and back.
+    """Carrier of the requests about one scene, from the channel to the service and back.
 
-    queries: the channel.  at_hand: takes a query from it without waiting; None where there is none.  start: starts a
-    thread of a name that runs a function with arguments.  tokens: those of the scene's clients.
+    queries: the channel.  at_hand: takes a query from it without waiting; None if there is none.
+    start: starts a named thread that runs a function with arguments.  tokens: of the clients.
     """
 
     def __init__(
@@ -88,8 +88,8 @@ class Lane:
             )
         )
         self._lock = threading.Lock()
-        self._jobs: set[Job] = set()  # at work now
-        self._streaming: dict[Request, Job] = {}  # whose answers are on their way in parts
+        self._jobs: set[Job] = set()  # running now
+        self._streaming: dict[Request, Job] = {}  # requests whose answers are being sent in parts
         self._to_start: deque[tuple[str, Callable[..., object], tuple[Any, ...]]] = deque()
         self._given_up = False
         self._emptied = 0.0  # when a worker queued all queries at hand
@@ -98,7 +98,7 @@ class Lane:
 
     def start(self) -> None:
         """Start the threads."""
-        # Not one of those that a stop waits for: it watches them.
+        # A stop does not wait for the watchdog's thread, which watches the others.
         self._watching = start_thread(f"{self._scene}-watchdog", self._watchdog.run)
         for _ in range(self._config.workers):
             self._start_taker()
@@ -110,17 +110,17 @@ class Lane:
 
     @property
     def in_flight(self) -> int:
-        """Return the number of requests that are neither answered nor dropped, and of threads about to be started."""
+        """Return the number of requests neither answered nor dropped, and of threads to start."""
         return len(self._queues) + len(self._to_start)
 
     def give_up(self) -> None:
-        """Stop what is at work, and drop what waits: its clients take it for unknown."""
+        """Stop running requests and drop waiting ones, which their clients treat as unknown."""
         self._given_up = True
         for job in [*self._jobs, *self._streaming.values()]:
             job.end("the server stops")
 
     def client_gone(self, client: str) -> None:
-        """Stop and drop all requests of a client whose liveliness token went, then have the service forget it."""
+        """Stop and drop all requests of a disconnected client, then have the service forget it."""
         dropped, started = self._queues.drop(client)
         self._start(started)
         for ticket in dropped:
@@ -147,37 +147,37 @@ class Lane:
             self._start_thread(self._scene, self._run, ticket)
 
     def _hand_over(self, name: str, run: Callable[..., object], *arguments: Any) -> None:
-        """Have the watchdog start a thread: one that a slow thread starts would have its low priority.
+        """Have the watchdog start a thread: a slow thread would pass on its low priority.
 
-        The watchdog tries again where the system has no thread left.
+        The watchdog retries while the system has no thread left.
         """
         self._to_start.append((name, run, arguments))
         self._watchdog.wake()
 
     def _take_all(self) -> None:
-        """Take queries, and answer them or leave them to a thread that is at work. A worker's work."""
+        """Take queries, and answer them or leave them to a running thread. Runs in a worker."""
         for query in self._queries:
             try:
                 if not self._take(query):
                     return
-            except Exception:  # of this query alone: the thread goes on with the next
-                log.exception("a query of scene %s", self._scene)
+            except Exception:  # affects this query only
+                log.exception("a query of scene %s failed", self._scene)
 
     def _run(self, ticket: Ticket) -> None:
-        """Carry out a request, and what follows. The work of a thread that takes no queries."""
+        """Carry out a request and those that follow. Runs in a thread that takes no queries."""
         if ticket.slow:
             lower_priority(threading.get_native_id())
         self._work(ticket, takes=False)
 
     def _take(self, query: Any) -> bool:
-        """Answer a query, or leave it to a thread that is at work. Returns whether this thread is still a worker."""
+        """Answer a query or leave it to a running thread; return whether this is still a worker."""
         ticket, takes = self._accept(query)
         return takes if ticket is None else self._work(ticket, takes)
 
     def _accept(self, query: Any) -> tuple[Ticket | None, bool]:
         """Queue a query, or refuse it.
 
-        Returns its ticket where this thread is to carry it out, and whether this thread is still a worker.
+        Return its ticket if this thread is to run it, and whether this thread is still a worker.
         """
         request = Request(query, self._wire)
         client = request.client
@@ -193,18 +193,18 @@ class Lane:
         return None, True
 
     def _empty(self, following: Ticket | None) -> tuple[Ticket | None, bool]:
-        """Queue the queries that are at hand.
+        """Queue the queries that wait in the channel.
 
-        following: what this thread carries out next; None: nothing yet. Returns that, and whether this thread is still
-        a worker.
+        following: what this thread carries out next, None if nothing yet. Return that, and whether
+        this thread is still a worker.
         """
         takes, number = True, 0
         while takes and number < _MOST_AT_HAND and (query := self._at_hand()) is not None:
             number += 1
             try:
                 ticket, takes = self._accept(query)
-            except Exception:  # of this query alone
-                log.exception("a query of scene %s", self._scene)
+            except Exception:  # affects this query only
+                log.exception("a query of scene %s failed", self._scene)
                 continue
             if following is None:
                 following = ticket
@@ -214,7 +214,7 @@ class Lane:
         return following, takes
 
     def _refuse(self, request: Request, offer: Offer) -> bool:
-        """Answer that there is no room. Returns whether this thread is still a worker."""
+        """Answer `busy`; return whether this thread is still a worker."""
         full = Full.OWN_REQUESTS if offer is Offer.FULL_TURN else Full.REQUESTS
         busy = self._service.busy(request.encoding, full)
         job = Job(None, takes=True, sending=True)
@@ -235,9 +235,9 @@ class Lane:
     # --- requests --------------------------------------------------------------------------------------------
 
     def _work(self, ticket: Ticket, takes: bool) -> bool:
-        """Carry out a request, and then what waits, until nothing does.
+        """Carry out a request, and then those that wait, until none does.
 
-        takes: whether this thread is a worker, which takes queries. Returns whether it is still one.
+        takes: whether this thread is a worker, which takes queries. Return whether it still is.
         """
         following: Ticket | None = ticket
         while following is not None:
@@ -253,7 +253,7 @@ class Lane:
         return takes
 
     def _carry_out(self, ticket: Ticket, takes: bool) -> tuple[bool, list[Ticket]]:
-        """Carry out one request. Returns whether it gave up its worker, and the tickets to be started."""
+        """Carry out a request; return whether it gave up its worker, and the tickets to start."""
         job = Job(ticket, takes, part_seconds=self._config.max_request_seconds)
         self._enter(job)
         parts = None
@@ -263,7 +263,7 @@ class Lane:
             else:
                 parts = self._answer(ticket.request, job)
         except Exception:
-            log.exception("request of client %s of scene %s", ticket.client, self._scene)
+            log.exception("a request of client %s of scene %s failed", ticket.client, self._scene)
         finally:
             with self._lock:
                 self._jobs.discard(job)
@@ -277,14 +277,14 @@ class Lane:
         return ticket.left, started
 
     def _enter(self, job: Job) -> None:
-        """Have a job watched."""
+        """Have the watchdog watch a job."""
         with self._lock:
             self._jobs.add(job)
         if self._watchdog.asleep:
             self._watchdog.wake()
 
     def _answer(self, request: Request, job: Job) -> Iterator[Answer] | None:
-        """Have one query answered. What comes in parts is returned, to be sent by a thread of its own."""
+        """Answer one query. Return an answer in parts, which a separate thread is to send."""
         if self._given_up:
             self._drop(request)
             return None
@@ -302,22 +302,22 @@ class Lane:
         if job.ticket is not None and job.ticket.left:
             for ticket in self._queues.waits(job.ticket) or []:
                 self._hand_over(self._scene, self._run, ticket)
-        # Leaving `with query` tells the client that no more will come.
+        # Leaving `with query` tells the client that no more replies come.
         with request.query as query:
             self._wire.reply(query, request.key_expr, answer, request.sealer, 0)
         return None
 
     def _has_room(self, job: Job) -> bool:
-        """Return whether one more answer may come in parts.
+        """Return whether one more answer may be sent in parts.
 
-        One turn may take half of the room, so that there is always some for another.
+        One turn may take half of the places, so that some are always left for others.
         """
         most, streaming = self._config.max_paths, list(self._streaming.values())
         own = sum(other.turn == job.turn for other in streaming)
         return len(streaming) < most and own < max(1, most // 2)
 
     def _stream(self, ticket: Ticket, answers: Iterator[Answer]) -> None:
-        """Send an answer's parts. A thread's work."""
+        """Send the parts of an answer. Runs in a thread."""
         request = ticket.request
         try:
             with request.query as query:
@@ -326,7 +326,7 @@ class Lane:
                     if left or not self._wire.reply(query, request.key_expr, answer, request.sealer, number):
                         break
         except Exception:
-            log.exception("parts for client %s of scene %s", request.client, self._scene)
+            log.exception("sending parts to client %s of scene %s failed", request.client, self._scene)
         finally:
             self._streaming.pop(request, None)
             self._queues.release(ticket)
@@ -334,7 +334,7 @@ class Lane:
     # --- the watchdog ----------------------------------------------------------------------------------------
 
     def _look(self, now: float) -> bool:
-        """Look at all jobs; returns whether there are any."""
+        """Check all jobs; return whether there are any."""
         while self._to_start:
             name, run, arguments = self._to_start[0]
             self._start_thread(name, run, *arguments)
@@ -351,9 +351,9 @@ class Lane:
         return bool(jobs)
 
     def _end_unheard(self, job: Job, now: float) -> None:
-        """Stop a path of a client without a token once it has taken as long as an avatar is kept for such a client.
+        """Stop a path of a client without a token after the time for which its avatars are kept.
 
-        Nothing tells that such a client is gone: zenoh takes replies for a link that is closed.
+        zenoh accepts replies for a closed link, so nothing reports that this client is gone.
         """
         most = self._config.avatar_seconds
         if now - job.begun >= most and self._tokens.turn(job.client) == ANONYMOUS:
@@ -362,7 +362,7 @@ class Lane:
             )
 
     def _look_at(self, job: Job, now: float) -> None:
-        """Take the worker of a job that has been at work for long, and stop one whose time is up."""
+        """Replace the worker of a job that takes long, and stop a job whose time is up."""
         most = self._config.max_request_seconds
         if job.ticket is None:
             with self._lock:
@@ -377,10 +377,10 @@ class Lane:
             job.stop.set(f"the request took longer than {most:g} s, the most that this server spends on one")
 
     def _replace(self, job: Job, ticket: Ticket) -> None:
-        """Have a fresh thread go on in the place of a job's.
+        """Start a new thread in place of the job's thread.
 
-        A job that waits, for a voxel, a client or a processor, takes up nothing but its thread; one that works takes up
-        a slow place.
+        A job that waits for a voxel, a client or a processor occupies only its thread; one that
+        computes occupies a slow place.
         """
         left, works = ticket.left, not job.sending and job.works
         if left and not works:
@@ -394,7 +394,7 @@ class Lane:
                 self._start_taker()
             self._start(started)
         elif works and not job.stop and ticket.state in (State.WORKING, State.WAITS):
-            # All slow places are taken: the request waits for one without a worker, and begins anew.
+            # All slow places are taken: the request waits for one without a worker, and restarts.
             with self._lock:
                 job.again = not job.sending
             if job.again:

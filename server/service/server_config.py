@@ -1,4 +1,4 @@
-"""What an operator may set for a server, each default with its reason."""
+"""Configuration of a server."""
 
 import math
 from dataclasses import dataclass
@@ -12,26 +12,35 @@ from ..served.avatar_limits import AvatarLimits
 
 @dataclass(frozen=True)
 class ServerConfig:
-    """Of one server. BadRequestError says which value is wrong.
+    """Configuration of one server. BadRequestError names an invalid value.
 
-    listen: the zenoh endpoint to be reached at. Loopback only, because anyone who reaches it may ask.
+    listen: zenoh endpoint of the server. It must be on loopback unless `insecure` is set, because
+    every client that reaches it may send requests.
     insecure: allow an endpoint that other hosts reach; there is no authentication yet.
-    workers: requests answered at the same time. 2: one client that does not take its replies holds one.
-    max_slow: requests at work for longer than some 10 ms; they hold no worker. More of them wait for one to end.
-    max_request_seconds: server time for one request, or one part of a path; what was not reached by then is `unknown`.
-    max_in_flight: requests accepted and not yet answered, over all clients; one more is answered `busy`, unless its
-    client has none in flight and it is small. As many liveliness tokens are heeded.
-    max_in_flight_by_client: the same for one client; all clients without a liveliness token count as one.
+    workers: requests answered at the same time. The default is 2, because a client that does not
+    accept its replies holds one.
+    max_slow: requests that run for longer than some 10 ms; they hold no worker. Further ones wait.
+    max_request_seconds: time limit for one request or one part of a path; what was not computed by
+    then is `unknown`.
+    max_in_flight: requests accepted and not yet answered, over all clients; a further one is
+    answered `busy`, unless it is small and its client has none in flight. It is also the number of
+    liveliness tokens that are heeded.
+    max_in_flight_by_client: the same for one client; all clients without a liveliness token count
+    as one.
     max_in_flight_bytes: bytes of the payloads of all requests in flight.
-    max_paths: paths answered at the same time, each by a thread that sends its parts, half of them of one client; one
-    more is answered `busy`.
-    max_poses, max_avatar_points: of one request; more is answered `too_large`.
-    max_avatar_bytes, max_avatar_bytes_by_client: what the arrays of avatars may take, some 54 bytes a point.
-    max_avatars, max_avatars_by_client, max_avatar_clients: their number, and of clients that have any.
-    avatar_seconds: an avatar that was not used for so long is dropped, unless its client has a liveliness token.
+    max_paths: paths answered at the same time, at most half of them for one client; a separate
+    thread sends the parts of each. A further one is answered `busy`.
+    max_poses, max_avatar_points: limits of one request; a larger one is answered `too_large`.
+    max_avatar_bytes, max_avatar_bytes_by_client: bytes of the arrays of avatars, some 54 a point.
+    max_avatars, max_avatars_by_client: number of avatars.
+    max_avatar_clients: number of clients that have avatars.
+    avatar_seconds: an avatar unused for this long is dropped, unless its client has a liveliness
+    token.
     stop_seconds: how long a stop waits for accepted requests to be answered before it stops them.
-    key_file: holds the key that replies are sealed with, for clients that have it too; None: one made at the start.
-    metrics_port: where Prometheus' text is served over HTTP, on loopback unless `insecure`; 0: nowhere.
+    key_file: file with the key that seals replies, shared with clients; None: a key made at the
+    start.
+    metrics_port: port on which Prometheus metrics are served over HTTP, on loopback unless
+    `insecure` is set; 0: none.
     """
 
     listen: str = DEFAULT_ENDPOINT
@@ -60,7 +69,7 @@ class ServerConfig:
         if not self.insecure and not is_loopback(self.listen):
             raise BadRequestError(
                 f"listen {self.listen!r}: other hosts could reach it, and there is no authentication: "
-                f"listen on loopback such as {DEFAULT_ENDPOINT}, or say --insecure"
+                f"listen on loopback such as {DEFAULT_ENDPOINT}, or give --insecure"
             )
         for name, most in (("max_poses", MAX_POSES), ("max_avatar_points", MAX_AVATAR_POINTS)):
             if not 1 <= getattr(self, name) <= most:
@@ -81,7 +90,7 @@ class ServerConfig:
 
     @property
     def avatar_limits(self) -> AvatarLimits:
-        """The limits of one scene's avatars."""
+        """Return the limits of one scene's avatars."""
         return AvatarLimits(
             self.max_avatar_bytes,
             self.max_avatar_bytes_by_client,
@@ -92,5 +101,5 @@ class ServerConfig:
 
     @property
     def metrics_host(self) -> str:
-        """The address that metrics are served at."""
+        """Return the address at which metrics are served."""
         return "0.0.0.0" if self.insecure else "127.0.0.1"

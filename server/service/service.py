@@ -1,6 +1,6 @@
-"""Builds a server of its parts, warms them, starts them and stops them, in that order.
+"""Assembly of a server: build its parts, warm them up, start them and stop them.
 
-`Service` is what is between the bytes of the wire and the scenes; `serve` is what the command runs.
+`Service` connects the bytes of the wire with the scenes; the command runs `serve`.
 """
 
 import logging
@@ -60,8 +60,9 @@ log = logging.getLogger(__name__)
 class _Operation(NamedTuple):
     """How an operation with a payload is answered.
 
-    request: its type.  counted: the field whose length is bounded by `ServerConfig.max_poses`, "" for none.
-    ask: a scene, the request, the client and the stop flag to an answer, or to the parts of one.
+    request: its type.  counted: the field whose length is bounded by `ServerConfig.max_poses`, ""
+    for none. ask: a scene, the request, the client and the stop flag to an answer, or to the parts
+    of one.
     """
 
     request: type
@@ -131,7 +132,7 @@ _OPERATIONS = {
 
 
 class Service:
-    """Answers the wire's questions by asking scenes. Thread-safe; never raises: an error is an answer too."""
+    """Answers requests on the wire from scenes. Thread-safe; never raises: errors are answers."""
 
     def __init__(self, scenes: Sequence[SceneLike], config: ServerConfig) -> None:
         names = [keys.check_name(scene.name, "scene") for scene in scenes]
@@ -140,12 +141,12 @@ class Service:
         self._scenes = {scene.name: scene for scene in scenes}
         self._config = config
         self._frames: dict[str, Frames] = {}
-        self.left_at_work = False  # once it is served no more: whether a request did not end in time
+        self.left_at_work = False  # after serving: whether a request did not end in time
         for scene in scenes:
             scene.limit_avatars(config.avatar_limits)
 
     def scenes(self, encoding: str | None) -> Answer:
-        """Which scenes are served here."""
+        """Return the answer that lists the served scenes."""
         formats = {scene.info().format_version for scene in self._scenes.values()}
         answer = ScenesAnswer(sorted(self._scenes), WIRE_VERSION, max(formats, default=0))
         try:
@@ -157,9 +158,9 @@ class Service:
     def answer(
         self, key: str, payload: bytes, encoding: str | None, stop: Stop | None = None
     ) -> Answer | Iterator[Answer]:
-        """Return the answer to the question asked under this key; an iterator where it comes in parts.
+        """Return the answer to a request under this key; an iterator if it comes in parts.
 
-        stop: ends the work early once it is set; what was not reached then is unknown.
+        stop: ends the work early once it is set; what was not computed by then is unknown.
         """
         avatars: list[bytes] = []
         try:
@@ -174,7 +175,7 @@ class Service:
             return self._failed(key, encoding, error, b"".join(avatars))
 
     def _parts(self, key: str, parts: Iterator[Any], encoding: str, about: bytes) -> Iterator[Answer]:
-        """Parts as answers; an error is the last one."""
+        """Yield parts as answers; an error is the last one."""
         try:
             for part in parts:
                 yield self._encoded(part, encoding, about)
@@ -182,9 +183,9 @@ class Service:
             yield self._failed(key, encoding, error, about)
 
     def _encoded(self, message: Any, encoding: str, about: bytes) -> Answer:
-        """A message as an answer. TooLargeError: its receiver would drop it unread."""
+        """Encode a message as an answer. TooLargeError: its receiver would drop it unread."""
         payload = encode(message, encoding)
-        # zenoh's own part of the message takes some of it, far less than this.
+        # The margin is far more than zenoh's own part of a message takes.
         if len(payload) > MAX_MESSAGE_BYTES - (1 << 16):
             raise TooLargeError(
                 f"the answer takes {len(payload)} bytes, a message holds {MAX_MESSAGE_BYTES}: ask for less at a time"
@@ -192,21 +193,21 @@ class Service:
         return Answer(payload, encoding, True, about)
 
     def _failed(self, key: str, encoding: str | None, error: Exception, about: bytes) -> Answer:
-        """What went wrong as an answer; what is no SolidcloudError is logged, and told by its kind alone.
+        """Return an error as an answer; log one that is no SolidcloudError and send its type only.
 
-        about: of the avatars that were looked up; where one is not known, the answer is about none.
+        about: of the avatars that were looked up; if one is unknown, the answer is about none.
         """
         if isinstance(error, SolidcloudError):
             answer = self._error(encoding, error.code, str(error))
             return answer if isinstance(error, UnknownAvatarError) else answer._replace(about=about)
-        log.error("a request failed for no reason of its own: %s", key, exc_info=error)
+        log.error("a request failed with an internal error: %s", key, exc_info=error)
         answer = self._error(
             encoding, ErrorCode.INTERNAL, f"{type(error).__name__} in the server: its log says more"
         )
         return answer._replace(about=about)
 
     def busy(self, encoding: str | None, full: Full) -> Answer:
-        """Return the answer to a question that there is no room for. full: which limit was reached."""
+        """Return the answer to a request that exceeds a limit. full: the limit reached."""
         as_one = "(all clients without a liveliness token count as one)"
         config = self._config
         message = {
@@ -224,13 +225,13 @@ class Service:
         return self._error(encoding, ErrorCode.BUSY, message)
 
     def client_gone(self, scene: str, client: str) -> None:
-        """Forget the avatars of a client that went, and end its bodies."""
+        """Remove the avatars of a disconnected client, and end its bodies."""
         if (frames := self._frames.get(scene)) is not None:
             frames.client_gone(client)
         self._scenes[scene].drop_client(client)
 
     def drop_unused(self, scene: str, alive: Collection[str]) -> None:
-        """Forget avatars that were not used for long, but for those of clients in `alive`."""
+        """Drop avatars unused for long, except those of clients in `alive`."""
         self._scenes[scene].drop_unused_avatars(alive, self._config.avatar_seconds)
 
     def frames(
@@ -239,7 +240,7 @@ class Service:
         publish: Callable[[keys.User, Answer], None],
         turn: Callable[[str], str] = str,
     ) -> Frames | None:
-        """Return the sessions of a scene, whose states are sent by `publish`; None: it simulates nothing.
+        """Return the sessions of a scene, which send states with `publish`; None if it has none.
 
         turn: returns the turn of a client (liveliness_tokens.py); by default each has its own.
         """
@@ -250,14 +251,14 @@ class Service:
         return self._frames.setdefault(scene, frames)
 
     def warm(self) -> None:
-        """Warm every scene, so that the first client does not wait for compilers."""
+        """Warm every scene, so that the first client does not wait for compilation."""
         start_deadlines()
         for scene in self._scenes.values():
             log.info("warming %s: the first start on a machine compiles, for a minute or two", scene.name)
             (scene.simulation or scene).warm()
 
     def _ask(self, key: str, payload: bytes, encoding: str, stop: Stop) -> Any:
-        """Put one question to the scene its key names."""
+        """Send one request to the scene that its key names."""
         route = keys.parse_question(key)
         scene = self._scenes.get(route.scene)
         if scene is None:
@@ -272,18 +273,18 @@ class Service:
                 raise BadRequestError(
                     f"{route.operation} with a payload of {len(payload)} bytes: expected none"
                 )
-            # As an answer in one part: whoever sends parts has a thread for it, and nobody else waits meanwhile.
+            # `reload` answers in one part: parts are sent by a separate thread, so no worker waits.
             return self._reload(scene) if route.operation == "reload" else scene.info()
         request: Any = decode_request(operation.request, payload, encoding)
         self._check_size(operation, request)
         return operation.ask(scene, request, route.client, stop)
 
     def _reload(self, scene: SceneLike) -> Iterator[ReloadAnswer]:
-        """Reload one scene when the answer is asked for; what goes wrong is logged here, and raised."""
+        """Reload one scene when the answer is requested; log and raise errors."""
         try:
             answer = scene.reload()
         except Exception as error:
-            log.error("%s is not reloaded, what was served is served on: %s", scene.name, error)
+            log.error("%s cannot be reloaded and is served as before: %s", scene.name, error)
             raise
         log.info(
             "reloaded %s in %.1f s: generation %d, was %d; %d points",
@@ -292,13 +293,13 @@ class Service:
         yield answer
 
     def reload(self) -> None:
-        """Reload every scene, one after the other; what goes wrong is logged, and that scene served on as it was."""
+        """Reload every scene in turn; log errors, and serve the scene concerned as before."""
         for scene in self._scenes.values():
             with suppress(Exception):
                 next(self._reload(scene))
 
     def _check_size(self, operation: _Operation, request: Any) -> None:
-        """TooLargeError for more than this server takes."""
+        """Raise TooLargeError for a request that exceeds this server's limits."""
         if operation.counted:
             count, most = len(getattr(request, operation.counted)), self._config.max_poses
             if count > most:
@@ -308,7 +309,7 @@ class Service:
             raise TooLargeError(f"avatar of {len(request.points)} points: at most {most}: thin it out first")
 
     def _error(self, encoding: str | None, code: ErrorCode, message: str) -> Answer:
-        """An error as an answer, in the encoding that was stated if it is one."""
+        """Return an error as an answer, in the stated encoding if that is valid."""
         try:
             stated = wire_encoding(encoding)
         except BadRequestError:
@@ -318,9 +319,9 @@ class Service:
 
 @contextmanager
 def serving(scenes: Sequence[SceneLike], config: ServerConfig) -> Iterator[Service]:
-    """Serve scenes while inside; they stay the caller's, to be closed after.
+    """Serve scenes inside a `with`; the caller closes them afterwards.
 
-    Entered once everything is warm and reachable. SolidcloudError: a scene or the endpoint is unusable.
+    Everything is warm and reachable once entered. SolidcloudError: a scene or endpoint is unusable.
     """
     service = Service(scenes, config)
     service.warm()
@@ -335,17 +336,16 @@ def serving(scenes: Sequence[SceneLike], config: ServerConfig) -> Iterator[Servi
 def serve(
     scenes: Sequence[SceneLike], config: ServerConfig, ready: Callable[[], object] = lambda: None
 ) -> bool:
-    """Serve scenes until SIGTERM or SIGINT, then answer what was accepted and return. Main thread only.
+    """Serve scenes until SIGTERM or SIGINT, then answer accepted requests. Main thread only.
 
-    Returns whether all requests have ended; where one has not, closing its scene waits for it.
-    ready: called once all is warm and reachable.
-    SIGHUP: what is in the archives' folders now is served from then on, see `Scene.reload`.
+    Return whether all requests have ended; if not, closing their scene waits for them.
+    ready: called once all is warm and reachable.  SIGHUP: reload all scenes, see `Scene.reload`.
     """
     give_back_large_blocks()
-    # A thread in pure Python may keep the interpreter for 5 ms by default while a reply waits for it.
+    # By default, a pure Python thread may hold the interpreter's lock for 5 ms while a reply waits.
     sys.setswitchinterval(0.0005)
     if config.insecure:
-        log.warning("--insecure: whoever reaches %s may ask anything, unauthenticated", config.listen)
+        log.warning("--insecure: every client that reaches %s may send requests", config.listen)
     with (
         _signalled(signal.SIGTERM, signal.SIGINT, signal.SIGHUP) as signals,
         _metrics(scenes, config),
@@ -362,7 +362,7 @@ def serve(
 
 @contextmanager
 def _metrics(scenes: Sequence[SceneLike], config: ServerConfig) -> Iterator[None]:
-    """Serve the metrics of scenes where the configuration says so; from the start, so that a fault is early."""
+    """Serve the metrics of scenes if configured; from the start, so that errors show early."""
     if not config.metrics_port:
         yield
         return
@@ -375,7 +375,7 @@ def _metrics(scenes: Sequence[SceneLike], config: ServerConfig) -> Iterator[None
 
 @contextmanager
 def _reloader(service: Service) -> Iterator[threading.Event]:
-    """A thread that reloads all scenes each time the event is set, so that a stop need not wait for it to come back."""
+    """Run a thread that reloads all scenes when the event is set; a stop does not wait for it."""
     wanted, ended = threading.Event(), threading.Event()
 
     def run() -> None:
@@ -383,7 +383,7 @@ def _reloader(service: Service) -> Iterator[threading.Event]:
             wanted.clear()
             service.reload()
 
-    # A reload that is under way at the end is given up when its scene is closed (`Scene.close` waits for that).
+    # A reload that is running at the end is abandoned when its scene closes (`Scene.close` waits).
     start_thread("reload", run)
     try:
         yield wanted
@@ -394,10 +394,10 @@ def _reloader(service: Service) -> Iterator[threading.Event]:
 
 @contextmanager
 def _signalled(*numbers: signal.Signals) -> Iterator[socket.socket]:
-    """A socket that has something to read once one of the signals came, in place of what they did before.
+    """Replace the signals' handlers and yield a socket that becomes readable when a signal arrives.
 
-    Not an event that a handler sets: the system may hand the signal to one of zenoh's threads, and then a main
-    thread that waits for a lock is not woken to run the handler.
+    An event set by a handler would not do: the system may deliver the signal to one of zenoh's
+    threads, and a main thread that waits for a lock is not woken then to run the handler.
     """
     reader, writer = socket.socketpair()
     with reader, writer:

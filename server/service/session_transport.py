@@ -1,7 +1,9 @@
-"""Sessions over zenoh, the server's side: wishes that clients publish, states that they ask for with one long query.
+"""Server side of sessions over zenoh: clients publish motion commands and query for states.
 
-zenoh hands wishes and queries to bounded channels. One thread empties wishes into mailboxes, one opens streams of
-states, and another simulates frames and sends their states (command_mailboxes.py).
+A motion command is a `Wish` on the wire; one long query a user receives all its states. zenoh
+passes motion commands and queries to bounded channels. One thread moves motion commands into
+mailboxes, one opens streams of states, and another simulates frames and sends their states
+(command_mailboxes.py).
 """
 
 import logging
@@ -23,14 +25,14 @@ from .waiting_commands import WaitingWishes
 
 log = logging.getLogger(__name__)
 
-# Wishes that zenoh may hand over before the thread takes them: of a thousand users one each.
+# Motion commands that the channel holds until the thread takes them: one each of a thousand users.
 _CHANNEL = 1024
-# Queries for states that may be open for each user that a scene has room for.
+# Open queries for states, for each user that a scene has room for.
 _STREAMS_A_USER = 2
 
 
 class Sessions(Protocol):
-    """What has the frames of a scene simulated."""
+    """Service that simulates the frames of scenes."""
 
     def frames(
         self, scene: str, publish: Callable[[keys.User, Answer], None], turn: Callable[[str], str]
@@ -39,7 +41,10 @@ class Sessions(Protocol):
 
 
 class SceneSessions:
-    """The sessions of one scene. declared: what is to be undeclared at the end; then its threads end too."""
+    """Sessions of one scene.
+
+    declared: zenoh objects to undeclare at the end, which also ends the threads.
+    """
 
     def __init__(
         self,
@@ -50,10 +55,10 @@ class SceneSessions:
         sealer: Callable[[zenoh.Query, str, bytes], Sealer | None],
         tokens: Tokens,
     ) -> None:
-        """Declare them.
+        """Declare the sessions and start their threads, if the scene simulates.
 
-        start: starts a thread of a name that runs a function with arguments.  sealer: as in `Wire`.  tokens: those of
-        the scene's clients.
+        start: starts a named thread that runs a function with arguments.  sealer: as in `Wire`.
+        tokens: those of the scene's clients.
         """
         self.declared: list[Any] = []
         self._service, self._sealer, self._tokens = service, sealer, tokens
@@ -73,39 +78,39 @@ class SceneSessions:
         start(f"{scene}-frames", self._run_frames, frames)
 
     def give_up(self) -> None:
-        """Stop the frame at work, and those of the wishes that wait."""
+        """Stop the running frame, and those of the waiting motion commands."""
         if self._frames is not None:
             self._frames.give_up()
 
     def client_gone(self, client: str) -> None:
-        """End what a client that is gone has asked for."""
+        """End the queries of a disconnected client."""
         self._streams.end_client(client)
 
     def _send(self, user: keys.User, answer: Answer) -> None:
         self._streams.send(user, answer)
 
     def _run_frames(self, frames: Frames) -> None:
-        """Simulate until there are no more wishes, then end the streams. A thread's work."""
+        """Simulate until motion commands end, then end the streams. Runs in a thread."""
         try:
             frames.run()
         finally:
             self._streams.close()
 
     def _open_streams(self, queries: Any) -> None:
-        """Take the queries for states. A thread's work."""
+        """Take the queries for states. Runs in a thread."""
         for query in queries:
             try:
                 self._open_stream(query)
-            except Exception:  # of this query alone
-                log.exception("a query for states")
+            except Exception:  # affects this query only
+                log.exception("a query for states failed")
 
     def _open_stream(self, query: zenoh.Query) -> None:
-        """Open a stream, or say that there is no room; a query for the states of several users ends without a reply."""
+        """Open a stream or answer `busy`; end a query for several users without a reply."""
         try:
             key = str(query.key_expr)
             user = keys.parse_state(key)
         except BadRequestError as error:
-            log.debug("a query for nobody's states: %s", error)
+            log.debug("a query for the states of no user: %s", error)
             query.drop()
             return
         payload = query.payload
@@ -116,9 +121,10 @@ class SceneSessions:
                 send_reply(query, query.key_expr, self._service.busy(encoding, Full.STATES), sealer)
 
     def _take_wishes(self, samples: Any, frames: Frames) -> None:
-        """Take wishes in until there are no more, then end the frames. A thread's work.
+        """Take motion commands until they end, then end the frames. Runs in a thread.
 
-        What has come is sorted by turns before a wish is read: reading a large one takes milliseconds.
+        Waiting samples are sorted by turns before one is decoded: decoding a large one takes
+        milliseconds.
         """
         waiting = WaitingWishes(self._tokens.turn)
         try:
@@ -134,26 +140,26 @@ class SceneSessions:
             frames.close()
 
     def _sort(self, sample: zenoh.Sample, waiting: WaitingWishes, frames: Frames) -> None:
-        """Have a wish wait for its client's turn; refuse one that is too large, unread."""
+        """Queue a motion command for its client's turn; refuse one that is too large, undecoded."""
         try:
             user = keys.parse_wish(str(sample.key_expr))
         except BadRequestError as error:
-            log.debug("a wish of nobody: %s", error)
+            log.debug("a motion command of no user: %s", error)
             return
         try:
             size = len(sample.payload)
             if sample.kind == zenoh.SampleKind.DELETE or frames.fits(user, size, str(sample.encoding)):
                 waiting.put(user, sample, size)
-        except Exception:  # of this wish alone
-            log.exception("a wish")
+        except Exception:  # affects this motion command only
+            log.exception("a motion command failed")
 
     def _take_wish(self, user: keys.User, sample: zenoh.Sample, frames: Frames) -> None:
-        """Take in one wish, or that a user leaves."""
+        """Accept one motion command, or have a user leave."""
         try:
             if sample.kind == zenoh.SampleKind.DELETE:
                 frames.leave(user)
                 self._streams.forget(user)
             elif frames.wish(user, sample.payload.to_bytes(), str(sample.encoding)):
                 self._streams.send_again(user)
-        except Exception:  # of this wish alone
-            log.exception("a wish")
+        except Exception:  # affects this motion command only
+            log.exception("a motion command failed")

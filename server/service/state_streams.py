@@ -1,7 +1,7 @@
-"""The queries under which clients hear the states of their users: one long query a user, answered with many replies.
+"""Streams of users' states: one long query a user, answered with many replies.
 
-A state is sent to the client that asked for it and to nobody else. A subscription could not be bound to one client: a
-wildcard includes every client's key, and would tell its holder the ids in them.
+A state is sent only to the client that queried for it. A subscription could not be restricted to
+one client: a wildcard matches every client's key and would reveal the ids in them.
 """
 
 import threading
@@ -16,16 +16,18 @@ from ...schemas.wire.seals import Sealer
 from ..network.replies import send_reply
 from ..served.served_scene import Answer
 
-# A query whose user had no state for so long makes room for another's [s].
+# A query without a reply for this long may be ended to make room for another one [s].
 IDLE_SECONDS = 60.0
-# How long a state waits for the query that it is the reply to [s]: a first wish may come before it.
+# How long a state is kept for a query that has not arrived [s]: a first motion command may overtake
+# it.
 _KEPT_SECONDS = 5.0
 
 
 class _Stream:
-    """One open query. used: when it was opened or last replied to, on the monotonic clock [s].  number: of replies.
+    """One open query.
 
-    last: the answer sent last.
+    used: time of its opening or last reply, on the monotonic clock [s].  number: replies so far.
+    last: the last answer sent.
     """
 
     __slots__ = ("_key", "_sealer", "last", "number", "query", "used")
@@ -37,7 +39,7 @@ class _Stream:
         self.last: Answer | None = None
 
     def reply(self, answer: Answer) -> bool:
-        """Send one reply; return False where the client is gone."""
+        """Send one reply; return False if the client has disconnected."""
         self.last = answer
         sent = send_reply(self.query, self._key, answer, self._sealer, self.number)
         self.number += 1
@@ -45,23 +47,24 @@ class _Stream:
 
 
 class StateStreams:
-    """The open queries of one scene. Thread-safe; no method blocks, since states are dropped and never wait."""
+    """Open queries of one scene. Thread-safe; no method blocks: states are dropped, not queued."""
 
     def __init__(self, most: int, turn: Callable[[str], str] = str) -> None:
-        """most: queries that are open at a time; one turn has half of them at most.
+        """Begin without open queries.
 
+        most: queries that are open at a time; one turn has at most half of them.
         turn: returns the turn of a client (liveliness_tokens.py); by default each has its own.
         """
         self._most, self._turn = most, turn
-        self._streams: OrderedDict[User, _Stream] = OrderedDict()  # the one used last comes last
+        self._streams: OrderedDict[User, _Stream] = OrderedDict()  # the most recently used last
         self._kept: OrderedDict[User, tuple[float, Answer]] = OrderedDict()
         self._closed = False
         self._lock = threading.Lock()
 
     def open(self, user: User, query: zenoh.Query, sealer: Sealer | None) -> bool:
-        """Send the user's states as replies to this query from now on, and end an earlier query of the user.
+        """Send the user's states as replies to this query, and end an earlier query of the user.
 
-        Returns False where there is no room: then the query is still the caller's to answer.
+        Return False if there is no room; the caller must then answer the query.
         """
         with self._lock:
             if self._closed or not self._make_room(user):
@@ -75,7 +78,7 @@ class StateStreams:
         return True
 
     def send(self, user: User, answer: Answer) -> None:
-        """Send what is said to a user. Without an open query it is kept for a short while."""
+        """Send an answer to a user; without an open query, keep it for a short time."""
         with self._lock:
             stream = self._streams.get(user)
             if stream is None:
@@ -87,20 +90,20 @@ class StateStreams:
                 self._end(user)
 
     def send_again(self, user: User) -> None:
-        """Send what was said to a user last once more: it may have been dropped on the way."""
+        """Repeat the last answer to a user: it may have been dropped on the way."""
         with self._lock:
             stream = self._streams.get(user)
             if stream is not None and stream.last is not None and not stream.reply(stream.last):
                 self._end(user)
 
     def forget(self, user: User) -> None:
-        """Forget what was said to a user, who left."""
+        """Forget the last answer to a user that left."""
         with self._lock:
             if (stream := self._streams.get(user)) is not None:
                 stream.last = None
 
     def end_client(self, client: str) -> None:
-        """End the queries of a client that is gone."""
+        """End the queries of a disconnected client."""
         with self._lock:
             for user in [user for user in self._streams if user.client == client]:
                 self._end(user)
@@ -113,7 +116,7 @@ class StateStreams:
                 self._end(user)
 
     def _make_room(self, user: User) -> bool:
-        """End queries until one of this user has room. The oldest of its turn goes first, then one that is idle."""
+        """Make room for a query: end the oldest of its turn, then an idle one; return success."""
         if user in self._streams:
             return True
         turn = self._turn(user.client)
@@ -134,7 +137,7 @@ class StateStreams:
             self._kept.popitem(last=False)
 
     def _end(self, user: User) -> _Stream | None:
-        """Tell a client that no more replies come to its query. Return what was its stream."""
+        """Tell a client that no more replies come to its query; return its stream."""
         stream = self._streams.pop(user, None)
         if stream is not None:
             stream.query.drop()

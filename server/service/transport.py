@@ -1,7 +1,7 @@
-"""Bytes in, bytes out over zenoh: the server's only user of it. What the bytes mean is the service's matter.
+"""Transport of bytes over zenoh; the service interprets them.
 
-zenoh hands queries to a bounded channel; our own threads take them from there, since nothing may block in
-one of its callbacks. What these threads do is in request_lanes.py.
+zenoh passes queries to a bounded channel, from which the server's threads take them, because a
+zenoh callback must not block. request_lanes.py holds the work of these threads.
 """
 
 import logging
@@ -34,31 +34,34 @@ from .session_transport import SceneSessions, Sessions
 
 log = logging.getLogger(__name__)
 
-# Queries that zenoh may hand over before a thread takes them; a full channel holds up zenoh's receiver, which
-# is what bounds memory in a storm. The threads empty it at once, into `FairQueues` or with `busy`.
+# Queries that the channel holds until a thread takes them. A full channel blocks zenoh's receiver,
+# which bounds memory under overload. The threads empty it at once, into `FairQueues` or with
+# `busy`.
 _CHANNEL = 1024
-# How long a stop waits, twice, for threads whose work was given up [s]. Kernels look at a stop every few milliseconds;
-# a reply to a client that takes none waits for `wait_before_close`.
+# How long a stop waits, twice, for threads whose requests were stopped [s]. Kernels check the stop
+# flag every few milliseconds; a reply that its client does not accept waits for
+# `wait_before_close`.
 _GIVE_UP_SECONDS = 0.4
-# How often it looks whether a thread has begun that is about to [s].
+# Interval at which a stop checks whether a thread about to start has started [s].
 _NEXT_SECONDS = 0.001
 
-# zenoh's threads that send, of which it has one by default. The one that closes the link of a client that takes no
-# replies is held for `wait_before_close`, and with one thread all other clients wait meanwhile.
+# zenoh's sending threads, one by default. The thread that closes the link of a client that accepts
+# no replies is blocked for `wait_before_close`; with one thread all other clients would wait.
 _RUNTIME = "(tx: (worker_threads: 16))"
 
 
 class ServiceLike(Sessions, Questions, Protocol):
-    """What a transport carries questions to. No method raises: an error is an answer too."""
+    """Service that a transport carries requests to. No method raises: an error is an answer."""
 
     def scenes(self, encoding: str | None) -> Answer: ...
 
 
 class Transport:
-    """Carries questions to a service and its answers back, from `__enter__` until `__exit__`.
+    """Carries requests to a service and its answers back, from `__enter__` until `__exit__`.
 
-    SolidcloudError on entry when the endpoint cannot be listened on. Leaving it stops accepting, answers
-    what was accepted (up to `config.stop_seconds`), gives up the rest, then closes.
+    Entering raises SolidcloudError if the server cannot listen on the endpoint. Leaving stops
+    accepting requests, answers the accepted ones for up to `config.stop_seconds`, stops the rest
+    and closes.
     """
 
     def __init__(self, scenes: Sequence[str], service: ServiceLike, config: ServerConfig) -> None:
@@ -68,17 +71,17 @@ class Transport:
         self._declared: list[Any] = []
         self._lanes: list[Lane] = []
         self._sessions: list[SceneSessions] = []
-        self.left_at_work = False  # once it was left: whether threads did not end in time
+        self.left_at_work = False  # after leaving: whether threads did not end in time
 
     def __enter__(self) -> Self:
         with ExitStack() as stack:
             session = stack.enter_context(self._open())
-            # Once the endpoint is ours: the key of a server that is still there is not written over.
+            # After opening the endpoint: this must not overwrite the key of a server still running.
             self._key = stack.enter_context(published_key(self._config.listen, self._config.key_file))
             for scene in self._scenes:
                 stack.callback(self._declare_scene(session, scene).close)
             self._declare_scenes(session)
-            # Last: whoever sees the token may ask at once.
+            # Last: a client that sees the token may send requests at once.
             for scene in self._scenes:
                 key = keys.server_alive_key(scene, str(session.zid()))
                 self._declared.append(session.liveliness().declare_token(key))
@@ -89,28 +92,29 @@ class Transport:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         with self._stack:
-            # The tokens first. An undeclared queryable's channel still hands out what it holds, then ends.
+            # Tokens first. The channel of an undeclared queryable still yields its queries, then
+            # ends.
             for declared in reversed(self._declared):
                 declared.undeclare()
             if not self._wait(self._config.stop_seconds):
-                log.warning("not all is answered after %g s: the rest is given up", self._config.stop_seconds)
+                log.warning("stopping requests unanswered after %g s", self._config.stop_seconds)
                 for lane in self._lanes:
                     lane.give_up()
                 for sessions in self._sessions:
                     sessions.give_up()
                 self._wait(_GIVE_UP_SECONDS)
-        # Closing the session ends what waits for a client that takes nothing. A thread that is still at work when the
-        # interpreter ends, inside zenoh, would abort the process.
+        # Closing the session ends replies that wait for a client that accepts none. A thread inside
+        # zenoh when the interpreter exits would abort the process.
         if not self._wait(_GIVE_UP_SECONDS):
             self.left_at_work = True
-            log.error("stopped with threads at work")
+            log.error("stopped with threads still running")
 
     def _wait(self, seconds: float) -> bool:
-        """Wait for all requests and threads, for so long at most; return whether they have ended."""
+        """Wait at most `seconds` for all requests and threads; return whether they have ended."""
         deadline = time.monotonic() + seconds
         while True:
-            # One may have started another, for a path, before it ended. Where none is left and requests are in flight,
-            # a watchdog is about to start the next.
+            # A thread may have started another one, for a path, before it ended. If no thread is
+            # left while requests are in flight, a watchdog is about to start the next.
             alive = [thread for thread in list(self._threads) if thread.is_alive()]
             if not alive and not any(lane.in_flight for lane in self._lanes):
                 return True
@@ -123,7 +127,7 @@ class Transport:
                 time.sleep(_NEXT_SECONDS)
 
     def _open(self) -> zenoh.Session:
-        """A session that listens; SolidcloudError when it cannot."""
+        """Open a session that listens; raise SolidcloudError if it cannot."""
         os.environ.setdefault("ZENOH_RUNTIME", _RUNTIME)  # read when the process opens its first session
         try:
             return zenoh.open(session_config(listen=self._config.listen))
@@ -133,8 +137,8 @@ class Transport:
             raise SolidcloudError(f"cannot listen on {self._config.listen}: {said}: {hint}") from None
 
     def _declare_scene(self, session: zenoh.Session, scene: str) -> Lane:
-        """Answer the questions about one scene, and watch which clients come and go."""
-        # history: also of clients that were connected before this line.
+        """Answer requests for one scene, and watch clients connect and disconnect."""
+        # history: includes clients that connected before.
         watch = session.liveliness().declare_subscriber(
             keys.clients_alive_key(scene), zenoh.handlers.FifoChannel(_CHANNEL), history=True
         )
@@ -163,7 +167,7 @@ class Transport:
         return lane
 
     def _declare_scenes(self, session: zenoh.Session) -> None:
-        """Answer which scenes are served."""
+        """Answer queries for the served scenes."""
         queryable = session.declare_queryable(
             keys.scenes_key(), zenoh.handlers.FifoChannel(_CHANNEL), complete=True
         )
@@ -173,27 +177,28 @@ class Transport:
             for query in queries:
                 try:
                     with query:
-                        # Under its own key: a wider one that matches is no server's.
+                        # Reply under the exact key: a wildcard that matches is not the server's
+                        # key.
                         sealer = self._sealer(query, keys.scenes_key(), b"")
                         send_reply(query, keys.scenes_key(), self._service.scenes(_encoding(query)), sealer)
-                except Exception:  # of this query alone
-                    log.exception("a query for the scenes")
+                except Exception:  # affects this query only
+                    log.exception("a query for the scenes failed")
 
         self._start("scenes", take, queryable.handler)
 
     def _sealer(self, query: zenoh.Query, key_expression: str, request: bytes) -> Sealer | None:
-        """What seals the replies to a query with this server's key."""
+        """Return the sealer of the replies to a query, with this server's key."""
         return sealer_of(query, self._key, key_expression, request)
 
     def _start(self, name: str, run: Callable[..., None], *arguments: Any) -> None:
-        """A thread that is waited for at the end."""
+        """Start a thread that `__exit__` waits for."""
         thread = start_thread(name, run, *arguments)
         with self._lock:
             self._threads = [other for other in self._threads if other.is_alive()] + [thread]
 
 
 def _watch(samples: Any, tokens: Tokens, lane: Lane, sessions: SceneSessions) -> None:
-    """Tell a lane and the sessions of its scene which clients come and go. A thread's work."""
+    """Tell a lane and its scene's sessions which clients come and go. Runs in a thread."""
     for sample in samples:
         try:
             client = keys.parse_client_alive(str(sample.key_expr))
@@ -207,10 +212,10 @@ def _watch(samples: Any, tokens: Tokens, lane: Lane, sessions: SceneSessions) ->
                 lane.client_gone(client)
             else:
                 tokens.here(client)
-        except Exception:  # of this client alone
+        except Exception:  # affects this client only
             log.exception("client %s", client)
 
 
 def _encoding(query: zenoh.Query) -> str | None:
-    """The encoding a query states, if any."""
+    """Return the encoding that a query states, if any."""
     return None if query.encoding is None else str(query.encoding)

@@ -1,4 +1,4 @@
-"""Wishes that came and were not read yet: clients in turn, each bounded in bytes. No zenoh here."""
+"""Queues of received motion commands, not yet decoded: round-robin, bounded in bytes."""
 
 from collections import OrderedDict, deque
 from collections.abc import Callable
@@ -6,29 +6,31 @@ from typing import Any
 
 from ...schemas.wire.keys import User
 
-# Of one turn, and of all together [bytes]: beyond it a turn's oldest ones are dropped. A turn may always have one.
+# Limits of one turn and of all turns [bytes]. Beyond them, the oldest motion commands of a turn are
+# dropped, except its last one.
 _MOST_BYTES_A_TURN, _MOST_BYTES = 1 << 20, 16 << 20
-# What a wish takes beside its payload [bytes].
+# Size of a motion command without its payload [bytes].
 _OVERHEAD = 256
 
 _Wish = tuple[User, Any, int]
 
 
 class WaitingWishes:
-    """A queue for each turn. Not thread-safe.
+    """Queue of motion commands for each turn. Not thread-safe.
 
-    Where a turn has more bytes than it may, its oldest wishes are dropped: a newer one replaces them anyway.
+    If a turn exceeds its bytes, its oldest motion commands are dropped: newer ones replace them
+    anyway.
     """
 
     def __init__(self, turn: Callable[[str], str]) -> None:
-        """turn: returns the turn of a client (liveliness_tokens.py)."""
+        """Begin empty. turn: returns the turn of a client (liveliness_tokens.py)."""
         self._turn = turn
-        self._queues: OrderedDict[str, deque[_Wish]] = OrderedDict()  # the turn that is next comes first
+        self._queues: OrderedDict[str, deque[_Wish]] = OrderedDict()  # the next turn first
         self._sizes: dict[str, int] = {}
         self._size = 0
 
     def put(self, user: User, wish: Any, size: int) -> None:
-        """Take a wish in. size: of its payload [bytes]."""
+        """Add a motion command. size: of its payload [bytes]."""
         turn = self._turn(user.client)
         self._queues.setdefault(turn, deque()).append((user, wish, size + _OVERHEAD))
         self._count(turn, size + _OVERHEAD)
@@ -37,7 +39,7 @@ class WaitingWishes:
             self._count(turn, -queue.popleft()[2])
 
     def take(self) -> tuple[User, Any] | None:
-        """Return the next wish, and whose it is; None where there is none."""
+        """Remove and return the next motion command with its user; None if there is none."""
         if not self._queues:
             return None
         turn, queue = self._queues.popitem(last=False)
@@ -50,6 +52,6 @@ class WaitingWishes:
         return user, wish
 
     def _count(self, turn: str, size: int) -> None:
-        """Count so many bytes more."""
+        """Add `size` bytes to the counts."""
         self._sizes[turn] = self._sizes.get(turn, 0) + size
         self._size += size

@@ -185,7 +185,7 @@ def test_what_cannot_be_opened_is_said_and_the_old_one_served_on(
         shutil.rmtree(place)
         with pytest.raises(FormatError, match="no archive here"):
             client.reload()
-        assert "served on" in caplog.text
+        assert "served as before" in caplog.text
         assert which(generations, client.collide("al", generations.poses).verdict) == {0}
 
 

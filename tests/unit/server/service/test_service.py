@@ -334,7 +334,7 @@ def test_a_reload_that_fails_says_why(service, scene, caplog):
     scene.refuses = FormatError("no archive here")
     (answer,) = list(service.answer(key("reload"), b"", MSGPACK))
     assert error(answer).code == "corrupt" and "no archive here" in error(answer).message
-    assert "floor is not reloaded, what was served is served on: no archive here" in caplog.text
+    assert "floor cannot be reloaded and is served as before: no archive here" in caplog.text
     scene.refuses = RuntimeError("a secret of the server's own")
     (answer,) = list(service.answer(key("reload"), b"", MSGPACK))
     assert error(answer).code == "internal" and "secret" not in error(answer).message

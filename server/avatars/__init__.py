@@ -1,4 +1,4 @@
-"""Avatars: the model of one, and the registry of the avatars of each client.
+"""Avatars: their model, and the registry of each client's avatars.
 
 May import server.kernels, server.served, builder.voxel, schemas.
 Begin with avatar_model.py.

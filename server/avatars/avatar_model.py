@@ -1,4 +1,4 @@
-"""An avatar: the user's body as spheres, and its hierarchy, built by the code that builds a voxel's."""
+"""Avatar: the user's body as spheres, with a hierarchy built by the code that builds a voxel's."""
 
 from typing import NamedTuple
 
@@ -13,15 +13,16 @@ from ..kernels.core.avatar_front import MAX_FRONT
 from ..kernels.core.pose_transform import Avatar
 from ..kernels.core.voxel_layout import LANES
 
-# Children a node of an avatar's tree; as for voxels, see BuildConfig.degree.
+# Children per node of an avatar's tree; as for voxels, see BuildConfig.degree.
 DEGREE = 8
 
 
 class AvatarModel(NamedTuple):
-    """An avatar as added.
+    """Avatar as added.
 
     points: (n, 3) float64, avatar frame [m], as given.  radius: of each point's sphere [m].
-    arrays: what the kernels read.  rows: (b, LANES) int32, the row of `points` that each lane of a block is.
+    arrays: what the kernels read.
+    rows: (b, LANES) int32, the row of `points` in each lane of a block.
     digest: `avatar_digest` of an avatar that a client added; empty for one of the scene's own.
     """
 
@@ -33,17 +34,18 @@ class AvatarModel(NamedTuple):
 
     @property
     def bounding_radius(self) -> float:
-        """Radius of a sphere around all of the avatar's spheres [m]."""
+        """Return the radius of a sphere around all of the avatar's spheres [m]."""
         return float(self.arrays.radius[0]) + self.radius if len(self.arrays.radius) else 0.0
 
 
 def make_avatar(points: ArrayLike, radius: float | None = None) -> AvatarModel:
-    """Build an avatar from points (n, 3) [m]; n may be 0, which touches nothing.
+    """Build an avatar from points (n, 3) [m]. n may be 0; the avatar then touches nothing.
 
-    radius: of every point's sphere [m], zero or more; None: half the mean closest-point distance ([Fig12] section
-    7), over distinct points on their own lattice of 2^-20 m; one point alone needs a radius given.
+    radius: of every point's sphere [m], zero or more; None: half the mean closest-point distance
+    ([Fig12] section 7), over distinct points on their own lattice of 2^-20 m. A single point needs
+    a radius.
     """
-    array = make_positions(points).copy()  # the caller may go on writing into theirs
+    array = make_positions(points).copy()  # the caller may still write into the original
     if len(array) and np.abs(array).max() > MAX_COORDINATE:
         raise BadRequestError(
             f"avatar coordinate {np.abs(array).max():g} m: expected within {MAX_COORDINATE:g} m"
@@ -75,11 +77,12 @@ def make_avatar(points: ArrayLike, radius: float | None = None) -> AvatarModel:
         1 + np.concatenate([[0], np.cumsum(tree.count[:leaves], dtype=np.int64)[:-1]]) if leaves else 0
     )
     first[leaves:] = ~np.arange(len(tree.begin) - leaves)
-    # The last point of a block is repeated to its end.
+    # The last point of a block fills its remaining lanes.
     last = tree.end[leaves:, None] - 1
     rows = tree.order[np.minimum(tree.begin[leaves:, None] + np.arange(LANES), last)]
     lanes = array[rows].transpose(0, 2, 1)
-    # The lattice point lies within sqrt(3) steps of the point as given: two steps more hold it, rounding included.
+    # A lattice point lies within sqrt(3) steps of the given point: two more steps enclose the given
+    # point, rounding included.
     center = np.asarray(local.low + bounds.center * local.step)
     node_radius = np.asarray((bounds.radius + 2) * local.step, np.float64)
     # The deepest level that fits: the leaf nodes, for avatars of up to some 8,000 points.
@@ -92,7 +95,8 @@ def make_avatar(points: ArrayLike, radius: float | None = None) -> AvatarModel:
         first,
         tree.count.astype(np.int32),
         np.ascontiguousarray(lanes),
-        # Not in the order concatenate leaves it in: of an array in another order numba compiles every kernel anew.
+        # `concatenate` may return another memory order, for which numba would recompile every
+        # kernel.
         np.ascontiguousarray(np.concatenate([center[front].T, node_radius[None, front]])),
         front.start,
     )

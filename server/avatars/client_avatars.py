@@ -1,4 +1,4 @@
-"""The avatars of a scene's clients: who has which, what they take of memory, and how much they may."""
+"""Registry of the avatars of a scene's clients, with their memory and its limits."""
 
 import threading
 import time
@@ -17,15 +17,16 @@ from ..served.answering_avatars import note
 from ..served.avatar_limits import EVERYBODY, THIS_PROCESS, AvatarLimits
 from .avatar_model import AvatarModel, make_avatar
 
-# What the arrays of an avatar take, at most [bytes]: 53.5 a point were measured, and one block for a few points.
+# Upper bound of the arrays of an avatar [bytes]: measured 53.5 a point, and one block for a few
+# points.
 _BYTES_A_POINT, _LEAST_BYTES = 56, 1200
 _OWN = (EVERYBODY, THIS_PROCESS)
-# Avatars of more points are built one at a time: while one is built it takes three times its bytes.
+# Avatars of more points are built one at a time: building one takes three times its bytes.
 _LARGE = 50_000
 
 
 class _Held(NamedTuple):
-    """What the avatars of all clients take. bytes: of their arrays.  avatars, clients: numbers."""
+    """Memory and number of all clients' avatars. bytes: of their arrays."""
 
     bytes: int
     avatars: int
@@ -33,7 +34,11 @@ class _Held(NamedTuple):
 
 
 class _Entry:
-    """One avatar. model: None while it is built.  asked: the radius it was added with.  used: when it was last [s]."""
+    """One avatar.
+
+    model: None while it is being built.  asked: the radius it was added with.
+    used: time of the last use [s].
+    """
 
     __slots__ = ("asked", "bytes", "model", "used")
 
@@ -47,19 +52,19 @@ class _Entry:
 class Avatars:
     """Avatars by client and name. Thread-safe.
 
-    limits: None: no limits. The avatars of the scene and those of this process (`EVERYBODY`, `THIS_PROCESS`) stay, and
-    are neither limited nor counted.
+    limits: None for no limits. The avatars of the scene and of this process (`EVERYBODY`,
+    `THIS_PROCESS`) are never dropped, limited or counted.
     """
 
     def __init__(self, limits: AvatarLimits | None = None) -> None:
-        """Make a table without avatars."""
+        """Make an empty registry."""
         self.limits = limits
         self._changed = threading.Condition()
         self._large = threading.Lock()  # held while a large avatar is built
         self._clients: dict[str, dict[str, _Entry]] = {}
 
     def get(self, name: str, client: str) -> AvatarModel:
-        """Return a client's avatar, or the scene's own, and note it. Raises UnknownAvatarError."""
+        """Return a client's or the scene's avatar, and note its use. Raise UnknownAvatarError."""
         with self._changed:
             for owner in (client, EVERYBODY):
                 entry = self._clients.get(owner, {}).get(name)
@@ -70,10 +75,11 @@ class Avatars:
         raise UnknownAvatarError(f"avatar {name!r} is not known: add it with add_avatar first")
 
     def add(self, name: str, points: ArrayLike, radius: float | None, client: str) -> AvatarModel:
-        """Build an avatar of points (n, 3) [m] and keep it; the same one again is not built again.
+        """Build an avatar of points (n, 3) [m] and store it, unless the same one exists already.
 
-        One named as one of the scene's own must be it, and shares its arrays. Raises BadRequestError where the name is
-        taken by another avatar, TooLargeError where it is over the limits.
+        An avatar with the name of one of the scene's own must equal it, and shares its arrays.
+        Raise BadRequestError if the name belongs to a different avatar, TooLargeError beyond the
+        limits.
         """
         array = make_positions(points)
         shared = None if client == EVERYBODY else self._scene_avatar(name)
@@ -94,7 +100,7 @@ class Avatars:
         return known
 
     def _scene_avatar(self, name: str) -> _Entry | None:
-        """Return the entry of one of the scene's own avatars; None where there is none of this name."""
+        """Return the entry of one of the scene's own avatars; None if none has this name."""
         with self._changed:
             entry = self._clients.get(EVERYBODY, {}).get(name)
             return None if entry is None or entry.model is None else entry
@@ -102,12 +108,12 @@ class Avatars:
     def _check_same(
         self, name: str, entry: _Entry, points: NDArray[np.float64], radius: float | None
     ) -> None:
-        """Raise BadRequestError unless an avatar that is known is that of these points and radius."""
+        """Raise BadRequestError unless a known avatar has these points and this radius."""
         known = entry.model
         assert known is not None
         same = np.array_equal(known.points, points)
         if same and radius is None and entry.asked is not None:
-            # The radius that the points make may be the one that was asked for: only building the avatar tells.
+            # The default radius of the points may equal the requested one: only building tells.
             radius = _built(self._large, points, None).radius
         if not same or (radius is not None and radius != known.radius):
             raise BadRequestError(
@@ -115,12 +121,12 @@ class Avatars:
             )
 
     def drop_client(self, client: str) -> None:
-        """Forget the avatars of a client."""
+        """Drop the avatars of a client."""
         with self._changed:
             self._clients.pop(client, None)
 
     def drop_unused(self, alive: Collection[str], seconds: float) -> int:
-        """Forget avatars that were not used for so long [s], but for those of clients in `alive`; return how many."""
+        """Drop avatars unused for `seconds`, except of clients in `alive`; return how many."""
         before, dropped = time.monotonic() - seconds, 0
         with self._changed:
             for client, entries in list(self._clients.items()):
@@ -134,7 +140,7 @@ class Avatars:
         return dropped
 
     def stats(self) -> AvatarStats:
-        """Return what the avatars of all clients take, and the limits."""
+        """Return the memory and number of all clients' avatars, and the limits."""
         with self._changed:
             held = self._held()
         limits = self.limits
@@ -156,8 +162,9 @@ class Avatars:
 
     @contextmanager
     def _reserved(self, name: str, client: str, count: int, new: _Entry) -> Iterator[_Entry]:
-        """Yield the entry of a name: one that is known, or a new one, counted while it is built and kept if it was.
+        """Yield the entry of a name, known or new.
 
+        A new entry is counted while its avatar is built, and kept if it was built.
         count: of the avatar's points.
         """
         with self._changed:
@@ -188,7 +195,7 @@ class Avatars:
                 del self._clients[client]
 
     def _check(self, name: str, count: int, size: int, client: str) -> None:
-        """Raise TooLargeError where one more avatar is over the limits."""
+        """Raise TooLargeError if one more avatar exceeds the limits."""
         limits = self.limits
         if limits is None:
             return
@@ -210,18 +217,18 @@ class Avatars:
         ):
             if found + more > most:
                 raise TooLargeError(
-                    f"avatar {name!r} of {count} points: {found} {what} are there, this one makes it {found + more}, "
+                    f"avatar {name!r} of {count} points: {found} {what} exist, with this one {found + more}: "
                     f"at most {most} are allowed: {then}"
                 )
 
 
 def _built(large: threading.Lock, points: NDArray[np.float64], radius: float | None) -> AvatarModel:
-    """Build an avatar. large: held while it is, if it is a large one."""
+    """Build an avatar. large: lock held while a large one is built."""
     with large if len(points) > _LARGE else nullcontext():
         return make_avatar(points, radius)
 
 
 def bytes_of(model: AvatarModel) -> int:
-    """Return what the arrays of an avatar take of memory [bytes]."""
+    """Return the memory of an avatar's arrays [bytes]."""
     arrays = [model.points, model.rows, *(each for each in model.arrays if isinstance(each, np.ndarray))]
     return sum(array.nbytes for array in arrays)

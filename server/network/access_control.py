@@ -1,22 +1,24 @@
-"""What a server lets pass over its zenoh session: everything that is not listed here is denied, in both directions.
+"""Access control of a server's zenoh session: all messages not listed here are denied both ways.
 
-zenoh decides by inclusion: a message passes if one of the listed key expressions includes the message's own. So a list
-of what is allowed also stops wider keys (`**`, `solidcloud/*/scene/**`), and a list of what is denied does not.
+zenoh decides by inclusion: a message passes if one of the listed key expressions includes the
+message's own. A list of allowed keys therefore also blocks wider keys (`**`,
+`solidcloud/*/scene/**`); a list of denied keys would not.
 """
 
 from typing import Any
 
 from ...schemas.wire.keys import ROOT
 
-# An operation that this server does not have is answered with an error, so any is let pass.
+# All operations pass: the server answers an unknown one with an error.
 _QUESTIONS = [f"{ROOT}/scenes", f"{ROOT}/scene/*/*/*"]
 _STATES = [f"{ROOT}/state/*/*/*"]
 _WISHES = [f"{ROOT}/wish/*/*/*"]
 _CLIENTS = [f"{ROOT}/client/*/*"]
 _SERVERS = [f"{ROOT}/alive/**"]
 
-# Messages and the key expressions they may come under. Nobody may declare a queryable or a subscriber, reply or publish
-# states: what a client hears comes from the server, as replies to its own questions.
+# Messages from clients, and their allowed key expressions. No client may declare a queryable or a
+# subscriber, send replies or publish states: a client receives data only from the server, as
+# replies to its own queries.
 _FROM_CLIENTS = {
     "query": [*_QUESTIONS, *_STATES],
     "put": _WISHES,
@@ -25,7 +27,7 @@ _FROM_CLIENTS = {
     "liveliness_query": _SERVERS,
     "declare_liveliness_subscriber": _SERVERS,
 }
-# The server's own; the last two have clients send it their tokens.
+# Messages of the server; the last two make clients send it their tokens.
 _TO_CLIENTS = {
     "reply": [*_QUESTIONS, *_STATES],
     "declare_queryable": [*_QUESTIONS, *_STATES],
@@ -59,12 +61,13 @@ def access_control() -> dict[str, Any]:
 
 
 def state_priority() -> list[dict[str, Any]]:
-    """Return zenoh's configuration `qos/network` of a server: how states travel, whatever their asker says.
+    """Return zenoh's configuration `qos/network` of a server: the transport of states.
 
-    A reply travels as its query did, so the query is changed when it comes. A state is dropped where its client takes
-    none: under zenoh's default, or a client's choice, it would wait 200 ms and hold up the states of all users.
-    The priority is not that of other replies, because what is dropped where there is no room would wait behind a reply
-    that blocks (zenoh's issue 2584). Express: a frame's states are not kept back to fill a batch.
+    It overrides the client's choice. A reply has the settings of its query, so the query is changed
+    on arrival. A state is dropped if its client does not accept it: under zenoh's default, or a
+    client's choice, it would wait 200 ms and delay the states of all users. The priority differs
+    from that of other replies, because a droppable message would wait behind a reply that blocks
+    (zenoh's issue 2584). Express: the states of a frame are not held back to fill a batch.
     """
     overwrite = {"congestion_control": "drop", "priority": "interactive_high", "express": True}
     return [

@@ -1,4 +1,4 @@
-"""Channels in which zenoh hands over queries and samples."""
+"""Channels in which zenoh passes on queries and samples."""
 
 from typing import Any
 

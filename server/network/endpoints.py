@@ -1,4 +1,4 @@
-"""zenoh endpoints such as tcp/127.0.0.1:7447: what may stand in one, and its one name for the files about it."""
+"""Syntax of zenoh endpoints such as tcp/127.0.0.1:7447, and their canonical names."""
 
 import re
 
@@ -6,28 +6,31 @@ from ...schemas.errors import BadRequestError
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 
-# Those that zenoh's Python library opens without further configuration.
+# Protocols that zenoh's Python library opens without further configuration.
 PROTOCOLS = ("tcp", "udp", "ws", "unixsock-stream")
 _ENCRYPTED = ("tls", "quic", "wss")
 
 _ENDPOINT = re.compile(r"(?P<protocol>[a-z0-9-]+)/(?P<address>[^?#\s]+)(?P<rest>[?#]\S*)?")
 _LOOPBACK = re.compile(r"(127(\.\d{1,3}){3}|localhost|\[::1\]):\d{1,5}")
 _HOST_AND_PORT = re.compile(r"(?P<host>\[[0-9A-Fa-f:.%]+\]|[^:/\[\]]+):(?P<port>\d{1,5})")
-# All addresses of this host, and another name of one of them.
+# Hosts that stand for all addresses of this host, and another name of a loopback address.
 _SAME_AS_LOOPBACK = ("localhost", "0.0.0.0", "[::]")
 
 
 def check_endpoint(endpoint: str, what: str) -> str:
-    """Return the same endpoint; BadRequestError where zenoh could not open it. what: names it in the error."""
+    """Return the endpoint; raise BadRequestError if zenoh cannot open it.
+
+    what: names it in the error.
+    """
     expected = f"expected one such as {DEFAULT_ENDPOINT}"
     match = _ENDPOINT.fullmatch(endpoint)
     if not match:
-        hint = f": say tcp/{endpoint}" if _HOST_AND_PORT.fullmatch(endpoint) else ""
+        hint = f": write tcp/{endpoint}" if _HOST_AND_PORT.fullmatch(endpoint) else ""
         raise BadRequestError(f"{what} {endpoint!r}: not PROTOCOL/ADDRESS: {expected}{hint}")
     protocol = match["protocol"]
     if protocol in _ENCRYPTED:
         raise BadRequestError(
-            f"{what} {endpoint!r}: {protocol} needs certificates, and this version takes none: {expected}"
+            f"{what} {endpoint!r}: {protocol} needs certificates, which this version does not support: {expected}"
         )
     if protocol not in PROTOCOLS:
         raise BadRequestError(
@@ -43,7 +46,7 @@ def check_endpoint(endpoint: str, what: str) -> str:
 
 
 def is_loopback(endpoint: str) -> bool:
-    """Whether only processes of this host can reach a zenoh endpoint; unsure counts as no."""
+    """Return whether only processes of this host can reach an endpoint; False if undecided."""
     match = _ENDPOINT.fullmatch(endpoint)
     if not match:
         return False
@@ -53,7 +56,10 @@ def is_loopback(endpoint: str) -> bool:
 
 
 def canonical(endpoint: str) -> str:
-    """Return one text for all endpoints of this host that lead to the same server, as far as that can be told."""
+    """Return one canonical text for the endpoints of this host that lead to the same server.
+
+    Not all such endpoints are recognized.
+    """
     protocol, _, address = endpoint.partition("/")
     match = _HOST_AND_PORT.fullmatch(re.split("[?#]", address)[0])
     if match and match["host"].lower() in _SAME_AS_LOOPBACK:
@@ -62,5 +68,5 @@ def canonical(endpoint: str) -> str:
 
 
 def zenoh_words(error: Exception) -> str:
-    """Return what an error of zenoh says, without the paths of its build."""
+    """Return the message of a zenoh error, without the paths of its build."""
     return re.sub(r"\s+at /\S+\.rs:\d+\.?", "", str(error)).strip().rstrip(".") or type(error).__name__

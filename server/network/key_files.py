@@ -1,4 +1,4 @@
-"""Key files: where a server leaves the key of its seals for clients of the same user, and where a client finds it."""
+"""Key files, in which a server leaves the key of its seals for clients of the same user."""
 
 import hashlib
 import logging
@@ -21,29 +21,30 @@ log = logging.getLogger(__name__)
 
 
 class KeyFile(NamedTuple):
-    """A key that was read, and what tells its file from one that has taken its place."""
+    """Key that was read. version: distinguishes its file from one that has replaced it."""
 
     key: bytes
     version: tuple[int, int, int]
 
 
 def key_paths(endpoint: str) -> list[Path]:
-    """Return the files in which the key of a server at an endpoint may be: the first that can be is written.
+    """Return the possible key files of a server at an endpoint; the server writes the first it can.
 
-    Both folders are the user's own. The host's name is in the file's: a home folder may be that of many hosts.
+    Both folders belong to the user. The file name contains the host's name, because several hosts
+    may share a home folder.
     """
     name = _file_name(socket.gethostname(), endpoint)
     folders = []
     if runtime := os.environ.get("XDG_RUNTIME_DIR"):
         folders.append(Path(runtime))
-    with suppress(RuntimeError):  # nobody's home
+    with suppress(RuntimeError):  # no home folder
         folders.append(Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"))
     return [folder / "solidcloud" / name for folder in folders]
 
 
 @lru_cache(maxsize=256)
 def _file_name(host: str, endpoint: str) -> str:
-    """Return the name of the key file of a server. Remembered: it is looked for with each reply that has no seal."""
+    """Return the name of a server's key file. Cached: each reply without a seal needs it."""
     text = f"{host} {canonical(endpoint)}"
     plain = re.sub(r"[^A-Za-z0-9.-]+", "_", text)[:80]
     return f"{plain}-{hashlib.sha256(text.encode()).hexdigest()[:8]}.key"
@@ -51,9 +52,10 @@ def _file_name(host: str, endpoint: str) -> str:
 
 @contextmanager
 def published_key(endpoint: str, key_file: Path | None) -> Iterator[bytes]:
-    """Give a server's key, which the user's clients find while inside. To be entered once the endpoint is taken.
+    """Yield a server's key, which the user's clients find inside the `with`.
 
-    key_file: holds the key; None: a random one. BadRequestError: that file does not do.
+    Enter it after the endpoint was opened.
+    key_file: holds the key; None: a random one. BadRequestError: the file is not usable.
     """
     key = secrets.token_bytes(KEY_BYTES) if key_file is None else read_given_key(key_file)
     written: Path | None = None
@@ -67,8 +69,8 @@ def published_key(endpoint: str, key_file: Path | None) -> Iterator[bytes]:
             break
     if written is None:
         log.warning(
-            "no key file could be written: clients cannot tell this server from another program at its endpoint, "
-            "unless both have --key-file"
+            "no key file could be written: clients cannot tell this server from another program at its endpoint: "
+            "give both --key-file"
         )
     try:
         yield key
@@ -78,17 +80,18 @@ def published_key(endpoint: str, key_file: Path | None) -> Iterator[bytes]:
 
 
 def find_key(endpoint: str, known: KeyFile | None = None, unusable: set[Any] | None = None) -> KeyFile | None:
-    """Return the key of the server at an endpoint of this host, the newest that its user left; None: no usable one.
+    """Return the newest key that this user's server at an endpoint left; None if none is usable.
 
-    known: returned where its file is still the newest.  unusable: files that were found unusable before and are not
-    read again; others are added. A file that others can read or write is left alone, with a warning.
+    known: returned if its file is still the newest.  unusable: files found unusable before, which
+    are not read again; further ones are added. A file that other users can read or write is
+    ignored with a warning.
     """
     unusable = set() if unusable is None else unusable
     found = []
     for path in key_paths(endpoint):
         with suppress(OSError):
             status = os.stat(path, follow_symlinks=False)
-            # The time of a change of mode or owner too: it may make a file usable.
+            # The change time is included: a change of mode or owner may make a file usable.
             found.append((_version(status), status.st_ctime_ns, path))
     for each in sorted(found, reverse=True):
         version, _, path = each
@@ -105,7 +108,10 @@ def find_key(endpoint: str, known: KeyFile | None = None, unusable: set[Any] | N
 
 
 def read_given_key(path: Path) -> bytes:
-    """Return the key in a file that somebody named; BadRequestError where it is none, or everybody could read it."""
+    """Return the key in a file given by the user.
+
+    Raise BadRequestError if it holds no key or all users can read it.
+    """
     try:
         return _read(path, private=False).key
     except OSError as error:
@@ -117,7 +123,7 @@ def _version(status: os.stat_result) -> tuple[int, int, int]:
 
 
 def _read(path: Path, *, private: bool) -> KeyFile:
-    """Read a key file. private: nobody but this user may have access; else a group may read it."""
+    """Read a key file. private: only this user may have access; otherwise a group may read it."""
     with open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NOFOLLOW * private)) as file:
         status = os.fstat(file.fileno())
         forbidden = 0o077 if private else 0o027
@@ -131,7 +137,7 @@ def _read(path: Path, *, private: bool) -> KeyFile:
 
 
 def _write(path: Path, key: bytes) -> None:
-    """Write a key file whole or not at all, in a folder that nobody else enters."""
+    """Write a key file atomically, in a folder that only this user can enter."""
     from ...schemas.process.new_file import publish, temporary_path  # imports h5py, which no client needs
 
     path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""Replies to zenoh queries: sending an answer as one, with its seal, and reading one."""
+"""Sealed replies to zenoh queries: sending and reading them."""
 
 import logging
 import os
@@ -20,7 +20,7 @@ _ENCODINGS = {name: zenoh.Encoding(name) for name in (MSGPACK, JSON)}
 
 
 def sealer_of(query: zenoh.Query, key: bytes, key_expression: str, request: bytes) -> Sealer | None:
-    """Return what seals the replies to a query; None where the query has no nonce, and wants none.
+    """Return the sealer of the replies to a query; None if the query has no nonce.
 
     key: the server's.  request: the query's payload.
     """
@@ -33,9 +33,9 @@ def sealer_of(query: zenoh.Query, key: bytes, key_expression: str, request: byte
 def send_reply(
     query: zenoh.Query, key: Any, answer: Answer, sealer: Sealer | None = None, number: int = 0
 ) -> bool:
-    """Send one answer; return False where the client or its link is gone, which is logged.
+    """Send one answer; log and return False if the client or its link no longer exists.
 
-    number: of the replies to this query, growing.
+    number: of the replies to this query, increasing.
     """
     payload, encoding, ok, about = answer
     seal = None if sealer is None else sealer.seal(number, ok, encoding, payload, about)
@@ -54,7 +54,7 @@ def send_reply(
 
 
 class OtherAvatarError(UnknownAvatarError):
-    """The server's reply is about another avatar than the client added: somebody else asks under the client's id.
+    """Reply about another avatar than the client added: another program uses the client's id.
 
     key_expression: of the query, with the id.
     """
@@ -65,20 +65,24 @@ class OtherAvatarError(UnknownAvatarError):
 
 
 def _no_avatars() -> bytes:
-    """Return the digests of no avatar."""
+    """Return the joined digests of no avatars."""
     return b""
 
 
 class Anchor:
-    """How one client knows its server's replies: by a key that it was given, or finds in the user's key files.
+    """Trust anchor of one client: the key by which it recognizes its server's replies.
 
-    Once there is a key, a reply without the right seal is ignored, for as long as this object lives. The key is read
-    again from the file alone, where a server that was restarted has left another. Without a key, replies are taken as
-    they come, and a warning says so once. Thread-safe: what is assigned is whole.
+    The key is given, or found in the user's key files. Once there is a key, this object ignores
+    every reply without the right seal. The key is replaced only from the file, where a restarted
+    server leaves a new one. Without a key, all replies are accepted, with one warning. Thread-safe:
+    assignments are atomic.
     """
 
     def __init__(self, endpoint: str, key_file: Path | str | None = None) -> None:
-        """key_file: holds the key; BadRequestError where it does not. None: it is looked for."""
+        """Read or find the key.
+
+        key_file: holds the key; BadRequestError if it does not. None: search the user's key files.
+        """
         self._endpoint = endpoint
         self._given = None if key_file is None else Path(key_file)
         self._known: KeyFile | None = None
@@ -91,27 +95,27 @@ class Anchor:
 
     @property
     def key(self) -> bytes | None:
-        """Return the key; None where there is none yet."""
+        """Return the key; None if there is none yet."""
         return None if self._known is None else self._known.key
 
     def look_again(self) -> bytes | None:
-        """Return the key after a look at its file, where a new server may have left another."""
+        """Return the key after rereading its file, in which a new server may have left another."""
         if self._given is None:
             self._known = find_key(self._endpoint, self._known, self._unusable) or self._known
         return self.key
 
     def unsealed(self) -> None:
-        """Say, once, that replies are taken although nobody vouches for them."""
+        """Warn once that unauthenticated replies are accepted."""
         if "unsealed" not in self._said:
             self._said.add("unsealed")
             log.warning(
-                "no key of the server at %s: its replies are taken as they come; give its --key-file to tell it from "
+                "no key of the server at %s: its replies are accepted unchecked; give its --key-file to tell it from "
                 "another program at that endpoint",
                 self._endpoint,
             )
 
     def refused(self, key_expression: str) -> None:
-        """Say, once, that a reply is ignored."""
+        """Warn once that a reply is ignored."""
         if "refused" not in self._said:
             self._said.add("refused")
             log.warning(
@@ -123,7 +127,7 @@ class Anchor:
 
 
 class Asked:
-    """One query of a client, and the reading of its replies."""
+    """Query of a client, and reader of its replies."""
 
     __slots__ = (
         "_about",
@@ -144,10 +148,11 @@ class Asked:
         request: bytes = b"",
         about: Callable[[], bytes | None] = _no_avatars,
     ) -> None:
-        """Make a nonce, which is to be sent as the query's attachment.
+        """Make a nonce, which the caller sends as the query's attachment.
 
-        about: returns the digests, joined, of the avatars that this client added and asks about; None where it does not
-        know one. With a key, a reply about others is not believed.
+        about: returns the joined digests of the avatars that this client added and that the query
+        names; None if the client does not know one of them. With a key, a reply about other avatars
+        is rejected.
         """
         self._anchor, self._key_expression, self._request = anchor, key_expression, request
         self._about = about
@@ -158,14 +163,15 @@ class Asked:
         self._last = -1  # number of the last reply
 
     def sent(self) -> None:
-        """Hash the request, once it is sent: a large one takes as long as the server does, too."""
+        """Hash the request after it was sent: the server hashes a large one at the same time."""
         self._hash = hash_of(self._request)
 
     def read(self, reply: zenoh.Reply) -> tuple[bool, bytes] | None:
-        """Return whether a reply is an answer or an error, and its bytes; None where the server did not send it.
+        """Return (whether a reply is an answer, its bytes); None if the server did not send it.
 
-        A reply under any other key than the one asked, a wider one included, is none of the server's. Raises
-        OtherAvatarError for the server's reply about other avatars; an error may also be about none.
+        A reply that is no answer is an error. The server replies only under the exact key of the
+        query, never under a wider one. Raise OtherAvatarError for the server's reply about other
+        avatars; an error may also be about none.
         """
         sample: Any = reply.ok
         if sample is None:
@@ -197,7 +203,7 @@ class Asked:
         return ok, payload
 
     def _has_key_and_seal(self, seal: bytes, ok: bool, encoding: str, payload: bytes) -> bool:
-        """Return whether there is a key and the reply has its seal; the key is looked for again where it has not."""
+        """Return whether a key exists and the reply has its seal; reread the key if not."""
         key = self._anchor.key
         if key is not None and self._is_sealed(key, seal, ok, encoding, payload):
             return True
@@ -205,12 +211,12 @@ class Asked:
         return fresh is not None and fresh != key and self._is_sealed(fresh, seal, ok, encoding, payload)
 
     def _is_about_ours(self, seal: bytes, ok: bool) -> bool:
-        """Return whether a sealed reply is about the avatars that this client added; an error may be about none."""
+        """Return whether a sealed reply is about the client's avatars; errors may be about none."""
         about = self._about()
         return (about is not None and is_about(seal, about)) or (not ok and is_about(seal, b""))
 
     def _is_sealed(self, key: bytes, seal: bytes, ok: bool, encoding: str, payload: bytes) -> bool:
-        """Return whether a reply has its seal, and is none that came before."""
+        """Return whether a reply has a valid seal and does not repeat an earlier reply."""
         if self._sealer is None or key is not self._key:
             if self._hash is None:
                 self.sent()
@@ -223,7 +229,7 @@ class Asked:
 
 
 def _unhexed(text: str) -> bytes:
-    """Return the bytes of hex digits; none where the text is something else."""
+    """Return the bytes of hex digits; b"" if the text is not hexadecimal."""
     try:
         return bytes.fromhex(text)
     except ValueError:

@@ -1,4 +1,4 @@
-"""The settings of a zenoh session, server's or client's."""
+"""Settings of a zenoh session, for servers and clients."""
 
 import json
 from typing import Any
@@ -8,7 +8,7 @@ import zenoh
 from ...schemas.wire.encoding import MAX_MESSAGE_BYTES
 from .access_control import access_control, state_priority
 
-# How wishes travel; states travel the same way (access.state_priority).
+# Transport of motion commands; states use the same (access_control.state_priority).
 FRAME_QOS: dict[str, Any] = {
     "congestion_control": zenoh.CongestionControl.DROP,
     "priority": zenoh.Priority.INTERACTIVE_HIGH,
@@ -17,25 +17,27 @@ FRAME_QOS: dict[str, Any] = {
 
 
 def session_config(*, listen: str | None = None, connect: str | None = None) -> zenoh.Config:
-    """The configuration of a session, server's or client's: one endpoint, and nothing found by itself."""
+    """Return the configuration of a server's or client's session: one endpoint, no discovery."""
     settings: dict[str, Any] = {
-        # A peer opens although nobody is there yet, and goes on trying; a zenoh "client" fails instead.
+        # A peer opens without a server and keeps trying to connect; a zenoh "client" fails instead.
         "mode": "peer",
         "listen/endpoints": [listen] if listen else [],
         "connect/endpoints": [connect] if connect else [],
-        # By default 1 s, growing to 4 s: an outage would last that much longer than the server is away.
+        # The default of 1 s, growing to 4 s, would prolong each outage by as much.
         "connect/retry": {"period_init_ms": 50, "period_max_ms": 500, "period_increase_factor": 2},
-        # How long opening waits for the connection [ms], also now and then where it is there at once: 500.
+        # How long opening waits for the connection [ms]; default 500. Opening sometimes waits this
+        # long although the connection exists at once.
         "scouting/delay": 200,
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
-        # A killed process would leave 16 MiB behind in /dev/shm.
+        # With shared memory a killed process would leave 16 MiB in /dev/shm.
         "transport/shared_memory/enabled": False,
-        # A longer message is dropped unread, and its sender's query expires; by default 1 GiB is taken in.
+        # A longer message is dropped unread, and its sender's query times out; default 1 GiB.
         "transport/link/rx/max_message_size": MAX_MESSAGE_BYTES,
-        # How long a reply waits for a client that takes none before its link is closed [µs]; by default 5 s.
+        # How long a reply waits for a client that accepts none before its link is closed [µs];
+        # default 5 s.
         "transport/link/tx/queue/congestion_control/block/wait_before_close": 200_000,
-        # By default 100 connections that never say a word keep new ones out for 10 s.
+        # By default, 100 connections that send nothing block new ones for 10 s.
         "transport/unicast/accept_timeout": 1000,
         "transport/unicast/accept_pending": 1000,
     }

@@ -1,8 +1,8 @@
 """Deadlines of requests: one thread sets the stop flag of each request whose time is up.
 
-The thread runs for the life of the process: a server starts it before it answers, anything else with the first
-deadline. It waits outside the interpreter's lock and wakes when the earliest deadline comes, so that thousands of
-deadlines that are met in time cost a heap operation each.
+The thread runs for the life of the process. A server starts it before it answers requests; in any
+other process the first deadline starts it. It waits without the interpreter's lock until the
+earliest deadline, so thousands of deadlines that are met cost one heap operation each.
 """
 
 import heapq
@@ -14,7 +14,8 @@ import weakref
 from .stop_flag import Stop
 from .threads import start_thread
 
-# Entries whose request has ended stay until their time comes, or until they outnumber the others by this factor.
+# Entries whose request has ended stay until their time, or until the heap has grown by this factor
+# since it was last compacted.
 _DEAD_SHARE = 2
 _LEAST_ENTRIES = 256
 
@@ -22,7 +23,7 @@ _LEAST_ENTRIES = 256
 class Deadlines:
     """Stop flags by the time at which they are to be set. Thread-safe.
 
-    A flag that nobody else refers to any more is dropped.
+    A flag without other references is dropped.
     """
 
     def __init__(self) -> None:
@@ -49,12 +50,12 @@ class Deadlines:
                 self._changed.notify()
 
     def _start(self) -> None:
-        """Start the thread, unless it runs. Where that raises, the next deadline tries again."""
+        """Start the thread, unless it runs. If that raises, the next deadline tries again."""
         if self._thread is None:
             self._thread = start_thread("deadlines", self._run)
 
     def _compact(self) -> None:
-        """Drop the entries whose flag is gone or set."""
+        """Drop the entries whose flag no longer exists or is set."""
         self._heap = [entry for entry in self._heap if (stop := entry[2]()) is not None and not stop]
         heapq.heapify(self._heap)
         self._compact_at = max(_LEAST_ENTRIES, _DEAD_SHARE * len(self._heap))
@@ -76,10 +77,10 @@ _DEADLINES = Deadlines()
 
 
 def stop_at(stop: Stop, when: float, reason: str) -> None:
-    """Set `stop` with this reason at `when`, on time.perf_counter()'s clock [s], if anybody still refers to it."""
+    """Set `stop` at `when`, on time.perf_counter()'s clock [s], if it is still referenced then."""
     _DEADLINES.add(stop, when, reason)
 
 
 def start_deadlines() -> None:
-    """Start the thread now, so that no slow request does, whose low priority it would have."""
+    """Start the thread now, so that it does not inherit the low priority of a slow request."""
     _DEADLINES.start()

@@ -1,4 +1,4 @@
-"""The threads of a scene that compute parts of paths, those of all clients in turn."""
+"""Threads of a scene that compute parts of paths, round-robin over clients."""
 
 import threading
 from collections import OrderedDict, deque
@@ -13,41 +13,42 @@ _Work = tuple[Future[Any], Callable[..., Any], tuple[Any, ...]]
 
 
 class PathThreads:
-    """A queue for each client that has parts to be computed; one part of each at a time, in order. Thread-safe."""
+    """Queues of clients' path parts, computed in order, one a client at a time. Thread-safe."""
 
     def __init__(self, scene: str, count: int) -> None:
-        """scene: its name.  count: of threads, which start with `start` or with the first part."""
+        """Make the queues without threads; `start` or the first part starts the threads.
+
+        scene: its name.  count: of threads.
+        """
         self._scene, self._count = scene, count
-        self._queues: OrderedDict[str, deque[_Work]] = (
-            OrderedDict()
-        )  # the client whose turn is next comes first
+        self._queues: OrderedDict[str, deque[_Work]] = OrderedDict()  # the client whose turn is next first
         self._changed = threading.Condition()
         self._threads: list[threading.Thread] = []
         self._closed = False
 
     def start(self) -> None:
-        """Start the threads that do not run yet. They keep the priority of the thread that starts them."""
+        """Start the threads that do not run yet; they inherit the priority of the calling thread."""
         with self._changed:
             while len(self._threads) < self._count and not self._closed:
                 self._threads.append(start_thread(f"{self._scene}-path", self._run))
 
     def of(self, client: str) -> Executor:
-        """Return what a path of this client submits its parts to."""
+        """Return the executor for the parts of this client's paths."""
         return _OfClient(self, client)
 
     def submit(self, client: str, run: Callable[..., Any], arguments: tuple[Any, ...]) -> Future[Any]:
-        """Have a part computed when its client's turn comes. BadRequestError once closed."""
+        """Queue a part until its client's turn comes. Raise BadRequestError once closed."""
         self.start()
         future: Future[Any] = Future()
         with self._changed:
             if self._closed:
-                raise BadRequestError(f"{self._scene}: closed while a path was asked: open it again")
+                raise BadRequestError(f"{self._scene}: closed during a path request: open it again")
             self._queues.setdefault(client, deque()).append((future, run, arguments))
             self._changed.notify()
         return future
 
     def close(self) -> None:
-        """Cancel what waits, and wait for what is being computed."""
+        """Cancel the waiting parts, and wait for those being computed."""
         with self._changed:
             self._closed = True
             waiting = [work for queue in self._queues.values() for work in queue]
@@ -72,12 +73,15 @@ class PathThreads:
             return work
 
     def _run(self) -> None:
-        """Compute parts until closed. A thread's work."""
+        """Compute parts until closed. Runs in a thread."""
         while self._compute_next():
             pass
 
     def _compute_next(self) -> bool:
-        """Compute one part; return False once closed. What it was of is not kept while the next is waited for."""
+        """Compute one part; return False once closed.
+
+        A separate function, so that no reference to the part remains while waiting for the next.
+        """
         work = self._next()
         if work is None:
             return False
@@ -86,24 +90,24 @@ class PathThreads:
 
 
 def _compute(future: Future[Any], run: Callable[..., Any], arguments: tuple[Any, ...]) -> None:
-    """Compute one part, unless nobody wants it any more."""
+    """Compute one part, unless it was cancelled."""
     if not future.set_running_or_notify_cancel():
         return
     try:
         found = run(*arguments)
-    except BaseException as error:  # whoever waits for the part raises it
+    except BaseException as error:  # raised where the part's result is read
         future.set_exception(error)
     else:
         future.set_result(found)
 
 
 class _OfClient(Executor):
-    """Submits the parts of one client's path."""
+    """Executor of the parts of one client's path."""
 
     def __init__(self, threads: PathThreads, client: str) -> None:
         self._threads, self._client = threads, client
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Have a part computed."""
+        """Queue a part for computation."""
         assert not kwargs, "a part has no named arguments"
         return self._threads.submit(self._client, fn, args)

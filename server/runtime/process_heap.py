@@ -1,20 +1,21 @@
-"""How the process's memory allocator gives memory back to the system."""
+"""Settings and calls that make the process's memory allocator return memory to the system."""
 
 import ctypes
 import sys
 from contextlib import suppress
 
-# glibc's numbers of the settings, see mallopt(3).
+# glibc's parameter numbers, see mallopt(3).
 _MMAP_THRESHOLD, _ARENA_MAX = -3, -8
-# Blocks of more bytes are given back when they are freed. By default glibc raises this to the largest block freed so
-# far, up to 32 MB, and then keeps such blocks, in up to eight arenas a core.
+# Larger blocks are returned when they are freed. By default glibc raises this threshold to the
+# largest block freed so far, up to 32 MB, and then keeps such blocks, in up to eight arenas a core.
 _LARGE_BYTES, _ARENAS = 4 << 20, 2
 
 
 def give_back_freed_memory() -> None:
-    """Give the memory that was freed back to the system, where the allocator is glibc's.
+    """Return freed memory to the system, if the allocator is glibc's.
 
-    By itself it keeps what lies below the last block in use: all of a thousand avatars of 100 KB that were forgotten.
+    By itself glibc keeps all free memory below the last block in use: after a thousand avatars of
+    100 KB were dropped, all of theirs.
     """
     if sys.platform == "linux":
         with suppress(OSError, AttributeError):  # another allocator
@@ -22,7 +23,7 @@ def give_back_freed_memory() -> None:
 
 
 def give_back_large_blocks() -> None:
-    """Have large blocks of memory given back to the system when they are freed, where the allocator is glibc's."""
+    """Make the allocator, if it is glibc's, return large blocks to the system on release."""
     if sys.platform != "linux":
         return
     with suppress(OSError, AttributeError):  # another allocator

@@ -1,7 +1,7 @@
-"""The stop flag of one request: ends its work early.
+"""Stop flag of one request: ends its work early.
 
-Whoever watches a request sets the flag: its time is up, its client is gone, the server stops. Kernels
-read it every few microseconds and return; what they had not looked at then is `unknown`.
+The flag is set when the request's time is up, its client has disconnected or the server stops.
+Kernels read it every few microseconds and return; what they have not examined by then is `unknown`.
 """
 
 import math
@@ -12,15 +12,16 @@ import weakref
 import numpy as np
 
 _PARTS = threading.Lock()
-# How often a request that waits looks at its stop flag [s].
+# Interval at which a waiting request checks its stop flag [s].
 _LOOK_SECONDS = 0.005
 
 
 class Stop:
-    """A flag that the kernels of one request read and any thread may set. Thread-safe; never cleared.
+    """Flag that the kernels of one request read and any thread may set. Thread-safe; never cleared.
 
-    flag: (1,) int64, 0 until it is set; kernels read it without a lock.  reason: why it was set, for the answer.
-    part_seconds: the most that one part of an answer in parts may take [s].
+    flag: (1,) int64, 0 until it is set; kernels read it without a lock.
+    reason: why it was set, for the answer.
+    part_seconds: time limit of one part of an answer in parts [s].
     """
 
     __slots__ = ("__weakref__", "_parts", "flag", "part_seconds", "reason")
@@ -44,7 +45,7 @@ class Stop:
             part.set(reason)
 
     def part(self) -> "Stop":
-        """Return a flag for a part of the work: it is set with this one, or alone."""
+        """Return a flag for a part of the work; setting this flag sets the part's flag too."""
         part = Stop()
         with _PARTS:
             self._parts = [each for each in self._parts if each() is not None]
@@ -59,34 +60,34 @@ class Stop:
 
 
 class _Never(Stop):
-    """A flag that cannot be set: all requests that nobody watches share it."""
+    """Flag that cannot be set, shared by all requests without a time limit or watchdog."""
 
     __slots__ = ()
 
     def set(self, reason: str) -> None:
-        """Refuse."""
+        """Raise RuntimeError: the flag is shared."""
         raise RuntimeError(
             f"the stop flag of all requests was to be set ({reason}): make a Stop for the request"
         )
 
     def part(self) -> Stop:
-        """Return a flag of its own: this one is never set."""
+        """Return an independent flag: this one is never set."""
         return Stop()
 
 
-# Of requests that nobody watches.
+# Stop flag of requests that nothing stops.
 NEVER: Stop = _Never()
 
 
 class StoppedError(Exception):
-    """A request was stopped before any of its poses could be looked at. The scene answers `unknown` for all."""
+    """Request stopped before any of its poses was examined. The scene answers `unknown` for all."""
 
 
 def seconds_to(deadline: float, stop: Stop) -> float | None:
-    """Return how long a request may wait before it looks again [s]; None: without limit.
+    """Return how long a request may wait before it checks again [s]; None: without limit.
 
-    deadline: on time.perf_counter()'s clock [s]. The result is 0 when the deadline or the stop flag
-    has come, and at most 5 ms for a request that can be stopped.
+    deadline: on time.perf_counter()'s clock [s]. The result is 0 after the deadline or once the
+    stop flag is set, and at most 5 ms for a request that can be stopped.
     """
     if stop:
         return 0.0

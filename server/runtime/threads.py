@@ -1,4 +1,4 @@
-"""Start the threads of this process, each under a name that `top -H` shows too."""
+"""Start of this process's threads, each with a name that `top -H` shows too."""
 
 import sys
 import threading
@@ -7,7 +7,7 @@ from contextlib import suppress
 from pathlib import Path
 
 PREFIX = "solidcloud-"
-# The longest name that Linux keeps of a thread [bytes].
+# The longest thread name that Linux stores [bytes].
 _LONGEST = 15
 
 
@@ -24,7 +24,10 @@ def start_thread(name: str, run: Callable[..., object], *arguments: object) -> t
 
 
 def _name_for_system(name: str) -> None:
-    """Give the calling thread the end of a name as the operating system's; Python 3.14 does so itself."""
+    """Set the calling thread's name in the operating system to the end of `name`.
+
+    Python 3.14 does so itself.
+    """
     if sys.platform == "linux":
         with suppress(OSError):
             file = Path(f"/proc/self/task/{threading.get_native_id()}/comm")

@@ -1,4 +1,4 @@
-"""A thread that looks, every few milliseconds, at what is at work. No zenoh here."""
+"""Watchdog: a thread that checks running work every few milliseconds."""
 
 import logging
 import math
@@ -11,43 +11,44 @@ from contextlib import suppress
 
 log = logging.getLogger(__name__)
 
-# How often the thread looks [s]. A look costs some 10 µs of the interpreter.
+# Interval of the checks [s]. A check costs some 10 µs of the interpreter's time.
 PERIOD = 0.005
-# How long the thread goes on looking after there was something at work [s]. Being woken costs the first request more
-# than a look does.
+# How long the thread continues to check after work has ended [s]. Waking it costs the first request
+# more than a check does.
 LINGER = 1.0
-# What is added to the nice value of threads whose requests are slow: Linux gives them a tenth of what others get.
+# Increment of the nice value of threads with slow requests: Linux gives them a tenth of the
+# processor time of others.
 _NICER = 10
 
 
 class Watchdog:
-    """Calls a function at intervals while there is something to look at.
+    """Calls a function at intervals while work is running.
 
-    look: takes the time on `time.monotonic`'s clock [s] and returns whether anything is at work. It is called every
-    `period` seconds then, and once in `idle` seconds otherwise.
+    look: takes the time on `time.monotonic`'s clock [s] and returns whether any work is running. It
+    is called every `period` seconds while that is so, and every `idle` seconds otherwise.
     """
 
     def __init__(
         self, look: Callable[[float], bool], *, period: float = PERIOD, idle: float = LINGER
     ) -> None:
-        """Make a watchdog that does not look yet."""
+        """Make a watchdog that is not running yet."""
         self._look, self._period, self._idle = look, period, idle
         self._woken = threading.Event()
         self._closed = False
         self.asleep = True
 
     def wake(self) -> None:
-        """Have the thread look now, and from now on."""
+        """Have the thread check now, and regularly from now on."""
         self.asleep = False
         self._woken.set()
 
     def close(self) -> None:
-        """End the thread after its next look."""
+        """End the thread after its next check."""
         self._closed = True
         self._woken.set()
 
     def run(self) -> None:
-        """Look until the watchdog is closed. A thread's work."""
+        """Check until the watchdog is closed. Runs in a thread."""
         until = 0.0
         self.asleep = False
         while not self._closed:
@@ -58,7 +59,7 @@ class Watchdog:
                 if self._woken.wait(self._period):
                     self._woken.clear()
                 continue
-            # Whoever begins after this wakes the thread, even before it waits.
+            # Work that begins after this line wakes the thread, even if it does not wait yet.
             self._woken.clear()
             self.asleep = True
             if not self._is_busy(time.monotonic()) and not self._closed:
@@ -66,16 +67,16 @@ class Watchdog:
             self.asleep = False
 
     def _is_busy(self, now: float) -> bool:
-        """Look once."""
+        """Check once; return whether any work is running."""
         try:
             return self._look(now)
-        except Exception:  # of this look alone
-            log.exception("a look at what is at work")
+        except Exception:  # affects this check only
+            log.exception("a check of running work failed")
             return True
 
 
 def cpu_seconds(thread_id: int) -> float:
-    """Return the processor time that a thread has taken so far [s]; inf where the system does not say.
+    """Return the processor time a thread has used so far [s]; inf if the system does not report it.
 
     thread_id: as `threading.get_native_id` returns it.
     """
@@ -90,10 +91,10 @@ def cpu_seconds(thread_id: int) -> float:
 
 
 def lower_priority(thread_id: int) -> None:
-    """Lower the priority of a thread for good, where the system has priorities of threads.
+    """Lower the priority of a thread permanently, if the system has priorities of threads.
 
-    thread_id: as `threading.get_native_id` returns it. Raising a priority again takes privileges, and threads that are
-    started by such a thread have its priority.
+    thread_id: as `threading.get_native_id` returns it. Raising a priority again requires
+    privileges. Threads started by the thread inherit its priority.
     """
     if sys.platform == "linux":  # elsewhere this would change the whole process
         with suppress(OSError):  # the thread has ended, or a limit forbids it

@@ -1,7 +1,8 @@
-"""The avatars that answer the request at hand: a thread notes the digest of each that it looks up.
+"""Avatars that answer the current request: a thread notes the digest of each that it looks up.
 
-The seal of a reply names them (WIRE.md, "Seals"), so that a client knows whether its own avatars answered. They are
-noted where they are looked up: an avatar may be dropped and another added under its name while the answer is made.
+The seal of a reply names them (WIRE.md, "Seals"), so a client can tell whether its own avatars
+answered. They are noted at the lookup, because an avatar may be dropped and another added under its
+name while the answer is computed.
 """
 
 import threading
@@ -27,6 +28,6 @@ def noted(digests: list[bytes]) -> Iterator[None]:
 
 
 def note(digest: bytes) -> None:
-    """Note the digest of an avatar that was looked up; empty for one of the scene's own, which is not named."""
+    """Note the digest of an avatar that was looked up; ignore the empty one of a scene's own."""
     if digest and _NOTED.digests is not None:
         _NOTED.digests.append(digest)

@@ -1,17 +1,17 @@
-"""Limits on the avatars of a scene, and the clients that no key names."""
+"""Limits on the avatars of a scene, and the two client names that no key contains."""
 
 from typing import NamedTuple
 
-# The client whose avatars every client may ask about; no key can name it.
+# Owner of the avatars that every client may use in requests; no key can name it.
 EVERYBODY = "*"
-# The client of avatars that were added in the process that serves, by no client.
+# Owner of the avatars added in the serving process, not by a client.
 THIS_PROCESS = ""
 
 
 class AvatarLimits(NamedTuple):
-    """How much memory avatars may take; of all clients together, and of each one.
+    """Limits on avatars, for all clients together and for each one.
 
-    bytes: of their arrays.  avatars: their number.  clients: how many clients may have any.
+    bytes: of their arrays.  avatars: their number.  clients: number of clients with avatars.
     """
 
     bytes: int

@@ -1,4 +1,4 @@
-"""What is served: what a service asks its questions of, and what simulates its frames."""
+"""Protocols of a served scene: answers requests and simulates frames."""
 
 from collections.abc import Collection, Iterator, Sequence
 from enum import Enum
@@ -23,7 +23,7 @@ from .avatar_limits import AvatarLimits
 
 
 class Full(Enum):
-    """What a server has no more room for."""
+    """Limit of a server that is reached."""
 
     REQUESTS = "requests in flight, of all clients"
     OWN_REQUESTS = "requests in flight, of one client"
@@ -32,9 +32,9 @@ class Full(Enum):
 
 
 class Answer(NamedTuple):
-    """What is sent: its bytes, their encoding, and whether it is an answer or an error.
+    """Encoded reply: its bytes, their encoding, and whether it is an answer or an error.
 
-    about: the digests of the client's own avatars that answered, joined; its seal names them.
+    about: the joined digests of the client's own avatars that answered; the seal names them.
     """
 
     payload: bytes
@@ -44,7 +44,10 @@ class Answer(NamedTuple):
 
 
 class Turn(NamedTuple):
-    """What one user wishes in one frame. late: its wishes that were dropped so far because a newer one had come."""
+    """Motion command of one user in one frame.
+
+    late: number of its motion commands dropped so far because a newer one had arrived.
+    """
 
     user: User
     wish: Wish
@@ -52,7 +55,7 @@ class Turn(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """What came of a turn. state: where the user is now, or why that was not said.  about: as in `Answer`."""
+    """Result of a turn. state: the user's new state, or an error.  about: as in `Answer`."""
 
     user: User
     state: State | SolidcloudError
@@ -60,7 +63,7 @@ class Outcome(NamedTuple):
 
 
 class Simulates(Protocol):
-    """What simulates the frames of users that walk a scene; thread-safe."""
+    """Simulation of the frames of users that move in a scene; thread-safe."""
 
     @property
     def most_users(self) -> int: ...
@@ -79,10 +82,11 @@ class Simulates(Protocol):
 
 
 class SceneLike(Protocol):
-    """What a service asks its questions of; thread-safe. Raises SolidcloudErrors for what it refuses.
+    """Scene that answers a service's requests; thread-safe. Refuses one with a SolidcloudError.
 
-    The questions take what those of `Scene` do. Each notes the avatars that answer it (answering_avatars.py) in the
-    thread that calls it, before it returns. simulation: of its users' frames; None: it has none.
+    The query methods take the parameters of those of `Scene`. Each notes the avatars that answer it
+    (answering_avatars.py) in the calling thread, before it returns.
+    simulation: of its users' frames; None if it has none.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""`collide`: does an avatar touch the scene, one verdict a pose? One request -> one result."""
+"""Query `collide`: whether an avatar touches the scene, one verdict a pose."""
 
 import time
 from typing import Any
@@ -18,17 +18,19 @@ from .context.query_budget import EXACT, NO_LIMIT, Effort
 from .context.query_context import SceneData, as_held, in_unknown, kernel_poses, pieces, refuse, to_units
 from .context.query_cost import Spent
 
-# An avatar up to this size is answered under the residency's lock when a request holds one pose: 20 µs for the
-# 3,617 points of the walk. A larger one could keep others waiting, and gains little.
+# Avatars of at most this many points are tested under the residency's lock in a request of one
+# pose: 20 µs for the 3,617 points of the walk. Larger ones could block other requests, and gain
+# little.
 QUICK_POINTS = 1 << 13
 
 
 def _answer_at_once(
     data: SceneData, avatar: AvatarModel, poses: NDArray[np.float64], other_units: int, begin: float
 ) -> CollideAnswers | None:
-    """Answer one pose in one kernel call, as its voxels are resident nearly always; None: they are not.
+    """Answer one pose in one kernel call; return None if a voxel in reach is not resident.
 
-    scripts/bench_walk shows what a call of one pose costs on top of the test itself.
+    The voxels are nearly always resident. scripts/bench_walk measures the overhead of a call of one
+    pose.
     """
     residency = data.residency
     rows, outside = np.empty(64, np.int64), np.zeros(1, bool)
@@ -60,13 +62,15 @@ def _answer_at_once(
 def collide(
     data: SceneData, avatar: AvatarModel, poses: ArrayLike, margin: float = 0.0, effort: Effort = EXACT
 ) -> CollideAnswers:
-    """Whether the avatar touches the scene under each pose.
+    """Test whether the avatar touches the scene under each pose.
 
     poses: (k, 4, 4) float64, avatar to world, rigid or with a uniform scale, bits used as given.
-    margin: distance below or at which two spheres are called in contact [m].
-    effort: with a budget, see `collide_bounded`; with a tolerance alone the answer is exact, and has bounds.
-    CONTACT, CLEAR or UNKNOWN (a voxel in reach cannot be read, or a scan was left out there, and no contact was
-    found elsewhere); the definition is NUMERICS.md N5. Raises BadRequestError, BadTransformError, TooLargeError.
+    margin: distance at or below which two spheres are in contact [m].
+    effort: with a budget, see `collide_bounded`; with a tolerance alone the answer is exact, and
+    has bounds.
+    The verdict is CONTACT, CLEAR or UNKNOWN. UNKNOWN means that a voxel in reach cannot be read or
+    a scan was left out there, and that no contact was found elsewhere. NUMERICS.md N5 has the
+    definition. Raise BadRequestError, BadTransformError, TooLargeError.
     """
     if effort.limited:
         return collide_bounded(data, avatar, poses, margin, effort)
@@ -89,7 +93,7 @@ def collide(
 
     reach = find_proved_reach(data, avatar, array, other_units, effort, spent, settled)
     verdict, counts = np.zeros(k, np.uint8), np.zeros((3, k), np.uint32)
-    # An empty avatar is clear, whatever is unknown here.
+    # An empty avatar is clear, whatever else is unknown.
     for which, rows, part in (
         pieces(reach, residency, effort.share, effort.stop) if len(avatar.points) else ()
     ):
@@ -100,7 +104,7 @@ def collide(
             seen = as_held(data, held)
             overlap_poses(array, avatar.arrays, seen.arrays, part, which, NO_LIMIT, verdict, counts)
         spent.add(held)
-    if (data.nothing_clear or unseen) and len(avatar.points):  # a load may have found the index wrong
+    if (data.nothing_clear or unseen) and len(avatar.points):  # a load may have proved the index wrong
         lost = in_unknown(reach.boxes, data.unknown, data.nothing_clear)
         verdict[lost & (verdict == CLEAR)] = UNKNOWN
     return CollideAnswers(
@@ -112,10 +116,10 @@ def collide(
 def _bounds(
     verdict: NDArray[np.uint8], radii: NDArray[np.int64], margin: float, margin_units: int, effort: Effort
 ) -> dict[str, Any]:
-    """The bounds of `CollideAnswers` that verdicts alone give; none where no tolerance asks for them.
+    """Return the bounds of `CollideAnswers` that follow from verdicts; {} without a tolerance.
 
-    radii: (k,) of avatar's and scan's largest spheres together, exact units: no pair is deeper.  margin: [m];
-    margin_units: what it was rounded to, up or down, and what the verdicts go by.
+    radii: (k,) sum of the largest radii of avatar and scan, exact units: the depth limit of a pair.
+    margin: [m].  margin_units: the margin as rounded, up or down; verdicts are based on it.
     """
     if effort.tolerance == 0:
         return {}

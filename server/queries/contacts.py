@@ -1,7 +1,7 @@
-"""`contacts`: all pairs of spheres in contact, the deepest listed, all of them gathered into clusters.
+"""Query `contacts`: pairs of spheres in contact, the deepest listed, all gathered into clusters.
 
-What users of clash detection ask for: not that two things touch, which `collide` says, but where, how deep, and how
-many places it is.
+It serves clash detection: where and how deep two bodies touch, and at how many places. `collide`
+only tells that they touch.
 """
 
 import math
@@ -47,13 +47,14 @@ from .context.query_context import SceneData, as_held, in_unknown, kernel_poses,
 from .context.query_cost import Spent
 from .distance import signed_from_square
 
-# Pairs and clusters that one request may list, all poses together [bytes]; some three times as much is needed for a
-# moment, to make columns of them. The wire's largest message holds an eighth of it.
+# Limit on the pairs and clusters listed by one request, over all poses [bytes]. Converting them to
+# columns temporarily takes some three times as much. The wire's largest message holds an eighth.
 MOST_BYTES = 256 << 20
-# Node visits between two looks at the clock, about a millisecond; and at what is listed, where there is no deadline.
+# Node visits between two checks of the clock, about a millisecond; and, without a deadline, between
+# two checks of the size of the lists.
 SLICE_VISITS = 1 << 15
 SIZE_VISITS = 1 << 19
-# Cells there is room for at first, a power of two and LANES or more; a kernel doubles them as it needs, up to
+# Initial capacity in cells, a power of two and at least LANES. A kernel doubles it as needed, up to
 # MOST_CELLS, which take 200 MB.
 FIRST_CELLS, MOST_CELLS = 256, 1 << 20
 
@@ -67,20 +68,23 @@ def contacts(
     cluster_distance: float | None = None,
     effort: Effort = EXACT,
 ) -> ContactsAnswers:
-    """All pairs in contact under each pose: counted, the deepest `limit` listed, gathered into clusters.
+    """Find all pairs in contact under each pose: count them, list the deepest, and cluster them.
 
-    poses, margin: as for `collide`.  limit: pairs listed a pose, 0 to MAX_CONTACTS; all are counted.
-    cluster_distance: edge of the grid cells that touched scan points fall in [m], rounded up to whole lattice steps,
-    at least one; cells lie on multiples of it from the dataset's origin. None: twice r_a + r_b + margin, r_b of the
-    largest sphere that the radius model has. Touched cells that share a face, an edge or a corner are one cluster:
-    points at most this far apart always are in one cluster, and points of two clusters are farther apart than it along
-    an axis.
-    Deepest is where |a - b| - r_a - r_b is least, r_b of the scan point's own sphere, compared exactly and not by the
-    rounded figure. Coincident points are pairs each. Ties go by scan point, avatar centre, avatar row, scan number.
-    effort: a budget leaves pairs out, and says so in `exact`; what is listed then is in contact, but there may be
-    deeper. A tolerance changes nothing: counting has no end that it would allow earlier.
-    CONTACT where a pair was found; else CLEAR, or UNKNOWN where not all in reach was looked at.
-    Raises BadRequestError, BadTransformError, TooLargeError.
+    poses, margin: as for `collide`.
+    limit: number of deepest pairs listed a pose, 0 to MAX_CONTACTS; all pairs are counted.
+    cluster_distance: edge of the grid cells that touched scan points fall in [m], rounded up to
+    whole lattice steps, at least one. Cells lie on multiples of it from the dataset's origin. None:
+    twice r_a + r_b + margin, with r_b of the largest sphere of the radius model. Touched cells that
+    share a face, an edge or a corner form one cluster: points at most this far apart are always in
+    one cluster, and points of two clusters are farther apart than it along an axis.
+
+    The deepest pair has the least |a - b| - r_a - r_b, with r_b of the scan point's own sphere,
+    compared exactly and not by the rounded figure. Each of several coincident points forms a pair.
+    Ties are ordered by scan point, avatar centre, avatar row, scan number.
+    effort: a budget may leave pairs out; `exact` is then false, and the listed pairs are in contact
+    but may not be the deepest. A tolerance has no effect: it cannot end a count earlier.
+    The verdict is CONTACT if a pair was found; otherwise CLEAR, or UNKNOWN if not everything in
+    reach was examined. Raise BadRequestError, BadTransformError, TooLargeError.
     """
     begin = time.perf_counter()
     array = kernel_poses(poses)
@@ -99,7 +103,8 @@ def contacts(
         asked = Asked(avatar.rows, edges, data.keeps_scan, limit, effort.visits, MOST_CELLS)
         parts = list(pieces(reach, data.residency, effort.share, effort.stop))
         for number, (which, rows, part) in enumerate(parts):
-            # A pose in several pieces is alone in each of them, and they follow one another.
+            # A pose that is split over several pieces is alone in each, and the pieces are
+            # adjacent.
             closes = (
                 number + 1 == len(parts) or len(which) > 1 or parts[number + 1][0].tolist() != which.tolist()
             )
@@ -115,7 +120,7 @@ def contacts(
 
 
 def _checked_limit(limit: int) -> int:
-    """The number of pairs to list, as an int. Raises BadRequestError."""
+    """Return the number of pairs to list as an int. Raise BadRequestError."""
     try:
         number = operator.index(limit)
     except TypeError:
@@ -128,17 +133,20 @@ def _checked_limit(limit: int) -> int:
 
 
 def _edges(reach: Reach, edge_units: int | None, units_per_step: float) -> NDArray[np.int64]:
-    """The edge (k,) of a cell under each pose [steps]. reach: its units are of the largest sphere."""
+    """Return the edge (k,) of a cell under each pose [steps].
+
+    reach: its units are those of the largest sphere.
+    """
     units = 2 * reach.units if edge_units is None else np.full(len(reach.units), edge_units)
     steps = units / units_per_step
     whole = np.rint(steps)
-    # A distance that is a whole number of steps but for its rounding is that number.
+    # A distance that differs from a whole number of steps only by rounding is that number.
     steps = np.where(np.abs(steps - whole) <= 1e-9 * whole + 1.0 / units_per_step, whole, np.ceil(steps))
     return np.asarray(np.maximum(steps, 1.0).astype(np.int64))
 
 
 def _empty_memory(limit: int) -> Memory:
-    """Nothing found yet, nothing begun."""
+    """Return the memory of a search that has not begun."""
     return Memory(
         make_cells(FIRST_CELLS, NEVER.flag), np.empty((limit, RECORD), np.int64), np.array([0, 0, 0, 0, -1]),
         np.zeros(3, np.int64), np.empty((STACK, 2), np.int64), np.empty((0, RECORD), np.int64),
@@ -158,7 +166,7 @@ def _gather(
     memory: Memory,
     tally: Tally,
 ) -> Memory:
-    """Answer one piece, to its end or to the deadline; what is left then is cut."""
+    """Answer one piece, to its end or to the deadline; mark poses left over as cut."""
     memory.cursor[:] = 0, -1, 0
     pause = SIZE_VISITS if effort.deadline == math.inf else SLICE_VISITS
     while memory.cursor[0] < len(which):
@@ -172,10 +180,10 @@ def _gather(
 
 
 def _check_room(memory: Memory) -> None:
-    """TooLargeError where more is listed than a request may list, or a pose touches more cells than there may be."""
+    """Raise TooLargeError if the lists or the cells touched by a pose exceed their limits."""
     if memory.sizes[CELLS] + LANES > MOST_CELLS:
         raise TooLargeError(
-            f"a pose touches {memory.sizes[CELLS]} cells or more, {MOST_CELLS - LANES} is the most: ask for "
+            f"a pose touches {memory.sizes[CELLS]} cells or more: at most {MOST_CELLS - LANES}: ask for "
             "a larger cluster_distance"
         )
     pairs, clusters = int(memory.sizes[LISTED]), int(memory.sizes[CLUSTERS])
@@ -187,7 +195,7 @@ def _check_room(memory: Memory) -> None:
 
 
 def _by_pose(rows: NDArray[np.int64], runs: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """The rows of each pose's run (k, 2) first, count, one behind the other; with where each begins (k + 1,)."""
+    """Join the rows of each pose's run (k, 2), first and count; return starts (k + 1,) and rows."""
     starts = np.concatenate([[0], np.cumsum(runs[:, 1])])
     taken = np.arange(starts[-1]) + np.repeat(runs[:, 0] - starts[:-1], runs[:, 1])
     return starts, rows[taken]
@@ -196,9 +204,9 @@ def _by_pose(rows: NDArray[np.int64], runs: NDArray[np.int64]) -> tuple[NDArray[
 def _columns(
     data: SceneData, reach: Reach, margin_units: int, tally: Tally, memory: Memory, has_points: bool
 ) -> dict[str, Any]:
-    """The fields of `ContactsAnswers` but the cost of the request."""
+    """Return the fields of `ContactsAnswers` except the cost of the request."""
     exact = ~tally.cut & (tally.counts[0] == 0)
-    if has_points:  # an empty avatar is clear, whatever is unknown here
+    if has_points:  # an empty avatar is clear, whatever else is unknown
         exact &= ~in_unknown(reach.boxes, data.unknown, data.nothing_clear)
     verdict = np.where(exact, Verdict.CLEAR, Verdict.UNKNOWN)
     verdict[tally.pairs > 0] = Verdict.CONTACT
@@ -225,16 +233,19 @@ def _columns(
 
 
 def _to_world(data: SceneData, lattice: NDArray[np.int64]) -> NDArray[np.float64]:
-    """World positions (n, 3) [m] of lattice points, as schemas/archive/voxel_grid.py Lattice.to_world."""
+    """Return world positions (n, 3) [m] of lattice points, computed as `Lattice.to_world` does.
+
+    See schemas/archive/voxel_grid.py.
+    """
     return np.asarray(lattice * data.arrays.step + data.arrays.origin)
 
 
 def _places(
     data: SceneData, records: NDArray[np.int64], radii: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Avatar centres and scan points (n, 3), world [m], and signed distances (n,) [m] of records of pairs.
+    """Return avatar centres and scan points (n, 3), world [m], and signed distances (n,) [m].
 
-    radii: (n,) int64, r_a + r_b with the largest sphere's r_b, exact units.
+    records: of pairs.  radii: (n,) int64, r_a + r_b with r_b of the largest sphere, exact units.
     """
     avatar = records[:, CENTER : CENTER + 3] / UNITS_PER_METRE + data.arrays.origin
     return (

@@ -1,6 +1,6 @@
-"""`distance`: how far an avatar is from the scene, and where.
+"""Query `distance`: distance of an avatar from the scene, and the nearest pair.
 
-One request -> one result. signed_distance.py defines it.
+signed_distance.py has the definition.
 """
 
 import math
@@ -26,12 +26,14 @@ __all__ = ["distance", "signed_from_square"]
 def distance(
     data: SceneData, avatar: AvatarModel, poses: ArrayLike, reach: float, effort: Effort = EXACT
 ) -> DistanceAnswers:
-    """How far the avatar is from the scene under each pose, up to `reach` [m].
+    """Compute the distance of the avatar from the scene under each pose, up to `reach` [m].
 
-    poses: (k, 4, 4) float64, avatar to world, rigid or with a uniform scale.  reach: pairs whose spheres are farther
-    apart than this do not count; with the largest radii at most 16 m. Where a voxel in reach is missing, or a scan was
-    left out, the distance is that of the nearest pair looked at, exact only if what is missing can hold no nearer one.
-    Raises BadRequestError, BadTransformError, TooLargeError.
+    poses: (k, 4, 4) float64, avatar to world, rigid or with a uniform scale.
+    reach: pairs whose spheres are farther apart than this do not count; reach and largest radii
+    together are at most 16 m.
+    If a voxel in reach is missing or a scan was left out, the distance is that of the nearest
+    examined pair, and exact only if nothing missing can contain a nearer pair.
+    Raise BadRequestError, BadTransformError, TooLargeError.
     """
     if effort.limited:
         return distance_bounded(data, avatar, poses, reach, effort)

@@ -1,4 +1,4 @@
-"""How near each scan of an archive comes to an avatar under one pose: what noise of scans is asked of."""
+"""Separation of each scan of an archive from an avatar under one pose, to estimate scan noise."""
 
 import time
 from typing import NamedTuple
@@ -13,14 +13,16 @@ from .context.query_budget import EXACT, Effort
 from .context.query_context import SceneData, as_held, in_unknown, kernel_poses, pieces, to_units
 from .context.query_cost import Spent
 
-# The number of a point's scan where the archive does not keep it.
+# Number of points whose scan is not stored, or whose number belongs to no scan.
 ANY_SCAN = -1
 
 
 class ScanGaps(NamedTuple):
-    """gaps: least signed gap [m] of each scan that comes within the margin, by its row in `SceneInfo.sources`.
+    """Separation of each scan from an avatar.
 
-    exact: whether all in reach was looked at.  node_visits, point_tests: what it took.
+    gaps: least signed separation [m] of each scan within the margin, by its row in
+    `SceneInfo.sources`.
+    exact: whether everything in reach was examined.  node_visits, point_tests: cost.
     """
 
     gaps: dict[int, float]
@@ -32,13 +34,16 @@ class ScanGaps(NamedTuple):
 def gaps_by_scan(
     data: SceneData, avatar: AvatarModel, pose: ArrayLike, margin: float, scans: int, effort: Effort = EXACT
 ) -> ScanGaps:
-    """The least signed gap of every scan to the avatar under a pose (4, 4), where it is at most `margin` [m].
+    """Compute the least signed separation of every scan from the avatar under a pose (4, 4).
 
-    data: of an archive that keeps the scan of each point.  scans: so many there are. The pairs are those in contact by
-    `contacts` with that margin, and a scan's gap is that of its deepest pair, but for the last bits: of pairs whose
-    gaps are the same but for the rounding of the figure, either. A point whose number no scan has counts as of
-    ANY_SCAN.  effort: a budget leaves pairs out, and says so in `exact`.
-    Raises BadRequestError, BadTransformError, TooLargeError.
+    Scans farther than `margin` [m] are omitted.
+    data: of an archive that keeps the scan of each point.  scans: their number.
+    The pairs are those that `contacts` finds with this margin, and the separation of a scan is that
+    of its deepest pair, except for the last bits: if the separations of several pairs differ only
+    by rounding, it is that of one of them. A point whose number belongs to no scan counts as
+    ANY_SCAN.
+    effort: a budget may leave pairs out; `exact` is then false.
+    Raise BadRequestError, BadTransformError, TooLargeError.
     """
     poses = kernel_poses(np.asarray(pose)[None])
     margin_units = to_units(margin, "margin")

@@ -1,6 +1,7 @@
-"""`objects`: several avatars at once, against the scene and against one another. One request -> one result.
+"""Query `objects`: contacts of several avatars with the scene and with one another.
 
-Nothing is kept between requests: a door or a vehicle is an object of the request, with its pose of the moment.
+Nothing is stored between requests: a door or a vehicle is an object of the request, with its
+current pose.
 """
 
 import time
@@ -22,18 +23,23 @@ from .context.query_budget import EXACT, Effort
 from .context.query_context import SceneData, kernel_poses, refuse, to_units, with_stop
 from .context.query_cost import Spent
 
-# The scene's own group: an object whose mask lacks this bit is not tested against the scene.
+# Group of the scene: an object whose mask lacks this bit is not tested against the scene.
 SCENE_GROUP = 1 << 31
-# Pairs between two looks at a deadline.
+# Pairs tested between two checks of a deadline.
 TIMED_PAIRS = 64
-# How far from the dataset's origin an object may be put [m]: exact units of 2^37 m do not fit 63 bits. Against the
-# scene nothing so far is ever compared; objects are compared wherever they are.
+# Largest distance of an object from the dataset's origin [m]: 2^37 m in exact units do not fit in
+# 63 bits. No object this far away is compared with the scene, but objects are compared with one
+# another everywhere.
 MAX_PLACE = 1e11
 
 
 class Placing(NamedTuple):
-    """n objects, checked. models: the distinct avatars.  model_of: (n,) int64.  poses: (n, 4, 4).  groups, masks: (n,)
-    uint32.  scales: (n,).  units: (n,) int64, radii as placed, exact units.  margin_units: of each pair."""
+    """Checked objects of a request, n of them.
+
+    models: the distinct avatars.  model_of: (n,) int64, index into `models`.  poses: (n, 4, 4).
+    groups, masks: (n,) uint32.  scales: (n,).  units: (n,) int64, scaled radii, exact units.
+    margin_units: of each pair.
+    """
 
     models: list[AvatarModel]
     model_of: NDArray[np.int64]
@@ -46,7 +52,7 @@ class Placing(NamedTuple):
 
 
 class Met(NamedTuple):
-    """What objects do to one another; the fields of `ObjectsAnswers`."""
+    """Contacts between objects; fields as in `ObjectsAnswers`."""
 
     pairs: NDArray[np.int32]
     pair_verdict: NDArray[np.uint8]
@@ -65,16 +71,17 @@ def objects(
     margin: float = 0.0,
     effort: Effort = EXACT,
 ) -> ObjectsAnswers:
-    """Which of n objects touch the scene, and which touch one another.
+    """Test which of n objects touch the scene, and which touch one another.
 
-    avatars: n, of which several may be the same.  poses: (n, 4, 4) float64, avatar to world.  groups, masks: (n,)
-    uint32, bits: a pair is tested when each one's group has a bit in common with the other's mask. The scene's group is
-    SCENE_GROUP, its mask all.  margin: of each pair, and of each object with the scene [m].
-    Contact is as NUMERICS.md N5 has it, of two objects too: kernels/bodies/body_pairs.py; a radius
-    model is of the scan's spheres
-    and of no object's. No tolerance is used, as these answers could not say where they are early by it; visits are
-    counted an object and a pair. Pairs that a budget cuts off are listed as UNKNOWN.
-    Raises BadRequestError, BadTransformError, TooLargeError.
+    avatars: n, repetitions allowed.  poses: (n, 4, 4) float64, avatar to world.
+    groups, masks: (n,) uint32 bit fields. A pair is tested if the group of each object has a bit in
+    common with the other's mask. The scene's group is SCENE_GROUP, and its mask has all bits.
+    margin: of each pair, and of each object with the scene [m].
+    NUMERICS.md N5 defines contact, also between two objects: kernels/bodies/body_pairs.py. A radius
+    model applies to the scan's spheres and not to objects. The tolerance is ignored, because these
+    answers could not express which of them are approximate. Visits are counted for each object and
+    each pair. Pairs left untested by a budget are listed as UNKNOWN.
+    Raise BadRequestError, BadTransformError, TooLargeError.
     """
     begin = time.perf_counter()
     placing = _check(data, avatars, poses, groups, masks, margin)
@@ -106,9 +113,9 @@ def _check(
     masks: ArrayLike,
     margin: float,
 ) -> Placing:
-    """Return the objects of a request; all poses are admitted and all reaches are within what squares in 63 bits allow.
+    """Check the objects of a request: poses are valid, and squares of reaches fit in 63 bits.
 
-    This takes milliseconds for the most objects of a request, and so does not look at the stop.
+    This takes milliseconds for the largest request, so it does not check the stop flag.
     """
     data = with_stop(data, NEVER)
     array = kernel_poses(poses)
@@ -150,7 +157,7 @@ def _check_places(
     scales: NDArray[np.float64],
     origin: NDArray[np.float64],
 ) -> None:
-    """Raise BadTransformError for an object, of those of one avatar, that is put too far away for exact units."""
+    """Raise BadTransformError if an object of this avatar is too far away for exact units."""
     if not len(model.points):
         return
     center = np.abs(poses[rows, :3, :3]) @ np.abs(model.arrays.center[0]) + np.abs(
@@ -165,10 +172,11 @@ def _check_places(
 
 
 def find_pairs(placing: Placing, origin: NDArray[np.float64]) -> tuple[NDArray[np.int64], int]:
-    """Return pairs (p, 2) of objects that could touch and may, first < second, ascending; and how many more may not.
+    """Return the pairs (p, 2) of objects to test, ascending, and how many the masks exclude.
 
-    Sweep and prune, along the axis on which the objects' root spheres are spread farthest. This takes milliseconds for
-    the most objects of a request, and so does not look at the stop.
+    Pairs have first < second, and their bounds overlap. Sweep and prune along the axis on which the
+    objects' root spheres are spread farthest. This takes milliseconds for the largest request, so
+    it does not check the stop flag.
     """
     full = [number for number, model in enumerate(placing.models) if len(model.points)]
     present = np.flatnonzero(np.isin(placing.model_of, full))
@@ -192,21 +200,22 @@ def find_pairs(placing: Placing, origin: NDArray[np.float64]) -> tuple[NDArray[n
         if found <= capacity:
             break
         capacity = found
-    # One number a pair: a sort by two keys takes ten times as long.
+    # One sort key a pair: sorting by two keys takes ten times as long.
     n = len(placing.poses)
     numbers = np.sort(pairs[:found, 0].astype(np.int64) * n + pairs[:found, 1])
     return np.column_stack((numbers // n, numbers % n)), filtered
 
 
 def _meet(placing: Placing, origin: NDArray[np.float64], effort: Effort) -> Met:
-    """Test the pairs, those of the same two avatars in one kernel call unless there is a deadline."""
+    """Test the pairs; without a deadline, those of the same two avatars in one kernel call."""
     pairs, filtered = find_pairs(placing, origin)
     kinds = placing.model_of[pairs]
-    # As contact is symmetric, each two avatars need be met in one order only.
+    # Contact is symmetric, so two avatars are tested in one order only.
     turned = kinds[:, 0] > kinds[:, 1]
     ordered = np.where(turned[:, None], pairs[:, ::-1], pairs)
     models = len(placing.models)
-    # One number a kind: sorting rows of two would keep the interpreter, for a second where there are 10^6 pairs.
+    # One sort key for each pair of avatars: sorting rows of two would hold the interpreter's lock,
+    # for a second with 10^6 pairs.
     kind = kinds.min(axis=1) * models + kinds.max(axis=1)
     order = np.argsort(kind, kind="stable")
     firsts = np.flatnonzero(np.diff(kind[order], prepend=-1))

@@ -1,8 +1,8 @@
-"""`path`: one question asked along thousands of poses, its answers in parts, order kept.
+"""Query `path`: one query along thousands of poses, answered in parts and in order.
 
-Parts are computed by a few threads ahead of whoever takes them; kernels hold no GIL. How many answers a part holds
-follows from how long they took so far, so that the first part comes soon and no part keeps others waiting for long.
-What is answered does not depend on it, cost counters of a part apart.
+A few threads compute parts ahead of the consumer; kernels release the GIL. The number of answers in
+a part depends on how long the previous ones took, so that the first part comes soon and no part
+blocks others for long. The answers do not depend on it, except for the cost counters of a part.
 """
 
 import math
@@ -31,15 +31,17 @@ from .distance import distance
 from .stopped_answers import ask_until_stopped, unknown_part
 from .sweep import sweep
 
-# Parts computed at a time, by default.
+# Default number of parts computed at a time.
 PATH_THREADS = 2
-# Answers in a part. The first is small, so that it comes soon; later ones take about PART_SECONDS. At 1,024 answers the
-# overhead of a part, a few tenths of a millisecond with zenoh, is a few per cent of the fastest question.
+# Answers in a part. The first part is small, so that it comes soon; later ones take about
+# PART_SECONDS. At 1,024 answers the overhead of a part, a few tenths of a millisecond with zenoh,
+# is a few per cent of the fastest query.
 FIRST_PART = 64
 LARGEST_PART = 1024
 PART_SECONDS = 0.01
-# Of a part's answer, under the largest message even as JSON; a contact takes 68 bytes and its cluster up to 116. There
-# may be more clusters than contacts listed, so what a part holds is looked at again when it is there.
+# Size of a part's answer, below the largest message even as JSON. A contact takes 68 bytes and its
+# cluster up to 116. There may be more clusters than contacts listed, so the size of a computed part
+# is checked again.
 _PART_BYTES = 8 << 20
 _CONTACT_BYTES = 184
 
@@ -47,7 +49,10 @@ Ask = Callable[[int, int], Cost]
 
 
 class AskPart(Protocol):
-    """Answers [start, end) of a path. part: the flag of the part that they are in; None: they are a part."""
+    """Function that computes answers [start, end) of a path.
+
+    part: stop flag of the part that contains them; None: they form a part.
+    """
 
     def __call__(self, start: int, end: int, part: Stop | None = None) -> Cost: ...
 
@@ -60,19 +65,23 @@ def path_question(
     parameters: dict[str, Any],
     stop: Stop = NEVER,
 ) -> tuple[AskPart, int]:
-    """Return what answers [start, stop) of a path, and how many answers there are. The budget's time begins now.
+    """Return the function that answers a range of a path, and the total number of answers.
 
-    poses: (k, 4, 4) float64.  parameters: of `op`, tolerance and budgets included.  stop: ends the path early; a part
-    that takes longer than its `part_seconds` ends alone, see `AskPart`. All poses are checked here, so that an error
-    names one by its place on the path. BadRequestError, BadTransformError, TooLargeError.
+    The budget's time begins with this call.
+    poses: (k, 4, 4) float64.  parameters: of `op`, including tolerance and budgets.
+    stop: ends the path early; a part that takes longer than its `part_seconds` is stopped alone,
+    see `AskPart`.
+    All poses are checked here, so that an error names a pose by its position on the path. Raise
+    BadRequestError, BadTransformError, TooLargeError.
     """
     given = {name: value for name, value in parameters.items() if value is not None}
     check_path_parameters(op, given)
     budgets = {name: given.pop(name) for name in ("budget_ms", "budget_visits") if name in given}
     tolerance = given.pop("tolerance", 1e-6 if op == "sweep" else 0.0)
-    # Nobody stays along a path; what users stand in, at most half of the cache (prefetch.py), can stay beside it.
+    # The voxels along a path are used once. Half of the cache is left for those at users'
+    # positions, which take at most half (prefetch.py).
     effort = make_effort(tolerance, **budgets, stop=stop)._replace(scan=True, share=0.5)
-    poses = kernel_poses(poses)  # copied once if at all, or every part would copy its own
+    poses = kernel_poses(poses)  # copied here at most once, so that no part copies its poses
     other = (
         to_units(given["reach"], "reach")
         if op == "distance"
@@ -105,7 +114,7 @@ def path_question(
 
 
 def part_stop(stop: Stop, seconds: float) -> Stop:
-    """Return the flag of a part that begins now: set with the path's, or once the part has taken so many seconds."""
+    """Return the stop flag of a part that begins now: set after `seconds` or with the path's."""
     if seconds == math.inf:
         return stop
     part = stop.part()
@@ -115,7 +124,7 @@ def part_stop(stop: Stop, seconds: float) -> Stop:
 
 
 def largest_part(op: str, parameters: dict[str, Any]) -> int:
-    """How many answers of `op` a part may hold, so that it fits a message."""
+    """Return how many answers of `op` a part may hold to fit in a message."""
     if op != "contacts":
         return LARGEST_PART
     limit = parameters.get("limit")
@@ -127,10 +136,11 @@ def largest_part(op: str, parameters: dict[str, Any]) -> int:
 def path_parts(
     ask: Ask, total: int, most: int = LARGEST_PART, pool: Executor | None = None, ahead: int = 1
 ) -> Generator[Part, None, None]:
-    """The parts of a path in order; at least one, empty if the path is.
+    """Yield the parts of a path in order; one empty part if the path is empty.
 
-    most: answers in a part.  pool: computes parts, up to `ahead` of them before they are taken; None: each is computed
-    when it is asked for. A generator: closing it leaves what is being computed to end by itself.
+    most: answers in a part.  pool: computes up to `ahead` parts before they are consumed; None:
+    each part is computed on demand. Closing the generator cancels waiting parts; running ones end
+    by themselves.
     """
     waiting: deque[tuple[int, Future[Cost]]] = deque()
     size, start = min(FIRST_PART, most), 0
@@ -159,7 +169,7 @@ def path_parts(
 
 
 def _ask_part(ask: Ask, start: int, stop: int) -> Cost:
-    """The answers for [start, stop); an error says where on the path."""
+    """Compute the answers for [start, stop); an error names the position on the path."""
     try:
         return ask(start, stop)
     except SolidcloudError as error:
@@ -169,7 +179,7 @@ def _ask_part(ask: Ask, start: int, stop: int) -> Cost:
 
 
 def _next_size(size: int, answers: Any, most: int) -> int:
-    """How many answers the next part is to hold, by what these took; at most four times as many as before."""
+    """Return the size of the next part from the time these answers took; at most 4 times `size`."""
     each = answers.engine_seconds / max(1, len(answers))
     fitting = most if each <= 0 else int(PART_SECONDS / each)
     return max(1, min(fitting, 4 * size, most))

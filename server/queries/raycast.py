@@ -1,4 +1,4 @@
-"""`raycast`: the first scan point's sphere that each ray hits. One request -> one result."""
+"""Query `raycast`: the first scan point's sphere that each ray hits."""
 
 import time
 
@@ -17,14 +17,15 @@ from .context.query_budget import EXACT, Effort
 from .context.query_context import SceneData, to_units
 from .context.query_cost import Spent
 
-# Differences within this reach are exact in float64: 2^53 units are 134,000 km.
+# Differences within this reach [m] are exact in float64: 2^53 units are 134,000 km.
 MAX_RAY_REACH = 1e6
 
 
 def make_directions(values: ArrayLike) -> NDArray[np.float64]:
-    """Unit vectors (k, 3): divided by the largest component, then by the root of (x x + y y) + z z, float64.
+    """Normalize vectors (k, 3) in float64.
 
-    Raises BadRequestError for one that is zero or not finite.
+    Each is divided by its largest component, then by the square root of (x x + y y) + z z. Raise
+    BadRequestError for a vector that is zero or not finite.
     """
     array = make_vectors(values, "directions")
     largest = np.abs(array).max(axis=1, initial=0.0)
@@ -38,14 +39,16 @@ def make_directions(values: ArrayLike) -> NDArray[np.float64]:
 def raycast(
     data: SceneData, origins: ArrayLike, directions: ArrayLike, reach: float, effort: Effort = EXACT
 ) -> RaycastAnswers:
-    """The first sphere of the scan that each ray meets, each of the radius its point has under the radius model.
+    """Find the first sphere of the scan that each ray hits; the radius model gives each radius.
 
-    origins: (k, 3) float64, world [m].  directions: (k, 3), of any length but zero.  reach: how far along [m], at
-    most MAX_RAY_REACH. The definition is in kernels/rays/rays.py. A ray is `outside` when either end of it, o or
+    origins: (k, 3) float64, world [m].  directions: (k, 3), of any length except zero.
+    reach: length of the rays [m], at most MAX_RAY_REACH.
+    kernels/rays/rays.py has the definition. A ray is `outside` if either of its ends, o or
     o + reach u in exact units, leaves the box of all scan points.
-    CONTACT: a sphere is hit; CLEAR: none; UNKNOWN: none found, but something in reach could not be looked at, or was
-    not within the budget. Where that might hide a nearer hit, `exact` is false and `lower` says how near; with a
-    tolerance `lower` may be below `upper` by as much. Raises BadRequestError.
+    The verdict is CONTACT if a sphere is hit, CLEAR if none is, and UNKNOWN if none was found but
+    something in reach could not be examined or exceeded the budget. If that could hide a nearer
+    hit, `exact` is false and `lower` bounds its distance. With a tolerance, `lower` may be below
+    `upper` by at most the tolerance. Raise BadRequestError.
     """
     spent = Spent(time.perf_counter())
     world, units = make_origins(data, origins, "origins")
@@ -55,7 +58,7 @@ def raycast(
     if not 0 <= reach <= MAX_RAY_REACH:
         raise BadRequestError(f"reach {reach!r}: expected 0 to {MAX_RAY_REACH:g} metres")
     if data.radius_units > MAX_REACH_UNITS:
-        raise BadRequestError("the scan's radius is over 16 m: rays cannot be told exactly against it")
+        raise BadRequestError("the scan's radius is over 16 m: rays cannot be tested exactly against it")
     reach_units = to_units(reach, "reach")
     tolerance = effort.tolerance * UNITS_PER_METRE
 
@@ -91,10 +94,11 @@ def _where(
     unit: NDArray[np.float64],
     best: Nearest,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """hit, cloud_point and normal (k, 3), NaN where nothing is hit.
+    """Return hit, cloud_point and normal (k, 3); NaN for rays that hit nothing.
 
-    hit: origin + distance u, world.  normal: along t u - d, exact units, as the sphere's centre sees the hit; where
-    they coincide, against the ray.
+    hit: origin + distance u, world [m].
+    normal: along t u - d in exact units, from the sphere's centre to the hit; opposite to the ray
+    if they coincide.
     """
     touched = np.isfinite(best.value)
     hit, cloud, normal = (np.full((len(world), 3), np.nan) for _ in range(3))

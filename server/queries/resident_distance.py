@@ -1,4 +1,7 @@
-"""`distance` of one pose, for who asks each frame: one kernel call where all voxels in reach are resident."""
+"""Fast path of `distance` for one pose: one kernel call if all voxels in reach are resident.
+
+Intended for callers that query in each frame.
+"""
 
 import time
 
@@ -13,8 +16,8 @@ from .context.query_budget import EXACT, Effort
 from .context.query_context import SceneData, kernel_poses, refuse, to_units
 from .distance import distance
 
-# The search keeps the residency's lock, so that others wait for it. What it takes grows with the voxels in reach, where
-# nothing is near: so many at most are looked into so [voxels], and so far [m].
+# Limits of the fast path [voxels] and [m]. The search holds the residency's lock, so others wait
+# for it, and with nothing near its time grows with the number of voxels in reach.
 QUICK_ROWS, QUICK_REACH = 64, 2.0
 
 _CLEAR, _CONTACT = np.uint8(Verdict.CLEAR), np.uint8(Verdict.CONTACT)
@@ -23,9 +26,10 @@ _CLEAR, _CONTACT = np.uint8(Verdict.CLEAR), np.uint8(Verdict.CONTACT)
 def near(
     data: SceneData, avatar: AvatarModel, pose: ArrayLike, reach: float, effort: Effort = EXACT
 ) -> DistanceAnswers:
-    """What `distance` answers for one pose (4, 4), to the last bit, its cost counters too; engine_seconds aside.
+    """Return the answer of `distance` for one pose (4, 4).
 
-    reach, effort, errors: as there.
+    It is identical to the last bit, cost counters included, except engine_seconds.
+    reach, effort, errors: as for `distance`.
     """
     poses = kernel_poses(np.asarray(pose)[None])
     answers = _near_at_once(data, avatar, poses, reach, effort)
@@ -35,7 +39,10 @@ def near(
 def _near_at_once(
     data: SceneData, avatar: AvatarModel, poses: ArrayLike, reach: float, effort: Effort
 ) -> DistanceAnswers | None:
-    """The answer of one kernel call; None: something has to be loaded, or it is not to be had so."""
+    """Return the answer of one kernel call, or None if the fast path does not apply.
+
+    It does not apply if a voxel has to be loaded or the request exceeds its limits.
+    """
     if effort.limited or len(avatar.points) > QUICK_POINTS or data.nothing_clear or len(data.unknown):
         return None
     begin = time.perf_counter()

@@ -1,7 +1,8 @@
-"""One avatar asked about frame after frame: one motion or one pose a question, one kernel call where all is resident.
+"""Fast path of `sweep` and `collide` for one avatar, queried frame after frame.
 
-The answers are those of server/queries/sweep.py and server/queries/collide.py, bit for bit; where
-something has to be loaded, or a question is none for a quick look, these give them.
+A query has one motion or one pose, and takes one kernel call if all voxels are resident. The
+answers equal those of server/queries/sweep.py and server/queries/collide.py bit for bit. These are
+called if a voxel has to be loaded or the fast path does not apply.
 """
 
 from typing import NamedTuple
@@ -22,22 +23,25 @@ from .sweep import sweep
 Vec = NDArray[np.float64]
 Pose = NDArray[np.float64]
 
-# By value; making one of a number takes as long as a question's share of Python otherwise.
+# Verdicts by value: constructing one from a number would double the Python time of a query.
 _VERDICTS = tuple(Verdict(value) for value in range(3))
 _CLEAR = int(Verdict.CLEAR)
-# Voxels in reach of a quick question.
+# Most voxels in reach of a query on the fast path.
 _ROWS = 64
-# So many questions in the same voxels count as one use of them.
+# This many consecutive queries in the same voxels count as one use of them.
 _AGAIN = 16
 
 
 class Swept(NamedTuple):
-    """When an avatar first touches on its way. Fields as of one motion in `SweepAnswers`.
+    """First contact of an avatar on a motion. Fields as for one motion in `SweepAnswers`.
 
-    avatar, cloud: (3,) the witness's centres, world [m]; None where the verdict is not CONTACT.  archive: which of a
-    scene's archives is touched.  exact: nothing else may be touched before: no point goes farther than the tolerance
-    between `lower` and `upper`.  visits: node visits.  missing: voxels that could not be looked at.  unknown: whether
-    something there could not be looked at, or was not; a contact that is not exact may be a graze, all looked at.
+    avatar, cloud: (3,) the witness's centres, world [m]; None unless the verdict is CONTACT.
+    archive: number of the touched archive in its scene.
+    exact: whether nothing else can be touched before: no point moves farther than the tolerance
+    between `lower` and `upper`.
+    visits: node visits.  missing: voxels that could not be examined.
+    unknown: whether something in reach could not be or was not examined. If it is false, a contact
+    that is not exact may be a graze, with everything examined.
     """
 
     verdict: Verdict
@@ -53,14 +57,14 @@ class Swept(NamedTuple):
 
 
 def _has_unknown(data: SceneData) -> bool:
-    """Return whether a scan was left out anywhere, or a load found the index wrong."""
+    """Return whether a scan was left out anywhere, or a load proved the index wrong."""
     return data.nothing_clear or len(data.unknown) > 0
 
 
 class Probe:
-    """One avatar's questions. Not thread-safe: it has arrays that are written again and again.
+    """Queries of one avatar. Not thread-safe: it reuses its arrays.
 
-    avatar: the model asked about.
+    avatar: the avatar's model.
     """
 
     __slots__ = (
@@ -91,9 +95,9 @@ class Probe:
     def sweep(
         self, data: SceneData, pose_from: Pose, pose_to: Pose, tolerance: float, effort: Effort
     ) -> Swept:
-        """When the avatar first touches between two poses (4, 4).
+        """Find when the avatar first touches between two poses (4, 4).
 
-        See server/queries/sweep.py, which says what is refused.
+        server/queries/sweep.py documents the errors.
         """
         if self.quick and not effort.limited:
             avatar, residency, rows, said = self.avatar, data.residency, self._rows, self._said
@@ -116,7 +120,7 @@ class Probe:
         answers = sweep(data, self.avatar, pose_from[None], pose_to[None], tolerance=tolerance, effort=effort)
         verdict, exact = _VERDICTS[answers.verdict[0]], bool(answers.exact[0])
         touches, missing = verdict == Verdict.CONTACT, int(answers.voxels_missing[0])
-        # A budget, too, leaves places that were not looked at.
+        # A budget may leave places unexamined too.
         partial = effort.limited or bool(data.arrays.stop.item(0)) or _has_unknown(data)
         return Swept(
             verdict,
@@ -132,15 +136,17 @@ class Probe:
         )
 
     def _use(self, residency: Residency, rows: list[int]) -> None:
-        """Count voxels as used, once for questions that follow one another in the same ones: it takes as long as a
-        tenth of a question."""
+        """Record a use of voxels, once for _AGAIN consecutive queries in the same voxels.
+
+        Recording takes as long as a tenth of a query.
+        """
         if rows != self._used or not self._again:
             residency.use(rows)
             self._used, self._again = rows, _AGAIN
         self._again -= 1
 
     def collide(self, data: SceneData, pose: Pose, effort: Effort) -> tuple[Verdict, int]:
-        """Whether the avatar touches at a pose (4, 4), and the node visits; see server/queries/collide.py."""
+        """Return verdict and node visits for a pose (4, 4); see server/queries/collide.py."""
         if self.quick and not effort.limited and not data.nothing_clear and not len(data.unknown):
             avatar, residency, rows = self.avatar, data.residency, self._rows
             poses, verdict, counts = self._poses, self._verdict, self._counts
@@ -161,7 +167,7 @@ class Probe:
         return _VERDICTS[answers.verdict[0]], int(answers.node_visits[0])
 
     def between(self, origin: Vec, pose_from: Pose, pose_to: Pose, fraction: float) -> tuple[Pose, bool]:
-        """The pose at a fraction of a motion, and whether what a sweep proved of the motion there holds for it.
+        """Return the pose at a fraction of a motion, and whether a sweep's proof holds for it.
 
         origin: (3,) of the dataset, world [m].
         """

@@ -1,4 +1,4 @@
-"""Answers of requests that were stopped: what was not reached is unknown, and the answer says why."""
+"""Answers of stopped requests: unknown where nothing was computed, with the reason of the stop."""
 
 from collections.abc import Callable
 from typing import Any, TypeVar
@@ -40,7 +40,7 @@ _ANSWERS: dict[Callable[..., Any], type[Cost]] = {
 
 
 def ask_until_stopped(question: Callable[..., _A], k: int, effort: Effort, ask: Callable[[], _A]) -> _A:
-    """Ask a question of k poses (motions, rays, points, objects) by `ask`; where the request is stopped, say why."""
+    """Run a query of k poses (motions, rays, points, objects) with `ask`; add a stop's reason."""
     try:
         answers = ask()
     except StoppedError:
@@ -49,6 +49,6 @@ def ask_until_stopped(question: Callable[..., _A], k: int, effort: Effort, ask: 
 
 
 def unknown_part(kind: type[Any], k: int, effort: Effort) -> Any:
-    """Return answers that know nothing of k poses (motions, rays, points, objects), with the reason of a stop."""
+    """Return `unknown` for k poses (motions, rays, points, objects), with the stop's reason."""
     answers = unknown(kind, k, bounded=effort.limited or effort.tolerance > 0.0)
     return structs.replace(answers, stopped=effort.stop.reason)

@@ -1,7 +1,7 @@
-"""Surface normals at scan points, estimated where somebody asks and remembered; for the effects that slide and stand.
+"""Surface normals at scan points, estimated on demand and cached; for the effects slide and stand.
 
-Point by point, not voxel by voxel: all normals of a voxel of half a million points would take seconds, and those of
-the few that are touched in a frame take some microseconds each.
+Normals are estimated one point at a time: all normals of a voxel of half a million points would
+take seconds, and those of the few points touched in a frame take some microseconds each.
 """
 
 from collections import OrderedDict
@@ -18,12 +18,12 @@ from ..residency.voxel_store import Store
 from ..runtime.stop_flag import NEVER, Stop, StoppedError
 from .context.query_context import SceneData, with_stop
 
-# Of the budget for voxels, what normals may take besides.
+# Memory for normals, as a share of the budget for voxels, in addition to it.
 SHARE = 1 / 32
 
 
 def warm(data: SceneData) -> None:
-    """Have the kernels compiled before anybody waits for them: a frame asks for normals only where it touches."""
+    """Compile the kernels in advance: a frame needs normals only once something is touched."""
     nowhere = data.arrays._replace(where=np.full_like(data.arrays.where, -1))
     find_voxel(data.broad.keys, nowhere.voxel_steps, 0, 0, 0)
     code_at(nowhere, 0, 0, 0, 0, 1, np.empty(0, np.uint16))
@@ -32,23 +32,26 @@ def warm(data: SceneData) -> None:
 
 
 class Normals:
-    """The normals of one generation of an archive. Thread-safe.
+    """Normals of one generation of an archive. Thread-safe.
 
-    Those that the store has loaded (`Store.with_normals`) are looked up where somebody asks for their reach. What is
-    estimated is kept, two bytes for each point of a voxel, from the first question about it until the voxel is
-    evicted or others need the room: those asked first go first.
-    used_bytes: of these.  most_bytes: their bound.  estimated: normals that were computed.  visits: tree nodes, of all.
+    Normals that the store has loaded (`Store.with_normals`) are looked up for requests of their
+    reach. Other normals are estimated and cached: a voxel takes two bytes a point from the first
+    request until the voxel is evicted or others need the memory, first in, first out.
+    used_bytes: memory of the cached normals.  most_bytes: its limit.
+    estimated: number of estimated normals.  visits: tree nodes visited for all normals.
     """
 
     def __init__(self, store: Store, data: SceneData, most_bytes: int | None = None) -> None:
-        """Of the voxels of `store`, which `data` has in memory; both must stay open while this is asked.
+        """Make an empty cache for the voxels of `store`, which `data` holds in memory.
 
-        most_bytes: None: a 32nd of the budget for voxels. A voxel that takes more is asked, and nothing of it kept.
+        Both must stay open while this object is used.
+        most_bytes: None for a 32nd of the budget for voxels. The normals of a voxel that needs more
+        are not cached.
         """
         rows = store.archive.voxels
         self.most_bytes = int(data.residency.budget_bytes * SHARE) if most_bytes is None else most_bytes
         self.used_bytes = self.estimated = self.visits = 0
-        # Kept for all requests: the stop of the one that asks first is not theirs.
+        # Shared by all requests, so the stop flag of the first one must not apply.
         self._data, self._leaves = with_stop(data, NEVER), rows["leaves"]
         self._most_points = int(rows["rows"][:, 2].max(initial=0))
         self._origin = tuple(data.arrays.origin.tolist())
@@ -64,13 +67,15 @@ class Normals:
     def at(
         self, cloud: ArrayLike, toward: ArrayLike, reach: float, stop: Stop = NEVER
     ) -> NDArray[np.float64] | None:
-        """Return the unit normal (3,) of the surface at a scan point, on the side that `toward` points to.
+        """Return the unit normal (3,) of the surface at a scan point, on the side of `toward`.
 
-        cloud: (3,) the point, world [m], within half a lattice step.  toward: (3,) any length; where it lies in the
-        surface or is 0 the side is as it comes.  reach: points so near the point make its surface [m].
-        None: no point is there, or the points make no surface (schemas/kernels/normal_codes.py).
-        stop: ends a wait for a
-        load. Raises BadRequestError for a reach that is none, CorruptError for a voxel that cannot be read,
+        Return None if there is no point, or the points form no surface
+        (schemas/kernels/normal_codes.py).
+        cloud: (3,) the point, world [m], within half a lattice step.
+        toward: (3,) any length; if it is 0 or lies in the surface, the side is arbitrary.
+        reach: points within this distance of the point form its surface [m].
+        stop: ends a wait for a load.
+        Raise BadRequestError for an invalid reach, CorruptError for an unreadable voxel,
         StoppedError.
         """
         code = self.code(cloud, reach, stop)
@@ -82,9 +87,9 @@ class Normals:
         return np.array([side * x, side * y, side * z])
 
     def code(self, cloud: ArrayLike, reach: float, stop: Stop = NEVER) -> int:
-        """Return the code of the normal, as schemas/kernels/normal_codes.py has it; NONE for none.
+        """Return the code of the normal (schemas/kernels/normal_codes.py); NONE if there is none.
 
-        stop: ends a wait for a load. Raises CorruptError, and StoppedError.
+        stop: ends a wait for a load. Raise CorruptError, StoppedError.
         """
         square = self._squares.get(reach)
         if square is None:
@@ -111,7 +116,7 @@ class Normals:
                 return self._look(row, x, y, z, square)
 
     def _look(self, row: int, x: int, y: int, z: int, square: int) -> int:
-        """`code` of a lattice point in a resident voxel, which stays."""
+        """Return `code` of a lattice point in a voxel that stays resident during the call."""
         if square == self._stored:
             found, visits = stored_code_at(self._data.arrays, row, x, y, z, self._data.keeps_scan)
             self.visits += int(visits)
@@ -126,7 +131,7 @@ class Normals:
         return int(code)
 
     def _drop_evicted(self) -> None:
-        """Forget what is known of voxels that are not resident any more."""
+        """Drop the normals of voxels that are no longer resident."""
         residency = self._data.residency
         if residency.evictions == self._evictions:
             return
@@ -138,7 +143,7 @@ class Normals:
         self.used_bytes -= self._codes.pop(key).nbytes
 
     def _make(self, row: int, square: int) -> NDArray[np.uint16]:
-        """Room for the codes of a voxel, of which none is known; others go for it. None where it takes too much."""
+        """Make an array for the codes of a voxel, dropping others; empty if it is too large."""
         points = int(self._leaves[row]) * LANES
         if points * UNASKED.itemsize > self.most_bytes:
             return np.empty(0, np.uint16)

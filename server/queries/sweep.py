@@ -1,4 +1,4 @@
-"""`sweep`: when does an avatar on its way from one pose to another first touch the scene? One request -> one result."""
+"""Query `sweep`: first contact of an avatar with the scene on a motion between two poses."""
 
 import time
 
@@ -21,7 +21,7 @@ from .context.query_budget import EXACT, Effort
 from .context.query_context import SceneData, as_held, kernel_poses, pieces, refuse, to_units
 from .context.query_cost import Spent
 
-# Motions of one kernel call where there is a deadline: it is looked at between calls.
+# Motions of one kernel call if there is a deadline, which is checked between calls.
 _PER_CALL = 64
 
 
@@ -32,10 +32,13 @@ def _check(
     last: NDArray[np.float64],
     other_units: int,
 ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
-    """Check the poses of k motions. Returns, each (k,), the larger scale and reach of either end, the latter in exact
-    units and to the scan's largest sphere, and by how many units the reach may differ on the way."""
+    """Check the poses of k motions, and return scales, reaches and their variation, (k,) each.
+
+    Scale and reach are the larger ones of both ends; the reach is in exact units, up to the scan's
+    largest sphere. The variation is by how many units the reach may differ during the motion.
+    """
     k = len(first)
-    scales, units = np.ones((2, k)), np.zeros((2, k), np.int64)  # a stop may leave some as they are
+    scales, units = np.ones((2, k)), np.zeros((2, k), np.int64)  # a stop may leave some unchanged
     for end, poses in enumerate((first, last)):
         fault, pose, found = check_poses(
             poses, avatar.arrays.radius, avatar.radius, other_units, data.arrays, scales[end], units[end]
@@ -48,8 +51,8 @@ def _check(
             f"motion {i} begins at scale {scales[0, i]:g} and ends at {scales[1, i]:g}: expected one scale "
             "within 1e-9: a rigid motion changes no size"
         )
-    # On the way the scale lies between those of the ends. Well within 1e-9 of 1 it is 1 all the
-    # way (pose_transform.py).
+    # During the motion the scale lies between those of the ends. If both are well within 1e-9 of 1,
+    # it is 1 throughout (pose_transform.py).
     rigid = np.ones(k, bool)
     for poses in (first, last):
         rigid &= np.abs((poses[:, :3, :3] ** 2).sum(axis=(1, 2)) / 3.0 - 1.0) <= SIMILARITY_TOLERANCE
@@ -62,10 +65,11 @@ def _check(
 def _from_origin(
     data: SceneData, first: NDArray[np.float64], last: NDArray[np.float64]
 ) -> tuple[SceneData, NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Scene and poses with the dataset's origin at zero, and where it was, world [m].
+    """Move scene and poses so that the dataset's origin is zero; return its world position too [m].
 
-    A pose on the way is computed, and rounded, there: a scene at map coordinates answers as it does at the origin, bit
-    for bit (NUMERICS.md case 1), and its poses on the way are as fine. The ends are what they are: t - O, N5.
+    Intermediate poses are computed and rounded in this frame. A scene at map coordinates therefore
+    gives the same answers as at the origin, bit for bit (NUMERICS.md case 1), with intermediate
+    poses of the same precision. The end poses are t - O, see N5.
     """
     origin = data.arrays.origin
     first, last = first.copy(), last.copy()
@@ -78,7 +82,10 @@ def _answers(
     progress: Progress, frozen: NDArray[np.float64], counts: NDArray[np.uint32], outside: NDArray[np.bool_],
     tolerance: float,
 ) -> SweepAnswers:  # fmt: skip
-    """The answers, from how far each motion came. frozen: (k,) up to where it was proved that nothing touches."""
+    """Make the answers from the progress of each motion.
+
+    frozen: (k,) fraction up to which nothing is proved to touch.
+    """
     touches = progress.upper < np.inf
     verdict = np.full(len(frozen), Verdict.UNKNOWN, np.uint8)
     verdict[touches] = Verdict.CONTACT
@@ -102,18 +109,22 @@ def sweep(
     tolerance: float = 1e-6,
     effort: Effort = EXACT,
 ) -> SweepAnswers:
-    """When the avatar first touches the scene on the screw motion (kernels/motion/screw_motion.py)
-    from one pose to the other.
+    """Find the first contact of the avatar with the scene on the screw motion between two poses.
 
-    The motion is that of the dataset's frame: its translations are t - O (NUMERICS.md N5). Each scan point has its own
-    sphere, as the radius model of `data` has it, the whole way.
-    pose_from, pose_to: (k, 4, 4) float64, avatar to world, rigid or of one scale, bits used as given.
-    margin: distance below or at which two spheres are called in contact [m].  tolerance: how far any avatar point may
-    go between `lower` and `upper` [m]; that of `effort` where it is larger.
-    CONTACT in [lower, upper]; CLEAR; UNKNOWN from `lower` on: something is missing there, the effort was spent, or a
-    graze of some hundredths of a micrometre cannot be told from a touch. A contact found after such a place is CONTACT
-    all the same, with exact=False. With a budget of visits what is clear stays clear under a larger one; a contact may
-    not: it may be spent on a doubt before it. Raises BadRequestError, BadTransformError, TooLargeError.
+    kernels/motion/screw_motion.py defines the motion, in the dataset's frame: translations are
+    t - O (NUMERICS.md N5). Each scan point has the sphere given by the radius model of `data`,
+    constant during the motion.
+    pose_from, pose_to: (k, 4, 4) float64, avatar to world, rigid or of one scale, bits used as
+    given.
+    margin: distance at or below which two spheres are in contact [m].
+    tolerance: how far any avatar point may move between `lower` and `upper` [m]; the tolerance of
+    `effort` if that is larger.
+    The verdict is CONTACT in [lower, upper]; CLEAR; or UNKNOWN from `lower` on: something is
+    missing there, the budget was spent, or a graze of some hundredths of a micrometre cannot be
+    distinguished from a touch. A contact found after an unknown place is CONTACT with exact=False.
+    A motion that is clear with a budget of visits is clear with a larger one. A contact found may
+    be lost with a larger budget, which may be spent on an unresolved place before it.
+    Raise BadRequestError, BadTransformError, TooLargeError.
     """
     begin = time.perf_counter()
     if not 0.0 <= tolerance <= MAX_COORDINATE:
@@ -137,7 +148,7 @@ def sweep(
     bounds, residency, spent, box = data.bounds, data.residency, Spent(begin), avatar_box(avatar.arrays)
     starts, rows = np.zeros(k + 1, np.int64), np.empty(16 * k + 64, np.int64)
     which = np.arange(k)
-    asked: set[int] = set()  # rows that were loaded to prove the index
+    asked: set[int] = set()  # rows loaded to prove the index
     while len(which):
         begun = progress.at.copy()
         unproved = bounds.unproved
@@ -149,7 +160,7 @@ def sweep(
             rows = np.empty(2 * needed, np.int64)
             continue
         if unproved and bounds.unsettled(rows[:needed], unproved).any():
-            # By the boxes of the index some may be out of reach, and segments are then others.
+            # By the boxes of the index some may be out of reach, which changes the segments.
             by_index = progress._replace(
                 at=begun.copy(), end=progress.end.copy(), speed=progress.speed.copy()
             )
@@ -167,7 +178,7 @@ def sweep(
                 progress.at[:] = begun
                 continue
         progress.lower[which] = progress.end[which]
-        boxes = np.empty((k, 2, 3))  # of no use here
+        boxes = np.empty((k, 2, 3))  # unused here
         around = Reach(scales, units, starts, rows, boxes, outside)
         for part, held_rows, reach in pieces(around, residency, effort.share, effort.stop):
             chunk = len(part) if effort.deadline == np.inf else _PER_CALL
@@ -188,7 +199,7 @@ def sweep(
         which = _next_round(which, progress, proved)
         if effort.stop:
             break
-    # Those that were stopped on their way: nothing is known beyond.
+    # Motions that were stopped before their end: nothing is known beyond.
     proved[which] = np.minimum(proved[which], progress.at[which])
     until = np.minimum(progress.upper, 1.0)
     lost = np.empty(k)
@@ -210,7 +221,7 @@ def sweep(
         lost[:] = 0.0
     met = lost <= until
     proved[met] = np.minimum(proved, lost)[met]
-    # The avatar's centre as the definition has it, in exact units, as `distance` and `contacts` name it.
+    # The avatar's centre by the definition, in exact units, as `distance` and `contacts` report it.
     progress.witness[:, 0] = np.rint(progress.witness[:, 0] * UNITS_PER_METRE) / UNITS_PER_METRE
     progress.witness[:] += origin
     answers = _answers(progress, proved, counts, outside, tolerance)
@@ -223,9 +234,10 @@ def _hidden_rows(
     voxels: int,
     stop: Stop,
 ) -> list[int]:
-    """Return the distinct rows, ascending, that a motion has in reach as planned and not by the index.
+    """Return the distinct rows, ascending, in reach of a motion by `planned` but not by the index.
 
-    planned, by_index: starts (k + 1,) and rows of k motions.  stop: once it is set, some may be left out.
+    planned, by_index: starts (k + 1,) and rows of k motions.
+    stop: once it is set, the result may be incomplete.
     """
     hidden: NDArray[np.bool_] = np.zeros(voxels, bool)
     starts, _ = planned
@@ -243,7 +255,7 @@ def _hidden_rows(
 def _pairs(
     starts: NDArray[np.int64], rows: NDArray[np.int64], begin: int, end: int, voxels: int
 ) -> NDArray[np.int64]:
-    """Return motion and voxel of each row of motions [begin, end) as one number: motion * voxels + voxel."""
+    """Encode each row of motions [begin, end) as one number: motion * voxels + voxel."""
     motions = np.repeat(np.arange(begin, end), np.diff(starts[begin : end + 1]))
     return np.asarray(motions * voxels + rows[starts[begin] : starts[end]], np.int64)
 
@@ -251,13 +263,14 @@ def _pairs(
 def _next_round(
     which: NDArray[np.int64], progress: Progress, proved: NDArray[np.float64]
 ) -> NDArray[np.int64]:
-    """Take up what a round of segments found; returns the motions that go on.
+    """Evaluate a round of segments; return the motions that continue.
 
-    proved: (k,) up to where nothing touches, 1 while nothing has stood against it: the first doubt fixes it.
+    proved: (k,) fraction up to which nothing touches, 1 until an unresolved place or a contact
+    fixes it.
     """
     at, end, lower = progress.at[which], progress.end[which], progress.lower[which]
     touches = progress.upper[which] < np.inf
-    looked = at < 1.0  # else nothing was left in reach
+    looked = at < 1.0  # otherwise nothing was left in reach
     doubt = looked & ((lower < end) | touches) & (proved[which] >= 1.0)
     proved[which[doubt]] = lower[doubt]
     progress.at[which] = np.where(looked, end, at)

@@ -1,4 +1,4 @@
-"""`within`: the scan point nearest to each loose point. One request -> one result."""
+"""Query `within`: the scan point nearest to each query point."""
 
 import time
 
@@ -19,18 +19,18 @@ from .context.query_cost import Spent
 
 
 def within(data: SceneData, points: ArrayLike, reach: float, effort: Effort = EXACT) -> WithinAnswers:
-    """The scan point nearest to each of k loose points, centre to centre: no radius and no radius model matters.
+    """Find the scan point nearest to each of k query points, centre to centre, ignoring radii.
 
-    points: (k, 3) float64, world [m].  reach: inclusive [m], at most 16. The definition is in
-    kernels/rays/nearest_point.py. A
-    point is `outside` when its reach, a cube of exact units, leaves the box of all scan points.
-    Verdicts, bounds and effort as in `raycast`. Raises BadRequestError.
+    points: (k, 3) float64, world [m].  reach: inclusive [m], at most 16.
+    kernels/rays/nearest_point.py has the definition. A point is `outside` if its reach, a cube of
+    exact units, leaves the box of all scan points. Verdicts, bounds and effort are as for
+    `raycast`. Raise BadRequestError.
     """
     spent = Spent(time.perf_counter())
     _, units = make_origins(data, points, "points")
     reach_units = to_units(reach, "reach")
     if reach_units > MAX_REACH_UNITS:
-        raise BadRequestError(f"reach {reach!r}: expected at most 16 m: squares of more do not fit 63 bits")
+        raise BadRequestError(f"reach {reach!r}: expected at most 16 m: larger squares do not fit in 63 bits")
     tolerance = effort.tolerance * UNITS_PER_METRE
 
     def kernel(

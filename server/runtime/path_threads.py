@@ -27,7 +27,7 @@ class PathThreads:
         self._closed = False
 
     def start(self) -> None:
-        """Start the threads that do not run yet; they inherit the priority of the calling thread."""
+        """Start the threads that do not run yet; they inherit the calling thread's priority."""
         with self._changed:
             while len(self._threads) < self._count and not self._closed:
                 self._threads.append(start_thread(f"{self._scene}-path", self._run))

@@ -1,4 +1,4 @@
-"""What the query engines share: scene data, budgets, costs, proofs of clearance.
+"""Code shared by the query engines: scene data, budgets, costs, proofs of clearance.
 
 May import server.avatars, server.kernels, server.residency, server.runtime, schemas.
 Begin with query_context.py.

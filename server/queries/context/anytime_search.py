@@ -1,8 +1,9 @@
-"""`collide` and `distance` with a budget, and a tolerance or none: bounds that hold whenever the search stops.
+"""`collide` and `distance` with a budget, and optionally a tolerance.
 
-See kernels/nearest/best_first_search.py for the search. Without a deadline one kernel call answers
-a request, and the same request gets
-the same answer. With one, the time left is shared among the poses left, and looked at between slices of the search.
+Their bounds hold whenever the search stops. kernels/nearest/best_first_search.py has the search.
+Without a deadline, one kernel call answers a request, and the same request gets the same answer.
+With a deadline, the remaining time is divided among the remaining poses, and checked between slices
+of the search.
 """
 
 import math
@@ -34,18 +35,18 @@ from .query_context import SceneData, as_held, in_unknown, kernel_poses, pieces,
 from .query_cost import Spent
 from .signed_distance import distance_columns, signed_bound, signed_from_square, unknown_gaps
 
-# Pairs the heap holds before the search turns depth first: half a megabyte a request.
+# Capacity of the heap [pairs], beyond which the search is depth first: half a megabyte a request.
 HEAP_PAIRS = 1 << 14
-# Node visits between two looks at the clock: some 20 to 100 µs.
+# Node visits between two checks of the clock: some 20 to 100 µs.
 SLICE_VISITS = 2000
-# Voxels in reach of poses that are given up, looked up at a time: some 10 MB.
+# Entries of voxels in reach of abandoned poses, processed at a time: some 10 MB.
 LEFT_AT_A_TIME = 1 << 16
-# Bounds are widened by some exact units when they become metres; a tolerance below that is none.
+# Conversion to metres widens bounds by some exact units; a smaller tolerance has no effect.
 TOLERANCE_SLACK = 8.0
 
 
 class _Gathered(NamedTuple):
-    """What a request has found out: known, counts (3, k) uint32, and the fields of `Cost`."""
+    """Results of a request: known, counts (3, k) uint32, and cost."""
 
     known: Known
     counts: NDArray[np.uint32]
@@ -64,7 +65,10 @@ def _search_until(
     known: Known,
     counts: NDArray[np.uint32],
 ) -> None:
-    """Search for the poses `which`, each with its share of the time left. data: its arrays as held."""
+    """Search for the poses `which`, each with its share of the remaining time.
+
+    data: with the arrays of the current hold.
+    """
     deadline = effort.deadline
     search = make_search(avatar.arrays, data.arrays, heap)
     for done, pose in enumerate(which.tolist()):
@@ -94,9 +98,10 @@ def _leave_open(
     known: Known,
     counts: NDArray[np.uint32],
 ) -> None:
-    """Give up the poses `left`, all at once: a kernel call for each took a deadline of 5 ms to half a second.
+    """Abandon the poses `left` in one step and bound them by the index.
 
-    Their bounds are what the index alone says: box to box, as in `unknown_gaps`. Once the stop is set, nothing is said.
+    With a kernel call for each pose, a request with a deadline of 5 ms took half a second. The
+    bounds are distances between boxes, as in `unknown_gaps`; once the stop flag is set, they are 0.
     """
     if stop:
         known.lower[left] = 0.0
@@ -127,7 +132,7 @@ def _gather(
     effort: Effort,
     spent: Spent,
 ) -> _Gathered:
-    """Search for all poses, piece by piece. What it takes is added to `spent`."""
+    """Search for all poses, piece by piece. Add the cost to `spent`."""
     k = len(array)
     known = Known(
         np.full(k, -1, np.int64), np.zeros((k, 6), np.int64), np.zeros(k, np.int64), np.full(k, math.inf),
@@ -159,9 +164,9 @@ def _fields(cost: Cost) -> dict[str, Any]:
 
 
 def _upper(data: SceneData, known: Known, radii: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Signed distances (k,) [m] that some pair surely has at most; inf where no pair was bounded.
+    """Return upper bounds (k,) of the signed distances [m]; inf if no pair was bounded.
 
-    radii: (k,) of avatar's and scan's largest spheres together, exact units.
+    radii: (k,) sum of the largest radii of avatar and scan, exact units.
     """
     found = signed_from_square(np.maximum(known.square, 0), radii - known.drop)
     signed = np.where(known.square >= 0, found, np.inf)
@@ -172,11 +177,11 @@ def _upper(data: SceneData, known: Known, radii: NDArray[np.int64]) -> NDArray[n
 def distance_bounded(
     data: SceneData, avatar: AvatarModel, poses: ArrayLike, reach: float, effort: Effort
 ) -> DistanceAnswers:
-    """`distance` (see there) with a budget, with a tolerance or without.
+    """Answer `distance` with a budget, and optionally a tolerance.
 
-    Ends when the bounds lie within the tolerance, or when the budget is spent; the bounds hold either way. A pair is
-    found before the tolerance ends anything; where the budget ended it first there may be none, `upper` can say
-    all the same that one is in reach.
+    The search ends when the bounds lie within the tolerance or the budget is spent; the bounds hold
+    in either case. The tolerance ends it only after a pair was found. If the budget ends it first,
+    there may be no pair, although `upper` may prove that one is in reach.
     """
     array = kernel_poses(poses)
     reach_units = to_units(reach, "reach")
@@ -187,7 +192,7 @@ def distance_bounded(
     known, counts, cost = _gather(data, avatar, array, around, goal, effort, spent)
     if len(avatar.points):
         np.minimum(known.gap, unknown_gaps(data, around), out=known.gap)
-    # What was left open is as what is missing: somewhere, no nearer than that.
+    # Unfinished searches bound the distance like missing voxels.
     np.minimum(known.gap, known.lower, out=known.gap)
     upper = _upper(data, known, around.units - reach_units)
     nearest = Nearest(known.square, known.pair, known.drop, known.gap)
@@ -198,10 +203,11 @@ def distance_bounded(
 def collide_bounded(
     data: SceneData, avatar: AvatarModel, poses: ArrayLike, margin: float, effort: Effort
 ) -> CollideAnswers:
-    """`collide` (see there) with a budget, with a tolerance or without.
+    """Answer `collide` with a budget, and optionally a tolerance.
 
-    CONTACT where a pair is within the margin, or within margin and tolerance (then not `exact`); CLEAR where surely
-    none is; else UNKNOWN: the budget was spent, or something in reach is missing.
+    The verdict is CONTACT if a pair is within the margin, or within margin plus tolerance (then not
+    `exact`); CLEAR if provably none is; otherwise UNKNOWN, because the budget was spent or
+    something in reach is missing.
     """
     array = kernel_poses(poses)
     margin_units = to_units(margin, "margin")
@@ -209,7 +215,8 @@ def collide_bounded(
     around = find_proved_reach(data, avatar, array, data.radius_units + margin_units, effort, spent)
     radii = around.units - margin_units
     early = math.floor(min(effort.tolerance * UNITS_PER_METRE, float(MAX_REACH_UNITS)))
-    # Sums of float64 on both sides of a comparison: some units of slack make it one of the true numbers.
+    # Both sides of the comparison are float64 sums: some units of slack make it valid for the exact
+    # values.
     certain = (around.units - TOLERANCE_SLACK) / data.arrays.units_per_step
     enough = np.asarray((around.units + early - TOLERANCE_SLACK) / data.arrays.units_per_step, np.float64)
     goal = Goal(True, early, enough, 0.0, effort.visits)

@@ -1,8 +1,9 @@
-"""What `raycast` and `within` share: voxels looked at front to back, in rounds, so that no more is loaded than asked.
+"""Front-to-back search of `raycast` and `within`, in rounds that load only the voxels needed.
 
-A round holds the next voxel of every ray or point that is not done, and of the voxels further on those that are in
-memory already, and makes one kernel call for all of them. So a request whose voxels are resident takes one round, and a
-hit in the first voxel loads no second one. What is held at a time stays within the cache's budget.
+A round holds the next voxel of every unfinished ray or point and all later voxels that are already
+resident, and makes one kernel call for all of them. A request whose voxels are resident therefore
+takes one round, and a hit in the first voxel loads no second one. The voxels held at a time fit in
+the cache's budget.
 """
 
 import math
@@ -25,16 +26,19 @@ from .query_budget import Effort
 from .query_context import SceneData
 from .query_cost import Spent
 
-# Rays or points whose lists are in memory together.
+# Rays or points whose lists are in memory at a time.
 BATCH = 1 << 14
-# The same where there is a deadline, which is looked at between batches and rounds: some 10 ms of work.
+# The same with a deadline, which is checked between batches and rounds: some 10 ms of work.
 TIMED_BATCH = 1 << 11
 
 
 def make_origins(
     data: SceneData, values: ArrayLike, what: str
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """World positions (k, 3) [m], and the same in exact units from the dataset's origin, half to even."""
+    """Return world positions (k, 3) [m], and the same in exact units from the dataset's origin.
+
+    Rounding is half to even. Raise BadRequestError for a position that is too far away.
+    """
     array = make_vectors(values, what)
     if len(array) and np.abs(array).max() > MAX_COORDINATE:
         raise BadRequestError(f"{what} at {np.abs(array).max():g} m: expected within {MAX_COORDINATE:g} m")
@@ -42,7 +46,7 @@ def make_origins(
 
 
 def make_best(k: int) -> Nearest:
-    """Nothing found yet."""
+    """Return the results of k searches that have found nothing."""
     return Nearest(
         np.full(k, np.inf),
         np.full(k, -1, np.int64),
@@ -53,7 +57,7 @@ def make_best(k: int) -> Nearest:
 
 
 def _part(best: Nearest, begin: int, end: int) -> Nearest:
-    """Views of rows [begin, end); counts contiguous, to be written back."""
+    """Return views of rows [begin, end), and a contiguous copy of counts to be written back."""
     rows = slice(begin, end)
     return Nearest(
         best.value[rows],
@@ -65,7 +69,7 @@ def _part(best: Nearest, begin: int, end: int) -> Nearest:
 
 
 def _forget(best: Nearest) -> None:
-    """Make it what `make_best` makes, but for what was not seen."""
+    """Reset results to those of `make_best`, except `unseen`."""
     best.value[:], best.square[:], best.lattice[:], best.counts[:] = np.inf, -1, 0, 0
 
 
@@ -79,11 +83,13 @@ def look(
     kernel: Callable[..., Any],
     spent: Spent,
 ) -> Nearest:
-    """Answer k rays (direction (k, 3)) or loose points (None) by rounds.
+    """Answer k rays (direction (k, 3)) or query points (direction None) in rounds.
 
-    radius_units: of the scan's largest sphere, 0 where radii do not count: what the index alone can tell of a voxel.
-    kernel(begin, end, lists, cursor, held, best) looks as far as it may; see `kernels.rays.follow_rays`.
-    What a deadline left undone is in `unseen` of what is returned. What it took is added to `spent`.
+    radius_units: of the scan's largest sphere; 0 if radii do not count. The index gives no other
+    radius of a voxel.
+    kernel(begin, end, lists, cursor, held, best) searches as far as the held voxels allow; see
+    `kernels.rays.follow_rays`.
+    `unseen` of the result bounds what a deadline left unfinished. Add the cost to `spent`.
     """
     k = len(at_units)
     best = make_best(k)
@@ -110,8 +116,8 @@ def look(
                 break
             rows = _next_rows(data, lists, cursor, open_)
             if doubts is None and unproved and bounds.unsettled(rows, unproved).any():
-                # By the boxes of the index they may be out of the way: begin again with those, and look at the end
-                # at what they hide.
+                # By the boxes of the index they may be out of reach: restart with those boxes, and
+                # finally examine the voxels that they exclude.
                 doubts = lists
                 _forget(part)
                 lists = _list(data, index_tree, *ways, reach_units, radius_units, part)
@@ -124,14 +130,14 @@ def look(
             with data.residency.hold(
                 rows.tolist(), effort.deadline, scan=effort.scan, stop=effort.stop
             ) as found:
-                held[list(found.late)] = False  # they may be written to just now
+                held[list(found.late)] = False  # another thread may be writing them
                 kernel(begin, end, lists, cursor, held, part)
             spent.add(found, int(looked[rows].sum()))
             looked |= held
         if doubts is not None:
             _settle_doubts(data, doubts, lists, part, reach_units, effort, spent)
         best.counts[:, begin:end] = part.counts
-    if data.nothing_clear:  # a load may have found the index wrong
+    if data.nothing_clear:  # a load may have proved the index wrong
         best.unseen[:] = 0.0
     return best
 
@@ -145,7 +151,7 @@ def _list(
     radius_units: int,
     part: Nearest,
 ) -> Lists:
-    """List the voxels that k rays or points reach, by the boxes of a tree. The lists share `unseen` with `part`."""
+    """List the voxels that k rays or points reach by a tree's boxes; share `unseen` with `part`."""
     k = len(at_units)
     directions = np.empty((0, 3)) if direction is None else direction
     capacity = max(64, 8 * k)
@@ -171,10 +177,11 @@ def _settle_doubts(
     effort: Effort,
     spent: Spent,
 ) -> None:
-    """Load the voxels that the index places out of the way, where nothing was found before their cells.
+    """Load the voxels that only the index excludes, unless something was found before their cells.
 
-    doubts: what rays or points reach by proved bounds and cells.  lists: by the index, and looked at. A voxel that
-    cannot be read is missing: `part` says so. Where the effort's stop is set, nothing is known in `part`.
+    doubts: voxels that rays or points reach by proved boxes and cells.  lists: those reached by the
+    index, already examined. A voxel that cannot be read is counted as missing in `part`. If the
+    effort's stop flag is set, everything in `part` is unknown.
     """
     proved, v = data.bounds.proved, len(data.bounds.proved)
     found = np.where(part.square >= 0, np.sqrt(np.maximum(part.square, 0)), part.value)
@@ -196,7 +203,7 @@ def _settle_doubts(
     rows, near = doubts.rows[open_], doubts.near[open_]
     ray = np.searchsorted(doubts.starts, open_, side="right") - 1
     np.minimum.at(part.unseen, ray, near)
-    # Those that the index has in reach were counted when they were looked at.
+    # Voxels in reach by the index were counted when they were examined.
     known = np.repeat(np.arange(len(until)), np.diff(lists.starts)) * v + lists.rows[: lists.starts[-1]]
     hidden = ~np.isin(ray * v + rows, known)
     np.add.at(part.counts[0], ray[hidden], np.uint32(1))
@@ -205,9 +212,9 @@ def _settle_doubts(
 def _open_doubts(
     doubts: Lists, until: NDArray[np.float64], proved: NDArray[np.bool_], stop: Stop
 ) -> NDArray[np.int64]:
-    """Return the numbers, ascending, of the entries of `doubts` whose voxel is not proved and not beyond `until`.
+    """Return the entries of `doubts`, ascending, with an unproved voxel no farther than `until`.
 
-    until: (k,) of each ray [exact units].  stop: once it is set, some may be left out.
+    until: (k,) of each ray [exact units].  stop: once it is set, the result may be incomplete.
     """
     entries, found = int(doubts.starts[-1]), [np.empty(0, np.int64)]
     for begin in range(0, entries, ENTRIES_AT_ONCE):
@@ -223,9 +230,11 @@ def _open_doubts(
 def _next_rows(
     data: SceneData, lists: Lists, cursor: NDArray[np.int64], open_: NDArray[np.bool_]
 ) -> NDArray[np.int64]:
-    """The voxels to hold in the next round: those wanted next, the most wanted first, then what is resident already.
+    """Return the voxels to hold in the next round.
 
-    At least one is wanted next and fits, as the cache holds every voxel alone; so each round comes further.
+    These are the voxels needed next, those of most rays first, and then resident voxels needed
+    later. At least one of the former fits, because the cache can hold every single voxel;
+    therefore each round makes progress.
     """
     v = len(data.arrays.where)
     wanted = np.bincount(lists.rows[cursor[open_]], minlength=v)
@@ -250,10 +259,11 @@ def _next_rows(
 def finish(
     found: NDArray[np.float64], unseen: NDArray[np.float64], reach_units: int
 ) -> tuple[NDArray[np.uint8], NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
-    """verdict, lower, upper [m] and exact of distances found (k,) [exact units], inf: none.
+    """Return verdict, lower, upper [m] and exact for the distances found (k,) [exact units].
 
-    unseen: (k,) lower bounds of what was not looked at [exact units]. A hit found is a hit, whatever is missing; it is
-    the first one, as `exact` says, when all that is missing lies farther.
+    found: inf for none.  unseen: (k,) lower bounds of the distance of what was not examined [exact
+    units]. A hit remains a hit, whatever is missing. It is the first one, and `exact` is true, if
+    everything missing is farther away.
     """
     missing = np.where(unseen > reach_units, math.inf, unseen)
     hit = np.isfinite(found)

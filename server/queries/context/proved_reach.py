@@ -1,9 +1,9 @@
-"""Proof of the index before an answer relies on it: voxels in reach by their cells alone are loaded first.
+"""Proof of the index before an answer relies on it, by loading voxels in reach by their cells only.
 
-By the boxes of the index such a voxel is out of reach. If its record agrees with the index
-(index_proof.py), it is not looked
-at, and every answer and every count of work is that of the index. If the record cannot be read, the voxel stays in
-reach and is missing there. So each voxel costs at most one load more, even where nothing comes near its points.
+By its box in the index such a voxel is out of reach. If its record agrees with the index
+(index_proof.py), the voxel is not examined, and every answer and work count is that of the index.
+If the record cannot be read, the voxel stays in reach and is missing. Each voxel therefore costs at
+most one additional load, even if nothing comes near its points.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,10 +19,10 @@ from .query_cost import Spent
 
 
 def prove(data: SceneData, rows: Sequence[int], effort: Effort, spent: Spent) -> None:
-    """Load the voxels of distinct rows in their order, as many at a time as fit, until the effort's time is up.
+    """Load voxels of distinct rows in order, as many at a time as fit, within the effort's time.
 
-    The voxels are not kept for the request. Add the cost to `spent`, without late voxels: the request finds those
-    itself.
+    The voxels are not held afterwards. Add the cost to `spent`, without late voxels: the request
+    finds those itself.
     """
     residency = data.residency
     for part in residency.parts_that_fit(rows, int(residency.buffer.total_bytes * effort.share)):
@@ -42,9 +42,10 @@ def find_proved_reach(
     spent: Spent,
     settled: Callable[[Reach], Reach] = lambda reach: reach,
 ) -> Reach:
-    """Return the reach of poses (k, 4, 4) as `check_request` does, of voxels that are proved or cannot be read.
+    """Return the reach of poses (k, 4, 4) with only voxels that are proved or unreadable.
 
-    settled: takes out of a reach what need not be looked at. Raises as `check_request`.
+    Otherwise the same as `check_request`, errors included.
+    settled: removes pairs that need not be examined from a reach.
     """
     bounds, stop = data.bounds, effort.stop
     unproved = bounds.unproved
@@ -62,10 +63,10 @@ def find_proved_reach(
 
 
 def _likely(data: SceneData, reach: Reach, doubted: list[int], effort: Effort) -> list[int]:
-    """Return the rows to load before the doubted ones: where there is a deadline, those in reach by the index.
+    """Return the rows to load before doubted ones: with a deadline, those in reach by the index.
 
-    Proofs may take half of the time, and what is likely to be touched is worth more. Where all together do not fit, the
-    likely ones are loaded later, piece by piece: none are returned.
+    Proofs may take half of the time, and voxels that are likely to be touched matter more. If the
+    likely voxels do not fit together, return none: they are loaded later, piece by piece.
     """
     if effort.deadline == np.inf:
         return []

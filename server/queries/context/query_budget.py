@@ -1,7 +1,8 @@
-"""How much an answer may cost: tolerance and budgets (DESIGN.md, "Verdicts, bounds and budgets"; NUMERICS.md case 30).
+"""Tolerance and budgets of a query.
 
-Every question takes an `Effort`. Without a budget the work ends when the answer is exact, or known within the
-tolerance. With one it ends there or when the budget is spent, whichever is first; what is said then is still true.
+Every query takes an `Effort`. Without a budget the work ends when the answer is exact, or known
+within the tolerance. With a budget it also ends when the budget is spent; the answer is then still
+correct. See DESIGN.md, "Verdicts, bounds and budgets", and NUMERICS.md case 30.
 """
 
 import math
@@ -16,22 +17,26 @@ from ...kernels.core.stop_flag_checks import (
 from ...runtime.deadlines import stop_at
 from ...runtime.stop_flag import NEVER, Stop
 
-# Of the time left, what loads may take: what is resident is to be searched as well.
+# Share of the remaining time that loads may take; the rest is for searching resident voxels.
 LOAD_SHARE = 0.5
-# After the deadline of a budget, searches that look at the clock have so long to end by themselves, with what they know
-# by then; after that the stop flag ends everything [s].
+# Time after a budget's deadline in which searches that check the clock end by themselves, with the
+# results so far; after it the stop flag ends everything [s].
 GRACE = 0.05
 
 
 class Effort(NamedTuple):
-    """What one request may cost.
+    """Limits on the cost of one request.
 
-    tolerance: how early contact may be called, and how far bounds may lie apart [m]; 0, the default: exact, for no
-    search that may stop early is as fast (`solidcloud accuracy`).
-    visits: node visits a pose (ray, point, motion).  deadline: on time.perf_counter()'s clock [s], inf: none.
-    scan: what is looked at is passed by, as on a sweep along a path: it is not to wash the cache (eviction.py).
-    share: of the cache, what may be held at a time. Counts of work depend on it, where not all fits; no verdict does.
-    stop: ends the work early once it is set; what was not looked at then is unknown.
+    tolerance: separation at which contact may already be reported, and largest distance between
+    bounds [m]. The default 0 means exact, because no search that may stop early is as fast
+    (`solidcloud accuracy`).
+    visits: node visits a pose (ray, point, motion).
+    deadline: on time.perf_counter()'s clock [s], inf for none.
+    scan: voxels are used in passing, as on a sweep along a path, and should not displace others in
+    the cache (eviction.py).
+    share: of the cache, for the voxels held at a time. If not all fit, work counts depend on it;
+    verdicts never do.
+    stop: ends the work early once it is set; what was not examined by then is unknown.
     """
 
     tolerance: float = 0.0
@@ -43,20 +48,21 @@ class Effort(NamedTuple):
 
     @property
     def limited(self) -> bool:
-        """Whether there is a budget.
+        """Return whether there is a budget.
 
-        `collide` and `distance` search by priority only then. A tolerance alone they answer exactly, for that takes a
-        fraction of the time of a search that may stop early (`solidcloud accuracy`, knob "tolerance").
+        `collide` and `distance` use best-first search only then. With only a tolerance they answer
+        exactly, which takes a fraction of the time of a search that may stop early (`solidcloud
+        accuracy`, knob "tolerance").
         """
         return self.visits < NO_LIMIT or self.deadline < math.inf
 
     @property
     def spent(self) -> bool:
-        """Whether the time is up, or the request was stopped."""
+        """Return whether the time is up or the request was stopped."""
         return bool(self.stop) or (self.deadline < math.inf and time.perf_counter() >= self.deadline)
 
     def loads_until(self) -> float:
-        """Until when loads that begin now may go on, on the same clock [s]; inf: until they are done."""
+        """Return the deadline of loads that begin now, on the same clock [s]; inf if none."""
         if self.deadline == math.inf:
             return math.inf
         now = time.perf_counter()
@@ -67,7 +73,7 @@ EXACT = Effort()
 
 
 class EngineOptions(QuestionOptions, total=False):
-    """The options of a question to a scene: those of the wire, and the stop flag of whoever asks."""
+    """Options of a query to a scene: those of the wire, and the caller's stop flag."""
 
     stop: Stop
 
@@ -78,12 +84,13 @@ def make_effort(
     budget_visits: int | None = None,
     stop: Stop = NEVER,
 ) -> Effort:
-    """The effort of a request that starts now.
+    """Make the effort of a request that starts now.
 
-    tolerance: [m], finite and >= 0.  budget_ms: waiting for loads and work together; None: no limit.
-    budget_visits: its twin that needs no clock, node visits a pose; None: no limit.  stop: the request's stop flag. A
-    budget of time sets it `GRACE` after its end, for kernels that do not look at the clock; where it is NEVER, the
-    effort has one of its own. Raises BadRequestError.
+    tolerance: [m], finite and >= 0.
+    budget_ms: time limit including waits for loads; None: no limit.
+    budget_visits: limit in node visits a pose, independent of the clock; None: no limit.
+    stop: the request's stop flag. A time budget sets it `GRACE` after its end, for kernels that do
+    not check the clock; if it is NEVER, the effort gets a new flag. Raise BadRequestError.
     """
     if not 0 <= tolerance < math.inf:
         raise BadRequestError(f"tolerance is {tolerance}: expected a finite number of metres, 0 or more")

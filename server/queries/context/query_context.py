@@ -1,4 +1,4 @@
-"""What every question about a scene shares: what it reads, poses checked, voxels in reach held piece by piece."""
+"""Context of every query: the scene data it reads, checked poses, and its voxels in pieces."""
 
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -22,10 +22,10 @@ from ...residency.index_proof import Bounds
 from ...residency.voxel_cache import Residency
 from ...runtime.stop_flag import NEVER, Stop, StoppedError
 
-# Voxels in reach of all poses of one request: 128 MB of row numbers. The index would make gigabytes of them for 100,000
-# poses whose reach covers thousands of voxels.
+# Most voxels in reach of one request, over all poses: 128 MB of row numbers. For 100,000 poses
+# whose reach covers thousands of voxels, there would be gigabytes.
 MOST_ROWS = 1 << 24
-# Rows looked at between two looks at the stop flag.
+# Rows processed between two checks of the stop flag.
 _MARKED_AT_ONCE = 1 << 18
 
 _POSE_FAULTS: dict[int, tuple[type[SolidcloudError], str]] = {
@@ -54,12 +54,15 @@ _POSE_FAULTS: dict[int, tuple[type[SolidcloudError], str]] = {
 
 
 class SceneData(NamedTuple):
-    """What every question about one scene reads; made once, by `make_scene_data`.
+    """Data of one scene that every query reads; made once, by `make_scene_data`.
 
-    arrays: what the kernels read.  bounds: boxes around the points of each voxel; broad: its index, which the broad
-    phase reads.  radius_units: of the largest sphere of a scan point, exact units.  unknown: (u, 2, 3) int64, lattice
-    boxes of scans left out; unknown_everywhere: also elsewhere.  keeps_scan: whether the arena holds the scan each
-    point came from.  coarse: what is known of voxels that are not in memory; None: nothing is.
+    arrays: what the kernels read.  bounds: boxes around the points of each voxel.
+    broad: the index of `bounds`, which the broad phase reads.
+    radius_units: of the largest sphere of a scan point, exact units.
+    unknown: (u, 2, 3) int64, lattice boxes of scans left out.
+    unknown_everywhere: whether a scan was left out whose bounds are not known.
+    keeps_scan: whether the arena holds the scan that each point came from.
+    coarse: coarse bounds of voxels that are not in memory; None if there are none.
     """
 
     residency: Residency
@@ -74,19 +77,28 @@ class SceneData(NamedTuple):
 
     @property
     def nothing_clear(self) -> bool:
-        """Whether no place is known to be clear: a scan was left out anywhere, or a load found the index wrong."""
+        """Return whether no place is known to be clear.
+
+        This is so if a scan with unknown bounds was left out, or a load proved the index wrong.
+        """
         return self.unknown_everywhere or self.residency.misled
 
 
 def kernel_poses(poses: ArrayLike) -> NDArray[np.float64]:
-    """Poses (k, 4, 4) as kernels take them: numba would compile them anew for a read-only array. BadRequestError."""
+    """Return poses (k, 4, 4) in a writable array. Raise BadRequestError.
+
+    numba would compile the kernels again for a read-only array.
+    """
     array = make_poses(poses)
     return array if array.flags.writeable else array.copy()
 
 
 def to_units(metres: float, what: str) -> int:
-    """A length in exact units, rounded once (NUMERICS.md N5). Raises BadRequestError for a negative or absurd one."""
-    if not 0 <= metres <= MAX_COORDINATE:  # not so for NaN either; kernels take the result as int64
+    """Convert a length to exact units, rounded once (NUMERICS.md N5).
+
+    Raise BadRequestError if it is negative or beyond MAX_COORDINATE.
+    """
+    if not 0 <= metres <= MAX_COORDINATE:  # rejects NaN too; kernels take the result as int64
         raise BadRequestError(f"{what} {metres!r}: expected zero or a positive length in metres")
     return round(metres * UNITS_PER_METRE)  # half to even
 
@@ -94,9 +106,9 @@ def to_units(metres: float, what: str) -> int:
 def make_scene_data(
     archive: Archive, residency: Residency, bounds: Bounds | None = None, coarse: Coarse | None = None
 ) -> SceneData:
-    """What the questions read of an archive whose voxels `residency` holds; radii are the archive's one figure.
+    """Make the data of an archive whose voxels `residency` holds, with the archive's single radius.
 
-    bounds: those of its voxels, where somebody else has use for them too. Loads prove them from now on.
+    bounds: those of its voxels if they are shared; None: new ones. Loads prove them from now on.
     """
     bounds = Bounds(archive) if bounds is None else bounds
     residency.proved = bounds.prove
@@ -128,28 +140,29 @@ def make_scene_data(
 
 
 def with_radius_model(data: SceneData, archive: Archive, text: str | None) -> SceneData:
-    """The same scene with the radii of a model (schemas/archive/radius_model.py); None: the archive's one figure.
+    """Return the same scene with the radii of a model (schemas/archive/radius_model.py).
 
-    Raises BadRequestError for a model that is none, or that the archive does not hold.
+    text: the model; None: the archive's single radius. Raise BadRequestError for an invalid model,
+    or one that the archive does not contain.
     """
     header = archive.header
     radii = class_radii(text, header.radius, header.models)
-    # Of the classes that there are: on a dense scan all are small, and so is what is in reach. A node may have a class
-    # that no point has; its points' spheres are none the larger.
+    # Only classes that occur count: on a dense scan all are small, which keeps the reach small. A
+    # node may have a class that no point has, but no sphere of its points is larger than these.
     largest = int(radii[header.radius_counts > 0].max()) if len(radii) > 1 else int(radii[0])
     drop = np.maximum(largest - radii, 0)
     return data._replace(arrays=data.arrays._replace(drop=drop), radius_units=largest)
 
 
 def with_stop(data: SceneData, stop: Stop) -> SceneData:
-    """Return the same scene for a request that `stop` ends early, and no other stop."""
+    """Return the same scene for a request that only `stop` ends early."""
     return (
         data if data.arrays.stop is stop.flag else data._replace(arrays=data.arrays._replace(stop=stop.flag))
     )
 
 
 def _empty_reach(k: int, rows: int) -> Reach:
-    """A `Reach` to be filled for k poses with room for so many voxel rows."""
+    """Return an empty `Reach` for k poses with capacity for `rows` voxel rows."""
     return Reach(
         np.empty(k), np.empty(k, np.int64), np.zeros(k + 1, np.int64), np.empty(rows, np.int64), np.empty((k, 2, 3)),
         np.zeros(k, bool),
@@ -157,7 +170,7 @@ def _empty_reach(k: int, rows: int) -> Reach:
 
 
 def refuse(fault: int, pose: int, found: float) -> None:
-    """Raise what a fault that `find_reach` found stands for, if it is one."""
+    """Raise the error for a fault reported by `find_reach`; do nothing if there is none."""
     if fault != placing.GOOD:
         error, text = _POSE_FAULTS[fault]
         raise error(f"pose {pose} {text.format(found)}")
@@ -166,10 +179,10 @@ def refuse(fault: int, pose: int, found: float) -> None:
 def check_request(
     data: SceneData, avatar: AvatarModel, poses: NDArray[np.float64], other_units: int
 ) -> Reach:
-    """The voxels in reach of each pose (k, 4, 4); none for an empty avatar.
+    """Check poses (k, 4, 4) and return the voxels in reach of each; none for an empty avatar.
 
-    Raises BadRequestError, BadTransformError or TooLargeError naming the pose, TooLargeError for more than MOST_ROWS
-    voxels in reach of all poses, and StoppedError.
+    Raise BadRequestError, BadTransformError or TooLargeError naming the pose, TooLargeError for
+    more than MOST_ROWS voxels in reach of all poses, and StoppedError.
     """
     needed = 16 * len(poses) + 64
     while True:
@@ -192,13 +205,13 @@ def check_request(
 def pieces(
     reach: Reach, residency: Residency, share: float = 1.0, stop: Stop = NEVER
 ) -> Iterator[tuple[NDArray[np.int64], list[int], Reach]]:
-    """Cut a request into pieces whose voxels fit the budget: (pose numbers, voxel rows, reach) each.
+    """Split a request into pieces whose voxels fit in the budget: (pose numbers, rows, reach) each.
 
-    share: of the budget, what a piece may take, but for a voxel that alone takes more.  stop: once it is set, the last
-    piece has all poses that are left, and no voxels.
+    share: of the budget, for each piece; a single larger voxel is allowed.
+    stop: once it is set, the last piece has all remaining poses and no voxels.
 
-    Nearly always one piece. A pose that alone reaches more than the budget is looked at voxel by voxel run
-    (NUMERICS.md case 23), and so appears in several pieces.
+    There is nearly always one piece. A pose whose voxels exceed the budget by themselves appears in
+    several pieces, each with a run of its voxels (NUMERICS.md case 23).
     """
     k = len(reach.scales)
     rows = reach.rows[: reach.starts[k]]
@@ -231,9 +244,9 @@ def pieces(
 
 
 def distinct_rows(rows: NDArray[np.int64], voxels: int, stop: Stop) -> NDArray[np.int64]:
-    """Return the distinct values of `rows`, ascending; not all of them where the stop is set meanwhile."""
+    """Return the distinct values of `rows`, ascending; perhaps not all after a stop."""
     if len(rows) <= _MARKED_AT_ONCE:
-        return np.unique(rows)  # a sort in numpy lets other threads run meanwhile
+        return np.unique(rows)  # a sort in numpy lets other threads run
     met = np.zeros(voxels, bool)
     for begin in range(0, len(rows), _MARKED_AT_ONCE):
         if stop:
@@ -243,23 +256,26 @@ def distinct_rows(rows: NDArray[np.int64], voxels: int, stop: Stop) -> NDArray[n
 
 
 def _only(reach: Reach, pose: int, rows: list[int]) -> Reach:
-    """The same request with the voxels of one pose replaced by some of them."""
+    """Return the reach with the voxels of one pose replaced by some of them."""
     starts = np.zeros_like(reach.starts)
     starts[pose + 1 :] = len(rows)
     return reach._replace(starts=starts, rows=np.array(rows, np.int64))
 
 
 def as_held(data: SceneData, held: Held) -> SceneData:
-    """What a kernel may read while `held`: what is late is not resident, though it may become so meanwhile."""
+    """Return what a kernel may read during a hold: late voxels appear as not resident.
+
+    They may become resident during the hold.
+    """
     if not held.late:
         return data
-    where = data.arrays.where.copy()  # rows that others write now are not among those held, or late
+    where = data.arrays.where.copy()  # other threads write only rows that are late or not held
     where[list(held.late)] = -1
     return data._replace(arrays=data.arrays._replace(where=where))
 
 
 def in_unknown(boxes: NDArray[np.float64], unknown: NDArray[np.int64], everywhere: bool) -> NDArray[np.bool_]:
-    """Which boxes (k, 2, 3) of reach meet a region (u, 2, 3) whose scan was left out."""
+    """Return which boxes (k, 2, 3) of reach meet a region (u, 2, 3) of a scan left out."""
     if everywhere:
         return np.ones(len(boxes), bool)
     met = np.zeros(len(boxes), bool)

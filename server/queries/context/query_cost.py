@@ -1,4 +1,4 @@
-"""What the holds of one request add up to: the fields of `Cost`."""
+"""Cost of one request, summed over its holds: the fields of `Cost`."""
 
 import time
 from collections.abc import Sequence
@@ -10,21 +10,21 @@ from .query_context import SceneData
 
 
 class Spent:
-    """A request that began at `begin`, and what it took since. Not thread-safe."""
+    """Accumulated cost of a request. Not thread-safe."""
 
     __slots__ = ("begin", "faults", "hits", "late", "loaded", "misses", "waited")
 
     def __init__(self, begin: float) -> None:
-        """begin: on time.perf_counter()'s clock [s]."""
+        """Begin with zero cost. begin: start time on time.perf_counter()'s clock [s]."""
         self.begin = begin
         self.hits = self.misses = 0
-        self.loaded = 0  # voxels of holds to come that the request itself has loaded: they are no hits
+        self.loaded = 0  # voxels the request itself has loaded for later holds: they are no hits
         self.waited = 0.0
         self.faults: dict[str, None] = {}
         self.late: dict[int, None] = {}
 
     def add(self, held: Held, again: int = 0) -> None:
-        """One more hold. again: of its hits, those of voxels that the request has held before."""
+        """Add a hold. again: number of its hits on voxels that the request has held before."""
         found = held.hits - again - self.loaded
         self.hits, self.loaded = self.hits + max(0, found), max(0, -found)
         self.misses += held.misses
@@ -33,12 +33,12 @@ class Spent:
         self.late.update(dict.fromkeys(held.late))
 
     def add_cost(self, cost: Cost, data: SceneData) -> None:
-        """What another question came to."""
+        """Add the cost of another query."""
         rows = [int(data.broad.keys.searchsorted(key)) for key in cost.late]
         self.add(Held(cost.hits, cost.misses, cost.faults, tuple(rows), cost.wait_seconds))
 
     def cost(self, data: SceneData) -> dict[str, Any]:
-        """The fields of `Cost`, now that the answer is there."""
+        """Return the fields of `Cost`; call it when the answer is complete."""
         residency = data.residency
         return {
             "engine_seconds": time.perf_counter() - self.begin,
@@ -53,5 +53,5 @@ class Spent:
 
 
 def _keys(data: SceneData, rows: Sequence[int]) -> tuple[int, ...]:
-    """The keys of voxels, by rows of the index."""
+    """Return the keys of voxels, given their rows in the index."""
     return tuple(data.broad.keys[list(rows)].tolist()) if rows else ()

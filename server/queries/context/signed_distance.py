@@ -1,15 +1,17 @@
-"""Squares of integers -> signed distances in metres, and the bounds of what was not looked at.
+"""Signed distances in metres from integer squares, and bounds of what was not examined.
 
-The definition, in the integers of NUMERICS.md N5: with D2 = |a - b|^2 and r = r_a + r_b, the pair's own radii, each
-rounded once to exact units, of all pairs of placed avatar centre a and scan point b the one with the least gap
-sqrt(D2) - r, compared exactly; its signed distance is
+The definition uses the integers of NUMERICS.md N5. Let D2 = |a - b|^2 and r = r_a + r_b for a pair
+of placed avatar centre a and scan point b, with the pair's own radii, each rounded once to exact
+units. Of all pairs, take the one with the least separation sqrt(D2) - r, compared exactly. Its
+signed distance is
 
     (D2 - r^2) / (sqrt(D2) + r) / 2^26 m
 
-The difference in int64, the rest in float64, in this order; 0 where D2 and r are. That is sqrt(D2) - r without
-cancellation: it is negative, zero or positive as the spheres overlap, touch or do not. No pair has a lesser gap, so it
-is positive exactly where no pair of spheres is in contact. Where all scan points have one radius, the pair is that with
-the least D2.
+with the difference in int64 and the rest in float64, in this order; it is 0 if D2 and r are 0. This
+equals sqrt(D2) - r without cancellation. It is negative if the spheres overlap, zero if they touch
+and positive if they do neither. No pair has a smaller separation, so the signed distance is
+positive exactly if no pair of spheres is in contact. If all scan points have the same radius, the
+pair is that with the least D2.
 """
 
 from typing import Any
@@ -25,7 +27,10 @@ from .query_context import SceneData
 
 
 def signed_from_square(square: NDArray[np.int64], radii: NDArray[np.int64]) -> NDArray[np.float64]:
-    """The signed distances (k,) [m] of pairs with |a - b|^2 = square and r_a + r_b = radii, exact units."""
+    """Return the signed distances (k,) [m] of pairs.
+
+    square: |a - b|^2.  radii: r_a + r_b. Both are in exact units.
+    """
     above = (square - radii * radii).astype(np.float64)
     both = np.sqrt(square.astype(np.float64)) + radii.astype(np.float64)
     return np.divide(above, both, out=np.zeros(len(square)), where=both > 0) / UNITS_PER_METRE
@@ -34,20 +39,23 @@ def signed_from_square(square: NDArray[np.int64], radii: NDArray[np.int64]) -> N
 def signed_bound(
     steps: NDArray[np.float64], data: SceneData, radii: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Signed distances (k,) [m] that are surely not above what centres at least `steps` apart have.
+    """Return lower bounds (k,) of the signed distance [m] for centres at least `steps` apart.
 
-    radii: (k,) of avatar's and scan's largest spheres together, exact units.
+    radii: (k,) sum of the largest radii of avatar and scan, exact units.
     """
     metres = steps * data.arrays.step * (1.0 - 1e-12)
     return metres - radii / UNITS_PER_METRE - 2.0 / UNITS_PER_METRE
 
 
 def unknown_gaps(data: SceneData, reach: Reach) -> NDArray[np.float64]:
-    """How far (k,) an avatar's centres are at least from any region whose scan was left out [steps]; inf: none."""
+    """Return lower bounds (k,) of the distance of centres from regions left out [steps].
+
+    The bound is inf without regions of scans that were left out.
+    """
     k = len(reach.scales)
     if data.nothing_clear:
         return np.zeros(k)
-    # The boxes hold the avatar's centres and the reach around them.
+    # The boxes enclose the avatar's centres and the reach around them.
     own = (reach.units / data.arrays.units_per_step)[:, None]
     low, high = reach.boxes[:, 0] + own, reach.boxes[:, 1] - own
     gaps = np.full(k, np.inf)
@@ -66,17 +74,18 @@ def distance_columns(
     counts: NDArray[np.uint32],
     upper: NDArray[np.float64] | None = None,
 ) -> dict[str, Any]:
-    """The fields of `DistanceAnswers` that say where the nearest pair is.
+    """Return the fields of `DistanceAnswers` except the cost of the request.
 
-    farthest: the reach asked for [m].  reach_units: the same, exact units.  nearest: what was found; its gap counts
-    missing voxels, unknown regions and what was not looked at.  upper: (k,) [m], where more is known than the
-    pair found says.
+    farthest: the requested reach [m].  reach_units: the same, exact units.
+    nearest: the pairs found; its gap includes missing voxels, unknown regions and what was not
+    examined.
+    upper: (k,) [m], upper bounds that may be tighter than the pairs found.
     """
     radii = reach.units - reach_units  # of the largest spheres
     found = nearest.square >= 0
     signed = np.where(found, signed_from_square(np.maximum(nearest.square, 0), radii - nearest.drop), np.inf)
     floor = np.maximum(signed_bound(nearest.gap, data, radii), -radii / UNITS_PER_METRE)
-    # `farthest` itself may be a rounding above what the reach is in exact units.
+    # `farthest` may exceed the reach in exact units by a rounding.
     exact = floor >= np.where(found, signed, farthest)
     upper = signed if upper is None else np.where(exact, signed, np.where(upper <= farthest, upper, np.inf))
     lower = np.where(exact, np.minimum(signed, farthest), np.minimum(np.minimum(upper, floor), farthest))
@@ -101,5 +110,5 @@ def distance_columns(
 
 
 def _units_of(data: SceneData, lattice: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Exact units (k, 3) of lattice points: one product, half to even (NUMERICS.md N5)."""
+    """Convert lattice points to exact units (k, 3): one product, half to even (NUMERICS.md N5)."""
     return np.rint(lattice.astype(np.float64) * data.arrays.units_per_step).astype(np.int64)

@@ -88,7 +88,7 @@ def test_the_number_of_clients_is_limited():
     avatars = Avatars(LIMITS)
     for client in "abc":
         avatars.add("al", BODY[:2], 0.01, client)
-    with pytest.raises(TooLargeError, match="3 clients with avatars are there"):
+    with pytest.raises(TooLargeError, match="3 clients with avatars exist"):
         avatars.add("al", BODY[:2], 0.01, "d")
     avatars.add("bo", BODY[:2], 0.01, "c")
     avatars.drop_client("a")

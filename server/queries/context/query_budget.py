@@ -2,7 +2,7 @@
 
 Every query takes an `Effort`. Without a budget the work ends when the answer is exact, or known
 within the tolerance. With a budget it also ends when the budget is spent; the answer is then still
-correct. See DESIGN.md, "Verdicts, bounds and budgets", and NUMERICS.md case 30.
+correct. See NUMERICS.md case 30.
 """
 
 import math

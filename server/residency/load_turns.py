@@ -14,9 +14,9 @@ from ..runtime.stop_flag import Stop, seconds_to
 
 # A turn that takes longer, for a slow disk or a wait for memory, does not block others [s].
 MAX_TURN_SECONDS = 0.025
-# A request that misses at most so many voxels does not wait for its turn behind those that miss
-# more. Eight threads answer as many queries a second with 4 as with 0 (97 and 100), and with 16
-# fewer (63).
+# A request that misses at most this many voxels does not wait for a turn behind those that miss
+# more. Eight threads answer about as many queries a second with 4 as with 0 (97 and 100), and fewer
+# with 16 (63).
 LOADS_WITHOUT_TURN = 4
 
 

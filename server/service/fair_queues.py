@@ -15,8 +15,8 @@ class Offer(Enum):
     """Outcome of offering a request."""
 
     RUN = "run it now"
-    START = "run it now, in a thread of its own: it is slow"
-    WAIT = "it waits; whoever finishes starts it"
+    START = "run it now, in a separate thread: it is slow"
+    WAIT = "it waits; the end of another request starts it"
     FULL = "refused: the server has too many requests in flight"
     FULL_TURN = "refused: this client has too many requests in flight"
 

@@ -47,5 +47,5 @@ class Tokens:
 
     @property
     def heeded(self) -> frozenset[str]:
-        """Return the clients that have a turn of their own."""
+        """Return the clients that have their own turn."""
         return frozenset(self._heeded)

@@ -142,7 +142,7 @@ class Lane:
         self._start_thread(self._scene, self._take_all)
 
     def _start(self, tickets: Iterable[Ticket]) -> None:
-        """Carry out requests, each in a thread of its own."""
+        """Carry out requests, each in a separate thread."""
         for ticket in tickets:
             self._start_thread(self._scene, self._run, ticket)
 

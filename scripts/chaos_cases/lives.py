@@ -19,14 +19,13 @@ from .ground import SCENE, Ground
 START_SECONDS = 300.0  # the first start on a machine compiles
 STOP_SECONDS = 60.0
 WATCH_PERIOD = 0.5
-# What a life takes to fill its caches; memory is judged after [s].
-SETTLED = 120.0
 
 
 class Quiet(NamedTuple):
     """What a server holds while nobody asks. life: which.  at: when [s].  threads: by name.  files: by kind or name.
 
     rss: bytes resident.  of_files: those of them that are a file's, so that the system may take them back.
+    calm: whether the server had dropped all avatars that nobody used.
     """
 
     life: int
@@ -35,6 +34,7 @@ class Quiet(NamedTuple):
     files: dict[str, int]
     rss: int
     of_files: int
+    calm: bool
 
 
 class Stop(NamedTuple):
@@ -117,8 +117,8 @@ class Lives:
         """Ask the server to reload."""
         os.kill(self.pid, signal.SIGHUP)
 
-    def look(self) -> None:
-        """Note what the server holds; for moments when nobody asks."""
+    def look(self, *, calm: bool) -> None:
+        """Note what the server holds; for moments when nobody asks. calm: see `Quiet`."""
         folder = Path("/proc") / str(self.pid)
         threads = Counter((task / "comm").read_text().strip() for task in (folder / "task").iterdir())
         files: Counter[str] = Counter()
@@ -126,16 +126,17 @@ class Lives:
             with suppress(OSError):  # closed meanwhile
                 files[entry.readlink().name.partition(":")[0]] += 1
         self.quiet.append(
-            Quiet(self.number, time.monotonic(), dict(threads), dict(files), *_resident(self.pid))
+            Quiet(self.number, time.monotonic(), dict(threads), dict(files), *_resident(self.pid), calm)
         )
 
     def slope(self) -> tuple[float, float] | None:
-        """Return the slope of the last life's memory once settled [MB a minute], and the minutes it was seen for."""
-        begin = next((at for life, at, _ in self.memory if life == self.number), 0.0)
-        end = self.stops[-1].begin if self.stops else time.monotonic()
+        """Return the slope of the last life's memory once settled [MB a minute], and the minutes it was seen for.
+
+        Memory is what is no file's, at calm quiet points. None: they are too few, or less than a minute apart.
+        """
         seen = np.array(
-            [(at, rss) for life, at, rss in self.memory if life == self.number and begin + SETTLED < at < end]
-        )
+            [(q.at, q.rss - q.of_files) for q in self.quiet if q.life == self.number and q.calm], np.float64
+        ).reshape(-1, 2)
         if len(seen) < 2 or seen[-1, 0] - seen[0, 0] < 60:
             return None
         rate = np.polyfit(seen[:, 0] - seen[0, 0], seen[:, 1], 1)[0]

@@ -40,6 +40,12 @@ HARM = {
 }  # fmt: skip
 
 
+# Harm that leaves avatars behind, which the server keeps for a minute. At the end of each period of the last life none
+# is done for so long that the server has dropped them all [s]; memory is judged then.
+LEAVES_AVATARS = ("invented", "heavy")
+PERIOD, CALM, DROPPED = 120.0, 75.0, 70.0
+
+
 def _forking() -> Any:
     """Return what forks processes that have imported all they need: 16 that import it anew take a minute."""
     from multiprocessing import forkserver
@@ -77,6 +83,7 @@ class Storm:
         self._born: dict[int, float] = {}
         self._frozen: dict[int, float] = {}
         self._strangers: list[tuple[Any, float]] = []
+        self._disturbed = 0.0  # when harm was last done that leaves avatars behind
         self._harm = dict(HARM)
         for kind in [*without, *(() if has_strace() else ("read errors",))]:
             self._harm.pop(kind, None)
@@ -95,8 +102,18 @@ class Storm:
             )
             begin = time.monotonic()
             quiet_at = begin + QUIET_EVERY / 3
+            periods = 0
             while (now := time.monotonic()) < begin + seconds:
-                kinds = self._harm | (KILLS if now < begin + 0.4 * seconds else {})
+                deadly = now < begin + 0.4 * seconds
+                lived = now - self.lives.serving_at
+                calm = not deadly and lived % PERIOD > PERIOD - CALM
+                kinds = self._harm | (KILLS if deadly else {})
+                kinds = {
+                    kind: often for kind, often in kinds.items() if not (calm and kind in LEAVES_AVATARS)
+                }
+                if not deadly and int(lived / PERIOD) > periods:
+                    self._quiet(calm=now - self._disturbed > DROPPED)
+                periods = int(lived / PERIOD)
                 kind = self.random.choices(list(kinds), list(kinds.values()))[0]
                 self.say(f"{now - begin:6.1f} s  {kind}")
                 self._do(kind)
@@ -112,6 +129,8 @@ class Storm:
     def _do(self, kind: str) -> None:
         """Do one harm."""
         self.done[kind] += 1
+        if kind in LEAVES_AVATARS:
+            self._disturbed = time.monotonic()
         if kind in strangers.STRANGERS:
             self._stranger(kind)
         elif kind == "kill server":
@@ -334,8 +353,11 @@ class Storm:
             time.sleep(0.005)
         return True
 
-    def _quiet(self) -> None:
-        """Let everybody be still, and see what the server holds."""
+    def _quiet(self, *, calm: bool = False) -> None:
+        """Let everybody be still, and record what the server holds.
+
+        calm: the server has dropped all avatars that nobody uses.
+        """
         for slot in list(self._frozen):
             self._thaw(slot)
         self._until(lambda: not self._strangers, 15.0)
@@ -343,7 +365,7 @@ class Storm:
         self.board.driver[b.PAUSE] = 1
         if self._until(lambda: all(row[b.IDLE] for _, row in self._rows()), 15.0):
             self._pause(2.0)
-            self.lives.look()
+            self.lives.look(calm=calm)
         else:
             self.done["no quiet point"] += 1
         self.board.driver[b.PAUSE] = 0

@@ -11,7 +11,7 @@ import pytest
 from chaos_cases import board as b
 from chaos_cases.ground import AVATARS, ask, judge_claims, make_pool
 from chaos_cases.judge import judge
-from chaos_cases.lives import Quiet
+from chaos_cases.lives import Lives, Quiet
 from chaos_cases.report import Limits, _violations
 from msgspec.structs import replace
 from rogues.tools import zeros
@@ -169,8 +169,8 @@ def test_a_client_is_still_once_all_its_ids_are(tmp_path: Path) -> None:
 
 def violations(threads: list[dict[str, int]], files: list[dict[str, int]]) -> list[str]:
     """What of a run is broken whose last life has held this at quiet points."""
-    quiet = [Quiet(1, 0.0, {"odd": 7}, {"odd": 7}, 0, 0)]  # of a life before
-    quiet += [Quiet(2, 0.0, *held, 0, 0) for held in zip(threads, files, strict=True)]
+    quiet = [Quiet(1, 0.0, {"odd": 7}, {"odd": 7}, 0, 0, False)]  # of a life before
+    quiet += [Quiet(2, 0.0, *held, 0, 0, False) for held in zip(threads, files, strict=True)]
     report = dict.fromkeys(
         ("wrong", "of them in contact", "clear_away", "errors", "tracebacks in the server's log",
          "seconds from serving to right, of each client", "MB a minute, last server, after two minutes")
@@ -218,3 +218,13 @@ def test_a_generation_that_was_served_while_a_question_was_under_way_is_remember
         driver.serve(generations)
     assert client.served_since(asked) == 3
     assert client.served_since(time.monotonic()) == 1
+
+
+def test_memory_is_judged_at_calm_quiet_points_of_the_last_life() -> None:
+    def quiet(life: int, minutes: float, megabytes: float, calm: bool, of_files: float = 0.0) -> Quiet:
+        return Quiet(life, 60 * minutes, {}, {}, int(megabytes * 1e6), int(of_files * 1e6), calm)
+
+    lives = SimpleNamespace(number=2, quiet=[quiet(1, 0, 900, True), quiet(2, 1, 300, True)])
+    assert Lives.slope(lives) is None, "one point has no slope"
+    lives.quiet += [quiet(2, 2, 500, False), quiet(2, 3, 340, True, of_files=36), quiet(2, 5, 308, True)]
+    assert Lives.slope(lives) == pytest.approx((2.0, 4.0))

@@ -24,7 +24,7 @@ def session_config(*, listen: str | None = None, connect: str | None = None) -> 
         "listen/endpoints": [listen] if listen else [],
         "connect/endpoints": [connect] if connect else [],
         # The default of 1 s, growing to 4 s, would prolong each outage by as much.
-        "connect/retry": {"period_init_ms": 50, "period_max_ms": 500, "period_increase_factor": 2},
+        "connect/retry": {"period_init_ms": 50, "period_max_ms": 250, "period_increase_factor": 2},
         # How long opening waits for the connection [ms]; default 500. Opening sometimes waits this
         # long although the connection exists at once.
         "scouting/delay": 200,
